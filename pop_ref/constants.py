@@ -1,0 +1,150 @@
+"""Named profiles: every constant and every strictness that decides what a render is.
+
+A render is defined by a `Profile`. Four names exist; `paper` is the default and equals `gsplat_1_5`, because POP was
+built on gsplat 1.5 (clamp 0.999, before 1.6). The profile is a value that is passed, never a global.
+
+Decisions, that is everything discontinuous, carry labels that can be searched for in code, docstrings, margins, CUDA
+source and tests:
+
+    D1 near plane            D2 extent and cull       D3 tile overlap        D4 depth order and ties
+    D5 alpha floor           D6 alpha ceiling         D7 transmittance stop  D8 dominance tie
+
+Gradient kinks: B1 frustum clamp in J, B2 colour clamp at 0, B3 alpha ceiling, B4 loss kinks.
+
+Sources: diff-gaussian-rasterization 59f5f77 (`inria`), gsplat v1.5.0-1.5.3 (`gsplat_1_5`), gsplat main from 2026-03
+(`gsplat_1_6`: clamp 0.99), the POP paper section 3.1 (transmittance stop `T <= 1e-4`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+DECISIONS: Final = {
+    "D1": "near plane: is the centre in front of it",
+    "D2": "extent and cull: how far a splat reaches, and whether it reaches the image",
+    "D3": "tile overlap: which tile lists hold the splat",
+    "D4": "depth order and ties: equal depths keep index order",
+    "D5": "alpha floor: a splat under it is skipped at that pixel",
+    "D6": "alpha ceiling: alpha is clamped to it",
+    "D7": "transmittance stop: the splat that would pass it is not blended and ends the pixel",
+    "D8": "dominance tie: equal weights go to the front splat",
+}
+
+KINKS: Final = {
+    "B1": "frustum clamp in the projection's Jacobian",
+    "B2": "colour clamp at 0",
+    "B3": "alpha ceiling",
+    "B4": "kinks of the losses (sign of zero in L1)",
+}
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The table of constants that defines a render.
+
+    Attributes:
+        name: the profile's name.
+        near_plane: camera z in world units at or under which a Gaussian is culled (D1).
+        near_inclusive: True culls `z <= near_plane`, False culls `z < near_plane` (D1).
+        far_plane: camera z in world units beyond which a Gaussian is culled (D1).
+        eps2d: low-pass, px^2 added to both diagonal entries of the screen covariance.
+        frustum_margin: the Jacobian's x/z and y/z are clamped this many tan(fov/2) outside the image (B1).
+        principal_point: "used" takes cx and cy from K, "centred" replaces them by W/2 and H/2 throughout.
+        clamp_gradient: "exact" differentiates the clamped Jacobian, "inria" omits the clamp's z term (B1).
+        extent: "opacity_aware" is the rectangle that holds every pixel with alpha >= alpha_floor,
+            "square" is Inria's square of 3 standard deviations of the larger axis (D2).
+        extent_sigmas: upper bound of the extent in standard deviations (D2).
+        alpha_floor: alpha under it is skipped (D5).
+        alpha_ceiling: alpha is clamped to it (D6).
+        ceiling_gradient: "zero" stops the gradient of a clamped alpha, "pass" lets it through (B3).
+        transmittance_stop: the transmittance at which a pixel ends (D7).
+        stop_inclusive: True stops at `T <= transmittance_stop`, False at `T <` (D7).
+        tile_size: px; part of the meaning in `inria` only (D3).
+    """
+
+    name: str
+    near_plane: float
+    near_inclusive: bool
+    far_plane: float
+    eps2d: float
+    frustum_margin: float
+    principal_point: Literal["used", "centred"]
+    clamp_gradient: Literal["exact", "inria"]
+    extent: Literal["opacity_aware", "square"]
+    extent_sigmas: float
+    alpha_floor: float
+    alpha_ceiling: float
+    ceiling_gradient: Literal["zero", "pass"]
+    transmittance_stop: float
+    stop_inclusive: bool
+    tile_size: int
+
+
+GSPLAT_1_5: Final = Profile(
+    name="gsplat_1_5",
+    near_plane=0.01,
+    near_inclusive=False,
+    far_plane=1e10,
+    eps2d=0.3,
+    frustum_margin=0.3,
+    principal_point="used",
+    clamp_gradient="exact",
+    extent="opacity_aware",
+    extent_sigmas=3.33,
+    alpha_floor=1.0 / 255.0,
+    alpha_ceiling=0.999,
+    ceiling_gradient="zero",
+    transmittance_stop=1e-4,
+    stop_inclusive=True,
+    tile_size=16,
+)
+
+GSPLAT_1_6: Final = Profile(**{**GSPLAT_1_5.__dict__, "name": "gsplat_1_6", "alpha_ceiling": 0.99})
+
+PAPER: Final = Profile(**{**GSPLAT_1_5.__dict__, "name": "paper"})
+
+INRIA: Final = Profile(
+    name="inria",
+    near_plane=0.2,
+    near_inclusive=True,
+    far_plane=1e10,
+    eps2d=0.3,
+    frustum_margin=0.3,
+    principal_point="centred",
+    clamp_gradient="inria",
+    extent="square",
+    extent_sigmas=3.0,
+    alpha_floor=1.0 / 255.0,
+    alpha_ceiling=0.99,
+    ceiling_gradient="pass",
+    transmittance_stop=1e-4,
+    stop_inclusive=False,
+    tile_size=16,
+)
+
+PROFILES: Final = {p.name: p for p in (PAPER, GSPLAT_1_5, GSPLAT_1_6, INRIA)}
+
+
+def profile_named(name: str) -> Profile:
+    """Return the profile of that name.
+
+    Source: the rasterizers named in this module's docstring.
+    Departs: nothing.
+
+    Args:
+        name: one of "paper", "gsplat_1_5", "gsplat_1_6", "inria".
+
+    Returns:
+        The profile.
+
+    Raises:
+        ValueError: the name is not a profile's.
+
+    Example:
+        >>> profile_named("gsplat_1_6").alpha_ceiling
+        0.99
+    """
+    if name not in PROFILES:
+        raise ValueError(f"profile {name!r} is unknown; use one of {', '.join(PROFILES)}")
+    return PROFILES[name]
