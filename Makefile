@@ -1,0 +1,48 @@
+# Each target is one command, from nothing: `make demo` on a fresh clone builds the environment first.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+TORCH := $(shell sed -n 's/^\(torch==.*\)/\1/p' constraints.txt)
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint bench cuda docs-check clean
+
+help:  ## list the targets
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
+
+setup: $(STAMP)  ## make .venv and install everything into it
+
+# torch goes first and by exact version: left to the resolver, pip picks the newest build and its gigabytes of CUDA.
+$(STAMP): pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet $(TORCH)
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	@touch $@
+
+demo: setup  ## write the demo capture, train POP on it, leave report.html, PLY, renders and metrics in out/demo
+	$(BIN)/pop demo out/demo_capture --overwrite
+	$(BIN)/pop train out/demo_capture --out out/demo --preset quick --overwrite
+	@echo "open out/demo/report.html"
+
+test: setup  ## run every test
+	$(BIN)/python -m pytest
+
+lint: setup  ## ruff (rules and format) and pyright
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+bench: setup  ## check the fast path against the oracle, then time it
+	$(BIN)/python benchmarks/run.py
+
+cuda: setup  ## compile the CUDA extension (needs nvcc)
+	$(BIN)/pop build-cuda
+
+docs-check: setup  ## fail when a table, name, path or command in README.md is no longer true
+	$(BIN)/python -m pytest -q tests/meta/test_readme.py
+	$(BIN)/python -m pytest -q --doctest-modules pop_ref
+
+clean:  ## remove what was built here; .venv stays
+	rm -rf out build dist .pytest_cache .ruff_cache .hypothesis htmlcov .coverage
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
