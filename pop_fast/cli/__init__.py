@@ -1,0 +1,115 @@
+"""The command line, `pop`: one small module a subcommand, loaded only when it is called.
+
+`main` owns what every subcommand shares: the list of them, one-line errors, exit statuses. A subcommand module has one
+public function, `run(argv) -> int`, and prints nothing but its result; all errors travel as exceptions.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from typing import Final
+
+from pop_fast.cli.errors import describe
+
+COMMANDS: Final = {
+    "train": "fit a splat to a capture or a folder of photographs",
+    "eval": "measure a result, a checkpoint or a PLY on the held-out views",
+    "render": "write held-out views, or a camera path as pictures or a video",
+    "export": "write a result as PLY, .splat or an Inria-style folder",
+    "compare": "put several results side by side in one table",
+    "report": "write report.html again from the files of a result",
+    "sfm": "find the cameras of a folder of photographs (pycolmap)",
+    "demo": "write the built-in demo capture, made from a seed",
+    "data check": "look a capture over before training: sizes, pairing, masks, memory",
+    "doctor": "say what is installed, what is missing and how to get it",
+}
+
+EXIT_BAD_INPUT: Final = 2
+EXIT_INTERRUPTED: Final = 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one subcommand and turn what went wrong into one line and an exit status.
+
+    Args:
+        argv: the words after `pop`; the process's own when None.
+
+    Returns:
+        0, or 2 for bad input and bad usage, or 130 after Ctrl-C.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in words or os.environ.get("POP_DEBUG", "") not in ("", "0")
+    words = [word for word in words if word != "--debug"]
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(_overview())
+        return 0
+    if words[0] in ("-V", "--version"):
+        print(f"pop {_version()}")
+        return 0
+    name, rest = _split(words)
+    if name is None:
+        return _unknown(words)
+    try:
+        module = importlib.import_module(f"pop_fast.cli.{name.replace(' ', '_')}")
+        return module.run(rest)
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else 0
+    except KeyboardInterrupt:
+        print("pop: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        line = describe(error)
+        if debug or line is None:
+            raise
+        print(f"pop: error: {line}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+
+
+def _split(words: list[str]) -> tuple[str | None, list[str]]:
+    for length in (2, 1):
+        name = " ".join(words[:length])
+        if name in COMMANDS:
+            return name, words[length:]
+    return None, words
+
+
+def _unknown(words: list[str]) -> int:
+    tried = " ".join(words[:2]) if words[0] == "data" else words[0]
+    near = difflib.get_close_matches(tried, COMMANDS, n=1, cutoff=0.5)
+    hint = f"did you mean 'pop {near[0]}'?" if near else "see 'pop --help'"
+    print(f"pop: error: '{tried}' is not a subcommand; {hint}", file=sys.stderr)
+    return EXIT_BAD_INPUT
+
+
+def _overview() -> str:
+    width = max(map(len, COMMANDS)) + 2
+    lines = [f"  {name:<{width}}{summary}" for name, summary in COMMANDS.items()]
+    return "\n".join(
+        [
+            "usage: pop COMMAND ...",
+            "",
+            "3D Gaussian Splatting with the Polarized Opacity Prior, on a CPU.",
+            "",
+            "commands:",
+            *lines,
+            "",
+            "start here:",
+            "  pop demo scene && pop train scene --preset quick",
+            "  pop train my_photos --factor 4 --out out/mine",
+            "",
+            "'pop COMMAND --help' explains one. --debug (or POP_DEBUG=1) shows the traceback of an error.",
+        ]
+    )
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return version("pop-splatting")

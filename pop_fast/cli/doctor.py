@@ -1,0 +1,157 @@
+"""`pop doctor`: what is installed, what is missing and how to get it."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import platform
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+import tyro
+
+from pop_fast.cli.arguments import parse
+
+State = Literal["ok", "missing", "off"]
+
+# (distribution, module, what it is for, needed by pop itself)
+_PACKAGES: Final = (
+    ("numpy", "numpy", "arrays", True),
+    ("scipy", "scipy", "nearest neighbours, camera paths", True),
+    ("torch", "torch", "the fast path", True),
+    ("opencv-contrib-python-headless", "cv2", "images, undistortion, video", True),
+    ("pycolmap", "pycolmap", "COLMAP models, structure from motion", True),
+    ("plyfile", "plyfile", "PLY files", True),
+    ("tqdm", "tqdm", "progress", True),
+    ("tyro", "tyro", "this command line", True),
+    ("matplotlib", "matplotlib", "colours of the error maps", True),
+    ("hypothesis", "hypothesis", "the conformance kit: pip install 'pop-splatting[conformance]'", False),
+)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the examination: a thing, its state, what was found, and how to get it when it is missing."""
+
+    name: str
+    state: State
+    found: str
+    fix: str = ""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Say what is installed, what is missing and how to get it.
+
+    Exit status 0 when everything that pop needs is there, 1 otherwise. Optional parts that are off do not count.
+    """
+
+    lpips_weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Also check this file of LPIPS weights."""
+
+
+def run(argv: Sequence[str]) -> int:
+    """Run the subcommand."""
+    args = parse(Args, argv, "doctor")
+    findings = [*packages(), *machine(), *extensions(), *lpips(args.lpips_weights)]
+    width = max(len(finding.name) for finding in findings) + 2
+    marks = {"ok": "ok", "missing": "MISSING", "off": "-"}
+    print(f"pop-splatting {_installed('pop-splatting') or '(not installed)'}, Python {platform.python_version()}")
+    for finding in findings:
+        fix = f"  ->  {finding.fix}" if finding.fix else ""
+        print(f"  {marks[finding.state]:<9}{finding.name:<{width}}{finding.found}{fix}")
+    missing = [finding.name for finding in findings if finding.state == "missing"]
+    print(f"missing: {', '.join(missing)}" if missing else "everything that pop needs is here")
+    return 1 if missing else 0
+
+
+def packages() -> Iterator[Finding]:
+    """Import every package that pop uses and tell its version."""
+    for distribution, module, purpose, needed in _PACKAGES:
+        version = _installed(distribution)
+        try:
+            importlib.import_module(module)
+        except Exception as error:  # a broken install raises anything: OSError for a shared library, for one
+            reason = f"{purpose}; import fails: {type(error).__name__}: {error}" if version else purpose
+            fix = f"pip install --force-reinstall {distribution}" if version else f"pip install {distribution}"
+            yield Finding(distribution, "missing" if needed else "off", reason, fix if needed else "")
+            continue
+        yield Finding(distribution, "ok", f"{version or 'version unknown'}  ({purpose})")
+
+
+def machine() -> Iterator[Finding]:
+    """Tell processor, threads, memory and the torch build."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    yield Finding("processor", "ok", f"{processor_name()}, {cores} usable core{'s' if cores != 1 else ''}")
+    total, free = memory_bytes()
+    if total:
+        low = free < 2 * 2**30
+        hint = "close other programs, or train with --factor 4" if low else ""
+        yield Finding("memory", "ok", f"{total / 2**30:.1f} GiB, {free / 2**30:.1f} GiB free", hint)
+    try:
+        import torch
+    except Exception:
+        return
+    build = f"CUDA {torch.version.cuda}" if torch.version.cuda else "CPU"
+    yield Finding("torch build", "ok", f"{build}, {torch.get_num_threads()} threads")
+
+
+def extensions() -> Iterator[Finding]:
+    """Ask the CUDA extension whether it can be used and, if not, why."""
+    cuda_ext = importlib.import_module("cuda_ext")
+    if cuda_ext.available():
+        yield Finding("cuda_ext", "ok", "the CUDA backend is available")
+    else:
+        yield Finding(
+            "cuda_ext", "off", f"not available: {cuda_ext.why_not()} (optional; the CPU path needs none of it)"
+        )
+
+
+def lpips(path: Path | None) -> Iterator[Finding]:
+    """Tell whether the LPIPS metric can be computed."""
+    if path is None:
+        fix = "pop eval RESULT --lpips-weights FILE"
+        yield Finding("LPIPS weights", "off", "no file given (optional; weights are not shipped)", fix)
+        return
+    from pop_fast.train.metrics import load_lpips
+
+    load_lpips(path)
+    yield Finding("LPIPS weights", "ok", str(path))
+
+
+def processor_name() -> str:
+    """Give the processor's name as the system tells it."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            names = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
+        if names:
+            return names[0]
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def memory_bytes() -> tuple[int, int]:
+    """Give the machine's memory and what is free of it, bytes; (0, 0) where the system does not tell."""
+    try:
+        with open("/proc/meminfo", encoding="utf-8") as file:
+            sizes = {line.split(":")[0]: int(line.split()[1]) * 1024 for line in file}
+        return sizes["MemTotal"], sizes["MemAvailable"]
+    except (OSError, KeyError, ValueError, IndexError):
+        pass
+    if sys.platform != "win32" and "SC_PHYS_PAGES" in os.sysconf_names:
+        total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        return total, total
+    return 0, 0
+
+
+def _installed(distribution: str) -> str | None:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return None

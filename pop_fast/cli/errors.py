@@ -1,0 +1,49 @@
+"""Which exceptions are the user's to mend, and the one line that says how."""
+
+from __future__ import annotations
+
+import errno
+import re
+import traceback
+from typing import Final
+
+_PACKAGES: Final = ("/pop_fast/", "/pop_ref/", "/cuda_ext/")
+
+
+def describe(error: BaseException) -> str | None:
+    """Say in one line what the user can do about an error, or None when it is a fault of the program.
+
+    A `ValueError` counts as the user's when the package itself raised it (then its message names field and fix); one
+    that escapes from a library below is a fault, and keeps its traceback.
+    """
+    if isinstance(error, OSError):
+        return _describe_os_error(error)
+    if isinstance(error, MemoryError) or "not enough memory" in str(error) or "can't allocate memory" in str(error):
+        return "out of memory; use smaller images (--factor 2 or more) or fewer Gaussians"
+    if isinstance(error, ValueError) and _raised_here(error):
+        return re.sub(r"\s*\n\s*", " ", str(error))
+    return None
+
+
+def _describe_os_error(error: OSError) -> str | None:
+    where = f"{error.filename}: " if error.filename else ""
+    match error.errno:
+        case errno.ENOSPC | errno.EDQUOT:
+            return f"{where}the disk is full; free some space or write elsewhere with --out"
+        case errno.EACCES | errno.EPERM | errno.EROFS:
+            return f"{where}permission denied; change its owner or mode, or write elsewhere with --out"
+        case errno.ENOENT:
+            return f"{where}no such file or folder"
+        case errno.EISDIR:
+            return f"{where}is a folder where a file is needed"
+        case errno.ENOTDIR | errno.EEXIST:
+            return f"{where}a file is in the way where a folder is needed"
+        case None:
+            return None
+        case _:
+            return f"{where}{error.strerror}"
+
+
+def _raised_here(error: BaseException) -> bool:
+    frames = traceback.extract_tb(error.__traceback__)
+    return bool(frames) and any(package in frames[-1].filename.replace("\\", "/") for package in _PACKAGES)

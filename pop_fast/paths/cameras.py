@@ -1,0 +1,147 @@
+"""Camera paths made from the cameras of a capture: NumPy float64, viewmats in, viewmats out.
+
+Every path is closed (its last camera leads back to its first) except `interpolate`, which runs once through the given
+cameras. Frames: world -> camera, OpenCV axes (+x right, +y down, +z forward), as everywhere in the package.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+_SWAY: Final = 0.9  # the percentile that the ellipse keeps of the cameras' spread, so that one outlier does not set it
+
+
+def orbit(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
+    """Circle around the point the cameras look at, at their median distance and height.
+
+    Args:
+        viewmats: cameras of the capture, world -> camera. [M, 4, 4]
+        n_frames: cameras on the path.
+
+    Returns:
+        Cameras on the path, world -> camera. [n_frames, 4, 4]
+    """
+    up, focus = mean_up(viewmats), focus_point(viewmats)
+    offsets = camera_centers(viewmats) - focus
+    heights = offsets @ up
+    radius = float(np.median(np.linalg.norm(offsets - heights[:, None] * up, axis=1)))
+    a, b = _plane_axes(up, offsets)
+    turn = np.linspace(0.0, 2.0 * np.pi, n_frames, endpoint=False)[:, None]
+    centers = focus + radius * (np.cos(turn) * a + np.sin(turn) * b) + float(np.median(heights)) * up
+    return look_at(centers, focus, up)
+
+
+def ellipse(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
+    """Circle on the ellipse that the cameras themselves spread over, rising and sinking once a turn.
+
+    Args:
+        viewmats: cameras of the capture, world -> camera. [M, 4, 4]
+        n_frames: cameras on the path.
+
+    Returns:
+        Cameras on the path, world -> camera, evenly spaced along the ellipse. [n_frames, 4, 4]
+    """
+    up, focus = mean_up(viewmats), focus_point(viewmats)
+    offsets = camera_centers(viewmats) - focus
+    flat = offsets - (offsets @ up)[:, None] * up
+    axes = np.linalg.svd(flat, full_matrices=False)[2][:2]
+    a, b = axes[0], np.cross(up, axes[0])
+    half = np.quantile(np.abs(np.stack([flat @ a, flat @ b])), _SWAY, axis=1)
+    low, high = np.quantile(offsets @ up, [1.0 - _SWAY, _SWAY])
+    fine = np.linspace(0.0, 2.0 * np.pi, 1025)
+    steps = np.hypot(half[0] * np.diff(np.cos(fine)), half[1] * np.diff(np.sin(fine)))
+    length = np.concatenate([[0.0], np.cumsum(steps)])
+    turn = np.interp(np.linspace(0.0, length[-1], n_frames, endpoint=False), length, fine)[:, None]
+    height = (low + high) / 2.0 + (high - low) / 2.0 * np.sin(turn)
+    return look_at(focus + half[0] * np.cos(turn) * a + half[1] * np.sin(turn) * b + height * up, focus, up)
+
+
+def interpolate(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
+    """Glide through the given cameras in order: cubic splines through centres and rotations.
+
+    Args:
+        viewmats: cameras of the capture in the order to visit, world -> camera. [M, 4, 4], M >= 2
+        n_frames: cameras on the path; its first and last are the given first and last.
+
+    Returns:
+        Cameras on the path, world -> camera. [n_frames, 4, 4]
+    """
+    if len(viewmats) < 2:
+        raise ValueError(f"viewmats has {len(viewmats)} cameras; a path through them needs at least 2")
+    knots = np.arange(len(viewmats), dtype=np.float64)
+    at = np.linspace(0.0, knots[-1], n_frames)
+    centers = CubicSpline(knots, camera_centers(viewmats))(at)
+    rotations = RotationSpline(knots, Rotation.from_matrix(viewmats[:, :3, :3]))(at).as_matrix()
+    return _viewmats(rotations, centers)
+
+
+PATHS: Final[dict[str, Callable[[np.ndarray, int], np.ndarray]]] = {
+    "orbit": orbit,
+    "ellipse": ellipse,
+    "interpolate": interpolate,
+}
+
+
+def camera_path(name: str, viewmats: np.ndarray, n_frames: int) -> np.ndarray:
+    """Make the path called `name`: one of `PATHS`. [n_frames, 4, 4]"""
+    if name not in PATHS:
+        raise ValueError(f"path is '{name}'; it must be one of {', '.join(PATHS)}")
+    if n_frames < 1:
+        raise ValueError(f"n_frames is {n_frames}; it must be >= 1")
+    return PATHS[name](np.asarray(viewmats, dtype=np.float64), n_frames)
+
+
+def camera_centers(viewmats: np.ndarray) -> np.ndarray:
+    """Give the cameras' centres in the world: c = -R^T t. [M, 3]"""
+    return -np.einsum("mji,mj->mi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+
+
+def mean_up(viewmats: np.ndarray) -> np.ndarray:
+    """Give the direction that is up on average: minus the cameras' y axes, unit length. [3]"""
+    up = -viewmats[:, 1, :3].mean(axis=0)
+    norm = float(np.linalg.norm(up))
+    return up / norm if norm > 1e-9 else -viewmats[0, 1, :3]
+
+
+def focus_point(viewmats: np.ndarray) -> np.ndarray:
+    """Give the point nearest to all optical axes: sum_i (I - d_i d_i^T)(x - c_i) = 0.
+
+    Parallel axes meet nowhere; then it is the point one mean camera distance ahead of the cameras' mean.
+    """
+    centers, forward = camera_centers(viewmats), viewmats[:, 2, :3]
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    total = across.sum(axis=0)
+    if np.linalg.cond(total) > 1e6:
+        spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean())
+        return centers.mean(axis=0) + (spread or 1.0) * forward.mean(axis=0)
+    return np.linalg.solve(total, np.einsum("mij,mj->i", across, centers))
+
+
+def look_at(centers: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Place cameras at `centers` that look at `target` with `up` upwards in the picture. [n, 4, 4]"""
+    forward = target - centers
+    forward = forward / np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, up)
+    right = right / np.linalg.norm(right, axis=1, keepdims=True)
+    rotations = np.stack([right, np.cross(forward, right), forward], axis=1)
+    return _viewmats(rotations, centers)
+
+
+def _viewmats(rotations: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    viewmats = np.tile(np.eye(4), (len(centers), 1, 1))
+    viewmats[:, :3, :3] = rotations
+    viewmats[:, :3, 3] = -np.einsum("mij,mj->mi", rotations, centers)
+    return viewmats
+
+
+def _plane_axes(up: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    first = offsets[0] - (offsets[0] @ up) * up
+    if np.linalg.norm(first) < 1e-9:
+        first = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    a = first / np.linalg.norm(first)
+    return a, np.cross(up, a)

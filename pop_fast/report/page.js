@@ -1,0 +1,38 @@
+// a crosshair for each chart: the values at the iteration nearest to the pointer
+for (const figure of document.querySelectorAll("[data-chart]")) {
+  const chart = JSON.parse(figure.dataset.chart);
+  const [left, right, top, bottom, width, height] = chart.box;
+  const svg = figure.querySelector("svg");
+  const cross = document.createElementNS("http://www.w3.org/2000/svg", "path");
+  cross.setAttribute("class", "cross");
+  const tip = document.createElement("div");
+  tip.className = "tip";
+  tip.hidden = true;
+  svg.append(cross);
+  figure.append(tip);
+  const nearest = (xs, x) => xs.reduce((best, v, i) => (Math.abs(v - x) < Math.abs(xs[best] - x) ? i : best), 0);
+  const hide = () => { tip.hidden = true; cross.removeAttribute("d"); };
+  const show = (event) => {
+    const box = svg.getBoundingClientRect();
+    const px = ((event.clientX - box.left) / box.width) * width;
+    const wanted = ((px - left) / (width - left - right)) * chart.stop;
+    const longest = chart.series.reduce((a, b) => (b.x.length > a.x.length ? b : a), { x: [] });
+    if (!longest.x.length || px < left - 8) return hide();
+    const step = longest.x[nearest(longest.x, wanted)];
+    const at = left + ((width - left - right) * step) / chart.stop;
+    cross.setAttribute("d", `M${at} ${top}V${height - bottom}`);
+    const rows = chart.series.filter((s) => s.x.length).map((s) => {
+      const value = s.y[nearest(s.x, step)];
+      const text = value === null ? "–" : value.toLocaleString("en", { maximumSignificantDigits: 5 });
+      return `<div><i style="background:${s.c}"></i>${s.n} ${text}${chart.unit}</div>`;
+    });
+    tip.innerHTML = `<div>iteration ${step}</div>` + rows.join("");
+    tip.hidden = false;
+    const x = (at / width) * box.width;
+    tip.style.top = svg.offsetTop + 8 + "px";
+    tip.style.left = (x < box.width / 2 ? svg.offsetLeft + x + 12 : svg.offsetLeft + x - tip.offsetWidth - 12) + "px";
+  };
+  svg.addEventListener("pointermove", show);
+  svg.addEventListener("pointerdown", show);
+  svg.addEventListener("pointerleave", hide);
+}

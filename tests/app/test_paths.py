@@ -1,0 +1,117 @@
+"""Camera paths and video files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pop_fast.errors import PopError
+from pop_fast.paths import PATHS, VideoFile, camera_path, interpolate, orbit
+from pop_fast.paths.cameras import camera_centers, focus_point, look_at, mean_up
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def ring(
+    n: int = 12, radius: float = 3.0, height: float = 1.0, target: tuple[float, ...] = (0.5, -0.25, 0.0)
+) -> np.ndarray:
+    turn = np.linspace(0.0, 2.0 * np.pi, n, endpoint=False)
+    centers = np.array(target) + np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(n, height)], axis=1)
+    return look_at(centers, np.array(target), UP)
+
+
+@pytest.mark.parametrize("name", PATHS)
+def test_every_path_has_rigid_cameras_and_as_many_as_asked(name: str) -> None:
+    path = camera_path(name, ring(), 17)
+    assert path.shape == (17, 4, 4)
+    np.testing.assert_allclose(
+        path[:, :3, :3] @ path[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (17, 1, 1)), atol=1e-12
+    )
+    np.testing.assert_allclose(np.linalg.det(path[:, :3, :3]), 1.0, atol=1e-12)
+    np.testing.assert_array_equal(path[:, 3], np.tile([0.0, 0.0, 0.0, 1.0], (17, 1)))
+
+
+def test_the_focus_of_a_ring_is_the_point_its_cameras_look_at() -> None:
+    np.testing.assert_allclose(focus_point(ring()), [0.5, -0.25, 0.0], atol=1e-9)
+
+
+def test_parallel_cameras_focus_ahead_of_themselves_instead_of_nowhere() -> None:
+    viewmats = np.tile(np.eye(4), (3, 1, 1))
+    viewmats[:, 0, 3] = [-1.0, 0.0, 1.0]
+    focus = focus_point(viewmats)
+    assert focus[2] > 0.0
+    assert np.all(np.isfinite(orbit(viewmats, 5)))
+
+
+def test_an_orbit_keeps_distance_height_and_gaze() -> None:
+    path = orbit(ring(radius=3.0, height=1.0), 8)
+    offsets = camera_centers(path) - [0.5, -0.25, 0.0]
+    np.testing.assert_allclose(np.hypot(offsets[:, 0], offsets[:, 1]), 3.0, atol=1e-9)
+    np.testing.assert_allclose(offsets[:, 2], 1.0, atol=1e-9)
+    gaze = np.einsum("mij,mj->mi", path[:, :3, :3], -offsets)
+    np.testing.assert_allclose(gaze[:, :2], 0.0, atol=1e-9)
+    assert np.all(gaze[:, 2] > 0.0)
+
+
+def test_up_stays_up_along_closed_paths() -> None:
+    for name in ("orbit", "ellipse"):
+        assert mean_up(camera_path(name, ring(), 9)) @ UP > 0.5
+
+
+def test_a_closed_path_steps_evenly_round_to_its_start() -> None:
+    for name in ("orbit", "ellipse"):
+        centers = camera_centers(camera_path(name, ring(n=24), 40))
+        steps = np.linalg.norm(np.diff(np.vstack([centers, centers[:1]]), axis=0), axis=1)
+        assert steps.max() < 1.3 * steps.min()
+
+
+@given(st.integers(2, 6), st.integers(1, 4))
+def test_interpolation_passes_through_every_given_camera(n: int, between: int) -> None:
+    viewmats = ring(n=12)[:n]
+    path = interpolate(viewmats, (n - 1) * between + 1)
+    np.testing.assert_allclose(path[::between], viewmats, atol=1e-9)
+
+
+def test_bad_path_requests_name_the_field_and_the_choices() -> None:
+    with pytest.raises(ValueError, match="orbit, ellipse, interpolate"):
+        camera_path("spiral", ring(), 5)
+    with pytest.raises(ValueError, match="n_frames is 0"):
+        camera_path("orbit", ring(), 0)
+    with pytest.raises(ValueError, match="at least 2"):
+        camera_path("interpolate", ring()[:1], 5)
+
+
+def test_a_video_holds_the_frames_that_were_added(tmp_path: Path) -> None:
+    path = tmp_path / "clip.mp4"
+    with VideoFile(path, fps=10) as video:
+        for shade in (0, 120, 240):
+            video.add(np.full((49, 64, 3), shade, np.uint8))  # an odd height loses its last row
+    reader = cv2.VideoCapture(str(path))
+    frames = [reader.read()[1] for _ in range(3)]
+    assert frames[0].shape == (48, 64, 3)
+    assert [abs(int(frame.mean()) - shade) < 8 for frame, shade in zip(frames, (0, 120, 240), strict=True)] == [
+        True
+    ] * 3
+    assert [p.name for p in tmp_path.iterdir()] == ["clip.mp4"]
+
+
+def _film_two_sizes(path: Path) -> None:
+    with VideoFile(path) as video:
+        video.add(np.zeros((16, 16, 3), np.uint8))
+        video.add(np.zeros((16, 8, 3), np.uint8))
+
+
+def test_a_video_that_fails_half_way_leaves_no_file(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="frame is 8 x 16"):
+        _film_two_sizes(tmp_path / "clip.mp4")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_video_ending_names_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(PopError, match=r"\.mp4"):
+        VideoFile(tmp_path / "clip.gif")
