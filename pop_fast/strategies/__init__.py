@@ -1,0 +1,9 @@
+"""Population strategies, compatible with gsplat's protocol: how the number of Gaussians grows and shrinks."""
+
+from __future__ import annotations
+
+from pop_fast.strategies.adc import ADCStrategy
+from pop_fast.strategies.base import Strategy
+from pop_fast.strategies.pop import POPStrategy
+
+__all__ = ["ADCStrategy", "POPStrategy", "Strategy"]

@@ -1,0 +1,77 @@
+"""The protocol that every population strategy follows; it is gsplat's, so that a strategy serves both trainers.
+
+A trainer holds a dict of raw parameters (`means`, `scales` in log, `quats`, `opacities` in logit, `sh0`, `shN`) and one
+optimizer per key. Every step it calls, in this order,
+
+    strategy.step_pre_backward(params, optimizers, state, step, info)
+    loss.backward()
+    optimizers step                       (gsplat >= 1.5: the optimizers move first, then the strategy looks)
+    strategy.step_post_backward(params, optimizers, state, step, info)
+
+`info` is the dict that `rasterization()` returns last. `step` counts from 0. A strategy is a dataclass of settings;
+everything that changes lives in `state`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, MutableMapping
+from typing import Any, Protocol, TypeAlias, runtime_checkable
+
+from torch import Tensor
+from torch.optim import Optimizer
+
+Params: TypeAlias = MutableMapping[str, Any]
+Optimizers: TypeAlias = Mapping[str, Optimizer]
+State: TypeAlias = dict[str, Any]
+Info: TypeAlias = Mapping[str, Any]
+
+
+@runtime_checkable
+class Strategy(Protocol):
+    """What a trainer asks of a strategy."""
+
+    def check_sanity(self, params: Params, optimizers: Optimizers) -> None:
+        """Raise ValueError when the parameters and the optimizers are not laid out as the protocol says."""
+        ...
+
+    def initialize_state(self, scene_scale: float = 1.0) -> State:
+        """Return what the strategy remembers between steps."""
+        ...
+
+    def step_pre_backward(self, params: Params, optimizers: Optimizers, state: State, step: int, info: Info) -> None:
+        """Prepare for the backward pass: ask autograd to keep the gradient of the screen centres."""
+        ...
+
+    def step_post_backward(
+        self, params: Params, optimizers: Optimizers, state: State, step: int, info: Info, packed: bool = False
+    ) -> None:
+        """Collect statistics and, when it is time, change the population."""
+        ...
+
+
+class Regularized(Protocol):
+    """A strategy that adds a term to the loss; trainers that know it call it before the backward pass."""
+
+    def regularizer(self, opacities: Tensor, state: State, step: int, info: Info) -> Tensor | None:
+        """Return the weighted term, or None when it is off at this step."""
+        ...
+
+
+def check_layout(params: Params, optimizers: Optimizers, needed: tuple[str, ...]) -> None:
+    """Raise ValueError when keys, optimizers or row counts do not fit the protocol."""
+    missing = [key for key in needed if key not in params]
+    if missing:
+        raise ValueError(f"params has no {missing[0]!r}; a strategy needs {', '.join(needed)}")
+    trainable = {key for key, value in params.items() if value.requires_grad}
+    if trainable != set(optimizers):
+        odd = sorted(trainable.symmetric_difference(optimizers))[0]
+        have = "a parameter without an optimizer" if odd in trainable else "an optimizer without a trainable parameter"
+        raise ValueError(f"{odd!r} is {have}; give every trainable parameter its own optimizer under the same key")
+    rows = len(params[needed[0]])
+    for key, value in params.items():
+        if len(value) != rows:
+            raise ValueError(f"{key!r} has {len(value)} rows but {needed[0]!r} has {rows}; rows are Gaussians")
+    for key, optimizer in optimizers.items():
+        groups = optimizer.param_groups
+        if len(groups) != 1 or len(groups[0]["params"]) != 1 or groups[0]["params"][0] is not params[key]:
+            raise ValueError(f"optimizers[{key!r}] must hold exactly one tensor, params[{key!r}]")

@@ -1,0 +1,128 @@
+"""Edits of the population that carry the optimizers' moments and the statistics with their rows.
+
+Every edit is one call of `edit_rows`: keep some rows, append others. Rows that are kept keep their bits and their
+order, in every parameter, in every moment and in every per-Gaussian tensor of the state. Rows that are appended start
+with zero moments; an optimizer's scalar step counter is never touched.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from pop_fast.strategies.base import Optimizers, Params, State
+
+SPLIT_CHILDREN = 2
+SPLIT_SHRINK = 0.8 * SPLIT_CHILDREN
+
+
+@torch.no_grad()
+def edit_rows(
+    params: Params,
+    optimizers: Optimizers,
+    state: State,
+    keep: Tensor | None = None,
+    appended: Mapping[str, Tensor] | None = None,
+    sources: Tensor | None = None,
+) -> None:
+    """Keep the rows of the mask `keep` (None: all) and append rows after them.
+
+    Args:
+        params: raw parameters, replaced in place under their keys.
+        optimizers: one per key; their moments follow the rows.
+        state: the strategy's state; its tensors with one row per Gaussian follow the rows.
+        keep: which rows stay. [N] bool
+        appended: the new rows of every parameter.
+        sources: the old row that each new row's statistics are copied from. [M] int64
+    """
+    rows = len(next(iter(params.values())))
+
+    def edited(old: Tensor, tail: Tensor | None) -> Tensor:
+        head = old if keep is None else old[keep]
+        return head.clone() if tail is None else torch.cat([head, tail])
+
+    for key in list(params):
+        old = params[key]
+        tail = None if appended is None else appended[key].to(old.dtype)
+        new = torch.nn.Parameter(edited(old.detach(), tail), requires_grad=old.requires_grad)
+        params[key] = new
+        if key not in optimizers:
+            continue
+        optimizer = optimizers[key]
+        moments = optimizer.state.pop(old, {})
+        for name, value in moments.items():
+            if isinstance(value, Tensor) and value.shape == old.shape:
+                moments[name] = edited(value, None if tail is None else torch.zeros_like(tail))
+        if moments:
+            optimizer.state[new] = moments
+        optimizer.param_groups[0]["params"] = [new]
+    for name, value in state.items():
+        if isinstance(value, Tensor) and value.dim() > 0 and len(value) == rows:
+            state[name] = edited(value, None if sources is None else value[sources])
+
+
+def clone(params: Params, optimizers: Optimizers, state: State, mask: Tensor) -> None:
+    """Append an exact copy of every selected Gaussian; the source keeps its moments, the copy starts with none."""
+    appended = {key: value.detach()[mask] for key, value in params.items()}
+    edit_rows(params, optimizers, state, appended=appended, sources=torch.nonzero(mask)[:, 0])
+
+
+def split(
+    params: Params,
+    optimizers: Optimizers,
+    state: State,
+    mask: Tensor,
+    generator: torch.Generator | None = None,
+    revised_opacity: bool = False,
+) -> None:
+    """Replace every selected Gaussian by two, drawn from it and 1.6 times smaller.
+
+    `mean' = mean + R(q) (s * noise)`, `s' = s / 1.6`; rotation, colour and opacity are copied. Survivors come first,
+    then all first children, then all second children.
+
+    Args:
+        params: raw parameters.
+        optimizers: one per key.
+        state: the strategy's state.
+        mask: the Gaussians to split. [N] bool
+        generator: source of the noise; None takes torch's global one.
+        revised_opacity: give the children `1 - sqrt(1 - o)`, so that two coincident ones equal the parent.
+    """
+    chosen = {key: value.detach()[mask] for key, value in params.items()}
+    scales = torch.exp(chosen["scales"])
+    shape = (SPLIT_CHILDREN, *scales.shape)
+    device = "cpu" if generator is None else generator.device
+    noise = torch.randn(shape, generator=generator, dtype=scales.dtype, device=device).to(scales.device)
+    offsets = _rotate(chosen["quats"], scales * noise)
+    appended = {key: value.repeat(SPLIT_CHILDREN, *[1] * (value.dim() - 1)) for key, value in chosen.items()}
+    appended["means"] = (chosen["means"] + offsets).reshape(-1, 3)
+    appended["scales"] = torch.log(scales / SPLIT_SHRINK).repeat(SPLIT_CHILDREN, 1)
+    if revised_opacity:
+        appended["opacities"] = torch.logit(1.0 - torch.sqrt(1.0 - torch.sigmoid(appended["opacities"])))
+    sources = torch.nonzero(mask)[:, 0].repeat(SPLIT_CHILDREN)
+    edit_rows(params, optimizers, state, keep=~mask, appended=appended, sources=sources)
+
+
+def prune(params: Params, optimizers: Optimizers, state: State, mask: Tensor) -> None:
+    """Remove every selected Gaussian with its moments and statistics."""
+    edit_rows(params, optimizers, state, keep=~mask)
+
+
+@torch.no_grad()
+def reset_opacities(params: Params, optimizers: Optimizers, ceiling: float) -> None:
+    """Lower every opacity to `min(o, ceiling)` and forget the moments of all opacities, the step counter excepted."""
+    opacities = params["opacities"]
+    opacities.clamp_(max=math.log(ceiling / (1.0 - ceiling)))
+    for value in optimizers["opacities"].state.get(opacities, {}).values():
+        if isinstance(value, Tensor) and value.shape == opacities.shape:
+            value.zero_()
+
+
+def _rotate(quats: Tensor, vectors: Tensor) -> Tensor:
+    """Rotate vectors [..., n, 3] by quaternions wxyz [n, 4] of any norm > 0: `v + 2 u x (u x v + w v)`."""
+    unit = torch.nn.functional.normalize(quats, dim=-1)
+    w, u = unit[:, :1], unit[:, 1:].expand_as(vectors)
+    return vectors + 2.0 * torch.linalg.cross(u, torch.linalg.cross(u, vectors) + w * vectors)
