@@ -40,7 +40,7 @@ class Statistics:
         n_visible: views that showed the Gaussian. [N]
         n_views: views of the window.
         dominant_sum: pixels dominated, over all views of the window. [N]
-        blurred: the blur flag, see `DensityConfig.blur_counts`. [N]
+        blurred: the blur flag, see `DensityConfig.blur_window`. [N]
     """
 
     grad_sum: Float64[np.ndarray, " N"]
@@ -71,7 +71,7 @@ def zero_statistics(n: int) -> Statistics:
 
 
 def blur_set(
-    dominant_counts: Int64[np.ndarray, " N"], width: int, height: int, blur_theta: float
+    dominant_counts: Int64[np.ndarray, " N"], width: int, height: int, theta_blur: float
 ) -> Bool[np.ndarray, " N"]:
     """Select the Gaussians that dominate more of an image than a point should: `D > theta H W`, strictly.
 
@@ -82,16 +82,16 @@ def blur_set(
         dominant_counts: pixels that each Gaussian dominates.
         width: of the view, px (A18: each view's own size).
         height: of the view, px.
-        blur_theta: share of the pixels.
+        theta_blur: share of the pixels.
 
     Returns:
         True where a Gaussian is blurred.
 
     Example:
-        >>> blur_set(np.array([2, 3]), width=16, height=8, blur_theta=1 / 64).tolist()
+        >>> blur_set(np.array([2, 3]), width=16, height=8, theta_blur=1 / 64).tolist()
         [False, True]
     """
-    return dominant_counts > blur_theta * height * width
+    return dominant_counts > theta_blur * (height * width)
 
 
 def accumulate(
@@ -130,9 +130,9 @@ def accumulate(
     """
     grads = np.sqrt((0.5 * width * v_means2d[:, 0]) ** 2 + (0.5 * height * v_means2d[:, 1]) ** 2)
     dominant_sum = statistics.dominant_sum + dominant_counts
-    tested = dominant_sum if config.blur_counts == "window_sum" else dominant_counts
-    blurred = blur_set(tested, width, height, config.blur_theta)
-    if config.blur_counts == "any_view":
+    tested = dominant_sum if config.blur_window == "sum" else dominant_counts
+    blurred = blur_set(tested, width, height, config.theta_blur)
+    if config.blur_window == "any_view":
         blurred = blurred | statistics.blurred
     return Statistics(
         grad_sum=statistics.grad_sum + np.where(visible, grads, 0.0),
@@ -178,7 +178,7 @@ def grow_masks(
     """Decide who is cloned and who is split.
 
     A Gaussian is small if its largest scale is at most `grow_scale3d * scene_scale`. The grad set, joined inside the
-    blur window by the blur set (A8), is cloned where small and split where not (A14). Under "split_only" blurred
+    blur window by the blur set (A8), is cloned where small and split where not (A14). Under "split" blurred
     Gaussians are split whatever their size, so one that is small with a high gradient is cloned and split.
 
     Source: POP paper eqs. 3 and 6, section 3.3 ("choose between cloning and splitting based on scale").
@@ -202,13 +202,12 @@ def grow_masks(
         ([True, False, False], [False, True, False])
     """
     grads = average_grads(statistics, config)
-    by_grad = grads >= config.grow_grad2d if config.grad_inclusive else grads > config.grow_grad2d
-    in_window = blurs_at(step, config)
-    if config.grad_growth == "never" or (config.grad_growth == "outside_blur_window" and in_window):
+    by_grad = grads >= config.grow_grad2d if config.inclusive else grads > config.grow_grad2d
+    by_blur = statistics.blurred & blurs_at(step, config)
+    if not config.grow_on_gradient or (blurs_at(step, config) and not config.grow_on_gradient_in_blur_window):
         by_grad = np.zeros_like(by_grad)
-    by_blur = statistics.blurred if in_window else np.zeros_like(by_grad)
     small = np.max(scales, axis=1) <= config.grow_scale3d * scene_scale
-    if config.blur_growth == "split_only":
+    if config.blur_rule == "split":
         return by_grad & small, (by_grad & ~small) | by_blur
     return (by_grad | by_blur) & small, (by_grad | by_blur) & ~small
 
@@ -240,7 +239,7 @@ def prune_mask(
         [True, False]
     """
     too_faint = opacities < config.prune_opa
-    if not config.prune_big or step <= config.prune_big_after:
+    if not config.prune_too_big or step <= config.prune_too_big_after:
         return too_faint
     return too_faint | (np.max(scales, axis=1) > config.prune_scale3d * scene_scale)
 

@@ -17,24 +17,23 @@ class DensityConfig:
     Attributes:
         prune_opa: an opacity under it is pruned (A15: gsplat's default).
         grow_grad2d: tau_Den, in NDC units (A9: not retuned for L2).
-        grad_inclusive: True selects `>=` tau_Den as Inria does, False `>` as gsplat does.
+        inclusive: True selects `>=` tau_Den as Inria does, False `>` as gsplat does.
         grad_denominator: "visible_views" averages over the views that saw the Gaussian, "window" over all (A23).
-        grad_growth: "always" keeps the gradient rule beside the blur rule, "outside_blur_window" lets the blur rule
-            work alone in its window, "never" everywhere (A8).
+        grow_on_gradient: use the gradient rule, eq. 3 (A8: beside the blur rule).
+        grow_on_gradient_in_blur_window: ... also inside the blur window, where else the blur rule works alone (A8).
         grow_scale3d: a Gaussian is small if its largest scale is at most this share of the scene's (A14).
-        prune_big: prune Gaussians that grow excessively large (A16: kept although the reset is gone).
+        prune_too_big: prune Gaussians that grow excessively large (A16: kept although the reset is gone).
         prune_scale3d: excessively large is above this share of the scene's scale (A16).
-        prune_big_after: ... and only at steps after this one (A16: not tied to `reset_every`).
+        prune_too_big_after: ... and only at steps after this one (A16: not tied to `reset_every`).
         refine_start_iter: events happen at steps after it.
         refine_stop_iter: events happen at steps before it (A17: pruning too ends there).
         refine_every: an event each so many steps (A17: pruning happens with each).
-        blur: use the blur rule.
-        blur_theta: share of a view's pixels above which a Gaussian is blurred (eq. 6; A18: of each view's own size).
+        theta_blur: share of a view's pixels above which a Gaussian is blurred (eq. 6; A18: of each view's own size).
         blur_start_iter: first step of the blur window, inclusive.
-        blur_stop_iter: last step of the blur window, inclusive (A19).
-        blur_counts: "any_view" tests each view by itself and keeps the flag until the event, "window_sum" adds the
+        blur_stop_iter: last step of the blur window, inclusive (A19); under `blur_start_iter` there is none.
+        blur_window: "any_view" tests each view by itself and keeps the flag until the event, "sum" adds the
             counts of the window up and tests the sum, "own_view" tests the event's own view only (A2).
-        blur_growth: "by_scale" clones small blurred Gaussians and splits large ones, "split_only" splits all (A14).
+        blur_rule: "by_scale" clones small blurred Gaussians and splits large ones, "split" splits all (A14).
         revised_opacity: split children get 1 - sqrt(1 - o) instead of o (A26).
         reset_every: reset opacities each so many steps before `refine_stop_iter`; 0 never (A22, A29).
         reset_at_zero: reset at step 0 as well, as gsplat up to 1.5.2 does (A25).
@@ -43,22 +42,22 @@ class DensityConfig:
 
     prune_opa: float = 0.005
     grow_grad2d: float = 2e-4
-    grad_inclusive: bool = False
+    inclusive: bool = False
     grad_denominator: Literal["visible_views", "window"] = "visible_views"
-    grad_growth: Literal["always", "outside_blur_window", "never"] = "always"
+    grow_on_gradient: bool = True
+    grow_on_gradient_in_blur_window: bool = True
     grow_scale3d: float = 0.01
-    prune_big: bool = True
+    prune_too_big: bool = True
     prune_scale3d: float = 0.1
-    prune_big_after: int = 3000
+    prune_too_big_after: int = 3000
     refine_start_iter: int = 500
     refine_stop_iter: int = 15_000
     refine_every: int = 100
-    blur: bool = True
-    blur_theta: float = 2e-5
+    theta_blur: float = 2e-5
     blur_start_iter: int = 3000
     blur_stop_iter: int = 7000
-    blur_counts: Literal["any_view", "window_sum", "own_view"] = "any_view"
-    blur_growth: Literal["by_scale", "split_only"] = "by_scale"
+    blur_window: Literal["any_view", "sum", "own_view"] = "any_view"
+    blur_rule: Literal["by_scale", "split"] = "by_scale"
     revised_opacity: bool = False
     reset_every: int = 0
     reset_at_zero: bool = False
@@ -66,7 +65,7 @@ class DensityConfig:
 
 
 POP: Final = DensityConfig()
-ADC: Final = DensityConfig(blur=False, reset_every=3000)
+ADC: Final = DensityConfig(blur_start_iter=0, blur_stop_iter=-1, reset_every=3000)
 
 
 def densifies_at(step: int, config: DensityConfig) -> bool:
@@ -108,7 +107,7 @@ def blurs_at(step: int, config: DensityConfig) -> bool:
         >>> [blurs_at(step, POP) for step in (2999, 3000, 7000, 7001)]
         [False, True, True, False]
     """
-    return config.blur and config.blur_start_iter <= step <= config.blur_stop_iter
+    return config.blur_start_iter <= step <= config.blur_stop_iter
 
 
 def resets_at(step: int, config: DensityConfig) -> bool:

@@ -6,8 +6,8 @@ Adam, with t counting updates from 1:
     x <- x - lr / (1 - beta1^t)  m / (sqrt(v) / sqrt(1 - beta2^t) + eps)
 
 Moments are arrays with one row a Gaussian, so that density control can carry them (`density_rows`); t belongs to the
-tensor. eps is 1e-15: for a gradient that keeps its sign the step is about lr, however small the gradient is. That is why
-a tiny weight of the POP term moves every opacity that the photographs do not hold.
+tensor. With eps = 1e-15 a gradient that keeps its sign makes steps of about lr, however small it is: that is why a tiny
+weight of the POP term moves every opacity that the photographs do not hold.
 
 Label decided here: A21 (no learning rate changes with the L2 loss).
 """
