@@ -130,7 +130,7 @@ def clone_rows(rows: Rows, mask: Tensor) -> Rows:
 
 
 def split_children(params: Mapping[str, Tensor], normals: Tensor, revised_opacity: bool = False) -> Params:
-    """Return the children of these parents, all first ones before all second ones; see `pop_ref.density_rows`.
+    """Return the children of these parents, all first ones before all second; see `pop_ref.density_rows.split_rows`.
 
     Optimizations: one batched product for both children of all parents.
     """
