@@ -29,7 +29,7 @@ def error_scale(errors: list[np.ndarray]) -> float:
     if not errors:
         return 0.1
     top = float(np.quantile(np.concatenate([e.ravel()[:: max(1, e.size // 50_000)] for e in errors]), 0.99))
-    return min(max(np.ceil(top / 0.05 - 1e-9) * 0.05, 0.05), 1.0)
+    return min(max(np.ceil(top / 0.05 - 1e-4) * 0.05, 0.05), 1.0)
 
 
 def error_picture(error: np.ndarray, top: float) -> np.ndarray:

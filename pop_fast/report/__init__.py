@@ -1,0 +1,27 @@
+"""`report.html`: one self-contained page that shows how a training run went, made from the files it left."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pop_fast.io.atomic import write_atomically
+from pop_fast.report.page import page
+from pop_fast.report.source import read_result
+
+__all__ = ["write_report"]
+
+
+def write_report(result_dir: str | Path) -> Path:
+    """Write report.html into a result folder, from the files in it alone.
+
+    Returns:
+        The page's path.
+
+    Raises:
+        PopError: the folder is not a result of `pop train`, or one of its files cannot be read.
+    """
+    folder = Path(result_dir)
+    html = page(read_result(folder)).encode("utf-8")
+    target = folder / "report.html"
+    write_atomically(target, lambda file: file.write(html))
+    return target

@@ -1,0 +1,252 @@
+"""Read a result folder into what the report shows. Only files in the folder are read; what is absent is left out."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from pop_fast.errors import PopError
+from pop_fast.report.curves import Window
+from pop_fast.report.model import Histogram, ReportData, Tile, View
+from pop_fast.train.config import TrainConfig
+
+MIB: Final = 2**20
+# float32 numbers of a Gaussian: as gsplat's checkpoints hold it, and as Inria's PLY does (with three zero normals)
+BYTES_CKPT: Final = 59 * 4
+BYTES_PLY: Final = 62 * 4
+_METHODS: Final = {"pop": "POP", "adc": "Plain density control (3DGS)"}
+_SMOOTH: Final = 0.03  # width of the running means, as a share of the records
+
+
+def read_result(folder: Path) -> ReportData:
+    """Read all that the report shows of a result folder.
+
+    Raises:
+        PopError: the folder is not a result of `pop train`, or one of its files cannot be read.
+    """
+    config = read_config(folder)
+    records = read_records(folder)
+    run = config.resolved()
+    stats = read_last_stats(folder)
+    method = _METHODS.get(config.method, config.method)
+    histograms = list(_histograms(folder, run.max_steps))
+    views = list(_views(folder))
+    dominant = _dominant(folder)
+    events = [record for record in records if "cloned" in record or "reset" in record]
+    return ReportData(
+        title=f"{Path(config.data).resolve().name} · {_METHODS.get(config.method, config.method).split(' (')[0]}",
+        subtitle=" · ".join(filter(None, [method, _schedule_note(config), _machine(stats)])),
+        headline=headline(stats),
+        curves=_curves(records, folder),
+        max_steps=run.max_steps,
+        windows=_windows(run),
+        resets=[int(record["step"]) for record in events if record.get("reset")],
+        histograms=histograms,
+        dominant=dominant,
+        views=views,
+        config=_flat(json.loads(config.to_json())),
+        events=[{key: event.get(key) for key in _EVENT_COLUMNS} for event in events],
+    )
+
+
+_EVENT_COLUMNS: Final = ("step", "cloned", "split", "pruned", "reset", "num_gaussians")
+
+
+def read_config(folder: Path) -> TrainConfig:
+    """Read cfg.json."""
+    path = folder / "cfg.json"
+    if not path.is_file():
+        raise PopError(f"{folder}: has no cfg.json, so it is not a result of 'pop train'")
+    return TrainConfig.from_json(path.read_text(encoding="utf-8"))
+
+
+def read_records(folder: Path) -> list[dict[str, Any]]:
+    """Read metrics.jsonl; a last line that was cut off by a kill is ignored."""
+    path = folder / "metrics.jsonl"
+    if not path.is_file():
+        return []
+    lines = path.read_text(encoding="utf-8").splitlines()
+    records: list[dict[str, Any]] = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            records.append(json.loads(line))
+        except json.JSONDecodeError as error:
+            if number == len(lines):
+                break
+            raise PopError(f"{path}: line {number} is not JSON: {error.msg}; train again to write it anew") from error
+    return records
+
+
+def read_last_stats(folder: Path) -> dict[str, Any]:
+    """Read the statistics of the last step: the training's, overlaid by those of the held-out views."""
+    merged: dict[str, Any] = {}
+    for kind in ("train", "val"):
+        numbered = _numbered(folder / "stats", rf"{kind}_step(\d+)\.json")
+        if numbered:
+            merged |= read_json(numbered[-1][1])
+    return merged
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON file that holds an object."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise PopError(f"{path}: is not JSON ({error}); write it again with 'pop eval'") from error
+    if not isinstance(content, dict):
+        raise PopError(f"{path}: holds {type(content).__name__}; it must be an object")
+    return content
+
+
+def headline(stats: Mapping[str, Any]) -> list[Tile]:
+    """Choose the numbers at the top of the page."""
+    tiles: list[Tile] = []
+    for key, label, form, unit in (("psnr", "PSNR", "{:.2f}", "dB"), ("ssim", "SSIM", "{:.4f}", "")):
+        if stats.get(key) is not None:
+            tiles.append(Tile(label, form.format(stats[key]), unit, "mean of the held-out views"))
+    if stats.get("lpips") is not None:
+        tiles.append(Tile("LPIPS", f"{stats['lpips']:.4f}", "", str(stats.get("lpips_net", ""))))
+    elif "lpips" in stats:
+        tiles.append(Tile("LPIPS", "–", "", str(stats.get("lpips_reason", "not measured"))))
+    if "num_GS" in stats:
+        n = int(stats["num_GS"])
+        left = stats.get("num_GS_above_floor")
+        tiles.append(Tile("Gaussians", f"{n:,}", "", "" if left is None else f"{int(left):,} with opacity ≥ 1/255"))
+        as_ply = f"as PLY {n * BYTES_PLY / MIB:.1f} ({BYTES_PLY} B)"
+        tiles.append(Tile("Size", f"{n * BYTES_CKPT / MIB:.1f}", "MiB", f"{BYTES_CKPT} B each; {as_ply}"))
+    return tiles + _cost_tiles(stats)
+
+
+def _cost_tiles(stats: Mapping[str, Any]) -> list[Tile]:
+    tiles: list[Tile] = []
+    seconds, steps = stats.get("seconds"), stats.get("step")
+    if seconds:
+        value, unit = (f"{seconds:.0f}", "s") if seconds < 600 else (f"{seconds / 60:.1f}", "min")
+        note = "" if steps is None else f"{(steps + 1) / seconds:.1f} iterations a second"
+        tiles.append(Tile("Training", value, unit, note))
+    if stats.get("peak_memory_bytes"):
+        tiles.append(Tile("Peak memory", f"{stats['peak_memory_bytes'] / 2**30:.1f}", "GiB", "of the whole process"))
+    return tiles
+
+
+def _machine(stats: Mapping[str, Any]) -> str:
+    versions = stats.get("versions") or {}
+    torch = f"torch {versions['torch']}" if "torch" in versions else ""
+    return ", ".join(filter(None, [str(stats.get("machine") or ""), torch]))
+
+
+def _schedule_note(config: TrainConfig) -> str:
+    steps = f"{config.resolved().max_steps:,} iterations"
+    return steps if config.scaler == 1.0 else f"{steps} (the paper's schedule times {config.scaler:g})"
+
+
+def _curves(records: Sequence[Mapping[str, Any]], folder: Path) -> dict[str, tuple[list[float], list[float]]]:
+    curves: dict[str, tuple[list[float], list[float]]] = {}
+    window = max(1, round(len(records) * _SMOOTH))
+    for name, key, smooth in (
+        ("num_gaussians", "num_gaussians", False),
+        ("psnr_train", "psnr", True),
+        ("loss", "loss", True),
+        ("n_blended", "n_blended", True),
+        ("n_traversed", "n_traversed", True),
+    ):
+        points = [(float(r["step"]), float(r[key])) for r in records if r.get(key) is not None]
+        if points:
+            steps, values = (list(column) for column in zip(*points, strict=True))
+            curves[name] = steps, running_mean(values, window) if smooth else values
+    measured = [
+        (step, read_json(path).get("psnr")) for step, path in _numbered(folder / "stats", r"val_step(\d+)\.json")
+    ]
+    held_out = [(float(step + 1), float(psnr)) for step, psnr in measured if psnr is not None]
+    if held_out:
+        curves["psnr_val"] = [step for step, _ in held_out], [psnr for _, psnr in held_out]
+    return {name: thin_out(*curve) for name, curve in curves.items()}
+
+
+def running_mean(values: Sequence[float], window: int) -> list[float]:
+    """Average each value with those before it, `window` in all (fewer at the start), without what is not finite."""
+    out: list[float] = []
+    for i in range(len(values)):
+        part = [v for v in values[max(0, i + 1 - window) : i + 1] if math.isfinite(v)]
+        out.append(sum(part) / len(part) if part else math.nan)
+    return out
+
+
+def thin_out(steps: list[float], values: list[float], most: int = 400) -> tuple[list[float], list[float]]:
+    """Keep at most about `most` points of a curve, evenly, the first and the last among them."""
+    if len(steps) <= most:
+        return steps, values
+    kept = np.unique(np.round(np.linspace(0, len(steps) - 1, most)).astype(int))
+    return [steps[i] for i in kept], [values[i] for i in kept]
+
+
+def _windows(run: TrainConfig) -> list[Window]:
+    plan = run.strategy
+    windows = [Window("density control", plan.refine_start_iter, plan.refine_stop_iter, "var(--density)")]
+    if run.method == "pop":
+        pop = run.pop
+        if pop.blur_stop_iter >= pop.blur_start_iter:
+            windows.append(Window("blur densification", pop.blur_start_iter, pop.blur_stop_iter, "var(--blur)"))
+        if pop.lambda_pop > 0.0:
+            windows.append(Window("POP loss", pop.pop_start_iter, pop.pop_stop_iter, "var(--pop)"))
+    return [Window(w.name, w.start, min(w.stop, run.max_steps), w.color) for w in windows if w.start < run.max_steps]
+
+
+def _histograms(folder: Path, max_steps: int) -> Iterator[Histogram]:
+    numbered = _numbered(folder / "report_data", r"opacity_step(-?\d+)\.npz")
+    for place, (step, path) in enumerate(numbered):
+        with _arrays(path) as arrays:
+            counts = arrays["counts"]
+        last = place == len(numbered) - 1 and step + 1 >= max_steps
+        title = "start" if step < 0 else "end" if last else f"iteration {step + 1:,}"
+        # two of the file's bins make one bar: 50 bars are readable, and 0.1 and 0.9 stay bin edges
+        yield Histogram(title, counts.reshape(-1, 2).sum(axis=1))
+
+
+def _views(folder: Path) -> Iterator[View]:
+    for path in _last_view_files(folder):
+        with _arrays(path) as a:
+            yield View(str(a["name"]), a["render"], a["photo"], float(a["psnr"]), float(a["ssim"]))
+
+
+def _dominant(folder: Path) -> tuple[str, np.ndarray, np.ndarray] | None:
+    for path in _last_view_files(folder):
+        with _arrays(path) as a:
+            if "dominant_ids" in a:
+                return str(a["name"]), a["dominant_ids"], a["render"]
+    return None
+
+
+def _last_view_files(folder: Path) -> list[Path]:
+    pattern = re.compile(r"val_step(\d+)_(\d+)\.npz")
+    data = folder / "report_data"
+    found = [(m, p) for p in data.iterdir() if (m := pattern.fullmatch(p.name))] if data.is_dir() else []
+    last = max((int(m[1]) for m, _ in found), default=-1)
+    return [path for _, path in sorted((int(m[2]), path) for m, path in found if int(m[1]) == last)]
+
+
+def _arrays(path: Path) -> Any:
+    try:
+        return np.load(path, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise PopError(f"{path}: is damaged ({error}); remove it, or train again") from error
+
+
+def _numbered(folder: Path, pattern: str) -> list[tuple[int, Path]]:
+    if not folder.is_dir():
+        return []
+    found = ((re.fullmatch(pattern, path.name), path) for path in folder.iterdir())
+    return sorted((int(match[1]), path) for match, path in found if match)
+
+
+def _flat(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in plain.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat
