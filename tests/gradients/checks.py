@@ -62,8 +62,8 @@ def assert_vjp_matches(
 
     Four things must hold, with random cotangents of every output:
     every argument has a gradient that is not zero (unless its position is in `zero_gradient_allowed`);
-    it equals central differences to `rtol` of its norm; `<v, J u> = <J^T v, u>` along a random direction of all arguments
-    together; a zero cotangent gives exact zeros.
+    it equals central differences to `rtol` of its norm; `<v, J u> = <J^T v, u>` along a random direction of all
+    arguments together; a zero cotangent gives exact zeros.
     """
     rng = np.random.default_rng(seed)
     args = [np.asarray(a, dtype=np.float64) for a in args]
