@@ -1,0 +1,134 @@
+"""What a capture is to the rest of the program: pinhole views with their photographs, and a sparse cloud of points.
+
+Conventions: OpenCV cameras (+x right, +y down, +z forward); pixel centres at +0.5, so that the point (0, 0) of an
+image is its outer corner, `K` of an image resized by s is exactly diag(s, s, 1) K, and COLMAP's intrinsics are used as
+they are stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from pop_fast.errors import CaptureError
+
+__all__ = ["Capture", "Progress", "Split", "View"]
+
+Split = Literal["train", "val", "test"]
+# called from the main thread with (what is being done, how many are done, of how many)
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One photograph and its pinhole camera.
+
+    Attributes:
+        name: relative file name, with forward slashes; unique in a capture.
+        image: undistorted, downscaled, composited over the background where it had alpha. uint8 [H, W, 3]
+        viewmat: world -> camera, rigid. float64 [4, 4]
+        K: intrinsics in px. float64 [3, 3]
+        mask: True where the photograph counts; None where all of it does. bool [H, W]
+        split: the capture's own assignment, or None where every n-th file is held out.
+    """
+
+    name: str
+    image: np.ndarray
+    viewmat: np.ndarray
+    K: np.ndarray
+    mask: np.ndarray | None = None
+    split: Split | None = None
+
+    @property
+    def width(self) -> int:
+        """Width of the image, px."""
+        return int(self.image.shape[1])
+
+    @property
+    def height(self) -> int:
+        """Height of the image, px."""
+        return int(self.image.shape[0])
+
+    @property
+    def camera_center(self) -> np.ndarray:
+        """The camera's position in the world: -R^T t. float64 [3]"""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def __repr__(self) -> str:
+        mask = "" if self.mask is None else ", masked"
+        return f"View({self.name!r}, {self.width}x{self.height}{mask})"
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """A loaded capture.
+
+    Attributes:
+        name: the folder's name.
+        views: sorted by file name.
+        points: sparse points in the same world as the views. float64 [P, 3]
+        points_rgb: their colours. uint8 [P, 3]
+        source: one line that says where poses and points come from.
+        world_transform: similarity, world = world_transform @ capture's own frame; the identity where the capture was
+            loaded with `normalize=False`. float64 [4, 4]
+        notes: what was skipped, chosen or made up while loading, one line each.
+    """
+
+    name: str
+    views: tuple[View, ...]
+    points: np.ndarray
+    points_rgb: np.ndarray
+    source: str
+    world_transform: np.ndarray = field(default_factory=lambda: np.eye(4))
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.views) < 2:
+            raise CaptureError(f"{self.name}: has {len(self.views)} view(s); a scene needs two or more")
+        object.__setattr__(self, "views", tuple(sorted(self.views, key=lambda view: view.name)))
+
+    @property
+    def world_scale(self) -> float:
+        """Length of one unit of the capture's own frame in this world: det(world_transform[:3, :3])^(1/3)."""
+        return float(np.cbrt(np.linalg.det(self.world_transform[:3, :3])))
+
+    @property
+    def camera_centers(self) -> np.ndarray:
+        """Positions of all cameras. float64 [V, 3]"""
+        return np.stack([view.camera_center for view in self.views])
+
+    def scene_scale(self) -> float:
+        """Measure the scene as gsplat does: 1.1 * max_k |c_k - mean(c)| over all cameras, train and test."""
+        centers = self.camera_centers
+        return float(1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+
+    def train_views(self, test_every: int = 8) -> tuple[View, ...]:
+        """Select the views to train on: all that `test_views` leaves, validation views apart.
+
+        Args:
+            test_every: as `test_views`.
+        """
+        if self._has_split:
+            return tuple(view for view in self.views if view.split == "train")
+        return tuple(view for i, view in enumerate(self.views) if test_every <= 0 or i % test_every != 0)
+
+    def test_views(self, test_every: int = 8) -> tuple[View, ...]:
+        """Select the views to hold out.
+
+        The capture's own split where it has one (its validation views where it names no test views); otherwise every
+        `test_every`-th view by file name, starting with the first (index % test_every == 0), as 3DGS and gsplat.
+
+        Args:
+            test_every: 8 in the paper; 0 holds nothing out.
+        """
+        if self._has_split:
+            held_out = "test" if any(view.split == "test" for view in self.views) else "val"
+            return tuple(view for view in self.views if view.split == held_out)
+        return tuple(view for i, view in enumerate(self.views) if test_every > 0 and i % test_every == 0)
+
+    @property
+    def _has_split(self) -> bool:
+        return any(view.split is not None for view in self.views)

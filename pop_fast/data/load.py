@@ -1,0 +1,164 @@
+"""Load a capture, whatever made it: a COLMAP model, transforms.json, or a bare folder of photographs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pop_fast.data.capture import Capture, Progress, View
+from pop_fast.data.colmap import find_model, read_model
+from pop_fast.data.normalize import normalizing_transform, transform_points, transform_viewmats
+from pop_fast.data.photos import photo_folder, run_sfm
+from pop_fast.data.random_points import random_points
+from pop_fast.data.shots import Cloud, Shot
+from pop_fast.data.transforms import find_transforms, read_transforms
+from pop_fast.data.views import PhotoOptions, read_views
+from pop_fast.errors import CaptureError
+from pop_fast.io.images import IMAGE_SUFFIXES, list_images
+
+__all__ = ["load_capture"]
+
+Source = Literal["auto", "colmap", "transforms", "photos"]
+
+
+def load_capture(
+    path: str | Path,
+    factor: int = 1,
+    normalize: bool = True,
+    masks: bool = True,
+    missing: Literal["error", "skip"] = "error",
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    progress: Progress | None = None,
+    *,
+    source: Source = "auto",
+    images: str | None = None,
+    sfm: bool = False,
+    points: int = 30_000,
+    seed: int = 0,
+) -> Capture:
+    """Load photographs, cameras and sparse points of a capture.
+
+    `source="auto"` takes the first that is there: a COLMAP model (`sparse/0`, `sparse`, `colmap/sparse/0`, or the
+    folder itself), `transforms.json` or Blender's `transforms_train.json`, a bare folder of photographs.
+
+    Args:
+        path: the capture's folder.
+        factor: shrink photographs by this whole number; `images_<factor>` is read instead where it exists.
+        normalize: move the world into gsplat's training frame; the way back is `Capture.world_transform`.
+        masks: read `masks/<name>.png`, `masks/<name>.<ext>.png` or the list's `mask_path`; white means keep.
+        missing: what to do about photographs that are listed but absent.
+        background: colour in [0, 1] that photographs with alpha are composited over; alpha says what is transparent and
+            is no mask.
+        progress: called with (stage, done, total).
+        source: take this one, or fail.
+        images: read photographs from this folder in place of the listed one, shrunk by `factor` unless its name ends in
+            `_<factor>`.
+        sfm: for a bare folder of photographs: find the cameras first, and write them to `<path>/sparse/0`.
+        points: how many random points to make where the capture brings none.
+        seed: of the random points.
+
+    Raises:
+        CaptureError: one line that names the file, the field and the fix.
+    """
+    root = Path(path)
+    if not root.is_dir():
+        what = "is a file, not a folder" if root.exists() else "no such folder"
+        raise CaptureError(f"{root}: {what}; give the folder that holds the photographs and their cameras")
+    if factor < 1 or int(factor) != factor:
+        raise CaptureError(f"factor is {factor}; it must be a whole number of at least 1")
+    if missing not in ("error", "skip"):
+        raise CaptureError(f"missing is {missing!r}; it must be 'error' or 'skip'")
+    options = PhotoOptions(int(factor), masks, missing, _background(background), images)
+    listing, shots, cloud, made_from = _read_listing(root, source, sfm, progress)
+    if len(shots) < 2:
+        raise CaptureError(f"{listing}: has {len(shots)} view(s) with a known camera; a scene needs two or more")
+    if made_from == "COLMAP model":
+        shots = _beside_the_model(root, shots, images)
+    views, notes = read_views(root, listing, shots, options, progress)
+    return _assemble(root, listing, views, cloud, made_from, notes, normalize, points, seed)
+
+
+def _background(color: tuple[float, float, float]) -> tuple[float, float, float]:
+    if len(color) != 3 or not all(0.0 <= c <= 1.0 for c in color):
+        raise CaptureError(f"background is {tuple(color)}; it must be three numbers in [0, 1]")
+    return (float(color[0]), float(color[1]), float(color[2]))
+
+
+def _read_listing(
+    root: Path, source: Source, sfm: bool, progress: Progress | None
+) -> tuple[Path, list[Shot], Cloud | None, str]:
+    model = find_model(root) if source in ("auto", "colmap") else None
+    if model is None and source == "photos":
+        model = _from_photos(root, sfm, progress)
+    if model is not None:
+        return model, *read_model(model), "COLMAP model"
+    found = find_transforms(root) if source in ("auto", "transforms") else []
+    if found:
+        return found[0], *read_transforms(found), found[0].name
+    if source == "colmap":
+        raise CaptureError(
+            f"{root}: has no COLMAP model in sparse/0, sparse or colmap/sparse/0; run pop sfm, or COLMAP"
+        )
+    if source == "transforms":
+        raise CaptureError(f"{root}: has no transforms.json and no transforms_train.json; choose another --source")
+    model = _from_photos(root, sfm, progress)
+    return model, *read_model(model), "COLMAP model"
+
+
+def _beside_the_model(root: Path, shots: list[Shot], images: str | None) -> list[Shot]:
+    """Look for a COLMAP model's photographs in `images`, or in the capture itself where there is no such folder."""
+    if (root / (images or "images")).is_dir():
+        return shots
+    if images is None and any(path.suffix.lower() in IMAGE_SUFFIXES for path in root.iterdir()):
+        return [replace(shot, folder="") for shot in shots]
+    raise CaptureError(
+        f"{root / (images or 'images')}: no such folder; name the one with the photographs: --images NAME"
+    )
+
+
+def _from_photos(root: Path, sfm: bool, progress: Progress | None) -> Path:
+    photos = photo_folder(root)
+    count = len(list_images(photos))
+    if count == 0:
+        raise CaptureError(
+            f"{root}: has no photographs, no COLMAP model and no transforms.json; give the folder of a capture"
+        )
+    if not sfm:
+        raise CaptureError(
+            f"{root}: has {count} photographs but nothing says where they were taken; run pop sfm {root} first"
+        )
+    run_sfm(photos, root, progress=progress)
+    return root / "sparse" / "0"
+
+
+def _assemble(
+    root: Path,
+    listing: Path,
+    views: list[View],
+    cloud: Cloud | None,
+    made_from: str,
+    notes: list[str],
+    normalize: bool,
+    points: int,
+    seed: int,
+) -> Capture:
+    try:
+        transform = np.eye(4)
+        if normalize:
+            viewmats = np.stack([view.viewmat for view in views])
+            transform = normalizing_transform(viewmats, cloud.xyz if cloud else None)
+            moved = transform_viewmats(transform, viewmats)
+            views = [replace(view, viewmat=viewmat) for view, viewmat in zip(views, moved, strict=True)]
+        if cloud:
+            cloud = Cloud(transform_points(transform, cloud.xyz), cloud.rgb)
+            source = f"{made_from}: {len(views)} views, {len(cloud)} points"
+        else:
+            cloud = random_points(views, points, seed)
+            source = f"{made_from}: {len(views)} views, no points: {len(cloud)} random ones (seed {seed})"
+    except CaptureError as error:
+        raise CaptureError(f"{listing}: {error}") from error
+    name = root.resolve().name
+    return Capture(name, tuple(views), cloud.xyz, cloud.rgb, source, transform, tuple(notes))

@@ -1,0 +1,110 @@
+"""Put the world of a capture into the frame that gsplat trains in, and remember how.
+
+Three steps, each one similarity: (1) turn the mean up direction of the cameras to -y, put the origin at the median of
+the points of the optical axes that are nearest to the capture's origin, and scale the median camera distance to 1;
+(2) turn the principal axes of the sparse points to x, y, z in order of falling variance, origin at their median;
+(3) turn half round about x where the points lie above their middle, because a scene has more points near its floor.
+
+Source: gsplat v1.5.3, examples/datasets/normalize.py and colmap.py. Departs: the signs of the principal axes, which
+gsplat leaves to LAPACK, are fixed so that the largest entry of the x and y axes is positive.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pop_fast.errors import CaptureError
+
+__all__ = ["normalizing_transform", "transform_points", "transform_viewmats"]
+
+
+def transform_points(transform: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Move points by a similarity: p' = s R p + t. float64 [P, 3]"""
+    return points @ transform[:3, :3].T + transform[:3, 3]
+
+
+def transform_viewmats(transform: np.ndarray, viewmats: np.ndarray) -> np.ndarray:
+    """Move cameras by a similarity of the world, and keep their view matrices rigid.
+
+    With R, s, t of the similarity and c' = s R c + t the new centre: rotation' = rotation R^T, viewmat' = [rotation',
+    -rotation' c'].
+
+    Args:
+        transform: [4, 4] similarity, new world from old.
+        viewmats: [V, 4, 4] old world -> camera.
+    """
+    linear = transform[:3, :3]
+    scale = np.cbrt(np.linalg.det(linear))
+    rotations = viewmats[:, :3, :3] @ (linear / scale).T
+    centers = transform_points(transform, _centers(viewmats))
+    moved = viewmats.copy()
+    moved[:, :3, :3] = rotations
+    moved[:, :3, 3] = -np.einsum("vij,vj->vi", rotations, centers)
+    return moved
+
+
+def normalizing_transform(viewmats: np.ndarray, points: np.ndarray | None) -> np.ndarray:
+    """Find the similarity, normalised world from the capture's own.
+
+    Args:
+        viewmats: [V, 4, 4] world -> camera.
+        points: [P, 3] sparse points; without points, or with fewer than four, only step (1) is taken.
+
+    Raises:
+        CaptureError: the cameras have no extent or no common up direction.
+    """
+    transform = _from_cameras(viewmats)
+    if points is None or len(points) < 4:
+        return transform
+    transform = _principal_axes(transform_points(transform, points)) @ transform
+    heights = transform_points(transform, points)[:, 2]
+    if np.median(heights) > np.mean(heights):
+        transform = np.diag([1.0, -1.0, -1.0, 1.0]) @ transform
+    return transform
+
+
+def _centers(viewmats: np.ndarray) -> np.ndarray:
+    return -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+
+
+def _from_cameras(viewmats: np.ndarray) -> np.ndarray:
+    # the rows of a view matrix are the camera's axes in the world: x right, y down, z forward
+    up = -viewmats[:, 1, :3].mean(axis=0)
+    length = np.linalg.norm(up)
+    turn = _rotation_between(up / length, np.array([0.0, -1.0, 0.0])) if length > 1e-6 else np.eye(3)
+    centers = _centers(viewmats) @ turn.T
+    forwards = viewmats[:, 2, :3] @ turn.T
+    nearest = centers - np.sum(forwards * centers, axis=1, keepdims=True) * forwards
+    origin = np.median(nearest, axis=0)
+    distance = float(np.median(np.linalg.norm(centers - origin, axis=1)))
+    spread = float(np.ptp(centers, axis=0).max())
+    if spread <= 1e-9 * max(1.0, float(np.abs(centers).max())) or distance == 0.0:
+        raise CaptureError("all cameras stand at one place; a scene can only be made from photographs that moved")
+    transform = np.eye(4)
+    transform[:3, :3] = turn / distance
+    transform[:3, 3] = -origin / distance
+    return transform
+
+
+def _rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Rotate unit vector a onto unit vector b by the shortest way: I + [v] + [v]^2 / (1 + a.b), v = a x b."""
+    cosine = float(a @ b)
+    if cosine <= -1.0 + 1e-12:
+        return np.diag([-1.0, -1.0, 1.0])
+    x, y, z = np.cross(a, b)
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + skew + skew @ skew / (1.0 + cosine)
+
+
+def _principal_axes(points: np.ndarray) -> np.ndarray:
+    middle = np.median(points, axis=0)
+    _, axes = np.linalg.eigh(np.cov(points - middle, rowvar=False))
+    rotation = axes.T[::-1].copy()
+    for row in rotation[:2]:
+        if row[np.argmax(np.abs(row))] < 0.0:
+            row *= -1.0
+    rotation[2] = np.cross(rotation[0], rotation[1])
+    transform = np.eye(4)
+    transform[:3, :3] = rotation
+    transform[:3, 3] = -rotation @ middle
+    return transform

@@ -1,0 +1,193 @@
+"""Photographs and masks: found by name, checked to be complete, decoded with OpenCV as COLMAP does.
+
+EXIF orientation is ignored, because COLMAP ignores it: a model's width and height are those of the stored pixels.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pop_fast.errors import CaptureError
+from pop_fast.io.atomic import write_atomically
+
+__all__ = ["IMAGE_SUFFIXES", "find_image", "list_images", "read_image", "read_mask", "write_png"]
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+_FIX = "copy it again from its source, or remove it from the capture"
+
+
+def list_images(folder: Path) -> list[Path]:
+    """List the photographs of a folder and its subfolders, sorted by relative name; hidden files are left out."""
+    return sorted(
+        (
+            path
+            for path in folder.rglob("*")
+            if path.suffix.lower() in IMAGE_SUFFIXES
+            and path.is_file()
+            and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+        ),
+        key=lambda path: path.relative_to(folder).as_posix(),
+    )
+
+
+def find_image(folder: Path, name: str) -> Path | None:
+    """Find the file of an image by its relative name, under another image extension where the exact one is absent.
+
+    Files are paired by name and never by their place in a sorted list, so one missing file cannot shift the others.
+
+    Returns:
+        The file, or None.
+
+    Raises:
+        CaptureError: two files of the same stem fit and neither is the exact name.
+    """
+    exact = folder / name
+    if exact.is_file():
+        return exact
+    if not exact.parent.is_dir():
+        return None
+    # nerfstudio and blender name frames with and without their extension
+    stems = {exact.stem, exact.name} if exact.suffix.lower() in IMAGE_SUFFIXES else {exact.name}
+    found = sorted(
+        path
+        for path in exact.parent.iterdir()
+        if path.stem in stems and path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
+    )
+    if len(found) > 1:
+        raise CaptureError(
+            f"{folder / name}: is absent, and both {found[0].name} and {found[1].name} could stand for it; remove one"
+        )
+    return found[0] if found else None
+
+
+def read_image(path: Path) -> np.ndarray:
+    """Read a photograph as stored: RGB or RGBA, 8 bit.
+
+    Gray becomes RGB; 16-bit samples are divided by 257 and rounded; EXIF orientation is ignored.
+
+    Returns:
+        uint8 [H, W, 3] or, with an alpha channel, [H, W, 4] (not premultiplied).
+
+    Raises:
+        CaptureError: the file is absent, truncated, corrupt, empty or not an image.
+    """
+    image = _decode(path)
+    if image.ndim == 2:
+        return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
+    if image.shape[2] == 4:
+        return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA)
+    if image.shape[2] == 3:
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    raise CaptureError(f"{path}: has {image.shape[2]} channels; save it as gray, RGB or RGBA")
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """Read a mask: True (keep) where the picture is brighter than half; colour is averaged, alpha ignored.
+
+    Returns:
+        bool [H, W].
+
+    Raises:
+        CaptureError: as `read_image`.
+    """
+    image = read_image(path)
+    return image[:, :, :3].mean(axis=2) > 127.5
+
+
+def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
+    """Write uint8 [H, W, 3] or [H, W] as PNG, atomically."""
+    stored = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
+    _, data = cv2.imencode(".png", stored)
+    write_atomically(path, lambda file: file.write(data.tobytes()))
+
+
+def _decode(path: Path) -> np.ndarray:
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise CaptureError(f"{path}: the file is absent; restore it, or remove it from the capture") from None
+    except OSError as error:
+        raise CaptureError(f"{path}: could not be read: {error.strerror}; check the file's permissions") from error
+    defect = _defect(data)
+    if defect:
+        raise CaptureError(f"{path}: {defect}; {_FIX}")
+    try:
+        # IMREAD_UNCHANGED keeps alpha and 16 bit, and leaves the EXIF orientation alone
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None or image.size == 0:
+        raise CaptureError(f"{path}: is not an image that OpenCV can decode, or is corrupt; {_FIX}")
+    if image.dtype == np.uint16:
+        return ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise CaptureError(f"{path}: has samples of type {image.dtype}; save it with 8 or 16 bit per channel")
+    return image
+
+
+def _defect(data: bytes) -> str | None:
+    """Say what is wrong with a file before it is decoded: decoders fill what is missing with gray and only warn."""
+    if not data:
+        return "the file is empty"
+    if data.startswith(b"\xff\xd8"):
+        return _jpeg_defect(data)
+    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return _png_defect(data)
+    if data.startswith(b"RIFF") and len(data) < 8 + int.from_bytes(data[4:8], "little"):
+        return "the WebP file is truncated"
+    if data.startswith(b"BM") and len(data) < int.from_bytes(data[2:6], "little"):
+        return "the BMP file is truncated"
+    return None
+
+
+def _png_defect(data: bytes) -> str | None:
+    at = 8
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        kind = data[at + 4 : at + 8]
+        end = at + 12 + length
+        if end > len(data):
+            break
+        if zlib.crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+            return f"the PNG file is corrupt: wrong checksum in chunk {kind.decode('latin-1')!r} at byte {at}"
+        if kind == b"IEND":
+            return None
+        at = end
+    return "the PNG file is truncated: it ends before its IEND chunk"
+
+
+def _jpeg_defect(data: bytes) -> str | None:
+    at = 2
+    while at + 4 <= len(data):
+        if data[at] != 0xFF:
+            return f"the JPEG file is corrupt: no marker at byte {at}"
+        marker = data[at + 1]
+        if marker == 0xFF:  # fill byte
+            at += 1
+        elif marker == 0xDA:
+            return _jpeg_scan_defect(np.frombuffer(data, np.uint8), at + 2)
+        else:
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return "the JPEG file is truncated: it ends before its pixels"
+
+
+def _jpeg_scan_defect(data: np.ndarray, start: int) -> str | None:
+    """Look through the coded pixels: only stuffed zeros, restarts and new segments may follow 0xFF, and EOI ends."""
+    marks = np.flatnonzero(data[start:-1] == 0xFF) + start
+    after = data[marks + 1]
+    ends = marks[after == 0xD9]
+    if len(ends) == 0:
+        return "the JPEG file is truncated: its end-of-image marker is missing"
+    # the tables between progressive scans may hold any byte, so only files with one scan can be searched further
+    inside = marks < ends[0]
+    if not np.any(after[inside] == 0xDA):
+        inside &= (after != 0x00) & (after != 0xFF) & (after != 0xDC) & ((after < 0xD0) | (after > 0xD7))
+        if np.any(inside):
+            return f"the JPEG file is corrupt: unexpected marker at byte {int(marks[inside][0])}"
+    return None

@@ -1,0 +1,182 @@
+"""Read and write splats in the PLY layout of the 3DGS reference code, which every viewer opens, and in `.splat`.
+
+One row a Gaussian, little-endian float32: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_0..44, opacity, scale_0..2,
+rot_0..3. Opacities are logits, scales logarithms, rotations wxyz of any norm; f_rest is channel-major: fifteen
+coefficients of red, then green, then blue. A header comment `SplatRenderMode: mip` marks antialiased splats.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement
+
+from pop_fast.errors import PopError
+from pop_fast.io.atomic import write_atomically
+from pop_fast.io.points import read_vertices
+
+__all__ = ["is_antialiased", "load_ply", "save_ply", "save_splat"]
+
+_SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3)}
+_SH_C0 = 0.28209479177387814
+_MODE = "SplatRenderMode:"
+# sigmoid(logit) >= 1/255, what a renderer can show at all
+_VISIBLE_LOGIT = -np.log(254.0)
+_COLUMNS = (
+    ["x", "y", "z", "nx", "ny", "nz"]
+    + [f"f_dc_{i}" for i in range(3)]
+    + [f"f_rest_{i}" for i in range(45)]
+    + ["opacity"]
+    + [f"scale_{i}" for i in range(3)]
+    + [f"rot_{i}" for i in range(4)]
+)
+
+
+def save_ply(
+    path: str | os.PathLike[str],
+    params: dict[str, torch.Tensor],
+    antialiased: bool = False,
+    drop_transparent: bool = False,
+) -> tuple[int, int]:
+    """Write raw parameters as PLY, atomically.
+
+    Args:
+        path: the file to write.
+        params: means [N, 3], scales [N, 3], quats [N, 4], opacities [N], sh0 [N, 1, 3], shN [N, 0|3|8|15, 3], raw.
+        antialiased: the splats were trained with antialiasing, and are to be drawn so.
+        drop_transparent: leave out Gaussians with an opacity under 1/255, which no renderer shows.
+
+    Returns:
+        The number of Gaussians before and after that filter.
+
+    Raises:
+        PopError: a parameter is absent, of the wrong shape, NaN or Inf; or the file cannot be written.
+    """
+    arrays = _checked(params)
+    before = len(arrays["means"])
+    if drop_transparent:
+        visible = arrays["opacities"] >= _VISIBLE_LOGIT
+        arrays = {name: array[visible] for name, array in arrays.items()}
+    n = len(arrays["means"])
+    rest = np.zeros((n, 15, 3), np.float32)
+    rest[:, : arrays["shN"].shape[1]] = arrays["shN"]
+    columns = [
+        arrays["means"],
+        np.zeros((n, 3), np.float32),
+        arrays["sh0"].reshape(n, 3),
+        rest.transpose(0, 2, 1).reshape(n, 45),
+        arrays["opacities"][:, None],
+        arrays["scales"],
+        arrays["quats"],
+    ]
+    table = np.ascontiguousarray(np.concatenate(columns, axis=1), dtype="<f4")
+    rows = table.view([(name, "<f4") for name in _COLUMNS]).reshape(n)
+    comments = [f"{_MODE} {'mip' if antialiased else 'default'}"]
+    ply = PlyData([PlyElement.describe(rows, "vertex")], text=False, byte_order="<", comments=comments)
+    write_atomically(path, ply.write)
+    return before, n
+
+
+def load_ply(path: str | os.PathLike[str]) -> dict[str, torch.Tensor]:
+    """Read splats from a PLY file: columns by name, in any order, among any others.
+
+    Normals are ignored; f_rest may be absent or of a lower degree (0, 9, 24 or 45 columns) and is padded with zeros.
+
+    Returns:
+        means [N, 3], scales [N, 3], quats [N, 4], opacities [N], sh0 [N, 1, 3], shN [N, 15, 3]; raw, float32.
+
+    Raises:
+        PopError: the file is absent, truncated or corrupt, is no splat, or holds NaN, Inf or a zero quaternion.
+    """
+    path = Path(path)
+    _, rows = read_vertices(path)
+    names = set(rows.dtype.names or ())
+    needed = [c for c in _COLUMNS if not c.startswith(("n", "f_rest"))]
+    absent = [name for name in needed if name not in names]
+    if absent:
+        raise PopError(f"{path}: vertex has no property {absent[0]!r}; it is not a splat as 3DGS writes it")
+    count = sum(name.startswith("f_rest_") for name in names)
+    if count not in (0, 9, 24, 45) or any(f"f_rest_{i}" not in names for i in range(count)):
+        raise PopError(f"{path}: vertex has {count} f_rest properties; there must be 0, 9, 24 or 45, without a gap")
+
+    def column(*wanted: str) -> np.ndarray:
+        stacked = np.stack([rows[name].astype(np.float32) for name in wanted], axis=1)
+        bad = np.argwhere(~np.isfinite(stacked))
+        if len(bad):
+            row, which = (int(i) for i in bad[0])
+            raise PopError(f"{path}: vertex[{row}].{wanted[which]} is {stacked[row, which]}; it must be finite")
+        return stacked
+
+    n = len(rows)
+    rest = np.zeros((n, 15, 3), np.float32)
+    if count:
+        rest[:, : count // 3] = column(*(f"f_rest_{i}" for i in range(count))).reshape(n, 3, -1).transpose(0, 2, 1)
+    quats = column(*(f"rot_{i}" for i in range(4)))
+    if n and not quats.any(axis=1).all():
+        row = int(np.argmin(quats.any(axis=1)))
+        raise PopError(f"{path}: vertex[{row}].rot is a zero quaternion; write [1, 0, 0, 0] for no rotation")
+    arrays = {
+        "means": column("x", "y", "z"),
+        "scales": column(*(f"scale_{i}" for i in range(3))),
+        "quats": quats,
+        "opacities": column("opacity")[:, 0],
+        "sh0": column(*(f"f_dc_{i}" for i in range(3)))[:, None, :],
+        "shN": rest,
+    }
+    return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}
+
+
+def is_antialiased(path: str | os.PathLike[str]) -> bool:
+    """Tell whether a PLY file asks to be drawn with antialiasing: its comment `SplatRenderMode: mip`."""
+    ply, _ = read_vertices(Path(path))
+    return any(comment.strip().startswith(_MODE) and comment.split()[-1] == "mip" for comment in ply.comments)
+
+
+def save_splat(path: str | os.PathLike[str], params: dict[str, torch.Tensor]) -> int:
+    """Write `.splat`, 32 bytes a Gaussian, the largest and most opaque first, atomically; degree-0 colour only.
+
+    Position 3 float32, scale 3 float32 (activated), RGBA 4 uint8, quaternion wxyz 4 uint8 as 128 + 128 q.
+
+    Returns:
+        The number of bytes written.
+
+    Raises:
+        PopError: as `save_ply`.
+    """
+    arrays = {name: array.astype(np.float64) for name, array in _checked(params).items()}
+    opacities = 1.0 / (1.0 + np.exp(-arrays["opacities"]))
+    order = np.argsort(-np.exp(arrays["scales"].sum(axis=1)) * opacities, kind="stable")
+    rgba = np.concatenate([0.5 + _SH_C0 * arrays["sh0"][:, 0], opacities[:, None]], axis=1)
+    unit = arrays["quats"] / np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
+    rows = np.zeros(len(order), [("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rot", "u1", 4)])
+    rows["xyz"] = arrays["means"][order]
+    rows["scale"] = np.exp(arrays["scales"][order])
+    rows["rgba"] = np.clip(np.rint(255.0 * rgba[order]), 0, 255)
+    rows["rot"] = np.clip(np.rint(128.0 + 128.0 * unit[order]), 0, 255)
+    write_atomically(path, lambda file: file.write(rows.tobytes()))
+    return rows.nbytes
+
+
+def _checked(params: dict[str, torch.Tensor]) -> dict[str, np.ndarray]:
+    arrays: dict[str, np.ndarray] = {}
+    for name in (*_SHAPES, "shN"):
+        if name not in params:
+            raise PopError(f"params has no {name!r}; a splat needs {', '.join(_SHAPES)} and shN")
+        arrays[name] = params[name].detach().cpu().numpy().astype(np.float32, copy=False)
+    n = len(arrays["means"])
+    for name, array in arrays.items():
+        bands = array.shape[1] if name == "shN" and array.ndim == 3 and array.shape[1] in (0, 3, 8, 15) else 15
+        want = (n, *_SHAPES.get(name, (bands, 3)))
+        if array.shape != want:
+            raise PopError(f"{name} has shape {list(array.shape)}; it must be {list(want)}")
+        bad = np.argwhere(~np.isfinite(array))
+        if len(bad):
+            index = tuple(int(i) for i in bad[0])
+            raise PopError(f"{name}{list(index)} is {array[index]}; every parameter must be finite")
+    norms = np.abs(arrays["quats"]).sum(axis=1)
+    if n and norms.min() == 0.0:
+        raise PopError(f"quats[{int(np.argmin(norms))}] is zero; every quaternion must have a norm > 0")
+    return arrays
