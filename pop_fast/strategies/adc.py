@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -31,6 +32,13 @@ class ADCStrategy(DensityControl):
     prune_scale2d: float = 0.15
     refine_scale2d_stop_iter: int = 0
 
+    # what the rules of growth read besides: gradients always count, and there is no blur rule
+    grow_on_gradient: ClassVar[bool] = True
+    grow_on_gradient_in_blur_window: ClassVar[bool] = True
+    blur_start_iter: ClassVar[int] = 0
+    blur_stop_iter: ClassVar[int] = -1
+    blur_rule: ClassVar[str] = "by_scale"
+
     def initialize_state(self, scene_scale: float = 1.0, seed: int = 0) -> State:
         """Return the state, with the largest extents seen when they are asked for."""
         return {**super().initialize_state(scene_scale, seed), "radii": None}
@@ -58,8 +66,9 @@ class ADCStrategy(DensityControl):
         if state["radii"] is not None:
             state["radii"].zero_()
 
-    def _forced_splits(self, state: State, step: int) -> Tensor | None:
-        return state["radii"] > self.grow_scale2d if step < self.refine_scale2d_stop_iter else None
+    def _grow_masks(self, params: Params, state: State, step: int) -> tuple[Tensor, Tensor]:
+        clones, splits = super()._grow_masks(params, state, step)
+        return clones, splits | (state["radii"] > self.grow_scale2d) if step < self.refine_scale2d_stop_iter else splits
 
     def _prune_mask(self, params: Params, state: State, step: int) -> Tensor:
         mask = super()._prune_mask(params, state, step)

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from pop_fast.density import Statistics, grow_masks, prune_mask
 from pop_fast.strategies import ops
 from pop_fast.strategies.base import Info, Optimizers, Params, State, check_layout
 
@@ -170,25 +171,8 @@ class DensityControl:
             state["grad2d"].add_(norms.masked_fill_(~visible, 0.0).sum(0))
             state["count"].add_(visible.sum(0))
 
-    def _grow_mask(self, state: State, step: int) -> Tensor:
-        views = state["count"].clamp_min(1) if self.grad_denominator == "visible_views" else max(state["views"], 1)
-        mean = state["grad2d"] / views
-        return mean >= self.grow_grad2d if self.inclusive else mean > self.grow_grad2d
-
-    def _forced_splits(self, state: State, step: int) -> Tensor | None:
-        """Return Gaussians to split whatever their size, or None."""
-        return None
-
     def _grow(self, params: Params, optimizers: Optimizers, state: State, step: int) -> dict[str, Any]:
-        grow = self._grow_mask(state, step)
-        large = largest_axes(params) > self.grow_scale3d * state["scene_scale"]
-        forced = self._forced_splits(state, step)
-        splits = grow & large if forced is None else grow & large | forced
-        return self._clone_and_split(params, optimizers, state, grow & ~large, splits)
-
-    def _clone_and_split(
-        self, params: Params, optimizers: Optimizers, state: State, clones: Tensor, splits: Tensor
-    ) -> dict[str, Any]:
+        clones, splits = self._grow_masks(params, state, step)
         n_clones, n_splits = int(clones.sum()), int(splits.sum())
         if n_clones:
             ops.clone(params, optimizers, state, clones)
@@ -198,11 +182,21 @@ class DensityControl:
             ops.split(params, optimizers, state, padded, state["generator"], self.revised_opacity)
         return {"cloned": n_clones, "split": n_splits}
 
+    def _grow_masks(self, params: Params, state: State, step: int) -> tuple[Tensor, Tensor]:
+        blurred = state.get("blurred")
+        none = torch.zeros_like(state["count"], dtype=torch.bool)
+        statistics = Statistics(
+            grad_sum=state["grad2d"],
+            n_visible=state["count"],
+            n_views=state["views"],
+            dominant_sum=none,
+            blurred=none if blurred is None else blurred,
+        )
+        return grow_masks(statistics, torch.exp(params["scales"]), state["scene_scale"], step, self)
+
     def _prune_mask(self, params: Params, state: State, step: int) -> Tensor:
-        mask = torch.sigmoid(params["opacities"].detach().flatten()) < self.prune_opa
-        if self.prune_too_big and step > self.prune_too_big_after:
-            mask |= largest_axes(params) > self.prune_scale3d * state["scene_scale"]
-        return mask
+        opacities = torch.sigmoid(params["opacities"].flatten())
+        return prune_mask(opacities, torch.exp(params["scales"]), state["scene_scale"], step, self)
 
     def _prune(self, params: Params, optimizers: Optimizers, state: State, step: int) -> int:
         mask = self._prune_mask(params, state, step)
@@ -220,8 +214,3 @@ class DensityControl:
 def visible_from_radii(radii: Tensor) -> Tensor:
     """Return which Gaussians each camera sees: all extents > 0. [C, N, 2] (or [C, N] before gsplat 1.5) -> [C, N]"""
     return (radii > 0).all(-1) if radii.dim() == 3 else radii > 0
-
-
-def largest_axes(params: Params) -> Tensor:
-    """Return each Gaussian's largest standard deviation, world units. [N]"""
-    return torch.exp(params["scales"].detach().amax(dim=-1))

@@ -13,10 +13,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from pop_fast.density import SPLIT_CHILDREN, split_children
 from pop_fast.strategies.base import Optimizers, Params, State
-
-SPLIT_CHILDREN = 2
-SPLIT_SHRINK = 0.8 * SPLIT_CHILDREN
 
 
 @torch.no_grad()
@@ -92,16 +90,10 @@ def split(
         revised_opacity: give the children `1 - sqrt(1 - o)`, so that two coincident ones equal the parent.
     """
     chosen = {key: value.detach()[mask] for key, value in params.items()}
-    scales = torch.exp(chosen["scales"])
-    shape = (SPLIT_CHILDREN, *scales.shape)
     device = "cpu" if generator is None else generator.device
-    noise = torch.randn(shape, generator=generator, dtype=scales.dtype, device=device).to(scales.device)
-    offsets = _rotate(chosen["quats"], scales * noise)
-    appended = {key: value.repeat(SPLIT_CHILDREN, *[1] * (value.dim() - 1)) for key, value in chosen.items()}
-    appended["means"] = (chosen["means"] + offsets).reshape(-1, 3)
-    appended["scales"] = torch.log(scales / SPLIT_SHRINK).repeat(SPLIT_CHILDREN, 1)
-    if revised_opacity:
-        appended["opacities"] = torch.logit(1.0 - torch.sqrt(1.0 - torch.sigmoid(appended["opacities"])))
+    shape = (SPLIT_CHILDREN, *chosen["means"].shape)
+    noise = torch.randn(shape, generator=generator, dtype=chosen["means"].dtype, device=device).to(mask.device)
+    appended = split_children(chosen, noise, revised_opacity)
     sources = torch.nonzero(mask)[:, 0].repeat(SPLIT_CHILDREN)
     edit_rows(params, optimizers, state, keep=~mask, appended=appended, sources=sources)
 
@@ -119,10 +111,3 @@ def reset_opacities(params: Params, optimizers: Optimizers, ceiling: float) -> N
     for value in optimizers["opacities"].state.get(opacities, {}).values():
         if isinstance(value, Tensor) and value.shape == opacities.shape:
             value.zero_()
-
-
-def _rotate(quats: Tensor, vectors: Tensor) -> Tensor:
-    """Rotate vectors [..., n, 3] by quaternions wxyz [n, 4] of any norm > 0: `v + 2 u x (u x v + w v)`."""
-    unit = torch.nn.functional.normalize(quats, dim=-1)
-    w, u = unit[:, :1], unit[:, 1:].expand_as(vectors)
-    return vectors + 2.0 * torch.linalg.cross(u, torch.linalg.cross(u, vectors) + w * vectors)

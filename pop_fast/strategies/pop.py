@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from pop_fast.density import blur_set, blurs_at
 from pop_fast.polarization import importance_mask, pop_loss
 from pop_fast.strategies.base import Info, Params, State
 from pop_fast.strategies.control import DensityControl, visible_from_radii
@@ -63,7 +64,7 @@ class POPStrategy(DensityControl):
 
     def is_blur_step(self, step: int) -> bool:
         """Tell whether the change after this step looks at blur."""
-        return self.is_refine_step(step) and self.blur_start_iter <= step <= self.blur_stop_iter
+        return self.is_refine_step(step) and blurs_at(step, self)
 
     def regularizer(self, opacities: Tensor, state: State, step: int, info: Info) -> Tensor | None:
         """Return `lambda_pop * L_pop` of this view, or None when the term is off.
@@ -101,11 +102,11 @@ class POPStrategy(DensityControl):
             self._collect_blur(state, info)
 
     def _collect_blur(self, state: State, info: Info) -> None:
-        threshold = self.theta_blur * int(info["height"]) * int(info["width"])
+        height, width = int(info["height"]), int(info["width"])
         if self.blur_window == "sum":
-            state["blurred"] = state["dominant_sum"] > threshold
+            state["blurred"] = blur_set(state["dominant_sum"], width, height, self.theta_blur)
             return
-        blurred = (dominant_counts(info) > threshold).any(0)
+        blurred = blur_set(dominant_counts(info), width, height, self.theta_blur).any(0)
         if self.blur_window == "any_view" and state["blurred"] is not None:
             blurred |= state["blurred"]
         state["blurred"] = blurred
@@ -113,20 +114,6 @@ class POPStrategy(DensityControl):
     def _clear(self, state: State) -> None:
         super()._clear(state)
         state["blurred"] = state["dominant_sum"] = None
-
-    def _blur_mask(self, state: State, step: int) -> Tensor | None:
-        return state["blurred"] if self.is_blur_step(step) else None
-
-    def _grow_mask(self, state: State, step: int) -> Tensor:
-        grow = super()._grow_mask(state, step)
-        in_window = self.is_blur_step(step)
-        if not self.grow_on_gradient or (in_window and not self.grow_on_gradient_in_blur_window):
-            grow = torch.zeros_like(grow)
-        blur = self._blur_mask(state, step) if self.blur_rule == "by_scale" else None
-        return grow if blur is None else grow | blur
-
-    def _forced_splits(self, state: State, step: int) -> Tensor | None:
-        return self._blur_mask(state, step) if self.blur_rule == "split" else None
 
 
 def dominant_counts(info: Info) -> Tensor:

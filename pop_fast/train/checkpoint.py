@@ -1,0 +1,160 @@
+"""Checkpoints: all that a run needs to go on with the same bits, in one file that is written whole or not at all.
+
+The file is a dict that `torch.load(weights_only=True)` reads, so loading one cannot run code. `splats` and `step` are
+gsplat's keys: its trainer evaluates these files as they are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+from pop_fast.data.capture import Capture
+from pop_fast.errors import PopError
+from pop_fast.io.atomic import write_atomically
+from pop_fast.strategies.base import State
+from pop_fast.train.config import TrainConfig, first_difference
+
+FORMAT = 1
+_NAME = re.compile(r"ckpt_(\d+)_rank0\.pt")
+_NEEDED = (
+    "format",
+    "step",
+    "splats",
+    "optimizers",
+    "strategy",
+    "view_order",
+    "config",
+    "capture",
+    "metrics_bytes",
+    "seconds",
+    "threads",
+)
+
+
+def checkpoint_path(result_dir: Path, step: int) -> Path:
+    """Return the name of the checkpoint after that step (counted from 0, as in gsplat)."""
+    return result_dir / "ckpts" / f"ckpt_{step}_rank0.pt"
+
+
+def list_checkpoints(result_dir: Path) -> list[tuple[int, Path]]:
+    """Return (step, file) of the checkpoints of a result folder, the latest last."""
+    folder = result_dir / "ckpts"
+    if not folder.is_dir():
+        return []
+    found = ((_NAME.fullmatch(path.name), path) for path in folder.iterdir())
+    return sorted((int(match[1]), path) for match, path in found if match)
+
+
+def prune_checkpoints(result_dir: Path, keep_last: int, keep_steps: set[int]) -> None:
+    """Remove all but the latest `keep_last` checkpoints and those of `keep_steps`."""
+    found = list_checkpoints(result_dir)
+    for step, path in found[: max(len(found) - keep_last, 0)]:
+        if step not in keep_steps:
+            path.unlink()
+
+
+def save_checkpoint(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a checkpoint; a reader finds the old file or the new one, never a part."""
+    write_atomically(path, lambda file: torch.save({"format": FORMAT, **content}, file))
+
+
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """Read a checkpoint.
+
+    Raises:
+        PopError: the file is absent, damaged, of another format, or not a checkpoint of a training run.
+    """
+    if not path.is_file():
+        raise PopError(f"{path}: there is no such checkpoint")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise PopError(f"{path}: cannot be read as a checkpoint; remove it to go on from the one before") from error
+    missing = [key for key in _NEEDED if not isinstance(content, dict) or key not in content]
+    if missing:
+        raise PopError(f"{path}: has no {missing[0]!r}, so it is not a checkpoint of 'pop train'")
+    if content["format"] != FORMAT:
+        raise PopError(f"{path}: has format {content['format']}; this version reads format {FORMAT}")
+    return content
+
+
+def check_fits(
+    path: Path, content: Mapping[str, Any], config: TrainConfig, fingerprint: Mapping[str, str], threads: int
+) -> None:
+    """Raise PopError when a checkpoint belongs to other settings or another capture; name what differs."""
+    ours = {**config.binding(), "threads": threads}
+    found = first_difference(ours, {**content["config"], "threads": content["threads"]})
+    if found:
+        name, ours, theirs = found
+        raise PopError(
+            f"{path}: was written with {name} = {theirs}, but this run has {name} = {ours}; "
+            f"use the same settings, or another result folder"
+        )
+    for name, ours in fingerprint.items():
+        theirs = content["capture"].get(name)
+        if theirs != ours:
+            raise PopError(
+                f"{path}: was written for another capture: the {name} differ ({str(theirs)[:12]}, here {ours[:12]}); "
+                "use the same photographs and model, or another result folder"
+            )
+
+
+def capture_fingerprint(capture: Capture, test_every: int) -> dict[str, str]:
+    """Hash what of a capture reaches the training, part by part, so that a difference can be named."""
+    views = capture.train_views(test_every)
+    parts: dict[str, list[Any]] = {"view names": [], "photographs": [], "masks": [], "cameras": [], "sparse points": []}
+    for view in views:
+        parts["view names"].append(view.name.encode())
+        parts["photographs"].append(view.image)
+        parts["masks"].append(b"none" if view.mask is None else view.mask)
+        parts["cameras"] += [view.viewmat, view.K]
+    parts["sparse points"] = [capture.points, capture.points_rgb]
+    return {name: _digest(items) for name, items in parts.items()}
+
+
+def _digest(items: list[Any]) -> str:
+    digest = hashlib.sha256()
+    for item in items:
+        array = np.frombuffer(item, np.uint8) if isinstance(item, bytes) else np.ascontiguousarray(item)
+        digest.update(json.dumps([str(array.dtype), list(array.shape)]).encode())
+        digest.update(array.data)
+    return digest.hexdigest()
+
+
+def pack_optimizers(optimizers: Mapping[str, Optimizer]) -> dict[str, dict[str, Tensor]]:
+    """Return each optimizer's moments and step counter."""
+    packed = {}
+    for key, optimizer in optimizers.items():
+        state = optimizer.state[optimizer.param_groups[0]["params"][0]]
+        packed[key] = {name: value.detach() for name, value in state.items()}
+    return packed
+
+
+def unpack_optimizers(optimizers: Mapping[str, Optimizer], packed: Mapping[str, Mapping[str, Tensor]]) -> None:
+    """Put back what `pack_optimizers` took."""
+    for key, optimizer in optimizers.items():
+        optimizer.state[optimizer.param_groups[0]["params"][0]] = dict(packed[key])
+
+
+def pack_strategy(state: State) -> dict[str, Any]:
+    """Return a strategy's state with its random generators as their states."""
+    return {k: v.get_state() if isinstance(v, torch.Generator) else v for k, v in state.items()}
+
+
+def unpack_strategy(state: State, packed: Mapping[str, Any]) -> None:
+    """Put back what `pack_strategy` took into a freshly initialised state."""
+    for key, value in packed.items():
+        if isinstance(state.get(key), torch.Generator):
+            state[key].set_state(value)
+        else:
+            state[key] = value

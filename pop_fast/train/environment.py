@@ -1,0 +1,112 @@
+"""What a run's bits depend on besides its settings: threads, denormal numbers, versions, the machine."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import platform
+import resource
+import sys
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+_OMP_PAUSE_SOFT = 1
+
+
+@contextlib.contextmanager
+def reproducible(threads: int = 0) -> Iterator[None]:
+    """Run a block with a fixed number of threads, deterministic operations and no denormal numbers; then put all back.
+
+    Denormals are flushed to zero because the moments of Gaussians that no view sees decay into them, and stay there,
+    and arithmetic on them is slow. The flag belongs to a thread and is inherited when a thread is born, so torch's pool
+    of threads is dismissed after setting it; the next operation makes a new one.
+
+    Args:
+        threads: threads of one operation; 0 takes all cores.
+    """
+    before = torch.get_num_threads()
+    deterministic = torch.are_deterministic_algorithms_enabled()
+    mode: Any = torch.utils.deterministic
+    filling = mode.fill_uninitialized_memory
+    torch.set_num_threads(threads if threads > 0 else before)
+    # would write NaN into every empty tensor first: it guards against reading them, and costs a pass over the memory
+    mode.fill_uninitialized_memory = False
+    torch.use_deterministic_algorithms(True)
+    _flush_denormals(True)
+    try:
+        yield
+    finally:
+        _flush_denormals(False)
+        torch.use_deterministic_algorithms(deterministic)
+        mode.fill_uninitialized_memory = filling
+        torch.set_num_threads(before)
+
+
+def _flush_denormals(on: bool) -> None:
+    torch.set_flush_denormal(on)
+    for library in _openmp_libraries():
+        pause = getattr(library, "omp_pause_resource_all", None)
+        if pause is not None:
+            pause(_OMP_PAUSE_SOFT)
+    if on and not _threads_flush_denormals():
+        # all threads or none: half of a tensor rounded one way would depend on how the pool was born
+        torch.set_flush_denormal(False)
+
+
+def _openmp_libraries() -> list[ctypes.CDLL]:
+    """Return the OpenMP runtimes that torch brought into this process (Linux; elsewhere none are found)."""
+    maps = Path("/proc/self/maps")
+    if not maps.exists():
+        return []
+    files = {line.split()[-1] for line in maps.read_text().splitlines() if "/torch/lib/" in line and "omp" in line}
+    return [ctypes.CDLL(file) for file in sorted(files)]
+
+
+def _threads_flush_denormals() -> bool:
+    # large enough that torch shares it out over all threads
+    smallest = torch.full((torch.get_num_threads() * 65_536,), torch.finfo(torch.float32).tiny)
+    return bool((smallest * 0.5 == 0.0).all())
+
+
+def peak_memory_bytes() -> int:
+    """Return the most memory that this process has held resident."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def machine_name() -> str:
+    """Return the processor's name."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def run_facts(backend: str, train_seconds: float, total_seconds: float) -> dict[str, Any]:
+    """Return what else belongs beside a result: time, memory, machine. `mem` is in GiB, as gsplat's."""
+    peak = peak_memory_bytes()
+    return {
+        "seconds": train_seconds,
+        "seconds_total": total_seconds,
+        "memory_bytes": peak,
+        "mem": peak / 2**30,
+        "machine": machine_name(),
+        "threads": torch.get_num_threads(),
+        "backend": backend,
+        "versions": versions(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what a result depends on."""
+    found = {"python": platform.python_version(), "torch": str(torch.__version__)}
+    for name in ("numpy", "opencv-contrib-python-headless", "pop-splatting"):
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found

@@ -1,0 +1,81 @@
+"""How good a render is (PSNR, SSIM and, with weights at hand, LPIPS), and what to count of a population."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pop_fast.losses import ssim
+from pop_fast.train.lpips import LPIPS, VARIANTS
+
+NO_LPIPS = "no weights were given (lpips_vgg, lpips_alex)"
+ALPHA_FLOOR = 1.0 / 255.0
+
+
+@dataclass(frozen=True)
+class ViewMetrics:
+    """What was measured on one view; `lpips` by variant."""
+
+    psnr: float
+    ssim: float
+    lpips: Mapping[str, float]
+
+
+def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Return `-10 log10(mean squared error)` in dB of images in [0, 1], inf when they are equal.
+
+    Args:
+        image: clamped to [0, 1], not rounded to 8 bit. [H, W, 3]
+        target: [H, W, 3]
+        mask: True where a pixel counts; None for all. [H, W]
+    """
+    squares = (image.clamp(0.0, 1.0) - target) ** 2
+    error = float((squares if mask is None else squares[mask]).double().mean())
+    return -10.0 * math.log10(error) if error > 0.0 else math.inf
+
+
+def measure(image: Tensor, target: Tensor, mask: Tensor | None = None, nets: Sequence[LPIPS] = ()) -> ViewMetrics:
+    """Measure one view, as gsplat does: on floats clamped to [0, 1], SSIM over windows that lie inside.
+
+    Masked pixels are left out of PSNR, and given the photograph's colour for SSIM and LPIPS, whose windows need
+    whole images.
+    """
+    image = image.clamp(0.0, 1.0)
+    whole = image if mask is None else torch.where(mask[..., None], image, target)
+    lpips = {variant: net(whole, target, variant) for net in nets for variant in VARIANTS[net.net]}
+    return ViewMetrics(psnr(image, target, mask), float(ssim(whole, target, padding="valid")), lpips)
+
+
+def average(views: Sequence[ViewMetrics], nets: Sequence[LPIPS]) -> dict[str, Any]:
+    """Average over views; `lpips` is gsplat's variant where AlexNet's weights were given, else 3DGS's, else null."""
+    means = {name: _mean([view.lpips[name] for view in views]) for net in nets for name in VARIANTS[net.net]}
+    chosen = next((name for name in ("alex_norm", "vgg_01") if name in means), None)
+    return {
+        "psnr": _mean([view.psnr for view in views]),
+        "ssim": _mean([view.ssim for view in views]),
+        "lpips": means[chosen] if chosen else None,
+        "lpips_net": chosen,
+        "lpips_variants": means,
+        "lpips_weights_sha256": {name: value for net in nets for name, value in net.sha256.items()},
+        "lpips_reason": None if chosen else NO_LPIPS,
+    }
+
+
+def population(opacities: Tensor) -> dict[str, Any]:
+    """Count Gaussians: all, those that can reach a pixel (opacity >= 1/255), and the shares at either pole."""
+    n = max(len(opacities), 1)
+    return {
+        "num_GS": len(opacities),
+        "num_GS_above_floor": int((opacities >= ALPHA_FLOOR).sum()),
+        "opacity_below_0.1": int((opacities < 0.1).sum()) / n,
+        "opacity_above_0.9": int((opacities > 0.9).sum()) / n,
+    }
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return sum(values) / len(values) if values else None

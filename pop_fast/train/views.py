@@ -1,0 +1,106 @@
+"""A capture's views as tensors, and the one call that renders them from raw parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pop_fast.activations import opacities_from_logits, scales_from_log_scales
+from pop_fast.data.capture import View
+from pop_fast.train.config import TrainConfig
+
+
+@dataclass(frozen=True, eq=False)
+class ViewTensors:
+    """One view.
+
+    Attributes:
+        name: relative file name.
+        photo: uint8 [H, W, 3]
+        mask: True where the photograph counts, or None. bool [H, W]
+        viewmat: world -> camera. float32 [1, 4, 4]
+        K: intrinsics, px. float32 [1, 3, 3]
+    """
+
+    name: str
+    photo: Tensor
+    mask: Tensor | None
+    viewmat: Tensor
+    K: Tensor
+
+    @classmethod
+    def of(cls, view: View) -> ViewTensors:
+        """Take over a view of a capture."""
+        return cls(
+            name=view.name,
+            photo=torch.from_numpy(view.image),
+            mask=None if view.mask is None else torch.from_numpy(view.mask),
+            viewmat=torch.from_numpy(view.viewmat).float()[None],
+            K=torch.from_numpy(view.K).float()[None],
+        )
+
+    @property
+    def height(self) -> int:
+        """Height, px."""
+        return self.photo.shape[0]
+
+    @property
+    def width(self) -> int:
+        """Width, px."""
+        return self.photo.shape[1]
+
+    def target(self) -> Tensor:
+        """Return the photograph as floats in [0, 1]. [H, W, 3]"""
+        return self.photo.float().div_(255.0)
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A rendered view: the image [H, W, 3], the activated opacities that made it [N], and rasterization's `info`."""
+
+    image: Tensor
+    opacities: Tensor
+    info: dict[str, Any]
+
+
+def render_view(
+    backend: Any, params: Mapping[str, Tensor], view: ViewTensors, config: TrainConfig, sh_degree: int
+) -> Rendered:
+    """Render a view from raw parameters.
+
+    Colour bands above `sh_degree` are left out of the graph, so that their gradient need not be made to be zero.
+    """
+    opacities = opacities_from_logits(params["opacities"])
+    bands = (sh_degree + 1) ** 2
+    sh = params["sh0"] if bands == 1 else torch.cat([params["sh0"], params["shN"][:, : bands - 1]], dim=1)
+    background = torch.tensor([config.background]) if any(config.background) else None
+    colors, _, info = backend.rasterization(
+        means=params["means"],
+        quats=params["quats"],
+        scales=scales_from_log_scales(params["scales"]),
+        opacities=opacities,
+        colors=sh,
+        viewmats=view.viewmat,
+        Ks=view.K,
+        width=view.width,
+        height=view.height,
+        sh_degree=sh_degree,
+        packed=False,
+        backgrounds=background,
+        absgrad=config.strategy.absgrad,
+        rasterize_mode="antialiased" if config.antialiased else "classic",
+        profile=config.profile,
+    )
+    if view.mask is not None:
+        info["dominant_counts"] = _counts_inside(info["dominant_ids"], view.mask, len(opacities))
+    return Rendered(colors[0], opacities, info)
+
+
+def _counts_inside(dominant_ids: Tensor, mask: Tensor, n: int) -> Tensor:
+    """Count dominated pixels of one camera where the mask keeps them: ignored pixels say nothing about importance."""
+    ids = dominant_ids[0][mask & (dominant_ids[0] >= 0)]
+    return torch.bincount(ids, minlength=n)[None]

@@ -1,0 +1,440 @@
+"""The strategies: when they act, whom they select, and that rows, moments and statistics stay together."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pop_fast.strategies import ADCStrategy, POPStrategy, Strategy
+from pop_fast.strategies.control import SHORTEST_REFINE_EVERY
+from pop_ref import density as oracle
+from pop_ref.density_rows import Rows as OracleRows
+
+KEYS = ("means", "scales", "quats", "opacities", "sh0", "shN")
+WIDTH, HEIGHT = 64, 32
+
+
+def make(n: int, seed: int = 0, opacities: float = 0.5, scale: float = 0.005):
+    g = torch.Generator().manual_seed(seed)
+    params = {
+        "means": torch.randn(n, 3, generator=g),
+        "scales": torch.full((n, 3), math.log(scale)),
+        "quats": torch.randn(n, 4, generator=g),
+        "opacities": torch.full((n,), math.log(opacities / (1 - opacities))),
+        "sh0": torch.randn(n, 1, 3, generator=g),
+        "shN": torch.randn(n, 15, 3, generator=g),
+    }
+    params = {key: torch.nn.Parameter(value) for key, value in params.items()}
+    optimizers = {key: torch.optim.Adam([value], lr=0.01, eps=1e-15, fused=True) for key, value in params.items()}
+    for key, value in params.items():
+        value.grad = torch.randn(value.shape, generator=g)
+        optimizers[key].step()
+    return params, optimizers
+
+
+def make_info(
+    n: int, grads=None, visible=None, counts=None, cameras: int = 1, width: int = WIDTH, height: int = HEIGHT
+):
+    means2d = torch.zeros(cameras, n, 2, requires_grad=True)
+    grads = torch.zeros(cameras, n, 2) if grads is None else torch.as_tensor(grads).float().reshape(cameras, n, 2)
+    means2d.grad = grads
+    seen = torch.ones(cameras, n, dtype=torch.bool) if visible is None else torch.as_tensor(visible).reshape(cameras, n)
+    counts = (
+        torch.zeros(cameras, n, dtype=torch.int64) if counts is None else torch.as_tensor(counts).reshape(cameras, n)
+    )
+    radii = seen[..., None].int().expand(-1, -1, 2) * 4
+    return {
+        "means2d": means2d,
+        "radii": radii,
+        "width": width,
+        "height": height,
+        "n_cameras": cameras,
+        "dominant_counts": counts,
+        "gaussian_ids": None,
+    }
+
+
+def packed(info):
+    """The same statistics as rasterization(packed=True) reports them: visible rows only."""
+    cameras, ids = torch.nonzero((info["radii"] > 0).all(-1), as_tuple=True)
+    means2d = torch.zeros(len(ids), 2, requires_grad=True)
+    means2d.grad = info["means2d"].grad[cameras, ids]
+    return {**info, "means2d": means2d, "radii": info["radii"][cameras, ids], "gaussian_ids": ids.int()}
+
+
+def moments(optimizers, params, key):
+    state = optimizers[key].state[params[key]]
+    return state["exp_avg"], state["exp_avg_sq"], state["step"]
+
+
+@pytest.mark.parametrize("strategy", [POPStrategy(), ADCStrategy()])
+def test_the_population_changes_144_times_from_600_to_14900(strategy):
+    steps = [s for s in range(30_000) if strategy.is_refine_step(s)]
+    assert (len(steps), steps[0], steps[-1]) == (144, 600, 14_900)
+
+
+def test_blur_is_looked_at_41_times_both_ends_included():
+    steps = [s for s in range(30_000) if POPStrategy().is_blur_step(s)]
+    assert (len(steps), steps[0], steps[-1]) == (41, 3000, 7000)
+
+
+def test_plain_control_resets_four_times_and_pop_never():
+    assert [s for s in range(30_000) if ADCStrategy().is_reset_step(s)] == [3000, 6000, 9000, 12_000]
+    assert not any(POPStrategy().is_reset_step(s) for s in range(30_000))
+
+
+def test_a_reset_at_step_0_is_a_switch():
+    assert ADCStrategy(reset_at_zero=True).is_reset_step(0)
+    assert not ADCStrategy().is_reset_step(0)
+
+
+def test_both_strategies_satisfy_the_protocol():
+    assert isinstance(POPStrategy(), Strategy)
+    assert isinstance(ADCStrategy(), Strategy)
+
+
+def test_gsplat_attribute_names_exist_with_gsplat_numbers():
+    for strategy in (POPStrategy(), ADCStrategy()):
+        got = [getattr(strategy, name) for name in ("prune_opa", "grow_grad2d", "grow_scale3d", "prune_scale3d")]
+        assert got == [0.005, 0.0002, 0.01, 0.1]
+        assert (strategy.refine_start_iter, strategy.refine_stop_iter, strategy.refine_every) == (500, 15_000, 100)
+        assert (strategy.absgrad, strategy.revised_opacity, strategy.key_for_gradient) == (False, False, "means2d")
+    assert (ADCStrategy().reset_every, POPStrategy().reset_every) == (3000, 0)
+
+
+def test_a_scaled_schedule_keeps_its_shape_and_a_window_worth_averaging():
+    quick = POPStrategy().scaled(0.1)
+    assert (quick.refine_start_iter, quick.refine_stop_iter, quick.refine_every) == (50, 1500, SHORTEST_REFINE_EVERY)
+    assert (quick.blur_start_iter, quick.blur_stop_iter, quick.pop_stop_iter) == (300, 700, 1500)
+    assert quick.prune_too_big_after == 300
+    assert ADCStrategy().scaled(0.1).reset_every == 300
+    assert POPStrategy().scaled(1.0) == POPStrategy()
+    assert POPStrategy(refine_every=10).scaled(0.1).refine_every == 10
+
+
+def run_event(strategy, params, optimizers, info, step: int, is_packed: bool = False, scene_scale: float = 1.0):
+    state = strategy.initialize_state(scene_scale, seed=3)
+    strategy.step_post_backward(params, optimizers, state, step, info, packed=is_packed)
+    return state
+
+
+def test_small_gaussians_are_cloned_with_their_bits_and_large_ones_split_in_two():
+    params, optimizers = make(4)
+    params["scales"].data[2] = math.log(0.5)
+    before = {key: value.detach().clone() for key, value in params.items()}
+    first, second, steps = (x.clone() for x in moments(optimizers, params, "means"))
+    grads = torch.tensor([[0.0, 0], [1.0, 0], [1.0, 0], [0.0, 0]])
+    state = run_event(POPStrategy(), params, optimizers, make_info(4, grads), step=600)
+    assert state["event"] == {"cloned": 1, "split": 1, "pruned": 0}
+    # survivors 0, 1, 3; the clone of 1; two children of 2
+    assert len(params["means"]) == 6
+    for key in KEYS:
+        assert torch.equal(params[key][:4], before[key][[0, 1, 3, 1]])
+    assert torch.equal(params["quats"][4:], before["quats"][[2, 2]])
+    assert torch.allclose(params["scales"][4:], before["scales"][[2, 2]] - math.log(1.6))
+    assert not torch.equal(params["means"][4], params["means"][5])
+    got = moments(optimizers, params, "means")
+    assert torch.equal(got[0], torch.cat([first[[0, 1, 3]], torch.zeros(3, 3)]))
+    assert torch.equal(got[1], torch.cat([second[[0, 1, 3]], torch.zeros(3, 3)]))
+    assert torch.equal(got[2], steps)
+    for key in KEYS:
+        assert optimizers[key].param_groups[0]["params"][0] is params[key]
+        assert list(optimizers[key].state) == [params[key]]
+
+
+def test_optimizers_step_on_after_an_event():
+    params, optimizers = make(4)
+    grads = torch.ones(4, 2)
+    run_event(POPStrategy(), params, optimizers, make_info(4, grads), step=600)
+    before = params["means"].detach().clone()
+    params["means"].grad = torch.ones_like(params["means"])
+    optimizers["means"].step()
+    assert (params["means"] != before).all()
+
+
+def test_transparent_gaussians_are_pruned_and_oversized_ones_only_after_step_3000():
+    for step, survivors in ((2900, 2), (3000, 2), (3100, 1)):
+        params, optimizers = make(3)
+        params["opacities"].data[0] = -6.0
+        params["scales"].data[1] = math.log(0.2)
+        run_event(POPStrategy(blur_stop_iter=-1), params, optimizers, make_info(3), step)
+        assert len(params["means"]) == survivors, step
+    params, optimizers = make(3)
+    params["scales"].data[1] = math.log(0.2)
+    run_event(POPStrategy(prune_too_big=False), params, optimizers, make_info(3), 3100)
+    assert len(params["means"]) == 3
+
+
+def test_a_reset_lowers_opacities_to_twice_the_prune_threshold_and_forgets_their_moments_only():
+    params, optimizers = make(3)
+    other = [x.clone() for x in moments(optimizers, params, "scales")]
+    run_event(ADCStrategy(), params, optimizers, make_info(3), 3000)
+    assert torch.allclose(torch.sigmoid(params["opacities"]), torch.tensor(0.01))
+    first, second, steps = moments(optimizers, params, "opacities")
+    assert not first.any()
+    assert not second.any()
+    assert steps == 1
+    assert all(torch.equal(a, b) for a, b in zip(other, moments(optimizers, params, "scales"), strict=True))
+
+
+def test_a_reset_does_not_raise_opacities():
+    params, optimizers = make(2, opacities=0.006)
+    before = params["opacities"].detach().clone()
+    run_event(ADCStrategy(), params, optimizers, make_info(2), 3000)
+    assert torch.equal(params["opacities"], before)
+
+
+def test_the_gradient_is_measured_in_half_images_and_averaged_over_visible_views():
+    params, optimizers = make(2)
+    strategy, threshold = POPStrategy(refine_every=3, refine_start_iter=0), 0.0002
+    # pixel gradients that make a Gaussian exceed the threshold in one view of the one it is seen in, of three
+    just_over = threshold / (WIDTH / 2) * 1.01
+    state = strategy.initialize_state()
+    for step, visible in ((1, [True, False]), (2, [True, False]), (3, [True, True])):
+        grads = torch.tensor([[just_over, 0.0], [just_over, 0.0]]) * torch.tensor(visible)[:, None]
+        if step < 3:
+            grads[0] = 0.0
+        info = make_info(2, grads, visible)
+        strategy.step_post_backward(params, optimizers, state, step, info)
+    # 0 was seen three times and moved once; 1 was seen once and moved
+    assert state["event"]["cloned"] == 1
+    assert torch.equal(params["means"][2], params["means"][1])
+    assert not state["grad2d"].any()
+    assert not state["count"].any()
+
+
+def test_inclusive_selects_a_gradient_at_the_threshold():
+    for inclusive, n in ((False, 1), (True, 2)):
+        params, optimizers = make(1)
+        grads = torch.tensor([[2.0**-10, 0.0]])
+        strategy = ADCStrategy(inclusive=inclusive, grow_grad2d=2.0**-10 * WIDTH / 2)
+        run_event(strategy, params, optimizers, make_info(1, grads), 600)
+        assert len(params["means"]) == n
+
+
+def test_absgrad_reads_the_absolute_gradient():
+    params, optimizers = make(1)
+    info = make_info(1)
+    info["means2d"].absgrad = torch.ones(1, 1, 2)
+    run_event(POPStrategy(absgrad=True), params, optimizers, info, 600)
+    assert len(params["means"]) == 2
+
+
+@pytest.mark.parametrize("strategy", [POPStrategy(pop_views="window"), ADCStrategy(refine_scale2d_stop_iter=15_000)])
+def test_packed_and_unpacked_infos_give_the_same_bits(strategy):
+    g = torch.Generator().manual_seed(1)
+    results = []
+    for is_packed in (False, True):
+        params, optimizers = make(20)
+        g.manual_seed(1)
+        state = strategy.initialize_state(1.0, seed=5)
+        for step in (3098, 3099, 3100):
+            visible = torch.rand(2, 20, generator=g) < 0.7
+            grads = 1e-5 * torch.randn(2, 20, 2, generator=g) * visible[..., None]
+            counts = torch.randint(0, 2, (2, 20), generator=g) * visible
+            info = make_info(20, grads, visible, counts, cameras=2)
+            info["radii"] = torch.randint(1, 9, (2, 20, 2), generator=g).int() * visible[..., None].int()
+            strategy.step_post_backward(
+                params, optimizers, state, step, packed(info) if is_packed else info, packed=is_packed
+            )
+        results.append((params, state["event"]))
+    assert results[0][1] == results[1][1]
+    assert results[0][1]["cloned"] > 0
+    for key in KEYS:
+        assert torch.equal(results[0][0][key], results[1][0][key])
+
+
+def test_extents_on_screen_split_and_prune_where_they_are_asked_for():
+    params, optimizers = make(3)
+    info = make_info(3)
+    info["radii"] = torch.tensor([[[1, 1], [4, 1], [1, 20]]]).int()
+    run_event(ADCStrategy(refine_scale2d_stop_iter=15_000), params, optimizers, info, 3100)
+    # 0 stays, 1 (4/64 > 0.05) is split, 2 (20/64) is split, and its children inherit an extent that is pruned
+    assert len(params["means"]) == 3
+
+
+def test_a_gaussian_that_dominates_enough_pixels_of_one_view_grows_in_the_blur_window_only():
+    threshold = 2e-5
+    height = width = 1000
+    for step, counts, n in ((3000, [20, 21], 3), (7000, [20, 21], 3), (2900, [21, 21], 2), (7100, [21, 21], 2)):
+        params, optimizers = make(2)
+        info = make_info(2, counts=torch.tensor(counts), width=width, height=height)
+        run_event(POPStrategy(theta_blur=threshold), params, optimizers, info, step)
+        assert len(params["means"]) == n, step
+
+
+@pytest.mark.parametrize(("window", "n"), [("any_view", 2), ("sum", 3), ("own_view", 1)])
+def test_what_the_dominant_count_is_taken_over_is_a_switch(window, n):
+    # Gaussian 0 is over the threshold of 2 px in the first view, Gaussian 1 in the sum alone
+    params, optimizers = make(2)
+    params["opacities"].data[:] = 0.0
+    strategy = POPStrategy(theta_blur=2 / (WIDTH * HEIGHT), blur_window=window, refine_every=2)
+    state = strategy.initialize_state()
+    for step, counts in ((3001, [3, 2]), (3002, [0, 1])):
+        strategy.step_post_backward(params, optimizers, state, step, make_info(2, counts=torch.tensor(counts)))
+    assert len(params["means"]) == {"any_view": 3, "sum": 4, "own_view": 2}[window]
+    assert n == len(params["means"]) - 1
+
+
+def test_blur_flags_are_forgotten_after_an_event():
+    params, optimizers = make(1)
+    strategy = POPStrategy()
+    state = strategy.initialize_state()
+    strategy.step_post_backward(params, optimizers, state, 3000, make_info(1, counts=torch.tensor([99])))
+    assert len(params["means"]) == 2
+    strategy.step_post_backward(params, optimizers, state, 3100, make_info(2))
+    assert len(params["means"]) == 2
+
+
+def test_blur_clones_small_and_splits_large_or_splits_all():
+    for rule, event in (("by_scale", {"cloned": 1, "split": 1}), ("split", {"cloned": 0, "split": 2})):
+        params, optimizers = make(2)
+        params["scales"].data[1] = math.log(0.05)
+        info = make_info(2, counts=torch.tensor([99, 99]))
+        state = run_event(POPStrategy(blur_rule=rule), params, optimizers, info, 3000)
+        assert state["event"] == {**event, "pruned": 0}
+
+
+def test_growth_by_gradient_can_be_switched_off_altogether_or_in_the_blur_window():
+    grads = torch.ones(1, 2)
+    for strategy, step, n in (
+        (POPStrategy(grow_on_gradient=False), 600, 1),
+        (POPStrategy(grow_on_gradient_in_blur_window=False), 600, 2),
+        (POPStrategy(grow_on_gradient_in_blur_window=False), 3000, 1),
+    ):
+        params, optimizers = make(1)
+        run_event(strategy, params, optimizers, make_info(1, grads), step)
+        assert len(params["means"]) == n
+
+
+def test_nothing_happens_from_step_15000():
+    params, optimizers = make(2)
+    state = run_event(POPStrategy(), params, optimizers, make_info(2, torch.ones(2, 2)), 15_000)
+    assert len(params["means"]) == 2
+    assert state["grad2d"] is None
+
+
+def test_the_regularizer_pulls_dominant_opacities_up_and_the_others_down():
+    strategy = POPStrategy()
+    opacities = torch.tensor([0.25, 0.5, 0.75, 0.5], requires_grad=True)
+    info = make_info(4, counts=torch.tensor([5, 0, 1, 0]))
+    term = strategy.regularizer(opacities, strategy.initialize_state(), 0, info)
+    assert term is not None
+    assert term.item() == pytest.approx(1e-3 * (0.5 + 0.5))
+    term.backward()
+    assert torch.allclose(opacities.grad, 1e-3 * torch.tensor([-0.5, 0.5, -0.5, 0.5]))
+
+
+def test_the_regularizer_is_off_outside_its_steps_and_at_weight_0():
+    info, opacities = make_info(2), torch.tensor([0.5, 0.5])
+    for strategy, step in (
+        (POPStrategy(), 15_000),
+        (POPStrategy(pop_start_iter=500), 499),
+        (POPStrategy(lambda_pop=0), 0),
+    ):
+        assert strategy.regularizer(opacities, strategy.initialize_state(), step, info) is None
+    assert ADCStrategy().regularizer(opacities, {}, 0, info) is None
+
+
+def test_importance_can_be_kept_for_the_window_and_the_loss_for_the_visible():
+    opacities = torch.tensor([0.25, 0.5, 0.75], requires_grad=True)
+    strategy = POPStrategy(pop_views="window", pop_over="visible")
+    params, optimizers = make(3)
+    state = strategy.initialize_state()
+    strategy.step_post_backward(params, optimizers, state, 1, make_info(3, counts=torch.tensor([1, 0, 0])))
+    info = make_info(3, visible=[True, True, False], counts=torch.tensor([0, 0, 0]))
+    for each in (info, packed(info)):
+        term = strategy.regularizer(opacities, state, 2, each)
+        assert term is not None
+        assert term.item() == pytest.approx(1e-3 * (0.75 + 0.5))
+
+
+def test_missing_dominant_counts_are_explained():
+    info = make_info(2)
+    del info["dominant_counts"]
+    strategy = POPStrategy()
+    with pytest.raises(ValueError, match=r"dominant_counts.*pop_fast\.rasterization"):
+        strategy.regularizer(torch.tensor([0.5, 0.5]), strategy.initialize_state(), 0, info)
+    params, optimizers = make(2)
+    run_event(ADCStrategy(), params, optimizers, info, 600)
+
+
+def test_sanity_checks_name_the_key():
+    params, optimizers = make(2)
+    strategy = POPStrategy()
+    strategy.check_sanity(params, optimizers)
+    with pytest.raises(ValueError, match="'quats'"):
+        strategy.check_sanity({k: v for k, v in params.items() if k != "quats"}, optimizers)
+    with pytest.raises(ValueError, match="'sh0' is a parameter without an optimizer"):
+        strategy.check_sanity(params, {k: v for k, v in optimizers.items() if k != "sh0"})
+    with pytest.raises(ValueError, match="'scales' has 3 rows but 'means' has 2"):
+        strategy.check_sanity({**params, "scales": torch.nn.Parameter(torch.zeros(3, 3))}, optimizers)
+    with pytest.raises(ValueError, match="exactly one tensor"):
+        strategy.check_sanity(params, {**optimizers, "sh0": torch.optim.Adam(list(params.values()))})
+    with pytest.raises(ValueError, match="refine_every"):
+        POPStrategy(refine_every=0).check_sanity(params, optimizers)
+
+
+def test_the_same_seed_splits_to_the_same_bits_and_another_does_not():
+    means = []
+    for seed in (1, 1, 2):
+        params, optimizers = make(3, scale=0.05)
+        strategy = POPStrategy()
+        state = strategy.initialize_state(seed=seed)
+        strategy.step_post_backward(params, optimizers, state, 600, make_info(3, torch.ones(3, 2)))
+        means.append(params["means"].detach())
+    assert torch.equal(means[0], means[1])
+    assert not torch.equal(means[0], means[2])
+
+
+@given(
+    rows=st.lists(
+        st.tuples(
+            st.sampled_from([0.0, 1e-6, 1e-2]),  # pixel gradient
+            st.integers(0, 4),  # pixels dominated
+            st.booleans(),  # visible
+            st.sampled_from([0.004, 0.05, 0.3]),  # size
+            st.sampled_from([0.001, 0.5, 1.0 - 2**-10]),  # opacity
+        ),
+        min_size=1,
+        max_size=8,
+    ),
+    step=st.sampled_from([600, 3000, 3100, 7000, 7100]),
+    blur_rule=st.sampled_from(["by_scale", "split"]),
+    inclusive=st.booleans(),
+)
+def test_an_event_equals_the_oracles_row_for_row(rows, step, blur_rule, inclusive):
+    n = len(rows)
+    gradient, dominant, visible, size, opacity = (np.array(column) for column in zip(*rows, strict=True))
+    params, optimizers = make(n)
+    params["scales"].data = torch.from_numpy(np.log(size)).float()[:, None].repeat(1, 3)
+    params["opacities"].data = torch.from_numpy(np.log(opacity / (1 - opacity))).float()
+    grads = np.stack([gradient * visible, np.zeros(n)], axis=1)
+    settings = {"blur_rule": blur_rule, "inclusive": inclusive, "theta_blur": 2 / (WIDTH * HEIGHT)}
+    strategy = POPStrategy(**settings)
+    drawn = []
+
+    def normals(k: int) -> np.ndarray:
+        generator = torch.Generator().manual_seed(3)
+        drawn.append(torch.randn((2, k, 3), generator=generator).double().numpy() if k else np.zeros((2, 0, 3)))
+        return drawn[-1]
+
+    double = {key: value.detach().double().numpy() for key, value in params.items()}
+    m, v = ({k: moments(optimizers, params, k)[i].double().numpy() for k in KEYS} for i in (0, 1))
+    config = oracle.DensityConfig(**settings)
+    statistics = oracle.accumulate(
+        oracle.zero_statistics(n), grads, visible.astype(bool), dominant.astype(np.int64), WIDTH, HEIGHT, config
+    )
+    want, _ = oracle.densify_and_prune(OracleRows(double, m, v), statistics, 1.0, step, normals, config)
+
+    run_event(strategy, params, optimizers, make_info(n, grads, visible, torch.from_numpy(dominant)), step)
+    assert len(params["means"]) == len(want)
+    for key in KEYS:
+        np.testing.assert_allclose(params[key].detach().numpy(), want.params[key], rtol=2e-6, atol=2e-6)
+        np.testing.assert_array_equal(moments(optimizers, params, key)[0].numpy(), want.m[key].astype(np.float32))
+        np.testing.assert_array_equal(moments(optimizers, params, key)[1].numpy(), want.v[key].astype(np.float32))
