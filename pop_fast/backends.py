@@ -1,0 +1,89 @@
+"""Backends by name: "fast" (this package, CPU), "cuda" (cuda_ext), "ref" (the oracle, slow).
+
+A backend offers `rasterization()` with gsplat's signature and this project's meta keys. Which one runs is a value that
+is passed; nothing is patched, so two can be alive in one process and be compared in one assertion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from torch import Tensor
+
+from pop_fast.errors import PopError
+
+
+class Backend(Protocol):
+    """What a trainer or a test asks of a backend."""
+
+    @property
+    def name(self) -> str:
+        """Return the backend's name."""
+        ...
+
+    def available(self) -> bool:
+        """Tell whether it can run here."""
+        ...
+
+    def why_not(self) -> str | None:
+        """Return one sentence on why it cannot run here and what to do, or None."""
+        ...
+
+    def rasterization(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        """Render; see `pop_fast.rasterization.rasterization`."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Registered:
+    name: str
+    load: Callable[[], Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]]
+    reason: Callable[[], str | None]
+
+    def available(self) -> bool:
+        return self.reason() is None
+
+    def why_not(self) -> str | None:
+        return self.reason()
+
+    def rasterization(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        reason = self.reason()
+        if reason is not None:
+            raise PopError(f"backend {self.name!r} cannot run: {reason}")
+        return self.load()(*args, **kwargs)
+
+
+def _load_fast() -> Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]:
+    from pop_fast.rasterization import rasterization
+
+    return rasterization
+
+
+def _load_ref() -> Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]:
+    from pop_fast.oracle_backend import rasterization
+
+    return rasterization
+
+
+_BACKENDS: dict[str, Backend] = {
+    "fast": _Registered("fast", _load_fast, lambda: None),
+    "ref": _Registered("ref", _load_ref, lambda: None),
+}
+
+
+def backend_names() -> tuple[str, ...]:
+    """Return the names that `get_backend` knows."""
+    return tuple(_BACKENDS)
+
+
+def get_backend(name: str) -> Backend:
+    """Return the backend of that name, whether or not it can run here.
+
+    Raises:
+        PopError: the name is unknown.
+    """
+    if name not in _BACKENDS:
+        raise PopError(f"backend {name!r} is unknown; use one of {', '.join(_BACKENDS)}")
+    return _BACKENDS[name]

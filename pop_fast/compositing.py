@@ -1,0 +1,259 @@
+"""Blend splats into an image, differentiably. Meaning: `pop_ref.compositing`; the arithmetic is in `blender`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from pop_fast.alpha import Entries, entries_of_lists, entry_gradients, exponent_coefficients, pixel_basis
+from pop_fast.blender import Blender, GroupBlend
+from pop_fast.dominance import dominant_places
+from pop_fast.layout import from_columns
+from pop_fast.tile_groups import CHUNK, TileGroup, tile_groups
+from pop_fast.tiles import TileLists
+from pop_ref.constants import PAPER, Profile
+
+KEPT_BYTES = 768 << 20  # alphas and weights kept for the transpose; tiles beyond that are blended once more in it
+
+
+@dataclass(frozen=True)
+class Composite:
+    """A blended view, over black.
+
+    Attributes:
+        image: weighted colours. [H, W, D]
+        alphas: sum of weights, 1 - T_final. [H, W]
+        dominant_ids: -1 where none was blended. [H, W] int64, or None when not asked for
+        dominant_weights: [H, W], or None when not asked for
+        n_blended: [H, W] int32, or None when not asked for
+        n_traversed: list entries visited, the terminating one included. [H, W] int32, or None when not asked for
+        n_pairs: (entry, pixel) pairs evaluated.
+    """
+
+    image: Tensor
+    alphas: Tensor
+    dominant_ids: Tensor | None
+    dominant_weights: Tensor | None
+    n_blended: Tensor | None
+    n_traversed: Tensor | None
+    n_pairs: int
+
+
+def composite(
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    lists: TileLists,
+    width: int,
+    height: int,
+    profile: Profile = PAPER,
+    *,
+    dominance: bool = False,
+    counts: bool = False,
+    absgrad_sink: Tensor | None = None,
+) -> Composite:
+    """Blend every tile's list front to back, over black. See `pop_ref.compositing.composite`.
+
+    Optimizations: see `blender`; alphas and weights are kept for the transpose up to `KEPT_BYTES`, beyond that tiles
+    are blended a second time, so that memory is bounded.
+
+    Args:
+        means2d: screen centres, px. [N, 2]
+        conics: inverse screen covariances, px^-2. [N, 3]
+        opacities: [N]
+        colors: any number of channels. [N, D]
+        lists: what each tile blends.
+        width: px.
+        height: px.
+        profile: constants and strictness.
+        dominance: also find dominant ids.
+        counts: also count blended and traversed entries.
+        absgrad_sink: [N, 2], to which the transpose adds the sum over pixels of |dL/dmeans2d|.
+
+    Returns:
+        The blended view; `image` and `alphas` are differentiable.
+    """
+    inputs = (means2d, conics, opacities, colors)
+    keep = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
+    options = _Options(lists, width, height, profile, dominance, counts, keep, absgrad_sink)
+    image, alphas, ids, weights, blended, traversed, pairs = _Composite.apply(*inputs, options)
+    return Composite(image, alphas, ids, weights, blended, traversed, int(pairs))
+
+
+@dataclass(frozen=True)
+class _Options:
+    lists: TileLists
+    width: int
+    height: int
+    profile: Profile
+    dominance: bool
+    counts: bool
+    keep: bool
+    absgrad_sink: Tensor | None
+
+
+@dataclass
+class _Saved:
+    n_splats: int
+    entries: Entries
+    blender: Blender
+    groups: list[TileGroup]
+    blends: list[GroupBlend | None]
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, options: _Options
+    ) -> tuple[Tensor | None, ...]:
+        lists, profile, dtype = options.lists, options.profile, means2d.dtype
+        entries = entries_of_lists(means2d, conics, opacities, lists)
+        padded = torch.cat((colors, colors.new_ones((len(colors), 1))), 1).index_select(0, lists.ids)
+        blender = Blender(
+            exponent_coefficients(entries, dtype),
+            torch.cat((padded, padded.new_zeros((1, padded.shape[1])))),
+            pixel_basis(lists.tile_size, dtype),
+            profile,
+            bool((opacities > profile.alpha_ceiling).any()),
+        )
+        groups = tile_groups(lists)
+        canvas = _Canvas(options, colors.shape[1] + 1, dtype)
+        blends: list[GroupBlend | None] = []
+        budget = KEPT_BYTES if options.keep else 0
+        pairs = 0
+        for group in groups:
+            blend = blender.blend(group, options.counts, keep=budget > 0 or options.dominance)
+            canvas.put(group, blend)
+            pairs += blend.n_pairs
+            budget -= 2 * dtype.itemsize * blend.n_pairs
+            if budget > 0:
+                blends.append(blend)
+            else:
+                blend.release()
+                blends.append(None)
+        ctx.saved, ctx.options = _Saved(len(means2d), entries, blender, groups, blends), options
+        outputs = canvas.images()
+        ctx.mark_non_differentiable(*(o for o in outputs[2:] if o is not None))
+        ctx.set_materialize_grads(False)
+        return (*outputs, torch.tensor(pairs))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
+        saved: _Saved = ctx.saved
+        options: _Options = ctx.options
+        gradients = _Gradients(saved, options)
+        tiles = _tiles_of_cotangents(v_image, v_alphas, options, saved.blender)
+        for i, group in enumerate(saved.groups):
+            # what was not kept, or was used up by an earlier backward of the same graph, is blended again
+            blend, saved.blends[i] = saved.blends[i] or saved.blender.blend(group), None
+            gradients.add(group, blend, tiles.index_select(0, group.tiles))
+        return (*gradients.of_splats(), None)
+
+
+class _Canvas:
+    """The image in tiles, filled group by group."""
+
+    def __init__(self, options: _Options, channels: int, dtype: torch.dtype) -> None:
+        self.options = options
+        lists = options.lists
+        n_tiles, n_pixels = lists.tiles_x * lists.tiles_y, lists.tile_size**2
+        self.image = torch.zeros((n_tiles, channels, n_pixels), dtype=dtype)
+        self.ids = torch.full((n_tiles, n_pixels), -1) if options.dominance else None
+        self.weights = torch.zeros((n_tiles, n_pixels), dtype=dtype) if options.dominance else None
+        self.blended = torch.zeros((n_tiles, n_pixels), dtype=torch.int32) if options.counts else None
+        self.traversed = torch.zeros((n_tiles, n_pixels), dtype=torch.int32) if options.counts else None
+
+    def put(self, group: TileGroup, blend: GroupBlend) -> None:
+        self.image.index_copy_(0, group.tiles, blend.image)
+        if self.ids is not None and self.weights is not None:
+            places, weights = dominant_places(group, blend)
+            slots = torch.cat((group.slots, group.slots.new_full((len(group.tiles), 1), -1)), 1)
+            entry = slots.gather(1, places.where(places >= 0, slots.shape[1] - 1))
+            ids = torch.cat((self.options.lists.ids, torch.tensor([-1])))
+            self.ids.index_copy_(0, group.tiles, ids[entry])
+            self.weights.index_copy_(0, group.tiles, weights)
+        if self.blended is not None and self.traversed is not None:
+            assert blend.n_blended is not None
+            assert blend.n_passed is not None
+            self.blended.index_copy_(0, group.tiles, blend.n_blended)
+            length = group.lengths[:, None].to(torch.int32)
+            # a pixel that stopped has also looked at the entry that stopped it; padding is passed but does not count
+            self.traversed.index_copy_(0, group.tiles, torch.minimum(blend.n_passed + 1, length))
+
+    def images(self) -> tuple[Tensor | None, ...]:
+        image = self._flat(self.image)
+        whole = (self.ids, self.weights, self.blended, self.traversed)
+        rest = tuple(None if x is None else self._flat(x[:, None])[..., 0] for x in whole)
+        return image[..., :-1], image[..., -1], *rest
+
+    def _flat(self, tiles: Tensor) -> Tensor:
+        lists, size = self.options.lists, self.options.lists.tile_size
+        grid = tiles.view(lists.tiles_y, lists.tiles_x, tiles.shape[1], size, size).permute(0, 3, 1, 4, 2)
+        whole = grid.reshape(lists.tiles_y * size, lists.tiles_x * size, tiles.shape[1])
+        return whole[: self.options.height, : self.options.width]
+
+
+def _tiles_of_cotangents(
+    v_image: Tensor | None, v_alphas: Tensor | None, options: _Options, blender: Blender
+) -> Tensor:
+    """Cut the cotangents of image and alphas into tiles. [tiles, D + 1, P]"""
+    lists, size = options.lists, options.lists.tile_size
+    channels = blender.colors.shape[1]
+    whole = blender.basis.new_zeros((lists.tiles_y * size, lists.tiles_x * size, channels))
+    if v_image is not None:
+        whole[: options.height, : options.width, :-1] = v_image
+    if v_alphas is not None:
+        whole[: options.height, : options.width, -1] = v_alphas
+    grid = whole.view(lists.tiles_y, size, lists.tiles_x, size, channels).permute(0, 2, 4, 1, 3)
+    return grid.reshape(lists.tiles_y * lists.tiles_x, channels, size * size)
+
+
+class _Gradients:
+    """Gradients of splats, gathered group by group."""
+
+    def __init__(self, saved: _Saved, options: _Options) -> None:
+        self.saved, self.options = saved, options
+        self.n_colors = saved.blender.colors.shape[1] - 1
+        n_entries = len(options.lists.ids)
+        dtype = saved.blender.basis.dtype
+        self.n_absolute = 0 if options.absgrad_sink is None else 2
+        self.rows = torch.zeros((6 + self.n_colors + self.n_absolute, n_entries), dtype=dtype)
+
+    def add(self, group: TileGroup, blend: GroupBlend, v_image: Tensor) -> None:
+        padded = self.rows.new_zeros((len(self.rows), *group.slots.shape))
+        for part in self.saved.blender.transpose(group, blend, v_image, self.n_absolute > 0):
+            at = slice(part.chunk.index * CHUNK, (part.chunk.index + 1) * CHUNK)
+            where = part.chunk.where
+            padded[:6, where, at] = part.moments
+            padded[6 : 6 + self.n_colors, where, at] = part.v_colors.transpose(0, 1)
+            if part.v_abs is not None:
+                padded[6 + self.n_colors :, where, at] = part.v_abs
+        flat = padded.view(len(self.rows), -1)
+        for row, values in zip(self.rows, flat, strict=True):
+            row[group.entries] = values[group.places]
+
+    def of_splats(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Sum over the entries of each splat: gradients to means2d, conics, opacities, colors."""
+        geometry = entry_gradients(self.saved.entries, self.rows[:6])
+        v_x, v_y, v_a, v_b, v_c, v_o = (self._summed(row) for row in geometry)
+        colors = [self._summed(row) for row in self.rows[6 : 6 + self.n_colors]]
+        if self.options.absgrad_sink is not None:
+            absolute = [self._summed(row) for row in self.rows[6 + self.n_colors :]]
+            self.options.absgrad_sink.add_(from_columns(absolute, (2,)))
+        return (
+            from_columns((v_x, v_y), (2,)),
+            from_columns((v_a, v_b, v_c), (3,)),
+            v_o,
+            from_columns(colors, (self.n_colors,)),
+        )
+
+    def _summed(self, row: Tensor) -> Tensor:
+        # one serial pass a component: the order of the sum, and so its bits, never change
+        total = self.rows.new_zeros(self.saved.n_splats)
+        return total.index_add_(0, self.options.lists.ids, row.to(total.dtype))

@@ -1,0 +1,139 @@
+"""Spherical harmonics to colour, with the clamp at 0 (B2). Meaning: `pop_ref.harmonics`."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from pop_fast.layout import columns, from_columns
+
+_C0 = math.sqrt(1.0 / (4.0 * math.pi))
+_C1 = math.sqrt(3.0 / (4.0 * math.pi))
+_C2 = math.sqrt(15.0 / (4.0 * math.pi))
+_C2_Z = math.sqrt(5.0 / (16.0 * math.pi))
+_C3_3 = math.sqrt(35.0 / (32.0 * math.pi))
+_C3_2 = math.sqrt(105.0 / (4.0 * math.pi))
+_C3_1 = math.sqrt(21.0 / (32.0 * math.pi))
+_C3_0 = math.sqrt(7.0 / (16.0 * math.pi))
+
+
+def sh_basis(dirs: Tensor, degree: int) -> Tensor:
+    """See `pop_ref.harmonics.sh_basis`.
+
+    Optimizations: one row per basis function; products of coordinates are shared.
+    """
+    return from_columns(_basis_columns(*columns(dirs), degree), (_n_sh(degree),))
+
+
+def sh_basis_vjp(dirs: Tensor, degree: int, v_basis: Tensor) -> Tensor:
+    """See `pop_ref.harmonics.sh_basis_vjp`.
+
+    Optimizations: component rows; only the active bands are touched.
+    """
+    x, y, z = columns(dirs)
+    v = columns(v_basis)
+    _n_sh(degree)
+    v_x, v_y, v_z = torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(x)
+    if degree > 0:
+        v_x, v_y, v_z = -_C1 * v[3], -_C1 * v[1], _C1 * v[2]
+    if degree > 1:
+        v_x = v_x + _C2 * (y * v[4] - z * v[7] + x * v[8]) - 2.0 * _C2_Z * x * v[6]
+        v_y = v_y + _C2 * (x * v[4] - z * v[5] - y * v[8]) - 2.0 * _C2_Z * y * v[6]
+        v_z = v_z + 4.0 * _C2_Z * z * v[6] - _C2 * (y * v[5] + x * v[7])
+    if degree > 2:
+        g_x, g_y, g_z = _third_band_vjp(x, y, z, v)
+        v_x, v_y, v_z = v_x + g_x, v_y + g_y, v_z + g_z
+    return from_columns((v_x, v_y, v_z), (3,))
+
+
+def colors_from_sh(sh: Tensor, dirs: Tensor, degree: int) -> Tensor:
+    """See `pop_ref.harmonics.colors_from_sh`.
+
+    Optimizations: coefficients are transposed once so that the sum over bands runs over contiguous rows.
+    """
+    basis, _, _ = _basis_of_dirs(dirs, degree)
+    return (_unclamped(_coefficient_rows(sh, degree), basis)).clamp_min(0.0).T
+
+
+def colors_from_sh_vjp(sh: Tensor, dirs: Tensor, degree: int, v_colors: Tensor) -> tuple[Tensor, Tensor]:
+    """See `pop_ref.harmonics.colors_from_sh_vjp` (B2).
+
+    Optimizations: as `colors_from_sh`; the gradient to the coefficients is one outer product of rows.
+    """
+    basis, unit, norms = _basis_of_dirs(dirs, degree)
+    rows = _coefficient_rows(sh, degree)
+    v_sum = v_colors.T * (_unclamped(rows, basis) >= 0.0)
+    v_sh = sh.new_zeros((sh.shape[1], 3, len(sh)))
+    torch.mul(basis[:, None], v_sum, out=v_sh[: len(basis)])
+    v_unit = sh_basis_vjp(unit.T, degree, (rows * v_sum).sum(1).T).T
+    v_dirs = (v_unit - unit * (unit * v_unit).sum(0)) / norms
+    return v_sh.permute(2, 0, 1), v_dirs.T
+
+
+def _n_sh(degree: int) -> int:
+    if degree not in (0, 1, 2, 3):
+        raise ValueError(f"degree is {degree}; it must be 0, 1, 2 or 3")
+    return (degree + 1) ** 2
+
+
+def _basis_of_dirs(dirs: Tensor, degree: int) -> tuple[Tensor, Tensor, Tensor]:
+    rows = dirs.T
+    norms = torch.sqrt((rows * rows).sum(0))
+    unit = rows / norms
+    return torch.stack(_basis_columns(unit[0], unit[1], unit[2], degree)), unit, norms
+
+
+def _coefficient_rows(sh: Tensor, degree: int) -> Tensor:
+    n_sh = _n_sh(degree)
+    if sh.shape[1] < n_sh:
+        raise ValueError(f"sh has {sh.shape[1]} coefficients; degree {degree} needs {n_sh}")
+    return sh[:, :n_sh].reshape(len(sh), -1).T.contiguous().reshape(n_sh, 3, -1)
+
+
+def _unclamped(rows: Tensor, basis: Tensor) -> Tensor:
+    return (rows * basis[:, None]).sum(0) + 0.5
+
+
+def _basis_columns(x: Tensor, y: Tensor, z: Tensor, degree: int) -> list[Tensor]:
+    n_sh = _n_sh(degree)
+    basis = [torch.full_like(x, _C0)]
+    if degree > 0:
+        basis += [-_C1 * y, _C1 * z, -_C1 * x]
+    if degree > 1:
+        xx, yy, zz = x * x, y * y, z * z
+        basis += [_C2 * x * y, -_C2 * y * z, _C2_Z * (2.0 * zz - xx - yy), -_C2 * x * z, 0.5 * _C2 * (xx - yy)]
+        if degree > 2:
+            basis += [
+                -_C3_3 * y * (3.0 * xx - yy),
+                _C3_2 * x * y * z,
+                -_C3_1 * y * (4.0 * zz - xx - yy),
+                _C3_0 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+                -_C3_1 * x * (4.0 * zz - xx - yy),
+                0.5 * _C3_2 * z * (xx - yy),
+                -_C3_3 * x * (xx - 3.0 * yy),
+            ]
+    return basis[:n_sh]
+
+
+def _third_band_vjp(x: Tensor, y: Tensor, z: Tensor, v: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    v_x = (
+        _C3_3 * (-6.0 * xy * v[9] - 3.0 * (xx - yy) * v[15])
+        + _C3_2 * (yz * v[10] + xz * v[14])
+        + _C3_1 * (2.0 * xy * v[11] - (4.0 * zz - 3.0 * xx - yy) * v[13])
+        - 6.0 * _C3_0 * xz * v[12]
+    )
+    v_y = (
+        _C3_3 * (-3.0 * (xx - yy) * v[9] + 6.0 * xy * v[15])
+        + _C3_2 * (xz * v[10] - yz * v[14])
+        + _C3_1 * (2.0 * xy * v[13] - (4.0 * zz - xx - 3.0 * yy) * v[11])
+        - 6.0 * _C3_0 * yz * v[12]
+    )
+    v_z = (
+        _C3_2 * (xy * v[10] + 0.5 * (xx - yy) * v[14])
+        - 8.0 * _C3_1 * (yz * v[11] + xz * v[13])
+        + 3.0 * _C3_0 * (2.0 * zz - xx - yy) * v[12]
+    )
+    return v_x, v_y, v_z

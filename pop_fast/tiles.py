@@ -1,0 +1,155 @@
+"""Which splats each tile blends, front to back (D3, D4). Meaning: `pop_ref.tiles`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pop_fast.layout import columns, from_columns
+from pop_ref.constants import PAPER, Profile
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """The lists of all tiles, one after the other.
+
+    Attributes:
+        ids: row of the splat of every entry; front to back within a tile, tiles in row-major order. [I] int64
+        offsets: where each tile's list begins, and the end of the last one. [tiles_x * tiles_y + 1] int64
+        tile_size: px.
+        tiles_x: tiles in a row.
+        tiles_y: rows of tiles.
+    """
+
+    ids: Tensor
+    offsets: Tensor
+    tile_size: int
+    tiles_x: int
+    tiles_y: int
+
+    @property
+    def lengths(self) -> Tensor:
+        """Return the number of entries of every tile. [tiles_x * tiles_y] int64"""
+        return self.offsets.diff()
+
+    @property
+    def entry_tiles(self) -> Tensor:
+        """Return the tile of every entry. [I] int64"""
+        return torch.repeat_interleave(self.lengths)
+
+
+def grid_size(width: int, height: int, tile_size: int) -> tuple[int, int]:
+    """See `pop_ref.tiles.grid_size`. Optimizations: none."""
+    return -(-width // tile_size), -(-height // tile_size)
+
+
+def tile_rects(
+    means2d: Tensor, radii: Tensor, width: int, height: int, tile_size: int, profile: Profile = PAPER
+) -> Tensor:
+    """See `pop_ref.tiles.tile_rects` (D3). Optimizations: component rows, no branches."""
+    tiles_x, tiles_y = grid_size(width, height, tile_size)
+    (x, y), (rx, ry) = columns(means2d), columns(radii)
+    shown = (rx > 0) & (ry > 0)
+    x0, x1 = _span(x, rx, tiles_x, tile_size, profile)
+    y0, y1 = _span(y, ry, tiles_y, tile_size, profile)
+    return from_columns([torch.where(shown, edge, 0.0).to(torch.int64) for edge in (x0, y0, x1, y1)], (4,))
+
+
+def tile_lists(
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    profile: Profile = PAPER,
+    *,
+    conics: Tensor | None = None,
+    opacities: Tensor | None = None,
+) -> TileLists:
+    """See `pop_ref.tiles.tile_lists` (D3, D4).
+
+    Optimizations: only visible splats are sorted, by the bits of their depths, which order positive floats as
+    integers; entries are made in depth order, so that one stable sort by 16-bit tile number finishes the lists. With
+    `conics` and `opacities`, entries whose ellipse of alpha >= alpha_floor misses every pixel centre of the tile are
+    left out: shorter lists, the same image.
+    """
+    tiles_x, tiles_y = grid_size(width, height, tile_size)
+    rects = tile_rects(means2d, radii, width, height, tile_size, profile)
+    x0, y0, x1, y1 = columns(rects)
+    rows = ((x1 > x0) & (y1 > y0)).nonzero().squeeze(1)
+    rows = rows[_depth_order(depths.index_select(0, rows))]
+    left, top, columns_of_tiles = x0[rows], y0[rows], (x1 - x0)[rows]
+    counts = columns_of_tiles * (y1 - y0)[rows]
+    # entry e is the k-th tile of its splat's rectangle
+    splat = torch.repeat_interleave(counts)
+    k = (torch.arange(len(splat)) - (counts.cumsum(0) - counts)[splat]).to(torch.float64)
+    per_row = columns_of_tiles[splat]
+    row_of_rect = (k / per_row).floor_().to(torch.int64)
+    tile_x = left[splat] + k.to(torch.int64) - row_of_rect * per_row
+    tile_y = top[splat] + row_of_rect
+    ids = rows[splat]
+    if conics is not None and opacities is not None:
+        touched = _touches(means2d, conics, opacities, ids, tile_x, tile_y, tile_size, profile).nonzero().squeeze(1)
+        ids, tile_x, tile_y = ids[touched], tile_x[touched], tile_y[touched]
+    tile = tile_y * tiles_x + tile_x
+    n_tiles = tiles_x * tiles_y
+    order = torch.sort(tile.to(torch.int16 if n_tiles < 2**15 else torch.int32), stable=True).indices
+    offsets = torch.zeros(n_tiles + 1, dtype=torch.int64)
+    torch.cumsum(torch.bincount(tile, minlength=n_tiles), 0, out=offsets[1:])
+    return TileLists(ids[order], offsets, tile_size, tiles_x, tiles_y)
+
+
+def _span(center: Tensor, radius: Tensor, n_tiles: int, tile_size: int, profile: Profile) -> tuple[Tensor, Tensor]:
+    if profile.extent == "square":
+        index = center - 0.5
+        first = torch.trunc((index - radius) / tile_size)
+        last = torch.trunc((index + radius + (tile_size - 1)) / tile_size)
+    else:
+        first = torch.floor((center - radius) / tile_size)
+        last = torch.ceil((center + radius) / tile_size)
+    return first.clamp(0, n_tiles), last.clamp(0, n_tiles)
+
+
+def _depth_order(depths: Tensor) -> Tensor:
+    bits = torch.int32 if depths.dtype == torch.float32 else torch.int64
+    return torch.sort(depths.contiguous().view(bits), stable=True).indices
+
+
+def _touches(
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    ids: Tensor,
+    tile_x: Tensor,
+    tile_y: Tensor,
+    tile_size: int,
+    profile: Profile,
+) -> Tensor:
+    """Tell for each entry whether some pixel centre of the tile may reach alpha >= alpha_floor; errs towards True.
+
+    sigma is convex, so its smallest value over the rectangle of pixel centres is 0 at an inside centre, and else lies
+    on one of the two edges that face the centre, where it is a parabola.
+    """
+    x, y = (c.contiguous()[ids] for c in columns(means2d))
+    a, b, c = (column.contiguous()[ids] for column in columns(conics))
+    limit = torch.log(opacities / profile.alpha_floor)[ids]
+    left = (tile_x * tile_size).to(x.dtype) + 0.5 - x
+    top = (tile_y * tile_size).to(x.dtype) + 0.5 - y
+    right, bottom = left + (tile_size - 1), top + (tile_size - 1)
+    edge_x = torch.minimum(torch.maximum(left, torch.zeros_like(left)), right)
+    edge_y = torch.minimum(torch.maximum(top, torch.zeros_like(top)), bottom)
+    along_y = torch.minimum(torch.maximum(-b * edge_x / c, top), bottom)
+    along_x = torch.minimum(torch.maximum(-b * edge_y / a, left), right)
+    vertical, size_v = _sigma_and_size(a, b, c, edge_x, along_y)
+    horizontal, size_h = _sigma_and_size(a, b, c, along_x, edge_y)
+    # needles cancel: the slack grows with the terms that were subtracted
+    slack = 1e-3 + 1e-5 * torch.maximum(size_v, size_h)
+    return torch.minimum(vertical, horizontal) <= limit + slack
+
+
+def _sigma_and_size(a: Tensor, b: Tensor, c: Tensor, dx: Tensor, dy: Tensor) -> tuple[Tensor, Tensor]:
+    size = 0.5 * (a * dx * dx + c * dy * dy)
+    return size + b * dx * dy, size
