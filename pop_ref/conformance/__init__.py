@@ -1,0 +1,10 @@
+"""The kit that judges a rasterizer by the oracle: strategies, laws, tolerances, thresholds and mutants.
+
+    pytest --pyargs pop_ref.conformance --rasterizer my.module:rasterization --profile gsplat_1_6
+
+A law is a sentence that every correct rasterizer obeys; it is written once, in `laws`, against an `Adapter`, and runs
+over every backend and over the oracle itself. Needs numpy, hypothesis and pytest; an adapter imports what it adapts.
+
+In reading order: `scenes` (what is drawn), `strategies` and `near` (how it is drawn), `adapter` (who is judged),
+`tolerances` and `charges` (how much rounding costs), `doubts` (what is decided by rounding), `compare` (the verdict).
+"""

@@ -1,0 +1,1 @@
+"""The laws, a module a stage. Each is a test that takes `backend`, an `Adapter`."""

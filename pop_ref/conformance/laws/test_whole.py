@@ -1,0 +1,215 @@
+"""Laws of whole renders: what must not change an image, and what must move it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from hypothesis import strategies as st
+
+from pop_ref.conformance.compare import assert_same_bits
+from pop_ref.conformance.law import PROFILES, RENDER, law
+from pop_ref.conformance.scenes import Record, Scene, pack
+from pop_ref.conformance.strategies import backgrounds, cameras, plain_sizes, quats, records, rigid, scenes
+from pop_ref.conformance.verdicts import assert_same_image, assert_same_light, assert_seen, charged
+from pop_ref.types import Camera, Gaussians
+
+plain = scenes(anchored=True, size=plain_sizes())
+
+
+def _tallies(view):
+    return [(n, getattr(view, n)) for n in ("dominant_ids", "n_blended") if getattr(view, n) is not None]
+
+
+def _same_render(key, backend, one, other, charges):
+    assert_same_image(key, backend, one.image, other.image, charges)
+    assert_same_light(key, backend, one.T_final, other.T_final, charges)
+    for (name, a), (_, b) in zip(_tallies(one), _tallies(other), strict=True):
+        sure = charges.certain & ~charges.dominance
+        assert_same_bits(name, a[sure], b[sure])
+
+
+@law("whole", RENDER, scene=scenes(max_degree=3))
+def test_two_runs_give_the_same_bits(backend, scene):
+    seen = backend.sees(scene)
+    one, other = backend.render(seen), backend.render(seen)
+    assert_same_bits("image", one.image, other.image)
+    assert_same_bits("remaining light", one.T_final, other.T_final)
+    for (name, a), (_, b) in zip(_tallies(one), _tallies(other), strict=True):
+        assert_same_bits(name, a, b)
+
+
+@law("whole", RENDER, camera=cameras(), background=backgrounds())
+def test_an_empty_scene_is_the_background(backend, camera, background):
+    view = backend.render(backend.sees(Scene(pack([], camera), camera, background)))
+    H, W = camera.height, camera.width
+    assert_same_bits("image", view.image, np.broadcast_to(np.array(background), (H, W, 3)))
+    assert_same_bits("remaining light", view.T_final, np.ones((H, W)))
+
+
+@law("whole", RENDER, scene=plain, size=st.sampled_from([1, 2, 3, 5, 16]))
+def test_any_tile_size_gives_the_same_image(backend, scene, size):
+    # D3: where extents hold all visible alpha, tiling is only an optimisation
+    seen, charges = charged(backend, scene)
+    view = backend.render(seen)
+    assert_seen(view)
+    _same_render("whole.tiles", backend, backend.render(seen.but(tile_size=size)), view, charges)
+
+
+@law("whole", RENDER, scene=plain, seed=st.randoms(use_true_random=False))
+def test_permuting_gaussians_permutes_ids_only(backend, scene, seed):
+    # depths are made distinct: memory order decides ties (D4)
+    depths = scene.gaussians.means @ scene.camera.viewmat[2, :3] + scene.camera.viewmat[2, 3]
+    _, first = np.unique(np.round(depths, 4), return_index=True)
+    seen, charges = charged(backend, scene.rows(np.sort(first)))
+    order = list(range(len(seen.gaussians)))
+    seed.shuffle(order)
+    one, other = backend.render(seen), backend.render(seen.rows(order))
+    assert_same_image("whole.permutation", backend, other.image, one.image, charges)
+    if one.dominant_ids is not None:
+        sure = charges.certain & ~charges.dominance & (other.dominant_ids >= 0)
+        assert_same_bits("winner", np.array(order)[other.dominant_ids[sure]], one.dominant_ids[sure])
+
+
+invisible = st.sampled_from(
+    [
+        Record(depth=-2.0, size=(8.0, 8.0, 8.0), opacity=1.0),
+        Record(depth=0.001953125, size=(8.0, 8.0, 8.0), opacity=1.0),
+        Record(x=-400.0, size=(4.0, 4.0, 4.0), opacity=1.0),
+        Record(y=400.0, size=(4.0, 4.0, 4.0), opacity=1.0),
+        Record(size=(64.0, 64.0, 64.0), opacity=0.0),
+        Record(size=(64.0, 64.0, 64.0), opacity=0.001086),
+        Record(size=(64.0, 64.0, 64.0), opacity=1.0 / 256.0),
+    ]
+)
+
+
+@law("whole", RENDER, scene=scenes(max_gaussians=4), hidden=invisible, at=st.integers(0, 4))
+def test_an_invisible_gaussian_changes_no_bit(backend, scene, hidden, at):
+    g, more = scene.gaussians, pack([hidden], scene.camera)
+    sh = np.zeros((1, g.sh.shape[1], 3))
+    sh[:, :1] = more.sh
+    at = min(at, len(g))
+    joined = Gaussians(
+        *(
+            np.insert(a, at, b, axis=0)
+            for a, b in ((g.means, more.means), (g.quats, more.quats), (g.scales, more.scales))
+        ),
+        np.insert(g.opacities, at, more.opacities),
+        np.insert(g.sh, at, sh, axis=0),
+    )
+    one, other = (
+        backend.render(backend.sees(scene)),
+        backend.render(backend.sees(dataclasses.replace(scene, gaussians=joined))),
+    )
+    assert_same_bits("image", other.image, one.image)
+    assert_same_bits("remaining light", other.T_final, one.T_final)
+
+
+@law("whole", RENDER, scene=plain, power=st.integers(-3, 3))
+def test_scaling_the_world_by_a_power_of_two_changes_no_bit(backend, scene, power):
+    scale = 2.0**power
+    seen = backend.sees(scene)
+    viewmat = seen.camera.viewmat.copy()
+    viewmat[:3, 3] *= scale
+    g = seen.gaussians
+    bigger = seen.but(means=g.means * scale, scales=g.scales * scale, viewmat=viewmat)
+    depths = g.means @ seen.camera.viewmat[2, :3] + seen.camera.viewmat[2, 3]
+    # the near plane is in world units, so only what is well before or behind it is scaled
+    clear = (depths < 0.0) | (depths > 0.125)
+    one, other = backend.render(seen.rows(clear)), backend.render(bigger.rows(clear))
+    assert_seen(one)
+    assert_same_bits("image", other.image, one.image)
+    assert_same_bits("remaining light", other.T_final, one.T_final)
+
+
+@law("whole", RENDER, scene=plain, turn=quats(), shift=st.tuples(*[st.integers(-4, 4).map(float)] * 3))
+def test_moving_world_and_camera_together_changes_nothing(backend, scene, turn, shift):
+    # degree 0: colours of higher bands are fixed to the world's axes
+    motion = rigid(turn, shift)
+    R, t = motion[:3, :3], motion[:3, 3]
+    g = scene.gaussians
+    w, x, y, z = np.array(turn) / np.linalg.norm(turn)
+    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    moved = scene.but(
+        means=g.means @ R.T + t, quats=g.quats @ left.T, viewmat=scene.camera.viewmat @ np.linalg.inv(motion)
+    )
+    seen, charges = charged(backend, scene)
+    seen_moved, moved_charges = charged(backend, moved)
+    charges.image += moved_charges.image
+    charges.T_final += moved_charges.T_final
+    charges.doubtful |= moved_charges.doubtful
+    charges.dominance |= moved_charges.dominance
+    view = backend.render(seen)
+    assert_seen(view)
+    _same_render("whole.rigid", backend, backend.render(seen_moved), view, charges)
+
+
+@law(
+    "whole",
+    RENDER,
+    scene=scenes(anchored=True, size=plain_sizes(), max_side=8),
+    left=st.integers(0, 3),
+    top=st.integers(0, 3),
+)
+def test_cropping_commutes_with_rendering(backend, scene, left, top):
+    W, H = scene.camera.width, scene.camera.height
+    left, top = min(left, W - 1), min(top, H - 1)
+    K = scene.camera.K.copy()
+    K[0, 2], K[1, 2] = K[0, 2] - left, K[1, 2] - top
+    # the frustum clamp is measured in image widths (B1), so what it touches is left out
+    p = scene.gaussians.means @ scene.camera.viewmat[:3, :3].T + scene.camera.viewmat[:3, 3]
+    u, v = (scene.camera.K[a, a] * p[:, a] / p[:, 2] + scene.camera.K[a, 2] for a in (0, 1))
+    inside = (p[:, 2] > 0.0) & (u > left) & (u < W) & (v > top) & (v < H)
+    seen, charges = charged(backend, scene.rows(inside))
+    crop = backend.sees(seen.but(K=K, width=W - left, height=H - top))
+    whole, part = backend.render(seen), backend.render(crop)
+    window = (slice(top, None), slice(left, None))
+    sure = charges.certain[window]
+    size = (charges.image + charges.absolute + charges.T_final[..., None])[window]
+    from pop_ref.conformance.compare import assert_close
+
+    assert_close("whole.crop", part.image[sure], whole.image[window][sure], size[sure], backend.dtype)
+
+
+@law("whole", RENDER, scene=scenes(anchored=True, size=plain_sizes(), turned=False))
+def test_a_mirrored_world_makes_a_mirrored_image(backend, scene):
+    # x -> -x: the principal point mirrors about the image's middle, a rotation keeps w and x and flips y and z
+    mirror = np.array([-1.0, 1.0, 1.0])
+    g, c = scene.gaussians, scene.camera
+    K, viewmat = c.K.copy(), c.viewmat.copy()
+    K[0, 2] = c.width - K[0, 2]
+    viewmat[0, 3] = -viewmat[0, 3]
+    viewmat[:3, :3] = np.eye(3)
+    upright = scene.but(viewmat=np.vstack([np.hstack([np.eye(3), c.viewmat[:3, 3:]]), [[0.0, 0.0, 0.0, 1.0]]]))
+    mirrored = upright.but(
+        means=g.means * mirror, quats=g.quats * np.array([1.0, 1.0, -1.0, -1.0]), K=K, viewmat=viewmat
+    )
+    seen, charges = charged(backend, upright)
+    view, flipped = backend.render(seen), backend.render(backend.sees(mirrored))
+    assert_same_image("whole.mirror", backend, flipped.image[:, ::-1], view.image, charges)
+    assert_same_light("whole.mirror", backend, flipped.T_final[:, ::-1], view.T_final, charges)
+
+
+denormals = st.sampled_from([5e-324, 1e-310, 1e-45, 1e-40, 1e-30])
+
+
+@law("whole", RENDER, small=denormals, record=records(5, 5))
+def test_denormal_sizes_and_opacities_give_finite_images(backend, small, record):
+    camera = Camera(np.eye(4), np.array([[8.0, 0, 2.5], [0, 8.0, 2.5], [0, 0, 1]]), 5, 5)
+    g = pack([record, Record(2.5, 2.5)], camera)
+    tiny_opacity, tiny_scales = g.opacities.copy(), g.scales.copy()
+    tiny_opacity[1], tiny_scales[0] = small, small
+    view = backend.render(backend.sees(Scene(g, camera).but(opacities=tiny_opacity, scales=tiny_scales)))
+    assert np.all(np.isfinite(view.image))
+    assert np.all(np.isfinite(view.T_final))
+
+
+@law("whole", RENDER, PROFILES, scene=scenes(max_gaussians=3))
+def test_a_huge_world_far_away_is_finite(backend, scene):
+    scale = 2.0**40
+    g = scene.gaussians
+    viewmat = scene.camera.viewmat.copy()
+    viewmat[:3, 3] *= scale
+    view = backend.render(backend.sees(scene.but(means=g.means * scale, scales=g.scales * scale, viewmat=viewmat)))
+    assert np.all(np.isfinite(view.image))

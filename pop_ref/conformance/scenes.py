@@ -1,0 +1,147 @@
+"""Scenes as a person would write them down, and as the rasterizer takes them.
+
+A `Record` places one Gaussian on the screen: pixel, depth, size in pixels. Lists of records are what Hypothesis draws
+and shrinks; `pack` turns them into `Gaussians` in the world of a camera. Every value here prints as code that makes it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+
+from pop_ref.constants import PAPER, PROFILES, Profile
+from pop_ref.types import Camera, Gaussians
+
+SH_C0 = 0.28209479177387814
+
+
+@dataclass(frozen=True)
+class Record:
+    """One Gaussian, placed by what it looks like.
+
+    Attributes:
+        x, y: screen centre, px from the top left corner, pixel centres at +0.5.
+        depth: camera z, world units.
+        size: standard deviations along the Gaussian's own axes, px at that depth.
+        quat: rotation wxyz, any norm > 0.
+        opacity: in [0, 1].
+        sh: coefficients by band, rows of rgb; the first row is the colour at degree 0 less one half, over C0.
+    """
+
+    x: float = 2.0
+    y: float = 2.0
+    depth: float = 1.0
+    size: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    opacity: float = 0.5
+    sh: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0),)
+
+
+@dataclass(frozen=True, repr=False)
+class Scene:
+    """Everything that decides a render.
+
+    Attributes:
+        gaussians, camera: what is seen and from where.
+        background: colour behind everything, rgb.
+        profile: the constants.
+        tile_size: px; None takes the profile's.
+        sh_degree: bands used; None takes all that are there.
+        antialiased: scale opacities by the low-pass compensation.
+    """
+
+    gaussians: Gaussians
+    camera: Camera
+    background: Any = field(default_factory=lambda: np.zeros(3))
+    profile: Profile = PAPER
+    tile_size: int | None = None
+    sh_degree: int | None = None
+    antialiased: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "background", np.asarray(self.background, dtype=np.float64))
+
+    def __repr__(self) -> str:
+        shown = [f"gaussians={self.gaussians!r}", f"camera={self.camera!r}"]
+        for each in fields(self)[2:]:
+            value = getattr(self, each.name)
+            if each.name == "background" and not np.any(value):
+                continue
+            if each.name not in ("background", "profile") and value == each.default:
+                continue
+            shown.append(f"{each.name}={_code(value)}")
+        return f"Scene({', '.join(shown)})"
+
+    def but(self, **changes: Any) -> Scene:
+        """Return this scene with some fields, of the Gaussians or the camera too, replaced."""
+        gaussians = {k: changes.pop(k) for k in list(changes) if k in ("means", "quats", "scales", "opacities", "sh")}
+        camera = {k: changes.pop(k) for k in list(changes) if k in ("viewmat", "K", "width", "height")}
+        if gaussians:
+            changes["gaussians"] = replace(self.gaussians, **gaussians)
+        if camera:
+            changes["camera"] = replace(self.camera, **camera)
+        return replace(self, **changes)
+
+    def rows(self, index: Any) -> Scene:
+        """Return this scene with the Gaussians picked by an index array or a mask, in that order."""
+        g = self.gaussians
+        index = np.asarray(index)
+        picked = index if index.dtype == bool else index.astype(np.int64)
+        return replace(
+            self,
+            gaussians=Gaussians(g.means[picked], g.quats[picked], g.scales[picked], g.opacities[picked], g.sh[picked]),
+        )
+
+
+def _code(value: Any) -> str:
+    if isinstance(value, Profile):
+        if PROFILES.get(value.name) == value:
+            return f"PROFILES[{value.name!r}]"
+        return repr(value)
+    return repr(value.tolist() if isinstance(value, np.ndarray) else value)
+
+
+def scene_as_code(scene: Scene) -> str:
+    """Return a script that makes the scene again when pasted."""
+    return (
+        "from pop_ref.conformance.scenes import Scene\n"
+        "from pop_ref.constants import PROFILES, Profile\n"
+        "from pop_ref.types import Camera, Gaussians\n\n"
+        f"scene = {scene!r}\n"
+    )
+
+
+def pack(records: list[Record], camera: Camera) -> Gaussians:
+    """Return the records as Gaussians in the world of a camera, padded with zero bands to one number of coefficients.
+
+    The x extent in px is measured with fx, so a Gaussian that is round in px is round in space when fx = fy.
+    """
+    if not records:
+        return Gaussians([], [], [], [], np.zeros((0, 1, 3)))  # type: ignore[arg-type]
+    K, R, t = camera.K, camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+    n_sh = max(len(r.sh) for r in records)
+    means, scales, sh = [], [], np.zeros((len(records), n_sh, 3))
+    for i, r in enumerate(records):
+        p = np.array([(r.x - K[0, 2]) / K[0, 0], (r.y - K[1, 2]) / K[1, 1], 1.0]) * r.depth
+        means.append(R.T @ (p - t))
+        scales.append(np.abs(np.array(r.size) * r.depth / K[0, 0]))
+        sh[i, : len(r.sh)] = r.sh
+    quats, opacities = np.array([r.quat for r in records]), np.array([r.opacity for r in records])
+    return Gaussians(np.array(means), quats, np.array(scales), opacities, sh)
+
+
+def rounded_to(scene: Scene, dtype: Any) -> Scene:
+    """Return the scene with every array rounded to a dtype, so that oracle and accused read the same numbers."""
+    g, c = scene.gaussians, scene.camera
+
+    def near(array: np.ndarray) -> np.ndarray:
+        return array.astype(dtype).astype(np.float64)
+
+    return replace(
+        scene,
+        gaussians=Gaussians(near(g.means), near(g.quats), near(g.scales), near(g.opacities), near(g.sh)),
+        camera=Camera(near(c.viewmat), near(c.K), c.width, c.height),
+        background=near(scene.background),
+    )

@@ -1,0 +1,166 @@
+"""What rounding costs up to the screen: a running error analysis of projection, one row a Gaussian.
+
+Every quantity x carries a charge e(x), so that a computation in precision eps may be wrong by about eps * e(x). Charges
+follow the textbook rule on absolute values, `e(f(x)) = |df/dx| e(x) + |terms of f|`, so they grow where terms cancel
+(needles, splats seen edge-on) and nowhere else. Charges are of first order and hold for any order of evaluation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pop_ref.camera import camera_center, covars_cam_from_covars, in_front, means_cam_from_means, view_dirs
+from pop_ref.conformance.scenes import Scene
+from pop_ref.covariance import covars_from_quats_scales, rotmats_from_quats
+from pop_ref.footprint import compensations, conics_from_covars2d, low_pass
+from pop_ref.harmonics import colors_from_sh, sh_basis
+from pop_ref.projection import project_covars, project_means, projection_jacobians
+
+TINY = np.finfo(np.float64).tiny
+
+
+@dataclass(frozen=True)
+class ScreenCharges:
+    """Screen quantities in float64 with their charges; rows behind the near plane are left at zero.
+
+    Attributes:
+        kept: in front of the near plane with a positive determinant. [N]
+        depths, e_depths: camera z. [N]
+        means2d, e_means2d: px. [N, 2]
+        conics, e_conics: px^-2. [N, 3]
+        det, e_det: determinant of the blurred screen covariance, px^4. [N]
+        opacities, e_opacities: that blend. [N]
+        colors, e_colors: before and after the clamp at 0. [N, 3]
+        means_cam, covars_cam, jacobians, covars2d: intermediate values, and e_ of each, for gradients.
+    """
+
+    kept: np.ndarray
+    depths: np.ndarray
+    e_depths: np.ndarray
+    means2d: np.ndarray
+    e_means2d: np.ndarray
+    conics: np.ndarray
+    e_conics: np.ndarray
+    det: np.ndarray
+    e_det: np.ndarray
+    opacities: np.ndarray
+    e_opacities: np.ndarray
+    colors: np.ndarray
+    e_colors: np.ndarray
+    means_cam: np.ndarray
+    e_means_cam: np.ndarray
+    covars_cam: np.ndarray
+    e_covars_cam: np.ndarray
+    jacobians: np.ndarray
+    e_jacobians: np.ndarray
+    covars2d: np.ndarray
+    e_covars2d: np.ndarray
+
+
+def _t(matrices: np.ndarray) -> np.ndarray:
+    return np.swapaxes(matrices, -1, -2)
+
+
+def _camera_charges(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Return e(means_cam) and e(covars_cam)."""
+    g, viewmat = scene.gaussians, scene.camera.viewmat
+    R, t = viewmat[:3, :3], viewmat[:3, 3]
+    terms = np.concatenate(
+        [np.abs(R)[None] * np.abs(g.means)[:, None, :], np.broadcast_to(np.abs(t)[:, None], (len(g), 3, 1))], 2
+    )
+    # a sum with one term, times one, is exact: only so can depths tie on purpose
+    exact = (np.sum(terms != 0.0, axis=2) <= 1) & np.all((np.abs(R) == 1.0) | (R == 0.0), axis=1)
+    e_means_cam = np.where(exact, 0.0, 2.0 * np.sum(terms, axis=2))
+    A = np.abs(rotmats_from_quats(g.quats))
+    variances = g.scales[:, None, :] ** 2
+    e_covars = 4.0 * (A * variances) @ _t(A) + 2.0 * (
+        np.sum(A * variances, 2)[:, :, None] + np.sum(A * variances, 2)[:, None, :]
+    )
+    covars = np.abs(covars_from_quats_scales(g.quats, g.scales))
+    return e_means_cam, np.abs(R) @ (e_covars + 4.0 * covars) @ np.abs(R).T
+
+
+def _jacobian_charges(means_cam: np.ndarray, e: np.ndarray, J: np.ndarray) -> np.ndarray:
+    z = np.maximum(np.abs(means_cam[:, 2]), TINY)
+    relative = e[:, 2] / z + 2.0
+    e_J = np.abs(J) * relative[:, None, None]
+    for axis in range(2):
+        focal_over_z = np.abs(J[:, axis, axis])
+        e_J[:, axis, 2] = 2.0 * np.abs(J[:, axis, 2]) * relative + focal_over_z * (e[:, axis] / z)
+    return e_J
+
+
+def _conic_charges(covars2d: np.ndarray, e_covars2d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    a, b, c = covars2d[:, 0, 0], np.abs(covars2d[:, 0, 1]), covars2d[:, 1, 1]
+    e_a, e_b, e_c = e_covars2d[:, 0, 0], e_covars2d[:, 0, 1], e_covars2d[:, 1, 1]
+    det = covars2d[:, 0, 0] * covars2d[:, 1, 1] - covars2d[:, 0, 1] * covars2d[:, 1, 0]
+    e_det = c * e_a + a * e_c + 2.0 * b * e_b + a * c + b * b
+    safe = np.where(det > 0.0, det, np.inf)
+    e_conics = np.stack([(e + x * (e_det / safe + 2.0)) / safe for x, e in ((c, e_c), (b, e_b), (a, e_a))], axis=1)
+    return det, e_det, e_conics
+
+
+def _color_charges(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    g = scene.gaussians
+    degree = round(np.sqrt(g.sh.shape[1])) - 1 if scene.sh_degree is None else scene.sh_degree
+    n_sh = (degree + 1) ** 2
+    dirs = view_dirs(g.means, scene.camera.viewmat)
+    length = np.maximum(np.linalg.norm(dirs, axis=1), TINY)
+    basis = np.abs(sh_basis(dirs / length[:, None], degree))
+    t = np.linalg.norm(scene.camera.viewmat[:3, 3]) + np.linalg.norm(camera_center(scene.camera.viewmat))
+    # a unit direction moves by eps (|mean| + 2 |center|) / distance, a basis function by at most 2 degree^2 times that
+    e_dirs = (np.linalg.norm(g.means, axis=1) + 2.0 * t) / length + 4.0
+    e_basis = 4.0 * basis + (2.0 * degree**2 * e_dirs)[:, None]
+    e_colors = np.einsum("nk,nkc->nc", e_basis, np.abs(g.sh[:, :n_sh])) + 1.0
+    return colors_from_sh(g.sh, dirs, degree), e_colors
+
+
+def screen_charges(scene: Scene) -> ScreenCharges:
+    """Carry charges from the scene to the screen."""
+    g, camera, profile = scene.gaussians, scene.camera, scene.profile
+    N = len(g)
+    e_p, e_S = _camera_charges(scene)
+    p = means_cam_from_means(g.means, camera.viewmat)
+    kept = in_front(p[:, 2], profile)
+    # rows behind the camera take no part; a harmless point in their place keeps every formula finite
+    p = np.where(kept[:, None], p, np.array([0.0, 0.0, 1.0]))
+    z = p[:, 2]
+    means2d = project_means(p, camera.K, camera.width, camera.height, profile)
+    focal = np.array([camera.K[0, 0], camera.K[1, 1]])
+    shift = means2d - focal * p[:, :2] / z[:, None]
+    slopes = np.abs(focal * p[:, :2]) / z[:, None]
+    e_means2d = (
+        focal / z[:, None] * e_p[:, :2] + slopes * (e_p[:, 2] / z + 2.0)[:, None] + np.abs(shift) + np.abs(means2d)
+    )
+    S = covars_cam_from_covars(covars_from_quats_scales(g.quats, g.scales), camera.viewmat)
+    J = projection_jacobians(p, camera.K, camera.width, camera.height, profile)
+    e_J = _jacobian_charges(p, e_p, J)
+    A = np.abs(J)
+    e_2d = A @ (e_S + 4.0 * np.abs(S)) @ _t(A) + e_J @ np.abs(S) @ _t(A) + A @ np.abs(S) @ _t(e_J)
+    raw = project_covars(S, J)
+    covars2d = low_pass(raw, profile.eps2d)
+    e_2d = e_2d + np.abs(covars2d)
+    det, e_det, e_conics = _conic_charges(covars2d, e_2d)
+    opacities, e_opacities = g.opacities, g.opacities.copy()
+    if scene.antialiased:
+        opacities, e_opacities = _antialiased(g.opacities, raw, e_2d, det, e_det, profile.eps2d)
+    colors, e_colors = _color_charges(scene) if N else (np.zeros((0, 3)), np.zeros((0, 3)))
+    return ScreenCharges(
+        kept=kept & (det > 0.0), depths=means_cam_from_means(g.means, camera.viewmat)[:, 2], e_depths=e_p[:, 2],
+        means2d=means2d, e_means2d=e_means2d, conics=conics_from_covars2d(covars2d), e_conics=e_conics,
+        det=det, e_det=e_det, opacities=opacities, e_opacities=e_opacities, colors=colors, e_colors=e_colors,
+        means_cam=p, e_means_cam=e_p, covars_cam=S, e_covars_cam=e_S, jacobians=J, e_jacobians=e_J,
+        covars2d=covars2d, e_covars2d=e_2d,
+    )  # fmt: skip
+
+
+def _antialiased(
+    opacities: np.ndarray, raw: np.ndarray, e_2d: np.ndarray, det: np.ndarray, e_det: np.ndarray, eps2d: float
+) -> tuple[np.ndarray, np.ndarray]:
+    factors = compensations(raw, eps2d)
+    raw_det, e_raw_det, _ = _conic_charges(raw, e_2d)
+    relative = e_raw_det / np.maximum(raw_det, TINY) + e_det / np.maximum(det, TINY) + 4.0
+    # sqrt(max(0, x)): never wrong by more than the root of x's own error, which eps * charge cannot express; bounded by 1
+    return opacities * factors, opacities * factors * np.minimum(relative, 1e30)

@@ -1,0 +1,190 @@
+"""Adapters for torch programs: a function with gsplat's `rasterization` signature, and stage functions on tensors.
+
+torch is imported when an adapter is made, never when the kit is.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from pop_ref.conformance.adapter import View, stage_function
+from pop_ref.conformance.law import DOMINANCE, GRADIENTS, PROFILES, RENDER
+from pop_ref.conformance.scenes import Scene, rounded_to
+from pop_ref.constants import PAPER, Profile
+
+
+class TorchAdapter:
+    """A torch rasterizer and, when a package is named, its stage functions.
+
+    Args:
+        name: how reports call it.
+        rasterization: a function with gsplat's signature, or None to judge stage functions only.
+        package: a package whose stage modules carry the oracle's names, or None.
+        dtype: "float64" or "float32".
+        device: a torch device.
+        profile: the profile that a function without a `profile` argument implements.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        rasterization: Callable[..., Any] | None = None,
+        package: str | None = None,
+        dtype: str = "float64",
+        device: str = "cpu",
+        profile: Profile = PAPER,
+    ) -> None:
+        self.name = name
+        self.dtype = {"float64": np.float64, "float32": np.float32}[dtype]
+        self.profile = profile
+        self._torch = importlib.import_module("torch")
+        self._float = getattr(self._torch, dtype)
+        self._device = device
+        self._package = package
+        self._rasterization = rasterization
+        parameters = inspect.signature(rasterization).parameters if rasterization else {}
+        self._takes_profile = "profile" in parameters
+        self._asked = {name: True for name in ("dominance", "counts") if name in parameters}
+        self._tells_dominance: bool | None = None if rasterization else False
+
+    def has(self, need: str) -> bool:
+        """Tell what the program offers; asks the rasterizer for its meta once to learn about dominance."""
+        if need in (RENDER, GRADIENTS):
+            return self._rasterization is not None
+        if need == PROFILES:
+            return self._takes_profile
+        if need == DOMINANCE:
+            if self._tells_dominance is None:
+                self._tells_dominance = self._asked_for_dominance()
+            return self._tells_dominance
+        return self._package is not None and self._stage(need) is not None
+
+    def _asked_for_dominance(self) -> bool:
+        from pop_ref.conformance.golden import golden_scene
+
+        return self.render(golden_scene()).dominant_ids is not None
+
+    def _stage(self, name: str) -> Callable[..., Any] | None:
+        return stage_function(str(self._package), name)
+
+    def stage(self, name: str) -> Callable[..., Any]:
+        """Return a stage function wrapped so that arrays go in as tensors and come out as arrays."""
+        function = self._stage(name)
+        if function is None:
+            raise LookupError(f"{self._package} has no stage function {name}")
+
+        def with_arrays(*args: Any, **kwargs: Any) -> Any:
+            tensors = {key: self._tensor(value) for key, value in kwargs.items()}
+            return self._array(function(*[self._tensor(a) for a in args], **tensors))
+
+        return with_arrays
+
+    def sees(self, scene: Scene) -> Scene:
+        """Return the scene rounded to the program's precision."""
+        return rounded_to(scene, self.dtype)
+
+    def render(self, scene: Scene) -> View:
+        """Draw a scene with one camera."""
+        leaves = self._leaves(scene, grad=False)
+        image, alphas, meta = self._call(scene, leaves, **self._asked)
+        H, W = scene.camera.height, scene.camera.width
+        told = {}
+        for name in ("dominant_ids", "dominant_weights", "n_blended", "n_traversed"):
+            value = meta.get("n_contrib" if name == "n_blended" else name)
+            told[name] = None if value is None else self._array(value).reshape(H, W)
+        counts = meta.get("dominant_counts")
+        N = len(scene.gaussians)
+        T_final = meta.get("final_T")
+        return View(
+            image=self._array(image).reshape(H, W, -1),
+            T_final=self._array(T_final if T_final is not None else 1.0 - alphas).reshape(H, W),
+            dominant_counts=None if counts is None else self._array(counts).reshape(N),
+            radii=self._array(meta["radii"]).reshape(N, 2) if "radii" in meta else None,
+            means2d=self._array(meta["means2d"]).reshape(N, 2) if "means2d" in meta else None,
+            **told,
+        )
+
+    def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
+        """Return autograd's cotangents; those of the screen means when the meta keeps them."""
+        leaves = self._leaves(scene, grad=True)
+        image, alphas, meta = self._call(scene, leaves, absgrad=True)
+        means2d = meta.get("means2d")
+        if means2d is not None and means2d.requires_grad:
+            means2d.retain_grad()
+        H, W = scene.camera.height, scene.camera.width
+        loss = (image.reshape(H, W, -1) * self._tensor(v_image)).sum()
+        loss = loss - (alphas.reshape(H, W) * self._tensor(v_T_final)).sum()
+        if loss.requires_grad:
+            loss.backward()
+        found = {name: self._grad_of(leaf) for name, leaf in leaves.items()}
+        found["background"], found["viewmat"] = found["background"].reshape(-1), found["viewmat"].reshape(4, 4)
+        N = len(scene.gaussians)
+        if means2d is not None:
+            found["means2d"] = self._grad_of(means2d).reshape(N, 2)
+            if getattr(means2d, "absgrad", None) is not None:
+                found["means2d_abs"] = self._array(means2d.absgrad).reshape(N, 2)
+        return found
+
+    def _leaves(self, scene: Scene, grad: bool) -> dict[str, Any]:
+        g, c = scene.gaussians, scene.camera
+        named = {
+            "means": g.means,
+            "quats": g.quats,
+            "scales": g.scales,
+            "opacities": g.opacities,
+            "sh": g.sh,
+            "viewmat": c.viewmat[None],
+            "background": scene.background[None],
+        }
+        return {name: self._tensor(value).requires_grad_(grad) for name, value in named.items()}
+
+    def _call(self, scene: Scene, leaves: dict[str, Any], **more: Any) -> Any:
+        if self._rasterization is None:
+            raise LookupError(f"{self.name} has no rasterization function")
+        n_bands = round(np.sqrt(scene.gaussians.sh.shape[1])) - 1
+        options: dict[str, Any] = {"profile": scene.profile, **more} if self._takes_profile else more
+        return self._rasterization(
+            leaves["means"],
+            leaves["quats"],
+            leaves["scales"],
+            leaves["opacities"],
+            leaves["sh"],
+            leaves["viewmat"],
+            self._tensor(scene.camera.K[None]),
+            scene.camera.width,
+            scene.camera.height,
+            near_plane=scene.profile.near_plane,
+            eps2d=scene.profile.eps2d,
+            sh_degree=n_bands if scene.sh_degree is None else scene.sh_degree,
+            packed=False,
+            tile_size=scene.profile.tile_size if scene.tile_size is None else scene.tile_size,
+            backgrounds=leaves["background"],
+            rasterize_mode="antialiased" if scene.antialiased else "classic",
+            **options,
+        )
+
+    def _tensor(self, value: Any) -> Any:
+        if not isinstance(value, np.ndarray):
+            return value
+        dtype = self._float if value.dtype.kind == "f" else None
+        return self._torch.as_tensor(value.copy(), dtype=dtype, device=self._device)
+
+    def _grad_of(self, tensor: Any) -> np.ndarray:
+        return self._array(self._torch.zeros_like(tensor) if tensor.grad is None else tensor.grad)
+
+    def _array(self, value: Any) -> Any:
+        if isinstance(value, tuple | list):
+            return type(value)(self._array(each) for each in value)
+        if hasattr(value, "offsets") and hasattr(value, "ids"):
+            ids, offsets = self._array(value.ids), self._array(value.offsets)
+            return [ids[a:b].tolist() for a, b in itertools.pairwise(offsets)]
+        if not isinstance(value, self._torch.Tensor):
+            return value
+        array = value.detach().cpu().numpy()
+        return array.astype({"f": np.float64, "i": np.int64}.get(array.dtype.kind, array.dtype))

@@ -1,0 +1,52 @@
+"""Comparisons of whole renders, with the charges that rounding may cost and the doubts it may turn."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from hypothesis import assume
+
+from pop_ref.conformance.charges import PixelCharges, charge, relative_condition
+from pop_ref.conformance.compare import assert_close
+from pop_ref.conformance.scenes import Scene
+
+# beyond this many units a conic has no digits left to compare: the scene is set aside by a computed number
+WORST_CONDITION = 1.0 / 64.0
+
+
+def charged(backend: Any, scene: Scene) -> tuple[Scene, PixelCharges]:
+    """Return the scene as the backend reads it and its charges; set scenes aside that its precision cannot resolve."""
+    seen = backend.sees(scene)
+    charges = charge(seen, backend.dtype)
+    assume(relative_condition(charges) * charges.reach < WORST_CONDITION)
+    return seen, charges
+
+
+def assert_same_image(
+    key: str,
+    backend: Any,
+    actual: Any,
+    expected: Any,
+    charges: PixelCharges,
+    against_oracle: bool = False,
+    at: Any = None,
+) -> None:
+    """Assert that two images agree where no decision is in doubt, within their charges."""
+    where = charges.certain if at is None else charges.certain & at
+    magnitude = charges.image + charges.absolute
+    assert_close(key, actual[where], expected[where], magnitude[where], backend.dtype, against_oracle)
+
+
+def assert_same_light(
+    key: str, backend: Any, actual: Any, expected: Any, charges: PixelCharges, against_oracle: bool = False
+) -> None:
+    """Assert that two maps of remaining transmittance agree where no decision is in doubt."""
+    where = charges.certain
+    magnitude = charges.T_final + 1.0
+    assert_close(key, actual[where], expected[where], magnitude[where], backend.dtype, against_oracle)
+
+
+def assert_seen(view: Any) -> None:
+    """Assert that the image is not empty: no law may pass on a blank picture."""
+    assert np.min(view.T_final) < 1.0, "nothing was blended anywhere; the comparison would say nothing"
