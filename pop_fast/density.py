@@ -140,7 +140,8 @@ def split_children(params: Mapping[str, Tensor], normals: Tensor, revised_opacit
     children["means"] = (params["means"] + offsets).reshape(-1, 3)
     children["scales"] = torch.log(scales / SPLIT_SHRINK).repeat(SPLIT_CHILDREN, 1)
     if revised_opacity:
-        children["opacities"] = torch.logit(1.0 - torch.sqrt(1.0 - torch.sigmoid(children["opacities"])))
+        log_left = -0.5 * torch.logaddexp(children["opacities"], torch.zeros_like(children["opacities"]))
+        children["opacities"] = torch.log(-torch.expm1(log_left)) - log_left
     return children
 
 

@@ -22,7 +22,7 @@ from typing import Final
 import numpy as np
 
 from pop_ref._shapes import Bool, Float64
-from pop_ref.activations import opacities_from_logits, scales_from_log_scales
+from pop_ref.activations import scales_from_log_scales
 from pop_ref.covariance import rotmats_from_quats
 
 SPLIT_CHILDREN: Final = 2
@@ -147,8 +147,9 @@ def split_rows(
             children["means"][child * n_split + i] += rotmats[i] @ (scales[i] * normals[child, i])
     children["scales"] = np.concatenate([np.log(scales / SPLIT_SHRINK)] * SPLIT_CHILDREN)
     if revised_opacity:
-        opacities = 1.0 - np.sqrt(1.0 - opacities_from_logits(children["opacities"]))
-        children["opacities"] = np.log(opacities / (1.0 - opacities))
+        # log sqrt(1 - o), written so that neither o = 0 nor o = 1 is rounded to on the way
+        log_left = -0.5 * np.logaddexp(0.0, children["opacities"])
+        children["opacities"] = np.log(-np.expm1(log_left)) - log_left
     return _keep_and_append(rows, ~mask, children)
 
 

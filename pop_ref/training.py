@@ -1,0 +1,272 @@
+"""Training, one step at a time: render -> loss -> gradient -> Adam -> density control.
+
+The order is gsplat's since 1.5: Adam moves first, then density control edits the population. Dominant counts come from
+the forward pass that made the loss (A27), so importance and blur cost no second render.
+
+What is minimised and when is a `recipes.Recipe`.
+
+Label decided here: A27 (whose dominant counts).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import isqrt
+
+import numpy as np
+
+from pop_ref import losses
+from pop_ref._shapes import Float64
+from pop_ref.activations import (
+    opacities_from_logits,
+    opacities_from_logits_vjp,
+    scales_from_log_scales,
+    scales_from_log_scales_vjp,
+)
+from pop_ref.density import (
+    DensityConfig,
+    Rows,
+    Statistics,
+    accumulate,
+    densifies_at,
+    densify_and_prune,
+    reset_opacities,
+    resets_at,
+    rows_from_params,
+    zero_statistics,
+)
+from pop_ref.optimizer import adam_step, learning_rates, sh_degree_at
+from pop_ref.polarization import importance_mask, pop_loss, pop_loss_vjp
+from pop_ref.recipes import RECIPES, Recipe
+from pop_ref.render import RenderGradients, render, render_vjp
+from pop_ref.types import Camera, Gaussians, Render
+
+
+@dataclass(frozen=True)
+class Training:
+    """The state of a training between two steps.
+
+    Attributes:
+        rows: raw parameters ("means", "scales", "quats", "opacities", "sh0", "shN") and Adam's moments.
+        statistics: of the current densification window.
+        step: number of the next step, from 0.
+    """
+
+    rows: Rows
+    statistics: Statistics
+    step: int = 0
+
+
+def start(params: Mapping[str, np.ndarray]) -> Training:
+    """Begin a training with these parameters.
+
+    Source: Kerbl et al. 2023, algorithm 1.
+    Departs: nothing.
+
+    Args:
+        params: raw parameters.
+
+    Returns:
+        The state before step 0.
+
+    Example:
+        >>> start({"means": np.zeros((2, 3))}).step
+        0
+    """
+    rows = rows_from_params(params)
+    return Training(rows, zero_statistics(len(rows)))
+
+
+def train_step(
+    state: Training,
+    camera: Camera,
+    target: Float64[np.ndarray, "H W 3"],
+    scene_scale: float,
+    normals: Callable[[int], np.ndarray],
+    recipe: Recipe = RECIPES["POP"],
+) -> tuple[Training, float]:
+    """Take one step with one view.
+
+    Source: POP paper, section 3; Kerbl et al. 2023, algorithm 1.
+    Departs: Inria edits the population before Adam and so loses that step's update; gsplat, and this, edit it after.
+
+    Args:
+        state: before the step.
+        camera: of the view.
+        target: the photograph.
+        scene_scale: world units.
+        normals: given n, standard normal draws [2, n, 3], for instance `lambda n: rng.standard_normal((2, n, 3))`.
+        recipe: what is minimised.
+
+    Returns:
+        The state after the step; the loss before it.
+
+    Example:
+        >>> params = {"means": np.array([[0.0, 0.0, 4.0]]), "quats": np.array([[1.0, 0.0, 0.0, 0.0]]),
+        ...           "scales": np.zeros((1, 3)), "opacities": np.zeros(1), "sh0": np.zeros((1, 1, 3))}
+        >>> camera = Camera(np.eye(4), np.array([[16.0, 0.0, 8.0], [0.0, 16.0, 8.0], [0.0, 0.0, 1.0]]), 16, 16)
+        >>> state, before = train_step(start(params), camera, np.ones((16, 16, 3)), 1.0, lambda n: np.zeros((2, n, 3)))
+        >>> state, after = train_step(state, camera, np.ones((16, 16, 3)), 1.0, lambda n: np.zeros((2, n, 3)))
+        >>> state.step, after < before
+        (2, True)
+    """
+    rows, step = state.rows, state.step
+    gaussians = gaussians_from_params(rows.params)
+    degree = sh_degree_at(step, recipe.sh_interval, isqrt(gaussians.sh.shape[1]) - 1)
+    view = render(gaussians, camera, sh_degree=degree, profile=recipe.profile)
+    # the dominant counts of this very forward pass say who is important (A27)
+    loss, v_image, v_opacities = objective(view, gaussians, target, state, recipe)
+    gradients = render_vjp(gaussians, camera, v_image, sh_degree=degree, profile=recipe.profile)
+    grads = params_vjp(rows.params, gradients, v_opacities)
+    rates = learning_rates(step, scene_scale, recipe.max_steps)
+    rows = Rows(*adam_step(rows.params, grads, rows.m, rows.v, step + 1, rates))
+    seen = (gradients.means2d, view.splats.visible, view.dominant_counts, camera.width, camera.height)
+    statistics = accumulate(state.statistics, *seen, recipe.density)
+    rows, statistics = control(rows, statistics, scene_scale, step, normals, recipe.density)
+    return Training(rows, statistics, step + 1), loss
+
+
+def gaussians_from_params(params: Mapping[str, np.ndarray]) -> Gaussians:
+    """Activate raw parameters; quaternions stay as they are, the renderer normalises them.
+
+    Source: Kerbl et al. 2023, section 5.1.
+    Departs: nothing.
+
+    Args:
+        params: "means", "scales" (log), "quats", "opacities" (logit), "sh0" and, unless there is one band only, "shN".
+
+    Returns:
+        The Gaussians.
+
+    Example:
+        >>> params = {"means": np.zeros((1, 3)), "quats": np.ones((1, 4)), "scales": np.zeros((1, 3)),
+        ...           "opacities": np.zeros(1), "sh0": np.zeros((1, 1, 3)), "shN": np.zeros((1, 3, 3))}
+        >>> g = gaussians_from_params(params)
+        >>> g.scales.tolist(), g.opacities.tolist(), g.sh.shape
+        ([[1.0, 1.0, 1.0]], [0.5], (1, 4, 3))
+    """
+    return Gaussians(
+        means=params["means"],
+        quats=params["quats"],
+        scales=scales_from_log_scales(params["scales"]),
+        opacities=opacities_from_logits(params["opacities"]),
+        sh=np.concatenate([params[name] for name in ("sh0", "shN") if name in params], axis=1),
+    )
+
+
+def params_vjp(
+    params: Mapping[str, np.ndarray], gradients: RenderGradients, v_opacities: Float64[np.ndarray, " N"]
+) -> dict[str, np.ndarray]:
+    """Pull cotangents of the activated Gaussians back to raw parameters.
+
+    Source: transpose of `gaussians_from_params`.
+    Departs: nothing.
+
+    Args:
+        params: raw parameters.
+        gradients: what the render hands back.
+        v_opacities: what the POP term adds for the opacities.
+
+    Returns:
+        Gradients, keys and shapes as `params`.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> params = {"means": np.zeros((1, 3)), "quats": np.ones((1, 4)), "scales": np.zeros((1, 3)),
+        ...           "opacities": np.zeros(1), "sh0": np.zeros((1, 1, 3))}
+        >>> g = SimpleNamespace(means=np.zeros((1, 3)), quats=np.zeros((1, 4)), scales=np.ones((1, 3)),
+        ...                     opacities=np.ones(1), sh=np.zeros((1, 1, 3)))
+        >>> params_vjp(params, g, np.ones(1))["opacities"].tolist()
+        [0.5]
+    """
+    sh = {"sh0": gradients.sh[:, :1], "shN": gradients.sh[:, 1:]}
+    return {
+        "means": gradients.means,
+        "quats": gradients.quats,
+        "scales": scales_from_log_scales_vjp(params["scales"], gradients.scales),
+        "opacities": opacities_from_logits_vjp(params["opacities"], gradients.opacities + v_opacities),
+        **{name: value for name, value in sh.items() if name in params},
+    }
+
+
+def objective(
+    view: Render, gaussians: Gaussians, target: Float64[np.ndarray, "H W 3"], state: Training, recipe: Recipe
+) -> tuple[float, Float64[np.ndarray, "H W 3"], Float64[np.ndarray, " N"]]:
+    """Compare a render with its photograph and opacities with their poles: eq. 9, or eq. 2.
+
+    Source: POP paper eqs. 2 and 9.
+    Departs: nothing.
+
+    Args:
+        view: the render.
+        gaussians: what was rendered.
+        target: the photograph.
+        state: tells the step, and the window's dominant counts.
+        recipe: the terms and their weights.
+
+    Returns:
+        The loss; its cotangents of the image and, through the POP term alone, of the opacities.
+
+    Example:
+        >>> g = Gaussians([[0, 0, 4]], [[1, 0, 0, 0]], [[1, 1, 1]], [0.5], [[[0, 0, 0]]])
+        >>> camera = Camera(np.eye(4), np.array([[16.0, 0.0, 8.0], [0.0, 16.0, 8.0], [0.0, 0.0, 1.0]]), 16, 16)
+        >>> view = render(g, camera)
+        >>> loss, _, v_opacities = objective(view, g, view.image, start({"opacities": np.zeros(1)}), RECIPES["POP"])
+        >>> round(loss, 12), v_opacities.tolist()
+        (0.0005, [-0.001])
+    """
+    l1_again = recipe.l2_stop_iter is not None and state.step >= recipe.l2_stop_iter
+    lambda_ssim = 0.2 if l1_again else recipe.lambda_ssim
+    options = (lambda_ssim, recipe.padding, None, recipe.d_ssim_halved, recipe.pixel_scale)
+    if recipe.pixelwise == "l1" or l1_again:
+        loss = losses.photometric_3dgs(view.image, target, *options)
+        v_image = losses.photometric_3dgs_vjp(view.image, target, 1.0, *options)
+    else:
+        loss = losses.photometric_pop(view.image, target, *options)
+        v_image = losses.photometric_pop_vjp(view.image, target, 1.0, *options)
+    if not recipe.pop_start_iter <= state.step < recipe.pop_stop_iter:
+        return loss, v_image, np.zeros(len(gaussians))
+    counts = view.dominant_counts
+    mask = importance_mask(counts + state.statistics.dominant_sum if recipe.pop_views == "window" else counts)
+    visible = view.splats.visible if recipe.pop_over == "visible" else None
+    loss += recipe.lambda_pop * pop_loss(gaussians.opacities, mask, visible)
+    return loss, v_image, pop_loss_vjp(gaussians.opacities, mask, recipe.lambda_pop, visible)
+
+
+def control(
+    rows: Rows,
+    statistics: Statistics,
+    scene_scale: float,
+    step: int,
+    normals: Callable[[int], np.ndarray],
+    config: DensityConfig,
+) -> tuple[Rows, Statistics]:
+    """Edit the population if this step is one for it: an event, a reset, both, or neither.
+
+    Source: POP paper sections 3.1 and 4.1.
+    Departs: nothing.
+
+    Args:
+        rows: after Adam.
+        statistics: of the window, this step's view included.
+        scene_scale: world units.
+        step: just taken, from 0.
+        normals: as in `train_step`.
+        config: of density control.
+
+    Returns:
+        The population and the window for the next step.
+
+    Example:
+        >>> rows = rows_from_params({"opacities": np.array([9.0])})
+        >>> rows, _ = control(rows, zero_statistics(1), 1.0, 3000, lambda n: np.zeros((2, n, 3)),
+        ...                   DensityConfig(reset_every=3000, reset_opa=0.25, refine_every=7))
+        >>> rows.params["opacities"].round(3).tolist()
+        [-1.099]
+    """
+    if densifies_at(step, config):
+        rows, statistics = densify_and_prune(rows, statistics, scene_scale, step, normals, config)
+    if resets_at(step, config):
+        rows = reset_opacities(rows, config.reset_opa)
+    return rows, statistics
