@@ -102,6 +102,10 @@ class DensityControl:
         floor = min(SHORTEST_REFINE_EVERY, self.refine_every)
         return replace(self, **changed, refine_every=max(round(self.refine_every * factor), floor))
 
+    def needs_dominance(self, step: int) -> bool:
+        """Tell whether `info["dominant_counts"]` is read at this step, so that a trainer can spare the work."""
+        return False
+
     def regularizer(self, opacities: Tensor, state: State, step: int, info: Info) -> Tensor | None:
         """Return the term that the method adds to the loss: none."""
         return None

@@ -66,6 +66,11 @@ class POPStrategy(DensityControl):
         """Tell whether the change after this step looks at blur."""
         return self.is_refine_step(step) and blurs_at(step, self)
 
+    def needs_dominance(self, step: int) -> bool:
+        """Tell whether `info["dominant_counts"]` is read at this step: by the POP loss, the blur rule or a window."""
+        blur = step < self.refine_stop_iter and (step <= self.blur_stop_iter or self.pop_views == "window")
+        return self._pop_is_on(step) or blur
+
     def regularizer(self, opacities: Tensor, state: State, step: int, info: Info) -> Tensor | None:
         """Return `lambda_pop * L_pop` of this view, or None when the term is off.
 
@@ -75,13 +80,16 @@ class POPStrategy(DensityControl):
             step: counts from 0.
             info: what `rasterization()` returned last; its `dominant_counts` decide who is important.
         """
-        if self.lambda_pop == 0.0 or not self.pop_start_iter <= step < self.pop_stop_iter:
+        if not self._pop_is_on(step):
             return None
         mask = importance_mask(dominant_counts(info).sum(0))
         if self.pop_views == "window" and state["dominant_sum"] is not None:
             mask = mask | importance_mask(state["dominant_sum"])
         visible = self._visible(info, len(mask)) if self.pop_over == "visible" else None
         return self.lambda_pop * pop_loss(opacities.reshape(-1), mask, visible=visible)
+
+    def _pop_is_on(self, step: int) -> bool:
+        return self.lambda_pop != 0.0 and self.pop_start_iter <= step < self.pop_stop_iter
 
     def _visible(self, info: Info, n: int) -> Tensor:
         if info.get("gaussian_ids") is None:
@@ -95,7 +103,8 @@ class POPStrategy(DensityControl):
 
     def _collect(self, params: Params, state: State, step: int, info: Info, packed: bool) -> None:
         super()._collect(params, state, step, info, packed)
-        if self.blur_window == "sum" or self.pop_views == "window":
+        sums = self.blur_window == "sum" and step <= self.blur_stop_iter
+        if sums or self.pop_views == "window":
             counts = dominant_counts(info).sum(0)
             state["dominant_sum"] = counts if state["dominant_sum"] is None else state["dominant_sum"] + counts
         if step <= self.blur_stop_iter:

@@ -75,6 +75,7 @@ class TrainConfig:
         photometric_divisor: divides the L1 or L2 term, as in the paper's figure of L1/n against L2.
         lambda_ssim: weight of 1 - SSIM; the rest is L1 or L2. None takes the method's own: 0.01 or 0.2.
         ssim_padding: "valid" as gsplat, or "same" as 3DGS.
+        d_ssim_halved: (1 - SSIM) / 2 instead of 1 - SSIM.
         lr: learning rates.
         pop: the POP strategy's settings.
         adc: plain density control's settings.
@@ -113,6 +114,7 @@ class TrainConfig:
     photometric_divisor: float = 1.0
     lambda_ssim: float | None = None
     ssim_padding: Literal["valid", "same"] = "valid"
+    d_ssim_halved: bool = False
     lr: LearningRates = field(default_factory=LearningRates)
     pop: POPStrategy = field(default_factory=POPStrategy)
     adc: ADCStrategy = field(default_factory=ADCStrategy)

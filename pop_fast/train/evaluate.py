@@ -54,7 +54,7 @@ def evaluate(
     seconds = 0.0
     for i, view in enumerate(views):
         start = time.perf_counter()
-        rendered = render_view(backend, params, view, config, sh_degree)
+        rendered = render_view(backend, params, view, config, sh_degree, counts=True)
         seconds += time.perf_counter() - start
         per_pixel += gaussians_per_pixel(rendered.info)
         metrics = measure(rendered.image, view.target(), view.mask, nets)

@@ -6,27 +6,45 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from pop_fast.losses import d_ssim, l1, l2
+from pop_fast.losses import TargetMoments, d_ssim, l1, l2, photometric_3dgs, photometric_pop, target_moments
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.views import ViewTensors
 
 
 class Objective:
-    """Compares renders with the photographs of the training views."""
+    """Compares renders with the photographs of the training views.
+
+    What SSIM needs of a photograph alone is computed at its first visit and kept, for as many views as
+    `target_cache_mb` has room for; the others compute it anew at every visit, to the same bits.
+    """
 
     def __init__(self, config: TrainConfig, views: Sequence[ViewTensors]) -> None:
-        self._kind = config.photometric_kind
-        self._pixelwise = l1 if self._kind == "l1" else l2
-        self._divisor = config.photometric_divisor
-        self._weight = config.ssim_weight
-        self._padding = config.ssim_padding
+        self._config = config
         self._views = views
+        self._kept: dict[int, TargetMoments] = {}
+        self._room = config.target_cache_mb * 2**20
 
-    def __call__(self, image: Tensor, index: int) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss of a render of view `index`, and its unweighted terms by name."""
-        view = self._views[index]
-        target = view.target()
-        pixelwise = self._pixelwise(image, target, view.mask)
-        structural = d_ssim(image, target, self._padding, view.mask)
-        loss = (1.0 - self._weight) / self._divisor * pixelwise + self._weight * structural
-        return loss, {self._kind: pixelwise.detach(), "d_ssim": structural.detach()}
+    def __call__(self, image: Tensor, index: int) -> Tensor:
+        """Return the loss of a render [H, W, 3] of view `index`."""
+        config, moments, mask = self._config, self._moments(index), self._views[index].mask
+        common = (config.ssim_weight, config.ssim_padding, mask, config.d_ssim_halved, 1.0 / config.photometric_divisor)
+        if config.photometric_kind == "l1":
+            return photometric_3dgs(image, moments.target, *common, moments=moments)
+        return photometric_pop(image, moments.target, *common, moments=moments)
+
+    def terms(self, image: Tensor, index: int) -> dict[str, float]:
+        """Return the unweighted terms by name: l1 or l2, and d_ssim."""
+        config, moments, mask = self._config, self._moments(index), self._views[index].mask
+        pixelwise = l1 if config.photometric_kind == "l1" else l2
+        structural = d_ssim(image, moments.target, config.ssim_padding, mask, config.d_ssim_halved, moments)
+        return {config.photometric_kind: float(pixelwise(image, moments.target, mask)), "d_ssim": float(structural)}
+
+    def _moments(self, index: int) -> TargetMoments:
+        if index in self._kept:
+            return self._kept[index]
+        moments = target_moments(self._views[index].target(), self._config.ssim_padding)
+        needed = sum(t.numel() * t.element_size() for t in (moments.target, moments.mu_y, moments.s_yy))
+        if needed <= self._room:
+            self._room -= needed
+            self._kept[index] = moments
+        return moments

@@ -39,9 +39,10 @@ class Step:
     """What one training step did."""
 
     step: int
+    index: int
     view: ViewTensors
     loss: float
-    terms: dict[str, Tensor]
+    regularizer: float | None
     rendered: Rendered
     sh_degree: int
     event: dict[str, Any] | None
@@ -124,12 +125,11 @@ class Trainer:
         index = self._order.next()
         view = self._train[index]
         degree = active_sh_degree(step, config.sh_interval, config.sh_degree)
-        rendered = self._render(view, degree)
-        loss, terms = self._objective(rendered.image, index)
+        rendered = self._render(view, degree, counts=step % config.log_every == 0)
+        loss = self._objective(rendered.image, index)
         term = self.strategy.regularizer(rendered.opacities, self.state, step, rendered.info)
         if term is not None:
             loss = loss + term
-            terms["pop"] = term.detach()
         self.strategy.step_pre_backward(self.params, self.optimizers, self.state, step, rendered.info)
         loss.backward()
         value = loss.item()
@@ -139,11 +139,13 @@ class Trainer:
         self._adam(step, degree)
         self.strategy.step_post_backward(self.params, self.optimizers, self.state, step, rendered.info)
         self.step += 1
-        return Step(step, view, value, terms, rendered, degree, self.state["event"])
+        regularizer = None if term is None else term.item()
+        return Step(step, index, view, value, regularizer, rendered, degree, self.state["event"])
 
-    def _render(self, view: ViewTensors, degree: int) -> Rendered:
+    def _render(self, view: ViewTensors, degree: int, counts: bool) -> Rendered:
+        dominance = self.strategy.needs_dominance(self.step)
         try:
-            return render_view(self._backend, self.params, view, self.config, degree)
+            return render_view(self._backend, self.params, view, self.config, degree, dominance, counts)
         except ValueError:
             self._require_finite()
             raise
@@ -186,12 +188,14 @@ class Trainer:
 
     def _log(self, done: Step, seconds: float, bar: tqdm) -> None:
         blended, traversed = gaussians_per_pixel(done.rendered.info)
+        image = done.rendered.image.detach()
         record = {
             "step": done.step,
             "view": done.view.name,
             "loss": done.loss,
-            **{name: float(term) for name, term in done.terms.items()},
-            "psnr": psnr(done.rendered.image.detach(), done.view.target(), done.view.mask),
+            **self._objective.terms(image, done.index),
+            **({} if done.regularizer is None else {"pop": done.regularizer}),
+            "psnr": psnr(image, done.view.target(), done.view.mask),
             "num_gaussians": len(self.params["means"]),
             "n_blended": blended,
             "n_traversed": traversed,

@@ -68,11 +68,26 @@ class Rendered:
 
 
 def render_view(
-    backend: Any, params: Mapping[str, Tensor], view: ViewTensors, config: TrainConfig, sh_degree: int
+    backend: Any,
+    params: Mapping[str, Tensor],
+    view: ViewTensors,
+    config: TrainConfig,
+    sh_degree: int,
+    dominance: bool = False,
+    counts: bool = False,
 ) -> Rendered:
     """Render a view from raw parameters.
 
     Colour bands above `sh_degree` are left out of the graph, so that their gradient need not be made to be zero.
+
+    Args:
+        backend: what renders.
+        params: raw parameters.
+        view: the camera, and the mask that `dominant_counts` are restricted to.
+        config: background, profile, antialiasing and absgrad are read.
+        sh_degree: highest active colour band.
+        dominance: dominant ids and counts will be read from `info`.
+        counts: Gaussians per pixel will be read from `info`.
     """
     opacities = opacities_from_logits(params["opacities"])
     bands = (sh_degree + 1) ** 2
@@ -94,8 +109,10 @@ def render_view(
         absgrad=config.strategy.absgrad,
         rasterize_mode="antialiased" if config.antialiased else "classic",
         profile=config.profile,
+        dominance=dominance,
+        counts=counts,
     )
-    if view.mask is not None:
+    if dominance and view.mask is not None:
         info["dominant_counts"] = _counts_inside(info["dominant_ids"], view.mask, len(opacities))
     return Rendered(colors[0], opacities, info)
 

@@ -354,6 +354,20 @@ def test_importance_can_be_kept_for_the_window_and_the_loss_for_the_visible():
         assert term.item() == pytest.approx(1e-3 * (0.75 + 0.5))
 
 
+def test_dominant_counts_are_asked_for_where_they_are_read():
+    assert [s for s in range(0, 30_000, 500) if POPStrategy().needs_dominance(s)] == list(range(0, 15_000, 500))
+    assert not any(ADCStrategy().needs_dominance(s) for s in range(0, 30_000, 500))
+    params, optimizers = make(2)
+    for strategy in (POPStrategy(lambda_pop=0.0), POPStrategy(lambda_pop=0.0, blur_window="sum"), POPStrategy()):
+        for step in (0, 7000, 7001, 14_999, 15_000):
+            info = make_info(2)
+            if not strategy.needs_dominance(step):
+                del info["dominant_counts"]
+            state = strategy.initialize_state()
+            strategy.regularizer(torch.sigmoid(params["opacities"]), state, step, info)
+            strategy.step_post_backward(params, optimizers, state, step, info)
+
+
 def test_missing_dominant_counts_are_explained():
     info = make_info(2)
     del info["dominant_counts"]
