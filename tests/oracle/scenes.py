@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pop_ref import PAPER, Camera, Gaussians, Profile, margins
+from pop_ref import PAPER, Camera, Gaussians, Profile, margins, project
+from pop_ref.splatting import geometry
 
 _FOUND: dict[object, Gaussians] = {}
 
@@ -32,14 +33,14 @@ def loose_camera(like: Camera, viewmat: np.ndarray) -> Camera:
 
 
 def random_gaussians(seed: int, n: int = 5, n_sh: int = 4) -> Gaussians:
-    """Scatter Gaussians about (0, 0, 4), all shapes, opacities and colours, two of them far off the axis."""
+    """Scatter Gaussians about (0, 0, 4) in all shapes, opacities and colours, the last one beyond the clamp (B1)."""
     rng = np.random.default_rng(seed)
     means = rng.normal(size=(n, 3)) * [0.8, 0.6, 0.5] + [0.0, 0.0, 4.0]
-    means[n // 2 + 1 :, 0] += 1.5
+    means[-1, 0] += 4.0
     return Gaussians(
         means=means,
         quats=rng.normal(size=(n, 4)) * rng.uniform(0.5, 2.0, size=(n, 1)),
-        scales=np.exp(rng.normal(size=(n, 3)) * 0.5 - 0.5),
+        scales=np.exp(rng.normal(size=(n, 3)) * 0.5 - 0.5) + 1.5 * (np.arange(n) == n - 1)[:, None],
         opacities=rng.uniform(0.1, 0.95, size=n),
         sh=rng.normal(size=(n, n_sh, 3)) * 0.6,
     )
@@ -51,17 +52,29 @@ def safe_gaussians(
     n_sh: int = 4,
     profile: Profile = PAPER,
     antialiased: bool = False,
-    tolerance: float = 5e-5,
+    tolerance: float = 1e-5,
 ) -> Gaussians:
-    """Find a random scene with every decision and kink at least the tolerance from flipping."""
+    """Find a random scene with every decision and kink at least the tolerance from flipping.
+
+    In it some Gaussian is clamped to the frustum (B1) and some colour is clamped at 0 (B2).
+    """
     key = (repr(view), n, n_sh, profile, antialiased, tolerance)
     for seed in range(300) if key not in _FOUND else ():
         gaussians = random_gaussians(seed, n, n_sh)
         nearest = margins(gaussians, view, profile=profile, antialiased=antialiased).nearest
-        if nearest is None or nearest.margin > tolerance:
+        if (nearest is None or nearest.margin > tolerance) and _has_clamps(gaussians, view, profile):
             _FOUND[key] = gaussians
             break
     return _FOUND[key]
+
+
+def _has_clamps(gaussians: Gaussians, view: Camera, profile: Profile) -> bool:
+    splats = project(gaussians, view, profile=profile)
+    seen = np.flatnonzero(splats.visible)
+    shape = geometry(gaussians, view, profile)
+    slopes = -shape.jacobians[seen, 0, 2] * shape.means_cam[seen, 2] / view.K[0, 0]
+    clamped = np.abs(slopes - shape.means_cam[seen, 0] / shape.means_cam[seen, 2]) > 0.01
+    return bool(np.any(clamped) and np.any(splats.colors[seen] == 0.0))
 
 
 def dyadic_camera(width: int, height: int) -> Camera:
