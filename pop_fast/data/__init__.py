@@ -3,9 +3,21 @@
 from __future__ import annotations
 
 from pop_fast.data.capture import Capture, View
+from pop_fast.data.demo import make_demo
 from pop_fast.data.initialize import initialize_params
 from pop_fast.data.load import load_capture
 from pop_fast.data.photos import run_sfm
+from pop_fast.data.similarity import apply_similarity, to_capture_frame
 from pop_fast.errors import CaptureError
 
-__all__ = ["Capture", "CaptureError", "View", "initialize_params", "load_capture", "run_sfm"]
+__all__ = [
+    "Capture",
+    "CaptureError",
+    "View",
+    "apply_similarity",
+    "initialize_params",
+    "load_capture",
+    "make_demo",
+    "run_sfm",
+    "to_capture_frame",
+]
