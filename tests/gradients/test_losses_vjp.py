@@ -30,18 +30,20 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_loss_transpose_matches_differences(name: str) -> None:
     loss, vjp, options = CASES[name]
-    _check(loss, vjp, options, IMAGE)
+    # zero padding gives every pixel a window, so a smaller picture does
+    small = np.s_[:7, :8] if options.get("padding") == "same" else np.s_[:, :]
+    _check(loss, vjp, options, IMAGE[small], TARGET[small])
 
 
 @pytest.mark.parametrize("name", ["l1", "l2", "ssim_valid", "photometric_pop"])
 def test_masked_loss_transpose_matches_differences(name: str) -> None:
     loss, vjp, options = CASES[name]
-    _check(loss, vjp, {**options, "mask": MASK}, IMAGE)
+    _check(loss, vjp, {**options, "mask": MASK}, IMAGE, TARGET)
 
 
-def _check(loss: Callable[..., float], vjp: Callable[..., np.ndarray], options: dict, image: np.ndarray) -> None:
+def _check(
+    loss: Callable[..., float], vjp: Callable[..., np.ndarray], options: dict, image: np.ndarray, target: np.ndarray
+) -> None:
     assert_vjp_matches(
-        lambda x: np.array(loss(x, TARGET, **options)),
-        lambda x, v: vjp(x, TARGET, float(v), **options),
-        [image],
+        lambda x: np.array(loss(x, target, **options)), lambda x, v: vjp(x, target, float(v), **options), [image]
     )

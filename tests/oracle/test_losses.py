@@ -1,0 +1,212 @@
+"""The losses against definitions written down elsewhere: eq. 4, scikit-image, scipy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.ndimage
+from hypothesis import given
+from hypothesis import strategies as st
+from skimage.metrics import structural_similarity
+
+from pop_ref import losses
+from pop_ref.ssim import WINDOW_SIGMA, gaussian_window
+
+SIZES = ((11, 11), (12, 17), (16, 13))
+
+
+def pair(height: int, width: int, channels: int = 3, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    target = rng.random((height, width, channels))
+    return np.clip(target + 0.25 * rng.normal(size=target.shape), -0.25, 1.25), target
+
+
+def convolved(image: np.ndarray) -> np.ndarray:
+    window = gaussian_window()[:, :, None]
+    return scipy.ndimage.convolve(image, window, mode="constant", cval=0.0)
+
+
+def test_gradient_of_l1_is_the_sign_over_3hw_as_eq_4_prints() -> None:
+    image, target = pair(4, 5)
+    np.testing.assert_array_equal(losses.l1_vjp(image, target, 1.0), np.sign(image - target) / (3 * 4 * 5))
+
+
+def test_gradient_of_l2_is_twice_the_difference_over_3hw_as_eq_4_prints() -> None:
+    image, target = pair(4, 5)
+    np.testing.assert_array_equal(losses.l2_vjp(image, target, 1.0), 2.0 * (image - target) / (3 * 4 * 5))
+
+
+def test_gradient_of_l2_is_two_255ths_to_two_times_that_of_l1_as_the_paper_says() -> None:
+    differences = np.array([1.0, 128.0, 255.0]) / 255.0
+    image, target = differences.reshape(1, 1, 3), np.zeros((1, 1, 3))
+    ratio = losses.l2_vjp(image, target, 1.0) / losses.l1_vjp(image, target, 1.0)
+    np.testing.assert_allclose(ratio.ravel(), 2.0 * differences, rtol=1e-15)
+
+
+def test_losses_of_dyadic_images_are_exact_means() -> None:
+    image = np.array([[[0.5, 0.25, 1.0], [0.0, 0.75, 0.5]]])
+    target = np.array([[[0.25, 0.25, 0.0], [0.5, 0.5, 0.5]]])
+    assert losses.l1(image, target) == (0.25 + 1.0 + 0.5 + 0.25) / 6
+    assert losses.l2(image, target) == (0.0625 + 1.0 + 0.25 + 0.0625) / 6
+
+
+def test_l1_at_equality_has_the_mean_of_its_one_sided_slopes() -> None:
+    target = np.full((1, 1, 1), 0.5)
+    above, at, below = (losses.l1_vjp(target + d, target, 1.0).item() for d in (2.0**-40, 0.0, -(2.0**-40)))
+    assert (above, at, below) == (1.0, 0.0, -1.0)
+
+
+def test_window_is_the_impulse_response_of_scipys_gaussian_filter() -> None:
+    impulse = np.zeros((11, 11))
+    impulse[5, 5] = 1.0
+    expected = scipy.ndimage.gaussian_filter(impulse, WINDOW_SIGMA, radius=5, mode="constant")
+    np.testing.assert_allclose(gaussian_window(), expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize(("height", "width"), SIZES)
+def test_ssim_valid_equals_scikit_image(height: int, width: int) -> None:
+    image, target = pair(height, width)
+    expected, full = structural_similarity(
+        *(image, target),
+        channel_axis=2,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        full=True,
+    )
+    assert losses.ssim(image, target, "valid") == pytest.approx(expected, abs=1e-13)
+    np.testing.assert_allclose(losses.ssim_map(image, target, "valid"), full[5:-5, 5:-5], atol=1e-12)
+
+
+@pytest.mark.parametrize(("height", "width"), [*SIZES, (1, 1), (3, 7)])
+def test_ssim_same_equals_zero_padded_convolutions(height: int, width: int) -> None:
+    image, target = pair(height, width)
+    mu_x, mu_y = convolved(image), convolved(target)
+    s_xx, s_yy = convolved(image**2) - mu_x**2, convolved(target**2) - mu_y**2
+    s_xy = convolved(image * target) - mu_x * mu_y
+    c1, c2 = 1e-4, 9e-4
+    expected = (2 * mu_x * mu_y + c1) * (2 * s_xy + c2) / ((mu_x**2 + mu_y**2 + c1) * (s_xx + s_yy + c2))
+    np.testing.assert_allclose(losses.ssim_map(image, target, "same"), expected, atol=1e-12)
+    assert losses.ssim(image, target, "same") == pytest.approx(expected.mean(), abs=1e-13)
+
+
+def test_the_two_paddings_agree_on_windows_inside_the_image() -> None:
+    image, target = pair(14, 15)
+    inside = losses.ssim_map(image, target, "same")[5:-5, 5:-5]
+    np.testing.assert_allclose(losses.ssim_map(image, target, "valid"), inside, rtol=1e-13)
+
+
+def test_ssim_of_equal_images_is_one_and_is_its_maximum() -> None:
+    image, target = pair(12, 12)
+    for padding in ("valid", "same"):
+        assert losses.ssim(image, image, padding) == pytest.approx(1.0, abs=1e-15)
+        assert losses.d_ssim(image, image, padding) == pytest.approx(0.0, abs=1e-15)
+        assert np.all(losses.ssim_map(image, target, padding) < 1.0)
+        assert np.max(np.abs(losses.ssim_vjp(image, image, 1.0, padding))) < 1e-15
+
+
+def test_ssim_does_not_tell_render_and_photograph_apart() -> None:
+    image, target = pair(12, 13)
+    for padding in ("valid", "same"):
+        assert losses.ssim(image, target, padding) == pytest.approx(losses.ssim(target, image, padding), rel=1e-14)
+
+
+def test_channels_are_compared_one_by_one() -> None:
+    image, target = pair(11, 12, channels=2)
+    alone = [losses.ssim(image[:, :, c : c + 1], target[:, :, c : c + 1]) for c in range(2)]
+    assert losses.ssim(image, target) == pytest.approx(np.mean(alone), rel=1e-14)
+
+
+@pytest.mark.parametrize("height_width", [(10, 64), (64, 10), (1, 1)])
+def test_an_image_without_a_whole_window_is_refused_with_the_fix(height_width: tuple[int, int]) -> None:
+    image = np.zeros((*height_width, 3))
+    with pytest.raises(ValueError, match=r"at least 11 x 11: use padding='same'"):
+        losses.ssim(image, image, "valid")
+
+
+def test_unfit_arguments_are_refused_by_name() -> None:
+    # either by the shape types, when they are checked, or by the function itself
+    image = np.zeros((11, 11, 3))
+    with pytest.raises(Exception, match="reflect"):
+        losses.ssim_map(image, image, "reflect")  # type: ignore[arg-type]
+    with pytest.raises(Exception, match="target"):
+        losses.l2(image, np.zeros((11, 12, 3)))
+    with pytest.raises(Exception, match="mask"):
+        losses.l2(image, image, np.ones((11, 12), dtype=bool))
+
+
+def test_objectives_are_the_weighted_sums_of_eqs_2_and_9() -> None:
+    image, target = pair(12, 12)
+    for padding in ("valid", "same"):
+        d_ssim = 1.0 - losses.ssim(image, target, padding)
+        expected_3dgs = 0.8 * losses.l1(image, target) + 0.2 * d_ssim
+        expected_pop = 0.99 * losses.l2(image, target) + 0.01 * d_ssim
+        assert losses.photometric_3dgs(image, target, padding=padding) == pytest.approx(expected_3dgs, rel=1e-14)
+        assert losses.photometric_pop(image, target, padding=padding) == pytest.approx(expected_pop, rel=1e-14)
+
+
+def test_halved_d_ssim_is_half_of_it() -> None:
+    image, target = pair(11, 11)
+    whole = losses.d_ssim(image, target)
+    assert losses.d_ssim(image, target, halved=True) == 0.5 * whole
+    gained = losses.photometric_pop(image, target) - losses.photometric_pop(image, target, halved=True)
+    assert gained == pytest.approx(0.01 * 0.5 * whole, rel=1e-12)
+
+
+def test_scales_act_on_the_pixelwise_term_alone() -> None:
+    image, target = pair(11, 11)
+    for loss, scale, pixelwise, weight in (
+        (losses.photometric_3dgs, "l1_scale", losses.l1, 0.8),
+        (losses.photometric_pop, "l2_scale", losses.l2, 0.99),
+    ):
+        less = loss(image, target) - loss(image, target, **{scale: 0.25})
+        assert less == pytest.approx(0.75 * weight * pixelwise(image, target), rel=1e-12)
+
+
+ALL = (
+    (losses.l1, losses.l1_vjp),
+    (losses.l2, losses.l2_vjp),
+    (losses.d_ssim, losses.d_ssim_vjp),
+    (losses.photometric_3dgs, losses.photometric_3dgs_vjp),
+    (losses.photometric_pop, losses.photometric_pop_vjp),
+)
+
+
+@given(seed=st.integers(0, 2**16), share=st.sampled_from([0.0, 0.25, 0.9]))
+def test_pixels_that_are_left_out_have_no_loss_and_no_gradient(seed: int, share: float) -> None:
+    image, target = pair(12, 12, channels=1, seed=seed)
+    mask = np.random.default_rng(seed).random((12, 12)) < share
+    poisoned = np.where(mask[:, :, None], image, np.nan)
+    for loss, vjp in ALL:
+        assert loss(poisoned, target, mask=mask) == loss(image, target, mask=mask)
+        v_image = vjp(poisoned, target, 1.0, mask=mask)
+        assert np.all(v_image[~mask] == 0.0)
+        assert np.all(np.isfinite(v_image))
+
+
+def test_a_mask_that_keeps_everything_changes_nothing() -> None:
+    image, target = pair(12, 12)
+    mask = np.ones((12, 12), dtype=bool)
+    for loss, vjp in ALL:
+        assert loss(image, target, mask=mask) == loss(image, target)
+        np.testing.assert_array_equal(vjp(image, target, 1.0, mask=mask), vjp(image, target, 1.0))
+
+
+def test_a_mask_that_keeps_nothing_leaves_no_loss() -> None:
+    image, target = pair(12, 12)
+    mask = np.zeros((12, 12), dtype=bool)
+    assert losses.ssim(image, target, mask=mask) == 1.0
+    for loss, vjp in ALL:
+        assert loss(image, target, mask=mask) == 0.0
+        assert np.all(vjp(image, target, 1.0, mask=mask) == 0.0)
+
+
+def test_masked_means_run_over_the_kept_pixels_only() -> None:
+    image, target = pair(12, 14)
+    mask = np.zeros((12, 14), dtype=bool)
+    mask[:, :6] = True
+    assert losses.l1(image, target, mask) == pytest.approx(losses.l1(image[:, :6], target[:, :6]), rel=1e-14)
+    replaced = np.where(mask[:, :, None], image, target)
+    kept = losses.ssim_map(replaced, target, "same")[mask]
+    assert losses.ssim(image, target, "same", mask) == pytest.approx(kept.mean(), rel=1e-14)
