@@ -51,11 +51,10 @@ def entries_of_lists(means2d: Tensor, conics: Tensor, opacities: Tensor, lists: 
     ids = lists.ids
     row = torch.div(tile, lists.tiles_x, rounding_mode="floor")
     half = 0.5 * lists.tile_size
-    x, y = (column.double()[ids] for column in columns(means2d))
-    a, b, c = (column.double()[ids] for column in columns(conics))
+    x, y, a, b, c, o = (t.double().index_select(0, ids) for t in (*columns(means2d), *columns(conics), opacities))
     u = x - ((tile - row * lists.tiles_x) * lists.tile_size + half)
     v = y - (row * lists.tile_size + half)
-    return Entries(u, v, a, b, c, opacities.double()[ids])
+    return Entries(u, v, a, b, c, o)
 
 
 def exponent_coefficients(entries: Entries, dtype: torch.dtype) -> Tensor:

@@ -28,6 +28,7 @@ import torch
 from torch import Tensor
 
 from pop_fast import workspace
+from pop_fast.dominance import Dominance
 from pop_fast.tile_groups import CHUNK, TileGroup
 from pop_ref.constants import Profile
 
@@ -82,6 +83,7 @@ class GroupBlend:
         n_blended: [G, P] int32, when counted.
         n_passed: list entries that the pixel went past without stopping. [G, P] int32, when counted.
         n_pairs: (entry, pixel) pairs evaluated.
+        dominance: the largest weights, when asked for.
     """
 
     image: Tensor
@@ -89,6 +91,7 @@ class GroupBlend:
     n_blended: Tensor | None = None
     n_passed: Tensor | None = None
     n_pairs: int = 0
+    dominance: Dominance | None = None
 
     def release(self) -> None:
         """Give the chunks' buffers back to the workspace."""
@@ -115,7 +118,7 @@ class Blender:
     profile: Profile
     clamps: bool
 
-    def blend(self, group: TileGroup, counted: bool = False, keep: bool = True) -> GroupBlend:
+    def blend(self, group: TileGroup, counted: bool = False, dominance: bool = False, keep: bool = True) -> GroupBlend:
         """Blend a group front to back."""
         n_pixels = self.basis.shape[1]
         n_tiles = len(group.tiles)
@@ -123,6 +126,8 @@ class Blender:
         if counted:
             result.n_blended = torch.zeros((n_tiles, n_pixels), dtype=torch.int32)
             result.n_passed = torch.zeros((n_tiles, n_pixels), dtype=torch.int32)
+        if dominance:
+            result.dominance = Dominance(result.image[:, 0])
         rows: Tensor | None = None
         image = result.image
         light = self.basis.new_ones((n_tiles, n_pixels))
@@ -134,6 +139,8 @@ class Blender:
             image[:n].baddbmm_(self._of_chunk(self.colors, group, chunk).transpose(1, 2), chunk.weight)
             if counted:
                 self._count(result, chunk, passing)
+            if result.dominance is not None:
+                result.dominance.see(chunk)
             light = passing[:, CHUNK].clone()
             result.n_pairs += chunk.weight.numel()
             if keep:

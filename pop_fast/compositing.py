@@ -11,7 +11,6 @@ from torch.autograd.function import once_differentiable
 
 from pop_fast.alpha import Entries, entries_of_lists, entry_gradients, exponent_coefficients, pixel_basis
 from pop_fast.blender import Blender, GroupBlend
-from pop_fast.dominance import dominant_places
 from pop_fast.layout import from_columns
 from pop_fast.tile_groups import CHUNK, TileGroup, tile_groups
 from pop_fast.tiles import TileLists
@@ -127,7 +126,7 @@ class _Composite(torch.autograd.Function):
         budget = KEPT_BYTES if options.keep else 0
         pairs = 0
         for group in groups:
-            blend = blender.blend(group, options.counts, keep=budget > 0 or options.dominance)
+            blend = blender.blend(group, options.counts, options.dominance, keep=budget > 0 or options.dominance)
             canvas.put(group, blend)
             pairs += blend.n_pairs
             budget -= 2 * dtype.itemsize * blend.n_pairs
@@ -172,12 +171,13 @@ class _Canvas:
     def put(self, group: TileGroup, blend: GroupBlend) -> None:
         self.image.index_copy_(0, group.tiles, blend.image)
         if self.ids is not None and self.weights is not None:
-            places, weights = dominant_places(group, blend)
+            assert blend.dominance is not None
+            places = blend.dominance.places(blend.chunks)
             slots = torch.cat((group.slots, group.slots.new_full((len(group.tiles), 1), -1)), 1)
             entry = slots.gather(1, places.where(places >= 0, slots.shape[1] - 1))
             ids = torch.cat((self.options.lists.ids, torch.tensor([-1])))
             self.ids.index_copy_(0, group.tiles, ids[entry])
-            self.weights.index_copy_(0, group.tiles, weights)
+            self.weights.index_copy_(0, group.tiles, blend.dominance.weights)
         if self.blended is not None and self.traversed is not None:
             assert blend.n_blended is not None
             assert blend.n_passed is not None
@@ -236,7 +236,7 @@ class _Gradients:
                 padded[6 + self.n_colors :, where, at] = part.v_abs
         flat = padded.view(len(self.rows), -1)
         for row, values in zip(self.rows, flat, strict=True):
-            row[group.entries] = values[group.places]
+            row.index_copy_(0, group.entries, values.index_select(0, group.places))
 
     def of_splats(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Sum over the entries of each splat: gradients to means2d, conics, opacities, colors."""

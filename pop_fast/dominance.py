@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from pop_fast.tile_groups import CHUNK, TileGroup
+from pop_fast.tile_groups import CHUNK
 
 if TYPE_CHECKING:
-    from pop_fast.blender import GroupBlend
+    from pop_fast.blender import Chunk
 
 
 def dominant_counts(dominant_ids: Tensor, n: int) -> Tensor:
@@ -18,33 +18,47 @@ def dominant_counts(dominant_ids: Tensor, n: int) -> Tensor:
     return torch.bincount(dominant_ids.reshape(-1) + 1, minlength=n + 1)[1:]
 
 
-def dominant_places(group: TileGroup, blend: GroupBlend) -> tuple[Tensor, Tensor]:
-    """Find the place in its tile's list, and the weight, of each pixel's dominant entry (D8).
+class Dominance:
+    """The running maximum of weights over a group's pixels, fed chunk by chunk, front to back (D8).
 
     Optimizations: the maximum over a chunk is a vectorised reduction; which chunk holds a pixel's maximum is kept as
-    one number per pixel, and only that chunk's eight weights are searched, once.
+    one number per pixel, and only that chunk's eight weights are searched, once, at the end.
 
-    Args:
-        group: the tiles.
-        blend: their blend, its chunks kept.
-
-    Returns:
-        Places, -1 where nothing was blended, and weights. Both [G, P].
+    Attributes:
+        weights: the largest weight so far. [G, P]
     """
-    best = torch.zeros_like(blend.image[:, 0])
-    best_chunk = torch.full(best.shape, -1, dtype=torch.int32)
-    for chunk in blend.chunks:
-        where = chunk.where
-        largest, before = chunk.weight.amax(1), best[where]
+
+    def __init__(self, like: Tensor) -> None:
+        self.weights = torch.zeros_like(like)
+        self._chunks = torch.full(like.shape, -1, dtype=torch.int32)
+
+    def see(self, chunk: Chunk) -> None:
+        """Take a chunk's weights into account."""
+        largest = chunk.weight.amax(1)
+        if chunk.rows is None:
+            best, chunks = self.weights[: chunk.n], self._chunks[: chunk.n]
+        else:
+            best, chunks = self.weights[chunk.where], self._chunks[chunk.where]
         # strictly larger: on equal weights the chunk in front keeps the pixel
-        better = largest > before
-        best[where] = torch.maximum(before, largest)
-        best_chunk[where] = best_chunk[where].masked_fill_(better, chunk.index)
-    places = torch.full(best.shape, -1, dtype=torch.int64)
-    for chunk in blend.chunks:
-        row, pixel = (best_chunk[chunk.where] == chunk.index).nonzero(as_tuple=True)
-        # argmax takes the first of equal weights, which is the front one
-        k = chunk.weight[row, :, pixel].argmax(1)
-        row_in_group = row if chunk.rows is None else chunk.rows[row]
-        places[row_in_group, pixel] = k + chunk.index * CHUNK
-    return places, best
+        chunks.masked_fill_(largest > best, chunk.index)
+        torch.maximum(best, largest, out=best)
+        if chunk.rows is not None:
+            self.weights[chunk.where] = best
+            self._chunks[chunk.where] = chunks
+
+    def places(self, chunks: list[Chunk]) -> Tensor:
+        """Return the place in its tile's list of each pixel's dominant entry, -1 where nothing was blended. [G, P]"""
+        places = torch.full(self.weights.shape, -1, dtype=torch.int64)
+        n_pixels = self.weights.shape[1]
+        of_eight = torch.arange(CHUNK) * n_pixels
+        for chunk in chunks:
+            at = (self._chunks[chunk.where] == chunk.index).view(-1).nonzero().squeeze(1)
+            row = torch.div(at, n_pixels, rounding_mode="floor")
+            first = at + row * (n_pixels * (CHUNK - 1))
+            eight = chunk.weight.view(-1).index_select(0, (first[:, None] + of_eight).view(-1)).view(-1, CHUNK)
+            # argmax takes the first of equal weights, which is the front one
+            place = eight.argmax(1) + chunk.index * CHUNK
+            if chunk.rows is not None:
+                at = at + (chunk.rows[row] - row) * n_pixels
+            places.view(-1).index_copy_(0, at, place)
+        return places

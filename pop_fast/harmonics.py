@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -24,7 +25,8 @@ def sh_basis(dirs: Tensor, degree: int) -> Tensor:
 
     Optimizations: one row per basis function; products of coordinates are shared.
     """
-    return from_columns(_basis_columns(*columns(dirs), degree), (_n_sh(degree),))
+    x, y, z = columns(dirs)
+    return from_columns(_basis_columns(x, y, z, degree), (_n_sh(degree),))
 
 
 def sh_basis_vjp(dirs: Tensor, degree: int, v_basis: Tensor) -> Tensor:
@@ -53,8 +55,7 @@ def colors_from_sh(sh: Tensor, dirs: Tensor, degree: int) -> Tensor:
 
     Optimizations: coefficients are transposed once so that the sum over bands runs over contiguous rows.
     """
-    basis, _, _ = _basis_of_dirs(dirs, degree)
-    return (_unclamped(_coefficient_rows(sh, degree), basis)).clamp_min(0.0).T
+    return evaluate_sh(sh, dirs, degree).unclamped.clamp_min(0.0).T
 
 
 def colors_from_sh_vjp(sh: Tensor, dirs: Tensor, degree: int, v_colors: Tensor) -> tuple[Tensor, Tensor]:
@@ -62,38 +63,59 @@ def colors_from_sh_vjp(sh: Tensor, dirs: Tensor, degree: int, v_colors: Tensor) 
 
     Optimizations: as `colors_from_sh`; the gradient to the coefficients is one outer product of rows.
     """
-    basis, unit, norms = _basis_of_dirs(dirs, degree)
-    rows = _coefficient_rows(sh, degree)
-    v_sum = v_colors.T * (_unclamped(rows, basis) >= 0.0)
-    v_sh = sh.new_zeros((sh.shape[1], 3, len(sh)))
-    torch.mul(basis[:, None], v_sum, out=v_sh[: len(basis)])
-    v_unit = sh_basis_vjp(unit.T, degree, (rows * v_sum).sum(1).T).T
-    v_dirs = (v_unit - unit * (unit * v_unit).sum(0)) / norms
-    return v_sh.permute(2, 0, 1), v_dirs.T
+    v_active, v_dirs = evaluate_sh_vjp(evaluate_sh(sh, dirs, degree), v_colors.T)
+    v_sh = torch.zeros_like(sh)
+    v_sh[:, : v_active.shape[1]] = v_active
+    return v_sh, v_dirs
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Harmonics evaluated, with what the transpose needs, all component-major.
+
+    Attributes:
+        degree: active bands.
+        rows: active coefficients. [n_sh, 3, N]
+        basis: [n_sh, N]
+        unit: unit directions. [3, N]
+        norms: of the directions given. [N]
+        unclamped: colours before the clamp at 0. [3, N]
+    """
+
+    degree: int
+    rows: Tensor
+    basis: Tensor
+    unit: Tensor
+    norms: Tensor
+    unclamped: Tensor
+
+
+def evaluate_sh(sh: Tensor, dirs: Tensor, degree: int) -> Evaluation:
+    """Evaluate the active bands and keep what the transpose needs."""
+    n_sh = _n_sh(degree)
+    if sh.shape[1] < n_sh:
+        raise ValueError(f"sh has {sh.shape[1]} coefficients; degree {degree} needs {n_sh}")
+    rows = sh[:, :n_sh].reshape(len(sh), -1).T.contiguous().view(n_sh, 3, -1)
+    components = dirs.T
+    norms = torch.sqrt((components * components).sum(0))
+    unit = components / norms
+    basis = torch.stack(_basis_columns(unit[0], unit[1], unit[2], degree))
+    return Evaluation(degree, rows, basis, unit, norms, (rows * basis[:, None]).sum(0) + 0.5)
+
+
+def evaluate_sh_vjp(evaluation: Evaluation, v_colors: Tensor) -> tuple[Tensor, Tensor]:
+    """Pull a cotangent of colours ([3, N]) back to the active coefficients [N, n_sh, 3] and the directions [N, 3]."""
+    e = evaluation
+    v_sum = v_colors * (e.unclamped >= 0.0)
+    v_unit = sh_basis_vjp(e.unit.T, e.degree, (e.rows * v_sum).sum(1).T).T
+    v_dirs = (v_unit - e.unit * (e.unit * v_unit).sum(0)) / e.norms
+    return (e.basis[:, None] * v_sum).permute(2, 0, 1), v_dirs.T
 
 
 def _n_sh(degree: int) -> int:
     if degree not in (0, 1, 2, 3):
         raise ValueError(f"degree is {degree}; it must be 0, 1, 2 or 3")
     return (degree + 1) ** 2
-
-
-def _basis_of_dirs(dirs: Tensor, degree: int) -> tuple[Tensor, Tensor, Tensor]:
-    rows = dirs.T
-    norms = torch.sqrt((rows * rows).sum(0))
-    unit = rows / norms
-    return torch.stack(_basis_columns(unit[0], unit[1], unit[2], degree)), unit, norms
-
-
-def _coefficient_rows(sh: Tensor, degree: int) -> Tensor:
-    n_sh = _n_sh(degree)
-    if sh.shape[1] < n_sh:
-        raise ValueError(f"sh has {sh.shape[1]} coefficients; degree {degree} needs {n_sh}")
-    return sh[:, :n_sh].reshape(len(sh), -1).T.contiguous().reshape(n_sh, 3, -1)
-
-
-def _unclamped(rows: Tensor, basis: Tensor) -> Tensor:
-    return (rows * basis[:, None]).sum(0) + 0.5
 
 
 def _basis_columns(x: Tensor, y: Tensor, z: Tensor, degree: int) -> list[Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,6 +14,9 @@ from pop_fast.dominance import dominant_counts
 from pop_fast.raster_meta import RenderMeta, intersections
 from pop_fast.splatting import Splats, View, colors_of_view, project
 from pop_fast.tiles import tile_lists
+
+SMALL_TILE, LARGE_TILE = 8, 16  # px
+SMALL_TILE_BELOW = 14.0  # px, root mean square extent of the visible splats; see benchmarks/NOTES.md
 
 
 @dataclass(frozen=True)
@@ -91,9 +95,9 @@ class Frame:
 
     def render(self, backgrounds: Tensor | None, dominance: bool, counts: bool) -> tuple[Tensor, Tensor, RenderMeta]:
         """Return images, alphas and meta."""
-        splats = [self._splats(i) for i in range(len(self.scene.viewmats))]
+        splats = self._splats()
         visible = [(s.radii > 0).all(1).nonzero().squeeze(1) for s in splats]
-        colors = [self._colors(i, rows) for i, rows in enumerate(visible)]
+        colors = self._colors(visible)
         meta, rows = self._packed(splats, visible, colors) if self.packed else self._unpacked(splats, colors)
         blends = [self._blend(r, dominance, counts) for r in rows]
         images = self._stacked([self._finish(i, blend, backgrounds) for i, blend in enumerate(blends)])
@@ -103,32 +107,33 @@ class Frame:
         self._add_instruments(meta, rows, blends, dominance, counts)
         return images, alphas, meta
 
-    def _splats(self, i: int) -> Splats:
-        scene, b = self.scene, i // self.scene.n_cameras
-        view = replace(self.view, K=scene.Ks[i])
-        return project(scene.means[b], scene.covars[b], scene.opacities[b], scene.viewmats[i], view)
+    def _splats(self) -> list[Splats]:
+        scene, n = self.scene, self.scene.n_cameras
+        scenes = list(zip(_items(scene.means), _items(scene.covars), _items(scene.opacities), strict=True))
+        return [
+            project(*scenes[i // n], viewmat, replace(self.view, K=K))
+            for i, (viewmat, K) in enumerate(zip(_items(scene.viewmats), scene.Ks, strict=True))
+        ]
 
-    def _colors(self, i: int, visible: Tensor) -> Tensor:
-        scene, b = self.scene, i // self.scene.n_cameras
-        colors = scene.colors[i if scene.per_camera else b]
-        if self.sh_degree is None:
+    def _colors(self, visible: list[Tensor]) -> list[Tensor]:
+        scene, n, degree = self.scene, self.scene.n_cameras, self.sh_degree
+        given = _items(scene.colors)
+        colors = given if scene.per_camera else [given[i // n] for i in range(len(visible))]
+        if degree is None:
             return colors
-        return colors_of_view(colors, scene.means[b], scene.viewmats[i], self.sh_degree, visible)
+        means, viewmats = _items(scene.means), _items(scene.viewmats)
+        return [colors_of_view(colors[i], means[i // n], viewmats[i], degree, rows) for i, rows in enumerate(visible)]
 
     def _unpacked(self, splats: list[Splats], colors: list[Tensor]) -> tuple[RenderMeta, list[Rows]]:
         names = ("means2d", "depths", "conics", "opacities", "radii")
         stacked = {name: self._stacked([getattr(s, name) for s in splats]) for name in names}
         meta = self._meta(stacked, {"batch_ids": None, "camera_ids": None, "gaussian_ids": None})
         sink = self._sink(meta["means2d"])
-        flat = {
-            name: tensor.reshape(len(splats), *tensor.shape[len(self.image_shape) :])
-            for name, tensor in stacked.items()
-        }
-        flat_sink = None if sink is None else sink.view(len(splats), -1, 2)
+        last_outer = len(self.image_shape) - 1
+        items = {name: _items(tensor.flatten(0, last_outer)) for name, tensor in stacked.items()}
+        sinks = [None] * len(splats) if sink is None else _items(sink.flatten(0, last_outer))
         return meta, [
-            self._rows(
-                {name: t[i] for name, t in flat.items()}, colors[i], None, None if flat_sink is None else flat_sink[i]
-            )
+            self._rows({name: tensors[i] for name, tensors in items.items()}, colors[i], None, sinks[i])
             for i in range(len(splats))
         ]
 
@@ -174,10 +179,12 @@ class Frame:
 
     def _blend(self, rows: Rows, dominance: bool, counts: bool) -> Composite:
         width, height, profile = self.view.width, self.view.height, self.view.profile
-        # counting visited entries needs the full lists; without it, entries that reach no pixel are left out
+        # counting visited entries needs the asked-for tiles and their full lists; without it, entries that reach no
+        # pixel are left out, and small splats are listed in small tiles
         exact = {} if counts else {"conics": rows.conics.detach(), "opacities": rows.opacities.detach()}
+        size = self.tile_size if counts or profile.extent == "square" else _blend_tile(rows.radii)
         lists = tile_lists(
-            rows.means2d.detach(), rows.radii, rows.depths.detach(), width, height, self.tile_size, profile, **exact
+            rows.means2d.detach(), rows.radii, rows.depths.detach(), width, height, size, profile, **exact
         )
         return composite(
             rows.means2d,
@@ -246,6 +253,18 @@ class Frame:
     def _stacked(self, tensors: list[Tensor]) -> Tensor:
         joined = tensors[0][None] if len(tensors) == 1 else torch.stack(tensors)
         return joined.reshape(*self.image_shape, *tensors[0].shape)
+
+
+def _items(tensor: Tensor) -> list[Tensor]:
+    """Take the first axis apart; a single item stays a view, whose transpose costs nothing."""
+    return [tensor.squeeze(0)] if len(tensor) == 1 else list(tensor.unbind(0))
+
+
+def _blend_tile(radii: Tensor) -> int:
+    """Choose the tile that is cheapest to blend; the image does not depend on it."""
+    visible = (radii > 0).all(1)
+    area = (radii * visible[:, None]).to(torch.float64).prod(1).sum() / visible.sum().clamp_min(1)
+    return SMALL_TILE if math.sqrt(float(area)) < SMALL_TILE_BELOW else LARGE_TILE
 
 
 def _present(tensor: Tensor | None) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
 from torch import Tensor
@@ -144,14 +145,16 @@ def rasterization(
         assert quats is not None
         assert scales is not None
         covars = covariances(quats.reshape(-1, 4), scales.reshape(-1, 3))
+    n_scenes = math.prod(batch)
+    n_images = n_scenes * n_cameras
     scene = Scene(
-        means.reshape(-1, n, 3),
-        covars.reshape(-1, n, 3, 3) if batch else covars[None],
-        opacities.reshape(-1, n),
-        colors.reshape(-1, *colors.shape[len(batch) + per_camera :]),
+        means.reshape(n_scenes, n, 3),
+        covars.reshape(n_scenes, n, 3, 3),
+        opacities.reshape(n_scenes, n),
+        colors.reshape(n_images if per_camera else n_scenes, *colors.shape[len(batch) + per_camera :]),
         per_camera,
-        viewmats.reshape(-1, 4, 4),
-        Ks.reshape(-1, 3, 3),
+        viewmats.reshape(n_images, 4, 4),
+        Ks.reshape(n_images, 3, 3),
         n_cameras,
     )
     chosen = resolved_profile(profile, near_plane, far_plane, eps2d)

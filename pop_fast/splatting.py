@@ -33,7 +33,7 @@ from pop_fast.footprint import (
     on_screen,
     radii_from_covars2d,
 )
-from pop_fast.harmonics import colors_from_sh, colors_from_sh_vjp
+from pop_fast.harmonics import evaluate_sh, evaluate_sh_vjp
 from pop_fast.projection import (
     project_covars,
     project_covars_vjp,
@@ -131,7 +131,8 @@ class _Covariances(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_covars: Tensor) -> tuple[Tensor, Tensor]:
-        return covars_from_quats_scales_vjp(*ctx.saved_tensors, v_covars)
+        quats, scales = ctx.saved_tensors
+        return covars_from_quats_scales_vjp(quats, scales, v_covars)
 
 
 class _Projection(torch.autograd.Function):
@@ -199,21 +200,22 @@ class _Projection(torch.autograd.Function):
 class _Colors(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, sh: Tensor, means: Tensor, viewmat: Tensor, degree: int, visible: Tensor) -> Tensor:
+        chosen = means[visible]
+        dirs = view_dirs(chosen, viewmat)
+        evaluation = evaluate_sh(sh[visible], dirs, degree)
         ctx.save_for_backward(sh, means, viewmat, visible)
-        ctx.degree = degree
-        dirs = view_dirs(means[visible], viewmat)
+        ctx.chosen, ctx.evaluation = chosen, evaluation
         colors = sh.new_zeros((3, len(sh)))
-        colors[:, visible] = colors_from_sh(sh[visible], dirs, degree).T
+        colors[:, visible] = evaluation.unclamped.clamp_min(0.0)
         return colors.T
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_colors: Tensor) -> tuple[Tensor | None, ...]:
         sh, means, viewmat, visible = ctx.saved_tensors
-        chosen = means[visible]
-        v = v_colors.T[:, visible].T
-        v_sh_rows, v_dirs = colors_from_sh_vjp(sh[visible], view_dirs(chosen, viewmat), ctx.degree, v)
-        v_rows, v_viewmat = view_dirs_vjp(chosen, viewmat, v_dirs)
-        v_sh = torch.zeros_like(sh, memory_format=torch.contiguous_format).index_copy_(0, visible, v_sh_rows)
+        v_sh_rows, v_dirs = evaluate_sh_vjp(ctx.evaluation, v_colors.T[:, visible])
+        v_rows, v_viewmat = view_dirs_vjp(ctx.chosen, viewmat, v_dirs)
+        v_sh = torch.zeros_like(sh, memory_format=torch.contiguous_format)
+        v_sh[:, : v_sh_rows.shape[1]].index_copy_(0, visible, v_sh_rows)
         v_means = torch.zeros_like(means).index_copy_(0, visible, v_rows)
         return v_sh, v_means, v_viewmat if ctx.needs_input_grad[2] else None, None, None

@@ -14,7 +14,9 @@ from torch import Tensor
 from pop_fast.tiles import TileLists
 
 CHUNK = 8  # list entries blended per step
-PAIRS_PER_SLAB = 1 << 20  # (entry, pixel) pairs of one step: 4 MB in float32, large enough to share among threads
+PAIRS_PER_SLAB = (
+    1 << 19
+)  # (entry, pixel) pairs of one step: enough to share among threads, small enough for their caches
 
 
 @dataclass(frozen=True)

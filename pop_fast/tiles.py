@@ -85,15 +85,16 @@ def tile_lists(
     counts = columns_of_tiles * (y1 - y0)[rows]
     # entry e is the k-th tile of its splat's rectangle
     splat = torch.repeat_interleave(counts)
-    k = (torch.arange(len(splat)) - (counts.cumsum(0) - counts)[splat]).to(torch.float64)
-    per_row = columns_of_tiles[splat]
-    row_of_rect = (k / per_row).floor_().to(torch.int64)
-    tile_x = left[splat] + k.to(torch.int64) - row_of_rect * per_row
-    tile_y = top[splat] + row_of_rect
-    ids = rows[splat]
+    k = (torch.arange(len(splat)) - (counts.cumsum(0) - counts).index_select(0, splat)).to(torch.int32)
+    per_row = columns_of_tiles.to(torch.int32).index_select(0, splat)
+    # both are small integers, whose float32 quotient never rounds up to the next one
+    row_of_rect = (k.to(torch.float32) / per_row).to(torch.int32)
+    tile_x = left.to(torch.int32).index_select(0, splat) + k - row_of_rect * per_row
+    tile_y = top.to(torch.int32).index_select(0, splat) + row_of_rect
+    ids = rows.index_select(0, splat)
     if conics is not None and opacities is not None:
         touched = _touches(means2d, conics, opacities, ids, tile_x, tile_y, tile_size, profile).nonzero().squeeze(1)
-        ids, tile_x, tile_y = ids[touched], tile_x[touched], tile_y[touched]
+        ids, tile_x, tile_y = (t.index_select(0, touched) for t in (ids, tile_x, tile_y))
     tile = tile_y * tiles_x + tile_x
     n_tiles = tiles_x * tiles_y
     order = torch.sort(tile.to(torch.int16 if n_tiles < 2**15 else torch.int32), stable=True).indices
@@ -133,9 +134,8 @@ def _touches(
     sigma is convex, so its smallest value over the rectangle of pixel centres is 0 at an inside centre, and else lies
     on one of the two edges that face the centre, where it is a parabola.
     """
-    x, y = (c.contiguous()[ids] for c in columns(means2d))
-    a, b, c = (column.contiguous()[ids] for column in columns(conics))
-    limit = torch.log(opacities / profile.alpha_floor)[ids]
+    x, y, a, b, c = (t.contiguous().index_select(0, ids) for t in (*columns(means2d), *columns(conics)))
+    limit = torch.log(opacities / profile.alpha_floor).index_select(0, ids)
     left = (tile_x * tile_size).to(x.dtype) + 0.5 - x
     top = (tile_y * tile_size).to(x.dtype) + 0.5 - y
     right, bottom = left + (tile_size - 1), top + (tile_size - 1)

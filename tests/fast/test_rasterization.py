@@ -1,0 +1,280 @@
+"""The drop-in's own promises: shapes, modes, batches, laziness, memory; the laws judge its numbers."""
+
+from __future__ import annotations
+
+import inspect
+import re
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from pop_fast import compositing, workspace
+from pop_fast.backends import backend_names, get_backend
+from pop_fast.errors import PopError
+from pop_fast.rasterization import rasterization
+
+WIDTH, HEIGHT, N = 21, 18, 24
+
+# fmt: off
+GSPLAT_1_5_3 = [
+    "means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height", "near_plane", "far_plane",
+    "radius_clip", "eps2d", "sh_degree", "packed", "tile_size", "backgrounds", "render_mode", "sparse_grad", "absgrad",
+    "rasterize_mode", "channel_chunk", "distributed", "camera_model", "segmented", "covars", "with_ut", "with_eval3d",
+    "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs", "rolling_shutter", "viewmats_rs",
+]
+GSPLAT_META = {
+    "means2d", "radii", "depths", "conics", "opacities", "camera_ids", "gaussian_ids", "batch_ids", "tile_width",
+    "tile_height", "tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets", "width", "height", "tile_size",
+    "n_batches", "n_cameras",
+}
+# fmt: on
+
+
+def scene(seed: int = 0, dtype: torch.dtype = torch.float64, n: int = N, channels: int = 3) -> dict[str, Tensor]:
+    rng = np.random.default_rng(seed)
+    made = {
+        "means": rng.normal(size=(n, 3)) * [1.0, 0.8, 0.6] + [0.0, 0.0, 3.0],
+        "quats": rng.normal(size=(n, 4)),
+        "scales": np.exp(rng.normal(size=(n, 3)) * 0.5 - 1.6),
+        "opacities": rng.uniform(size=n),
+        "colors": rng.uniform(size=(n, channels)),
+    }
+    return {name: torch.tensor(value, dtype=dtype) for name, value in made.items()}
+
+
+def cameras(count: int = 1, dtype: torch.dtype = torch.float64) -> dict[str, Tensor | int]:
+    viewmats = torch.eye(4, dtype=dtype).repeat(count, 1, 1)
+    viewmats[:, 0, 3] = torch.arange(count, dtype=dtype) * 0.25
+    K = torch.tensor([[20.0, 0.0, 10.25], [0.0, 20.0, 9.5], [0.0, 0.0, 1.0]], dtype=dtype)
+    return {"viewmats": viewmats, "Ks": K.repeat(count, 1, 1), "width": WIDTH, "height": HEIGHT}
+
+
+def test_the_signature_begins_with_gsplat_1_5_3s() -> None:
+    parameters = inspect.signature(rasterization).parameters
+    assert list(parameters)[: len(GSPLAT_1_5_3)] == GSPLAT_1_5_3
+    assert all(p.kind is p.KEYWORD_ONLY for name, p in parameters.items() if name not in GSPLAT_1_5_3)
+
+
+def test_meta_holds_gsplats_keys_unpacked_and_packed() -> None:
+    for packed in (False, True):
+        _, _, meta = rasterization(**scene(), **cameras(2), packed=packed)
+        assert set(meta) >= GSPLAT_META
+        assert meta["flatten_ids"].shape == meta["isect_ids"].shape == (meta["tiles_per_gauss"].sum(),)
+        rows = (2, N) if not packed else (len(meta["gaussian_ids"]),)
+        assert meta["means2d"].shape == (*rows, 2)
+        assert meta["radii"].shape == (*rows, 2)
+        assert meta["depths"].shape == rows
+
+
+def test_packed_and_unpacked_give_the_same_bits() -> None:
+    given = scene()
+    unpacked = rasterization(**given, **cameras(2), packed=False)
+    packed = rasterization(**given, **cameras(2), packed=True)
+    assert torch.equal(unpacked[0], packed[0])
+    assert torch.equal(unpacked[2]["dominant_ids"], packed[2]["dominant_ids"])
+    assert torch.equal(unpacked[2]["dominant_counts"], packed[2]["dominant_counts"])
+    rows = packed[2]["camera_ids"], packed[2]["gaussian_ids"]
+    assert torch.equal(unpacked[2]["means2d"][rows], packed[2]["means2d"])
+
+
+def test_cameras_of_one_call_equal_calls_of_one_camera() -> None:
+    given, three = scene(), cameras(3)
+    together, _, _ = rasterization(**given, **three)
+    for i in range(3):
+        alone, _, _ = rasterization(
+            **given, **{**three, "viewmats": three["viewmats"][i : i + 1], "Ks": three["Ks"][:1]}
+        )
+        assert torch.equal(together[i], alone[0])
+
+
+def test_batches_of_scenes_equal_their_scenes() -> None:
+    first, second = scene(1), scene(2)
+    batched = {name: torch.stack((first[name], second[name])) for name in first}
+    two = cameras(2)
+    views = {**two, "viewmats": two["viewmats"].repeat(2, 1, 1, 1), "Ks": two["Ks"].repeat(2, 1, 1, 1)}
+    images, alphas, meta = rasterization(**batched, **views, packed=False)
+    assert images.shape == (2, 2, HEIGHT, WIDTH, 3)
+    assert alphas.shape == (2, 2, HEIGHT, WIDTH, 1)
+    assert meta["dominant_counts"].shape == (2, 2, N)
+    for b, one in enumerate((first, second)):
+        assert torch.equal(images[b], rasterization(**one, **two)[0])
+
+
+def test_depth_modes_are_weighted_and_expected_depth() -> None:
+    given = scene()
+    colours = rasterization(**given, **cameras(), render_mode="RGB")
+    both = rasterization(**given, **cameras(), render_mode="RGB+D")[0]
+    depth = rasterization(**given, **cameras(), render_mode="D")[0]
+    expected = rasterization(**given, **cameras(), render_mode="RGB+ED")[0]
+    assert torch.equal(both[..., :3], colours[0])
+    torch.testing.assert_close(both[..., 3:], depth, rtol=1e-12, atol=1e-12)
+    seen = colours[1] > 0.0
+    torch.testing.assert_close((depth / colours[1])[seen], expected[..., 3:][seen], rtol=1e-12, atol=0.0)
+    nearest, farthest = given["means"][:, 2].min(), given["means"][:, 2].max()
+    assert ((expected[..., 3:][seen] >= nearest) & (expected[..., 3:][seen] <= farthest)).all()
+
+
+def test_the_background_shows_through_by_the_light_that_is_left_and_not_in_depth() -> None:
+    given = scene()
+    background = torch.tensor([[0.25, 0.5, 1.0]], dtype=torch.float64)
+    black, alphas, _ = rasterization(**given, **cameras(), render_mode="RGB+D")
+    tinted, _, _ = rasterization(**given, **cameras(), render_mode="RGB+D", backgrounds=background)
+    torch.testing.assert_close(tinted[..., :3], black[..., :3] + (1.0 - alphas) * background, rtol=1e-12, atol=1e-12)
+    assert torch.equal(tinted[..., 3], black[..., 3])
+
+
+def test_any_number_of_channels_is_blended() -> None:
+    many = scene(channels=37)
+    image = rasterization(**many, **cameras())[0]
+    one = rasterization(**{**many, "colors": many["colors"][:, 36:]}, **cameras())[0]
+    assert image.shape == (1, HEIGHT, WIDTH, 37)
+    torch.testing.assert_close(image[..., 36:], one, rtol=1e-12, atol=1e-14)
+
+
+def test_covariances_can_replace_quaternions_and_scales() -> None:
+    from pop_fast.covariance import covars_from_quats_scales
+
+    given = scene()
+    covars = covars_from_quats_scales(given["quats"], given["scales"])
+    other = rasterization(**{**given, "quats": None, "scales": None}, **cameras(), covars=covars)
+    assert torch.equal(other[0], rasterization(**given, **cameras())[0])
+
+
+@pytest.mark.parametrize("eager", [True, False])
+def test_instruments_read_later_equal_instruments_asked_for(eager: bool) -> None:
+    given = scene()
+    _, _, meta = rasterization(**given, **cameras(2), dominance=eager, counts=eager)
+    _, _, other = rasterization(**given, **cameras(2), dominance=not eager, counts=not eager)
+    for key in ("dominant_ids", "dominant_weights", "dominant_counts", "n_contrib", "n_traversed"):
+        assert torch.equal(meta[key], other[key]), key
+    assert torch.equal(
+        meta["dominant_counts"].sum(1) + (meta["dominant_ids"] < 0).sum((1, 2)), torch.tensor([378, 378])
+    )
+
+
+def _gradients(budget: int, monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
+    monkeypatch.setattr(compositing, "KEPT_BYTES", budget)
+    leaves = {name: value.requires_grad_() for name, value in scene(3).items()}
+    image, _, _ = rasterization(**leaves, **cameras())
+    image.square().sum().backward()
+    return [leaf.grad for leaf in leaves.values() if leaf.grad is not None]
+
+
+def test_blending_again_instead_of_keeping_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept, again = _gradients(1 << 30, monkeypatch), _gradients(0, monkeypatch)
+    assert len(kept) == 5
+    assert all(g.abs().sum() > 0.0 for g in kept)
+    assert all(torch.equal(a, b) for a, b in zip(kept, again, strict=True))
+
+
+def test_two_runs_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = _gradients(1 << 30, monkeypatch), _gradients(1 << 30, monkeypatch)
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+def test_a_graph_can_be_walked_twice() -> None:
+    leaf = scene(4)["means"].requires_grad_()
+    image, _, _ = rasterization(**{**scene(4), "means": leaf}, **cameras())
+    loss = image.square().sum()
+    loss.backward(retain_graph=True)
+    assert leaf.grad is not None
+    once = leaf.grad.clone()
+    loss.backward()
+    assert torch.equal(leaf.grad, 2.0 * once)
+
+
+def test_absolute_gradients_bound_the_signed_ones() -> None:
+    leaves = {name: value.requires_grad_() for name, value in scene(5).items()}
+    image, _, meta = rasterization(**leaves, **cameras(2), packed=False, absgrad=True)
+    meta["means2d"].retain_grad()
+    image.square().sum().backward()
+    assert meta["means2d"].absgrad.shape == meta["means2d"].shape
+    assert meta["means2d"].absgrad.sum() > 0.0
+    assert (meta["means2d"].absgrad >= meta["means2d"].grad.abs() - 1e-12).all()
+
+
+def test_buffers_are_reused_and_can_be_freed() -> None:
+    leaf = scene(4)["means"].requires_grad_()
+    rasterization(**{**scene(4), "means": leaf}, **cameras())[0].sum().backward()
+    taken = workspace.take(64, torch.float64)
+    workspace.give(taken)
+    assert workspace.take(64, torch.float64).data_ptr() == taken.data_ptr()
+    workspace.clear()
+    assert not workspace._free
+
+
+def test_an_empty_scene_is_the_background() -> None:
+    background = torch.tensor([[0.25, 0.5, 1.0]], dtype=torch.float64)
+    for packed in (True, False):
+        image, alphas, meta = rasterization(**scene(n=0), **cameras(), backgrounds=background, packed=packed)
+        assert (image == background).all()
+        assert (alphas == 0.0).all()
+        assert (meta["dominant_ids"] == -1).all()
+
+
+WRONG = {
+    "means[3, 1] is nan": {
+        "means": lambda t: t.index_put((torch.tensor(3), torch.tensor(1)), torch.tensor(np.nan).double())
+    },
+    "scales[2, 0] is -1.0": {
+        "scales": lambda t: t.index_put((torch.tensor(2), torch.tensor(0)), torch.tensor(-1.0).double())
+    },
+    "quats[4] is [0.0, 0.0, 0.0, 0.0]": {"quats": lambda t: t.index_fill(0, torch.tensor([4]), 0.0)},
+    "opacities[0] is 1.5": {"opacities": lambda t: t.index_fill(0, torch.tensor([0]), 1.5)},
+    "quats has shape": {"quats": lambda t: t[:, :3]},
+    "scales has dtype": {"scales": lambda t: t.float()},
+    "Ks[0] is": {"Ks": lambda t: torch.zeros_like(t)},
+    "viewmats[0] is": {"viewmats": lambda t: t * 2.0},
+    "width is 0": {"width": lambda _: 0},
+    "height is 0": {"height": lambda _: 0},
+    "colors has shape": {"colors": lambda t: t[:-1]},
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_wrong_input_is_named_with_its_index(message: str) -> None:
+    given = {**scene(), **cameras()}
+    (name, change), *_ = WRONG[message].items()
+    with pytest.raises(ValueError, match=re.escape(message)):
+        rasterization(**{**given, name: change(given[name])})
+
+
+@pytest.mark.parametrize(
+    "argument",
+    [
+        {"sparse_grad": True},
+        {"distributed": True},
+        {"camera_model": "fisheye"},
+        {"segmented": True},
+        {"with_ut": True},
+        {"with_eval3d": True},
+        {"radial_coeffs": torch.zeros(1, 6)},
+        {"rolling_shutter": 1},
+        {"viewmats_rs": torch.eye(4)[None]},
+    ],
+)
+def test_unsupported_arguments_raise_by_name(argument: dict[str, object]) -> None:
+    with pytest.raises(NotImplementedError, match=next(iter(argument))):
+        rasterization(**scene(), **cameras(), **argument)
+
+
+def test_the_oracle_and_the_fast_path_are_both_backends() -> None:
+    assert {"fast", "ref"} <= set(backend_names())
+    given = scene(6, n=6)
+    given["colors"] = torch.randn(6, 4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    results = []
+    for name in ("fast", "ref"):
+        leaves = {key: value.clone().requires_grad_() for key, value in given.items()}
+        image, alphas, meta = get_backend(name).rasterization(**leaves, **cameras(2), sh_degree=1, packed=False)
+        meta["means2d"].retain_grad()
+        (image.square().sum() + alphas.sum()).backward()
+        results.append((image, meta["n_traversed"], meta["means2d"].grad, *(leaf.grad for leaf in leaves.values())))
+    for fast, ref in zip(*results, strict=True):
+        torch.testing.assert_close(fast, ref, rtol=1e-10, atol=1e-10)
+
+
+def test_an_unknown_backend_is_an_error_that_lists_the_known() -> None:
+    with pytest.raises(PopError, match="fast"):
+        get_backend("metal")
