@@ -1,0 +1,293 @@
+"""Density control: the statistic's units, who is selected under every reading, the calendar, one whole event."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from pop_ref.density import (
+    ADC,
+    POP,
+    DensityConfig,
+    Rows,
+    Statistics,
+    accumulate,
+    average_grads,
+    blur_set,
+    blurs_at,
+    clone_rows,
+    densifies_at,
+    densify_and_prune,
+    grow_masks,
+    prune_mask,
+    prune_rows,
+    reset_opacities,
+    resets_at,
+    rows_from_params,
+    split_rows,
+    zero_statistics,
+)
+
+EYE = np.array([True])
+STEPS = range(30_000)
+SMALL, LARGE, HUGE = 0.005, 0.05, 0.5
+
+
+def population(n: int, seed: int = 0, scale: float = LARGE, opacity: float = 0.5) -> Rows:
+    rng = np.random.default_rng(seed)
+    params = {
+        "means": rng.normal(size=(n, 3)),
+        "scales": np.log(scale * rng.uniform(0.5, 1.0, (n, 3))),
+        "quats": rng.normal(size=(n, 4)),
+        "opacities": np.full(n, np.log(opacity / (1.0 - opacity))),
+        "tag": np.arange(float(n)),
+    }
+    m = {name: rng.normal(size=array.shape) for name, array in params.items()}
+    return Rows(params, m, {name: rng.random(array.shape) for name, array in params.items()})
+
+
+def window(grads: list[float], blurred: list[bool] | None = None) -> Statistics:
+    n = len(grads)
+    flags = np.array([False] * n if blurred is None else blurred, dtype=bool)
+    return replace(zero_statistics(n), grad_sum=np.array(grads), n_visible=np.ones(n, np.int64), blurred=flags)
+
+
+def view(
+    statistics: Statistics, counts: list[int], width: int = 10, height: int = 10, config: DensityConfig = POP
+) -> Statistics:
+    n = len(counts)
+    return accumulate(statistics, np.zeros((n, 2)), np.ones(n, bool), np.array(counts), width, height, config)
+
+
+def draws(n: int) -> np.ndarray:
+    return np.random.default_rng(n).standard_normal((2, n, 3))
+
+
+def test_gradients_are_counted_in_units_of_half_an_image() -> None:
+    v_means2d = np.array([[2.0**-5, 0.0], [0.0, 2.0**-5], [2.0**-5, -(2.0**-5)]])
+    s = accumulate(zero_statistics(3), v_means2d, np.ones(3, bool), np.zeros(3, np.int64), width=64, height=128)
+    assert s.grad_sum.tolist() == [1.0, 2.0, np.sqrt(5.0)]
+
+
+def test_only_views_that_show_a_gaussian_count_for_it() -> None:
+    s = zero_statistics(2)
+    for visible in ([True, False], [True, True], [True, False]):
+        s = accumulate(s, np.array([[1.0, 0.0], [1.0, 0.0]]), np.array(visible), np.zeros(2, np.int64), 2, 2)
+    assert s.grad_sum.tolist() == [3.0, 1.0]
+    assert s.n_visible.tolist() == [3, 1]
+    assert s.n_views == 3
+
+
+def test_average_divides_by_visible_views_or_by_the_window() -> None:
+    s = replace(zero_statistics(3), grad_sum=np.array([6.0, 2.0, 0.0]), n_visible=np.array([3, 1, 0]), n_views=4)
+    assert average_grads(s).tolist() == [2.0, 2.0, 0.0]
+    assert average_grads(s, replace(POP, grad_denominator="window")).tolist() == [1.5, 0.5, 0.0]
+    assert average_grads(zero_statistics(1), replace(POP, grad_denominator="window")).tolist() == [0.0]
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "least"), [(980, 545, 11), (1237, 822, 21), (1557, 1038, 33), (1264, 832, 22)]
+)
+def test_blur_threshold_is_two_hundred_thousandths_of_the_image(width: int, height: int, least: int) -> None:
+    assert blur_set(np.array([least - 1, least]), width, height, POP.theta_blur).tolist() == [False, True]
+
+
+def test_a_count_exactly_at_the_blur_threshold_is_not_blurred() -> None:
+    for k in (1, 2, 3, 7, 20):
+        assert blur_set(np.array([k, k + 1]), 250 * k, 200, 2e-5).tolist() == [False, True]
+
+
+def test_blur_readings_part_over_a_window_of_views() -> None:
+    theta = {"theta_blur": 0.055}
+    seen = {}
+    for reading in ("any_view", "sum", "own_view"):
+        s, config = zero_statistics(4), DensityConfig(blur_window=reading, **theta)
+        for counts in ([6, 0, 3, 0], [0, 6, 3, 0]):
+            s = view(s, counts, config=config)
+        seen[reading] = s.blurred.tolist()
+    assert seen["any_view"] == [True, True, False, False]
+    assert seen["sum"] == [True, True, True, False]
+    assert seen["own_view"] == [False, True, False, False]
+
+
+def test_blur_threshold_is_each_views_own() -> None:
+    s = view(zero_statistics(1), [6], width=10, height=20, config=replace(POP, theta_blur=0.055))
+    assert not s.blurred[0]
+    assert view(s, [6], width=10, height=10, config=replace(POP, theta_blur=0.055)).blurred[0]
+
+
+@given(
+    st.lists(st.tuples(st.booleans(), st.booleans(), st.booleans()), max_size=12), st.sampled_from([600, 3000, 8000])
+)
+def test_a_gaussian_is_cloned_or_split_by_size_and_never_both(
+    members: list[tuple[bool, bool, bool]], step: int
+) -> None:
+    s = window([1.0 if high else 0.0 for high, _, _ in members], [blurred for _, blurred, _ in members])
+    scales = np.array([[SMALL if small else LARGE] * 3 for _, _, small in members]).reshape(-1, 3)
+    clone, split = grow_masks(s, scales, 1.0, step)
+    selected = [high or (blurred and 3000 <= step <= 7000) for high, blurred, _ in members]
+    assert clone.tolist() == [picked and small for picked, (_, _, small) in zip(selected, members, strict=True)]
+    assert split.tolist() == [picked and not small for picked, (_, _, small) in zip(selected, members, strict=True)]
+
+
+def test_thresholds_are_strict_as_in_gsplat_and_not_as_in_inria() -> None:
+    s, scales = window([2e-4, np.nextafter(2e-4, 1.0)]), np.full((2, 3), SMALL)
+    assert grow_masks(s, scales, 1.0, 600)[0].tolist() == [False, True]
+    assert grow_masks(s, scales, 1.0, 600, replace(POP, inclusive=True))[0].tolist() == [True, True]
+
+
+def test_largest_axis_decides_and_equality_is_small() -> None:
+    scales = np.array([[0.25, 0.0, 0.0], [0.0, 0.0, np.nextafter(0.25, 1.0)]])
+    clone, split = grow_masks(window([1.0, 1.0]), scales, 1.0, 600, replace(POP, grow_scale3d=0.25))
+    assert (clone.tolist(), split.tolist()) == ([True, False], [False, True])
+
+
+def test_scene_scale_multiplies_the_size_thresholds() -> None:
+    scales = np.full((1, 3), LARGE)
+    assert grow_masks(window([1.0]), scales, 1.0, 600)[1][0]
+    assert grow_masks(window([1.0]), scales, 10.0, 600)[0][0]
+    assert not prune_mask(np.ones(1), np.full((1, 3), HUGE), 10.0, 3001)[0]
+
+
+def test_gradient_growth_beside_the_blur_rule_can_be_chosen() -> None:
+    s, scales = window([1.0, 0.0], [False, True]), np.full((2, 3), SMALL)
+    chosen = {
+        POP: ([True, False], [True, True]),
+        replace(POP, grow_on_gradient_in_blur_window=False): ([True, False], [False, True]),
+        replace(POP, grow_on_gradient=False): ([False, False], [False, True]),
+    }
+    for config, (before, inside) in chosen.items():
+        assert grow_masks(s, scales, 1.0, 2900, config)[0].tolist() == before
+        assert grow_masks(s, scales, 1.0, 3000, config)[0].tolist() == inside
+
+
+def test_split_only_blur_splits_small_ones_and_may_clone_them_as_well() -> None:
+    s = window([1.0, 1.0, 0.0, 0.0], [True, False, True, False])
+    clone, split = grow_masks(s, np.full((4, 3), SMALL), 1.0, 3000, replace(POP, blur_rule="split"))
+    assert clone.tolist() == [True, True, False, False]
+    assert split.tolist() == [True, False, True, False]
+
+
+def test_pruning_takes_faint_ones_always_and_huge_ones_after_step_3000() -> None:
+    opacities, scales = np.array([0.0, 0.005, 1.0, 1.0]), np.array([[SMALL] * 3, [SMALL] * 3, [0, 0, HUGE], [0.1] * 3])
+    assert prune_mask(opacities, scales, 1.0, 3000).tolist() == [True, False, False, False]
+    assert prune_mask(opacities, scales, 1.0, 3001).tolist() == [True, False, True, False]
+    assert prune_mask(opacities, scales, 1.0, 9000, replace(POP, prune_too_big=False)).tolist() == [True, *[False] * 3]
+
+
+def test_calendar_has_144_events_41_with_blur_and_4_resets() -> None:
+    events = [s for s in STEPS if densifies_at(s, POP)]
+    assert (len(events), events[0], events[-1]) == (144, 600, 14_900)
+    blurred = [s for s in events if blurs_at(s, POP)]
+    assert (len(blurred), blurred[0], blurred[-1]) == (41, 3000, 7000)
+    assert [s for s in STEPS if resets_at(s, POP)] == []
+    assert [s for s in STEPS if resets_at(s, ADC)] == [3000, 6000, 9000, 12_000]
+    assert resets_at(0, replace(ADC, reset_at_zero=True))
+    assert not any(blurs_at(s, ADC) for s in STEPS)
+
+
+def test_children_are_drawn_from_their_parent_and_1_6_times_smaller() -> None:
+    rows, mask = population(4), np.array([False, True, False, True])
+    eps = draws(2)
+    split = split_rows(rows, mask, eps).params
+    rotation = Rotation.from_quat(rows.params["quats"][mask], scalar_first=True)
+    scales = np.exp(rows.params["scales"][mask])
+    for child in range(2):
+        here = slice(2 + 2 * child, 4 + 2 * child)
+        expected = rows.params["means"][mask] + rotation.apply(scales * eps[child])
+        np.testing.assert_allclose(split["means"][here], expected, rtol=1e-13, atol=1e-15)
+        np.testing.assert_allclose(np.exp(split["scales"][here]), scales / 1.6, rtol=1e-14)
+        np.testing.assert_array_equal(split["quats"][here], rows.params["quats"][mask])
+        np.testing.assert_array_equal(split["opacities"][here], rows.params["opacities"][mask])
+        np.testing.assert_array_equal(split["tag"][here], [1.0, 3.0])
+
+
+@given(st.sampled_from([-40.0, 0.0, 40.0]) | st.floats(-30.0, 30.0))
+def test_two_revised_children_are_as_opaque_as_their_parent(logit: float) -> None:
+    rows = population(1)
+    rows = replace(rows, params={**rows.params, "opacities": np.array([logit])})
+    child = split_rows(rows, EYE, draws(1), revised_opacity=True).params["opacities"][0]
+    # 1 - o = 1 / (1 + e^logit) on both sides, in logarithms so that neither end is rounded away
+    assert 2.0 * np.logaddexp(0.0, child) == pytest.approx(np.logaddexp(0.0, logit), rel=1e-12)
+
+
+def test_reset_lowers_opacities_and_forgets_their_moments_alone() -> None:
+    rows = population(3)
+    logits = np.array([9.0, -9.0, np.log(0.01 / 0.99)])
+    after = reset_opacities(replace(rows, params={**rows.params, "opacities": logits}))
+    assert after.params["opacities"].tolist() == [logits[2], -9.0, logits[2]]
+    assert not np.any(after.m["opacities"])
+    assert not np.any(after.v["opacities"])
+    for name in ("means", "scales", "quats", "tag"):
+        assert after.m[name] is rows.m[name]
+        assert after.params[name] is rows.params[name]
+
+
+masks_st = st.integers(0, 7).flatmap(
+    lambda n: st.lists(st.tuples(st.booleans(), st.booleans(), st.booleans()), min_size=n, max_size=n)
+)
+
+
+@given(masks_st)
+def test_an_event_changes_the_number_by_clones_plus_splits_minus_prunes(members: list[tuple[bool, bool, bool]]) -> None:
+    n = len(members)
+    high, small, faint = (np.array([row[k] for row in members], dtype=bool) for k in range(3))
+    rows = population(n)
+    scales = np.log(np.where(small[:, None], SMALL, LARGE) * np.ones((n, 3)))
+    opacities = np.where(faint, -9.0, 0.0)
+    rows = replace(rows, params={**rows.params, "scales": scales, "opacities": opacities})
+    after, s = densify_and_prune(rows, window(high.astype(float).tolist()), 1.0, 600, draws)
+    # copies are as faint as their sources; a split turns one faint parent into two faint children
+    clones, splits = int(np.sum(high & small)), int(np.sum(high & ~small))
+    prunes = int(np.sum(faint)) + int(np.sum(faint & high))
+    assert len(after) == n + clones + splits - prunes
+    assert np.all(after.params["opacities"] == 0.0)
+    for statistic in (s.grad_sum, s.n_visible, s.dominant_sum, s.blurred):
+        assert statistic.shape == (len(after),)
+        assert not np.any(statistic)
+    assert s.n_views == 0
+
+
+def test_order_after_an_event_is_survivors_copies_first_children_second_children() -> None:
+    rows = population(5)
+    scales = np.log(np.array([SMALL, LARGE, SMALL, LARGE, LARGE])[:, None] * np.ones((5, 3)))
+    rows = replace(rows, params={**rows.params, "scales": scales})
+    after, _ = densify_and_prune(rows, window([1.0, 1.0, 1.0, 0.0, 1.0]), 1.0, 600, draws)
+    assert after.params["tag"].tolist() == [0.0, 2.0, 3.0, 0.0, 2.0, 1.0, 4.0, 1.0, 4.0]
+    assert np.all(after.m["tag"][3:] == 0.0)
+    np.testing.assert_array_equal(after.m["tag"][:3], rows.m["tag"][[0, 2, 3]])
+
+
+@pytest.mark.parametrize("n", [0, 1, 3])
+def test_everything_selected_or_nothing(n: int) -> None:
+    rows, everyone, nobody = population(n), np.ones(n, bool), np.zeros(n, bool)
+    assert len(clone_rows(rows, everyone)) == len(split_rows(rows, everyone, draws(n))) == 2 * n
+    assert len(prune_rows(rows, everyone)) == 0
+    for same in (clone_rows(rows, nobody), split_rows(rows, nobody, draws(0)), prune_rows(rows, nobody)):
+        for before, after in ((rows.params, same.params), (rows.m, same.m), (rows.v, same.v)):
+            assert all(np.array_equal(before[name], after[name]) for name in before)
+
+
+def test_a_population_that_is_pruned_to_nothing_can_go_on() -> None:
+    rows, s = densify_and_prune(population(3, opacity=0.001), zero_statistics(3), 1.0, 600, draws)
+    assert len(rows) == 0
+    rows, s = densify_and_prune(rows, s, 1.0, 700, draws)
+    assert len(rows) == len(s.grad_sum) == 0
+    assert rows.params["means"].shape == (0, 3)
+    assert len(reset_opacities(rows)) == 0
+
+
+def test_unfit_rows_and_draws_are_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="lengths"):
+        rows_from_params({"means": np.zeros((2, 3)), "opacities": np.zeros(3)})
+    with pytest.raises(ValueError, match="at least one key"):
+        rows_from_params({})
+    with pytest.raises(ValueError, match=r"v\['means'\]"):
+        Rows({"means": np.zeros((2, 3))}, {"means": np.zeros((2, 3))}, {"means": np.zeros((2, 2))})
+    with pytest.raises(Exception, match="normals"):
+        split_rows(population(2), np.array([True, False]), draws(2))
