@@ -26,7 +26,7 @@ def parse(kind: type[T], argv: Sequence[str], command: str, default: T | None = 
     Raises:
         SystemExit: 0 after --help, 2 after bad usage (tyro has then said what is wrong).
     """
-    about = inspect.cleandoc(kind.__doc__ or "")
+    about = inspect.cleandoc(kind.__doc__ or "").partition("\nAttributes:")[0].strip()
     if examples:
         about += "\n\nexamples:\n" + "\n".join(f"  {line.strip()}" for line in examples.strip().splitlines())
     start = tyro.MISSING_NONPROP if default is None else default

@@ -41,7 +41,7 @@ def read_result(folder: Path) -> ReportData:
     events = [record for record in records if "cloned" in record or "reset" in record]
     return ReportData(
         title=f"{Path(config.data).resolve().name} · {_METHODS.get(config.method, config.method).split(' (')[0]}",
-        subtitle=" · ".join(filter(None, [method, _schedule_note(config), _machine(stats)])),
+        subtitle=" · ".join(filter(None, [method, _schedule_note(config), _views_note(stats), _machine(stats)])),
         headline=headline(stats),
         curves=_curves(records, folder),
         max_steps=run.max_steps,
@@ -120,6 +120,9 @@ def headline(stats: Mapping[str, Any]) -> list[Tile]:
         tiles.append(Tile("Gaussians", f"{n:,}", "", "" if left is None else f"{int(left):,} with opacity ≥ 1/255"))
         as_ply = f"as PLY {n * BYTES_PLY / MIB:.1f} ({BYTES_PLY} B)"
         tiles.append(Tile("Size", f"{n * BYTES_CKPT / MIB:.1f}", "MiB", f"{BYTES_CKPT} B each; {as_ply}"))
+    if stats.get("n_blended") is not None:
+        traversed = f"{stats['n_traversed']:.1f} traversed"
+        tiles.append(Tile("Gaussians per pixel", f"{stats['n_blended']:.1f}", "blended", traversed))
     return tiles + _cost_tiles(stats)
 
 
@@ -130,20 +133,25 @@ def _cost_tiles(stats: Mapping[str, Any]) -> list[Tile]:
         value, unit = (f"{seconds:.0f}", "s") if seconds < 600 else (f"{seconds / 60:.1f}", "min")
         note = "" if steps is None else f"{(steps + 1) / seconds:.1f} iterations a second"
         tiles.append(Tile("Training", value, unit, note))
-    if stats.get("peak_memory_bytes"):
-        tiles.append(Tile("Peak memory", f"{stats['peak_memory_bytes'] / 2**30:.1f}", "GiB", "of the whole process"))
+    if stats.get("memory_bytes"):
+        tiles.append(Tile("Peak memory", f"{stats['memory_bytes'] / 2**30:.1f}", "GiB", "of the whole process"))
     return tiles
 
 
 def _machine(stats: Mapping[str, Any]) -> str:
     versions = stats.get("versions") or {}
     torch = f"torch {versions['torch']}" if "torch" in versions else ""
-    return ", ".join(filter(None, [str(stats.get("machine") or ""), torch]))
+    threads = f"{stats['threads']} threads" if "threads" in stats else ""
+    return ", ".join(filter(None, [str(stats.get("machine") or ""), threads, torch]))
 
 
 def _schedule_note(config: TrainConfig) -> str:
     steps = f"{config.resolved().max_steps:,} iterations"
     return steps if config.scaler == 1.0 else f"{steps} (the paper's schedule times {config.scaler:g})"
+
+
+def _views_note(stats: Mapping[str, Any]) -> str:
+    return f"{stats['views']} held-out views" if "views" in stats else ""
 
 
 def _curves(records: Sequence[Mapping[str, Any]], folder: Path) -> dict[str, tuple[list[float], list[float]]]:

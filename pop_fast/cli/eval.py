@@ -1,0 +1,115 @@
+"""`pop eval`: measure a result, a checkpoint or a PLY on the held-out views of a capture."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import tyro
+
+from pop_fast.backends import get_backend
+from pop_fast.cli.arguments import parse
+from pop_fast.cli.splat import CaptureOptions, Splat, load_splat, open_capture
+from pop_fast.errors import PopError
+from pop_fast.io.atomic import write_atomically
+from pop_fast.report import write_report
+from pop_fast.report.source import read_json
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.environment import reproducible
+from pop_fast.train.evaluate import evaluate
+from pop_fast.train.lpips import LPIPS
+from pop_fast.train.metrics import population
+from pop_fast.train.results import ResultFolder
+from pop_fast.train.views import ViewTensors
+
+_EXAMPLES: Final = """
+    pop eval out/scene_pop                                   the last checkpoint, on the capture it was trained on
+    pop eval out/scene_pop --lpips-alex alexnet.pth lin.pth  add LPIPS to its stats and its report
+    pop eval point_cloud.ply --capture scene --own-frame     a PLY of another trainer
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args(CaptureOptions):
+    """Measure a splat on the held-out views of a capture: PSNR, SSIM, LPIPS where weights are given.
+
+    For a result folder the numbers also go into its stats and its report.
+    """
+
+    splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|PLY")]
+    """What to measure."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Also write the numbers to this file."""
+    lpips_vgg: tuple[str, ...] = field(default=())
+    """Weights of LPIPS on VGG16: one merged file, or backbone and linear layers."""
+    lpips_alex: tuple[str, ...] = field(default=())
+    """Weights of LPIPS on AlexNet, likewise."""
+    per_view: bool = False
+    """Print a line a view."""
+
+
+def run(argv: Sequence[str]) -> int:
+    """Run the subcommand."""
+    args = parse(Args, argv, "eval", examples=_EXAMPLES)
+    splat = load_splat(args.splat)
+    nets = _nets(args, splat.config)
+    capture, config = open_capture(splat, args)
+    views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
+    if not views:
+        raise PopError(f"{capture.name}: holds no view out; give --test-every 8 or another number over 0")
+    stats = measure_splat(splat, config, views, nets)
+    if args.per_view:
+        for name, numbers in stats["per_view"].items():
+            print(f"{name}: " + ", ".join(f"{key} {value:.4f}" for key, value in numbers.items()))
+    for line in _lines(stats):
+        print(line)
+    if args.json is not None:
+        text = json.dumps(stats, indent=2) + "\n"
+        write_atomically(args.json, lambda file: file.write(text.encode()))
+    if args.splat.is_dir() and splat.step is not None and args.capture is None:
+        _record(args.splat, splat.step, stats)
+    return 0
+
+
+def measure_splat(splat: Splat, config: TrainConfig, views: list[ViewTensors], nets: Sequence[LPIPS]) -> dict[str, Any]:
+    """Measure a splat on views; the numbers are those that training itself would write."""
+    backend = get_backend(config.backend)
+    if not backend.available():
+        raise PopError(f"backend '{config.backend}' is not available: {backend.why_not()}")
+    with reproducible(config.threads):
+        measured = evaluate(backend, splat.params, views, config, splat.sh_degree, nets)
+        return {**population(splat.params["opacities"].sigmoid()), **measured}
+
+
+def _nets(args: Args, config: TrainConfig) -> list[LPIPS]:
+    chosen = {"vgg": args.lpips_vgg or config.lpips_vgg, "alex": args.lpips_alex or config.lpips_alex}
+    return [LPIPS(net, files) for net, files in chosen.items() if files]  # type: ignore[arg-type]
+
+
+def _record(folder: Path, step: int, stats: dict[str, Any]) -> None:
+    results = ResultFolder(folder)
+    path = results.stats_path("val", step)
+    before = read_json(path) if path.is_file() else {"step": step}
+    results.write_stats("val", step, {**before, **stats})
+    write_report(folder)
+
+
+def _lines(stats: dict[str, Any]) -> list[str]:
+    lines = [
+        f"views      {stats['views']}",
+        f"PSNR       {stats['psnr']:.3f} dB",
+        f"SSIM       {stats['ssim']:.4f}",
+    ]
+    for variant, value in stats["lpips_variants"].items():
+        lines.append(f"LPIPS      {value:.4f} ({variant})")
+    if not stats["lpips_variants"]:
+        lines.append("LPIPS      not measured: give --lpips-alex or --lpips-vgg FILE")
+    lines += [
+        f"Gaussians  {stats['num_GS']:,} ({stats['num_GS_above_floor']:,} with opacity >= 1/255)",
+        f"per pixel  {stats['n_blended']:.1f} blended, {stats['n_traversed']:.1f} traversed",
+        f"opacity    {100 * stats['opacity_below_0.1']:.1f} % under 0.1, {100 * stats['opacity_above_0.9']:.1f} % over 0.9",
+    ]
+    return lines

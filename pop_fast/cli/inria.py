@@ -1,0 +1,75 @@
+"""The folder that 3DGS's own trainer leaves, which SIBR, metrics.py and most papers' scripts read."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pop_fast.cli.render import rendered
+from pop_fast.cli.splat import Splat
+from pop_fast.data import Capture, View, to_capture_frame
+from pop_fast.io.atomic import folder_atomically
+from pop_fast.io.images import write_png
+from pop_fast.io.ply import save_ply
+from pop_fast.train.views import ViewTensors
+
+
+def write_inria_folder(splat: Splat, capture: Capture, out: Path, overwrite: bool) -> None:
+    """Write a splat and its capture in Inria's layout, whole or not at all, in the capture's own world frame.
+
+        cfg_args  cameras.json  point_cloud/iteration_N/point_cloud.ply
+        test/ours_N/renders/00000.png  test/ours_N/gt/00000.png
+
+    Args:
+        splat: what to write, in the frame of `capture`.
+        capture: its cameras and photographs.
+        out: the folder to make.
+        overwrite: replace an existing folder.
+    """
+    transform = capture.world_transform
+    steps = 30_000 if splat.step is None else splat.step + 1
+    held_out = capture.test_views(splat.config.test_every)
+    with folder_atomically(out, overwrite) as folder:
+        params = to_capture_frame(splat.params, transform)
+        save_ply(folder / "point_cloud" / f"iteration_{steps}" / "point_cloud.ply", params, splat.config.antialiased)
+        cameras = [_camera(i, view, transform, capture.world_scale) for i, view in enumerate(capture.views)]
+        (folder / "cameras.json").write_text(json.dumps(cameras), encoding="utf-8")
+        (folder / "cfg_args").write_text(_cfg_args(splat, out), encoding="utf-8")
+        frames = rendered(splat, splat.config, [ViewTensors.of(view) for view in held_out])
+        for i, (view, frame) in enumerate(zip(held_out, frames, strict=True)):
+            write_png(folder / "test" / f"ours_{steps}" / "renders" / f"{i:05d}.png", frame)
+            write_png(folder / "test" / f"ours_{steps}" / "gt" / f"{i:05d}.png", view.image)
+
+
+def _camera(index: int, view: View, transform: np.ndarray, scale: float) -> dict[str, Any]:
+    """Describe a camera of the capture's own frame: position, camera-to-world rotation, focal lengths."""
+    rotation = (view.viewmat[:3, :3] @ (transform[:3, :3] / scale)).T
+    position = (np.linalg.inv(transform) @ np.append(view.camera_center, 1.0))[:3]
+    return {
+        "id": index,
+        "img_name": Path(view.name).stem,
+        "width": view.width,
+        "height": view.height,
+        "position": position.tolist(),
+        "rotation": rotation.tolist(),
+        "fy": float(view.K[1, 1]),
+        "fx": float(view.K[0, 0]),
+    }
+
+
+def _cfg_args(splat: Splat, out: Path) -> str:
+    """Write the settings as Inria's scripts read them back: the text of an argparse Namespace."""
+    settings = {
+        "data_device": "cpu",
+        "eval": splat.config.test_every > 0,
+        "images": "images",
+        "model_path": str(out),
+        "resolution": splat.config.factor,
+        "sh_degree": splat.sh_degree,
+        "source_path": splat.config.data,
+        "white_background": splat.config.background == (1.0, 1.0, 1.0),
+    }
+    return f"Namespace({', '.join(f'{name}={value!r}' for name, value in settings.items())})"

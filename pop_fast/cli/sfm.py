@@ -1,0 +1,58 @@
+"""`pop sfm`: find the cameras of a folder of photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+import tyro
+
+from pop_fast.cli.arguments import parse
+from pop_fast.cli.progress import bars
+from pop_fast.data import run_sfm
+
+_EXAMPLES: Final = """
+    pop sfm photos                 writes photos/sparse/0
+    pop sfm photos --out scene     a new capture, with copies of the photographs
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Find the cameras and sparse points of a folder of photographs (structure from motion, pycolmap, on the CPU)."""
+
+    photos: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTOS")]
+    """The folder with the photographs."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Make a capture here; without it, sparse/0 is written beside the photographs."""
+    max_size: int = 1600
+    """Longest side at which features are looked for, px."""
+    camera_model: str = "SIMPLE_RADIAL"
+    """COLMAP's name of the lens model."""
+    seed: int = 0
+    """Of every random choice."""
+    overwrite: bool = False
+    """Replace an existing result."""
+
+
+def run(argv: Sequence[str]) -> int:
+    """Run the subcommand."""
+    args = parse(Args, argv, "sfm", examples=_EXAMPLES)
+    with bars() as progress:
+        found = run_sfm(
+            args.photos,
+            args.out,
+            progress,
+            max_size=args.max_size,
+            camera_model=args.camera_model,
+            seed=args.seed,
+            overwrite=args.overwrite,
+        )
+    print(
+        f"{found.registered} of {found.photographs} photographs placed, {found.points:,} points, "
+        f"mean reprojection error {found.reprojection_error:.2f} px -> {found.capture}"
+    )
+    print(f"next: pop train {found.capture}")
+    return 0

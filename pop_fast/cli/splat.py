@@ -1,0 +1,190 @@
+"""What `pop eval`, `render` and `export` start from: a result folder, a checkpoint or a PLY, and the capture it shows."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+import tyro
+from torch import Tensor
+
+from pop_fast.cli.progress import bars
+from pop_fast.data import Capture, load_capture
+from pop_fast.errors import PopError
+from pop_fast.io.atomic import write_atomically
+from pop_fast.io.ply import is_antialiased, load_ply
+from pop_fast.train.checkpoint import list_checkpoints
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.model import KEYS, first_non_finite
+from pop_fast.train.schedule import active_sh_degree
+
+_RECORD = "capture.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Splat:
+    """Gaussians and what is known about them.
+
+    Attributes:
+        path: the checkpoint or PLY that was read.
+        params: raw parameters.
+        config: the settings they were trained with; the defaults for a lone file.
+        step: the last step taken, from 0; None for a lone PLY.
+        folder: the result folder it belongs to, if any.
+    """
+
+    path: Path
+    params: dict[str, Tensor]
+    config: TrainConfig
+    step: int | None = None
+    folder: Path | None = None
+
+    @property
+    def sh_degree(self) -> int:
+        """The highest colour band to draw: all that the file has, or those that were active at its step."""
+        degree = {0: 0, 3: 1, 8: 2, 15: 3}[self.params["shN"].shape[1]]
+        if self.step is None or self.folder is None:
+            return degree
+        return active_sh_degree(self.step, self.config.resolved().sh_interval, degree)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureOptions:
+    """Which photographs and cameras to use; what is not given is as in training."""
+
+    capture: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """The capture; by default the one it was trained on."""
+    factor: int | None = None
+    """Photographs are shrunk by it."""
+    test_every: int | None = None
+    """Every n-th view by file name is held out."""
+    images: str | None = None
+    """Read the photographs from this folder of the capture."""
+    missing: Literal["error", "skip"] | None = None
+    """What to do about photographs that are listed but absent."""
+    own_frame: bool = False
+    """The splat is in the capture's own world frame (Inria's trainer, 'pop export'), not in the training frame."""
+
+
+@dataclass(frozen=True)
+class CaptureRecord:
+    """What `pop train` leaves in capture.json: how the capture was read, and its training frame."""
+
+    images: str | None = None
+    missing: Literal["error", "skip"] = "error"
+    masks: bool = True
+    source: Literal["auto", "colmap", "transforms", "photos"] = "auto"
+    world_transform: list[list[float]] = field(default_factory=lambda: np.eye(4).tolist())
+
+
+def write_record(folder: Path, record: CaptureRecord) -> None:
+    """Write capture.json into a result folder."""
+    text = json.dumps(asdict(record), indent=2) + "\n"
+    write_atomically(folder / _RECORD, lambda file: file.write(text.encode()))
+
+
+def read_record(folder: Path | None) -> CaptureRecord | None:
+    """Read capture.json, or None where there is none."""
+    path = folder / _RECORD if folder else None
+    if path is None or not path.is_file():
+        return None
+    try:
+        return CaptureRecord(**json.loads(path.read_text(encoding="utf-8")))
+    except (json.JSONDecodeError, TypeError) as error:
+        raise PopError(f"{path}: is not what 'pop train' writes ({error}); remove it and give --capture DIR") from error
+
+
+def load_splat(path: Path) -> Splat:
+    """Read a result folder (its last checkpoint), a checkpoint (ours or gsplat's) or a PLY.
+
+    Raises:
+        PopError: none of these, or damaged.
+    """
+    if path.is_dir():
+        return _from_folder(path)
+    if not path.exists():
+        raise PopError(f"{path}: no such file or folder; give a result folder, a checkpoint (.pt) or a PLY")
+    folder = path.resolve().parent.parent
+    owner = folder if (folder / "cfg.json").is_file() else None
+    config = _config(owner) if owner else TrainConfig()
+    if path.suffix == ".ply":
+        config = replace(config, antialiased=is_antialiased(path))
+        return Splat(path=path, params=load_ply(path), config=config, folder=owner)
+    if path.suffix == ".pt":
+        params, step = _read_checkpoint(path)
+        return Splat(path=path, params=params, config=config, step=step, folder=owner)
+    raise PopError(f"{path}: is neither a result folder nor a checkpoint (.pt) nor a .ply")
+
+
+def _from_folder(folder: Path) -> Splat:
+    config = _config(folder)
+    checkpoints = list_checkpoints(folder)
+    if checkpoints:
+        params, step = _read_checkpoint(checkpoints[-1][1])
+        return Splat(path=checkpoints[-1][1], params=params, config=config, step=step, folder=folder)
+    plys = sorted((folder / "ply").glob("point_cloud_*.ply"), key=lambda p: (len(p.name), p.name))
+    if not plys:
+        raise PopError(f"{folder}: holds no checkpoint and no PLY yet; train longer, or continue with --resume")
+    return Splat(path=plys[-1], params=load_ply(plys[-1]), config=config, folder=folder)
+
+
+def _config(folder: Path) -> TrainConfig:
+    path = folder / "cfg.json"
+    if not path.is_file():
+        raise PopError(f"{folder}: has no cfg.json, so it is not a result of 'pop train'")
+    return TrainConfig.from_json(path.read_text(encoding="utf-8"))
+
+
+def _read_checkpoint(path: Path) -> tuple[dict[str, Tensor], int | None]:
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise PopError(f"{path}: cannot be read as a checkpoint; copy it again, or use another one") from error
+    splats = content.get("splats") if isinstance(content, dict) else None
+    absent = [key for key in KEYS if not isinstance(splats, dict) or key not in splats]
+    if absent:
+        raise PopError(f"{path}: has no splats.{absent[0]}, so it is no checkpoint of 'pop train' or gsplat")
+    params = {key: splats[key].detach().float() for key in KEYS}
+    bad = first_non_finite(params)
+    if bad:
+        raise PopError(f"{path}: splats.{bad[0]}{bad[1]} is {bad[2]}; every entry must be finite: use an earlier one")
+    step = content.get("step")
+    return params, step if isinstance(step, int) else None
+
+
+def open_capture(splat: Splat, options: CaptureOptions) -> tuple[Capture, TrainConfig]:
+    """Load the capture that a splat shows, and give the settings to look at it with.
+
+    Raises:
+        PopError: no capture is known, or it cannot be read.
+    """
+    record = read_record(splat.folder) or CaptureRecord()
+    data = str(options.capture or splat.config.data)
+    if not data:
+        raise PopError(f"{splat.path}: nothing says which capture it shows; give --capture DIR")
+    changes: dict[str, Any] = {"data": data}
+    if options.factor is not None:
+        changes["factor"] = options.factor
+    if options.test_every is not None:
+        changes["test_every"] = options.test_every
+    if options.own_frame:
+        changes["normalize"] = False
+    config = replace(splat.config, **changes)
+    with bars() as progress:
+        capture = load_capture(
+            data,
+            factor=config.factor,
+            normalize=config.normalize,
+            masks=record.masks,
+            missing=options.missing or record.missing,
+            background=config.background,
+            progress=progress,
+            source=record.source if options.capture is None else "auto",
+            images=options.images or record.images,
+            seed=config.seed,
+        )
+    return capture, config

@@ -1,0 +1,212 @@
+"""`pop train`: fit a splat to a capture or a folder of photographs."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import typing
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+import tyro
+
+from pop_fast.cli.arguments import parse
+from pop_fast.cli.progress import bars
+from pop_fast.cli.splat import CaptureRecord, write_record
+from pop_fast.data import Capture, load_capture
+from pop_fast.errors import PopError
+from pop_fast.report import write_report
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.trainer import Trainer
+
+_EXAMPLES: Final = """
+    pop train scene                          POP, the paper's 30,000 steps, results in out/scene_pop
+    pop train scene --preset quick           a tenth of the schedule, for a CPU
+    pop train photos --factor 4              a bare folder of photographs: cameras are found first
+    pop train scene --method adc             plain density control with opacity reset
+    pop train scene --out out/a --resume     go on from the last checkpoint
+    pop train scene --pop.lambda-pop 0.01    any setting; --help-all lists them all
+"""
+
+# settings that --help shows; --help-all shows the rest
+_SHOWN: Final = frozenset(
+    "data result_dir method preset steps_scaler max_steps factor test_every seed backend profile antialiased background "
+    "lpips_vgg lpips_alex".split()
+)
+# words of other trainers' command lines: Inria's, gsplat's
+_ALIASES: Final = {
+    **dict.fromkeys(("-s", "--source-path", "--data-dir", "--data"), "DATA"),
+    **dict.fromkeys(("-m", "--model-path", "--result-dir", "-o"), "--out"),
+    "--data-factor": "--factor",
+}
+_IGNORED: Final = frozenset({"--eval"})  # Inria: hold out every 8th view; here the default (--test-every 0 holds none)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Run:
+    """Fit a splat to a capture or a folder of photographs.
+
+    DATA is a folder with a COLMAP model (sparse/0), with transforms.json, or with photographs alone.
+
+    Attributes:
+        resume: go on from the last checkpoint in the output folder, to the same bits as without the interruption.
+        overwrite: replace the results in the output folder.
+        missing: what to do about photographs that are listed but absent.
+        images: read the photographs from this folder of the capture.
+        ignore_masks: do not use the capture's masks (where white means keep).
+        source: where cameras come from; "auto" takes the first that is there.
+        quiet: show no progress bars.
+    """
+
+    resume: bool = False
+    overwrite: bool = False
+    missing: Literal["error", "skip"] = "error"
+    images: str | None = None
+    ignore_masks: bool = False
+    source: Literal["auto", "colmap", "transforms", "photos"] = "auto"
+    quiet: bool = False
+
+
+def run(argv: Sequence[str]) -> int:
+    """Run the subcommand."""
+    config, options = arguments(argv)
+    folder = Path(config.result_dir)
+    check_output(folder, options)
+    capture = open_capture(config, options)
+    for note in capture.notes:
+        print(f"note: {note}")
+    print(f"{capture.name}: {capture.source}; {_plan(config)}")
+    trainer = Trainer(config, capture, resume=options.resume, overwrite=options.overwrite)
+    try:
+        stats = trainer.run()
+    except KeyboardInterrupt:
+        print(f"pop: stopped after step {trainer.step}; the same command with --resume goes on", file=sys.stderr)
+        return 130
+    finally:
+        if (folder / "cfg.json").is_file():
+            write_record(folder, _record(capture, options))
+    report = write_report(folder)
+    print(summary(stats))
+    print(f"report: {report}")
+    return 0
+
+
+def arguments(argv: Sequence[str]) -> tuple[TrainConfig, Any]:
+    """Read the words after `pop train` into settings of the run and of what surrounds it.
+
+    Raises:
+        PopError: a setting is out of range.
+    """
+    words = rename_aliases(argv)
+    in_full = "--help-all" in words
+    words = ["--help" if word == "--help-all" else word for word in words]
+    args = parse(_arguments_type(in_full), words, "train", examples=_EXAMPLES)
+    settings = {field.name: getattr(args, field.name) for field in dataclasses.fields(TrainConfig)}
+    config = TrainConfig(**settings)
+    if args.quiet:
+        config = dataclasses.replace(config, progress=False)
+    if not config.result_dir:
+        config = dataclasses.replace(config, result_dir=f"out/{Path(config.data).resolve().name}_{config.method}")
+    return config, args
+
+
+def rename_aliases(argv: Sequence[str]) -> list[str]:
+    """Turn options of Inria's and gsplat's trainers into ours: `-s DIR` into `DIR`, `-m DIR` into `--out DIR`, ..."""
+    words: list[str] = []
+    rest = list(argv)
+    while rest:
+        word = rest.pop(0)
+        name, equals, value = word.partition("=")
+        name = name.replace("_", "-") if name.startswith("--") else name
+        target = _ALIASES.get(name)
+        if name in _IGNORED:
+            continue
+        if target == "DATA":
+            words += [value] if equals else []
+        else:
+            words += [target or name, value] if equals else [target or word]
+    return words
+
+
+def _arguments_type(in_full: bool) -> type:
+    """Make the class that tyro reads: every setting of `TrainConfig`, those for experts hidden unless `in_full`."""
+    hints = typing.get_type_hints(TrainConfig)
+    columns: list[Any] = []
+    for field in dataclasses.fields(TrainConfig):
+        kind = hints[field.name]
+        default: Any = dataclasses.field(default_factory=lambda field=field: _default(field))
+        if field.name == "data":
+            kind, default = Annotated[kind, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")], dataclasses.field()
+        elif field.name == "result_dir":
+            note, value = "where the run writes", "(default: out/<data>_<method>)"
+            kind = Annotated[kind, tyro.conf.arg(name="out", metavar="DIR", help=note, help_behavior_hint=value)]
+            default = ""
+        elif not in_full and field.name not in _SHOWN:
+            kind = Annotated[kind, tyro.conf.Suppress]
+        columns.append((field.name, kind, default))
+    documented = f"{_Run.__doc__}{(TrainConfig.__doc__ or '').partition('Attributes:')[2]}"
+    return dataclasses.make_dataclass(
+        "TrainArguments", columns, bases=(_Run,), frozen=True, kw_only=True, namespace={"__doc__": documented}
+    )
+
+
+def _default(field: dataclasses.Field[Any]) -> Any:
+    return field.default_factory() if field.default is dataclasses.MISSING else field.default  # type: ignore[misc]
+
+
+def check_output(folder: Path, options: Any) -> None:
+    """Refuse an output folder that is in use before the minutes of loading, not after.
+
+    Raises:
+        PopError: the folder exists, holds something, and neither --resume nor --overwrite was given.
+    """
+    if options.resume and options.overwrite:
+        raise PopError("--resume and --overwrite exclude each other; choose one")
+    if folder.is_dir() and any(folder.iterdir()) and not (options.resume or options.overwrite):
+        raise PopError(f"{folder}: exists and is not empty; pass --resume, --overwrite or another --out")
+
+
+def open_capture(config: TrainConfig, options: Any) -> Capture:
+    """Load the capture that a config names, with progress; finds the cameras of bare photographs first."""
+    with bars(config.progress) as progress:
+        return load_capture(
+            config.data,
+            factor=config.factor,
+            normalize=config.normalize,
+            masks=not options.ignore_masks,
+            missing=options.missing,
+            background=config.background,
+            progress=progress,
+            source=options.source,
+            images=options.images,
+            sfm=True,
+            seed=config.seed,
+        )
+
+
+def _record(capture: Capture, options: Any) -> CaptureRecord:
+    return CaptureRecord(
+        images=options.images,
+        missing=options.missing,
+        masks=not options.ignore_masks,
+        source=options.source,
+        world_transform=capture.world_transform.tolist(),
+    )
+
+
+def _plan(config: TrainConfig) -> str:
+    run = config.resolved()
+    return f"{config.method}, {run.max_steps:,} steps, seed {config.seed} -> {config.result_dir}"
+
+
+def summary(stats: dict[str, Any]) -> str:
+    """Say in one line how a run ended."""
+    parts: list[str] = []
+    if stats.get("psnr") is not None:
+        parts += [f"PSNR {stats['psnr']:.2f} dB", f"SSIM {stats['ssim']:.4f}"]
+    if stats.get("lpips") is not None:
+        parts.append(f"LPIPS {stats['lpips']:.4f} ({stats['lpips_net']})")
+    parts.append(f"{stats['num_GS']:,} Gaussians ({stats['num_GS_above_floor']:,} with opacity >= 1/255)")
+    parts.append(f"{stats['seconds']:.0f} s")
+    return ", ".join(parts)
