@@ -80,4 +80,4 @@ def _kron_square(viewmat: Tensor) -> Tensor:
 
 def _flat_product(matrix: Tensor, covars: Tensor) -> Tensor:
     flat = torch.stack(columns(covars))
-    return (matrix @ flat).reshape(3, 3, -1).permute(2, 0, 1)
+    return (matrix @ flat).reshape(3, 3, len(covars)).permute(2, 0, 1)

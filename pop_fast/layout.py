@@ -21,5 +21,5 @@ def columns(tensor: Tensor) -> tuple[Tensor, ...]:
 
 def from_columns(components: Sequence[Tensor], shape: tuple[int, ...]) -> Tensor:
     """Return [N, *shape] from its components ([N] each, the last axis fastest)."""
-    stacked = torch.stack(tuple(components)).reshape(*shape, -1)
+    stacked = torch.stack(tuple(components)).reshape(*shape, len(components[0]))
     return stacked.permute(stacked.dim() - 1, *range(stacked.dim() - 1))

@@ -204,7 +204,7 @@ class Frame:
         image = blend.image
         n_plain = image.shape[-1] - (self.render_mode != "RGB")
         if backgrounds is not None and n_plain > 0:
-            background = backgrounds.reshape(len(self.scene.viewmats), -1)[i]
+            background = backgrounds.reshape(len(self.scene.viewmats), n_plain)[i]
             behind = (1.0 - blend.alphas)[..., None] * background
             image = torch.cat((image[..., :n_plain] + behind, image[..., n_plain:]), -1)
         if self.render_mode.endswith("ED"):

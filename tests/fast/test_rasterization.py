@@ -147,11 +147,12 @@ def test_instruments_read_later_equal_instruments_asked_for(eager: bool) -> None
     given = scene()
     _, _, meta = rasterization(**given, **cameras(2), dominance=eager, counts=eager)
     _, _, other = rasterization(**given, **cameras(2), dominance=not eager, counts=not eager)
-    for key in ("dominant_ids", "dominant_weights", "dominant_counts", "n_contrib", "n_traversed"):
+    for key in ("dominant_ids", "dominant_counts", "n_contrib", "n_traversed"):
         assert torch.equal(meta[key], other[key]), key
-    assert torch.equal(
-        meta["dominant_counts"].sum(1) + (meta["dominant_ids"] < 0).sum((1, 2)), torch.tensor([378, 378])
-    )
+    # counting blends in the tiles that were asked for, which rounds differently
+    torch.testing.assert_close(meta["dominant_weights"], other["dominant_weights"], rtol=1e-12, atol=1e-14)
+    pixels = meta["dominant_counts"].sum(1) + (meta["dominant_ids"] < 0).sum((1, 2))
+    assert pixels.tolist() == [WIDTH * HEIGHT] * 2
 
 
 def _gradients(budget: int, monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
