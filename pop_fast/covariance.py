@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pop_fast.layout import columns, from_columns
+from pop_fast.layout import columns, from_columns, sum_of_products
 
 
 def rotmats_from_quats(quats: Tensor) -> Tensor:
@@ -51,14 +51,6 @@ def covars_from_quats_scales_vjp(quats: Tensor, scales: Tensor, v_covars: Tensor
     v_r = tuple(v_m[i][j] * s[j] for i in range(3) for j in range(3))
     v_scales = [sum_of_products((r[j], r[3 + j], r[6 + j]), (v_m[0][j], v_m[1][j], v_m[2][j])) for j in range(3)]
     return _quats_vjp(unit, norms, v_r), from_columns(v_scales, (3,))
-
-
-def sum_of_products(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> Tensor:
-    """Return a[0] b[0] + a[1] b[1] + ... of component rows."""
-    total = a[0] * b[0]
-    for x, y in zip(a[1:], b[1:], strict=True):
-        total = torch.addcmul(total, x, y)
-    return total
 
 
 def _unit_columns(quats: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
