@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from pop_ref.constants import Profile
 from pop_ref.magnitudes import Magnitudes, Rounded, constant, distance
-from pop_ref.tiles import grid_size, tile_rects
+from pop_ref.tiles import grid_size, tile_span
 
 Rect = tuple[int, int, int, int]
 
@@ -131,7 +129,7 @@ def _overlap(axis: _Axis, profile: Profile) -> float:
 
 
 def _rect(m: Magnitudes, radii: list[int], width: int, height: int, profile: Profile) -> Rect:
-    center = np.array([[m.mean2d[0].value, m.mean2d[1].value]])
-    rect = tile_rects(center, np.array([radii], dtype=np.int64), width, height, profile.tile_size, profile)
-    x0, y0, x1, y1 = rect[0].tolist()
+    tiles_x, tiles_y = grid_size(width, height, profile.tile_size)
+    x0, x1 = tile_span(m.mean2d[0].value, radii[0], tiles_x, profile.tile_size, profile)
+    y0, y1 = tile_span(m.mean2d[1].value, radii[1], tiles_y, profile.tile_size, profile)
     return x0, y0, x1, y1

@@ -40,6 +40,39 @@ def grid_size(width: int, height: int, tile_size: int) -> tuple[int, int]:
     return -(-width // tile_size), -(-height // tile_size)
 
 
+def tile_span(center: float, radius: int, n_tiles: int, tile_size: int, profile: Profile = PAPER) -> tuple[int, int]:
+    """Find the tiles that an extent overlaps along one axis (D3).
+
+    `floor((u - r) / t)` to `ceil((u + r) / t)`, clipped to the grid. In "square" extents, with the centre in index
+    space p = u - 0.5: `trunc((p - r) / t)` to `trunc((p + r + t - 1) / t)`.
+
+    Source: gsplat v1.5 ("opacity_aware"); diff-gaussian-rasterization ("square").
+    Departs: nothing.
+
+    Args:
+        center: screen centre along the axis, px.
+        radius: extent along the axis, px.
+        n_tiles: tiles along the axis.
+        tile_size: px.
+        profile: the kind of extent.
+
+    Returns:
+        First tile, and one past the last.
+
+    Example:
+        >>> tile_span(8.0, 4, 4, 4)
+        (1, 3)
+    """
+    if profile.extent == "square":
+        index = center - 0.5
+        first = int((index - radius) / tile_size)
+        last = int((index + radius + tile_size - 1) / tile_size)
+    else:
+        first = math.floor((center - radius) / tile_size)
+        last = math.ceil((center + radius) / tile_size)
+    return min(max(first, 0), n_tiles), min(max(last, 0), n_tiles)
+
+
 def tile_rects(
     means2d: Float64[np.ndarray, "N 2"],
     radii: Int64[np.ndarray, "N 2"],
@@ -50,8 +83,7 @@ def tile_rects(
 ) -> Int64[np.ndarray, "N 4"]:
     """Find the rectangle of tiles that each splat's extent overlaps (D3).
 
-    `x0 = floor((u - r) / t)`, `x1 = ceil((u + r) / t)`, clipped to the grid; y likewise. In "square" extents, with the
-    centre in index space p = u - 0.5: `x0 = trunc((p - r) / t)`, `x1 = trunc((p + r + t - 1) / t)`.
+    `tile_span` along x and along y.
 
     Source: gsplat v1.5 ("opacity_aware"); diff-gaussian-rasterization ("square").
     Departs: nothing.
@@ -76,8 +108,8 @@ def tile_rects(
     for i in range(len(means2d)):
         (u, v), (r_x, r_y) = means2d[i].tolist(), radii[i].tolist()
         if r_x > 0 and r_y > 0:
-            x0, x1 = _tile_span(u, r_x, tiles_x, tile_size, profile)
-            y0, y1 = _tile_span(v, r_y, tiles_y, tile_size, profile)
+            x0, x1 = tile_span(u, r_x, tiles_x, tile_size, profile)
+            y0, y1 = tile_span(v, r_y, tiles_y, tile_size, profile)
             rects[i] = x0, y0, x1, y1
     return rects
 
@@ -124,14 +156,3 @@ def tile_lists(
             for x in range(x0, x1):
                 lists[y * tiles_x + x].append(i)
     return lists
-
-
-def _tile_span(center: float, radius: int, n_tiles: int, tile_size: int, profile: Profile) -> tuple[int, int]:
-    if profile.extent == "square":
-        index = center - 0.5
-        first = int((index - radius) / tile_size)
-        last = int((index + radius + tile_size - 1) / tile_size)
-    else:
-        first = math.floor((center - radius) / tile_size)
-        last = math.ceil((center + radius) / tile_size)
-    return min(max(first, 0), n_tiles), min(max(last, 0), n_tiles)

@@ -84,10 +84,10 @@ def dyadic_camera(width: int, height: int) -> Camera:
 
 
 def grey(opacities: list[float], means: list[list[float]] | None = None, scale: float = 1.0) -> Gaussians:
-    """Make isotropic grey Gaussians, by default on the centre of `dyadic_camera`'s pixel (W/2, H/2)."""
+    """Make isotropic grey Gaussians, by default on the centre of the middle pixel of an odd-sized image."""
     n = len(opacities)
     return Gaussians(
-        means=np.array(means if means is not None else [[0.5, 0.5, 4.0]] * n).reshape(n, 3),
+        means=np.array(means if means is not None else [[0.0, 0.0, 4.0]] * n).reshape(n, 3),
         quats=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
         scales=np.full((n, 3), scale),
         opacities=np.array(opacities, dtype=np.float64),

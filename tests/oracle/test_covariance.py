@@ -9,8 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from pop_ref import covariance
 
-quat_lists = st.lists(st.floats(-4.0, 4.0), min_size=4, max_size=4).filter(lambda q: max(map(abs, q)) > 1e-2)
-scale_lists = st.lists(st.floats(0.0, 8.0), min_size=3, max_size=3)
+# multiples of 1/1024, so that no square underflows where bits are compared
+lattice = st.integers(-4096, 4096).map(lambda k: k / 1024.0)
+quat_lists = st.lists(lattice, min_size=4, max_size=4).filter(any)
+scale_lists = st.lists(lattice.map(abs), min_size=3, max_size=3)
 
 
 @given(quat_lists)

@@ -1,0 +1,223 @@
+"""Margins: each decision aimed at in turn, and sound against float32."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pop_ref import INRIA, PAPER, Gaussians, margins, render
+from pop_ref.magnitudes import Rounded, splat_magnitudes
+from pop_ref.splatting import geometry
+from tests.oracle.dense import dense_render
+from tests.oracle.scenes import camera, dyadic_camera, grey, random_gaussians, tilted_camera
+
+EPS32 = 2.0**-24
+TINY = 1e-9
+
+
+def test_d1_is_near_for_a_gaussian_next_to_the_near_plane() -> None:
+    for side in (-1.0, 1.0):
+        z = PAPER.near_plane * (1.0 + side * TINY)
+        got = margins(grey([0.5], means=[[0.003, 0.0, z]]), dyadic_camera(3, 3))
+        assert got.gaussians["D1"][0] < 10.0 * TINY
+        assert got.nearest is not None
+        assert got.nearest.decision == "D1"
+        assert got.nearest.where == (0,)
+        # whether it is there or not, it would cover every pixel
+        assert not np.any(got.safe_pixels(1e-7))
+
+
+def test_d2_is_near_for_an_opacity_next_to_the_floor() -> None:
+    got = margins(grey([PAPER.alpha_floor * (1.0 + TINY)]), dyadic_camera(3, 3))
+    assert got.gaussians["D2"][0] < 10.0 * TINY
+    assert not got.safe_gaussians(1e-7)[0]
+
+
+def test_d2_is_near_for_an_extent_next_to_an_integer() -> None:
+    # r = k sqrt(s^2 + 0.3) with k = sqrt(2 ln 255)
+    k = math.sqrt(2.0 * math.log(255.0))
+    scale = math.sqrt((8.0 / k) ** 2 - 0.3)
+    for side, radius in ((-1.0, 8), (1.0, 9)):
+        gaussians, view = grey([1.0], scale=scale * (1.0 + side * TINY)), dyadic_camera(5, 5)
+        assert render(gaussians, view).splats.radii[0].tolist() == [radius, radius]
+        got = margins(gaussians, view)
+        assert got.gaussians["D2"][0] < 10.0 * TINY
+        # but no pixel of so small an image can tell
+        assert np.all(got.safe_pixels(1e-7))
+
+
+def test_d2_is_near_for_a_splat_that_only_just_reaches_the_image() -> None:
+    gaussians = grey([1.0], means=[[-2.5 - 2.0 - TINY, 0.0, 4.0]], scale=0.0)
+    view = dyadic_camera(5, 5)
+    assert not render(gaussians, view).splats.visible[0]
+    got = margins(gaussians, view)
+    assert got.gaussians["D2"][0] < 1e-7
+    assert margins(grey([1.0], means=[[-60.0, 0.0, 4.0]], scale=0.0), view).gaussians["D2"][0] > 1e-2
+
+
+def test_d3_is_near_for_an_extent_that_ends_at_a_tile_s_edge() -> None:
+    # the middle at 8 + 2 + tiny, extent 2: the left edge next to the tile edge at 8
+    gaussians, view = grey([1.0], means=[[2.0 + TINY, 0.0, 4.0]], scale=0.0), dyadic_camera(16, 16)
+    assert render(gaussians, view, tile_size=8).splats.radii[0].tolist() == [2, 2]
+    got = margins(gaussians, view, tile_size=8)
+    assert got.gaussians["D3"][0] < 1e-7
+    unsafe = ~got.safe_pixels(1e-7)
+    assert np.all(unsafe[:, :8])
+    assert not np.any(unsafe[:, 8:])
+    assert np.all(got.safe_pixels(1e-7, decisions=("D4", "D5", "D6", "D7", "D8")))
+
+
+def test_d4_is_near_for_depths_that_almost_tie() -> None:
+    means = [[0.1, 0.0, 4.1], [0.0, 0.1, 4.1 + TINY], [0.0, 0.0, 8.3]]
+    got = margins(grey([0.5, 0.5, 0.5], means=means), tilted_camera())
+    near = [doubt for doubt in got.near if doubt.decision == "D4"]
+    assert got.gaussians["D4"][2] > 1e-3
+    assert len({frozenset(doubt.where) for doubt in near}) <= 1
+
+
+def test_d4_is_infinite_for_coincident_copies_and_for_exact_ties() -> None:
+    means = [[0.1, 0.0, 4.1]] * 2
+    assert math.isinf(margins(grey([0.5, 0.5], means=means), tilted_camera()).gaussians["D4"][0])
+    means = [[0.5, 0.0, 4.0], [0.0, 0.25, 4.0]]
+    assert math.isinf(margins(grey([0.5, 0.5], means=means), dyadic_camera(3, 3)).gaussians["D4"][0])
+
+
+def test_d4_is_zero_for_a_tie_of_different_centres_that_rounding_may_break() -> None:
+    means = [[0.1, 0.0, 4.1], [0.0, 0.1, 4.1]]
+    rolled = tilted_camera().viewmat
+    rolled[:3, :3] = [[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]]
+    view = replace(camera(), viewmat=rolled)
+    assert margins(grey([0.5, 0.5], means=means), view).gaussians["D4"][0] == 0.0
+
+
+def test_d5_is_near_where_alpha_is_next_to_the_floor() -> None:
+    # isotropic with variance 1 + 0.3: alpha = o exp(-d^2 / 2.6) at d = 1
+    opacity = PAPER.alpha_floor * math.exp(1.0 / 2.6) * (1.0 + TINY)
+    got = margins(grey([opacity]), dyadic_camera(3, 3))
+    assert got.pixels["D5"][1, 0] < 1e-7
+    assert got.pixels["D5"][1, 1] > 1e-3
+    aimed = [doubt.where for doubt in got.doubts(1e-7) if doubt.decision == "D5"]
+    assert aimed == [(1, 0, 0), (0, 1, 0), (2, 1, 0), (1, 2, 0)] or sorted(aimed) == [
+        (0, 1, 0),
+        (1, 0, 0),
+        (1, 2, 0),
+        (2, 1, 0),
+    ]
+    assert np.argwhere(~got.safe_pixels(1e-7)).tolist() == [[0, 1], [1, 0], [1, 2], [2, 1]]
+
+
+def test_d6_is_near_where_alpha_is_next_to_the_ceiling() -> None:
+    got = margins(grey([PAPER.alpha_ceiling * (1.0 - TINY)]), dyadic_camera(3, 3))
+    assert got.pixels["D6"][1, 1] < 1e-7
+    assert got.pixels["D6"][0, 1] > 1e-3
+
+
+def test_d7_is_near_where_the_next_transmittance_is_the_stop() -> None:
+    # 1e-3 is left behind the first, a tenth of it behind the second
+    got = margins(grey([1.0, 0.9]), dyadic_camera(1, 1))
+    assert got.pixels["D7"][0, 0] < 1e-7
+    assert [d.where for d in got.doubts(1e-7)] == [(0, 0, 1)]
+    assert margins(grey([1.0, 0.8]), dyadic_camera(1, 1)).pixels["D7"][0, 0] > 1e-4
+
+
+def test_d8_is_near_where_two_weights_almost_tie() -> None:
+    # 1/3 in front, then half of the 2/3 that are left
+    got = margins(grey([1.0 / 3.0 + TINY, 0.5]), dyadic_camera(1, 1))
+    assert got.pixels["D8"][0, 0] < 1e-7
+    assert [(d.decision, d.where) for d in got.doubts(1e-7)] == [("D8", (0, 0, 0, 1))]
+    assert math.isinf(margins(grey([0.5]), dyadic_camera(1, 1)).pixels["D8"][0, 0])
+
+
+def test_b1_and_b2_are_near_at_their_kinks() -> None:
+    view = camera()
+    limit = (view.width - view.K[0, 2]) / view.K[0, 0] + 0.3 * 0.5 * view.width / view.K[0, 0]
+    gaussians = grey([1.0], means=[[4.0 * limit * (1.0 + TINY), 0.0, 4.0]], scale=2.0)
+    assert margins(gaussians, view).gaussians["B1"][0] < 1e-7
+    dark = replace(gaussians, sh=np.full((1, 1, 3), -0.5 * math.sqrt(4.0 * math.pi) + TINY))
+    assert margins(dark, view).gaussians["B2"][0] < 1e-7
+    assert margins(gaussians, view).gaussians["B2"][0] > 1e-2
+
+
+def test_an_empty_scene_has_no_doubts() -> None:
+    got = margins(Gaussians([], [], [], [], []), camera())
+    assert got.nearest is None
+    assert np.all(got.safe_pixels(1.0))
+    assert got.safe_gaussians(1.0).shape == (0,)
+
+
+def test_values_under_error_analysis_are_those_of_the_stages() -> None:
+    gaussians, view = random_gaussians(1), tilted_camera()
+    shape = geometry(gaussians, view, antialiased=True)
+    splats = render(gaussians, view, antialiased=True).splats
+    for i in range(len(gaussians)):
+        m = splat_magnitudes(gaussians, i, view, antialiased=True)
+        np.testing.assert_allclose(m.depth.value, splats.depths[i], rtol=1e-13)
+        np.testing.assert_allclose([b.value for b in m.blurred], shape.blurred[i].ravel()[[0, 1, 3]], rtol=1e-11)
+        np.testing.assert_allclose(m.opacity.value, shape.opacities[i], rtol=1e-11)
+        if splats.visible[i]:
+            np.testing.assert_allclose([u.value for u in m.mean2d], splats.means2d[i], rtol=1e-12)
+            np.testing.assert_allclose([q.value for q in m.conic], splats.conics[i], rtol=1e-10)
+
+
+@given(st.floats(-8.0, 8.0, width=32), st.floats(0.125, 8.0, width=32), st.floats(-8.0, 8.0, width=32))
+def test_rounded_numbers_bound_the_rounding_of_float32(x: float, y: float, z: float) -> None:
+    a, b, c = Rounded(x), Rounded(y), Rounded(z)
+    bound = (a * b + c) / b - c * (b + a * a).sqrt()
+    f = [np.float32(v) for v in (x, y, z)]
+    got = (f[0] * f[1] + f[2]) / f[1] - f[2] * np.sqrt(f[1] + f[0] * f[0])
+    assert abs(float(got) - bound.value) <= bound.error * EPS32 * 1.01 + 1e-40
+
+
+def _float32_inputs(gaussians: Gaussians) -> Gaussians:
+    exact = {name: value.astype(np.float32).astype(np.float64) for name, value in gaussians.__dict__.items()}
+    return Gaussians(**exact)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_float32_agrees_in_every_integer_of_every_safe_pixel(seed: int) -> None:
+    view = tilted_camera(11, 9)
+    view = replace(view, viewmat=view.viewmat.astype(np.float32).astype(np.float64))
+    gaussians = _float32_inputs(random_gaussians(seed, 16, n_sh=1))
+    exact, single = render(gaussians, view), dense_render(gaussians, view, np.zeros(3), PAPER, np.float32)
+    got = margins(gaussians, view)
+    safe, known = got.safe_pixels(EPS32), got.safe_gaussians(EPS32)
+    assert np.mean(safe) > 0.95
+    assert np.mean(known) > 0.9
+    assert np.array_equal(exact.splats.radii[known], single.radii[known])
+    assert np.array_equal(exact.dominant_ids[safe], single.dominant_ids[safe])
+    assert np.array_equal(exact.n_blended[safe], single.n_blended[safe])
+
+
+def test_float32_disagrees_somewhere_when_a_threshold_is_aimed_at_and_only_where_margins_say_so() -> None:
+    view = dyadic_camera(3, 3)
+    flips = 0
+    for k in range(60):
+        scale = 1.0 + k / 64.0
+        opacity = PAPER.alpha_floor * math.exp(0.5 / (scale * scale + 0.3)) * (1.0 + (k % 5 - 2) * 2e-8)
+        gaussians = _float32_inputs(grey([opacity], scale=scale))
+        exact, single = render(gaussians, view), dense_render(gaussians, view, np.zeros(3), PAPER, np.float32)
+        differ = exact.n_blended != single.n_blended
+        safe = margins(gaussians, view).safe_pixels(EPS32)
+        flips += int(np.sum(differ))
+        assert not np.any(differ & safe)
+        assert safe[0, 0]
+    assert flips > 0
+
+
+def test_inria_s_margins_see_its_tile_edges_and_its_square() -> None:
+    view = dyadic_camera(81, 1)
+    assert render(grey([1.0], scale=0.0), view, profile=INRIA).splats.radii.tolist() == [[3, 3]]
+    # p - r at a tile's edge: the screen centre is x + 40.5, and p = x + 40
+    aimed = grey([1.0], means=[[16.0 + 3.0 - 40.0 + TINY, 0.0, 4.0]], scale=0.0)
+    assert margins(aimed, view, profile=INRIA).gaussians["D3"][0] < 1e-7
+    # p + r + t - 1 at a tile's edge
+    aimed = grey([1.0], means=[[64.0 - 15.0 - 3.0 - 40.0 - TINY, 0.0, 4.0]], scale=0.0)
+    assert margins(aimed, view, profile=INRIA).gaussians["D3"][0] < 1e-7
+    away = margins(grey([1.0], means=[[0.75, 0.0, 4.0]], scale=0.0), view, profile=INRIA)
+    assert away.gaussians["D3"][0] > 1e-2
+    assert 1e-3 < away.gaussians["D2"][0] < math.inf
