@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pop_ref.conformance.law import DOMINANCE, GRADIENTS, PROFILES, RENDER
+from pop_ref.conformance.law import DOMINANCE, DOUBLE, GRADIENTS, PROFILES, RENDER
 from pop_ref.conformance.scenes import Scene, rounded_to
 
 STAGE_MODULES = (
@@ -126,7 +126,9 @@ class OracleAdapter:
 
     def has(self, need: str) -> bool:
         """Tell that the oracle can do everything its modules define."""
-        return need in (RENDER, GRADIENTS, DOMINANCE, PROFILES) or stage_function(self.package, need) is not None
+        return (
+            need in (RENDER, GRADIENTS, DOMINANCE, PROFILES, DOUBLE) or stage_function(self.package, need) is not None
+        )
 
     def stage(self, name: str) -> Callable[..., Any]:
         """Return the oracle's function itself."""

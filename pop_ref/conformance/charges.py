@@ -2,7 +2,8 @@
 
 Splats are composited over the whole image at once, front to back, carrying the charges of `screen_charges` into alpha,
 transmittance, weight and colour. On the way every decision whose distance from its threshold is within reach of
-rounding is noted as a doubt: away from doubts integers must match the oracle exactly.
+rounding is noted as a doubt: away from doubts integers must match the oracle exactly. `pop_ref.margins` measures the
+same distances one by one and in its own way; a test holds the two against each other.
 """
 
 from __future__ import annotations
@@ -20,38 +21,98 @@ REACH = 64.0
 
 
 @dataclass
-class PixelCharges:
-    """Charges of one render.
+class Layer:
+    """One splat over the whole image, each entry [H, W] unless it says otherwise.
 
     Attributes:
-        screen: the charges of projection.
-        order: kept splats front to back.
-        image, T_final: charges. [H, W, 3], [H, W]
-        absolute: sum of weights times absolute colours, background included. [H, W, 3]
-        doubtful: some decision of the forward pass at this pixel is within reach of rounding. [H, W]
-        kinked: alpha is within reach of the ceiling, which matters to gradients only (D6). [H, W]
-        dominance: the two largest weights are within reach of each other (D8). [H, W]
-        doubts: label -> mask, of the decisions in `doubtful`. [H, W]
-        reach: eps of the dtype times REACH.
-        layers: per blended splat, what gradients need.
+        id: the splat. scalar
+        dx, dy, e_dx, e_dy: offsets mean - pixel with charges, px.
+        sigma, e_sigma: the exponent.
+        raw, e_raw: opacity times falloff before the ceiling.
+        alpha, e_alpha: after it.
+        taken: at or over the floor, so blended if the light reaches it.
+        doubtful: whether it is taken is within reach of rounding (D1, D2, D5).
+        seen: the pixel had not ended, and its tile lists the splat.
+        blended: taken, seen, and not the end.
+        T, e_T: transmittance before it.
+        T_after: transmittance after it.
     """
 
+    id: int
+    dx: np.ndarray
+    dy: np.ndarray
+    e_dx: np.ndarray
+    e_dy: np.ndarray
+    sigma: np.ndarray
+    e_sigma: np.ndarray
+    raw: np.ndarray
+    e_raw: np.ndarray
+    alpha: np.ndarray
+    e_alpha: np.ndarray
+    taken: np.ndarray
+    doubtful: np.ndarray
+    seen: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    blended: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    T: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    e_T: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    T_after: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass
+class PixelCharges:
+    """Charges and doubts of one render.
+
+    Attributes:
+        scene: what was charged.
+        screen: the charges of projection.
+        layers: splats front to back.
+        reach: eps of the dtype times REACH.
+        image, T_final: charges. [H, W, 3], [H, W]
+        absolute: sum of weights times absolute colours, background included. [H, W, 3]
+        doubts: decision label -> where it is within reach of rounding: D1, D4, D5, D6, D7, D8. [H, W]
+    """
+
+    scene: Scene
     screen: ScreenCharges
-    order: list[int]
+    layers: list[Layer]
+    reach: float
     image: np.ndarray
     T_final: np.ndarray
     absolute: np.ndarray
-    doubtful: np.ndarray
-    kinked: np.ndarray
-    dominance: np.ndarray
     doubts: dict[str, np.ndarray]
-    reach: float
-    layers: list[dict[str, Any]] = field(default_factory=list)
 
     @property
     def certain(self) -> np.ndarray:
-        """Return where every decision of the image is beyond doubt. [H, W]"""
-        return ~self.doubtful
+        """Return where every decision behind the image is clear of rounding. [H, W]"""
+        return ~(self.doubts["D1"] | self.doubts["D4"] | self.doubts["D5"] | self.doubts["D7"])
+
+    @property
+    def smooth(self) -> np.ndarray:
+        """Return where the gradient's decisions are clear too: the ceiling (D6). [H, W]"""
+        return self.certain & ~self.doubts["D6"]
+
+    @property
+    def decided(self) -> np.ndarray:
+        """Return where the dominant splat is clear too (D8). [H, W]"""
+        return self.certain & ~self.doubts["D8"]
+
+    def swappable(self, i: int, j: int) -> bool:
+        """Tell whether rounding could exchange two splats in depth (D4)."""
+        s, means = self.screen, self.scene.gaussians.means
+        band = self.reach * (s.e_depths[i] + s.e_depths[j])
+        # equal centres go through equal arithmetic and tie in any precision: index order decides
+        same = bool(np.all(means[i] == means[j]))
+        return not same and band > 0.0 and abs(s.depths[i] - s.depths[j]) <= band
+
+    def worst_condition(self) -> float:
+        """Return the largest relative charge of a conic; infinite where a determinant's sign is in doubt."""
+        s = self.screen
+        listed = s.kept | s.near
+        flat = np.abs(s.det) <= self.reach * s.e_det
+        relative = np.max(s.e_conics, axis=1, initial=0.0) / np.maximum(
+            np.max(np.abs(s.conics), axis=1, initial=0.0), TINY
+        )
+        return float(np.max(np.where(flat, np.inf, relative)[listed], initial=0.0))
 
 
 @dataclass
@@ -73,26 +134,25 @@ def charge(scene: Scene, dtype: Any, tile_lists: list[list[int]] | None = None) 
         dtype: float32 or float64; decides which decisions are doubtful.
         tile_lists: for profiles whose tile lists are part of the meaning, the oracle's.
     """
-    screen = screen_charges(scene)
-    H, W = scene.camera.height, scene.camera.width
     reach = REACH * float(np.finfo(dtype).eps)
-    none = {label: np.zeros((H, W), dtype=bool) for label in ("D1", "D2", "D4", "D5", "D6", "D7", "D8")}
-    state = _State(*(np.ones((H, W)), np.zeros((H, W)), np.zeros((H, W, 3)), np.zeros((H, W, 3))),
-                   alive=np.ones((H, W), dtype=bool), best=np.zeros((H, W)), e_best=np.zeros((H, W)))  # fmt: skip
-    order = [int(i) for i in np.lexsort((np.arange(len(screen.depths)), screen.depths)) if screen.kept[i]]
+    screen = screen_charges(scene, reach)
+    H, W = scene.camera.height, scene.camera.width
+    doubts = {label: np.zeros((H, W), dtype=bool) for label in ("D1", "D4", "D5", "D6", "D7", "D8")}
+    state = _State(np.ones((H, W)), np.zeros((H, W)), np.zeros((H, W, 3)), np.zeros((H, W, 3)),
+                   np.ones((H, W), dtype=bool), np.zeros((H, W)), np.zeros((H, W)))  # fmt: skip
     layers = []
-    for i in order:
-        listed = _listed(i, scene, tile_lists)
-        layers.append(_blend(i, scene, screen, state, none, reach, listed))
-    _doubt_depths(scene, screen, layers, none, reach)
+    for i in np.lexsort((np.arange(len(screen.depths)), screen.depths)).tolist():
+        if screen.kept[i] or screen.near[i]:
+            layer = _layer(i, scene, screen, reach)
+            layer.seen = state.alive & _listed(i, scene, tile_lists)
+            _blend(layer, scene, screen, state, doubts, reach)
+            layers.append(layer)
     background = np.abs(scene.background)
-    T_final = state.T
-    image = state.image + background * (state.e_T + T_final)[..., None] + state.absolute
-    doubtful = none["D1"] | none["D2"] | none["D4"] | none["D5"] | none["D7"]
-    absolute = state.absolute + background * T_final[..., None]
-    return PixelCharges(
-        screen, order, image, state.e_T, absolute, doubtful, none["D6"], none["D8"], none, reach, layers
-    )
+    image = state.image + background * (state.e_T + state.T)[..., None] + state.absolute
+    absolute = state.absolute + background * state.T[..., None]
+    charges = PixelCharges(scene, screen, layers, reach, image, state.e_T, absolute, doubts)
+    _doubt_depths(charges)
+    return charges
 
 
 def _listed(i: int, scene: Scene, tile_lists: list[list[int]] | None) -> np.ndarray:
@@ -100,86 +160,67 @@ def _listed(i: int, scene: Scene, tile_lists: list[list[int]] | None) -> np.ndar
     if tile_lists is None:
         return np.ones((H, W), dtype=bool)
     size = scene.tile_size or scene.profile.tile_size
-    tiles_x = -(-W // size)
-    tile = (np.arange(H)[:, None] // size) * tiles_x + np.arange(W)[None, :] // size
+    tile = (np.arange(H)[:, None] // size) * -(-W // size) + np.arange(W)[None, :] // size
     return np.array([i in ids for ids in tile_lists])[tile]
 
 
-def _blend(
-    i: int,
-    scene: Scene,
-    s: ScreenCharges,
-    state: _State,
-    doubts: dict[str, np.ndarray],
-    reach: float,
-    listed: np.ndarray,
-) -> dict[str, Any]:
-    profile = scene.profile
-    H, W = state.T.shape
+def _layer(i: int, scene: Scene, s: ScreenCharges, reach: float) -> Layer:
+    profile, (H, W) = scene.profile, (scene.camera.height, scene.camera.width)
     dx = s.means2d[i, 0] - (np.arange(W)[None, :] + 0.5) + np.zeros((H, 1))
     dy = s.means2d[i, 1] - (np.arange(H)[:, None] + 0.5) + np.zeros((1, W))
+    e_dx, e_dy = s.e_means2d[i, 0] + np.abs(dx), s.e_means2d[i, 1] + np.abs(dy)
     A, B, C = s.conics[i]
     e_A, e_B, e_C = s.e_conics[i]
-    e_dx, e_dy = s.e_means2d[i, 0] + np.abs(dx), s.e_means2d[i, 1] + np.abs(dy)
     sigma = 0.5 * (A * dx * dx + C * dy * dy) + B * dx * dy
     absolute = 0.5 * (abs(A) * dx * dx + abs(C) * dy * dy) + abs(B * dx * dy)
     e_form = 0.5 * (e_A * dx * dx + e_C * dy * dy) + e_B * np.abs(dx * dy) + 3.0 * absolute
     e_sigma = e_form + np.abs(A * dx + B * dy) * e_dx + np.abs(C * dy + B * dx) * e_dy
-    # a positive exponent beyond every threshold; bounded so that exp stays a number
-    raw = s.opacities[i] * np.exp(-np.clip(sigma, 0.0, 700.0))
-    e_raw = raw * (e_sigma + 2.0) + s.e_opacities[i] * np.exp(-np.clip(sigma, 0.0, 700.0))
-    alpha, e_alpha = np.minimum(raw, profile.alpha_ceiling), np.where(raw > profile.alpha_ceiling, 1.0, e_raw)
-    seen = listed & state.alive
-    negative = (sigma < reach * e_form) & (absolute > 0.0)
-    near_floor = (np.abs(raw - profile.alpha_floor) <= reach * e_raw) | (negative & (raw >= profile.alpha_floor))
-    doubts["D5"] |= seen & near_floor
-    doubts["D6"] |= seen & (np.abs(raw - profile.alpha_ceiling) <= reach * e_raw)
-    if abs(s.det[i]) <= reach * s.e_det[i]:
-        doubts["D2"] |= seen & (raw >= profile.alpha_floor * (1.0 - reach))
-    if abs(s.depths[i] - profile.near_plane) <= reach * s.e_depths[i] + reach * profile.near_plane * (
-        s.e_depths[i] > 0
-    ):
-        doubts["D1"] |= seen & (raw >= profile.alpha_floor * (1.0 - reach))
-    taken = seen & (raw >= profile.alpha_floor) & (sigma >= 0.0)
+    # far beyond every threshold, but still a number
+    falloff = np.exp(-np.clip(sigma, 0.0, 700.0))
+    raw = s.opacities[i] * falloff
+    e_raw = raw * (e_sigma + 2.0) + s.e_opacities[i] * falloff
+    taken = (raw >= profile.alpha_floor) & (sigma >= 0.0) & bool(s.kept[i])
+    # an exponent can only turn negative where rounding spoils the conic
+    negative = (sigma < reach * e_form) & (absolute > 0.0) & (raw >= profile.alpha_floor)
+    doubtful = (np.abs(raw - profile.alpha_floor) <= reach * e_raw) | negative
+    if s.near[i]:
+        doubtful |= raw >= profile.alpha_floor * (1.0 - reach)
+    alpha = np.minimum(raw, profile.alpha_ceiling)
+    e_alpha = np.where(raw > profile.alpha_ceiling, 1.0, e_raw)
+    return Layer(i, dx, dy, e_dx, e_dy, sigma, e_sigma, raw, e_raw, alpha, e_alpha, taken, doubtful)
+
+
+def _blend(
+    layer: Layer, scene: Scene, s: ScreenCharges, state: _State, doubts: dict[str, np.ndarray], reach: float
+) -> None:
+    profile, seen, alpha, e_alpha = scene.profile, layer.seen, layer.alpha, layer.e_alpha
+    doubts["D1" if s.near[layer.id] else "D5"] |= seen & layer.doubtful
+    doubts["D6"] |= seen & (np.abs(layer.raw - profile.alpha_ceiling) <= reach * layer.e_raw)
+    taken = seen & layer.taken
     next_T = state.T * (1.0 - alpha)
     e_next = state.e_T * (1.0 - alpha) + state.T * e_alpha + 2.0 * next_T
     stop = profile.transmittance_stop
-    doubts["D7"] |= taken & (np.abs(next_T - stop) <= reach * (e_next + stop))
+    doubts["D7"] |= taken & (np.abs(next_T - stop) <= reach * (e_next + abs(stop)))
     stops = taken & ((next_T <= stop) if profile.stop_inclusive else (next_T < stop))
     blended = taken & ~stops
     weight, e_weight = state.T * alpha, state.T * e_alpha + state.e_T * alpha + state.T * alpha
-    doubts["D8"] |= blended & (np.abs(weight - state.best) <= reach * (e_weight + state.e_best)) & (weight > 0.0)
+    doubts["D8"] |= blended & (np.abs(weight - state.best) <= reach * (e_weight + state.e_best))
     wins = blended & (weight > state.best)
     state.best, state.e_best = np.where(wins, weight, state.best), np.where(wins, e_weight, state.e_best)
-    color, e_color = np.abs(s.colors[i]), s.e_colors[i]
     share = np.where(blended, weight, 0.0)[..., None]
-    # one more unit of everything gathered so far pays for the addition
+    color = np.abs(s.colors[layer.id])
     state.absolute = state.absolute + share * color
-    state.image = state.image + share * e_color + np.where(blended, e_weight, 0.0)[..., None] * color + state.absolute
-    layer = {"id": i, "blended": blended, "T": state.T, "e_T": state.e_T, "alpha": alpha, "e_alpha": e_alpha, "dx": dx,
-             "dy": dy, "e_dx": e_dx, "e_dy": e_dy, "e_sigma": e_sigma, "clamped": raw > profile.alpha_ceiling, "seen": seen,
-             "weight": weight, "raw": raw}  # fmt: skip
+    # one more unit of everything gathered so far pays for the addition
+    gained = share * s.e_colors[layer.id] + np.where(blended, e_weight, 0.0)[..., None] * color
+    state.image = state.image + gained + state.absolute
+    layer.blended, layer.T, layer.e_T = blended, state.T, state.e_T
     state.T, state.e_T = np.where(blended, next_T, state.T), np.where(blended, e_next, state.e_T)
-    state.alive = state.alive & ~stops
-    return layer
+    state.alive, layer.T_after = state.alive & ~stops, state.T
 
 
-def _doubt_depths(
-    scene: Scene, s: ScreenCharges, layers: list[dict[str, Any]], doubts: dict[str, np.ndarray], reach: float
-) -> None:
-    floor = scene.profile.alpha_floor * (1.0 - 1e-3)
-    for a, front in enumerate(layers):
-        for back in layers[a + 1 :]:
-            i, j = front["id"], back["id"]
-            same_place = bool(np.all(scene.gaussians.means[i] == scene.gaussians.means[j]))
-            band = reach * (s.e_depths[i] + s.e_depths[j])
-            if not same_place and abs(s.depths[i] - s.depths[j]) <= band and band > 0.0:
-                doubts["D4"] |= front["seen"] & (front["raw"] >= floor) & (back["raw"] >= floor)
-
-
-def relative_condition(charges: PixelCharges) -> float:
-    """Return the largest relative charge of a conic: how ill-conditioned the worst kept splat is."""
-    s = charges.screen
-    size = np.max(np.abs(s.conics), axis=1)
-    worst = np.max(s.e_conics, axis=1) / np.maximum(size, TINY)
-    return float(np.max(worst[s.kept], initial=0.0))
+def _doubt_depths(charges: PixelCharges) -> None:
+    floor = charges.scene.profile.alpha_floor * (1.0 - 1e-3)
+    for a, front in enumerate(charges.layers):
+        for back in charges.layers[a + 1 :]:
+            if charges.swappable(front.id, back.id):
+                charges.doubts["D4"] |= front.seen & (front.raw >= floor) & (back.raw >= floor)

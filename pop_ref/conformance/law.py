@@ -26,7 +26,8 @@ STAGES = (
     "density",
     "optimizer",
 )
-RENDER, GRADIENTS, DOMINANCE, PROFILES = "render", "gradients", "dominance", "any profile"
+RENDER, GRADIENTS, DOMINANCE = "render", "gradients", "dominance"
+PROFILES, DOUBLE = "any profile", "double precision"
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Law:
 
     Attributes:
         stage: one of STAGES.
-        needs: names of stage functions, or RENDER, GRADIENTS, DOMINANCE; a backend without them is not judged.
+        needs: names of stage functions, or RENDER, GRADIENTS, DOMINANCE, PROFILES, DOUBLE; a backend without them is not judged.
         sentence: the function, whose name reads as the law; it takes `backend` and the drawn values.
         strategies: what it quantifies over, by argument name.
     """

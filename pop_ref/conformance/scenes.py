@@ -74,6 +74,10 @@ class Scene:
             shown.append(f"{each.name}={_code(value)}")
         return f"Scene({', '.join(shown)})"
 
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        # Hypothesis prints dataclasses by field unless told otherwise; a scene must paste
+        printer.text(repr(self))
+
     def but(self, **changes: Any) -> Scene:
         """Return this scene with some fields, of the Gaussians or the camera too, replaced."""
         gaussians = {k: changes.pop(k) for k in list(changes) if k in ("means", "quats", "scales", "opacities", "sh")}

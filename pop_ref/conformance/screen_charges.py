@@ -27,6 +27,8 @@ class ScreenCharges:
 
     Attributes:
         kept: in front of the near plane with a positive determinant. [N]
+        near: the near plane's decision is within `reach` (D1). [N]
+        kinked: a frustum clamp or a colour clamp is within `reach` (B1, B2). [N]
         depths, e_depths: camera z. [N]
         means2d, e_means2d: px. [N, 2]
         conics, e_conics: px^-2. [N, 3]
@@ -37,6 +39,8 @@ class ScreenCharges:
     """
 
     kept: np.ndarray
+    near: np.ndarray
+    kinked: np.ndarray
     depths: np.ndarray
     e_depths: np.ndarray
     means2d: np.ndarray
@@ -102,30 +106,49 @@ def _conic_charges(covars2d: np.ndarray, e_covars2d: np.ndarray) -> tuple[np.nda
     return det, e_det, e_conics
 
 
-def _color_charges(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def _color_charges(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return colours, their charges, and the sums before the clamp at 0."""
     g = scene.gaussians
     degree = round(np.sqrt(g.sh.shape[1])) - 1 if scene.sh_degree is None else scene.sh_degree
     n_sh = (degree + 1) ** 2
     dirs = view_dirs(g.means, scene.camera.viewmat)
     length = np.maximum(np.linalg.norm(dirs, axis=1), TINY)
-    basis = np.abs(sh_basis(dirs / length[:, None], degree))
-    t = np.linalg.norm(scene.camera.viewmat[:3, 3]) + np.linalg.norm(camera_center(scene.camera.viewmat))
+    basis = sh_basis(dirs / length[:, None], degree)
+    center = np.linalg.norm(scene.camera.viewmat[:3, 3]) + np.linalg.norm(camera_center(scene.camera.viewmat))
     # a unit direction moves by eps (|mean| + 2 |center|) / distance, a basis function by at most 2 degree^2 times that
-    e_dirs = (np.linalg.norm(g.means, axis=1) + 2.0 * t) / length + 4.0
-    e_basis = 4.0 * basis + (2.0 * degree**2 * e_dirs)[:, None]
+    e_dirs = (np.linalg.norm(g.means, axis=1) + 2.0 * center) / length + 4.0
+    e_basis = 4.0 * np.abs(basis) + (2.0 * degree**2 * e_dirs)[:, None]
     e_colors = np.einsum("nk,nkc->nc", e_basis, np.abs(g.sh[:, :n_sh])) + 1.0
-    return colors_from_sh(g.sh, dirs, degree), e_colors
+    sums = np.einsum("nk,nkc->nc", basis, g.sh[:, :n_sh]) + 0.5
+    return colors_from_sh(g.sh, dirs, degree), e_colors, sums
 
 
-def screen_charges(scene: Scene) -> ScreenCharges:
-    """Carry charges from the scene to the screen."""
+def _clamp_in_reach(scene: Scene, p: np.ndarray, e_p: np.ndarray, reach: float) -> np.ndarray:
+    """Tell whose x/z or y/z is within reach of the frustum clamp (B1)."""
+    camera, profile = scene.camera, scene.profile
+    near = np.zeros(len(p), dtype=bool)
+    for axis, size in ((0, camera.width), (1, camera.height)):
+        f = camera.K[axis, axis]
+        c = 0.5 * size if profile.principal_point == "centred" else camera.K[axis, 2]
+        margin = profile.frustum_margin * 0.5 * size / f
+        slope = p[:, axis] / p[:, 2]
+        e_slope = (e_p[:, axis] + np.abs(slope) * e_p[:, 2]) / p[:, 2] + np.abs(slope)
+        for limit in (-(c / f + margin), (size - c) / f + margin):
+            near |= np.abs(slope - limit) <= reach * (e_slope + (np.abs(c) + size) / f)
+    return near
+
+
+def screen_charges(scene: Scene, reach: float) -> ScreenCharges:
+    """Carry charges from the scene to the screen; decisions within reach times their charge are doubtful."""
     g, camera, profile = scene.gaussians, scene.camera, scene.profile
     N = len(g)
     e_p, e_S = _camera_charges(scene)
     p = means_cam_from_means(g.means, camera.viewmat)
     kept = in_front(p[:, 2], profile)
+    depths = p[:, 2]
+    near = np.abs(depths - profile.near_plane) <= reach * np.where(e_p[:, 2] > 0.0, e_p[:, 2] + profile.near_plane, 0.0)
     # rows behind the camera take no part; a harmless point in their place keeps every formula finite
-    p = np.where(kept[:, None], p, np.array([0.0, 0.0, 1.0]))
+    p = np.where((kept | near)[:, None], p, np.array([0.0, 0.0, 1.0]))
     z = p[:, 2]
     means2d = project_means(p, camera.K, camera.width, camera.height, profile)
     focal = np.array([camera.K[0, 0], camera.K[1, 1]])
@@ -146,9 +169,10 @@ def screen_charges(scene: Scene) -> ScreenCharges:
     opacities, e_opacities = g.opacities, g.opacities.copy()
     if scene.antialiased:
         opacities, e_opacities = _antialiased(g.opacities, raw, e_2d, det, e_det, profile.eps2d)
-    colors, e_colors = _color_charges(scene) if N else (np.zeros((0, 3)), np.zeros((0, 3)))
+    colors, e_colors, sums = _color_charges(scene) if N else (np.zeros((0, 3)),) * 3
+    kinked = _clamp_in_reach(scene, p, e_p, reach) | np.any(np.abs(sums) <= reach * e_colors, axis=1)
     return ScreenCharges(
-        kept=kept & (det > 0.0), depths=means_cam_from_means(g.means, camera.viewmat)[:, 2], e_depths=e_p[:, 2],
+        kept=kept & (det > 0.0), near=near, kinked=kinked, depths=depths, e_depths=e_p[:, 2],
         means2d=means2d, e_means2d=e_means2d, conics=conics_from_covars2d(covars2d), e_conics=e_conics,
         det=det, e_det=e_det, opacities=opacities, e_opacities=e_opacities, colors=colors, e_colors=e_colors,
         means_cam=p, e_means_cam=e_p, covars_cam=S, e_covars_cam=e_S, jacobians=J, e_jacobians=e_J,

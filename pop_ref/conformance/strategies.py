@@ -157,7 +157,10 @@ def scenes(
     record = records(camera.width, camera.height, max_degree, opacity, size)
     chosen = draw(st.lists(record, min_size=min_gaussians, max_size=max_gaussians - anchored))
     if anchored:
-        chosen = [Record(x=camera.width / 2.0, y=camera.height / 2.0, depth=2.5, opacity=0.5, sh=ANCHOR_SH), *chosen]
+        chosen = [
+            Record(camera.width * 0.5 + 0.25, camera.height * 0.5 + 0.25, 2.5, opacity=0.5, sh=ANCHOR_SH),
+            *chosen,
+        ]
     if chosen and copies:
         again = draw(st.lists(st.sampled_from(range(len(chosen))), max_size=2))
         chosen = (chosen + [chosen[i] for i in again])[: max(max_gaussians, 2)]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pop_ref.conformance.adapter import View, stage_function
-from pop_ref.conformance.law import DOMINANCE, GRADIENTS, PROFILES, RENDER
+from pop_ref.conformance.law import DOMINANCE, DOUBLE, GRADIENTS, PROFILES, RENDER
 from pop_ref.conformance.scenes import Scene, rounded_to
 from pop_ref.constants import PAPER, Profile
 
@@ -57,6 +57,8 @@ class TorchAdapter:
         """Tell what the program offers; asks the rasterizer for its meta once to learn about dominance."""
         if need in (RENDER, GRADIENTS):
             return self._rasterization is not None
+        if need == DOUBLE:
+            return self.dtype == np.float64
         if need == PROFILES:
             return self._takes_profile
         if need == DOMINANCE:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from hypothesis import assume
 
-from pop_ref.conformance.charges import PixelCharges, charge, relative_condition
+from pop_ref.conformance.charges import PixelCharges, charge
 from pop_ref.conformance.compare import assert_close
 from pop_ref.conformance.scenes import Scene
 
@@ -19,7 +19,7 @@ def charged(backend: Any, scene: Scene) -> tuple[Scene, PixelCharges]:
     """Return the scene as the backend reads it and its charges; set scenes aside that its precision cannot resolve."""
     seen = backend.sees(scene)
     charges = charge(seen, backend.dtype)
-    assume(relative_condition(charges) * charges.reach < WORST_CONDITION)
+    assume(charges.worst_condition() * charges.reach < WORST_CONDITION)
     return seen, charges
 
 

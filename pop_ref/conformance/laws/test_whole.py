@@ -25,7 +25,7 @@ def _same_render(key, backend, one, other, charges):
     assert_same_image(key, backend, one.image, other.image, charges)
     assert_same_light(key, backend, one.T_final, other.T_final, charges)
     for (name, a), (_, b) in zip(_tallies(one), _tallies(other), strict=True):
-        sure = charges.certain & ~charges.dominance
+        sure = charges.decided
         assert_same_bits(name, a[sure], b[sure])
 
 
@@ -67,7 +67,7 @@ def test_permuting_gaussians_permutes_ids_only(backend, scene, seed):
     one, other = backend.render(seen), backend.render(seen.rows(order))
     assert_same_image("whole.permutation", backend, other.image, one.image, charges)
     if one.dominant_ids is not None:
-        sure = charges.certain & ~charges.dominance & (other.dominant_ids >= 0)
+        sure = charges.decided & (other.dominant_ids >= 0)
         assert_same_bits("winner", np.array(order)[other.dominant_ids[sure]], one.dominant_ids[sure])
 
 
@@ -138,8 +138,8 @@ def test_moving_world_and_camera_together_changes_nothing(backend, scene, turn, 
     seen_moved, moved_charges = charged(backend, moved)
     charges.image += moved_charges.image
     charges.T_final += moved_charges.T_final
-    charges.doubtful |= moved_charges.doubtful
-    charges.dominance |= moved_charges.dominance
+    for label, doubt in moved_charges.doubts.items():
+        charges.doubts[label] |= doubt
     view = backend.render(seen)
     assert_seen(view)
     _same_render("whole.rigid", backend, backend.render(seen_moved), view, charges)

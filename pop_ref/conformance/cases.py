@@ -1,0 +1,182 @@
+"""One case a stage function: the inputs it is judged on, next to the oracle and next to its own transpose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+
+from pop_ref.conformance.strategies import arrays_of, dyadic, opacities, quats, reals, viewmats
+from pop_ref.constants import PROFILES
+
+W, H = 8, 4
+K = np.array([[8.0, 0.0, 3.0], [0.0, 16.0, 2.5], [0.0, 0.0, 1.0]])
+N = 3
+
+Inputs = st.SearchStrategy[tuple[Any, ...]]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A stage function and how to draw its positional arguments.
+
+    Attributes:
+        name: the function.
+        stage: its stage.
+        inputs: its arguments, without a cotangent.
+        wrt: positions of the arguments that its transpose returns cotangents of; empty if it has none.
+        cotangent_at: the position of v among the transpose's arguments; None puts it last.
+        magnitude: what one unit of the value is charged on; None measures it with `sensitivity`.
+    """
+
+    name: str
+    stage: str
+    inputs: Inputs
+    wrt: tuple[int, ...] = ()
+    cotangent_at: int | None = None
+    magnitude: Callable[[tuple[Any, ...]], float] | None = None
+
+
+def _stacked(rows: Inputs) -> st.SearchStrategy[np.ndarray]:
+    return st.lists(rows, min_size=N, max_size=N).map(lambda r: np.array(r, dtype=np.float64))
+
+
+def _vectors(n: int, low: float = -2.0, high: float = 2.0) -> st.SearchStrategy[np.ndarray]:
+    return _stacked(st.tuples(*[reals(low, high)] * n))
+
+
+def _pattern(seed: int, shape: tuple[int, ...]) -> np.ndarray:
+    k = np.arange(int(np.prod(shape)), dtype=np.float64).reshape(shape)
+    return np.mod(k * (2.0 * seed + 1.0) + np.floor(k / 7.0) * seed, 17.0) / 16.0
+
+
+def _apart_from_zero(array: np.ndarray) -> np.ndarray:
+    # a direction, like a quaternion, needs a length
+    short = np.sum(array * array, axis=1) < 2.0**-6
+    return np.where(short[:, None], 1.0, array)
+
+
+def _symmetric(n: int) -> st.SearchStrategy[np.ndarray]:
+    return arrays_of((N, n, n)).map(lambda a: a @ np.swapaxes(a, 1, 2) + 2.0**-4 * np.eye(n))
+
+
+profiles = st.sampled_from(sorted(PROFILES)).map(PROFILES.__getitem__)
+quat_rows = _stacked(quats())
+directions = _vectors(3).map(_apart_from_zero)
+units = directions.map(lambda d: d / np.linalg.norm(d, axis=1, keepdims=True))
+in_front = _stacked(st.tuples(reals(-4.0, 4.0), reals(-4.0, 4.0), reals(0.25, 8.0, dull=1.0)))
+degrees = st.integers(0, 3)
+# a pinhole's two zeros may be relied on
+pinholes = arrays_of((N, 4)).map(
+    lambda j: np.stack([j[:, 0], 0 * j[:, 0], j[:, 1], 0 * j[:, 0], j[:, 2], j[:, 3]], 1).reshape(N, 2, 3)
+)
+# 132 numbers are too many to draw one by one: a few seeds of dyadic patterns say as much
+pictures = st.integers(0, 255).map(lambda k: _pattern(k, (12, 11, 1)))
+masks = st.lists(st.booleans(), min_size=N, max_size=N).map(np.array)
+pinhole_inputs = st.tuples(in_front, st.just(K), st.just(W), st.just(H), profiles)
+pair = st.tuples(pictures, pictures)
+
+
+def _ssim_magnitude(inputs: tuple[Any, ...]) -> float:
+    # a variance is a difference of squares, divided by itself and C2 = 0.03^2 at least
+    return 1.0 + sum(float(np.max(np.abs(a))) ** 2 for a in inputs[:2]) / 0.03**2
+
+
+def _picture_magnitude(inputs: tuple[Any, ...]) -> float:
+    return 1.0 + sum(float(np.max(np.abs(a))) for a in inputs[:2])
+
+
+CASES = (
+    Case("scales_from_log_scales", "activations", st.tuples(_vectors(3, -8.0, 4.0)), (0,)),
+    Case("opacities_from_logits", "activations", st.tuples(_vectors(1, -8.0, 8.0).map(np.ravel)), (0,)),
+    Case("unit_quats_from_quats", "activations", st.tuples(quat_rows), (0,)),
+    Case("rotmats_from_quats", "covariance", st.tuples(quat_rows), (0,)),
+    Case("covars_from_quats_scales", "covariance", st.tuples(quat_rows, _vectors(3, 0.0, 4.0)), (0, 1)),
+    Case("sh_basis", "harmonics", st.tuples(units, degrees), (0,)),
+    Case("colors_from_sh", "harmonics", st.tuples(arrays_of((N, 16, 3), -1.0, 1.0), directions, degrees), (0, 1)),
+    Case("camera_center", "camera", st.tuples(viewmats()), (0,)),
+    Case("view_dirs", "camera", st.tuples(_vectors(3, -4.0, 4.0), viewmats()), (0, 1)),
+    Case("means_cam_from_means", "camera", st.tuples(_vectors(3, -4.0, 4.0), viewmats()), (0, 1)),
+    Case("covars_cam_from_covars", "camera", st.tuples(_symmetric(3), viewmats()), (0, 1)),
+    Case("project_means", "projection", pinhole_inputs, (0,), 4),
+    Case("projection_jacobians", "projection", pinhole_inputs, (0,), 4),
+    Case("project_covars", "projection", st.tuples(_symmetric(3), pinholes), (0, 1)),
+    Case("low_pass", "footprint", st.tuples(_symmetric(2), dyadic(0.125, 1.0)), (0,)),
+    Case("compensations", "footprint", st.tuples(_symmetric(2), dyadic(0.125, 1.0)), (0,)),
+    Case("conics_from_covars2d", "footprint", st.tuples(_symmetric(2)), (0,)),
+    Case("l1", "losses", pair, (0,), magnitude=_picture_magnitude),
+    Case("l2", "losses", pair, (0,), magnitude=_picture_magnitude),
+    Case("ssim", "losses", pair, (0,), magnitude=_ssim_magnitude),
+    Case("d_ssim", "losses", pair, (0,), magnitude=_ssim_magnitude),
+    Case("photometric_3dgs", "losses", pair, (0,), magnitude=_ssim_magnitude),
+    Case("photometric_pop", "losses", pair, (0,), magnitude=_ssim_magnitude),
+    Case("pop_loss", "polarization", st.tuples(_stacked(st.tuples(opacities())).map(np.ravel), masks), (0,)),
+)
+
+
+def transposed(case: Case, function: Callable[..., Any], inputs: tuple[Any, ...], v: Any) -> tuple[np.ndarray, ...]:
+    """Call a transpose with its cotangent in its place; return the cotangents as a tuple."""
+    at = len(inputs) if case.cotangent_at is None else case.cotangent_at
+    found = function(*inputs[:at], v, *inputs[at:])
+    return found if isinstance(found, tuple) else (found,)
+
+
+def cotangent_like(value: Any) -> Any:
+    """Return dyadic cotangents of either sign for a value, a number for a number; symmetric for symmetric matrices."""
+    array = np.asarray(value, dtype=np.float64)
+    if array.ndim == 0:
+        return 0.75
+    v = (np.mod(np.arange(array.size, dtype=np.float64) * 5.0 + 3.0, 16.0) - 7.5).reshape(array.shape) / 8.0
+    square = array.ndim == 3 and array.shape[1] == array.shape[2] and np.array_equal(array, np.swapaxes(array, 1, 2))
+    return 0.5 * (v + np.swapaxes(v, 1, 2)) if square else v
+
+
+def rounded(inputs: tuple[Any, ...], dtype: Any) -> tuple[Any, ...]:
+    """Return the arguments with float arrays rounded to a dtype."""
+    return tuple(
+        a.astype(dtype).astype(np.float64) if isinstance(a, np.ndarray) and a.dtype.kind == "f" else a for a in inputs
+    )
+
+
+def charges_of(case: Case, function: Callable[..., Any], inputs: tuple[Any, ...]) -> tuple[np.ndarray, ...]:
+    """Charge each output of a function, or of its transpose with the cotangent bound."""
+    if case.magnitude is None:
+        return sensitivity(function, inputs)
+    size = case.magnitude(inputs)
+    # a loss is a mean over pixels, so one unit of its gradient is a pixel's share
+    return tuple(np.asarray(size / value.size) for value in _outputs(function(*inputs)))
+
+
+def _outputs(value: Any) -> tuple[np.ndarray, ...]:
+    return tuple(np.asarray(v, dtype=np.float64) for v in (value if isinstance(value, tuple) else (value,)))
+
+
+def sensitivity(function: Callable[..., Any], inputs: tuple[Any, ...]) -> tuple[np.ndarray, ...]:
+    """Charge a function by how far its output moves when each entry of its input moves one eps, plus its own size.
+
+    This is the componentwise condition of the oracle's function, measured by differences; one array per output.
+    """
+
+    step = 2.0**-20
+    here = _outputs(function(*inputs))
+    charges = [np.abs(h) + _row_size(h) for h in here]
+    for k, argument in enumerate(inputs):
+        if not (isinstance(argument, np.ndarray) and argument.dtype.kind == "f"):
+            continue
+        for index in zip(*np.nonzero(argument), strict=True):
+            moved = argument.copy()
+            moved[index] *= 1.0 + step
+            there = _outputs(function(*inputs[:k], moved, *inputs[k + 1 :]))
+            for charge, a, b in zip(charges, here, there, strict=True):
+                charge += np.abs(b - a) / step
+    return tuple(charges)
+
+
+def _row_size(value: np.ndarray) -> np.ndarray:
+    if value.ndim < 2:
+        return np.abs(value)
+    largest = np.max(np.abs(value).reshape(len(value), -1), axis=1, initial=0.0)
+    return np.broadcast_to(largest.reshape(-1, *[1] * (value.ndim - 1)), value.shape)

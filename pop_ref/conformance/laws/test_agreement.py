@@ -1,0 +1,197 @@
+"""Laws of agreement: every stage function, image, integer and gradient is the oracle's."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import assume
+from hypothesis import strategies as st
+
+from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.cases import CASES, charges_of, cotangent_like, rounded, transposed
+from pop_ref.conformance.charges import charge
+from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.gradient_charges import gradient_charges
+from pop_ref.conformance.law import DOMINANCE, DOUBLE, GRADIENTS, PROFILES, RENDER, law
+from pop_ref.conformance.outcomes import assert_one_of_the_oracles_outcomes
+from pop_ref.conformance.strategies import cotangents, plain_sizes, scenes
+from pop_ref.conformance.verdicts import assert_same_image, assert_same_light, charged
+from pop_ref.constants import GSPLAT_1_6, INRIA
+
+ORACLE = OracleAdapter()
+
+
+def _values(value):
+    return value if isinstance(value, tuple) else (value,)
+
+
+def _agreement(case):
+    def sentence(backend, inputs):
+        inputs = rounded(inputs, backend.dtype)
+        function = ORACLE.stage(case.name)
+        expected = _values(function(*inputs))
+        found = _values(backend.stage(case.name)(*inputs))
+        for a, e, c in zip(found, expected, charges_of(case, function, inputs), strict=True):
+            assert_close(f"agreement.{case.name}", a, e, c, backend.dtype, against_oracle=True)
+
+    sentence.__name__ = f"test_{case.name}_is_the_oracles"
+    return law(case.stage, case.name, inputs=case.inputs)(sentence)
+
+
+def _transpose_agreement(case):
+    name = f"{case.name}_vjp"
+
+    def sentence(backend, inputs):
+        inputs = rounded(inputs, backend.dtype)
+        v = cotangent_like(ORACLE.stage(case.name)(*inputs))
+
+        def oracle(*args):
+            return transposed(case, ORACLE.stage(name), args, v)
+
+        found = transposed(case, backend.stage(name), inputs, v)
+        for a, e, c in zip(found, oracle(*inputs), charges_of(case, oracle, inputs), strict=True):
+            assert_close(f"agreement.{name}", a, e, c, backend.dtype, against_oracle=True)
+
+    sentence.__name__ = f"test_{name}_is_the_oracles"
+    return law(case.stage, name, inputs=case.inputs)(sentence)
+
+
+def _adjoint(case):
+    name = f"{case.name}_vjp"
+
+    def sentence(backend, inputs, direction):
+        function = backend.stage(case.name)
+        here = np.asarray(function(*inputs), dtype=np.float64)
+        v = cotangent_like(here)
+        pulled = transposed(case, backend.stage(name), inputs, v)
+        rng = np.random.default_rng(direction)
+        steps = [np.round(8.0 * rng.uniform(-1.0, 1.0, inputs[k].shape)) / 8.0 for k in case.wrt]
+        steps = [_kept_inside(case, u, inputs[k]) for u, k in zip(steps, case.wrt, strict=True)]
+        slopes = [_slope(function, inputs, case.wrt, steps, v, 2.0**-k) for k in (18, 20)]
+        # where the two step widths part, a kink or a pole is near; the derivative is one-sided there
+        size = sum(np.sum(np.abs(p * u)) for p, u in zip(pulled, steps, strict=True)) + np.sum(np.abs(v * here)) + 1.0
+        assume(abs(slopes[0] - slopes[1]) <= 1e-6 * size)
+        stated = sum(np.sum(p * u) for p, u in zip(pulled, steps, strict=True))
+        assert_close("adjoint", slopes[1], stated, size * 2.0**33, backend.dtype)
+
+    sentence.__name__ = f"test_{name}_is_the_transpose"
+    return law(case.stage, case.name, name, DOUBLE, inputs=case.inputs, direction=st.integers(0, 2**16))(sentence)
+
+
+def _kept_inside(case, step, value):
+    if case.name in ("low_pass", "compensations", "conics_from_covars2d", "covars_cam_from_covars", "project_covars"):
+        symmetric = value.ndim == 3 and value.shape[1] == value.shape[2]
+        return 0.5 * (step + np.swapaxes(step, 1, 2)) if symmetric else np.where(value == 0.0, 0.0, step)
+    if case.name == "sh_basis":
+        # the basis is a polynomial on the unit sphere only: step along it
+        return step - value * np.sum(step * value, axis=1, keepdims=True)
+    if value.shape == (4, 4):
+        return np.vstack([step[:3], np.zeros((1, 4))])
+    return step
+
+
+def _slope(function, inputs, wrt, steps, v, h):
+    ends = []
+    for sign in (1.0, -1.0):
+        moved = list(inputs)
+        for k, u in zip(wrt, steps, strict=True):
+            moved[k] = inputs[k] + sign * h * u
+        ends.append(np.sum(v * np.asarray(function(*moved), dtype=np.float64)))
+    return (ends[0] - ends[1]) / (2.0 * h)
+
+
+for _case in CASES:
+    for _make in (_agreement, *((_transpose_agreement, _adjoint) if _case.wrt else ())):
+        _test = _make(_case)
+        globals()[_test.law.sentence.__name__] = _test
+del _case, _make, _test
+
+
+@law("compositing", RENDER, scene=scenes(max_degree=3))
+def test_the_image_is_one_of_the_oracles_outcomes(backend, scene):
+    seen, charges = charged(backend, scene)
+    assert_one_of_the_oracles_outcomes(backend, seen, charges)
+
+
+@law("compositing", RENDER, PROFILES, scene=scenes(profile=GSPLAT_1_6))
+def test_the_image_under_the_lower_ceiling_is_one_of_the_oracles_outcomes(backend, scene):
+    seen, charges = charged(backend, scene)
+    assert_one_of_the_oracles_outcomes(backend, seen, charges)
+
+
+@law("compositing", RENDER, PROFILES, scene=scenes(profile=INRIA, size=plain_sizes(), max_side=16))
+def test_the_image_of_inrias_profile_is_the_oracles(backend, scene):
+    seen = backend.sees(scene)
+    drawn = ORACLE.full_render(seen)
+    charges = charge(seen, backend.dtype, drawn.tile_lists)
+    assume(not _extent_in_doubt(seen, drawn, backend.dtype))
+    view = backend.render(seen)
+    assert_same_image("agreement.image", backend, view.image, drawn.image, charges, against_oracle=True)
+    assert_same_light("agreement.T_final", backend, view.T_final, drawn.T_final, charges, against_oracle=True)
+
+
+def _extent_in_doubt(scene, drawn, dtype):
+    """Tell whether a square extent or its tile rectangle is within reach of rounding (D2, D3)."""
+    from pop_ref.margins import margins
+
+    found = margins(scene.gaussians, scene.camera, scene.sh_degree, scene.profile, scene.tile_size, scene.antialiased)
+    tolerance = 64.0 * float(np.finfo(dtype).eps)
+    return not np.all(found.safe_gaussians(tolerance, ("D1", "D2", "D3")))
+
+
+@law(
+    "footprint",
+    RENDER,
+    scene=scenes(max_gaussians=4, anchored=True, size=plain_sizes()).map(lambda s: s.but(antialiased=True)),
+)
+def test_the_antialiased_image_is_one_of_the_oracles_outcomes(backend, scene):
+    seen, charges = charged(backend, scene)
+    assert_one_of_the_oracles_outcomes(backend, seen, charges)
+
+
+@law("dominance", RENDER, DOMINANCE, scene=scenes(anchored=True))
+def test_dominant_ids_and_weights_are_the_oracles(backend, scene):
+    seen, charges = charged(backend, scene)
+    expected, view = ORACLE.render(seen), backend.render(seen)
+    sure = charges.decided
+    assert_same_bits("winner", view.dominant_ids[sure], expected.dominant_ids[sure])
+    magnitude = charges.T_final + 1.0
+    at = charges.certain
+    weights = (view.dominant_weights[at], expected.dominant_weights[at])
+    assert_close("agreement.weight", *weights, magnitude[at], backend.dtype, against_oracle=True)
+
+
+@law("gradients", GRADIENTS, scene=scenes(anchored=True, max_gaussians=5, max_degree=3))
+def test_gradients_are_the_oracles(backend, scene):
+    _gradients_agree(backend, scene)
+
+
+@law("gradients", GRADIENTS, PROFILES, scene=scenes(anchored=True, max_gaussians=4, profile=GSPLAT_1_6))
+def test_gradients_under_the_lower_ceiling_are_the_oracles(backend, scene):
+    _gradients_agree(backend, scene)
+
+
+@law(
+    "gradients",
+    GRADIENTS,
+    scene=scenes(anchored=True, max_gaussians=3, size=plain_sizes()).map(lambda s: s.but(antialiased=True)),
+)
+def test_antialiased_gradients_are_the_oracles(backend, scene):
+    _gradients_agree(backend, scene)
+
+
+def _gradients_agree(backend, scene):
+    """Compare every gradient where decisions are certain: doubtful pixels get no cotangent."""
+    seen, charges = charged(backend, scene)
+    sure = charges.smooth
+    v_image, v_T_final = cotangents(seen)
+    v_image, v_T_final = v_image * sure[..., None], v_T_final * sure
+    expected = ORACLE.gradients(seen, v_image, v_T_final)
+    found = backend.gradients(seen, v_image, v_T_final)
+    bounds = gradient_charges(seen, charges, v_image, v_T_final)
+    rows = ~charges.screen.kinked
+    for name, value in found.items():
+        pick = rows if len(rows) == len(value) and name not in ("background", "viewmat") else slice(None)
+        if name == "viewmat" and not np.all(rows):
+            continue
+        args = (value[pick], expected[name][pick], bounds[name][pick])
+        assert_close(f"agreement.v_{name}", *args, backend.dtype, against_oracle=True)

@@ -1,0 +1,104 @@
+"""Near a threshold: the outcomes that the oracle has when each doubtful decision is taken either way.
+
+At a pixel whose decisions are all clear of rounding there is one outcome. Elsewhere every doubtful splat is blended or
+skipped (D1, D2, D5), the pixel ends before a doubtful splat or goes on (D7), and doubtful neighbours in depth swap
+(D4); each combination is a list of splats, and the oracle's own blending of that list is an outcome. A backend must
+equal one of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from pop_ref.conformance import tolerances
+from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.charges import Layer, PixelCharges
+from pop_ref.conformance.compare import assert_same_bits
+from pop_ref.conformance.scenes import Scene
+from pop_ref.conformance.verdicts import assert_same_image, assert_same_light
+from pop_ref.pixel import Pixel, SplatRows, composite_pixel
+
+# more doubts than this at one pixel are not enumerated; the pixel is left out
+MOST_DOUBTS = 6
+
+
+def outcomes(charges: PixelCharges, x: int, y: int) -> list[Pixel]:
+    """Return every outcome of one pixel, the likeliest first; empty if there are too many doubts."""
+    met = [layer for layer in charges.layers if layer.taken[y, x] or layer.doubtful[y, x]]
+    swaps = [k for k in range(len(met) - 1) if charges.swappable(met[k].id, met[k + 1].id)]
+    if len(swaps) + sum(bool(layer.doubtful[y, x]) for layer in met) > MOST_DOUBTS:
+        return []
+    s, profile = charges.screen, charges.scene.profile
+    rows = SplatRows(s.means2d.tolist(), s.conics.tolist(), s.opacities.tolist(), s.colors.tolist())
+    # which splats are blended is decided here, so the oracle must not decide again
+    forced = dataclasses.replace(profile, alpha_floor=-1.0, transmittance_stop=-1.0)
+    orders = [met]
+    for k in swaps:
+        orders += [[*o[:k], o[k + 1], o[k], *o[k + 2 :]] for o in orders]
+    lists = [ids for order in orders for ids in _lists(order, charges, x, y)]
+    background = charges.scene.background.tolist()
+    return [composite_pixel(ids, rows, x + 0.5, y + 0.5, background, forced) for ids in lists]
+
+
+def _lists(met: list[Layer], charges: PixelCharges, x: int, y: int) -> Iterator[list[int]]:
+    """Yield the lists of blended splats that the doubtful decisions allow."""
+    profile, stop = charges.scene.profile, charges.scene.profile.transmittance_stop
+
+    def walk(k: int, T: float, e_T: float, blended: list[int]) -> Iterator[list[int]]:
+        if k == len(met):
+            yield blended
+            return
+        layer = met[k]
+        if layer.doubtful[y, x]:
+            yield from walk(k + 1, T, e_T, blended)
+        alpha, e_alpha = float(layer.alpha[y, x]), float(layer.e_alpha[y, x])
+        next_T = T * (1.0 - alpha)
+        e_next = e_T * (1.0 - alpha) + T * e_alpha + 2.0 * next_T
+        near = abs(next_T - stop) <= charges.reach * (e_next + abs(stop))
+        ends = next_T <= stop if profile.stop_inclusive else next_T < stop
+        if ends or near:
+            yield blended
+        if not ends or near:
+            yield from walk(k + 1, next_T, e_next, [*blended, layer.id])
+
+    yield from walk(0, 1.0, 0.0, [])
+
+
+def assert_one_of_the_oracles_outcomes(backend: Any, scene: Scene, charges: PixelCharges) -> None:
+    """Assert that a render equals the oracle's where that is certain, and one of its outcomes elsewhere."""
+    expected, view = OracleAdapter().render(scene), backend.render(scene)
+    assert_same_image("agreement.image", backend, view.image, expected.image, charges, against_oracle=True)
+    assert_same_light("agreement.T_final", backend, view.T_final, expected.T_final, charges, against_oracle=True)
+    if view.n_blended is not None:
+        sure = charges.certain
+        assert_same_bits("blended", view.n_blended[sure], expected.n_blended[sure])
+    for y, x in np.argwhere(~charges.certain).tolist():
+        _assert_an_outcome(backend, view, charges, x, y)
+
+
+def _assert_an_outcome(backend: Any, view: Any, charges: PixelCharges, x: int, y: int) -> None:
+    possible = outcomes(charges, x, y)
+    if not possible:
+        return
+    limit = tolerances.agreement("agreement.image", backend.dtype)
+    room = _room(charges, x, y)
+    got = np.append(view.image[y, x], view.T_final[y, x])
+    wanted = [np.append(p.color, p.T_final) for p in possible]
+    if any(np.all(np.abs(got - w) <= limit * room) for w in wanted):
+        return
+    raise AssertionError(
+        f"pixel ({x}, {y}) is none of the oracle's {len(possible)} outcomes: got {got.tolist()},"
+        f" outcomes {[w.tolist() for w in wanted]}, allowed {(limit * room).tolist()}"
+    )
+
+
+def _room(charges: PixelCharges, x: int, y: int) -> np.ndarray:
+    # the charges of the likeliest outcome, and as much again for what another one blends
+    brightest = max([1.0, float(np.max(np.abs(charges.screen.colors), initial=0.0))])
+    gain = brightest * (1.0 + sum(float(layer.e_raw[y, x]) for layer in charges.layers))
+    image = charges.image[y, x] + charges.absolute[y, x] + gain
+    return np.append(image, charges.T_final[y, x] + 1.0 + gain)
