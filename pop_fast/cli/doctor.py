@@ -8,10 +8,7 @@ import platform
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Final, Literal
-
-import tyro
+from typing import Final, Literal
 
 from pop_fast.cli.arguments import parse
 
@@ -49,14 +46,16 @@ class Args:
     Exit status 0 when everything that pop needs is there, 1 otherwise. Optional parts that are off do not count.
     """
 
-    lpips_weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Also check this file of LPIPS weights."""
+    lpips_vgg: tuple[str, ...] = ()
+    """Also read these LPIPS weights on VGG16: one merged file, or backbone and linear layers."""
+    lpips_alex: tuple[str, ...] = ()
+    """Also read these LPIPS weights on AlexNet, likewise."""
 
 
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "doctor")
-    findings = [*packages(), *machine(), *extensions(), *lpips(args.lpips_weights)]
+    findings = [*packages(), *machine(), *backends(), *lpips(args)]
     width = max(len(finding.name) for finding in findings) + 2
     marks = {"ok": "ok", "missing": "MISSING", "off": "-"}
     print(f"pop-splatting {_installed('pop-splatting') or '(not installed)'}, Python {platform.python_version()}")
@@ -99,27 +98,32 @@ def machine() -> Iterator[Finding]:
     yield Finding("torch build", "ok", f"{build}, {torch.get_num_threads()} threads")
 
 
-def extensions() -> Iterator[Finding]:
-    """Ask the CUDA extension whether it can be used and, if not, why."""
-    cuda_ext = importlib.import_module("cuda_ext")
-    if cuda_ext.available():
-        yield Finding("cuda_ext", "ok", "the CUDA backend is available")
-    else:
-        yield Finding(
-            "cuda_ext", "off", f"not available: {cuda_ext.why_not()} (optional; the CPU path needs none of it)"
-        )
-
-
-def lpips(path: Path | None) -> Iterator[Finding]:
-    """Tell whether the LPIPS metric can be computed."""
-    if path is None:
-        fix = "pop eval RESULT --lpips-weights FILE"
-        yield Finding("LPIPS weights", "off", "no file given (optional; weights are not shipped)", fix)
+def backends() -> Iterator[Finding]:
+    """Ask every backend whether it can run here and, if not, why."""
+    try:
+        from pop_fast.backends import backend_names, get_backend
+    except ImportError:  # torch is missing, which has its own line
         return
-    from pop_fast.train.metrics import load_lpips
+    for name in backend_names():
+        backend = get_backend(name)
+        if backend.available():
+            yield Finding(f"backend {name}", "ok", "can run here")
+        else:
+            yield Finding(f"backend {name}", "off", f"{backend.why_not()} (optional)")
 
-    load_lpips(path)
-    yield Finding("LPIPS weights", "ok", str(path))
+
+def lpips(args: Args) -> Iterator[Finding]:
+    """Read the LPIPS weights that were given, or say how to give them."""
+    given: dict[Literal["vgg", "alex"], tuple[str, ...]] = {"vgg": args.lpips_vgg, "alex": args.lpips_alex}
+    if not any(given.values()):
+        fix = "give files with --lpips-alex or --lpips-vgg to doctor, train and eval"
+        yield Finding("LPIPS", "off", "no weights given, none are shipped (optional)", fix)
+    for net, files in given.items():
+        if files:
+            from pop_fast.train.lpips import LPIPS
+
+            weights = LPIPS(net, files)
+            yield Finding(f"LPIPS {net}", "ok", ", ".join(f"{k} {v[:12]}" for k, v in weights.sha256.items()))
 
 
 def processor_name() -> str:

@@ -110,6 +110,6 @@ def _lines(stats: dict[str, Any]) -> list[str]:
     lines += [
         f"Gaussians  {stats['num_GS']:,} ({stats['num_GS_above_floor']:,} with opacity >= 1/255)",
         f"per pixel  {stats['n_blended']:.1f} blended, {stats['n_traversed']:.1f} traversed",
-        f"opacity    {100 * stats['opacity_below_0.1']:.1f} % under 0.1, {100 * stats['opacity_above_0.9']:.1f} % over 0.9",
+        f"opacity    {stats['opacity_below_0.1']:.1%} under 0.1, {stats['opacity_above_0.9']:.1%} over 0.9",
     ]
     return lines

@@ -107,9 +107,7 @@ def rendered(splat: Splat, config: TrainConfig, views: Sequence[ViewTensors]) ->
             yield (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
 
 
-def write_pictures(
-    frames: Iterator[np.ndarray], views: Sequence[ViewTensors], folder: Path
-) -> Iterator[np.ndarray]:
+def write_pictures(frames: Iterator[np.ndarray], views: Sequence[ViewTensors], folder: Path) -> Iterator[np.ndarray]:
     """Write each frame as PNG under its view's name, and hand it on."""
     for frame, view in zip(frames, views, strict=True):
         write_png(folder / Path(view.name).with_suffix(".png"), frame)

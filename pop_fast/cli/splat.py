@@ -1,4 +1,4 @@
-"""What `pop eval`, `render` and `export` start from: a result folder, a checkpoint or a PLY, and the capture it shows."""
+"""What `pop eval`, `render` and `export` start from: a result, a checkpoint or a PLY, and the capture it shows."""
 
 from __future__ import annotations
 
@@ -144,8 +144,8 @@ def _read_checkpoint(path: Path) -> tuple[dict[str, Tensor], int | None]:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
         raise PopError(f"{path}: cannot be read as a checkpoint; copy it again, or use another one") from error
-    splats = content.get("splats") if isinstance(content, dict) else None
-    absent = [key for key in KEYS if not isinstance(splats, dict) or key not in splats]
+    splats: Any = content.get("splats", {}) if isinstance(content, dict) else {}
+    absent = [key for key in KEYS if key not in splats]
     if absent:
         raise PopError(f"{path}: has no splats.{absent[0]}, so it is no checkpoint of 'pop train' or gsplat")
     params = {key: splats[key].detach().float() for key in KEYS}

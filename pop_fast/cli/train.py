@@ -31,8 +31,10 @@ _EXAMPLES: Final = """
 
 # settings that --help shows; --help-all shows the rest
 _SHOWN: Final = frozenset(
-    "data result_dir method preset steps_scaler max_steps factor test_every seed backend profile antialiased background "
-    "lpips_vgg lpips_alex".split()
+    {
+        *("data", "result_dir", "method", "preset", "steps_scaler", "max_steps", "seed", "backend", "profile"),
+        *("factor", "test_every", "antialiased", "background", "lpips_vgg", "lpips_alex"),
+    }
 )
 # words of other trainers' command lines: Inria's, gsplat's
 _ALIASES: Final = {

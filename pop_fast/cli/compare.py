@@ -1,0 +1,47 @@
+"""`pop compare`: several results side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+import tyro
+
+from pop_fast.cli.arguments import parse
+from pop_fast.errors import PopError
+from pop_fast.report.compare import markdown, plain, row
+from pop_fast.report.source import read_config, read_last_stats
+
+_EXAMPLES: Final = """
+    pop compare out/scene_pop out/scene_adc
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Put several results side by side: quality, Gaussians, Gaussians per pixel, opacities, seconds."""
+
+    results: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RESULT [RESULT ...]")]
+    """Folders that 'pop train' wrote."""
+    markdown: bool = False
+    """Print a Markdown table."""
+
+
+def run(argv: Sequence[str]) -> int:
+    """Run the subcommand."""
+    args = parse(Args, argv, "compare", examples=_EXAMPLES)
+    if not args.results:
+        raise PopError("nothing to compare; name one or more result folders")
+    rows = [row(_stats(folder)) for folder in args.results]
+    print(markdown(rows) if args.markdown else plain(rows))
+    return 0
+
+
+def _stats(folder: Path) -> dict[str, object]:
+    read_config(folder)
+    stats = read_last_stats(folder)
+    if not stats:
+        raise PopError(f"{folder}: has no statistics yet; train to the first evaluation, or run pop eval {folder}")
+    return stats

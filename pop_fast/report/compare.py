@@ -1,0 +1,67 @@
+"""Results side by side: one row a run, from the statistics of its last step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+COLUMNS: Final = (
+    "capture",
+    "method",
+    "steps",
+    "PSNR",
+    "SSIM",
+    "Gaussians",
+    "with opacity ≥ 1/255",
+    "per pixel: blended / traversed",
+    "opacity > 0.9 / < 0.1",
+    "seconds",
+    "machine",
+)
+_METHODS: Final = {"pop": "POP", "adc": "3DGS control"}
+_TEXT: Final = frozenset({"capture", "method", "machine"})
+
+
+def row(stats: Mapping[str, Any]) -> list[str]:
+    """Write one run's statistics (stats/val_step*.json) as the cells of a row; what is absent becomes a dash."""
+
+    def cell(form: str, *keys: str) -> str:
+        values = [stats.get(key) for key in keys]
+        return "–" if any(value is None for value in values) else form.format(*values)
+
+    steps = stats.get("step")
+    method = str(stats.get("method", "–"))
+    threads = f", {stats['threads']} threads" if "threads" in stats else ""
+    return [
+        str(stats.get("capture", "–")),
+        _METHODS.get(method, method),
+        "–" if steps is None else f"{steps + 1:,}",
+        cell("{:.2f}", "psnr"),
+        cell("{:.4f}", "ssim"),
+        cell("{:,}", "num_GS"),
+        cell("{:,}", "num_GS_above_floor"),
+        cell("{:.1f} / {:.1f}", "n_blended", "n_traversed"),
+        cell("{:.0%} / {:.0%}", "opacity_above_0.9", "opacity_below_0.1"),
+        cell("{:,.0f}", "seconds"),
+        f"{stats.get('machine', '–')}{threads}",
+    ]
+
+
+def markdown(rows: Sequence[Sequence[str]]) -> str:
+    """Lay rows out as a Markdown table, numbers to the right."""
+    rule = ["---" if name in _TEXT else "---:" for name in COLUMNS]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (COLUMNS, rule, *rows))
+
+
+def plain(rows: Sequence[Sequence[str]]) -> str:
+    """Lay rows out in columns for a terminal."""
+    table = [COLUMNS, *rows]
+    widths = [max(len(cells[i]) for cells in table) for i in range(len(COLUMNS))]
+    lines: list[str] = []
+    for cells in table:
+        padded = (
+            cell.ljust(width) if name in _TEXT else cell.rjust(width)
+            for name, cell, width in zip(COLUMNS, cells, widths, strict=True)
+        )
+        lines.append("  ".join(padded).rstrip())
+    return "\n".join(lines)
