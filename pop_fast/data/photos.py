@@ -6,12 +6,12 @@ incremental mapping. Every random choice is seeded and the largest model is kept
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
-import sqlite3
 import tempfile
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,9 @@ from pop_fast.io.images import list_images, read_image
 __all__ = ["SfmResult", "photo_folder", "run_sfm"]
 
 _EXHAUSTIVE_UP_TO = 60
+_NEIGHBOURS = 10
+# photographs, and the square of it pairs, between two reports of progress
+_BATCH = 8
 _FIX = "take photographs that overlap by two thirds, from different places, of a scene with texture"
 
 
@@ -95,10 +98,10 @@ def run_sfm(
     with folder_atomically(capture / "sparse" if in_place else capture, overwrite) as folder:
         model = folder / "0" if in_place else folder / "sparse" / "0"
         with tempfile.TemporaryDirectory(prefix="pop_sfm_") as work, quiet_colmap():
-            job = _Job(photos, [name.as_posix() for name in names], Path(work), progress)
-            _extract(job, camera_model, single_camera, max_size)
-            _match(job, seed)
-            best = _map(job, seed)
+            job = _Job(photos, _stage(photos, names, Path(work)), Path(work), progress)
+            best = _find_cameras(job, camera_model, single_camera, max_size, seed)
+            for image in best.images.values():
+                image.name = names[int(Path(image.name).stem)].as_posix()
             model.mkdir(parents=True)
             best.write_binary(model)
         if not in_place:
@@ -112,7 +115,7 @@ def run_sfm(
 @dataclass(frozen=True)
 class _Job:
     photos: Path
-    names: list[str]
+    names: list[str]  # in `work / "images"`
     work: Path
     progress: Progress | None
 
@@ -120,36 +123,21 @@ class _Job:
     def database(self) -> Path:
         return self.work / "database.db"
 
-    def count(self, table: str) -> int:
-        """Count rows while COLMAP is writing them."""
-        if not self.database.exists():
-            return 0
-        connection = sqlite3.connect(f"file:{self.database}?mode=ro", uri=True)
-        try:
-            return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
-        except sqlite3.OperationalError:  # not made yet, or locked
-            return 0
-        finally:
-            connection.close()
-
-    def run(self, stage: str, total: int, count: Callable[[], int], work: Callable[[Any], Any]) -> Any:
-        """Run one step of COLMAP in a thread, telling its progress; an interrupt ends it."""
-        token = pycolmap.CancellationToken()
-        with ThreadPoolExecutor(max_workers=1) as pool:
-            future = pool.submit(work, token)
-            try:
-                while not wait([future], timeout=0.3).done:
-                    if self.progress is not None:
-                        self.progress(stage, min(count(), total), total)
-                result = future.result()
-            except BaseException as error:
-                token.cancel()
-                if isinstance(error, ValueError | RuntimeError | IndexError | TypeError):
-                    raise CaptureError(f"{self.photos}: {stage} failed: {error}") from error
-                raise
+    def tell(self, stage: str, done: int, total: int) -> None:
         if self.progress is not None:
-            self.progress(stage, total, total)
-        return result
+            self.progress(stage, done, total)
+
+
+def _stage(photos: Path, names: list[Path], work: Path) -> list[str]:
+    """Give photographs plain numbers for names, because COLMAP's lists of pairs cannot hold a space."""
+    (work / "images").mkdir()
+    staged = [f"{i:06d}{name.suffix.lower()}" for i, name in enumerate(names)]
+    for name, plain in zip(names, staged, strict=True):
+        try:
+            (work / "images" / plain).symlink_to((photos / name).resolve())
+        except OSError:  # where links need a privilege
+            shutil.copyfile(photos / name, work / "images" / plain)
+    return staged
 
 
 def _sizes(photos: Path, names: list[Path], progress: Progress | None) -> set[tuple[int, int]]:
@@ -163,50 +151,68 @@ def _sizes(photos: Path, names: list[Path], progress: Progress | None) -> set[tu
     return sizes
 
 
+def _find_cameras(job: _Job, camera_model: str, single_camera: bool, max_size: int, seed: int) -> Any:
+    try:
+        _extract(job, camera_model, single_camera, max_size)
+        _match(job, seed)
+        return _map(job, seed)
+    except CaptureError:
+        raise
+    except (ValueError, RuntimeError, IndexError, TypeError) as error:
+        raise CaptureError(f"{job.photos}: COLMAP failed: {error}; {_FIX}") from error
+
+
 def _extract(job: _Job, camera_model: str, single_camera: bool, max_size: int) -> None:
+    """Find features, a few photographs at a time, so that progress can be told and an interrupt is heard."""
     if camera_model not in pycolmap.CameraModelId.__members__ or camera_model == "INVALID":
         known = ", ".join(name for name in pycolmap.CameraModelId.__members__ if name != "INVALID")
         raise CaptureError(f"camera_model is {camera_model!r}; use one of {known}")
-    reader = pycolmap.ImageReaderOptions(camera_model=camera_model)
-    options = pycolmap.FeatureExtractionOptions(max_image_size=max_size)
-    job.run(
-        "finding features",
-        len(job.names),
-        lambda: job.count("keypoints"),
-        lambda token: pycolmap.extract_features(
-            job.database,
-            job.photos,
-            image_names=job.names,
-            camera_mode=pycolmap.CameraMode.SINGLE if single_camera else pycolmap.CameraMode.AUTO,
-            reader_options=reader,
-            extraction_options=options,
-            device=pycolmap.Device.cpu,
-            cancellation_token=token,
-        ),
+    n = len(job.names)
+    # listed first and in order, because the threads that find features would number photographs as they finish
+    pycolmap.Database.open(job.database).close()
+    pycolmap.import_images(
+        job.database,
+        job.work / "images",
+        camera_mode=pycolmap.CameraMode.SINGLE if single_camera else pycolmap.CameraMode.AUTO,
+        image_names=job.names,
+        options=pycolmap.ImageReaderOptions(camera_model=camera_model),
     )
+    for start in range(0, n, _BATCH):
+        job.tell("finding features", start, n)
+        pycolmap.extract_features(
+            job.database,
+            job.work / "images",
+            image_names=job.names[start : start + _BATCH],
+            extraction_options=pycolmap.FeatureExtractionOptions(max_image_size=max_size),
+            device=pycolmap.Device.cpu,
+        )
+    job.tell("finding features", n, n)
+
+
+def _pairs(n: int) -> list[tuple[int, int]]:
+    """List which photographs to match: all with all, or each with its neighbours by name, near and 2^k further on."""
+    if n <= _EXHAUSTIVE_UP_TO:
+        return list(itertools.combinations(range(n), 2))
+    steps = {*range(1, _NEIGHBOURS + 1), *(2**k for k in range(_NEIGHBOURS))}
+    return sorted((i, i + step) for i in range(n) for step in steps if i + step < n)
 
 
 def _match(job: _Job, seed: int) -> None:
-    n = len(job.names)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
-    exhaustive = n <= _EXHAUSTIVE_UP_TO
-    pairing = pycolmap.SequentialPairingOptions()
-    # neighbours, and with quadratic overlap those 2, 4, 8 ... further on
-    pairs = n * (n - 1) // 2 if exhaustive else 2 * pairing.overlap * n
-
-    def work(token: Any) -> None:
-        common: dict[str, Any] = {
-            "verification_options": verification,
-            "device": pycolmap.Device.cpu,
-            "cancellation_token": token,
-        }
-        if exhaustive:
-            pycolmap.match_exhaustive(job.database, **common)
-        else:
-            pycolmap.match_sequential(job.database, pairing_options=pairing, **common)
-
-    job.run("matching photographs", pairs, lambda: job.count("two_view_geometries"), work)
+    pairs = _pairs(len(job.names))
+    listing = job.work / "pairs.txt"
+    for start in range(0, len(pairs), _BATCH**2):
+        job.tell("matching photographs", start, len(pairs))
+        batch = pairs[start : start + _BATCH**2]
+        listing.write_text("".join(f"{job.names[i]} {job.names[j]}\n" for i, j in batch), encoding="utf-8")
+        pycolmap.match_image_pairs(
+            job.database,
+            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listing),
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )
+    job.tell("matching photographs", len(pairs), len(pairs))
 
 
 def _map(job: _Job, seed: int) -> Any:
@@ -214,30 +220,30 @@ def _map(job: _Job, seed: int) -> Any:
     options.random_seed = seed
     options.mapper.random_seed = seed
     options.triangulation.random_seed = seed
-    options.min_model_size = min(options.min_model_size, 3)
-    registered = [0]
+    options.min_model_size = 3
+    # bundle adjustment adds in the order in which its threads finish: one thread gives the same bits every time
+    options.num_threads = 1
+    options.mapper.num_threads = 1
+    options.ba_min_num_residuals_for_cpu_multi_threading = 2**31 - 1
+    found = [0]
 
     def advance(by: int) -> Callable[[], None]:
         def callback() -> None:
-            registered[0] += by
+            found[0] += by
+            job.tell("finding cameras", min(found[0], len(job.names)), len(job.names))
 
         return callback
 
+    job.tell("finding cameras", 0, len(job.names))
     out = job.work / "models"
     out.mkdir()
-    models: dict[int, Any] = job.run(
-        "finding cameras",
-        len(job.names),
-        lambda: registered[0],
-        lambda token: pycolmap.incremental_mapping(
-            job.database,
-            job.photos,
-            out,
-            options=options,
-            initial_image_pair_callback=advance(2),
-            next_image_callback=advance(1),
-            cancellation_token=token,
-        ),
+    models: dict[int, Any] = pycolmap.incremental_mapping(
+        job.database,
+        job.work / "images",
+        out,
+        options=options,
+        initial_image_pair_callback=advance(2),
+        next_image_callback=advance(1),
     )
     best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
     if best is None or best.num_reg_images() < 2 or best.num_points3D() == 0:
