@@ -1,0 +1,274 @@
+"""The loop: it learns, it keeps to its schedule, it writes what it says it writes, and it refuses what it must."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from pop_fast.errors import PopError
+from pop_fast.io.ply import load_ply
+from pop_fast.strategies import POPStrategy
+from pop_fast.train import Trainer
+from pop_fast.train.environment import reproducible
+from pop_fast.train.model import KEYS, advance_idle, first_non_finite, make_optimizers
+from pop_fast.train.objective import Objective
+from pop_fast.train.views import ViewTensors, render_view
+from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config
+
+
+def records(folder):
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture(scope="module", params=["pop", "adc"])
+def finished(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / request.param
+    config = tiny_config(folder, method=request.param)
+    trainer = Trainer(config, tiny_capture())
+    stats = trainer.run()
+    return trainer, stats, folder
+
+
+def test_training_brings_renders_nearer_to_the_photographs(tmp_path):
+    # a fixed population: with one that changes every fourth step, thirty steps show mostly that
+    config = tiny_config(tmp_path, max_steps=60, pop=POPStrategy(refine_stop_iter=0))
+    Trainer(config, tiny_capture()).run()
+    psnr = [record["psnr"] for record in records(tmp_path)]
+    assert np.mean(psnr[-4:]) > np.mean(psnr[:4]) + 2.0
+
+
+def test_the_population_changes_when_the_schedule_says(finished):
+    trainer, _, folder = finished
+    events = [record for record in records(folder) if "cloned" in record]
+    changes = [record["step"] for record in events if not record.get("reset") or record["step"] % 4 == 0]
+    assert changes == [4, 8, 12, 16, 20]
+    resets = [record["step"] for record in events if record.get("reset")]
+    assert resets == ([12] if trainer.config.method == "adc" else [])
+    assert sum(record["cloned"] + record["split"] for record in events) > 0
+
+
+def test_numbers_of_gaussians_add_up(finished):
+    _, stats, folder = finished
+    n = len(tiny_capture().points)
+    for record in records(folder):
+        n += record.get("cloned", 0) + record.get("split", 0) - record.get("pruned", 0)
+        assert record["num_gaussians"] == n
+    assert stats["num_GS"] == n
+
+
+def test_the_pop_term_is_logged_while_it_is_on(finished):
+    trainer, _, folder = finished
+    with_term = [record["step"] for record in records(folder) if "pop" in record]
+    assert with_term == (list(range(0, 24, 2)) if trainer.config.method == "pop" else [])
+
+
+def test_the_loss_is_the_sum_of_its_terms(finished):
+    trainer, _, folder = finished
+    weight = trainer.config.ssim_weight
+    for record in records(folder):
+        pixelwise = record["l2" if trainer.config.method == "pop" else "l1"]
+        total = (1 - weight) * pixelwise + weight * record["d_ssim"] + record.get("pop", 0.0)
+        assert record["loss"] == pytest.approx(total, rel=1e-5)
+
+
+def test_a_record_is_written_every_other_step_and_at_events(finished):
+    _, _, folder = finished
+    assert [record["step"] for record in records(folder)] == list(range(0, 30, 2))
+    needed = {"view", "n_blended", "n_traversed", "sh_degree", "lr_means", "it_per_s", "seconds", "num_gaussians"}
+    assert all(needed <= set(record) for record in records(folder))
+
+
+def test_the_folder_holds_what_its_docstring_lists(finished):
+    _, _, folder = finished
+    names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert names == {
+        "cfg.json",
+        "metrics.jsonl",
+        *(f"ckpts/ckpt_{step}_rank0.pt" for step in (11, 24, 29)),
+        *(f"ply/point_cloud_{step}.ply" for step in (11, 29)),
+        *(f"stats/{kind}_step{step:04d}.json" for kind in ("train", "val") for step in (11, 29)),
+        "renders/val_step29_0000.png",
+        "renders/dominant_step29_0000.png",
+        "report_data/val_step29_0000.npz",
+        *(f"report_data/opacity_step{step}.npz" for step in (-1, 15, 29)),
+    }
+
+
+def test_statistics_are_complete(finished):
+    trainer, stats, folder = finished
+    assert json.loads((folder / "stats" / "val_step0029.json").read_text()) == stats
+    assert stats["num_GS"] == len(trainer.params["means"]) >= stats["num_GS_above_floor"]
+    assert 0.0 <= stats["opacity_below_0.1"] + stats["opacity_above_0.9"] <= 1.0
+    assert stats["psnr"] > 5.0
+    assert 0.0 < stats["ssim"] < 1.0
+    assert stats["lpips"] is None
+    assert "no weights" in stats["lpips_reason"]
+    assert stats["seconds_total"] > stats["seconds"] > 0.0
+    assert stats["memory_bytes"] > 2**20
+    assert stats["n_traversed"] >= stats["n_blended"] > 0.0
+    assert stats["versions"]["torch"] == torch.__version__
+    assert list(stats["per_view"]) == ["00.png"]
+
+
+def test_the_ply_holds_the_last_parameters(finished):
+    trainer, _, folder = finished
+    loaded = load_ply(folder / "ply" / "point_cloud_29.ply")
+    for key in KEYS:
+        assert torch.equal(loaded[key], trainer.params[key].detach())
+
+
+def test_pictures_keep_size_and_ids(finished):
+    trainer, _, folder = finished
+    with np.load(folder / "report_data" / "val_step29_0000.npz") as arrays:
+        assert arrays["render"].shape == arrays["photo"].shape == (HEIGHT, WIDTH, 3)
+        assert -1 <= arrays["dominant_ids"].min() <= arrays["dominant_ids"].max() < len(trainer.params["means"])
+
+
+def test_gsplat_can_read_the_checkpoint(finished):
+    trainer, _, folder = finished
+    content = torch.load(folder / "ckpts" / "ckpt_29_rank0.pt", weights_only=True)
+    assert content["step"] == 29
+    assert list(content["splats"]) == list(KEYS)
+    assert all(torch.equal(content["splats"][key], trainer.params[key]) for key in KEYS)
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_does_not(finished, tmp_path):
+    trainer, _, _ = finished
+    same = Trainer(replace(trainer._given, result_dir=str(tmp_path / "a")), tiny_capture())
+    same.run()
+    assert all(torch.equal(same.params[key], trainer.params[key]) for key in KEYS)
+    other = Trainer(replace(trainer._given, result_dir=str(tmp_path / "b"), seed=8), tiny_capture())
+    other.run()
+    assert not torch.equal(other.params["quats"], trainer.params["quats"])
+
+
+def test_skipping_the_idle_colour_bands_is_bit_identical_to_dense_adam():
+    g = torch.Generator().manual_seed(0)
+    start = torch.randn(50, 15, 3, generator=g)
+    start[0] = -0.0
+    results = []
+    for skips in (False, True):
+        g.manual_seed(1)
+        params = {key: torch.nn.Parameter(start.clone()) for key in KEYS}
+        optimizers = make_optimizers(params, tiny_config("x").lr, 1.0)
+        optimizer, param = optimizers["shN"], params["shN"]
+        for step in range(40):
+            if step < 20 and skips:
+                advance_idle(optimizer, param)
+                continue
+            param.grad = torch.zeros_like(param) if step < 20 else torch.randn(param.shape, generator=g)
+            optimizer.step()
+        state = optimizer.state[param]
+        results.append((param.detach(), state["exp_avg"], state["exp_avg_sq"], state["step"]))
+    for dense, skipped in zip(*results, strict=True):
+        assert torch.equal(dense, skipped)
+        assert torch.equal(torch.signbit(dense), torch.signbit(skipped))
+
+
+def test_masked_pixels_have_no_say(tmp_path):
+    mask = np.ones((HEIGHT, WIDTH), dtype=bool)
+    mask[:, WIDTH // 2 :] = False
+    runs = []
+    for seed in (0, 1):
+        capture = tiny_capture(mask=mask)
+        rng = np.random.default_rng(seed)
+        for view in capture.views:
+            view.image[:, WIDTH // 2 :] = rng.integers(0, 255, (HEIGHT, WIDTH // 2, 3))
+        # without SSIM, whose windows reach over the mask's edge
+        trainer = Trainer(tiny_config(tmp_path / str(seed), max_steps=12, lambda_ssim=0.0), capture)
+        stats = trainer.run()
+        runs.append((trainer.params, stats["psnr"]))
+    assert all(torch.equal(runs[0][0][key], runs[1][0][key]) for key in KEYS)
+    assert runs[0][1] == runs[1][1]
+
+
+def test_dominant_counts_of_a_masked_view_are_those_inside_the_mask(tmp_path):
+    mask = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    mask[5:15, 3:20] = True
+    trainer = Trainer(tiny_config(tmp_path), tiny_capture(mask=mask))
+    view = trainer._train[0]
+    rendered = render_view(trainer._backend, trainer.params, view, trainer.config, 0, dominance=True)
+    ids = rendered.info["dominant_ids"][0][view.mask]
+    want = torch.bincount(ids[ids >= 0], minlength=len(trainer.params["means"]))
+    assert torch.equal(rendered.info["dominant_counts"][0], want)
+    assert want.sum() > 0
+
+
+def test_the_target_cache_changes_no_bit(tmp_path):
+    views = [ViewTensors.of(view) for view in tiny_capture().views]
+    image = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))
+    losses = []
+    for megabytes in (0, 1):
+        objective = Objective(tiny_config(tmp_path, target_cache_mb=megabytes).resolved(), views)
+        losses.append([objective(image, i) for i in (0, 1, 0)])
+        assert len(objective._kept) == (2 if megabytes else 0)
+    assert losses[0] == losses[1]
+
+
+def test_an_existing_folder_is_not_touched_without_leave(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    for kind in ({}, {"overwrite": True}, {"resume": True}):
+        with pytest.raises(PopError, match="choose another|another result folder"):
+            Trainer(tiny_config(tmp_path), tiny_capture(), **kind).run()
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_overwriting_removes_results_and_nothing_else(tmp_path):
+    folder = tmp_path / "run"
+    Trainer(tiny_config(folder, max_steps=6), tiny_capture()).run()
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(PopError, match="--resume, --overwrite"):
+        Trainer(tiny_config(folder, max_steps=4), tiny_capture()).run()
+    Trainer(tiny_config(folder, max_steps=4), tiny_capture(), overwrite=True).run()
+    assert (folder / "notes.txt").read_text() == "mine"
+    assert [path.name for path in (folder / "ckpts").iterdir()] == ["ckpt_3_rank0.pt"]
+
+
+def test_a_result_folder_that_is_a_file_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(PopError, match="is a file"):
+        Trainer(tiny_config(tmp_path / "file"), tiny_capture()).run()
+
+
+def test_no_view_to_train_on_is_said(tmp_path):
+    with pytest.raises(PopError, match="no view to train on"):
+        Trainer(tiny_config(tmp_path, test_every=1), tiny_capture())
+
+
+@pytest.mark.parametrize("key", ["means", "opacities", "shN"])
+def test_a_number_that_is_not_finite_is_named_and_the_last_checkpoint_kept(tmp_path, key):
+    trainer = Trainer(tiny_config(tmp_path), tiny_capture())
+    step = trainer.train_step
+
+    def poisoned():
+        done = step()
+        if trainer.step == 8:
+            trainer.params[key].data[5] = float("nan")
+        return done
+
+    trainer.train_step = poisoned
+    with pytest.raises(PopError, match=rf"{key}\[5.*\] is nan after (8|9|10) steps"):
+        trainer.run()
+    assert [path.name for path in (tmp_path / "ckpts").iterdir()] == ["ckpt_4_rank0.pt"]
+
+
+def test_the_first_entry_that_is_not_finite_is_found():
+    good = {"a": torch.ones(3), "b": torch.full((2, 2), 3e38)}
+    assert first_non_finite(good) is None
+    bad = {**good, "c": torch.tensor([[0.0, 1.0], [float("-inf"), 2.0]])}
+    assert first_non_finite(bad) == ("c", [1, 0], float("-inf"))
+
+
+def test_settings_of_torch_are_put_back_after_a_run():
+    before = (torch.get_num_threads(), torch.are_deterministic_algorithms_enabled())
+    small = torch.full((4 * 65_536,), torch.finfo(torch.float32).tiny)
+    with reproducible(2):
+        assert torch.get_num_threads() == 2
+        assert torch.are_deterministic_algorithms_enabled()
+        assert (small * 0.5 == 0.0).all()
+    assert (torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()) == before
+    assert (small * 0.5 > 0.0).all()
