@@ -27,6 +27,7 @@ _REASONS = {
     errno.EPERM: "permission denied; choose a folder that you may write to",
     errno.EROFS: "the file system is read-only; choose another output folder",
     errno.ENOTDIR: "a part of this path is a file, not a folder; choose another path",
+    errno.EEXIST: "a file is in the place of this folder; choose another path",
     errno.EISDIR: "a folder of this name is in the way; remove it or choose another name",
     errno.ENAMETOOLONG: "the name is too long for this file system; choose a shorter one",
 }

@@ -113,7 +113,9 @@ def load_ply(path: str | os.PathLike[str]) -> dict[str, torch.Tensor]:
     n = len(rows)
     rest = np.zeros((n, 15, 3), np.float32)
     if count:
-        rest[:, : count // 3] = column(*(f"f_rest_{i}" for i in range(count))).reshape(n, 3, -1).transpose(0, 2, 1)
+        rest[:, : count // 3] = (
+            column(*(f"f_rest_{i}" for i in range(count))).reshape(n, 3, count // 3).transpose(0, 2, 1)
+        )
     quats = column(*(f"rot_{i}" for i in range(4)))
     if n and not quats.any(axis=1).all():
         row = int(np.argmin(quats.any(axis=1)))
