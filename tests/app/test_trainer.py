@@ -212,7 +212,7 @@ def test_the_target_cache_changes_no_bit(tmp_path):
 def test_an_existing_folder_is_not_touched_without_leave(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     for kind in ({}, {"overwrite": True}, {"resume": True}):
-        with pytest.raises(PopError, match="choose another|another result folder"):
+        with pytest.raises(PopError, match=r"choose another|another result folder"):
             Trainer(tiny_config(tmp_path), tiny_capture(), **kind).run()
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 

@@ -6,6 +6,7 @@ Run as a script it trains, for tests that have to stop a process: `python tests/
 from __future__ import annotations
 
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 from pop_fast.data.capture import Capture, View
 from pop_fast.strategies import ADCStrategy, POPStrategy
 from pop_fast.train import LearningRates, TrainConfig, Trainer
+from pop_fast.train.trainer import Step
 
 WIDTH, HEIGHT = 32, 24
 N_POINTS = 60
@@ -50,7 +52,7 @@ def tiny_capture(seed: int = 0, n_views: int = 5, mask: np.ndarray | None = None
 
 
 def tiny_config(folder: Path | str, **changes: Any) -> TrainConfig:
-    """Thirty steps, at high rates, with every kind of event in them: growth, blur, pruning, resets, all colour bands."""
+    """Thirty steps, at high rates, with every kind of event: growth, blur, pruning, resets, all colour bands."""
     steps = {"refine_start_iter": 3, "refine_stop_iter": 24, "refine_every": 4, "prune_too_big_after": 8}
     grow = {"grow_grad2d": 3e-3, "grow_scale3d": 0.05}
     base = TrainConfig(
@@ -74,5 +76,14 @@ def tiny_config(folder: Path | str, **changes: Any) -> TrainConfig:
     return replace(base, **changes)
 
 
+class SlowTrainer(Trainer):
+    """Leaves time to be stopped in."""
+
+    def train_step(self) -> Step:
+        """Take one step, and a breath."""
+        time.sleep(0.02)
+        return super().train_step()
+
+
 if __name__ == "__main__":
-    Trainer(tiny_config(sys.argv[1]), tiny_capture(), resume=sys.argv[2:] == ["resume"]).run()
+    SlowTrainer(tiny_config(sys.argv[1]), tiny_capture(), resume=sys.argv[2:] == ["resume"]).run()

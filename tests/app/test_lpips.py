@@ -1,0 +1,168 @@
+"""LPIPS with random weights of a fixed seed: the layers, the three variants, and the two ways to give weights."""
+
+from __future__ import annotations
+
+import hashlib
+
+import pytest
+import torch
+from torch import nn
+
+from pop_fast.errors import PopError
+from pop_fast.train.lpips import LPIPS, load_nets
+from pop_fast.train.metrics import average, measure
+
+# the networks as torchvision lays them out: convolutions (index: in, out, kernel, stride, padding), pools by index
+VGG_WIDTHS = [64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512, "M"]
+
+
+def vgg_features():
+    layers: list[nn.Module] = []
+    width = 3
+    for entry in VGG_WIDTHS:
+        if entry == "M":
+            layers.append(nn.MaxPool2d(2, 2))
+        else:
+            layers += [nn.Conv2d(width, entry, 3, padding=1), nn.ReLU()]
+            width = entry
+    return nn.Sequential(*layers)
+
+
+def alex_features():
+    return nn.Sequential(
+        *(nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2)),
+        *(nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)),
+        *(nn.Conv2d(192, 384, 3, padding=1), nn.ReLU()),
+        *(nn.Conv2d(384, 256, 3, padding=1), nn.ReLU()),
+        *(nn.Conv2d(256, 256, 3, padding=1), nn.ReLU(), nn.MaxPool2d(3, 2)),
+    )
+
+
+# the last layer of each slice whose output is compared
+TAPS = {"vgg": (3, 8, 15, 22, 29), "alex": (1, 4, 7, 9, 11)}
+FEATURES = {"vgg": vgg_features, "alex": alex_features}
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """For each net: the features module, the linear weights, and its files."""
+    folder = tmp_path_factory.mktemp("weights")
+    found = {}
+    for net in ("vgg", "alex"):
+        torch.manual_seed(5)
+        features = FEATURES[net]().eval()
+        backbone = {f"features.{key}": value for key, value in features.state_dict().items()}
+        backbone["classifier.6.weight"] = torch.zeros(2, 2)
+        convs = [layer for layer in features if isinstance(layer, nn.Conv2d)]
+        widths = [
+            next(l.out_channels for l in reversed(features[: tap + 1]) if hasattr(l, "out_channels"))
+            for tap in TAPS[net]
+        ]
+        lins = {f"lin{i}.model.1.weight": torch.rand(1, width, 1, 1) for i, width in enumerate(widths)}
+        assert len(convs) >= len(widths)
+        paths = [folder / f"{net}_backbone.pth", folder / f"{net}_lin.pth", folder / f"{net}_merged.pth"]
+        for path, content in zip(paths, (backbone, lins, {**backbone, **lins}), strict=True):
+            torch.save(content, path)
+        found[net] = features, list(lins.values()), paths
+    return found
+
+
+def pictures(size=80):
+    g = torch.Generator().manual_seed(0)
+    image = torch.rand(size, size + 3, 3, generator=g)
+    return image, (image + 0.1 * torch.randn(image.shape, generator=g)).clamp(0, 1)
+
+
+def by_the_book(features, lins, taps, image, target, rescaled):
+    """The definition, with torch's own layers."""
+    shift, spread = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+    total = 0.0
+    with torch.no_grad():
+        x, y = (((2 * p - 1 if rescaled else p) - shift) / spread for p in (image, target))
+        x, y = x.permute(2, 0, 1)[None], y.permute(2, 0, 1)[None]
+        for i, layer in enumerate(features):
+            x, y = layer(x), layer(y)
+            if i in taps:
+                fx, fy = (f / (f.square().sum(1, keepdim=True).sqrt() + 1e-10) for f in (x, y))
+                total += nn.functional.conv2d((fx - fy) ** 2, lins[taps.index(i)]).mean().item()
+    return total
+
+
+@pytest.mark.parametrize(("net", "variant"), [("vgg", "vgg_01"), ("alex", "alex_norm"), ("alex", "alex_01")])
+def test_each_variant_follows_the_definition(weights, net, variant):
+    features, lins, paths = weights[net]
+    got = LPIPS(net, paths[2:])(*pictures(), variant)
+    want = by_the_book(features, lins, TAPS[net], *pictures(), variant.endswith("norm"))
+    assert got == pytest.approx(want, rel=1e-4)
+    assert got > 0.0
+
+
+def test_equal_pictures_are_at_distance_zero(weights):
+    image, _ = pictures()
+    assert LPIPS("alex", weights["alex"][2][2:])(image, image, "alex_norm") == 0.0
+
+
+def test_two_files_in_any_order_equal_one_merged_file(weights):
+    paths = weights["alex"][2]
+    values = [LPIPS("alex", files)(*pictures(), "alex_01") for files in (paths[:2], paths[1::-1], paths[2:])]
+    assert values[0] == values[1] == values[2]
+
+
+def test_the_lpips_packages_own_state_dict_is_read(weights, tmp_path):
+    backbone = torch.load(weights["alex"][2][0], weights_only=True)
+    slices = {0: 1, 3: 2, 6: 3, 8: 4, 10: 5}
+    renamed = {}
+    for key, value in backbone.items():
+        if key.startswith("features."):
+            index, kind = key.split(".")[1:]
+            renamed[f"net.slice{slices[int(index)]}.{index}.{kind}"] = value
+    renamed |= torch.load(weights["alex"][2][1], weights_only=True)
+    torch.save({**renamed, "scaling_layer.shift": torch.zeros(3)}, tmp_path / "package.pth")
+    ours, want = LPIPS("alex", [tmp_path / "package.pth"]), LPIPS("alex", weights["alex"][2][2:])
+    assert ours(*pictures(), "alex_norm") == want(*pictures(), "alex_norm")
+
+
+def test_hashes_of_the_weight_files_are_reported_with_every_variant(weights):
+    nets = load_nets(vgg=weights["vgg"][2][2:], alex=weights["alex"][2][:2])
+    image, target = pictures()
+    means = average([measure(image, target, nets=nets)], nets)
+    assert set(means["lpips_variants"]) == {"vgg_01", "alex_norm", "alex_01"}
+    assert (means["lpips_net"], means["lpips"]) == ("alex_norm", means["lpips_variants"]["alex_norm"])
+    assert means["lpips_reason"] is None
+    files = {path.name: path for net in weights.values() for path in net[2]}
+    assert len(means["lpips_weights_sha256"]) == 3
+    for name, value in means["lpips_weights_sha256"].items():
+        assert value == hashlib.sha256(files[name].read_bytes()).hexdigest()
+
+
+def test_vgg_alone_is_reported_as_vgg(weights):
+    nets = load_nets(vgg=weights["vgg"][2][2:])
+    assert average([measure(*pictures(), nets=nets)], nets)["lpips_net"] == "vgg_01"
+
+
+def test_a_variant_of_the_other_net_is_refused(weights):
+    with pytest.raises(ValueError, match="alex computes alex_norm, alex_01"):
+        LPIPS("alex", weights["alex"][2][2:])(*pictures(), "vgg_01")
+
+
+def test_pictures_too_small_for_the_net_are_refused(weights):
+    with pytest.raises(ValueError, match="too small for LPIPS on alex"):
+        LPIPS("alex", weights["alex"][2][2:])(*pictures(12), "alex_01")
+
+
+def test_bad_weight_files_are_named(weights, tmp_path):
+    backbone, lins, merged = weights["alex"][2]
+    with pytest.raises(PopError, match="no such file"):
+        LPIPS("alex", [tmp_path / "absent.pth"])
+    (tmp_path / "text.pth").write_text("hello")
+    with pytest.raises(PopError, match=r"text\.pth: cannot be read"):
+        LPIPS("alex", [tmp_path / "text.pth"])
+    torch.save([1], tmp_path / "list.pth")
+    with pytest.raises(PopError, match="holds list"):
+        LPIPS("alex", [tmp_path / "list.pth"])
+    with pytest.raises(PopError, match=r"has no lin0\.model\.1\.weight; give the backbone and"):
+        LPIPS("alex", [backbone])
+    with pytest.raises(PopError, match=r"has no features\.0\.weight"):
+        LPIPS("alex", [lins])
+    with pytest.raises(PopError, match=r"features\.0\.weight has shape \[64, 3, 11, 11\]; it must be \[64, 3, 3, 3\]"):
+        LPIPS("vgg", [merged])
