@@ -30,6 +30,9 @@ class POPStrategy(DensityControl):
         grow_on_gradient: whether the gradient rule is on beside the blur rule. The paper adds the blur rule to it.
         grow_on_gradient_in_blur_window: and also where the blur rule is, which else works alone there.
         theta_blur: share of a view's pixels over which a dominant Gaussian counts as blur (eq. 6).
+        blur_min_pixels: and at least over so many pixels. The paper has no such bound and needs none: its smallest
+            images make `theta_blur` 11 pixels. In an image of 130,000 pixels it is 3, and every Gaussian that can be
+            seen would be split until it nearly cannot.
         blur_start_iter: first step of the blur rule.
         blur_stop_iter: last step of the blur rule, itself included; under `blur_start_iter` turns the rule off.
         blur_window: what the count is taken over. "any_view": one view since the last change is enough, as in
@@ -46,6 +49,7 @@ class POPStrategy(DensityControl):
     """
 
     theta_blur: float = 2e-5
+    blur_min_pixels: float = 0.0
     blur_start_iter: int = 3000
     blur_stop_iter: int = 7000
     blur_window: Literal["any_view", "sum", "own_view"] = "any_view"
@@ -112,10 +116,11 @@ class POPStrategy(DensityControl):
 
     def _collect_blur(self, state: State, info: Info) -> None:
         height, width = int(info["height"]), int(info["width"])
+        theta = max(self.theta_blur, self.blur_min_pixels / (height * width))
         if self.blur_window == "sum":
-            state["blurred"] = blur_set(state["dominant_sum"], width, height, self.theta_blur)
+            state["blurred"] = blur_set(state["dominant_sum"], width, height, theta)
             return
-        blurred = blur_set(dominant_counts(info), width, height, self.theta_blur).any(0)
+        blurred = blur_set(dominant_counts(info), width, height, theta).any(0)
         if self.blur_window == "any_view" and state["blurred"] is not None:
             blurred |= state["blurred"]
         state["blurred"] = blurred

@@ -25,6 +25,8 @@ from pop_fast.train.jsonable import from_plain, to_plain
 
 QUICK_SCALER: Final = 0.1
 PRESETS: Final = {"paper": 1.0, "quick": QUICK_SCALER}
+# what theta_blur comes to in the smallest images of the paper (980 x 545); "quick" is for images smaller than those
+QUICK_BLUR_MIN_PIXELS: Final = 11.0
 
 # what may differ between a checkpoint and the run that resumes it: it does not reach a single bit of the parameters
 _FREE: Final = frozenset(
@@ -56,7 +58,8 @@ class TrainConfig:
         data: the capture: a COLMAP folder, a folder with transforms.json, or a folder of photographs.
         result_dir: where the run writes.
         method: "pop", or "adc" for plain density control with opacity reset (3DGS as gsplat runs it).
-        preset: "paper" is the whole schedule; "quick" a tenth of it, for a CPU.
+        preset: "paper" is the whole schedule; "quick" a tenth of it, for a CPU, in which a Gaussian must dominate at
+            least `QUICK_BLUR_MIN_PIXELS` pixels to count as blur.
         steps_scaler: multiplies every step number of the schedule; None takes the preset's.
         max_steps: training steps, one view each.
         seed: of the view order, the initial rotations and the split noise.
@@ -175,6 +178,9 @@ class TrainConfig:
     def resolved(self) -> TrainConfig:
         """Return the same run with the scaler worked into every step number (and itself 1)."""
         by = self.scaler
+        pop = self.pop.scaled(by)
+        if self.preset == "quick":
+            pop = replace(pop, blur_min_pixels=max(pop.blur_min_pixels, QUICK_BLUR_MIN_PIXELS))
 
         def scaled(step: int) -> int:
             return max(round(step * by), 1)
@@ -187,7 +193,7 @@ class TrainConfig:
             sh_interval=scaled(self.sh_interval),
             eval_steps=tuple(scaled(step) for step in self.eval_steps),
             save_steps=tuple(scaled(step) for step in self.save_steps),
-            pop=self.pop.scaled(by),
+            pop=pop,
             adc=self.adc.scaled(by),
         )
 
