@@ -20,9 +20,9 @@ __all__ = ["Undistortion", "intrinsics", "undistortion"]
 
 # a wide lens may be opened up to twice its focal length's field of view, a strong pincushion closed to a quarter
 _ZOOMS = (0.5, 4.0)
-# px: what counts as no distortion at all, and as inside the photograph
+# what counts as no distortion at all, px, and as inside the photograph, in widths or heights of it
 _IDENTITY = 1e-7
-_SLACK = 1e-6
+_SLACK = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +119,9 @@ def _fits(fan: np.ndarray, center: np.ndarray, width: int, height: int) -> bool:
 
     Without the second condition a polynomial that bends back far outside, as they all do somewhere, would look inside.
     """
-    outline = fan[-1]
+    outline = fan[-1] / np.array([width, height])
     # a comparison with NaN is false: rays that the model cannot project do not fit
-    inside = np.all((outline >= -_SLACK) & (outline <= np.array([width, height]) + _SLACK))
+    inside = np.all((outline >= -_SLACK) & (outline <= 1.0 + _SLACK))
     radii = np.linalg.norm(fan - center, axis=-1)
     return bool(inside and np.all(np.diff(radii, axis=0) >= 0.0))
 
