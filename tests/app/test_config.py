@@ -144,7 +144,9 @@ def test_a_resumed_run_must_share_what_reaches_the_bits_and_only_that():
 
 
 def test_two_ways_to_say_the_same_schedule_are_the_same_run():
-    assert TrainConfig(preset="quick").digest() == TrainConfig(steps_scaler=0.1).digest()
+    spelled_out = TrainConfig(steps_scaler=0.1, pop=POPStrategy(blur_min_pixels=11.0))
+    assert TrainConfig(preset="quick").digest() == spelled_out.digest()
+    assert TrainConfig(preset="quick").digest() != TrainConfig(steps_scaler=0.1).digest()
 
 
 def test_every_setting_is_documented():
