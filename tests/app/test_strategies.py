@@ -268,6 +268,14 @@ def test_a_gaussian_that_dominates_enough_pixels_of_one_view_grows_in_the_blur_w
         assert len(params["means"]) == n, step
 
 
+def test_a_threshold_in_pixels_bounds_the_blur_rule_from_below():
+    for least, counts, n in ((0.0, [0, 1], 3), (11.0, [11, 12], 3), (11.0, [1, 11], 2)):
+        params, optimizers = make(2)
+        info = make_info(2, counts=torch.tensor(counts), width=240, height=135)
+        run_event(POPStrategy(blur_min_pixels=least), params, optimizers, info, 3000)
+        assert len(params["means"]) == n
+
+
 @pytest.mark.parametrize(("window", "n"), [("any_view", 2), ("sum", 3), ("own_view", 1)])
 def test_what_the_dominant_count_is_taken_over_is_a_switch(window, n):
     # Gaussian 0 is over the threshold of 2 px in the first view, Gaussian 1 in the sum alone
