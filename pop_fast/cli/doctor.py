@@ -127,15 +127,12 @@ def lpips(args: Args) -> Iterator[Finding]:
 
 
 def processor_name() -> str:
-    """Give the processor's name as the system tells it."""
+    """Give the processor's name as statistics files have it, or the system's own word for it where torch is missing."""
     try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            names = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
-        if names:
-            return names[0]
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
+        from pop_fast.train.environment import machine_name
+    except ImportError:
+        return platform.processor() or platform.machine()
+    return machine_name()
 
 
 def memory_bytes() -> tuple[int, int]:

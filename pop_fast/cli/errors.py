@@ -13,14 +13,14 @@ _PACKAGES: Final = ("/pop_fast/", "/pop_ref/", "/cuda_ext/")
 def describe(error: BaseException) -> str | None:
     """Say in one line what the user can do about an error, or None when it is a fault of the program.
 
-    A `ValueError` counts as the user's when the package itself raised it (then its message names field and fix); one
-    that escapes from a library below is a fault, and keeps its traceback.
+    A `ValueError` or `NotImplementedError` counts as the user's when the package itself raised it, because then its
+    message names field and fix; one that escapes from a library below is a fault, and keeps its traceback.
     """
     if isinstance(error, OSError):
         return _describe_os_error(error)
     if isinstance(error, MemoryError) or "not enough memory" in str(error) or "can't allocate memory" in str(error):
         return "out of memory; use smaller images (--factor 2 or more) or fewer Gaussians"
-    if isinstance(error, ValueError) and _raised_here(error):
+    if isinstance(error, ValueError | NotImplementedError) and _raised_here(error):
         return re.sub(r"\s*\n\s*", " ", str(error))
     return None
 

@@ -23,6 +23,7 @@ from pop_fast.train.model import KEYS, first_non_finite
 from pop_fast.train.schedule import active_sh_degree
 
 _RECORD = "capture.json"
+_SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,12 +149,29 @@ def _read_checkpoint(path: Path) -> tuple[dict[str, Tensor], int | None]:
     absent = [key for key in KEYS if key not in splats]
     if absent:
         raise PopError(f"{path}: has no splats.{absent[0]}, so it is no checkpoint of 'pop train' or gsplat")
+    _check_shapes(path, splats)
     params = {key: splats[key].detach().float() for key in KEYS}
     bad = first_non_finite(params)
     if bad:
         raise PopError(f"{path}: splats.{bad[0]}{bad[1]} is {bad[2]}; every entry must be finite: use an earlier one")
     step = content.get("step")
     return params, step if isinstance(step, int) else None
+
+
+def _check_shapes(path: Path, splats: Any) -> None:
+    n: int | None = None
+    for name, tail in _SHAPES.items():
+        value = splats[name]
+        if not isinstance(value, Tensor) or not value.is_floating_point():
+            found = str(value.dtype) if isinstance(value, Tensor) else type(value).__name__
+            raise PopError(f"{path}: splats.{name} is {found}; it must be a tensor of floats")
+        n = len(value) if n is None and value.dim() > 0 else n
+        want = [n, *tail]
+        if name == "shN" and value.dim() == 3 and value.shape[1] in (0, 3, 8):
+            want[1] = value.shape[1]
+        if list(value.shape) != want:
+            bands = " (or 0, 3 or 8 in place of 15)" if name == "shN" else ""
+            raise PopError(f"{path}: splats.{name} has shape {list(value.shape)}; it must be {want}{bands}")
 
 
 def open_capture(splat: Splat, options: CaptureOptions) -> tuple[Capture, TrainConfig]:

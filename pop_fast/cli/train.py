@@ -101,9 +101,9 @@ def arguments(argv: Sequence[str]) -> tuple[TrainConfig, Any]:
         PopError: a setting is out of range.
     """
     words = rename_aliases(argv)
-    in_full = "--help-all" in words
+    short_help = "--help" in words or "-h" in words
     words = ["--help" if word == "--help-all" else word for word in words]
-    args = parse(_arguments_type(in_full), words, "train", examples=_EXAMPLES)
+    args = parse(_arguments_type(short_help), words, "train", examples=_EXAMPLES)
     settings = {field.name: getattr(args, field.name) for field in dataclasses.fields(TrainConfig)}
     config = TrainConfig(**settings)
     if args.quiet:
@@ -131,8 +131,8 @@ def rename_aliases(argv: Sequence[str]) -> list[str]:
     return words
 
 
-def _arguments_type(in_full: bool) -> type:
-    """Make the class that tyro reads: every setting of `TrainConfig`, those for experts hidden unless `in_full`."""
+def _arguments_type(short: bool) -> type:
+    """Make the class that tyro reads: every setting of `TrainConfig`, or only those that the short help shows."""
     hints = typing.get_type_hints(TrainConfig)
     columns: list[Any] = []
     for field in dataclasses.fields(TrainConfig):
@@ -144,7 +144,7 @@ def _arguments_type(in_full: bool) -> type:
             note, value = "where the run writes", "(default: out/<data>_<method>)"
             kind = Annotated[kind, tyro.conf.arg(name="out", metavar="DIR", help=note, help_behavior_hint=value)]
             default = ""
-        elif not in_full and field.name not in _SHOWN:
+        elif short and field.name not in _SHOWN:
             kind = Annotated[kind, tyro.conf.Suppress]
         columns.append((field.name, kind, default))
     documented = f"{_Run.__doc__}{(TrainConfig.__doc__ or '').partition('Attributes:')[2]}"

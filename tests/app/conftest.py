@@ -1,0 +1,67 @@
+"""The command line called in this process, and a tiny capture and result to call it on, made once a session."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from pop_fast.cli import main
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a call of `pop` came to."""
+
+    status: int
+    out: str
+    err: str
+
+
+Pop = Callable[..., Outcome]
+# a capture of 8 photographs; 30 steps with a change of the population and all other events in them
+TRAIN = ("--steps-scaler", "0.001", "--quiet", "--pop.grow-grad2d", "1e-6")
+
+
+@pytest.fixture
+def pop(capsys: pytest.CaptureFixture[str]) -> Pop:
+    """Call `pop WORD ...` in this process."""
+
+    def call(*words: object) -> Outcome:
+        capsys.readouterr()
+        status = main([str(word) for word in words])
+        out, err = capsys.readouterr()
+        return Outcome(status, out, err)
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def shared_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny demo capture that tests only read."""
+    folder = tmp_path_factory.mktemp("capture") / "toy"
+    assert main(["demo", str(folder), "--views", "8", "--width", "40", "--height", "32"]) == 0
+    return folder
+
+
+@pytest.fixture
+def capture(shared_capture: Path, tmp_path: Path) -> Path:
+    """A copy of the tiny capture that a test may damage."""
+    return Path(shutil.copytree(shared_capture, tmp_path / "toy"))
+
+
+@pytest.fixture(scope="session")
+def shared_result(shared_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The result of training on the tiny capture, which tests only read."""
+    folder = tmp_path_factory.mktemp("result") / "toy_pop"
+    assert main(["train", str(shared_capture), "--out", str(folder), *TRAIN]) == 0
+    return folder
+
+
+@pytest.fixture
+def result(shared_result: Path, tmp_path: Path) -> Path:
+    """A copy of the tiny result that a test may damage or add to."""
+    return Path(shutil.copytree(shared_result, tmp_path / "result"))

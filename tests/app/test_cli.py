@@ -1,0 +1,248 @@
+"""The command line as a user meets it: help, aliases, exit statuses, and a whole run from nothing."""
+
+from __future__ import annotations
+
+import errno
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pop_fast.cli import COMMANDS, main
+from pop_fast.cli.errors import describe
+from pop_fast.cli.train import arguments, rename_aliases
+from pop_fast.errors import PopError
+from pop_fast.train import Trainer
+from tests.app.conftest import TRAIN, Pop
+
+
+def test_the_overview_lists_every_subcommand_without_importing_torch() -> None:
+    code = (
+        "import sys, pop_fast.cli as c; c.main(['--help']); sys.exit(any(m in sys.modules for m in ('torch', 'numpy')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    for name, summary in COMMANDS.items():
+        assert f"{name} " in done.stdout
+        assert summary in done.stdout
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_subcommand_explains_itself(pop: Pop, name: str) -> None:
+    outcome = pop(*name.split(), "--help")
+    assert outcome.status == 0
+    assert outcome.out.startswith(f"usage: pop {name}")
+    assert "Attributes:" not in outcome.out
+
+
+def test_help_all_shows_settings_that_help_leaves_out(pop: Pop) -> None:
+    assert "--pop.theta-blur" not in pop("train", "--help").out
+    assert "--pop.theta-blur" in pop("train", "--help-all").out
+
+
+def test_no_words_print_the_overview_and_version_prints_the_version(pop: Pop) -> None:
+    assert pop().out.startswith("usage: pop COMMAND")
+    assert pop("--version").out.startswith("pop 0.")
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (["trian", "x"], "did you mean 'pop train'?"),
+        (["data", "chek"], "did you mean 'pop data check'?"),
+        (["docter"], "did you mean 'pop doctor'?"),
+        (["qqqq"], "see 'pop --help'"),
+    ],
+)
+def test_an_unknown_subcommand_suggests_the_nearest(pop: Pop, words: list[str], hint: str) -> None:
+    outcome = pop(*words)
+    assert outcome.status == 2
+    assert outcome.err.startswith("pop: error: ")
+    assert hint in outcome.err
+
+
+def test_bad_usage_has_status_two(pop: Pop) -> None:
+    assert pop("train").status == 2
+    assert pop("train", "x", "--no-such-option").status == 2
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["scene", "--out", "r"],
+        ["-s", "scene", "-m", "r"],
+        ["--source_path", "scene", "--model_path", "r", "--eval"],
+        ["--source_path=scene", "--model_path=r"],
+        ["--data_dir", "scene", "--result_dir", "r"],
+    ],
+)
+def test_habits_of_other_trainers_are_understood(words: list[str]) -> None:
+    config, _ = arguments(words)
+    assert (config.data, config.result_dir) == ("scene", "r")
+
+
+def test_underscores_and_hyphens_are_the_same() -> None:
+    a, _ = arguments(["scene", "--steps_scaler", "0.5", "--pop.lambda_pop", "0.01", "--data_factor", "4"])
+    b, _ = arguments(["scene", "--steps-scaler", "0.5", "--pop.lambda-pop", "0.01", "--factor", "4"])
+    assert a == b
+    assert (a.pop.lambda_pop, a.factor) == (0.01, 4)
+
+
+def test_values_are_never_taken_for_aliases() -> None:
+    assert rename_aliases(["a", "--images", "my_photos"]) == ["a", "--images", "my_photos"]
+
+
+def test_without_out_the_folder_is_named_after_data_and_method() -> None:
+    assert arguments(["captures/garden/", "--method", "adc"])[0].result_dir == "out/garden_adc"
+
+
+def test_training_leaves_every_file_of_a_result(shared_result: Path) -> None:
+    assert (shared_result / "report.html").stat().st_size > 10_000
+    for name in ("ckpts/ckpt_29_rank0.pt", "ply/point_cloud_29.ply", "stats/val_step0029.json", "capture.json"):
+        assert (shared_result / name).is_file(), name
+    stats = json.loads((shared_result / "stats" / "val_step0029.json").read_text())
+    assert stats["num_GS"] >= stats["num_GS_above_floor"] > 0
+    assert stats["psnr"] > 5.0
+
+
+def test_a_finished_run_can_be_resumed_and_stays_as_it_is(pop: Pop, shared_capture: Path, result: Path) -> None:
+    before = (result / "ply" / "point_cloud_29.ply").read_bytes()
+    again = pop("train", shared_capture, "--out", result, *TRAIN, "--resume")
+    assert again.status == 0, again.err
+    assert (result / "ply" / "point_cloud_29.ply").read_bytes() == before
+
+
+def test_a_bare_folder_of_photographs_is_placed_then_trained_on_and_the_end_is_told(
+    pop: Pop, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (capture / "sparse").rename(tmp_path / "sparse")
+
+    def placed(photos: Path, root: Path, **_: Any) -> None:
+        assert photos == capture / "images"
+        (tmp_path / "sparse").rename(root / "sparse")
+
+    monkeypatch.setattr("pop_fast.data.load.run_sfm", placed)
+    outcome = pop("train", capture, "--out", tmp_path / "r", *TRAIN)
+    assert outcome.status == 0, outcome.err
+    assert "toy: COLMAP model: 8 views" in outcome.out
+    assert "PSNR" in outcome.out
+    assert f"report: {tmp_path / 'r' / 'report.html'}" in outcome.out
+
+
+def test_ctrl_c_says_how_to_go_on_and_exits_with_130(
+    pop: Pop, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(self: Trainer) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Trainer, "run", interrupted)
+    outcome = pop("train", shared_capture, "--out", tmp_path / "r", *TRAIN)
+    assert outcome.status == 130
+    assert outcome.err.strip() == "pop: stopped after step 0; the same command with --resume goes on"
+
+
+def test_eval_repeats_the_numbers_of_training(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
+    outcome = pop("eval", shared_result / "ckpts" / "ckpt_29_rank0.pt", "--json", tmp_path / "e.json", "--per-view")
+    assert outcome.status == 0, outcome.err
+    trained = json.loads((shared_result / "stats" / "val_step0029.json").read_text())
+    measured = json.loads((tmp_path / "e.json").read_text())
+    for key in ("psnr", "ssim", "num_GS", "n_blended", "n_traversed", "per_view"):
+        assert measured[key] == trained[key], key
+    assert f"PSNR       {trained['psnr']:.3f} dB" in outcome.out
+    assert "view_000.png: psnr" in outcome.out
+
+
+def test_eval_of_a_result_updates_its_stats_and_report(pop: Pop, result: Path) -> None:
+    path = result / "stats" / "val_step0029.json"
+    before = json.loads(path.read_text())
+    path.write_text(json.dumps({**before, "psnr": 1.0}))
+    (result / "report.html").unlink()
+    assert pop("eval", result).status == 0
+    after = json.loads(path.read_text())
+    assert after["psnr"] == before["psnr"]
+    assert after["seconds"] == before["seconds"]
+    assert (result / "report.html").is_file()
+
+
+def test_eval_of_a_ply_needs_a_capture_and_agrees_with_the_checkpoint(
+    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path
+) -> None:
+    ply = tmp_path / "lone.ply"
+    ply.write_bytes((shared_result / "ply" / "point_cloud_29.ply").read_bytes())
+    alone = pop("eval", ply)
+    assert alone.status == 2
+    assert "give --capture DIR" in alone.err
+    assert pop("eval", ply, "--capture", shared_capture, "--json", tmp_path / "e.json").status == 0
+    measured = json.loads((tmp_path / "e.json").read_text())
+    trained = json.loads((shared_result / "stats" / "val_step0029.json").read_text())
+    assert measured["psnr"] == pytest.approx(trained["psnr"], abs=1e-3)
+
+
+def test_compare_puts_results_side_by_side(pop: Pop, shared_result: Path) -> None:
+    plain = pop("compare", shared_result, shared_result)
+    assert plain.status == 0
+    assert len(plain.out.splitlines()) == 3
+    assert pop("compare", shared_result, "--markdown").out.splitlines()[1].startswith("| --- | --- | ---: |")
+
+
+def test_report_is_written_again_on_demand(pop: Pop, result: Path) -> None:
+    (result / "report.html").unlink()
+    outcome = pop("report", result)
+    assert outcome.out.strip() == str(result / "report.html")
+    assert (result / "report.html").is_file()
+
+
+def test_sfm_says_how_well_it_went(pop: Pop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pop_fast.data.photos import SfmResult
+
+    found = SfmResult(tmp_path / "scene", 7, 8, 1234, 0.75)
+    monkeypatch.setattr("pop_fast.cli.sfm.run_sfm", lambda *_, **__: found)
+    outcome = pop("sfm", tmp_path)
+    assert outcome.status == 0
+    assert "7 of 8 photographs placed, 1,234 points, mean reprojection error 0.75 px" in outcome.out
+
+
+def test_a_fault_of_the_program_keeps_its_traceback(pop: Pop, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(_: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr("pop_fast.cli.report.write_report", broken)
+    with pytest.raises(ZeroDivisionError):
+        pop("report", ".")
+
+
+@pytest.mark.parametrize("how", ["option", "environment"])
+def test_debug_shows_the_traceback_of_an_error(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ["report", "nowhere"]
+    if how == "environment":
+        monkeypatch.setenv("POP_DEBUG", "1")
+    else:
+        words.append("--debug")
+    with pytest.raises(PopError):
+        main(words)
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (OSError(errno.ENOSPC, "x", "a.png"), "a.png: the disk is full"),
+        (PermissionError(errno.EACCES, "x", "a.png"), "a.png: permission denied"),
+        (FileNotFoundError(errno.ENOENT, "x", "a.png"), "a.png: no such file or folder"),
+        (IsADirectoryError(errno.EISDIR, "x", "a"), "a: is a folder where a file is needed"),
+        (FileExistsError(errno.EEXIST, "x", "a"), "a: a file is in the way"),
+        (OSError(errno.EIO, "input/output error", "a"), "a: input/output error"),
+        (MemoryError(), "out of memory; use smaller images"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: 9 bytes"), "out of memory"),
+        (PopError("two\nlines"), None),
+        (ValueError("from a library below"), None),
+        (OSError("no number"), None),
+    ],
+)
+def test_errors_of_the_system_are_one_line_each(error: Exception, line: str | None) -> None:
+    said = describe(error)
+    assert (said is None) == (line is None)
+    assert line is None or str(said).startswith(line)
+    assert "\n" not in str(said)
