@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from pop_fast.ssim import Padding, TargetMoments, check_size, mean_similarity, ssim_map, target_moments
+from pop_fast.ssim import Padding, TargetMoments, check_size, mean_dissimilarity, ssim_map, target_moments
 
 __all__ = ["Padding", "TargetMoments", "target_moments", "ssim_map", "l1", "l1_vjp", "l2", "l2_vjp"]
 __all__ += ["ssim", "ssim_vjp", "d_ssim", "d_ssim_vjp"]
@@ -20,12 +20,15 @@ __all__ += ["photometric_3dgs", "photometric_3dgs_vjp", "photometric_pop", "phot
 
 
 class _Terms(NamedTuple):
-    """`pixel_weight * (l1 or l2) + ssim_weight * (ssim - ssim_origin)`; a weight of None leaves the term out."""
+    """`pixel_weight * (l1 or l2) + d_ssim_weight * (1 - ssim) + constant`; a weight of None leaves the term out."""
 
     pixel: Literal["l1", "l2"] = "l2"
     pixel_weight: float | None = None
-    ssim_weight: float | None = None
-    ssim_origin: float = 1.0
+    d_ssim_weight: float | None = None
+    constant: float = 0.0
+
+
+_SSIM = _Terms(d_ssim_weight=-1.0, constant=1.0)
 
 
 def l1(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -59,7 +62,7 @@ def ssim(
 
     Optimizations: see `pop_fast.ssim`; `moments` of the target may be passed.
     """
-    return _loss(image, target, _Terms(ssim_weight=1.0, ssim_origin=0.0), padding, mask, moments)
+    return _loss(image, target, _SSIM, padding, mask, moments)
 
 
 def ssim_vjp(
@@ -71,7 +74,7 @@ def ssim_vjp(
     moments: TargetMoments | None = None,
 ) -> Tensor:
     """See `pop_ref.ssim.ssim_vjp`."""
-    return v_ssim * _gradient(image, target, _Terms(ssim_weight=1.0), padding, mask, moments)
+    return v_ssim * _gradient(image, target, _SSIM, padding, mask, moments)
 
 
 def d_ssim(
@@ -83,7 +86,7 @@ def d_ssim(
     moments: TargetMoments | None = None,
 ) -> Tensor:
     """See `pop_ref.ssim.d_ssim`."""
-    return _loss(image, target, _Terms(ssim_weight=_d_ssim_weight(1.0, halved)), padding, mask, moments)
+    return _loss(image, target, _Terms(d_ssim_weight=0.5 if halved else 1.0), padding, mask, moments)
 
 
 def d_ssim_vjp(
@@ -96,7 +99,7 @@ def d_ssim_vjp(
     moments: TargetMoments | None = None,
 ) -> Tensor:
     """See `pop_ref.ssim.d_ssim_vjp`."""
-    return v_d_ssim * _gradient(image, target, _Terms(ssim_weight=_d_ssim_weight(1.0, halved)), padding, mask, moments)
+    return v_d_ssim * _gradient(image, target, _Terms(d_ssim_weight=0.5 if halved else 1.0), padding, mask, moments)
 
 
 def photometric_3dgs(
@@ -113,7 +116,7 @@ def photometric_3dgs(
 
     Optimizations: both terms and their gradients in one autograd node.
     """
-    terms = _Terms("l1", (1.0 - lambda_ssim) * l1_scale, _d_ssim_weight(lambda_ssim, halved))
+    terms = _Terms("l1", (1.0 - lambda_ssim) * l1_scale, lambda_ssim * (0.5 if halved else 1.0))
     return _loss(image, target, terms, padding, mask, moments)
 
 
@@ -129,7 +132,7 @@ def photometric_3dgs_vjp(
     moments: TargetMoments | None = None,
 ) -> Tensor:
     """See `pop_ref.losses.photometric_3dgs_vjp`."""
-    terms = _Terms("l1", (1.0 - lambda_ssim) * l1_scale, _d_ssim_weight(lambda_ssim, halved))
+    terms = _Terms("l1", (1.0 - lambda_ssim) * l1_scale, lambda_ssim * (0.5 if halved else 1.0))
     return v_loss * _gradient(image, target, terms, padding, mask, moments)
 
 
@@ -147,7 +150,7 @@ def photometric_pop(
 
     Optimizations: both terms and their gradients in one autograd node.
     """
-    terms = _Terms("l2", (1.0 - lambda_ssim) * l2_scale, _d_ssim_weight(lambda_ssim, halved))
+    terms = _Terms("l2", (1.0 - lambda_ssim) * l2_scale, lambda_ssim * (0.5 if halved else 1.0))
     return _loss(image, target, terms, padding, mask, moments)
 
 
@@ -163,13 +166,8 @@ def photometric_pop_vjp(
     moments: TargetMoments | None = None,
 ) -> Tensor:
     """See `pop_ref.losses.photometric_pop_vjp`."""
-    terms = _Terms("l2", (1.0 - lambda_ssim) * l2_scale, _d_ssim_weight(lambda_ssim, halved))
+    terms = _Terms("l2", (1.0 - lambda_ssim) * l2_scale, lambda_ssim * (0.5 if halved else 1.0))
     return v_loss * _gradient(image, target, terms, padding, mask, moments)
-
-
-def _d_ssim_weight(weight: float, halved: bool) -> float:
-    """Return the weight of (ssim - 1) that makes `weight * d_ssim`."""
-    return -0.5 * weight if halved else -weight
 
 
 class _Loss(torch.autograd.Function):
@@ -212,16 +210,17 @@ def _value_and_gradient(
 ) -> tuple[Tensor, Tensor | None]:
     _check(image, target, padding, mask, moments)
     target = target.to(image.dtype)
+    difference = image - target
     if mask is not None:
-        image = torch.where(mask[:, :, None], image, target)
-    value, grad = image.new_zeros(()), None
-    if terms.ssim_weight is not None:
+        difference.masked_fill_(~mask[:, :, None], 0.0)
+    value, grad = image.new_full((), terms.constant), None
+    if terms.d_ssim_weight is not None:
         if moments is None:
             moments = target_moments(target, padding)
-        similarity, grad = mean_similarity(image, moments, mask, terms.ssim_weight, want_grad)
-        value = terms.ssim_weight * (similarity - terms.ssim_origin)
+        weight = terms.d_ssim_weight if want_grad else None
+        dissimilarity, grad = mean_dissimilarity(difference, moments, mask, weight)
+        value = value + terms.d_ssim_weight * dissimilarity
     if terms.pixel_weight is not None:
-        difference = image - target
         n = image.numel() if mask is None else max(int(mask.sum()), 1) * image.shape[2]
         total = torch.sum(difference.abs() if terms.pixel == "l1" else difference * difference)
         value = value + (terms.pixel_weight / n) * total
@@ -231,7 +230,7 @@ def _value_and_gradient(
                 slope.mul_(terms.pixel_weight / n) if grad is None else grad.add_(slope, alpha=terms.pixel_weight / n)
             )
     if grad is not None and mask is not None:
-        grad = grad.masked_fill_(~mask[:, :, None], 0.0)
+        grad.masked_fill_(~mask[:, :, None], 0.0)
     return value, grad
 
 

@@ -1,4 +1,17 @@
-"""SSIM with its gradient in the same pass. Meaning: `pop_ref.ssim`.
+"""D-SSIM with its gradient in the same pass. Meaning: `pop_ref.ssim`.
+
+Everything is written in the difference d = x - y of render and photograph. With mu = Σ w d, s_dd = Σ w d² - mu² and
+s_dy = Σ w d y - mu mu_y,
+
+    B1 = mu_x² + mu_y² + C1      a = mu² / B1          that is A1 / B1 = 1 - a
+    B2 = 2 s_yy + 2 s_dy + s_dd + C2     b = s_dd / B2      that is A2 / B2 = 1 - b
+    1 - S = a + (1 - a) b
+
+    ∂(1-S)/∂Σwd² = (1 - a) (1 - b) / B2      ∂(1-S)/∂Σwdy = -2 (1 - a) b / B2
+    ∂(1-S)/∂mu = 2 (1 - b) ((1 - a) mu - a mu_y) / B1 - 2 (1 - a) (mu - b mu_x) / B2
+
+so rounding is proportional to the difference and vanishes with it. The textbook form subtracts squares of size 1 and
+compares the result with C2 = 9e-4, which costs float32 four of its seven digits.
 
 How it is made fast on a CPU:
 
@@ -69,56 +82,57 @@ def target_moments(target: Tensor, padding: Padding = "valid") -> TargetMoments:
     """Blur a photograph and its square, for any number of renders to be compared with it."""
     check_size(target, padding)
     channels, border = target.shape[2], _border(padding)
-    y = target.reshape(target.shape[0], -1)
+    # in float64: this is where the textbook form would lose its digits, and it is done once per view
+    y = target.double().reshape(target.shape[0], -1)
     padded = torch.nn.functional.pad(y, (border * channels, border * channels, border, border))
     mu_y, yy = _blur(torch.stack([padded, padded * padded]), channels).unbind(0)
-    return TargetMoments(target, padding, mu_y, yy.addcmul_(mu_y, mu_y, value=-1.0))
+    s_yy = yy.addcmul_(mu_y, mu_y, value=-1.0)
+    return TargetMoments(target, padding, mu_y.to(target.dtype), s_yy.to(target.dtype))
 
 
 def ssim_map(image: Tensor, target: Tensor, padding: Padding = "valid") -> Tensor:
     """See `pop_ref.ssim.ssim_map`.
 
-    Optimizations: bands of rows, see the module's docstring.
+    Optimizations: see the module's docstring.
     """
     moments = target_moments(target.to(image.dtype), padding)
-    x, y = image.reshape(image.shape[0], -1), moments.target.reshape(image.shape[0], -1)
-    bands = [_compare_rows(x, y, moments, band, 0.0)[0] for band in _bands(*moments.mu_y.shape)]
-    return torch.cat(bands).reshape(len(moments.mu_y), -1, image.shape[2])
+    d = (image - moments.target).reshape(image.shape[0], -1)
+    bands = [_compare_rows(d, moments, band, None)[0] for band in _bands(*moments.mu_y.shape)]
+    return (1.0 - torch.cat(bands)).reshape(len(moments.mu_y), -1, image.shape[2])
 
 
-def mean_similarity(
-    image: Tensor, moments: TargetMoments, mask: Tensor | None, weight: float, want_grad: bool
+def mean_dissimilarity(
+    difference: Tensor, moments: TargetMoments, mask: Tensor | None, weight: float | None
 ) -> tuple[Tensor, Tensor | None]:
-    """Return the mean of S over the kept windows, and the gradient of `weight` times it by the image.
+    """Return the mean of 1 - S over the kept windows, and the gradient of `weight` times it by the render.
 
     Args:
-        image: the render, already replaced by the photograph where the mask is False. [H, W, D]
+        difference: render minus photograph, 0 where the mask is False. [H, W, D]
         moments: of the photograph.
         mask: True where a window's centre counts, or None. [H, W]
-        weight: factor on the gradient only.
-        want_grad: False returns None as gradient.
+        weight: factor on the gradient only; None computes no gradient.
     """
-    height, channels = image.shape[0], image.shape[2]
-    x, y = image.reshape(height, -1), moments.target.reshape(height, -1)
-    kept = None if mask is None else _kept_windows(mask, moments.padding, channels, image.dtype)
+    channels = difference.shape[2]
+    d = difference.reshape(len(difference), -1)
+    kept = None if mask is None else _kept_windows(mask, moments.padding, channels, d.dtype)
     n = moments.mu_y.numel() if kept is None else int(kept.sum())
     if n == 0:
-        return image.new_ones(()), torch.zeros_like(image) if want_grad else None
-    total = image.new_zeros((), dtype=torch.float64)
-    margin = _REACH - _border(moments.padding)
+        return d.new_zeros(()), None if weight is None else torch.zeros_like(difference)
+    total = d.new_zeros((), dtype=torch.float64)
     rows, cols = moments.mu_y.shape
-    partials = x.new_zeros((3, rows + 2 * margin, cols + 2 * margin * channels)) if want_grad else None
+    margin = _REACH - _border(moments.padding)
+    partials = None if weight is None else d.new_zeros((3, rows + 2 * margin, cols + 2 * margin * channels))
     for band in _bands(rows, cols):
-        similarity, v_band = _compare_rows(x, y, moments, band, weight / n)
+        dissimilarity, v_band = _compare_rows(d, moments, band, None if weight is None else weight / n)
         if kept is not None:
-            similarity, v_band = similarity.mul_(kept[band]), [v.mul_(kept[band]) for v in v_band]
-        total += similarity.sum(dtype=torch.float64)
+            dissimilarity, v_band = dissimilarity.mul_(kept[band]), [v.mul_(kept[band]) for v in v_band]
+        total += dissimilarity.sum(dtype=torch.float64)
         if partials is not None:
             inner = partials[:, margin + band.start : margin + band.stop, margin * channels : margin * channels + cols]
             for plane, v in zip(inner, v_band, strict=True):
                 plane.copy_(v)
-    value = (total / n).to(image.dtype)
-    return value, None if partials is None else _spread(x, y, partials, channels).reshape(image.shape)
+    value = (total / n).to(d.dtype)
+    return value, None if partials is None else _gather(d, moments.target, partials).reshape(difference.shape)
 
 
 def check_size(image: Tensor, padding: Padding) -> None:
@@ -155,49 +169,49 @@ def _blur(maps: Tensor, channels: int) -> Tensor:
 
 
 def _compare_rows(
-    x: Tensor, y: Tensor, moments: TargetMoments, band: slice, weight: float
-) -> tuple[Tensor, list[Tensor]]:
-    """Return S for a band of the map's rows, and weight times its derivatives by mu_x, (Σ w x²) / 2 and Σ w x y."""
-    channels, border = moments.target.shape[2], _border(moments.padding)
-    mu_x, xx, xy = _blur(_products(x, y, band, border, channels), channels).unbind(0)
+    d: Tensor, moments: TargetMoments, band: slice, weight: float | None
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """Return 1 - S for a band of the map's rows, and weight times its derivatives by mu, (Σ w d²) / 2 and Σ w d y."""
+    mu, dd, dy = _blur(_products(d, moments, band), moments.target.shape[2]).unbind(0)
     mu_y, s_yy = moments.mu_y[band], moments.s_yy[band]
-    mu_xy, mu_xx = mu_x * mu_y, mu_x * mu_x
-    A1 = torch.add(mu_xy, mu_xy).add_(C1)
-    A2 = xy.sub_(mu_xy).mul_(2.0).add_(C2)
-    B1 = torch.addcmul(mu_xx, mu_y, mu_y).add_(C1)
-    B2 = xx.sub_(mu_xx).add_(s_yy).add_(C2)
-    inverse = torch.mul(B1, B2).reciprocal_()
-    v_xy = A1.mul_(inverse)
-    S = v_xy * A2
-    v_xy.mul_(2.0 * weight)
-    v_half_xx = torch.div(S, B2).mul_(-2.0 * weight)
-    # mu_y (A2 - A1) - mu_x S (B2 - B1), with A1 and B1 spelled out again because their buffers were reused
-    spread = B2.sub_(B1).mul_(mu_x).mul_(S)
-    A1_again = mu_xy.add_(mu_xy).add_(C1)
-    v_mu = A2.sub_(A1_again).mul_(mu_y).sub_(spread).mul_(inverse).mul_(2.0 * weight)
-    return S, [v_mu, v_half_xx, v_xy]
+    mu_sq, mu_x = mu * mu, mu + mu_y
+    s_dd, s_dy = dd.sub_(mu_sq), dy.addcmul_(mu, mu_y, value=-1.0)
+    B1 = (mu_x * mu_y).mul_(2.0).add_(mu_sq).add_(C1)
+    B2 = s_dy.add_(s_yy).mul_(2.0).add_(s_dd).add_(C2)
+    a, b = mu_sq.div_(B1), s_dd.div_(B2)
+    kept_a = 1.0 - a
+    dissimilarity = torch.addcmul(a, kept_a, b)
+    if weight is None:
+        return dissimilarity, ()
+    kept_b, slope = 1.0 - b, (kept_a / B2).mul_(2.0 * weight)
+    v_half_dd = slope * kept_b
+    v_mu = (kept_a.mul_(mu)).addcmul_(a, mu_y, value=-1.0).mul_(kept_b).div_(B1).mul_(2.0 * weight)
+    v_mu.addcmul_(slope, mu.addcmul_(b, mu_x, value=-1.0), value=-1.0)
+    return dissimilarity, (v_mu, v_half_dd, slope.mul_(b).neg_())
 
 
-def _products(x: Tensor, y: Tensor, band: slice, border: int, channels: int) -> Tensor:
-    """Return x, x² and x y on the rows that a band's windows read, with the zero border of "same". [3, ., .]"""
+def _products(d: Tensor, moments: TargetMoments, band: slice) -> Tensor:
+    """Return d, d² and d y on the rows that a band's windows read, with the zero border of "same". [3, ., .]"""
+    border, y = _border(moments.padding), moments.target.reshape(len(d), -1)
+    side = border * moments.target.shape[2]
     top, bottom = band.start - border, band.stop - border + _REACH
-    first, last = max(top, 0), min(bottom, len(x))
-    shape = (3, bottom - top, x.shape[1] + 2 * border * channels)
-    maps = x.new_zeros(shape) if border else x.new_empty(shape)
-    inner = maps[:, first - top : last - top, border * channels : border * channels + x.shape[1]]
-    inner[0].copy_(x[first:last])
-    torch.mul(x[first:last], x[first:last], out=inner[1])
-    torch.mul(x[first:last], y[first:last], out=inner[2])
+    first, last = max(top, 0), min(bottom, len(d))
+    shape = (3, bottom - top, d.shape[1] + 2 * side)
+    maps = d.new_zeros(shape) if border else d.new_empty(shape)
+    inner = maps[:, first - top : last - top, side : side + d.shape[1]]
+    inner[0].copy_(d[first:last])
+    torch.mul(d[first:last], d[first:last], out=inner[1])
+    torch.mul(d[first:last], y[first:last], out=inner[2])
     return maps
 
 
-def _spread(x: Tensor, y: Tensor, partials: Tensor, channels: int) -> Tensor:
+def _gather(d: Tensor, target: Tensor, partials: Tensor) -> Tensor:
     """Return the gradient: each pixel gathers from all windows over it. The window is symmetric, so this is a blur."""
-    v_x = torch.empty_like(x)
-    for band in _bands(*x.shape):
-        by_mu, by_half_xx, by_xy = _blur(partials[:, band.start : band.stop + _REACH], channels).unbind(0)
-        torch.addcmul(by_mu, x[band], by_half_xx, out=v_x[band])
-        v_x[band].addcmul_(y[band], by_xy)
+    v_x, y = torch.empty_like(d), target.reshape(len(d), -1)
+    for band in _bands(*d.shape):
+        by_mu, by_half_dd, by_dy = _blur(partials[:, band.start : band.stop + _REACH], target.shape[2]).unbind(0)
+        torch.addcmul(by_mu, d[band], by_half_dd, out=v_x[band])
+        v_x[band].addcmul_(y[band], by_dy)
     return v_x
 
 
