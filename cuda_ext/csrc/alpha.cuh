@@ -1,0 +1,105 @@
+// One splat at one pixel; beside pop_ref/alpha.py.
+//
+// Twice: as the oracle writes it, and as the kernels run it. The kernels' form folds log2(e) into the conic once per
+// splat and tile list entry, so that a pair costs two fused multiply-adds, a subtraction and a comparison before the
+// first pair that reaches exp2:
+//     sigma log2(e) = hA dx^2 + dy (hC dy + B dx),    hA = A log2(e) / 2, B = B log2(e), hC = C log2(e) / 2.
+#pragma once
+
+#include "footprint.cuh"
+
+namespace pop {
+
+constexpr double LOG2_E = 1.44269504088896340736;
+constexpr double LN_2 = 0.693147180559945309417;
+
+template <class Real>
+struct Alpha {
+    Real alpha;
+    bool skipped;
+};
+
+template <class Real>
+POP_HD Real sigma_at_pixel(Vec2<Real> mean2d, Conic<Real> conic, Real px, Real py) {
+    const Real A = conic.xx, B = conic.xy, C = conic.yy;
+    const Real dx = mean2d.x - px;
+    const Real dy = mean2d.y - py;
+    return Real(0.5) * (A * dx * dx + C * dy * dy) + B * dx * dy;
+}
+
+template <class Real>
+POP_HD void sigma_at_pixel_vjp(Vec2<Real> mean2d, Conic<Real> conic, Real px, Real py, Real v_sigma,
+                               Vec2<Real>& v_mean2d, Conic<Real>& v_conic) {
+    const Real A = conic.xx, B = conic.xy, C = conic.yy;
+    const Real dx = mean2d.x - px;
+    const Real dy = mean2d.y - py;
+    v_mean2d = {v_sigma * (A * dx + B * dy), v_sigma * (B * dx + C * dy)};
+    v_conic = {v_sigma * Real(0.5) * dx * dx, v_sigma * dx * dy, v_sigma * Real(0.5) * dy * dy};
+}
+
+template <class Real>
+POP_HD Real falloff(Real sigma) {
+    return exp(-sigma);
+}
+
+template <class Real>
+POP_HD Real falloff_vjp(Real sigma, Real v_falloff) {
+    return -exp(-sigma) * v_falloff;
+}
+
+// D5, D6
+template <class Real>
+POP_HD Alpha<Real> alpha_from_sigma(Real sigma, Real opacity, const Profile<Real>& profile) {
+    if (sigma < Real(0)) return {Real(0), true};
+    const Real alpha = min_of(profile.alpha_ceiling, opacity * falloff(sigma));
+    return {alpha, alpha < profile.alpha_floor};
+}
+
+// B3
+template <class Real>
+POP_HD Vec2<Real> alpha_from_sigma_vjp(Real sigma, Real opacity, Real v_alpha, const Profile<Real>& profile) {
+    if (alpha_from_sigma(sigma, opacity, profile).skipped) return {Real(0), Real(0)};
+    if (opacity * falloff(sigma) > profile.alpha_ceiling && !profile.pass_ceiling) return {Real(0), Real(0)};
+    return {falloff_vjp(sigma, opacity * v_alpha), falloff(sigma) * v_alpha};
+}
+
+// what the kernels ask of a profile, with every strictness turned into a number
+template <class Real>
+struct BlendConstants {
+    Real floor;             // D5
+    Real ceiling;           // D6
+    Real gradient_ceiling;  // B3: o exp(-sigma) above it passes no gradient
+    Real stop;              // D7: the pixel ends where next_T <= stop
+};
+
+template <class Real>
+inline BlendConstants<Real> blend_constants(const Profile<Real>& profile) {
+    const Real stop = profile.transmittance_stop;
+    return {profile.alpha_floor, profile.alpha_ceiling, profile.pass_ceiling ? Real(INFINITY) : profile.alpha_ceiling,
+            profile.stop_inclusive ? stop : Real(nextafter(stop, Real(0)))};
+}
+
+// a splat as the kernels blend it
+template <class Real>
+struct Blended {
+    Real x, y;
+    Real hA, B, hC;
+    Real opacity;
+    Real reach;  // sigma log2(e) beyond which alpha is certainly under the floor
+};
+
+template <class Real>
+POP_HD Blended<Real> blended_from_splat(Vec2<Real> mean2d, Conic<Real> conic, Real opacity, Real floor) {
+    const Real half_log2_e = Real(0.5 * LOG2_E), log2_e = Real(LOG2_E);
+    // a little beyond the floor: the comparison of alpha itself decides (D5)
+    const Real reach = log2(opacity / floor) + Real(1e-3);
+    return {mean2d.x, mean2d.y, conic.xx * half_log2_e, conic.xy * log2_e, conic.yy * half_log2_e, opacity, reach};
+}
+
+// sigma log2(e), from what a column of pixels shares
+template <class Real>
+POP_HD Real exponent_in_column(Real squared_x, Real cross, Real hC, Real dy) {
+    return fused(dy, fused(hC, dy, cross), squared_x);
+}
+
+}  // namespace pop

@@ -1,0 +1,25 @@
+// Which Gaussian a pixel belongs to; beside pop_ref/dominance.py.
+#pragma once
+
+#include "real.cuh"
+
+namespace pop {
+
+template <class Real>
+struct Dominant {
+    int id;
+    Real weight;
+};
+
+template <class Real>
+POP_HD Dominant<Real> no_dominant() {
+    return {-1, Real(0)};
+}
+
+// D8: front to back, a later splat must be strictly larger
+template <class Real>
+POP_HD void compete(Dominant<Real>& best, int id, Real weight) {
+    if (weight > best.weight) best = {id, weight};
+}
+
+}  // namespace pop

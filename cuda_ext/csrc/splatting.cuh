@@ -1,0 +1,102 @@
+// All that happens to a Gaussian before a pixel is touched, and its transpose; beside pop_ref/splatting.py.
+#pragma once
+
+#include "camera.cuh"
+#include "covariance.cuh"
+#include "footprint.cuh"
+#include "harmonics.cuh"
+#include "projection.cuh"
+
+namespace pop {
+
+template <class Real>
+struct GaussianRow {
+    Vec3<Real> mean;
+    Vec4<Real> quat;
+    Vec3<Real> scale;
+    Real opacity;
+};
+
+template <class Real>
+struct SplatRow {
+    Vec2<Real> mean2d;
+    Real depth;
+    Conic<Real> conic;
+    Real opacity;
+    Radii radii;  // both 0 where culled
+};
+
+template <class Real>
+struct GaussianVjp {
+    Vec3<Real> v_mean;
+    Vec4<Real> v_quat;
+    Vec3<Real> v_scale;
+    Real v_opacity;
+};
+
+// what a trainer asks beyond the profile
+template <class Real>
+struct ProjectOptions {
+    bool antialiased;
+    Real radius_clip;  // px; both extents at most this are culled
+};
+
+template <class Real>
+POP_HD SplatRow<Real> culled(Real depth) {
+    const Real zero = Real(0);
+    return {{zero, zero}, depth, {zero, zero, zero}, zero, {0, 0}};
+}
+
+template <class Real>
+POP_HD SplatRow<Real> project_one(const GaussianRow<Real>& g, const Camera<Real>& camera,
+                                  const Profile<Real>& profile, const ProjectOptions<Real>& options) {
+    const Vec3<Real> mean_cam = mean_cam_from_mean(g.mean, camera);
+    if (!in_front(mean_cam.z, profile)) return culled(mean_cam.z);  // D1
+    const Mat3<Real> covar_cam = covar_cam_from_covar(covar_from_quat_scale(g.quat, g.scale), camera);
+    const Mat2<Real> covar2d = project_covar(covar_cam, projection_jacobian(mean_cam, camera, profile));
+    const Mat2<Real> blurred = low_pass(covar2d, profile.eps2d);
+    const Real opacity = options.antialiased ? g.opacity * compensation(covar2d, profile.eps2d) : g.opacity;
+    const Vec2<Real> mean2d = project_mean(mean_cam, camera);
+    const Radii radii = radii_from_covar2d(blurred, opacity, profile);
+    const bool clipped = Real(radii.x) <= options.radius_clip && Real(radii.y) <= options.radius_clip;
+    if (clipped || !on_screen(mean2d, radii, camera.width, camera.height, profile)) return culled(mean_cam.z);  // D2
+    return {mean2d, mean_cam.z, conic_from_covar2d(blurred), opacity, radii};
+}
+
+// For a Gaussian that project_one kept; v_viewmat is added to, v_dir is the view direction's cotangent.
+template <class Real>
+POP_HD GaussianVjp<Real> project_one_vjp(const GaussianRow<Real>& g, const Camera<Real>& camera,
+                                         const Profile<Real>& profile, const ProjectOptions<Real>& options,
+                                         Vec2<Real> v_mean2d, Conic<Real> v_conic, Real v_opacity, Real v_depth,
+                                         Vec3<Real> v_dir, ViewmatVjp<Real>& v_viewmat) {
+    const Vec3<Real> mean_cam = mean_cam_from_mean(g.mean, camera);
+    const Mat3<Real> covar = covar_from_quat_scale(g.quat, g.scale);
+    const Mat3<Real> covar_cam = covar_cam_from_covar(covar, camera);
+    const Mat23<Real> J = projection_jacobian(mean_cam, camera, profile);
+    const Mat2<Real> covar2d = project_covar(covar_cam, J);
+
+    GaussianVjp<Real> v;
+    Mat2<Real> v_covar2d = conic_from_covar2d_vjp(low_pass(covar2d, profile.eps2d), v_conic);
+    v.v_opacity = v_opacity;
+    if (options.antialiased) {
+        const Mat2<Real> of_factor = compensation_vjp(covar2d, profile.eps2d, v_opacity * g.opacity);
+        for (int i = 0; i < 2; ++i)
+            for (int j = 0; j < 2; ++j) v_covar2d.m[i][j] += of_factor.m[i][j];
+        v.v_opacity = v_opacity * compensation(covar2d, profile.eps2d);
+    }
+    Mat3<Real> v_covar_cam;
+    Mat23<Real> v_J;
+    project_covar_vjp(covar_cam, J, v_covar2d, v_covar_cam, v_J);
+    const Mat3<Real> v_covar = covar_cam_from_covar_vjp(covar, camera, v_covar_cam, v_viewmat);
+    covar_from_quat_scale_vjp(g.quat, g.scale, v_covar, v.v_quat, v.v_scale);
+
+    Vec3<Real> v_mean_cam = projection_jacobian_vjp(mean_cam, camera, v_J, profile);
+    v_mean_cam = sum(v_mean_cam, project_mean_vjp(mean_cam, camera, v_mean2d));
+    v_mean_cam.z += v_depth;
+    v.v_mean = sum(mean_cam_from_mean_vjp(g.mean, camera, v_mean_cam, v_viewmat), v_dir);
+    const ViewmatVjp<Real> of_center = camera_center_vjp(camera, Vec3<Real>{-v_dir.x, -v_dir.y, -v_dir.z});
+    v_viewmat = {sum(v_viewmat.v_R, of_center.v_R), sum(v_viewmat.v_t, of_center.v_t)};
+    return v;
+}
+
+}  // namespace pop

@@ -1,0 +1,92 @@
+// Which tiles a splat overlaps; beside pop_ref/tiles.py. The exact test is this code's own: it only drops tiles in
+// which no pixel can reach the alpha floor, so that it changes no image where extents are opacity-aware.
+#pragma once
+
+#include "profile.cuh"
+
+namespace pop {
+
+struct Radii {
+    int x, y;
+};
+
+struct TileGrid {
+    int tiles_x, tiles_y;   // tiles along x and y
+    int tile_w, tile_h;     // px
+    int width, height;      // px
+};
+
+struct TileRect {
+    int x0, y0, x1, y1;  // half open
+};
+
+POP_HD TileGrid grid_of(int width, int height, int tile_w, int tile_h) {
+    return {(width + tile_w - 1) / tile_w, (height + tile_h - 1) / tile_h, tile_w, tile_h, width, height};
+}
+
+POP_HD int n_tiles_in(TileRect rect) {
+    return (rect.x1 > rect.x0 && rect.y1 > rect.y0) ? (rect.x1 - rect.x0) * (rect.y1 - rect.y0) : 0;
+}
+
+struct Span {
+    int first, last;
+};
+
+// a double holds every tile number exactly and bounds the conversion to int
+template <class Real>
+POP_HD int tile_number(Real tiles, int n_tiles) {
+    return int(clamped(tiles, Real(0), Real(n_tiles)));
+}
+
+// D3, one axis
+template <class Real>
+POP_HD Span tile_span(Real center, int radius, int n_tiles, int size, const Profile<Real>& profile) {
+    const Real r = Real(radius), t = Real(size);
+    if (profile.square) {
+        const Real index = center - Real(0.5);
+        return {tile_number(trunc((index - r) / t), n_tiles), tile_number(trunc((index + r + t - Real(1)) / t), n_tiles)};
+    }
+    return {tile_number(floor((center - r) / t), n_tiles), tile_number(ceil((center + r) / t), n_tiles)};
+}
+
+template <class Real>
+POP_HD TileRect tile_rect(Vec2<Real> mean2d, Radii radii, TileGrid grid, const Profile<Real>& profile) {
+    if (radii.x <= 0 || radii.y <= 0) return {0, 0, 0, 0};
+    const Span x = tile_span(mean2d.x, radii.x, grid.tiles_x, grid.tile_w, profile);
+    const Span y = tile_span(mean2d.y, radii.y, grid.tiles_y, grid.tile_h, profile);
+    return {x.first, y.first, x.last, y.last};
+}
+
+// the exponent on an edge of a box at offset `fixed`, at its least over the other offset in [low, high]
+template <class Real>
+POP_HD Real least_on_edge(Real fixed_coefficient, Real cross, Real free_coefficient, Real fixed, Real low, Real high) {
+    const Real free = clamped(-cross * fixed / free_coefficient, low, high);
+    const Real squares = Real(0.5) * (fixed_coefficient * fixed * fixed + free_coefficient * free * free);
+    const Real mixed = cross * fixed * free;
+    // charged 16 roundings of the terms, so that a tile is only dropped when it is certain
+    const Real slack = sizeof(Real) == 4 ? Real(16 * 1.1920929e-7) : Real(16 * 2.220446049250313e-16);
+    return squares + mixed - slack * (squares + Real(fabs(mixed)));
+}
+
+// The least sigma that any pixel centre of a tile can have, or a little less. sigma is convex: outside the box of
+// centres its least value lies on an edge that faces the splat's centre.
+template <class Real>
+POP_HD Real least_sigma_in_tile(Vec2<Real> mean2d, Real A, Real B, Real C, int tile_x, int tile_y, TileGrid grid) {
+    const Real half = Real(0.5), one = Real(1);
+    const Real left = Real(tile_x * grid.tile_w) + half;
+    const Real top = Real(tile_y * grid.tile_h) + half;
+    const Real right = Real(min_of((tile_x + 1) * grid.tile_w, grid.width)) - one + half;
+    const Real bottom = Real(min_of((tile_y + 1) * grid.tile_h, grid.height)) - one + half;
+    // offsets d = mean - p over the box
+    const Real x_low = mean2d.x - right, x_high = mean2d.x - left;
+    const Real y_low = mean2d.y - bottom, y_high = mean2d.y - top;
+    const bool x_inside = x_low <= Real(0) && x_high >= Real(0), y_inside = y_low <= Real(0) && y_high >= Real(0);
+    if (x_inside && y_inside) return Real(0);
+    const Real none = Real(3e38);
+    const Real dx = x_low > Real(0) ? x_low : x_high, dy = y_low > Real(0) ? y_low : y_high;
+    const Real on_x = x_inside ? none : least_on_edge(A, B, C, dx, y_low, y_high);
+    const Real on_y = y_inside ? none : least_on_edge(C, B, A, dy, x_low, x_high);
+    return min_of(on_x, on_y);
+}
+
+}  // namespace pop

@@ -1,0 +1,101 @@
+"""The host mirror as a backend of the conformance kit: stage functions, whole renders, whole gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pop_ref.conformance.adapter import View
+from pop_ref.conformance.law import DOMINANCE, GRADIENTS, PROFILES, RENDER
+from pop_ref.conformance.scenes import Scene, rounded_to
+
+from .mirror import Mirror
+from .mirror_stages import STAGES
+
+
+class MirrorAdapter:
+    """The kernels' mathematics on the host.
+
+    Args:
+        folder: where the mirror is built.
+        dtype: numpy.float32 or numpy.float64.
+        per_splat: which family goes back: one splat a lane, or a column of pixels a lane.
+        kernel_tiles: the kernels' own 16 x 8 tiles with exact lists, where the profile's tiles are an optimisation.
+    """
+
+    def __init__(self, folder: Path, dtype: Any, per_splat: bool = False, kernel_tiles: bool = False) -> None:
+        family = "splats" if per_splat else "columns"
+        self.name = f"mirror{np.dtype(dtype).itemsize * 8}-{family}{'-exact' if kernel_tiles else ''}"
+        self.dtype = dtype
+        self.mirror = Mirror(folder, dtype)
+        self._per_splat, self._kernel_tiles = per_splat, kernel_tiles
+
+    def has(self, need: str) -> bool:
+        """Tell what the mirror offers."""
+        return need in (RENDER, GRADIENTS, DOMINANCE, PROFILES) or need in STAGES
+
+    def stage(self, name: str) -> Callable[..., Any]:
+        """Return a stage function with the oracle's signature."""
+        if name not in STAGES:
+            raise LookupError(f"the mirror has no stage function {name}")
+        return partial(STAGES[name], self.mirror)
+
+    def sees(self, scene: Scene) -> Scene:
+        """Return the scene rounded to the mirror's precision."""
+        return rounded_to(scene, self.dtype)
+
+    def render(self, scene: Scene) -> View:
+        """Draw a scene."""
+        H, W, N = scene.camera.height, scene.camera.width, len(scene.gaussians)
+        image, T_final, weights, means2d, _, _, _, ids, blended, traversed, counts, radii = self.mirror.call(
+            "render",
+            N,
+            self._inputs(scene),
+            [(H, W, 3), (H, W), (H, W), (N, 2), (N,), (N, 3), (N,)],
+            [(H, W), (H, W), (H, W), (N,), (N, 2)],
+            integers=self._integers(scene),
+            profile=self._profile(scene),
+        )
+        visits = None if self._exact(scene) else traversed
+        return View(image, T_final, ids, weights, counts, blended, visits, radii, means2d)
+
+    def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
+        """Return every cotangent of a render."""
+        g = scene.gaussians
+        names = ("means", "quats", "scales", "opacities", "sh", "viewmat", "background", "means2d", "means2d_abs")
+        N = len(g)
+        shapes = [(N, 3), (N, 4), (N, 3), (N,), g.sh.shape, (4, 4), (3,), (N, 2), (N, 2)]
+        found = self.mirror.call(
+            "render_vjp",
+            N,
+            [*self._inputs(scene), v_image, v_T_final],
+            shapes,
+            integers=self._integers(scene),
+            profile=self._profile(scene),
+        )
+        return dict(zip(names, found, strict=True))
+
+    def _inputs(self, scene: Scene) -> list[Any]:
+        g, c = scene.gaussians, scene.camera
+        return [g.means, g.quats, g.scales, g.opacities, g.sh, c.viewmat, c.K, scene.background]
+
+    def _profile(self, scene: Scene) -> Any:
+        from dataclasses import replace
+
+        return replace(scene.profile, tile_size=scene.tile_size or scene.profile.tile_size)
+
+    def _exact(self, scene: Scene) -> bool:
+        return self._kernel_tiles and scene.profile.extent == "opacity_aware"
+
+    def _integers(self, scene: Scene) -> tuple[int, ...]:
+        n_sh = scene.gaussians.sh.shape[1]
+        degree = round(np.sqrt(n_sh)) - 1 if scene.sh_degree is None else scene.sh_degree
+        size = scene.tile_size or scene.profile.tile_size
+        exact = self._exact(scene)
+        tile = (16, 8) if exact else (size, size)
+        camera = scene.camera
+        return (camera.width, camera.height, n_sh, degree, *tile, scene.antialiased, exact, self._per_splat)
