@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pop_ref.conformance.law import DOMINANCE, DOUBLE, GRADIENTS, PROFILES, RENDER
+from pop_ref.conformance.law import DOMINANCE, DOUBLE, GRADIENTS, PROFILES, RENDER, ROWWISE
 from pop_ref.conformance.scenes import Scene, rounded_to
 
 STAGE_MODULES = (
@@ -27,12 +27,15 @@ STAGE_MODULES = (
     "footprint",
     "tiles",
     "alpha",
+    "pixel",
     "compositing",
     "dominance",
     "margins",
     "ssim",
     "losses",
     "polarization",
+    "density_config",
+    "density_rows",
     "density",
     "optimizer",
     "training",
@@ -75,7 +78,11 @@ class Adapter(Protocol):
     dtype: Any
 
     def has(self, need: str) -> bool:
-        """Tell whether the implementation offers a stage function, or RENDER, GRADIENTS, DOMINANCE or PROFILES."""
+        """Tell whether the implementation offers a stage function, or one of the abilities that `law` names.
+
+        RENDER, GRADIENTS and DOMINANCE speak for themselves; PROFILES: any profile can be passed; DOUBLE: computes in
+        float64; ROWWISE: a row's bits do not depend on the other rows, as they do where vector units split arrays.
+        """
         ...
 
     def stage(self, name: str) -> Callable[..., Any]:
@@ -127,7 +134,8 @@ class OracleAdapter:
     def has(self, need: str) -> bool:
         """Tell that the oracle can do everything its modules define."""
         return (
-            need in (RENDER, GRADIENTS, DOMINANCE, PROFILES, DOUBLE) or stage_function(self.package, need) is not None
+            need in (RENDER, GRADIENTS, DOMINANCE, PROFILES, DOUBLE, ROWWISE)
+            or stage_function(self.package, need) is not None
         )
 
     def stage(self, name: str) -> Callable[..., Any]:

@@ -48,7 +48,8 @@ def _vectors(n: int, low: float = -2.0, high: float = 2.0) -> st.SearchStrategy[
     return _stacked(st.tuples(*[reals(low, high)] * n))
 
 
-def _pattern(seed: int, shape: tuple[int, ...]) -> np.ndarray:
+def pattern(seed: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a picture of dyadic numbers in [0, 1], another for each seed."""
     k = np.arange(int(np.prod(shape)), dtype=np.float64).reshape(shape)
     return np.mod(k * (2.0 * seed + 1.0) + np.floor(k / 7.0) * seed, 17.0) / 16.0
 
@@ -74,7 +75,7 @@ pinholes = arrays_of((N, 4)).map(
     lambda j: np.stack([j[:, 0], 0 * j[:, 0], j[:, 1], 0 * j[:, 0], j[:, 2], j[:, 3]], 1).reshape(N, 2, 3)
 )
 # 132 numbers are too many to draw one by one: a few seeds of dyadic patterns say as much
-pictures = st.integers(0, 255).map(lambda k: _pattern(k, (12, 11, 1)))
+pictures = st.integers(0, 255).map(lambda k: pattern(k, (12, 11, 1)))
 masks = st.lists(st.booleans(), min_size=N, max_size=N).map(np.array)
 pinhole_inputs = st.tuples(in_front, st.just(K), st.just(W), st.just(H), profiles)
 pair = st.tuples(pictures, pictures)

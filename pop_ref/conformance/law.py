@@ -27,7 +27,7 @@ STAGES = (
     "optimizer",
 )
 RENDER, GRADIENTS, DOMINANCE = "render", "gradients", "dominance"
-PROFILES, DOUBLE = "any profile", "double precision"
+PROFILES, DOUBLE, ROWWISE = "any profile", "double precision", "rows computed one by one"
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,8 @@ import importlib
 import inspect
 import itertools
 from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -81,9 +83,11 @@ class TorchAdapter:
         if function is None:
             raise LookupError(f"{self._package} has no stage function {name}")
 
+        own = importlib.import_module(function.__module__)
+
         def with_arrays(*args: Any, **kwargs: Any) -> Any:
-            tensors = {key: self._tensor(value) for key, value in kwargs.items()}
-            return self._array(function(*[self._tensor(a) for a in args], **tensors))
+            tensors = {key: self._tensor(value, own) for key, value in kwargs.items()}
+            return self._array(function(*[self._tensor(a, own) for a in args], **tensors))
 
         return with_arrays
 
@@ -171,11 +175,20 @@ class TorchAdapter:
             **options,
         )
 
-    def _tensor(self, value: Any) -> Any:
-        if not isinstance(value, np.ndarray):
-            return value
-        dtype = self._float if value.dtype.kind == "f" else None
-        return self._torch.as_tensor(value.copy(), dtype=dtype, device=self._device)
+    def _tensor(self, value: Any, own: ModuleType | None = None) -> Any:
+        """Return a value with its arrays as tensors; value types become those that `own` calls by the same name."""
+        if isinstance(value, np.ndarray):
+            dtype = self._float if value.dtype.kind == "f" else None
+            return self._torch.as_tensor(value.copy(), dtype=dtype, device=self._device)
+        if isinstance(value, dict):
+            return {key: self._tensor(each, own) for key, each in value.items()}
+        if own is not None and is_dataclass(value) and hasattr(own, type(value).__name__):
+            return getattr(own, type(value).__name__)(
+                *(self._tensor(getattr(value, f.name), own) for f in fields(value))
+            )
+        if inspect.isfunction(value):
+            return lambda *args: self._tensor(value(*args), own)
+        return value
 
     def _grad_of(self, tensor: Any) -> np.ndarray:
         return self._array(self._torch.zeros_like(tensor) if tensor.grad is None else tensor.grad)
@@ -183,9 +196,13 @@ class TorchAdapter:
     def _array(self, value: Any) -> Any:
         if isinstance(value, tuple | list):
             return type(value)(self._array(each) for each in value)
+        if isinstance(value, dict):
+            return {key: self._array(each) for key, each in value.items()}
         if hasattr(value, "offsets") and hasattr(value, "ids"):
             ids, offsets = self._array(value.ids), self._array(value.offsets)
             return [ids[a:b].tolist() for a, b in itertools.pairwise(offsets)]
+        if is_dataclass(value):
+            return SimpleNamespace(**{f.name: self._array(getattr(value, f.name)) for f in fields(value)})
         if not isinstance(value, self._torch.Tensor):
             return value
         array = value.detach().cpu().numpy()

@@ -1,0 +1,216 @@
+"""Laws of density control: statistics, selection, and row operations that carry moments (paper eqs. 3, 6)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from hypothesis import strategies as st
+
+from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.law import law
+from pop_ref.conformance.strategies import arrays_of, dyadic, opacities
+from pop_ref.density import POP, Rows, Statistics
+from pop_ref.density_config import DensityConfig
+
+counts = st.lists(st.integers(0, 9), min_size=1, max_size=6)
+choices = st.lists(st.sampled_from(["keep", "clone", "split", "prune"]), min_size=1, max_size=6)
+W, H = 16, 8
+
+
+def tagged_rows(n):
+    """Return rows whose every number tells its row: the tag is the row index plus one, in all arrays alike."""
+    tag = np.arange(1.0, n + 1.0)
+    params = {
+        "means": tag[:, None] * np.array([1.0, 2.0, 4.0]),
+        "scales": -tag[:, None] * np.array([0.25, 0.5, 0.125]),
+        "quats": tag[:, None] * np.array([1.0, 0.0, 0.5, 0.0]),
+        "opacities": tag * 0.25,
+        "sh0": tag[:, None, None] * np.ones((1, 1, 3)),
+        "shN": tag[:, None, None] * np.ones((1, 3, 3)),
+    }
+    m = {name: 16.0 * array for name, array in params.items()}
+    v = {name: np.abs(64.0 * array) for name, array in params.items()}
+    return Rows(params, m, v)
+
+
+def masks_of(choices):
+    return {kind: np.array([c == kind for c in choices]) for kind in ("clone", "split", "prune")}
+
+
+@law("density", "clone_rows", choices=choices)
+def test_clones_are_exact_copies_at_the_end_with_fresh_moments(backend, choices):
+    rows, mask = tagged_rows(len(choices)), masks_of(choices)["clone"]
+    grown = backend.stage("clone_rows")(rows, mask)
+    n, n_new = len(choices), int(np.sum(mask))
+    for name, array in rows.params.items():
+        assert_same_bits(f"{name}, survivors", grown.params[name][:n], array)
+        assert_same_bits(f"{name}, copies", grown.params[name][n:], array[mask])
+        for kind, moments, old in (("m", grown.m, rows.m), ("v", grown.v, rows.v)):
+            assert_same_bits(f"{kind}[{name}], survivors", moments[name][:n], old[name])
+            assert_same_bits(f"{kind}[{name}], copies", moments[name][n:], np.zeros((n_new, *array.shape[1:])))
+
+
+@law("density", "prune_rows", choices=choices)
+def test_survivors_of_pruning_keep_their_order_bits_and_moments(backend, choices):
+    rows, mask = tagged_rows(len(choices)), masks_of(choices)["prune"]
+    left = backend.stage("prune_rows")(rows, mask)
+    for name in rows.params:
+        assert_same_bits(name, left.params[name], rows.params[name][~mask])
+        assert_same_bits(f"m[{name}]", left.m[name], rows.m[name][~mask])
+        assert_same_bits(f"v[{name}]", left.v[name], rows.v[name][~mask])
+
+
+@law("density", "split_rows", choices=choices, draws=arrays_of((2, 6, 3)))
+def test_a_split_replaces_each_parent_by_two_smaller_children_drawn_from_it(backend, choices, draws):
+    rows, mask = tagged_rows(len(choices)), masks_of(choices)["split"]
+    n_split, n_kept = int(np.sum(mask)), int(np.sum(~mask))
+    normals = draws[:, :n_split].copy()
+    after = backend.stage("split_rows")(rows, mask, normals)
+    parents = {name: array[mask] for name, array in rows.params.items()}
+    w, x, y, z = (parents["quats"] / np.linalg.norm(parents["quats"], axis=1, keepdims=True)).T
+    # the tags' quaternions turn about y only: x = z = 0
+    turn = np.zeros((n_split, 3, 3))
+    turn[:, 0, 0], turn[:, 0, 2], turn[:, 2, 0], turn[:, 2, 2] = 1 - 2 * y * y, 2 * w * y, -2 * w * y, 1 - 2 * y * y
+    turn[:, 1, 1] = 1.0
+    assert not np.any(x) and not np.any(z)
+    offset = np.einsum("nij,cnj->cni", turn, np.exp(parents["scales"]) * normals)
+    for name, array in rows.params.items():
+        assert_same_bits(f"{name}, survivors", after.params[name][:n_kept], array[~mask])
+        children = after.params[name][n_kept:].reshape(2, n_split, *array.shape[1:])
+        expected = np.repeat(parents[name][None], 2, axis=0)
+        if name == "means":
+            expected = expected + offset
+        if name == "scales":
+            expected = expected - np.log(1.6)
+        assert_close("density.split", children, expected, np.abs(expected) + 4.0, backend.dtype)
+        for moments in (after.m, after.v):
+            assert_same_bits(f"moments of {name}", moments[name][n_kept:], np.zeros((2 * n_split, *array.shape[1:])))
+
+
+@law("density", "reset_opacities", opacity=st.lists(opacities(), min_size=1, max_size=6))
+def test_a_reset_lowers_opacities_to_the_ceiling_and_forgets_their_moments_only(backend, opacity):
+    rows = tagged_rows(len(opacity))
+    o = np.clip(np.array(opacity), 1e-6, 1.0 - 1e-6)
+    rows.params["opacities"][:] = np.log(o / (1.0 - o))
+    after = backend.stage("reset_opacities")(rows, 0.01)
+    logits = after.params["opacities"]
+    # a logit of one over 2^20 of an opacity is rounded like its largest term, 14
+    assert_close("density.reset", 1.0 / (1.0 + np.exp(-logits)), np.minimum(o, 0.01), 1.0, backend.dtype)
+    for name in rows.params:
+        if name != "opacities":
+            assert_same_bits(name, after.params[name], rows.params[name])
+            assert_same_bits(f"m[{name}]", after.m[name], rows.m[name])
+    assert_same_bits("m of opacities", after.m["opacities"], np.zeros(len(opacity)))
+    assert_same_bits("v of opacities", after.v["opacities"], np.zeros(len(opacity)))
+
+
+@law("density", "rows_from_params", n=st.integers(1, 4))
+def test_a_new_population_has_zero_moments(backend, n):
+    params = tagged_rows(n).params
+    rows = backend.stage("rows_from_params")(dict(params))
+    for name, array in params.items():
+        assert_same_bits(name, rows.params[name], array)
+        assert_same_bits(f"m[{name}]", rows.m[name], np.zeros_like(array))
+        assert_same_bits(f"v[{name}]", rows.v[name], np.zeros_like(array))
+
+
+@law("density", "blur_set", counts=counts, theta=st.sampled_from([1 / 64, 1 / 128, 1 / 32, 0.0]))
+def test_the_blur_set_dominates_strictly_more_than_its_share_of_pixels(backend, counts, theta):
+    blurred = backend.stage("blur_set")(np.array(counts, dtype=np.int64), W, H, theta)
+    assert_same_bits("blurred", blurred, [c > theta * W * H for c in counts])
+
+
+views = st.lists(
+    st.tuples(dyadic(-1.0, 1.0), dyadic(-1.0, 1.0), st.booleans(), st.integers(0, 5)), min_size=1, max_size=4
+)
+
+
+def _window(backend, views, config=POP):
+    one = Statistics(np.zeros(1), np.zeros(1, dtype=np.int64), 0, np.zeros(1, dtype=np.int64), np.zeros(1, dtype=bool))
+    for x, y, visible, count in views:
+        v, shown, won = np.array([[x, y]]), np.array([visible]), np.array([count], dtype=np.int64)
+        found = backend.stage("accumulate")(one, v, shown, won, W, H, config)
+        one = Statistics(*(getattr(found, f.name) for f in dataclasses.fields(Statistics)))
+    return one
+
+
+@law("density", "accumulate", "average_grads", views=views)
+def test_the_density_statistic_averages_ndc_gradients_over_the_views_that_showed_the_gaussian(backend, views):
+    # a px gradient times W/2, H/2; hidden views count neither above nor below the line
+    shown = [np.hypot(0.5 * W * x, 0.5 * H * y) for x, y, visible, _ in views if visible]
+    window = _window(backend, views)
+    average = backend.stage("average_grads")(window, POP)
+    assert_close("density.average", average, [np.mean(shown) if shown else 0.0], 16.0, backend.dtype)
+    assert_same_bits("visible views", window.n_visible, [len(shown)])
+    assert window.n_views == len(views)
+
+
+@law("density", "accumulate", views=views, reading=st.sampled_from(["any_view", "sum", "own_view"]))
+def test_blur_flags_combine_over_views_as_the_reading_says(backend, views, reading):
+    # A2, at a share of three pixels
+    config = DensityConfig(theta_blur=3.0 / (W * H), blur_window=reading)
+    won = [count for *_, count in views]
+    expected = {"any_view": max(won) > 3, "sum": sum(won) > 3, "own_view": won[-1] > 3}[reading]
+    assert_same_bits("blurred", _window(backend, views, config).blurred, [expected])
+
+
+@law(
+    "density",
+    "grow_masks",
+    grads=st.lists(dyadic(0.0, 1.0), min_size=1, max_size=5),
+    step=st.sampled_from([600, 3000, 7000, 7100]),
+)
+def test_the_small_are_cloned_and_the_large_are_split_by_gradient_or_blur(backend, grads, step):
+    n = len(grads)
+    config = DensityConfig(grow_grad2d=0.5, grow_scale3d=0.25)
+    blurred = np.arange(n) % 3 == 1
+    large = np.arange(n) % 2 == 1
+    scales = np.where(large, 0.5, 0.25)[:, None] * np.array([[1.0, 0.5, 0.125]])
+    window = Statistics(np.array(grads), np.ones(n, dtype=np.int64), 1, np.zeros(n, dtype=np.int64), blurred)
+    clone, split = backend.stage("grow_masks")(window, scales, 1.0, step, config)
+    chosen = (np.array(grads) > 0.5) | (blurred & (3000 <= step <= 7000))
+    assert_same_bits("clone", clone, chosen & ~large)
+    assert_same_bits("split", split, chosen & large)
+
+
+@law(
+    "density",
+    "prune_mask",
+    opacity=st.lists(opacities(), min_size=1, max_size=5),
+    step=st.sampled_from([600, 3000, 3100]),
+)
+def test_the_faint_are_pruned_and_later_the_far_too_large(backend, opacity, step):
+    o = np.array(opacity).astype(backend.dtype).astype(np.float64)
+    sizes = np.where(np.arange(len(o)) % 2 == 0, 0.5, 0.0625)[:, None] * np.ones((1, 3))
+    pruned = backend.stage("prune_mask")(o, sizes, 1.0, step, POP)
+    clear = np.abs(o - 0.005) > 1e-6
+    expected = (o < 0.005) | ((step > 3000) & (sizes[:, 0] > 0.1))
+    assert_same_bits("pruned", pruned[clear], expected[clear])
+
+
+@law("density", "densify_and_prune", choices=choices)
+def test_an_event_adds_clones_and_splits_and_takes_prunes_away(backend, choices):
+    n = len(choices)
+    masks = masks_of(choices)
+    rows = tagged_rows(n)
+    rows.params["opacities"][:] = np.where(masks["prune"], -9.0, 1.0)
+    rows.params["scales"][:] = np.where(masks["split"], 0.0, -6.0)[:, None]
+    grads = np.where(masks["clone"] | masks["split"], 1.0, 0.0)
+    window = Statistics(grads, np.ones(n, dtype=np.int64), 1, np.zeros(n, dtype=np.int64), np.zeros(n, dtype=bool))
+
+    def at_the_centre(n_split):
+        return np.zeros((2, n_split, 3))
+
+    after, fresh = backend.stage("densify_and_prune")(rows, window, 1.0, 600, at_the_centre, POP)
+    expected = n + sum(int(np.sum(masks[k])) * sign for k, sign in (("clone", 1), ("split", 1), ("prune", -1)))
+    sizes = {len(array) for kind in (after.params, after.m, after.v) for array in kind.values()}
+    assert sizes == {expected}
+    # a row's tag stays with it in every parameter: means, colours and turns tell of the same row
+    tags = after.params["means"][:, 0]
+    assert_same_bits("tags of colours", after.params["sh0"][:, 0, 0], tags)
+    assert_same_bits("tags of turns", after.params["quats"][:, 0], tags)
+    old = after.m["means"][:, 0] != 0.0
+    assert_same_bits("tags of moments", after.m["means"][old, 0], 16.0 * tags[old])
+    assert_same_bits("fresh window", fresh.grad_sum, np.zeros(expected))
+    assert not np.any(fresh.blurred)
