@@ -1,0 +1,311 @@
+"""COLMAP captures: models of any kind, photographs paired by name, sizes, masks, transparency."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pop_fast.data import Capture, load_capture
+from pop_fast.data.colmap import read_model
+from tests.app.captures import (
+    HEIGHT,
+    PINHOLE,
+    WIDTH,
+    assert_one_line,
+    camera,
+    cloud,
+    colmap_capture,
+    photograph,
+    ring,
+    write_model,
+    write_photograph,
+)
+
+K = np.array([[PINHOLE[0], 0.0, PINHOLE[2]], [0.0, PINHOLE[1], PINHOLE[3]], [0.0, 0.0, 1.0]])
+
+
+def raw(root: Path, **options) -> Capture:
+    """Load in the capture's own frame."""
+    return load_capture(root, normalize=False, **options)
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_a_model_is_loaded_as_it_was_written(tmp_path: Path, binary: bool) -> None:
+    capture = raw(colmap_capture(tmp_path / "scene", binary=binary))
+    assert capture.name == "scene"
+    assert [view.name for view in capture.views] == ["00.png", "01.png", "02.png", "03.png"]
+    for i, (view, viewmat) in enumerate(zip(capture.views, ring(4), strict=True)):
+        assert np.allclose(view.viewmat, viewmat, atol=1e-12)
+        assert np.array_equal(view.K, K)
+        assert np.array_equal(view.image, photograph(i))
+        assert view.mask is None
+        assert np.allclose(view.camera_center, -viewmat[:3, :3].T @ viewmat[:3, 3])
+    xyz, rgb = cloud()
+    assert np.allclose(capture.points, xyz)
+    assert np.array_equal(capture.points_rgb, rgb)
+    assert np.array_equal(capture.world_transform, np.eye(4))
+    assert capture.source == "COLMAP model: 4 views, 20 points"
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
+def test_the_model_is_found_wherever_programs_put_it(tmp_path: Path, place: str) -> None:
+    root = colmap_capture(tmp_path / "scene")
+    for file in (root / "sparse" / "0").iterdir():
+        target = root / place / file.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if target != file:
+            file.rename(target)
+    assert len(raw(root).views) == 4
+
+
+def test_photographs_beside_the_model_are_found_without_a_folder_of_their_own(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path)
+    for file in (root / "images").iterdir():
+        file.rename(root / file.name)
+    (root / "images").rmdir()
+    assert np.array_equal(raw(root).views[2].image, photograph(2))
+
+
+def test_a_model_in_text_is_preferred_to_an_incomplete_one_in_binary(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path, binary=False)
+    (root / "sparse" / "0" / "cameras.bin").write_bytes(b"left over")
+    assert len(raw(root).views) == 4
+
+
+def test_subfolders_and_spaces_in_names_are_kept(tmp_path: Path) -> None:
+    names = ["left/a 1.png", "left/b.png", "right/a 1.png"]
+    capture = raw(colmap_capture(tmp_path, names=names))
+    assert [view.name for view in capture.views] == names
+    assert all(np.array_equal(view.image, photograph(i)) for i, view in enumerate(capture.views))
+
+
+def test_photographs_are_paired_by_name_whatever_else_lies_in_the_folder(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path)
+    write_photograph(root / "images" / "00a.png", photograph(9))
+    write_photograph(root / "images" / "unregistered.png", photograph(10))
+    capture = raw(root)
+    assert [view.name for view in capture.views] == ["00.png", "01.png", "02.png", "03.png"]
+    assert all(np.array_equal(view.image, photograph(i)) for i, view in enumerate(capture.views))
+
+
+def test_photographs_converted_to_another_format_are_found(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path, names=["a.JPG", "b.jpeg"])
+    for old, new in (("a.JPG", "a.png"), ("b.jpeg", "b.PNG")):
+        (root / "images" / old).unlink()
+        cv2.imwrite(str(root / "images" / new.lower()), photograph(3)[..., ::-1])
+        (root / "images" / new.lower()).rename(root / "images" / new)
+    assert all(np.array_equal(view.image, photograph(3)) for view in raw(root).views)
+
+
+def test_two_files_that_could_stand_for_an_absent_one_are_named(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path)
+    (root / "images" / "01.png").unlink()
+    write_photograph(root / "images" / "01.bmp", photograph(1))
+    write_photograph(root / "images" / "01.tif", photograph(1))
+    assert_one_line(lambda: raw(root), "01.png", "01.bmp", "01.tif", "remove one")
+
+
+def test_absent_photographs_are_an_error_or_are_skipped_with_a_note(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path)
+    (root / "images" / "00.png").unlink()
+    assert_one_line(lambda: raw(root), "lists 4 images, 1 of them absent", "00.png", "--missing skip")
+    capture = raw(root, missing="skip")
+    assert [view.name for view in capture.views] == ["01.png", "02.png", "03.png"]
+    assert np.array_equal(capture.views[0].image, photograph(1))
+    assert capture.notes == ("1 of 4 listed images are absent and were skipped",)
+    for file in (root / "images").iterdir():
+        file.unlink()
+    assert_one_line(lambda: raw(root, missing="skip"), "4 of them absent")
+
+
+@given(factor=st.integers(1, 12))
+def test_shrinking_keeps_every_point_of_the_scene_at_its_place_in_the_picture(factor: int, shared: Path) -> None:
+    capture = raw(shared, factor=factor)
+    for view in capture.views:
+        assert view.width == round(WIDTH / factor)
+        assert view.height == round(HEIGHT / factor)
+        # relative to the picture's width and height, K stays exactly the same
+        assert np.allclose(view.K[0] / view.width, K[0] / WIDTH, rtol=1e-14)
+        assert np.allclose(view.K[1] / view.height, K[1] / HEIGHT, rtol=1e-14)
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return colmap_capture(tmp_path_factory.mktemp("shared"))
+
+
+def test_shrinking_averages_areas(shared: Path) -> None:
+    capture = raw(shared, factor=2)
+    want = photograph(1).astype(float).reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(axis=(1, 3))
+    assert np.abs(capture.views[1].image - want).max() <= 0.5 + 1e-6
+
+
+def test_a_folder_of_shrunk_photographs_is_taken_where_it_exists(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path)
+    for i in range(4):
+        write_photograph(root / "images_2" / f"{i:02d}.jpg", photograph(i + 10, 20, 15))
+    exact = raw(root, factor=2)
+    assert exact.views[0].image.shape == (15, 20, 3)
+    assert not np.array_equal(exact.views[0].image, raw(root, factor=2, images="images").views[0].image)
+    assert np.allclose(exact.views[0].K[:2], K[:2] / 2.0)
+    named = raw(root, factor=1, images="images_2")
+    assert np.array_equal(named.views[0].image, exact.views[0].image)
+    (root / "images_2" / "03.jpg").unlink()
+    assert_one_line(lambda: raw(root, factor=2), "images_2", "03.png")
+    assert np.array_equal(raw(root, factor=2, missing="skip").views[2].image, exact.views[2].image)
+
+
+def test_every_photograph_is_scaled_by_its_own_size(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path)
+    write_photograph(root / "images" / "01.png", photograph(1, 2 * WIDTH, 2 * HEIGHT))
+    write_photograph(root / "images" / "02.png", photograph(2, 20, 15))
+    views = raw(root).views
+    assert [(view.width, view.height) for view in views] == [(40, 30), (80, 60), (20, 15), (40, 30)]
+    for view, scale in zip(views, (1.0, 2.0, 0.5, 1.0), strict=True):
+        assert np.allclose(view.K[:2], K[:2] * scale)
+
+
+def test_cameras_of_several_sizes_live_in_one_capture(tmp_path: Path) -> None:
+    names = ["a.png", "b.png"]
+    cameras = [camera(), camera("SIMPLE_PINHOLE", (60.0, 30.0, 40.0), 60, 80)]
+    write_photograph(tmp_path / "images" / "a.png", photograph(0))
+    write_photograph(tmp_path / "images" / "b.png", photograph(1, 60, 80))
+    write_model(tmp_path / "sparse" / "0", names, ring(2), cameras)
+    first, second = raw(tmp_path, factor=2).views
+    assert first.image.shape == (15, 20, 3)
+    assert second.image.shape == (40, 30, 3)
+    assert np.allclose(second.K, [[30.0, 0.0, 15.0], [0.0, 30.0, 20.0], [0.0, 0.0, 1.0]])
+
+
+def test_a_photograph_of_another_shape_than_its_camera_is_refused(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path)
+    write_photograph(root / "images" / "02.png", photograph(2, HEIGHT, WIDTH))
+    assert_one_line(lambda: raw(root), "02.png", "30x40", "40x30", "rotated")
+
+
+def test_rounding_of_shrunk_sizes_is_no_other_shape(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path, cameras=[camera(params=(4000.0, 4000.0, 2473.0, 1643.0), width=4946, height=3286)])
+    for i in range(4):
+        write_photograph(root / "images" / f"{i:02d}.png", photograph(i, 618, 410))
+    assert np.allclose(raw(root).views[0].K[0, 2], 309.0)
+
+
+def test_exif_orientation_is_ignored_as_colmap_ignores_it(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path, names=["a.jpg", "b.jpg"])
+    plain = raw(root).views[0].image
+    data = (root / "images" / "a.jpg").read_bytes()
+    rotate = b"Exif\0\0II*\0" + struct.pack("<IHHHIII", 8, 1, 0x0112, 3, 1, 6, 0)
+    (root / "images" / "a.jpg").write_bytes(
+        data[:2] + b"\xff\xe1" + struct.pack(">H", len(rotate) + 2) + rotate + data[2:]
+    )
+    assert cv2.imread(str(root / "images" / "a.jpg")).shape[:2] == (WIDTH, HEIGHT)
+    assert np.array_equal(raw(root).views[0].image, plain)
+
+
+@pytest.mark.parametrize("name", ["01.png", "01.PNG.png", "01.jpg"])
+def test_masks_are_found_under_all_usual_names_and_white_means_keep(tmp_path: Path, name: str) -> None:
+    root = colmap_capture(tmp_path, names=["00.PNG", "01.PNG"])
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[:, :10] = 255
+    write_photograph(root / "masks" / name, mask)
+    first, second = raw(root).views
+    assert first.mask is None
+    assert second.mask is not None
+    assert second.mask.dtype == bool
+    assert np.array_equal(second.mask, mask > 0)
+    assert raw(root, masks=False).views[1].mask is None
+    small = raw(root, factor=2).views[1].mask
+    assert small is not None
+    assert np.array_equal(small, mask[::2, ::2] > 0)
+
+
+def test_masks_that_fit_no_photograph_or_hide_all_of_it_are_refused(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path)
+    write_photograph(root / "masks" / "elsewhere.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    assert_one_line(lambda: raw(root), "masks", "no mask named as a photograph")
+    write_photograph(root / "masks" / "02.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    assert_one_line(lambda: raw(root), "02.png", "hides the whole photograph", "white means keep")
+    write_photograph(root / "masks" / "02.png", np.full((WIDTH, HEIGHT), 255, np.uint8))
+    assert_one_line(lambda: raw(root), "02.png", "the mask is 30x40", "40x30")
+
+
+def test_transparency_is_composited_over_the_background_and_is_no_mask(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path)
+    rgba = photograph(5, channels=4)
+    write_photograph(root / "images" / "00.png", rgba)
+    alpha = rgba[:, :, 3:] / 255.0
+    for background in ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.2, 0.5, 0.9)):
+        view = raw(root, background=background).views[0]
+        want = alpha * rgba[:, :, :3] + (1.0 - alpha) * 255.0 * np.array(background)
+        assert view.mask is None
+        assert np.abs(view.image - want).max() <= 0.5 + 1e-3
+
+
+def test_gray_and_sixteen_bit_photographs_become_eight_bit_rgb(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path)
+    gray = photograph(5)[:, :, 0]
+    write_photograph(root / "images" / "00.png", gray)
+    write_photograph(root / "images" / "01.png", gray.astype(np.uint16) * 257)
+    for view in raw(root).views[:2]:
+        assert np.array_equal(view.image, np.repeat(gray[:, :, None], 3, axis=2))
+
+
+def test_every_eighth_file_by_name_is_held_out_beginning_with_the_first(tmp_path: Path) -> None:
+    names = [f"{i}.png" for i in range(17)]
+    capture = raw(colmap_capture(tmp_path, names=names))
+    ordered = sorted(names)
+    assert [view.name for view in capture.test_views()] == [ordered[0], ordered[8], ordered[16]]
+    assert {view.name for view in capture.train_views()} == set(names) - {ordered[0], ordered[8], ordered[16]}
+    assert capture.test_views(0) == ()
+    assert capture.train_views(0) == capture.views
+    assert len(capture.test_views(5)) == 4
+
+
+def test_unregistered_images_of_a_model_are_left_out(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path, binary=False)
+    model = root / "sparse" / "0" / "images.txt"
+    kept = [line for line in model.read_text().splitlines() if not line.endswith("03.png")]
+    model.write_text("\n".join(kept) + "\n")
+    (root / "sparse" / "0" / "frames.txt").unlink()
+    (root / "sparse" / "0" / "rigs.txt").unlink()
+    assert [view.name for view in raw(root).views] == ["00.png", "01.png", "02.png"]
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV_FISHEYE", "FOV", "THIN_PRISM_FISHEYE"])
+def test_distorted_cameras_give_pinhole_views_of_the_same_size(tmp_path: Path, model: str) -> None:
+    terms = {"SIMPLE_RADIAL": (0.05,), "OPENCV_FISHEYE": (0.01, 0.0, 0.0, 0.0), "FOV": (0.4,)}.get(model, (0.01,) * 8)
+    focal = (36.0,) if model == "SIMPLE_RADIAL" else (36.0, 36.0)
+    root = colmap_capture(tmp_path, cameras=[camera(model, (*focal, 20.5, 14.25, *terms))])
+    write_photograph(root / "masks" / "00.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    view = raw(root).views[0]
+    assert view.image.shape == (HEIGHT, WIDTH, 3)
+    assert view.K[0, 2] == 20.5
+    assert view.K[1, 2] == 14.25
+    assert view.mask is not None
+    assert view.mask.all()
+    assert not np.array_equal(view.image, photograph(0))
+
+
+def test_progress_is_told_for_every_photograph(shared: Path) -> None:
+    told: list[tuple[str, int, int]] = []
+    raw(shared, progress=lambda *what: told.append(what))
+    assert told == [("reading photographs", i, 4) for i in range(1, 5)]
+
+
+def test_loading_twice_gives_the_same_bits(shared: Path) -> None:
+    first, second = load_capture(shared, factor=2), load_capture(shared, factor=2)
+    assert np.array_equal(first.points, second.points)
+    for a, b in zip(first.views, second.views, strict=True):
+        assert np.array_equal(a.image, b.image)
+        assert np.array_equal(a.viewmat, b.viewmat)
+
+
+def test_the_camera_of_a_shot_outlives_the_model_it_came_from(shared: Path) -> None:
+    shots, _ = read_model(shared / "sparse" / "0")
+    assert [shot.camera.params.tolist() for shot in shots] == [list(PINHOLE)] * 4
