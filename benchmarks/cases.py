@@ -1,0 +1,81 @@
+"""The scenes that are timed: made from a seed, with the numbers that decide their cost written beside the times."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pop_fast.data.capture import Capture, View
+
+
+@dataclass(frozen=True)
+class Case:
+    """A synthetic scene.
+
+    Attributes:
+        name: as it stands in results.
+        n: Gaussians.
+        width: px.
+        height: px.
+        spread: factor on the Gaussians' size; 1 covers a pixel with about fifteen.
+    """
+
+    name: str
+    n: int
+    width: int
+    height: int
+    spread: float = 1.0
+
+
+RASTER_CASES = (
+    Case("270x480-12k", 12_000, 270, 480),
+    Case("270x480-40k", 40_000, 270, 480),
+    Case("640x480-100k", 100_000, 640, 480),
+)
+ITERATION_CASES = (Case("270x480-12k", 12_000, 270, 480), Case("270x480-40k", 40_000, 270, 480))
+MEMORY_CASE = Case("1600x1000-300k", 300_000, 1600, 1000)
+GATE_CASE = Case("gate", 40, 37, 29, 6.0)
+
+
+def gaussians_of(case: Case, dtype: torch.dtype = torch.float32, seed: int = 0) -> dict[str, Tensor]:
+    """Draw a scene: centres fill the frustum, sizes are log-normal and shrink as the scene gets denser.
+
+    Returns:
+        The arguments of `rasterization`, third-degree harmonics as colours.
+    """
+    rng = np.random.default_rng(seed)
+    focal = 0.9 * max(case.width, case.height)
+    z = rng.uniform(2.0, 6.0, case.n)
+    x = rng.uniform(-0.6, 0.6, case.n) * case.width / focal * z
+    y = rng.uniform(-0.6, 0.6, case.n) * case.height / focal * z
+    pixels = 0.0069 * case.spread * np.sqrt(12_000 / case.n) * np.sqrt(case.width * case.height / 129_600)
+    scales = np.exp(rng.normal(0.0, 0.6, (case.n, 3))) * (pixels * 312.0 * z / focal)[:, None]
+    given = {
+        "means": np.stack((x, y, z), 1),
+        "quats": rng.normal(size=(case.n, 4)),
+        "scales": scales,
+        "opacities": 1.0 / (1.0 + np.exp(-2.5 * rng.normal(size=case.n))),
+        "colors": 0.2 * rng.normal(size=(case.n, 16, 3)),
+        "viewmats": np.eye(4)[None],
+        "Ks": np.array([[[focal, 0.0, 0.5 * case.width], [0.0, focal, 0.5 * case.height], [0.0, 0.0, 1.0]]]),
+    }
+    return {name: torch.tensor(value, dtype=dtype) for name, value in given.items()}
+
+
+def capture_of(case: Case, views: int = 6, seed: int = 0) -> Capture:
+    """Make a capture whose sparse points start training with `case.n` Gaussians; its photographs are smooth noise."""
+    rng = np.random.default_rng(seed)
+    scene = gaussians_of(case, torch.float64, seed)
+    K = scene["Ks"][0].numpy()
+    made: list[View] = []
+    for i in range(views):
+        coarse = torch.tensor(rng.uniform(0.0, 255.0, (1, 3, case.height // 16 + 2, case.width // 16 + 2)))
+        smooth = torch.nn.functional.interpolate(coarse, (case.height, case.width), mode="bicubic").clamp(0.0, 255.0)
+        viewmat = np.eye(4)
+        viewmat[:3, 3] = rng.uniform(-0.05, 0.05, 3)
+        made.append(View(f"{i:03d}.png", smooth[0].permute(1, 2, 0).to(torch.uint8).numpy(), viewmat, K))
+    colours = rng.integers(0, 256, (case.n, 3)).astype(np.uint8)
+    return Capture(case.name, tuple(made), scene["means"].numpy(), colours, "made from a seed")

@@ -1,0 +1,273 @@
+"""Time the CPU path: first the correctness gate against the oracle, then the numbers, written as one JSON file.
+
+    python benchmarks/run.py                          all of it, results to benchmarks/results/cpu.json
+    python benchmarks/run.py --only raster            one part: raster, iteration, memory, capture
+    python benchmarks/run.py --capture DIR --factor 4 also training steps on a real capture
+
+Every time is the median of `--repeats` runs in one process after warm-up; threads, machine and load are written beside
+it. A speed is never reported on a red gate.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from cases import GATE_CASE, ITERATION_CASES, MEMORY_CASE, RASTER_CASES, Case, capture_of, gaussians_of
+
+from pop_fast.compositing import composite
+from pop_fast.data import Capture, load_capture
+from pop_fast.rasterization import rasterization
+from pop_fast.tiles import tile_lists
+from pop_fast.train import TrainConfig, Trainer
+from pop_fast.train.environment import reproducible
+from pop_ref.render import render, render_vjp
+from pop_ref.types import Camera, Gaussians
+
+SCENE = ("means", "quats", "scales", "opacities", "colors")
+GATE = {torch.float64: 1e-10, torch.float32: 5e-5}
+
+
+def gate() -> dict[str, float]:
+    """Compare image and gradients with the oracle; raise SystemExit where they differ.
+
+    Returns:
+        The worst difference of each type, relative to each array's largest entry.
+    """
+    exact = gaussians_of(GATE_CASE, torch.float64)
+    arrays = [exact[name].numpy() for name in SCENE]
+    camera = Camera(exact["viewmats"][0].numpy(), exact["Ks"][0].numpy(), GATE_CASE.width, GATE_CASE.height)
+    image = render(Gaussians(*arrays), camera).image
+    v_image = np.random.default_rng(1).normal(size=image.shape)
+    v = render_vjp(Gaussians(*arrays), camera, v_image)
+    expected = [image, v.means, v.quats, v.scales, v.opacities, v.sh]
+    worst: dict[str, float] = {}
+    for dtype, bound in GATE.items():
+        given = {name: value.detach().to(dtype, copy=True) for name, value in exact.items()}
+        leaves = {name: given[name].requires_grad_() for name in SCENE}
+        size = {"width": GATE_CASE.width, "height": GATE_CASE.height, "sh_degree": 3}
+        fast, _, _ = rasterization(**{**given, **leaves}, **size)
+        (fast[0] * torch.tensor(v_image, dtype=dtype)).sum().backward()
+        found = [fast[0].detach(), *(_gradient(leaf) for leaf in leaves.values())]
+        error = max(
+            float(np.abs(a.double().numpy() - b).max() / np.abs(b).max()) for a, b in zip(found, expected, strict=True)
+        )
+        worst[str(dtype)] = error
+        if not error <= bound:
+            raise SystemExit(
+                f"gate: {dtype} differs from the oracle by {error:.2e}, more than {bound:.0e}; nothing was timed"
+            )
+    return worst
+
+
+def median_ms(run: Callable[[], Any], repeats: int, warm_up: int = 3) -> float:
+    """Return the median time of a call, ms."""
+    for _ in range(warm_up):
+        run()
+    times: list[float] = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - start)
+    return 1e3 * statistics.median(times)
+
+
+def time_raster(case: Case, repeats: int) -> dict[str, Any]:
+    """Time `rasterization()` and, apart from it, the blend alone in 16 and 8 pixel tiles."""
+    scene = gaussians_of(case)
+    leaves = {name: scene[name].requires_grad_() for name in SCENE}
+    arguments = {**scene, **leaves, "width": case.width, "height": case.height, "sh_degree": 3, "packed": False}
+    kept: dict[str, Any] = {}
+
+    def forward(dominance: bool) -> None:
+        kept["image"], _, kept["meta"] = rasterization(**arguments, dominance=dominance)
+
+    def both(dominance: bool) -> None:
+        forward(dominance)
+        kept["image"].square().mean().backward()
+
+    meta = rasterization(**arguments, counts=True)[2]
+    pixels = case.width * case.height
+    return {
+        **asdict(case),
+        "forward_ms": median_ms(lambda: forward(False), repeats),
+        "forward_dominance_ms": median_ms(lambda: forward(True), repeats),
+        "forward_backward_ms": median_ms(lambda: both(False), repeats),
+        "forward_backward_dominance_ms": median_ms(lambda: both(True), repeats),
+        "contributing_per_pixel": float(meta["n_contrib"].float().mean()),
+        "list_entries_per_pixel": float(meta["n_traversed"].float().mean()),
+        "visible": int((meta["radii"] > 0).all(-1).sum()),
+        "blend": [time_blend(case, scene, tile, pixels, repeats) for tile in (16, 8)],
+    }
+
+
+def time_blend(case: Case, scene: dict[str, Tensor], tile: int, pixels: int, repeats: int) -> dict[str, float]:
+    """Time blending and its transpose alone, per evaluated (Gaussian, pixel) pair."""
+    size = (case.width, case.height)
+    with torch.no_grad():
+        _, _, meta = rasterization(**scene, width=size[0], height=size[1], sh_degree=3, packed=False)
+    names = ("means2d", "conics", "opacities")
+    splats = [meta[name][0].detach().clone().requires_grad_() for name in names]
+    colors = torch.rand(case.n, 3, requires_grad=True)
+    exact = {"conics": meta["conics"][0], "opacities": meta["opacities"][0]}
+    lists = tile_lists(meta["means2d"][0], meta["radii"][0], meta["depths"][0], *size, tile, **exact)
+    kept: dict[str, Any] = {}
+
+    def forward() -> None:
+        kept["blend"] = composite(*splats, colors, lists, *size)
+
+    def both() -> None:
+        forward()
+        kept["blend"].image.square().mean().backward()
+
+    ahead, whole = median_ms(forward, repeats), median_ms(both, repeats)
+    pairs = kept["blend"].n_pairs
+    return {
+        "tile": tile,
+        "entries": len(lists.ids),
+        "pairs_per_pixel": pairs / pixels,
+        "forward_ns_per_pair": 1e6 * ahead / pairs,
+        "forward_backward_ns_per_pair": 1e6 * whole / pairs,
+    }
+
+
+def time_iteration(case: Case, repeats: int) -> dict[str, Any]:
+    """Time whole training steps of POP on a synthetic capture with `case.n` Gaussians."""
+    scene = gaussians_of(case)
+
+    def prepare(trainer: Trainer) -> None:
+        with torch.no_grad():
+            trainer.params["scales"].copy_(scene["scales"].log())
+            trainer.params["opacities"].copy_(torch.logit(scene["opacities"].clamp(1e-4, 1.0 - 1e-4)))
+
+    return {**asdict(case), **_time_steps(capture_of(case), repeats, prepare)}
+
+
+def time_capture(path: str, factor: int, repeats: int) -> dict[str, Any]:
+    """Time training steps of POP from the sparse points of a real capture, all bands active."""
+    capture = load_capture(path, factor=factor)
+    view = capture.views[0]
+    return {"capture": capture.name, "width": view.width, "height": view.height, **_time_steps(capture, repeats)}
+
+
+def _time_steps(
+    capture: Capture, repeats: int, prepare: Callable[[Trainer], None] = lambda trainer: None
+) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as folder:
+        config = TrainConfig(result_dir=str(Path(folder) / "run"), sh_interval=1, log_every=10**9, progress=False)
+        trainer = Trainer(config, capture)
+        prepare(trainer)
+        for _ in range(4):
+            trainer.train_step()
+        with reproducible(torch.get_num_threads()):
+            step_ms = median_ms(trainer.train_step, repeats)
+            pairs = trainer.train_step().rendered.info["n_pairs"]
+    view = capture.views[0]
+    return {
+        "iteration_ms": step_ms,
+        "num_gaussians": len(trainer.params["means"]),
+        "pairs_per_pixel": pairs / (view.width * view.height),
+    }
+
+
+def measure_memory() -> dict[str, Any]:
+    """Measure, in a process of its own, the peak memory of one render and its backward."""
+    code = "import run; run.render_once(run.MEMORY_CASE)"
+    here = Path(__file__).resolve().parent
+    done = subprocess.run([sys.executable, "-c", code], cwd=here, capture_output=True, text=True, check=True)
+    return {**asdict(MEMORY_CASE), **json.loads(done.stdout)}
+
+
+def render_once(case: Case) -> None:
+    """Render a case and its backward once, and print the peak memory of this process as JSON."""
+    scene = gaussians_of(case)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    leaves = {name: scene[name].requires_grad_() for name in SCENE}
+    start = time.perf_counter()
+    image, _, meta = rasterization(
+        **{**scene, **leaves}, width=case.width, height=case.height, sh_degree=3, packed=False, dominance=True
+    )
+    image.square().mean().backward()
+    seconds = time.perf_counter() - start
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    pairs = meta["n_pairs"] / (case.width * case.height)
+    print(
+        json.dumps(
+            {"peak_gib": peak / 2**20, "before_gib": before / 2**20, "seconds": seconds, "pairs_per_pixel": pairs}
+        )
+    )
+
+
+def machine() -> dict[str, Any]:
+    """Describe what the times were taken on."""
+    model = platform.processor()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        model = next(
+            (line.split(":")[1].strip() for line in info.read_text().splitlines() if "model name" in line), model
+        )
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    return {
+        "cpu": model,
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "load_before": os.getloadavg()[0],
+        "torch": torch.__version__,
+        "capability": torch.backends.cpu.get_cpu_capability(),
+        "python": platform.python_version(),
+        "commit": commit.stdout.strip(),
+    }
+
+
+def _gradient(leaf: Tensor) -> Tensor:
+    assert leaf.grad is not None
+    return leaf.grad
+
+
+def main() -> None:
+    """Run what is asked for and write the results."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent / "results" / "cpu.json")
+    parser.add_argument("--only", choices=("raster", "iteration", "memory", "capture"), default=None)
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--threads", type=int, default=os.cpu_count())
+    parser.add_argument("--capture", default=None)
+    parser.add_argument("--factor", type=int, default=1)
+    given = parser.parse_args()
+    torch.set_num_threads(given.threads)
+    result: dict[str, Any] = {"machine": machine(), "gate": gate()}
+    wanted = {given.only} if given.only else {"raster", "iteration", "memory", "capture"}
+    if "raster" in wanted:
+        result["raster"] = [time_raster(case, given.repeats) for case in RASTER_CASES]
+    if "iteration" in wanted:
+        result["iteration"] = [time_iteration(case, given.repeats) for case in ITERATION_CASES]
+    if "memory" in wanted:
+        result["memory"] = measure_memory()
+    if "capture" in wanted and given.capture:
+        result["capture"] = time_capture(given.capture, given.factor, given.repeats)
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    beside = given.out.with_suffix(".part")
+    beside.write_text(json.dumps(result, indent=2) + "\n")
+    os.replace(beside, given.out)
+    print(json.dumps(result, indent=2))
+
+
+if __name__ == "__main__":
+    main()
