@@ -30,7 +30,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.train.config import TrainConfig
 
-_OURS = ("cfg.json", "metrics.jsonl", "ckpts", "ply", "stats", "renders", "report_data", "report.html")
+_OURS = ("cfg.json", "metrics.jsonl", "ckpts", "ply", "stats", "renders", "report_data", "report.html", "capture.json")
 OPACITY_BINS = 100
 
 
@@ -41,8 +41,8 @@ class ResultFolder:
         self.path = Path(path)
         self._metrics: Any = None
 
-    def claim(self, config: TrainConfig, resume: bool, overwrite: bool) -> None:
-        """Make the folder this run's own and write its settings.
+    def claim(self, resume: bool, overwrite: bool) -> None:
+        """Make the folder this run's own: new, emptied of results, or left as it is to go on with.
 
         Raises:
             PopError: the folder is in use and neither `resume` nor `overwrite` is set, or it is not a result folder.
@@ -56,6 +56,9 @@ class ResultFolder:
             raise PopError(f"{self.path}: has no cfg.json, so it is not a result folder; choose another")
         if overwrite and not resume:
             self._remove_results()
+
+    def write_config(self, config: TrainConfig) -> None:
+        """Write cfg.json."""
         write_atomically(self.path / "cfg.json", lambda file: file.write(config.to_json().encode()))
 
     def _remove_results(self) -> None:

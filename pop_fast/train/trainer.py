@@ -112,7 +112,6 @@ class Trainer:
         """
         self._started = time.perf_counter()
         with reproducible(self.config.threads), stop_requests() as stop:
-            self._results.claim(self._given, self._resume, self._overwrite)
             try:
                 self._begin()
                 return self._loop(stop)
@@ -151,9 +150,8 @@ class Trainer:
             raise
 
     def _adam(self, step: int, degree: int) -> None:
-        initial = self.config.lr.means * self._scene_scale
-        rate = means_lr(step, self.config.max_steps, initial, self.config.lr.means_decay)
-        self.optimizers["means"].param_groups[0]["lr"] = rate
+        lr, group = self.config.lr, self.optimizers["means"].param_groups[0]
+        group["lr"] = means_lr(step, self.config.max_steps, lr.means * self._scene_scale, lr.means_decay)
         for key, optimizer in self.optimizers.items():
             if key == "shN" and degree == 0:
                 advance_idle(optimizer, self.params[key])
@@ -162,29 +160,35 @@ class Trainer:
             optimizer.zero_grad(set_to_none=True)
 
     def _begin(self) -> None:
+        self._results.claim(self._resume, self._overwrite)
         found = ckpt.list_checkpoints(self._results.path) if self._resume else []
         if found:
             self._restore(found[-1][1])
-            return
-        self._results.open_metrics(keep_bytes=0)
-        self._results.write_opacities(-1, self._opacities().numpy())
+        self._results.write_config(self._given)
+        if not found:
+            self._results.open_metrics(keep_bytes=0)
+            self._results.write_opacities(-1, self._opacities().numpy())
 
     def _loop(self, stop: threading.Event) -> dict[str, Any]:
         config = self.config
         with tqdm(total=config.max_steps, initial=self.step, disable=None if config.progress else True) as bar:
             while self.step < config.max_steps:
-                start = time.perf_counter()
-                done = self.train_step()
-                self._train_seconds += time.perf_counter() - start
-                if done.event is not None or done.step % config.log_every == 0:
-                    self._log(done, time.perf_counter() - start, bar)
-                bar.update()
-                self._milestones(done.step)
+                self._advance(bar)
+                self._milestones(self.step - 1)
                 if stop.is_set() and self.step < config.max_steps:
                     self._save()
                     raise KeyboardInterrupt
         last = config.max_steps - 1
         return self._results.read_stats("val", last) or self._evaluate(last)
+
+    def _advance(self, bar: tqdm) -> None:
+        # a method of its own, so that this step's render is let go of before the next one is made
+        start = time.perf_counter()
+        done = self.train_step()
+        self._train_seconds += time.perf_counter() - start
+        if done.event is not None or done.step % self.config.log_every == 0:
+            self._log(done, time.perf_counter() - start, bar)
+        bar.update()
 
     def _log(self, done: Step, seconds: float, bar: tqdm) -> None:
         blended, traversed = gaussians_per_pixel(done.rendered.info)
