@@ -2,9 +2,10 @@
 
 Copy stats/val_step*.json of a finished run to benchmarks/results/training/<capture>_<method>.json; then
 
-    python benchmarks/results_table.py            print the table
-    python benchmarks/results_table.py --write    put it into README.md
-    python benchmarks/results_table.py --check    exit with 1 when README.md holds another one
+    python benchmarks/results_table.py                      print the table
+    python benchmarks/results_table.py --check README.md    exit with 1 when that file holds another one
+
+`python docs/tables.py --write` puts it into README.md.
 """
 
 from __future__ import annotations
@@ -15,9 +16,7 @@ from pathlib import Path
 
 from pop_fast.report.compare import markdown, row
 
-ROOT = Path(__file__).resolve().parents[1]
-RUNS = ROOT / "benchmarks" / "results" / "training"
-BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
+RUNS = Path(__file__).resolve().parent / "results" / "training"
 
 
 def table(folder: Path = RUNS) -> str:
@@ -27,24 +26,13 @@ def table(folder: Path = RUNS) -> str:
     return markdown([row(stats) for stats in runs])
 
 
-def with_table(readme: str, folder: Path = RUNS) -> str:
-    """Put the table between its marks in README.md's text."""
-    before, rest = readme.split(BEGIN)
-    _, after = rest.split(END)
-    return f"{before}{BEGIN}\n{table(folder)}\n{END}{after}"
-
-
 def main(words: list[str]) -> int:
     """Run the script."""
-    path = ROOT / "README.md"
-    if "--write" not in words and "--check" not in words:
+    if words[:1] != ["--check"]:
         print(table())
         return 0
-    readme = path.read_text(encoding="utf-8")
-    if "--write" in words:
-        path.write_text(with_table(readme), encoding="utf-8")
-    elif with_table(readme) != readme:
-        print("README.md: the results table is not what the runs say; run 'python benchmarks/results_table.py --write'")
+    if f"\n{table()}\n" not in Path(words[1]).read_text(encoding="utf-8"):
+        print(f"{words[1]}: the results table is not what the runs say; run 'python docs/tables.py --write'")
         return 1
     return 0
 

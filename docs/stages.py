@@ -1,0 +1,81 @@
+"""The stages of the method, where the paper states each, and their functions as the sources have them."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A row of the Rosetta table: the modules that hold a step have the same names in each room."""
+
+    title: str
+    paper: str
+    modules: tuple[str, ...]
+    also_fast: tuple[str, ...] = ()  # files of pop_fast under other names, where torch or gsplat's interface sets them
+
+
+STAGES = (
+    Stage("raw parameters to scales, opacities, unit quaternions", "3.1", ("activations",)),
+    Stage("covariances from rotations and scales", "3.1", ("covariance",)),
+    Stage("spherical harmonics to colour", "3.1", ("harmonics",)),
+    Stage("world to camera, near plane", "3.1", ("camera",)),
+    Stage("projection of means and covariances (EWA)", "3.1", ("projection",)),
+    Stage("low-pass, conics, extents, off-screen cull", "3.1", ("footprint",)),
+    Stage("tile lists in depth order", "3.1", ("tiles",)),
+    Stage("falloff and alpha of one splat at one pixel", "eqs. 1, 11", ("alpha",)),
+    Stage("blending with early ray termination", "eq. 1", ("compositing", "pixel")),
+    Stage("dominant Gaussians", "eq. 5", ("dominance",)),
+    Stage("a whole view", "eq. 1", ("render", "splatting"), ("rasterization.py",)),
+    Stage("L1, L2, SSIM and both objectives", "eqs. 2, 4, 9", ("losses", "ssim")),
+    Stage("importance mask and POP loss", "eqs. 7, 8", ("polarization",)),
+    Stage("density control", "eqs. 3, 6", ("density", "density_config", "density_rows")),
+    Stage("Adam and its schedules", "4.1", ("optimizer",), ("train/model.py", "train/schedule.py")),
+    Stage("one training step", "eq. 9", ("training", "recipes"), ("train/trainer.py",)),
+    Stage(
+        "distance of every decision from flipping", "–", ("margins", "extent_margins", "pixel_margins", "magnitudes")
+    ),
+)
+
+# modules of pop_ref that are data or types, not stages
+NOT_STAGES = frozenset({"__init__", "_shapes", "ambiguities", "constants", "notation", "types"})
+# stages whose laws stand in a file of another name: whole views, and what has a file of its own outside tests/laws
+LAWS_ELSEWHERE = {
+    "render": "tests/laws/test_whole.py",
+    "training": "tests/golden",
+    "margins": "tests/thresholds",
+}
+
+
+def functions(path: Path) -> dict[str, list[str]]:
+    """Give the public functions of a source file, in order, each with its parameters' names."""
+    if not path.is_file():
+        return {}
+    found = (n for n in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(n, ast.FunctionDef))
+    return {f.name: [a.arg for a in (*f.args.args, *f.args.kwonlyargs)] for f in found if f.name[0] != "_"}
+
+
+def files(room: str, stage: Stage) -> Iterator[Path]:
+    """Give the files of a stage in one room, where they exist."""
+    suffixes = (".cuh", ".cu") if room == "cuda_ext/csrc" else (".py",)
+    for module in stage.modules:
+        for suffix in suffixes:
+            path = ROOT / room / f"{module}{suffix}"
+            if path.is_file():
+                yield path
+    if room == "pop_fast":
+        yield from (ROOT / room / name for name in stage.also_fast)
+
+
+def laws(stage: Stage) -> Iterator[Path]:
+    """Give the law files of a stage: tests/laws/test_<module>*.py, or the place named in `LAWS_ELSEWHERE`."""
+    for module in stage.modules:
+        if module in LAWS_ELSEWHERE:
+            yield ROOT / LAWS_ELSEWHERE[module]
+        yield from sorted((ROOT / "tests" / "laws").glob(f"test_{module}.py"))
+        yield from sorted((ROOT / "tests" / "laws").glob(f"test_{module}_*.py"))

@@ -1,0 +1,136 @@
+"""README.md says what is true: its tables, names, paths and commands."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import importlib.util
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from pop_fast.cli import COMMANDS
+
+ROOT = Path(__file__).resolve().parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+# functions whose fast twin cannot have the oracle's parameters, and why
+OTHER_PARAMETERS = {
+    "compositing.composite": "autograd has to see the arrays themselves, so they are not wrapped in Splats",
+    "splatting.project": "the same: arrays, and what all cameras share (covariances) is made once outside",
+}
+
+
+def load(name: str) -> ModuleType:
+    """Import a script of docs/ by its path."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+stages = load("stages")
+tables = load("tables")
+BOTH_ROOMS = [
+    (f"{module}.{name}", reference, fast[name])
+    for stage in stages.STAGES
+    for module in stage.modules
+    if (fast := stages.functions(ROOT / "pop_fast" / f"{module}.py")) is not None
+    for name, reference in stages.functions(ROOT / "pop_ref" / f"{module}.py").items()
+    if name in fast
+]
+
+
+def test_tables_are_what_sources_and_runs_say() -> None:
+    assert tables.with_tables(README) == README, "run 'python docs/tables.py --write'"
+
+
+def test_the_results_script_agrees_with_the_readme() -> None:
+    script = ROOT / "benchmarks" / "results_table.py"
+    done = subprocess.run([sys.executable, script, "--check", ROOT / "README.md"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_every_stage_of_the_oracle_has_its_row() -> None:
+    named = {module for stage in stages.STAGES for module in stage.modules}
+    present = {path.stem for path in (ROOT / "pop_ref").glob("*.py")} - stages.NOT_STAGES
+    assert present == named
+
+
+@pytest.mark.parametrize("stage", stages.STAGES, ids=lambda stage: stage.title)
+def test_every_stage_has_functions_and_laws(stage) -> None:
+    assert any(stages.functions(path) for path in stages.files("pop_ref", stage))
+    laws = list(stages.laws(stage))
+    assert laws
+    assert all(path.exists() for path in laws)
+    assert all(path.is_file() for path in stages.files("pop_fast", stage))
+
+
+def test_the_rooms_share_most_of_their_functions() -> None:
+    assert len(BOTH_ROOMS) >= 40
+
+
+@pytest.mark.parametrize(("name", "reference", "fast"), BOTH_ROOMS, ids=lambda value: value if value else "")
+def test_twins_take_the_same_parameters(name: str, reference: list[str], fast: list[str]) -> None:
+    """The fast twin may add parameters of its own, after the oracle's."""
+    assert (fast[: len(reference)] == reference) == (name not in OTHER_PARAMETERS), (reference, fast)
+
+
+def test_documented_differences_are_still_there() -> None:
+    assert set(OTHER_PARAMETERS) <= {name for name, _, _ in BOTH_ROOMS}
+
+
+@pytest.mark.parametrize("target", sorted(set(re.findall(r"\]\(([^)#]+)\)", README))))
+def test_every_link_leads_somewhere(target: str) -> None:
+    assert "://" not in target
+    assert (ROOT / target).exists()
+
+
+def shell_lines() -> list[str]:
+    """Give the commands of README's shell blocks, without comments."""
+    blocks = re.findall(r"```sh\n(.*?)```", README, flags=re.DOTALL)
+    return [line.partition("  #")[0].strip() for block in blocks for line in block.splitlines() if line.strip()]
+
+
+@pytest.mark.parametrize("line", [line for line in shell_lines() if line.startswith("pop ")])
+def test_every_command_of_the_readme_is_understood(line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    words = shlex.split(line)[1:]
+    name = " ".join(words[:2]) if " ".join(words[:2]) in COMMANDS else words[0]
+    module = importlib.import_module(f"pop_fast.cli.{name.replace(' ', '_')}")
+    rest = words[len(name.split()) :]
+    if name == "train":
+        module.arguments(rest)
+    else:
+        importlib.import_module("pop_fast.cli.arguments").parse(module.Args, rest, name)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("line", [line for line in shell_lines() if line.startswith("make ")])
+def test_every_make_target_of_the_readme_exists(line: str) -> None:
+    target = line.split()[1]
+    assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(encoding="utf-8"), flags=re.MULTILINE)
+
+
+def test_names_in_python_blocks_resolve() -> None:
+    blocks = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    imports = [node for block in blocks for node in ast.parse(block).body if isinstance(node, ast.ImportFrom)]
+    assert imports
+    for node in imports:
+        module = importlib.import_module(str(node.module))
+        for alias in node.names:
+            assert hasattr(module, alias.name), alias.name
+
+
+def test_the_picture_is_small_and_made_of_our_own_scene() -> None:
+    pictures = re.findall(r"!\[[^]]*\]\(([^)]+)\)", README)
+    assert len(pictures) == 1
+    assert pictures[0] == "docs/demo.png"
+    assert (ROOT / pictures[0]).stat().st_size < 300_000
