@@ -6,7 +6,8 @@ The numbers are the paper's: 30,000 steps, POP loss and density control to 15,00
     what                                          scaled
     max_steps                                     yes; the learning rate of the means decays over it, so that scales too
     refine start and stop, reset, blur, POP       yes
-    refine_every                                  yes, but not under 20 steps (see `DensityControl.scaled`)
+    refine_every                                  up only: a shorter schedule has fewer changes, as far apart as ever
+                                                  (see `DensityControl.scaled`)
     sh_interval, eval_steps, save_steps           yes
     learning rates, weights, thresholds           no: Adam's step does not depend on the length of a run
     checkpoint_every, log_every                   no: they are about time, not about the schedule
