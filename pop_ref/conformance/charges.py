@@ -34,7 +34,7 @@ class Layer:
         doubtful: whether it is taken is within reach of rounding (D1, D2, D5).
         seen: the pixel had not ended, and its tile lists the splat.
         blended: taken, seen, and not the end.
-        T, e_T: transmittance before it.
+        T, T_error: transmittance before it.
         T_after: transmittance after it.
     """
 
@@ -54,7 +54,7 @@ class Layer:
     seen: np.ndarray = field(default_factory=lambda: np.zeros(0))
     blended: np.ndarray = field(default_factory=lambda: np.zeros(0))
     T: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    e_T: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    T_error: np.ndarray = field(default_factory=lambda: np.zeros(0))
     T_after: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
@@ -118,7 +118,7 @@ class PixelCharges:
 @dataclass
 class _State:
     T: np.ndarray
-    e_T: np.ndarray
+    T_error: np.ndarray
     image: np.ndarray
     absolute: np.ndarray
     alive: np.ndarray
@@ -148,9 +148,9 @@ def charge(scene: Scene, dtype: Any, tile_lists: list[list[int]] | None = None) 
             _blend(layer, scene, screen, state, doubts, reach)
             layers.append(layer)
     background = np.abs(scene.background)
-    image = state.image + background * (state.e_T + state.T)[..., None] + state.absolute
+    image = state.image + background * (state.T_error + state.T)[..., None] + state.absolute
     absolute = state.absolute + background * state.T[..., None]
-    charges = PixelCharges(scene, screen, layers, reach, image, state.e_T, absolute, doubts)
+    charges = PixelCharges(scene, screen, layers, reach, image, state.T_error, absolute, doubts)
     _doubt_depths(charges)
     return charges
 
@@ -198,12 +198,12 @@ def _blend(
     doubts["D6"] |= seen & (np.abs(layer.raw - profile.alpha_ceiling) <= reach * layer.e_raw)
     taken = seen & layer.taken
     next_T = state.T * (1.0 - alpha)
-    e_next = state.e_T * (1.0 - alpha) + state.T * e_alpha + 2.0 * next_T
+    e_next = state.T_error * (1.0 - alpha) + state.T * e_alpha + 2.0 * next_T
     stop = profile.transmittance_stop
     doubts["D7"] |= taken & (np.abs(next_T - stop) <= reach * (e_next + abs(stop)))
     stops = taken & ((next_T <= stop) if profile.stop_inclusive else (next_T < stop))
     blended = taken & ~stops
-    weight, e_weight = state.T * alpha, state.T * e_alpha + state.e_T * alpha + state.T * alpha
+    weight, e_weight = state.T * alpha, state.T * e_alpha + state.T_error * alpha + state.T * alpha
     doubts["D8"] |= blended & (np.abs(weight - state.best) <= reach * (e_weight + state.e_best))
     wins = blended & (weight > state.best)
     state.best, state.e_best = np.where(wins, weight, state.best), np.where(wins, e_weight, state.e_best)
@@ -213,8 +213,8 @@ def _blend(
     # one more unit of everything gathered so far pays for the addition
     gained = share * s.e_colors[layer.id] + np.where(blended, e_weight, 0.0)[..., None] * color
     state.image = state.image + gained + state.absolute
-    layer.blended, layer.T, layer.e_T = blended, state.T, state.e_T
-    state.T, state.e_T = np.where(blended, next_T, state.T), np.where(blended, e_next, state.e_T)
+    layer.blended, layer.T, layer.T_error = blended, state.T, state.T_error
+    state.T, state.T_error = np.where(blended, next_T, state.T), np.where(blended, e_next, state.T_error)
     state.alive, layer.T_after = state.alive & ~stops, state.T
 
 

@@ -81,11 +81,11 @@ def _pixel_bounds(
     behind = Bound(v_T + v @ np.abs(scene.background), 2.0 * (v_T + v @ np.abs(scene.background)))
     for layer in reversed(charges.layers):
         i, shown = layer.id, layer.blended.astype(np.float64)
-        T, e_T, alpha, e_alpha = (layer.T, layer.e_T, layer.alpha, layer.e_alpha)
-        weight = Bound(T * alpha * shown, (e_T * alpha + T * e_alpha) * shown)
+        T, T_error, alpha, e_alpha = (layer.T, layer.T_error, layer.alpha, layer.e_alpha)
+        weight = Bound(T * alpha * shown, (T_error * alpha + T * e_alpha) * shown)
         out["colors"][i] = Bound(weight.m[..., None] * v, (weight.e + weight.m)[..., None] * v).summed((0, 1))
         worth = Bound(v @ np.abs(s.colors[i]), v @ s.e_colors[i] + 2.0 * v @ np.abs(s.colors[i]))
-        v_alpha = (worth + behind).times(T * shown, e_T * shown)
+        v_alpha = (worth + behind).times(T * shown, T_error * shown)
         step = worth.times(alpha, e_alpha) + behind.times(1.0 - alpha, e_alpha)
         behind = Bound(np.where(shown > 0, step.m, behind.m), np.where(shown > 0, step.e, behind.e))
         if scene.profile.ceiling_gradient == "zero":

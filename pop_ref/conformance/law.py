@@ -36,7 +36,8 @@ class Law:
 
     Attributes:
         stage: one of STAGES.
-        needs: names of stage functions, or RENDER, GRADIENTS, DOMINANCE, PROFILES, DOUBLE; a backend without them is not judged.
+        needs: names of stage functions, or RENDER, GRADIENTS, DOMINANCE, PROFILES, DOUBLE, ROWWISE; a backend
+            without them is not judged.
         sentence: the function, whose name reads as the law; it takes `backend` and the drawn values.
         strategies: what it quantifies over, by argument name.
     """

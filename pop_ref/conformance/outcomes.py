@@ -48,16 +48,16 @@ def _lists(met: list[Layer], charges: PixelCharges, x: int, y: int) -> Iterator[
     """Yield the lists of blended splats that the doubtful decisions allow."""
     profile, stop = charges.scene.profile, charges.scene.profile.transmittance_stop
 
-    def walk(k: int, T: float, e_T: float, blended: list[int]) -> Iterator[list[int]]:
+    def walk(k: int, T: float, T_error: float, blended: list[int]) -> Iterator[list[int]]:
         if k == len(met):
             yield blended
             return
         layer = met[k]
         if layer.doubtful[y, x]:
-            yield from walk(k + 1, T, e_T, blended)
+            yield from walk(k + 1, T, T_error, blended)
         alpha, e_alpha = float(layer.alpha[y, x]), float(layer.e_alpha[y, x])
         next_T = T * (1.0 - alpha)
-        e_next = e_T * (1.0 - alpha) + T * e_alpha + 2.0 * next_T
+        e_next = T_error * (1.0 - alpha) + T * e_alpha + 2.0 * next_T
         near = abs(next_T - stop) <= charges.reach * (e_next + abs(stop))
         ends = next_T <= stop if profile.stop_inclusive else next_T < stop
         if ends or near:

@@ -15,6 +15,7 @@ from pop_ref.camera import camera_center, covars_cam_from_covars, in_front, mean
 from pop_ref.conformance.scenes import Scene
 from pop_ref.covariance import covars_from_quats_scales, rotmats_from_quats
 from pop_ref.footprint import compensations, conics_from_covars2d, low_pass
+from pop_ref.magnitudes import in_float32
 from pop_ref.harmonics import colors_from_sh, sh_basis
 from pop_ref.projection import project_covars, project_means, projection_jacobians
 
@@ -67,16 +68,18 @@ def _t(matrices: np.ndarray) -> np.ndarray:
     return np.swapaxes(matrices, -1, -2)
 
 
+def _in_float32(values: np.ndarray) -> np.ndarray:
+    return values.astype(np.float32).astype(np.float64) == values
+
+
 def _camera_charges(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Return e(means_cam) and e(covars_cam)."""
     g, viewmat = scene.gaussians, scene.camera.viewmat
     R, t = viewmat[:3, :3], viewmat[:3, 3]
-    terms = np.concatenate(
-        [np.abs(R)[None] * np.abs(g.means)[:, None, :], np.broadcast_to(np.abs(t)[:, None], (len(g), 3, 1))], 2
-    )
-    # a sum with one term, times one, is exact: only so can depths tie on purpose
-    exact = (np.sum(terms != 0.0, axis=2) <= 1) & np.all((np.abs(R) == 1.0) | (R == 0.0), axis=1)
-    e_means_cam = np.where(exact, 0.0, 2.0 * np.sum(terms, axis=2))
+    terms = np.concatenate([R[None] * g.means[:, None, :], np.broadcast_to(t[:, None], (len(g), 3, 1))], axis=2)
+    # sums of short dyadic numbers are exact in any precision: only so can depths tie on purpose
+    exact = np.all(_in_float32(terms) & _in_float32(np.cumsum(terms, axis=2)), axis=2)
+    e_means_cam = np.where(exact, 0.0, 2.0 * np.sum(np.abs(terms), axis=2))
     A = np.abs(rotmats_from_quats(g.quats))
     variances = g.scales[:, None, :] ** 2
     e_covars = 4.0 * (A * variances) @ _t(A) + 2.0 * (
@@ -146,7 +149,9 @@ def screen_charges(scene: Scene, reach: float) -> ScreenCharges:
     p = means_cam_from_means(g.means, camera.viewmat)
     kept = in_front(p[:, 2], profile)
     depths = p[:, 2]
-    near = np.abs(depths - profile.near_plane) <= reach * np.where(e_p[:, 2] > 0.0, e_p[:, 2] + profile.near_plane, 0.0)
+    # the constant itself may have to be rounded
+    e_plane = 0.0 if in_float32(profile.near_plane) else profile.near_plane
+    near = np.abs(depths - profile.near_plane) <= reach * (e_p[:, 2] + e_plane)
     # rows behind the camera take no part; a harmless point in their place keeps every formula finite
     p = np.where((kept | near)[:, None], p, np.array([0.0, 0.0, 1.0]))
     z = p[:, 2]

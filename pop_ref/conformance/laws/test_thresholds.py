@@ -1,0 +1,99 @@
+"""Laws at the thresholds D1 to D8: a backend equals one of the oracle's outcomes, whichever way rounding decides."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import assume
+
+from pop_ref.conformance import near
+from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.charges import charge
+from pop_ref.conformance.law import DOMINANCE, PROFILES, RENDER, law
+from pop_ref.conformance.outcomes import assert_one_of_the_oracles_outcomes
+from pop_ref.conformance.verdicts import charged
+from pop_ref.margins import margins
+
+ORACLE = OracleAdapter()
+
+
+def _holds(backend, scene):
+    seen, charges = charged(backend, scene)
+    assert_one_of_the_oracles_outcomes(backend, seen, charges)
+
+
+@law("camera", RENDER, PROFILES, scene=near.near_plane())
+def test_at_the_near_plane_a_splat_is_wholly_there_or_wholly_gone(backend, scene):
+    # D1
+    seen = backend.sees(scene)
+    if seen.profile.extent == "square":
+        assume(not _extent_in_doubt(seen, backend.dtype))
+    assert_one_of_the_oracles_outcomes(backend, seen, charge(seen, backend.dtype))
+
+
+@law("footprint", RENDER, scene=near.near_edge().filter(lambda s: s.profile.extent != "square"))
+def test_no_pixel_is_lost_where_an_ellipse_touches_a_pixel_centre_or_a_tile_edge(backend, scene):
+    # D2, D3
+    _holds(backend, scene)
+
+
+@law("footprint", RENDER, PROFILES, scene=near.near_edge().filter(lambda s: s.profile.extent == "square"))
+def test_the_square_extent_cuts_where_inrias_does(backend, scene):
+    # D2, D3: here the extent is part of the meaning; where rounding decides it, nothing is said
+    seen = backend.sees(scene)
+    assume(not _extent_in_doubt(seen, backend.dtype))
+    drawn = ORACLE.full_render(seen)
+    charges = charge(seen, backend.dtype, drawn.tile_lists)
+    assert_one_of_the_oracles_outcomes(backend, seen, charges)
+
+
+@law("tiles", RENDER, scene=near.near_depth_tie())
+def test_at_a_depth_tie_the_order_is_one_of_the_two_and_by_index_where_the_tie_is_exact(backend, scene):
+    # D4: seen straight on, depths are exact in every precision, and nothing is in doubt
+    _holds(backend, scene)
+
+
+@law("alpha", RENDER, scene=near.near_floor())
+def test_at_the_alpha_floor_a_splat_is_blended_or_skipped(backend, scene):
+    # D5
+    _holds(backend, scene)
+
+
+@law("alpha", RENDER, scene=near.near_ceiling())
+def test_at_the_alpha_ceiling_nothing_jumps(backend, scene):
+    # D6 is continuous: the image is certain
+    _holds(backend, scene)
+
+
+@law("compositing", RENDER, scene=near.near_stop())
+def test_at_the_transmittance_stop_the_pixel_ends_or_goes_on(backend, scene):
+    # D7
+    _holds(backend, scene)
+
+
+@law("alpha", RENDER, scene=near.near_flat())
+def test_a_needle_shows_one_of_the_oracles_outcomes(backend, scene):
+    _holds(backend, scene)
+
+
+@law("dominance", RENDER, DOMINANCE, scene=near.near_dominance_tie())
+def test_at_a_dominance_tie_one_of_the_tied_wins(backend, scene):
+    # D8
+    seen, charges = charged(backend, scene)
+    view = backend.render(seen)
+    weights = np.zeros((len(seen.gaussians), *view.T_final.shape))
+    for layer in charges.layers:
+        weights[layer.id] = np.where(layer.blended, layer.T * layer.alpha, 0.0)
+    best = np.max(weights, axis=0)
+    y, x = np.nonzero(charges.certain & (best > 0.0))
+    winner = view.dominant_ids[y, x]
+    assert np.all(winner >= 0)
+    won = weights[winner, y, x]
+    room = charges.reach * (charges.T_final + 1.0)[y, x]
+    assert np.all(won >= best[y, x] - room), "a splat won that was not among the tied"
+
+
+def _extent_in_doubt(scene, dtype):
+    """Tell whether an extent or a tile rectangle is within reach of rounding (D2, D3)."""
+    found = margins(scene.gaussians, scene.camera, scene.sh_degree, scene.profile, scene.tile_size, scene.antialiased)
+    tolerance = 64.0 * float(np.finfo(dtype).eps)
+    return not np.all(found.safe_gaussians(tolerance, ("D2", "D3")))

@@ -1,0 +1,14 @@
+"""The laws at thresholds over our own backends: the oracle itself, and pop_fast in both precisions."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.register_assert_rewrite("pop_ref.conformance.laws")
+
+from pop_ref.conformance.backends import SHIPPED, shipped  # noqa: E402  asserts must be rewritten first
+from pop_ref.conformance.plugin import parametrize_backends  # noqa: E402
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    parametrize_backends(metafunc, [shipped(name) for name in SHIPPED])
