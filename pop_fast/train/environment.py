@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import platform
-import resource
 import sys
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
@@ -73,7 +72,11 @@ def _threads_flush_denormals() -> bool:
 
 
 def peak_memory_bytes() -> int:
-    """Return the most memory that this process has held resident."""
+    """Return the most memory that this process has held resident; 0 where the system does not say (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak
 

@@ -26,6 +26,8 @@ from pop_fast.errors import PopError
 
 Variant = Literal["vgg_01", "alex_norm", "alex_01"]
 VARIANTS: Final = {"vgg": ("vgg_01",), "alex": ("alex_norm", "alex_01")}
+# px; both networks halve or quarter an image several times
+SMALLEST_SIDE: Final = 64
 # mean and deviation of ImageNet for images in [-1, 1]
 _SHIFT: Final = (-0.030, -0.088, -0.188)
 _SPREAD: Final = (0.458, 0.448, 0.450)
@@ -85,6 +87,7 @@ class LPIPS:
         """Return the distance of two images in [0, 1]. [H, W, 3]"""
         if variant not in VARIANTS[self.net]:
             raise ValueError(f"variant is {variant!r}; {self.net} computes {', '.join(VARIANTS[self.net])}")
+        check_size(*image.shape[:2])
         pair = torch.stack([image, target]).movedim(-1, 1)
         if variant.endswith("_norm"):
             pair = 2.0 * pair - 1.0
@@ -103,8 +106,6 @@ class LPIPS:
             if layer == "tap":
                 taps.append(x)
             elif layer == "pool":
-                if min(x.shape[2:]) < pool:
-                    raise ValueError(f"the images are too small for LPIPS on {self.net}; use at least 64 x 64 px")
                 x = functional.max_pool2d(x, pool, 2)
             else:
                 weight, bias = self._convs[int(layer[0])]
@@ -126,10 +127,27 @@ class LPIPS:
                 self._lins.append(_tensor(lins, key, (1, width, 1, 1), where)[0])
 
 
-def load_nets(vgg: Sequence[str | Path] = (), alex: Sequence[str | Path] = ()) -> list[LPIPS]:
-    """Read the networks whose weight files are given."""
+def check_size(height: int, width: int) -> None:
+    """Raise PopError when an image is too small for the networks."""
+    if min(height, width) < SMALLEST_SIDE:
+        raise PopError(
+            f"images of {width} x {height} px are too small for LPIPS, which needs {SMALLEST_SIDE} px a side"
+        )
+
+
+def load_nets(
+    vgg: Sequence[str | Path] = (), alex: Sequence[str | Path] = (), sizes: Sequence[tuple[int, int]] = ()
+) -> list[LPIPS]:
+    """Read the networks whose weight files are given, for images of these sizes (height, width).
+
+    Raises:
+        PopError: weights cannot be used, or an image is too small.
+    """
     nets = [LPIPS("vgg", vgg)] if vgg else []
-    return [*nets, LPIPS("alex", alex)] if alex else nets
+    nets += [LPIPS("alex", alex)] if alex else []
+    for size in sizes if nets else ():
+        check_size(*size)
+    return nets
 
 
 def _tensor(found: dict, key: object, shape: tuple[int, ...], where: str) -> Tensor:

@@ -84,7 +84,7 @@ class Trainer:
         self._test = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
         if not self._train:
             raise PopError(f"{capture.name}: has no view to train on; lower test_every or set it to 0")
-        self._nets = load_nets(config.lpips_vgg, config.lpips_alex)
+        self._nets = load_nets(config.lpips_vgg, config.lpips_alex, [(view.height, view.width) for view in self._test])
         self._capture = capture
         self._scene_scale = capture.scene_scale()
         self._objective = Objective(self.config, self._train)

@@ -9,8 +9,10 @@ import torch
 from torch import nn
 
 from pop_fast.errors import PopError
+from pop_fast.train import Trainer
 from pop_fast.train.lpips import LPIPS, load_nets
 from pop_fast.train.metrics import average, measure
+from tests.app.tiny import tiny_capture, tiny_config
 
 # the networks as torchvision lays them out: convolutions (index: in, out, kernel, stride, padding), pools by index
 VGG_WIDTHS = [64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512, "M"]
@@ -145,9 +147,17 @@ def test_a_variant_of_the_other_net_is_refused(weights):
         LPIPS("alex", weights["alex"][2][2:])(*pictures(), "vgg_01")
 
 
-def test_pictures_too_small_for_the_net_are_refused(weights):
-    with pytest.raises(ValueError, match="too small for LPIPS on alex"):
-        LPIPS("alex", weights["alex"][2][2:])(*pictures(12), "alex_01")
+def test_pictures_too_small_for_the_nets_are_refused(weights):
+    net = LPIPS("alex", weights["alex"][2][2:])
+    with pytest.raises(PopError, match="images of 66 x 63 px are too small for LPIPS, which needs 64 px a side"):
+        net(*pictures(63), "alex_01")
+    assert net(*pictures(64), "alex_01") > 0.0
+
+
+def test_views_too_small_for_lpips_are_refused_before_training(weights, tmp_path):
+    config = tiny_config(tmp_path, lpips_alex=tuple(map(str, weights["alex"][2][2:])))
+    with pytest.raises(PopError, match="32 x 24 px are too small for LPIPS"):
+        Trainer(config, tiny_capture())
 
 
 def test_bad_weight_files_are_named(weights, tmp_path):
