@@ -54,6 +54,13 @@ def test_inria_s_tile_grid_is_part_of_its_meaning() -> None:
     assert render(gaussians, view, tile_size=1).n_blended[0].tolist() == [0] * 7 + [1] * 67 + [0] * 7
 
 
+def test_inria_s_cull_reads_the_tile_grid_that_is_asked_for() -> None:
+    # 3 px of extent about u = 35, right of an image of 20 px: inside the second tile of 16, outside every tile of 4
+    gaussians, view = grey([1.0], means=[[25.0, 0.0, 4.0]], scale=0.0), dyadic_camera(20, 16)
+    assert render(gaussians, view, profile=INRIA).splats.visible[0]
+    assert not render(gaussians, view, profile=INRIA, tile_size=4).splats.visible[0]
+
+
 def test_one_pixel_sees_a_gaussian_at_its_centre_at_its_opacity() -> None:
     out = render(grey([0.5]), dyadic_camera(1, 1), background=np.array([0.0, 1.0, 2.0]))
     assert out.image.tolist() == [[[0.25, 0.75, 1.25]]]
