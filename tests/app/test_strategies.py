@@ -147,6 +147,19 @@ def test_small_gaussians_are_cloned_with_their_bits_and_large_ones_split_in_two(
         assert list(optimizers[key].state) == [params[key]]
 
 
+def test_a_parameter_dict_with_a_frozen_extra_is_edited_too():
+    params, optimizers = make(4)
+    extra = torch.nn.Parameter(torch.arange(4.0), requires_grad=False)
+    params = torch.nn.ParameterDict({**params, "tags": extra})
+    strategy = POPStrategy()
+    strategy.check_sanity(params, optimizers)
+    params["opacities"].data[1] = -6.0
+    grads = torch.tensor([[1.0, 0], [0.0, 0], [0.0, 0], [1.0, 0]])
+    run_event(strategy, params, optimizers, make_info(4, grads), step=600)
+    assert params["tags"].tolist() == [0.0, 2.0, 3.0, 0.0, 3.0]
+    assert not params["tags"].requires_grad
+
+
 def test_optimizers_step_on_after_an_event():
     params, optimizers = make(4)
     grads = torch.ones(4, 2)
