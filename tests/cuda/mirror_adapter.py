@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pop_ref.conformance.adapter import View
-from pop_ref.conformance.law import DOMINANCE, GRADIENTS, PROFILES, RENDER
+from pop_ref.conformance.law import DOMINANCE, DOUBLE, GRADIENTS, PROFILES, RENDER, ROWWISE
 from pop_ref.conformance.scenes import Scene, rounded_to
 
 from .mirror import Mirror
@@ -36,7 +37,12 @@ class MirrorAdapter:
 
     def has(self, need: str) -> bool:
         """Tell what the mirror offers."""
-        return need in (RENDER, GRADIENTS, DOMINANCE, PROFILES) or need in STAGES
+        if need == DOUBLE:
+            return self.dtype == np.float64
+        # the laws of alpha speak in python floats, which a float32 function rounds on entry
+        if need == "alpha_from_sigma" and self.dtype == np.float32:
+            return False
+        return need in (RENDER, GRADIENTS, DOMINANCE, PROFILES, ROWWISE) or need in STAGES
 
     def stage(self, name: str) -> Callable[..., Any]:
         """Return a stage function with the oracle's signature."""
@@ -84,8 +90,6 @@ class MirrorAdapter:
         return [g.means, g.quats, g.scales, g.opacities, g.sh, c.viewmat, c.K, scene.background]
 
     def _profile(self, scene: Scene) -> Any:
-        from dataclasses import replace
-
         return replace(scene.profile, tile_size=scene.tile_size or scene.profile.tile_size)
 
     def _exact(self, scene: Scene) -> bool:

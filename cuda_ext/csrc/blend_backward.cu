@@ -1,0 +1,262 @@
+// Blending transposed, in moment form, by two families that give the same sums.
+//
+// columns: one warp a tile of 16 x 8 pixels, back to front; a lane owns four pixels, and a splat's sums are added over the
+//     lanes by a transposed butterfly, about one shuffle a value.
+// splats: one warp a bucket of 32 list entries, front to back; a lane owns a splat and keeps its sums in registers, and
+//     the tile's pixels travel through the lanes. Needs the forward pass's checkpoints.
+//
+// A row of sums goes to its instance's slot, by exactly one warp, so nothing is added in an order that varies; or, where
+// memory is short, by atomic addition to the splat.
+
+#include "cuda_check.h"
+#include "kernel_tools.cuh"
+
+namespace pop {
+
+namespace {
+
+template <int CH>
+__device__ __forceinline__ float worth_behind(const BlendBackward& blend, const float* v_color, float v_T) {
+    float behind = v_T;
+    if (blend.background != nullptr)
+#pragma unroll
+        for (int c = 0; c < CH; ++c) behind += __ldg(blend.background + c) * v_color[c];
+    return behind;
+}
+
+__device__ __forceinline__ float* row_of(const TileLists& lists, const BlendBackward& blend, const WarpTile& tile,
+                                         int entry) {
+    const size_t slot = lists.slots[1][entry];
+    return blend.rows + RECORD * (slot * tile.parts + tile.part);
+}
+
+template <int CH, bool ABS, bool ATOMIC>
+__global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
+    columns_kernel(TileLists lists, BlendBackward blend, BlendConstants<float> constants, int n_warp_tiles) {
+    constexpr int N = SumsOf<CH, ABS>::count;
+    __shared__ float4 staged[WARPS_PER_BLOCK][WARP][RECORD / 4];
+    __shared__ unsigned staged_rows[WARPS_PER_BLOCK][WARP];
+    const int lane = threadIdx.x & (WARP - 1), warp = threadIdx.x / WARP;
+    const int index = blockIdx.x * WARPS_PER_BLOCK + warp;
+    if (index >= n_warp_tiles) return;
+    const WarpTile tile = warp_tile(lists.grid, index);
+    const int x = tile.x + lane_x(lane), y = tile.y + lane_y(lane);
+    const int rows = x < lists.grid.width ? min(COLUMN_ROWS, lists.grid.height - y) : 0;
+    const float px = float(x) + 0.5f, py = float(y) + 0.5f;
+    const int begin = lists.tile_begin[tile.list], end = lists.tile_end[tile.list];
+    const int own_sum = sum_index<N>(lane);
+
+    BackwardColumn<float, CH, COLUMN_ROWS> column;
+    int last = 0;
+#pragma unroll
+    for (int k = 0; k < COLUMN_ROWS; ++k) {
+        const bool inside = k < rows;
+        const size_t pixel = inside ? size_t(y + k) * lists.grid.width + x : 0;
+        column.last[k] = inside ? blend.last[pixel] : 0;
+        column.T[k] = inside ? blend.T_final[pixel] : 1.0f;
+#pragma unroll
+        for (int c = 0; c < CH; ++c) column.v_color[k][c] = inside ? blend.v_image[CH * pixel + c] : 0.0f;
+        const float v_T = inside && blend.v_T_final != nullptr ? blend.v_T_final[pixel] : 0.0f;
+        column.behind[k] = worth_behind<CH>(blend, column.v_color[k], v_T);
+        last = max(last, column.last[k]);
+    }
+    last = begin + warp_max(last);
+    // entries behind every pixel's last splat have no gradient, but their slots are read
+    if (!ATOMIC)
+        for (int entry = last; entry < end; ++entry)
+            if (lane < N) row_of(lists, blend, tile, entry)[lane] = 0.0f;
+
+    for (int top = last; top > begin; top -= WARP) {
+        const int count = min(WARP, top - begin);
+        __syncwarp();
+        if (lane < count) {
+            const int entry = top - 1 - lane;
+            const unsigned splat = lists.listed[entry];
+            const Record record = load_record(blend.records, splat);
+            staged[warp][lane][0] = record.a;
+            staged[warp][lane][1] = record.b;
+            staged[warp][lane][2] = record.c;
+            staged_rows[warp][lane] = ATOMIC ? splat : lists.slots[1][entry] * tile.parts + tile.part;
+        }
+        __syncwarp();
+        for (int j = 0; j < count; ++j) {
+            const Record record = {staged[warp][j][0], staged[warp][j][1], staged[warp][j][2]};
+            float color[CH], sums[N];
+            record.color<CH>(color);
+#pragma unroll
+            for (int k = 0; k < N; ++k) sums[k] = 0.0f;
+            const bool any = blend_backward<ABS>(column, record.splat(), color, px, py, top - 1 - j - begin, constants,
+                                                 sums);
+            const bool some = __any_sync(FULL_WARP, any);
+            if (ATOMIC && !some) continue;
+            const float total = some ? TransposedSum<N, WARP / 2>::of(sums, lane) : 0.0f;
+            if (own_sum < 0) continue;
+            if (ATOMIC)
+                atomicAdd(blend.sums + size_t(RECORD) * staged_rows[warp][j] + own_sum, total);
+            else
+                blend.rows[size_t(RECORD) * staged_rows[warp][j] + own_sum] = total;
+        }
+    }
+}
+
+// A pixel of the tile as the splats of a bucket need it.
+template <int CH>
+struct BucketPixel {
+    float v_color[CH];
+    float T, left;
+    int last;
+};
+
+template <int CH, bool ABS, bool ATOMIC>
+__global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
+    splats_kernel(TileLists lists, BlendBackward blend, BlendConstants<float> constants, const DeviceState* state) {
+    constexpr int N = SumsOf<CH, ABS>::count;
+    __shared__ BucketPixel<CH> pixels[WARPS_PER_BLOCK][TILE_PIXELS];
+    const int lane = threadIdx.x & (WARP - 1), warp = threadIdx.x / WARP;
+    const int bucket = blockIdx.x * WARPS_PER_BLOCK + warp;
+    if (bucket >= state->n_buckets) return;
+    const int list = lists.bucket_tile[bucket];
+    // lists and warp tiles coincide in this family
+    const WarpTile tile = {list % lists.grid.tiles_x * WARP_TILE_W, list / lists.grid.tiles_x * WARP_TILE_H, list, 0, 1};
+    const int begin = lists.tile_begin[list], end = lists.tile_end[list];
+    const int first = (bucket - lists.bucket_begin[list]) * WARP;
+    const float* checkpoint = blend.checkpoints + size_t(bucket) * (1 + CH) * TILE_PIXELS;
+
+    int last = 0;
+#pragma unroll
+    for (int k = 0; k < COLUMN_ROWS; ++k) {
+        const int x = tile.x + lane_x(lane), y = tile.y + lane_y(lane) + k;
+        const bool inside = x < lists.grid.width && y < lists.grid.height;
+        const size_t pixel = inside ? size_t(y) * lists.grid.width + x : 0;
+        BucketPixel<CH> p = {};
+        p.last = inside ? blend.last[pixel] : 0;
+        if (p.last > first) {
+            p.T = checkpoint[k * WARP + lane];
+            p.left = blend.v_T_final == nullptr ? 0.0f : blend.v_T_final[pixel] * blend.T_final[pixel];
+#pragma unroll
+            for (int c = 0; c < CH; ++c) {
+                p.v_color[c] = blend.v_image[CH * pixel + c];
+                const float before = checkpoint[(1 + c) * TILE_PIXELS + k * WARP + lane];
+                p.left += (blend.image[CH * pixel + c] - before) * p.v_color[c];
+            }
+        }
+        pixels[warp][k * WARP + lane] = p;
+        last = max(last, p.last);
+    }
+    last = warp_max(last);
+    __syncwarp();
+
+    const int position = first + lane;
+    const bool exists = begin + position < end;
+    unsigned splat = 0;
+    Record record = {};
+    if (exists) {
+        splat = lists.listed[begin + position];
+        record = load_record(blend.records, splat);
+    }
+    float color[CH], sums[N];
+    record.color<CH>(color);
+#pragma unroll
+    for (int k = 0; k < N; ++k) sums[k] = 0.0f;
+    Passing<float> passing = {0.0f, 0.0f};
+    if (last > first)
+        for (int step = 0; step < TILE_PIXELS + WARP - 1; ++step) {
+            // the pixel that the lane in front has just left
+            passing.T = __shfl_up_sync(FULL_WARP, passing.T, 1);
+            passing.left = __shfl_up_sync(FULL_WARP, passing.left, 1);
+            const int p = step - lane;
+            if (p < 0 || p >= TILE_PIXELS) continue;
+            const BucketPixel<CH>& pixel = pixels[warp][p];
+            if (lane == 0) passing = {pixel.T, pixel.left};
+            if (position >= pixel.last) continue;
+            const int owner = p & (WARP - 1);
+            const float px = float(tile.x + lane_x(owner)) + 0.5f;
+            const float py = float(tile.y + lane_y(owner) + p / WARP) + 0.5f;
+            pass_pixel<ABS, float, CH>(passing, record.splat(), color, pixel.v_color, px, py, constants, sums);
+        }
+    if (!exists) return;
+    if (ATOMIC) {
+        for (int k = 0; k < N; ++k) atomicAdd(blend.sums + size_t(RECORD) * splat + k, sums[k]);
+    } else {
+        float* row = row_of(lists, blend, tile, begin + position);
+#pragma unroll
+        for (int k = 0; k < N; ++k) row[k] = sums[k];
+    }
+}
+
+// One warp a splat: eight rows at a time, three float4 a row, added in a fixed order.
+__global__ void sum_slots_kernel(TileLists lists, BlendBackward blend, int parts) {
+    const int splat = (blockIdx.x * blockDim.x + threadIdx.x) / WARP, lane = threadIdx.x & (WARP - 1);
+    if (splat >= lists.n) return;
+    const size_t begin = size_t(lists.splat_begin[splat]) * parts;
+    const size_t most = size_t(lists.capacity) * parts;
+    const size_t count = size_t(lists.splat_count[splat]) * parts;
+    const size_t end = begin + count < most ? begin + count : most;
+    const int quarter = lane & 3;
+    float4 total = {0.0f, 0.0f, 0.0f, 0.0f};
+    if (quarter < RECORD / 4)
+        for (size_t row = begin + lane / 4; row < end; row += WARP / 4) {
+            const float4 v = reinterpret_cast<const float4*>(blend.rows + RECORD * row)[quarter];
+            total = {total.x + v.x, total.y + v.y, total.z + v.z, total.w + v.w};
+        }
+#pragma unroll
+    for (int mask = 4; mask < WARP; mask *= 2) {
+        total.x += __shfl_xor_sync(FULL_WARP, total.x, mask);
+        total.y += __shfl_xor_sync(FULL_WARP, total.y, mask);
+        total.z += __shfl_xor_sync(FULL_WARP, total.z, mask);
+        total.w += __shfl_xor_sync(FULL_WARP, total.w, mask);
+    }
+    if (lane < RECORD / 4) reinterpret_cast<float4*>(blend.sums + size_t(RECORD) * splat)[lane] = total;
+}
+
+template <int CH, bool ABS, bool ATOMIC>
+void launch(const TileLists& lists, const BlendBackward& blend, const BlendConstants<float>& constants,
+            const DeviceState* state, cudaStream_t stream) {
+    const int threads = WARP * WARPS_PER_BLOCK;
+    if (blend.family == Family::columns) {
+        const int tiles = n_warp_tiles(lists.grid);
+        columns_kernel<CH, ABS, ATOMIC>
+            <<<blocks_for(tiles, WARPS_PER_BLOCK), threads, 0, stream>>>(lists, blend, constants, tiles);
+        POP_LAUNCHED("columns_kernel");
+    } else {
+        const int buckets = lists.capacity / WARP + lists.n_tiles;
+        splats_kernel<CH, ABS, ATOMIC>
+            <<<blocks_for(buckets, WARPS_PER_BLOCK), threads, 0, stream>>>(lists, blend, constants, state);
+        POP_LAUNCHED("splats_kernel");
+    }
+    if (!ATOMIC && lists.n > 0) {
+        const int parts = (lists.grid.tile_w / WARP_TILE_W) * (lists.grid.tile_h / WARP_TILE_H);
+        sum_slots_kernel<<<blocks_for((long long)(lists.n) * WARP, 256), 256, 0, stream>>>(lists, blend, parts);
+        POP_LAUNCHED("sum_slots_kernel");
+    }
+}
+
+template <int CH>
+void launch(const TileLists& lists, const BlendBackward& blend, const BlendConstants<float>& constants,
+            const DeviceState* state, cudaStream_t stream) {
+    const bool atomic = blend.gather == Gather::atomics;
+    if (blend.absolute)
+        atomic ? launch<CH, true, true>(lists, blend, constants, state, stream)
+               : launch<CH, true, false>(lists, blend, constants, state, stream);
+    else
+        atomic ? launch<CH, false, true>(lists, blend, constants, state, stream)
+               : launch<CH, false, false>(lists, blend, constants, state, stream);
+}
+
+}  // namespace
+
+void blend_backward(const TileLists& lists, const BlendBackward& blend, const Profile<float>& profile,
+                    const DeviceState* state, cudaStream_t stream) {
+    const bool own_tiles = lists.grid.tile_w == WARP_TILE_W && lists.grid.tile_h == WARP_TILE_H;
+    if (blend.family == Family::splats && (!own_tiles || blend.checkpoints == nullptr))
+        throw std::invalid_argument("blend_backward: family splats needs 16 x 8 lists and checkpoints");
+    const BlendConstants<float> constants = blend_constants(profile);
+    switch (blend.channels) {
+        case 1: return launch<1>(lists, blend, constants, state, stream);
+        case 3: return launch<3>(lists, blend, constants, state, stream);
+        case 4: return launch<4>(lists, blend, constants, state, stream);
+        default: throw std::invalid_argument("blend_backward: channels must be 1, 3 or 4");
+    }
+}
+
+}  // namespace pop

@@ -1,0 +1,164 @@
+// What the host may ask of the kernels: plain structs of device pointers, and one function a stage. No function here
+// allocates or synchronises, so that a whole training step can be captured in a CUDA graph.
+#pragma once
+
+#include <cuda_runtime.h>
+
+#include <cstddef>
+#include <cstdint>
+
+#include "profile.cuh"
+#include "splatting.cuh"
+
+namespace pop {
+
+constexpr int RECORD = 12;                // floats of a packed splat, and of a row of gradient sums
+constexpr int WARP_TILE_W = 16, WARP_TILE_H = 8, TILE_PIXELS = WARP_TILE_W * WARP_TILE_H;
+constexpr int MAX_CHANNELS = 4;
+
+// Flags and counts that the device keeps; the host reads them one step late.
+struct DeviceState {
+    int overflow;            // instances that did not fit; every later update leaves the parameters alone while > 0
+    int n_instances;
+    int n_buckets;
+    int n_important;         // Gaussians with a dominant pixel, for the POP term
+    int bad_row;             // the first Gaussian whose projection is not finite, or INT_MAX
+    int step;                // of the fused training step, from 0
+    int view;                // the photograph of this step
+    int sh_degree;
+};
+
+struct GaussianArrays {
+    int n;
+    const float* means;      // [n, 3]
+    const float* quats;      // [n, 4]
+    const float* scales;     // [n, 3], logarithms where raw
+    const float* opacities;  // [n], logits where raw
+    const float* sh_first;   // [n, sh_first_stride]
+    const float* sh_rest;    // [n, sh_rest_stride]
+    int sh_first_stride, sh_rest_stride;  // floats a row
+    bool raw;
+};
+
+// colors may be given instead of computed: then sh_first is null and project leaves them alone
+struct SplatArrays {
+    float* means2d;    // [n, 2]
+    float* depths;     // [n]
+    float* conics;     // [n, 3]
+    float* opacities;  // [n]
+    float* colors;     // [n, channels]
+    int* radii;        // [n, 2]
+};
+
+struct ViewArrays {
+    const float* viewmat;  // [16]
+    const float* K;        // [9]
+    int width, height;
+};
+
+struct ProjectSettings {
+    Profile<float> profile;
+    ProjectOptions<float> options;
+    int sh_degree;
+};
+
+// Lists of splats by tile. `capacity` instances fit; what does not is counted in state->overflow.
+struct TileLists {
+    int n, capacity, n_tiles;
+    TileGrid grid;
+    unsigned* depth_keys[2];   // [n]
+    unsigned* order[2];        // [n], splats front to back in order[1]
+    unsigned* counts;          // [n], tiles of the splat at each rank
+    unsigned* offsets;         // [n]
+    void* tile_keys[2];        // [capacity], 16 or 32 bits
+    unsigned* slots[2];        // [capacity]
+    unsigned* slot_splat;      // [capacity], splat of an instance slot
+    unsigned* listed;          // [capacity], splats tile by tile, front to back
+    int* tile_begin;           // [n_tiles]
+    int* tile_end;             // [n_tiles]
+    unsigned* splat_begin;     // [n], first slot of a splat
+    unsigned* splat_count;     // [n], its slots
+    int* bucket_begin;         // [n_tiles], first bucket of 32 list entries of a tile; null where no one asks
+    int* bucket_tile;          // [capacity / 32 + n_tiles]
+    void* workspace;
+    size_t workspace_bytes;
+    bool exact;                // drop tiles that no pixel centre reaches
+};
+
+struct BlendForward {
+    int channels;
+    const float* records;     // [n, RECORD]
+    const float* background;  // [channels] or null
+    float* image;             // [H, W, channels]
+    float* T_final;           // [H, W]
+    int* last;                // [H, W]
+    float* checkpoints;       // [buckets, 1 + channels, TILE_PIXELS] or null
+    // instruments, all or none
+    int* dominant_ids;
+    float* dominant_weights;
+    int* n_blended;
+    int* n_traversed;
+    int* dominant_counts;     // [n], zeroed by the caller
+};
+
+enum class Family : int { columns = 0, splats = 1 };
+enum class Gather : int { slots = 0, atomics = 1 };
+
+struct BlendBackward {
+    int channels;
+    Family family;
+    Gather gather;
+    bool absolute;            // also sum |v_means2d|
+    const float* records;
+    const float* background;
+    const float* image;       // read by family splats
+    const float* T_final;
+    const int* last;
+    const float* checkpoints; // read by family splats
+    const float* v_image;
+    const float* v_T_final;   // or null
+    float* rows;              // [capacity * tiles of a list tile, RECORD], for slots
+    float* sums;              // [n, RECORD]; zeroed by the caller for atomics
+};
+
+struct SplatGradients {
+    float* v_means2d;
+    float* v_means2d_abs;     // or null
+    float* v_conics;
+    float* v_opacities;
+    float* v_colors;
+};
+
+struct GaussianGradients {
+    float* v_means;
+    float* v_quats;
+    float* v_scales;
+    float* v_opacities;
+    float* v_sh;              // [n, sh_stride], or null
+    int sh_stride;
+    float* v_viewmat;         // [blocks, 12] partial sums, or null
+};
+
+constexpr int PROJECT_BLOCK = 128;
+
+void project(const GaussianArrays& gaussians, const ViewArrays& view, const ProjectSettings& settings,
+             const SplatArrays& splats, DeviceState* state, cudaStream_t stream);
+void pack_records(int n, int channels, const SplatArrays& splats, float alpha_floor, float* records,
+                  cudaStream_t stream);
+size_t tile_workspace(int n, int capacity, int n_tiles);
+// sorts by depth and counts instances into state->n_instances; make_tile_lists goes on from there
+void count_instances(const TileLists& lists, const SplatArrays& splats, const Profile<float>& profile,
+                     DeviceState* state, cudaStream_t stream);
+void make_tile_lists(const TileLists& lists, const SplatArrays& splats, const Profile<float>& profile,
+                     DeviceState* state, cudaStream_t stream);
+void blend_forward(const TileLists& lists, const BlendForward& blend, const Profile<float>& profile,
+                   cudaStream_t stream);
+void blend_backward(const TileLists& lists, const BlendBackward& blend, const Profile<float>& profile,
+                    const DeviceState* state, cudaStream_t stream);
+void splat_gradients(int n, int channels, const SplatArrays& splats, const float* sums,
+                     const SplatGradients& gradients, cudaStream_t stream);
+void project_backward(const GaussianArrays& gaussians, const ViewArrays& view, const ProjectSettings& settings,
+                      const SplatArrays& splats, const SplatGradients& of, const float* v_depths,
+                      const GaussianGradients& gradients, cudaStream_t stream);
+
+}  // namespace pop

@@ -1,0 +1,239 @@
+// Lists of splats by tile, without a host synchronisation: sort splats by depth, give every (splat, tile) instance a slot,
+// sort the instances by tile. Both sorts are stable, so a list is ordered by (depth, index) (D3, D4).
+//
+// Slots are numbered splat by splat; the instance sort carries them as its payload, so that the backward pass can write
+// one row a slot without atomics and sum a splat's rows, which lie together. Instances beyond the capacity are counted
+// and dropped: the host sees state->overflow, grows the buffers and repeats the step, and until then nothing is updated.
+
+#include <cub/device/device_radix_sort.cuh>
+#include <cub/device/device_scan.cuh>
+
+#include "cuda_check.h"
+#include "kernel_tools.cuh"
+
+namespace pop {
+
+namespace {
+
+constexpr int BLOCK = 256, SMALL_RECT = 8;
+
+__global__ void depth_keys_kernel(int n, SplatArrays splats, unsigned* keys, unsigned* order) {
+    const int i = blockIdx.x * blockDim.x + threadIdx.x;
+    if (i >= n) return;
+    // the bits of a float in the order of its value, whatever its sign; culled splats go last
+    const unsigned bits = __float_as_uint(splats.depths[i]);
+    const unsigned ordered = bits & 0x80000000u ? ~bits : bits | 0x80000000u;
+    keys[i] = splats.radii[2 * i] > 0 ? ordered : 0xffffffffu;
+    order[i] = unsigned(i);
+}
+
+struct Footprint {
+    float x, y, A, B, C, reach;
+    TileRect rect;
+};
+
+__device__ __forceinline__ Footprint footprint_of(unsigned splat, const SplatArrays& splats, const TileGrid& grid,
+                                                  const Profile<float>& profile) {
+    const float *u = splats.means2d + 2 * size_t(splat), *q = splats.conics + 3 * size_t(splat);
+    const Radii radii = {splats.radii[2 * size_t(splat)], splats.radii[2 * size_t(splat) + 1]};
+    const TileRect rect = tile_rect(Vec2<float>{u[0], u[1]}, radii, grid, profile);
+    const float reach = logf(splats.opacities[splat] / profile.alpha_floor) + 1e-3f;
+    return {u[0], u[1], q[0], q[1], q[2], reach, rect};
+}
+
+__device__ __forceinline__ bool reaches(const Footprint& f, int index, const TileGrid& grid, bool exact, int& tile) {
+    const int across = f.rect.x1 - f.rect.x0;
+    const int x = f.rect.x0 + index % across, y = f.rect.y0 + index / across;
+    tile = y * grid.tiles_x + x;
+    return !exact || least_sigma_in_tile(Vec2<float>{f.x, f.y}, f.A, f.B, f.C, x, y, grid) <= f.reach;
+}
+
+__device__ __forceinline__ Footprint from_lane(const Footprint& f, int lane) {
+    const auto real = [lane](float v) { return __shfl_sync(FULL_WARP, v, lane); };
+    const auto integer = [lane](int v) { return __shfl_sync(FULL_WARP, v, lane); };
+    return {real(f.x),         real(f.y),
+            real(f.A),         real(f.B),
+            real(f.C),         real(f.reach),
+            {integer(f.rect.x0), integer(f.rect.y0), integer(f.rect.x1), integer(f.rect.y1)}};
+}
+
+// Call visit(tile, number) for every tile that the splat of this lane reaches, in row-major order; small rectangles by
+// their own lane, large ones by the whole warp. Returns how many there were. All lanes of the warp must call it.
+template <class Visit>
+__device__ __forceinline__ unsigned visit_tiles(const Footprint& f, const TileGrid& grid, bool exact, Visit visit) {
+    const int lane = threadIdx.x & (WARP - 1), size = n_tiles_in(f.rect);
+    unsigned found = 0;
+    if (size <= SMALL_RECT) {
+        int tile;
+        for (int k = 0; k < size; ++k)
+            if (reaches(f, k, grid, exact, tile)) visit(lane, tile, found++);
+    }
+    unsigned large = __ballot_sync(FULL_WARP, size > SMALL_RECT);
+    while (large) {
+        const int owner = __ffs(large) - 1;
+        large &= large - 1;
+        const Footprint wide = from_lane(f, owner);
+        const int wide_size = n_tiles_in(wide.rect);
+        unsigned before = 0;
+        for (int first = 0; first < wide_size; first += WARP) {
+            const int k = first + lane;
+            int tile = 0;
+            const bool kept = k < wide_size && reaches(wide, k, grid, exact, tile);
+            const unsigned hits = __ballot_sync(FULL_WARP, kept);
+            if (kept) visit(owner, tile, before + __popc(hits & ((1u << lane) - 1u)));
+            before += __popc(hits);
+        }
+        if (lane == owner) found = before;
+    }
+    return found;
+}
+
+__global__ void count_kernel(TileLists lists, SplatArrays splats, Profile<float> profile) {
+    const int rank = blockIdx.x * blockDim.x + threadIdx.x;
+    Footprint f = {};
+    if (rank < lists.n) f = footprint_of(lists.order[1][rank], splats, lists.grid, profile);
+    const unsigned found = visit_tiles(f, lists.grid, lists.exact, [](int, int, unsigned) {});
+    if (rank < lists.n) lists.counts[rank] = found;
+}
+
+__global__ void total_kernel(TileLists lists, DeviceState* state) {
+    const unsigned total = lists.offsets[lists.n - 1] + lists.counts[lists.n - 1];
+    state->n_instances = int(total);
+    if (lists.capacity > 0 && total > unsigned(lists.capacity)) state->overflow = int(total);
+}
+
+template <class Key>
+__global__ void emit_kernel(TileLists lists, SplatArrays splats, Profile<float> profile) {
+    const int rank = blockIdx.x * blockDim.x + threadIdx.x;
+    Footprint f = {};
+    if (rank < lists.n) {
+        const unsigned splat = lists.order[1][rank];
+        f = footprint_of(splat, splats, lists.grid, profile);
+        lists.splat_begin[splat] = lists.offsets[rank];
+        lists.splat_count[splat] = lists.counts[rank];
+    }
+    const int first_rank = rank - int(threadIdx.x & (WARP - 1));
+    visit_tiles(f, lists.grid, lists.exact, [&](int owner, int tile, unsigned number) {
+        const unsigned slot = lists.offsets[first_rank + owner] + number;
+        if (slot >= unsigned(lists.capacity)) return;
+        static_cast<Key*>(lists.tile_keys[0])[slot] = Key(tile);
+        lists.slots[0][slot] = slot;
+        lists.slot_splat[slot] = lists.order[1][first_rank + owner];
+    });
+}
+
+// what is left of the buffers must sort behind every tile
+template <class Key>
+__global__ void fill_tail_kernel(TileLists lists, const DeviceState* state) {
+    const int k = blockIdx.x * blockDim.x + threadIdx.x;
+    if (k >= lists.capacity || k < state->n_instances) return;
+    static_cast<Key*>(lists.tile_keys[0])[k] = Key(lists.n_tiles);
+    lists.slots[0][k] = unsigned(k);
+}
+
+template <class Key>
+__global__ void ranges_kernel(TileLists lists, const DeviceState* state) {
+    const int k = blockIdx.x * blockDim.x + threadIdx.x;
+    if (k >= min(lists.capacity, state->n_instances)) return;
+    const Key* keys = static_cast<const Key*>(lists.tile_keys[1]);
+    const int tile = int(keys[k]);
+    lists.listed[k] = lists.slot_splat[lists.slots[1][k]];
+    if (k == 0 || int(keys[k - 1]) != tile) lists.tile_begin[tile] = k;
+    if (k + 1 == min(lists.capacity, state->n_instances) || int(keys[k + 1]) != tile) lists.tile_end[tile] = k + 1;
+}
+
+__global__ void buckets_kernel(TileLists lists, DeviceState* state) {
+    const int tile = blockIdx.x * blockDim.x + threadIdx.x;
+    if (tile >= lists.n_tiles) return;
+    const int n = (lists.tile_end[tile] - lists.tile_begin[tile] + WARP - 1) / WARP;
+    const int first = lists.bucket_begin[tile];
+    for (int b = 0; b < n; ++b) lists.bucket_tile[first + b] = tile;
+    if (tile == lists.n_tiles - 1) state->n_buckets = first + n;
+}
+
+__global__ void bucket_counts_kernel(TileLists lists) {
+    const int tile = blockIdx.x * blockDim.x + threadIdx.x;
+    if (tile < lists.n_tiles)
+        lists.bucket_begin[tile] = (lists.tile_end[tile] - lists.tile_begin[tile] + WARP - 1) / WARP;
+}
+
+int bits_for(int largest) {
+    int bits = 1;
+    while ((largest >> bits) > 0) ++bits;
+    return bits;
+}
+
+template <class Key>
+void sort_instances(const TileLists& lists, const SplatArrays& splats, const Profile<float>& profile,
+                    DeviceState* state, cudaStream_t stream) {
+    const int blocks = blocks_for(lists.capacity, BLOCK);
+    emit_kernel<Key><<<blocks_for(lists.n, BLOCK), BLOCK, 0, stream>>>(lists, splats, profile);
+    POP_LAUNCHED("emit_kernel");
+    fill_tail_kernel<Key><<<blocks, BLOCK, 0, stream>>>(lists, state);
+    POP_LAUNCHED("fill_tail_kernel");
+    size_t bytes = lists.workspace_bytes;
+    POP_CUDA(cub::DeviceRadixSort::SortPairs(
+        lists.workspace, bytes, static_cast<const Key*>(lists.tile_keys[0]), static_cast<Key*>(lists.tile_keys[1]),
+        static_cast<const unsigned*>(lists.slots[0]), lists.slots[1], lists.capacity, 0, bits_for(lists.n_tiles),
+        stream));
+    ranges_kernel<Key><<<blocks, BLOCK, 0, stream>>>(lists, state);
+    POP_LAUNCHED("ranges_kernel");
+}
+
+}  // namespace
+
+size_t tile_workspace(int n, int capacity, int n_tiles) {
+    size_t depth = 0, tiles16 = 0, tiles32 = 0, scan = 0, buckets = 0;
+    unsigned* u = nullptr;
+    uint16_t* k16 = nullptr;
+    int* i = nullptr;
+    POP_CUDA(cub::DeviceRadixSort::SortPairs(nullptr, depth, u, u, u, u, n));
+    POP_CUDA(cub::DeviceRadixSort::SortPairs(nullptr, tiles16, k16, k16, u, u, capacity));
+    POP_CUDA(cub::DeviceRadixSort::SortPairs(nullptr, tiles32, u, u, u, u, capacity));
+    POP_CUDA(cub::DeviceScan::ExclusiveSum(nullptr, scan, u, u, n));
+    POP_CUDA(cub::DeviceScan::ExclusiveSum(nullptr, buckets, i, i, n_tiles));
+    size_t most = 1;
+    for (size_t bytes : {depth, tiles16, tiles32, scan, buckets}) most = bytes > most ? bytes : most;
+    return most;
+}
+
+void count_instances(const TileLists& lists, const SplatArrays& splats, const Profile<float>& profile,
+                     DeviceState* state, cudaStream_t stream) {
+    POP_CUDA(cudaMemsetAsync(&state->n_instances, 0, sizeof(int), stream));
+    if (lists.n == 0) return;
+    const int blocks = blocks_for(lists.n, BLOCK);
+    depth_keys_kernel<<<blocks, BLOCK, 0, stream>>>(lists.n, splats, lists.depth_keys[0], lists.order[0]);
+    POP_LAUNCHED("depth_keys_kernel");
+    size_t bytes = lists.workspace_bytes;
+    POP_CUDA(cub::DeviceRadixSort::SortPairs(lists.workspace, bytes, lists.depth_keys[0], lists.depth_keys[1],
+                                             lists.order[0], lists.order[1], lists.n, 0, 32, stream));
+    count_kernel<<<blocks, BLOCK, 0, stream>>>(lists, splats, profile);
+    POP_LAUNCHED("count_kernel");
+    bytes = lists.workspace_bytes;
+    POP_CUDA(cub::DeviceScan::ExclusiveSum(lists.workspace, bytes, lists.counts, lists.offsets, lists.n, stream));
+    total_kernel<<<1, 1, 0, stream>>>(lists, state);
+    POP_LAUNCHED("total_kernel");
+}
+
+void make_tile_lists(const TileLists& lists, const SplatArrays& splats, const Profile<float>& profile,
+                     DeviceState* state, cudaStream_t stream) {
+    POP_CUDA(cudaMemsetAsync(lists.tile_begin, 0, sizeof(int) * lists.n_tiles, stream));
+    POP_CUDA(cudaMemsetAsync(lists.tile_end, 0, sizeof(int) * lists.n_tiles, stream));
+    if (lists.n > 0 && lists.capacity > 0) {
+        if (lists.n_tiles < 0xffff)
+            sort_instances<uint16_t>(lists, splats, profile, state, stream);
+        else
+            sort_instances<unsigned>(lists, splats, profile, state, stream);
+    }
+    if (lists.bucket_begin == nullptr) return;
+    const int blocks = blocks_for(lists.n_tiles, BLOCK);
+    bucket_counts_kernel<<<blocks, BLOCK, 0, stream>>>(lists);
+    POP_LAUNCHED("bucket_counts_kernel");
+    size_t bytes = lists.workspace_bytes;
+    POP_CUDA(cub::DeviceScan::ExclusiveSum(lists.workspace, bytes, lists.bucket_begin, lists.bucket_begin,
+                                           lists.n_tiles, stream));
+    buckets_kernel<<<blocks, BLOCK, 0, stream>>>(lists, state);
+    POP_LAUNCHED("buckets_kernel");
+}
+
+}  // namespace pop

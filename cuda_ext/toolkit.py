@@ -1,0 +1,53 @@
+"""Where the CUDA compiler is: the toolkit on this machine, or NVIDIA's pip wheels in this environment."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sysconfig
+from pathlib import Path
+
+NVCC_FLAGS = ("-std=c++17", "-O3", "--expt-relaxed-constexpr", "-lineinfo")
+# Turing is the oldest that CUDA 13 compiles for; older cards need a 12.x toolkit
+OLDEST = 75
+TESTED_ARCHS = ("sm_75", "sm_80", "sm_90")
+
+
+def _candidates() -> list[Path]:
+    """List where nvcc may be: CUDACXX, CUDA_HOME, the PATH, the usual place, the wheels of pip."""
+    found: list[Path] = []
+    if os.environ.get("CUDACXX"):
+        found.append(Path(os.environ["CUDACXX"]))
+    for name in ("CUDA_HOME", "CUDA_PATH"):
+        if os.environ.get(name):
+            found.append(Path(os.environ[name]) / "bin" / "nvcc")
+    on_path = shutil.which("nvcc")
+    if on_path:
+        found.append(Path(on_path))
+    found.append(Path("/usr/local/cuda/bin/nvcc"))
+    packages = Path(sysconfig.get_paths()["purelib"]) / "nvidia"
+    # nvidia-cuda-nvcc (13 and newer) shares one folder, nvidia-cuda-nvcc-cu12 has its own
+    return [*found, *sorted(packages.glob("cu*/bin/nvcc")), packages / "cuda_nvcc" / "bin" / "nvcc"]
+
+
+def find_nvcc() -> str | None:
+    """Return the path of nvcc, or None."""
+    for candidate in _candidates():
+        if candidate.is_file() and os.access(candidate, os.X_OK):
+            return str(candidate)
+    return None
+
+
+def nvcc_version(nvcc: str) -> tuple[int, int]:
+    """Ask nvcc for its version.
+
+    Raises:
+        RuntimeError: it does not answer as nvcc does.
+    """
+    done = subprocess.run([nvcc, "--version"], capture_output=True, text=True, check=False)
+    match = re.search(r"release (\d+)\.(\d+)", done.stdout)
+    if match is None:
+        raise RuntimeError(f"{nvcc} --version did not answer: {done.stdout or done.stderr}")
+    return int(match.group(1)), int(match.group(2))
