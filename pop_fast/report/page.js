@@ -22,15 +22,18 @@ for (const figure of document.querySelectorAll("[data-chart]")) {
     const at = left + ((width - left - right) * step) / chart.stop;
     cross.setAttribute("d", `M${at} ${top}V${height - bottom}`);
     const rows = chart.series.filter((s) => s.x.length).map((s) => {
-      const value = s.y[nearest(s.x, step)];
-      const text = value === null ? "–" : value.toLocaleString("en", { maximumSignificantDigits: 5 });
+      const at = nearest(s.x, step);
+      const value = Math.abs(s.x[at] - step) < 0.02 * chart.stop ? s.y[at] : null;
+      if (value === null) return "";
+      const text = value.toLocaleString("en", { maximumSignificantDigits: 5 });
       return `<div><i style="background:${s.c}"></i>${s.n} ${text}${chart.unit}</div>`;
     });
     tip.innerHTML = `<div>iteration ${step}</div>` + rows.join("");
     tip.hidden = false;
-    const x = (at / width) * box.width;
-    tip.style.top = svg.offsetTop + 8 + "px";
-    tip.style.left = (x < box.width / 2 ? svg.offsetLeft + x + 12 : svg.offsetLeft + x - tip.offsetWidth - 12) + "px";
+    const outer = figure.getBoundingClientRect();
+    const x = box.left - outer.left + (at / width) * box.width;
+    tip.style.top = box.top - outer.top + 0.4 * box.height + "px";
+    tip.style.left = (x < outer.width / 2 ? x + 12 : x - tip.offsetWidth - 12) + "px";
   };
   svg.addEventListener("pointermove", show);
   svg.addEventListener("pointerdown", show);
