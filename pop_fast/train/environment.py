@@ -61,7 +61,8 @@ def _openmp_libraries() -> list[ctypes.CDLL]:
     maps = Path("/proc/self/maps")
     if not maps.exists():
         return []
-    files = {line.split()[-1] for line in maps.read_text().splitlines() if "/torch/lib/" in line and "omp" in line}
+    lines = [line.split(maxsplit=5) for line in maps.read_text().splitlines()]
+    files = {fields[5] for fields in lines if len(fields) == 6 and "/torch/lib/" in fields[5] and "omp" in fields[5]}
     return [ctypes.CDLL(file) for file in sorted(files)]
 
 
