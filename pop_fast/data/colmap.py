@@ -56,7 +56,8 @@ def read_model(model: Path) -> tuple[list[Shot], Cloud]:
     Raises:
         CaptureError: a file is absent, truncated, corrupt, or holds an unknown camera model, NaN or a singular camera.
     """
-    suffix = ".bin" if all((model / f"{name}.bin").is_file() for name in _FILES) else ".txt"
+    whole = [suffix for suffix in (".bin", ".txt") if all((model / f"{name}{suffix}").is_file() for name in _FILES)]
+    suffix = whole[0] if whole else ".bin" if (model / "cameras.bin").is_file() else ".txt"
     for name in _FILES:
         if not (model / f"{name}{suffix}").is_file():
             raise CaptureError(f"{model / name}{suffix}: is absent from the COLMAP model; {_FIX}")

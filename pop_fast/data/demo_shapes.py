@@ -15,6 +15,8 @@ __all__ = ["Ball", "Box", "Frustum", "Shape", "Torus", "dot"]
 
 _FAR = np.float32(np.inf)
 _NEAR = np.float32(1e-4)
+# how near to a surface a walk along a ray ends
+_CLOSE = np.float32(2e-4)
 # albedo of a surface from its local points and normals, linear rgb: [3, M], [3, M] -> [3, M]
 Paint = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -190,7 +192,7 @@ class Torus(Shape):
 
     ring: float = 1.0
     tube: float = 0.3
-    steps: int = 28
+    steps: int = 100
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "bound", self.ring + self.tube)
@@ -199,11 +201,14 @@ class Torus(Shape):
         along = -dot(o, d)
         chord = np.sqrt(np.maximum(along * along - dot(o, o) + np.float32(self.bound**2), 0.0))
         t = np.maximum(along - chord, _NEAR)
-        gap = t
+        leave = along + chord
+        gap = self._gap(o + t * d)
         for _ in range(self.steps):
-            gap = self._gap(o + t * d)
             t = t + gap
-        found = (np.abs(gap) < 2e-3) & (t < along + chord) & (t > 10.0 * _NEAR)
+            gap = self._gap(o + t * d)
+            if not np.any((np.abs(gap) > _CLOSE) & (t < leave)):
+                break
+        found = (np.abs(gap) < 2.0 * _CLOSE) & (t < leave) & (t > 10.0 * _NEAR)
         return np.where(found, t, _FAR)
 
     def _gap(self, p: np.ndarray) -> np.ndarray:

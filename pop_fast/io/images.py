@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import struct
+import threading
 import zlib
 from pathlib import Path
 
@@ -107,6 +108,28 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
     write_atomically(path, lambda file: file.write(data.tobytes()))
 
 
+class _Quiet:
+    """Keep OpenCV's own log off the terminal while any thread decodes: what matters of it is raised as one line."""
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._level = threading.Lock(), 0, 0
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._inside == 0:
+                self._level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+            self._inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                cv2.utils.logging.setLogLevel(self._level)
+
+
+_QUIET = _Quiet()
+
+
 def _decode(path: Path) -> np.ndarray:
     try:
         data = path.read_bytes()
@@ -119,7 +142,8 @@ def _decode(path: Path) -> np.ndarray:
         raise CaptureError(f"{path}: {defect}; {_FIX}")
     try:
         # IMREAD_UNCHANGED keeps alpha and 16 bit, and leaves the EXIF orientation alone
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        with _QUIET:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     if image is None or image.size == 0:

@@ -33,7 +33,7 @@ def write_photograph(path: Path, image: np.ndarray) -> None:
     assert cv2.imwrite(str(path), stored)
 
 
-def look_at(center: Sequence[float], target: Sequence[float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+def look_at(center: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
     """World -> camera at `center`, z up. float64 [4, 4]"""
     forward = np.subtract(target, center)
     forward = forward / np.linalg.norm(forward)

@@ -1,0 +1,381 @@
+"""Whatever is wrong with a capture is said in one line that names the file, the field and the fix."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pop_fast.data import CaptureError, load_capture
+from pop_fast.errors import PopError
+from pop_fast.io.images import read_image
+from tests.app.captures import (
+    assert_one_line,
+    camera,
+    colmap_capture,
+    edit_transforms,
+    photograph,
+    ring,
+    transforms_capture,
+    write_model,
+    write_photograph,
+)
+
+
+def test_every_message_is_one_line_whatever_it_was_made_from() -> None:
+    assert str(PopError("a\n  b\tc")) == "a b c"
+    assert issubclass(CaptureError, PopError)
+    assert issubclass(PopError, ValueError)
+
+
+# folders
+
+
+def test_a_missing_folder_a_file_and_an_empty_folder_are_told_apart(tmp_path: Path) -> None:
+    assert_one_line(lambda: load_capture(tmp_path / "absent"), "absent", "no such folder")
+    (tmp_path / "file").write_text("")
+    assert_one_line(lambda: load_capture(tmp_path / "file"), "file", "not a folder")
+    (tmp_path / "empty").mkdir()
+    assert_one_line(lambda: load_capture(tmp_path / "empty"), "empty", "no photographs", "no COLMAP model")
+
+
+def test_a_source_that_is_not_there_is_named(tmp_path: Path) -> None:
+    write_photograph(tmp_path / "a.png", photograph(0))
+    assert_one_line(lambda: load_capture(tmp_path, source="colmap"), "no COLMAP model", "pop sfm")
+    assert_one_line(lambda: load_capture(tmp_path, source="transforms"), "no transforms.json")
+    assert_one_line(lambda: load_capture(tmp_path), "1 photographs", "pop sfm")
+
+
+def test_a_model_without_photographs_is_named(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path)
+    (root / "images").rename(root / "pictures")
+    assert_one_line(lambda: load_capture(root), str(root / "images"), "--images")
+    assert_one_line(lambda: load_capture(root, images="photos"), str(root / "photos"), "--images")
+    assert len(load_capture(root, images="pictures").views) == 4
+
+
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize("binary", [True, False])
+def test_an_absent_file_of_a_model_is_named(tmp_path: Path, file: str, binary: bool) -> None:
+    root = colmap_capture(tmp_path, binary=binary)
+    suffix = ".bin" if binary else ".txt"
+    (root / "sparse" / "0" / f"{file}{suffix}").unlink()
+    words = () if file == "cameras" else (file, "absent")
+    assert_one_line(lambda: load_capture(root, source="colmap"), *words)
+
+
+def test_fewer_than_two_views_are_refused(tmp_path: Path) -> None:
+    assert_one_line(lambda: load_capture(colmap_capture(tmp_path / "a", count=1)), "sparse", "1 view(s)", "two or more")
+    assert_one_line(lambda: load_capture(transforms_capture(tmp_path / "b", count=1)), "transforms.json", "1 view(s)")
+    root = colmap_capture(tmp_path / "c", count=2)
+    (root / "images" / "00.png").unlink()
+    assert_one_line(lambda: load_capture(root, missing="skip", normalize=False), "1 view(s)", "two or more")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"factor": 0}, ("factor is 0", "at least 1")),
+        ({"factor": 1.5}, ("factor is 1.5", "whole number")),
+        ({"factor": 1000}, ("40x30", "factor 1000")),
+        ({"missing": "ignore"}, ("missing is 'ignore'", "'skip'")),
+        ({"background": (0.0, 0.0, 255.0)}, ("background", "[0, 1]")),
+        ({"background": (0.0,)}, ("background", "three numbers")),
+    ],
+)
+def test_impossible_options_are_named(tmp_path: Path, options: dict[str, Any], words: tuple[str, ...]) -> None:
+    root = colmap_capture(tmp_path)
+    assert_one_line(lambda: load_capture(root, **options), *words)
+
+
+def test_cameras_that_did_not_move_are_refused(tmp_path: Path) -> None:
+    write_model(tmp_path / "sparse" / "0", ["a.png", "b.png"], ring(1)[[0, 0]])
+    for i, name in enumerate("ab"):
+        write_photograph(tmp_path / "images" / f"{name}.png", photograph(i))
+    assert_one_line(lambda: load_capture(tmp_path), "sparse", "one place")
+
+
+# binary models
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return colmap_capture(tmp_path_factory.mktemp("model"))
+
+
+def with_damage(root: Path, file: str, damage: Callable[[bytes], bytes]) -> str:
+    """Damage a file of a model, try to load it, repair it, and return the one line."""
+    path = root / "sparse" / "0" / file
+    whole = path.read_bytes()
+    path.write_bytes(damage(whole))
+    try:
+        return assert_one_line(lambda: load_capture(root))
+    finally:
+        path.write_bytes(whole)
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"])
+@given(cut=st.floats(0.0, 1.0, exclude_max=True))
+def test_a_model_file_cut_anywhere_is_named(file: str, cut: float, model: Path) -> None:
+    message = with_damage(model, file, lambda data: data[: int(cut * len(data))])
+    assert file in message
+    assert "truncated" in message
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"])
+def test_a_model_file_with_more_than_it_says_is_named(file: str, model: Path) -> None:
+    message = with_damage(model, file, lambda data: data + b"more")
+    assert file in message
+    assert "4 bytes too many" in message
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_an_absurd_count_asks_for_no_memory(file: str, model: Path) -> None:
+    assert file in with_damage(model, file, lambda data: struct.pack("<Q", 2**60) + data[8:])
+
+
+def patched(offset: int, value: bytes) -> Callable[[bytes], bytes]:
+    return lambda data: data[:offset] + value + data[offset + len(value) :]
+
+
+@pytest.mark.parametrize(
+    ("file", "offset", "value", "words"),
+    [
+        ("cameras.bin", 12, struct.pack("<i", 77), ("camera 1", "unknown camera model 77")),
+        ("cameras.bin", 12, struct.pack("<i", -2), ("unknown camera model -2",)),
+        ("cameras.bin", 16, struct.pack("<Q", 0), ("camera 1 (PINHOLE)", "0x30 px")),
+        ("cameras.bin", 32, struct.pack("<d", np.nan), ("params[0] is nan",)),
+        ("cameras.bin", 48, struct.pack("<d", np.inf), ("params[2] is inf",)),
+        ("cameras.bin", 32, struct.pack("<d", 0.0), ("focal length 0.0", "> 0")),
+        ("cameras.bin", 40, struct.pack("<d", -5.0), ("focal length -5.0",)),
+        ("points3D.bin", 16, struct.pack("<d", np.nan), ("point 1", "NaN")),
+    ],
+)
+def test_a_wrong_field_of_a_model_is_named(
+    model: Path, file: str, offset: int, value: bytes, words: tuple[str, ...]
+) -> None:
+    message = with_damage(model, file, patched(offset, value))
+    assert file in message
+    for word in words:
+        assert word in message
+
+
+# text models
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "words"),
+    [
+        ("cameras.txt", "PINHOLE", "PINHOLES", ()),
+        ("cameras.txt", "36", "NaN", ()),
+        ("cameras.txt", " 14.25", "", ()),
+        ("cameras.txt", " 40 30 ", " 0 30 ", ("0x30",)),
+        ("images.txt", " 1 00.png", " 9 00.png", ()),
+        ("points3D.txt", "1 ", "one ", ()),
+    ],
+)
+def test_a_wrong_field_of_a_text_model_is_one_line(
+    tmp_path: Path, file: str, old: str, new: str, words: tuple[str, ...]
+) -> None:
+    root = colmap_capture(tmp_path, binary=False)
+    path = root / "sparse" / "0" / file
+    lines = path.read_text().splitlines()
+    first = next(i for i, line in enumerate(lines) if not line.startswith("#"))
+    assert old in lines[first]
+    lines[first] = lines[first].replace(old, new, 1)
+    path.write_text("\n".join(lines) + "\n")
+    assert_one_line(lambda: load_capture(root), "sparse", *words)
+
+
+def test_a_pose_that_is_no_number_is_named(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path)
+    path = root / "sparse" / "0" / "frames.bin"
+    data = path.read_bytes()
+    path.write_bytes(patched(8 + 8 + 32, struct.pack("<d", np.nan))(data))
+    assert_one_line(lambda: load_capture(root), "images.bin", ".png", "NaN")
+
+
+# photographs
+
+
+def encoded(extension: str) -> bytes:
+    return cv2.imencode(extension, photograph(3, 64, 48))[1].tobytes()
+
+
+PROGRESSIVE = cv2.imencode(".jpg", photograph(3, 64, 48), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+WHOLE = {
+    "png": encoded(".png"),
+    "jpg": encoded(".jpg"),
+    "progressive.jpg": PROGRESSIVE,
+    "webp": encoded(".webp"),
+    "bmp": encoded(".bmp"),
+    "tiff": encoded(".tiff"),
+}
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_a_whole_photograph_is_read(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(WHOLE[name])
+    assert read_image(tmp_path / name).shape == (48, 64, 3)
+
+
+@pytest.mark.parametrize("name", WHOLE)
+@given(cut=st.floats(0.0, 1.0, exclude_max=True))
+def test_a_photograph_cut_anywhere_is_named(name: str, cut: float, tmp_path_factory: pytest.TempPathFactory) -> None:
+    path = tmp_path_factory.mktemp("cut") / name
+    path.write_bytes(WHOLE[name][: int(cut * len(WHOLE[name]))])
+    assert_one_line(lambda: read_image(path), str(path))
+
+
+@given(at=st.integers(8, len(WHOLE["png"]) - 1), flip=st.integers(1, 255))
+def test_a_png_with_any_byte_changed_is_named(at: int, flip: int, tmp_path_factory: pytest.TempPathFactory) -> None:
+    data = bytearray(WHOLE["png"])
+    data[at] ^= flip
+    path = tmp_path_factory.mktemp("flip") / "x.png"
+    path.write_bytes(data)
+    assert_one_line(lambda: read_image(path), str(path), "PNG")
+
+
+def test_a_jpeg_overwritten_in_the_middle_is_named(tmp_path: Path) -> None:
+    data = bytearray(WHOLE["jpg"])
+    scan = data.index(b"\xff\xda") + 20
+    data[scan : scan + 40] = b"\xff\x42" * 20
+    (tmp_path / "x.jpg").write_bytes(data)
+    assert_one_line(lambda: read_image(tmp_path / "x.jpg"), "x.jpg", "unexpected marker")
+
+
+@pytest.mark.parametrize("name", ["jpg", "progressive.jpg"])
+def test_what_cameras_append_to_a_jpeg_does_no_harm(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(WHOLE[name])
+    plain = read_image(tmp_path / name)
+    (tmp_path / name).write_bytes(WHOLE[name] + bytes(100) + WHOLE["jpg"])
+    assert np.array_equal(read_image(tmp_path / name), plain)
+
+
+@pytest.mark.parametrize(
+    ("content", "word"), [(b"", "empty"), (b"no picture at all", "not an image"), (b"\xff\xd8\xff", "truncated")]
+)
+def test_what_is_no_photograph_is_named_by_the_capture_too(tmp_path: Path, content: bytes, word: str) -> None:
+    root = colmap_capture(tmp_path)
+    (root / "images" / "02.png").write_bytes(content)
+    assert_one_line(lambda: load_capture(root), str(root / "images" / "02.png"), word, "copy it again")
+
+
+def test_reading_bad_photographs_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for name, data in WHOLE.items():
+        (tmp_path / name).write_bytes(data[: len(data) // 2])
+        assert_one_line(lambda path=tmp_path / name: read_image(path))
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err == ""
+
+
+# transforms.json
+
+
+def frame(**fields: Any) -> Callable[[dict[str, Any]], object]:
+    return lambda listing: listing["frames"][1].update(fields)
+
+
+def matrix(change: Callable[[np.ndarray], Any]) -> Callable[[dict[str, Any]], object]:
+    def edit(listing: dict[str, Any]) -> None:
+        m = change(np.array(listing["frames"][1]["transform_matrix"]))
+        listing["frames"][1]["transform_matrix"] = m.tolist() if isinstance(m, np.ndarray) else m
+
+    return edit
+
+
+def entry(row: int, column: int, value: float) -> Callable[[np.ndarray], np.ndarray]:
+    def change(m: np.ndarray) -> np.ndarray:
+        m[row, column] = value
+        return m
+
+    return change
+
+
+BAD_FIELDS: dict[str, tuple[Callable[[dict[str, Any]], object], tuple[str, ...]]] = {
+    "no frames": (lambda listing: listing.pop("frames"), ("'frames'",)),
+    "frames is a number": (lambda listing: listing.update(frames=3), ("'frames'",)),
+    "a frame is a number": (lambda listing: listing["frames"].append(3), ("frames[4]", "file_path")),
+    "no file_path": (lambda listing: listing["frames"][1].pop("file_path"), ("frames[1]", "file_path")),
+    "no matrix": (
+        lambda listing: listing["frames"][1].pop("transform_matrix"),
+        ("frames[1]", "transform_matrix", "4x4"),
+    ),
+    "3x3 matrix": (matrix(lambda m: m[:3, :3]), ("frames[1]", "[3, 3]", "4x4")),
+    "ragged matrix": (matrix(lambda m: [[1.0], [1.0, 2.0]]), ("frames[1]", "4x4")),
+    "words for a matrix": (matrix(lambda m: [["a"] * 4] * 4), ("frames[1]", "4x4")),
+    "NaN": (matrix(entry(1, 3, np.nan)), ("frames[1]", "transform_matrix", "[1][3] is nan", "finite")),
+    "Inf": (matrix(entry(0, 0, np.inf)), ("frames[1]", "[0][0] is inf")),
+    "scaled": (matrix(lambda m: m * [[2.0], [2.0], [2.0], [1.0]]), ("frames[1]", "not rigid", "scales by 2")),
+    "sheared": (matrix(lambda m: m @ (np.eye(4) + 0.1 * np.eye(4, k=1))), ("frames[1]",)),
+    "mirrored": (matrix(lambda m: m @ np.diag([-1.0, 1.0, 1.0, 1.0])), ("frames[1]", "mirrors")),
+    "transposed": (matrix(lambda m: m.T), ("frames[1]", "last row")),
+    "zero": (matrix(lambda m: m * 0.0), ("frames[1]",)),
+    "no focal length": (lambda listing: listing.pop("fl_x"), ("frames[0]", "fl_x", "camera_angle_x")),
+    "focal length 0": (frame(fl_x=0.0), ("frames[1]", "focal length")),
+    "focal length -1": (frame(fl_y=-1), ("frames[1]", "focal length")),
+    "focal length NaN": (frame(fl_x=float("nan")), ("frames[1]", "fl_x is nan", "finite")),
+    "focal length a word": (frame(fl_x="long"), ("frames[1]", "fl_x is 'long'")),
+    "focal length true": (frame(fl_x=True), ("frames[1]", "fl_x is True")),
+    "principal point a list": (frame(cx=[1]), ("frames[1]", "cx is [1]")),
+    "width 0": (frame(w=0), ("frames[1]", "0 x 30")),
+    "no size": (lambda listing: (listing.pop("w"), listing.pop("h")), ("frames[0]", "w and h are absent")),
+    "no height": (lambda listing: listing.pop("h"), ("frames[0]", "h is None")),
+    "unknown lens": (frame(camera_model="PANINI"), ("frames[1]", "camera_model is 'PANINI'", "OPENCV")),
+    "fourth radial term": (frame(k4=0.1), ("frames[1]", "k4 is 0.1")),
+    "listed twice": (lambda listing: listing["frames"].append(listing["frames"][0]), ("images/00.png twice",)),
+    "split of unknown": (lambda listing: listing.update(test_filenames=["no.png"]), ("test_filenames", "no.png")),
+}
+
+
+@pytest.mark.parametrize("what", BAD_FIELDS)
+def test_a_wrong_field_of_transforms_json_is_named(tmp_path: Path, what: str) -> None:
+    root = transforms_capture(tmp_path)
+    edit, words = BAD_FIELDS[what]
+    edit_transforms(root, edit)
+    assert_one_line(lambda: load_capture(root), str(root / "transforms.json"), *words)
+
+
+@pytest.mark.parametrize("angle", [0.0, -1.0, 4.0])
+def test_an_impossible_field_of_view_is_named(tmp_path: Path, angle: float) -> None:
+    none = dict.fromkeys(("w", "h", "fl_x", "fl_y", "cx", "cy"))
+    root = transforms_capture(tmp_path, camera_angle_x=angle, **none)
+    assert_one_line(lambda: load_capture(root), "frames[0]", "camera_angle_x", "radians")
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"\xff\xfe\x00", b'{"frames": [}'])
+def test_a_file_that_is_no_json_object_is_named(tmp_path: Path, content: bytes) -> None:
+    root = transforms_capture(tmp_path)
+    (root / "transforms.json").write_bytes(content)
+    assert_one_line(lambda: load_capture(root), str(root / "transforms.json"))
+
+
+def test_a_lens_that_folds_the_image_is_named_with_its_photograph(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path, cameras=[camera("SIMPLE_RADIAL", (2.0, 20.0, 15.0, -0.9))])
+    assert_one_line(lambda: load_capture(root), ".png", "SIMPLE_RADIAL", "folds", "undistort")
+
+
+@pytest.mark.parametrize(
+    "content", [b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n1\n", b"", b"ply"]
+)
+def test_damaged_points_beside_transforms_json_are_named(tmp_path: Path, content: bytes) -> None:
+    root = transforms_capture(tmp_path)
+    (root / "sparse_pc.ply").write_bytes(content)
+    assert_one_line(lambda: load_capture(root), "sparse_pc.ply", "truncated or corrupt")
+
+
+def test_points_without_a_coordinate_or_with_nan_are_named(tmp_path: Path) -> None:
+    root = transforms_capture(tmp_path)
+    header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n"
+    (root / "sparse_pc.ply").write_text(header + "end_header\n1 2\n3 4\n")
+    assert_one_line(lambda: load_capture(root), "sparse_pc.ply", "'z'")
+    (root / "sparse_pc.ply").write_text(header + "property float z\nend_header\n1 2 3\n3 nan 4\n")
+    assert_one_line(lambda: load_capture(root), "sparse_pc.ply", "vertex[1].y is nan")
