@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pop_ref import INRIA, PAPER, Gaussians, margins, render
+from pop_ref import GSPLAT_1_6, INRIA, PAPER, Gaussians, Profile, margins, render
 from pop_ref.alpha import sigma_at_pixel
 from pop_ref.magnitudes import Rounded, splat_magnitudes
 from pop_ref.splatting import geometry
@@ -130,6 +130,17 @@ def test_d7_is_near_where_the_next_transmittance_is_the_stop() -> None:
     assert got.pixels["D7"][0, 0] < 1e-7
     assert [d.where for d in got.doubts(1e-7)] == [(0, 0, 1)]
     assert margins(grey([1.0, 0.8]), dyadic_camera(1, 1)).pixels["D7"][0, 0] > 1e-4
+
+
+@pytest.mark.parametrize("profile", [INRIA, GSPLAT_1_6], ids=lambda p: p.name)
+def test_d7_is_near_where_two_splats_sit_at_a_ceiling_of_99_hundredths(profile: Profile) -> None:
+    # 0.01 squared is the stop itself; float32 falls under it, float64 does not
+    opaque, view = grey([1.0, 1.0]), dyadic_camera(1, 1)
+    assert render(opaque, view, profile=profile).n_blended[0, 0] == 2
+    left = np.float32(1.0) - np.float32(0.99)
+    assert left * left < np.float32(1e-4)
+    assert not margins(opaque, view, profile=profile).safe_pixels(EPS32)[0, 0]
+    assert margins(opaque, view, profile=PAPER).safe_pixels(EPS32)[0, 0]
 
 
 def test_d8_is_near_where_two_weights_almost_tie() -> None:
