@@ -153,7 +153,7 @@ def ssim_vjp(
         True
     """
     x, y = _padded(replace_left_out(image, target, mask), target, padding)
-    kept = np.argwhere(_kept_windows(image, padding, mask))
+    kept: list[list[int]] = np.argwhere(_kept_windows(image, padding, mask)).tolist()
     window = gaussian_window()[:, :, None]
     v_x = np.zeros_like(x)
     for row, col in kept:

@@ -172,11 +172,11 @@ def params_vjp(
         Gradients, keys and shapes as `params`.
 
     Example:
-        >>> from types import SimpleNamespace
         >>> params = {"means": np.zeros((1, 3)), "quats": np.ones((1, 4)), "scales": np.zeros((1, 3)),
         ...           "opacities": np.zeros(1), "sh0": np.zeros((1, 1, 3))}
-        >>> g = SimpleNamespace(means=np.zeros((1, 3)), quats=np.zeros((1, 4)), scales=np.ones((1, 3)),
-        ...                     opacities=np.ones(1), sh=np.zeros((1, 1, 3)))
+        >>> g = RenderGradients(means=np.zeros((1, 3)), quats=np.zeros((1, 4)), scales=np.ones((1, 3)),
+        ...                     opacities=np.ones(1), sh=np.zeros((1, 1, 3)), viewmat=np.zeros((4, 4)),
+        ...                     background=np.zeros(3), means2d=np.zeros((1, 2)), means2d_abs=np.zeros((1, 2)))
         >>> params_vjp(params, g, np.ones(1))["opacities"].tolist()
         [0.5]
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,11 @@ from tests.golden import ten_losses
 
 CAMERAS, PHOTOS = ten_losses.cameras(), ten_losses.photographs()
 PARAMS = ten_losses.first_params()
+
+
+@functools.cache
+def ladder() -> list[ten_losses.Rung]:
+    return ten_losses.ladder()
 
 
 def trained(params: dict[str, np.ndarray], steps: int, recipe: Recipe) -> tuple[Training, list[float]]:
@@ -43,7 +49,7 @@ def test_thirty_steps_lower_the_loss_of_every_view(name: str) -> None:
 
 
 def test_ten_losses_are_those_written_down() -> None:
-    rungs, written = ten_losses.ladder(), ten_losses.written()
+    rungs, written = ladder(), ten_losses.written()
     assert [rung.n for rung in rungs] == [rung.n for rung in written]
     np.testing.assert_allclose([rung.loss for rung in rungs], [rung.loss for rung in written], rtol=1e-9)
 
@@ -63,7 +69,7 @@ def test_the_ladder_passes_through_every_kind_of_edit(monkeypatch: pytest.Monkey
 
 
 def test_the_same_training_gives_the_same_bits() -> None:
-    assert ten_losses.ladder() == ten_losses.ladder()
+    assert ten_losses.ladder() == ladder()
 
 
 def test_a_step_does_not_touch_the_state_it_starts_from() -> None:
