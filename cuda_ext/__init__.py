@@ -1,1 +1,60 @@
-"""CUDA kernels with the same stage names, and the reasons why they may not be available here."""
+"""CUDA kernels with the same stage names, and the reasons why they may not be available here.
+
+Importing this package imports neither torch nor the compiled module, and compiles nothing: `python -m cuda_ext.build`
+(or `pop build-cuda`, `make cuda`) does that, when it is asked to.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from types import ModuleType
+
+_BUILD = "run `pop build-cuda` (it needs nvcc, cmake and nanobind)"
+
+
+def available() -> bool:
+    """Tell whether backend "cuda" can run here: built, a driver, a GPU that it was built for."""
+    return why_not() is None
+
+
+def why_not() -> str | None:
+    """Return one sentence on why backend "cuda" cannot run here and what to do, or None where it can."""
+    if importlib.util.find_spec("cuda_ext._kernels") is None:
+        return f"the CUDA extension is not built; {_BUILD}"
+    try:
+        kernels = load()
+    except ImportError as error:
+        return f"the CUDA extension does not load ({error}); build it again: {_BUILD}"
+    try:
+        import torch
+    except ImportError:
+        return "torch is not installed; install a CUDA build of torch"
+    if torch.version.cuda is None:
+        return f"torch {torch.__version__} is a CPU build; install a CUDA build of torch"
+    if not torch.cuda.is_available():
+        return "torch finds no usable GPU; check `nvidia-smi`: the driver must be there and new enough for " + (
+            f"CUDA {torch.version.cuda}"
+        )
+    return _why_not_this_gpu(torch.cuda.get_device_capability(), str(kernels.ARCHS))
+
+
+def load() -> ModuleType:
+    """Return the compiled module.
+
+    Raises:
+        ImportError: it is not built, or does not load.
+    """
+    return importlib.import_module("cuda_ext._kernels")
+
+
+def _why_not_this_gpu(capability: tuple[int, int], archs: str) -> str | None:
+    """Tell whether a card of that capability runs code built for `archs`, for example "75-real;90"."""
+    number = capability[0] * 10 + capability[1]
+    for arch in archs.split(";"):
+        built = int(arch.split("-")[0].rstrip("af"))
+        same_major = built // 10 == number // 10 and built <= number
+        # without "-real" the module carries PTX, which the driver compiles for newer cards
+        if same_major or (not arch.endswith("-real") and built <= number):
+            return None
+    return f"the GPU is sm_{number}, the CUDA extension was built for {archs}; run `pop build-cuda --arch sm_{number}`"

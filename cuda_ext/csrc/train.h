@@ -1,0 +1,88 @@
+// What a fused training step adds to launch.h: the loss, the update, density statistics, rows.
+#pragma once
+
+#include "launch.h"
+#include "optimizer.cuh"
+
+namespace pop {
+
+enum class Pixelwise : int { l2 = 0, l1 = 1 };
+
+struct LossSettings {
+    Pixelwise pixelwise;
+    float pixelwise_weight;  // (1 - lambda_ssim) times the scale of the pixelwise term
+    float ssim_weight;       // lambda_ssim, halved where D-SSIM is
+    int margin;              // 5 for "valid", 0 for "same"
+};
+
+// Photographs stay on the device as bytes; tables have one entry a view, and state->view picks it.
+struct Photographs {
+    const uint8_t* const* images;   // [H, W, 3] each
+    const uint8_t* const* masks;    // [H, W] each, nonzero keeps; null for none
+    const float* shares;            // [views, 2]: 1 / values compared, 1 / windows compared
+    float* const* moments;          // [2, 3, H, W] each: blurred y and y^2; null computes them every time
+};
+
+struct LossArrays {
+    const float* image;   // [H, W, 3]
+    float* windows;       // [3, 3, H, W]: channel, derivative
+    float* partials;      // [blocks, 2]
+    float* values;        // [3]: pixelwise mean, ssim, objective
+    float* v_image;       // [H, W, 3]
+    int width, height;
+};
+
+struct AdamGroup {
+    float *param, *m, *v;
+};
+
+enum Group { G_MEANS, G_SCALES, G_QUATS, G_OPACITIES, G_SH0, G_SHN, N_GROUPS };
+
+struct StepConstants {
+    AdamStep<float> adam[N_GROUPS];
+};
+
+struct Schedule {
+    const int* views;        // [max_steps], the view of every step
+    double lr[N_GROUPS];
+    double means_decay;      // what the means' rate falls to over max_steps
+    int max_steps;
+    double beta1, beta2, eps;
+    const float* viewmats;   // [views, 16]
+    const float* Ks;         // [views, 9]
+    float* viewmat;          // [16], this step's
+    float* K;                // [9]
+};
+
+struct UpdateArrays {
+    AdamGroup groups[N_GROUPS];
+    int n, n_rest;               // Gaussians; rows of harmonics beyond the first
+    const StepConstants* constants;
+    const float* sums;           // [n, RECORD]
+    const int* dominant_counts;  // [n] or null
+    float lambda_pop;            // 0 leaves the POP term out
+    // density statistics, each may be null
+    float* grad_sum;
+    int* n_visible;
+    int* dominant_sum;
+    uint8_t* blurred;
+    float blur_pixels;           // a view's count above it blurs
+};
+
+int loss_blocks(int width, int height);
+void target_moments(const Photographs& photographs, const LossArrays& loss, const LossSettings& settings,
+                    const DeviceState* state, cudaStream_t stream);
+void photometric(const Photographs& photographs, const LossArrays& loss, const LossSettings& settings,
+                 const DeviceState* state, cudaStream_t stream);
+void begin_step(const Schedule& schedule, StepConstants* constants, DeviceState* state, cudaStream_t stream);
+void count_important(int n, const int* dominant_counts, DeviceState* state, cudaStream_t stream);
+void update(const UpdateArrays& arrays, const ViewArrays& view, const ProjectSettings& settings,
+            const SplatArrays& splats, DeviceState* state, cudaStream_t stream);
+void end_step(DeviceState* state, cudaStream_t stream);
+void gather_rows(const float* source, const long long* index, float* target, int n, int row_floats,
+                 cudaStream_t stream);
+void split_rows(const float* means, const float* quats, const float* log_scales, const float* normals, float shrink,
+                float* child_means, float* child_log_scales, int n, cudaStream_t stream);
+void reset_opacities(AdamGroup opacities, int n, float logit, cudaStream_t stream);
+
+}  // namespace pop
