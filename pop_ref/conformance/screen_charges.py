@@ -15,8 +15,8 @@ from pop_ref.camera import camera_center, covars_cam_from_covars, in_front, mean
 from pop_ref.conformance.scenes import Scene
 from pop_ref.covariance import covars_from_quats_scales, rotmats_from_quats
 from pop_ref.footprint import compensations, conics_from_covars2d, low_pass
-from pop_ref.magnitudes import in_float32
 from pop_ref.harmonics import colors_from_sh, sh_basis
+from pop_ref.magnitudes import in_float32
 from pop_ref.projection import project_covars, project_means, projection_jacobians
 
 TINY = np.finfo(np.float64).tiny
@@ -191,5 +191,5 @@ def _antialiased(
     factors = compensations(raw, eps2d)
     raw_det, e_raw_det, _ = _conic_charges(raw, e_2d)
     relative = e_raw_det / np.maximum(raw_det, TINY) + e_det / np.maximum(det, TINY) + 4.0
-    # sqrt(max(0, x)): never wrong by more than the root of x's own error, which eps * charge cannot express; bounded by 1
+    # near zero sqrt(max(0, x)) is wrong by the root of x's error, which no multiple of eps bounds: let it be huge
     return opacities * factors, opacities * factors * np.minimum(relative, 1e30)

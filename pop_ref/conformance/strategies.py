@@ -1,12 +1,16 @@
 """Strategies that shrink: records in lists, dyadic numbers first, the dullest value first.
 
-Numbers are tried in this order when Hypothesis shrinks: the dull value, then dyadic ones (exact in every precision), then
-any float32. Opacities under 1/255 and at 1 are always in range, because POP drives them there. Sizes reach needles and
-splats larger than the picture. Images have at most 16 x 16 pixels.
+Numbers are tried in this order when Hypothesis shrinks: the dull value, then dyadic ones (exact in every precision),
+then any float32. Opacities under 1/255 and at 1 are always in range, because POP drives them there. Sizes reach needles
+and splats larger than the picture. Images have at most 16 x 16 pixels.
+
+Strategies are cached: Hypothesis examines each new strategy object before it draws from it, which takes longer than
+drawing.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -21,17 +25,20 @@ FLOOR = 1.0 / 255.0
 ANCHOR_SH = ((1.0, 0.5, 0.25),)
 
 
+@functools.cache
 def dyadic(low: float, high: float, bits: int = 3) -> st.SearchStrategy[float]:
     """Draw k / 2^bits in [low, high]; shrinks towards 0, or the end nearest to it."""
     return st.integers(math.ceil(low * 2**bits), math.floor(high * 2**bits)).map(lambda k: k / 2**bits)
 
 
+@functools.cache
 def reals(low: float, high: float, dull: float | None = None, bits: int = 3) -> st.SearchStrategy[float]:
     """Draw the dull value, a dyadic number or any float32 in [low, high]."""
     wild = st.floats(low, high, width=32, allow_subnormal=False)
     return st.one_of(*([st.just(dull)] if dull is not None else []), dyadic(low, high, bits), wild)
 
 
+@functools.cache
 def opacities() -> st.SearchStrategy[float]:
     """Draw an opacity: dull, at the ends, around 1/255 and the ceilings, or any."""
     return st.one_of(
@@ -41,6 +48,7 @@ def opacities() -> st.SearchStrategy[float]:
     )
 
 
+@functools.cache
 def quats() -> st.SearchStrategy[tuple[float, ...]]:
     """Draw wxyz of any norm > 0: the identity, quarter and odd integer turns, then any."""
     whole = st.tuples(*[st.integers(-2, 2).map(float)] * 4).filter(any)
@@ -48,6 +56,7 @@ def quats() -> st.SearchStrategy[tuple[float, ...]]:
     return st.one_of(st.just((1.0, 0.0, 0.0, 0.0)), whole, wild.filter(lambda q: 0.01 < sum(c * c for c in q) < 100.0))
 
 
+@functools.cache
 def sizes() -> st.SearchStrategy[tuple[float, ...]]:
     """Draw standard deviations in px: round and plain, uneven, needles, flat discs, points and giants."""
     side = reals(0.125, 4.0, dull=1.0)
@@ -58,19 +67,20 @@ def sizes() -> st.SearchStrategy[tuple[float, ...]]:
     return st.one_of(side.map(lambda s: (s, s, s)), uneven, uneven, needle, giant, point)
 
 
+@functools.cache
 def sh_rows(max_degree: int = 3) -> st.SearchStrategy[tuple[tuple[float, ...], ...]]:
     """Draw SH coefficients of a degree in {0..max_degree}; colours from under 0 to over 1."""
 
-    def rows(degree: int) -> st.SearchStrategy[tuple[tuple[float, ...], ...]]:
-        first = st.tuples(*[dyadic(-2.0, 2.0)] * 3)
-        rest = st.lists(
-            st.tuples(*[dyadic(-1.0, 1.0)] * 3), min_size=(degree + 1) ** 2 - 1, max_size=(degree + 1) ** 2 - 1
-        )
-        return st.tuples(first, rest).map(lambda fr: (fr[0], *fr[1]))
-
-    return st.sampled_from([0, 0, 0, *range(1, max_degree + 1)]).flatmap(rows)
+    return st.sampled_from([0, 0, 0, *range(1, max_degree + 1)]).flatmap(_sh_rows_of)
 
 
+@functools.cache
+def _sh_rows_of(degree: int) -> st.SearchStrategy[tuple[tuple[float, ...], ...]]:
+    first, rest = st.tuples(*[dyadic(-2.0, 2.0)] * 3), st.tuples(*[dyadic(-1.0, 1.0)] * 3)
+    return st.tuples(first, *[rest] * ((degree + 1) ** 2 - 1))
+
+
+@functools.cache
 def records(
     width: int = 8,
     height: int = 8,
@@ -92,6 +102,7 @@ def records(
     )
 
 
+@functools.cache
 def viewmats(turned: bool = True) -> st.SearchStrategy[np.ndarray]:
     """Draw a rigid world -> camera matrix: the identity, then shifts by eighths, then turns."""
     shift = st.tuples(*[dyadic(-4.0, 4.0)] * 3)
@@ -113,77 +124,106 @@ def rigid(quat: tuple[float, ...], shift: tuple[float, ...]) -> np.ndarray:
     return viewmat
 
 
+COINS = st.booleans()
+
+
+@functools.cache
+def _sides(max_side: int) -> st.SearchStrategy[int]:
+    return st.one_of(st.sampled_from([s for s in (4, 8, 16) if s <= max_side]), st.integers(1, max_side))
+
+
+@functools.cache
+def _focals() -> st.SearchStrategy[float]:
+    return st.one_of(st.sampled_from([8.0, 16.0, 4.0]), reals(4.0, 32.0))
+
+
+@functools.cache
+def _principal_points(size: int) -> st.SearchStrategy[float]:
+    return st.one_of(st.just(size / 2.0), dyadic(0.0, size), dyadic(-4.0, size + 4.0))
+
+
 @st.composite
 def cameras(draw: Any, max_side: int = 8, turned: bool = True, centred: bool = False) -> Camera:
     """Draw a camera: square and plain first; then off-centre principal points, oblong pixels, turns."""
-    side = st.one_of(st.sampled_from([s for s in (4, 8, 16) if s <= max_side]), st.integers(1, max_side))
-    width, height = draw(side), draw(side)
-    fx = draw(st.one_of(st.sampled_from([8.0, 16.0, 4.0]), reals(4.0, 32.0)))
-    fy = draw(st.one_of(st.just(fx), reals(4.0, 32.0)))
+    width, height = draw(_sides(max_side)), draw(_sides(max_side))
+    fx = draw(_focals())
+    fy = draw(_focals()) if draw(COINS) else fx
     cx, cy = width / 2.0, height / 2.0
     if not centred:
-        cx = draw(st.one_of(st.just(cx), dyadic(0.0, width), dyadic(-4.0, width + 4.0)))
-        cy = draw(st.one_of(st.just(cy), dyadic(0.0, height), dyadic(-4.0, height + 4.0)))
+        cx, cy = draw(_principal_points(width)), draw(_principal_points(height))
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     return Camera(draw(viewmats(turned)), K, width, height)
 
 
+@functools.cache
 def backgrounds() -> st.SearchStrategy[tuple[float, ...]]:
     """Draw a background colour, black first."""
     return st.one_of(st.just((0.0, 0.0, 0.0)), st.tuples(*[dyadic(0.0, 1.0)] * 3))
 
 
+@functools.cache
+def _lists(record: st.SearchStrategy[Record], low: int, high: int) -> st.SearchStrategy[list[Record]]:
+    return st.lists(record, min_size=low, max_size=high)
+
+
+@functools.cache
+def _cameras(max_side: int, turned: bool, centred: bool) -> st.SearchStrategy[Camera]:
+    return cameras(max_side, turned, centred)
+
+
+COPIES = st.lists(st.integers(0, 5), max_size=2)
+TILE_SIZES = st.sampled_from([4, 16, 1, 2, 3])
+
+
 @st.composite
 def scenes(
     draw: Any,
-    min_gaussians: int = 0,
     max_gaussians: int = 6,
     max_side: int = 8,
     max_degree: int = 0,
     turned: bool = True,
-    centred: bool = False,
     profile: Profile = PAPER,
-    tile_sizes: tuple[int, ...] = (4, 16, 1, 2, 3),
     opacity: st.SearchStrategy[float] | None = None,
     size: st.SearchStrategy[tuple[float, ...]] | None = None,
-    copies: bool = True,
     anchored: bool = False,
 ) -> Scene:
     """Draw a scene; coincident copies of its Gaussians are frequent, because cloning makes them.
 
     `anchored` puts one plain Gaussian into the middle of the picture, so that no law speaks of an empty image.
     """
-    camera = draw(cameras(max_side, turned, centred or profile.principal_point == "centred"))
+    camera = draw(_cameras(max_side, turned, profile.principal_point == "centred"))
     record = records(camera.width, camera.height, max_degree, opacity, size)
-    chosen = draw(st.lists(record, min_size=min_gaussians, max_size=max_gaussians - anchored))
+    chosen = draw(_lists(record, 0, max_gaussians - anchored))
     if anchored:
         chosen = [
             Record(camera.width * 0.5 + 0.25, camera.height * 0.5 + 0.25, 2.5, opacity=0.5, sh=ANCHOR_SH),
             *chosen,
         ]
-    if chosen and copies:
-        again = draw(st.lists(st.sampled_from(range(len(chosen))), max_size=2))
-        chosen = (chosen + [chosen[i] for i in again])[: max(max_gaussians, 2)]
-    tile_size = None if profile.extent == "square" else draw(st.sampled_from(tile_sizes))
+    if chosen:
+        chosen = (chosen + [chosen[i % len(chosen)] for i in draw(COPIES)])[:max_gaussians]
+    tile_size = None if profile.extent == "square" else draw(TILE_SIZES)
     return Scene(pack(chosen, camera), camera, draw(backgrounds()), profile, tile_size)
 
 
+@functools.cache
 def faint_opacities() -> st.SearchStrategy[float]:
     """Draw opacities so low that six Gaussians never reach the transmittance stop: 0.75^6 > 1e-4."""
     return st.one_of(st.sampled_from([0.5, 0.25, 0.75, 0.125]), st.floats(0.0, 0.75, width=32, allow_subnormal=False))
 
 
+@functools.cache
 def plain_sizes() -> st.SearchStrategy[tuple[float, ...]]:
     """Draw sizes in which no dimension is degenerate: one half to four px."""
     side = reals(0.5, 4.0, dull=1.0)
     return st.one_of(side.map(lambda s: (s, s, s)), st.tuples(side, side, side))
 
 
-@st.composite
-def arrays_of(draw: Any, shape: tuple[int, ...], low: float = -2.0, high: float = 2.0) -> np.ndarray:
+@functools.cache
+def arrays_of(shape: tuple[int, ...], low: float = -2.0, high: float = 2.0) -> st.SearchStrategy[np.ndarray]:
     """Draw an array of dyadic numbers, zero first."""
     count = int(np.prod(shape))
-    return np.array(draw(st.lists(dyadic(low, high), min_size=count, max_size=count)), dtype=np.float64).reshape(shape)
+    numbers = st.lists(dyadic(low, high), min_size=count, max_size=count)
+    return numbers.map(lambda k: np.array(k, dtype=np.float64).reshape(shape))
 
 
 def cotangents(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

@@ -62,7 +62,7 @@ def test_shifting_the_principal_point_translates_the_screen(backend, point, dx, 
     shifted = K + np.array([[0.0, 0.0, dx], [0.0, 0.0, dy], [0.0, 0.0, 0.0]])
     before = project(point, K, W, H)
     size = np.abs(before) + 8.0
-    assert_close("projection.shift", project(point, shifted, W, H), before + [dx, dy], size, backend.dtype)
+    assert_close("projection.shift", project(point, shifted, W, H), before + np.array([dx, dy]), size, backend.dtype)
 
 
 @law("projection", "project_means", "projection_jacobians", point=points, step=arrays_of((1, 3), -1.0, 1.0))
