@@ -113,12 +113,12 @@ def start(folder, *words):
     return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE)
 
 
-def wait_for(condition, process, seconds=60.0):
+def wait_for(condition, process, seconds=300.0):
     end = time.monotonic() + seconds
     while not condition():
         assert process.poll() is None, process.stderr.read().decode()
         assert time.monotonic() < end, "the process does not get on"
-        time.sleep(0.002)
+        time.sleep(0.005)
 
 
 def test_sigkill_at_random_moments_changes_nothing(tmp_path_factory, tmp_path):
@@ -132,7 +132,7 @@ def test_sigkill_at_random_moments_changes_nothing(tmp_path_factory, tmp_path):
             wait_for(lambda have=have: ckpt.list_checkpoints(tmp_path) != have, process)
             time.sleep(rng.uniform(0.0, 0.15))
             process.send_signal(signal.SIGKILL)
-        assert process.wait(120) == (-signal.SIGKILL if kills else 0)
+        assert process.wait(300) == (-signal.SIGKILL if kills else 0)
         process.stderr.close()
     assert_same_run(tmp_path, reference)
     assert not [path for path in tmp_path.rglob("*") if "partial" in path.name]
