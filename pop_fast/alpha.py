@@ -71,7 +71,7 @@ def exponent_coefficients(entries: Entries, dtype: torch.dtype) -> Tensor:
     torch.mul(e.a, -0.5 * _LOG2_E, out=rows[3, :-1])
     torch.mul(e.b, -_LOG2_E, out=rows[4, :-1])
     torch.mul(e.c, -0.5 * _LOG2_E, out=rows[5, :-1])
-    return rows.T.to(dtype).contiguous()
+    return rows.T.to(dtype)
 
 
 def pixel_basis(tile_size: int, dtype: torch.dtype) -> Tensor:

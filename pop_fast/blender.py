@@ -23,6 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -43,6 +44,8 @@ class Chunk:
         index: number of the chunk along the lists.
         rows: which of the group's tiles took part: the first `n` of these, or of all when None.
         n: how many took part.
+        slots: entry numbers, the null entry where a list is padded. [n * CHUNK]
+        entries: their rows of the blender's table. [n, CHUNK, 6 + D + 1]
         slabs: the buffers behind `alpha` and `weight`.
         alpha: 0 for skipped and terminated pairs. [n, CHUNK, P]
         weight: [n, CHUNK, P]
@@ -51,21 +54,37 @@ class Chunk:
     index: int
     rows: Tensor | None
     n: int
+    slots: Tensor
+    entries: Tensor
     slabs: tuple[Tensor, Tensor]
     alpha: Tensor
     weight: Tensor
 
     @classmethod
-    def empty(cls, index: int, rows: Tensor | None, n: int, n_pixels: int, capacity: int, like: Tensor) -> Chunk:
-        """Make a chunk over buffers of the workspace; `capacity` rows keep all chunks of a group the same size."""
-        slabs = tuple(workspace.take(capacity * CHUNK * n_pixels, like.dtype) for _ in range(2))
-        alpha, weight = (slab[: n * CHUNK * n_pixels].view(n, CHUNK, n_pixels) for slab in slabs)
-        return cls(index, rows, n, (slabs[0], slabs[1]), alpha, weight)
+    def of(cls, group: TileGroup, index: int, rows: Tensor | None, n: int, table: Tensor, n_pixels: int) -> Chunk:
+        """Gather a chunk's entries and take buffers for it."""
+        slots = group.slots[:, index * CHUNK : (index + 1) * CHUNK]
+        slots = (slots[:n] if rows is None else slots[rows[:n]]).reshape(n * CHUNK)
+        entries = table.index_select(0, slots).view(n, CHUNK, table.shape[1])
+        numel = n * CHUNK * n_pixels
+        slabs = (workspace.take(numel, table.dtype), workspace.take(numel, table.dtype))
+        alpha, weight = (slab[:numel].view(n, CHUNK, n_pixels) for slab in slabs)
+        return cls(index, rows, n, slots, entries, slabs, alpha, weight)
 
     @property
     def where(self) -> slice | Tensor:
         """Return what selects the chunk's tiles out of the group's."""
         return slice(self.n) if self.rows is None else self.rows[: self.n]
+
+    @property
+    def coefficients(self) -> Tensor:
+        """Return the exponent's coefficients of every entry. [n * CHUNK, 6]"""
+        return self.entries.view(self.n * CHUNK, self.entries.shape[2])[:, :6]
+
+    @property
+    def colors(self) -> Tensor:
+        """Return the colours of every entry and a 1. [n, CHUNK, D + 1]"""
+        return self.entries[:, :, 6:]
 
     def release(self) -> None:
         """Give the buffers back to the workspace."""
@@ -105,15 +124,13 @@ class Blender:
     """The fixed numbers of a blend.
 
     Attributes:
-        coefficients: exponent coefficients of every entry, the null entry last. [I + 1, 6]
-        colors: colours of every entry and a 1, the null entry last. [I + 1, D + 1]
+        table: per entry, the exponent's coefficients, the colours and a 1; the null entry last. [I + 1, 6 + D + 1]
         basis: pixel basis. [6, P]
         profile: constants and strictness.
         clamps: whether any alpha can pass the ceiling.
     """
 
-    coefficients: Tensor
-    colors: Tensor
+    table: Tensor
     basis: Tensor
     profile: Profile
     clamps: bool
@@ -122,7 +139,7 @@ class Blender:
         """Blend a group front to back."""
         n_pixels = self.basis.shape[1]
         n_tiles = len(group.tiles)
-        result = GroupBlend(self.basis.new_zeros((n_tiles, self.colors.shape[1], n_pixels)))
+        result = GroupBlend(self.basis.new_zeros((n_tiles, self.table.shape[1] - 6, n_pixels)))
         if counted:
             result.n_blended = torch.zeros((n_tiles, n_pixels), dtype=torch.int32)
             result.n_passed = torch.zeros((n_tiles, n_pixels), dtype=torch.int32)
@@ -136,7 +153,7 @@ class Blender:
             if n == 0:
                 break
             chunk, passing = self._step(group, index, rows, n, light[:n])
-            image[:n].baddbmm_(self._of_chunk(self.colors, group, chunk).transpose(1, 2), chunk.weight)
+            image[:n].baddbmm_(chunk.colors.transpose(1, 2), chunk.weight)
             if counted:
                 self._count(result, chunk, passing)
             if result.dominance is not None:
@@ -154,10 +171,9 @@ class Blender:
 
     def _step(self, group: TileGroup, index: int, rows: Tensor | None, n: int, light: Tensor) -> tuple[Chunk, Tensor]:
         n_pixels = self.basis.shape[1]
-        chunk = Chunk.empty(index, rows, n, n_pixels, len(group.tiles), self.basis)
+        chunk = Chunk.of(group, index, rows, n, self.table, n_pixels)
         alpha = chunk.alpha
-        coefficients = self._of_chunk(self.coefficients, group, chunk)
-        torch.mm(coefficients.reshape(n * CHUNK, 6), self.basis, out=alpha.view(n * CHUNK, n_pixels))
+        torch.mm(chunk.coefficients, self.basis, out=alpha.view(n * CHUNK, n_pixels))
         alpha.exp2_()
         torch.threshold_(alpha, _below(self.profile.alpha_floor, alpha.dtype), 0.0)
         if self.clamps:
@@ -174,12 +190,6 @@ class Blender:
             torch.ops.aten.threshold_backward.grad_input(alpha, passing[:, 1:], 0.0, grad_input=alpha)
         torch.mul(passing[:, :-1], alpha, out=chunk.weight)
         return chunk, passing
-
-    def _of_chunk(self, table: Tensor, group: TileGroup, chunk: Chunk) -> Tensor:
-        """Gather the table's rows for a chunk's entries. [n, CHUNK, columns]"""
-        slots = group.slots[:, chunk.index * CHUNK : (chunk.index + 1) * CHUNK]
-        slots = slots[: chunk.n] if chunk.rows is None else slots[chunk.rows[: chunk.n]]
-        return table.index_select(0, slots.reshape(-1)).view(chunk.n, CHUNK, table.shape[1])
 
     @staticmethod
     def _count(result: GroupBlend, chunk: Chunk, passing: Tensor) -> None:
@@ -203,70 +213,60 @@ class Blender:
         rows = keep if rows is None else rows[keep]
         return rows, light[keep], result.image[rows]
 
-    def transpose(
-        self, group: TileGroup, blend: GroupBlend, v_image: Tensor, absolute: bool
-    ) -> Iterator[EntryCotangents]:
-        """Pull the cotangent of a group's image ([G, D + 1, P]) back to its entries, chunk by chunk, back to front."""
+    def transpose(self, blend: GroupBlend, v_image: Tensor, absolute: bool) -> Iterator[tuple[Tensor, Tensor]]:
+        """Pull the cotangent of a group's image ([G, D + 1, P]) back to its entries, chunk by chunk, back to front.
+
+        Yields:
+            Entry numbers [n * CHUNK] and their rows [n * CHUNK, 6 + D (+ 2)]: six moments of G, the gradient to the
+            colours and, when asked for, the sums of absolute gradients along x and y.
+        """
         behind = v_image.new_zeros((v_image.shape[0], v_image.shape[2]))
         for chunk in reversed(blend.chunks):
             where = chunk.where
             v = v_image[where]
             light, n_pixels = v.new_empty((chunk.n, CHUNK + 1, v.shape[2])), v.shape[2]
-            q = torch.bmm(self._of_chunk(self.colors, group, chunk), v)
+            q = torch.bmm(chunk.colors, v)
             light[:, CHUNK] = behind[where]
             for k in reversed(range(CHUNK)):
                 torch.lerp(light[:, k + 1], q[:, k], chunk.alpha[:, k], out=light[:, k])
             behind[where] = light[:, 0]
             g = q.sub_(light[:, 1:]).mul_(chunk.weight)
-            v_colors = torch.bmm(v[:, :-1], chunk.weight.transpose(1, 2))
+            n_colors = v.shape[1] - 1
+            rows = g.new_empty((chunk.n, CHUNK, 6 + n_colors + 2 * absolute))
+            rows[:, :, 6 : 6 + n_colors] = torch.bmm(v[:, :-1], chunk.weight.transpose(1, 2)).transpose(1, 2)
             if self.clamps:
-                self._pass_ceiling(group, chunk, g)
-            moments = torch.mm(self.basis, g.view(chunk.n * CHUNK, n_pixels).T)
-            v_abs = self._absolute(group, chunk, g) if absolute else None
+                self._pass_ceiling(chunk, g)
+            flat = rows.view(chunk.n * CHUNK, rows.shape[2])
+            flat[:, :6] = torch.mm(self.basis, g.view(chunk.n * CHUNK, n_pixels).T).T
+            if absolute:
+                flat[:, 6 + n_colors :] = self._absolute(chunk, g).T
             chunk.release()
-            yield EntryCotangents(chunk, moments.view(6, chunk.n, CHUNK), v_colors, v_abs)
+            yield chunk.slots, flat
 
-    def _pass_ceiling(self, group: TileGroup, chunk: Chunk, g: Tensor) -> None:
+    def _pass_ceiling(self, chunk: Chunk, g: Tensor) -> None:
         """Apply the profile's gradient rule to clamped alphas (B3), in place."""
         ceiling = self.profile.alpha_ceiling
         if self.profile.ceiling_gradient == "zero":
             torch.ops.aten.hardtanh_backward.grad_input(g, chunk.alpha, -1.0, ceiling, grad_input=g)
         else:
             # passed through as if unclamped: G carries the clamped alpha, the chain rule wants the raw one
-            raw = torch.exp2(self._of_chunk(self.coefficients, group, chunk).reshape(-1, 6) @ self.basis)
+            raw = torch.exp2(chunk.coefficients @ self.basis)
             g.mul_((raw / ceiling).clamp_min_(1.0).view_as(g))
 
-    def _absolute(self, group: TileGroup, chunk: Chunk, g: Tensor) -> Tensor:
-        """Sum |dL/du| and |dL/dv| over the pixels of each entry. [2, n, CHUNK]"""
-        rows = self._of_chunk(self.coefficients, group, chunk).reshape(-1, 6) / math.log2(math.e)
+    def _absolute(self, chunk: Chunk, g: Tensor) -> Tensor:
+        """Sum |dL/du| and |dL/dv| over the pixels of each entry. [2, n * CHUNK]"""
+        rows = chunk.coefficients / math.log2(math.e)
         zero = torch.zeros_like(rows[:, 0])
         # the derivative of sigma along x and y, again as coefficients of (1, x, y)
         along = (
             torch.stack((rows[:, 1], 2.0 * rows[:, 3], rows[:, 4], zero, zero, zero), 1),
             torch.stack((rows[:, 2], rows[:, 4], 2.0 * rows[:, 5], zero, zero, zero), 1),
         )
-        flat = g.reshape(len(rows), -1)
-        sums = [(flat * (c @ self.basis)).abs_().sum(1) for c in along]
-        return torch.stack(sums).view(2, chunk.n, CHUNK)
+        flat = g.reshape(len(rows), g.shape[2])
+        return torch.stack([(flat * (c @ self.basis)).abs_().sum(1) for c in along])
 
 
-@dataclass(frozen=True)
-class EntryCotangents:
-    """What a chunk of the transpose gives to its entries.
-
-    Attributes:
-        chunk: which entries.
-        moments: six moments of G. [6, n, CHUNK]
-        v_colors: [n, D, CHUNK]
-        v_abs: absolute gradient of the screen centre, when asked for. [2, n, CHUNK]
-    """
-
-    chunk: Chunk
-    moments: Tensor
-    v_colors: Tensor
-    v_abs: Tensor | None
-
-
+@lru_cache
 def _below(value: float, dtype: torch.dtype) -> float:
     """Return the number just under `value` in a type, so that `>` of it means `>= value`."""
     at = torch.tensor(value, dtype=dtype)

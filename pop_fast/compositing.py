@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 from pop_fast.alpha import Entries, entries_of_lists, entry_gradients, exponent_coefficients, pixel_basis
 from pop_fast.blender import Blender, GroupBlend
 from pop_fast.layout import from_columns
-from pop_fast.tile_groups import CHUNK, TileGroup, tile_groups
+from pop_fast.tile_groups import TileGroup, tile_groups
 from pop_fast.tiles import TileLists
 from pop_ref.constants import PAPER, Profile
 
@@ -112,10 +112,8 @@ class _Composite(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         lists, profile, dtype = options.lists, options.profile, means2d.dtype
         entries = entries_of_lists(means2d, conics, opacities, lists)
-        padded = torch.cat((colors, colors.new_ones((len(colors), 1))), 1).index_select(0, lists.ids)
         blender = Blender(
-            exponent_coefficients(entries, dtype),
-            torch.cat((padded, padded.new_zeros((1, padded.shape[1])))),
+            _table(entries, colors, lists.ids),
             pixel_basis(lists.tile_size, dtype),
             profile,
             bool((opacities > profile.alpha_ceiling).any()),
@@ -151,8 +149,18 @@ class _Composite(torch.autograd.Function):
         for i, group in enumerate(saved.groups):
             # what was not kept, or was used up by an earlier backward of the same graph, is blended again
             blend, saved.blends[i] = saved.blends[i] or saved.blender.blend(group), None
-            gradients.add(group, blend, tiles.index_select(0, group.tiles))
+            gradients.add(blend, tiles.index_select(0, group.tiles))
         return (*gradients.of_splats(), None)
+
+
+def _table(entries: Entries, colors: Tensor, ids: Tensor) -> Tensor:
+    """Put what a pair needs of its entry into one row: coefficients, colours, a 1; the null entry's row is last."""
+    coefficients = exponent_coefficients(entries, colors.dtype)
+    table = colors.new_zeros((len(ids) + 1, 6 + colors.shape[1] + 1))
+    table[:, :6] = coefficients
+    table[:-1, 6:-1] = colors[ids]
+    table[:-1, -1] = 1.0
+    return table
 
 
 class _Canvas:
@@ -173,10 +181,8 @@ class _Canvas:
         if self.ids is not None and self.weights is not None:
             assert blend.dominance is not None
             places = blend.dominance.places(blend.chunks)
-            slots = torch.cat((group.slots, group.slots.new_full((len(group.tiles), 1), -1)), 1)
-            entry = slots.gather(1, places.where(places >= 0, slots.shape[1] - 1))
-            ids = torch.cat((self.options.lists.ids, torch.tensor([-1])))
-            self.ids.index_copy_(0, group.tiles, ids[entry])
+            ids = self.options.lists.ids[group.slots.gather(1, places.clamp_min(0))]
+            self.ids.index_copy_(0, group.tiles, ids.masked_fill_(places < 0, -1))
             self.weights.index_copy_(0, group.tiles, blend.dominance.weights)
         if self.blended is not None and self.traversed is not None:
             assert blend.n_blended is not None
@@ -204,7 +210,7 @@ def _tiles_of_cotangents(
 ) -> Tensor:
     """Cut the cotangents of image and alphas into tiles. [tiles, D + 1, P]"""
     lists, size = options.lists, options.lists.tile_size
-    channels = blender.colors.shape[1]
+    channels = blender.table.shape[1] - 6
     whole = blender.basis.new_zeros((lists.tiles_y * size, lists.tiles_x * size, channels))
     if v_image is not None:
         whole[: options.height, : options.width, :-1] = v_image
@@ -219,32 +225,24 @@ class _Gradients:
 
     def __init__(self, saved: _Saved, options: _Options) -> None:
         self.saved, self.options = saved, options
-        self.n_colors = saved.blender.colors.shape[1] - 1
-        n_entries = len(options.lists.ids)
-        dtype = saved.blender.basis.dtype
+        self.n_colors = saved.blender.table.shape[1] - 7
         self.n_absolute = 0 if options.absgrad_sink is None else 2
-        self.rows = torch.zeros((6 + self.n_colors + self.n_absolute, n_entries), dtype=dtype)
+        # one row an entry, and one for the null entry, into which padding falls
+        table = saved.blender.table
+        self.rows = table.new_zeros((len(table), 6 + self.n_colors + self.n_absolute))
 
-    def add(self, group: TileGroup, blend: GroupBlend, v_image: Tensor) -> None:
-        padded = self.rows.new_zeros((len(self.rows), *group.slots.shape))
-        for part in self.saved.blender.transpose(group, blend, v_image, self.n_absolute > 0):
-            at = slice(part.chunk.index * CHUNK, (part.chunk.index + 1) * CHUNK)
-            where = part.chunk.where
-            padded[:6, where, at] = part.moments
-            padded[6 : 6 + self.n_colors, where, at] = part.v_colors.transpose(0, 1)
-            if part.v_abs is not None:
-                padded[6 + self.n_colors :, where, at] = part.v_abs
-        flat = padded.view(len(self.rows), -1)
-        for row, values in zip(self.rows, flat, strict=True):
-            row.index_copy_(0, group.entries, values.index_select(0, group.places))
+    def add(self, blend: GroupBlend, v_image: Tensor) -> None:
+        for entries, rows in self.saved.blender.transpose(blend, v_image, self.n_absolute > 0):
+            self.rows.index_copy_(0, entries, rows)
 
     def of_splats(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Sum over the entries of each splat: gradients to means2d, conics, opacities, colors."""
-        geometry = entry_gradients(self.saved.entries, self.rows[:6])
+        columns = self.rows[:-1].T.contiguous()
+        geometry = entry_gradients(self.saved.entries, columns[:6])
         v_x, v_y, v_a, v_b, v_c, v_o = (self._summed(row) for row in geometry)
-        colors = [self._summed(row) for row in self.rows[6 : 6 + self.n_colors]]
+        colors = [self._summed(row) for row in columns[6 : 6 + self.n_colors]]
         if self.options.absgrad_sink is not None:
-            absolute = [self._summed(row) for row in self.rows[6 + self.n_colors :]]
+            absolute = [self._summed(row) for row in columns[6 + self.n_colors :]]
             self.options.absgrad_sink.add_(from_columns(absolute, (2,)))
         return (
             from_columns((v_x, v_y), (2,)),

@@ -48,17 +48,21 @@ class Dominance:
 
     def places(self, chunks: list[Chunk]) -> Tensor:
         """Return the place in its tile's list of each pixel's dominant entry, -1 where nothing was blended. [G, P]"""
-        places = torch.full(self.weights.shape, -1, dtype=torch.int64)
         n_pixels = self.weights.shape[1]
+        winners = self._chunks.view(-1)
+        order = torch.sort(winners, stable=True).indices
+        ends = torch.bincount(winners + 1, minlength=len(chunks) + 1).cumsum(0).tolist()
+        pixels = order[ends[0] :]
+        eights = self.weights.new_empty((len(pixels), CHUNK))
         of_eight = torch.arange(CHUNK) * n_pixels
-        for chunk in chunks:
-            at = (self._chunks[chunk.where] == chunk.index).view(-1).nonzero().squeeze(1)
+        for chunk, start, end in zip(chunks, ends[:-1], ends[1:], strict=True):
+            at = order[start:end]
             row = torch.div(at, n_pixels, rounding_mode="floor")
-            first = at + row * (n_pixels * (CHUNK - 1))
-            eight = chunk.weight.view(-1).index_select(0, (first[:, None] + of_eight).view(-1)).view(-1, CHUNK)
-            # argmax takes the first of equal weights, which is the front one
-            place = eight.argmax(1) + chunk.index * CHUNK
-            if chunk.rows is not None:
-                at = at + (chunk.rows[row] - row) * n_pixels
-            places.view(-1).index_copy_(0, at, place)
-        return places
+            first = at - row * n_pixels
+            row = row if chunk.rows is None else torch.searchsorted(chunk.rows, row)
+            first += row * (CHUNK * n_pixels)
+            eights[start - ends[0] : end - ends[0]] = chunk.weight.view(-1)[first[:, None] + of_eight]
+        places = torch.full(winners.shape, -1, dtype=torch.int64)
+        # argmax takes the first of equal weights, which is the front one
+        places[pixels] = eights.argmax(1) + winners[pixels] * CHUNK
+        return places.view(self.weights.shape)

@@ -27,16 +27,12 @@ class TileGroup:
         tiles: tile numbers. [G]
         lengths: list length of each tile, descending. [G]
         slots: entry number by tile and place in the list, padded with the null entry. [G, L], L a multiple of CHUNK
-        places: flat places in `slots` of the real entries. [E]
-        entries: their entry numbers. [E]
         reached: for each chunk of the lists, how many tiles' lists reach it.
     """
 
     tiles: Tensor
     lengths: Tensor
     slots: Tensor
-    places: Tensor
-    entries: Tensor
     reached: list[int]
 
 
@@ -55,7 +51,6 @@ def _group(tiles: Tensor, lengths: Tensor, offsets: Tensor, null_entry: int) -> 
     place = torch.arange(n_chunks * CHUNK)
     real = place < lengths[:, None]
     slots = torch.where(real, offsets[tiles][:, None] + place, null_entry)
-    places = real.reshape(-1).nonzero().squeeze(1)
     starts = torch.arange(n_chunks) * CHUNK
     reached = (lengths[:, None] > starts).sum(0).tolist()
-    return TileGroup(tiles, lengths, slots, places, slots.reshape(-1)[places], reached)
+    return TileGroup(tiles, lengths, slots, reached)

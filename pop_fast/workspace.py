@@ -6,7 +6,15 @@ import torch
 from torch import Tensor
 
 RETAINED_BYTES = 1 << 30
-_free: dict[tuple[torch.dtype, int], list[Tensor]] = {}
+
+
+class _Pool:
+    def __init__(self) -> None:
+        self.free: dict[tuple[torch.dtype, int], list[Tensor]] = {}
+        self.retained = 0
+
+
+_pool = _Pool()
 
 
 def take(numel: int, dtype: torch.dtype) -> Tensor:
@@ -15,17 +23,27 @@ def take(numel: int, dtype: torch.dtype) -> Tensor:
     Lengths are powers of two, so that scenes whose sizes change from step to step go on sharing a few kinds of buffers.
     """
     length = 1 << max(numel - 1, 0).bit_length()
-    slabs = _free.get((dtype, length))
-    return slabs.pop() if slabs else torch.empty(length, dtype=dtype)
+    slabs = _pool.free.get((dtype, length))
+    if not slabs:
+        return torch.empty(length, dtype=dtype)
+    _pool.retained -= length * dtype.itemsize
+    return slabs.pop()
 
 
 def give(slab: Tensor) -> None:
     """Return a buffer from `take`; nobody may use it afterwards."""
-    retained = sum(length * dtype.itemsize * len(slabs) for (dtype, length), slabs in _free.items())
-    if retained + slab.numel() * slab.element_size() <= RETAINED_BYTES:
-        _free.setdefault((slab.dtype, slab.numel()), []).append(slab)
+    size = slab.numel() * slab.itemsize
+    if _pool.retained + size <= RETAINED_BYTES:
+        _pool.retained += size
+        _pool.free.setdefault((slab.dtype, slab.numel()), []).append(slab)
+
+
+def retained_bytes() -> int:
+    """Return how much memory waits to be used again."""
+    return _pool.retained
 
 
 def clear() -> None:
     """Free every retained buffer."""
-    _free.clear()
+    _pool.free.clear()
+    _pool.retained = 0

@@ -202,8 +202,9 @@ def test_buffers_are_reused_and_can_be_freed() -> None:
     taken = workspace.take(64, torch.float64)
     workspace.give(taken)
     assert workspace.take(64, torch.float64).data_ptr() == taken.data_ptr()
+    assert workspace.retained_bytes() > 0
     workspace.clear()
-    assert not workspace._free
+    assert workspace.retained_bytes() == 0
 
 
 def test_an_empty_scene_is_the_background() -> None:
