@@ -21,6 +21,8 @@ _ZENITH = np.array([0.17, 0.42, 0.98], np.float32)[:, None]
 _HORIZON = np.array([0.95, 1.08, 1.20], np.float32)[:, None]
 _BOUNCE = np.array([0.16, 0.14, 0.09], np.float32)[:, None]
 _HAZE = 26.0
+# where the ground ends, long after the haze has swallowed it
+_WORLD = 1000.0
 _EXPOSURE = 0.75
 
 
@@ -59,6 +61,7 @@ def first_hits(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> tupl
     start = origin.astype(np.float32)[:, None]
     with np.errstate(divide="ignore"):
         t = np.where(directions[2] < 0.0, -start[2] / directions[2], np.float32(np.inf)).astype(np.float32)
+    t[t > _WORLD] = np.inf
     which = np.full(len(t), -1)
     for index, shape in enumerate(scene.shapes):
         if not _may_meet(shape, origin, directions):
