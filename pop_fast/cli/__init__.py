@@ -44,6 +44,28 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words or os.environ.get("POP_DEBUG", "") not in ("", "0")
     words = [word for word in words if word != "--debug"]
+    try:
+        status = _run(words)
+        sys.stdout.flush()
+        return status
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else 0
+    except KeyboardInterrupt:
+        print("pop: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        # the reader has gone, as in `pop train --help | head`: what is still buffered has nowhere to go
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        line = describe(error)
+        if debug or line is None:
+            raise
+        print(f"pop: error: {line}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+
+
+def _run(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help", "help"):
         print(_overview())
         return 0
@@ -53,23 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     name, rest = _split(words)
     if name is None:
         return _unknown(words)
-    try:
-        module = importlib.import_module(f"pop_fast.cli.{name.replace(' ', '_')}")
-        return module.run(rest)
-    except SystemExit as stop:
-        return stop.code if isinstance(stop.code, int) else 0
-    except KeyboardInterrupt:
-        print("pop: interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    except Exception as error:
-        line = describe(error)
-        if debug or line is None:
-            raise
-        print(f"pop: error: {line}", file=sys.stderr)
-        return EXIT_BAD_INPUT
+    return importlib.import_module(f"pop_fast.cli.{name.replace(' ', '_')}").run(rest)
 
 
 def _split(words: list[str]) -> tuple[str | None, list[str]]:

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final, Literal
 
 import tyro
 
+from pop_fast.cli import EXIT_INTERRUPTED
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.progress import bars
 from pop_fast.cli.splat import CaptureRecord, write_record
@@ -83,11 +84,10 @@ def run(argv: Sequence[str]) -> int:
     try:
         stats = trainer.run()
     except KeyboardInterrupt:
+        write_record(folder, _record(capture, options))
         print(f"pop: stopped after step {trainer.step}; the same command with --resume goes on", file=sys.stderr)
-        return 130
-    finally:
-        if (folder / "cfg.json").is_file():
-            write_record(folder, _record(capture, options))
+        return EXIT_INTERRUPTED
+    write_record(folder, _record(capture, options))
     report = write_report(folder)
     print(summary(stats))
     print(f"report: {report}")

@@ -141,6 +141,7 @@ def test_ctrl_c_says_how_to_go_on_and_exits_with_130(
     monkeypatch.setattr(Trainer, "run", interrupted)
     outcome = pop("train", shared_capture, "--out", tmp_path / "r", *TRAIN)
     assert outcome.status == 130
+    assert (tmp_path / "r" / "capture.json").is_file()
     assert outcome.err.strip() == "pop: stopped after step 0; the same command with --resume goes on"
 
 
@@ -212,6 +213,22 @@ def test_a_fault_of_the_program_keeps_its_traceback(pop: Pop, monkeypatch: pytes
     monkeypatch.setattr("pop_fast.cli.report.write_report", broken)
     with pytest.raises(ZeroDivisionError):
         pop("report", ".")
+
+
+def test_ctrl_c_anywhere_exits_with_130(pop: Pop, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pop_fast.cli.report.write_report", interrupted)
+    outcome = pop("report", ".")
+    assert outcome.status == 130
+    assert outcome.err.strip() == "pop: interrupted"
+
+
+def test_a_reader_that_stops_listening_is_no_error() -> None:
+    command = f"{sys.executable} -c 'import pop_fast.cli as c, sys; sys.exit(c.main([\"--help\"]))' | true"
+    done = subprocess.run(["bash", "-c", f"set -o pipefail; {command}"], capture_output=True, text=True, check=False)
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("how", ["option", "environment"])
