@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,7 +14,6 @@ from hypothesis import strategies as st
 
 from pop_fast.data import CaptureError, load_capture
 from pop_fast.errors import PopError
-from pop_fast.io.images import read_image
 from tests.app.captures import (
     assert_one_line,
     camera,
@@ -200,81 +198,6 @@ def test_a_pose_that_is_no_number_is_named(tmp_path: Path) -> None:
     data = path.read_bytes()
     path.write_bytes(patched(8 + 8 + 32, struct.pack("<d", np.nan))(data))
     assert_one_line(lambda: load_capture(root), "images.bin", ".png", "NaN")
-
-
-# photographs
-
-
-def encoded(extension: str) -> bytes:
-    return cv2.imencode(extension, photograph(3, 64, 48))[1].tobytes()
-
-
-PROGRESSIVE = cv2.imencode(".jpg", photograph(3, 64, 48), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
-WHOLE = {
-    "png": encoded(".png"),
-    "jpg": encoded(".jpg"),
-    "progressive.jpg": PROGRESSIVE,
-    "webp": encoded(".webp"),
-    "bmp": encoded(".bmp"),
-    "tiff": encoded(".tiff"),
-}
-
-
-@pytest.mark.parametrize("name", WHOLE)
-def test_a_whole_photograph_is_read(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_bytes(WHOLE[name])
-    assert read_image(tmp_path / name).shape == (48, 64, 3)
-
-
-@pytest.mark.parametrize("name", WHOLE)
-@given(cut=st.floats(0.0, 1.0, exclude_max=True))
-def test_a_photograph_cut_anywhere_is_named(name: str, cut: float, tmp_path_factory: pytest.TempPathFactory) -> None:
-    path = tmp_path_factory.mktemp("cut") / name
-    path.write_bytes(WHOLE[name][: int(cut * len(WHOLE[name]))])
-    assert_one_line(lambda: read_image(path), str(path))
-
-
-@given(at=st.integers(8, len(WHOLE["png"]) - 1), flip=st.integers(1, 255))
-def test_a_png_with_any_byte_changed_is_named(at: int, flip: int, tmp_path_factory: pytest.TempPathFactory) -> None:
-    data = bytearray(WHOLE["png"])
-    data[at] ^= flip
-    path = tmp_path_factory.mktemp("flip") / "x.png"
-    path.write_bytes(data)
-    assert_one_line(lambda: read_image(path), str(path), "PNG")
-
-
-def test_a_jpeg_overwritten_in_the_middle_is_named(tmp_path: Path) -> None:
-    data = bytearray(WHOLE["jpg"])
-    scan = data.index(b"\xff\xda") + 20
-    data[scan : scan + 40] = b"\xff\x42" * 20
-    (tmp_path / "x.jpg").write_bytes(data)
-    assert_one_line(lambda: read_image(tmp_path / "x.jpg"), "x.jpg", "unexpected marker")
-
-
-@pytest.mark.parametrize("name", ["jpg", "progressive.jpg"])
-def test_what_cameras_append_to_a_jpeg_does_no_harm(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_bytes(WHOLE[name])
-    plain = read_image(tmp_path / name)
-    (tmp_path / name).write_bytes(WHOLE[name] + bytes(100) + WHOLE["jpg"])
-    assert np.array_equal(read_image(tmp_path / name), plain)
-
-
-@pytest.mark.parametrize(
-    ("content", "word"), [(b"", "empty"), (b"no picture at all", "not an image"), (b"\xff\xd8\xff", "truncated")]
-)
-def test_what_is_no_photograph_is_named_by_the_capture_too(tmp_path: Path, content: bytes, word: str) -> None:
-    root = colmap_capture(tmp_path)
-    (root / "images" / "02.png").write_bytes(content)
-    assert_one_line(lambda: load_capture(root), str(root / "images" / "02.png"), word, "copy it again")
-
-
-def test_reading_bad_photographs_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    for name, data in WHOLE.items():
-        (tmp_path / name).write_bytes(data[: len(data) // 2])
-        assert_one_line(lambda path=tmp_path / name: read_image(path))
-    out, err = capfd.readouterr()
-    assert out == ""
-    assert err == ""
 
 
 # transforms.json

@@ -1,8 +1,7 @@
-"""COLMAP captures: models of any kind, photographs paired by name, sizes, masks, transparency."""
+"""COLMAP captures: models of any kind, photographs paired by name, sizes of every kind."""
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import cv2
@@ -194,66 +193,6 @@ def test_rounding_of_shrunk_sizes_is_no_other_shape(tmp_path: Path) -> None:
     for i in range(4):
         write_photograph(root / "images" / f"{i:02d}.png", photograph(i, 618, 410))
     assert np.allclose(raw(root).views[0].K[0, 2], 309.0)
-
-
-def test_exif_orientation_is_ignored_as_colmap_ignores_it(tmp_path: Path) -> None:
-    root = colmap_capture(tmp_path, names=["a.jpg", "b.jpg"])
-    plain = raw(root).views[0].image
-    data = (root / "images" / "a.jpg").read_bytes()
-    rotate = b"Exif\0\0II*\0" + struct.pack("<IHHHIII", 8, 1, 0x0112, 3, 1, 6, 0)
-    (root / "images" / "a.jpg").write_bytes(
-        data[:2] + b"\xff\xe1" + struct.pack(">H", len(rotate) + 2) + rotate + data[2:]
-    )
-    assert cv2.imread(str(root / "images" / "a.jpg")).shape[:2] == (WIDTH, HEIGHT)
-    assert np.array_equal(raw(root).views[0].image, plain)
-
-
-@pytest.mark.parametrize("name", ["01.png", "01.PNG.png", "01.jpg"])
-def test_masks_are_found_under_all_usual_names_and_white_means_keep(tmp_path: Path, name: str) -> None:
-    root = colmap_capture(tmp_path, names=["00.PNG", "01.PNG"])
-    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
-    mask[:, :10] = 255
-    write_photograph(root / "masks" / name, mask)
-    first, second = raw(root).views
-    assert first.mask is None
-    assert second.mask is not None
-    assert second.mask.dtype == bool
-    assert np.array_equal(second.mask, mask > 0)
-    assert raw(root, masks=False).views[1].mask is None
-    small = raw(root, factor=2).views[1].mask
-    assert small is not None
-    assert np.array_equal(small, mask[::2, ::2] > 0)
-
-
-def test_masks_that_fit_no_photograph_or_hide_all_of_it_are_refused(tmp_path: Path) -> None:
-    root = colmap_capture(tmp_path)
-    write_photograph(root / "masks" / "elsewhere.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
-    assert_one_line(lambda: raw(root), "masks", "no mask named as a photograph")
-    write_photograph(root / "masks" / "02.png", np.zeros((HEIGHT, WIDTH), np.uint8))
-    assert_one_line(lambda: raw(root), "02.png", "hides the whole photograph", "white means keep")
-    write_photograph(root / "masks" / "02.png", np.full((WIDTH, HEIGHT), 255, np.uint8))
-    assert_one_line(lambda: raw(root), "02.png", "the mask is 30x40", "40x30")
-
-
-def test_transparency_is_composited_over_the_background_and_is_no_mask(tmp_path: Path) -> None:
-    root = colmap_capture(tmp_path)
-    rgba = photograph(5, channels=4)
-    write_photograph(root / "images" / "00.png", rgba)
-    alpha = rgba[:, :, 3:] / 255.0
-    for background in ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.2, 0.5, 0.9)):
-        view = raw(root, background=background).views[0]
-        want = alpha * rgba[:, :, :3] + (1.0 - alpha) * 255.0 * np.array(background)
-        assert view.mask is None
-        assert np.abs(view.image - want).max() <= 0.5 + 1e-3
-
-
-def test_gray_and_sixteen_bit_photographs_become_eight_bit_rgb(tmp_path: Path) -> None:
-    root = colmap_capture(tmp_path)
-    gray = photograph(5)[:, :, 0]
-    write_photograph(root / "images" / "00.png", gray)
-    write_photograph(root / "images" / "01.png", gray.astype(np.uint16) * 257)
-    for view in raw(root).views[:2]:
-        assert np.array_equal(view.image, np.repeat(gray[:, :, None], 3, axis=2))
 
 
 def test_every_eighth_file_by_name_is_held_out_beginning_with_the_first(tmp_path: Path) -> None:
