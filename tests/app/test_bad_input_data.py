@@ -293,12 +293,3 @@ def test_damaged_points_beside_transforms_json_are_named(tmp_path: Path, content
     root = transforms_capture(tmp_path)
     (root / "sparse_pc.ply").write_bytes(content)
     assert_one_line(lambda: load_capture(root), "sparse_pc.ply", "truncated or corrupt")
-
-
-def test_points_without_a_coordinate_or_with_nan_are_named(tmp_path: Path) -> None:
-    root = transforms_capture(tmp_path)
-    header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n"
-    (root / "sparse_pc.ply").write_text(header + "end_header\n1 2\n3 4\n")
-    assert_one_line(lambda: load_capture(root), "sparse_pc.ply", "'z'")
-    (root / "sparse_pc.ply").write_text(header + "property float z\nend_header\n1 2 3\n3 nan 4\n")
-    assert_one_line(lambda: load_capture(root), "sparse_pc.ply", "vertex[1].y is nan")
