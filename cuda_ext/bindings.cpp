@@ -2,44 +2,14 @@
 //
 // Pointers cross as integers (tensor.data_ptr()); ops.py checks device, type, shape and contiguity before it takes one.
 
-#include <nanobind/nanobind.h>
-#include <nanobind/stl/string.h>
+#include "bindings.h"
 
 #include "csrc/cuda_check.h"
-#include "csrc/train.h"
-
-namespace nb = nanobind;
-using namespace pop;
 
 namespace {
 
-cudaStream_t as_stream(uintptr_t stream) { return reinterpret_cast<cudaStream_t>(stream); }
-
-DeviceState* as_state(uintptr_t state) { return reinterpret_cast<DeviceState*>(state); }
-
-// a pointer as a property that reads and writes integers
-template <class Struct, class Pointer>
-void pointer(nb::class_<Struct>& type, const char* name, Pointer Struct::* member) {
-    type.def_prop_rw(
-        name, [member](const Struct& s) { return reinterpret_cast<uintptr_t>(s.*member); },
-        [member](Struct& s, uintptr_t value) { s.*member = reinterpret_cast<Pointer>(value); });
-}
-
-// one of the two buffers of a sort
-template <class Struct, class Pointer>
-void pointer_pair(nb::class_<Struct>& type, const char* first, const char* second, Pointer (Struct::*member)[2]) {
-    const char* names[2] = {first, second};
-    for (int k = 0; k < 2; ++k)
-        type.def_prop_rw(
-            names[k], [member, k](const Struct& s) { return reinterpret_cast<uintptr_t>((s.*member)[k]); },
-            [member, k](Struct& s, uintptr_t value) { (s.*member)[k] = reinterpret_cast<Pointer>(value); });
-}
-
-#define POINTER(type, Struct, name) pointer(type, #name, &Struct::name)
-#define VALUE(type, Struct, name) type.def_rw(#name, &Struct::name)
-
 void bind_view(nb::module_& m) {
-    nb::class_<Profile<float>> profile(m, "Profile");
+    nb::class_<Profile<float>> profile(m, "Profile", nb::dynamic_attr());
     profile.def(nb::init<>());
     VALUE(profile, Profile<float>, near_plane);
     VALUE(profile, Profile<float>, far_plane);
@@ -57,14 +27,14 @@ void bind_view(nb::module_& m) {
     VALUE(profile, Profile<float>, pass_ceiling);
     VALUE(profile, Profile<float>, stop_inclusive);
 
-    nb::class_<ViewArrays> view(m, "View");
+    nb::class_<ViewArrays> view(m, "View", nb::dynamic_attr());
     view.def(nb::init<>());
     POINTER(view, ViewArrays, viewmat);
     POINTER(view, ViewArrays, K);
     VALUE(view, ViewArrays, width);
     VALUE(view, ViewArrays, height);
 
-    nb::class_<ProjectSettings> settings(m, "ProjectSettings");
+    nb::class_<ProjectSettings> settings(m, "ProjectSettings", nb::dynamic_attr());
     settings.def(nb::init<>());
     VALUE(settings, ProjectSettings, profile);
     VALUE(settings, ProjectSettings, sh_degree);
@@ -77,7 +47,7 @@ void bind_view(nb::module_& m) {
 }
 
 void bind_rows(nb::module_& m) {
-    nb::class_<GaussianArrays> gaussians(m, "Gaussians");
+    nb::class_<GaussianArrays> gaussians(m, "Gaussians", nb::dynamic_attr());
     gaussians.def(nb::init<>());
     VALUE(gaussians, GaussianArrays, n);
     POINTER(gaussians, GaussianArrays, means);
@@ -90,7 +60,7 @@ void bind_rows(nb::module_& m) {
     VALUE(gaussians, GaussianArrays, sh_rest_stride);
     VALUE(gaussians, GaussianArrays, raw);
 
-    nb::class_<SplatArrays> splats(m, "Splats");
+    nb::class_<SplatArrays> splats(m, "Splats", nb::dynamic_attr());
     splats.def(nb::init<>());
     POINTER(splats, SplatArrays, means2d);
     POINTER(splats, SplatArrays, depths);
@@ -99,7 +69,7 @@ void bind_rows(nb::module_& m) {
     POINTER(splats, SplatArrays, colors);
     POINTER(splats, SplatArrays, radii);
 
-    nb::class_<SplatGradients> of_splats(m, "SplatGradients");
+    nb::class_<SplatGradients> of_splats(m, "SplatGradients", nb::dynamic_attr());
     of_splats.def(nb::init<>());
     POINTER(of_splats, SplatGradients, v_means2d);
     POINTER(of_splats, SplatGradients, v_means2d_abs);
@@ -107,7 +77,7 @@ void bind_rows(nb::module_& m) {
     POINTER(of_splats, SplatGradients, v_opacities);
     POINTER(of_splats, SplatGradients, v_colors);
 
-    nb::class_<GaussianGradients> of_gaussians(m, "GaussianGradients");
+    nb::class_<GaussianGradients> of_gaussians(m, "GaussianGradients", nb::dynamic_attr());
     of_gaussians.def(nb::init<>());
     POINTER(of_gaussians, GaussianGradients, v_means);
     POINTER(of_gaussians, GaussianGradients, v_quats);
@@ -119,7 +89,7 @@ void bind_rows(nb::module_& m) {
 }
 
 void bind_blend(nb::module_& m) {
-    nb::class_<TileLists> lists(m, "TileLists");
+    nb::class_<TileLists> lists(m, "TileLists", nb::dynamic_attr());
     lists.def(nb::init<>());
     VALUE(lists, TileLists, n);
     VALUE(lists, TileLists, capacity);
@@ -146,7 +116,7 @@ void bind_blend(nb::module_& m) {
     POINTER(lists, TileLists, workspace);
     VALUE(lists, TileLists, workspace_bytes);
 
-    nb::class_<BlendForward> forward(m, "BlendForward");
+    nb::class_<BlendForward> forward(m, "BlendForward", nb::dynamic_attr());
     forward.def(nb::init<>());
     VALUE(forward, BlendForward, channels);
     POINTER(forward, BlendForward, records);
@@ -161,7 +131,7 @@ void bind_blend(nb::module_& m) {
     POINTER(forward, BlendForward, n_traversed);
     POINTER(forward, BlendForward, dominant_counts);
 
-    nb::class_<BlendBackward> backward(m, "BlendBackward");
+    nb::class_<BlendBackward> backward(m, "BlendBackward", nb::dynamic_attr());
     backward.def(nb::init<>());
     VALUE(backward, BlendBackward, channels);
     VALUE(backward, BlendBackward, absolute);
@@ -179,63 +149,6 @@ void bind_blend(nb::module_& m) {
     POINTER(backward, BlendBackward, v_T_final);
     POINTER(backward, BlendBackward, rows);
     POINTER(backward, BlendBackward, sums);
-}
-
-void bind_training(nb::module_& m) {
-    nb::class_<LossSettings> settings(m, "LossSettings");
-    settings.def(nb::init<>());
-    settings.def("set_pixelwise", [](LossSettings& s, bool l1) { s.pixelwise = l1 ? Pixelwise::l1 : Pixelwise::l2; });
-    VALUE(settings, LossSettings, pixelwise_weight);
-    VALUE(settings, LossSettings, ssim_weight);
-    VALUE(settings, LossSettings, margin);
-
-    nb::class_<Photographs> photographs(m, "Photographs");
-    photographs.def(nb::init<>());
-    POINTER(photographs, Photographs, images);
-    POINTER(photographs, Photographs, masks);
-    POINTER(photographs, Photographs, shares);
-    POINTER(photographs, Photographs, moments);
-
-    nb::class_<LossArrays> loss(m, "LossArrays");
-    loss.def(nb::init<>());
-    POINTER(loss, LossArrays, image);
-    POINTER(loss, LossArrays, windows);
-    POINTER(loss, LossArrays, partials);
-    POINTER(loss, LossArrays, values);
-    POINTER(loss, LossArrays, v_image);
-    VALUE(loss, LossArrays, width);
-    VALUE(loss, LossArrays, height);
-
-    nb::class_<Schedule> schedule(m, "Schedule");
-    schedule.def(nb::init<>());
-    POINTER(schedule, Schedule, views);
-    POINTER(schedule, Schedule, viewmats);
-    POINTER(schedule, Schedule, Ks);
-    POINTER(schedule, Schedule, viewmat);
-    POINTER(schedule, Schedule, K);
-    VALUE(schedule, Schedule, means_decay);
-    VALUE(schedule, Schedule, max_steps);
-    VALUE(schedule, Schedule, beta1);
-    VALUE(schedule, Schedule, beta2);
-    VALUE(schedule, Schedule, eps);
-    schedule.def("set_lr", [](Schedule& s, int group, double lr) { s.lr[group] = lr; });
-
-    nb::class_<UpdateArrays> update(m, "UpdateArrays");
-    update.def(nb::init<>());
-    VALUE(update, UpdateArrays, n);
-    VALUE(update, UpdateArrays, n_rest);
-    VALUE(update, UpdateArrays, lambda_pop);
-    VALUE(update, UpdateArrays, blur_pixels);
-    POINTER(update, UpdateArrays, constants);
-    POINTER(update, UpdateArrays, sums);
-    POINTER(update, UpdateArrays, dominant_counts);
-    POINTER(update, UpdateArrays, grad_sum);
-    POINTER(update, UpdateArrays, n_visible);
-    POINTER(update, UpdateArrays, dominant_sum);
-    POINTER(update, UpdateArrays, blurred);
-    update.def("set_group", [](UpdateArrays& s, int group, uintptr_t param, uintptr_t m, uintptr_t v) {
-        s.groups[group] = {reinterpret_cast<float*>(param), reinterpret_cast<float*>(m), reinterpret_cast<float*>(v)};
-    });
 }
 
 void bind_functions(nb::module_& m) {

@@ -27,7 +27,9 @@ class BuildError(RuntimeError):
     """Something that the build needs is missing, or a compiler failed; the message says what to do."""
 
 
-def build(arch: str | list[str] | None = None, jobs: int = 2, folder: Path | None = None, verbose: bool = False) -> Path:
+def build(
+    arch: str | list[str] | None = None, jobs: int = 2, folder: Path | None = None, verbose: bool = False
+) -> Path:
     """Compile the kernels and put the module beside this file.
 
     Args:

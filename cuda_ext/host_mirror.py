@@ -27,7 +27,11 @@ def find_compiler() -> str | None:
 
 def mirror_sources() -> list[Path]:
     """List every file that the mirror is made of."""
-    return [HERE / "host_mirror.cpp", *sorted((HERE / "csrc").glob("*.cuh")), *sorted((HERE / "csrc").glob("mirror*.h"))]
+    return [
+        HERE / "host_mirror.cpp",
+        *sorted((HERE / "csrc").glob("*.cuh")),
+        *sorted((HERE / "csrc").glob("mirror*.h")),
+    ]
 
 
 def build_mirror(folder: Path) -> Path:

@@ -1,0 +1,152 @@
+"""Tensors to the kernels' pointers: checks, allocation with words when it fails, the profile, the device's state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from cuda_ext import load
+from pop_ref.constants import Profile
+
+NOT_BAD = 2**31 - 1
+# places in DeviceState (csrc/launch.h)
+OVERFLOW, N_INSTANCES, N_BUCKETS, N_IMPORTANT, BAD_ROW, STEP, VIEW = range(7)
+
+_NUMBERS = (
+    "near_plane",
+    "far_plane",
+    "eps2d",
+    "frustum_margin",
+    "extent_sigmas",
+    "alpha_floor",
+    "alpha_ceiling",
+    "transmittance_stop",
+)
+
+
+class CudaMemoryError(RuntimeError):
+    """The GPU has no room; the message says how much was asked for and what to lower."""
+
+
+def pointer(name: str, tensor: Tensor | None, dtype: torch.dtype = torch.float32) -> int:
+    """Return a tensor's address, 0 for None.
+
+    Raises:
+        ValueError: it is not a contiguous CUDA tensor of that type.
+    """
+    if tensor is None:
+        return 0
+    if tensor.device.type != "cuda":
+        raise ValueError(f"{name} is on {tensor.device}; backend 'cuda' needs it on the GPU: use {name}.cuda()")
+    if tensor.dtype != dtype:
+        raise ValueError(f"{name} has dtype {tensor.dtype}; backend 'cuda' needs {dtype}")
+    if not tensor.is_contiguous():
+        raise ValueError(f"{name} is not contiguous; use {name}.contiguous()")
+    return tensor.data_ptr()
+
+
+def fill(struct: Any, **fields: Any) -> Any:
+    """Set a struct's fields, tensors by address and numbers as they are, and return it.
+
+    The struct keeps the tensors: an address is no use when its memory has been handed to somebody else.
+    """
+    kept = struct.__dict__.setdefault("kept", {})
+    for name, value in fields.items():
+        if isinstance(value, Tensor):
+            kept[name] = value
+            setattr(struct, name, pointer(name, value, value.dtype))
+        else:
+            setattr(struct, name, 0 if value is None else value)
+    return struct
+
+
+def empty(
+    what: str, lower: str, shape: tuple[int, ...], device: torch.device, dtype: torch.dtype = torch.float32
+) -> Tensor:
+    """Allocate, or say what was asked for and what to lower.
+
+    Raises:
+        CudaMemoryError: the GPU has no room.
+    """
+    try:
+        return torch.empty(shape, dtype=dtype, device=device)
+    except torch.cuda.OutOfMemoryError as error:
+        asked = dtype.itemsize
+        for size in shape:
+            asked *= size
+        free, total = torch.cuda.mem_get_info(device)
+        raise CudaMemoryError(
+            f"the GPU has no room for {what}: {asked / 2**20:.0f} MiB asked for, {free / 2**20:.0f} of "
+            f"{total / 2**20:.0f} MiB free; lower {lower}"
+        ) from error
+
+
+def stream_of(device: torch.device) -> int:
+    """Return the address of torch's current stream, on which every kernel runs."""
+    return torch.cuda.current_stream(device).cuda_stream
+
+
+def new_state(device: torch.device) -> Tensor:
+    """Make a device state: nothing overflowed, no bad row, step 0."""
+    state = torch.zeros(load().STATE_INTS, dtype=torch.int32, device=device)
+    state[BAD_ROW] = NOT_BAD
+    return state
+
+
+def kernel_profile(profile: Profile, tile_size: int) -> Any:
+    """Return the kernels' form of a profile."""
+    made = load().Profile()
+    for name in _NUMBERS:
+        setattr(made, name, getattr(profile, name))
+    made.tile_size = tile_size
+    made.near_inclusive = profile.near_inclusive
+    made.centred = profile.principal_point == "centred"
+    made.inria_clamp = profile.clamp_gradient == "inria"
+    made.square = profile.extent == "square"
+    made.pass_ceiling = profile.ceiling_gradient == "pass"
+    made.stop_inclusive = profile.stop_inclusive
+    return made
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a render depends on besides tensors.
+
+    Attributes:
+        width, height: px.
+        profile: constants.
+        tile_size: px, the caller's.
+        sh_degree: bands, None for given colours.
+        antialiased: scale opacities by the low-pass compensation.
+        radius_clip: px.
+        absgrad: also sum |v_means2d|.
+        family: "columns" or "splats", which kernel goes back.
+        deterministic: sum gradients through slots; False adds atomically and saves 48 bytes an instance.
+    """
+
+    width: int
+    height: int
+    profile: Profile
+    tile_size: int
+    sh_degree: int | None = None
+    antialiased: bool = False
+    radius_clip: float = 0.0
+    absgrad: bool = False
+    family: str = "columns"
+    deterministic: bool = True
+
+    def kernel_profile(self) -> Any:
+        """Return the kernels' form of the profile."""
+        return kernel_profile(self.profile, self.tile_size)
+
+    def project_settings(self) -> Any:
+        """Return what the projection kernels take."""
+        made = load().ProjectSettings()
+        made.profile = self.kernel_profile()
+        made.sh_degree = self.sh_degree or 0
+        made.antialiased = self.antialiased
+        made.radius_clip = self.radius_clip
+        return made

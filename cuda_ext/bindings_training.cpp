@@ -1,0 +1,60 @@
+// Python's side of csrc/train.h: the classes of the fused training step.
+
+#include "bindings.h"
+
+void bind_training(nb::module_& m) {
+    nb::class_<LossSettings> settings(m, "LossSettings", nb::dynamic_attr());
+    settings.def(nb::init<>());
+    settings.def("set_pixelwise", [](LossSettings& s, bool l1) { s.pixelwise = l1 ? Pixelwise::l1 : Pixelwise::l2; });
+    VALUE(settings, LossSettings, pixelwise_weight);
+    VALUE(settings, LossSettings, ssim_weight);
+    VALUE(settings, LossSettings, margin);
+
+    nb::class_<Photographs> photographs(m, "Photographs", nb::dynamic_attr());
+    photographs.def(nb::init<>());
+    POINTER(photographs, Photographs, images);
+    POINTER(photographs, Photographs, masks);
+    POINTER(photographs, Photographs, shares);
+    POINTER(photographs, Photographs, moments);
+
+    nb::class_<LossArrays> loss(m, "LossArrays", nb::dynamic_attr());
+    loss.def(nb::init<>());
+    POINTER(loss, LossArrays, image);
+    POINTER(loss, LossArrays, windows);
+    POINTER(loss, LossArrays, partials);
+    POINTER(loss, LossArrays, values);
+    POINTER(loss, LossArrays, v_image);
+    VALUE(loss, LossArrays, width);
+    VALUE(loss, LossArrays, height);
+
+    nb::class_<Schedule> schedule(m, "Schedule", nb::dynamic_attr());
+    schedule.def(nb::init<>());
+    POINTER(schedule, Schedule, views);
+    POINTER(schedule, Schedule, viewmats);
+    POINTER(schedule, Schedule, Ks);
+    POINTER(schedule, Schedule, viewmat);
+    POINTER(schedule, Schedule, K);
+    VALUE(schedule, Schedule, means_decay);
+    VALUE(schedule, Schedule, max_steps);
+    VALUE(schedule, Schedule, beta1);
+    VALUE(schedule, Schedule, beta2);
+    VALUE(schedule, Schedule, eps);
+    schedule.def("set_lr", [](Schedule& s, int group, double lr) { s.lr[group] = lr; });
+
+    nb::class_<UpdateArrays> update(m, "UpdateArrays", nb::dynamic_attr());
+    update.def(nb::init<>());
+    VALUE(update, UpdateArrays, n);
+    VALUE(update, UpdateArrays, n_rest);
+    VALUE(update, UpdateArrays, lambda_pop);
+    VALUE(update, UpdateArrays, blur_pixels);
+    POINTER(update, UpdateArrays, constants);
+    POINTER(update, UpdateArrays, sums);
+    POINTER(update, UpdateArrays, dominant_counts);
+    POINTER(update, UpdateArrays, grad_sum);
+    POINTER(update, UpdateArrays, n_visible);
+    POINTER(update, UpdateArrays, dominant_sum);
+    POINTER(update, UpdateArrays, blurred);
+    update.def("set_group", [](UpdateArrays& s, int group, uintptr_t param, uintptr_t m, uintptr_t v) {
+        s.groups[group] = {reinterpret_cast<float*>(param), reinterpret_cast<float*>(m), reinterpret_cast<float*>(v)};
+    });
+}

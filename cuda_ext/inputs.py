@@ -1,0 +1,111 @@
+"""Checks at the door of the CUDA `rasterization`: shapes, types, places and arguments, before a launch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pop_ref.constants import GSPLAT_1_5, Profile, profile_named
+
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+
+
+def resolved_profile(profile: str | Profile, near_plane: float, far_plane: float, eps2d: float) -> Profile:
+    """Return the profile with the caller's planes and low-pass where they differ from gsplat's defaults."""
+    chosen = profile_named(profile) if isinstance(profile, str) else profile
+    given = {"near_plane": near_plane, "far_plane": far_plane, "eps2d": eps2d}
+    return replace(chosen, **{name: value for name, value in given.items() if value != getattr(GSPLAT_1_5, name)})
+
+
+def check_only(arguments: Mapping[str, tuple[Any, Any, str]]) -> None:
+    """Raise for an argument that is not at the one value supported: name -> (value, supported, why).
+
+    Raises:
+        NotImplementedError: names the argument.
+    """
+    for name, (value, supported, why) in arguments.items():
+        if value is not supported and value != supported:
+            raise NotImplementedError(f"{name}={value!r} is not supported by backend 'cuda': {why}")
+
+
+def check_tensor(name: str, tensor: Tensor | None, shape: tuple[int | None, ...]) -> Tensor:
+    """Return a float32 CUDA tensor of that shape, None standing for any size.
+
+    Raises:
+        ValueError: names the tensor and what to do.
+    """
+    if tensor is None:
+        raise ValueError(f"{name} is missing")
+    if tensor.device.type != "cuda":
+        raise ValueError(f"{name} is on {tensor.device}; backend 'cuda' needs it on the GPU: use {name}.cuda()")
+    if tensor.dtype != torch.float32:
+        raise ValueError(f"{name} has dtype {tensor.dtype}; backend 'cuda' computes in float32: use {name}.float()")
+    fits = tensor.dim() == len(shape) and all(w is None or w == g for w, g in zip(shape, tensor.shape, strict=True))
+    if not fits:
+        want = "[" + ", ".join("any" if size is None else str(size) for size in shape) + "]"
+        raise ValueError(f"{name} has shape {list(tensor.shape)}; it must be {want}")
+    return tensor
+
+
+def check_scene(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    opacities: Tensor,
+    colors: Tensor,
+    sh_degree: int | None,
+    n_cameras: int,
+) -> bool:
+    """Check one scene's tensors and tell whether colours are given per camera.
+
+    Raises:
+        ValueError: names the tensor.
+        NotImplementedError: more than one scene.
+    """
+    if means.dim() > 2:
+        raise NotImplementedError("batch dimensions are not supported by backend 'cuda': call it once a scene")
+    n = check_tensor("means", means, (None, 3)).shape[0]
+    check_tensor("quats", quats, (n, 4))
+    check_tensor("scales", scales, (n, 3))
+    check_tensor("opacities", opacities, (n,))
+    if sh_degree is None:
+        per_camera = colors.dim() == 3
+        check_tensor("colors", colors, (n_cameras, n, None) if per_camera else (n, None))
+        return per_camera
+    if sh_degree not in (0, 1, 2, 3):
+        raise ValueError(f"sh_degree is {sh_degree}; it must be None, 0, 1, 2 or 3")
+    per_camera = colors.dim() == 4
+    check_tensor("colors", colors, (n_cameras, n, None, 3) if per_camera else (n, None, 3))
+    if colors.shape[-2] < (sh_degree + 1) ** 2:
+        raise ValueError(
+            f"colors has {colors.shape[-2]} coefficients; sh_degree={sh_degree} needs {(sh_degree + 1) ** 2}"
+        )
+    return per_camera
+
+
+def check_values(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> None:
+    """Check values; three small reductions on the GPU and one synchronisation.
+
+    Raises:
+        ValueError: names the tensor and the index.
+    """
+    rules = (
+        ("means", means, ~torch.isfinite(means), "must be finite"),
+        (
+            "quats",
+            quats,
+            ~(quats.abs().sum(1) > 0.0) | ~torch.isfinite(quats).all(1),
+            "must be finite, with a norm > 0",
+        ),
+        ("scales", scales, ~(scales >= 0.0) | torch.isinf(scales), "must be >= 0 and finite; not logarithms"),
+        ("opacities", opacities, ~((opacities >= 0.0) & (opacities <= 1.0)), "must be in [0, 1]"),
+    )
+    found = torch.stack([bad.any() for _, _, bad, _ in rules]).tolist() if len(means) else [False]
+    for wrong, (name, tensor, bad, rule) in zip(found, rules, strict=False):
+        if wrong:
+            index = bad.nonzero()[0].tolist()
+            raise ValueError(f"{name}{index} is {tensor.detach()[tuple(index)].tolist()}; it {rule}")
