@@ -67,8 +67,21 @@ def _load_ref() -> Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]:
     return rasterization
 
 
+def _load_cuda() -> Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]:
+    from cuda_ext.ops import rasterization
+
+    return rasterization
+
+
+def _why_not_cuda() -> str | None:
+    from cuda_ext import why_not
+
+    return why_not()
+
+
 _BACKENDS: dict[str, Backend] = {
     "fast": _Registered("fast", _load_fast, lambda: None),
+    "cuda": _Registered("cuda", _load_cuda, _why_not_cuda),
     "ref": _Registered("ref", _load_ref, lambda: None),
 }
 

@@ -277,6 +277,16 @@ def test_the_oracle_and_the_fast_path_are_both_backends() -> None:
         torch.testing.assert_close(fast, ref, rtol=1e-10, atol=1e-10)
 
 
+def test_a_backend_that_cannot_run_says_why_in_one_sentence() -> None:
+    cuda = get_backend("cuda")
+    if cuda.available():
+        pytest.skip("backend cuda runs here, so there is nothing to say")
+    reason = cuda.why_not()
+    assert reason is not None
+    with pytest.raises(PopError, match=re.escape(reason)):
+        cuda.rasterization(**scene(), **cameras())
+
+
 def test_an_unknown_backend_is_an_error_that_lists_the_known() -> None:
     with pytest.raises(PopError, match="fast"):
         get_backend("metal")
