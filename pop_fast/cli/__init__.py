@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import os
+import re
 import sys
 from collections.abc import Sequence
 from typing import Final
@@ -25,6 +26,7 @@ COMMANDS: Final = {
     "sfm": "find the cameras of a folder of photographs (pycolmap)",
     "demo": "write the built-in demo capture, made from a seed",
     "data check": "look a capture over before training: sizes, pairing, masks, memory",
+    "build-cuda": "compile the CUDA extension (needs nvcc)",
     "doctor": "say what is installed, what is missing and how to get it",
 }
 
@@ -75,7 +77,7 @@ def _run(words: list[str]) -> int:
     name, rest = _split(words)
     if name is None:
         return _unknown(words)
-    return importlib.import_module(f"pop_fast.cli.{name.replace(' ', '_')}").run(rest)
+    return importlib.import_module(f"pop_fast.cli.{re.sub('[ -]', '_', name)}").run(rest)
 
 
 def _split(words: list[str]) -> tuple[str | None, list[str]]:

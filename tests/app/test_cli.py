@@ -206,6 +206,21 @@ def test_sfm_says_how_well_it_went(pop: Pop, tmp_path: Path, monkeypatch: pytest
     assert "7 of 8 photographs placed, 1,234 points, mean reprojection error 0.75 px" in outcome.out
 
 
+def test_building_cuda_says_what_is_missing_first_and_the_compiler_s_words_apart(
+    pop: Pop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from cuda_ext.build import BuildError
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise BuildError("compiling the CUDA extension failed; nvcc said:\nerror: expected a ;")
+
+    monkeypatch.setattr("pop_fast.cli.build_cuda.build", fail)
+    outcome = pop("build-cuda")
+    assert outcome.status == 2
+    assert outcome.err.strip() == "pop: error: compiling the CUDA extension failed; nvcc said:"
+    assert outcome.out == "error: expected a ;\n"
+
+
 def test_a_fault_of_the_program_keeps_its_traceback(pop: Pop, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(_: object) -> None:
         raise ZeroDivisionError("a bug")

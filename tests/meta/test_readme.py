@@ -104,7 +104,7 @@ def shell_lines() -> list[str]:
 def test_every_command_of_the_readme_is_understood(line: str, capsys: pytest.CaptureFixture[str]) -> None:
     words = shlex.split(line)[1:]
     name = " ".join(words[:2]) if " ".join(words[:2]) in COMMANDS else words[0]
-    module = importlib.import_module(f"pop_fast.cli.{name.replace(' ', '_')}")
+    module = importlib.import_module(f"pop_fast.cli.{re.sub('[ -]', '_', name)}")
     rest = words[len(name.split()) :]
     if name == "train":
         module.arguments(rest)
