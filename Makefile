@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 TORCH := $(shell sed -n 's/^\(torch==.*\)/\1/p' constraints.txt)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench cuda docs-check clean
+.PHONY: help setup demo test lint bench cuda gpu-check docs-check clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
@@ -36,8 +36,12 @@ lint: setup  ## ruff (rules and format) and pyright
 bench: setup  ## check the fast path against the oracle, then time it
 	$(BIN)/python benchmarks/run.py
 
-cuda: setup  ## compile the CUDA extension (needs nvcc)
-	$(BIN)/pop build-cuda
+cuda: setup  ## compile the CUDA extension (needs nvcc; no GPU)
+	$(BIN)/python -m pip install --quiet 'nanobind>=2.4' 'cmake>=3.24' ninja
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python -m cuda_ext.build
+
+gpu-check: cuda  ## build, hold the CUDA backend to every law, time it; one JSON file (needs a GPU)
+	$(BIN)/python -m cuda_ext.gpu_check $(or $(OUT),benchmarks/results/gpu_check.json)
 
 docs-check: setup  ## fail when a table, name, path or command in README.md is no longer true
 	$(BIN)/python -m pytest -q tests/meta/test_readme.py

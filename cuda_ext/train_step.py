@@ -23,7 +23,8 @@ from cuda_ext.resident import ResidentViews
 from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings
 
 GROWTH = 1.5
-LATE = 2
+FIRST_GUESS = (8, 1024)  # instances a Gaussian, and at least
+LATE = 2  # steps between an overflow and its notice
 
 
 @dataclass
@@ -68,6 +69,7 @@ class FusedTrainer:
         self._constants = torch.zeros(load().STEP_CONSTANTS_FLOATS, device=self.device)
         self.values = torch.zeros(3, device=self.device)
         self._capacity = 0
+        self.grown = 0
         self.rebind(params, m, v)
 
     def rebind(self, params: Mapping[str, Tensor], m: Mapping[str, Tensor], v: Mapping[str, Tensor]) -> None:
@@ -122,6 +124,7 @@ class FusedTrainer:
         told = self.state.tolist()
         if told[BAD_ROW] != NOT_BAD:
             raise ValueError(f"step {told[STEP]}: Gaussian {told[BAD_ROW]} projects to a value that is not finite")
+        self.grown += 1
         self._capacity = int(max(told[OVERFLOW], told[N_INSTANCES]) * GROWTH)
         self.state[OVERFLOW] = 0
         self._frames.clear()
@@ -146,8 +149,9 @@ class FusedTrainer:
         if size in self._frames:
             return self._frames[size]
         kernels, (width, height), device = load(), size, self.device
-        # a first guess; the flag corrects it
-        self._capacity = max(self._capacity, 8 * self.n, 1024)
+        # a guess that the flag corrects
+        per_gaussian, least = FIRST_GUESS
+        self._capacity = max(self._capacity, per_gaussian * self.n, least)
         buckets = self.settings.family == "splats"
         lists = TileBuffers(self.n, width, height, WARP_TILE, True, device, buckets)
         lists.reserve(self._capacity)

@@ -1,0 +1,63 @@
+"""What needs a GPU: the laws on the CUDA backend, bits, ten training steps. Skipped, with the reason, without."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import pytest
+
+pytest.register_assert_rewrite("pop_ref.conformance.laws")
+
+import cuda_ext  # noqa: E402  asserts must be rewritten first
+from pop_ref.conformance.plugin import parametrize_backends  # noqa: E402
+
+TOLD = ("means2d", "radii", "depths", "conics", "opacities", "final_T")
+DOMINANCE = ("dominant_ids", "dominant_weights", "dominant_counts")
+COUNTS = ("n_contrib", "n_traversed")
+
+
+def rasterizer(family: str, deterministic: bool = True) -> Any:
+    """Return the CUDA rasterization with one backward family; visits are counted where the tile allows it."""
+    from cuda_ext.ops import rasterization
+
+    def draw(*args: Any, profile: Any = "paper", dominance: bool = False, **options: Any) -> Any:
+        image, alphas, meta = rasterization(
+            *args, profile=profile, dominance=dominance, family=family, deterministic=deterministic, **options
+        )
+        counted = COUNTS if options.get("tile_size", 16) % 16 == 0 else ()
+        return image, alphas, {key: meta[key] for key in (*TOLD, *DOMINANCE, *counted)}
+
+    return draw
+
+
+@functools.cache
+def gpu_backends() -> list[Any]:
+    from pop_ref.conformance.torch_adapter import TorchAdapter
+
+    return [
+        TorchAdapter("cuda32-columns", rasterizer("columns"), None, "float32", device="cuda"),
+        TorchAdapter("cuda32-splats", rasterizer("splats"), None, "float32", device="cuda"),
+        TorchAdapter("cuda32-atomics", rasterizer("columns", deterministic=False), None, "float32", device="cuda"),
+    ]
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "backend" not in metafunc.fixturenames:
+        return
+    reason = cuda_ext.why_not()
+    if reason is None:
+        parametrize_backends(metafunc, gpu_backends())
+    else:
+        metafunc.parametrize("backend", [pytest.param(None, id="cuda", marks=[pytest.mark.skip(reason=reason)])])
+
+
+@pytest.fixture
+def gpu() -> Any:
+    """Return the device, or skip with the reason why there is none."""
+    import torch
+
+    reason = cuda_ext.why_not()
+    if reason is not None:
+        pytest.skip(reason)
+    return torch.device("cuda")

@@ -1,0 +1,142 @@
+"""Ten steps of training on the GPU beside the same ten on the CPU, and the same bits twice."""
+
+from __future__ import annotations
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from .scene import HEIGHT, LR, STEPS, WIDTH, TrainingScene, training_scene  # noqa: E402  torch first
+
+
+def _fused(scene: TrainingScene, device, **options):
+    from cuda_ext.resident import ResidentViews
+    from cuda_ext.train_settings import Phase, StepSettings
+    from cuda_ext.train_step import FusedTrainer
+
+    params = {name: value.to(device).clone() for name, value in scene.params.items()}
+    m, v = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))
+    views = ResidentViews(scene.photographs, scene.viewmats, scene.Ks, None, "valid", device)
+    settings = StepSettings(LR, STEPS, means_decay=1.0, **options)
+    trainer = FusedTrainer(params, m, v, views, scene.order, settings)
+    losses = []
+    for step in range(STEPS):
+        trainer.run(step + 1, Phase(3, True, True))
+        losses.append(float(trainer.values[2]))
+    return losses, params, trainer
+
+
+def _on_the_cpu(scene: TrainingScene):
+    from pop_fast.losses import photometric_pop
+    from pop_fast.polarization import importance_mask, pop_loss
+    from pop_fast.rasterization import rasterization
+
+    params = {name: value.clone().requires_grad_() for name, value in scene.params.items()}
+    optimizer = torch.optim.Adam([{"params": [params[name]], "lr": LR[name]} for name in params], eps=1e-15)
+    losses = []
+    for step in range(STEPS):
+        view = scene.order[step]
+        opacities = torch.sigmoid(params["opacities"])
+        image, _, meta = rasterization(
+            params["means"], params["quats"], params["scales"].exp(), opacities,
+            torch.cat((params["sh0"], params["shN"]), 1), scene.viewmats[view][None], scene.Ks[view][None],
+            WIDTH, HEIGHT, sh_degree=3, packed=False, dominance=True,
+        )  # fmt: skip
+        loss = photometric_pop(image[0], scene.photographs[view].float() / 255.0)
+        losses.append(float(loss))
+        (loss + 0.001 * pop_loss(opacities, importance_mask(meta["dominant_counts"][0]))).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    return losses, {name: value.detach() for name, value in params.items()}
+
+
+@pytest.mark.parametrize("family", ["columns", "splats"])
+def test_ten_fused_steps_are_the_cpus_ten_steps(gpu, family):
+    scene = training_scene()
+    losses, params, _ = _fused(scene, gpu, family=family)
+    expected, wanted = _on_the_cpu(scene)
+    assert expected[-1] < expected[0]
+    torch.testing.assert_close(torch.tensor(losses), torch.tensor(expected), rtol=1e-4, atol=1e-6)
+    for name, value in wanted.items():
+        # where a gradient is rounding, Adam turns its sign into a whole step; compare what nearly all rows do
+        apart = (params[name].cpu() - value).abs() > 0.1 * LR[name] * STEPS
+        assert apart.float().mean() < 0.01, name
+
+
+def test_two_runs_give_the_same_bits(gpu):
+    first, second = (_fused(training_scene(), gpu)[1] for _ in range(2))
+    for name, value in first.items():
+        assert torch.equal(value, second[name]), name
+
+
+def test_buffers_that_overflow_grow_and_nothing_is_lost(gpu):
+    expected = _fused(training_scene(), gpu)[1]
+    _, small, cramped = _fused_from_one_instance(training_scene(), gpu)
+    assert cramped.grown > 0
+    for name, value in expected.items():
+        assert torch.equal(value, small[name]), name
+
+
+def _fused_from_one_instance(scene, device):
+    from cuda_ext import train_step
+
+    per_gaussian, least = train_step.FIRST_GUESS
+    train_step.FIRST_GUESS = (0, 1)
+    try:
+        return _fused(scene, device)
+    finally:
+        train_step.FIRST_GUESS = (per_gaussian, least)
+
+
+def test_rasterization_and_its_gradients_give_the_same_bits_twice(gpu):
+    from cuda_ext.ops import rasterization
+
+    scene = training_scene()
+    grads = []
+    for _ in range(2):
+        leaves = {name: value.to(gpu).requires_grad_() for name, value in scene.params.items()}
+        image, _, _ = rasterization(
+            leaves["means"], leaves["quats"], leaves["scales"].exp(), torch.sigmoid(leaves["opacities"]),
+            torch.cat((leaves["sh0"], leaves["shN"]), 1), scene.viewmats.to(gpu), scene.Ks.to(gpu),
+            WIDTH, HEIGHT, sh_degree=3,
+        )  # fmt: skip
+        (image * torch.linspace(-1, 1, image.numel(), device=gpu).reshape(image.shape)).sum().backward()
+        grads.append({name: leaf.grad for name, leaf in leaves.items()})
+    for name, value in grads[0].items():
+        assert bool(value.any()), f"{name} has no gradient"
+        assert torch.equal(value, grads[1][name]), name
+
+
+@pytest.mark.parametrize("mode", ["D", "ED", "RGB+D", "RGB+ED"])
+@pytest.mark.parametrize("packed", [False, True])
+def test_every_render_mode_is_the_cpus(gpu, mode, packed):
+    from cuda_ext.ops import rasterization as on_gpu
+    from pop_fast.rasterization import rasterization as on_cpu
+
+    scene = training_scene()
+
+    def draw(function, device):
+        p = {name: value.to(device) for name, value in scene.params.items()}
+        return function(
+            p["means"], p["quats"], p["scales"].exp(), torch.sigmoid(p["opacities"]), p["sh0"],
+            scene.viewmats.to(device), scene.Ks.to(device), WIDTH, HEIGHT, sh_degree=0, render_mode=mode, packed=packed,
+        )  # fmt: skip
+
+    found, expected = draw(on_gpu, gpu), draw(on_cpu, "cpu")
+    for k in (0, 1):
+        torch.testing.assert_close(found[k].cpu(), expected[k], rtol=1e-4, atol=1e-5)
+    for key in ("flatten_ids", "isect_offsets", "tiles_per_gauss"):
+        assert torch.equal(found[2][key].cpu(), expected[2][key]), key
+
+
+def test_a_row_that_is_not_finite_is_named(gpu):
+    from cuda_ext.ops import rasterization
+
+    scene = training_scene()
+    p = {name: value.to(gpu) for name, value in scene.params.items()}
+    p["means"][7, 1] = float("nan")
+    with pytest.raises(ValueError, match=r"means\[7, 1\] is nan"):
+        rasterization(
+            p["means"], p["quats"], p["scales"].exp(), torch.sigmoid(p["opacities"]), p["sh0"],
+            scene.viewmats.to(gpu), scene.Ks.to(gpu), WIDTH, HEIGHT, sh_degree=0,
+        )  # fmt: skip
