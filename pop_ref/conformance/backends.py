@@ -50,10 +50,11 @@ def adapter_for(
     device: str = "cpu",
     profile: Profile = PAPER,
 ) -> Any:
-    """Return an adapter for a torch function with gsplat's signature, given as `module:function`."""
+    """Return an adapter for a torch function with gsplat's signature, given as `module:function`, and for a package of
+    stage functions."""
     try:
         from pop_ref.conformance.torch_adapter import TorchAdapter
 
-        return TorchAdapter(name, function_named(path), package, dtype, device, profile)
+        return TorchAdapter(name, function_named(path) if path else None, package, dtype, device, profile)
     except ModuleNotFoundError as error:
         raise Unavailable(f"{name} needs {error.name}, which is not installed") from error

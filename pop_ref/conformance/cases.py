@@ -14,7 +14,7 @@ from pop_ref.constants import PROFILES
 
 W, H = 8, 4
 K = np.array([[8.0, 0.0, 3.0], [0.0, 16.0, 2.5], [0.0, 0.0, 1.0]])
-N = 3
+N = 2
 
 Inputs = st.SearchStrategy[tuple[Any, ...]]
 

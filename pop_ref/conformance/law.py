@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from hypothesis import given
+from hypothesis.errors import HypothesisException
 
 STAGES = (
     "activations",
@@ -28,6 +30,16 @@ STAGES = (
 )
 RENDER, GRADIENTS, DOMINANCE = "render", "gradients", "dominance"
 PROFILES, DOUBLE, ROWWISE = "any profile", "double precision", "rows computed one by one"
+
+
+def _tell(name: str, backend: Any, drawn: dict[str, Any]) -> str:
+    from pop_ref.conformance.telling import tell
+
+    return tell(name, backend, drawn)
+
+
+# what a failing law is told by: functions of its name, the backend and the drawn values
+TELL: list[Callable[[str, Any, dict[str, Any]], str]] = [_tell]
 
 
 @dataclass(frozen=True)
@@ -59,19 +71,38 @@ def law(stage: str, *needs: str, **strategies: Any) -> Callable[[Callable[..., N
         raise ValueError(f"stage {stage!r} is unknown; use one of {', '.join(STAGES)}")
 
     def decorate(sentence: Callable[..., None]) -> Callable[..., None]:
-        test = given(**strategies)(sentence) if strategies else _plain(sentence)
+        told = _telling(sentence)
+        test = given(**strategies)(told) if strategies else told
         test.law = Law(stage, needs, sentence, strategies)  # type: ignore[attr-defined]
         return test
 
     return decorate
 
 
-def _plain(sentence: Callable[..., None]) -> Callable[..., None]:
-    def test(backend: Any) -> None:
-        sentence(backend)
+def _telling(sentence: Callable[..., None]) -> Callable[..., None]:
+    """Return the sentence, adding to what it raises where the backend parts from the oracle and code to paste."""
 
-    test.__name__, test.__doc__, test.__module__ = sentence.__name__, sentence.__doc__, sentence.__module__
-    return test
+    @functools.wraps(sentence)
+    def told(backend: Any, **drawn: Any) -> None:
+        try:
+            sentence(backend, **drawn)
+        except HypothesisException:
+            # a scene that is set aside, or a misuse of a strategy: nothing about the backend
+            raise
+        except Exception as error:
+            for tell in TELL:
+                error.add_note(_safely(tell, sentence.__name__, backend, drawn))
+            raise
+
+    return told
+
+
+def _safely(tell: Callable[..., str], *about: Any) -> str:
+    try:
+        return tell(*about)
+    except Exception as error:
+        # a broken backend may fail in the report as well; the law's own failure is what must be seen
+        return f"no report: {error!r}"
 
 
 def missing(backend: Any, needs: tuple[str, ...]) -> list[str]:

@@ -1,22 +1,152 @@
-"""The pytest plugin: hands every law every backend, and writes down what it saw."""
+"""The pytest plugin: hands every law every backend, and writes down what it saw.
+
+    pytest --pyargs pop_ref.conformance --rasterizer my.module:rasterization --profile gsplat_1_6
+
+Nothing of the kit is imported before an option or a law asks for it: a session that judges nothing pays nothing.
+"""
 
 from __future__ import annotations
 
+import json
+import os
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pop_ref.conformance.law import Law, missing
+LAWS = "pop_ref.conformance.laws"
 
 
-def parametrize_backends(metafunc: Any, backends: list[Any]) -> None:
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the kit's options."""
+    group = parser.getgroup("pop conformance", "judge a rasterizer by the oracle (pop_ref.conformance)")
+    group.addoption("--rasterizer", metavar="MODULE:FUNCTION", help="a function with gsplat's rasterization signature")
+    group.addoption("--stages", metavar="PACKAGE", help="a package whose stage modules carry the oracle's names")
+    group.addoption("--dtype", default="float32", choices=["float32", "float64"], help="precision of --rasterizer")
+    group.addoption("--device", default="cpu", help="torch device of --rasterizer")
+    group.addoption("--profile", default="paper", help="constants that --rasterizer implements, default paper")
+    group.addoption("--backend", action="append", default=[], help="judge an adapter that comes with the kit, by name")
+    group.addoption("--stage", action="append", default=[], help="only the laws of this stage; may be repeated")
+    group.addoption("--scorecard", metavar="FILE", help="write a summary by stage, as .json or .html")
+    group.addoption("--failures", metavar="DIR", help="save the scene of every broken law there, as npz")
+    group.addoption("--record-worst", metavar="FILE", help="write the units that each tolerance needed, as JSON")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Rewrite the laws' asserts, choose the number of examples, and start what the options ask for."""
+    pytest.register_assert_rewrite(LAWS)
+    if config.getoption("--rasterizer") or config.getoption("--backend") or config.getoption("--stages"):
+        from pop_ref.conformance.examples import load_profile
+
+        load_profile(os.environ.get("HYPOTHESIS_PROFILE", "dev"))
+    if config.getoption("--scorecard"):
+        config.pluginmanager.register(_Recorder(config), "pop-conformance-scorecard")
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Give the kit's own laws the backends that the options name, or the oracle."""
+    if metafunc.module.__name__.startswith(LAWS):
+        parametrize_backends(metafunc, _chosen_backends(metafunc.config))
+
+
+def parametrize_backends(metafunc: pytest.Metafunc, backends: list[Any]) -> None:
     """Run a test that takes `backend` once for each; a law whose needs a backend lacks is skipped by name."""
+    from pop_ref.conformance.law import missing
+
     if "backend" not in metafunc.fixturenames:
         return
-    stated: Law | None = getattr(metafunc.function, "law", None)
+    stated = getattr(metafunc.function, "law", None)
     cases = []
     for backend in backends:
         lacks = missing(backend, stated.needs) if stated else []
         marks = [pytest.mark.skip(reason=f"{backend.name} has no {', '.join(lacks)}")] if lacks else []
         cases.append(pytest.param(backend, id=backend.name, marks=marks))
     metafunc.parametrize("backend", cases)
+
+
+def _chosen_backends(config: pytest.Config) -> list[Any]:
+    cached = getattr(config, "_pop_backends", None)
+    if cached is None:
+        cached = config._pop_backends = _make_backends(config)  # type: ignore[attr-defined]
+    return cached
+
+
+def _make_backends(config: pytest.Config) -> list[Any]:
+    from pop_ref.conformance.backends import Unavailable, adapter_for, shipped
+    from pop_ref.constants import profile_named
+
+    try:
+        chosen = [shipped(name) for name in config.getoption("--backend")]
+        path, package = config.getoption("--rasterizer"), config.getoption("--stages")
+        if path or package:
+            profile = profile_named(config.getoption("--profile"))
+            name = path or package
+            chosen.append(
+                adapter_for(path, name, package, config.getoption("--dtype"), config.getoption("--device"), profile)
+            )
+    except (Unavailable, ValueError) as error:
+        raise pytest.UsageError(str(error)) from error
+    return chosen or [shipped("oracle")]
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Keep the laws of the stages asked for, and label every law for the scorecard."""
+    stages = config.getoption("--stage")
+    kept, dropped = [], []
+    for item in items:
+        stated = getattr(getattr(item, "function", None), "law", None)
+        if stated is not None:
+            backend = item.callspec.params["backend"].name  # type: ignore[attr-defined]
+            item.user_properties.append(("law", (backend, stated.stage, stated.name)))
+        (dropped if stages and (stated is None or stated.stage not in stages) else kept).append(item)
+    if dropped:
+        config.hook.pytest_deselected(items=dropped)
+        items[:] = kept
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Have the scenes of failing laws saved."""
+    folder = session.config.getoption("--failures")
+    if folder:
+        from pop_ref.conformance.law import TELL
+        from pop_ref.conformance.telling import failure_saver
+
+        TELL.append(failure_saver(Path(folder)))
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Write what the tolerances needed."""
+    path = session.config.getoption("--record-worst")
+    if path:
+        from pop_ref.conformance.tolerances import measured
+
+        needed = {f"{key} {dtype}": units for (key, dtype), units in sorted(measured().items())}
+        Path(path).write_text(json.dumps(needed, indent=1) + "\n", encoding="utf-8")
+
+
+class _Recorder:
+    """Collects outcomes and writes the scorecard at the end."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        from pop_ref.conformance.scorecard import Scorecard
+
+        self.path = Path(config.getoption("--scorecard"))
+        judged = config.getoption("--rasterizer") or ", ".join(config.getoption("--backend")) or "the oracle"
+        self.card = Scorecard(f"{judged} under profile {config.getoption('--profile')}")
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        from pop_ref.conformance.scorecard import Entry
+
+        named = dict(report.user_properties).get("law")
+        if named is None or not (report.when == "call" or report.skipped or report.failed):
+            return
+        detail = ""
+        if report.skipped and isinstance(report.longrepr, tuple):
+            detail = str(report.longrepr[2]).removeprefix("Skipped: ")
+        elif report.failed:
+            crash = getattr(report.longrepr, "reprcrash", None)
+            detail = str(crash.message if crash else report.longrepr).splitlines()[0]
+        self.card.entries.append(Entry(*named, report.outcome, detail, report.duration))
+
+    def pytest_sessionfinish(self) -> None:
+        self.card.write(self.path)

@@ -43,7 +43,9 @@ def opacities() -> st.SearchStrategy[float]:
     """Draw an opacity: dull, at the ends, around 1/255 and the ceilings, or any."""
     return st.one_of(
         st.sampled_from([0.5, 1.0, 0.25, 0.75, 0.0, 0.125]),
-        st.sampled_from([FLOOR, 0.001086, 1.0 / 512.0, 0.005, 0.0040, 0.0039, 0.99, 0.999, 0.9995, 1.0 - 2.0**-20]),
+        st.sampled_from(
+            [FLOOR, 0.001086, 1.0 / 512.0, 0.005, 0.0040, 0.0039, 0.99, 0.995, 0.999, 0.9995, 1.0 - 2.0**-20]
+        ),
         st.floats(0.0, 1.0, width=32, allow_subnormal=False),
     )
 

@@ -178,6 +178,16 @@ def test_a_pixel_ends_before_the_splat_that_would_pass_the_stop(backend, alphas,
             assert_same_bits("traversed", view.n_traversed[1, 1], traversed)
 
 
+@law("compositing", "stops", name=st.sampled_from(sorted(ALL_PROFILES)))
+def test_the_stop_itself_ends_a_pixel_where_the_profile_includes_it(backend, name):
+    # D7
+    profile = ALL_PROFILES[name]
+    stops, at = backend.stage("stops"), profile.transmittance_stop
+    assert stops(at, profile) == profile.stop_inclusive
+    assert stops(0.5 * at, profile)
+    assert not stops(2.0 * at, profile)
+
+
 @law("compositing", RENDER, camera=cameras(turned=False, centred=True), near=opacities(), far=opacities())
 def test_the_nearer_splat_hides_the_farther_whatever_their_order_in_memory(backend, camera, near, far):
     x, y = camera.width // 2 + 0.5, camera.height // 2 + 0.5

@@ -29,7 +29,7 @@ def test_adam_follows_the_scalar_recurrence(backend, gradients):
     assert_close("optimizer.adam", found, [x, m, v], np.array([1.0, 2.0, 4.0]) * len(gradients), backend.dtype)
 
 
-@law("optimizer", "adam_step", gradients=gradients, power=st.integers(-8, 8))
+@law("optimizer", "adam_step", gradients=gradients, power=st.integers(0, 8))
 def test_adam_forgets_the_scale_of_the_loss(backend, gradients, power):
     scaled = _walk(backend, [g * 2.0**power for g in gradients])
     assert_close("optimizer.scale", scaled[0], _walk(backend, gradients)[0], 4.0 * len(gradients), backend.dtype)

@@ -1,0 +1,22 @@
+"""How many examples a law is tried on: the Hypothesis profiles dev, ci and thorough, registered in one place."""
+
+from __future__ import annotations
+
+from hypothesis import HealthCheck, settings
+
+EXAMPLES = {"dev": 25, "ci": 50, "thorough": 500}
+
+
+def load_profile(name: str) -> None:
+    """Register the profiles and choose one; `ci` draws the same examples every time."""
+    checks = [HealthCheck.too_slow, HealthCheck.data_too_large]
+    for each, count in EXAMPLES.items():
+        settings.register_profile(
+            each,
+            max_examples=count,
+            deadline=None,
+            suppress_health_check=checks,
+            derandomize=each == "ci",
+            print_blob=each == "ci",
+        )
+    settings.load_profile(name)

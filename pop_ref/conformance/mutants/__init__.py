@@ -1,0 +1,10 @@
+"""Broken rasterizers, one line each, built from bugs that really happened; every one is killed by a named law."""
+
+from pop_ref.conformance.mutants.copies import Mutant, living
+from pop_ref.conformance.mutants.geometry import GEOMETRY
+from pop_ref.conformance.mutants.pixels import PIXELS
+from pop_ref.conformance.mutants.training import TRAINING
+
+MUTANTS = (*GEOMETRY, *PIXELS, *TRAINING)
+
+__all__ = ["MUTANTS", "Mutant", "living"]

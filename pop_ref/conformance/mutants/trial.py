@@ -1,0 +1,101 @@
+"""Mutants on trial: does a law kill a mutant, and which laws kill which."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Callable
+from typing import Any
+
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis.errors import HypothesisException
+
+from pop_ref.conformance import laws
+from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.examples import EXAMPLES
+from pop_ref.conformance.law import TELL, Law, missing
+from pop_ref.conformance.mutants.copies import Mutant, living
+
+
+def law_named(path: str) -> Law:
+    """Return the law written as `test_alpha:a_negative_exponent_is_skipped`."""
+    module_name, _, name = path.partition(":")
+    module = importlib.import_module(f"{laws.__name__}.{module_name}")
+    return getattr(module, f"test_{name}").law
+
+
+def every_law() -> dict[str, Law]:
+    """Return all laws by path, in the order of the modules' names."""
+    found = {}
+    for each in sorted(m.name for m in pkgutil.iter_modules(laws.__path__)):
+        module = importlib.import_module(f"{laws.__name__}.{each}")
+        for value in vars(module).values():
+            stated = getattr(value, "law", None)
+            if isinstance(stated, Law):
+                found[f"{each}:{stated.name}"] = stated
+    return found
+
+
+def obeys(stated: Law, backend: Any, examples: int = EXAMPLES["ci"]) -> str | None:
+    """Try a law on a backend with the examples of the ci profile; return None, or the first line of what breaks it."""
+    tellers, TELL[:] = TELL[:], []
+    try:
+        _tried(stated, examples)(backend)
+    except HypothesisException:
+        raise
+    except Exception as error:
+        return f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+    finally:
+        TELL[:] = tellers
+    return None
+
+
+def _tried(stated: Law, examples: int) -> Callable[[Any], None]:
+    if not stated.strategies:
+        return stated.sentence
+    # one counterexample is enough, the shortest is not needed
+    chosen = settings(
+        max_examples=examples,
+        derandomize=True,
+        database=None,
+        deadline=None,
+        phases=(Phase.generate,),
+        report_multiple_bugs=False,
+        suppress_health_check=list(HealthCheck),
+    )
+
+    def run(backend: Any) -> None:
+        chosen(given(**stated.strategies)(_bound(stated, backend)))()
+
+    return run
+
+
+def _bound(stated: Law, backend: Any) -> Callable[..., None]:
+    names = ", ".join(stated.strategies)
+    # given() reads argument names, so the bound sentence needs them spelled out
+    scope: dict[str, Any] = {"sentence": stated.sentence, "backend": backend}
+    source = f"lambda {names}: sentence(backend, {', '.join(f'{n}={n}' for n in stated.strategies)})"
+    function: Callable[..., None] = eval(source, scope)
+    function.__name__ = stated.sentence.__name__
+    return function
+
+
+def killed_by(mutant: Mutant) -> str | None:
+    """Return how the mutant's named law breaks on it, None if the mutant survives."""
+    with living(mutant) as backend:
+        return obeys(law_named(mutant.law), backend)
+
+
+def killers(mutant: Mutant, examples: int = EXAMPLES["ci"]) -> list[str]:
+    """Return the paths of every law that breaks on a mutant."""
+    found = []
+    with living(mutant) as backend:
+        for path, stated in every_law().items():
+            if not missing(backend, stated.needs) and obeys(stated, backend, examples) is not None:
+                found.append(path)
+    return found
+
+
+def sound(path: str) -> str | None:
+    """Return how a law breaks on the oracle itself, None if it holds, as it must."""
+    return obeys(law_named(path), OracleAdapter())
