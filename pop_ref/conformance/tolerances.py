@@ -36,7 +36,7 @@ TABLE: Final[dict[str, Tolerance]] = {
     "activations.norm": Tolerance(units=6, worst=1.5),
     "activations.opacities": Tolerance(units=4, worst=1),
     "activations.scales": Tolerance(units=1.5, worst=0.26),
-    "adjoint": Tolerance(units=150000, worst=26000),
+    "adjoint": Tolerance(units=0.002, worst=0.00044),
     "agreement.T_final": Tolerance(units=8, worst=2),
     "agreement.camera_center": Tolerance(units=1, worst=0.2),
     "agreement.colors_from_sh": Tolerance(units=1.5, worst=0.37),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from hypothesis import assume
 from hypothesis import strategies as st
@@ -15,7 +17,7 @@ from pop_ref.conformance.law import DOMINANCE, DOUBLE, GRADIENTS, PROFILES, REND
 from pop_ref.conformance.outcomes import assert_one_of_the_oracles_outcomes
 from pop_ref.conformance.strategies import cotangents, plain_sizes, scenes
 from pop_ref.conformance.verdicts import assert_same_image, assert_same_light, charged
-from pop_ref.constants import GSPLAT_1_6, INRIA
+from pop_ref.constants import GSPLAT_1_6, INRIA, Profile
 
 ORACLE = OracleAdapter()
 
@@ -59,6 +61,7 @@ def _adjoint(case):
     name = f"{case.name}_vjp"
 
     def sentence(backend, inputs, direction):
+        inputs = tuple(_with_true_gradient(value) for value in inputs)
         function = backend.stage(case.name)
         here = np.asarray(function(*inputs), dtype=np.float64)
         v = cotangent_like(here)
@@ -75,6 +78,11 @@ def _adjoint(case):
 
     sentence.__name__ = f"test_{name}_is_the_transpose"
     return law(case.stage, case.name, name, DOUBLE, inputs=case.inputs, direction=st.integers(0, 2**16))(sentence)
+
+
+def _with_true_gradient(value):
+    # inria's clamp is differentiated wrongly on purpose (B1); the same clamp has a true transpose too
+    return dataclasses.replace(value, clamp_gradient="exact") if isinstance(value, Profile) else value
 
 
 def _kept_inside(case, step, value):
