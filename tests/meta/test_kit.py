@@ -1,0 +1,171 @@
+"""The checks checked: scenes survive pasting and storing, strategies cover what they promise, reports say enough."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+
+from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.golden import golden_scene
+from pop_ref.conformance.mutants import MUTANTS, living
+from pop_ref.conformance.scene_files import load_scene, save_scene
+from pop_ref.conformance.scenes import Scene, rounded_to, scene_as_code
+from pop_ref.conformance.scorecard import Entry, Scorecard
+from pop_ref.conformance.strategies import FLOOR, cotangents, scenes
+from pop_ref.conformance.telling import tell
+from pop_ref.conformance.tolerances import TABLE
+from pop_ref.constants import INRIA
+
+ROOT = Path(__file__).resolve().parents[2]
+SEEN = settings(max_examples=200, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
+
+
+def _same(one: Scene, other: Scene) -> bool:
+    return repr(one) == repr(other)
+
+
+@given(scene=scenes(max_degree=2))
+def test_a_printed_scene_can_be_pasted(scene: Scene) -> None:
+    scope: dict[str, object] = {}
+    exec(scene_as_code(scene.but(profile=INRIA, background=[0.25, 0.5, 1.0])), scope)
+    pasted = scope["scene"]
+    assert isinstance(pasted, Scene)
+    assert _same(pasted, scene.but(profile=INRIA, background=[0.25, 0.5, 1.0]))
+
+
+def test_a_stored_scene_is_the_same_scene(tmp_path: Path) -> None:
+    scene = golden_scene().but(tile_size=4, antialiased=True)
+    save_scene(tmp_path / "deep" / "scene.npz", scene)
+    assert _same(load_scene(tmp_path / "deep" / "scene.npz"), scene)
+
+
+def test_the_strategies_reach_what_they_promise() -> None:
+    drawn: list[Scene] = []
+
+    @SEEN
+    @given(scene=scenes(max_side=16, max_degree=3))
+    def collect(scene: Scene) -> None:
+        drawn.append(scene)
+
+    collect()
+    opacities = np.concatenate([s.gaussians.opacities for s in drawn])
+    assert np.any((opacities > 0.0) & (opacities < FLOOR)), "no opacity under 1/255"
+    assert np.any(opacities == FLOOR), "no opacity at 1/255"
+    assert np.any(opacities == 1.0), "no opacity at 1"
+    assert np.any(opacities == 0.0), "no opacity at 0"
+    assert any(len(s.gaussians) == 0 for s in drawn), "no empty scene"
+    assert any(s.camera.width == s.camera.height == 16 for s in drawn)
+    assert max(max(s.camera.width, s.camera.height) for s in drawn) == 16
+    assert any(np.any(s.camera.viewmat[:3, :3] != np.eye(3)) for s in drawn), "no turned camera"
+    assert any(s.camera.K[0, 2] != s.camera.width / 2 for s in drawn), "no principal point off the centre"
+    assert {s.gaussians.sh.shape[1] for s in drawn} == {1, 4, 9, 16}
+    depths = np.concatenate([s.gaussians.means @ s.camera.viewmat[2, :3] + s.camera.viewmat[2, 3] for s in drawn])
+    assert np.any(depths < 0.0), "nothing behind the camera"
+    means = [tuple(m) for s in drawn for m in s.gaussians.means.tolist()]
+    assert len(set(means)) < len(means), "no coincident copies"
+
+
+def test_cotangents_are_nowhere_zero() -> None:
+    v_image, v_T_final = cotangents(golden_scene())
+    assert np.all(v_image != 0.0)
+    assert np.all(v_T_final != 0.0)
+    assert np.any(v_image < 0.0)
+    assert np.any(v_image > 0.0)
+
+
+def test_rounding_a_scene_twice_is_rounding_it_once() -> None:
+    once = rounded_to(golden_scene(), np.float32)
+    assert _same(rounded_to(once, np.float32), once)
+    assert not _same(once, golden_scene())
+
+
+def test_a_comparison_reports_index_values_and_units() -> None:
+    with pytest.raises(AssertionError, match=r"first at \[1\].*differs by .* units, allowed") as caught:
+        assert_close("alpha.sigma", np.array([1.0, 2.5]), np.array([1.0, 2.0]), 1.0, np.float64)
+    assert "got np.float64(2.5), expected np.float64(2.0)" in str(caught.value)
+
+
+def test_one_wrong_entry_among_a_million_fails() -> None:
+    expected = np.zeros(1_000_000)
+    actual = expected.copy()
+    actual[123_456] = 1e-6
+    with pytest.raises(AssertionError, match=r"first at \[123456\]"):
+        assert_close("alpha.sigma", actual, expected, 1.0, np.float32)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_never_passes(bad: float) -> None:
+    with pytest.raises(AssertionError, match="not finite"):
+        assert_close("alpha.sigma", np.array([bad]), np.array([1.0]), 1e300, np.float64)
+
+
+def test_shapes_must_agree() -> None:
+    with pytest.raises(AssertionError, match="shape"):
+        assert_close("alpha.sigma", np.zeros(2), np.zeros((2, 1)), 1.0, np.float64)
+    with pytest.raises(AssertionError, match="shape"):
+        assert_same_bits("x", np.zeros(2), np.zeros(3))
+
+
+@pytest.mark.parametrize("key", sorted(TABLE))
+def test_no_tolerance_is_far_above_the_worst_case_that_was_measured(key: str) -> None:
+    tolerance = TABLE[key]
+    assert tolerance.units >= 2.0 * tolerance.worst, "no room over the worst case that was measured"
+    assert tolerance.units <= max(8.0 * tolerance.worst, 1.0), "room that no measurement asked for"
+
+
+def test_a_failing_law_tells_stage_gaussian_pixel_decision_and_scene() -> None:
+    by_name = {mutant.name: mutant for mutant in MUTANTS}
+    with living(by_name["jacobian_sign"]) as backend:
+        text = tell("test_some_law", backend, {"scene": golden_scene()})
+    assert "law some_law fails on jacobian_sign" in text
+    assert "first stage that differs: projection_jacobians, Gaussian" in text
+    assert "first pixel that differs: " in text
+    assert "nearest decision at that pixel: D" in text
+    assert "scene = Scene(gaussians=Gaussians(means=" in text
+
+
+def test_the_scorecard_counts_by_backend_and_stage(tmp_path: Path) -> None:
+    card = Scorecard("mine")
+    card.entries = [
+        Entry("a", "alpha", "sigma_is_right", "passed", "", 0.5),
+        Entry("a", "alpha", "floor_is_right", "failed", "differs <by> 3", 0.5),
+        Entry("a", "camera", "it_looks_ahead", "skipped", "a has no camera", 0.0),
+    ]
+    assert card.summary()["a"] == {
+        "camera": {"passed": 0, "failed": 0, "skipped": 1},
+        "alpha": {"passed": 1, "failed": 1, "skipped": 0},
+    }
+    card.write(tmp_path / "card.json")
+    card.write(tmp_path / "card.html")
+    assert json.loads((tmp_path / "card.json").read_text())["summary"] == card.summary()
+    page = (tmp_path / "card.html").read_text()
+    assert "floor is right" in page
+    assert "differs &lt;by&gt; 3" in page
+
+
+def _kit(*options: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "pop_ref.conformance.plugin"]
+    command += ["--pyargs", "pop_ref.conformance", *options]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT / "docs")
+
+
+def test_the_kit_runs_from_the_command_line_and_writes_a_scorecard(tmp_path: Path) -> None:
+    card = tmp_path / "card.json"
+    done = _kit("--rasterizer", "pop_fast.rasterization:rasterization", "--stages", "pop_fast", "--stage", "camera",
+                "--dtype", "float64", "--profile", "paper", "--scorecard", str(card))  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    told = json.loads(card.read_text())
+    assert set(told["summary"]["pop_fast.rasterization:rasterization"]) == {"camera"}
+    assert {entry["outcome"] for entry in told["laws"]} <= {"passed", "skipped"}
+
+
+def test_the_kit_refuses_what_it_cannot_judge() -> None:
+    done = _kit("--rasterizer", "no.such.module:f", "--stage", "camera")
+    assert done.returncode != 0
+    assert "no.such" in done.stdout + done.stderr or "needs no" in done.stdout + done.stderr
