@@ -84,7 +84,9 @@ POP_HD Radii radii_from_covar2d(Mat2<Real> s, Real opacity, const Profile<Real>&
         return {r, r};
     }
     if (!(opacity >= profile.alpha_floor)) return {0, 0};
-    const Real k = min_of(profile.extent_sigmas, sqrt(Real(2) * log(opacity / profile.alpha_floor)));
+    // a float's 1/255 may be rounded up: the logarithm is charged that, so that the extent still encloses
+    const Real charge = sizeof(Real) == 4 ? Real(6e-8) : Real(0);
+    const Real k = min_of(profile.extent_sigmas, sqrt(Real(2) * (log(opacity / profile.alpha_floor) + charge)));
     return {radius_from_reach(k * sqrt(a)), radius_from_reach(k * sqrt(c))};
 }
 

@@ -20,19 +20,28 @@ struct Picture {
     }
 };
 
+// rows first, then columns, as the kernels add
 template <class Real>
 WindowMoments<Real> moments_at(const Picture<Real>& x, const Picture<Real>& y, int row, int col, int c) {
     WindowMoments<Real> w = {};
-    for (int i = -SSIM_REACH; i <= SSIM_REACH; ++i)
+    for (int i = -SSIM_REACH; i <= SSIM_REACH; ++i) {
+        WindowMoments<Real> across = {};
         for (int j = -SSIM_REACH; j <= SSIM_REACH; ++j) {
-            const Real weight = ssim_weight<Real>(i) * ssim_weight<Real>(j);
+            const Real weight = ssim_weight<Real>(j);
             const Real a = x.at(row + i, col + j, c), b = y.at(row + i, col + j, c);
-            w.mu_x += weight * a;
-            w.mu_y += weight * b;
-            w.xx += weight * a * a;
-            w.yy += weight * b * b;
-            w.xy += weight * a * b;
+            across.mu_x += weight * a;
+            across.mu_y += weight * b;
+            across.xx += weight * a * a;
+            across.yy += weight * b * b;
+            across.xy += weight * a * b;
         }
+        const Real weight = ssim_weight<Real>(i);
+        w.mu_x += weight * across.mu_x;
+        w.mu_y += weight * across.mu_y;
+        w.xx += weight * across.xx;
+        w.yy += weight * across.yy;
+        w.xy += weight * across.xy;
+    }
     return w;
 }
 
