@@ -20,6 +20,7 @@ COMMANDS: Final = {
     "train": "fit a splat to a capture or a folder of photographs",
     "eval": "measure a result, a checkpoint or a PLY on the held-out views",
     "render": "write held-out views, or a camera path as pictures or a video",
+    "explain": "say why a pixel looks as it does, and where two renderers part",
     "export": "write a result as PLY, .splat or an Inria-style folder",
     "compare": "put several results side by side in one table",
     "report": "write report.html again from the files of a result",

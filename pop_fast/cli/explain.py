@@ -1,0 +1,133 @@
+"""`pop explain`: why a pixel looks as it does, as a table, JSON and a page, and the view as maps."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from textwrap import wrap
+from typing import Annotated, Final, Literal
+
+import tyro
+
+from pop_fast.cli.arguments import parse
+from pop_fast.cli.splat import CaptureOptions, load_splat, open_capture
+from pop_fast.data import Capture, View
+from pop_fast.errors import PopError
+from pop_fast.explain import explain_pixel, explain_view
+from pop_fast.explain.diff import difference
+from pop_fast.explain.maps import view_maps, write_maps
+from pop_fast.explain.page import page
+from pop_fast.explain.pixel import check_inside
+from pop_fast.explain.scene import with_objective
+from pop_fast.explain.table import WIDTH, table
+from pop_fast.io.atomic import folder_atomically, write_atomically
+from pop_fast.train.environment import reproducible
+
+_EXAMPLES: Final = """
+    pop explain out/scene_pop --view 3 --pixel 120,80                     the table
+    pop explain out/scene_pop --view 3 --pixel 120,80 --html why.html     and a page with pictures and maps
+    pop explain a.ply --capture scene --view IMG_7.jpg --maps maps        the maps alone, one PNG each
+    pop explain out/scene_pop --view 3 --pixel 120,80 --diff paper inria  where two profiles or backends part
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args(CaptureOptions):
+    """Explain a pixel: what it is blended from, why entries were skipped, what the loss and POP do to them."""
+
+    splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|PLY")]
+    """What to look into."""
+    view: Annotated[str, tyro.conf.arg(metavar="INDEX|NAME")]
+    """A view of the capture: its place by file name, from 0, or the name itself."""
+    pixel: Annotated[str | None, tyro.conf.arg(metavar="X,Y")] = None
+    """The pixel: column and row, from 0 at the upper left. Only maps alone need none."""
+    profile: Literal["paper", "gsplat_1_5", "gsplat_1_6", "inria"] | None = None
+    """The rasterizer's constants; by default as in training."""
+    objective: Literal["run", "pop", "3dgs"] = "run"
+    """The loss that is differentiated: the run's own (POP's for a lone file), paper eq. 9, or eq. 2."""
+    all: bool = False
+    """Print every entry, not only those that matter."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Also write all numbers to this file."""
+    html: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Also write a page with the picture, the splats' ellipses, the table and the maps."""
+    maps: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Also write the view's maps into this new folder, one PNG each."""
+    diff: Annotated[tuple[str, str] | None, tyro.conf.arg(metavar="A B")] = None
+    """Also compare two profiles or backends (fast, ref) on the view and at the pixel."""
+    overwrite: bool = False
+    """Replace the folder of maps when it is there."""
+
+
+def run(argv: Sequence[str]) -> int:
+    """Run the subcommand."""
+    args = parse(Args, argv, "explain", examples=_EXAMPLES)
+    at = None if args.pixel is None else parse_pixel(args.pixel)
+    if at is None and (args.maps is None or args.html or args.json or args.diff):
+        raise PopError("pixel is not given; say which with --pixel X,Y, or ask for maps alone with --maps DIR")
+    splat = load_splat(args.splat)
+    capture, config = open_capture(splat, args)
+    view = chosen_view(capture, args.view)
+    if at is not None:
+        check_inside(view, *at)
+    config = with_objective(replace(config, profile=args.profile or config.profile), args.objective)
+    with reproducible(config.threads):
+        scene = explain_view(splat.params, view, config, splat.sh_degree, splat.step)
+        parting = None if args.diff is None or at is None else difference(scene, *args.diff, *at)
+        maps = view_maps(scene) if args.maps or args.html else []
+    maps += parting.maps if parting else ()
+    if at is not None:
+        explanation = explain_pixel(scene, *at)
+        print(table(explanation, args.all))
+        if parting:
+            print(
+                "\n" + "\n".join(part for line in parting.lines for part in wrap(line, WIDTH, subsequent_indent="    "))
+            )
+        if args.json is not None:
+            plain = json.loads(explanation.to_json()) | ({"difference": parting.plain()} if parting else {})
+            _write(args.json, json.dumps(plain, indent=1) + "\n")
+        if args.html is not None:
+            _write(args.html, page(explanation, maps, parting.lines if parting else ()))
+    if args.maps is not None:
+        with folder_atomically(args.maps, args.overwrite) as folder:
+            write_maps(maps, folder)
+        print(f"{len(maps)} maps of {view.name} -> {args.maps}")
+    return 0
+
+
+def parse_pixel(text: str) -> tuple[int, int]:
+    """Read "X,Y".
+
+    Raises:
+        PopError: it is something else.
+    """
+    try:
+        x, y = (int(word) for word in text.split(","))
+    except ValueError:
+        raise PopError(f"pixel is {text!r}; give column and row as two whole numbers, --pixel 120,80") from None
+    return x, y
+
+
+def chosen_view(capture: Capture, which: str) -> View:
+    """Find a view by its place or by its name.
+
+    Raises:
+        PopError: there is none such.
+    """
+    named = [view for view in capture.views if which in (view.name, Path(view.name).name, Path(view.name).stem)]
+    if len(named) == 1:
+        return named[0]
+    last = len(capture.views) - 1
+    span = f"0 ({capture.views[0].name}) to {last} ({capture.views[-1].name})"
+    if not which.lstrip("-").isdigit():
+        what = f"names {len(named)} views" if named else "is no view"
+        raise PopError(f"view {which!r} {what} of {capture.name}; give a file name, or a place from {span}")
+    if not 0 <= int(which) <= last:
+        raise PopError(f"view is {which}; {capture.name} has views {span}")
+    return capture.views[int(which)]
+
+
+def _write(path: Path, text: str) -> None:
+    write_atomically(path, lambda file: file.write(text.encode()))
