@@ -27,13 +27,13 @@ def compensations(covars2d: Tensor, eps2d: float) -> Tensor:
     return torch.sqrt(torch.clamp_min(det / det_blurred, 0.0))
 
 
-def compensations_vjp(covars2d: Tensor, eps2d: float, v_compensations: Tensor) -> Tensor:
+def compensations_vjp(covars2d: Tensor, eps2d: float, v_factors: Tensor) -> Tensor:
     """See `pop_ref.footprint.compensations_vjp`. Optimizations: component rows, no branches."""
     xx, xy, _, yy = columns(covars2d)
     det, det_blurred = _determinants(covars2d, eps2d)
     ratio = det / det_blurred
     # d sqrt(r) = dr / (2 sqrt(r)); where r <= 0 the factor is flat at 0
-    slope = torch.where(ratio > 0.0, 0.5 * v_compensations / torch.sqrt(ratio.clamp_min(1e-300)), 0.0)
+    slope = torch.where(ratio > 0.0, 0.5 * v_factors / torch.sqrt(ratio.clamp_min(1e-300)), 0.0)
     v_det = slope / det_blurred
     v_det_blurred = -slope * ratio / det_blurred
     v_xx = v_det * yy + v_det_blurred * (yy + eps2d)
