@@ -17,7 +17,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from cuda_ext.toolkit import OLDEST, find_nvcc, nvcc_version
+from cuda_ext.toolkit import OLDEST, find_nvcc, link_flags, nvcc_version
 
 HERE = Path(__file__).resolve().parent
 DEFAULT_ARCHS = ("sm_75", "sm_80", "sm_90")
@@ -54,10 +54,17 @@ def build(
         f"-DCMAKE_CUDA_ARCHITECTURES={';'.join(archs)}",
         f"-DPython_EXECUTABLE={sys.executable}",
         f"-DCMAKE_INSTALL_PREFIX={HERE}",
+        f"-DCMAKE_CUDA_FLAGS={' '.join(link_flags(nvcc))}",
     ]
     if shutil.which("ninja"):
         configure += ["-G", "Ninja"]
-    _run("configuring", configure)
+    try:
+        _run("configuring", configure)
+    except BuildError:
+        # a half-configured folder would fail in another way next time
+        (work / "CMakeCache.txt").unlink(missing_ok=True)
+        shutil.rmtree(work / "CMakeFiles", ignore_errors=True)
+        raise
     _run("compiling", [cmake, "--build", str(work), "--parallel", str(jobs), *(["--verbose"] if verbose else [])])
     _run("installing", [cmake, "--install", str(work)])
     found = sorted(HERE.glob("_kernels*.so"), key=lambda path: path.stat().st_mtime)
@@ -70,8 +77,8 @@ def _tools() -> tuple[str, str]:
     nvcc = find_nvcc()
     if nvcc is None:
         raise BuildError(
-            "nvcc was not found; install a CUDA toolkit (12.4 or newer), or `pip install nvidia-cuda-nvcc "
-            "nvidia-cuda-runtime nvidia-cuda-cccl`, or set CUDACXX to nvcc's path"
+            "nvcc was not found; install a CUDA toolkit (12 or newer), or `pip install nvidia-cuda-nvcc nvidia-nvvm "
+            "nvidia-cuda-crt nvidia-cuda-runtime nvidia-cuda-cccl` (all of one version), or set CUDACXX to nvcc's path"
         )
     cmake = shutil.which("cmake")
     if cmake is None:

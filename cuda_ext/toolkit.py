@@ -51,3 +51,10 @@ def nvcc_version(nvcc: str) -> tuple[int, int]:
     if match is None:
         raise RuntimeError(f"{nvcc} --version did not answer: {done.stdout or done.stderr}")
     return int(match.group(1)), int(match.group(2))
+
+
+def link_flags(nvcc: str) -> list[str]:
+    """Return what nvcc must be told to find its own runtime: the wheels keep it in lib, nvcc looks into lib64."""
+    root = Path(nvcc).resolve().parent.parent
+    here, usual = root / "lib" / "libcudart_static.a", root / "lib64" / "libcudart_static.a"
+    return [f"-L{here.parent}"] if here.exists() and not usual.exists() else []
