@@ -100,7 +100,7 @@ def difference(scene: ExplainedView, a: str, b: str, x: int, y: int) -> Differen
     dominant, blended = sides[0].dominant != sides[1].dominant, sides[0].blended != sides[1].blended
     at = (x, y)
     flip, words = _at(scene, sides, *at)
-    lines = [_overall(sides, region, colors, dominant, blended), *words]
+    lines = [*_overall(sides, region, colors, dominant, blended), *words]
     asked = (y - region[1], x - region[0])
     severity = colors * (colors > _SEEN) + dominant + 0.5 * blended
     if flip is None and severity[asked] == 0.0 and severity.max() > 0.0:
@@ -206,14 +206,16 @@ def _words(
 
 def _overall(
     sides: tuple[Side, Side], region: tuple[int, int, int, int], colors: np.ndarray, dominant: np.ndarray, n: np.ndarray
-) -> str:
+) -> Iterator[str]:
     left, top, width, height = region
     worst = np.unravel_index(np.argmax(colors), colors.shape)
-    return (
-        f"{sides[0].name} | {sides[1].name}, {width} x {height} px from ({left}, {top}): "
-        f"colours differ by over 1/255 at {int((colors > _SEEN).sum()):,} px, "
-        f"at most {colors.max():.2e} at ({worst[1] + left}, {worst[0] + top}); another "
-        f"dominant Gaussian at {int(dominant.sum()):,} px; another number blended at {int(n.sum()):,} px"
+    yield f"{sides[0].name} | {sides[1].name}, {width} x {height} px from ({left}, {top}):"
+    yield (
+        f"  colours differ by over 1/255 at {int((colors > _SEEN).sum()):,} px, "
+        f"at most by {colors.max():.2e} at ({worst[1] + left}, {worst[0] + top})"
+    )
+    yield (
+        f"  another Gaussian dominates at {int(dominant.sum()):,} px, another number is blended at {int(n.sum()):,} px"
     )
 
 

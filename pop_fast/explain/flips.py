@@ -92,7 +92,10 @@ def _decision(
         return "D6" if one.status == "blended" and _ceiling(one) != _ceiling(other) else None
     if "hidden" in statuses:
         return "D7" if _acts(one) or _acts(other) else None
-    return "D5" if "skipped" in statuses else "D7"
+    if "skipped" in statuses:
+        return "D5"
+    # a ceiling that only one of them met moved what the stop is compared with
+    return "D6" if _ceiling(one) != _ceiling(other) else "D7"
 
 
 def _ceiling(step: Step) -> float | None:
@@ -123,7 +126,8 @@ def _words(step: Step | None, row: int, walks: tuple[Walk, Walk], profile: Profi
         return f"blends it: alpha {step.alpha:.7f}{clamped}, T {step.T:.7g} -> {left:.7g}"
     if step.status == "skipped":
         return f"skips it: alpha {step.alpha_raw:.9f}, floor {profile.alpha_floor:.9f}"
-    return f"stops at it: T {step.T:.7g} would become {left:.7g}, stop {profile.transmittance_stop:g}"
+    stop = profile.transmittance_stop
+    return f"stops at it: alpha {step.alpha:.7f}, T {step.T:.7g} would become {left:.7g}, stop {stop:g}"
 
 
 def _weights(walked: Walk, rows: list[int]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -117,29 +117,30 @@ def _shares(scene: ExplainedView) -> tuple[np.ndarray, np.ndarray]:
     return blended[..., 0].numpy(), blended[..., 1].numpy()
 
 
-def _termination(scene: ExplainedView) -> Map:
-    """Map the depth of the entry that ended each pixel (D7); NaN where the list ran out first."""
+def termination_depths(scene: ExplainedView) -> np.ndarray:
+    """Give the camera z of the entry that ended each pixel (D7); NaN where the list ran out first. [H, W]"""
     info, profile = scene.info, PROFILES[scene.config.profile]
-    height, width = info["n_traversed"].shape[1:]
-    rows, columns = np.mgrid[:height, :width]
+    # T only falls, so a walk stops somewhere if and only if all of the list would take T to the stop
+    nothing = scene.gaussians["means"].new_zeros((len(scene.counts), 1))
+    endless = replace(profile, transmittance_stop=0.0)
+    _, to_the_end = scene.rasterized(colors=nothing, profile=endless, dominance=False, counts=False)
+    left, stop = to_the_end["final_T"][0].numpy(), profile.transmittance_stop
+    ended = left <= stop if profile.stop_inclusive else left < stop
+    rows, columns = np.nonzero(ended)
     first = info["isect_offsets"][0].numpy()[rows // TILE_SIZE, columns // TILE_SIZE]
-    visited, ids = info["n_traversed"][0].numpy(), info["flatten_ids"].numpy()
-    depth = np.full((height, width), np.nan)
-    if len(ids):
-        last = ids[np.maximum(first + visited - 1, 0)]
-        d = info["means2d"][0].numpy()[last] - np.stack([columns + 0.5, rows + 0.5], axis=-1)
-        A, B, C = np.moveaxis(info["conics"][0].numpy()[last], -1, 0)
-        sigma = 0.5 * (A * d[..., 0] ** 2 + C * d[..., 1] ** 2) + B * d[..., 0] * d[..., 1]
-        alpha = np.minimum(info["opacities"][0].numpy()[last] * np.exp(-np.maximum(sigma, 0.0)), profile.alpha_ceiling)
-        # an entry that was blended has already been taken off T; at the stop itself T is a decade above what is left
-        ended = (visited > 0) & (alpha >= profile.alpha_floor) & (sigma >= 0.0)
-        ended &= info["final_T"][0].numpy() * (1.0 - alpha) <= profile.transmittance_stop
-        depth[ended] = info["depths"][0].numpy()[last][ended]
-    known = depth[np.isfinite(depth)]
+    last = info["flatten_ids"].numpy()[first + info["n_traversed"][0].numpy()[ended] - 1]
+    depths = np.full(ended.shape, np.nan)
+    depths[ended] = info["depths"][0].numpy()[last]
+    return depths
+
+
+def _termination(scene: ExplainedView) -> Map:
+    depths = termination_depths(scene)
+    known = depths[np.isfinite(depths)]
     low, top = (float(np.quantile(known, q)) for q in (0.01, 0.99)) if len(known) else (0.0, 1.0)
-    share = len(known) / depth.size
+    share = len(known) / depths.size
     about = f"camera z of the splat that ended the pixel (D7), which {share:.0%} have; grey: the list ran out first"
-    return scaled("termination_depth", "Termination depth", about, depth, "viridis", top, low)
+    return scaled("termination_depth", "Termination depth", about, depths, "viridis", top, low)
 
 
 def _dots(scene: ExplainedView, render: np.ndarray) -> Map:

@@ -1,0 +1,269 @@
+"""`pop explain`: its numbers are rasterization's and autograd's, and it says what to do about bad input."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from pop_fast.errors import PopError
+from pop_fast.explain import ExplainedView, explain_pixel, explain_view
+from pop_fast.explain.diff import difference
+from pop_fast.explain.flips import first_flip
+from pop_fast.explain.maps import termination_depths
+from pop_fast.explain.table import WIDTH, table
+from pop_fast.explain.walk import candidates, oracle_splats, walk
+from pop_fast.losses import photometric_pop
+from pop_fast.strategies import POPStrategy
+from pop_fast.train.config import TrainConfig
+from pop_ref.constants import PAPER, Profile
+from pop_ref.types import Splats
+from tests.app.conftest import Pop
+from tests.app.tiny import tiny_capture
+
+VIEW = tiny_capture().views[1]
+PIXELS = [(x, y) for y in range(0, VIEW.height, 6) for x in range(0, VIEW.width, 4)]
+AXIS = VIEW.camera_center / np.linalg.norm(VIEW.camera_center)
+MIXED = {"background": (0.25, 0.5, 0.75)}
+
+
+def params(n: int = 120, seed: int = 3) -> dict[str, torch.Tensor]:
+    """Splats of all sizes, from fainter than the floor to more opaque than the ceiling; the first is a backdrop."""
+    g = torch.Generator().manual_seed(seed)
+    made = {
+        "means": torch.rand((n, 3), generator=g) * 2.0 - 1.0,
+        "scales": torch.rand((n, 3), generator=g) * 2.4 - 2.8,
+        "quats": torch.randn((n, 4), generator=g),
+        "opacities": torch.rand((n,), generator=g) * 20.0 - 7.0,
+        "sh0": torch.randn((n, 1, 3), generator=g),
+        "shN": torch.randn((n, 15, 3), generator=g) * 0.1,
+    }
+    made["means"][0] = torch.from_numpy(-1.5 * AXIS)
+    made["scales"][0], made["opacities"][0] = 1.5, 12.0
+    return made
+
+
+@pytest.fixture(scope="module")
+def scene() -> ExplainedView:
+    """The made-up splat in one view, over a background that is not black."""
+    return explain_view(params(), VIEW, TrainConfig(**MIXED))
+
+
+@pytest.mark.parametrize("changes", [{}, {"profile": "inria"}, {"antialiased": True}], ids=["paper", "inria", "mip"])
+def test_the_oracle_on_a_few_gaussians_agrees_with_rasterization_of_all(changes: dict[str, object]) -> None:
+    view = explain_view(params(), VIEW, TrainConfig(**MIXED, **changes))  # type: ignore[arg-type]
+    statuses = set()
+    for x, y in PIXELS:
+        e = explain_pixel(view, x, y)
+        np.testing.assert_allclose(e.color, view.image[y, x], rtol=0, atol=1e-12)
+        assert e.T_final == pytest.approx(float(view.info["final_T"][0, y, x]), abs=1e-12)
+        assert e.dominant_id == int(view.info["dominant_ids"][0, y, x])
+        assert len(e.blended) == int(view.info["n_contrib"][0, y, x])
+        assert e.n_traversed == int(view.info["n_traversed"][0, y, x])
+        statuses |= {row.status for row in e.rows} | {"clamped" for row in e.rows if row.clamped}
+    assert statuses == {"blended", "skipped", "stopped", "hidden", "clamped"}
+
+
+def test_weights_and_what_is_left_sum_to_one_and_the_sums_end_at_the_colour(scene: ExplainedView) -> None:
+    for x, y in PIXELS:
+        e = explain_pixel(scene, x, y)
+        assert sum(row.weight for row in e.rows) + e.T_final == pytest.approx(1.0, abs=1e-12)
+        behind = np.array(e.background) * e.T_final
+        np.testing.assert_allclose(e.rows[-1].cumulative + behind, e.color, rtol=0, atol=1e-12)
+        heaviest = max(e.blended, key=lambda row: row.weight)
+        assert [row.id for row in e.rows if row.dominant] == [heaviest.id] == [e.dominant_id]
+
+
+def test_listed_derivatives_are_those_of_autograd(scene: ExplainedView) -> None:
+    for x, y in PIXELS[::5]:
+        e = explain_pixel(scene, x, y)
+        alphas = torch.tensor([row.alpha for row in e.blended], dtype=torch.float64, requires_grad=True)
+        left = torch.cat([torch.ones(1, dtype=torch.float64), torch.cumprod(1.0 - alphas, 0)])
+        colors = torch.tensor([row.color for row in e.blended], dtype=torch.float64)
+        color = ((left[:-1] * alphas)[:, None] * colors).sum(0) + left[-1] * scene.background
+        (v_alphas,) = torch.autograd.grad(color @ scene.v_image[y, x], alphas)
+        np.testing.assert_allclose([row.v_alpha for row in e.blended], v_alphas, rtol=1e-9, atol=1e-18)
+
+
+def test_derivatives_through_single_pixels_sum_to_the_views() -> None:
+    small = replace(VIEW, image=VIEW.image[:12, :14], K=VIEW.K - [[0, 0, 9], [0, 0, 6], [0, 0, 0]])
+    view = explain_view(params(40), small, TrainConfig(**MIXED, antialiased=True))
+    total = np.zeros(40)
+    for y, x in np.ndindex(12, 14):
+        for row in explain_pixel(view, x, y).rows:
+            total[row.id] += row.v_opacity
+    np.testing.assert_allclose(total, view.v_opacities, rtol=1e-9, atol=1e-16)
+    assert np.count_nonzero(total) > 10
+
+
+def test_the_views_derivatives_are_those_of_the_loss_that_is_trained(scene: ExplainedView) -> None:
+    opacities = scene.gaussians["opacities"].clone().requires_grad_(True)
+    again = replace(scene, gaussians={**scene.gaussians, "opacities": opacities})
+    target = torch.from_numpy(VIEW.image).double() / 255.0
+    with torch.enable_grad():
+        image = rendered(again)
+        prior = POPStrategy().regularizer(opacities, {"dominant_sum": None}, 0, {"dominant_counts": scene.counts[None]})
+        assert prior is not None
+        (v,) = torch.autograd.grad(photometric_pop(image, target) + prior, opacities)
+    rows = {row.id: row for x, y in PIXELS for row in explain_pixel(scene, x, y).rows}
+    assert len(rows) > 60
+    for i, row in rows.items():
+        assert row.v_opacity_view + row.v_opacity_pop == pytest.approx(float(v[i]), rel=1e-9, abs=1e-16)
+        assert row.pop == ("up" if row.pixels_dominated > 0 else "down")
+        assert row.net == ("up" if v[i] < 0 else "down")
+
+
+def rendered(view: ExplainedView) -> torch.Tensor:
+    from pop_fast.explain.scene import settings_of
+    from pop_fast.rasterization import rasterization
+
+    given = {**view.gaussians, "colors": view.gaussians["sh"]}
+    del given["sh"]
+    settings = settings_of(view.view, view.config, torch.float64)
+    return rasterization(**given, **settings, sh_degree=3, backgrounds=view.background[None])[0][0]
+
+
+def test_rays_end_at_the_depth_of_the_splat_that_stopped_them(scene: ExplainedView) -> None:
+    depths = termination_depths(scene)
+    ended = [explain_pixel(scene, x, y).stopped_by for x, y in PIXELS]
+    expected = [np.nan if row is None else row.depth for row in ended]
+    np.testing.assert_allclose([depths[y, x] for x, y in PIXELS], expected, rtol=1e-12)
+    assert 0 < np.isfinite(expected).sum() < len(expected)
+
+
+def test_the_table_fits_a_terminal_and_shows_every_entry_when_asked(scene: ExplainedView) -> None:
+    for x, y in PIXELS:
+        e = explain_pixel(scene, x, y)
+        for text in (str(e), table(e, everything=True)):
+            assert max(map(len, text.splitlines())) <= WIDTH
+            assert not re.search(r"\bnan\b", text)
+        ranks = re.findall(r"^[* ] +(\d+) ", table(e, everything=True).partition("---")[2], re.MULTILINE)
+        assert ranks == [str(row.rank) for row in e.rows]
+        dominant = next(row for row in e.rows if row.dominant)
+        assert re.search(rf"^\* +{dominant.rank} +{dominant.id} ", str(e), re.MULTILINE)
+        if e.stopped_by:
+            assert "stopped, D7: would leave T" in str(e)
+
+
+def test_a_pixel_that_nothing_reaches_is_background() -> None:
+    far = params(5)
+    far["means"] = far["means"] + 100.0
+    e = explain_pixel(far, 3, 4, view=VIEW, config=TrainConfig(**MIXED))
+    assert (e.color, e.rows, e.dominant_id, e.T_final) == ((0.25, 0.5, 0.75), (), -1, 1.0)
+    assert "nothing is blended here" in str(e)
+
+
+def test_json_holds_every_number(scene: ExplainedView) -> None:
+    e = explain_pixel(scene, 16, 12)
+    plain = json.loads(e.to_json())
+    assert plain["format"] == "pop-explain/1"
+    assert plain["rows"][2].pop("pop") == e.rows[2].pop
+    assert plain["rows"][2].pop("net") == e.rows[2].net
+    assert plain["rows"][2] == json.loads(json.dumps(asdict(e.rows[2])))
+    assert len(plain["rows"]) == len(e.rows)
+
+
+def flipped(scene: ExplainedView, profile: Profile, change: dict[str, np.ndarray] | None = None) -> str | None:
+    """Walk the middle under the paper's profile and, changed, under another; name the first decision that differs."""
+    x, y = 16, 12
+    ids = candidates(scene.info, x, y)
+    a, b = oracle_splats(scene, ids, PAPER), oracle_splats(scene, ids, profile)
+    if change:
+        b = Splats(**({name: getattr(b, name) for name in Splats.__dataclass_fields__} | change))
+    walks = walk(scene, a, x, y, PAPER), walk(scene, b, x, y, profile)
+    flip = first_flip(ids, walks, (PAPER, profile))
+    return None if flip is None else flip.decision
+
+
+def test_the_decision_that_flipped_is_named() -> None:
+    # four round splats on the axis of a camera, each at its own depth; the third ends the ray
+    four = params(4)
+    four["means"] = torch.tensor(np.outer([0.6, 0.2, -0.2, -0.6], AXIS))
+    four["scales"] = torch.full((4, 3), -2.0)
+    centred = replace(VIEW, K=VIEW.K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]))
+    four["opacities"] = torch.logit(torch.tensor([0.3, 0.9995, 0.95, 0.5], dtype=torch.float64))
+    scene = explain_view(four, centred)
+    e = explain_pixel(scene, 16, 12)
+    assert [row.status for row in e.rows] == ["blended", "blended", "stopped", "hidden"]
+    splats = oracle_splats(scene, candidates(scene.info, 16, 12), PAPER)
+    behind = replace(PAPER, near_plane=float(splats.depths[0]) + 0.1)
+    assert flipped(scene, PAPER) is None
+    assert flipped(scene, behind) == "D1"
+    small = splats.radii.copy()
+    small[0] = 0
+    assert flipped(scene, PAPER, {"radii": small}) == "D2"
+    away = splats.means2d.copy()
+    away[0] += 40.0
+    assert flipped(scene, PAPER, {"means2d": away}) == "D3"
+    assert flipped(scene, PAPER, {"depths": splats.depths[[1, 0, 2, 3]]}) == "D4"
+    assert flipped(scene, PAPER, {"opacities": splats.opacities * [0.01, 1.0, 1.0, 1.0]}) == "D5"
+    assert flipped(scene, replace(PAPER, alpha_ceiling=0.99)) == "D6"
+    assert flipped(scene, replace(PAPER, transmittance_stop=1e-6)) == "D7"
+    assert flipped(scene, PAPER, {"opacities": splats.opacities * [2.0, 1.0, 1.0, 1.0]}) == "D8"
+
+
+def test_profiles_are_compared_over_the_view_and_the_oracle_over_the_tile(scene: ExplainedView) -> None:
+    parting = difference(scene, "paper", "inria", 16, 12)
+    inria, info = scene.rasterized(profile="inria")
+    assert parting.region == (0, 0, VIEW.width, VIEW.height)
+    assert parting.n_dominant == int((info["dominant_ids"] != scene.info["dominant_ids"]).sum())
+    assert parting.largest == pytest.approx(float((inria - scene.image).abs().max()))
+    assert parting.n_blended > 0
+    assert parting.flip is not None
+    assert parting.maps[0].picture.shape == (VIEW.height, VIEW.width, 3)
+    exact = difference(scene, "fast", "ref", 16, 12)
+    assert exact.region == (16, 0, 16, 16)
+    assert exact.largest < 1e-4
+    assert exact.flip is None
+    with pytest.raises(PopError, match=r"neither a profile .* nor a backend"):
+        difference(scene, "paper", "nonsense", 16, 12)
+
+
+def test_one_command_writes_table_json_page_and_maps(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
+    files = {"--json": "why.json", "--html": "why.html", "--maps": "maps"}
+    words = [word for flag, name in files.items() for word in (flag, tmp_path / name)]
+    outcome = pop("explain", shared_result, "--view", "3", "--pixel", "20,16", *words, "--diff", "paper", "gsplat_1_6")
+    assert outcome.status == 0, outcome.err
+    assert "pixel (20, 16)" in outcome.out
+    assert "paper | gsplat_1_6" in outcome.out
+    plain = json.loads((tmp_path / "why.json").read_text())
+    assert plain["difference"]["names"] == ["paper", "gsplat_1_6"]
+    html = (tmp_path / "why.html").read_text()
+    assert not re.search(r"""(src|href)=["'](?!data:)""", html)
+    drawn = [row for row in plain["rows"] if row["status"] == "blended"]
+    assert all(f'data-id="{row["id"]}"' in html for row in drawn)
+    assert html.count("<ellipse") == 4 * min(len(drawn), 14)
+    names = {path.stem for path in (tmp_path / "maps").iterdir()}
+    assert {"dominant_ids", "n_blended", "n_traversed", "termination_depth", "T_final", "error", "pop_pull"} <= names
+    assert {"importance", "importance_gaussians", "diff_color", "diff_dominant"} <= names
+    assert all(cv2.imread(str(path)).shape == (32, 40, 3) for path in (tmp_path / "maps").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["--view", "0", "--pixel", "40,3"], "pixel x is 40; view view_000.png is 40 x 32 px, so x must lie in 0..39"),
+        (["--view", "0", "--pixel", "4,-1"], "pixel y is -1;"),
+        (["--view", "0", "--pixel", "four"], "pixel is 'four'; give column and row"),
+        (["--view", "0"], "pixel is not given; say which with --pixel X,Y"),
+        (["--view", "8", "--pixel", "1,1"], "view is 8; toy has views 0 (view_000.png) to 7 (view_007.png)"),
+        (["--view", "cat.jpg", "--pixel", "1,1"], "view 'cat.jpg' is no view of toy; give a file name"),
+        (["--view", "0", "--pixel", "1,1", "--capture", "nowhere"], "nowhere: no such folder"),
+        (["--view", "0", "--pixel", "1,1", "--diff", "paper", "mine"], "'mine', which is neither a profile"),
+    ],
+    ids=["x", "y", "no numbers", "no pixel", "view", "name", "capture", "diff"],
+)
+def test_bad_words_are_answered_by_one_line_that_names_field_and_fix(
+    pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], part: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    outcome = pop("explain", shared_result, *words)
+    assert outcome.status == 2
+    assert part in outcome.err
+    assert len(outcome.err.strip().splitlines()) == 1
