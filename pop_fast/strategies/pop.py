@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -40,7 +40,7 @@ class POPStrategy(DensityControl):
             literal reading of "cumulative". "own_view": the view of the step alone.
         blur_rule: "by_scale" clones small and splits large blur Gaussians, as the paper says; "split" always splits, as
             Mini-Splatting does.
-        lambda_pop: weight of the POP loss (eqs. 7, 8).
+        lambda_pop: weight of the POP loss (eqs. 7, 8); `scaled` divides it by the factor.
         pop_start_iter: first step with the POP loss.
         pop_stop_iter: step from which there is none.
         pop_views: a Gaussian is important when it dominates a pixel of the "current" view, as the paper says, or of
@@ -65,6 +65,15 @@ class POPStrategy(DensityControl):
     def initialize_state(self, scene_scale: float = 1.0, seed: int = 0) -> State:
         """Return the state, with the blur flags of the window and, where a setting needs it, its summed counts."""
         return {**super().initialize_state(scene_scale, seed), "blurred": None, "dominant_sum": None}
+
+    def scaled(self, factor: float) -> Any:
+        """Return the same settings on a schedule `factor` times as long; see `DensityControl.scaled`.
+
+        `lambda_pop` is divided by the factor, so that the prior's push on an opacity, which adds up over the steps that
+        it is on for, is the same in a short schedule and in a long one. With the paper's weight in a tenth of the
+        paper's steps the population would stop shrinking a tenth of the way.
+        """
+        return replace(super().scaled(factor), lambda_pop=self.lambda_pop / factor)
 
     def is_blur_step(self, step: int) -> bool:
         """Tell whether the change after this step looks at blur."""

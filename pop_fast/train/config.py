@@ -9,7 +9,8 @@ The numbers are the paper's: 30,000 steps, POP loss and density control to 15,00
     refine_every                                  up only: a shorter schedule has fewer changes, as far apart as ever
                                                   (see `DensityControl.scaled`)
     sh_interval, eval_steps, save_steps           yes
-    learning rates, weights, thresholds           no: Adam's step does not depend on the length of a run
+    lambda_pop                                    divided: the prior's push adds up over its steps
+    learning rates, other weights, thresholds     no: Adam's step does not depend on the length of a run
     checkpoint_every, log_every                   no: they are about time, not about the schedule
 """
 

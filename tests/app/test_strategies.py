@@ -107,6 +107,13 @@ def test_gsplat_attribute_names_exist_with_gsplat_numbers():
     assert (ADCStrategy().reset_every, POPStrategy().reset_every) == (3000, 0)
 
 
+def test_the_priors_push_adds_up_to_the_same_on_any_schedule():
+    paper = POPStrategy()
+    for factor in (0.1, 0.5, 2.0):
+        scaled = paper.scaled(factor)
+        assert scaled.lambda_pop * scaled.pop_stop_iter == pytest.approx(paper.lambda_pop * paper.pop_stop_iter)
+
+
 def test_a_scaled_schedule_keeps_its_shape_and_a_window_worth_averaging():
     quick = POPStrategy().scaled(0.1)
     assert (quick.refine_start_iter, quick.refine_stop_iter, quick.refine_every) == (50, 1500, SHORTEST_REFINE_EVERY)
