@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from pop_ref.conformance.compare import assert_close, assert_same_bits
 from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.mutants import MUTANTS, living
+from pop_ref.conformance.poison import POISONED_INTEGER, poisoned_allocations
 from pop_ref.conformance.scene_files import load_scene, save_scene
 from pop_ref.conformance.scenes import Scene, rounded_to, scene_as_code
 from pop_ref.conformance.scorecard import Entry, Scorecard
@@ -115,8 +116,8 @@ def test_shapes_must_agree() -> None:
 @pytest.mark.parametrize("key", sorted(TABLE))
 def test_no_tolerance_is_far_above_the_worst_case_that_was_measured(key: str) -> None:
     tolerance = TABLE[key]
-    assert tolerance.units >= 2.0 * tolerance.worst, "no room over the worst case that was measured"
-    assert tolerance.units <= max(8.0 * tolerance.worst, 1.0), "room that no measurement asked for"
+    assert tolerance.units >= 4.0 * tolerance.worst, "no room over the worst case that was measured"
+    assert tolerance.units <= 16.0 * tolerance.worst or tolerance.units == 1.0, "room that no measurement asked for"
 
 
 def test_a_failing_law_tells_stage_gaussian_pixel_decision_and_scene() -> None:
@@ -169,3 +170,18 @@ def test_the_kit_refuses_what_it_cannot_judge() -> None:
     done = _kit("--rasterizer", "no.such.module:f", "--stage", "camera")
     assert done.returncode != 0
     assert "no.such" in done.stdout + done.stderr or "needs no" in done.stdout + done.stderr
+
+
+def test_poison_reaches_what_the_package_allocates_and_nothing_else() -> None:
+    import torch
+
+    before = torch.empty
+    theirs: dict[str, object] = {"__name__": "accused.stage", "torch": torch}
+    with poisoned_allocations("accused"):
+        exec("a = torch.empty(3); b = torch.ones(2).new_empty(2); c = torch.empty(2, dtype=torch.int64)", theirs)
+        ours = torch.empty(3).fill_(1.0)
+        assert torch.all(torch.isnan(theirs["a"]))  # type: ignore[arg-type]
+        assert torch.all(torch.isnan(theirs["b"]))  # type: ignore[arg-type]
+        assert theirs["c"].tolist() == [POISONED_INTEGER] * 2  # type: ignore[attr-defined]
+        assert torch.all(ours == 1.0)
+    assert torch.empty is before

@@ -1,6 +1,8 @@
-"""The laws at thresholds over our own backends: the oracle itself, and pop_fast in both precisions."""
+"""The laws at thresholds over our own backends."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import pytest
 
@@ -8,7 +10,14 @@ pytest.register_assert_rewrite("pop_ref.conformance.laws")
 
 from pop_ref.conformance.backends import SHIPPED, shipped  # noqa: E402  asserts must be rewritten first
 from pop_ref.conformance.plugin import parametrize_backends  # noqa: E402
+from pop_ref.conformance.poison import poisoned_allocations  # noqa: E402
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     parametrize_backends(metafunc, [shipped(name) for name in SHIPPED])
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _allocations_are_poisoned() -> Iterator[None]:
+    with poisoned_allocations("pop_fast"):
+        yield

@@ -63,3 +63,12 @@ def test_the_position_rate_falls_log_linearly_to_a_hundredth(backend, step, scal
 @law("optimizer", "sh_degree_at", step=st.integers(0, 10_000))
 def test_a_band_is_added_every_thousand_steps_up_to_the_third(backend, step):
     assert backend.stage("sh_degree_at")(step) == min(step // 1000, 3)
+
+
+@law("optimizer", "learning_rates", step=st.integers(0, 30_000), scale=dyadic(0.5, 8.0))
+def test_every_other_rate_stays_as_it_is(backend, step, scale):
+    rates = backend.stage("learning_rates")(step, scale)
+    fixed = {"scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
+    assert set(rates) == {"means", *fixed}
+    for name, rate in fixed.items():
+        assert_close("optimizer.rate", rates[name], rate, rate, backend.dtype)

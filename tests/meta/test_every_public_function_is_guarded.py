@@ -1,0 +1,221 @@
+"""Every public function of the oracle is reached by a check that fails when the function is broken.
+
+A function is broken wherever it is used, the kit included: its results are scaled by 1 + 2^-10, integers are off by
+one, truths are negated. For each function one cheap check that notices is written down here: a law on the oracle
+itself, a test of `tests/oracle`, the ladder of ten losses, or the function's doctest. Laws of agreement with the oracle
+do not count: a broken oracle agrees with itself.
+"""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import sys
+from collections.abc import Callable
+
+import pytest
+
+from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.mutants.trial import law_named, obeys
+from tests.golden import ten_losses
+from tests.meta.breakage import broken, public_functions
+
+FUNCTIONS = public_functions()
+
+STEP = "gradients:a_step_along_any_direction_changes_the_image_as_the_gradient_says"
+FLOOR_MARGIN = "test_margins.test_d5_is_near_where_alpha_is_next_to_the_floor"
+CALENDAR = "test_density.test_calendar_has_144_events_41_with_blur_and_4_resets"
+VISIBLE = "density:the_density_statistic_averages_ndc_gradients_over_the_views_that_showed_the_gaussian"
+OUTCOME = "thresholds:at_a_depth_tie_the_order_is_one_of_the_two_and_by_index_where_the_tie_is_exact"
+
+LAWS = {
+    "activations.scales_from_log_scales": "activations:scales_are_positive_and_one_at_zero",
+    "activations.scales_from_log_scales_vjp": "agreement:scales_from_log_scales_vjp_is_the_transpose",
+    "activations.opacities_from_logits": "activations:opposite_logits_give_opacities_that_sum_to_one",
+    "activations.opacities_from_logits_vjp": "agreement:opacities_from_logits_vjp_is_the_transpose",
+    "activations.unit_quats_from_quats": "activations:unit_quaternions_have_norm_one_and_forget_a_power_of_two",
+    "activations.unit_quats_from_quats_vjp": "agreement:unit_quats_from_quats_vjp_is_the_transpose",
+    "alpha.sigma_at_pixel": "alpha:the_exponent_is_half_the_squared_distance_in_the_conics_metric",
+    "alpha.sigma_at_pixel_vjp": "alpha:the_exponents_gradient_is_its_exact_change_for_a_quadratic",
+    "alpha.falloff": "alpha:the_falloff_is_one_at_the_centre_and_multiplies_over_sums",
+    "alpha.falloff_vjp": "alpha:the_falloffs_gradient_is_minus_itself",
+    "alpha.alpha_from_sigma": "alpha:alpha_is_the_falloff_times_opacity_between_the_floor_and_the_ceiling",
+    "alpha.alpha_from_sigma_vjp": "alpha:alphas_gradient_stops_at_floor_and_ceiling_and_nowhere_else",
+    "camera.camera_center": "agreement:camera_center_vjp_is_the_transpose",
+    "camera.camera_center_vjp": "agreement:camera_center_vjp_is_the_transpose",
+    "camera.view_dirs": "agreement:view_dirs_vjp_is_the_transpose",
+    "camera.view_dirs_vjp": "agreement:view_dirs_vjp_is_the_transpose",
+    "camera.means_cam_from_means": "agreement:means_cam_from_means_vjp_is_the_transpose",
+    "camera.means_cam_from_means_vjp": "agreement:means_cam_from_means_vjp_is_the_transpose",
+    "camera.covars_cam_from_covars": "agreement:covars_cam_from_covars_vjp_is_the_transpose",
+    "camera.covars_cam_from_covars_vjp": "agreement:covars_cam_from_covars_vjp_is_the_transpose",
+    "camera.in_front": "camera:the_near_plane_keeps_what_lies_beyond_it_and_decides_equality_by_profile",
+    "compositing.composite": "compositing:weights_and_remaining_light_sum_to_one",
+    "compositing.composite_vjp": STEP,
+    "covariance.rotmats_from_quats": "agreement:rotmats_from_quats_vjp_is_the_transpose",
+    "covariance.rotmats_from_quats_vjp": "agreement:rotmats_from_quats_vjp_is_the_transpose",
+    "covariance.covars_from_quats_scales": "agreement:covars_from_quats_scales_vjp_is_the_transpose",
+    "covariance.covars_from_quats_scales_vjp": "agreement:covars_from_quats_scales_vjp_is_the_transpose",
+    "density.zero_statistics": "density:an_event_adds_clones_and_splits_and_takes_prunes_away",
+    "density.blur_set": "density:the_blur_set_dominates_strictly_more_than_its_share_of_pixels",
+    "density.accumulate": VISIBLE,
+    "density.average_grads": VISIBLE,
+    "density.grow_masks": "density:the_small_are_cloned_and_the_large_are_split_by_gradient_or_blur",
+    "density.prune_mask": "density:the_faint_are_pruned_and_later_the_far_too_large",
+    "density.densify_and_prune": "density:an_event_adds_clones_and_splits_and_takes_prunes_away",
+    "density_rows.rows_from_params": "density:a_new_population_has_zero_moments",
+    "density_rows.clone_rows": "density:clones_are_exact_copies_at_the_end_with_fresh_moments",
+    "density_rows.split_rows": "density:a_split_replaces_each_parent_by_two_smaller_children_drawn_from_it",
+    "density_rows.prune_rows": "density:survivors_of_pruning_keep_their_order_bits_and_moments",
+    "density_rows.reset_opacities": "density:a_reset_lowers_opacities_to_the_ceiling_and_forgets_their_moments_only",
+    "dominance.dominant_id": "dominance:the_largest_weight_wins_and_ties_go_to_the_front",
+    "dominance.dominant_counts": "dominance:counts_and_empty_pixels_add_up_to_the_image",
+    "footprint.low_pass": "agreement:low_pass_vjp_is_the_transpose",
+    "footprint.low_pass_vjp": "agreement:low_pass_vjp_is_the_transpose",
+    "footprint.compensations": "footprint:antialiasing_keeps_the_energy_of_a_splat",
+    "footprint.compensations_vjp": "agreement:compensations_vjp_is_the_transpose",
+    "footprint.conics_from_covars2d": "agreement:conics_from_covars2d_vjp_is_the_transpose",
+    "footprint.conics_from_covars2d_vjp": "agreement:conics_from_covars2d_vjp_is_the_transpose",
+    "footprint.radii_from_covars2d": "footprint:a_flat_covariance_has_no_conic_and_no_extent",
+    "footprint.on_screen": "footprint:a_splat_is_kept_exactly_while_its_extent_overlaps_the_image",
+    "harmonics.sh_basis": "agreement:sh_basis_vjp_is_the_transpose",
+    "harmonics.sh_basis_vjp": "agreement:sh_basis_vjp_is_the_transpose",
+    "harmonics.colors_from_sh": "agreement:colors_from_sh_vjp_is_the_transpose",
+    "harmonics.colors_from_sh_vjp": "agreement:colors_from_sh_vjp_is_the_transpose",
+    "losses.l1": "agreement:l1_vjp_is_the_transpose",
+    "losses.l1_vjp": "agreement:l1_vjp_is_the_transpose",
+    "losses.l2": "agreement:l2_vjp_is_the_transpose",
+    "losses.l2_vjp": "agreement:l2_vjp_is_the_transpose",
+    "losses.photometric_3dgs": "agreement:photometric_3dgs_vjp_is_the_transpose",
+    "losses.photometric_3dgs_vjp": "agreement:photometric_3dgs_vjp_is_the_transpose",
+    "losses.photometric_pop": "agreement:photometric_pop_vjp_is_the_transpose",
+    "losses.photometric_pop_vjp": "agreement:photometric_pop_vjp_is_the_transpose",
+    "optimizer.adam_step": "optimizer:adam_follows_the_scalar_recurrence",
+    "optimizer.means_learning_rate": "optimizer:the_position_rate_falls_log_linearly_to_a_hundredth",
+    "optimizer.learning_rates": "optimizer:every_other_rate_stays_as_it_is",
+    "optimizer.sh_degree_at": "optimizer:a_band_is_added_every_thousand_steps_up_to_the_third",
+    "pixel.rows_from_splats": "compositing:a_round_splat_on_the_axis_looks_as_the_formula_says",
+    "pixel.stops": "compositing:the_stop_itself_ends_a_pixel_where_the_profile_includes_it",
+    "pixel.composite_pixel": "compositing:a_round_splat_on_the_axis_looks_as_the_formula_says",
+    "pixel.composite_pixel_vjp": STEP,
+    "pixel.zero_gradients": STEP,
+    "polarization.importance_mask": "polarization:a_gaussian_is_important_if_it_dominates_one_pixel",
+    "polarization.pop_loss": "agreement:pop_loss_vjp_is_the_transpose",
+    "polarization.pop_loss_vjp": "agreement:pop_loss_vjp_is_the_transpose",
+    "projection.project_means": "agreement:project_means_vjp_is_the_transpose",
+    "projection.project_means_vjp": "agreement:project_means_vjp_is_the_transpose",
+    "projection.projection_jacobians": "agreement:projection_jacobians_vjp_is_the_transpose",
+    "projection.projection_jacobians_vjp": "agreement:projection_jacobians_vjp_is_the_transpose",
+    "projection.project_covars": "agreement:project_covars_vjp_is_the_transpose",
+    "projection.project_covars_vjp": "agreement:project_covars_vjp_is_the_transpose",
+    "render.render": "compositing:weights_and_remaining_light_sum_to_one",
+    "render.render_vjp": STEP,
+    "splatting.geometry": "compositing:a_round_splat_on_the_axis_looks_as_the_formula_says",
+    "splatting.project": "compositing:a_round_splat_on_the_axis_looks_as_the_formula_says",
+    "splatting.project_vjp": STEP,
+    "ssim.ssim": "agreement:ssim_vjp_is_the_transpose",
+    "ssim.ssim_vjp": "agreement:ssim_vjp_is_the_transpose",
+    "ssim.d_ssim": "agreement:d_ssim_vjp_is_the_transpose",
+    "ssim.d_ssim_vjp": "agreement:d_ssim_vjp_is_the_transpose",
+    "tiles.grid_size": "tiles:the_grid_covers_the_image_and_no_tile_lies_outside",
+    "tiles.tile_span": OUTCOME,
+    "tiles.tile_rects": "tiles:a_tile_is_listed_exactly_if_it_overlaps_the_open_extent",
+    "tiles.tile_lists": "tiles:lists_run_front_to_back_and_equal_depths_keep_index_order",
+}
+TESTS = {
+    "density_config.densifies_at": CALENDAR,
+    "density_config.resets_at": CALENDAR,
+    "density_config.blurs_at": "test_density.test_split_only_blur_splits_small_ones_and_may_clone_them_as_well",
+    "ssim.gaussian_window": "test_losses.test_window_is_the_impulse_response_of_scipys_gaussian_filter",
+    "ssim.ssim_map": "test_losses.test_ssim_of_equal_images_is_one_and_is_its_maximum",
+    "ssim.replace_left_out": "test_losses.test_l1_at_equality_has_the_mean_of_its_one_sided_slopes",
+    "magnitudes.in_float32": "test_margins.test_rounded_numbers_inherit_errors_as_their_derivatives_say",
+    "magnitudes.frustum_limits": "test_margins.test_values_under_error_analysis_are_those_of_the_stages",
+    "extent_margins.extent_margins": "test_margins.test_d2_is_near_for_an_opacity_next_to_the_floor",
+    "magnitudes.constant": FLOOR_MARGIN,
+    "magnitudes.depths_magnitudes": FLOOR_MARGIN,
+    "magnitudes.splat_magnitudes": FLOOR_MARGIN,
+    "margins.margins": FLOOR_MARGIN,
+    "pixel_margins.pixel_doubts": FLOOR_MARGIN,
+}
+LADDER = (
+    "training.start",
+    "training.train_step",
+    "training.gaussians_from_params",
+    "training.params_vjp",
+    "training.objective",
+    "training.control",
+)
+DOCTESTS = ("constants.profile_named", "notation.symbol_named", "magnitudes.distance", "magnitudes.colors_magnitudes")
+
+
+def _breaks(check: Callable[[], None]) -> bool:
+    try:
+        check()
+    except Exception:
+        return True
+    return False
+
+
+def _law(path: str) -> None:
+    failure = obeys(law_named(f"test_{path}"), OracleAdapter(), examples=25)
+    assert failure is None, failure
+
+
+# imported while everything is sound: a module that is imported under breakage would keep the broken function
+MODULES = {
+    name: importlib.import_module(f"tests.oracle.{name}") for name in {t.partition(".")[0] for t in TESTS.values()}
+}
+
+
+def _oracle_test(path: str) -> None:
+    module, _, name = path.partition(".")
+    getattr(MODULES[module], name)()
+
+
+def _ladder() -> None:
+    for rung, written in zip(ten_losses.ladder(), ten_losses.written(), strict=True):
+        assert rung.n == written.n
+        assert abs(rung.loss - written.loss) <= 1e-9 * written.loss
+
+
+def _doctest(function_name: str) -> None:
+    module_name, _, name = function_name.partition(".")
+    module = sys.modules[f"pop_ref.{module_name}"]
+    runner = doctest.DocTestRunner(verbose=False)
+    for example in doctest.DocTestFinder().find(getattr(module, name), name, module, vars(module)):
+        runner.run(example, out=lambda text: None)
+    assert runner.tries > 0
+    assert runner.failures == 0
+
+
+def _check_of(name: str) -> Callable[[], None]:
+    if name in LAWS:
+        return lambda: _law(LAWS[name])
+    if name in TESTS:
+        return lambda: _oracle_test(TESTS[name])
+    return _ladder if name in LADDER else lambda: _doctest(name)
+
+
+def test_the_list_is_complete() -> None:
+    listed = [*LAWS, *TESTS, *LADDER, *DOCTESTS]
+    assert len(listed) == len(set(listed)), "a function is listed twice"
+    assert set(listed) == set(FUNCTIONS), f"they differ in {sorted(set(listed) ^ set(FUNCTIONS))}"
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_broken_function_is_noticed(name: str) -> None:
+    check = _check_of(name)
+    with broken(FUNCTIONS[name]):
+        assert _breaks(check), f"nothing noticed that {name} is broken"
+
+
+@pytest.mark.parametrize("check", sorted({*LAWS.values(), *TESTS.values()}))
+def test_the_check_holds_while_nothing_is_broken(check: str) -> None:
+    (_law if ":" in check else _oracle_test)(check)
+
+
+def test_the_ladder_and_the_doctests_hold_while_nothing_is_broken() -> None:
+    _ladder()
+    for name in DOCTESTS:
+        _doctest(name)
