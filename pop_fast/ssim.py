@@ -11,7 +11,7 @@ s_dy = Σ w d y - mu mu_y,
     ∂(1-S)/∂mu = 2 (1 - b) ((1 - a) mu - a mu_y) / B1 - 2 (1 - a) (mu - b mu_x) / B2
 
 so rounding is proportional to the difference and vanishes with it. The textbook form subtracts squares of size 1 and
-compares the result with C2 = 9e-4: three of float32's seven digits are lost, and near convergence all of 1 - S.
+compares the result with C2 = 9e-4: three of float32's seven digits are lost, and near convergence most of 1 - S.
 
 How it is made fast on a CPU:
 
