@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 
 from pop_fast.explain.scene import TILE_SIZE, ExplainedView
+from pop_fast.io.atomic import write_atomically
 from pop_fast.io.images import write_png
 from pop_fast.report.pictures import error_magnitude, error_scale, id_colors
 from pop_ref.constants import PROFILES
@@ -85,9 +87,14 @@ def view_maps(scene: ExplainedView) -> list[Map]:
 
 
 def write_maps(maps: list[Map], folder: Path) -> None:
-    """Write each map as PNG, pixel for pixel as large as the view."""
+    """Write each map as PNG, pixel for pixel as large as the view, and maps.json, which tells how to read them."""
+    legend = {}
     for entry in maps:
         write_png(folder / f"{entry.name}.png", entry.picture)
+        scale = None if entry.scale is None else dict(zip(("colors", "low", "top"), entry.scale, strict=True))
+        legend[f"{entry.name}.png"] = {"title": entry.title, "about": entry.about, "scale": scale}
+    text = json.dumps(legend, indent=2) + "\n"
+    write_atomically(folder / "maps.json", lambda file: file.write(text.encode()))
 
 
 def scaled(name: str, title: str, about: str, values: np.ndarray, colors: str, top: float, low: float = 0.0) -> Map:

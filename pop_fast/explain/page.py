@@ -222,10 +222,14 @@ def _map(entry: Map) -> str:
         stops = np.round(colormaps[name](np.linspace(0.0, 1.0, 10))[:, :3] * 255.0).astype(int)
         colors = ",".join(f"rgb({r},{g},{b})" for r, g, b in stops.tolist())
         gradient = f"linear-gradient(90deg,{colors})"
-        bar = f'<div class="bar">{low:.3g}<i style="background:{gradient}"></i>{top:.3g}</div>'
+        bar = f'<div class="bar">{_short(low)}<i style="background:{gradient}"></i>{_short(top)}</div>'
     lossless = entry.name in ("dominant_ids", "importance_gaussians")
     picture = data_uri(fit(entry.picture, nearest=lossless, max_side=480), lossless=lossless)
     return (
         f'<figure><img alt="{escape(entry.title)}" src="{picture}"><b>{escape(entry.title)}</b>{bar}'
         f'<div class="caption">{escape(entry.about)}</div></figure>'
     )
+
+
+def _short(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 100.0 else f"{value:.3g}"

@@ -242,7 +242,11 @@ def test_one_command_writes_table_json_page_and_maps(pop: Pop, shared_result: Pa
     names = {path.stem for path in (tmp_path / "maps").iterdir()}
     assert {"dominant_ids", "n_blended", "n_traversed", "termination_depth", "T_final", "error", "pop_pull"} <= names
     assert {"importance", "importance_gaussians", "diff_color", "diff_dominant"} <= names
-    assert all(cv2.imread(str(path)).shape == (32, 40, 3) for path in (tmp_path / "maps").iterdir())
+    pictures = sorted((tmp_path / "maps").glob("*.png"))
+    assert all(cv2.imread(str(path)).shape == (32, 40, 3) for path in pictures)
+    legend = json.loads((tmp_path / "maps" / "maps.json").read_text())
+    assert sorted(legend) == [path.name for path in pictures]
+    assert legend["pop_pull.png"]["scale"] == {"colors": "coolwarm", "low": -1.0, "top": 1.0}
 
 
 @pytest.mark.parametrize(
