@@ -1,48 +1,17 @@
-"""Bad input on the command line: status 2, one line that names file, field and fix, and nothing half-written."""
+"""Bad captures and settings on the command line: status 2, one line that names file, field and fix."""
 
 from __future__ import annotations
 
-import errno
 import json
-import os
 import struct
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-import torch
 
-from pop_fast.io.ply import load_ply, save_ply
-from tests.app.conftest import TRAIN, Outcome, Pop
-
-Damage = Callable[[Path], None]
-
-
-def says(outcome: Outcome, *parts: str) -> None:
-    """Assert that the outcome is one clean line of error with all of these parts."""
-    assert outcome.status == 2, outcome
-    lines = outcome.err.strip().splitlines()
-    assert len(lines) == 1, outcome.err
-    assert lines[0].startswith("pop: error: ")
-    for part in parts:
-        assert part in lines[0], (part, lines[0])
-
-
-def photo(folder: Path, number: int = 0) -> Path:
-    return folder / "images" / f"view_{number:03d}.png"
-
-
-def truncate(path: Path, share: float = 0.5) -> None:
-    data = path.read_bytes()
-    path.write_bytes(data[: int(len(data) * share)])
-
-
-def patch_bytes(path: Path, at: int, data: bytes) -> None:
-    content = bytearray(path.read_bytes())
-    content[at : at + len(data)] = data
-    path.write_bytes(bytes(content))
+from tests.app.conftest import TRAIN, Pop
+from tests.app.damage import Damage, patch_bytes, photo, says, truncate
 
 
 def corrupt_pixels(folder: Path) -> None:
@@ -200,165 +169,3 @@ def test_a_setting_out_of_range_is_named(
 ) -> None:
     says(pop("train", shared_capture, "--out", tmp_path / "r", "--quiet", *words), *parts)
     assert not (tmp_path / "r").exists()
-
-
-def contents(folder: Path) -> dict[Path, bytes]:
-    """Read every file under a folder, to see that nothing changed."""
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def test_an_output_folder_in_use_is_left_alone(pop: Pop, shared_capture: Path, result: Path) -> None:
-    before = contents(result)
-    says(pop("train", shared_capture, "--out", result, *TRAIN), str(result), "--resume", "--overwrite")
-    assert contents(result) == before
-
-
-def test_a_folder_of_somebody_else_is_not_overwritten(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
-    (tmp_path / "home").mkdir()
-    (tmp_path / "home" / "thesis.txt").write_text("mine")
-    outcome = pop("train", shared_capture, "--out", tmp_path / "home", "--overwrite", *TRAIN)
-    says(outcome, "home", "not a result folder")
-    assert [path.name for path in (tmp_path / "home").iterdir()] == ["thesis.txt"]
-
-
-def test_a_run_is_not_resumed_with_other_settings(pop: Pop, shared_capture: Path, result: Path) -> None:
-    before = contents(result)
-    outcome = pop("train", shared_capture, "--out", result, *TRAIN, "--resume", "--seed", "7")
-    says(outcome, "ckpt_29_rank0.pt", "seed = 42", "seed = 7", "use the same settings")
-    assert contents(result) == before
-
-
-def test_a_run_is_not_resumed_on_another_capture(pop: Pop, capture: Path, result: Path) -> None:
-    cv2.imwrite(str(photo(capture, 2)), np.zeros((32, 40, 3), np.uint8))
-    before = contents(result)
-    outcome = pop("train", capture, "--out", result, *TRAIN, "--resume")
-    says(outcome, "another capture", "photographs", "use the same photographs")
-    assert contents(result) == before
-
-
-def test_a_damaged_checkpoint_is_named_on_resume(pop: Pop, shared_capture: Path, result: Path) -> None:
-    truncate(result / "ckpts" / "ckpt_29_rank0.pt")
-    says(pop("train", shared_capture, "--out", result, *TRAIN, "--resume"), "ckpt_29_rank0.pt", "remove it")
-
-
-@pytest.mark.parametrize("command", ["train", "demo", "render", "export"])
-def test_a_full_disk_leaves_nothing_half_written(
-    pop: Pop, shared_capture: Path, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
-) -> None:
-    def full(_: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "fsync", full)
-    target = tmp_path / "here" / ("out.ply" if command == "export" else "out")
-    words = {
-        "train": ["train", shared_capture, "--out", target, *TRAIN],
-        "demo": ["demo", target, "--views", "4", "--width", "16", "--height", "16"],
-        "render": ["render", shared_result, "--out", target],
-        "export": ["export", shared_result, "--out", target],
-    }
-    says(pop(*words[command]), str(target.parent), "the disk is full", "free some space")
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
-
-
-@pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may write anywhere")
-def test_a_folder_that_may_not_be_written_is_named(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
-    (tmp_path / "locked").mkdir(mode=0o500)
-    says(pop("train", shared_capture, "--out", tmp_path / "locked" / "r", *TRAIN), "locked", "permission denied")
-
-
-def splat_file(shared_result: Path, path: Path, **changes: object) -> Path:
-    """Write a checkpoint or PLY like the tiny result's, with tensors changed or left out (None)."""
-    params = load_ply(shared_result / "ply" / "point_cloud_29.ply")
-    kept = {name: changes.get(name, value) for name, value in params.items()}
-    torch.save({"step": 29, "splats": {k: v for k, v in kept.items() if v is not None}}, path)
-    return path
-
-
-def with_value(shape: tuple[int, ...], index: tuple[int, ...], value: float) -> torch.Tensor:
-    tensor = torch.zeros(shape)
-    tensor[index] = value
-    return tensor
-
-
-def test_every_defect_of_a_checkpoint_is_named_with_its_tensor(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
-    n = len(load_ply(shared_result / "ply" / "point_cloud_29.ply")["means"])
-    cases: list[tuple[dict[str, object], tuple[str, ...]]] = [
-        ({"scales": None}, ("no splats.scales",)),
-        ({"means": with_value((n, 3), (4, 1), float("nan"))}, ("splats.means[4, 1] is nan",)),
-        ({"sh0": with_value((n, 1, 3), (0, 0, 2), float("inf"))}, ("splats.sh0[0, 0, 2] is inf",)),
-        ({"quats": torch.zeros((n, 3))}, (f"splats.quats has shape [{n}, 3]; it must be [{n}, 4]",)),
-        ({"shN": torch.zeros((n, 7, 3))}, ("splats.shN has shape", "or 0, 3 or 8")),
-        ({"opacities": torch.zeros(n, dtype=torch.int64)}, ("splats.opacities is torch.int64", "floats")),
-        ({"means": torch.zeros(())}, ("splats.means has shape []",)),
-        ({"means": [1.0]}, ("splats.means is list",)),
-    ]
-    for changes, parts in cases:
-        path = splat_file(shared_result, tmp_path / "broken.pt", **changes)
-        says(pop("export", path, "--out", tmp_path / "o.ply"), "broken.pt", *parts)
-    assert not (tmp_path / "o.ply").exists()
-
-
-def test_a_zero_quaternion_is_named_before_it_is_rendered_or_exported(
-    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path
-) -> None:
-    quats = load_ply(shared_result / "ply" / "point_cloud_29.ply")["quats"]
-    quats[2] = 0.0
-    path = splat_file(shared_result, tmp_path / "zero.pt", quats=quats)
-    says(pop("export", path, "--out", tmp_path / "o.ply"), "quats[2", "norm > 0")
-    says(pop("eval", path, "--capture", shared_capture), "quats[", "norm > 0")
-    assert not (tmp_path / "o.ply").exists()
-
-
-@pytest.mark.parametrize(
-    ("damage", "parts"),
-    [
-        (lambda p: truncate(p), ("x.ply",)),
-        (lambda p: p.write_bytes(b""), ("x.ply",)),
-        (lambda p: p.write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n"), ("'y'",)),
-        (lambda p: patch_bytes(p, p.stat().st_size - 248, struct.pack("<f", float("nan"))), (".x is nan", "finite")),
-        (lambda p: patch_bytes(p, p.stat().st_size - 16, bytes(16)), (".rot is a zero quaternion", "[1, 0, 0, 0]")),
-    ],
-    ids=["truncated", "empty", "not a splat", "NaN", "zero quaternion"],
-)
-def test_a_damaged_ply_is_named_and_nothing_is_exported(
-    pop: Pop, shared_result: Path, tmp_path: Path, damage: Damage, parts: tuple[str, ...]
-) -> None:
-    path = tmp_path / "x.ply"
-    save_ply(path, load_ply(shared_result / "ply" / "point_cloud_29.ply"))
-    damage(path)
-    says(pop("export", path, "--out", tmp_path / "o.splat"), "x.ply", *parts)
-    assert not (tmp_path / "o.splat").exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "parts"),
-    [
-        (["eval", "gone"], ("gone", "no such file or folder")),
-        (["report", "gone"], ("gone", "no cfg.json")),
-        (["compare", "gone"], ("gone", "no cfg.json")),
-        (["compare"], ("name one or more",)),
-        (["data", "check", "gone"], ("gone", "no such folder")),
-        (["sfm", "gone"], ("gone", "no such folder")),
-        (["demo", "here", "--views", "2"], ("2 views", "use 4")),
-        (["doctor", "--lpips-alex", "gone"], ("gone", "LPIPS")),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
-)
-def test_the_other_subcommands_name_what_is_wrong(
-    pop: Pop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], parts: tuple[str, ...]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    says(pop(*words), *parts)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_result_that_was_never_saved_is_named(pop: Pop, result: Path) -> None:
-    for path in [*(result / "ckpts").iterdir(), *(result / "ply").iterdir()]:
-        path.unlink()
-    says(pop("eval", result), "no checkpoint and no PLY", "--resume")
-
-
-def test_an_unknown_setting_in_cfg_json_is_named(pop: Pop, result: Path) -> None:
-    config = json.loads((result / "cfg.json").read_text())
-    (result / "cfg.json").write_text(json.dumps({**config, "colour": 1}))
-    says(pop("eval", result), "config.colour", "not a setting")

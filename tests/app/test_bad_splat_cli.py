@@ -1,0 +1,112 @@
+"""Damaged checkpoints, PLY files and results: refused in one line that names file, field and fix."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import pytest
+import torch
+
+from pop_fast.io.ply import load_ply, save_ply
+from tests.app.conftest import Pop
+from tests.app.damage import Damage, patch_bytes, says, truncate
+
+
+def splat_file(shared_result: Path, path: Path, **changes: object) -> Path:
+    """Write a checkpoint or PLY like the tiny result's, with tensors changed or left out (None)."""
+    params = load_ply(shared_result / "ply" / "point_cloud_29.ply")
+    kept = {name: changes.get(name, value) for name, value in params.items()}
+    torch.save({"step": 29, "splats": {k: v for k, v in kept.items() if v is not None}}, path)
+    return path
+
+
+def with_value(shape: tuple[int, ...], index: tuple[int, ...], value: float) -> torch.Tensor:
+    tensor = torch.zeros(shape)
+    tensor[index] = value
+    return tensor
+
+
+def test_every_defect_of_a_checkpoint_is_named_with_its_tensor(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
+    n = len(load_ply(shared_result / "ply" / "point_cloud_29.ply")["means"])
+    cases: list[tuple[dict[str, object], tuple[str, ...]]] = [
+        ({"scales": None}, ("no splats.scales",)),
+        ({"means": with_value((n, 3), (4, 1), float("nan"))}, ("splats.means[4, 1] is nan",)),
+        ({"sh0": with_value((n, 1, 3), (0, 0, 2), float("inf"))}, ("splats.sh0[0, 0, 2] is inf",)),
+        ({"quats": torch.zeros((n, 3))}, (f"splats.quats has shape [{n}, 3]; it must be [{n}, 4]",)),
+        ({"shN": torch.zeros((n, 7, 3))}, ("splats.shN has shape", "or 0, 3 or 8")),
+        ({"opacities": torch.zeros(n, dtype=torch.int64)}, ("splats.opacities is torch.int64", "floats")),
+        ({"means": torch.zeros(())}, ("splats.means has shape []",)),
+        ({"means": [1.0]}, ("splats.means is list",)),
+    ]
+    for changes, parts in cases:
+        path = splat_file(shared_result, tmp_path / "broken.pt", **changes)
+        says(pop("export", path, "--out", tmp_path / "o.ply"), "broken.pt", *parts)
+    assert not (tmp_path / "o.ply").exists()
+
+
+def test_a_zero_quaternion_is_named_before_it_is_rendered_or_exported(
+    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path
+) -> None:
+    quats = load_ply(shared_result / "ply" / "point_cloud_29.ply")["quats"]
+    quats[2] = 0.0
+    path = splat_file(shared_result, tmp_path / "zero.pt", quats=quats)
+    says(pop("export", path, "--out", tmp_path / "o.ply"), "quats[2", "norm > 0")
+    says(pop("eval", path, "--capture", shared_capture), "quats[", "norm > 0")
+    assert not (tmp_path / "o.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("damage", "parts"),
+    [
+        (lambda p: truncate(p), ("x.ply",)),
+        (lambda p: p.write_bytes(b""), ("x.ply",)),
+        (lambda p: p.write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n"), ("'y'",)),
+        (lambda p: patch_bytes(p, p.stat().st_size - 248, struct.pack("<f", float("nan"))), (".x is nan", "finite")),
+        (lambda p: patch_bytes(p, p.stat().st_size - 16, bytes(16)), (".rot is a zero quaternion", "[1, 0, 0, 0]")),
+    ],
+    ids=["truncated", "empty", "not a splat", "NaN", "zero quaternion"],
+)
+def test_a_damaged_ply_is_named_and_nothing_is_exported(
+    pop: Pop, shared_result: Path, tmp_path: Path, damage: Damage, parts: tuple[str, ...]
+) -> None:
+    path = tmp_path / "x.ply"
+    save_ply(path, load_ply(shared_result / "ply" / "point_cloud_29.ply"))
+    damage(path)
+    says(pop("export", path, "--out", tmp_path / "o.splat"), "x.ply", *parts)
+    assert not (tmp_path / "o.splat").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["eval", "gone"], ("gone", "no such file or folder")),
+        (["report", "gone"], ("gone", "no cfg.json")),
+        (["compare", "gone"], ("gone", "no cfg.json")),
+        (["compare"], ("name one or more",)),
+        (["data", "check", "gone"], ("gone", "no such folder")),
+        (["sfm", "gone"], ("gone", "no such folder")),
+        (["demo", "here", "--views", "2"], ("2 views", "use 4")),
+        (["doctor", "--lpips-alex", "gone"], ("gone", "LPIPS")),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_the_other_subcommands_name_what_is_wrong(
+    pop: Pop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], parts: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    says(pop(*words), *parts)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_result_that_was_never_saved_is_named(pop: Pop, result: Path) -> None:
+    for path in [*(result / "ckpts").iterdir(), *(result / "ply").iterdir()]:
+        path.unlink()
+    says(pop("eval", result), "no checkpoint and no PLY", "--resume")
+
+
+def test_an_unknown_setting_in_cfg_json_is_named(pop: Pop, result: Path) -> None:
+    config = json.loads((result / "cfg.json").read_text())
+    (result / "cfg.json").write_text(json.dumps({**config, "colour": 1}))
+    says(pop("eval", result), "config.colour", "not a setting")

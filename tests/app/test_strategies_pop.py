@@ -1,0 +1,115 @@
+"""What is POP's own: the blur rule and the prior."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from pop_fast.strategies import ADCStrategy, POPStrategy
+from tests.app.populations import HEIGHT, WIDTH, make, make_info, packed, run_event
+
+
+def test_a_gaussian_that_dominates_enough_pixels_of_one_view_grows_in_the_blur_window_only():
+    threshold = 2e-5
+    height = width = 1000
+    for step, counts, n in ((3000, [20, 21], 3), (7000, [20, 21], 3), (2900, [21, 21], 2), (7100, [21, 21], 2)):
+        params, optimizers = make(2)
+        info = make_info(2, counts=torch.tensor(counts), width=width, height=height)
+        run_event(POPStrategy(theta_blur=threshold), params, optimizers, info, step)
+        assert len(params["means"]) == n, step
+
+
+def test_a_threshold_in_pixels_bounds_the_blur_rule_from_below():
+    for least, counts, n in ((0.0, [0, 1], 3), (11.0, [11, 12], 3), (11.0, [1, 11], 2)):
+        params, optimizers = make(2)
+        info = make_info(2, counts=torch.tensor(counts), width=240, height=135)
+        run_event(POPStrategy(blur_min_pixels=least), params, optimizers, info, 3000)
+        assert len(params["means"]) == n
+
+
+@pytest.mark.parametrize(("window", "n"), [("any_view", 2), ("sum", 3), ("own_view", 1)])
+def test_what_the_dominant_count_is_taken_over_is_a_switch(window, n):
+    # Gaussian 0 is over the threshold of 2 px in the first view, Gaussian 1 in the sum alone
+    params, optimizers = make(2)
+    params["opacities"].data[:] = 0.0
+    strategy = POPStrategy(theta_blur=2 / (WIDTH * HEIGHT), blur_window=window, refine_every=2)
+    state = strategy.initialize_state()
+    for step, counts in ((3001, [3, 2]), (3002, [0, 1])):
+        strategy.step_post_backward(params, optimizers, state, step, make_info(2, counts=torch.tensor(counts)))
+    assert len(params["means"]) == {"any_view": 3, "sum": 4, "own_view": 2}[window]
+    assert n == len(params["means"]) - 1
+
+
+def test_blur_flags_are_forgotten_after_an_event():
+    params, optimizers = make(1)
+    strategy = POPStrategy()
+    state = strategy.initialize_state()
+    strategy.step_post_backward(params, optimizers, state, 3000, make_info(1, counts=torch.tensor([99])))
+    assert len(params["means"]) == 2
+    strategy.step_post_backward(params, optimizers, state, 3100, make_info(2))
+    assert len(params["means"]) == 2
+
+
+def test_blur_clones_small_and_splits_large_or_splits_all():
+    for rule, event in (("by_scale", {"cloned": 1, "split": 1}), ("split", {"cloned": 0, "split": 2})):
+        params, optimizers = make(2)
+        params["scales"].data[1] = math.log(0.05)
+        info = make_info(2, counts=torch.tensor([99, 99]))
+        state = run_event(POPStrategy(blur_rule=rule), params, optimizers, info, 3000)
+        assert state["event"] == {**event, "pruned": 0}
+
+
+def test_growth_by_gradient_can_be_switched_off_altogether_or_in_the_blur_window():
+    grads = torch.ones(1, 2)
+    for strategy, step, n in (
+        (POPStrategy(grow_on_gradient=False), 600, 1),
+        (POPStrategy(grow_on_gradient_in_blur_window=False), 600, 2),
+        (POPStrategy(grow_on_gradient_in_blur_window=False), 3000, 1),
+    ):
+        params, optimizers = make(1)
+        run_event(strategy, params, optimizers, make_info(1, grads), step)
+        assert len(params["means"]) == n
+
+
+def test_nothing_happens_from_step_15000():
+    params, optimizers = make(2)
+    state = run_event(POPStrategy(), params, optimizers, make_info(2, torch.ones(2, 2)), 15_000)
+    assert len(params["means"]) == 2
+    assert state["grad2d"] is None
+
+
+def test_the_regularizer_pulls_dominant_opacities_up_and_the_others_down():
+    strategy = POPStrategy()
+    opacities = torch.tensor([0.25, 0.5, 0.75, 0.5], requires_grad=True)
+    info = make_info(4, counts=torch.tensor([5, 0, 1, 0]))
+    term = strategy.regularizer(opacities, strategy.initialize_state(), 0, info)
+    assert term is not None
+    assert term.item() == pytest.approx(1e-3 * (0.5 + 0.5))
+    term.backward()
+    assert torch.allclose(opacities.grad, 1e-3 * torch.tensor([-0.5, 0.5, -0.5, 0.5]))
+
+
+def test_the_regularizer_is_off_outside_its_steps_and_at_weight_0():
+    info, opacities = make_info(2), torch.tensor([0.5, 0.5])
+    for strategy, step in (
+        (POPStrategy(), 15_000),
+        (POPStrategy(pop_start_iter=500), 499),
+        (POPStrategy(lambda_pop=0), 0),
+    ):
+        assert strategy.regularizer(opacities, strategy.initialize_state(), step, info) is None
+    assert ADCStrategy().regularizer(opacities, {}, 0, info) is None
+
+
+def test_importance_can_be_kept_for_the_window_and_the_loss_for_the_visible():
+    opacities = torch.tensor([0.25, 0.5, 0.75], requires_grad=True)
+    strategy = POPStrategy(pop_views="window", pop_over="visible")
+    params, optimizers = make(3)
+    state = strategy.initialize_state()
+    strategy.step_post_backward(params, optimizers, state, 1, make_info(3, counts=torch.tensor([1, 0, 0])))
+    info = make_info(3, visible=[True, True, False], counts=torch.tensor([0, 0, 0]))
+    for each in (info, packed(info)):
+        term = strategy.regularizer(opacities, state, 2, each)
+        assert term is not None
+        assert term.item() == pytest.approx(1e-3 * (0.75 + 0.5))
