@@ -36,4 +36,6 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         mark = pytest.mark.skip(reason="no C++ compiler: the host mirror cannot be built (install g++ or set CXX)")
         metafunc.parametrize("backend", [pytest.param(None, id="mirror", marks=[mark])])
         return
-    parametrize_backends(metafunc, mirrors())
+    # in double the mirror is the oracle to 1e-12, for which the laws are proved already; float has to stand by itself
+    agreement = metafunc.definition.path.stem == "test_host_mirror_agreement"
+    parametrize_backends(metafunc, mirrors() if agreement else mirrors()[1:])
