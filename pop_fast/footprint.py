@@ -76,7 +76,9 @@ def radii_from_covars2d(covars2d: Tensor, opacities: Tensor, profile: Profile = 
         r = torch.ceil(profile.extent_sigmas * torch.sqrt(largest))
         radii, shown = (r, r), det > 0.0
     else:
-        reach = torch.sqrt(2.0 * torch.log(torch.clamp_min(opacities / profile.alpha_floor, 1.0)))
+        # in float32 the ratio is off by its rounding, which just above the floor would round a splat away
+        rounding = torch.finfo(torch.float32).eps if opacities.dtype == torch.float32 else 0.0
+        reach = torch.sqrt(2.0 * (torch.log(torch.clamp_min(opacities / profile.alpha_floor, 1.0)) + rounding))
         reach = reach.clamp_max(profile.extent_sigmas)
         radii = (torch.ceil(reach * torch.sqrt(xx)), torch.ceil(reach * torch.sqrt(yy)))
         shown = (det > 0.0) & (opacities >= profile.alpha_floor)
