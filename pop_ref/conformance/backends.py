@@ -9,7 +9,9 @@ from typing import Any
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.constants import PAPER, Profile
 
+# what this project's own tests judge, and what else the kit knows how to judge where it is installed
 SHIPPED = ("oracle", "fast64", "fast32")
+FOREIGN = ("gsplat", "gsplat-torch64", "gsplat-torch32")
 
 
 class Unavailable(Exception):  # noqa: N818  a state of the machine, not a fault of the program
@@ -33,13 +35,27 @@ def shipped(name: str) -> Any:
 
     Raises:
         Unavailable: its implementation, or torch, is not installed.
-        ValueError: the name is not one of SHIPPED.
+        ValueError: the name is not one of SHIPPED or FOREIGN.
     """
     if name == "oracle":
         return OracleAdapter()
     if name in ("fast64", "fast32"):
         return adapter_for("pop_fast.rasterization:rasterization", name, "pop_fast", f"float{name[-2:]}")
-    raise ValueError(f"backend {name!r} is unknown; use one of {', '.join(SHIPPED)}")
+    if name in FOREIGN:
+        return _gsplat(name)
+    raise ValueError(f"backend {name!r} is unknown; use one of {', '.join((*SHIPPED, *FOREIGN))}")
+
+
+def _gsplat(name: str) -> Any:
+    try:
+        adapters = importlib.import_module("pop_ref.conformance.gsplat_adapter")
+        if name == "gsplat":
+            if not importlib.import_module("torch").cuda.is_available():
+                raise Unavailable("gsplat's rasterizer needs a CUDA device; gsplat-torch64 judges its torch stages")
+            return adapters.gsplat_cuda(name)
+        return adapters.gsplat_torch(name, f"float{name[-2:]}")
+    except ModuleNotFoundError as error:
+        raise Unavailable(f"{name} needs {error.name}, which is not installed") from error
 
 
 def adapter_for(

@@ -117,6 +117,8 @@ CASES = (
     Case("pop_loss", "polarization", st.tuples(_stacked(st.tuples(opacities())).map(np.ravel), masks), (0,)),
 )
 
+BY_NAME = {case.name: case for case in CASES}
+
 
 def transposed(case: Case, function: Callable[..., Any], inputs: tuple[Any, ...], v: Any) -> tuple[np.ndarray, ...]:
     """Call a transpose with its cotangent in its place; return the cotangents as a tuple."""

@@ -152,6 +152,7 @@ TABLE: Final[dict[str, Tolerance]] = {
     "optimizer.scale": Tolerance(units=800, worst=200),
     "polarization.gradient": Tolerance(units=1.5, worst=0.26),
     "polarization.loss": Tolerance(units=2, worst=0.5),
+    "projection.axis": Tolerance(units=1, worst=0.1),
     "projection.clamp": Tolerance(units=1, worst=0.25),
     "projection.clamp_gradient": Tolerance(units=1, worst=0),
     "projection.covariance": Tolerance(units=1, worst=0),

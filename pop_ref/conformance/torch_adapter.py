@@ -8,14 +8,17 @@ from __future__ import annotations
 import importlib
 import inspect
 import itertools
-from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass, replace
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
+from hypothesis import reject
 
 from pop_ref.conformance.adapter import View, stage_function
+from pop_ref.conformance.cases import BY_NAME, Case
 from pop_ref.conformance.law import DOMINANCE, DOUBLE, GRADIENTS, PROFILES, RENDER
 from pop_ref.conformance.scenes import Scene, rounded_to
 from pop_ref.constants import PAPER, Profile
@@ -28,6 +31,7 @@ class TorchAdapter:
         name: how reports call it.
         rasterization: a function with gsplat's signature, or None to judge stage functions only.
         package: a package whose stage modules carry the oracle's names, or None.
+        stages: stage functions on tensors by the oracle's names, beside those of the package.
         dtype: "float64" or "float32".
         device: a torch device.
         profile: the profile that a function without a `profile` argument implements.
@@ -41,8 +45,10 @@ class TorchAdapter:
         dtype: str = "float64",
         device: str = "cpu",
         profile: Profile = PAPER,
+        stages: Mapping[str, Callable[..., Any]] | None = None,
     ) -> None:
         self.name = name
+        self._stages = dict(stages or {})
         self.dtype = {"float64": np.float64, "float32": np.float32}[dtype]
         self.profile = profile
         self._torch = importlib.import_module("torch")
@@ -67,7 +73,7 @@ class TorchAdapter:
             if self._tells_dominance is None:
                 self._tells_dominance = self._asked_for_dominance()
             return self._tells_dominance
-        return self._package is not None and self._stage(need) is not None
+        return self._stage(need) is not None
 
     def _asked_for_dominance(self) -> bool:
         from pop_ref.conformance.golden import golden_scene
@@ -75,21 +81,58 @@ class TorchAdapter:
         return self.render(golden_scene()).dominant_ids is not None
 
     def _stage(self, name: str) -> Callable[..., Any] | None:
-        return stage_function(str(self._package), name)
+        found = self._stages.get(name)
+        if found is None and self._package is not None:
+            found = stage_function(self._package, name)
+        base = name.removesuffix("_vjp")
+        if found is None and base != name and base in BY_NAME:
+            forward = self._stage(base)
+            return None if forward is None or not BY_NAME[base].wrt else self._by_autograd(BY_NAME[base], forward)
+        return found
+
+    def _by_autograd(self, case: Case, forward: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the transpose that torch derives of a stage function."""
+
+        def pull(*args: Any) -> Any:
+            at = len(args) - 1 if case.cotangent_at is None else case.cotangent_at
+            inputs, v = [*args[:at], *args[at + 1 :]], args[at]
+            leaves = [inputs[k].detach().clone().requires_grad_(True) for k in case.wrt]
+            for k, leaf in zip(case.wrt, leaves, strict=True):
+                inputs[k] = leaf
+            out = forward(*inputs)
+            if not out.requires_grad:
+                # a constant, as degree 0 is
+                grads: Any = [None] * len(leaves)
+            else:
+                grads = self._torch.autograd.grad(
+                    out, leaves, self._torch.as_tensor(v, dtype=out.dtype), allow_unused=True
+                )
+            pulled = tuple(self._torch.zeros_like(x) if g is None else g for g, x in zip(grads, leaves, strict=True))
+            return pulled if len(pulled) > 1 else pulled[0]
+
+        return pull
 
     def stage(self, name: str) -> Callable[..., Any]:
-        """Return a stage function wrapped so that arrays go in as tensors and come out as arrays."""
+        """Return a stage function wrapped so that arrays go in as tensors and come out as arrays.
+
+        Constants that the implementation does not offer set the example aside.
+        """
         function = self._stage(name)
         if function is None:
-            raise LookupError(f"{self._package} has no stage function {name}")
-
-        own = importlib.import_module(function.__module__)
+            raise LookupError(f"{self.name} has no stage function {name}")
+        own = sys.modules.get(function.__module__)
 
         def with_arrays(*args: Any, **kwargs: Any) -> Any:
+            if any(isinstance(a, Profile) and not self._implements(a) for a in (*args, *kwargs.values())):
+                reject()
             tensors = {key: self._tensor(value, own) for key, value in kwargs.items()}
             return self._array(function(*[self._tensor(a, own) for a in args], **tensors))
 
         return with_arrays
+
+    def _implements(self, profile: Profile) -> bool:
+        # stage functions of a package take the profile that they are given
+        return self._package is not None or replace(profile, name=self.profile.name) == self.profile
 
     def sees(self, scene: Scene) -> Scene:
         """Return the scene rounded to the program's precision."""

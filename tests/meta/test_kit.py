@@ -185,3 +185,33 @@ def test_poison_reaches_what_the_package_allocates_and_nothing_else() -> None:
         assert theirs["c"].tolist() == [POISONED_INTEGER] * 2  # type: ignore[attr-defined]
         assert torch.all(ours == 1.0)
     assert torch.empty is before
+
+
+STRANGER = """
+from pop_fast.rasterization import rasterization as sound
+
+def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane=0.01, far_plane=1e10,
+                  radius_clip=0.0, eps2d=0.3, sh_degree=None, packed=True, tile_size=16, backgrounds=None, absgrad=False,
+                  rasterize_mode="classic"):
+    Ks = Ks.clone()
+    Ks[..., 0, 2] += {shift}
+    image, alphas, meta = sound(means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree=sh_degree,
+                                packed=packed, tile_size=tile_size, backgrounds=backgrounds, absgrad=absgrad,
+                                rasterize_mode=rasterize_mode)
+    return image, alphas, {{"means2d": meta["means2d"], "radii": meta["radii"]}}
+"""
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.5])
+def test_a_stranger_with_gsplats_signature_is_judged_by_what_it_offers(
+    tmp_path: Path, shift: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # nothing but gsplat's arguments and meta keys; with half a pixel's shift it must fail and say where
+    (tmp_path / "stranger.py").write_text(STRANGER.format(shift=shift))
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{ROOT}")
+    done = _kit("--rasterizer", "stranger:rasterization", "--dtype", "float64", "--profile", "gsplat_1_5", "-rs",
+                "-k", "round_splat or stop_itself or any_tile", "--failures", str(tmp_path / "broken"))  # fmt: skip
+    assert "has no stops" in done.stdout, done.stdout + done.stderr
+    assert done.returncode == (1 if shift else 0), done.stdout + done.stderr
+    if shift:
+        assert "a_round_splat_on_the_axis_looks_as_the_formula_says" in done.stdout

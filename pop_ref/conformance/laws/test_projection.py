@@ -8,6 +8,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.law import PROFILES as PROFILES_NEEDED
 from pop_ref.conformance.law import law
 from pop_ref.conformance.strategies import arrays_of, dyadic, reals
 from pop_ref.constants import INRIA, PAPER, PROFILES
@@ -33,11 +34,18 @@ def _slope_limits(profile, intrinsics=K):
 def test_a_point_on_the_axis_lands_on_the_principal_point_and_others_to_its_right_and_below(backend, point):
     project = backend.stage("project_means")
     axis = np.array([[0.0, 0.0, point[0, 2]]])
-    assert_same_bits("axis", project(axis, K, W, H), np.array([[3.0, 2.5]]))
-    assert_same_bits("axis, centred", project(axis, K, W, H, INRIA), np.array([[W / 2.0, H / 2.0]]))
+    assert_close("projection.axis", project(axis, K, W, H), np.array([[3.0, 2.5]]), 8.0, backend.dtype)
     u, v = project(np.abs(point), K, W, H)[0]
-    assert u >= 3.0
-    assert v >= 2.5
+    slack = 16.0 * np.finfo(backend.dtype).eps
+    assert u >= 3.0 - slack
+    assert v >= 2.5 - slack
+
+
+@law("projection", "project_means", PROFILES_NEEDED, point=points)
+def test_where_the_profile_says_so_the_principal_point_is_the_images_centre(backend, point):
+    axis = np.array([[0.0, 0.0, point[0, 2]]])
+    centre = np.array([[W / 2.0, H / 2.0]])
+    assert_close("projection.axis", backend.stage("project_means")(axis, K, W, H, INRIA), centre, 8.0, backend.dtype)
 
 
 @law("projection", "project_means", "projection_jacobians", point=points, power=st.integers(-4, 4))
