@@ -29,6 +29,7 @@ class Case:
         inputs: its arguments, without a cotangent.
         wrt: positions of the arguments that its transpose returns cotangents of; empty if it has none.
         cotangent_at: the position of v among the transpose's arguments; None puts it last.
+        on_sphere: the argument is a unit vector: only the tangential part of its cotangent means anything.
         magnitude: what one unit of the value is charged on; None measures it with `sensitivity`.
     """
 
@@ -38,6 +39,7 @@ class Case:
     wrt: tuple[int, ...] = ()
     cotangent_at: int | None = None
     magnitude: Callable[[tuple[Any, ...]], float] | None = None
+    on_sphere: bool = False
 
 
 def _stacked(rows: Inputs) -> st.SearchStrategy[np.ndarray]:
@@ -96,7 +98,7 @@ CASES = (
     Case("unit_quats_from_quats", "activations", st.tuples(quat_rows), (0,)),
     Case("rotmats_from_quats", "covariance", st.tuples(quat_rows), (0,)),
     Case("covars_from_quats_scales", "covariance", st.tuples(quat_rows, _vectors(3, 0.0, 4.0)), (0, 1)),
-    Case("sh_basis", "harmonics", st.tuples(units, degrees), (0,)),
+    Case("sh_basis", "harmonics", st.tuples(units, degrees), (0,), on_sphere=True),
     Case("colors_from_sh", "harmonics", st.tuples(arrays_of((N, 16, 3), -1.0, 1.0), directions, degrees), (0, 1)),
     Case("camera_center", "camera", st.tuples(viewmats()), (0,)),
     Case("view_dirs", "camera", st.tuples(_vectors(3, -4.0, 4.0), viewmats()), (0, 1)),
@@ -124,7 +126,13 @@ def transposed(case: Case, function: Callable[..., Any], inputs: tuple[Any, ...]
     """Call a transpose with its cotangent in its place; return the cotangents as a tuple."""
     at = len(inputs) if case.cotangent_at is None else case.cotangent_at
     found = function(*inputs[:at], v, *inputs[at:])
-    return found if isinstance(found, tuple) else (found,)
+    pulled = found if isinstance(found, tuple) else (found,)
+    return (tangential(pulled[0], inputs[0]),) if case.on_sphere else pulled
+
+
+def tangential(v: np.ndarray, units: np.ndarray) -> np.ndarray:
+    """Return what is left of rows along the unit sphere."""
+    return v - units * np.sum(v * units, axis=1, keepdims=True)
 
 
 def cotangent_like(value: Any) -> Any:
