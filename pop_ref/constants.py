@@ -17,7 +17,7 @@ Sources: diff-gaussian-rasterization 59f5f77 (`inria`), gsplat v1.5.0-1.5.3 (`gs
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 DECISIONS: Final = {
@@ -100,9 +100,9 @@ GSPLAT_1_5: Final = Profile(
     tile_size=16,
 )
 
-GSPLAT_1_6: Final = Profile(**{**GSPLAT_1_5.__dict__, "name": "gsplat_1_6", "alpha_ceiling": 0.99})
+GSPLAT_1_6: Final = replace(GSPLAT_1_5, name="gsplat_1_6", alpha_ceiling=0.99)
 
-PAPER: Final = Profile(**{**GSPLAT_1_5.__dict__, "name": "paper"})
+PAPER: Final = replace(GSPLAT_1_5, name="paper")
 
 INRIA: Final = Profile(
     name="inria",

@@ -108,7 +108,7 @@ def stage_function(package: str, name: str) -> Callable[..., Any] | None:
     for module_name in STAGE_MODULES:
         module = _module(f"{package}.{module_name}")
         function = getattr(module, name, None)
-        if inspect.isfunction(function) and function.__module__ == module.__name__:
+        if module and inspect.isfunction(function) and function.__module__ == module.__name__:
             return function
     return None
 

@@ -45,7 +45,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Give the kit's own laws the backends that the options name, or the oracle."""
-    if metafunc.module.__name__.startswith(LAWS):
+    if metafunc.module is not None and metafunc.module.__name__.startswith(LAWS):
         parametrize_backends(metafunc, _chosen_backends(metafunc.config))
 
 
@@ -76,14 +76,13 @@ def _make_backends(config: pytest.Config) -> list[Any]:
     from pop_ref.constants import profile_named
 
     try:
-        chosen = [shipped(name) for name in config.getoption("--backend")]
-        path, package = config.getoption("--rasterizer"), config.getoption("--stages")
+        option: Any = config.getoption
+        chosen = [shipped(name) for name in option("--backend")]
+        path, package = option("--rasterizer"), option("--stages")
         if path or package:
-            profile = profile_named(config.getoption("--profile"))
+            profile = profile_named(option("--profile"))
             name = path or package
-            chosen.append(
-                adapter_for(path, name, package, config.getoption("--dtype"), config.getoption("--device"), profile)
-            )
+            chosen.append(adapter_for(path, name, package, option("--dtype"), option("--device"), profile))
     except (Unavailable, ValueError) as error:
         raise pytest.UsageError(str(error)) from error
     return chosen or [shipped("oracle")]
@@ -130,14 +129,15 @@ class _Recorder:
     def __init__(self, config: pytest.Config) -> None:
         from pop_ref.conformance.scorecard import Scorecard
 
-        self.path = Path(config.getoption("--scorecard"))
-        judged = config.getoption("--rasterizer") or ", ".join(config.getoption("--backend")) or "the oracle"
-        self.card = Scorecard(f"{judged} under profile {config.getoption('--profile')}")
+        option: Any = config.getoption
+        self.path = Path(option("--scorecard"))
+        judged = option("--rasterizer") or ", ".join(option("--backend")) or "the oracle"
+        self.card = Scorecard(f"{judged} under profile {option('--profile')}")
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         from pop_ref.conformance.scorecard import Entry
 
-        named = dict(report.user_properties).get("law")
+        named: Any = dict(report.user_properties).get("law")
         if named is None or not (report.when == "call" or report.skipped or report.failed):
             return
         detail = ""
@@ -146,7 +146,8 @@ class _Recorder:
         elif report.failed:
             crash = getattr(report.longrepr, "reprcrash", None)
             detail = str(crash.message if crash else report.longrepr).splitlines()[0]
-        self.card.entries.append(Entry(*named, report.outcome, detail, report.duration))
+        backend, stage, law = named
+        self.card.entries.append(Entry(backend, stage, law, report.outcome, detail, report.duration))
 
     def pytest_sessionfinish(self) -> None:
         self.card.write(self.path)

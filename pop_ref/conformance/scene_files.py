@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,7 +40,8 @@ def scene_arrays(scene: Scene) -> dict[str, np.ndarray]:
 def save_scene(path: Path, scene: Scene) -> None:
     """Write a scene."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(path, **scene_arrays(scene))
+    arrays: dict[str, Any] = scene_arrays(scene)
+    np.savez(path, **arrays)
 
 
 def load_scene(path: Path) -> Scene:

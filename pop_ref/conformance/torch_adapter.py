@@ -107,8 +107,12 @@ class TorchAdapter:
                 grads = self._torch.autograd.grad(
                     out, leaves, self._torch.as_tensor(v, dtype=out.dtype), allow_unused=True
                 )
-            pulled = tuple(self._torch.zeros_like(x) if g is None else g for g, x in zip(grads, leaves, strict=True))
-            return pulled if len(pulled) > 1 else pulled[0]
+            pulled: tuple[Any, ...] = tuple(
+                self._torch.zeros_like(x) if g is None else g for g, x in zip(grads, leaves, strict=True)
+            )
+            if len(pulled) == 1:
+                return pulled[0]
+            return pulled
 
         return pull
 

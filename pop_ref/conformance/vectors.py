@@ -109,7 +109,7 @@ def export(folder: Path) -> list[str]:
         "vectors": {},
     }
     for name, scene in vector_scenes().items():
-        arrays = expected_arrays(scene)
+        arrays: dict[str, Any] = expected_arrays(scene)
         np.savez_compressed(folder / f"{name}.npz", **arrays)
         index["vectors"][name] = {key: [str(a.dtype), list(a.shape)] for key, a in arrays.items()}
     (folder / "index.json").write_text(json.dumps(index, indent=1) + "\n", encoding="utf-8")

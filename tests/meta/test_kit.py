@@ -191,13 +191,13 @@ STRANGER = """
 from pop_fast.rasterization import rasterization as sound
 
 def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane=0.01, far_plane=1e10,
-                  radius_clip=0.0, eps2d=0.3, sh_degree=None, packed=True, tile_size=16, backgrounds=None, absgrad=False,
-                  rasterize_mode="classic"):
+                  radius_clip=0.0, eps2d=0.3, sh_degree=None, packed=True, tile_size=16, backgrounds=None,
+                  absgrad=False, rasterize_mode="classic"):
     Ks = Ks.clone()
     Ks[..., 0, 2] += {shift}
-    image, alphas, meta = sound(means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree=sh_degree,
-                                packed=packed, tile_size=tile_size, backgrounds=backgrounds, absgrad=absgrad,
-                                rasterize_mode=rasterize_mode)
+    image, alphas, meta = sound(means, quats, scales, opacities, colors, viewmats, Ks, width, height,
+                                sh_degree=sh_degree, packed=packed, tile_size=tile_size, backgrounds=backgrounds,
+                                absgrad=absgrad, rasterize_mode=rasterize_mode)
     return image, alphas, {{"means2d": meta["means2d"], "radii": meta["radii"]}}
 """
 

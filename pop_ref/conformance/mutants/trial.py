@@ -61,7 +61,7 @@ def _tried(stated: Law, examples: int) -> Callable[[Any], None]:
         deadline=None,
         phases=(Phase.generate,),
         report_multiple_bugs=False,
-        suppress_health_check=list(HealthCheck),
+        suppress_health_check=[HealthCheck(check) for check in HealthCheck],
     )
 
     def run(backend: Any) -> None:
