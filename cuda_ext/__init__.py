@@ -49,9 +49,9 @@ def load() -> ModuleType:
 
 
 def _why_not_this_gpu(capability: tuple[int, int], archs: str) -> str | None:
-    """Tell whether a card of that capability runs code built for `archs`, for example "75-real;90"."""
+    """Tell whether a card of that capability runs code built for `archs`, for example "75-real,90"."""
     number = capability[0] * 10 + capability[1]
-    for arch in archs.split(";"):
+    for arch in archs.split(","):
         built = int(arch.split("-")[0].rstrip("af"))
         same_major = built // 10 == number // 10 and built <= number
         # without "-real" the module carries PTX, which the driver compiles for newer cards

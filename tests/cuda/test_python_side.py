@@ -58,10 +58,10 @@ def test_a_missing_driver_is_named(monkeypatch):
     ("capability", "archs", "runs"),
     [
         ((9, 0), "90", True),
-        ((8, 9), "80-real;90", True),
-        ((10, 0), "75-real;90", True),
+        ((8, 9), "80-real,90", True),
+        ((10, 0), "75-real,90", True),
         ((10, 0), "90-real", False),
-        ((7, 5), "80-real;90", False),
+        ((7, 5), "80-real,90", False),
         ((7, 0), "75", False),
     ],
 )
