@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from pop_ref.conformance.catalogue import FILE, catalogue
+from pop_ref.conformance.law import STAGES
 from pop_ref.conformance.mutants import MUTANTS
 from pop_ref.conformance.mutants.copies import Mutant
-from pop_ref.conformance.mutants.trial import killed_by, law_named
+from pop_ref.conformance.mutants.trial import every_law, killed_by, law_named
 
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.name)
@@ -24,3 +26,16 @@ def test_each_change_is_one_place_of_one_file() -> None:
     for mutant in MUTANTS:
         assert mutant.broken_source()
         assert law_named(mutant.law).name == mutant.law.partition(":")[2]
+
+
+def test_the_written_list_of_laws_and_mutants_is_current() -> None:
+    assert FILE.read_text(encoding="utf-8") == catalogue(), "run 'python -m pop_ref.conformance.catalogue'"
+
+
+def test_every_law_has_a_stage_of_its_own_and_a_sentence_for_a_name() -> None:
+    laws = every_law()
+    assert len({stated.name for stated in laws.values()}) == len(laws), "two laws have one name"
+    for path, stated in laws.items():
+        assert "_" in stated.name, f"{path} is not a sentence"
+        assert stated.name == stated.name.lower(), f"{path} shouts"
+    assert {stated.stage for stated in laws.values()} == set(STAGES)

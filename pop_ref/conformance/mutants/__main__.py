@@ -1,4 +1,4 @@
-"""Print which law kills which mutant, as a Markdown table: `python -m pop_ref.conformance.mutants`."""
+"""Put every mutant on trial: `python -m pop_ref.conformance.mutants [--every]`."""
 
 from __future__ import annotations
 
@@ -8,20 +8,18 @@ from pop_ref.conformance.mutants import MUTANTS
 from pop_ref.conformance.mutants.trial import killed_by, killers
 
 
-def table(every: bool) -> str:
-    """Return the table; with `every`, all laws are tried on each mutant and counted."""
-    lines = ["| mutant | what happened | broken in | killed by |", "| --- | --- | --- | --- |"]
+def report(every: bool) -> str:
+    """Return a line a mutant: how its law breaks on it; with `every`, all laws that do."""
+    lines = []
     for mutant in MUTANTS:
-        verdict = mutant.law.partition(":")[2].replace("_", " ")
+        breaks = killed_by(mutant)
+        lines.append(f"{mutant.name}: {'SURVIVES' if breaks is None else 'killed by'} {mutant.law} ({breaks})")
         if every:
-            verdict += f" ({len(killers(mutant))} laws in all)"
-        elif killed_by(mutant) is None:
-            verdict = "**survives**"
-        lines.append(f"| {mutant.name.replace('_', ' ')} | {mutant.story} | `{mutant.file}` | {verdict} |")
+            lines += [f"    {path}" for path in killers(mutant)]
     return "\n".join(lines)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="which law kills which mutant")
-    parser.add_argument("--every", action="store_true", help="try every law on every mutant and count those that break")
-    print(table(parser.parse_args().every))
+    parser = argparse.ArgumentParser(description="put every mutant on trial")
+    parser.add_argument("--every", action="store_true", help="try every law on every mutant and list those that break")
+    print(report(parser.parse_args().every))
