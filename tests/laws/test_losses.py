@@ -1,1 +1,5 @@
-from pop_ref.conformance.laws.test_losses import *  # noqa: F403  the laws of one stage, over our backends
+"""The laws of `pop_ref.conformance.laws.test_losses`, over our own backends."""
+
+from __future__ import annotations
+
+from pop_ref.conformance.laws.test_losses import *  # noqa: F403

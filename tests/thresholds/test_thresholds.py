@@ -1,1 +1,5 @@
-from pop_ref.conformance.laws.test_thresholds import *  # noqa: F403  over our backends
+"""The laws of `pop_ref.conformance.laws.test_thresholds`, over our own backends."""
+
+from __future__ import annotations
+
+from pop_ref.conformance.laws.test_thresholds import *  # noqa: F403
