@@ -138,7 +138,7 @@ def explain_view(
     loss = _photometric(image, view, config)
     v_image, v_opacities = torch.autograd.grad(loss, (image, leaf))
     counts = _counts(info, view, len(leaf))
-    weight = config.pop.lambda_pop if config.method == "pop" else 0.0
+    weight = config.resolved().pop.lambda_pop if config.method == "pop" else 0.0
     visible = (info["radii"][0] > 0).all(1) if config.pop.pop_over == "visible" else None
     v_pop = pop_loss_vjp(gaussians["opacities"], importance_mask(counts), weight, visible)
     return ExplainedView(
