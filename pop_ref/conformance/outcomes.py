@@ -9,6 +9,7 @@ equal one of them.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -22,26 +23,33 @@ from pop_ref.conformance.scenes import Scene
 from pop_ref.conformance.verdicts import assert_same_image, assert_same_light
 from pop_ref.pixel import Pixel, SplatRows, composite_pixel
 
-# more doubts than this at one pixel are not enumerated; the pixel is left out
+# more than this at one pixel is not enumerated; the pixel is left out
 MOST_DOUBTS = 6
+MOST_ORDERS = 24
 
 
 def outcomes(charges: PixelCharges, x: int, y: int) -> list[Pixel]:
     """Return every outcome of one pixel, the likeliest first; empty if there are too many doubts."""
     met = [layer for layer in charges.layers if layer.taken[y, x] or layer.doubtful[y, x]]
-    swaps = [k for k in range(len(met) - 1) if charges.swappable(met[k].id, met[k + 1].id)]
-    if len(swaps) + sum(bool(layer.doubtful[y, x]) for layer in met) > MOST_DOUBTS:
+    orders = list(itertools.islice(_orders(met, charges), MOST_ORDERS + 1))
+    if len(orders) > MOST_ORDERS or sum(bool(layer.doubtful[y, x]) for layer in met) > MOST_DOUBTS:
         return []
     s, profile = charges.screen, charges.scene.profile
     rows = SplatRows(s.means2d.tolist(), s.conics.tolist(), s.opacities.tolist(), s.colors.tolist())
     # which splats are blended is decided here, so the oracle must not decide again
     forced = dataclasses.replace(profile, alpha_floor=-1.0, transmittance_stop=-1.0)
-    orders = [met]
-    for k in swaps:
-        orders += [[*o[:k], o[k + 1], o[k], *o[k + 2 :]] for o in orders]
     lists = [ids for order in orders for ids in _lists(order, charges, x, y)]
     background = charges.scene.background.tolist()
     return [composite_pixel(ids, rows, x + 0.5, y + 0.5, background, forced) for ids in lists]
+
+
+def _orders(met: list[Layer], charges: PixelCharges) -> Iterator[list[Layer]]:
+    """Yield the orders in depth that rounding allows: those that keep every pair whose order is certain."""
+    if not met:
+        yield []
+    for k, layer in enumerate(met):
+        if all(charges.swappable(front.id, layer.id) for front in met[:k]):
+            yield from ([layer, *rest] for rest in _orders([*met[:k], *met[k + 1 :]], charges))
 
 
 def _lists(met: list[Layer], charges: PixelCharges, x: int, y: int) -> Iterator[list[int]]:
