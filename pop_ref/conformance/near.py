@@ -26,8 +26,8 @@ round_sizes = st.sampled_from([1.0, 0.5, 2.0])
 SIDE = 5
 
 
-def _camera(viewmat: np.ndarray | None = None) -> Camera:
-    K = np.array([[8.0, 0.0, SIDE / 2.0], [0.0, 8.0, SIDE / 2.0], [0.0, 0.0, 1.0]])
+def _camera(viewmat: np.ndarray | None = None, focal: float = 8.0) -> Camera:
+    K = np.array([[focal, 0.0, SIDE / 2.0], [0.0, focal, SIDE / 2.0], [0.0, 0.0, 1.0]])
     return Camera(np.eye(4) if viewmat is None else viewmat, K, SIDE, SIDE)
 
 
@@ -116,22 +116,44 @@ def near_dominance_tie(draw: Any) -> Scene:
     return _scene([Record(2.5, 2.5, 1.0 + k, (size,) * 3, opacity=a) for k, a in enumerate(stack)], PAPER)
 
 
+def _just_seen(edge: float, side: float, size: float, opacity: float, profile: Profile, camera: Camera) -> float:
+    """Return where a sphere's centre must lie, left (-1) or right (1) of an edge, for alpha to be 1/255 on the edge."""
+    deviations = math.sqrt(2.0 * math.log(opacity / profile.alpha_floor))
+    x = edge
+    for _ in range(60):
+        # off the axis by s = x / z a sphere widens by sqrt(1 + s^2), so its place depends on its own reach; beyond the
+        # picture the frustum clamp holds s (B1)
+        slope = min(abs(x - SIDE / 2.0), SIDE / 2.0 * (1.0 + profile.frustum_margin)) / camera.K[0, 0]
+        x = edge + side * deviations * math.sqrt(size * size * (1.0 + slope * slope) + profile.eps2d)
+    return x
+
+
+@st.composite
+def near_tile_edge(draw: Any) -> Scene:
+    """Aim at D3: opaque splats that just reach the first column or row of the next tile, from a tile further off.
+
+    At 1.5625 px three deviations are 4.97 px, which round up to less than the 5.5 px at which such a splat is seen.
+    """
+    camera = _camera(focal=64.0)
+    edge, side = draw(st.sampled_from([(3.5, 1.0), (4.5, -1.0)]))
+    u = _just_seen(edge, side, 1.5625, 1.0, PAPER, camera) - side * draw(
+        st.sampled_from([0.0, 2.0**-10, 2.0**-6, 2.0**-22])
+    )
+    x, y = (u, 2.5) if draw(st.booleans()) else (2.5, u)
+    return _scene(
+        [Record(x, y, 8.0, (1.5625,) * 3, opacity=1.0), draw(_on_axis(opacity=0.25, depth=16.0))], PAPER, camera
+    )
+
+
 @st.composite
 def near_edge(draw: Any) -> Scene:
     """Aim at D2 and D3: the ellipse alpha = 1/255 through a pixel centre, extents at tile and image edges."""
     profile = draw(st.sampled_from([PAPER, INRIA]))
-    camera = _camera()
+    camera = _camera(focal=64.0)
     size = draw(round_sizes)
     opacity = draw(st.sampled_from([1.0, 0.5, 0.0625, 0.015625]))
-    edge = draw(st.sampled_from([0.5, 4.5, 3.5, 0.0, 4.0, 5.0]))
-    side = draw(st.sampled_from([-1.0, 1.0]))
-    deviations = math.sqrt(2.0 * math.log(opacity / profile.alpha_floor))
-    x = edge
-    for _ in range(60):
-        # off the axis by s = x / z a sphere widens by sqrt(1 + s^2), so its place depends on its own reach
-        variance = size * size * (1.0 + ((x - SIDE / 2.0) / camera.K[0, 0]) ** 2) + profile.eps2d
-        x = edge + side * deviations * math.sqrt(variance)
-    x += draw(slight)
+    edge = draw(st.sampled_from([3.5, 0.5, 4.5, 0.0, 4.0, 5.0]))
+    x = _just_seen(edge, draw(st.sampled_from([1.0, -1.0])), size, opacity, profile, camera) + draw(slight)
     records = [Record(x, 2.5, 8.0, (size,) * 3, opacity=opacity), draw(_on_axis(opacity=0.25, depth=16.0))]
     return _scene(records, profile, camera)
 
@@ -149,6 +171,7 @@ def near_flat(draw: Any) -> Scene:
 AIMS = {
     "D1": near_plane,
     "D2": near_edge,
+    "D3": near_tile_edge,
     "D4": near_depth_tie,
     "D5": near_floor,
     "D6": near_ceiling,

@@ -20,7 +20,7 @@ def _margins(scene: Scene) -> Margins:
 
 
 # an ellipse that touches a pixel centre is a question of extent, of tiles and of the floor at once
-COUNTED = {"D2": ("D2", "D3", "D5")}
+COUNTED = {"D2": ("D2", "D3", "D5"), "D3": ("D2", "D3", "D5")}
 TRIED = settings(max_examples=25, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
 
 

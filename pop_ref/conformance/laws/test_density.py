@@ -145,16 +145,17 @@ def test_the_density_statistic_averages_ndc_gradients_over_the_views_that_showed
     assert window.n_views == len(views)
 
 
-several = st.lists(st.sampled_from([0, 4, 2, 5, 3]), min_size=2, max_size=4)
+several = st.lists(st.sampled_from([4, 0, 2, 5, 3]), min_size=2, max_size=4)
 
 
-@law("density", "accumulate", won=several, reading=st.sampled_from(["any_view", "sum", "own_view"]))
-def test_blur_flags_combine_over_views_as_the_reading_says(backend, won, reading):
+@law("density", "accumulate", won=several)
+def test_blur_flags_combine_over_views_as_the_reading_says(backend, won):
     # A2, at a share of three pixels
-    config = DensityConfig(theta_blur=3.0 / (W * H), blur_window=reading)
     views = [(0.0, 0.0, True, count) for count in won]
-    expected = {"any_view": max(won) > 3, "sum": sum(won) > 3, "own_view": won[-1] > 3}[reading]
-    assert_same_bits("blurred", _window(backend, views, config).blurred, [expected])
+    expected = {"any_view": max(won) > 3, "sum": sum(won) > 3, "own_view": won[-1] > 3}
+    for reading, blurred in expected.items():
+        config = DensityConfig(theta_blur=3.0 / (W * H), blur_window=reading)
+        assert_same_bits(reading, _window(backend, views, config).blurred, [blurred])
 
 
 @law(

@@ -36,6 +36,12 @@ def test_no_pixel_is_lost_where_an_ellipse_touches_a_pixel_centre_or_a_tile_edge
     _holds(backend, scene)
 
 
+@law("tiles", RENDER, scene=near.near_tile_edge())
+def test_a_splat_that_just_reaches_the_next_tile_is_drawn_there(backend, scene):
+    # D3
+    _holds(backend, scene)
+
+
 @law("footprint", RENDER, PROFILES, scene=near.near_edge().filter(lambda s: s.profile.extent == "square"))
 def test_the_square_extent_cuts_where_inrias_does(backend, scene):
     # D2, D3: here the extent is part of the meaning; where rounding decides it, nothing is said
