@@ -37,7 +37,7 @@ bench: setup  ## check the fast path against the oracle, then time it
 	$(BIN)/python benchmarks/run.py
 
 cuda: setup  ## compile the CUDA extension (needs nvcc; no GPU)
-	$(BIN)/python -m pip install --quiet 'nanobind>=2.4' 'cmake>=3.24' ninja
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[cuda-build]'
 	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python -m cuda_ext.build
 
 gpu-check: cuda  ## build, hold the CUDA backend to every law, time it; one JSON file (needs a GPU)
