@@ -174,10 +174,9 @@ def _time_steps(
         config = TrainConfig(result_dir=str(Path(folder) / "run"), sh_interval=1, log_every=10**9, progress=False)
         trainer = Trainer(config, capture)
         prepare(trainer)
-        for _ in range(4):
-            trainer.train_step()
         with reproducible(torch.get_num_threads()):
-            step_ms = median_ms(trainer.train_step, repeats)
+            # what SSIM needs of a photograph is made at its first visit, so every photograph is visited once before
+            step_ms = median_ms(trainer.train_step, repeats, warm_up=len(capture.views))
             pairs = trainer.train_step().rendered.info["n_pairs"]
     view = capture.views[0]
     return {

@@ -1,18 +1,20 @@
 """Front-to-back blending of a group of tiles with early ray termination, and its transpose.
 
 Meaning: `pop_ref.compositing`.
-One step of the blend takes a group of tiles, CHUNK list entries and all pixels of a tile, in this order:
+One step of the blend takes a group of tiles, K list entries and all pixels of a tile, in this order:
 
     alpha = 2^(coefficients @ basis), 0 under the floor (D5), the ceiling at most (D6)
-    S[0] = T;  S[k+1] = S[k] - S[k] alpha[k], set to 0 where that passes the stop (D7)
-    alpha = 0 where S[k+1] = 0;  weight[k] = S[k] alpha[k];  image += colours @ weight
+    weight[k] = T alpha[k];  T -= weight[k];  where T passes the stop (D7): T = weight[k] = alpha[k] = 0
+    image += colours @ weight
 
-S is the transmittance that is still worth blending into: it falls to 0 at the terminating splat, whose weight and
-those of all behind it are then 0 without a branch.
+T is the light that is still worth blending into: it falls to 0 at the terminating splat, and with it the weights of
+all behind it. Few tiles have a pixel that stops in a given step: only those are run again with the third rule.
 
-The transpose goes back to front with one number per pixel, B, the light from behind dotted with the pixel's gradient:
+Nothing of a step is kept but the light before it, 4 bytes for K pairs: the transpose makes alphas and weights anew
+in buffers that stay in the cache, which is cheaper than a way through memory and back. It goes back to front with one
+number per pixel, B, the light from behind dotted with the pixel's gradient:
 
-    q[k] = colour[k] . v_image;  G[k] = weight[k] (q[k] - B);  B += alpha[k] (q[k] - B)
+    q[k] = colour[k] . v_image - B;  B += alpha[k] q[k];  G[k] = weight[k] q[k]
 
 G = alpha dL/dalpha; its six moments over a tile's pixels give every geometric gradient (`alpha.entry_gradients`).
 There is no division by 1 - alpha.
@@ -23,73 +25,35 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from pop_fast import workspace
 from pop_fast.dominance import Dominance
+from pop_fast.lit import Lit
 from pop_fast.tile_groups import CHUNK, TileGroup
+from pop_fast.transmittance import Stop, below, count_passed, weights_of_alphas
 from pop_ref.constants import Profile
 
 COMPACT_BELOW = 0.8  # share of live tiles under which the group is compacted
 
 
-@dataclass
-class Chunk:
+@dataclass(frozen=True)
+class Step:
     """One blended step, as the transpose needs it.
 
     Attributes:
-        index: number of the chunk along the lists.
+        slots: entry numbers, the null entry where a list is padded. [n, K]
         rows: which of the group's tiles took part: the first `n` of these, or of all when None.
-        n: how many took part.
-        slots: entry numbers, the null entry where a list is padded. [n * CHUNK]
-        entries: their rows of the blender's table. [n, CHUNK, 6 + D + 1]
-        slabs: the buffers behind `alpha` and `weight`.
-        alpha: 0 for skipped and terminated pairs. [n, CHUNK, P]
-        weight: [n, CHUNK, P]
+        light: T before the step; belongs to the workspace. [n, P]
+        stopping: of the tiles that took part, those where a pixel stopped; None for "treat all so".
     """
 
-    index: int
-    rows: Tensor | None
-    n: int
     slots: Tensor
-    entries: Tensor
-    slabs: tuple[Tensor, Tensor]
-    alpha: Tensor
-    weight: Tensor
-
-    @classmethod
-    def of(cls, group: TileGroup, index: int, rows: Tensor | None, n: int, table: Tensor, n_pixels: int) -> Chunk:
-        """Gather a chunk's entries and take buffers for it."""
-        slots = group.slots[:, index * CHUNK : (index + 1) * CHUNK]
-        slots = (slots[:n] if rows is None else slots[rows[:n]]).reshape(n * CHUNK)
-        entries = table.index_select(0, slots).view(n, CHUNK, table.shape[1])
-        numel = n * CHUNK * n_pixels
-        slabs = (workspace.take(numel, table.dtype), workspace.take(numel, table.dtype))
-        alpha, weight = (slab[:numel].view(n, CHUNK, n_pixels) for slab in slabs)
-        return cls(index, rows, n, slots, entries, slabs, alpha, weight)
-
-    @property
-    def where(self) -> slice | Tensor:
-        """Return what selects the chunk's tiles out of the group's."""
-        return slice(self.n) if self.rows is None else self.rows[: self.n]
-
-    @property
-    def coefficients(self) -> Tensor:
-        """Return the exponent's coefficients of every entry. [n * CHUNK, 6]"""
-        return self.entries.view(self.n * CHUNK, self.entries.shape[2])[:, :6]
-
-    @property
-    def colors(self) -> Tensor:
-        """Return the colours of every entry and a 1. [n, CHUNK, D + 1]"""
-        return self.entries[:, :, 6:]
-
-    def release(self) -> None:
-        """Give the buffers back to the workspace."""
-        for slab in self.slabs:
-            workspace.give(slab)
+    rows: Tensor | None
+    light: Tensor
+    stopping: Tensor | None
 
 
 @dataclass
@@ -98,25 +62,21 @@ class GroupBlend:
 
     Attributes:
         image: weighted colours and, last, the sum of weights. [G, D + 1, P]
-        chunks: the steps, front to back.
-        n_blended: [G, P] int32, when counted.
-        n_passed: list entries that the pixel went past without stopping. [G, P] int32, when counted.
+        steps: front to back.
+        n_blended: [G, P], when counted.
+        n_passed: list entries that the pixel went past without stopping. [G, P], when counted.
+        dominant_weights: the largest weights, when asked for. [G, P]
+        dominant_places: and their places in the tile's list, -1 where nothing was blended. [G, P]
         n_pairs: (entry, pixel) pairs evaluated.
-        dominance: the largest weights, when asked for.
     """
 
     image: Tensor
-    chunks: list[Chunk] = field(default_factory=list)
+    steps: list[Step] = field(default_factory=list)
     n_blended: Tensor | None = None
     n_passed: Tensor | None = None
+    dominant_weights: Tensor | None = None
+    dominant_places: Tensor | None = None
     n_pairs: int = 0
-    dominance: Dominance | None = None
-
-    def release(self) -> None:
-        """Give the chunks' buffers back to the workspace."""
-        for chunk in self.chunks:
-            chunk.release()
-        self.chunks.clear()
 
 
 @dataclass(frozen=True)
@@ -135,139 +95,152 @@ class Blender:
     profile: Profile
     clamps: bool
 
+    @property
+    def stop(self) -> Stop:
+        """Return the transmittance that a pixel must stay above."""
+        return Stop.of(self.profile, self.table.dtype)
+
     def blend(self, group: TileGroup, counted: bool = False, dominance: bool = False, keep: bool = True) -> GroupBlend:
-        """Blend a group front to back."""
-        n_pixels = self.basis.shape[1]
-        n_tiles = len(group.tiles)
-        result = GroupBlend(self.basis.new_zeros((n_tiles, self.table.shape[1] - 6, n_pixels)))
+        """Blend a group front to back; `keep` what the transpose needs."""
+        lit = self._lit(group, counted, dominance)
+        dominant = Dominance(self.table.dtype)
+        steps: list[Step] = []
+        start, n_pairs, crowded = 0, 0, False
+        with workspace.slabs(2, group.slab, self.table.dtype) as slabs:
+            while start < group.slots.shape[1] and (n := lit.count_below(group.reached[start // CHUNK])) > 0:
+                slots = _slots(group, lit.rows, n, start, group.step_length(start, n))
+                entries, light = self._entries(slots), lit["light"][:n]
+                alpha, weight = _shaped(slabs, slots, group.n_pixels)
+                self._alphas(entries, alpha)
+                before = workspace.copy(light)
+                if counted:
+                    lit["n_passed"][:n].add_(count_passed(alpha, light, self.stop))
+                stopping = weights_of_alphas(alpha, weight, light, before, self.stop, crowded)
+                crowded = stopping is None
+                lit["image"][:n].baddbmm_(entries[:, :, 6:].transpose(1, 2), weight)
+                if counted:
+                    lit["n_blended"][:n].add_((weight > 0.0).sum(1))
+                if dominance:
+                    dominant.see(weight, start, lit["best"][:n], lit["codes"][:n], alpha)
+                start += slots.shape[1]
+                n_pairs += weight.numel()
+                if keep:
+                    steps.append(Step(slots, lit.rows, before, stopping))
+                else:
+                    workspace.give(before)
+                lit.drop(n, light, COMPACT_BELOW)
+        return self._result(lit.whole(), steps, n_pairs)
+
+    def _lit(self, group: TileGroup, counted: bool, dominance: bool) -> Lit:
+        size = (len(group.tiles), self.basis.shape[1])
+        states = {
+            "light": self.basis.new_ones(size),
+            "image": self.basis.new_zeros((size[0], self.table.shape[1] - 6, size[1])),
+        }
         if counted:
-            result.n_blended = torch.zeros((n_tiles, n_pixels), dtype=torch.int32)
-            result.n_passed = torch.zeros((n_tiles, n_pixels), dtype=torch.int32)
+            states |= {name: torch.zeros(size, dtype=torch.int64) for name in ("n_blended", "n_passed")}
         if dominance:
-            result.dominance = Dominance(result.image[:, 0])
-        rows: Tensor | None = None
-        image = result.image
-        light = self.basis.new_ones((n_tiles, n_pixels))
-        for index, reached in enumerate(group.reached):
-            n = reached if rows is None else int((rows < reached).sum())
-            if n == 0:
-                break
-            chunk, passing = self._step(group, index, rows, n, light[:n])
-            image[:n].baddbmm_(chunk.colors.transpose(1, 2), chunk.weight)
-            if counted:
-                self._count(result, chunk, passing)
-            if result.dominance is not None:
-                result.dominance.see(chunk)
-            light = passing[:, CHUNK].clone()
-            result.n_pairs += chunk.weight.numel()
-            if keep:
-                result.chunks.append(chunk)
-            else:
-                chunk.release()
-            rows, light, image = self._drop_dark_tiles(result, rows, n, light, image)
-        if rows is not None:
-            result.image.index_copy_(0, rows, image)
-        return result
+            states |= {"best": self.basis.new_zeros(size), "codes": self.basis.new_full(size, -1.0)}
+        return Lit(states)
 
-    def _step(self, group: TileGroup, index: int, rows: Tensor | None, n: int, light: Tensor) -> tuple[Chunk, Tensor]:
-        n_pixels = self.basis.shape[1]
-        chunk = Chunk.of(group, index, rows, n, self.table, n_pixels)
-        alpha = chunk.alpha
-        torch.mm(chunk.coefficients, self.basis, out=alpha.view(n * CHUNK, n_pixels))
-        alpha.exp2_()
-        torch.threshold_(alpha, _below(self.profile.alpha_floor, alpha.dtype), 0.0)
+    @staticmethod
+    def _result(states: dict[str, Tensor], steps: list[Step], n_pairs: int) -> GroupBlend:
+        codes = states.get("codes")
+        return GroupBlend(
+            states["image"],
+            steps,
+            states.get("n_blended"),
+            states.get("n_passed"),
+            states.get("best"),
+            None if codes is None else Dominance.places(codes),
+            n_pairs,
+        )
+
+    def _entries(self, slots: Tensor) -> Tensor:
+        """Gather a step's rows of the table. [n, K, 6 + D + 1]"""
+        return self.table.index_select(0, slots.view(-1)).view(*slots.shape, self.table.shape[1])
+
+    def _alphas(self, entries: Tensor, alpha: Tensor) -> None:
+        flat = alpha.view(-1, alpha.shape[2])
+        torch.mm(entries.view(len(flat), entries.shape[2])[:, :6], self.basis, out=flat)
+        flat.exp2_()
+        torch.threshold_(flat, below(self.profile.alpha_floor, flat.dtype), 0.0)
         if self.clamps:
-            alpha.clamp_max_(self.profile.alpha_ceiling)
-        passing = alpha.new_empty((n, CHUNK + 1, n_pixels))
-        passing[:, 0] = light
-        stop = self.profile.transmittance_stop
-        stop = stop if self.profile.stop_inclusive else _below(stop, alpha.dtype)
-        for k in range(CHUNK):
-            after = passing[:, k + 1]
-            torch.addcmul(passing[:, k], passing[:, k], alpha[:, k], value=-1.0, out=after)
-            torch.threshold_(after, stop, 0.0)
-        if passing[:, CHUNK].amin() <= 0.0:
-            torch.ops.aten.threshold_backward.grad_input(alpha, passing[:, 1:], 0.0, grad_input=alpha)
-        torch.mul(passing[:, :-1], alpha, out=chunk.weight)
-        return chunk, passing
+            flat.clamp_max_(self.profile.alpha_ceiling)
 
-    @staticmethod
-    def _count(result: GroupBlend, chunk: Chunk, passing: Tensor) -> None:
-        assert result.n_blended is not None
-        assert result.n_passed is not None
-        where = chunk.where
-        result.n_blended[where] += (chunk.weight > 0.0).sum(1, dtype=torch.int32)
-        result.n_passed[where] += (passing[:, 1:] > 0.0).sum(1, dtype=torch.int32)
-
-    @staticmethod
-    def _drop_dark_tiles(
-        result: GroupBlend, rows: Tensor | None, n: int, light: Tensor, image: Tensor
-    ) -> tuple[Tensor | None, Tensor, Tensor]:
-        lit = light.amax(1) > 0.0
-        n_lit = int(lit.sum())
-        if n_lit >= COMPACT_BELOW * n:
-            return rows, light, image
-        if rows is not None:
-            result.image.index_copy_(0, rows, image)
-        keep = lit.nonzero().squeeze(1)
-        rows = keep if rows is None else rows[keep]
-        return rows, light[keep], result.image[rows]
-
-    def transpose(self, blend: GroupBlend, v_image: Tensor, absolute: bool) -> Iterator[tuple[Tensor, Tensor]]:
-        """Pull the cotangent of a group's image ([G, D + 1, P]) back to its entries, chunk by chunk, back to front.
+    def transpose(
+        self, group: TileGroup, blend: GroupBlend, v_image: Tensor, absolute: bool
+    ) -> Iterator[tuple[Tensor, Tensor]]:
+        """Pull the cotangent of a group's image ([G, D + 1, P]) back to its entries, step by step, back to front.
 
         Yields:
-            Entry numbers [n * CHUNK] and their rows [n * CHUNK, 6 + D (+ 2)]: six moments of G, the gradient to the
+            Entry numbers [n K] and their rows [n K, 6 + D (+ 2)]: six moments of G, the gradient to the
             colours and, when asked for, the sums of absolute gradients along x and y.
         """
-        behind = v_image.new_zeros((v_image.shape[0], v_image.shape[2]))
-        for chunk in reversed(blend.chunks):
-            where = chunk.where
-            v = v_image[where]
-            light, n_pixels = v.new_empty((chunk.n, CHUNK + 1, v.shape[2])), v.shape[2]
-            q = torch.bmm(chunk.colors, v)
-            light[:, CHUNK] = behind[where]
-            for k in reversed(range(CHUNK)):
-                torch.lerp(light[:, k + 1], q[:, k], chunk.alpha[:, k], out=light[:, k])
-            behind[where] = light[:, 0]
-            g = q.sub_(light[:, 1:]).mul_(chunk.weight)
-            n_colors = v.shape[1] - 1
-            rows = g.new_empty((chunk.n, CHUNK, 6 + n_colors + 2 * absolute))
-            rows[:, :, 6 : 6 + n_colors] = torch.bmm(v[:, :-1], chunk.weight.transpose(1, 2)).transpose(1, 2)
-            if self.clamps:
-                self._pass_ceiling(chunk, g)
-            flat = rows.view(chunk.n * CHUNK, rows.shape[2])
-            flat[:, :6] = torch.mm(self.basis, g.view(chunk.n * CHUNK, n_pixels).T).T
-            if absolute:
-                flat[:, 6 + n_colors :] = self._absolute(chunk, g).T
-            chunk.release()
-            yield chunk.slots, flat
+        lit = Lit({"behind": v_image.new_zeros((v_image.shape[0], v_image.shape[2])), "v": v_image})
+        with workspace.slabs(3, group.slab, self.table.dtype) as slabs:
+            for step in reversed(blend.steps):
+                lit.select(step.rows)
+                n = len(step.slots)
+                v, behind = lit["v"][:n], lit["behind"][:n]
+                entries = self._entries(step.slots)
+                alpha, weight, q = _shaped(slabs, step.slots, group.n_pixels)
+                self._alphas(entries, alpha)
+                light = workspace.copy(step.light)
+                crowded = step.stopping is None
+                weights_of_alphas(alpha, weight, light, step.light, self.stop, crowded, step.stopping, alpha_too=True)
+                workspace.give(light)
+                torch.bmm(entries[:, :, 6:], v, out=q)
+                for a, q_k in zip(reversed(alpha.unbind(1)), reversed(q.unbind(1)), strict=True):
+                    q_k.sub_(behind)
+                    behind.addcmul_(a, q_k)
+                # nothing lies behind a pixel that had stopped before this step
+                torch.ops.aten.threshold_backward.grad_input(behind, step.light, 0.0, grad_input=behind)
+                workspace.give(step.light)
+                yield step.slots.view(-1), self._rows(entries, alpha, weight, q, v, absolute)
 
-    def _pass_ceiling(self, chunk: Chunk, g: Tensor) -> None:
+    def _rows(self, entries: Tensor, alpha: Tensor, weight: Tensor, q: Tensor, v: Tensor, absolute: bool) -> Tensor:
+        n_colors, n_rows = v.shape[1] - 1, q.shape[0] * q.shape[1]
+        rows = q.new_empty((n_rows, 6 + n_colors + 2 * absolute))
+        by_color = torch.bmm(v[:, :-1], weight.transpose(1, 2)).transpose(1, 2)
+        rows.view(*q.shape[:2], -1)[:, :, 6 : 6 + n_colors] = by_color
+        g = q.mul_(weight)
+        flat = entries.view(n_rows, entries.shape[2])[:, :6]
+        if self.clamps:
+            self._pass_ceiling(flat, alpha, g)
+        pairs = g.view(n_rows, g.shape[2])
+        rows[:, :6] = torch.mm(self.basis, pairs.T).T
+        if absolute:
+            rows[:, 6 + n_colors :] = self._absolute(flat, pairs).T
+        return rows
+
+    def _pass_ceiling(self, coefficients: Tensor, alpha: Tensor, g: Tensor) -> None:
         """Apply the profile's gradient rule to clamped alphas (B3), in place."""
         ceiling = self.profile.alpha_ceiling
         if self.profile.ceiling_gradient == "zero":
-            torch.ops.aten.hardtanh_backward.grad_input(g, chunk.alpha, -1.0, ceiling, grad_input=g)
+            torch.ops.aten.hardtanh_backward.grad_input(g, alpha, -1.0, ceiling, grad_input=g)
         else:
             # passed through as if unclamped: G carries the clamped alpha, the chain rule wants the raw one
-            raw = torch.exp2(chunk.coefficients @ self.basis)
+            raw = torch.exp2(coefficients @ self.basis)
             g.mul_((raw / ceiling).clamp_min_(1.0).view_as(g))
 
-    def _absolute(self, chunk: Chunk, g: Tensor) -> Tensor:
-        """Sum |dL/du| and |dL/dv| over the pixels of each entry. [2, n * CHUNK]"""
-        rows = chunk.coefficients / math.log2(math.e)
+    def _absolute(self, coefficients: Tensor, g: Tensor) -> Tensor:
+        """Sum |dL/du| and |dL/dv| over the pixels of each entry. [2, n K]"""
+        rows = coefficients / math.log2(math.e)
         zero = torch.zeros_like(rows[:, 0])
         # the derivative of sigma along x and y, again as coefficients of (1, x, y)
         along = (
             torch.stack((rows[:, 1], 2.0 * rows[:, 3], rows[:, 4], zero, zero, zero), 1),
             torch.stack((rows[:, 2], rows[:, 4], 2.0 * rows[:, 5], zero, zero, zero), 1),
         )
-        flat = g.reshape(len(rows), g.shape[2])
-        return torch.stack([(flat * (c @ self.basis)).abs_().sum(1) for c in along])
+        return torch.stack([(g * (c @ self.basis)).abs_().sum(1) for c in along])
 
 
-@lru_cache
-def _below(value: float, dtype: torch.dtype) -> float:
-    """Return the number just under `value` in a type, so that `>` of it means `>= value`."""
-    at = torch.tensor(value, dtype=dtype)
-    return float(torch.nextafter(at, torch.zeros_like(at)))
+def _slots(group: TileGroup, rows: Tensor | None, n: int, start: int, length: int) -> Tensor:
+    """Return the entry numbers of a step. [n, K]"""
+    slots = group.slots[:, start : start + length]
+    return slots[:n].contiguous() if rows is None else slots[rows[:n]]
+
+
+def _shaped(slabs: list[Tensor], slots: Tensor, n_pixels: int) -> list[Tensor]:
+    return [slab[: slots.numel() * n_pixels].view(*slots.shape, n_pixels) for slab in slabs]

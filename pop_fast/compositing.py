@@ -16,8 +16,6 @@ from pop_fast.tile_groups import TileGroup, tile_groups
 from pop_fast.tiles import TileLists
 from pop_ref.constants import PAPER, Profile
 
-KEPT_BYTES = 768 << 20  # alphas and weights kept for the transpose; tiles beyond that are blended once more in it
-
 
 @dataclass(frozen=True)
 class Composite:
@@ -58,8 +56,7 @@ def composite(
 ) -> Composite:
     """Blend every tile's list front to back, over black. See `pop_ref.compositing.composite`.
 
-    Optimizations: see `blender`; alphas and weights are kept for the transpose up to `KEPT_BYTES`, beyond that tiles
-    are blended a second time, so that memory is bounded.
+    Optimizations: see `blender`; what is kept for the transpose is the light of every pixel before every eighth entry.
 
     Args:
         means2d: screen centres, px. [N, 2]
@@ -121,18 +118,12 @@ class _Composite(torch.autograd.Function):
         groups = tile_groups(lists)
         canvas = _Canvas(options, colors.shape[1] + 1, dtype)
         blends: list[GroupBlend | None] = []
-        budget = KEPT_BYTES if options.keep else 0
         pairs = 0
         for group in groups:
-            blend = blender.blend(group, options.counts, options.dominance, keep=budget > 0 or options.dominance)
+            blend = blender.blend(group, options.counts, options.dominance, options.keep)
             canvas.put(group, blend)
             pairs += blend.n_pairs
-            budget -= 2 * dtype.itemsize * blend.n_pairs
-            if budget > 0:
-                blends.append(blend)
-            else:
-                blend.release()
-                blends.append(None)
+            blends.append(blend)
         ctx.saved, ctx.options = _Saved(len(means2d), entries, blender, groups, blends), options
         outputs = canvas.images()
         ctx.mark_non_differentiable(*(o for o in outputs[2:] if o is not None))
@@ -147,9 +138,9 @@ class _Composite(torch.autograd.Function):
         gradients = _Gradients(saved, options)
         tiles = _tiles_of_cotangents(v_image, v_alphas, options, saved.blender)
         for i, group in enumerate(saved.groups):
-            # what was not kept, or was used up by an earlier backward of the same graph, is blended again
+            # what an earlier backward of the same graph used up is blended again
             blend, saved.blends[i] = saved.blends[i] or saved.blender.blend(group), None
-            gradients.add(blend, tiles.index_select(0, group.tiles))
+            gradients.add(group, blend, tiles.index_select(0, group.tiles))
         return (*gradients.of_splats(), None)
 
 
@@ -179,18 +170,19 @@ class _Canvas:
     def put(self, group: TileGroup, blend: GroupBlend) -> None:
         self.image.index_copy_(0, group.tiles, blend.image)
         if self.ids is not None and self.weights is not None:
-            assert blend.dominance is not None
-            places = blend.dominance.places(blend.chunks)
+            places, weights = blend.dominant_places, blend.dominant_weights
+            assert places is not None
+            assert weights is not None
             ids = self.options.lists.ids[group.slots.gather(1, places.clamp_min(0))]
             self.ids.index_copy_(0, group.tiles, ids.masked_fill_(places < 0, -1))
-            self.weights.index_copy_(0, group.tiles, blend.dominance.weights)
+            self.weights.index_copy_(0, group.tiles, weights)
         if self.blended is not None and self.traversed is not None:
             assert blend.n_blended is not None
             assert blend.n_passed is not None
-            self.blended.index_copy_(0, group.tiles, blend.n_blended)
-            length = group.lengths[:, None].to(torch.int32)
+            self.blended.index_copy_(0, group.tiles, blend.n_blended.to(torch.int32))
             # a pixel that stopped has also looked at the entry that stopped it; padding is passed but does not count
-            self.traversed.index_copy_(0, group.tiles, torch.minimum(blend.n_passed + 1, length))
+            traversed = torch.minimum(blend.n_passed + 1, group.lengths[:, None])
+            self.traversed.index_copy_(0, group.tiles, traversed.to(torch.int32))
 
     def images(self) -> tuple[Tensor | None, ...]:
         image = self._flat(self.image)
@@ -231,8 +223,8 @@ class _Gradients:
         table = saved.blender.table
         self.rows = table.new_zeros((len(table), 6 + self.n_colors + self.n_absolute))
 
-    def add(self, blend: GroupBlend, v_image: Tensor) -> None:
-        for entries, rows in self.saved.blender.transpose(blend, v_image, self.n_absolute > 0):
+    def add(self, group: TileGroup, blend: GroupBlend, v_image: Tensor) -> None:
+        for entries, rows in self.saved.blender.transpose(group, blend, v_image, self.n_absolute > 0):
             self.rows.index_copy_(0, entries, rows)
 
     def of_splats(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Final
 
 import torch
 from torch import Tensor
 
-from pop_fast.tile_groups import CHUNK
-
-if TYPE_CHECKING:
-    from pop_fast.blender import Chunk
+EIGHT: Final = 8  # entries whose comparisons make one number
 
 
 def dominant_counts(dominant_ids: Tensor, n: int) -> Tensor:
@@ -19,50 +16,42 @@ def dominant_counts(dominant_ids: Tensor, n: int) -> Tensor:
 
 
 class Dominance:
-    """The running maximum of weights over a group's pixels, fed chunk by chunk, front to back (D8).
+    """The running maximum of weights over a group's pixels, fed step by step, front to back (D8).
 
-    Optimizations: the maximum over a chunk is a vectorised reduction; which chunk holds a pixel's maximum is kept as
-    one number per pixel, and only that chunk's eight weights are searched, once, at the end.
-
-    Attributes:
-        weights: the largest weight so far. [G, P]
+    Optimizations: the comparisons of eight weights with their maximum become one number by a matrix product with
+    (128, …, 2, 1), whose highest set bit is the foremost entry that equals the maximum; no index ever moves through
+    the slab, and the bit is looked up once, at the end.
     """
 
-    def __init__(self, like: Tensor) -> None:
-        self.weights = torch.zeros_like(like)
-        self._chunks = torch.full(like.shape, -1, dtype=torch.int32)
+    def __init__(self, dtype: torch.dtype) -> None:
+        self._powers = 2.0 ** torch.arange(EIGHT - 1, -1, -1, dtype=dtype)
 
-    def see(self, chunk: Chunk) -> None:
-        """Take a chunk's weights into account."""
-        largest = chunk.weight.amax(1)
-        if chunk.rows is None:
-            best, chunks = self.weights[: chunk.n], self._chunks[: chunk.n]
-        else:
-            best, chunks = self.weights[chunk.where], self._chunks[chunk.where]
-        # strictly larger: on equal weights the chunk in front keeps the pixel
-        chunks.masked_fill_(largest > best, chunk.index)
-        torch.maximum(best, largest, out=best)
-        if chunk.rows is not None:
-            self.weights[chunk.where] = best
-            self._chunks[chunk.where] = chunks
+    def see(self, weight: Tensor, first: int, best: Tensor, codes: Tensor, scratch: Tensor) -> None:
+        """Take a step's weights into account.
 
-    def places(self, chunks: list[Chunk]) -> Tensor:
+        Args:
+            weight: of the step, K a multiple of 8. [n, K, P]
+            first: place of the step's first entry, a multiple of 8.
+            best: the largest weight of each pixel so far, in and out. [n, P]
+            codes: which entry that is, -1 for none, in and out. [n, P]
+            scratch: overwritten. [n, K, P]
+        """
+        n, K, n_pixels = weight.shape
+        for start in range(0, K, EIGHT):
+            part, equal = weight[:, start : start + EIGHT], scratch[:, start : start + EIGHT]
+            largest = part.amax(1)
+            torch.ge(part, largest[:, None], out=equal)
+            code = torch.bmm(self._powers.expand(n, 1, EIGHT), equal).view(n, n_pixels)
+            code.add_(float((first + start) // EIGHT * 2**EIGHT))
+            # strictly larger: on equal weights the entry in front keeps the pixel
+            improved = torch.gt(largest, best, out=torch.empty_like(best))
+            codes.lerp_(code, improved)
+            torch.maximum(best, largest, out=best)
+
+    @staticmethod
+    def places(codes: Tensor) -> Tensor:
         """Return the place in its tile's list of each pixel's dominant entry, -1 where nothing was blended. [G, P]"""
-        n_pixels = self.weights.shape[1]
-        winners = self._chunks.view(-1)
-        order = torch.sort(winners, stable=True).indices
-        ends = torch.bincount(winners + 1, minlength=len(chunks) + 1).cumsum(0).tolist()
-        pixels = order[ends[0] :]
-        eights = self.weights.new_empty((len(pixels), CHUNK))
-        of_eight = torch.arange(CHUNK) * n_pixels
-        for chunk, start, end in zip(chunks, ends[:-1], ends[1:], strict=True):
-            at = order[start:end]
-            row = torch.div(at, n_pixels, rounding_mode="floor")
-            first = at - row * n_pixels
-            row = row if chunk.rows is None else torch.searchsorted(chunk.rows, row)
-            first += row * (CHUNK * n_pixels)
-            eights[start - ends[0] : end - ends[0]] = chunk.weight.view(-1)[first[:, None] + of_eight]
-        places = torch.full(winners.shape, -1, dtype=torch.int64)
-        # argmax takes the first of equal weights, which is the front one
-        places[pixels] = eights.argmax(1) + winners[pixels] * CHUNK
-        return places.view(self.weights.shape)
+        whole = codes.to(torch.int64)
+        eight, bits = whole >> EIGHT, whole & (2**EIGHT - 1)
+        highest = torch.frexp(bits.to(torch.float32)).exponent - 1
+        return torch.where(whole < 0, -1, eight * EIGHT + (EIGHT - 1 - highest))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from torch import Tensor
 
@@ -31,11 +34,28 @@ def take(numel: int, dtype: torch.dtype) -> Tensor:
 
 
 def give(slab: Tensor) -> None:
-    """Return a buffer from `take`; nobody may use it afterwards."""
-    size = slab.numel() * slab.itemsize
+    """Return a buffer from `take`, or a view of one's beginning; nobody may use it afterwards."""
+    size = slab.untyped_storage().nbytes()
+    slab = slab.as_strided((size // slab.itemsize,), (1,), 0)
     if _pool.retained + size <= RETAINED_BYTES:
         _pool.retained += size
         _pool.free.setdefault((slab.dtype, slab.numel()), []).append(slab)
+
+
+def copy(tensor: Tensor) -> Tensor:
+    """Return a copy in a buffer from `take`, which `give` takes back."""
+    return take(tensor.numel(), tensor.dtype)[: tensor.numel()].view(tensor.shape).copy_(tensor)
+
+
+@contextmanager
+def slabs(n: int, numel: int, dtype: torch.dtype) -> Iterator[list[Tensor]]:
+    """Lend `n` buffers of at least `numel` numbers for a block of code."""
+    taken = [take(numel, dtype) for _ in range(n)]
+    try:
+        yield taken
+    finally:
+        for slab in taken:
+            give(slab)
 
 
 def retained_bytes() -> int:
