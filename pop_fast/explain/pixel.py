@@ -72,7 +72,7 @@ def explain_pixel(
         width=scene.view.width,
         height=scene.view.height,
         profile=profile.name,
-        objective=_objective(scene.config),
+        objective=_objective(scene.config, scene.step or 0),
         loss=scene.loss,
         lambda_pop=scene.lambda_pop,
         pop_note=_pop_note(scene),
@@ -160,10 +160,10 @@ def _row(
     )
 
 
-def _objective(config: TrainConfig) -> str:
-    weight, kind = config.ssim_weight, config.photometric_kind.upper()
+def _objective(config: TrainConfig, step: int) -> str:
+    kind, weight = config.resolved().photometric_at(step)
     divided = "" if config.photometric_divisor == 1.0 else f"/{config.photometric_divisor:g}"
-    return f"{1.0 - weight:g} {kind}{divided} + {weight:g} (1 - SSIM)"
+    return f"{1.0 - weight:g} {kind.upper()}{divided} + {weight:g} (1 - SSIM)"
 
 
 def _pop_note(scene: ExplainedView) -> str:

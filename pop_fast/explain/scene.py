@@ -110,7 +110,7 @@ def explain_view(
         view: camera, photograph and mask.
         config: profile, background, antialiasing and objective; the defaults (POP's objective) when None.
         sh_degree: highest colour band, all of them when None.
-        step: the training step the parameters are of, to say whether POP was on.
+        step: the training step the parameters are of, which decides the loss and whether POP was on.
 
     Raises:
         ValueError: the image is too small for SSIM, or a parameter is not finite; says which.
@@ -135,7 +135,7 @@ def explain_view(
     settings = settings_of(view, config, torch.float64)
     images, _, info = rasterization(**given, **settings, sh_degree=degree, backgrounds=background)
     image = images[0]
-    loss = _photometric(image, view, config)
+    loss = _photometric(image, view, config, step or 0)
     v_image, v_opacities = torch.autograd.grad(loss, (image, leaf))
     counts = _counts(info, view, len(leaf))
     weight = config.resolved().pop.lambda_pop if config.method == "pop" else 0.0
@@ -162,7 +162,9 @@ def with_objective(config: TrainConfig, objective: str) -> TrainConfig:
     """Choose the loss: "run" keeps the splat's own, "pop" and "3dgs" are those of paper eqs. 9 and 2."""
     if objective == "run":
         return config
-    return replace(config, method="pop" if objective == "pop" else "adc", photometric="method", lambda_ssim=None)
+    return replace(
+        config, method="pop" if objective == "pop" else "adc", photometric="method", lambda_ssim=None, l2_stop_iter=None
+    )
 
 
 def _wanted(info: Mapping[str, Any]) -> dict[str, Any]:
@@ -170,14 +172,15 @@ def _wanted(info: Mapping[str, Any]) -> dict[str, Any]:
     return {name: info[name] for name in (*names, "n_traversed", "final_T", "flatten_ids", "isect_offsets")}
 
 
-def _photometric(image: Tensor, view: View, config: TrainConfig) -> Tensor:
+def _photometric(image: Tensor, view: View, config: TrainConfig, step: int) -> Tensor:
     target = torch.from_numpy(view.image).double() / 255.0
     mask = None if view.mask is None else torch.from_numpy(view.mask)
-    loss = photometric_3dgs if config.photometric_kind == "l1" else photometric_pop
+    kind, weight = config.resolved().photometric_at(step)
+    loss = photometric_3dgs if kind == "l1" else photometric_pop
     return loss(
         image,
         target,
-        config.ssim_weight,
+        weight,
         config.ssim_padding,
         mask,
         config.d_ssim_halved,

@@ -5,7 +5,7 @@ The numbers are the paper's: 30,000 steps, POP loss and density control to 15,00
 
     what                                          scaled
     max_steps                                     yes; the learning rate of the means decays over it, so that scales too
-    refine start and stop, reset, blur, POP       yes
+    refine start and stop, reset, blur, POP, L2   yes
     refine_every                                  up only: a shorter schedule has fewer changes, as far apart as ever
                                                   (see `DensityControl.scaled`)
     sh_interval, eval_steps, save_steps           yes
@@ -79,6 +79,8 @@ class TrainConfig:
         photometric: "l1", "l2", or "method" for the method's own: l2 for pop (paper eq. 9), l1 for adc (eq. 2).
         photometric_divisor: divides the L1 or L2 term, as in the paper's figure of L1/n against L2.
         lambda_ssim: weight of 1 - SSIM; the rest is L1 or L2. None takes the method's own: 0.01 or 0.2.
+        l2_stop_iter: step from which eq. 2 (L1, 0.2) takes over; None never, as the paper says of POP alone that it
+            ends (A20).
         ssim_padding: "valid" as gsplat, or "same" as 3DGS.
         d_ssim_halved: (1 - SSIM) / 2 instead of 1 - SSIM.
         lr: learning rates.
@@ -118,6 +120,7 @@ class TrainConfig:
     photometric: Literal["method", "l1", "l2"] = "method"
     photometric_divisor: float = 1.0
     lambda_ssim: float | None = None
+    l2_stop_iter: int | None = None
     ssim_padding: Literal["valid", "same"] = "valid"
     d_ssim_halved: bool = False
     lr: LearningRates = field(default_factory=LearningRates)
@@ -148,6 +151,8 @@ class TrainConfig:
             value = getattr(self, name)
             if value is not None and not value > 0.0:
                 raise PopError(f"{name} is {value}; it must be > 0")
+        if self.l2_stop_iter is not None and self.l2_stop_iter < 0:
+            raise PopError(f"l2_stop_iter is {self.l2_stop_iter}; it must be at least 0")
         if self.lambda_ssim is not None and not 0.0 <= self.lambda_ssim <= 1.0:
             raise PopError(f"lambda_ssim is {self.lambda_ssim}; it must lie in [0, 1]")
         if any(not 0.0 <= value <= 1.0 for value in self.background):
@@ -163,19 +168,13 @@ class TrainConfig:
         """The settings of the method that was chosen."""
         return self.pop if self.method == "pop" else self.adc
 
-    @property
-    def photometric_kind(self) -> Literal["l1", "l2"]:
-        """The pixel-wise loss that is used."""
-        if self.photometric != "method":
-            return self.photometric
-        return "l2" if self.method == "pop" else "l1"
-
-    @property
-    def ssim_weight(self) -> float:
-        """The weight of 1 - SSIM that is used."""
-        if self.lambda_ssim is not None:
-            return self.lambda_ssim
-        return 0.01 if self.method == "pop" else 0.2
+    def photometric_at(self, step: int) -> tuple[Literal["l1", "l2"], float]:
+        """Return the pixel-wise loss of a step and the weight of 1 - SSIM; the rest of the weight, to 1, is its own."""
+        if self.l2_stop_iter is not None and step >= self.l2_stop_iter:
+            return "l1", 0.2
+        pop = self.method == "pop"
+        weight = self.lambda_ssim if self.lambda_ssim is not None else 0.01 if pop else 0.2
+        return self.photometric if self.photometric != "method" else "l2" if pop else "l1", weight
 
     def resolved(self) -> TrainConfig:
         """Return the same run with the scaler worked into every step number (and itself 1)."""
@@ -193,6 +192,7 @@ class TrainConfig:
             steps_scaler=None,
             max_steps=scaled(self.max_steps),
             sh_interval=scaled(self.sh_interval),
+            l2_stop_iter=None if self.l2_stop_iter is None else scaled(self.l2_stop_iter),
             eval_steps=tuple(scaled(step) for step in self.eval_steps),
             save_steps=tuple(scaled(step) for step in self.save_steps),
             pop=pop,

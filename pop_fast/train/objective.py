@@ -24,20 +24,22 @@ class Objective:
         self._kept: dict[int, TargetMoments] = {}
         self._room = config.target_cache_mb * 2**20
 
-    def __call__(self, image: Tensor, index: int) -> Tensor:
-        """Return the loss of a render [H, W, 3] of view `index`."""
+    def __call__(self, image: Tensor, index: int, step: int) -> Tensor:
+        """Return the loss of a render [H, W, 3] of view `index` at a step."""
         config, moments, mask = self._config, self._moments(index), self._views[index].mask
-        common = (config.ssim_weight, config.ssim_padding, mask, config.d_ssim_halved, 1.0 / config.photometric_divisor)
-        if config.photometric_kind == "l1":
+        kind, weight = config.photometric_at(step)
+        common = (weight, config.ssim_padding, mask, config.d_ssim_halved, 1.0 / config.photometric_divisor)
+        if kind == "l1":
             return photometric_3dgs(image, moments.target, *common, moments=moments)
         return photometric_pop(image, moments.target, *common, moments=moments)
 
-    def terms(self, image: Tensor, index: int) -> dict[str, float]:
+    def terms(self, image: Tensor, index: int, step: int) -> dict[str, float]:
         """Return the unweighted terms by name: l1 or l2, and d_ssim."""
         config, moments, mask = self._config, self._moments(index), self._views[index].mask
-        pixelwise = l1 if config.photometric_kind == "l1" else l2
+        kind, _ = config.photometric_at(step)
+        pixelwise = l1 if kind == "l1" else l2
         structural = d_ssim(image, moments.target, config.ssim_padding, mask, config.d_ssim_halved, moments)
-        return {config.photometric_kind: float(pixelwise(image, moments.target, mask)), "d_ssim": float(structural)}
+        return {kind: float(pixelwise(image, moments.target, mask)), "d_ssim": float(structural)}
 
     def _moments(self, index: int) -> TargetMoments:
         if index in self._kept:

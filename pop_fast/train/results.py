@@ -76,7 +76,8 @@ class ResultFolder:
         have = path.stat().st_size
         if have < keep_bytes:
             raise PopError(f"{path}: has {have} bytes, fewer than the {keep_bytes} of the checkpoint; restore the file")
-        self._metrics = open(path, "r+b")  # noqa: SIM115 - stays open as long as the run
+        # unbuffered: whoever watches the file sees a record when it is made
+        self._metrics = open(path, "r+b", buffering=0)  # noqa: SIM115 - stays open as long as the run
         self._metrics.truncate(keep_bytes)
         self._metrics.seek(keep_bytes)
 

@@ -125,7 +125,7 @@ class Trainer:
         view = self._train[index]
         degree = active_sh_degree(step, config.sh_interval, config.sh_degree)
         rendered = self._render(view, degree, counts=step % config.log_every == 0)
-        loss = self._objective(rendered.image, index)
+        loss = self._objective(rendered.image, index, step)
         term = self.strategy.regularizer(rendered.opacities, self.state, step, rendered.info)
         if term is not None:
             loss = loss + term
@@ -197,7 +197,7 @@ class Trainer:
             "step": done.step,
             "view": done.view.name,
             "loss": done.loss,
-            **self._objective.terms(image, done.index),
+            **self._objective.terms(image, done.index, done.step),
             **({} if done.regularizer is None else {"pop": done.regularizer}),
             "psnr": psnr(image, done.view.target(), done.view.mask),
             "num_gaussians": len(self.params["means"]),

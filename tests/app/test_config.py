@@ -21,7 +21,7 @@ def test_the_defaults_are_the_papers_schedule():
     assert (config.max_steps, config.sh_degree, config.sh_interval, config.test_every) == (30_000, 3, 1000, 8)
     assert (config.pop.pop_start_iter, config.pop.pop_stop_iter, config.pop.lambda_pop) == (0, 15_000, 1e-3)
     assert (config.pop.blur_start_iter, config.pop.blur_stop_iter, config.pop.theta_blur) == (3000, 7000, 2e-5)
-    assert (config.photometric_kind, config.ssim_weight, config.ssim_padding) == ("l2", 0.01, "valid")
+    assert (config.photometric_at(29_999), config.ssim_padding) == (("l2", 0.01), "valid")
     lr = config.lr
     assert (lr.means, lr.means_decay, lr.scales, lr.quats, lr.opacities) == (1.6e-4, 0.01, 5e-3, 1e-3, 5e-2)
     assert (lr.sh0, lr.sh_rest) == (2.5e-3, 1.25e-4)
@@ -29,11 +29,19 @@ def test_the_defaults_are_the_papers_schedule():
 
 def test_the_plain_method_has_its_own_loss_unless_told_otherwise():
     config = TrainConfig(method="adc")
-    assert (config.photometric_kind, config.ssim_weight) == ("l1", 0.2)
+    assert config.photometric_at(0) == ("l1", 0.2)
     config = replace(config, photometric="l2", lambda_ssim=0.05)
-    assert (config.photometric_kind, config.ssim_weight) == ("l2", 0.05)
+    assert config.photometric_at(0) == ("l2", 0.05)
     assert isinstance(config.strategy, ADCStrategy)
     assert isinstance(TrainConfig().strategy, POPStrategy)
+
+
+def test_eq_2_takes_over_where_the_l2_loss_is_said_to_stop():
+    config = TrainConfig(l2_stop_iter=15_000, preset="quick").resolved()
+    assert config.photometric_at(1499) == ("l2", 0.01)
+    assert config.photometric_at(1500) == ("l1", 0.2)
+    with pytest.raises(PopError, match="l2_stop_iter is -1"):
+        TrainConfig(l2_stop_iter=-1)
 
 
 def test_shrinking_multiplies_every_step_number_and_no_rate():

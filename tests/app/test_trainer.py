@@ -68,7 +68,7 @@ def test_the_pop_term_is_logged_while_it_is_on(finished):
 
 def test_the_loss_is_the_sum_of_its_terms(finished):
     trainer, _, folder = finished
-    weight = trainer.config.ssim_weight
+    _, weight = trainer.config.photometric_at(0)
     for record in records(folder):
         pixelwise = record["l2" if trainer.config.method == "pop" else "l1"]
         total = (1 - weight) * pixelwise + weight * record["d_ssim"] + record.get("pop", 0.0)
@@ -204,7 +204,7 @@ def test_the_target_cache_changes_no_bit(tmp_path):
     losses = []
     for megabytes in (0, 1):
         objective = Objective(tiny_config(tmp_path, target_cache_mb=megabytes).resolved(), views)
-        losses.append([objective(image, i) for i in (0, 1, 0)])
+        losses.append([objective(image, i, 0) for i in (0, 1, 0)])
         assert len(objective._kept) == (2 if megabytes else 0)
     assert losses[0] == losses[1]
 
