@@ -28,7 +28,8 @@ _FIX = "copy the model again, or run COLMAP again"
 def find_model(folder: Path) -> Path | None:
     """Find a capture's COLMAP model: `sparse/0`, `sparse`, nerfstudio's `colmap/sparse/0`, or the folder itself."""
     for candidate in (folder / "sparse" / "0", folder / "sparse", folder / "colmap" / "sparse" / "0", folder):
-        if any((candidate / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+        # one of its files makes a model, so that another that is absent is named instead of the model being passed over
+        if any((candidate / f"{name}{suffix}").is_file() for name in _FILES for suffix in (".bin", ".txt")):
             return candidate
     return None
 
@@ -56,8 +57,8 @@ def read_model(model: Path) -> tuple[list[Shot], Cloud]:
     Raises:
         CaptureError: a file is absent, truncated, corrupt, or holds an unknown camera model, NaN or a singular camera.
     """
-    whole = [suffix for suffix in (".bin", ".txt") if all((model / f"{name}{suffix}").is_file() for name in _FILES)]
-    suffix = whole[0] if whole else ".bin" if (model / "cameras.bin").is_file() else ".txt"
+    # the kind of which most is there, so that what is missed is named with its own ending
+    suffix = max((".bin", ".txt"), key=lambda ending: sum((model / f"{name}{ending}").is_file() for name in _FILES))
     for name in _FILES:
         if not (model / f"{name}{suffix}").is_file():
             raise CaptureError(f"{model / name}{suffix}: is absent from the COLMAP model; {_FIX}")

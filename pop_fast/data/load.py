@@ -78,6 +78,10 @@ def load_capture(
     if made_from == "COLMAP model":
         shots = _beside_the_model(root, shots, images)
     views, notes = read_views(root, listing, shots, options, progress)
+    if len(views) < 2:
+        raise CaptureError(
+            f"{listing}: {len(views)} view(s) are left of {len(shots)}; a scene needs two or more: restore them"
+        )
     return _assemble(root, listing, views, cloud, made_from, notes, normalize, points, seed)
 
 

@@ -65,7 +65,7 @@ def test_an_absent_file_of_a_model_is_named(tmp_path: Path, file: str, binary: b
     root = colmap_capture(tmp_path, binary=binary)
     suffix = ".bin" if binary else ".txt"
     (root / "sparse" / "0" / f"{file}{suffix}").unlink()
-    words = () if file == "cameras" else (file, "absent")
+    words = (file, "absent")
     assert_one_line(lambda: load_capture(root, source="colmap"), *words)
 
 
