@@ -124,6 +124,8 @@ class _Blended:
         kernels, device, n = load(), means2d.device, len(means2d)
         H, W, self.channels = settings.height, settings.width, colors.shape[1]
         self.rows, self.background, self.buffers, self.settings = rows, background, buffers, settings
+        # only lists of the warps' own tiles are numbered in buckets; the others go back column by column
+        self.by_splats = settings.family == "splats" and buffers.buckets
         self.records = empty("packed splats", LOWER, (max(n, 1), kernels.RECORD), device)
         self.splats = fill(kernels.Splats(), means2d=means2d, conics=conics, opacities=opacities, colors=colors)
         floor = settings.profile.alpha_floor
@@ -132,7 +134,7 @@ class _Blended:
         self.T_final = empty("the image", "the image size", (H, W), device)
         self.last = empty("the image", "the image size", (H, W), device, torch.int32)
         self.checkpoints: Tensor | None = None
-        if settings.family == "splats":
+        if self.by_splats:
             shape = (buffers.max_buckets, 1 + self.channels, kernels.TILE_PIXELS)
             self.checkpoints = empty("checkpoints", LOWER + ", or use family='columns'", shape, device)
 
@@ -177,7 +179,7 @@ class _Blended:
             rows=rows,
             sums=sums,
         )
-        blend.set_family(self.settings.family == "splats", not slots)
+        blend.set_family(self.by_splats, not slots)
         stream, profile = stream_of(device), self.settings.kernel_profile()
         kernels.blend_backward(self.buffers.struct, blend, profile, state.data_ptr(), stream)
         found: dict[str, Tensor | None] = {

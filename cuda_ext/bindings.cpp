@@ -130,6 +130,8 @@ void bind_blend(nb::module_& m) {
     POINTER(forward, BlendForward, n_blended);
     POINTER(forward, BlendForward, n_traversed);
     POINTER(forward, BlendForward, dominant_counts);
+    POINTER(forward, BlendForward, masks);
+    POINTER(forward, BlendForward, state);
 
     nb::class_<BlendBackward> backward(m, "BlendBackward", nb::dynamic_attr());
     backward.def(nb::init<>());
@@ -189,12 +191,22 @@ void bind_functions(nb::module_& m) {
     m.def("begin_step", [](const Schedule& s, P constants, P state, P stream) {
         begin_step(s, reinterpret_cast<StepConstants*>(constants), as_state(state), as_stream(stream));
     });
-    m.def("count_important", [](int n, P counts, P state, P stream) {
-        count_important(n, reinterpret_cast<const int*>(counts), as_state(state), as_stream(stream));
+    m.def("important_blocks", &important_blocks);
+    m.def("count_important", [](int n, P counts, P logits, P sums, P state, P stream) {
+        count_important(n, reinterpret_cast<const int*>(counts), reinterpret_cast<const float*>(logits),
+                        reinterpret_cast<float*>(sums), as_state(state), as_stream(stream));
     });
     m.def("update", [](const UpdateArrays& a, const ViewArrays& v, const ProjectSettings& s, const SplatArrays& splats,
                        P state, P stream) { update(a, v, s, splats, as_state(state), as_stream(stream)); });
-    m.def("end_step", [](P state, P stream) { end_step(as_state(state), as_stream(stream)); });
+    m.def("end_step", [](const StepRecord& record, P state, P stream) {
+        end_step(record, as_state(state), as_stream(stream));
+    });
+    // the newest CUDA that the driver knows, 0 where there is no driver
+    m.def("driver_version", []() {
+        int version = 0;
+        POP_CUDA(cudaDriverGetVersion(&version));
+        return version;
+    });
     m.def("gather_rows", [](P source, P index, P target, int n, int row_floats, P stream) {
         gather_rows(reinterpret_cast<const float*>(source), reinterpret_cast<const long long*>(index),
                     reinterpret_cast<float*>(target), n, row_floats, as_stream(stream));
@@ -225,6 +237,7 @@ NB_MODULE(_kernels, m) {
     m.attr("TILE_PIXELS") = TILE_PIXELS;
     m.attr("PROJECT_BLOCK") = PROJECT_BLOCK;
     m.attr("STATE_INTS") = int(sizeof(DeviceState) / sizeof(int));
+    m.attr("N_VALUES") = int(N_VALUES);
     m.attr("STEP_CONSTANTS_FLOATS") = int(sizeof(StepConstants) / sizeof(float));
     // what the kernels were compiled for, so that another card gets a sentence instead of a launch error
     m.attr("ARCHS") = POP_CUDA_ARCHS;

@@ -41,6 +41,14 @@ void bind_training(nb::module_& m) {
     VALUE(schedule, Schedule, eps);
     schedule.def("set_lr", [](Schedule& s, int group, double lr) { s.lr[group] = lr; });
 
+    nb::class_<StepRecord> record(m, "StepRecord", nb::dynamic_attr());
+    record.def(nb::init<>());
+    POINTER(record, StepRecord, values);
+    POINTER(record, StepRecord, history);
+    POINTER(record, StepRecord, pop_sums);
+    VALUE(record, StepRecord, n);
+    VALUE(record, StepRecord, lambda_pop);
+
     nb::class_<UpdateArrays> update(m, "UpdateArrays", nb::dynamic_attr());
     update.def(nb::init<>());
     VALUE(update, UpdateArrays, n);

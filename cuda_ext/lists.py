@@ -8,7 +8,17 @@ import torch
 from torch import Tensor
 
 from cuda_ext import load
-from cuda_ext.arrays import BAD_ROW, N_INSTANCES, NOT_BAD, Settings, empty, fill, new_state, stream_of
+from cuda_ext.arrays import (
+    BAD_ROW,
+    N_INSTANCES,
+    NOT_BAD,
+    CudaMemoryError,
+    Settings,
+    empty,
+    fill,
+    new_state,
+    stream_of,
+)
 
 WARP_TILE = (16, 8)  # px, what a warp blends
 BUCKET = 32
@@ -30,7 +40,7 @@ class TileBuffers:
     def __init__(
         self, n: int, width: int, height: int, tile: tuple[int, int], exact: bool, device: torch.device, buckets: bool
     ) -> None:
-        self.n, self.device, self.tile, self._buckets = n, device, tile, buckets
+        self.n, self.device, self.tile, self.buckets = n, device, tile, buckets
         self.struct = load().TileLists()
         self.struct.n, self.struct.exact = n, exact
         self.struct.set_grid(width, height, *tile)
@@ -45,9 +55,15 @@ class TileBuffers:
         self.reserve(0)
 
     def reserve(self, capacity: int) -> None:
-        """Make room for at least that many instances; buffers only grow."""
+        """Make room for at least that many instances; buffers only grow.
+
+        Raises:
+            CudaMemoryError: no room, or more entries than the kernels can number.
+        """
         if capacity <= self.capacity:
             return
+        if capacity >= 2**31:
+            raise CudaMemoryError(f"the tile lists would have {capacity:,} entries, more than 2^31; lower {LOWER}")
         self.capacity = capacity
         self.struct.capacity = capacity
         wide = self.n_tiles >= 0xFFFF
@@ -55,7 +71,7 @@ class TileBuffers:
             self._allocate(name, (capacity,), torch.int32 if wide else torch.int16)
         for name in ("slots_unsorted", "slots", "slot_splat", "listed"):
             self._allocate(name, (capacity,))
-        if self._buckets:
+        if self.buckets:
             self._allocate("bucket_begin", (self.n_tiles,))
             self._allocate("bucket_tile", (self.max_buckets,))
         bytes_needed = load().tile_workspace(self.n, capacity, self.n_tiles)
@@ -137,8 +153,8 @@ def make_lists(
     told = state.tolist()
     if told[BAD_ROW] != NOT_BAD:
         raise ValueError(
-            f"Gaussian {told[BAD_ROW]} projects to a value that is not finite; look at row {told[BAD_ROW]} of means, "
-            "quats, scales and opacities for NaN or inf"
+            f"Gaussian {told[BAD_ROW]} has a value that is not finite, or projects to one; look at row "
+            f"{told[BAD_ROW]} of means, quats, scales, opacities and colors for NaN, inf and numbers near 1e38"
         )
     buffers.reserve(told[N_INSTANCES])
     kernels.make_tile_lists(buffers.struct, splats, profile, state.data_ptr(), stream)

@@ -12,6 +12,7 @@ from cuda_ext import load
 from cuda_ext.arrays import VIEW, empty, fill, new_state, stream_of
 
 MARGIN = 5  # px, half of SSIM's window
+LOWER = "the photographs' size or number"
 
 
 class ResidentViews:
@@ -27,7 +28,7 @@ class ResidentViews:
         cache_moments: keep the photographs' blurred values, 24 bytes a pixel.
 
     Raises:
-        ValueError: a photograph is not uint8 [H, W, 3], or too small for "valid".
+        ValueError: a photograph is not uint8 [H, W, 3], a mask has another size, or "valid" has no window.
         CudaMemoryError: no room.
     """
 
@@ -42,44 +43,55 @@ class ResidentViews:
         cache_moments: bool = True,
     ) -> None:
         self.device, self._margin = device, MARGIN if padding == "valid" else 0
-        self.sizes: list[tuple[int, int]] = []
-        for k, image in enumerate(images):
-            if image.dtype != torch.uint8 or image.dim() != 3 or image.shape[2] != 3:
-                raise ValueError(f"images[{k}] is {image.dtype} {list(image.shape)}; it must be uint8 [H, W, 3]")
-            if min(image.shape[:2]) <= 2 * self._margin:
-                raise ValueError(f"images[{k}] is {list(image.shape[:2])} px; SSIM with padding 'valid' needs 11 x 11")
-            self.sizes.append((image.shape[1], image.shape[0]))
+        kept = [None] * len(images) if masks is None else list(masks)
+        for k, (image, mask) in enumerate(zip(images, kept, strict=True)):
+            self._check(k, image, mask)
+        self.sizes = [(image.shape[1], image.shape[0]) for image in images]
         self.viewmats = viewmats.to(device, torch.float32).contiguous()
         self.Ks = Ks.to(device, torch.float32).contiguous()
-        self._images = [image.to(device).contiguous() for image in images]
-        kept = [None] * len(images) if masks is None else list(masks)
-        self._masks = [self._mask(mask, image) for mask, image in zip(kept, images, strict=True)]
-        self._shares = torch.tensor([self._share(mask) for mask in self._masks], dtype=torch.float32, device=device)
+        self._images = [self._uploaded("the photographs", image) for image in images]
         self._tables = {"images": self._table(self._images)}
-        if masks is not None:
+        shares = [self._share(size, mask) for size, mask in zip(self.sizes, kept, strict=True)]
+        self._shares = torch.tensor(shares, dtype=torch.float32, device=device)
+        if any(mask is not None for mask in kept):
+            whole = [torch.ones(1, 1, dtype=torch.bool).expand(image.shape[:2]) for image in images]
+            given = [w if mask is None else mask for mask, w in zip(kept, whole, strict=True)]
+            self._masks = [self._uploaded("the masks", mask) for mask in given]
             self._tables["masks"] = self._table(self._masks)
         if cache_moments:
-            self._moments = [
-                empty("the photographs' blurred values", "their size, or use cache_moments=False", (6, h, w), device)
-                for w, h in self.sizes
-            ]
+            what, lower = "the photographs' blurred values", f"{LOWER}, or use cache_moments=False"
+            self._moments = [empty(what, lower, (6, h, w), device) for w, h in self.sizes]
             self._tables["moments"] = self._table(self._moments)
             self._fill_moments()
+
+    @property
+    def masks(self) -> Tensor | None:
+        """Return the table of masks by view, or None where there are none."""
+        return self._tables.get("masks")
 
     def photographs(self) -> Any:
         """Return the kernels' view of the tables."""
         tables = {name: self._tables.get(name) for name in ("images", "masks", "moments")}
         return fill(load().Photographs(), shares=self._shares, **tables)
 
-    def _mask(self, mask: Tensor | None, image: Tensor) -> Tensor:
-        if mask is None:
-            return torch.ones(image.shape[:2], dtype=torch.uint8, device=self.device)
-        return mask.to(self.device, torch.uint8).contiguous()
+    def _check(self, k: int, image: Tensor, mask: Tensor | None) -> None:
+        if image.dtype != torch.uint8 or image.dim() != 3 or image.shape[2] != 3:
+            raise ValueError(f"images[{k}] is {image.dtype} {list(image.shape)}; it must be uint8 [H, W, 3]")
+        if min(image.shape[:2]) <= 2 * self._margin:
+            raise ValueError(f"images[{k}] is {list(image.shape[:2])} px; SSIM with padding 'valid' needs 11 x 11")
+        if mask is not None and mask.shape != image.shape[:2]:
+            raise ValueError(f"masks[{k}] is {list(mask.shape)}; it must be {list(image.shape[:2])} as images[{k}]")
 
-    def _share(self, mask: Tensor) -> tuple[float, float]:
-        m = self._margin
-        windows = mask[m : mask.shape[0] - m, m : mask.shape[1] - m]
-        pixels, inner = int(mask.count_nonzero()), int(windows.count_nonzero())
+    def _uploaded(self, what: str, pixels: Tensor) -> Tensor:
+        there = empty(what, LOWER, tuple(pixels.shape), self.device, torch.uint8)
+        return there.copy_(pixels)
+
+    def _share(self, size: tuple[int, int], mask: Tensor | None) -> tuple[float, float]:
+        m, (width, height) = self._margin, size
+        if mask is None:
+            pixels, inner = width * height, (width - 2 * m) * (height - 2 * m)
+        else:
+            pixels, inner = int(mask.count_nonzero()), int(mask[m : height - m, m : width - m].count_nonzero())
         return 1.0 / max(3 * pixels, 1), 1.0 / (3 * inner) if inner else 0.0
 
     def _table(self, tensors: Sequence[Tensor]) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -24,11 +25,16 @@ class StepSettings:
         max_steps: length of the schedule.
         means_decay: what the means' rate falls to.
         lambda_ssim, padding: weight and border of D-SSIM.
+        d_ssim_halved: (1 - SSIM) / 2 instead of 1 - SSIM.
+        pixelwise_scale: multiplies the L1 or L2 term.
+        l1: L1 instead of L2.
         lambda_pop: weight of the POP term where it is on.
         theta_blur: share of the image a Gaussian must dominate to be blurred.
-        l1: L1 instead of L2.
+        blur_min_pixels: and at least so many pixels.
+        background: colour behind everything.
         profile, antialiased, family, deterministic: as in `cuda_ext.ops.rasterization`.
         betas, eps: Adam's.
+        replay: replay steps as CUDA graphs; False launches every kernel anew, for debuggers and profilers.
     """
 
     lr: Mapping[str, float]
@@ -36,28 +42,70 @@ class StepSettings:
     means_decay: float = 0.01
     lambda_ssim: float = 0.01
     padding: str = "valid"
+    d_ssim_halved: bool = False
+    pixelwise_scale: float = 1.0
+    l1: bool = False
     lambda_pop: float = 0.001
     theta_blur: float = 2e-5
-    l1: bool = False
+    blur_min_pixels: float = 0.0
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     profile: Profile = PAPER
     antialiased: bool = False
     family: str = "columns"
     deterministic: bool = True
     betas: tuple[float, float] = (0.9, 0.999)
     eps: float = 1e-15
+    replay: bool = True
+
+    def blur_pixels(self, width: int, height: int) -> float:
+        """Return the whole number of pixels that a blurred Gaussian dominates more than."""
+        theta = max(self.theta_blur, self.blur_min_pixels / (height * width))
+        # counts are whole, so that rounding down changes no comparison and a float holds the bound exactly
+        return float(math.floor(theta * (height * width)))
 
 
 class Phase(NamedTuple):
-    """What one kind of step does; steps of one phase and one image size share a graph."""
+    """What one kind of step does; steps of one phase and one image size share a graph.
+
+    Attributes:
+        sh_degree: highest active colour band.
+        pop: the POP term is on.
+        statistics: screen gradients are collected.
+        blur: dominant pixels are collected.
+    """
 
     sh_degree: int
     pop: bool
     statistics: bool
+    blur: bool
+
+    @property
+    def tells(self) -> bool:
+        """Whether dominant Gaussians are asked for."""
+        return self.pop or self.blur
+
+
+class StepValues(NamedTuple):
+    """What a step tells, in the kernels' order (csrc/train.h).
+
+    Attributes:
+        pixelwise: mean of the L1 or L2 term, without its weight.
+        ssim: SSIM.
+        objective: the photometric objective.
+        square: mean square of the difference, the render clamped to [0, 1].
+        pop: the weighted POP term, 0 where it is off.
+    """
+
+    pixelwise: float
+    ssim: float
+    objective: float
+    square: float
+    pop: float
 
 
 @dataclass
 class Statistics:
-    """What density control reads, one entry a Gaussian, added to by every step of a phase with statistics."""
+    """What density control reads, one entry a Gaussian, added to by every step of a phase that collects it."""
 
     grad_sum: Tensor
     n_visible: Tensor

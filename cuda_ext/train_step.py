@@ -1,15 +1,14 @@
 """The fused training step: photographs resident as bytes, one CUDA graph a step, no host synchronisation in the loop.
 
 `FusedTrainer.run(until)` replays begin -> project -> list -> blend -> loss -> blend back -> update -> end. The device
-holds the step counter, picks the view and makes the learning rates, so that one graph serves all steps of a kind. When
-instances do not fit, the device raises a flag and leaves parameters and counter alone from that step on; the host sees
-the flag two steps late, grows the buffers and goes on from the device's counter: nothing is truncated or lost.
+holds the step counter, picks the view, makes the learning rates and keeps what every step tells, so that one graph
+serves all steps of a kind. When instances do not fit, the device raises a flag and does nothing from that step on; the
+host sees the flag two steps late, grows the buffers and goes on from the device's counter: nothing is cut or lost.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,10 +16,23 @@ import torch
 from torch import Tensor
 
 from cuda_ext import load
-from cuda_ext.arrays import BAD_ROW, N_INSTANCES, NOT_BAD, OVERFLOW, STEP, Settings, empty, fill, new_state, stream_of
-from cuda_ext.lists import LOWER, WARP_TILE, TileBuffers, splat_struct
+from cuda_ext.arrays import (
+    BAD_ROW,
+    N_INSTANCES,
+    NOT_BAD,
+    OVERFLOW,
+    STEP,
+    Settings,
+    empty,
+    fill,
+    new_state,
+    pointer,
+    stream_of,
+)
+from cuda_ext.graphs import Watch, captured
+from cuda_ext.lists import LOWER, TileBuffers, list_tile, splat_struct
 from cuda_ext.resident import ResidentViews
-from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings
+from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, StepValues
 
 GROWTH = 1.5
 FIRST_GUESS = (8, 1024)  # instances a Gaussian, and at least
@@ -47,6 +59,11 @@ class FusedTrainer:
         order: the view of every step, at least `settings.max_steps` long.
         settings: objective and update.
         step: the step to begin at.
+
+    Attributes:
+        statistics: what density control reads; zeros after `rebind`.
+        values: what the last step told, in the order of `StepValues`.
+        grown: how often the instance buffers had to grow.
     """
 
     def __init__(
@@ -59,7 +76,7 @@ class FusedTrainer:
         settings: StepSettings,
         step: int = 0,
     ) -> None:
-        self.settings, self.views = settings, views
+        self.settings, self.views, self.step = settings, views, step
         self.device = params["means"].device
         self._order_on_host = list(order)
         self._order = torch.tensor(self._order_on_host, dtype=torch.int32, device=self.device)
@@ -67,7 +84,10 @@ class FusedTrainer:
         self.state[STEP] = step
         self._viewmat, self._K = torch.zeros(16, device=self.device), torch.zeros(9, device=self.device)
         self._constants = torch.zeros(load().STEP_CONSTANTS_FLOATS, device=self.device)
-        self.values = torch.zeros(3, device=self.device)
+        self._background = torch.tensor(settings.background, device=self.device) if any(settings.background) else None
+        self.values = torch.zeros(load().N_VALUES, device=self.device)
+        self._history = torch.zeros((settings.max_steps, load().N_VALUES), device=self.device)
+        self._watch = Watch(self.state, LATE + 1)
         self._capacity = 0
         self.grown = 0
         self.rebind(params, m, v)
@@ -76,19 +96,16 @@ class FusedTrainer:
         """Take new rows after a density event: buffers, statistics and graphs start anew."""
         self.params, self.m, self.v = dict(params), dict(m), dict(v)
         n = self.n = len(params["means"])
+        # what the old number of Gaussians needed goes first, so that old and new need not fit side by side
+        self._frames: dict[tuple[int, int], _Frame] = {}
+        self._steps: dict[tuple[int, int, Phase], Callable[[], None]] = {}
         self.statistics = Statistics.zeros(n, self.device)
-        self._splat = {
-            "means2d": torch.empty((n, 2), device=self.device),
-            "depths": torch.empty(n, device=self.device),
-            "conics": torch.empty((n, 3), device=self.device),
-            "opacities": torch.empty(n, device=self.device),
-            "radii": torch.empty((n, 2), dtype=torch.int32, device=self.device),
-            "colors": torch.empty((n, 3), device=self.device),
-        }
+        shapes = {"means2d": (n, 2), "depths": (n,), "conics": (n, 3), "opacities": (n,), "colors": (n, 3)}
+        self._splat = {name: empty("the splats", LOWER, shape, self.device) for name, shape in shapes.items()}
+        self._splat["radii"] = empty("the splats", LOWER, (n, 2), self.device, torch.int32)
         self._records = empty("packed splats", LOWER, (max(n, 1), load().RECORD), self.device)
         self._sums = torch.zeros((max(n, 1), load().RECORD), device=self.device)
-        self._frames: dict[tuple[int, int], _Frame] = {}
-        self._graphs: dict[tuple[int, int, Phase], torch.cuda.CUDAGraph] = {}
+        self._pop_sums = torch.zeros((max(load().important_blocks(n), 1), 2), device=self.device)
 
     def run(self, until: int, phase: Phase) -> None:
         """Take steps until the counter stands at `until`, all of one phase.
@@ -97,90 +114,90 @@ class FusedTrainer:
             ValueError: a Gaussian is no longer finite; the message names its row and step.
             CudaMemoryError: no room to grow.
         """
-        step = int(self.state[STEP])
-        watched: deque[tuple[torch.cuda.Event, Tensor]] = deque()
-        while step < until or watched:
-            if step < until:
-                self._replay(self.views.sizes[self._order_on_host[step]], phase)
-                watched.append(self._watch())
-                step += 1
-                if len(watched) <= LATE and step < until:
+        watch = self._watch
+        while self.step < until or watch:
+            if self.step < until:
+                self._take(self.views.sizes[self._order_on_host[self.step]], phase)
+                watch.post()
+                self.step += 1
+                if len(watch) <= LATE and self.step < until:
                     continue
-            event, told = watched.popleft()
-            event.synchronize()
+            told = watch.take()
             if told[BAD_ROW] != NOT_BAD or told[OVERFLOW] > 0:
-                watched.clear()
-                step = self._recover()
+                self.step = self._recover()
+                watch.clear()
 
-    def _watch(self) -> tuple[torch.cuda.Event, Tensor]:
-        told = torch.empty(self.state.shape, dtype=torch.int32, pin_memory=True)
-        told.copy_(self.state, non_blocking=True)
-        event = torch.cuda.Event()
-        event.record()
-        return event, told
+    def told(self, first: int, last: int) -> list[StepValues]:
+        """Return what the steps from `first` to before `last` told; `run` must have taken them in this session."""
+        return [StepValues(*row) for row in self._history[first:last].tolist()]
 
     def _recover(self) -> int:
         """Handle what halted the device, and return the step to go on from."""
-        told = self.state.tolist()
-        if told[BAD_ROW] != NOT_BAD:
-            raise ValueError(f"step {told[STEP]}: Gaussian {told[BAD_ROW]} projects to a value that is not finite")
+        flags = self.state.tolist()
+        if flags[BAD_ROW] != NOT_BAD:
+            raise ValueError(f"step {flags[STEP]}: Gaussian {flags[BAD_ROW]} has a value that is not finite")
         self.grown += 1
-        self._capacity = int(max(told[OVERFLOW], told[N_INSTANCES]) * GROWTH)
+        self._capacity = int(max(flags[OVERFLOW], flags[N_INSTANCES]) * GROWTH)
         self.state[OVERFLOW] = 0
         self._frames.clear()
-        self._graphs.clear()
-        return int(told[STEP])
+        self._steps.clear()
+        return int(flags[STEP])
 
-    def _replay(self, size: tuple[int, int], phase: Phase) -> None:
+    def _take(self, size: tuple[int, int], phase: Phase) -> None:
         key = (*size, phase)
-        if key in self._graphs:
-            self._graphs[key].replay()
+        if key in self._steps:
+            self._steps[key]()
             return
-        # the first step of a kind runs as it is, which loads the kernels; capturing then executes nothing
         frame = self._frame(size)
-        self._launch(frame, size, phase)
-        torch.cuda.synchronize(self.device)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
+
+        def launch() -> None:
             self._launch(frame, size, phase)
-        self._graphs[key] = graph
+
+        # the first step of a kind runs as it is, which loads the kernels; capturing then executes nothing
+        launch()
+        if self.settings.replay:
+            torch.cuda.synchronize(self.device)
+            self._steps[key] = captured(launch, self.device)
 
     def _frame(self, size: tuple[int, int]) -> _Frame:
         if size in self._frames:
             return self._frames[size]
-        kernels, (width, height), device = load(), size, self.device
+        kernels, (width, height), device, s = load(), size, self.device, self.settings
         # a guess that the flag corrects
         per_gaussian, least = FIRST_GUESS
         self._capacity = max(self._capacity, per_gaussian * self.n, least)
-        buckets = self.settings.family == "splats"
-        lists = TileBuffers(self.n, width, height, WARP_TILE, True, device, buckets)
+        tile, exact = list_tile(self._render(size, 0), counted=False)
+        lists = TileBuffers(self.n, width, height, tile, exact, device, s.family == "splats" and exact)
         lists.reserve(self._capacity)
         shape = (height, width)
-        told = {name: torch.empty(shape, dtype=torch.int32, device=device) for name in ("dominant_ids", "n_blended")}
-        told["n_traversed"] = torch.empty(shape, dtype=torch.int32, device=device)
-        told["dominant_weights"] = torch.empty(shape, device=device)
+        maps = ("dominant_ids", "n_blended", "n_traversed")
+        told = {name: empty("the image", "the image size", shape, device, torch.int32) for name in maps}
+        told["dominant_weights"] = empty("the image", "the image size", shape, device)
         told["dominant_counts"] = torch.zeros(max(self.n, 1), dtype=torch.int32, device=device)
-        blocks = kernels.loss_blocks(width, height)
         work = {
-            "T_final": torch.empty(shape, device=device),
-            "last": torch.empty(shape, dtype=torch.int32, device=device),
+            "T_final": empty("the image", "the image size", shape, device),
+            "last": empty("the image", "the image size", shape, device, torch.int32),
             "windows": empty("the loss", "the image size", (9, *shape), device),
-            "partials": torch.empty((blocks, 2), device=device),
-            "v_image": torch.empty((*shape, 3), device=device),
+            "partials": torch.empty((kernels.loss_blocks(width, height), 3), device=device),
+            "v_image": empty("the image", "the image size", (*shape, 3), device),
         }
-        if self.settings.deterministic:
-            work["rows"] = empty("gradient slots", LOWER, (lists.capacity, kernels.RECORD), device)
-        if buckets:
+        if s.deterministic:
+            rows = (lists.capacity * lists.parts, kernels.RECORD)
+            work["rows"] = empty("gradient slots", LOWER + ", or use deterministic=False", rows, device)
+        if lists.buckets:
             work["checkpoints"] = empty("checkpoints", LOWER, (lists.max_buckets, 4, kernels.TILE_PIXELS), device)
         frame = _Frame(lists, empty("the image", "the image size", (*shape, 3), device), told, work)
         self._frames[size] = frame
         return frame
 
+    def _render(self, size: tuple[int, int], sh_degree: int) -> Settings:
+        s = self.settings
+        return Settings(*size, s.profile, s.profile.tile_size, sh_degree, s.antialiased, family=s.family)
+
     def _launch(self, frame: _Frame, size: tuple[int, int], phase: Phase) -> None:
         kernels, s, state, stream = load(), self.settings, self.state.data_ptr(), stream_of(self.device)
-        render = Settings(*size, s.profile, WARP_TILE[0], phase.sh_degree, s.antialiased, family=s.family)
+        render = self._render(size, phase.sh_degree)
         profile, project, lists = render.kernel_profile(), render.project_settings(), frame.lists.struct
-        tells = phase.pop or phase.statistics
         splats = splat_struct(**self._splat)
         view = fill(kernels.View(), viewmat=self._viewmat, K=self._K, width=size[0], height=size[1])
         kernels.begin_step(self._schedule(), self._constants.data_ptr(), state, stream)
@@ -188,37 +205,31 @@ class FusedTrainer:
         kernels.count_instances(lists, splats, profile, state, stream)
         kernels.make_tile_lists(lists, splats, profile, state, stream)
         kernels.pack_records(self.n, 3, splats, s.profile.alpha_floor, self._records.data_ptr(), stream)
-        if tells:
-            frame.told["dominant_counts"].zero_()
         shared = {key: frame.work.get(key) for key in ("T_final", "last", "checkpoints")}
-        drawn = {"channels": 3, "records": self._records, "background": None, "image": frame.image, **shared}
-        told = frame.told if tells else {}
-        kernels.blend_forward(lists, fill(kernels.BlendForward(), **drawn, **told), profile, stream)
+        drawn = {"channels": 3, "records": self._records, "background": self._background, "image": frame.image}
+        forward = fill(kernels.BlendForward(), **drawn, **shared)
+        if phase.tells:
+            frame.told["dominant_counts"].zero_()
+            fill(forward, **frame.told, masks=self.views.masks, state=self.state)
+        kernels.blend_forward(lists, forward, profile, stream)
         kernels.photometric(self.views.photographs(), self._loss(frame, size), self._objective(), state, stream)
         if not s.deterministic:
             self._sums.zero_()
-        backward = fill(
-            kernels.BlendBackward(),
-            **drawn,
-            absolute=False,
-            v_image=frame.work["v_image"],
-            v_T_final=None,
-            rows=frame.work.get("rows"),
-            sums=self._sums,
-        )
-        backward.set_family(s.family == "splats", not s.deterministic)
+        backward = fill(kernels.BlendBackward(), **drawn, **shared, absolute=False, v_image=frame.work["v_image"])
+        fill(backward, v_T_final=None, rows=frame.work.get("rows"), sums=self._sums)
+        backward.set_family(frame.lists.buckets, not s.deterministic)
         kernels.blend_backward(lists, backward, profile, state, stream)
         if phase.pop:
-            kernels.count_important(self.n, frame.told["dominant_counts"].data_ptr(), state, stream)
+            counts, logits = frame.told["dominant_counts"], self.params["opacities"]
+            sums = self._pop_sums.data_ptr()
+            kernels.count_important(self.n, counts.data_ptr(), logits.data_ptr(), sums, state, stream)
         kernels.update(self._update(frame, size, phase), view, project, splats, state, stream)
-        kernels.end_step(state, stream)
+        kernels.end_step(self._record(phase), state, stream)
 
     def _gaussians(self) -> Any:
         p = self.params
-        made = fill(
-            load().Gaussians(), n=self.n, raw=True, **{k: p[k] for k in ("means", "quats", "scales", "opacities")}
-        )
-        fill(made, sh_first=p["sh0"], sh_rest=p["shN"])
+        rows = {k: p[k] for k in ("means", "quats", "scales", "opacities")}
+        made = fill(load().Gaussians(), n=self.n, raw=True, **rows, sh_first=p["sh0"], sh_rest=p["shN"])
         made.sh_first_stride, made.sh_rest_stride = 3, 3 * p["shN"].shape[1]
         return made
 
@@ -233,7 +244,8 @@ class FusedTrainer:
 
     def _objective(self) -> Any:
         s = self.settings
-        made = fill(load().LossSettings(), pixelwise_weight=1.0 - s.lambda_ssim, ssim_weight=s.lambda_ssim)
+        made = fill(load().LossSettings(), pixelwise_weight=(1.0 - s.lambda_ssim) * s.pixelwise_scale)
+        made.ssim_weight = s.lambda_ssim * (0.5 if s.d_ssim_halved else 1.0)
         made.margin = 5 if s.padding == "valid" else 0
         made.set_pixelwise(s.l1)
         return made
@@ -244,12 +256,21 @@ class FusedTrainer:
         return fill(made, width=size[0], height=size[1])
 
     def _update(self, frame: _Frame, size: tuple[int, int], phase: Phase) -> Any:
-        tells = phase.pop or phase.statistics
         made = fill(load().UpdateArrays(), n=self.n, n_rest=self.params["shN"].shape[1], sums=self._sums)
-        fill(made, constants=self._constants, dominant_counts=frame.told["dominant_counts"] if tells else None)
+        counts = frame.told["dominant_counts"] if phase.tells else None
+        fill(made, constants=self._constants, dominant_counts=counts)
         made.lambda_pop = self.settings.lambda_pop if phase.pop else 0.0
-        made.blur_pixels = self.settings.theta_blur * size[0] * size[1]
-        fill(made, **(self.statistics.__dict__ if phase.statistics else {}))
+        made.blur_pixels = self.settings.blur_pixels(*size)
+        found = self.statistics
+        if phase.statistics:
+            fill(made, grad_sum=found.grad_sum, n_visible=found.n_visible)
+        if phase.blur:
+            fill(made, dominant_sum=found.dominant_sum, blurred=found.blurred)
         for k, name in enumerate(GROUPS):
-            made.set_group(k, *(rows[name].data_ptr() for rows in (self.params, self.m, self.v)))
+            made.set_group(k, *(pointer(name, rows[name]) for rows in (self.params, self.m, self.v)))
         return made
+
+    def _record(self, phase: Phase) -> Any:
+        sums = self._pop_sums if phase.pop else None
+        made = fill(load().StepRecord(), values=self.values, history=self._history, pop_sums=sums)
+        return fill(made, n=self.n, lambda_pop=self.settings.lambda_pop)

@@ -79,10 +79,13 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
         }
     }
     if (TELL) {
+        const bool masked = blend.masks != nullptr && !halted(blend.state);
+        const uint8_t* mask = masked ? blend.masks[blend.state->view] : nullptr;
         // neighbours mostly agree on the winner: one integer addition a group of equal winners, in any order
 #pragma unroll
         for (int k = 0; k < COLUMN_ROWS; ++k) {
-            const int id = k < rows ? told.best[k].id : -1;
+            int id = k < rows ? told.best[k].id : -1;
+            if (id >= 0 && mask != nullptr && mask[size_t(y + k) * lists.grid.width + x] == 0) id = -1;
             unsigned group = __match_any_sync(FULL_WARP, id);
             if (id >= 0 && lane == __ffs(group) - 1) atomicAdd(blend.dominant_counts + id, __popc(group));
         }

@@ -1,6 +1,8 @@
 // What several kernels share: packed splats, the warp's tile, sums over a warp.
 #pragma once
 
+#include <limits.h>
+
 #include "compositing.cuh"
 #include "launch.h"
 
@@ -100,6 +102,12 @@ __device__ __forceinline__ int sum_index(int lane) {
         size = kept;
     }
     return copy || count <= 0 ? -1 : first;
+}
+
+// After an overflow or a bad row a fused step does nothing until the host has seen to it: the views of the steps behind
+// it may have another size than the buffers they are drawn into.
+__device__ __forceinline__ bool halted(const DeviceState* state) {
+    return state->overflow > 0 || state->bad_row != INT_MAX;
 }
 
 __device__ __forceinline__ int warp_max(int value) {

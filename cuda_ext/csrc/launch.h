@@ -18,11 +18,11 @@ constexpr int MAX_CHANNELS = 4;
 
 // Flags and counts that the device keeps; the host reads them one step late.
 struct DeviceState {
-    int overflow;            // instances that did not fit; every later update leaves the parameters alone while > 0
+    int overflow;            // instances that did not fit; every later step does nothing while > 0
     int n_instances;
     int n_buckets;
     int n_important;         // Gaussians with a dominant pixel, for the POP term
-    int bad_row;             // the first Gaussian whose projection is not finite, or INT_MAX
+    int bad_row;             // the first Gaussian with a value that is not finite, or INT_MAX
     int step;                // of the fused training step, from 0
     int view;                // the photograph of this step
     int sh_degree;
@@ -99,6 +99,9 @@ struct BlendForward {
     int* n_blended;
     int* n_traversed;
     int* dominant_counts;     // [n], zeroed by the caller
+    // pixels that a mask leaves out are not counted: one mask a view [H, W], picked by state->view; null counts all
+    const uint8_t* const* masks;
+    const DeviceState* state;  // read with masks
 };
 
 enum class Family : int { columns = 0, splats = 1 };

@@ -59,6 +59,7 @@ __global__ void __launch_bounds__(THREADS)
     __shared__ float2 pixels[HALO][HALO + 1];
     __shared__ float rows[MAPS][HALO][SIDE];
     __shared__ float sums[THREADS];
+    if (halted(state)) return;
     const Photograph photo = photograph_of(photographs, state);
     const int left = blockIdx.x * SIDE, top = blockIdx.y * SIDE;
     const int in_x = threadIdx.x % SIDE, in_y = threadIdx.x / SIDE;
@@ -67,7 +68,7 @@ __global__ void __launch_bounds__(THREADS)
     const bool inside = x < loss.width && y < loss.height;
     const int m = settings.margin;
     const bool counts = x >= m && x < loss.width - m && y >= m && y < loss.height - m && kept(photo, inside ? pixel : 0);
-    float similarity = 0.0f, difference = 0.0f;
+    float similarity = 0.0f, difference = 0.0f, square = 0.0f;
     for (int c = 0; c < CHANNELS; ++c) {
         for (int k = threadIdx.x; k < HALO * HALO; k += THREADS)
             pixels[k / HALO][k % HALO] =
@@ -115,16 +116,19 @@ __global__ void __launch_bounds__(THREADS)
                 const float2 p = pixels[in_y + SSIM_REACH][in_x + SSIM_REACH];
                 const float d = p.x - p.y;
                 difference += settings.pixelwise == Pixelwise::l2 ? d * d : fabsf(d);
+                const float e = clamped(p.x, 0.0f, 1.0f) - p.y;
+                square += e * e;
             }
         }
         __syncthreads();
     }
     if (ONLY_TARGET) return;
     const int block = blockIdx.y * gridDim.x + blockIdx.x;
-    const float d = block_sum(difference, sums), s = block_sum(similarity, sums);
+    const float d = block_sum(difference, sums), s = block_sum(similarity, sums), e = block_sum(square, sums);
     if (threadIdx.x == 0) {
-        loss.partials[2 * block] = d;
-        loss.partials[2 * block + 1] = s;
+        loss.partials[3 * block] = d;
+        loss.partials[3 * block + 1] = s;
+        loss.partials[3 * block + 2] = e;
     }
 }
 
@@ -132,6 +136,7 @@ __global__ void __launch_bounds__(THREADS)
     pixels_kernel(Photographs photographs, LossArrays loss, LossSettings settings, const DeviceState* state) {
     __shared__ float derivatives[CHANNELS][HALO][HALO + 1];
     __shared__ float rows[CHANNELS][HALO][SIDE];
+    if (halted(state)) return;
     const Photograph photo = photograph_of(photographs, state);
     const int left = blockIdx.x * SIDE, top = blockIdx.y * SIDE;
     const int in_x = threadIdx.x % SIDE, in_y = threadIdx.x / SIDE;
@@ -181,19 +186,22 @@ __global__ void __launch_bounds__(THREADS)
 __global__ void __launch_bounds__(THREADS) values_kernel(Photographs photographs, LossArrays loss,
                                                          LossSettings settings, const DeviceState* state, int blocks) {
     __shared__ float sums[THREADS];
-    float difference = 0.0f, similarity = 0.0f;
+    if (halted(state)) return;
+    float difference = 0.0f, similarity = 0.0f, square = 0.0f;
     for (int k = threadIdx.x; k < blocks; k += THREADS) {
-        difference += loss.partials[2 * k];
-        similarity += loss.partials[2 * k + 1];
+        difference += loss.partials[3 * k];
+        similarity += loss.partials[3 * k + 1];
+        square += loss.partials[3 * k + 2];
     }
-    const float d = block_sum(difference, sums), s = block_sum(similarity, sums);
+    const float d = block_sum(difference, sums), s = block_sum(similarity, sums), e = block_sum(square, sums);
     if (threadIdx.x > 0) return;
     const Photograph photo = photograph_of(photographs, state);
     // a mask that keeps no window compares nothing, and nothing differs
     const float ssim = photo.window_share > 0.0f ? s * photo.window_share : 1.0f;
-    loss.values[0] = d * photo.pixel_share;
-    loss.values[1] = ssim;
-    loss.values[2] = settings.pixelwise_weight * loss.values[0] + settings.ssim_weight * (1.0f - ssim);
+    loss.values[V_PIXELWISE] = d * photo.pixel_share;
+    loss.values[V_SSIM] = ssim;
+    loss.values[V_OBJECTIVE] = settings.pixelwise_weight * d * photo.pixel_share + settings.ssim_weight * (1.0f - ssim);
+    loss.values[V_SQUARE] = e * photo.pixel_share;
 }
 
 dim3 grid_for(const LossArrays& loss) {

@@ -2,8 +2,6 @@
 // thread owns a Gaussian while gradients are made; then the block owns its rows, so that parameters and moments are read
 // and written in whole lines. Gradients never reach memory.
 
-#include <limits.h>
-
 #include "cuda_check.h"
 #include "density.cuh"
 #include "kernel_tools.cuh"
@@ -14,15 +12,11 @@ namespace pop {
 
 namespace {
 
-constexpr int BLOCK = 128;
+constexpr int BLOCK = 128, SUM_BLOCK = 256;
 
 // floats of a row of each parameter whose rows have a fixed length
 constexpr __host__ __device__ int row_floats(int group) {
     return group == G_QUATS ? 4 : group == G_OPACITIES ? 1 : 3;
-}
-
-__device__ __forceinline__ bool halted(const DeviceState* state) {
-    return state->overflow > 0 || state->bad_row != INT_MAX;
 }
 
 __global__ void begin_step_kernel(Schedule schedule, StepConstants* constants, DeviceState* state) {
@@ -41,15 +35,56 @@ __global__ void begin_step_kernel(Schedule schedule, StepConstants* constants, D
         adam_step_at<float>(step + 1, schedule.lr[k] * decay, schedule.beta1, schedule.beta2, schedule.eps);
 }
 
-__global__ void end_step_kernel(DeviceState* state) {
-    if (!halted(state)) ++state->step;
+// two sums over a block in a fixed order; valid in thread 0
+__device__ __forceinline__ float2 block_sums(float2 value) {
+    __shared__ float2 shared[SUM_BLOCK];
+    shared[threadIdx.x] = value;
+    __syncthreads();
+    for (int half = SUM_BLOCK / 2; half > 0; half /= 2) {
+        if (threadIdx.x < half) {
+            shared[threadIdx.x].x += shared[threadIdx.x + half].x;
+            shared[threadIdx.x].y += shared[threadIdx.x + half].y;
+        }
+        __syncthreads();
+    }
+    return shared[0];
 }
 
-__global__ void count_important_kernel(int n, const int* dominant_counts, DeviceState* state) {
+__global__ void __launch_bounds__(SUM_BLOCK) end_step_kernel(StepRecord record, DeviceState* state) {
+    if (halted(state)) return;
+    float2 sums = {0.0f, 0.0f};
+    if (record.pop_sums != nullptr) {
+        const int blocks = (record.n + SUM_BLOCK - 1) / SUM_BLOCK;
+        for (int k = threadIdx.x; k < blocks; k += SUM_BLOCK) {
+            sums.x += record.pop_sums[2 * k];
+            sums.y += record.pop_sums[2 * k + 1];
+        }
+    }
+    sums = block_sums(sums);
+    if (threadIdx.x > 0) return;
+    const int important = state->n_important;
+    record.values[V_POP] =
+        record.pop_sums == nullptr
+            ? 0.0f
+            : record.lambda_pop * (sums.x / float(max(important, 1)) + sums.y / float(max(record.n - important, 1)));
+    for (int k = 0; k < N_VALUES; ++k) record.history[size_t(N_VALUES) * state->step + k] = record.values[k];
+    ++state->step;
+}
+
+__global__ void __launch_bounds__(SUM_BLOCK)
+    count_important_kernel(int n, const int* dominant_counts, const float* logits, float* pop_sums,
+                           DeviceState* state) {
     const int i = blockIdx.x * blockDim.x + threadIdx.x;
-    const unsigned hits = __ballot_sync(FULL_WARP, i < n && dominant_counts[i] > 0);
+    const bool important = i < n && dominant_counts[i] > 0;
+    const unsigned hits = __ballot_sync(FULL_WARP, important);
     // an integer: the order of additions does not matter
     if ((threadIdx.x & (WARP - 1)) == 0 && hits) atomicAdd(&state->n_important, __popc(hits));
+    // 1 - o is the opacity of the negated logit
+    const float o = i < n ? opacity_from_logit(important ? -logits[i] : logits[i]) : 0.0f;
+    const float2 sums = block_sums(important ? float2{o, 0.0f} : float2{0.0f, o});
+    if (threadIdx.x > 0) return;
+    pop_sums[2 * blockIdx.x] = sums.x;
+    pop_sums[2 * blockIdx.x + 1] = sums.y;
 }
 
 // gradients of a block's rows, as its threads leave them for the update
@@ -168,14 +203,17 @@ void begin_step(const Schedule& schedule, StepConstants* constants, DeviceState*
     POP_LAUNCHED("begin_step_kernel");
 }
 
-void end_step(DeviceState* state, cudaStream_t stream) {
-    end_step_kernel<<<1, 1, 0, stream>>>(state);
+void end_step(const StepRecord& record, DeviceState* state, cudaStream_t stream) {
+    end_step_kernel<<<1, SUM_BLOCK, 0, stream>>>(record, state);
     POP_LAUNCHED("end_step_kernel");
 }
 
-void count_important(int n, const int* dominant_counts, DeviceState* state, cudaStream_t stream) {
+int important_blocks(int n) { return blocks_for(n, SUM_BLOCK); }
+
+void count_important(int n, const int* dominant_counts, const float* logits, float* pop_sums, DeviceState* state,
+                     cudaStream_t stream) {
     if (n == 0) return;
-    count_important_kernel<<<blocks_for(n, 256), 256, 0, stream>>>(n, dominant_counts, state);
+    count_important_kernel<<<important_blocks(n), SUM_BLOCK, 0, stream>>>(n, dominant_counts, logits, pop_sums, state);
     POP_LAUNCHED("count_important_kernel");
 }
 

@@ -17,6 +17,12 @@ __device__ __forceinline__ GaussianRow<float> load_gaussian(const GaussianArrays
     return row;
 }
 
+__device__ __forceinline__ bool all_finite(const GaussianRow<float>& g) {
+    return isfinite(g.mean.x) && isfinite(g.mean.y) && isfinite(g.mean.z) && isfinite(g.quat.w) &&
+           isfinite(g.quat.x) && isfinite(g.quat.y) && isfinite(g.quat.z) && isfinite(g.scale.x) &&
+           isfinite(g.scale.y) && isfinite(g.scale.z) && isfinite(g.opacity);
+}
+
 __device__ __forceinline__ ShRow<float> load_sh(const GaussianArrays& g, int i) {
     return {g.sh_first + size_t(g.sh_first_stride) * i, g.sh_rest + size_t(g.sh_rest_stride) * i};
 }
@@ -30,8 +36,8 @@ __global__ void __launch_bounds__(PROJECT_BLOCK) project_kernel(GaussianArrays g
         camera_from_matrices(view.viewmat, view.K, view.width, view.height, settings.profile.centred);
     const GaussianRow<float> g = load_gaussian(gaussians, i);
     const SplatRow<float> s = project_one(g, camera, settings.profile, settings.options);
-    // a depth that is not finite would spoil the sort of everybody else
-    if (!isfinite(s.depth) || !isfinite(s.mean2d.x) || !isfinite(s.conic.xx)) atomicMin(&state->bad_row, i);
+    bool finite = all_finite(g) && isfinite(s.depth) && isfinite(s.mean2d.x) && isfinite(s.mean2d.y) &&
+                  isfinite(s.conic.xx) && isfinite(s.conic.xy) && isfinite(s.conic.yy);
     reinterpret_cast<float2*>(splats.means2d)[i] = {s.mean2d.x, s.mean2d.y};
     splats.depths[i] = s.depth;
     splats.conics[3 * i] = s.conic.xx;
@@ -39,12 +45,16 @@ __global__ void __launch_bounds__(PROJECT_BLOCK) project_kernel(GaussianArrays g
     splats.conics[3 * i + 2] = s.conic.yy;
     splats.opacities[i] = s.opacity;
     reinterpret_cast<int2*>(splats.radii)[i] = {s.radii.x, s.radii.y};
-    if (gaussians.sh_first == nullptr) return;
-    Vec3<float> color = {0.0f, 0.0f, 0.0f};
-    if (s.radii.x > 0) color = color_from_sh(load_sh(gaussians, i), view_dir(g.mean, camera), settings.sh_degree);
-    splats.colors[3 * i] = color.x;
-    splats.colors[3 * i + 1] = color.y;
-    splats.colors[3 * i + 2] = color.z;
+    if (gaussians.sh_first != nullptr) {
+        Vec3<float> color = {0.0f, 0.0f, 0.0f};
+        if (s.radii.x > 0) color = color_from_sh(load_sh(gaussians, i), view_dir(g.mean, camera), settings.sh_degree);
+        finite = finite && isfinite(color.x) && isfinite(color.y) && isfinite(color.z);
+        splats.colors[3 * i] = color.x;
+        splats.colors[3 * i + 1] = color.y;
+        splats.colors[3 * i + 2] = color.z;
+    }
+    // found here, before the sort: most culls are comparisons that a NaN fails, so that it would vanish without a word
+    if (!finite) atomicMin(&state->bad_row, i);
 }
 
 __global__ void pack_kernel(int n, int channels, SplatArrays splats, float alpha_floor, float* records) {

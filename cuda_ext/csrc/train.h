@@ -23,11 +23,15 @@ struct Photographs {
     float* const* moments;          // [2, 3, H, W] each: blurred y and y^2; null computes them every time
 };
 
+// What a step tells: the pixelwise mean, SSIM, the photometric objective, the mean square with the render clamped to
+// [0, 1] (for PSNR), the weighted POP term.
+enum Value { V_PIXELWISE, V_SSIM, V_OBJECTIVE, V_SQUARE, V_POP, N_VALUES };
+
 struct LossArrays {
     const float* image;   // [H, W, 3]
     float* windows;       // [3, 3, H, W]: channel, derivative
-    float* partials;      // [blocks, 2]
-    float* values;        // [3]: pixelwise mean, ssim, objective
+    float* partials;      // [blocks, 3]
+    float* values;        // [N_VALUES]; the first four are written here
     float* v_image;       // [H, W, 3]
     int width, height;
 };
@@ -69,16 +73,28 @@ struct UpdateArrays {
     float blur_pixels;           // a view's count above it blurs
 };
 
+// what end_step keeps of a step
+struct StepRecord {
+    float* values;          // [N_VALUES]
+    float* history;         // [max_steps, N_VALUES]: row `step` is written
+    const float* pop_sums;  // [important_blocks(n), 2], or null where the POP term is off
+    int n;
+    float lambda_pop;
+};
+
 int loss_blocks(int width, int height);
+int important_blocks(int n);
 void target_moments(const Photographs& photographs, const LossArrays& loss, const LossSettings& settings,
                     const DeviceState* state, cudaStream_t stream);
 void photometric(const Photographs& photographs, const LossArrays& loss, const LossSettings& settings,
                  const DeviceState* state, cudaStream_t stream);
 void begin_step(const Schedule& schedule, StepConstants* constants, DeviceState* state, cudaStream_t stream);
-void count_important(int n, const int* dominant_counts, DeviceState* state, cudaStream_t stream);
+// pop_sums: [important_blocks(n), 2], sums of 1 - o over the important and of o over the others
+void count_important(int n, const int* dominant_counts, const float* logits, float* pop_sums, DeviceState* state,
+                     cudaStream_t stream);
 void update(const UpdateArrays& arrays, const ViewArrays& view, const ProjectSettings& settings,
             const SplatArrays& splats, DeviceState* state, cudaStream_t stream);
-void end_step(DeviceState* state, cudaStream_t stream);
+void end_step(const StepRecord& record, DeviceState* state, cudaStream_t stream);
 void gather_rows(const float* source, const long long* index, float* target, int n, int row_floats,
                  cudaStream_t stream);
 void split_rows(const float* means, const float* quats, const float* log_scales, const float* normals, float shrink,

@@ -21,7 +21,7 @@ def _fused(scene: TrainingScene, device, **options):
     trainer = FusedTrainer(params, m, v, views, scene.order, settings)
     losses = []
     for step in range(STEPS):
-        trainer.run(step + 1, Phase(3, True, True))
+        trainer.run(step + 1, Phase(3, True, True, True))
         losses.append(float(trainer.values[2]))
     return losses, params, trainer
 
