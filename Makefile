@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 TORCH := $(shell sed -n 's/^\(torch==.*\)/\1/p' constraints.txt)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench cuda gpu-check docs-check clean
+.PHONY: help setup demo walkthrough test lint bench cuda gpu-check docs-check clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
@@ -24,6 +24,9 @@ demo: setup  ## write the demo capture, train POP on it, leave report.html, PLY,
 	$(BIN)/pop demo out/demo_capture --overwrite
 	$(BIN)/pop train out/demo_capture --out out/demo --preset quick --steps-scaler 0.05 --overwrite
 	@echo "open out/demo/report.html"
+
+walkthrough: setup  ## run the twelve chapters and write their pages with pictures to out/walkthrough
+	$(BIN)/python -m pop_ref.walkthrough out/walkthrough
 
 test: setup  ## run every test
 	$(BIN)/python -m pytest
@@ -45,7 +48,7 @@ gpu-check: cuda  ## build, hold the CUDA backend to every law, time it; one JSON
 
 docs-check: setup  ## fail when a table, name, path or command in README.md is no longer true
 	$(BIN)/python -m pytest -q tests/meta/test_readme.py
-	$(BIN)/python -m pytest -q --doctest-modules pop_ref
+	$(BIN)/python -m pytest -q --doctest-modules pop_ref --ignore pop_ref/walkthrough
 
 clean:  ## remove what was built here; .venv stays
 	rm -rf out build dist .pytest_cache .ruff_cache .hypothesis htmlcov .coverage

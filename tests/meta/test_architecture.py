@@ -58,6 +58,30 @@ def test_the_kit_adds_hypothesis_and_pytest_only() -> None:
         assert not _foreign(path, allowed), f"{_name(path)} imports {_foreign(path, allowed)}"
 
 
+WALKTHROUGH = sorted((ROOT / "pop_ref" / "walkthrough").glob("*.py"))
+
+
+@pytest.mark.parametrize("path", WALKTHROUGH, ids=lambda path: path.stem)
+def test_the_walk_through_adds_pictures_and_its_last_chapters_the_program(path: Path) -> None:
+    allowed = {"numpy", "pop_ref", "matplotlib"}
+    if not path.name.startswith("chapter_"):
+        allowed |= {"markdown_it", "mdit_py_plugins", "latex2mathml", "pygments"}
+    last = path.name.startswith(("chapter_10", "chapter_11", "chapter_12"))
+    if last:
+        allowed |= {"pop_fast", "torch", "hypothesis"}
+    assert not _foreign(path, allowed), f"{_name(path)} imports {_foreign(path, allowed)}"
+    kit = [m for m in _imports(path) if m.startswith("pop_ref.conformance")]
+    assert last or not kit, f"{_name(path)} imports {kit}: it explains the oracle, the kit comes at the end"
+
+
+def test_nothing_else_imports_the_walk_through() -> None:
+    outside = [path for path in FILES if path not in WALKTHROUGH and "tests" not in path.parts]
+    assert WALKTHROUGH
+    for path in outside:
+        taken = [m for m in _imports(path) if m.startswith("pop_ref.walkthrough")]
+        assert not taken, f"{_name(path)} imports {taken}"
+
+
 def test_the_program_takes_no_formula_from_the_oracle() -> None:
     for path in sorted((ROOT / "pop_fast").rglob("*.py")):
         if _name(path).startswith(SHOW_THE_ORACLE):

@@ -1,0 +1,73 @@
+"""Write the walk-through: `python -m pop_ref.walkthrough out/walkthrough`."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import os
+import sys
+import time
+from pathlib import Path
+
+from pop_ref.walkthrough.cells import ChapterError, chapter_files, read_chapter
+
+_NEEDED = ("matplotlib", "markdown_it", "mdit_py_plugins", "latex2mathml", "pygments")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the chapters and write their pages and the contents.
+
+    Args:
+        arguments: of the command line, default the process's own.
+
+    Returns:
+        The exit status: 0, or 2 with one line on stderr.
+    """
+    parser = argparse.ArgumentParser(prog="python -m pop_ref.walkthrough", description="Write the walk-through.")
+    parser.add_argument("folder", type=Path, help="where the pages go; it is made")
+    parser.add_argument("--only", type=int, nargs="+", metavar="N", help="run these chapters only")
+    wanted = parser.parse_args(arguments)
+    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        print(f"{', '.join(missing)} missing; pip install 'pop-splatting[walkthrough]'", file=sys.stderr)
+        return 2
+    try:
+        write(wanted.folder, wanted.only)
+    except ChapterError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+def write(folder: Path, only: list[int] | None = None) -> None:
+    """Write the pages into a folder.
+
+    Args:
+        folder: made if it is not there.
+        only: numbers of the chapters to run, default all. The contents lists all of them.
+
+    Raises:
+        ChapterError: a chapter failed; pages of earlier chapters are written.
+    """
+    from pop_ref.walkthrough.layout import chapter_page, index_page
+    from pop_ref.walkthrough.pages import run_chapter
+
+    chapters = [read_chapter(path) for path in chapter_files()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for chapter in chapters:
+        if only is None or chapter.number in only:
+            start = time.perf_counter()
+            _write(folder / chapter.page, chapter_page(chapter, run_chapter(chapter), chapters))
+            print(f"{chapter.number:2}  {chapter.title}  {time.perf_counter() - start:.1f} s", flush=True)
+    _write(folder / "index.html", index_page(chapters))
+    print(f"open {folder / 'index.html'}")
+
+
+def _write(path: Path, text: str) -> None:
+    beside = path.with_name(f".{path.name}.partial")
+    beside.write_text(text, encoding="utf-8")
+    os.replace(beside, path)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,204 @@
+"""Every chapter runs and becomes a page; a chapter that is broken says in which file and line."""
+
+from __future__ import annotations
+
+import functools
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from pop_ref.walkthrough.__main__ import main
+from pop_ref.walkthrough.cells import Chapter, ChapterError, chapter_files, read_chapter
+from pop_ref.walkthrough.layout import chapter_page, index_page
+from pop_ref.walkthrough.pages import Outcome, run_chapter
+
+CHAPTERS = chapter_files()
+VOID = {"meta", "br", "img", "hr", "link", "input"}
+
+
+class _Reader(HTMLParser):
+    """Holds that every tag is closed, and collects what a page shows, names and leads to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.ids: list[str] = []
+        self.links: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.ids += [value or "" for name, value in attrs if name == "id"]
+        self.links += [value or "" for name, value in attrs if name in ("href", "src", "xlink:href")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def _read(page: str) -> _Reader:
+    reader = _Reader()
+    reader.feed(page)
+    assert reader.open == []
+    return reader
+
+
+@functools.cache
+def _ran(path: Path) -> tuple[Chapter, list[Outcome]]:
+    chapter = read_chapter(path)
+    return chapter, run_chapter(chapter)
+
+
+@pytest.mark.parametrize("path", CHAPTERS, ids=lambda path: path.stem)
+def test_a_chapter_runs_and_holds_what_a_chapter_must(path: Path) -> None:
+    chapter, outcomes = _ran(path)
+    assert 2 <= chapter.n_exercises <= 3
+    assert 1 <= sum(len(outcome.pictures) for outcome in outcomes) <= 6
+    assert sum(len(outcome.printed.splitlines()) for outcome in outcomes) <= 60
+    assert any("eq." in cell.text for cell in chapter.cells if cell.kind == "prose"), "no formula names its equation"
+
+
+@pytest.mark.parametrize("path", CHAPTERS, ids=lambda path: path.stem)
+def test_a_chapter_becomes_a_page(path: Path) -> None:
+    chapter, outcomes = _ran(path)
+    every = [read_chapter(each) for each in CHAPTERS]
+    page = chapter_page(chapter, outcomes, every)
+    read = _read(page)
+    assert read.tags.count("details") == chapter.n_exercises
+    assert read.tags.count("figure") == sum(len(outcome.pictures) for outcome in outcomes)
+    assert "math" in read.tags
+    assert "$" not in re.sub(r"<(pre|style|code)\b.*?</\1>|<svg.*?</svg>", "", page, flags=re.DOTALL), "a bare dollar"
+    assert len(set(read.ids)) == len(read.ids)
+    pages = {each.page for each in every} | {"index.html"}
+    for link in read.links:
+        assert link.startswith(("#", "data:image/png;base64,", "https://")) or link in pages, f"{link} leads nowhere"
+    # a page loads nothing: what is on the network is only linked to
+    assert not re.search(r'src="(?!data:)|@import|<script|<link', page)
+
+
+def test_numbers_follow_each_other_and_the_contents_names_them_all() -> None:
+    chapters = [read_chapter(path) for path in CHAPTERS]
+    assert [chapter.number for chapter in chapters] == list(range(1, len(chapters) + 1))
+    page = index_page(chapters)
+    assert _read(page).links == [chapter.page for chapter in chapters]
+
+
+def test_a_chapter_runs_as_a_script() -> None:
+    done = subprocess.run([sys.executable, "-m", read_chapter(CHAPTERS[0]).module], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_command_writes_pages_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(tmp_path / "pages"), "--only", "1"]) == 0
+    assert sorted(path.name for path in (tmp_path / "pages").iterdir()) == [f"{CHAPTERS[0].stem}.html", "index.html"]
+    assert "index.html" in capsys.readouterr().out
+
+
+GOOD = """# %% [markdown]
+# # 1. Title
+#
+# What the reader will know, with $x^2$.
+
+# %%
+from dataclasses import dataclass
+
+import matplotlib.pyplot as plt
+
+from pop_ref.walkthrough.pages import picture
+
+@dataclass
+class Pair:
+    x: "float"
+
+fig, ax = plt.subplots()
+picture(fig, "A caption < with $y$.")
+print(Pair(1.0).x)
+
+# %% [markdown]
+# ### Exercise 1
+# What is two?
+
+# %% answer
+two = 2
+assert two == 2
+"""
+NAME = Path("chapter_01_small.py")
+
+
+def test_a_small_chapter_shows_what_it_prints_draws_and_folds() -> None:
+    chapter = read_chapter(NAME, GOOD)
+    assert (chapter.number, chapter.title) == (1, "Title")
+    assert chapter.opening == "What the reader will know, with $x^2$."
+    outcomes = run_chapter(chapter)
+    assert [outcome.printed for outcome in outcomes] == ["", "1.0\n", "", ""]
+    page = chapter_page(chapter, outcomes, [chapter])
+    assert "A caption &lt; with" in page
+    assert page.index("<summary>Answer</summary>") > page.index("What is two?")
+    assert "<msup><mi>x</mi><mn>2</mn></msup>" in page
+
+
+def _whole(text: str) -> str:
+    chapter = read_chapter(NAME, text)
+    return chapter_page(chapter, run_chapter(chapter), [chapter])
+
+
+def test_the_same_chapter_makes_the_same_bytes() -> None:
+    assert _whole(GOOD) == _whole(GOOD)
+
+
+def _fails(old: str, new: str) -> str:
+    assert GOOD.count(old) == 1
+    with pytest.raises(ChapterError) as caught:
+        _whole(GOOD.replace(old, new))
+    return str(caught.value)
+
+
+def test_a_false_claim_is_named_with_its_file_and_line() -> None:
+    told = _fails("assert two == 2", "assert two == 3")
+    assert told == "chapter_01_small.py:27: AssertionError\n    assert two == 3"
+
+
+def test_an_error_inside_the_oracle_is_named_where_the_chapter_calls() -> None:
+    told = _fails("two = 2", "from pop_ref.constants import profile_named\ntwo = profile_named('none')")
+    assert told.startswith("chapter_01_small.py:27: ValueError: profile 'none' is unknown")
+    assert told.endswith("\n    two = profile_named('none')")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("# %% answer\ntwo = 2\nassert two == 2\n", "", ":22: exercise 1 has no answer"),
+        ("# %% answer", "# %%", ":22: exercise 1 has no answer"),
+        ("assert two == 2\n", "", ":26: the answer to exercise 1 asserts nothing"),
+        ("# ### Exercise 1", "# ### Exercise 2", ":22: this is exercise 1, not 2"),
+        ("# ### Exercise 1", "# ### A question", ":26: an answer must follow its exercise"),
+        ("print(Pair(1.0).x)", "print(Pair(1.0).x", ":19: SyntaxError: '(' was never closed"),
+        ("# # 1. Title", "# # 2. Title", ":2: the first line must be '# # 1. Title'"),
+        ("# What is two?", "What is two?", ":23: a line of prose begins with '# '"),
+        ("# %% answer", "# %% solution", ":25: a cell is marked"),
+        ("$x^2$", r"$\nosuchthing{x}$", ":4: a formula cannot be set"),
+        ("$y$", r"$\\nosuchthing{x}$", ":7: a formula cannot be set in 'A caption"),
+    ],
+)
+def test_a_chapter_out_of_form_is_named_with_its_file_and_line(old: str, new: str, told: str) -> None:
+    assert _fails(old, new).startswith("chapter_01_small.py" + told)
+
+
+def test_a_broken_chapter_ends_the_command_with_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / NAME).write_text(GOOD.replace("assert two == 2", "assert two == 3"), encoding="utf-8")
+    monkeypatch.setattr("pop_ref.walkthrough.__main__.chapter_files", lambda: [tmp_path / NAME])
+    assert main([str(tmp_path / "pages")]) == 2
+    assert capsys.readouterr().err.startswith("chapter_01_small.py:27: AssertionError")
+    assert list((tmp_path / "pages").iterdir()) == []
