@@ -107,8 +107,8 @@ class Blender:
         steps: list[Step] = []
         start, n_pairs, crowded = 0, 0, False
         with workspace.slabs(2, group.slab, self.table.dtype) as slabs:
-            while start < group.slots.shape[1] and (n := lit.count_below(group.reached[start // CHUNK])) > 0:
-                slots = _slots(group, lit.rows, n, start, group.step_length(start, n))
+            while start < len(group.reached) * CHUNK and (n := lit.count_below(group.reached[start // CHUNK])) > 0:
+                slots = group.slots(lit.rows, n, start, group.step_length(start, n))
                 entries, light = self._entries(slots), lit["light"][:n]
                 alpha, weight = _shaped(slabs, slots, group.n_pixels)
                 self._alphas(entries, alpha)
@@ -188,7 +188,7 @@ class Blender:
                 self._alphas(entries, alpha)
                 light = workspace.copy(step.light)
                 crowded = step.stopping is None
-                weights_of_alphas(alpha, weight, light, step.light, self.stop, crowded, step.stopping, alpha_too=True)
+                weights_of_alphas(alpha, weight, light, step.light, self.stop, crowded, step.stopping)
                 workspace.give(light)
                 torch.bmm(entries[:, :, 6:], v, out=q)
                 for a, q_k in zip(reversed(alpha.unbind(1)), reversed(q.unbind(1)), strict=True):
@@ -234,12 +234,6 @@ class Blender:
             torch.stack((rows[:, 2], rows[:, 4], 2.0 * rows[:, 5], zero, zero, zero), 1),
         )
         return torch.stack([(g * (c @ self.basis)).abs_().sum(1) for c in along])
-
-
-def _slots(group: TileGroup, rows: Tensor | None, n: int, start: int, length: int) -> Tensor:
-    """Return the entry numbers of a step. [n, K]"""
-    slots = group.slots[:, start : start + length]
-    return slots[:n].contiguous() if rows is None else slots[rows[:n]]
 
 
 def _shaped(slabs: list[Tensor], slots: Tensor, n_pixels: int) -> list[Tensor]:

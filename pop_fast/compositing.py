@@ -173,7 +173,7 @@ class _Canvas:
             places, weights = blend.dominant_places, blend.dominant_weights
             assert places is not None
             assert weights is not None
-            ids = self.options.lists.ids[group.slots.gather(1, places.clamp_min(0))]
+            ids = self.options.lists.ids[places.clamp_min(0) + group.firsts[:, None]]
             self.ids.index_copy_(0, group.tiles, ids.masked_fill_(places < 0, -1))
             self.weights.index_copy_(0, group.tiles, weights)
         if self.blended is not None and self.traversed is not None:

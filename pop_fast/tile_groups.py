@@ -15,9 +15,7 @@ from pop_fast.tiles import TileLists
 
 CHUNK = 8  # list entries blended per step, where many tiles are
 LONGEST = 4  # chunks that a step takes at most, where few are
-PAIRS_PER_SLAB = (
-    1 << 19
-)  # (entry, pixel) pairs of one step: enough to share among threads, small enough for their caches
+PAIRS_PER_THREAD = 1 << 18  # (entry, pixel) pairs of a step: more than its overhead, and little enough for the caches
 
 
 @dataclass(frozen=True)
@@ -26,16 +24,18 @@ class TileGroup:
 
     Attributes:
         tiles: tile numbers. [G]
+        firsts: number of each tile's first entry. [G]
         lengths: list length of each tile, descending. [G]
-        slots: entry number by tile and place in the list, padded with the null entry. [G, L], L a multiple of CHUNK
         reached: for each chunk of the lists, how many tiles' lists reach it.
+        null_entry: number of the entry that blends nothing.
         n_pixels: of a tile.
     """
 
     tiles: Tensor
+    firsts: Tensor
     lengths: Tensor
-    slots: Tensor
     reached: list[int]
+    null_entry: int
     n_pixels: int
 
     @property
@@ -48,25 +48,36 @@ class TileGroup:
 
         Few tiles take longer steps, so that the overhead of a step has pairs to be spread over.
         """
-        left = self.slots.shape[1] - start
-        return min(left, CHUNK * max(1, min(LONGEST, len(self.tiles) // (2 * n))))
+        left = len(self.reached) - start // CHUNK
+        return CHUNK * min(left, max(1, min(LONGEST, len(self.tiles) // (2 * n))))
+
+    def slots(self, rows: Tensor | None, n: int, start: int, length: int) -> Tensor:
+        """Return the entry numbers of a step, the null entry where a list has ended.
+
+        Args:
+            rows: tiles to choose from, as places in the group; all when None.
+            n: how many of them take part, from the first.
+            start: place in the lists where the step begins.
+            length: entries that it takes.
+
+        Returns:
+            [n, length]
+        """
+        chosen = slice(n) if rows is None else rows[:n]
+        place = torch.arange(start, start + length)
+        return torch.where(place < self.lengths[chosen, None], self.firsts[chosen, None] + place, self.null_entry)
 
 
 def tile_groups(lists: TileLists) -> list[TileGroup]:
     """Group the tiles whose lists are not empty."""
     lengths, order = torch.sort(lists.lengths, descending=True, stable=True)
-    n_filled = int((lengths > 0).sum())
-    n_pixels = lists.tile_size**2
-    size = max(1, PAIRS_PER_SLAB // (CHUNK * n_pixels))
+    n_filled, n_pixels = int((lengths > 0).sum()), lists.tile_size**2
+    size = max(1, PAIRS_PER_THREAD * torch.get_num_threads() // (CHUNK * n_pixels))
     parts = zip(order[:n_filled].split(size), lengths[:n_filled].split(size), strict=True)
-    return [_group(tiles, of_tiles, lists, n_pixels) for tiles, of_tiles in parts if len(tiles)]
+    return [_group(tiles, of_tiles, lists) for tiles, of_tiles in parts if len(tiles)]
 
 
-def _group(tiles: Tensor, lengths: Tensor, lists: TileLists, n_pixels: int) -> TileGroup:
-    n_chunks = -(-int(lengths[0]) // CHUNK)
-    place = torch.arange(n_chunks * CHUNK)
-    real = place < lengths[:, None]
-    slots = torch.where(real, lists.offsets[tiles][:, None] + place, len(lists.ids))
-    starts = torch.arange(n_chunks) * CHUNK
+def _group(tiles: Tensor, lengths: Tensor, lists: TileLists) -> TileGroup:
+    starts = torch.arange(0, int(lengths[0]), CHUNK)
     reached = (lengths[:, None] > starts).sum(0).tolist()
-    return TileGroup(tiles, lengths, slots, reached, n_pixels)
+    return TileGroup(tiles, lists.offsets[tiles], lengths, reached, len(lists.ids), lists.tile_size**2)

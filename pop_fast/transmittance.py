@@ -8,6 +8,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from pop_fast import workspace
 from pop_ref.constants import Profile
 
 CROWDED = 0.15  # share of tiles with a stopping pixel from which all tiles are treated as such
@@ -38,42 +39,40 @@ def weights_of_alphas(
     stop: Stop,
     crowded: bool,
     stopping: Tensor | None = None,
-    alpha_too: bool = False,
 ) -> Tensor | None:
-    """Fill the weights of a step and take them off the light; weights and light are 0 from where a pixel stops.
+    """Fill the weights of a step and take them off the light; all are 0 from where a pixel stops.
 
     Args:
-        alpha: in and, for `alpha_too`, out. [n, K, P]
+        alpha: in and, in tiles where a pixel stops, out. [n, K, P]
         weight: out. [n, K, P]
         light: T, in and out. [n, P]
         before: another copy of the light. [n, P]
         stop: when pixels stop.
         crowded: pixels stop in so many tiles that all are treated alike.
         stopping: the tiles where pixels stop, if known.
-        alpha_too: zero alphas as well where pixels stop, in the tiles where one stops in this step.
 
     Returns:
         The tiles where pixels stop; None when all were treated alike.
     """
     if crowded:
-        _masked(alpha, weight, light, stop, alpha_too)
+        _masked(alpha, weight, light, stop)
         return None
     for a, w in zip(alpha.unbind(1), weight.unbind(1), strict=True):
         torch.mul(light, a, out=w)
-        light.sub_(w)
+        # not light - weight: with the product anew the rounding is that of `_masked`, whatever path a tile takes
+        light.addcmul_(light, a, value=-1.0)
     if stopping is None:
         stopping = _stopping(light, stop)
         if len(stopping) > CROWDED * len(light):
-            _masked(alpha, weight, light.copy_(before), stop, alpha_too)
+            _masked(alpha, weight, light.copy_(before), stop)
             return None
     if len(stopping):
         some_alpha, some_light = alpha[stopping], before[stopping]
         some_weight = torch.empty_like(some_alpha)
-        _masked(some_alpha, some_weight, some_light, stop, alpha_too)
+        _masked(some_alpha, some_weight, some_light, stop)
         weight.index_copy_(0, stopping, some_weight)
         light.index_copy_(0, stopping, some_light)
-        if alpha_too:
-            alpha.index_copy_(0, stopping, some_alpha)
+        alpha.index_copy_(0, stopping, some_alpha)
     return stopping
 
 
@@ -82,19 +81,24 @@ def count_passed(alpha: Tensor, light: Tensor, stop: Stop) -> Tensor:
     light = light.clone()
     passed = torch.zeros(light.shape, dtype=torch.int64)
     for a in alpha.unbind(1):
-        torch.threshold_(light.sub_(light * a), stop.at, 0.0)
+        torch.threshold_(light.addcmul_(light, a, value=-1.0), stop.at, 0.0)
         passed += light > 0.0
     return passed
 
 
-def _masked(alpha: Tensor, weight: Tensor, light: Tensor, stop: Stop, alpha_too: bool) -> None:
-    zero_where = torch.ops.aten.threshold_backward.grad_input
-    for a, w in zip(alpha.unbind(1), weight.unbind(1), strict=True):
-        torch.mul(light, a, out=w)
-        torch.threshold_(light.sub_(w), stop.at, 0.0)
-        zero_where(w, light, 0.0, grad_input=w)
-        if alpha_too:
-            zero_where(a, light, 0.0, grad_input=a)
+def _masked(alpha: Tensor, weight: Tensor, light: Tensor, stop: Stop) -> None:
+    n, length, n_pixels = alpha.shape
+    slab = workspace.take(n * (length + 1) * n_pixels, alpha.dtype)
+    passing = slab[: n * (length + 1) * n_pixels].view(n, length + 1, n_pixels)
+    passing[:, 0] = light
+    lights = passing.unbind(1)
+    for before, after, a in zip(lights, lights[1:], alpha.unbind(1), strict=False):
+        torch.addcmul(before, before, a, value=-1.0, out=after)
+        torch.threshold_(after, stop.at, 0.0)
+    torch.ops.aten.threshold_backward.grad_input(alpha, passing[:, 1:], 0.0, grad_input=alpha)
+    torch.mul(passing[:, :-1], alpha, out=weight)
+    light.copy_(passing[:, -1])
+    workspace.give(slab)
 
 
 def _stopping(light: Tensor, stop: Stop) -> Tensor:
