@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +11,6 @@ from typing import Annotated, Any, Final
 
 import tyro
 
-from pop_fast.backends import get_backend
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.splat import CaptureOptions, Splat, load_splat, open_capture
 from pop_fast.errors import PopError
@@ -22,6 +22,7 @@ from pop_fast.train.environment import reproducible
 from pop_fast.train.evaluate import evaluate
 from pop_fast.train.lpips import LPIPS
 from pop_fast.train.metrics import population
+from pop_fast.train.on_device import renderer
 from pop_fast.train.results import ResultFolder
 from pop_fast.train.views import ViewTensors
 
@@ -76,9 +77,9 @@ def run(argv: Sequence[str]) -> int:
 
 def measure_splat(splat: Splat, config: TrainConfig, views: list[ViewTensors], nets: Sequence[LPIPS]) -> dict[str, Any]:
     """Measure a splat on views; the numbers are those that training itself would write."""
-    backend = get_backend(config.backend)
-    if not backend.available():
-        raise PopError(f"backend '{config.backend}' is not available: {backend.why_not()}")
+    backend, note = renderer(config.backend)
+    if note:
+        print(f"note: {note}", file=sys.stderr)
     with reproducible(config.threads):
         measured = evaluate(backend, splat.params, views, config, splat.sh_degree, nets)
         return {**population(splat.params["opacities"].sigmoid()), **measured}

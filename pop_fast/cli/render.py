@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,6 @@ import torch
 import tyro
 from tqdm import tqdm
 
-from pop_fast.backends import get_backend
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.splat import CaptureOptions, Splat, load_splat, open_capture
 from pop_fast.data import Capture
@@ -22,6 +22,7 @@ from pop_fast.io.images import write_png
 from pop_fast.paths import VideoFile, camera_path
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.environment import reproducible
+from pop_fast.train.on_device import renderer
 from pop_fast.train.views import ViewTensors, render_view
 
 _EXAMPLES: Final = """
@@ -98,9 +99,9 @@ def planned_views(capture: Capture, config: TrainConfig, path: str, frames: int)
 @torch.no_grad()
 def rendered(splat: Splat, config: TrainConfig, views: Sequence[ViewTensors]) -> Iterator[np.ndarray]:
     """Render views one by one. uint8 [H, W, 3] each"""
-    backend = get_backend(config.backend)
-    if not backend.available():
-        raise PopError(f"backend '{config.backend}' is not available: {backend.why_not()}")
+    backend, note = renderer(config.backend)
+    if note:
+        print(f"note: {note}", file=sys.stderr)
     with reproducible(config.threads):
         for view in tqdm(views, desc="rendering", unit="view", disable=None, leave=False):
             image = render_view(backend, splat.params, view, config, splat.sh_degree).image

@@ -141,6 +141,15 @@ class DensityControl:
         if step >= self.refine_stop_iter:
             return
         self._collect(params, state, step, info, packed)
+        self.change(params, optimizers, state, step)
+
+    @torch.no_grad()
+    def change(self, params: Params, optimizers: Optimizers, state: State, step: int) -> None:
+        """Do what is due after a step whose statistics are collected; for trainers that collect them themselves.
+
+        What happened is left in `state["event"]`, as by `step_post_backward`.
+        """
+        state["event"] = None
         if self.is_refine_step(step):
             state["event"] = self._grow(params, optimizers, state, step)
             state["event"]["pruned"] = self._prune(params, optimizers, state, step)

@@ -1,0 +1,107 @@
+"""A backend on a GPU behind the door of one on the CPU, and which backend measures and draws what was trained."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pop_fast.backends import Backend, get_backend
+from pop_fast.errors import PopError
+
+
+class OnDevice:
+    """Renders on a device what lies anywhere, and hands images and `info` back on the CPU.
+
+    Args:
+        backend: what renders there.
+        device: where.
+    """
+
+    def __init__(self, backend: Backend, device: torch.device) -> None:
+        self._backend, self.device = backend, device
+
+    @property
+    def name(self) -> str:
+        """Return the backend's name."""
+        return self._backend.name
+
+    def available(self) -> bool:
+        """Tell whether it can run here."""
+        return self._backend.available()
+
+    def why_not(self) -> str | None:
+        """Return why it cannot run here and what to do, or None."""
+        return self._backend.why_not()
+
+    def rasterization(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        """Render; see `pop_fast.rasterization.rasterization`. No gradient comes back.
+
+        Raises:
+            PopError: the GPU has no room; says what to lower.
+        """
+        there = [self._moved(value) for value in args]
+        named = {key: self._moved(value) for key, value in kwargs.items()}
+        try:
+            with torch.no_grad():
+                image, alphas, info = self._backend.rasterization(*there, **named)
+        except RuntimeError as error:
+            told = no_room(error)
+            if told is None:
+                raise
+            raise told from error
+        return image.cpu(), alphas.cpu(), _Fetched(info)
+
+    def _moved(self, value: Any) -> Any:
+        return value.to(self.device) if isinstance(value, Tensor) else value
+
+
+class _Fetched(dict[str, Any]):
+    """Values of an `info` on the CPU, each fetched when it is first read."""
+
+    def __init__(self, info: Mapping[str, Any]) -> None:
+        super().__init__()
+        self._info = info
+
+    def __missing__(self, key: str) -> Any:
+        value = self._info[key]
+        self[key] = value.detach().cpu() if isinstance(value, Tensor) else value
+        return self[key]
+
+    def __contains__(self, key: object) -> bool:
+        return super().__contains__(key) or key in self._info
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Return the value on the CPU, or `default`."""
+        return self[key] if key in self else default  # noqa: SIM401 - `get` itself
+
+
+def no_room(error: RuntimeError) -> PopError | None:
+    """Return what to say where an error means that the GPU's memory is full, or None for every other error."""
+    from cuda_ext.arrays import CudaMemoryError
+
+    if isinstance(error, CudaMemoryError):
+        return PopError(str(error))
+    if isinstance(error, torch.cuda.OutOfMemoryError):
+        first = str(error).split(". ")[0]
+        return PopError(f"the GPU has no room ({first}); use smaller images (--factor 2 or more) or fewer Gaussians")
+    return None
+
+
+def renderer(name: str) -> tuple[Backend, str | None]:
+    """Return the backend for CPU tensors under a name of settings, and a note where another one stands in for it.
+
+    "auto" is "cuda" where it can run, else "fast"; results trained by "cuda" are drawn by "fast" on other machines.
+
+    Raises:
+        PopError: the name is unknown.
+    """
+    if name not in ("auto", "cuda"):
+        return get_backend(name), None
+    cuda = get_backend("cuda")
+    reason = cuda.why_not()
+    if reason is None:
+        return OnDevice(cuda, torch.device("cuda", torch.cuda.current_device())), None
+    return get_backend("fast"), None if name == "auto" else f"backend 'fast' stands in for 'cuda': {reason}"

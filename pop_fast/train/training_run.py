@@ -1,0 +1,235 @@
+"""What a training run does whoever takes its steps: results, milestones, measurements, checkpoints, stop and go on."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+from tqdm import tqdm
+
+from pop_fast.activations import opacities_from_logits
+from pop_fast.backends import Backend, get_backend
+from pop_fast.data.capture import Capture
+from pop_fast.data.initialize import initialize_params
+from pop_fast.errors import PopError
+from pop_fast.io.ply import save_ply
+from pop_fast.train import checkpoint as ckpt
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.environment import reproducible, run_facts, versions
+from pop_fast.train.evaluate import evaluate
+from pop_fast.train.lpips import load_nets
+from pop_fast.train.metrics import population
+from pop_fast.train.model import KEYS, first_non_finite, make_optimizers
+from pop_fast.train.results import ResultFolder
+from pop_fast.train.schedule import ViewOrder, active_sh_degree
+from pop_fast.train.signals import stop_requests
+from pop_fast.train.views import ViewTensors
+
+
+class TrainingRun:
+    """A run of one capture; `Trainer` and `DeviceTrainer` add how steps are taken.
+
+    Attributes:
+        config: the settings, step numbers as they are run.
+        params: raw parameters.
+        optimizers: one Adam a parameter.
+        strategy: the population's.
+        state: the strategy's state.
+        step: steps taken.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        capture: Capture,
+        *,
+        resume: bool = False,
+        overwrite: bool = False,
+        loading_seconds: float = 0.0,
+        backend: Backend | None = None,
+    ) -> None:
+        """Prepare a run; nothing is written yet.
+
+        Args:
+            config: the settings.
+            capture: the photographs and cameras.
+            resume: go on from the latest checkpoint of `config.result_dir`, or start where there is none.
+            overwrite: remove the results of an earlier run in `config.result_dir`.
+            loading_seconds: how long reading the capture took, for the statistics.
+            backend: what renders; None takes the one that `config` names.
+
+        Raises:
+            PopError: the capture cannot be trained on, weights are missing, or the backend is not available.
+        """
+        self._given, self.config = config, config.resolved()
+        self._resume, self._overwrite = resume, overwrite
+        self._backend = get_backend(config.backend) if backend is None else backend
+        if not self._backend.available():
+            raise PopError(f"backend {config.backend!r} is not available: {self._backend.why_not()}")
+        self._train = [ViewTensors.of(view) for view in capture.train_views(config.test_every)]
+        self._test = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
+        if not self._train:
+            raise PopError(f"{capture.name}: has no view to train on; lower test_every or set it to 0")
+        self._nets = load_nets(config.lpips_vgg, config.lpips_alex, [(view.height, view.width) for view in self._test])
+        self._capture = capture
+        self._scene_scale = capture.scene_scale()
+        self._order = ViewOrder(len(self._train), self.config.seed)
+        self._results = ResultFolder(self.config.result_dir)
+        initial = initialize_params(capture, self.config.seed, self.config.init_opacity, self.config.init_scale)
+        self.params = {key: Parameter(initial[key]) for key in KEYS}
+        self.optimizers = make_optimizers(self.params, self.config.lr, self._scene_scale)
+        self.strategy = self.config.strategy
+        self.strategy.check_sanity(self.params, self.optimizers)
+        self.state = self.strategy.initialize_state(self._scene_scale, seed=self.config.seed)
+        self.step = 0
+        self._train_seconds = 0.0
+        self._loading_seconds = loading_seconds
+        self._started = 0.0
+
+    def run(self) -> dict[str, Any]:
+        """Train to the end.
+
+        Returns:
+            The statistics of the last step, as in stats/val_step{step}.json.
+
+        Raises:
+            PopError: the folder is in use, a checkpoint does not fit, or a number is no longer finite.
+            KeyboardInterrupt: after Ctrl-C or SIGTERM, when a checkpoint has been written.
+        """
+        self._started = time.perf_counter()
+        with reproducible(self.config.threads), stop_requests() as stop:
+            try:
+                self._begin()
+                return self._loop(stop)
+            finally:
+                self._results.close()
+
+    def _begin(self) -> None:
+        self._results.claim(self._resume, self._overwrite)
+        found = ckpt.list_checkpoints(self._results.path) if self._resume else []
+        if found:
+            self._restore(found[-1][1])
+        self._results.write_config(self._given)
+        if not found:
+            self._results.open_metrics(keep_bytes=0)
+            self._results.write_opacities(-1, self._opacities().numpy())
+
+    def _loop(self, stop: threading.Event) -> dict[str, Any]:
+        config = self.config
+        with tqdm(total=config.max_steps, initial=self.step, disable=None if config.progress else True) as bar:
+            while self.step < config.max_steps:
+                self._advance(bar)
+                self._milestones(self.step - 1)
+                if stop.is_set() and self.step < config.max_steps:
+                    self._save()
+                    raise KeyboardInterrupt
+        last = config.max_steps - 1
+        return self._results.read_stats("val", last) or self._evaluate(last)
+
+    def _advance(self, bar: tqdm) -> None:
+        """Take one step or several, move `step`, and log."""
+        raise NotImplementedError
+
+    def _milestones(self, step: int) -> None:
+        """After a step (counted from 0): keep histograms, measure, write PLY and checkpoint when it is time."""
+        config, taken = self.config, step + 1
+        last = taken == config.max_steps
+        if taken == config.pop.blur_stop_iter or last:
+            self._results.write_opacities(step, self._opacities().numpy())
+        if taken in config.eval_steps or last:
+            self._evaluate(step)
+        if taken in config.save_steps or last:
+            save_ply(self._results.path / "ply" / f"point_cloud_{step}.ply", self._detached(), config.antialiased)
+        # the checkpoint comes last: a run that is killed in between does this step's milestones again
+        due = config.checkpoint_every > 0 and taken % config.checkpoint_every == 0
+        if due or taken in config.save_steps or last:
+            self._save()
+
+    def _evaluate(self, step: int) -> dict[str, Any]:
+        self._require_finite()
+        config = self.config
+        stats = {
+            "step": step,
+            "method": config.method,
+            "capture": self._capture.name,
+            **population(self._opacities()),
+            **self._facts(),
+        }
+        self._results.write_stats("train", step, {**stats, "ellipse_time": self._train_seconds})
+        degree = active_sh_degree(step, config.sh_interval, config.sh_degree)
+        folder = self._results if step + 1 == config.max_steps else None
+        stats |= evaluate(self._backend, self.params, self._test, config, degree, self._nets, folder, step)
+        stats["seconds_total"] = self._total_seconds
+        self._results.write_stats("val", step, stats)
+        return stats
+
+    def _facts(self) -> dict[str, Any]:
+        facts = run_facts(self._backend.name, self._train_seconds, self._total_seconds)
+        return {**facts, "seconds_loading": self._loading_seconds}
+
+    def _save(self) -> None:
+        self._require_finite()
+        content = {
+            "step": self.step - 1,
+            "splats": self._detached(),
+            "optimizers": _on_cpu(ckpt.pack_optimizers(self.optimizers)),
+            "strategy": _on_cpu(ckpt.pack_strategy(self.state)),
+            "view_order": self._order.state_dict(),
+            "config": self._given.binding(),
+            "capture": self._fingerprint(),
+            "metrics_bytes": self._results.flush_metrics(),
+            "seconds": {"train": self._train_seconds, "total": self._total_seconds},
+            "threads": torch.get_num_threads(),
+            "versions": versions(),
+        }
+        ckpt.save_checkpoint(ckpt.checkpoint_path(self._results.path, self.step - 1), content)
+        milestones = {step - 1 for step in self.config.save_steps}
+        ckpt.prune_checkpoints(self._results.path, self.config.keep_checkpoints, milestones)
+
+    def _restore(self, path: Path) -> None:
+        content = ckpt.load_checkpoint(path)
+        ckpt.check_fits(path, content, self._given, self._fingerprint(), torch.get_num_threads())
+        self.params = {key: Parameter(content["splats"][key]) for key in KEYS}
+        self.optimizers = make_optimizers(self.params, self.config.lr, self._scene_scale)
+        ckpt.unpack_optimizers(self.optimizers, content["optimizers"])
+        ckpt.unpack_strategy(self.state, content["strategy"])
+        self._order.load_state_dict(content["view_order"])
+        self._results.open_metrics(content["metrics_bytes"])
+        self._train_seconds = content["seconds"]["train"]
+        self._started -= content["seconds"]["total"]
+        self.step = content["step"] + 1
+
+    @property
+    def _total_seconds(self) -> float:
+        return time.perf_counter() - self._started
+
+    def _fingerprint(self) -> dict[str, str]:
+        return ckpt.capture_fingerprint(self._capture, self.config.test_every)
+
+    def _detached(self) -> dict[str, Tensor]:
+        return {key: value.detach().cpu() for key, value in self.params.items()}
+
+    def _opacities(self) -> Tensor:
+        return opacities_from_logits(self.params["opacities"].detach().cpu())
+
+    def _require_finite(self) -> None:
+        found = first_non_finite(self._detached())
+        if found:
+            name, index, value = found
+            raise PopError(
+                f"{name}{index} is {value} after {self.step} steps; the latest checkpoint is kept: lower the learning "
+                f"rate of {name} and start again, or look at the photographs and masks of the capture"
+            )
+
+
+def _on_cpu(content: Any) -> Any:
+    """Return nested dicts with their tensors on the CPU; those that are there already are not copied."""
+    if isinstance(content, Mapping):
+        return {key: _on_cpu(value) for key, value in content.items()}
+    return content.cpu() if isinstance(content, Tensor) else content
