@@ -23,13 +23,20 @@ def main(arguments: list[str] | None = None) -> int:
     Returns:
         The exit status: 0, or 2 with one line on stderr.
     """
-    parser = argparse.ArgumentParser(prog="python -m pop_ref.walkthrough", description="Write the walk-through.")
+    parser = argparse.ArgumentParser(
+        prog="python -m pop_ref.walkthrough", description="Write the walk-through."
+    )
     parser.add_argument("folder", type=Path, help="where the pages go; it is made")
-    parser.add_argument("--only", type=int, nargs="+", metavar="N", help="run these chapters only")
+    parser.add_argument(
+        "--only", type=int, nargs="+", metavar="N", help="run these chapters only"
+    )
     wanted = parser.parse_args(arguments)
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
-        print(f"{', '.join(missing)} missing; pip install 'pop-splatting[walkthrough]'", file=sys.stderr)
+        print(
+            f"{', '.join(missing)} missing; pip install 'pop-splatting[walkthrough]'",
+            file=sys.stderr,
+        )
         return 2
     try:
         write(wanted.folder, wanted.only)
@@ -57,8 +64,13 @@ def write(folder: Path, only: list[int] | None = None) -> None:
     for chapter in chapters:
         if only is None or chapter.number in only:
             start = time.perf_counter()
-            _write(folder / chapter.page, chapter_page(chapter, run_chapter(chapter), chapters))
-            print(f"{chapter.number:2}  {chapter.title}  {time.perf_counter() - start:.1f} s", flush=True)
+            _write(
+                folder / chapter.page, chapter_page(chapter, run_chapter(chapter), chapters)
+            )
+            print(
+                f"{chapter.number:2}  {chapter.title}  {time.perf_counter() - start:.1f} s",
+                flush=True,
+            )
     _write(folder / "index.html", index_page(chapters))
     print(f"open {folder / 'index.html'}")
 

@@ -86,10 +86,18 @@ def read_chapter(path: Path, text: str | None = None) -> Chapter:
     titled = _TITLE.match(heading)
     if titled is None or int(titled[1]) != int(named[1]):
         wanted = f"# # {int(named[1])}. Title"
-        raise ChapterError(path, cells[0].line, f"the first line must be {wanted!r}, it is {'# ' + heading!r}")
+        raise ChapterError(
+            path,
+            cells[0].line,
+            f"the first line must be {wanted!r}, it is {'# ' + heading!r}",
+        )
     opening = rest.strip().split("\n\n")[0]
     if not opening or opening.startswith("#"):
-        raise ChapterError(path, cells[0].line, "a paragraph on what the chapter teaches must follow the title")
+        raise ChapterError(
+            path,
+            cells[0].line,
+            "a paragraph on what the chapter teaches must follow the title",
+        )
     _hold_exercises(path, cells)
     return Chapter(path, int(titled[1]), titled[2], opening, cells)
 
@@ -105,7 +113,9 @@ def _cells(path: Path, text: str) -> list[Cell]:
         word = lines[start].removeprefix("# %%").strip()
         if word not in _KINDS:
             raise ChapterError(
-                path, start + 1, f"a cell is marked '# %%', '# %% [markdown]' or '# %% answer', not {word!r}"
+                path,
+                start + 1,
+                f"a cell is marked '# %%', '# %% [markdown]' or '# %% answer', not {word!r}",
             )
         first, last = start + 1, end
         while first < last and not lines[first].strip():
@@ -123,7 +133,9 @@ def _cells(path: Path, text: str) -> list[Cell]:
 
 def _prose_line(path: Path, number: int, line: str) -> str:
     if line != "#" and not line.startswith("# "):
-        raise ChapterError(path, number, f"a line of prose begins with '# ', this one is {line!r}")
+        raise ChapterError(
+            path, number, f"a line of prose begins with '# ', this one is {line!r}"
+        )
     return line[2:]
 
 
@@ -135,17 +147,33 @@ def _hold_exercises(path: Path, cells: tuple[Cell, ...]) -> None:
         if exercise is not None:
             asked += 1
             if int(exercise[1]) != asked:
-                raise ChapterError(path, cell.line, f"this is exercise {asked}, not {exercise[1]}")
+                raise ChapterError(
+                    path, cell.line, f"this is exercise {asked}, not {exercise[1]}"
+                )
             if after is None or after.kind != "answer":
-                raise ChapterError(path, cell.line, f"exercise {asked} has no answer: a cell '# %% answer' must follow")
+                raise ChapterError(
+                    path,
+                    cell.line,
+                    f"exercise {asked} has no answer: a cell '# %% answer' must follow",
+                )
         elif after is not None and after.kind == "answer":
-            raise ChapterError(path, after.line, "an answer must follow its exercise, a prose cell '# ### Exercise k'")
-        if cell.kind == "answer" and not any(isinstance(node, ast.Assert) for node in ast.walk(_parsed(path, cell))):
-            raise ChapterError(path, cell.line, f"the answer to exercise {asked} asserts nothing")
+            raise ChapterError(
+                path,
+                after.line,
+                "an answer must follow its exercise, a prose cell '# ### Exercise k'",
+            )
+        if cell.kind == "answer" and not any(
+            isinstance(node, ast.Assert) for node in ast.walk(_parsed(path, cell))
+        ):
+            raise ChapterError(
+                path, cell.line, f"the answer to exercise {asked} asserts nothing"
+            )
 
 
 def _parsed(path: Path, cell: Cell) -> ast.Module:
     try:
         return ast.parse(cell.text)
     except SyntaxError as error:
-        raise ChapterError(path, cell.line + (error.lineno or 1) - 1, f"SyntaxError: {error.msg}") from error
+        raise ChapterError(
+            path, cell.line + (error.lineno or 1) - 1, f"SyntaxError: {error.msg}"
+        ) from error

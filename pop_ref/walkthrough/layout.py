@@ -16,6 +16,7 @@ from pygments.formatters.html import HtmlFormatter
 from pygments.lexers.python import PythonLexer
 
 from pop_ref.walkthrough.cells import FOLDER, Cell, Chapter, ChapterError
+from pop_ref.walkthrough.folding import Part, parts
 from pop_ref.walkthrough.pages import Outcome, Picture
 from pop_ref.walkthrough.style import VARIABLES
 
@@ -31,7 +32,9 @@ class _FormulaError(Exception):
     pass
 
 
-def chapter_page(chapter: Chapter, outcomes: Sequence[Outcome], chapters: Sequence[Chapter]) -> str:
+def chapter_page(
+    chapter: Chapter, outcomes: Sequence[Outcome], chapters: Sequence[Chapter]
+) -> str:
     """Lay out one chapter.
 
     Args:
@@ -64,7 +67,9 @@ def index_page(chapters: Sequence[Chapter]) -> str:
         f"<p>{_inline(chapter, chapter.opening)}</p></li>"
         for chapter in chapters
     ]
-    return _document(_TITLE, f'<h1>{_TITLE}</h1><p>{_LEAD}</p><ol class="contents">{"".join(items)}</ol>')
+    return _document(
+        _TITLE, f'<h1>{_TITLE}</h1><p>{_LEAD}</p><ol class="contents">{"".join(items)}</ol>'
+    )
 
 
 def _document(title: str, body: str) -> str:
@@ -86,13 +91,36 @@ def _cell(chapter: Chapter, name: str, outcome: Outcome) -> str:
     cell = outcome.cell
     if cell.kind == "prose":
         return _prose(chapter, cell)
-    code = highlight(cell.text, PythonLexer(), HtmlFormatter(nowrap=True))
-    parts = [f"<pre><code>{code}</code></pre>"]
+    shown = (
+        [_code(cell.text)]
+        if cell.kind == "answer"
+        else [_part(part) for part in parts(cell.text)]
+    )
     if outcome.printed.strip():
-        parts.append(f'<pre class="printed">{escape(outcome.printed.rstrip())}</pre>')
-    parts += [_figure(chapter, cell, f"{name}-{i}", each) for i, each in enumerate(outcome.pictures)]
-    whole = "".join(parts)
-    return f"<details><summary>Answer</summary>{whole}</details>" if cell.kind == "answer" else whole
+        shown.append(f'<pre class="printed">{escape(outcome.printed.rstrip())}</pre>')
+    shown += [
+        _figure(chapter, cell, f"{name}-{i}", each)
+        for i, each in enumerate(outcome.pictures)
+    ]
+    whole = "".join(shown)
+    return (
+        f"<details><summary>Answer</summary>{whole}</details>"
+        if cell.kind == "answer"
+        else whole
+    )
+
+
+def _part(part: Part) -> str:
+    code = _code(part.text)
+    return (
+        f'<details class="drawing"><summary>The code that draws</summary>{code}</details>'
+        if part.draws
+        else code
+    )
+
+
+def _code(text: str) -> str:
+    return f"<pre><code>{highlight(text, PythonLexer(), HtmlFormatter(nowrap=True))}</code></pre>"
 
 
 def _figure(chapter: Chapter, cell: Cell, name: str, picture: Picture) -> str:
@@ -116,7 +144,9 @@ def _inline_svg(svg: str, name: str, caption: str) -> str:
 
 
 def _formula(latex: str, options: dict[str, Any]) -> str:
-    mathml = convert(latex.strip(), display="block" if options["display_mode"] else "inline")
+    mathml = convert(
+        latex.strip(), display="block" if options["display_mode"] else "inline"
+    )
     unknown = re.search(r">(\\[a-zA-Z]+)", mathml)
     if unknown:
         raise _FormulaError(f"{latex.strip()}\n    {unknown[1]} is not known")
@@ -130,7 +160,9 @@ def _link(self: Any, tokens: Any, at: int, options: Any, env: Any) -> str:
     return self.renderToken(tokens, at, options, env)
 
 
-_MARKDOWN: Final = MarkdownIt("commonmark").enable("table").use(dollarmath_plugin, renderer=_formula)
+_MARKDOWN: Final = (
+    MarkdownIt("commonmark").enable("table").use(dollarmath_plugin, renderer=_formula)
+)
 _MARKDOWN.add_render_rule("link_open", _link)
 
 
@@ -138,7 +170,9 @@ def _prose(chapter: Chapter, cell: Cell) -> str:
     try:
         return _MARKDOWN.render(cell.text)
     except Exception as error:
-        raise ChapterError(chapter.path, _line_of(cell, error), f"a formula cannot be set: {error}") from error
+        raise ChapterError(
+            chapter.path, _line_of(cell, error), f"a formula cannot be set: {error}"
+        ) from error
 
 
 def _line_of(cell: Cell, error: Exception) -> int:
@@ -151,4 +185,6 @@ def _inline(chapter: Chapter, text: str, line: int = 1) -> str:
     try:
         return _MARKDOWN.renderInline(text)
     except Exception as error:
-        raise ChapterError(chapter.path, line, f"a formula cannot be set in {text!r}: {error}") from error
+        raise ChapterError(
+            chapter.path, line, f"a formula cannot be set in {text!r}: {error}"
+        ) from error

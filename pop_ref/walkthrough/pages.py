@@ -73,7 +73,11 @@ def run_chapter(chapter: Chapter) -> list[Outcome]:
     outcomes = []
     with _module(chapter.module) as namespace:
         for cell in chapter.cells:
-            outcomes.append(Outcome(cell) if cell.kind == "prose" else _run_cell(chapter, cell, namespace))
+            outcomes.append(
+                Outcome(cell)
+                if cell.kind == "prose"
+                else _run_cell(chapter, cell, namespace)
+            )
     return outcomes
 
 
@@ -123,7 +127,9 @@ def _drawn(figure: Figure, caption: str) -> Picture:
     # no date and a fixed salt: the same chapter makes the same bytes
     with plt.rc_context({"svg.hashsalt": "walk-through"}):
         svg = io.StringIO()
-        figure.savefig(svg, format="svg", dpi=_DPI, transparent=True, metadata={"Date": None})
+        figure.savefig(
+            svg, format="svg", dpi=_DPI, transparent=True, metadata={"Date": None}
+        )
     if len(svg.getvalue()) <= _LARGEST_SVG:
         return Picture(svg.getvalue(), None, width, caption)
     png = io.BytesIO()

@@ -67,7 +67,11 @@ def apply() -> None:
 
 
 def axes(
-    n_columns: int = 1, n_rows: int = 1, width: float = 7.2, height: float | None = None, **options: Any
+    n_columns: int = 1,
+    n_rows: int = 1,
+    width: float = 7.2,
+    height: float | None = None,
+    **options: Any,
 ) -> tuple[Figure, Any]:
     """Make a figure as wide as the page's text and axes on it.
 

@@ -13,6 +13,7 @@ import pytest
 
 from pop_ref.walkthrough.__main__ import main
 from pop_ref.walkthrough.cells import Chapter, ChapterError, chapter_files, read_chapter
+from pop_ref.walkthrough.folding import Part, parts
 from pop_ref.walkthrough.layout import chapter_page, index_page
 from pop_ref.walkthrough.pages import Outcome, run_chapter
 
@@ -74,7 +75,7 @@ def test_a_chapter_becomes_a_page(path: Path) -> None:
     every = [read_chapter(each) for each in CHAPTERS]
     page = chapter_page(chapter, outcomes, every)
     read = _read(page)
-    assert read.tags.count("details") == chapter.n_exercises
+    assert page.count("<summary>Answer</summary>") == chapter.n_exercises
     assert read.tags.count("figure") == sum(len(outcome.pictures) for outcome in outcomes)
     assert "math" in read.tags
     assert "$" not in re.sub(r"<(pre|style|code)\b.*?</\1>|<svg.*?</svg>", "", page, flags=re.DOTALL), "a bare dollar"
@@ -145,6 +146,19 @@ def test_a_small_chapter_shows_what_it_prints_draws_and_folds() -> None:
     assert "A caption &lt; with" in page
     assert page.index("<summary>Answer</summary>") > page.index("What is two?")
     assert "<msup><mi>x</mi><mn>2</mn></msup>" in page
+
+
+def test_code_that_draws_is_folded_apart() -> None:
+    drawing = "# a line\nfig, ax = axes(2)\nax.plot(x)\npicture(fig, 'A line.')"
+    helper = "def bars():\n    return axes()"
+    assert parts(f"x = 1\n\n{drawing}\ny = 2\n\n{helper}") == [
+        Part("x = 1", False),
+        Part(drawing, True),
+        Part("y = 2", False),
+        Part(helper, True),
+    ]
+    assert parts("x = 1\n\ny = 2") == [Part("x = 1\n\ny = 2", False)]
+    assert parts("fig, ax = plt.subplots()\nx = 1") == [Part("fig, ax = plt.subplots()\nx = 1", True)]
 
 
 def _whole(text: str) -> str:
