@@ -1,10 +1,22 @@
-"""Hypothesis profiles, and the pieces every test may lean on."""
+"""Hypothesis profiles, and shapes checked: under test every annotation of the oracle is held to by beartype."""
 
 from __future__ import annotations
 
 import os
 
 from hypothesis import HealthCheck, settings
+from jaxtyping import install_import_hook
+
+# not the innermost loops, where the check costs more than the work, and not the dataclasses, which check themselves
+SHAPES_CHECKED = tuple(
+    f"pop_ref.{module}"
+    for module in (
+        *("activations", "covariance", "harmonics", "camera", "projection", "footprint", "tiles", "compositing"),
+        *("dominance", "splatting", "render", "losses", "ssim", "polarization", "density", "density_rows"),
+        *("optimizer", "training", "margins", "extent_margins"),
+    )
+)
+install_import_hook(SHAPES_CHECKED, "beartype.beartype")
 
 _COMMON = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow, HealthCheck.data_too_large]}
 settings.register_profile("dev", max_examples=25, **_COMMON)
