@@ -54,18 +54,12 @@ def params_of(*lines):
     """Write raw parameters from lines "x y sx sy opacity colour", all on the plane at depth 4."""
     *numbers, names = zip(*(line.split() for line in lines), strict=True)
     x, y, sx, sy, o = np.array(numbers, dtype=float)
-    quats, sh0 = (
-        np.tile([1.0, 0.0, 0.0, 0.0], (len(x), 1)),
-        np.array([[COLORS[name]] for name in names]),
-    )
-    scales = np.log(np.stack([sx, sy, 0.2 + 0.0 * x], axis=1))
-    means = np.stack([x, y, 4.0 + 0.0 * x], axis=1)
     return {
-        "means": means,
-        "scales": scales,
-        "quats": quats,
+        "means": np.stack([x, y, 4.0 + 0.0 * x], axis=1),
+        "scales": np.log(np.stack([sx, sy, 0.2 + 0.0 * x], axis=1)),
+        "quats": np.tile([1.0, 0.0, 0.0, 0.0], (len(x), 1)),
         "opacities": logit(o),
-        "sh0": sh0,
+        "sh0": np.array([[COLORS[name]] for name in names]),
     }
 
 
@@ -77,17 +71,14 @@ def pulled(params, camera, target, **options):
     """Draw, compare, and return the view with its gradients."""
     view = drawn(params, camera)
     v_image = photometric_pop_vjp(view.image, target, 1.0, **options)
-    return view, render_vjp(
-        training.gaussians_from_params(params), camera, v_image, background=WHITE
-    )
+    gaussians = training.gaussians_from_params(params)
+    return view, render_vjp(gaussians, camera, v_image, background=WHITE)
 
 
-right, camera = "-1.0 1.1 0.4 0.4 0.95 green", camera_of(24)
-stripe, dots = (
-    "-0.95 -0.8 0.45 0.15 0.95 blue",
-    ("0.6 -1.1 0.2 0.2 0.95 orange", "1.2 -0.3 0.2 0.2 0.95 orange"),
-)
-short, wide = "-1.25 -0.8 0.15 0.15 0.95 blue", "0.9 -0.7 0.5 0.5 0.8 orange"
+camera, right = camera_of(24), "-1.0 1.1 0.4 0.4 0.95 green"
+short, stripe = "-1.25 -0.8 0.15 0.15 0.95 blue", "-0.95 -0.8 0.45 0.15 0.95 blue"
+wide = "0.9 -0.7 0.5 0.5 0.8 orange"
+dots = "0.6 -1.1 0.2 0.2 0.95 orange", "1.2 -0.3 0.2 0.2 0.95 orange"
 target = drawn(params_of(stripe, *dots, right), camera).image
 params = params_of(short, wide, right, "1.0 1.1 0.3 0.3 0.004 blue")
 view, v = pulled(params, camera, target)
@@ -98,9 +89,7 @@ window = density.accumulate(density.zero_statistics(4), *seen)
 pull = density.average_grads(window)
 assert density.POP.grow_grad2d == 2e-4
 assert density.POP.refine_every == 100
-assert np.allclose(
-    pull, np.hypot(12.0 * v.means2d[:, 0], 12.0 * v.means2d[:, 1]), rtol=1e-12
-)
+assert np.allclose(pull, np.hypot(*(12.0 * v.means2d.T)), rtol=1e-12)
 assert (pull > config.grow_grad2d).tolist() == [True, True, False, False]
 print("pull: too short {:.4f}, too wide {:.4f}, right {:.4f}, faint {:.4f}".format(*pull))
 
@@ -121,18 +110,15 @@ fresh, grads = density.rows_from_params(params), training.params_vjp(params, v, 
 moved = adam_step(params, grads, fresh.m, fresh.v, 1, learning_rates(STEP, SCENE_SCALE))
 rows = density.Rows(*moved)
 
-clone, split = density.grow_masks(
-    window, np.exp(rows.params["scales"]), SCENE_SCALE, STEP, config
-)
+scales = np.exp(rows.params["scales"])
+clone, split = density.grow_masks(window, scales, SCENE_SCALE, STEP, config)
 assert clone.tolist() == [True, False, False, False]
 assert split.tolist() == [False, True, False, False]
 draws = np.array([[[-0.6, -0.8, 0.0]], [[0.6, 0.8, 0.0]]])
-after, _ = density.densify_and_prune(
-    rows, window, SCENE_SCALE, STEP, lambda n: draws, config
-)
-assert len(after) == 4 + 1 + 1 - 1, (
-    "one clone more, two children for one parent, one pruned"
-)
+event = (window, SCENE_SCALE, STEP, lambda n: draws, config)
+after, _ = density.densify_and_prune(rows, *event)
+# one clone more, two children for one parent, one pruned
+assert len(after) == 4 + 1 + 1 - 1
 
 
 def outline(ax, splats, row, color, dashed=False):
@@ -145,11 +131,10 @@ def outline(ax, splats, row, color, dashed=False):
 
 fig, panels = axes(3, sharey=True)
 edited = drawn(after.params, camera)
-titles = ("target", "before: who is pulled where", "after: 5 Gaussians")
-for panel, image, title in zip(
-    panels, (target, view.image, edited.image), titles, strict=True
-):
-    show_image(panel, image, title)
+show_image(panels[0], target, "target")
+show_image(panels[1], view.image, "before: who is pulled where")
+show_image(panels[2], edited.image, "after: 5 Gaussians")
+for panel in panels:
     panel.set(xlim=(0, 24), ylim=(24, 0), xlabel="x [px]")
 for row, color in enumerate((ACCENT, SECOND, THIRD, "#888888")):
     outline(panels[1], view.splats, row, color, dashed=row == 3)
@@ -175,22 +160,16 @@ picture(
 
 # %%
 for before, now in ((rows.params, after.params), (rows.m, after.m), (rows.v, after.v)):
-    assert all(np.array_equal(before[name][[0, 2]], now[name][:2]) for name in before), (
-        "survivors keep their bits"
-    )
-assert not any(
-    moments[name][2:].any() for moments in (after.m, after.v) for name in moments
-), "newcomers have none"
-assert np.array_equal(after.params["means"][2], rows.params["means"][0]), (
-    "a clone is an exact copy"
-)
-assert np.allclose(
-    after.params["scales"][3:], rows.params["scales"][1] - np.log(1.6), rtol=1e-12
-)
-print(
-    "largest |m| of the means, row by row:",
-    np.abs(after.m["means"]).max(axis=1).round(5).tolist(),
-)
+    for name in before:
+        assert np.array_equal(before[name][[0, 2]], now[name][:2])
+for moments in (after.m, after.v):
+    assert not any(moments[name][2:].any() for name in moments)
+# a clone is an exact copy; children are smaller by 1.6
+assert np.array_equal(after.params["means"][2], rows.params["means"][0])
+shrunk = rows.params["scales"][1] - np.log(1.6)
+assert np.allclose(after.params["scales"][3:], shrunk, rtol=1e-12)
+largest = np.abs(after.m["means"]).max(axis=1)
+print("largest |m| of the means, row by row:", largest.round(5).tolist())
 
 # %% [markdown]
 # ## The reset
@@ -208,14 +187,10 @@ assert density.ADC.reset_every == 3000
 assert density.ADC.reset_opa == 0.01
 rng = np.random.default_rng(1)
 wall = [(x, y) for y in (1.5, 4.5) for x in (1.5, 5.0, 8.5)]
-place, spread = (
-    np.array([*wall, *wall, (3.0, 3.0), (7.0, 3.0)]),
-    np.repeat([1.6, 1.6, 2.5], [6, 6, 2]),
-)
-depth, first_opacity = (
-    np.repeat([2.0, 3.0, 1.0], [6, 6, 2]),
-    np.repeat([0.5, 0.3, 0.1], [6, 6, 2]),
-)
+place = np.array([*wall, *wall, (3.0, 3.0), (7.0, 3.0)])
+spread = np.repeat([1.6, 1.6, 2.5], [6, 6, 2])
+depth = np.repeat([2.0, 3.0, 1.0], [6, 6, 2])
+first_opacity = np.repeat([0.5, 0.3, 0.1], [6, 6, 2])
 hue = rng.uniform(0.1, 0.9, (6, 3))
 near_hue, any_hue = hue + rng.normal(0.0, 0.1, (6, 3)), rng.uniform(0.0, 1.0, (6, 3))
 guess = np.concatenate([near_hue, any_hue, np.full((2, 3), 0.5)])
@@ -224,15 +199,9 @@ guess = np.concatenate([near_hue, any_hue, np.full((2, 3), 0.5)])
 def blended(function, params, *cotangent):
     """Call `composite` or its transpose on rows that say who they are, how opaque, and of which colour."""
     who = params["who"]
-    conics, radii = spread[who, None] ** -2.0 * [1.0, 0.0, 1.0], np.full((len(who), 2), 9)
-    splats = Splats(
-        place[who],
-        depth[who],
-        conics,
-        opacities_from_logits(params["opacities"]),
-        params["colors"],
-        radii,
-    )
+    conics = spread[who, None] ** -2.0 * [1.0, 0.0, 1.0]
+    radii, o = np.full((len(who), 2), 9), opacities_from_logits(params["opacities"])
+    splats = Splats(place[who], depth[who], conics, o, params["colors"], radii)
     lists = tile_lists(splats.means2d, radii, splats.depths, WIDTH, HEIGHT, 16)
     return function(splats, lists, WIDTH, HEIGHT, 16, *cotangent)
 
@@ -240,63 +209,54 @@ def blended(function, params, *cotangent):
 def trained(config, lambda_pop):
     """Train; return PSNR and opacities (nan where pruned) before every step, and who is left."""
     first = {"who": np.arange(14), "opacities": logit(first_opacity), "colors": guess}
-    rows, rates = (
-        density.rows_from_params(first),
-        {"who": 0.0, "opacities": 0.05, "colors": 0.0025},
-    )
+    rows = density.rows_from_params(first)
+    rates = {"who": 0.0, "opacities": 0.05, "colors": 0.0025}
     psnr, opacities = np.zeros(STEPS), np.full((STEPS, 14), np.nan)
     for t in range(STEPS):
         x, now = rows.params, blended(composite, rows.params)
         o = opacities[t, x["who"]] = opacities_from_logits(x["opacities"])
         psnr[t] = -10.0 * np.log10(l2(now.image, photograph))
         v = blended(composite_vjp, x, l2_vjp(now.image, photograph, 1.0))
-        v_o = v.v_opacities + pop_loss_vjp(
-            o, importance_mask(now.dominant_counts), lambda_pop
-        )
+        mask = importance_mask(now.dominant_counts)
+        v_o = v.v_opacities + pop_loss_vjp(o, mask, lambda_pop)
         v_logits = opacities_from_logits_vjp(x["opacities"], v_o)
         grads = {"who": 0.0 * o, "opacities": v_logits, "colors": v.v_colors}
         moved, m, v = adam_step(x, grads, rows.m, rows.v, t + 1, rates)
         rows = density.Rows({**moved, "who": x["who"]}, m, v)
         if density.densifies_at(t, config):
-            rows = density.prune_rows(
-                rows, density.prune_mask(o, np.ones((len(o), 3)), 1.0, t, config)
-            )
+            faint = density.prune_mask(o, np.ones((len(o), 3)), 1.0, t, config)
+            rows = density.prune_rows(rows, faint)
         if density.resets_at(t, config):
             rows = density.reset_opacities(rows, config.reset_opa)
     return psnr, opacities, rows.params["who"]
 
 
-photograph = blended(
-    composite, {"who": np.arange(6), "opacities": np.full(6, 4.0), "colors": hue}
-).image
+true = {"who": np.arange(6), "opacities": np.full(6, 4.0), "colors": hue}
+photograph = blended(composite, true).image
 calendar = replace(density.POP, refine_start_iter=0, refine_every=10)
 with_reset = trained(replace(calendar, reset_every=80), 0.0)
 with_prior = trained(calendar, 1e-3 * 15_000 / STEPS)
 
 psnr, opacities, left = with_reset
-assert psnr[80] - psnr[81] > 25.0, "a reset costs 25 dB"
+# a reset costs 25 dB, and twice eighty steps do not bring the picture back
+assert psnr[80] - psnr[81] > 25.0
+assert psnr[81:].max() < psnr[80]
+# twenty steps later nobody has sorted good from bad: all climb in step, and all stay
 assert np.allclose(opacities[81], 0.01)
-assert np.ptp(opacities[100]) < 1e-3, (
-    "twenty steps later nobody has sorted good from bad: all climb in step"
-)
-assert psnr[81:].max() < psnr[80], "two times eighty steps do not bring the picture back"
-assert len(left) == 14, "and all are still there"
+assert np.ptp(opacities[100]) < 1e-3
+assert len(left) == 14
 psnr, opacities, left = with_prior
-assert left.tolist() == [0, 1, 2, 3, 4, 5], "the prior leaves the wall"
+# the prior leaves the wall, all but opaque, and no step costs half a decibel
+assert left.tolist() == [0, 1, 2, 3, 4, 5]
 assert opacities[-1, :6].min() > 0.97
-assert np.diff(psnr).min() > -0.5, "no step costs half a decibel"
+assert np.diff(psnr).min() > -0.5
 
 fig, panels = axes(3, height=2.6)
-groups = {
-    "wall": (slice(0, 6), ACCENT),
-    "hidden": (slice(6, 12), SECOND),
-    "haze": (slice(12, 14), THIRD),
-}
-for panel, name, run in zip(
-    panels, ("reset", "prior"), (with_reset, with_prior), strict=False
-):
-    for label, (columns, color) in groups.items():
-        lines = panel.plot(run[1][:, columns], color=color, lw=1.0)
+runs = {"reset": with_reset, "prior": with_prior}
+for panel, (name, run) in zip(panels, runs.items(), strict=False):
+    for first, last, label in ((0, 6, "wall"), (6, 12, "hidden"), (12, 14, "haze")):
+        color = {"wall": ACCENT, "hidden": SECOND, "haze": THIRD}[label]
+        lines = panel.plot(run[1][:, first:last], color=color, lw=1.0)
         lines[0].set_label(label)
     panel.set(title=f"opacities with {name}", xlabel="step", ylim=(-0.02, 1.02))
     panels[2].plot(run[0], color=MUTED if name == "reset" else ACCENT, label=name)
