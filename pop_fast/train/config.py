@@ -92,7 +92,8 @@ class TrainConfig:
         save_steps: after so many steps a PLY and a checkpoint are kept; the last step always counts.
         checkpoint_every: steps between the checkpoints a run resumes from; 0 writes none of these.
         keep_checkpoints: how many of those are kept.
-        log_every: steps between records of metrics.jsonl.
+        log_every: steps between records of metrics.jsonl; such a step also counts what is blended and traversed, which
+            doubles its cost.
         max_renders: held-out views saved as pictures at the end.
         lpips_vgg: weights of LPIPS on VGG16: one merged file, or backbone and linear layers; empty for none.
         lpips_alex: weights of LPIPS on AlexNet, likewise.
@@ -132,7 +133,7 @@ class TrainConfig:
     save_steps: tuple[int, ...] = (7_000, 30_000)
     checkpoint_every: int = 1_000
     keep_checkpoints: int = 2
-    log_every: int = 10
+    log_every: int = 25
     max_renders: int = 12
     lpips_vgg: tuple[str, ...] = ()
     lpips_alex: tuple[str, ...] = ()
