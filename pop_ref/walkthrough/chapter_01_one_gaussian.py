@@ -216,7 +216,7 @@ picture(fig, "The same splat blended over a warm background, pixel by pixel.")
 # depend on the covariance?
 
 # %% answer
-# 0.5 exp(-k^2 / 2) = 0.25 gives k = sqrt(2 ln 2), whatever the covariance
+# $0.5\, e^{-k^2/2} = 0.25$ gives $k = \sqrt{2 \ln 2} \approx 1.177$, whatever the covariance.
 answer = math.sqrt(2 * math.log(2))
 assert round(answer, 3) == 1.177
 for axis in range(2):
@@ -229,8 +229,8 @@ for axis in range(2):
 # Why is the sum a little smaller?
 
 # %% answer
-# the normalising constant of a bivariate normal density is 2 pi sqrt(det); the floor takes what lies outside k:
-# the share exp(-k^2 / 2) = 1 / (255 o) of it
+# $2 \pi\, o \sqrt{\det \Sigma}$, from the normalising constant of a normal density. The floor takes the share
+# $e^{-k^2/2} = 1/(255\, o)$ of it, what lies outside the ellipse of $k$ standard deviations.
 paint = opacity * 2 * math.pi * math.sqrt(np.linalg.det(covar2d))
 assert np.isclose(alphas.sum(), paint * (1 - 1 / (255 * opacity)), rtol=5e-3)
 assert alphas.sum() < paint
@@ -241,7 +241,7 @@ assert alphas.sum() < paint
 # the image show? (Chapter 2 has the remedy.)
 
 # %% answer
-# the nearest centres are sqrt(0.5) px away, seven standard deviations: nothing at all is seen
+# Nothing at all: the nearest centres are $\sqrt{0.5}$ px away, seven standard deviations.
 tiny = conics_from_covars2d(0.01 * np.eye(2)[None])[0].tolist()
 nearest = sigma_at_pixel((8.0, 8.0), tiny, 7.5, 7.5)
 assert round(math.sqrt(2 * nearest), 1) == 7.1

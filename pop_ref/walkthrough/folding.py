@@ -54,6 +54,16 @@ def parts(code: str) -> list[Part]:
     return [part for part in found if part.text]
 
 
+def said_and_done(code: str) -> tuple[str, str]:
+    """Part the comment that opens an answer, without its marks, from the code that proves it."""
+    lines = code.split("\n")
+    n_said = next(
+        (i for i, line in enumerate(lines) if not line.startswith("#")), len(lines)
+    )
+    said = "\n".join(line.removeprefix("#").removeprefix(" ") for line in lines[:n_said])
+    return said, "\n".join(lines[n_said:]).strip("\n")
+
+
 def _called(node: ast.AST) -> set[str]:
     functions = [each.func for each in ast.walk(node) if isinstance(each, ast.Call)]
     named = {each.id for each in functions if isinstance(each, ast.Name)}

@@ -16,7 +16,7 @@ from pygments.formatters.html import HtmlFormatter
 from pygments.lexers.python import PythonLexer
 
 from pop_ref.walkthrough.cells import FOLDER, Cell, Chapter, ChapterError
-from pop_ref.walkthrough.folding import Part, parts
+from pop_ref.walkthrough.folding import Part, parts, said_and_done
 from pop_ref.walkthrough.pages import Outcome, Picture
 from pop_ref.walkthrough.style import VARIABLES
 
@@ -91,11 +91,9 @@ def _cell(chapter: Chapter, name: str, outcome: Outcome) -> str:
     cell = outcome.cell
     if cell.kind == "prose":
         return _prose(chapter, cell)
-    shown = (
-        [_code(cell.text)]
-        if cell.kind == "answer"
-        else [_part(part) for part in parts(cell.text)]
-    )
+    said, code = said_and_done(cell.text) if cell.kind == "answer" else ("", cell.text)
+    shown = [_prose(chapter, Cell("prose", said, cell.line))] if said else []
+    shown += [_part(part) for part in parts(code)]
     if outcome.printed.strip():
         shown.append(f'<pre class="printed">{escape(outcome.printed.rstrip())}</pre>')
     shown += [
@@ -103,11 +101,9 @@ def _cell(chapter: Chapter, name: str, outcome: Outcome) -> str:
         for i, each in enumerate(outcome.pictures)
     ]
     whole = "".join(shown)
-    return (
-        f"<details><summary>Answer</summary>{whole}</details>"
-        if cell.kind == "answer"
-        else whole
-    )
+    if cell.kind == "answer":
+        return f"<details><summary>Answer</summary>{whole}</details>"
+    return whole
 
 
 def _part(part: Part) -> str:
@@ -161,7 +157,9 @@ def _link(self: Any, tokens: Any, at: int, options: Any, env: Any) -> str:
 
 
 _MARKDOWN: Final = (
-    MarkdownIt("commonmark").enable("table").use(dollarmath_plugin, renderer=_formula)
+    MarkdownIt("commonmark", {"html": False})
+    .enable("table")
+    .use(dollarmath_plugin, renderer=_formula)
 )
 _MARKDOWN.add_render_rule("link_open", _link)
 

@@ -13,7 +13,7 @@ import pytest
 
 from pop_ref.walkthrough.__main__ import main
 from pop_ref.walkthrough.cells import Chapter, ChapterError, chapter_files, read_chapter
-from pop_ref.walkthrough.folding import Part, parts
+from pop_ref.walkthrough.folding import Part, parts, said_and_done
 from pop_ref.walkthrough.layout import chapter_page, index_page
 from pop_ref.walkthrough.pages import Outcome, run_chapter
 
@@ -159,6 +159,14 @@ def test_code_that_draws_is_folded_apart() -> None:
     ]
     assert parts("x = 1\n\ny = 2") == [Part("x = 1\n\ny = 2", False)]
     assert parts("fig, ax = plt.subplots()\nx = 1") == [Part("fig, ax = plt.subplots()\nx = 1", True)]
+
+
+def test_the_comment_that_opens_an_answer_is_prose() -> None:
+    assert said_and_done("# because $x$\n# is 2\nx = 2\n# more\ny = 2") == ("because $x$\nis 2", "x = 2\n# more\ny = 2")
+    assert said_and_done("x = 2") == ("", "x = 2")
+    page = _whole(GOOD.replace("two = 2", "# it is $1 + 1$ < 3\ntwo = 2"))
+    assert "it is <span" in page
+    assert "# it is" not in page
 
 
 def _whole(text: str) -> str:
