@@ -6,5 +6,10 @@ A law is a sentence that every correct rasterizer obeys; it is written once, in 
 over every backend and over the oracle itself. Needs numpy, hypothesis and pytest; an adapter imports what it adapts.
 
 In reading order: `scenes` (what is drawn), `strategies` and `near` (how it is drawn), `adapter` (who is judged),
-`tolerances` and `charges` (how much rounding costs), `doubts` (what is decided by rounding), `compare` (the verdict).
+`tolerances` and `charges` (how much rounding costs), `outcomes` (what rounding may decide), `compare` (the verdict).
 """
+
+from pop_ref.conformance.adapter import Adapter, View
+from pop_ref.conformance.scenes import Scene
+
+__all__ = ["Adapter", "Scene", "View"]

@@ -1,4 +1,4 @@
-"""Who is judged: the protocol between the laws and an implementation, and its form for the oracle itself.
+"""Who is judged: what stands between the laws and an implementation, and its form for the oracle itself.
 
 Everything crosses the border as NumPy float64 (ids int64), in the oracle's names and shapes, one camera at a time. An
 adapter says with `has` what its implementation can do; laws that need more are skipped by name.
@@ -9,14 +9,26 @@ from __future__ import annotations
 import importlib
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from pop_ref.conformance.law import DOMINANCE, DOUBLE, GRADIENTS, PROFILES, RENDER, ROWWISE
+from pop_ref.conformance.abilities import (
+    ANTIALIASING,
+    DOMINANCE,
+    DOUBLE,
+    GRADIENTS,
+    RENDER,
+    ROWWISE,
+    abilities_of,
+)
 from pop_ref.conformance.scenes import Scene, rounded_to
+from pop_ref.constants import PAPER, Profile
+from pop_ref.splatting import project, project_vjp
+from pop_ref.tiles import tile_lists
+from pop_ref.types import Splats
 
 STAGE_MODULES = (
     "activations",
@@ -52,7 +64,7 @@ class View:
         dominant_ids, dominant_weights, n_blended, n_traversed: [H, W]
         dominant_counts: [N]
         radii: [N, 2]
-        means2d: [N, 2]
+        means2d, depths, conics: [N, 2], [N], [N, 3]; read only where a failure is told
     """
 
     image: Any
@@ -64,43 +76,123 @@ class View:
     n_traversed: Any = None
     radii: Any = None
     means2d: Any = None
+    depths: Any = None
+    conics: Any = None
 
 
-class Adapter(Protocol):
-    """An implementation under judgement.
+class Adapter:
+    """An implementation under judgement; subclass it and define what the implementation has.
+
+    A stage is judged through a method of the oracle's name and parameters, on arrays. With `composite` alone whole
+    scenes are drawn from the oracle's splats and tile lists, with `composite_vjp` too they have gradients. `render`
+    and `gradients` replace both. What is not defined is skipped by name.
 
     Attributes:
         name: how reports call it.
         dtype: the NumPy type of the precision it computes in; its rounding is charged in units of that type's eps.
+        profile: the constants that it implements; None when it takes any, which scenes then carry.
+        able: what nothing else tells: ANTIALIASING, DOMINANCE, ROWWISE of `abilities`.
+
+    Example:
+        >>> class Mine(Adapter):
+        ...     name = "mine"
+        ...
+        ...     def falloff(self, sigma):
+        ...         return float(np.exp(np.float32(-sigma)))
+        >>> Mine().has("falloff"), Mine().has(RENDER)
+        (True, False)
     """
 
-    name: str
-    dtype: Any
+    name: str = "adapter"
+    dtype: Any = np.float32
+    profile: Profile | None = PAPER
+    able: tuple[str, ...] = ()
 
     def has(self, need: str) -> bool:
-        """Tell whether the implementation offers a stage function, or one of the abilities that `law` names.
-
-        RENDER, GRADIENTS and DOMINANCE speak for themselves; PROFILES: any profile can be passed; DOUBLE: computes in
-        float64; ROWWISE: a row's bits do not depend on the other rows, as they do where vector units split arrays.
-        """
-        ...
+        """Tell whether the implementation offers a stage function, or one of the abilities of `abilities`."""
+        if need == RENDER:
+            return type(self).render is not Adapter.render or self.has("composite")
+        if need == GRADIENTS:
+            return type(self).gradients is not Adapter.gradients or self.has("composite_vjp")
+        if need == DOUBLE:
+            return bool(self.dtype == np.float64)
+        return need in self.able or need in abilities_of(self.profile) or callable(getattr(self, need, None))
 
     def stage(self, name: str) -> Callable[..., Any]:
         """Return a stage function that takes and returns NumPy arrays."""
-        ...
+        function = getattr(self, name, None)
+        if not callable(function):
+            raise LookupError(f"{self.name} has no stage function {name}")
+        return function
+
+    def sees(self, scene: Scene) -> Scene:
+        """Return the scene as the implementation reads it: rounded to its dtype, under the constants that it has."""
+        return rounded_to(under(scene, self.profile), self.dtype)
 
     def render(self, scene: Scene) -> View:
-        """Draw a scene."""
-        ...
+        """Draw a scene; by default the oracle projects and lists, and `composite` blends."""
+        camera, size = scene.camera, scene.profile.tile_size if scene.tile_size is None else scene.tile_size
+        splats, lists = _projected(scene)
+        drawn = self.stage("composite")(
+            splats, lists, camera.width, camera.height, size, scene.background, scene.profile
+        )
+        told = {f.name: getattr(drawn, f.name, None) for f in fields(View)}
+        return View(**{**told, "radii": splats.radii, "means2d": splats.means2d})
 
     def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
         """Return cotangents by name: means, quats, scales, opacities, sh, and those of viewmat, background, means2d,
-        means2d_abs that the implementation offers."""
-        ...
+        means2d_abs that the implementation offers; by default those of `composite_vjp`, projected by the oracle."""
+        camera, size = scene.camera, scene.profile.tile_size if scene.tile_size is None else scene.tile_size
+        splats, lists = _projected(scene)
+        v = self.stage("composite_vjp")(
+            splats, lists, camera.width, camera.height, size, v_image, v_T_final, scene.background, scene.profile
+        )
+        of = project_vjp(
+            scene.gaussians,
+            camera,
+            v.v_means2d,
+            v.v_conics,
+            v.v_opacities,
+            v.v_colors,
+            sh_degree=scene.sh_degree,
+            profile=scene.profile,
+            antialiased=scene.antialiased,
+        )
+        found = {name: getattr(of, name) for name in ("means", "quats", "scales", "opacities", "sh", "viewmat")}
+        found |= {"background": v.v_background, "means2d": v.v_means2d}
+        absolute = getattr(v, "v_means2d_abs", None)
+        return found if absolute is None else {**found, "means2d_abs": absolute}
 
-    def sees(self, scene: Scene) -> Scene:
-        """Return the scene as the implementation reads it: rounded to its dtype."""
-        ...
+
+def under(scene: Scene, profile: Profile | None) -> Scene:
+    """Return the scene under a profile, its own for None.
+
+    Where the principal point is the image's centre, Gaussians are moved sideways so that they stay where they were on
+    the screen; where extents are square, the grid is part of the meaning (D3) and takes the profile's tile size.
+    """
+    if profile is None:
+        return scene
+    changes: dict[str, Any] = {"profile": profile}
+    if profile.extent == "square":
+        changes["tile_size"] = None
+    if profile.principal_point == "centred":
+        K, viewmat = scene.camera.K.copy(), scene.camera.viewmat
+        depths = scene.gaussians.means @ viewmat[2, :3] + viewmat[2, 3]
+        centre = 0.5 * np.array([scene.camera.width, scene.camera.height])
+        aside = depths[:, None] * (K[:2, 2] - centre) / np.array([K[0, 0], K[1, 1]])
+        K[:2, 2] = centre
+        changes |= {"K": K, "means": scene.gaussians.means + aside @ viewmat[:2, :3]}
+    return scene.but(**changes)
+
+
+def _projected(scene: Scene) -> tuple[Splats, list[list[int]]]:
+    camera = scene.camera
+    size = scene.profile.tile_size if scene.tile_size is None else scene.tile_size
+    # the square extent's cull reads the grid from the profile
+    profile = replace(scene.profile, tile_size=size)
+    splats = project(scene.gaussians, camera, scene.sh_degree, profile, scene.antialiased)
+    lists = tile_lists(splats.means2d, splats.radii, splats.depths, camera.width, camera.height, size, profile)
+    return splats, lists
 
 
 def stage_function(package: str, name: str) -> Callable[..., Any] | None:
@@ -123,20 +215,20 @@ def _module(name: str) -> ModuleType | None:
         return None
 
 
-class OracleAdapter:
+class OracleAdapter(Adapter):
     """The oracle as a backend of its own laws; also any copy of it under another package name, as mutants are."""
+
+    dtype = np.float64
+    profile = None
+    able = (ANTIALIASING, DOMINANCE, ROWWISE)
 
     def __init__(self, package: str = "pop_ref", name: str = "oracle") -> None:
         self.name = name
         self.package = package
-        self.dtype = np.float64
 
     def has(self, need: str) -> bool:
         """Tell that the oracle can do everything its modules define."""
-        return (
-            need in (RENDER, GRADIENTS, DOMINANCE, PROFILES, DOUBLE, ROWWISE)
-            or stage_function(self.package, need) is not None
-        )
+        return super().has(need) or stage_function(self.package, need) is not None
 
     def stage(self, name: str) -> Callable[..., Any]:
         """Return the oracle's function itself."""
@@ -153,7 +245,9 @@ class OracleAdapter:
         """Draw a scene with `render.render`."""
         drawn = self.full_render(scene)
         common = {f.name: getattr(drawn, f.name) for f in fields(View) if hasattr(drawn, f.name)}
-        return View(**common, radii=drawn.splats.radii, means2d=drawn.splats.means2d)
+        return View(
+            **common, **{name: getattr(drawn.splats, name) for name in ("radii", "means2d", "depths", "conics")}
+        )
 
     def full_render(self, scene: Scene) -> Any:
         """Draw a scene and return the oracle's own `Render`, with the splats and tile lists."""

@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import importlib
+import os
+import sys
 from collections.abc import Callable
 from typing import Any
 
-from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.adapter import Adapter, OracleAdapter
 from pop_ref.constants import PAPER, Profile
 
-# what this project's own tests judge, and what else the kit knows how to judge where it is installed
+# what this project's own tests judge everywhere, and what else the kit knows how to judge where it can run
 SHIPPED = ("oracle", "fast64", "fast32")
-FOREIGN = ("gsplat", "gsplat-torch64", "gsplat-torch32")
+ELSEWHERE = (
+    "mirror64",
+    "mirror32",
+    "cuda",
+    "gsplat",
+    "gsplat-torch64",
+    "gsplat-torch32",
+    "diff-gaussian-rasterization",
+)
 
 
 class Unavailable(Exception):  # noqa: N818  a state of the machine, not a fault of the program
@@ -19,15 +29,33 @@ class Unavailable(Exception):  # noqa: N818  a state of the machine, not a fault
 
 
 def function_named(path: str) -> Callable[..., Any]:
-    """Import `my.module:rasterization`."""
+    """Import `my.module:rasterization`; the working folder is looked into first, as `python -m` does."""
     module_name, _, attribute = path.partition(":")
     if not attribute:
-        raise ValueError(f"rasterizer {path!r} must be written module:function")
-    module = importlib.import_module(module_name)
+        raise ValueError(f"{path!r} must be written module:name, as my.module:rasterization")
+    if "" not in sys.path and os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise Unavailable(f"{path} needs {error.name}, which is not installed and not in {os.getcwd()}") from error
     function = getattr(module, attribute, None)
     if not callable(function):
         raise ValueError(f"module {module_name} has no function {attribute}")
     return function
+
+
+def made_by(path: str) -> Adapter:
+    """Make the adapter whose class, or any function that returns one, stands at `my.module:Mine`."""
+    made = function_named(path)()
+    lacks = [
+        name for name in ("name", "dtype", "has", "stage", "sees", "render", "gradients") if not hasattr(made, name)
+    ]
+    if lacks:
+        raise ValueError(
+            f"{path} makes no adapter: it has no {', '.join(lacks)}; derive it from pop_ref.conformance.Adapter"
+        )
+    return made
 
 
 def shipped(name: str) -> Any:
@@ -35,27 +63,62 @@ def shipped(name: str) -> Any:
 
     Raises:
         Unavailable: its implementation, or torch, is not installed.
-        ValueError: the name is not one of SHIPPED or FOREIGN.
+        ValueError: the name is not one of SHIPPED or ELSEWHERE.
     """
     if name == "oracle":
         return OracleAdapter()
     if name in ("fast64", "fast32"):
         return adapter_for("pop_fast.rasterization:rasterization", name, "pop_fast", f"float{name[-2:]}")
-    if name in FOREIGN:
-        return _gsplat(name)
-    raise ValueError(f"backend {name!r} is unknown; use one of {', '.join((*SHIPPED, *FOREIGN))}")
-
-
-def _gsplat(name: str) -> Any:
+    if name not in ELSEWHERE:
+        raise ValueError(f"backend {name!r} is unknown; use one of {', '.join((*SHIPPED, *ELSEWHERE))}")
     try:
-        adapters = importlib.import_module("pop_ref.conformance.gsplat_adapter")
-        if name == "gsplat":
-            if not importlib.import_module("torch").cuda.is_available():
-                raise Unavailable("gsplat's rasterizer needs a CUDA device; gsplat-torch64 judges its torch stages")
-            return adapters.gsplat_cuda(name)
-        return adapters.gsplat_torch(name, f"float{name[-2:]}")
+        return _elsewhere(name)
     except ModuleNotFoundError as error:
         raise Unavailable(f"{name} needs {error.name}, which is not installed") from error
+
+
+def _elsewhere(name: str) -> Any:
+    kit = "pop_ref.conformance"
+    if name.startswith("mirror"):
+        reason = importlib.import_module("cuda_ext.host_mirror").find_compiler() is None
+        if reason:
+            raise Unavailable("the host mirror needs a C++ compiler; install g++ or set CXX")
+        return importlib.import_module(f"{kit}.mirror_adapter").mirror(name)
+    if name == "cuda":
+        reason = importlib.import_module("cuda_ext").why_not()
+        if reason is not None:
+            raise Unavailable(reason)
+        return adapter_for("cuda_ext.ops:rasterization", name, None, "float32", "cuda")
+    if name.startswith("gsplat-torch"):
+        return importlib.import_module(f"{kit}.gsplat_adapter").gsplat_torch(name, f"float{name[-2:]}")
+    # the packages first: what is not installed cannot run anywhere
+    importlib.import_module("gsplat" if name == "gsplat" else name.replace("-", "_"))
+    if not importlib.import_module("torch").cuda.is_available():
+        hint = "; gsplat-torch64 judges its torch stages" if name == "gsplat" else ""
+        raise Unavailable(f"{name} needs a CUDA device, and torch finds none{hint}")
+    if name == "gsplat":
+        return importlib.import_module(f"{kit}.gsplat_adapter").gsplat_cuda(name)
+    return importlib.import_module(f"{kit}.inria_adapter").inria(name)
+
+
+class Absent:
+    """Stands for a backend that is not here, so that its laws are skipped with the reason."""
+
+    def __init__(self, name: str, reason: str) -> None:
+        self.name = name
+        self.reason = reason
+
+    def has(self, need: str) -> bool:
+        """Tell that nothing can be judged."""
+        return False
+
+
+def shipped_or_absent(name: str) -> Any:
+    """Return the adapter of that name, or the reason why there is none as an `Absent`."""
+    try:
+        return shipped(name)
+    except Unavailable as error:
+        return Absent(name, str(error))
 
 
 def adapter_for(

@@ -32,7 +32,7 @@ class Layer:
         alpha, e_alpha: after it.
         taken: at or over the floor, so blended if the light reaches it.
         doubtful: whether it is taken is within reach of rounding (D1, D2, D5).
-        seen: the pixel had not ended, and its tile lists the splat.
+        seen: the pixel had not ended.
         blended: taken, seen, and not the end.
         T, T_error: transmittance before it.
         T_after: transmittance after it.
@@ -143,8 +143,8 @@ def charge(scene: Scene, dtype: Any, tile_lists: list[list[int]] | None = None) 
     layers = []
     for i in np.lexsort((np.arange(len(screen.depths)), screen.depths)).tolist():
         if screen.kept[i] or screen.near[i]:
-            layer = _layer(i, scene, screen, reach)
-            layer.seen = state.alive & _listed(i, scene, tile_lists)
+            layer = _layer(i, scene, screen, reach, _listed(i, scene, tile_lists))
+            layer.seen = state.alive
             _blend(layer, scene, screen, state, doubts, reach)
             layers.append(layer)
     background = np.abs(scene.background)
@@ -164,7 +164,7 @@ def _listed(i: int, scene: Scene, tile_lists: list[list[int]] | None) -> np.ndar
     return np.array([i in ids for ids in tile_lists])[tile]
 
 
-def _layer(i: int, scene: Scene, s: ScreenCharges, reach: float) -> Layer:
+def _layer(i: int, scene: Scene, s: ScreenCharges, reach: float, listed: np.ndarray) -> Layer:
     profile, (H, W) = scene.profile, (scene.camera.height, scene.camera.width)
     dx = s.means2d[i, 0] - (np.arange(W)[None, :] + 0.5) + np.zeros((H, 1))
     dy = s.means2d[i, 1] - (np.arange(H)[:, None] + 0.5) + np.zeros((1, W))
@@ -177,8 +177,9 @@ def _layer(i: int, scene: Scene, s: ScreenCharges, reach: float) -> Layer:
     e_sigma = e_form + np.abs(A * dx + B * dy) * e_dx + np.abs(C * dy + B * dx) * e_dy
     # far beyond every threshold, but still a number
     falloff = np.exp(-np.clip(sigma, 0.0, 700.0))
-    raw = s.opacities[i] * falloff
-    e_raw = raw * (e_sigma + 2.0) + s.e_opacities[i] * falloff
+    # a pixel whose tile does not list the splat never sees it
+    raw = np.where(listed, s.opacities[i] * falloff, 0.0)
+    e_raw = raw * (e_sigma + 2.0) + np.where(listed, s.e_opacities[i] * falloff, 0.0)
     taken = (raw >= profile.alpha_floor) & (sigma >= 0.0) & bool(s.kept[i])
     # an exponent can only turn negative where rounding spoils the conic
     negative = (sigma < reach * e_form) & (absolute > 0.0) & (raw >= profile.alpha_floor)

@@ -17,6 +17,8 @@ def load_profile(name: str) -> None:
             deadline=None,
             suppress_health_check=checks,
             derandomize=each == "ci",
+            # one law, one failure: the report is about a single scene
+            report_multiple_bugs=False,
             print_blob=each == "ci",
         )
     settings.load_profile(name)

@@ -10,6 +10,8 @@ from typing import Any
 from hypothesis import given
 from hypothesis.errors import HypothesisException
 
+from pop_ref.conformance.scenes import Scene
+
 STAGES = (
     "activations",
     "covariance",
@@ -28,18 +30,16 @@ STAGES = (
     "density",
     "optimizer",
 )
-RENDER, GRADIENTS, DOMINANCE = "render", "gradients", "dominance"
-PROFILES, DOUBLE, ROWWISE = "any profile", "double precision", "rows computed one by one"
 
 
-def _tell(name: str, backend: Any, drawn: dict[str, Any]) -> str:
+def _tell(name: str, backend: Any, scenes: dict[str, Scene]) -> str:
     from pop_ref.conformance.telling import tell
 
-    return tell(name, backend, drawn)
+    return tell(name, backend, scenes)
 
 
-# what a failing law is told by: functions of its name, the backend and the drawn values
-TELL: list[Callable[[str, Any, dict[str, Any]], str]] = [_tell]
+# what a failing law is told by: functions of its name, the backend and the scenes that were drawn
+TELL: list[Callable[[str, Any, dict[str, Scene]], str]] = [_tell]
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,7 @@ class Law:
 
     Attributes:
         stage: one of STAGES.
-        needs: names of stage functions, or RENDER, GRADIENTS, DOMINANCE, PROFILES, DOUBLE, ROWWISE; a backend
-            without them is not judged.
+        needs: names of stage functions, or abilities (`abilities`); a backend without them is not judged.
         sentence: the function, whose name reads as the law; it takes `backend` and the drawn values.
         strategies: what it quantifies over, by argument name.
     """
@@ -71,30 +70,79 @@ def law(stage: str, *needs: str, **strategies: Any) -> Callable[[Callable[..., N
         raise ValueError(f"stage {stage!r} is unknown; use one of {', '.join(STAGES)}")
 
     def decorate(sentence: Callable[..., None]) -> Callable[..., None]:
-        told = _telling(sentence)
-        test = given(**strategies)(told) if strategies else told
+        test = _telling(sentence, given(**strategies) if strategies else lambda watched: watched)
         test.law = Law(stage, needs, sentence, strategies)  # type: ignore[attr-defined]
         return test
 
     return decorate
 
 
-def _telling(sentence: Callable[..., None]) -> Callable[..., None]:
-    """Return the sentence, adding to what it raises where the backend parts from the oracle and code to paste."""
+def _telling(sentence: Callable[..., None], quantified: Callable[..., Any]) -> Callable[..., None]:
+    """Return the law as a test whose failure says where the backend parts from the oracle, with code to paste.
+
+    It is told once, about the last example that broke the law: the shrunk one.
+    """
+    broken: list[_Watched] = []
 
     @functools.wraps(sentence)
-    def told(backend: Any, **drawn: Any) -> None:
+    def watched(backend: Any, **drawn: Any) -> None:
+        __tracebackhide__ = True
+        seen = _Watched(backend, drawn)
         try:
-            sentence(backend, **drawn)
+            sentence(seen, **drawn)
         except HypothesisException:
             # a scene that is set aside, or a misuse of a strategy: nothing about the backend
             raise
-        except Exception as error:
-            for tell in TELL:
-                error.add_note(_safely(tell, sentence.__name__, backend, drawn))
+        except Exception:
+            broken[:] = [seen]
             raise
 
+    test = quantified(watched)
+
+    @functools.wraps(test)
+    def told(*args: Any, **named: Any) -> None:
+        __tracebackhide__ = True
+        broken.clear()
+        try:
+            test(*args, **named)
+        except Exception as error:
+            for seen in broken:
+                for tell in TELL:
+                    error.add_note(_safely(tell, sentence.__name__, seen.adapter, seen.scenes))
+            raise
+        finally:
+            broken.clear()
+
     return told
+
+
+class _Watched:
+    """A backend that remembers the scenes that it was asked to draw."""
+
+    def __init__(self, adapter: Any, drawn: dict[str, Any]) -> None:
+        self.adapter = adapter
+        self._given = {name: value for name, value in drawn.items() if isinstance(value, Scene)}
+        self._made: list[Scene] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.adapter, name)
+
+    def render(self, scene: Scene) -> Any:
+        self._made.append(scene)
+        return self.adapter.render(scene)
+
+    def gradients(self, scene: Scene, *cotangents: Any) -> Any:
+        self._made.append(scene)
+        return self.adapter.gradients(scene, *cotangents)
+
+    @property
+    def scenes(self) -> dict[str, Scene]:
+        """Return, by name, the scenes that the law drew, as the backend reads them, and those that it made of them."""
+        found = {name: self.adapter.sees(scene) for name, scene in self._given.items()}
+        for scene in self._made:
+            if repr(scene) not in map(repr, found.values()):
+                found[f"scene{len(found)}"] = scene
+        return found
 
 
 def _safely(tell: Callable[..., str], *about: Any) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -10,19 +11,24 @@ from typing import Any
 
 import numpy as np
 
-from pop_ref.conformance.adapter import View
-from pop_ref.conformance.law import DOMINANCE, DOUBLE, GRADIENTS, PROFILES, RENDER, ROWWISE
-from pop_ref.conformance.scenes import Scene, rounded_to
+from pop_ref.conformance.abilities import ANTIALIASING, DOMINANCE, ROWWISE
+from pop_ref.conformance.adapter import Adapter, View
+from pop_ref.conformance.mirror_library import Mirror
+from pop_ref.conformance.mirror_stages import STAGES
+from pop_ref.conformance.scenes import Scene
 
-from .mirror import Mirror
-from .mirror_stages import STAGES
-
-# The laws of alpha speak in Python floats, which a float32 function rounds on entry; the kit's table has no float32
-# tolerance for the camera's centre. `test_host_mirror_closely` judges both.
-NOT_IN_FLOAT = ("alpha_from_sigma", "camera_center_vjp")
+FOLDER = Path(tempfile.gettempdir()) / "pop_mirror"
 
 
-class MirrorAdapter:
+def mirror(name: str) -> MirrorAdapter:
+    """Return the mirror in double ("mirror64"), or in float with the kernels' own tiles ("mirror32")."""
+    double = name == "mirror64"
+    made = MirrorAdapter(FOLDER, np.float64 if double else np.float32, kernel_tiles=not double)
+    made.name = name
+    return made
+
+
+class MirrorAdapter(Adapter):
     """The kernels' mathematics on the host.
 
     Args:
@@ -31,6 +37,9 @@ class MirrorAdapter:
         per_splat: which family goes back: one splat a lane, or a column of pixels a lane.
         kernel_tiles: the kernels' own 16 x 8 tiles with exact lists, where the profile's tiles are an optimisation.
     """
+
+    profile = None
+    able = (ANTIALIASING, DOMINANCE, ROWWISE)
 
     def __init__(self, folder: Path, dtype: Any, per_splat: bool = False, kernel_tiles: bool = False) -> None:
         family = "splats" if per_splat else "columns"
@@ -41,21 +50,13 @@ class MirrorAdapter:
 
     def has(self, need: str) -> bool:
         """Tell what the mirror offers."""
-        if need == DOUBLE:
-            return self.dtype == np.float64
-        if self.dtype == np.float32 and need in NOT_IN_FLOAT:
-            return False
-        return need in (RENDER, GRADIENTS, DOMINANCE, PROFILES, ROWWISE) or need in STAGES
+        return super().has(need) or need in STAGES
 
     def stage(self, name: str) -> Callable[..., Any]:
         """Return a stage function with the oracle's signature."""
         if name not in STAGES:
             raise LookupError(f"the mirror has no stage function {name}")
         return partial(STAGES[name], self.mirror)
-
-    def sees(self, scene: Scene) -> Scene:
-        """Return the scene rounded to the mirror's precision."""
-        return rounded_to(scene, self.dtype)
 
     def render(self, scene: Scene) -> View:
         """Draw a scene."""

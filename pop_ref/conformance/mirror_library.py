@@ -1,15 +1,15 @@
-"""The host mirror as Python: arrays in, arrays out, in either precision."""
+"""The host mirror of the CUDA kernels as Python: arrays in, arrays out, in either precision."""
 
 from __future__ import annotations
 
 import ctypes
+import importlib
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cuda_ext.host_mirror import build_mirror
 from pop_ref.constants import PAPER, Profile
 
 N_ARRAYS = 12
@@ -51,7 +51,7 @@ def _structs(real: Any) -> tuple[Any, Any]:
 @cache
 def library(folder: Path) -> ctypes.CDLL:
     """Build the mirror if it is not there yet, and load it."""
-    return ctypes.CDLL(str(build_mirror(folder)))
+    return ctypes.CDLL(str(importlib.import_module("cuda_ext.host_mirror").build_mirror(folder)))
 
 
 class Mirror:

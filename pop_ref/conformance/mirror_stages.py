@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from pop_ref.conformance.mirror_library import Mirror
 from pop_ref.constants import PAPER, Profile
-
-from .mirror import Mirror
 
 _IDENTITY = np.eye(4)
 

@@ -141,7 +141,9 @@ def near_tile_edge(draw: Any) -> Scene:
     )
     x, y = (u, 2.5) if draw(st.booleans()) else (2.5, u)
     return _scene(
-        [Record(x, y, 8.0, (1.5625,) * 3, opacity=1.0), draw(_on_axis(opacity=0.25, depth=16.0))], PAPER, camera
+        [Record(x, y, 8.0, (1.5625, 1.5625, 1.5625), opacity=1.0), draw(_on_axis(opacity=0.25, depth=16.0))],
+        PAPER,
+        camera,
     )
 
 

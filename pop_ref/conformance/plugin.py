@@ -15,12 +15,20 @@ from typing import Any
 import pytest
 
 LAWS = "pop_ref.conformance.laws"
+FAILURES = "conformance_failures"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the kit's options."""
     group = parser.getgroup("pop conformance", "judge a rasterizer by the oracle (pop_ref.conformance)")
     group.addoption("--rasterizer", metavar="MODULE:FUNCTION", help="a function with gsplat's rasterization signature")
+    group.addoption(
+        "--adapter",
+        metavar="MODULE:CLASS",
+        action="append",
+        default=[],
+        help="a class derived from pop_ref.conformance.Adapter",
+    )
     group.addoption("--stages", metavar="PACKAGE", help="a package whose stage modules carry the oracle's names")
     group.addoption("--dtype", default="float32", choices=["float32", "float64"], help="precision of --rasterizer")
     group.addoption("--device", default="cpu", help="torch device of --rasterizer")
@@ -28,19 +36,31 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--backend", action="append", default=[], help="judge an adapter that comes with the kit, by name")
     group.addoption("--stage", action="append", default=[], help="only the laws of this stage; may be repeated")
     group.addoption("--scorecard", metavar="FILE", help="write a summary by stage, as .json or .html")
-    group.addoption("--failures", metavar="DIR", help="save the scene of every broken law there, as npz")
+    group.addoption(
+        "--failures",
+        metavar="DIR",
+        default=FAILURES,
+        help=f"save the scenes of broken laws there, as npz; default {FAILURES}",
+    )
     group.addoption("--record-worst", metavar="FILE", help="write the units that each tolerance needed, as JSON")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Rewrite the laws' asserts, choose the number of examples, and start what the options ask for."""
     pytest.register_assert_rewrite(LAWS)
-    if config.getoption("--rasterizer") or config.getoption("--backend") or config.getoption("--stages"):
+    if _chosen(config):
         from pop_ref.conformance.examples import load_profile
 
         load_profile(os.environ.get("HYPOTHESIS_PROFILE", "dev"))
     if config.getoption("--scorecard"):
         config.pluginmanager.register(_Recorder(config), "pop-conformance-scorecard")
+
+
+def _chosen(config: pytest.Config) -> str:
+    """Return the names of what the options choose to judge; empty for the oracle."""
+    option: Any = config.getoption
+    single = option("--rasterizer") or option("--stages")
+    return ", ".join([*option("--backend"), *option("--adapter"), *([single] if single else [])])
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -59,7 +79,8 @@ def parametrize_backends(metafunc: pytest.Metafunc, backends: list[Any]) -> None
     cases = []
     for backend in backends:
         lacks = missing(backend, stated.needs) if stated else []
-        marks = [pytest.mark.skip(reason=f"{backend.name} has no {', '.join(lacks)}")] if lacks else []
+        reason = getattr(backend, "reason", f"{backend.name} has no {', '.join(lacks)}")
+        marks = [pytest.mark.skip(reason=reason)] if lacks or hasattr(backend, "reason") else []
         cases.append(pytest.param(backend, id=backend.name, marks=marks))
     metafunc.parametrize("backend", cases)
 
@@ -72,12 +93,14 @@ def _chosen_backends(config: pytest.Config) -> list[Any]:
 
 
 def _make_backends(config: pytest.Config) -> list[Any]:
-    from pop_ref.conformance.backends import Unavailable, adapter_for, shipped
+    from pop_ref.conformance.backends import Unavailable, adapter_for, made_by, shipped, shipped_or_absent
     from pop_ref.constants import profile_named
 
     try:
         option: Any = config.getoption
-        chosen = [shipped(name) for name in option("--backend")]
+        chosen = [shipped_or_absent(name) for name in option("--backend")] + [
+            made_by(path) for path in option("--adapter")
+        ]
         path, package = option("--rasterizer"), option("--stages")
         if path or package:
             profile = profile_named(option("--profile"))
@@ -106,7 +129,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Have the scenes of failing laws saved."""
     folder = session.config.getoption("--failures")
-    if folder:
+    if folder and _chosen(session.config):
         from pop_ref.conformance.law import TELL
         from pop_ref.conformance.telling import failure_saver
 
@@ -131,8 +154,9 @@ class _Recorder:
 
         option: Any = config.getoption
         self.path = Path(option("--scorecard"))
-        judged = option("--rasterizer") or ", ".join(option("--backend")) or "the oracle"
-        self.card = Scorecard(f"{judged} under profile {option('--profile')}")
+        single = option("--rasterizer") or option("--stages")
+        how = f", {option('--dtype')}, profile {option('--profile')}" if single else ""
+        self.card = Scorecard(f"{_chosen(config) or 'oracle'}{how}")
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         from pop_ref.conformance.scorecard import Entry

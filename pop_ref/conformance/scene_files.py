@@ -17,45 +17,44 @@ _ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 
 
 def scene_arrays(scene: Scene) -> dict[str, np.ndarray]:
-    """Return the scene's arrays by name; `options` is a JSON string of what is not an array."""
-    g, c = scene.gaussians, scene.camera
-    options = {
-        "width": c.width,
-        "height": c.height,
+    """Return the scene's arrays by name."""
+    arrays = {name: getattr(scene.gaussians, name) for name in _ARRAYS}
+    return {**arrays, "viewmat": scene.camera.viewmat, "K": scene.camera.K, "background": scene.background}
+
+
+def scene_options(scene: Scene) -> dict[str, Any]:
+    """Return everything of a scene that is not an array, as JSON can hold it."""
+    return {
+        "width": scene.camera.width,
+        "height": scene.camera.height,
         "tile_size": scene.tile_size,
         "sh_degree": scene.sh_degree,
         "antialiased": scene.antialiased,
         "profile": dataclasses.asdict(scene.profile),
-    }
-    arrays = {name: getattr(g, name) for name in _ARRAYS}
-    return {
-        **arrays,
-        "viewmat": c.viewmat,
-        "K": c.K,
-        "background": scene.background,
-        "options": np.array(json.dumps(options)),
     }
 
 
 def save_scene(path: Path, scene: Scene) -> None:
     """Write a scene."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    arrays: dict[str, Any] = scene_arrays(scene)
+    arrays: dict[str, Any] = {**scene_arrays(scene), "options": np.array(json.dumps(scene_options(scene)))}
     np.savez(path, **arrays)
 
 
 def load_scene(path: Path) -> Scene:
     """Read a scene that `save_scene` wrote."""
     with np.load(path) as stored:
-        options = json.loads(str(stored["options"]))
-        gaussians = Gaussians(*(stored[name] for name in _ARRAYS))
-        camera = Camera(stored["viewmat"], stored["K"], options["width"], options["height"])
-        return Scene(
-            gaussians,
-            camera,
-            stored["background"],
-            Profile(**options["profile"]),
-            options["tile_size"],
-            options["sh_degree"],
-            options["antialiased"],
-        )
+        return scene_from(dict(stored), json.loads(str(stored["options"])))
+
+
+def scene_from(arrays: dict[str, np.ndarray], options: dict[str, Any]) -> Scene:
+    """Make a scene of its arrays and options."""
+    return Scene(
+        Gaussians(*(arrays[name] for name in _ARRAYS)),
+        Camera(arrays["viewmat"], arrays["K"], options["width"], options["height"]),
+        arrays["background"],
+        Profile(**options["profile"]),
+        options["tile_size"],
+        options["sh_degree"],
+        options["antialiased"],
+    )

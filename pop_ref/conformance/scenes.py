@@ -149,3 +149,12 @@ def rounded_to(scene: Scene, dtype: Any) -> Scene:
         camera=Camera(near(c.viewmat), near(c.K), c.width, c.height),
         background=near(scene.background),
     )
+
+
+def cotangents(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Return v_image and v_T_final for a scene: dyadic, of either sign, nowhere zero, and the same on every run."""
+    H, W = scene.camera.height, scene.camera.width
+    k = np.arange(H * W * 3, dtype=np.float64).reshape(H, W, 3)
+    v_image = (np.mod(k * 5.0 + 3.0, 16.0) - 7.5) / 8.0
+    v_T_final = (np.mod(np.arange(H * W, dtype=np.float64).reshape(H, W) * 3.0, 8.0) - 3.5) / 8.0
+    return v_image, v_T_final

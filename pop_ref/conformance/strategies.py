@@ -231,12 +231,3 @@ def arrays_of(shape: tuple[int, ...], low: float = -2.0, high: float = 2.0) -> s
     count = int(np.prod(shape))
     numbers = st.lists(dyadic(low, high), min_size=count, max_size=count)
     return numbers.map(lambda k: np.array(k, dtype=np.float64).reshape(shape))
-
-
-def cotangents(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Return v_image and v_T_final for a scene: dyadic, of either sign, nowhere zero, and the same on every run."""
-    H, W = scene.camera.height, scene.camera.width
-    k = np.arange(H * W * 3, dtype=np.float64).reshape(H, W, 3)
-    v_image = (np.mod(k * 5.0 + 3.0, 16.0) - 7.5) / 8.0
-    v_T_final = (np.mod(np.arange(H * W, dtype=np.float64).reshape(H, W) * 3.0, 8.0) - 3.5) / 8.0
-    return v_image, v_T_final

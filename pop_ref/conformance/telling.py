@@ -1,4 +1,4 @@
-"""Where a backend parts from the oracle: the first stage, Gaussian and pixel, and the decision that was nearest."""
+"""Where a backend parts from the oracle: the first stage, Gaussian, pixel and gradient, and the nearest decision."""
 
 from __future__ import annotations
 
@@ -8,29 +8,35 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pop_ref.conformance.abilities import GRADIENTS, RENDER
 from pop_ref.conformance.adapter import OracleAdapter, View
 from pop_ref.conformance.cases import sensitivity
-from pop_ref.conformance.charges import REACH, charge
+from pop_ref.conformance.charges import REACH, PixelCharges, charge
+from pop_ref.conformance.gradient_charges import gradient_charges
 from pop_ref.conformance.scene_files import save_scene
-from pop_ref.conformance.scenes import Scene, scene_as_code
+from pop_ref.conformance.scenes import Scene, cotangents, scene_as_code
 from pop_ref.margins import margins
+
+ORACLE = OracleAdapter()
+# what a rasterizer's meta may show of the stages before the pixel, in the order of a render
+SHOWN = (("depths", "means_cam_from_means"), ("means2d", "project_means"), ("conics", "conics_from_covars2d"))
 
 
 class Difference(NamedTuple):
     """One place where the two sides differ."""
 
-    stage: str
+    what: str
     where: str
     oracle: Any
     backend: Any
 
     def __str__(self) -> str:
-        return f"{self.stage}, {self.where}: oracle {self.oracle}, backend {self.backend}"
+        return f"{self.what}, {self.where}: oracle {self.oracle}, backend {self.backend}"
 
 
 def _calls(scene: Scene) -> Iterator[tuple[str, tuple[Any, ...]]]:
     """Yield the stage functions in the order of a render with the oracle's own inputs; rows behind are left out."""
-    oracle = OracleAdapter().stage
+    oracle = ORACLE.stage
     camera, profile = scene.camera, scene.profile
     depths = oracle("means_cam_from_means")(scene.gaussians.means, camera.viewmat)[:, 2]
     yield "in_front", (depths, profile)
@@ -59,11 +65,11 @@ def _calls(scene: Scene) -> Iterator[tuple[str, tuple[Any, ...]]]:
 
 def first_stage(backend: Any, scene: Scene) -> Difference | None:
     """Find the first stage function that differs, each called with the oracle's inputs."""
-    oracle, eps = OracleAdapter(), float(np.finfo(backend.dtype).eps)
+    eps = float(np.finfo(backend.dtype).eps)
     for name, inputs in _calls(scene):
         if not backend.has(name):
             continue
-        function: Callable[..., Any] = oracle.stage(name)
+        function: Callable[..., Any] = ORACLE.stage(name)
         expected = np.asarray(function(*inputs))
         found = np.asarray(backend.stage(name)(*inputs))
         if expected.dtype.kind in "bi":
@@ -76,15 +82,42 @@ def first_stage(backend: Any, scene: Scene) -> Difference | None:
     return None
 
 
+def first_shown(backend: Any, scene: Scene) -> Difference | list[str]:
+    """Find the first stage whose result, as the rasterizer's meta shows it, differs; else the names of those shown."""
+    found, expected, charges = backend.render(scene), ORACLE.render(scene), _charged(backend, scene)
+    alike = []
+    # rows that either side culls hold nothing to compare
+    drawn = np.all(expected.radii > 0, axis=1)
+    if found.radii is not None:
+        drawn &= np.all(found.radii > 0, axis=1)
+    for name, stage in SHOWN:
+        value = getattr(found, name)
+        if value is None:
+            continue
+        wanted, units = getattr(expected, name), getattr(charges.screen, f"e_{name}")
+        for i in np.flatnonzero(drawn).tolist():
+            limit = charges.reach * (units[i] + np.abs(wanted[i]))
+            if np.any(~(np.abs(value[i] - wanted[i]) <= limit)):
+                told = f"{name} as its meta shows them ({stage})"
+                return Difference(told, f"Gaussian {i}", np.asarray(wanted[i]).tolist(), np.asarray(value[i]).tolist())
+        alike.append(name)
+    return alike
+
+
+def _charged(backend: Any, scene: Scene) -> PixelCharges:
+    square = scene.profile.extent == "square"
+    return charge(scene, backend.dtype, ORACLE.full_render(scene).tile_lists if square else None)
+
+
 def first_pixel(backend: Any, scene: Scene) -> tuple[Difference, tuple[int, int]] | None:
     """Find the first pixel that differs by more than rounding, doubtful or not."""
-    expected, found = OracleAdapter().render(scene), backend.render(scene)
-    charges = charge(scene, backend.dtype)
+    expected, found = ORACLE.render(scene), backend.render(scene)
+    charges = _charged(backend, scene)
     limit = charges.reach * (charges.T_final + 1.0)
     colors = charges.reach * (charges.image + charges.absolute)
     checks: list[tuple[str, Any]] = [
-        ("T_final", np.abs(found.T_final - expected.T_final) > limit),
-        ("image", np.any(np.abs(found.image - expected.image) > colors, axis=2)),
+        ("T_final", ~(np.abs(found.T_final - expected.T_final) <= limit)),
+        ("image", np.any(~(np.abs(found.image - expected.image) <= colors), axis=2)),
     ]
     for name in ("n_blended", "dominant_ids"):
         if getattr(found, name) is not None:
@@ -101,6 +134,41 @@ def _at(name: str, expected: View, found: View, x: int, y: int) -> Difference:
     return Difference(name, f"pixel ({x}, {y})", *values)
 
 
+def first_gaussian(backend: Any, scene: Scene) -> str | None:
+    """Add Gaussians one by one from the front until a pixel differs, and say with which."""
+    V = scene.camera.viewmat
+    depths = scene.gaussians.means @ V[2, :3] + V[2, 3]
+    order = np.lexsort((np.arange(len(depths)), depths))
+    for k in range(len(order) + 1):
+        found = first_pixel(backend, scene.rows(np.sort(order[:k])))
+        if found is not None:
+            who = f"Gaussian {int(order[k - 1])} is added to those in front of it" if k else "there is no Gaussian"
+            return f"as soon as {who}: {found[0]}"
+    return None
+
+
+def first_gradient(backend: Any, scene: Scene) -> Difference | None:
+    """Find the first gradient that differs, of the standard cotangents where no decision is in doubt."""
+    charges = _charged(backend, scene)
+    v_image, v_T_final = cotangents(scene)
+    v_image, v_T_final = v_image * charges.smooth[..., None], v_T_final * charges.smooth
+    expected, found = (side.gradients(scene, v_image, v_T_final) for side in (ORACLE, backend))
+    bounds = gradient_charges(scene, charges, v_image, v_T_final)
+    smooth = ~charges.screen.kinked
+    for name in ("background", "sh", "opacities", "means2d", "means2d_abs", "scales", "quats", "means", "viewmat"):
+        if name not in found or (name == "viewmat" and not np.all(smooth)):
+            continue
+        wrong = ~(np.abs(found[name] - expected[name]) <= charges.reach * bounds[name])
+        if name not in ("background", "viewmat"):
+            wrong[~smooth] = False
+        if np.any(wrong):
+            i = tuple(int(k) for k in np.argwhere(wrong)[0])
+            row = "entry" if name in ("background", "viewmat") else f"Gaussian {i[0]}, entry"
+            entry = i if name in ("background", "viewmat") else i[1:]
+            return Difference(f"v_{name}", f"{row} {list(entry)}", expected[name][i], found[name][i])
+    return None
+
+
 def nearest_decision(scene: Scene, pixel: tuple[int, int] | None) -> str:
     """Name the decision closest to its threshold, at a pixel if one is given."""
     found = margins(scene.gaussians, scene.camera, scene.sh_degree, scene.profile, scene.tile_size, scene.antialiased)
@@ -115,34 +183,52 @@ def nearest_decision(scene: Scene, pixel: tuple[int, int] | None) -> str:
     return f"nearest decision: {doubt.decision} of {doubt.where}, margin {doubt.margin:.3g}"
 
 
-def tell(name: str, backend: Any, drawn: dict[str, Any]) -> str:
-    """Write a failing law's report: what differs first, the nearest decision, and the scene as code to paste."""
-    lines = [f"law {name.removeprefix('test_')} fails on {backend.name}"]
-    for scene in (value for value in drawn.values() if isinstance(value, Scene)):
-        seen = backend.sees(scene)
-        stage = first_stage(backend, seen)
-        pixel = first_pixel(backend, seen)
-        if stage is not None:
-            lines.append(f"first stage that differs: {stage}")
-        if pixel is not None:
-            lines.append(f"first pixel that differs: {pixel[0]}")
-        if stage is None and pixel is None:
-            lines.append("stages and pixels of this scene are the oracle's; the law breaks in what it compares")
-        lines.append(nearest_decision(seen, None if pixel is None else pixel[1]))
-        lines.append("scene to paste:\n" + scene_as_code(seen))
-    return "\n".join(lines)
+def tell(name: str, backend: Any, scenes: dict[str, Scene]) -> str:
+    """Write a failing law's report: what differs first, the nearest decision, and the scene as code to paste.
+
+    Args:
+        name: the law.
+        backend: who broke it.
+        scenes: what was drawn, by name; the first that the backend draws otherwise than the oracle is told.
+    """
+    title = f"law {name.removeprefix('test_')} fails on {backend.name}"
+    reports = [(scene, *_findings(backend, scene)) for scene in scenes.values()]
+    if not reports:
+        return f"{title}\nit draws no scene; what was drawn stands above"
+    scene, lines, pixel = next((report for report in reports if report[1]), reports[0])
+    if not lines:
+        lines = ["stages, pixels and gradients of its scenes are the oracle's; the law breaks in what it compares"]
+    return "\n".join([title, *lines, nearest_decision(scene, pixel), f"scene to paste:\n{scene_as_code(scene)}"])
 
 
-def failure_saver(folder: Path) -> Callable[[str, Any, dict[str, Any]], str]:
-    """Return a teller that saves the scene of a failing law; the last one written is the shrunk one."""
+def _findings(backend: Any, scene: Scene) -> tuple[list[str], tuple[int, int] | None]:
+    stage = first_stage(backend, scene)
+    lines = [] if stage is None else [f"first stage that differs: {stage}"]
+    pixel = first_pixel(backend, scene) if backend.has(RENDER) else None
+    if pixel is not None:
+        if stage is None:
+            shown = first_shown(backend, scene)
+            if isinstance(shown, list):
+                alike = f"{', '.join(shown)} are the oracle's, so it is" if shown else "it shows none before"
+                shown = f"{alike} alpha, order or blending"
+            lines.append(f"first stage that differs: {shown}")
+        lines.append(f"first pixel that differs: {pixel[0]}")
+        lines.append(f"first Gaussian: {first_gaussian(backend, scene)}")
+    elif backend.has(GRADIENTS):
+        gradient = first_gradient(backend, scene)
+        lines += [] if gradient is None else [f"first gradient that differs: {gradient}"]
+    return lines, None if pixel is None else pixel[1]
 
-    def save(name: str, backend: Any, drawn: dict[str, Any]) -> str:
+
+def failure_saver(folder: Path) -> Callable[[str, Any, dict[str, Scene]], str]:
+    """Return a teller that saves the scenes of a failing law."""
+
+    def save(name: str, backend: Any, scenes: dict[str, Scene]) -> str:
         saved = []
-        for key, value in drawn.items():
-            if isinstance(value, Scene):
-                path = folder / f"{name.removeprefix('test_')}.{backend.name.replace(':', '.')}.{key}.npz"
-                save_scene(path, backend.sees(value))
-                saved.append(f"saved as {path}")
+        for key, scene in scenes.items():
+            path = folder / f"{name.removeprefix('test_')}.{backend.name.replace(':', '.')}.{key}.npz"
+            save_scene(path, scene)
+            saved.append(f"saved as {path}")
         return "\n".join(saved)
 
     return save

@@ -10,21 +10,21 @@ import inspect
 import itertools
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 from hypothesis import reject
 
-from pop_ref.conformance.adapter import View, stage_function
+from pop_ref.conformance.abilities import ANTIALIASING, DOMINANCE, GRADIENTS, RENDER, same_constants
+from pop_ref.conformance.adapter import Adapter, View, stage_function
 from pop_ref.conformance.cases import BY_NAME, Case
-from pop_ref.conformance.law import DOMINANCE, DOUBLE, GRADIENTS, PROFILES, RENDER
-from pop_ref.conformance.scenes import Scene, rounded_to
+from pop_ref.conformance.scenes import Scene
 from pop_ref.constants import PAPER, Profile
 
 
-class TorchAdapter:
+class TorchAdapter(Adapter):
     """A torch rasterizer and, when a package is named, its stage functions.
 
     Args:
@@ -32,6 +32,7 @@ class TorchAdapter:
         rasterization: a function with gsplat's signature, or None to judge stage functions only.
         package: a package whose stage modules carry the oracle's names, or None.
         stages: stage functions on tensors by the oracle's names, beside those of the package.
+        without_gradients: names of gradients that the program does not offer.
         dtype: "float64" or "float32".
         device: a torch device.
         profile: the profile that a function without a `profile` argument implements.
@@ -46,11 +47,11 @@ class TorchAdapter:
         device: str = "cpu",
         profile: Profile = PAPER,
         stages: Mapping[str, Callable[..., Any]] | None = None,
+        without_gradients: tuple[str, ...] = (),
     ) -> None:
         self.name = name
-        self._stages = dict(stages or {})
+        self._stages, self._without = dict(stages or {}), without_gradients
         self.dtype = {"float64": np.float64, "float32": np.float32}[dtype]
-        self.profile = profile
         self._torch = importlib.import_module("torch")
         self._float = getattr(self._torch, dtype)
         self._device = device
@@ -58,6 +59,10 @@ class TorchAdapter:
         self._rasterization = rasterization
         parameters = inspect.signature(rasterization).parameters if rasterization else {}
         self._takes_profile = "profile" in parameters
+        # stage functions of a package take the profile that they are given
+        takes_any = self._takes_profile or (rasterization is None and package is not None)
+        self.profile = None if takes_any else profile
+        self.able = (ANTIALIASING,) if "rasterize_mode" in parameters else ()
         self._asked = {name: True for name in ("dominance", "counts") if name in parameters}
         self._tells_dominance: bool | None = None if rasterization else False
 
@@ -65,15 +70,11 @@ class TorchAdapter:
         """Tell what the program offers; asks the rasterizer for its meta once to learn about dominance."""
         if need in (RENDER, GRADIENTS):
             return self._rasterization is not None
-        if need == DOUBLE:
-            return self.dtype == np.float64
-        if need == PROFILES:
-            return self._takes_profile
         if need == DOMINANCE:
             if self._tells_dominance is None:
                 self._tells_dominance = self._asked_for_dominance()
             return self._tells_dominance
-        return self._stage(need) is not None
+        return super().has(need) or self._stage(need) is not None
 
     def _asked_for_dominance(self) -> bool:
         from pop_ref.conformance.golden import golden_scene
@@ -135,12 +136,7 @@ class TorchAdapter:
         return with_arrays
 
     def _implements(self, profile: Profile) -> bool:
-        # stage functions of a package take the profile that they are given
-        return self._package is not None or replace(profile, name=self.profile.name) == self.profile
-
-    def sees(self, scene: Scene) -> Scene:
-        """Return the scene rounded to the program's precision."""
-        return rounded_to(scene, self.dtype)
+        return self._package is not None or self.profile is None or same_constants(profile, self.profile)
 
     def render(self, scene: Scene) -> View:
         """Draw a scene with one camera."""
@@ -160,6 +156,8 @@ class TorchAdapter:
             dominant_counts=None if counts is None else self._array(counts).reshape(N),
             radii=self._array(meta["radii"]).reshape(N, 2) if "radii" in meta else None,
             means2d=self._array(meta["means2d"]).reshape(N, 2) if "means2d" in meta else None,
+            depths=self._array(meta["depths"]).reshape(N) if "depths" in meta else None,
+            conics=self._array(meta["conics"]).reshape(N, 3) if "conics" in meta else None,
             **told,
         )
 
@@ -182,7 +180,7 @@ class TorchAdapter:
             found["means2d"] = self._grad_of(means2d).reshape(N, 2)
             if getattr(means2d, "absgrad", None) is not None:
                 found["means2d_abs"] = self._array(means2d.absgrad).reshape(N, 2)
-        return found
+        return {key: value for key, value in found.items() if key not in self._without}
 
     def _leaves(self, scene: Scene, grad: bool) -> dict[str, Any]:
         g, c = scene.gaussians, scene.camera
@@ -202,6 +200,8 @@ class TorchAdapter:
             raise LookupError(f"{self.name} has no rasterization function")
         n_bands = round(np.sqrt(scene.gaussians.sh.shape[1])) - 1
         options: dict[str, Any] = {"profile": scene.profile, **more} if self._takes_profile else more
+        if scene.antialiased:
+            options = {"rasterize_mode": "antialiased", **options}
         return self._rasterization(
             leaves["means"],
             leaves["quats"],
@@ -218,7 +218,6 @@ class TorchAdapter:
             packed=False,
             tile_size=scene.profile.tile_size if scene.tile_size is None else scene.tile_size,
             backgrounds=leaves["background"],
-            rasterize_mode="antialiased" if scene.antialiased else "classic",
             **options,
         )
 

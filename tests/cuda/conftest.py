@@ -3,29 +3,21 @@
 from __future__ import annotations
 
 import functools
-import tempfile
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 pytest.register_assert_rewrite("pop_ref.conformance.laws")
 
 from cuda_ext.host_mirror import find_compiler  # noqa: E402  asserts must be rewritten first
+from pop_ref.conformance.backends import shipped  # noqa: E402
 from pop_ref.conformance.plugin import parametrize_backends  # noqa: E402
-
-FOLDER = Path(tempfile.gettempdir()) / "pop_mirror"
 
 
 @functools.cache
 def mirrors() -> list[Any]:
-    from .mirror_adapter import MirrorAdapter
-
-    return [
-        MirrorAdapter(FOLDER, np.float64),
-        MirrorAdapter(FOLDER, np.float32, kernel_tiles=True),
-    ]
+    return [shipped("mirror64"), shipped("mirror32")]
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

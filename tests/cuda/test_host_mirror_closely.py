@@ -11,7 +11,8 @@ from cuda_ext.host_mirror import find_compiler
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.cases import CASES, cotangent_like, rounded, sensitivity, transposed
 from pop_ref.conformance.golden import golden_scene
-from pop_ref.conformance.strategies import arrays_of, cotangents, scenes, viewmats
+from pop_ref.conformance.scenes import cotangents
+from pop_ref.conformance.strategies import arrays_of, scenes, viewmats
 from pop_ref.constants import PAPER
 from pop_ref.density import accumulate, zero_statistics
 from pop_ref.density_rows import rows_from_params, split_rows
@@ -19,14 +20,12 @@ from pop_ref.optimizer import adam_step
 from pop_ref.polarization import pop_loss_vjp
 from pop_ref.tiles import tile_lists
 
-from .conftest import FOLDER
-
 if find_compiler() is None:
     pytest.skip("no C++ compiler: the host mirror cannot be built (install g++ or set CXX)", allow_module_level=True)
 
-from .mirror import Mirror
-from .mirror_adapter import MirrorAdapter
-from .mirror_stages import STAGES
+from pop_ref.conformance.mirror_adapter import FOLDER, MirrorAdapter
+from pop_ref.conformance.mirror_library import Mirror
+from pop_ref.conformance.mirror_stages import STAGES
 
 ORACLE = OracleAdapter()
 DOUBLE = 1e-12  # of the oracle's own sensitivity

@@ -18,7 +18,7 @@ ORACLE = [p for p in sorted((ROOT / "pop_ref").glob("*.py")) if p.name != "__ini
 STAGES = {p.stem for p in ORACLE}
 SHARED_WITH_FAST = {"pop_ref.constants", "pop_ref.notation", "pop_ref.types"}
 # rooms of the program whose work is to show what the oracle does
-SHOW_THE_ORACLE = ("pop_fast/explain/", "pop_fast/oracle_backend.py")
+SHOW_THE_ORACLE = ("pop_fast/explain/", "pop_fast/oracle_backend.py", "pop_fast/cli/vectors.py")
 
 
 def _name(path: Path) -> str:
@@ -128,6 +128,7 @@ assert not happened, f"importing {package} does {{happened}}"
         ("pop_ref", ("torch", "scipy", "cv2", "hypothesis", "pytest", "matplotlib", "pycolmap")),
         ("pop_ref.conformance", ("torch", "scipy", "cv2", "matplotlib", "pycolmap")),
         ("pop_ref.conformance.plugin", ("torch", "scipy", "cv2", "matplotlib", "pycolmap", "hypothesis")),
+        ("pop_ref.conformance.vectors", ("torch", "scipy", "cv2", "matplotlib", "pycolmap", "hypothesis", "pytest")),
         ("pop_fast", ("torch", "scipy", "cv2", "matplotlib", "pycolmap")),
         ("pop_fast.cli", ("torch", "scipy", "cv2", "matplotlib", "pycolmap")),
         ("cuda_ext", ("torch", "numpy")),

@@ -16,9 +16,9 @@ from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.mutants import MUTANTS, living
 from pop_ref.conformance.poison import POISONED_INTEGER, poisoned_allocations
 from pop_ref.conformance.scene_files import load_scene, save_scene
-from pop_ref.conformance.scenes import Scene, rounded_to, scene_as_code
+from pop_ref.conformance.scenes import Scene, cotangents, rounded_to, scene_as_code
 from pop_ref.conformance.scorecard import Entry, Scorecard
-from pop_ref.conformance.strategies import FLOOR, cotangents, scenes
+from pop_ref.conformance.strategies import FLOOR, scenes
 from pop_ref.conformance.telling import tell
 from pop_ref.conformance.tolerances import TABLE
 from pop_ref.constants import INRIA
@@ -151,7 +151,7 @@ def test_the_scorecard_counts_by_backend_and_stage(tmp_path: Path) -> None:
 
 
 def _kit(*options: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "pop_ref.conformance.plugin"]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
     command += ["--pyargs", "pop_ref.conformance", *options]
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT / "docs")
 
@@ -164,6 +164,29 @@ def test_the_kit_runs_from_the_command_line_and_writes_a_scorecard(tmp_path: Pat
     told = json.loads(card.read_text())
     assert set(told["summary"]["pop_fast.rasterization:rasterization"]) == {"camera"}
     assert {entry["outcome"] for entry in told["laws"]} <= {"passed", "skipped"}
+
+
+def test_a_session_that_judges_nothing_is_left_alone(tmp_path: Path) -> None:
+    # pytest loads the kit's door in every session; options of the kit's names may then be somebody else's
+    (tmp_path / "conftest.py").write_text("def pytest_addoption(parser): parser.addoption('--profile')\n")
+    (tmp_path / "test_mine.py").write_text(
+        "import sys\ndef test_mine(request):\n    assert request.config.getoption('--profile') == 'cpu'\n"
+        "    assert 'pop_fast.conformance_door' in sys.modules\n"
+        "    assert not {'pop_ref', 'torch'} & set(sys.modules)\n"
+    )
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "no:hypothesispytest",
+        "--profile=cpu",
+    ]
+    done = subprocess.run([*command, str(tmp_path)], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_the_kit_refuses_what_it_cannot_judge() -> None:

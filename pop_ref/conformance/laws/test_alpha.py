@@ -8,8 +8,9 @@ import numpy as np
 from hypothesis import assume
 from hypothesis import strategies as st
 
+from pop_ref.conformance.abilities import DOUBLE
 from pop_ref.conformance.compare import assert_close
-from pop_ref.conformance.law import DOUBLE, law
+from pop_ref.conformance.law import law
 from pop_ref.conformance.strategies import dyadic, opacities, reals
 from pop_ref.constants import PROFILES
 
@@ -56,7 +57,7 @@ def test_the_falloff_is_one_at_the_centre_and_multiplies_over_sums(backend, sigm
 @law("alpha", "alpha_from_sigma", sigma=reals(0.0, 8.0), opacity=opacities(), profile=profiles)
 def test_alpha_is_the_falloff_times_opacity_between_the_floor_and_the_ceiling(backend, sigma, opacity, profile):
     # D5, D6
-    (opacity,) = _seen(backend, (opacity,))
+    sigma, opacity = _seen(backend, (sigma, opacity))
     alpha, skipped = backend.stage("alpha_from_sigma")(sigma, opacity, profile)
     raw = opacity * math.exp(-sigma)
     expected = min(raw, profile.alpha_ceiling)
@@ -112,7 +113,7 @@ def test_the_falloffs_gradient_is_minus_itself(backend, sigma, v):
 )
 def test_alphas_gradient_stops_at_floor_and_ceiling_and_nowhere_else(backend, sigma, opacity, profile):
     # B3: over the ceiling "zero" passes nothing, "pass" passes all
-    (opacity,) = _seen(backend, (opacity,))
+    sigma, opacity = _seen(backend, (sigma, opacity))
     raw, falloff = opacity * math.exp(-sigma), math.exp(-sigma)
     assume(min(abs(raw / profile.alpha_floor - 1.0), abs(raw / profile.alpha_ceiling - 1.0)) > 1e-5)
     v_sigma, v_opacity = backend.stage("alpha_from_sigma_vjp")(sigma, opacity, 0.75, profile)

@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 from hypothesis import strategies as st
 
+from pop_ref.conformance.abilities import DOMINANCE, PROFILES, RENDER
 from pop_ref.conformance.compare import assert_close, assert_same_bits
-from pop_ref.conformance.law import DOMINANCE, PROFILES, RENDER, law
+from pop_ref.conformance.law import law
 from pop_ref.conformance.laws.test_compositing import colored
 from pop_ref.conformance.scenes import Record, Scene, pack
 from pop_ref.conformance.strategies import arrays_of, dyadic, plain_sizes, scenes
@@ -97,7 +98,7 @@ def test_colours_and_background_do_not_matter(backend, scene, colors, background
     assert_same_bits("weight", one.dominant_weights, other.dominant_weights)
 
 
-@law("dominance", RENDER, DOMINANCE, PROFILES, opacity=st.sampled_from([0.5, 0.25, 0.75]), copies=st.integers(2, 4))
+@law("dominance", RENDER, DOMINANCE, opacity=st.sampled_from([0.5, 0.25, 0.75]), copies=st.integers(2, 4))
 def test_of_coincident_copies_only_the_first_in_memory_dominates(backend, opacity, copies):
     camera = Camera(np.eye(4), np.array([[8.0, 0, 2.5], [0, 8.0, 2.5], [0, 0, 1]]), 5, 5)
     records = [Record(2.5, 2.5, 1.0, (2.0, 2.0, 2.0), opacity=opacity)] * copies

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import assume
 from hypothesis import strategies as st
 
+from pop_ref.conformance.abilities import DERIVATIVES, DOUBLE, GRADIENTS, RENDER
 from pop_ref.conformance.charges import charge
 from pop_ref.conformance.compare import assert_close, assert_same_bits
 from pop_ref.conformance.gradient_charges import gradient_charges
-from pop_ref.conformance.law import DOUBLE, GRADIENTS, RENDER, law
+from pop_ref.conformance.law import law
 from pop_ref.conformance.laws.test_compositing import colored
-from pop_ref.conformance.scenes import SH_C0
+from pop_ref.conformance.scenes import SH_C0, cotangents
 from pop_ref.conformance.screen_charges import screen_charges
-from pop_ref.conformance.strategies import arrays_of, cotangents, plain_sizes, scenes
-from pop_ref.conformance.verdicts import charged
+from pop_ref.conformance.strategies import arrays_of, plain_sizes, scenes
+from pop_ref.conformance.verdicts import charged, require
 
 plain = scenes(anchored=True, size=plain_sizes(), max_gaussians=4)
 banded = scenes(anchored=True, size=plain_sizes(), max_gaussians=3, max_degree=3)
@@ -71,7 +73,8 @@ def test_the_quaternion_gradient_of_an_image_is_orthogonal_to_the_quaternion(bac
 def test_culled_gaussians_get_exactly_zero(backend, scene):
     seen = backend.sees(scene)
     view = backend.render(seen)
-    assume(view.radii is not None)
+    if view.radii is None:
+        pytest.skip(f"{backend.name} shows no radii, so nobody knows which Gaussians it culls")
     culled = ~np.all(view.radii > 0, axis=1)
     g, _, _ = _pulled(backend, seen)
     for name in (*PARAMETERS, "means2d", "means2d_abs"):
@@ -84,7 +87,7 @@ def test_moving_world_and_camera_together_has_no_gradient(backend, scene):
     # degree 0: shifts by d and turns by w of the world, undone by the camera
     seen, charges = charged(backend, scene)
     g, v_image, v_T_final = _pulled(backend, seen)
-    assume("viewmat" in g)
+    require(backend, g, "viewmat")
     bounds = gradient_charges(seen, charges, v_image, v_T_final)
     R = seen.camera.viewmat[:3, :3]
     shift = np.sum(g["means"], axis=0) - R.T @ g["viewmat"][:3, 3]
@@ -106,7 +109,7 @@ def test_moving_world_and_camera_together_has_no_gradient(backend, scene):
 def test_the_background_gradient_is_the_cotangent_seen_through_the_remaining_light(backend, scene):
     seen = backend.sees(scene)
     g, v_image, _ = _pulled(backend, seen)
-    assume("background" in g)
+    require(backend, g, "background")
     T_final = backend.render(seen).T_final
     expected = np.einsum("hw,hwc->c", T_final, v_image)
     size = np.einsum("hw,hwc->c", T_final, np.abs(v_image)) + 1.0
@@ -135,7 +138,7 @@ def test_the_colour_gradient_is_what_the_colour_adds_to_the_image(backend, scene
 def test_absolute_screen_gradients_are_at_least_the_signed_ones(backend, scene):
     seen, charges = charged(backend, scene)
     g, v_image, v_T_final = _pulled(backend, seen)
-    assume("means2d_abs" in g)
+    require(backend, g, "means2d_abs")
     slack = 64.0 * np.finfo(backend.dtype).eps * gradient_charges(seen, charges, v_image, v_T_final)["means2d"]
     assert np.all(g["means2d_abs"] + slack >= np.abs(g["means2d"]))
     assert np.any(g["means2d_abs"] > 0.0)
@@ -148,12 +151,12 @@ def test_absolute_and_signed_screen_gradients_agree_in_size_for_one_pixel(backen
     v_image[y % seen.camera.height, x % seen.camera.width] = [1.0, -0.5, 0.25]
     v_T_final = np.zeros(v_image.shape[:2])
     g = backend.gradients(seen, v_image, v_T_final)
-    assume("means2d_abs" in g)
+    require(backend, g, "means2d_abs")
     bounds = gradient_charges(seen, charges, v_image, v_T_final)["means2d"]
     assert_close("gradients.absgrad", g["means2d_abs"], np.abs(g["means2d"]), bounds, backend.dtype)
 
 
-@law("gradients", RENDER, GRADIENTS, DOUBLE, scene=banded, direction=st.integers(0, 2**16))
+@law("gradients", RENDER, GRADIENTS, DOUBLE, DERIVATIVES, scene=banded, direction=st.integers(0, 2**16))
 def test_a_step_along_any_direction_changes_the_image_as_the_gradient_says(backend, scene, direction):
     # <v, J u> = <J^T v, u>, with J u by central differences; in double precision only
     seen = backend.sees(scene)

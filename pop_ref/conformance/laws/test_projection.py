@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 from hypothesis import strategies as st
 
+from pop_ref.conformance.abilities import PROFILES as PROFILES_NEEDED
 from pop_ref.conformance.compare import assert_close, assert_same_bits
-from pop_ref.conformance.law import PROFILES as PROFILES_NEEDED
 from pop_ref.conformance.law import law
 from pop_ref.conformance.strategies import arrays_of, dyadic, reals
 from pop_ref.constants import INRIA, PAPER, PROFILES

@@ -1,0 +1,41 @@
+"""What an implementation may be able to do beside single stage functions; a law that needs more is skipped by name."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from pop_ref.constants import GSPLAT_1_6, INRIA, Profile
+
+RENDER: Final = "render"
+GRADIENTS: Final = "gradients"
+DOMINANCE: Final = "dominance"
+ANTIALIASING: Final = "antialiased mode"
+DOUBLE: Final = "double precision"
+ROWWISE: Final = "rows computed one by one"
+
+# these follow from the constants that are implemented
+PROFILES: Final = "any profile"
+LOWER_CEILING: Final = "profile gsplat_1_6"
+INRIAS: Final = "profile inria"
+EXTENTS: Final = "extents that hold all that is visible"
+PRINCIPAL_POINT: Final = "principal point off the centre"
+DERIVATIVES: Final = "gradients without exceptions"
+
+
+def abilities_of(profile: Profile | None) -> frozenset[str]:
+    """Return the abilities that follow from the one profile an implementation has, or from its taking any (None)."""
+    if profile is None:
+        return frozenset((PROFILES, LOWER_CEILING, INRIAS, EXTENTS, PRINCIPAL_POINT, DERIVATIVES))
+    found = {
+        LOWER_CEILING: same_constants(profile, GSPLAT_1_6),
+        INRIAS: same_constants(profile, INRIA),
+        EXTENTS: profile.extent == "opacity_aware",
+        PRINCIPAL_POINT: profile.principal_point == "used",
+        DERIVATIVES: profile.clamp_gradient == "exact" and profile.ceiling_gradient == "zero",
+    }
+    return frozenset(need for need, offered in found.items() if offered)
+
+
+def same_constants(one: Profile, other: Profile) -> bool:
+    """Tell whether two profiles differ in their names at most."""
+    return {**vars(one), "name": ""} == {**vars(other), "name": ""}

@@ -1,0 +1,224 @@
+"""`pop vectors`: what it writes is enough for a port without Python, and what it is given is answered in one line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pop_fast.cli import main
+from tests.app import tiny_port
+from tests.app.conftest import Pop
+from tests.app.damage import contents, says, truncate
+
+
+@pytest.fixture(scope="session")
+def shared_vectors(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Vectors that tests only read."""
+    folder = tmp_path_factory.mktemp("vectors") / "vectors"
+    assert main(["vectors", "export", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture
+def vectors(shared_vectors: Path, tmp_path: Path) -> Path:
+    """A copy of the vectors that a test may damage."""
+    return Path(shutil.copytree(shared_vectors, tmp_path / "vectors"))
+
+
+@pytest.fixture(scope="session")
+def port(shared_vectors: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of a sound port, which tests only read."""
+    results = tmp_path_factory.mktemp("port") / "results"
+    # by its own judgement, from the index alone, nothing fails
+    assert tiny_port.run(shared_vectors, results) == set()
+    return results
+
+
+def test_a_port_written_from_the_index_passes_in_npz(pop: Pop, shared_vectors: Path, port: Path) -> None:
+    outcome = pop("vectors", "check", shared_vectors, port)
+    drawn = len(list(port.iterdir()))
+    assert outcome.status == 0, outcome.out
+    assert drawn >= 10
+    assert f"image         {drawn} of {drawn} vectors pass" in outcome.out
+    assert "not there, not judged: v_means" in outcome.out
+    assert "no result for, not judged: harmonics_of_degree_three, inria" in outcome.out
+    assert outcome.out.endswith("all that is there passes\n")
+
+
+def test_results_may_be_json(pop: Pop, shared_vectors: Path, port: Path, tmp_path: Path) -> None:
+    for path in port.iterdir():
+        with np.load(path) as stored:
+            text = json.dumps({name: stored[name].tolist() for name in stored.files})
+        (tmp_path / f"{path.stem}.json").write_text(text)
+    assert pop("vectors", "check", shared_vectors, tmp_path).status == 0
+
+
+def test_a_broken_port_is_told_which_array_of_which_vector_and_where(
+    pop: Pop, shared_vectors: Path, tmp_path: Path
+) -> None:
+    own = tiny_port.run(shared_vectors, tmp_path / "results", shift=0.0)
+    assert ("one_round_splat", "image") in own
+    outcome = pop("vectors", "check", shared_vectors, tmp_path / "results")
+    assert outcome.status == 1
+    blocks = dict(zip(*[iter(_split(outcome.out))] * 2, strict=True))
+    found = {(line.split(":")[0].strip(), array) for array, lines in blocks.items() for line in lines}
+    # the command and the port's own few lines agree on every array
+    assert {pair for pair in found if pair[1] in ("image", "T_final", "dominant_ids", "n_blended")} == own
+    assert "one_round_splat: off by" in outcome.out
+    assert "at [" in outcome.out
+    assert f"{len(own)} of {4 * len(list((tmp_path / 'results').iterdir()))} arrays fail" in outcome.out
+
+
+def _split(text: str) -> list:
+    """Give array names and the indented lines under each, in turns."""
+    parts: list = []
+    for line in text.splitlines():
+        if line.startswith("  "):
+            parts[-1].append(line)
+        elif "vectors pass" in line:
+            parts += [line.split()[0], []]
+    return parts
+
+
+def test_one_wrong_entry_is_found_and_named(pop: Pop, shared_vectors: Path, port: Path, tmp_path: Path) -> None:
+    results = shutil.copytree(port, tmp_path / "results")
+    with np.load(results / "golden.npz") as stored:
+        arrays = dict(stored)
+    arrays["image"][3, 5, 1] += 1e-3
+    np.savez(results / "golden.npz", **arrays)
+    outcome = pop("vectors", "check", shared_vectors, results)
+    assert outcome.status == 1
+    assert "golden: off by" in outcome.out
+    assert "at [3, 5, 1]: got " in outcome.out
+
+
+def test_what_the_index_does_not_know_is_said(pop: Pop, shared_vectors: Path, port: Path, tmp_path: Path) -> None:
+    results = shutil.copytree(port, tmp_path / "results")
+    (results / "notes.txt").write_text("mine")
+    with np.load(results / "golden.npz") as stored:
+        np.savez(results / "golden.npz", **{**stored, "v_mean": np.zeros(3)})
+    outcome = pop("vectors", "check", shared_vectors, results)
+    assert outcome.status == 0
+    assert "unknown, not judged: notes.txt, golden.npz: v_mean" in outcome.out
+
+
+def test_an_export_says_what_it_wrote_and_leaves_an_existing_folder_alone(
+    pop: Pop, vectors: Path, tmp_path: Path
+) -> None:
+    (vectors / "mine.txt").write_text("keep")
+    before = contents(vectors)
+    says(pop("vectors", "export", vectors), str(vectors), "--overwrite")
+    assert contents(vectors) == before
+    outcome = pop("vectors", "export", vectors, "--overwrite")
+    assert outcome.out.startswith(f"14 vectors -> {vectors}; {vectors / 'index.json'}")
+    assert not (vectors / "mine.txt").exists()
+    # zip archives carry times; what is in them is the same on every run
+    for name in before:
+        if name.suffix == ".npz":
+            continue
+        assert name.name == "mine.txt" or name.read_bytes() == before[name]
+
+
+def test_an_export_that_fails_leaves_nothing(pop: Pop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wrote = []
+
+    def full(path: Path, **arrays: object) -> None:
+        wrote.append(path)
+        Path(path).write_bytes(b"half")
+        if len(wrote) == 3:
+            raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    says(pop("vectors", "export", tmp_path / "new"), "disk is full")
+    assert len(wrote) == 3
+    assert list(tmp_path.iterdir()) == []
+
+
+def _index(change: Callable[[dict], object]) -> Callable[[Path], None]:
+    def damage(folder: Path) -> None:
+        index = json.loads((folder / "index.json").read_text())
+        change(index)
+        (folder / "index.json").write_text(json.dumps(index))
+
+    return damage
+
+
+def _without(name: str) -> Callable[[Path], None]:
+    def damage(folder: Path) -> None:
+        with np.load(folder / "golden.npz") as stored:
+            np.savez(folder / "golden.npz", **{key: stored[key] for key in stored.files if key != name})
+
+    return damage
+
+
+@pytest.mark.parametrize(
+    ("damage", "parts"),
+    [
+        (shutil.rmtree, ("no such folder", "pop vectors export")),
+        (lambda f: (f / "index.json").unlink(), ("index.json", "absent", "pop vectors export")),
+        (lambda f: truncate(f / "index.json"), ("index.json", "damaged", "pop vectors export")),
+        (lambda f: (f / "index.json").write_text("[]"), ("index.json", "format")),
+        (_index(lambda i: i.update(format="other")), ("index.json", "format is not 'pop-vectors'")),
+        (_index(lambda i: i.update(version=1)), ("index.json", "version is 1", "reads 2")),
+        (_index(lambda i: i.pop("arrays")), ("index.json", "arrays is absent")),
+        (lambda f: (f / "golden.npz").unlink(), ("golden.npz", "absent", "again")),
+        (lambda f: truncate(f / "golden.npz"), ("golden.npz", "is no npz file", "again")),
+        (lambda f: (f / "golden.npz").write_text("hello"), ("golden.npz", "is no npz file")),
+        (lambda f: np.savez(f / "golden.npz", other=np.zeros(3)), ("golden.npz", "has no array means", "again")),
+        (_without("charge_image"), ("golden.npz", "has no array charge_image")),
+        (_index(lambda i: i["vectors"]["golden"]["shapes"].update(image=[1])), ("golden.npz", "image has shape")),
+    ],
+    ids=lambda value: None if callable(value) else value[-1],
+)
+def test_damaged_vectors_are_refused_by_one_line(
+    pop: Pop, vectors: Path, port: Path, damage: Callable[[Path], object], parts: tuple[str, ...]
+) -> None:
+    damage(vectors)
+    says(pop("vectors", "check", vectors, port), *parts)
+
+
+def _result(**arrays: object) -> Callable[[Path], None]:
+    return lambda folder: np.savez(folder / "golden.npz", **arrays)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("damage", "parts"),
+    [
+        (shutil.rmtree, ("no such folder", "NAME.npz")),
+        (lambda f: None, ("holds nothing to judge", "one_round_splat.npz", "image")),
+        (_result(other=np.zeros(3)), ("holds nothing to judge",)),
+        (_result(image=np.zeros((2, 2, 3))), ("golden.npz", "image has shape [2, 2, 3]", "must be [16, 16, 3]")),
+        (_result(image=np.full((16, 16, 3), "a")), ("golden.npz", "image has type", "numbers")),
+        (_result(image=np.array([None])), ("golden.npz", "is no npz file")),
+        (lambda f: (f / "golden.npz").write_bytes(b""), ("golden.npz", "is no npz file")),
+        (lambda f: (f / "golden.json").write_text("{"), ("golden.json", "is no JSON")),
+        (lambda f: (f / "golden.json").write_text("[1]"), ("golden.json", "is no JSON")),
+        (lambda f: (f / "golden.json").write_text('{"image": [[1], [1, 2]]}'), ("golden.json", "is no JSON")),
+    ],
+    ids=["no folder", "empty", "foreign", "shape", "type", "objects", "no bytes", "no json", "no object", "ragged"],
+)
+def test_results_that_cannot_be_read_are_refused_by_one_line(
+    pop: Pop, shared_vectors: Path, tmp_path: Path, damage: Callable[[Path], object], parts: tuple[str, ...]
+) -> None:
+    results = tmp_path / "results"
+    results.mkdir()
+    damage(results)
+    says(pop("vectors", "check", shared_vectors, results), *parts)
+
+
+def test_what_is_not_finite_never_passes(pop: Pop, shared_vectors: Path, tmp_path: Path) -> None:
+    with np.load(shared_vectors / "golden.npz") as stored:
+        np.savez(tmp_path / "golden.npz", T_final=np.full_like(stored["T_final"], np.nan))
+    outcome = pop("vectors", "check", shared_vectors, tmp_path)
+    assert outcome.status == 1
+    assert "golden: off by inf" in outcome.out
+
+
+@pytest.mark.parametrize("words", [(), ("judge",), ("check", "a"), ("check", "a", "b", "--dtype", "half")])
+def test_bad_usage_has_status_two(pop: Pop, words: tuple[str, ...]) -> None:
+    assert pop("vectors", *words).status == 2
