@@ -221,10 +221,11 @@ class Call:
         }
 
     def _counts(self, told: list[Instruments]) -> dict[str, Any]:
-        return {
-            "n_contrib": torch.stack([found.n_blended for found in told]),
-            "n_traversed": torch.stack([found.n_traversed for found in told]),
-        }
+        return {**self._blended_counts(told), "n_traversed": torch.stack([found.n_traversed for found in told])}
+
+    def _blended_counts(self, told: list[Instruments]) -> dict[str, Any]:
+        # unlike the entries that are visited, those that are blended do not depend on the lists' tiles
+        return {"n_contrib": torch.stack([found.n_blended for found in told])}
 
     def _later(self, images: list[Image], n: int) -> dict[tuple[str, ...], Callable[[], dict[str, Any]]]:
         @torch.no_grad()
@@ -239,7 +240,8 @@ class Call:
 
         return {
             ("dominant_ids", "dominant_weights", "dominant_counts"): lambda: self._dominance(images, again(False), n),
-            ("n_contrib", "n_traversed"): lambda: self._counts(again(True)),
+            ("n_contrib",): lambda: self._blended_counts(again(False)),
+            ("n_traversed",): lambda: self._counts(again(True)),
             ("tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets"): lambda: intersections(
                 self.settings, images
             ),

@@ -24,10 +24,9 @@ class StepSettings:
         lr: learning rate by parameter; that of the means already times the scene's scale.
         max_steps: length of the schedule.
         means_decay: what the means' rate falls to.
-        lambda_ssim, padding: weight and border of D-SSIM.
+        padding: SSIM's border, "valid" or "same".
         d_ssim_halved: (1 - SSIM) / 2 instead of 1 - SSIM.
         pixelwise_scale: multiplies the L1 or L2 term.
-        l1: L1 instead of L2.
         lambda_pop: weight of the POP term where it is on.
         theta_blur: share of the image a Gaussian must dominate to be blurred.
         blur_min_pixels: and at least so many pixels.
@@ -40,11 +39,9 @@ class StepSettings:
     lr: Mapping[str, float]
     max_steps: int
     means_decay: float = 0.01
-    lambda_ssim: float = 0.01
     padding: str = "valid"
     d_ssim_halved: bool = False
     pixelwise_scale: float = 1.0
-    l1: bool = False
     lambda_pop: float = 0.001
     theta_blur: float = 2e-5
     blur_min_pixels: float = 0.0
@@ -72,12 +69,16 @@ class Phase(NamedTuple):
         pop: the POP term is on.
         statistics: screen gradients are collected.
         blur: dominant pixels are collected.
+        l1: L1 instead of L2.
+        lambda_ssim: weight of D-SSIM; the rest, to 1, is that of L1 or L2.
     """
 
     sh_degree: int
     pop: bool
     statistics: bool
     blur: bool
+    l1: bool = False
+    lambda_ssim: float = 0.01
 
     @property
     def tells(self) -> bool:

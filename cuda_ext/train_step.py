@@ -31,7 +31,7 @@ from cuda_ext.arrays import (
 )
 from cuda_ext.graphs import Watch, captured
 from cuda_ext.lists import LOWER, TileBuffers, list_tile, splat_struct
-from cuda_ext.resident import ResidentViews
+from cuda_ext.resident import MARGIN, ResidentViews
 from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, StepValues
 
 GROWTH = 1.5
@@ -135,6 +135,7 @@ class FusedTrainer:
         """Handle what halted the device, and return the step to go on from."""
         flags = self.state.tolist()
         if flags[BAD_ROW] != NOT_BAD:
+            self.step = flags[STEP]
             raise ValueError(f"step {flags[STEP]}: Gaussian {flags[BAD_ROW]} has a value that is not finite")
         self.grown += 1
         self._capacity = int(max(flags[OVERFLOW], flags[N_INSTANCES]) * GROWTH)
@@ -212,7 +213,8 @@ class FusedTrainer:
             frame.told["dominant_counts"].zero_()
             fill(forward, **frame.told, masks=self.views.masks, state=self.state)
         kernels.blend_forward(lists, forward, profile, stream)
-        kernels.photometric(self.views.photographs(), self._loss(frame, size), self._objective(), state, stream)
+        objective = self._objective(phase)
+        kernels.photometric(self.views.photographs(), self._loss(frame, size), objective, state, stream)
         if not s.deterministic:
             self._sums.zero_()
         backward = fill(kernels.BlendBackward(), **drawn, **shared, absolute=False, v_image=frame.work["v_image"])
@@ -242,12 +244,12 @@ class FusedTrainer:
             made.set_lr(k, s.lr[name])
         return made
 
-    def _objective(self) -> Any:
-        s = self.settings
-        made = fill(load().LossSettings(), pixelwise_weight=(1.0 - s.lambda_ssim) * s.pixelwise_scale)
-        made.ssim_weight = s.lambda_ssim * (0.5 if s.d_ssim_halved else 1.0)
-        made.margin = 5 if s.padding == "valid" else 0
-        made.set_pixelwise(s.l1)
+    def _objective(self, phase: Phase) -> Any:
+        s, weight = self.settings, phase.lambda_ssim
+        made = fill(load().LossSettings(), pixelwise_weight=(1.0 - weight) * s.pixelwise_scale)
+        made.ssim_weight = weight * (0.5 if s.d_ssim_halved else 1.0)
+        made.margin = MARGIN if s.padding == "valid" else 0
+        made.set_pixelwise(phase.l1)
         return made
 
     def _loss(self, frame: _Frame, size: tuple[int, int]) -> Any:

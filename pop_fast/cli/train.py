@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+import time
 import typing
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Annotated, Any, Final, Literal
 
 import tyro
 
+from pop_fast.backends import get_backend
 from pop_fast.cli import EXIT_INTERRUPTED
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.progress import bars
@@ -18,8 +20,9 @@ from pop_fast.cli.splat import CaptureRecord, write_record
 from pop_fast.data import Capture, load_capture
 from pop_fast.errors import PopError
 from pop_fast.report import write_report
+from pop_fast.train.choose import choose_backend, make_trainer
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.trainer import Trainer
+from pop_fast.train.device_plan import unsupported
 
 _EXAMPLES: Final = """
     pop train scene                          POP, the paper's 30,000 steps, results in out/scene_pop
@@ -27,6 +30,7 @@ _EXAMPLES: Final = """
     pop train photos --factor 4              a bare folder of photographs: cameras are found first
     pop train scene --method adc             plain density control with opacity reset
     pop train scene --out out/a --resume     go on from the last checkpoint
+    pop train scene --backend fast           on the CPU, also where a GPU is
     pop train scene --pop.lambda-pop 0.01    any setting; --help-all lists them all
 """
 
@@ -76,11 +80,17 @@ def run(argv: Sequence[str]) -> int:
     config, options = arguments(argv)
     folder = Path(config.result_dir)
     check_output(folder, options)
+    config, chosen = choose_backend(config, options.resume)
+    check_backend(config)
+    start = time.perf_counter()
     capture = open_capture(config, options)
+    loading = time.perf_counter() - start
     for note in capture.notes:
         print(f"note: {note}")
     print(f"{capture.name}: {capture.source}; {_plan(config)}")
-    trainer = Trainer(config, capture, resume=options.resume, overwrite=options.overwrite)
+    print(chosen)
+    how = {"resume": options.resume, "overwrite": options.overwrite, "loading_seconds": loading}
+    trainer = make_trainer(config, capture, **how)
     try:
         stats = trainer.run()
     except KeyboardInterrupt:
@@ -169,6 +179,20 @@ def check_output(folder: Path, options: Any) -> None:
         raise PopError(f"{folder}: exists and is not empty; pass --resume, --overwrite or another --out")
 
 
+def check_backend(config: TrainConfig) -> None:
+    """Refuse a backend that cannot run here, or not with these settings, before the minutes of loading, not after.
+
+    Raises:
+        PopError: says why and what to do.
+    """
+    backend = get_backend(config.backend)
+    if not backend.available():
+        raise PopError(f"backend {config.backend!r} is not available: {backend.why_not()}")
+    reason = unsupported(config.resolved()) if config.backend == "cuda" else None
+    if reason is not None:
+        raise PopError(reason)
+
+
 def open_capture(config: TrainConfig, options: Any) -> Capture:
     """Load the capture that a config names, with progress; finds the cameras of bare photographs first."""
     with bars(config.progress) as progress:
@@ -210,5 +234,6 @@ def summary(stats: dict[str, Any]) -> str:
     if stats.get("lpips") is not None:
         parts.append(f"LPIPS {stats['lpips']:.4f} ({stats['lpips_net']})")
     parts.append(f"{stats['num_GS']:,} Gaussians ({stats['num_GS_above_floor']:,} with opacity >= 1/255)")
-    parts.append(f"{stats['seconds']:.0f} s")
+    loading = f", loading {stats['seconds_loading']:.0f} s" if "seconds_loading" in stats else ""
+    parts.append(f"{stats['seconds']:.0f} s on {stats.get('gpu', 'the CPU')}{loading}")
     return ", ".join(parts)

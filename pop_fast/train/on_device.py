@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -10,6 +11,8 @@ from torch import Tensor
 
 from pop_fast.backends import Backend, get_backend
 from pop_fast.errors import PopError
+
+_LESS = "use smaller images (--factor 2 or more), fewer Gaussians, or a card with more memory"
 
 
 class OnDevice:
@@ -44,14 +47,8 @@ class OnDevice:
         """
         there = [self._moved(value) for value in args]
         named = {key: self._moved(value) for key, value in kwargs.items()}
-        try:
-            with torch.no_grad():
-                image, alphas, info = self._backend.rasterization(*there, **named)
-        except RuntimeError as error:
-            told = no_room(error)
-            if told is None:
-                raise
-            raise told from error
+        with words_for_memory(), torch.no_grad():
+            image, alphas, info = self._backend.rasterization(*there, **named)
         return image.cpu(), alphas.cpu(), _Fetched(info)
 
     def _moved(self, value: Any) -> Any:
@@ -78,16 +75,21 @@ class _Fetched(dict[str, Any]):
         return self[key] if key in self else default  # noqa: SIM401 - `get` itself
 
 
-def no_room(error: RuntimeError) -> PopError | None:
-    """Return what to say where an error means that the GPU's memory is full, or None for every other error."""
+@contextmanager
+def words_for_memory() -> Iterator[None]:
+    """Turn what says that the GPU's memory is full into a sentence on what to lower.
+
+    Raises:
+        PopError: the memory is full.
+    """
     from cuda_ext.arrays import CudaMemoryError
 
-    if isinstance(error, CudaMemoryError):
-        return PopError(str(error))
-    if isinstance(error, torch.cuda.OutOfMemoryError):
-        first = str(error).split(". ")[0]
-        return PopError(f"the GPU has no room ({first}); use smaller images (--factor 2 or more) or fewer Gaussians")
-    return None
+    try:
+        yield
+    except CudaMemoryError as error:
+        raise PopError(f"{error}; {_LESS}") from error
+    except torch.cuda.OutOfMemoryError as error:
+        raise PopError(f"the GPU has no room ({str(error).split('. ')[0]}); {_LESS}") from error
 
 
 def renderer(name: str) -> tuple[Backend, str | None]:

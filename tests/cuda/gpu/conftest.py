@@ -14,7 +14,6 @@ from pop_ref.conformance.plugin import parametrize_backends  # noqa: E402
 
 TOLD = ("means2d", "radii", "depths", "conics", "opacities", "final_T")
 DOMINANCE = ("dominant_ids", "dominant_weights", "dominant_counts")
-COUNTS = ("n_contrib", "n_traversed")
 
 
 def rasterizer(family: str, deterministic: bool = True) -> Any:
@@ -25,8 +24,8 @@ def rasterizer(family: str, deterministic: bool = True) -> Any:
         image, alphas, meta = rasterization(
             *args, profile=profile, dominance=dominance, family=family, deterministic=deterministic, **options
         )
-        counted = COUNTS if options.get("tile_size", 16) % 16 == 0 else ()
-        return image, alphas, {key: meta[key] for key in (*TOLD, *DOMINANCE, *counted)}
+        visits = ("n_traversed",) if options.get("tile_size", 16) % 16 == 0 else ()
+        return image, alphas, {key: meta[key] for key in (*TOLD, *DOMINANCE, "n_contrib", *visits)}
 
     return draw
 

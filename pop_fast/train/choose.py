@@ -1,0 +1,64 @@
+"""Which backend a run is done by, and the trainer that goes with it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pop_fast.backends import get_backend
+from pop_fast.data.capture import Capture
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.training_run import TrainingRun
+
+
+def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConfig, str]:
+    """Settle backend "auto": "cuda" where a GPU, the build and the settings allow it, else "fast".
+
+    A run that is gone on with keeps the backend that it was begun with.
+
+    Args:
+        config: the settings as given.
+        resume: go on with the run in `config.result_dir`, if there is one.
+
+    Returns:
+        The settings with a backend's name, and one line that says which and why.
+    """
+    if config.backend != "auto":
+        return config, f"backend {config.backend}, as asked for"
+    begun = _begun_with(Path(config.result_dir)) if resume else None
+    if begun is not None:
+        return replace(config, backend=begun), f"backend {begun}, with which the run was begun"
+    reason = get_backend("cuda").why_not()
+    if reason is None:
+        from pop_fast.train.device_plan import unsupported
+
+        reason = unsupported(config.resolved())
+    if reason is None:
+        return replace(config, backend="cuda"), "backend cuda: a GPU and the build are here"
+    return replace(config, backend="fast"), f"backend fast (CPU): {reason}"
+
+
+def make_trainer(config: TrainConfig, capture: Capture, **options: Any) -> TrainingRun:
+    """Return the trainer of the backend that `config` names; see `TrainingRun` for the options.
+
+    Raises:
+        PopError: the backend cannot run here, or does not know a setting.
+    """
+    if config.backend == "cuda":
+        from pop_fast.train.device_trainer import DeviceTrainer
+
+        return DeviceTrainer(config, capture, **options)
+    from pop_fast.train.trainer import Trainer
+
+    return Trainer(config, capture, **options)
+
+
+def _begun_with(folder: Path) -> Any:
+    """Return the backend of the run in a folder, or None where there is none or its settings cannot be read."""
+    path = folder / "cfg.json"
+    try:
+        return json.loads(path.read_text(encoding="utf-8")).get("backend")
+    except (OSError, ValueError, AttributeError):
+        return None
