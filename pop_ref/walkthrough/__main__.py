@@ -9,7 +9,12 @@ import sys
 import time
 from pathlib import Path
 
-from pop_ref.walkthrough.cells import ChapterError, chapter_files, read_chapter
+from pop_ref.walkthrough.cells import (
+    ChapterError,
+    chapter_files,
+    chapter_number,
+    read_chapter,
+)
 
 _NEEDED = ("matplotlib", "markdown_it", "mdit_py_plugins", "latex2mathml", "pygments")
 
@@ -51,7 +56,8 @@ def write(folder: Path, only: list[int] | None = None) -> None:
 
     Args:
         folder: made if it is not there.
-        only: numbers of the chapters to run, default all. The contents lists all of them.
+        only: numbers of the chapters to run, default all. The contents then lists what can be read: while one
+            chapter is being written, another may be out of form.
 
     Raises:
         ChapterError: a chapter failed; pages of earlier chapters are written.
@@ -59,20 +65,29 @@ def write(folder: Path, only: list[int] | None = None) -> None:
     from pop_ref.walkthrough.layout import chapter_page, index_page
     from pop_ref.walkthrough.pages import run_chapter
 
-    chapters = [read_chapter(path) for path in chapter_files()]
+    chapters = [
+        read_chapter(path)
+        for path in chapter_files()
+        if only is None or chapter_number(path) in only or _readable(path)
+    ]
     folder.mkdir(parents=True, exist_ok=True)
     for chapter in chapters:
         if only is None or chapter.number in only:
             start = time.perf_counter()
-            _write(
-                folder / chapter.page, chapter_page(chapter, run_chapter(chapter), chapters)
-            )
-            print(
-                f"{chapter.number:2}  {chapter.title}  {time.perf_counter() - start:.1f} s",
-                flush=True,
-            )
+            page = chapter_page(chapter, run_chapter(chapter), chapters)
+            _write(folder / chapter.page, page)
+            took = time.perf_counter() - start
+            print(f"{chapter.number:2}  {chapter.title}  {took:.1f} s", flush=True)
     _write(folder / "index.html", index_page(chapters))
     print(f"open {folder / 'index.html'}")
+
+
+def _readable(path: Path) -> bool:
+    try:
+        read_chapter(path)
+    except ChapterError:
+        return False
+    return True
 
 
 def _write(path: Path, text: str) -> None:

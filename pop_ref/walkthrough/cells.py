@@ -66,6 +66,18 @@ def chapter_files(folder: Path = FOLDER) -> list[Path]:
     return sorted(folder.glob("chapter_*.py"))
 
 
+def chapter_number(path: Path) -> int:
+    """Read a chapter's number off its file's name.
+
+    Raises:
+        ChapterError: the name is not `chapter_NN_short_name.py`.
+    """
+    named = _NAME.match(path.stem)
+    if named is None:
+        raise ChapterError(path, 1, "a chapter's file is named chapter_NN_short_name.py")
+    return int(named[1])
+
+
 def read_chapter(path: Path, text: str | None = None) -> Chapter:
     """Read one chapter and hold it to the form that all chapters have.
 
@@ -77,15 +89,13 @@ def read_chapter(path: Path, text: str | None = None) -> Chapter:
         ChapterError: a cell, the title or an exercise does not have its form.
     """
     cells = tuple(_cells(path, path.read_text(encoding="utf-8") if text is None else text))
-    named = _NAME.match(path.stem)
-    if named is None:
-        raise ChapterError(path, 1, "a chapter's file is named chapter_NN_short_name.py")
+    number = chapter_number(path)
     if not cells or cells[0].kind != "prose":
         raise ChapterError(path, 1, "the first cell must be prose, '# %% [markdown]'")
     heading, _, rest = cells[0].text.partition("\n")
     titled = _TITLE.match(heading)
-    if titled is None or int(titled[1]) != int(named[1]):
-        wanted = f"# # {int(named[1])}. Title"
+    if titled is None or int(titled[1]) != number:
+        wanted = f"# # {number}. Title"
         raise ChapterError(
             path,
             cells[0].line,

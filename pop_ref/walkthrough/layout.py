@@ -93,13 +93,15 @@ def _cell(chapter: Chapter, name: str, outcome: Outcome) -> str:
         return _prose(chapter, cell)
     said, code = said_and_done(cell.text) if cell.kind == "answer" else ("", cell.text)
     shown = [_prose(chapter, Cell("prose", said, cell.line))] if said else []
-    shown += [_part(part) for part in parts(code)]
+    every = parts(code)
+    # code that draws at a cell's end goes under its picture
+    n_before = len(every) - 1 if every[-1].draws else len(every)
+    shown += [_part(part) for part in every[:n_before]]
     if outcome.printed.strip():
         shown.append(f'<pre class="printed">{escape(outcome.printed.rstrip())}</pre>')
-    shown += [
-        _figure(chapter, cell, f"{name}-{i}", each)
-        for i, each in enumerate(outcome.pictures)
-    ]
+    for i, each in enumerate(outcome.pictures):
+        shown.append(_figure(chapter, cell, f"{name}-{i}", each))
+    shown += [_part(part) for part in every[n_before:]]
     whole = "".join(shown)
     if cell.kind == "answer":
         return f"<details><summary>Answer</summary>{whole}</details>"

@@ -7,6 +7,7 @@ from typing import Any, Final
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
 
@@ -16,6 +17,11 @@ RULE: Final = "#dedbd4"
 ACCENT: Final = "#2563c9"
 SECOND: Final = "#d2622a"
 THIRD: Final = "#23835a"
+
+# negative, zero, positive
+DIVERGING: Final = LinearSegmentedColormap.from_list(
+    "diverging", [SECOND, "#f6f4f0", ACCENT]
+)
 
 # what the pages' style sheet calls them; it gives each a form for dark screens
 VARIABLES: Final = {
