@@ -30,10 +30,11 @@ PRESETS: Final = {"paper": 1.0, "quick": QUICK_SCALER}
 # what theta_blur comes to in the smallest images of the paper (980 x 545); "quick" is for images smaller than those
 QUICK_BLUR_MIN_PIXELS: Final = 11.0
 
-# what may differ between a checkpoint and the run that resumes it: it does not reach a single bit of the parameters
+# what may differ between a checkpoint and the run that resumes it: it does not reach a single bit of the parameters.
+# log_every is not among it: where Gaussians per pixel are counted, tile lists are cut otherwise and sums round otherwise
 _FREE: Final = frozenset(
     {
-        *("data", "result_dir", "eval_steps", "save_steps", "checkpoint_every", "keep_checkpoints", "log_every"),
+        *("data", "result_dir", "eval_steps", "save_steps", "checkpoint_every", "keep_checkpoints"),
         *("max_renders", "progress", "lpips_vgg", "lpips_alex", "target_cache_mb"),
     }
 )

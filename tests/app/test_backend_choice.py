@@ -1,0 +1,141 @@
+"""Which backend a command runs on: asked for, found by itself, kept when a run is gone on with, stood in for."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from pop_fast.backends import get_backend
+from pop_fast.cli.train import check_backend
+from pop_fast.errors import PopError
+from pop_fast.strategies import POPStrategy
+from pop_fast.train import Trainer
+from pop_fast.train.choose import choose_backend, make_trainer
+from pop_fast.train.device_trainer import DeviceTrainer
+from pop_fast.train.hardware import this_machine
+from pop_fast.train.on_device import OnDevice, renderer, words_for_memory
+from pop_fast.train.views import ViewTensors, render_view
+from tests.app.conftest import TRAIN, Pop
+from tests.app.stand_in import stand_in_hardware
+from tests.app.tiny import tiny_capture, tiny_config
+
+NOT_BUILT = "the CUDA extension is not built; run `pop build-cuda`"
+
+
+@pytest.fixture
+def without_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a machine where the extension was never built."""
+    monkeypatch.setattr("cuda_ext.why_not", lambda: NOT_BUILT)
+
+
+@pytest.fixture
+def with_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a machine with a GPU and the build, whose part the stand-in plays."""
+    monkeypatch.setattr("cuda_ext.why_not", lambda: None)
+    monkeypatch.setattr("pop_fast.train.device_trainer.this_machine", stand_in_hardware)
+
+
+def settings(folder: Path) -> dict[str, object]:
+    return json.loads((folder / "cfg.json").read_text())
+
+
+def test_auto_is_cuda_where_it_can_run_and_says_why_where_it_cannot(monkeypatch, tmp_path):
+    config = tiny_config(tmp_path)
+    assert config.backend == "auto"
+    monkeypatch.setattr("cuda_ext.why_not", lambda: None)
+    assert choose_backend(config)[0].backend == "cuda"
+    monkeypatch.setattr("cuda_ext.why_not", lambda: NOT_BUILT)
+    chosen, line = choose_backend(config)
+    assert (chosen.backend, line) == ("fast", f"backend fast (CPU): {NOT_BUILT}")
+
+
+@pytest.mark.usefixtures("with_gpu")
+def test_auto_takes_the_cpu_for_settings_that_the_device_does_not_know(tmp_path):
+    chosen, line = choose_backend(tiny_config(tmp_path, pop=POPStrategy(absgrad=True)))
+    assert chosen.backend == "fast"
+    assert "pop.absgrad" in line
+
+
+@pytest.mark.usefixtures("with_gpu")
+def test_a_run_is_gone_on_with_by_the_backend_it_was_begun_with(tmp_path):
+    config = tiny_config(tmp_path)
+    assert choose_backend(config, resume=True)[0].backend == "cuda"
+    (tmp_path / "cfg.json").write_text('{"backend": "fast"}')
+    assert choose_backend(config, resume=True)[0].backend == "fast"
+    assert choose_backend(config, resume=False)[0].backend == "cuda"
+    (tmp_path / "cfg.json").write_text("[oops")
+    assert choose_backend(config, resume=True)[0].backend == "cuda"
+
+
+@pytest.mark.usefixtures("with_gpu")
+def test_the_trainer_goes_with_the_backend(tmp_path):
+    config = tiny_config(tmp_path, max_steps=2)
+    kinds = {name: make_trainer(tiny_config(tmp_path, backend=name), tiny_capture()) for name in ("cuda", "fast")}
+    assert type(kinds["cuda"]) is DeviceTrainer
+    assert type(kinds["fast"]) is Trainer
+    assert Trainer(config, tiny_capture())._given.backend == "fast"
+
+
+@pytest.mark.usefixtures("without_gpu")
+def test_cuda_asked_for_in_vain_is_one_sentence_before_anything_is_read(pop: Pop, tmp_path: Path) -> None:
+    outcome = pop("train", tmp_path / "no such capture", "--backend", "cuda", "--out", tmp_path / "r")
+    assert outcome.status == 2
+    assert outcome.err == f"pop: error: backend 'cuda' is not available: {NOT_BUILT}\n"
+    with pytest.raises(PopError, match="not built"):
+        this_machine()
+    with pytest.raises(PopError, match="backend 'cuda' cannot run: the CUDA extension is not built"):
+        get_backend("cuda").rasterization()
+
+
+@pytest.mark.usefixtures("with_gpu")
+def test_settings_that_the_device_does_not_know_are_refused_before_anything_is_read(tmp_path):
+    with pytest.raises(PopError, match=r"pop\.pop_over = 'all' only"):
+        check_backend(tiny_config(tmp_path, backend="cuda", pop=POPStrategy(pop_over="visible")))
+
+
+@pytest.mark.usefixtures("with_gpu")
+def test_a_run_on_a_gpu_from_the_command_line(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
+    outcome = pop("train", shared_capture, "--out", tmp_path / "r", *TRAIN)
+    assert outcome.status == 0, outcome.err
+    assert "backend cuda: a GPU and the build are here" in outcome.out
+    assert " s on stand-in, loading " in outcome.out
+    assert settings(tmp_path / "r")["backend"] == "cuda"
+    stats = json.loads((tmp_path / "r" / "stats" / "val_step0029.json").read_text())
+    assert stats["gpu"] == "stand-in"
+    assert stats["psnr"] > 5.0
+    again = pop("train", shared_capture, "--out", tmp_path / "r", *TRAIN, "--resume")
+    assert again.status == 0, again.err
+    assert "backend cuda, with which the run was begun" in again.out
+
+
+def test_a_result_of_a_gpu_can_be_measured_without_one(pop: Pop, result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (result / "cfg.json").read_text()
+    (result / "cfg.json").write_text(text.replace('"backend": "fast"', '"backend": "cuda"'))
+    monkeypatch.setattr("cuda_ext.why_not", lambda: NOT_BUILT)
+    outcome = pop("eval", result)
+    assert outcome.status == 0, outcome.err
+    assert f"note: backend 'fast' stands in for 'cuda': {NOT_BUILT}" in outcome.err
+    assert renderer("auto")[1] is None
+
+
+def test_images_and_what_is_told_of_them_come_back_from_the_device(tmp_path):
+    trainer = Trainer(tiny_config(tmp_path), tiny_capture())
+    view: ViewTensors = trainer._train[0]
+    on = OnDevice(get_backend("fast"), torch.device("cpu"))
+    there = render_view(on, trainer.params, view, trainer.config, 0, counts=True)
+    here = render_view(get_backend("fast"), trainer.params, view, trainer.config, 0, counts=True)
+    assert torch.equal(there.image, here.image.detach())
+    assert not there.image.requires_grad
+    for key in ("n_contrib", "n_traversed", "dominant_ids"):
+        assert key in there.info
+        assert torch.equal(there.info[key], here.info[key])
+    assert there.info.get("nothing of that name") is None
+    assert (on.name, on.available(), on.why_not()) == ("fast", True, None)
+
+
+def test_other_errors_keep_their_words():
+    with pytest.raises(RuntimeError, match="a launch failed"), words_for_memory():
+        raise RuntimeError("a launch failed")
