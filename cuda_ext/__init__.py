@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import re
 from types import ModuleType
 
-_BUILD = "run `pop build-cuda` (it needs nvcc, cmake and nanobind)"
+_could_run: list[bool] = []
+_BUILD = "run `pop build-cuda`"
 
 
 def available() -> bool:
@@ -20,8 +22,18 @@ def available() -> bool:
 
 def why_not() -> str | None:
     """Return one sentence on why backend "cuda" cannot run here and what to do, or None where it can."""
+    # a machine that could run it once goes on to; asking anew would cost at every render
+    if not _could_run:
+        reason = _why_not()
+        if reason is not None:
+            return reason
+        _could_run.append(True)
+    return None
+
+
+def _why_not() -> str | None:
     if importlib.util.find_spec("cuda_ext._kernels") is None:
-        return f"the CUDA extension is not built; {_BUILD}"
+        return f"the CUDA extension is not built; {_BUILD}, which says what it needs"
     try:
         kernels = load()
     except ImportError as error:
@@ -32,9 +44,17 @@ def why_not() -> str | None:
         return "torch is not installed; install a CUDA build of torch"
     if torch.version.cuda is None:
         return f"torch {torch.__version__} is a CPU build; install a CUDA build of torch"
+    driver, runtime = kernels.driver_version(), kernels.RUNTIME
+    if driver == 0:
+        return "there is no NVIDIA driver; install one: `nvidia-smi` must show the GPU"
+    if driver // 1000 < runtime // 1000:
+        return (
+            f"the driver knows CUDA {_named(driver)}, the CUDA extension was built with {_named(runtime)}; update the "
+            f"driver, or build with a toolkit of the driver's age (CUDACXX=.../nvcc pop build-cuda)"
+        )
     if not torch.cuda.is_available():
-        return "torch finds no usable GPU; check `nvidia-smi`: the driver must be there and new enough for " + (
-            f"CUDA {torch.version.cuda}"
+        return f"torch finds no usable GPU ({_words_of_torch()}); check `nvidia-smi`, and that its driver is new " + (
+            f"enough for torch's CUDA {torch.version.cuda}"
         )
     return _why_not_this_gpu(torch.cuda.get_device_capability(), str(kernels.ARCHS))
 
@@ -46,6 +66,22 @@ def load() -> ModuleType:
         ImportError: it is not built, or does not load.
     """
     return importlib.import_module("cuda_ext._kernels")
+
+
+def _named(version: int) -> str:
+    """Turn 12040 into "12.4"."""
+    return f"{version // 1000}.{version % 1000 // 10}"
+
+
+def _words_of_torch() -> str:
+    """Ask torch why it cannot start CUDA; the first sentence."""
+    import torch
+
+    try:
+        torch.cuda.init()
+    except (RuntimeError, AssertionError) as error:
+        return re.split(r"[.\n]\s", f"{error} ")[0].strip()
+    return "it does not say why"
 
 
 def _why_not_this_gpu(capability: tuple[int, int], archs: str) -> str | None:

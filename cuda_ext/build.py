@@ -20,6 +20,7 @@ from pathlib import Path
 from cuda_ext.toolkit import OLDEST, find_nvcc, link_flags, nvcc_version
 
 HERE = Path(__file__).resolve().parent
+INSTALL = "`pip install 'pop-splatting[cuda-build]'` (from a clone: pip install -e '.[cuda-build]')"
 DEFAULT_ARCHS = ("sm_75", "sm_80", "sm_90")
 
 
@@ -44,7 +45,7 @@ def build(
     Raises:
         BuildError: nvcc, CMake or nanobind is missing, nvcc does not know the architecture, or a step failed.
     """
-    nvcc, cmake = _tools()
+    nvcc, cmake = tools()
     archs = _architectures(arch, nvcc)
     work = folder or HERE / "build"
     configure = [
@@ -56,8 +57,9 @@ def build(
         f"-DCMAKE_INSTALL_PREFIX={HERE}",
         f"-DCMAKE_CUDA_FLAGS={' '.join(link_flags(nvcc))}",
     ]
-    if shutil.which("ninja"):
-        configure += ["-G", "Ninja"]
+    ninja = _program("ninja")
+    if ninja is not None:
+        configure += ["-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={ninja}"]
     try:
         _run("configuring", configure)
     except BuildError:
@@ -73,19 +75,29 @@ def build(
     return found[-1]
 
 
-def _tools() -> tuple[str, str]:
+def tools() -> tuple[str, str]:
+    """Find nvcc and cmake, and see that nanobind is here.
+
+    Raises:
+        BuildError: one of the three is missing; says how to get it.
+    """
     nvcc = find_nvcc()
     if nvcc is None:
         raise BuildError(
             "nvcc was not found; install a CUDA toolkit (12 or newer), or `pip install nvidia-cuda-nvcc nvidia-nvvm "
             "nvidia-cuda-crt nvidia-cuda-runtime nvidia-cuda-cccl` (all of one version), or set CUDACXX to nvcc's path"
         )
-    cmake = shutil.which("cmake")
+    cmake = _program("cmake")
     if cmake is None:
-        raise BuildError("cmake was not found; `pip install cmake ninja`")
+        raise BuildError(f"cmake was not found; {INSTALL}")
     if importlib.util.find_spec("nanobind") is None:
-        raise BuildError("nanobind was not found; `pip install nanobind`")
+        raise BuildError(f"nanobind was not found; {INSTALL}")
     return nvcc, cmake
+
+
+def _program(name: str) -> str | None:
+    """Find a program beside this Python, where pip puts it, or on the PATH."""
+    return shutil.which(name, path=os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", ""))))
 
 
 def _architectures(arch: str | list[str] | None, nvcc: str) -> list[str]:

@@ -18,7 +18,11 @@ _EXAMPLES: Final = """
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Compile the CUDA extension with nvcc, CMake and nanobind. Nothing else ever compiles it."""
+    """Compile the CUDA extension with nvcc, CMake and nanobind. Nothing else ever compiles it.
+
+    `pip install 'pop-splatting[cuda-build]'` brings all but nvcc, which comes from a CUDA toolkit or from NVIDIA's
+    packages on PyPI; `pop doctor` says what is missing.
+    """
 
     arch: tuple[str, ...] = ()
     """Architectures, for example sm_90; by default this machine's GPU, or sm_75, sm_80 and sm_90 without one."""

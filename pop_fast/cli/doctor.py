@@ -55,7 +55,7 @@ class Args:
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "doctor")
-    findings = [*packages(), *machine(), *backends(), *lpips(args)]
+    findings = [*packages(), *machine(), *backends(), cuda_build(), *lpips(args)]
     width = max(len(finding.name) for finding in findings) + 2
     marks = {"ok": "ok", "missing": "MISSING", "off": "-"}
     print(f"pop-splatting {_installed('pop-splatting') or '(not installed)'}, Python {platform.python_version()}")
@@ -110,6 +110,19 @@ def backends() -> Iterator[Finding]:
             yield Finding(f"backend {name}", "ok", "can run here")
         else:
             yield Finding(f"backend {name}", "off", f"{backend.why_not()} (optional)")
+
+
+def cuda_build() -> Finding:
+    """Tell whether `pop build-cuda` has what it needs here, or what it lacks."""
+    from cuda_ext.build import BuildError, tools
+    from cuda_ext.toolkit import nvcc_version
+
+    try:
+        nvcc, _ = tools()
+        version = ".".join(map(str, nvcc_version(nvcc)))
+    except (BuildError, RuntimeError, OSError) as error:
+        return Finding("CUDA build", "off", f"{error} (optional)")
+    return Finding("CUDA build", "ok", f"nvcc {version} at {nvcc}, cmake and nanobind are here")
 
 
 def lpips(args: Args) -> Iterator[Finding]:

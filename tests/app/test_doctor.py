@@ -22,6 +22,28 @@ def test_a_whole_install_is_found_whole(pop: Pop) -> None:
     assert "everything that pop needs is here" in outcome.out
 
 
+@pytest.mark.parametrize(
+    ("missing", "words"),
+    [(None, "ok       CUDA build"), ("nvcc", "nvcc was not found; install a CUDA toolkit"), ("cmake", "[cuda-build]")],
+)
+def test_what_building_the_cuda_extension_lacks_is_said(
+    pop: Pop, monkeypatch: pytest.MonkeyPatch, missing: str | None, words: str
+) -> None:
+    from cuda_ext import build, toolkit
+
+    monkeypatch.setattr(build, "find_nvcc", lambda: None if missing == "nvcc" else "/opt/nvcc")
+    monkeypatch.setattr(build, "_program", lambda name: None if name == missing else f"/bin/{name}")
+    monkeypatch.setattr(build.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(toolkit, "nvcc_version", lambda nvcc: (13, 0))
+    monkeypatch.setattr("cuda_ext.why_not", lambda: "the CUDA extension is not built")
+    outcome = pop("doctor")
+    assert outcome.status == 0
+    line = next(line for line in outcome.out.splitlines() if "CUDA build" in line)
+    assert words in line
+    backend = next(line for line in outcome.out.splitlines() if "backend cuda" in line)
+    assert backend.split() == ["-", *"backend cuda the CUDA extension is not built (optional)".split()]
+
+
 @pytest.mark.parametrize("how", ["absent", "broken"])
 def test_a_missing_package_is_named_with_the_way_to_get_it(pop: Pop, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
     real = importlib.import_module

@@ -46,12 +46,39 @@ def test_a_cpu_build_of_torch_is_named(monkeypatch):
     assert "is a CPU build" in str(cuda_ext.why_not())
 
 
-def test_a_missing_driver_is_named(monkeypatch):
+@pytest.mark.parametrize(
+    ("driver", "words"),
+    [
+        (0, "there is no NVIDIA driver"),
+        (12040, "the driver knows CUDA 12.4, the CUDA extension was built with 13.0; update the driver"),
+        (13010, "torch finds no usable GPU (the driver on your system is too old); check `nvidia-smi`"),
+    ],
+)
+def test_a_missing_or_wrong_driver_is_named(monkeypatch, driver, words):
+    def init():
+        raise RuntimeError("the driver on your system is too old. Please update it.")
+
+    kernels = {"ARCHS": "90", "RUNTIME": 13000, "driver_version": staticmethod(lambda: driver)}
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
-    monkeypatch.setattr(cuda_ext, "load", lambda: type("Kernels", (), {"ARCHS": "90"}))
+    monkeypatch.setattr(cuda_ext, "load", lambda: type("Kernels", (), kernels))
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert "no usable GPU" in str(cuda_ext.why_not())
+    monkeypatch.setattr(torch.cuda, "init", init)
+    assert words in str(cuda_ext.why_not())
+
+
+def test_a_machine_that_can_run_it_is_asked_once(monkeypatch):
+    kernels = {"ARCHS": "90", "RUNTIME": 12040, "driver_version": staticmethod(lambda: 13000)}
+    asked = []
+    monkeypatch.setattr(cuda_ext, "_could_run", [])
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: asked.append(name) or object())
+    monkeypatch.setattr(cuda_ext, "load", lambda: type("Kernels", (), kernels))
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (9, 0))
+    assert cuda_ext.available()
+    assert cuda_ext.available()
+    assert len(asked) == 1
 
 
 @pytest.mark.parametrize(
@@ -82,11 +109,11 @@ def test_a_module_that_does_not_load_asks_to_be_built_again(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("missing", "words"), [("nvcc", "CUDACXX"), ("cmake", "pip install cmake"), ("nanobind", "pip")]
+    ("missing", "words"), [("nvcc", "CUDACXX"), ("cmake", "[cuda-build]"), ("nanobind", "[cuda-build]")]
 )
 def test_a_missing_build_tool_is_named_with_its_cure(monkeypatch, missing, words):
     monkeypatch.setattr(build_module, "find_nvcc", lambda: None if missing == "nvcc" else "/bin/nvcc")
-    monkeypatch.setattr(build_module.shutil, "which", lambda name: None if name == missing else f"/bin/{name}")
+    monkeypatch.setattr(build_module.shutil, "which", lambda name, path: None if name == missing else f"/bin/{name}")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == missing else object())
     with pytest.raises(BuildError, match=missing) as error:
         build_module.build("sm_90")
