@@ -120,9 +120,9 @@ assert reach.tolist() == [math.ceil(k * math.sqrt(10.0)), math.ceil(k * math.sqr
 
 assert np.array_equal(alphas > 0, sigmas <= k * k / 2)
 
+fig, (left, right) = axes(2, height=2.9, sharey=True)
 angle = np.linspace(0, 2 * np.pi, 200)
 circle = np.stack([np.cos(angle), np.sin(angle)])
-fig, (left, right) = axes(2, height=2.9, sharey=True)
 for times, shade in ((1, ACCENT), (2, ACCENT), (k, SECOND)):
     x, y = mean2d[:, None] + times * directions @ (np.sqrt(lambdas)[:, None] * circle)
     left.plot(x, y, color=shade, lw=1.4)

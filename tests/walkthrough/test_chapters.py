@@ -18,6 +18,7 @@ from pop_ref.walkthrough.layout import chapter_page, index_page
 from pop_ref.walkthrough.pages import Outcome, run_chapter
 
 CHAPTERS = chapter_files()
+README = Path(__file__).resolve().parents[2] / "README.md"
 VOID = {"meta", "br", "img", "hr", "link", "input"}
 
 
@@ -79,7 +80,9 @@ def test_a_chapter_becomes_a_page(path: Path) -> None:
     assert read.tags.count("figure") == sum(len(outcome.pictures) for outcome in outcomes)
     assert "math" in read.tags
     assert "$" not in re.sub(r"<(pre|style|code)\b.*?</\1>|<svg.*?</svg>", "", page, flags=re.DOTALL), "a bare dollar"
-    assert len(set(read.ids)) == len(read.ids)
+    # equal images in one picture share an id, which nothing refers to
+    for used in set(re.findall(r'(?:href="#|url\(#)([^")]+)', page)):
+        assert read.ids.count(used) == 1, used
     pages = {each.page for each in every} | {"index.html"}
     for link in read.links:
         assert link.startswith(("#", "data:image/png;base64,", "https://")) or link in pages, f"{link} leads nowhere"
@@ -92,6 +95,13 @@ def test_numbers_follow_each_other_and_the_contents_names_them_all() -> None:
     assert [chapter.number for chapter in chapters] == list(range(1, len(chapters) + 1))
     page = index_page(chapters)
     assert _read(page).links == [chapter.page for chapter in chapters]
+
+
+def test_the_readme_lists_the_chapters_by_title() -> None:
+    text = README.read_text(encoding="utf-8")
+    listed = re.findall(r"^(\d+)\. \[(.+)\]\(pop_ref/walkthrough/(chapter_\w+\.py)\)$", text, re.MULTILINE)
+    chapters = [read_chapter(path) for path in CHAPTERS]
+    assert listed == [(str(each.number), each.title, each.path.name) for each in chapters]
 
 
 def test_a_chapter_runs_as_a_script() -> None:
