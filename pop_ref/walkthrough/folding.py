@@ -22,7 +22,7 @@ def parts(code: str) -> list[Part]:
     """Cut a cell where drawing begins and ends.
 
     Drawing begins with the statement that makes axes and ends with the one that calls `picture`; a function that makes
-    axes is drawing by itself. Comments right above a part belong to it.
+    axes, or takes them as `ax`, is drawing by itself. Comments right above a part belong to it.
 
     Args:
         code: a cell that Python can parse.
@@ -35,8 +35,11 @@ def parts(code: str) -> list[Part]:
     start = None
     for node in ast.parse(code).body:
         called = _called(node)
-        if start is None and called & _OPENS:
+        if start is None and (called & _OPENS or _takes_axes(node)):
             start = _with_comments(lines, node.lineno - 1)
+            # drawing that goes on where drawing ended is one part
+            if cut and not "".join(lines[cut[-1][1] : start]).strip():
+                start = cut.pop()[0]
         defined = isinstance(node, ast.FunctionDef)
         if start is not None and (defined or called & _CLOSES):
             cut.append((start, node.end_lineno or node.lineno))
@@ -68,6 +71,12 @@ def _called(node: ast.AST) -> set[str]:
     functions = [each.func for each in ast.walk(node) if isinstance(each, ast.Call)]
     named = {each.id for each in functions if isinstance(each, ast.Name)}
     return named | {each.attr for each in functions if isinstance(each, ast.Attribute)}
+
+
+def _takes_axes(node: ast.stmt) -> bool:
+    return isinstance(node, ast.FunctionDef) and any(
+        each.arg == "ax" for each in node.args.args
+    )
 
 
 def _with_comments(lines: list[str], first: int) -> int:

@@ -167,6 +167,8 @@ def test_code_that_draws_is_folded_apart() -> None:
         Part("y = 2", False),
         Part(helper, True),
     ]
+    cross = "def cross(ax):\n    ax.plot(0)"
+    assert parts(f"x = 1\n\n{cross}\n\n\n{drawing}") == [Part("x = 1", False), Part(f"{cross}\n\n\n{drawing}", True)]
     assert parts("x = 1\n\ny = 2") == [Part("x = 1\n\ny = 2", False)]
     assert parts("fig, ax = plt.subplots()\nx = 1") == [Part("fig, ax = plt.subplots()\nx = 1", True)]
 
