@@ -120,8 +120,8 @@ np.testing.assert_allclose(T * q - S / (1.0 - alphas), v_alphas, rtol=1e-12)
 # which $c$ does the first splat's derivative vanish?
 
 # %% answer
-# (a) nothing lies behind it, so T_4 c = c / 8; (b) B_1 must be c_1 = 1/2: B_3 = c/2, B_2 = 1/2 + c/4,
-# B_1 = 1/8 + 1/4 + c/8, which is 1/2 at c = 1
+# (a) Nothing lies behind it, so it is $T_4 c = c/8$. (b) $B_1$ must be $c_1 = 1/2$. From the back, $B_3 = c/2$,
+# $B_2 = 1/2 + c/4$ and $B_1 = 1/8 + 1/4 + c/8$, which is $1/2$ at $c = 1$.
 four = v_alphas_of(stack([0.5] * 4, [0.5, 0.25, 1.0, 1.0]), 0.0)
 assert (four[3], four[0]) == (1 / 8, 0.0)
 
@@ -355,7 +355,7 @@ assert np.isclose((moved_by(1e-5) - moved_by(-1e-5)) / 2e-5, v_shift, rtol=1e-6)
 # jump where its alpha crosses the floor, and what does the gradient say on either side?
 
 # %% answer
-# from 1/255 to 0, one step of a byte; the gradient is finite above and exactly zero below, and sees no jump
+# From 1/255 to 0, one step of a byte. The gradient is finite above and exactly zero below, and sees no jump.
 edge = np.log(255.0)
 assert [alpha_from_sigma(edge + e, 1.0)[1] for e in (-1e-9, 1e-9)] == [False, True]
 assert np.isclose(alpha_from_sigma_vjp(edge - 1e-9, 1.0, 1.0)[0], -1.0 / 255.0)

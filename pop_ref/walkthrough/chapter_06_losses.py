@@ -104,7 +104,7 @@ picture(fig, "Left: eq. 4. Right: L1 holds or breaks, L2 bends.")
 # colour minimises L1, and which L2?
 
 # %% answer
-# L1: the median, 0.2, and the lamp is ignored however bright; L2: the mean, 0.28
+# L1: the median, 0.2, and the lamp is ignored however bright. L2: the mean, 0.28.
 covered = np.array([0.2] * 90 + [1.0] * 10).reshape(10, 10, 1)
 greys = np.linspace(0.0, 1.0, 101)
 for loss, best in ((l1, 0.2), (l2, 0.28)):
@@ -138,8 +138,8 @@ assert np.isclose(l2(0.2 * flat, 0.1 * flat), l2(0.9 * flat, 0.8 * flat))
 # deviation $s$. What is S for $s = 0.03$ and for $s = 0.3$? What does that say about blur?
 
 # %% answer
-# equal means make the first factor 1, and sigma_x = sigma_xy = 0 leave C2 / (s^2 + C2): 1/2 at s = 0.03, the
-# root of C2, and 1/101 at 0.3. to lose even a faint texture costs half of all that SSIM has to give
+# Equal means make the first factor 1, and $\sigma_x = \sigma_{xy} = 0$ leave $C_2 / (s^2 + C_2)$: 1/2 at $s = 0.03$,
+# the root of $C_2$, and 1/101 at 0.3. To lose even a faint texture costs half of all that SSIM has to give.
 texture = np.where(np.indices((11, 11)).sum(axis=0) % 2 == 0, 1.0, -1.0)[:, :, None]
 for s, similarity in ((0.03, 1 / 2), (0.3, 1 / 101)):
     assert np.isclose(C2 / (s**2 + C2), similarity)
@@ -315,7 +315,7 @@ assert np.all(20.0 * size_ssim[20:] > 5.0 * size_l2[20:])
 
 # %% answer
 # Adam divides a gradient by its own running size, so its steps stay; the statistic of eq. 3 falls tenfold
-# against its fixed threshold, so fewer Gaussians grow; the prior gains tenfold
+# against its fixed threshold, so fewer Gaussians grow; the prior gains tenfold.
 (_, whole), (_, tenth) = pulls_at(params), pulls_at(params, 0.1)
 one, other = (
     adam_step(params, params_vjp(params, gradients, np.zeros(50)), zero, zero, 1, rates)[0]

@@ -68,7 +68,7 @@ for alpha in (0.01, 0.5, 0.99):
 # How opaque must the front splat be at a pixel so that nothing behind it can dominate, whatever it is?
 
 # %% answer
-# alpha >= 1/2: all that lies behind shares 1 - alpha <= alpha, and a tie goes to the front
+# $\alpha \ge 1/2$: all that lies behind shares $1 - \alpha \le \alpha$, and a tie goes to the front.
 rng = np.random.default_rng(0)
 for _ in range(200):
     behind = rng.uniform(0.0, 1.0, 5).tolist()
@@ -177,8 +177,8 @@ for width, height in ((980, 545), (1557, 1038)):
 # have at least, once everybody has escaped?
 
 # %% answer
-# any view: 1 < 11, no. sum: 100 > 10.68, yes; the counts now sum to 100 HW, so at least 100 / theta = 5 million. the
-# paper's models have a few hundred thousand, which is why the oracle takes "any view" by default
+# Any view: 1 < 11, no. Sum: 100 > 10.68, yes; the counts now sum to $100\,HW$, so at least $100/\theta$, five million.
+# The paper's models have a few hundred thousand, which is why the oracle takes "any view" by default.
 statistics = {}
 for reading in ("any_view", "sum"):
     statistics[reading] = zero_statistics(1)
@@ -325,8 +325,8 @@ assert np.exp(rows.params["scales"]).max(axis=1).min() > POP.grow_scale3d
 # winners at which the rule falls silent?
 
 # %% answer
-# L2's gradients are smaller than L1's, so the gradient rule adds less, and the blur rule has to add more. the
-# least number of winners of a covered view is 1 / theta: it goes from 5,000 to 50,000
+# L2's gradients are smaller than L1's, so the gradient rule adds less, and the blur rule has to add more. The
+# least number of winners of a covered view is $1/\theta$: it goes from 5,000 to 50,000.
 for theta, least in ((1.0 / 5000.0, 5000), (THETA, 50000)):
     pixels = 1_000_000
     each = int(theta * pixels)
