@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 TORCH := $(shell sed -n 's/^\(torch==.*\)/\1/p' constraints.txt)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo walkthrough test lint bench cuda gpu-check docs-check clean
+.PHONY: help setup demo walkthrough test lint bench cuda emulate gpu-check docs-check clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
@@ -42,6 +42,9 @@ bench: setup  ## check the fast path against the oracle, then time it
 cuda: setup  ## compile the CUDA extension (needs nvcc; no GPU)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[cuda-build]'
 	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python -m cuda_ext.build
+
+emulate: setup  ## run the CUDA kernels' own source on the host, warp by warp: every law, training steps (minutes)
+	POP_EMULATED_LAWS=1 $(BIN)/python -m pytest -q tests/cuda/emulated
 
 gpu-check: cuda  ## build, hold the CUDA backend to every law, time it; one JSON file (needs a GPU)
 	$(BIN)/python -m cuda_ext.gpu_check $(or $(OUT),benchmarks/results/gpu_check.json)

@@ -31,6 +31,11 @@ class CudaMemoryError(RuntimeError):
     """The GPU has no room; the message says how much was asked for and what to lower."""
 
 
+def on_gpu(tensor: Tensor) -> bool:
+    """Tell whether kernels can read a tensor."""
+    return tensor.device.type == "cuda"
+
+
 def pointer(name: str, tensor: Tensor | None, dtype: torch.dtype = torch.float32) -> int:
     """Return a tensor's address, 0 for None.
 
@@ -39,7 +44,7 @@ def pointer(name: str, tensor: Tensor | None, dtype: torch.dtype = torch.float32
     """
     if tensor is None:
         return 0
-    if tensor.device.type != "cuda":
+    if not on_gpu(tensor):
         raise ValueError(f"{name} is on {tensor.device}; backend 'cuda' needs it on the GPU: use {name}.cuda()")
     if tensor.dtype != dtype:
         raise ValueError(f"{name} has dtype {tensor.dtype}; backend 'cuda' needs {dtype}")

@@ -201,6 +201,9 @@ void bind_functions(nb::module_& m) {
     m.def("end_step", [](const StepRecord& record, P state, P stream) {
         end_step(record, as_state(state), as_stream(stream));
     });
+    m.def("clear", [](P data, size_t bytes, P stream) {
+        POP_CUDA(cudaMemsetAsync(reinterpret_cast<void*>(data), 0, bytes, as_stream(stream)));
+    });
     // the newest CUDA that the driver knows, 0 where there is no driver
     m.def("driver_version", []() {
         int version = 0;

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from cuda_ext import arrays
 from pop_ref.constants import GSPLAT_1_5, Profile, profile_named
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -40,7 +41,7 @@ def check_tensor(name: str, tensor: Tensor | None, shape: tuple[int | None, ...]
     """
     if tensor is None:
         raise ValueError(f"{name} is missing")
-    if tensor.device.type != "cuda":
+    if not arrays.on_gpu(tensor):
         raise ValueError(f"{name} is on {tensor.device}; backend 'cuda' needs it on the GPU: use {name}.cuda()")
     if tensor.dtype != torch.float32:
         raise ValueError(f"{name} has dtype {tensor.dtype}; backend 'cuda' computes in float32: use {name}.float()")

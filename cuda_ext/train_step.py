@@ -210,13 +210,13 @@ class FusedTrainer:
         drawn = {"channels": 3, "records": self._records, "background": self._background, "image": frame.image}
         forward = fill(kernels.BlendForward(), **drawn, **shared)
         if phase.tells:
-            frame.told["dominant_counts"].zero_()
+            self._clear(frame.told["dominant_counts"])
             fill(forward, **frame.told, masks=self.views.masks, state=self.state)
         kernels.blend_forward(lists, forward, profile, stream)
         objective = self._objective(phase)
         kernels.photometric(self.views.photographs(), self._loss(frame, size), objective, state, stream)
         if not s.deterministic:
-            self._sums.zero_()
+            self._clear(self._sums)
         backward = fill(kernels.BlendBackward(), **drawn, **shared, absolute=False, v_image=frame.work["v_image"])
         fill(backward, v_T_final=None, rows=frame.work.get("rows"), sums=self._sums)
         backward.set_family(frame.lists.buckets, not s.deterministic)
@@ -227,6 +227,9 @@ class FusedTrainer:
             kernels.count_important(self.n, counts.data_ptr(), logits.data_ptr(), sums, state, stream)
         kernels.update(self._update(frame, size, phase), view, project, splats, state, stream)
         kernels.end_step(self._record(phase), state, stream)
+
+    def _clear(self, tensor: Tensor) -> None:
+        load().clear(tensor.data_ptr(), tensor.nbytes, stream_of(self.device))
 
     def _gaussians(self) -> Any:
         p = self.params

@@ -38,12 +38,11 @@ struct WarpTile {
     int part, parts;  // which of the warp tiles of that list tile this is
 };
 
-__device__ __forceinline__ int warp_tiles_x(const TileGrid& grid) {
-    return (grid.width + WARP_TILE_W - 1) / WARP_TILE_W;
-}
+// of whole list tiles, also where they stick out of the image: every part of a list's gradient slots has its warp
+__device__ __forceinline__ int warp_tiles_x(const TileGrid& grid) { return grid.tiles_x * (grid.tile_w / WARP_TILE_W); }
 
 inline int n_warp_tiles(const TileGrid& grid) {
-    return ((grid.width + WARP_TILE_W - 1) / WARP_TILE_W) * ((grid.height + WARP_TILE_H - 1) / WARP_TILE_H);
+    return grid.tiles_x * (grid.tile_w / WARP_TILE_W) * grid.tiles_y * (grid.tile_h / WARP_TILE_H);
 }
 
 __device__ __forceinline__ WarpTile warp_tile(const TileGrid& grid, int index) {

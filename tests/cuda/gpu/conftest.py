@@ -30,15 +30,19 @@ def rasterizer(family: str, deterministic: bool = True) -> Any:
     return draw
 
 
-@functools.cache
-def gpu_backends() -> list[Any]:
+def cuda_backends(device: str, name: str) -> list[Any]:
     from pop_ref.conformance.torch_adapter import TorchAdapter
 
+    kinds = {"columns": ("columns", True), "splats": ("splats", True), "atomics": ("columns", False)}
     return [
-        TorchAdapter("cuda32-columns", rasterizer("columns"), None, "float32", device="cuda"),
-        TorchAdapter("cuda32-splats", rasterizer("splats"), None, "float32", device="cuda"),
-        TorchAdapter("cuda32-atomics", rasterizer("columns", deterministic=False), None, "float32", device="cuda"),
+        TorchAdapter(f"{name}32-{kind}", rasterizer(family, deterministic), None, "float32", device=device)
+        for kind, (family, deterministic) in kinds.items()
     ]
+
+
+@functools.cache
+def gpu_backends() -> list[Any]:
+    return cuda_backends("cuda", "cuda")
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -60,3 +64,11 @@ def gpu() -> Any:
     if reason is not None:
         pytest.skip(reason)
     return torch.device("cuda")
+
+
+@pytest.fixture
+def hardware(gpu: Any) -> Any:
+    """Return the GPU as `pop train` finds it, or skip with the reason why there is none."""
+    from pop_fast.train.hardware import this_machine
+
+    return this_machine()

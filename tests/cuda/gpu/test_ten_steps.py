@@ -43,7 +43,7 @@ def _on_the_cpu(scene: TrainingScene):
             WIDTH, HEIGHT, sh_degree=3, packed=False, dominance=True,
         )  # fmt: skip
         loss = photometric_pop(image[0], scene.photographs[view].float() / 255.0)
-        losses.append(float(loss))
+        losses.append(loss.item())
         (loss + 0.001 * pop_loss(opacities, importance_mask(meta["dominant_counts"][0]))).backward()
         optimizer.step()
         optimizer.zero_grad()
@@ -67,6 +67,12 @@ def test_two_runs_give_the_same_bits(gpu):
     first, second = (_fused(training_scene(), gpu)[1] for _ in range(2))
     for name, value in first.items():
         assert torch.equal(value, second[name]), name
+
+
+def test_steps_launched_anew_are_the_replayed_steps(gpu):
+    replayed, launched = (_fused(training_scene(), gpu, replay=replay)[1] for replay in (True, False))
+    for name, value in replayed.items():
+        assert torch.equal(value, launched[name]), name
 
 
 def test_buffers_that_overflow_grow_and_nothing_is_lost(gpu):
@@ -105,6 +111,27 @@ def test_rasterization_and_its_gradients_give_the_same_bits_twice(gpu):
     for name, value in grads[0].items():
         assert bool(value.any()), f"{name} has no gradient"
         assert torch.equal(value, grads[1][name]), name
+
+
+@pytest.mark.parametrize("options", [{"counts": True}, {"profile": "inria"}])
+def test_lists_of_the_callers_tiles_go_back_as_the_warps_own_do(gpu, options):
+    from cuda_ext.ops import rasterization as on_gpu
+    from pop_fast.rasterization import rasterization as on_cpu
+
+    scene, grads = training_scene(), []
+    # 36 px: the last row of 16 px tiles is less than half full, so that a warp's part of it lies outside
+    for function, device, family in ((on_cpu, "cpu", {}), (on_gpu, gpu, {}), (on_gpu, gpu, {"family": "splats"})):
+        leaves = {name: value.to(device).requires_grad_() for name, value in scene.params.items()}
+        image, _, _ = function(
+            leaves["means"], leaves["quats"], leaves["scales"].exp(), torch.sigmoid(leaves["opacities"]),
+            leaves["sh0"], scene.viewmats.to(device), scene.Ks.to(device), WIDTH, HEIGHT, sh_degree=0, **options,
+            **family,
+        )  # fmt: skip
+        image.square().sum().backward()
+        grads.append({name: leaf.grad.cpu() for name, leaf in leaves.items() if leaf.grad is not None})
+    for found in grads[1:]:
+        for name, value in grads[0].items():
+            torch.testing.assert_close(found[name], value, rtol=1e-3, atol=1e-4 * float(value.abs().max()))
 
 
 @pytest.mark.parametrize("mode", ["D", "ED", "RGB+D", "RGB+ED"])

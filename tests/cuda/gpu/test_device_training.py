@@ -1,0 +1,134 @@
+"""`pop train --backend cuda` beside `--backend fast` on a tiny capture, and beside itself, interrupted."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from pop_fast.strategies import ADCStrategy, POPStrategy  # noqa: E402  torch first
+from pop_fast.train import Trainer  # noqa: E402
+from pop_fast.train import checkpoint as ckpt  # noqa: E402
+from pop_fast.train.device_trainer import DeviceTrainer  # noqa: E402
+from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config  # noqa: E402
+
+COMPARED = ("loss", "pop", "psnr", "d_ssim", "l1", "l2", "lr_means", "num_gaussians")
+STILL = {"refine_stop_iter": 0}
+
+
+def masked(capture):
+    mask = np.ones((HEIGHT, WIDTH), dtype=bool)
+    mask[:, 20:] = False
+    views = [dataclasses.replace(view, mask=mask if k != 2 else None) for k, view in enumerate(capture.views)]
+    return dataclasses.replace(capture, views=tuple(views))
+
+
+def mixed_sizes(capture):
+    small = dataclasses.replace(capture.views[2], image=np.ascontiguousarray(capture.views[2].image[:-5, :-3]))
+    return dataclasses.replace(capture, views=(*capture.views[:2], small, *capture.views[3:]))
+
+
+CASES = {
+    "plain": ({}, lambda capture: capture),
+    "masks": ({}, masked),
+    "sizes": ({}, mixed_sizes),
+    "background": ({"background": (0.25, 0.5, 1.0), "antialiased": True}, lambda capture: capture),
+    "losses": ({"l2_stop_iter": 4, "d_ssim_halved": True, "ssim_padding": "same"}, lambda capture: capture),
+    "inria": ({"profile": "inria", "photometric_divisor": 2.0}, lambda capture: capture),
+    "gsplat": ({"profile": "gsplat_1_6", "sh_interval": 2}, lambda capture: capture),
+}
+
+
+def records(folder):
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_steps_are_the_cpus_under_every_setting(hardware, case, tmp_path):
+    changes, edit = CASES[case]
+    # a population that stays, and rates at which rounding does not grow
+    settings = {"max_steps": 8, "log_every": 1, "pop": POPStrategy(**STILL, pop_stop_iter=6), "checkpoint_every": 0}
+    capture = edit(tiny_capture())
+    rates = replace(tiny_config("x").lr, quats=0.0)
+    expected = Trainer(tiny_config(tmp_path / "cpu", lr=rates, **settings, **changes), capture).run()
+    on_gpu = tiny_config(tmp_path / "gpu", lr=rates, **settings, **changes)
+    found = DeviceTrainer(on_gpu, capture, hardware=hardware).run()
+    for ours, theirs in zip(records(tmp_path / "gpu"), records(tmp_path / "cpu"), strict=True):
+        assert ours.pop("view") == theirs.pop("view")
+        compared = {key: value for key, value in theirs.items() if key in COMPARED}
+        assert {key: ours.get(key, 0.0) for key in compared} == pytest.approx(compared, rel=2e-3), (case, ours["step"])
+    assert found["psnr"] == pytest.approx(expected["psnr"], abs=0.02)
+    assert found["n_blended"] == pytest.approx(expected["n_blended"], rel=0.02)
+
+
+@pytest.mark.parametrize("method", ["pop", "adc"])
+def test_events_come_when_the_cpus_come_and_change_about_as_many(hardware, method, tmp_path):
+    Trainer(tiny_config(tmp_path / "cpu", method=method), tiny_capture()).run()
+    DeviceTrainer(tiny_config(tmp_path / "gpu", method=method), tiny_capture(), hardware=hardware).run()
+    ours, theirs = ([r for r in records(tmp_path / name) if "cloned" in r] for name in ("gpu", "cpu"))
+    assert [event["step"] for event in ours] == [event["step"] for event in theirs]
+    first, wanted = ours[0], theirs[0]
+    for key in ("cloned", "split", "pruned", "num_gaussians"):
+        assert abs(first[key] - wanted[key]) <= 2, key
+    assert ours[-1]["num_gaussians"] == pytest.approx(theirs[-1]["num_gaussians"], rel=0.2)
+    assert [event.get("reset") for event in ours] == [event.get("reset") for event in theirs]
+
+
+@pytest.mark.parametrize("method", ["pop", "adc"])
+def test_an_interrupted_run_goes_on_to_the_same_bits(hardware, method, tmp_path, monkeypatch):
+    settings = {"method": method, "adc": replace(tiny_config("x").adc, reset_every=7)}
+    DeviceTrainer(tiny_config(tmp_path / "whole", **settings), tiny_capture(), hardware=hardware).run()
+    for stop_after in (8, 16, 23):
+        trainer = DeviceTrainer(
+            tiny_config(tmp_path / "parts", **settings), tiny_capture(), hardware=hardware, resume=stop_after > 8
+        )
+        advance = trainer._advance
+
+        def stepping(bar, trainer=trainer, advance=advance, stop_after=stop_after):
+            if trainer.step >= stop_after:
+                raise KeyboardInterrupt
+            advance(bar)
+
+        monkeypatch.setattr(trainer, "_advance", stepping)
+        with pytest.raises(KeyboardInterrupt):
+            trainer.run()
+    config = tiny_config(tmp_path / "parts", **settings)
+    DeviceTrainer(config, tiny_capture(), hardware=hardware, resume=True).run()
+    ours, theirs = (ckpt.load_checkpoint(ckpt.checkpoint_path(tmp_path / name, 29)) for name in ("parts", "whole"))
+    for key, value in theirs["splats"].items():
+        assert torch.equal(ours["splats"][key], value), key
+        for name, moment in theirs["optimizers"][key].items():
+            assert torch.equal(ours["optimizers"][key][name], moment), (key, name)
+
+
+def test_buffers_that_overflow_between_views_of_several_sizes_lose_nothing(hardware, tmp_path, monkeypatch):
+    from cuda_ext import train_step
+
+    capture = mixed_sizes(tiny_capture())
+    whole = DeviceTrainer(tiny_config(tmp_path / "whole"), capture, hardware=hardware)
+    whole.run()
+    monkeypatch.setattr(train_step, "FIRST_GUESS", (0, 1))
+    cramped = DeviceTrainer(tiny_config(tmp_path / "cramped"), capture, hardware=hardware)
+    assert cramped.run()["instance_buffers_grown"] > 0
+    for key, value in whole.params.items():
+        assert torch.equal(cramped.params[key], value), key
+
+
+def test_a_number_that_is_not_finite_is_found_on_the_device(hardware, tmp_path):
+    trainer = DeviceTrainer(tiny_config(tmp_path, adc=ADCStrategy()), tiny_capture(), hardware=hardware)
+    change = trainer._change
+
+    def poisoned(step):
+        found = change(step)
+        if step == 4:
+            trainer.params["quats"].data[7, 2] = float("nan")
+        return found
+
+    trainer._change = poisoned
+    with pytest.raises(ValueError, match=r"quats\[7, 2\] is nan after 5 steps; the latest checkpoint is kept"):
+        trainer.run()
