@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -88,25 +89,81 @@ def check_scene(
     return per_camera
 
 
-def check_values(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> None:
-    """Check values; three small reductions on the GPU and one synchronisation.
+def check_values(scene: Mapping[str, Tensor], viewmats: Tensor, Ks: Tensor) -> None:
+    """Check values; a few reductions on the GPU and one synchronisation.
+
+    Args:
+        scene: means, quats, scales, opacities and colors.
+        viewmats: [C, 4, 4]
+        Ks: [C, 3, 3]
 
     Raises:
         ValueError: names the tensor and the index.
     """
-    rules = (
-        ("means", means, ~torch.isfinite(means), "must be finite"),
-        (
-            "quats",
-            quats,
-            ~(quats.abs().sum(1) > 0.0) | ~torch.isfinite(quats).all(1),
-            "must be finite, with a norm > 0",
+    rules = [*_scene_rules(**scene), *_camera_rules(viewmats.detach(), Ks.detach())]
+    found = torch.stack([rule.suspicious() for rule in rules]).tolist()
+    for wrong, rule in zip(found, rules, strict=True):
+        bad = rule.bad().nonzero() if wrong else None
+        if bad is not None and len(bad):
+            index = bad[0].tolist()
+            raise ValueError(f"{rule.name}{index} is {rule.tensor.detach()[tuple(index)].tolist()}; it {rule.words}")
+
+
+@dataclass(frozen=True)
+class _Rule:
+    """A tensor, which of its entries or rows are bad, and what it must be; `quick` asks whether any may be."""
+
+    name: str
+    tensor: Tensor
+    bad: Callable[[], Tensor]
+    words: str
+    quick: Callable[[], Tensor] | None = None
+
+    def suspicious(self) -> Tensor:
+        return self.bad().any() if self.quick is None else self.quick()
+
+
+def _scene_rules(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor) -> list[_Rule]:
+    def no_rotation() -> Tensor:
+        return ~(quats.abs().sum(1) > 0.0) | ~torch.isfinite(quats).all(1)
+
+    # a sum is one pass without a mask of colours' size, and only a suspicious one is looked at closely
+    quick = partial(_sum_is_not_finite, colors.detach())
+    return [
+        _Rule("means", means, lambda: ~torch.isfinite(means), "must be finite"),
+        _Rule("quats", quats, no_rotation, "must be finite, with a norm > 0"),
+        _Rule(
+            "scales", scales, lambda: ~(scales >= 0.0) | torch.isinf(scales), "must be >= 0 and finite; not logarithms"
         ),
-        ("scales", scales, ~(scales >= 0.0) | torch.isinf(scales), "must be >= 0 and finite; not logarithms"),
-        ("opacities", opacities, ~((opacities >= 0.0) & (opacities <= 1.0)), "must be in [0, 1]"),
-    )
-    found = torch.stack([bad.any() for _, _, bad, _ in rules]).tolist() if len(means) else [False]
-    for wrong, (name, tensor, bad, rule) in zip(found, rules, strict=False):
-        if wrong:
-            index = bad.nonzero()[0].tolist()
-            raise ValueError(f"{name}{index} is {tensor.detach()[tuple(index)].tolist()}; it {rule}")
+        _Rule("opacities", opacities, lambda: ~((opacities >= 0.0) & (opacities <= 1.0)), "must be in [0, 1]"),
+        _Rule("colors", colors, lambda: ~torch.isfinite(colors), "must be finite", quick),
+    ]
+
+
+def _camera_rules(viewmats: Tensor, Ks: Tensor) -> list[_Rule]:
+    R = viewmats[:, :3, :3]
+
+    def not_rigid() -> Tensor:
+        # products of rows: no matrix library, which torch's deterministic mode would have an opinion on
+        products = (R[:, :, None, :] * R[:, None, :, :]).sum(-1)
+        off = (products - torch.eye(3, device=R.device)).abs().amax((-1, -2))
+        right_handed = (torch.linalg.cross(R[:, 0], R[:, 1]) * R[:, 2]).sum(-1) > 0.0
+        return ~((off < 1e-3) & right_handed & torch.isfinite(viewmats).all(-1).all(-1))
+
+    def not_last() -> Tensor:
+        return (viewmats[:, 3] != torch.tensor([0.0, 0.0, 0.0, 1.0], device=R.device)).any(-1)
+
+    def not_pinhole() -> Tensor:
+        skew = (Ks[:, 0, 1] != 0.0) | (Ks[:, 1, 0] != 0.0) | (Ks[:, 2, :2] != 0.0).any(-1) | (Ks[:, 2, 2] != 1.0)
+        return skew | ~(Ks[:, 0, 0] > 0.0) | ~(Ks[:, 1, 1] > 0.0) | ~torch.isfinite(Ks).all(-1).all(-1)
+
+    pinhole = "must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with finite fx, fy > 0; skew is not supported"
+    return [
+        _Rule("viewmats", viewmats, not_rigid, "must be rigid: an orthonormal 3x3 rotation with determinant +1"),
+        _Rule("viewmats", viewmats, not_last, "must end in the row [0, 0, 0, 1]"),
+        _Rule("Ks", Ks, not_pinhole, pinhole),
+    ]
+
+
+def _sum_is_not_finite(tensor: Tensor) -> Tensor:
+    return ~torch.isfinite(tensor.sum())

@@ -79,7 +79,8 @@ def rasterization(
     per_camera = check_scene(means, quats, scales, opacities, colors, sh_degree, n_cameras)
     assert quats is not None
     assert scales is not None
-    check_values(means, quats, scales, opacities)
+    scene = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
+    check_values(scene, viewmats, Ks)
     if backgrounds is not None:
         check_tensor("backgrounds", backgrounds, (n_cameras, 3 if sh_degree is not None else colors.shape[-1]))
     settings = Settings(
@@ -95,6 +96,5 @@ def rasterization(
         deterministic,
     )
     call = Call(settings, render_mode, packed)
-    scene = (means, quats, scales, opacities)
-    images = call.project(scene, colors, per_camera, viewmats, Ks)
+    images = call.project((means, quats, scales, opacities), colors, per_camera, viewmats, Ks)
     return call.blend(images, len(means), backgrounds, dominance, counts)

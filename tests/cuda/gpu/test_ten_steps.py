@@ -156,14 +156,27 @@ def test_every_render_mode_is_the_cpus(gpu, mode, packed):
         assert torch.equal(found[2][key].cpu(), expected[2][key]), key
 
 
-def test_a_row_that_is_not_finite_is_named(gpu):
+@pytest.mark.parametrize(
+    ("name", "index", "value", "words"),
+    [
+        ("means", (7, 1), float("nan"), r"means\[7, 1\] is nan; it must be finite"),
+        ("quats", (3, slice(None)), 0.0, r"quats\[3\] is \[0.0, .*\]; it must be finite, with a norm > 0"),
+        ("scales", (2, 0), -1.0, r"scales\[2, 0\] is -1.0; it must be >= 0"),
+        ("opacities", (5,), 1.5, r"opacities\[5\] is 1.5; it must be in \[0, 1\]"),
+        ("colors", (4, 0, 2), float("inf"), r"colors\[4, 0, 2\] is inf; it must be finite"),
+        ("viewmats", (1, 0, 0), 2.0, r"viewmats\[1\] is .*; it must be rigid"),
+        ("viewmats", (2, 3, 0), 0.5, r"viewmats\[2\] is .*; it must end in the row"),
+        ("Ks", (0, 0, 1), 0.5, r"Ks\[0\] is .*; skew is not supported"),
+    ],
+)
+def test_a_bad_value_is_named_with_its_index(gpu, name, index, value, words):
     from cuda_ext.ops import rasterization
 
     scene = training_scene()
-    p = {name: value.to(gpu) for name, value in scene.params.items()}
-    p["means"][7, 1] = float("nan")
-    with pytest.raises(ValueError, match=r"means\[7, 1\] is nan"):
-        rasterization(
-            p["means"], p["quats"], p["scales"].exp(), torch.sigmoid(p["opacities"]), p["sh0"],
-            scene.viewmats.to(gpu), scene.Ks.to(gpu), WIDTH, HEIGHT, sh_degree=0,
-        )  # fmt: skip
+    p = {key: tensor.to(gpu).clone() for key, tensor in scene.params.items()}
+    p |= {"scales": p["scales"].exp(), "opacities": torch.sigmoid(p["opacities"]), "colors": p.pop("sh0")}
+    p |= {"viewmats": scene.viewmats.to(gpu).clone(), "Ks": scene.Ks.to(gpu).clone()}
+    del p["shN"]
+    p[name][index] = value
+    with pytest.raises(ValueError, match=words):
+        rasterization(**p, width=WIDTH, height=HEIGHT, sh_degree=0)
