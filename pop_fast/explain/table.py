@@ -99,7 +99,8 @@ def _folded(rows: Sequence[Row]) -> Iterator[str]:
 
 def _below(e: PixelExplanation) -> Iterator[str]:
     yield "* dominant (D8)   ^ clamped to the ceiling (D6)   G falloff   raw o G   dL/do: through this pixel alone"
-    yield "descent moves against dL/do: a negative one raises the opacity. POP: where it moves it, and |dL_POP/do|"
+    where = " POP: where it moves it, and |dL_POP/do|" if e.lambda_pop else ""
+    yield f"descent moves against dL/do: a negative one raises the opacity.{where}"
     for text in (_about_dominant(e), *_about_pop(e)):
         yield from wrap(text, WIDTH)
 
@@ -108,10 +109,10 @@ def _about_dominant(e: PixelExplanation) -> str:
     row = next((row for row in e.rows if row.dominant), None)
     if row is None:
         return "nothing is blended here, so no Gaussian dominates"
+    prior = f" and POP's {row.v_opacity_pop:+.1e}" if e.lambda_pop else ""
     return (
         f"#{row.rank} dominates here and at {row.pixels_dominated:,} pixels of the view; over the whole view its "
-        f"photometric dL/do is {row.v_opacity_view:+.1e} and POP's {row.v_opacity_pop:+.1e}: opacity {row.opacity:.4f} "
-        f"goes {row.net}"
+        f"photometric dL/do is {row.v_opacity_view:+.1e}{prior}: opacity {row.opacity:.4f} goes {row.net}"
     )
 
 
