@@ -1,11 +1,10 @@
-"""The written list of laws and mutants: `python -m pop_ref.conformance.catalogue > pop_ref/conformance/LAWS.md`."""
+"""The written list of laws: `python -m pop_ref.conformance.catalogue > pop_ref/conformance/LAWS.md`."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from pop_ref.conformance.law import STAGES
-from pop_ref.conformance.mutants import MUTANTS
 from pop_ref.conformance.mutants.trial import every_law
 
 FILE = Path(__file__).with_name("LAWS.md")
@@ -19,10 +18,33 @@ pytest --pyargs pop_ref.conformance --rasterizer my.module:rasterization --profi
 ```
 
 `--rasterizer` names a function with gsplat's signature, `--stages` a package whose modules carry the oracle's function
-names; either will do. `--stage compositing` keeps the laws of one stage, `--dtype float64` charges double precision,
-`--failures DIR` saves the scene of every broken law. `HYPOTHESIS_PROFILE` is `dev`, `ci` or `thorough`. What an
-implementation does not offer is skipped by name. A failing law prints the first stage, Gaussian and pixel that differ,
-the values on both sides, the nearest decision with its margin, and a scene to paste.
+names, `--adapter` a class derived from `pop_ref.conformance.Adapter`, for single stages or another signature, and
+`--backend` an adapter that comes with the kit: oracle, fast64, fast32, mirror64, mirror32, cuda, gsplat,
+gsplat-torch64, gsplat-torch32, diff-gaussian-rasterization; what is not installed is skipped with the reason.
+
+`--profile` says which constants a rasterizer has; `--dtype float64` charges double precision; `--stage compositing`
+keeps the laws of one stage. `HYPOTHESIS_PROFILE` is `dev`, `ci` or `thorough`. What an implementation does not offer is
+skipped by name. A failing law prints the first stage, Gaussian, pixel or gradient that differs, the values on both
+sides, the nearest decision with its margin, and a scene to paste, which is also saved as npz (`--failures DIR`).
+`--scorecard card.html`, or `.json`, sums up by stage.
+
+An adapter defines what there is, under the oracle's names, on arrays. With `composite` alone the oracle projects and
+lists the splats of whole scenes; a stage function such as `project_means` is judged by its own laws.
+
+```python
+import numpy as np
+from pop_ref.conformance import Adapter
+
+
+class Mine(Adapter):  # pytest --pyargs pop_ref.conformance --adapter my.module:Mine --stage compositing
+    name, dtype = "mine", np.float32
+
+    def composite(self, splats, lists, width, height, tile_size, background, profile):
+        return my_blend(...)  # anything with image [H, W, 3] and T_final [H, W]
+```
+
+Programs in other languages: `pop vectors export DIR` writes scenes with all that is expected of them, and
+`DIR/index.json` explains every array and how it is compared; `pop vectors check DIR RESULTS` does the comparing.
 
 Numbers are compared in units of eps times a magnitude that is computed from absolute values (`tolerances.py` has every
 tolerance beside the worst case that was measured); integers exactly; at a threshold a backend must equal one of the
@@ -37,15 +59,7 @@ def catalogue() -> str:
     for stage in STAGES:
         names = sorted(law.name for law in laws if law.stage == stage)
         parts.append(f"### {stage}\n\n" + "\n".join(f"- {name.replace('_', ' ')}" for name in names) + "\n")
-    parts.append(f"## {len(MUTANTS)} mutants\n\nBroken copies of the oracle, one line each, from bugs that happened.\n")
-    rows = [
-        f"| {m.name.replace('_', ' ')} | {m.story} | `{m.file}` | {m.law.partition(':')[2].replace('_', ' ')} |"
-        for m in MUTANTS
-    ]
-    parts.append(
-        "\n".join(["| mutant | what happened | file | killed by the law |", "| --- | --- | --- | --- |", *rows])
-    )
-    return "\n".join(parts) + "\n"
+    return "\n".join(parts)
 
 
 if __name__ == "__main__":

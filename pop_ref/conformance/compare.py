@@ -57,4 +57,4 @@ def assert_same_bits(what: str, actual: Any, expected: Any) -> None:
 
 def _first(wrong: Any, actual: Any, expected: Any) -> str:
     where = tuple(int(i) for i in np.argwhere(wrong)[0])
-    return f"first at {list(where)}: got {actual[where]!r}, expected {expected[where]!r}"
+    return f"first at {list(where)}: got {actual[where].item()!r}, expected {expected[where].item()!r}"

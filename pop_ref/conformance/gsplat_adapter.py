@@ -1,12 +1,14 @@
 """Adapters for gsplat 1.5: its CUDA rasterizer, and the stage functions in plain torch that its tests compare with.
 
 gsplat's torch functions run on a CPU. They are its private reference, so their names may move between versions; the
-adapter was written against 1.5.3. Their extents leave out the opacity, so footprint and culling are not judged.
+adapter was written against 1.5.3. Their extents leave out the opacity, so culling is not judged; conics and the
+antialiasing's factors are read from the fused projection of splats that a unit camera sees straight on.
 """
 
 from __future__ import annotations
 
 import importlib
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -38,6 +40,34 @@ def torch_stages() -> dict[str, Callable[..., Any]]:
     def project_means(means_cam: Any, K: Any, width: int, height: int, profile: Profile | None = None) -> Any:
         return impl._persp_proj(means_cam[None], _identities(means_cam)[None], K[None], width, height)[0][0]
 
+    def conics_from_covars2d(covars2d: Any) -> Any:
+        return _seen_straight_on(covars2d, 0.0)[3][0]
+
+    def compensations(covars2d: Any, eps2d: float) -> Any:
+        return _seen_straight_on(covars2d, eps2d)[4][0]
+
+    def _seen_straight_on(covars2d: Any, eps2d: float) -> Any:
+        # at depth 1 on the axis of a camera of focal length 1 the Jacobian drops z and changes nothing else
+        n, like = len(covars2d), {"dtype": covars2d.dtype, "device": covars2d.device}
+        means = torch.tensor([[0.0, 0.0, 1.0]], **like).expand(n, 3)
+        covars = torch.nn.functional.pad(covars2d, (0, 1, 0, 1))
+        camera = (torch.eye(4, **like)[None], torch.eye(3, **like)[None], 2, 2)
+        return impl._fully_fused_projection(means, covars, *camera, eps2d=eps2d, calc_compensations=True)
+
+    def tile_lists(
+        means2d: Any,
+        radii: Any,
+        depths: Any,
+        width: int,
+        height: int,
+        tile_size: int,
+        profile: Profile | None = None,
+    ) -> Any:
+        grid = (-(-width // tile_size), -(-height // tile_size))
+        _, keys, ids = impl._isect_tiles(means2d[None], radii[None], depths[None], tile_size, *grid)
+        starts = impl._isect_offset_encode(keys, 1, *grid).flatten().tolist()
+        return [ids[a:b].tolist() for a, b in itertools.pairwise([*starts, len(ids)])]
+
     def _identities(means: Any) -> Any:
         return torch.eye(3, dtype=means.dtype, device=means.device).expand(len(means), 3, 3)
 
@@ -49,6 +79,9 @@ def torch_stages() -> dict[str, Callable[..., Any]]:
         "means_cam_from_means": means_cam_from_means,
         "covars_cam_from_covars": covars_cam_from_covars,
         "project_means": project_means,
+        "conics_from_covars2d": conics_from_covars2d,
+        "compensations": compensations,
+        "tile_lists": tile_lists,
     }
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,10 @@ import pytest
 
 LAWS = "pop_ref.conformance.laws"
 FAILURES = "conformance_failures"
+# the lines of a failure's report that say what differs first (`telling`)
+TOLD = re.compile(
+    r"^E +((?:first|nearest|no) (?:stage|pixel|Gaussian|gradient|decision)\b.*|saved as .*)$", re.MULTILINE
+)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -164,14 +169,15 @@ class _Recorder:
         named: Any = dict(report.user_properties).get("law")
         if named is None or not (report.when == "call" or report.skipped or report.failed):
             return
-        detail = ""
+        detail, told = "", ()
         if report.skipped and isinstance(report.longrepr, tuple):
             detail = str(report.longrepr[2]).removeprefix("Skipped: ")
         elif report.failed:
             crash = getattr(report.longrepr, "reprcrash", None)
             detail = str(crash.message if crash else report.longrepr).splitlines()[0]
+            told = tuple(TOLD.findall(report.longreprtext))
         backend, stage, law = named
-        self.card.entries.append(Entry(backend, stage, law, report.outcome, detail, report.duration))
+        self.card.entries.append(Entry(backend, stage, law, report.outcome, detail, report.duration, told))
 
     def pytest_sessionfinish(self) -> None:
         self.card.write(self.path)

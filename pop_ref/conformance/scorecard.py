@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import html
+import contextlib
 import json
-from dataclasses import asdict, dataclass, field
+import os
+import platform
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,7 @@ class Entry:
         outcome: passed, failed or skipped.
         detail: the first line of the failure, or why it was skipped.
         seconds: how long it took.
+        told: of a failure, what differs first and where, a line each.
     """
 
     backend: str
@@ -28,6 +32,7 @@ class Entry:
     outcome: str
     detail: str
     seconds: float
+    told: tuple[str, ...] = ()
 
 
 @dataclass
@@ -52,49 +57,27 @@ class Scorecard:
 
     def write(self, path: Path) -> None:
         """Write JSON, or a page if the name ends in .html."""
-        text = self.as_page() if path.suffix == ".html" else json.dumps(self.as_dict(), indent=1)
+        from pop_ref.conformance.scorecard_page import page
+
+        text = page(self) if path.suffix == ".html" else json.dumps(self.as_dict(), indent=1)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text + "\n", encoding="utf-8")
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what the JSON file holds."""
-        return {"title": self.title, "summary": self.summary(), "laws": [asdict(entry) for entry in self.entries]}
-
-    def as_page(self) -> str:
-        """Return a page that needs nothing else: a table a backend, stages as rows, and the failures below it."""
-        parts = [_HEAD.format(title=html.escape(self.title))]
-        for backend, stages in self.summary().items():
-            parts.append(
-                f"<h2>{html.escape(backend)}</h2><table><tr><th>stage<th>laws obeyed<th>broken<th>skipped</tr>"
-            )
-            for stage, count in stages.items():
-                judged = count["passed"] + count["failed"]
-                kind = "bad" if count["failed"] else "none" if not judged else "good"
-                parts.append(
-                    f"<tr class={kind}><td>{stage}<td>{count['passed']} of {judged}<td>{count['failed'] or ''}"
-                    f"<td>{count['skipped'] or ''}</tr>"
-                )
-            parts.append("</table>")
-            parts += self._details(backend)
-        return "\n".join(parts)
-
-    def _details(self, backend: str) -> list[str]:
-        parts = []
-        for outcome, heading in (("failed", "Broken"), ("skipped", "Skipped")):
-            chosen = [e for e in self.entries if e.backend == backend and e.outcome == outcome]
-            if chosen:
-                rows = [f"<li>{_sentence(e.law)} <small>{html.escape(e.detail)}</small></li>" for e in chosen]
-                parts += [f"<details><summary>{heading}: {len(chosen)}</summary><ul>", *rows, "</ul></details>"]
-        return parts
+        """Return what the JSON file holds: counts, and by backend and stage what came of each law."""
+        laws: dict[str, dict[str, dict[str, str]]] = {}
+        for entry in sorted(self.entries, key=lambda e: STAGES.index(e.stage)):
+            told = f"{entry.outcome}: {entry.detail}" if entry.detail else entry.outcome
+            laws.setdefault(entry.backend, {}).setdefault(entry.stage, {})[entry.law] = told
+        seconds = round(sum(entry.seconds for entry in self.entries))
+        made = {**versions(), "seconds": seconds}
+        return {"title": self.title, "made": made, "summary": self.summary(), "laws": laws}
 
 
-def _sentence(law: str) -> str:
-    return html.escape(law.replace("_", " "))
-
-
-_HEAD = """<!doctype html><html lang=en><meta charset=utf-8><title>{title}</title><style>
-body{{font:16px/1.5 system-ui,sans-serif;max-width:52rem;margin:2rem auto;padding:0 1rem;color:#222}}
-table{{border-collapse:collapse}} td,th{{padding:.2rem .9rem;text-align:left;border-bottom:1px solid #ddd}}
-.good td:first-child{{border-left:4px solid #2a7}} .bad td:first-child{{border-left:4px solid #c33}}
-.none{{color:#888}} small{{color:#777}} h2{{margin-top:2rem}}
-</style><h1>{title}</h1>"""
+def versions() -> dict[str, str]:
+    """Return what the laws ran with: how many examples, and the versions of what is installed."""
+    found = {"hypothesis profile": os.environ.get("HYPOTHESIS_PROFILE", "dev"), "python": platform.python_version()}
+    for package in ("pop-splatting", "numpy", "hypothesis", "torch", "gsplat", "diff-gaussian-rasterization"):
+        with contextlib.suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
