@@ -46,8 +46,9 @@ cuda: setup  ## compile the CUDA extension (needs nvcc; no GPU)
 emulate: setup  ## run the CUDA kernels' own source on the host, warp by warp: every law, training steps (minutes)
 	POP_EMULATED_LAWS=1 $(BIN)/python -m pytest -q tests/cuda/emulated
 
-gpu-check: cuda  ## build, hold the CUDA backend to every law, time it; one JSON file (needs a GPU)
-	$(BIN)/python -m cuda_ext.gpu_check $(or $(OUT),benchmarks/results/gpu_check.json)
+gpu-check: cuda  ## every law, times, training on CAPTURES="a b"; one JSON file, a stage at a time (needs a GPU)
+	$(BIN)/python -m cuda_ext.gpu_check $(or $(OUT),benchmarks/results/gpu_check.json) \
+		$(if $(STAGES),--stages $(STAGES)) $(if $(CAPTURES),--captures $(CAPTURES))
 
 docs-check: setup  ## fail when a table, name, path or command in README.md is no longer true
 	$(BIN)/python -m pytest -q tests/meta/test_readme.py
