@@ -27,7 +27,7 @@ from cuda_ext.host_mirror import find_compiler
 HERE, CUDA_EXT = Path(__file__).parent, Path(cuda_ext.__file__).parent
 # _setjmp and _longjmp switch fibers, which a fortified longjmp takes for an accident
 FLAGS = ("-std=c++17", "-O1", "-fPIC", "-shared", "-ffp-contract=off", "-fno-strict-aliasing", "-U_FORTIFY_SOURCE")
-# more flags, a sanitizer's for one: POP_EMULATED_FLAGS="-fsanitize=address --param asan-stack=0", with libasan preloaded
+# more flags: POP_EMULATED_FLAGS="-fsanitize=address --param asan-stack=0", with libasan preloaded, watches every access
 FLAGS += tuple(os.environ.get("POP_EMULATED_FLAGS", "").split())
 FLAGS += ("-fvisibility=hidden", "-Wno-attributes", '-DPOP_CUDA_ARCHS="emulated"')
 _LAUNCH = re.compile(r"([A-Za-z_]\w*(?:<[\w\s,:]*>)?)\s*<<<")
