@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import importlib.util
 import re
 import subprocess
 import sys
@@ -236,3 +237,11 @@ def test_a_broken_chapter_ends_the_command_with_one_line(
     assert main([str(tmp_path / "pages")]) == 2
     assert capsys.readouterr().err.startswith("chapter_01_small.py:27: AssertionError")
     assert list((tmp_path / "pages").iterdir()) == []
+
+
+def test_what_is_not_installed_is_named(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "latex2mathml" else found(name))
+    assert main(["anywhere"]) == 2
+    assert capsys.readouterr().err == "latex2mathml missing; pip install 'pop-splatting[walkthrough]'\n"
+    assert not Path("anywhere").exists()
