@@ -1,10 +1,32 @@
-"""What an implementation may be able to do beside single stage functions; a law that needs more is skipped by name."""
+"""The stages that laws speak of, and what an implementation may be able to do beside single stage functions.
+
+A law that needs more than an implementation offers is skipped by name.
+"""
 
 from __future__ import annotations
 
 from typing import Final
 
 from pop_ref.constants import GSPLAT_1_6, INRIA, Profile
+
+STAGES: Final = (
+    "activations",
+    "covariance",
+    "harmonics",
+    "camera",
+    "projection",
+    "footprint",
+    "tiles",
+    "alpha",
+    "compositing",
+    "dominance",
+    "gradients",
+    "whole",
+    "losses",
+    "polarization",
+    "density",
+    "optimizer",
+)
 
 RENDER: Final = "render"
 GRADIENTS: Final = "gradients"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pop_ref.conformance.law import STAGES
+from pop_ref.conformance.abilities import STAGES
 from pop_ref.conformance.mutants.trial import every_law
 
 FILE = Path(__file__).with_name("LAWS.md")

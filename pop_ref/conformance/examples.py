@@ -8,7 +8,13 @@ EXAMPLES = {"dev": 25, "ci": 50, "thorough": 500}
 
 
 def load_profile(name: str) -> None:
-    """Register the profiles and choose one; `ci` draws the same examples every time."""
+    """Register the profiles and choose one; `ci` draws the same examples every time.
+
+    Raises:
+        ValueError: there is no such profile.
+    """
+    if name not in EXAMPLES:
+        raise ValueError(f"HYPOTHESIS_PROFILE is {name!r}; use one of {', '.join(EXAMPLES)}")
     checks = [HealthCheck.too_slow, HealthCheck.data_too_large]
     for each, count in EXAMPLES.items():
         settings.register_profile(

@@ -10,26 +10,8 @@ from typing import Any
 from hypothesis import given
 from hypothesis.errors import HypothesisException
 
+from pop_ref.conformance.abilities import STAGES
 from pop_ref.conformance.scenes import Scene
-
-STAGES = (
-    "activations",
-    "covariance",
-    "harmonics",
-    "camera",
-    "projection",
-    "footprint",
-    "tiles",
-    "alpha",
-    "compositing",
-    "dominance",
-    "gradients",
-    "whole",
-    "losses",
-    "polarization",
-    "density",
-    "optimizer",
-)
 
 
 def _tell(name: str, backend: Any, scenes: dict[str, Scene]) -> str:

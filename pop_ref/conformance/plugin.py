@@ -15,6 +15,8 @@ from typing import Any
 
 import pytest
 
+from pop_ref.conformance.abilities import STAGES
+
 LAWS = "pop_ref.conformance.laws"
 FAILURES = "conformance_failures"
 # the lines of a failure's report that say what differs first (`telling`)
@@ -39,7 +41,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--device", default="cpu", help="torch device of --rasterizer")
     group.addoption("--profile", default="paper", help="constants that --rasterizer implements, default paper")
     group.addoption("--backend", action="append", default=[], help="judge an adapter that comes with the kit, by name")
-    group.addoption("--stage", action="append", default=[], help="only the laws of this stage; may be repeated")
+    group.addoption(
+        "--stage", action="append", default=[], choices=STAGES, help="only the laws of this stage; may be repeated"
+    )
     group.addoption("--scorecard", metavar="FILE", help="write a summary by stage, as .json or .html")
     group.addoption(
         "--failures",
@@ -56,9 +60,17 @@ def pytest_configure(config: pytest.Config) -> None:
     if _chosen(config):
         from pop_ref.conformance.examples import load_profile
 
-        load_profile(os.environ.get("HYPOTHESIS_PROFILE", "dev"))
+        try:
+            load_profile(os.environ.get("HYPOTHESIS_PROFILE", "dev"))
+        except ValueError as error:
+            raise pytest.UsageError(str(error)) from error
     if config.getoption("--scorecard"):
         config.pluginmanager.register(_Recorder(config), "pop-conformance-scorecard")
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Make the backends that the options name, so that a wrong name is one line and not an error in every file."""
+    _chosen_backends(session.config)
 
 
 def _chosen(config: pytest.Config) -> str:

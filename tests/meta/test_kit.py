@@ -195,10 +195,33 @@ def test_a_session_that_judges_nothing_is_left_alone(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_the_kit_refuses_what_it_cannot_judge() -> None:
-    done = _kit("--rasterizer", "no.such.module:f", "--stage", "camera")
-    assert done.returncode != 0
-    assert "no.such" in done.stdout + done.stderr or "needs no" in done.stdout + done.stderr
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--rasterizer", "no_such.module:f"), "no_such.module:f needs no_such, which is not installed"),
+        (("--rasterizer", "numpy"), "'numpy' must be written module:name, as my.module:rasterization"),
+        (("--rasterizer", "math:exp", "--profile", "gsplat_2"), "profile 'gsplat_2' is unknown; use one of paper"),
+        (("--adapter", "pathlib:Path"), "pathlib:Path makes no adapter: it has no dtype"),
+        (("--backend", "gsplt"), "backend 'gsplt' is unknown; use one of oracle, fast64"),
+        (("--stage", "order"), "invalid choice: 'order' (choose from"),
+    ],
+    ids=lambda value: value[1] if isinstance(value, tuple) else None,
+)
+def test_the_kit_refuses_what_it_cannot_judge(words: tuple[str, ...], said: str) -> None:
+    done = _kit(*words, "-k", "grid")
+    assert done.returncode == 4, done.stdout + done.stderr
+    assert said in done.stdout + done.stderr
+    assert len((done.stdout + done.stderr).strip().splitlines()) < 8
+
+
+def test_a_backend_that_is_not_here_is_skipped_with_the_reason(tmp_path: Path) -> None:
+    card = tmp_path / "card.json"
+    done = _kit("--backend", "diff-gaussian-rasterization", "--stage", "dominance", "-rs", "--scorecard", str(card))
+    assert done.returncode == 0, done.stdout + done.stderr
+    (laws,) = json.loads(card.read_text())["laws"]["diff-gaussian-rasterization"].values()
+    (came,) = set(laws.values())
+    assert came.startswith("skipped: diff-gaussian-rasterization needs ")
+    assert came.removeprefix("skipped: ") in done.stdout
 
 
 def test_poison_reaches_what_the_package_allocates_and_nothing_else() -> None:

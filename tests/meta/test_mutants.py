@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from pop_ref.conformance.abilities import STAGES
 from pop_ref.conformance.catalogue import FILE, catalogue
-from pop_ref.conformance.law import STAGES
 from pop_ref.conformance.mutants import MUTANTS
+from pop_ref.conformance.mutants.__main__ import main
 from pop_ref.conformance.mutants.copies import Mutant
 from pop_ref.conformance.mutants.trial import every_law, killed_by, law_named
 
@@ -14,6 +15,17 @@ from pop_ref.conformance.mutants.trial import every_law, killed_by, law_named
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.name)
 def test_the_named_law_kills_the_mutant(mutant: Mutant) -> None:
     assert killed_by(mutant) is not None, f"{mutant.name} survives {mutant.law}"
+
+
+def test_a_trial_says_who_dies_by_what(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["no_half_in_the_exponent"]) == 0
+    assert capsys.readouterr().out.startswith(
+        "no_half_in_the_exponent: killed by "
+        "test_alpha:the_exponent_is_half_the_squared_distance_in_the_conics_metric (AssertionError: alpha.sigma"
+    )
+    with pytest.raises(SystemExit):
+        main(["nobody"])
+    assert "there is no mutant nobody" in capsys.readouterr().err
 
 
 def test_there_are_at_least_twenty_mutants_and_no_two_alike() -> None:
@@ -28,7 +40,7 @@ def test_each_change_is_one_place_of_one_file() -> None:
         assert law_named(mutant.law).name == mutant.law.partition(":")[2]
 
 
-def test_the_written_list_of_laws_and_mutants_is_current() -> None:
+def test_the_written_list_of_laws_is_current() -> None:
     assert FILE.read_text(encoding="utf-8") == catalogue(), "run 'python -m pop_ref.conformance.catalogue'"
 
 
