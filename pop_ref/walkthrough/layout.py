@@ -28,6 +28,10 @@ _LEAD: Final = (
 )
 
 
+_FUNCTIONS: Final = "argmax|argmin|cos|det|diag|exp|ln|log|max|min|sign|sin"
+_THIN: Final = '<mspace width="0.167em" />'
+
+
 class _FormulaError(Exception):
     pass
 
@@ -148,7 +152,19 @@ def _formula(latex: str, options: dict[str, Any]) -> str:
     unknown = re.search(r">(\\[a-zA-Z]+)", mathml)
     if unknown:
         raise _FormulaError(f"{latex.strip()}\n    {unknown[1]} is not known")
-    return mathml
+    return _spaced(mathml)
+
+
+def _spaced(mathml: str) -> str:
+    """Set thin spaces around the names of functions as TeX does: none before a parenthesis or a subscript."""
+    name = rf"<m([io])[^>]*>({_FUNCTIONS})</m\1>"
+    mathml = re.sub(name, r"<mi>\2</mi>", mathml)
+    mathml = re.sub(
+        rf"(?<=</mi>|</mn>)<mi>({_FUNCTIONS})</mi>", rf"{_THIN}<mi>\1</mi>", mathml
+    )
+    return re.sub(
+        rf"<mi>({_FUNCTIONS})</mi>(?=<mi|<mn|<mfrac|<msqrt)", rf"<mi>\1</mi>{_THIN}", mathml
+    )
 
 
 def _link(self: Any, tokens: Any, at: int, options: Any, env: Any) -> str:

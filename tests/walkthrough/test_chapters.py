@@ -182,6 +182,16 @@ def test_the_comment_that_opens_an_answer_is_prose() -> None:
     assert "# it is" not in page
 
 
+def test_names_of_functions_stand_apart_from_what_is_no_parenthesis() -> None:
+    def formula(latex: str) -> str:
+        return re.sub(r"<mspace[^>]*>", " ", _whole(GOOD.replace("$x^2$", f"${latex}$")))
+
+    assert "<mi>o</mi> <mi>exp</mi><mo" in formula(r"o\exp(x)")
+    assert "<mi>ln</mi> <mi>o</mi>" in formula(r"\ln o")
+    assert "<mi>diag</mi><mo" in formula(r"\operatorname{diag}(2, 1)")
+    assert "<msub><mi>max</mi><mi>i</mi></msub>" in formula(r"\max_i x")
+
+
 def _whole(text: str) -> str:
     chapter = read_chapter(NAME, text)
     return chapter_page(chapter, run_chapter(chapter), [chapter])
