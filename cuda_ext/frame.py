@@ -25,7 +25,8 @@ class Meta(dict[str, Any]):
     def __missing__(self, key: str) -> Any:
         if key not in self._later:
             raise KeyError(key)
-        self.update(self._later[key]())
+        with torch.cuda.device_of(self["means2d"]):
+            self.update(self._later[key]())
         return self[key]
 
     def __contains__(self, key: object) -> bool:

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import cuda_ext
-from cuda_ext.gpu_check_tools import ROOT, first_line, run, write_json
+from cuda_ext.gpu_check_tools import ROOT, first_line, python_path, run, write_json
 
 GPU_TESTS = ROOT / "tests" / "cuda" / "gpu"
 STEPS = ("test_ten_steps.py", "test_device_training.py")
@@ -117,7 +117,7 @@ def gsplat_stage(check: Check) -> dict[str, Any]:
     """Get gsplat to compare with, into a folder of its own; where that cannot be, keep the reason: it is no failure."""
     probe = [sys.executable, "-c", "import gsplat; print(gsplat.__version__)"]
     pip = [sys.executable, "-m", "pip", "install", "-q", "--upgrade", "--target", str(SITE)]
-    path = {"PYTHONPATH": str(SITE)}
+    path = {"PYTHONPATH": python_path(SITE)}
     found = run(probe, check.left, **path)
     if found["status"] != 0:
         # not its dependencies: torch, which is here, would come along once more
@@ -136,7 +136,8 @@ def bench_stage(check: Check) -> dict[str, Any]:
     target = OUT / "bench.json"
     target.parent.mkdir(parents=True, exist_ok=True)
     target.unlink(missing_ok=True)
-    found = run([sys.executable, str(ROOT / "benchmarks" / "gpu_kernels.py"), str(target)], check.left, PYTHONPATH=SITE)
+    command = [sys.executable, str(ROOT / "benchmarks" / "gpu_kernels.py"), str(target)]
+    found = run(command, check.left, PYTHONPATH=python_path(ROOT, SITE))
     if target.exists():
         # case by case: also what was measured before the time was up
         found["results"] = json.loads(target.read_text())

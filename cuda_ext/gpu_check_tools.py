@@ -16,7 +16,7 @@ TAIL = 4000  # characters of a command's words that are kept
 GRACE = 20.0  # seconds between asking a command to stop and making it
 
 
-def run(command: list[str], limit: float, **environment: str | Path) -> dict[str, Any]:
+def run(command: list[str], limit: float, **environment: str) -> dict[str, Any]:
     """Run a command in the repository and return its status, seconds and the end of its words.
 
     A command whose time is up is asked to stop first, so that it can leave a checkpoint; its status is its own answer,
@@ -29,7 +29,7 @@ def run(command: list[str], limit: float, **environment: str | Path) -> dict[str
         text=True,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
-        env={**os.environ, **{name: str(value) for name, value in environment.items()}},
+        env={**os.environ, **environment},
         start_new_session=True,
     )
     try:
@@ -45,6 +45,11 @@ def run(command: list[str], limit: float, **environment: str | Path) -> dict[str
             words, _ = process.communicate()
         status = process.returncode if process.returncode > 0 else 124
     return {"status": status, "seconds": round(time.monotonic() - start, 1), "output": words[-TAIL:]}
+
+
+def python_path(*folders: Path) -> str:
+    """Return PYTHONPATH with folders put before what it holds."""
+    return os.pathsep.join(filter(None, [*map(str, folders), os.environ.get("PYTHONPATH", "")]))
 
 
 def first_line(command: list[str]) -> str:

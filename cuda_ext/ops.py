@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 from cuda_ext.arrays import Settings
@@ -96,5 +97,7 @@ def rasterization(
         deterministic,
     )
     call = Call(settings, render_mode, packed)
-    images = call.project((means, quats, scales, opacities), colors, per_camera, viewmats, Ks)
-    return call.blend(images, len(means), backgrounds, dominance, counts)
+    # kernels run on the current device, which need not be the tensors'
+    with torch.cuda.device_of(means):
+        images = call.project((means, quats, scales, opacities), colors, per_camera, viewmats, Ks)
+        return call.blend(images, len(means), backgrounds, dominance, counts)
