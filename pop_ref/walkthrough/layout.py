@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from html import escape
 from typing import Any, Final
+from xml.etree import ElementTree
 
 from latex2mathml.converter import convert
 from markdown_it import MarkdownIt
@@ -28,8 +29,22 @@ _LEAD: Final = (
 )
 
 
-_FUNCTIONS: Final = "argmax|argmin|cos|det|diag|exp|ln|log|max|min|sign|sin"
-_THIN: Final = '<mspace width="0.167em" />'
+_NAMES: Final = (
+    "argmax",
+    "argmin",
+    "cos",
+    "det",
+    "diag",
+    "exp",
+    "ln",
+    "log",
+    "max",
+    "min",
+    "sign",
+    "sin",
+)
+_MATHML: Final = "{http://www.w3.org/1998/Math/MathML}"
+ElementTree.register_namespace("", _MATHML[1:-1])
 
 
 class _FormulaError(Exception):
@@ -156,15 +171,32 @@ def _formula(latex: str, options: dict[str, Any]) -> str:
 
 
 def _spaced(mathml: str) -> str:
-    """Set thin spaces around the names of functions as TeX does: none before a parenthesis or a subscript."""
-    name = rf"<m([io])[^>]*>({_FUNCTIONS})</m\1>"
-    mathml = re.sub(name, r"<mi>\2</mi>", mathml)
-    mathml = re.sub(
-        rf"(?<=</mi>|</mn>)<mi>({_FUNCTIONS})</mi>", rf"{_THIN}<mi>\1</mi>", mathml
-    )
-    return re.sub(
-        rf"<mi>({_FUNCTIONS})</mi>(?=<mi|<mn|<mfrac|<msqrt)", rf"<mi>\1</mi>{_THIN}", mathml
-    )
+    """Set thin spaces around the names of functions as TeX does: none beside an operator or a parenthesis."""
+    math = ElementTree.fromstring(mathml)
+    for row in math.iter(f"{_MATHML}mrow"):
+        children = list(row)
+        row[:] = []
+        for i, child in enumerate(children):
+            named = child if child.text else next(iter(child), child)
+            if named.text in _NAMES:
+                # an mo would be spaced as a relation is
+                named.tag, named.attrib = f"{_MATHML}mi", {}
+                apart = [
+                    _takes_room(children[i - 1 : i]),
+                    _takes_room(children[i + 1 : i + 2]),
+                ]
+                row.extend([_thin()] * apart[0] + [child] + [_thin()] * apart[1])
+            else:
+                row.append(child)
+    return ElementTree.tostring(math, encoding="unicode")
+
+
+def _thin() -> ElementTree.Element:
+    return ElementTree.Element(f"{_MATHML}mspace", width="0.167em")
+
+
+def _takes_room(neighbour: list[ElementTree.Element]) -> bool:
+    return bool(neighbour) and neighbour[0].tag not in (f"{_MATHML}mo", f"{_MATHML}mspace")
 
 
 def _link(self: Any, tokens: Any, at: int, options: Any, env: Any) -> str:

@@ -189,7 +189,8 @@ def test_names_of_functions_stand_apart_from_what_is_no_parenthesis() -> None:
     assert "<mi>o</mi> <mi>exp</mi><mo" in formula(r"o\exp(x)")
     assert "<mi>ln</mi> <mi>o</mi>" in formula(r"\ln o")
     assert "<mi>diag</mi><mo" in formula(r"\operatorname{diag}(2, 1)")
-    assert "<msub><mi>max</mi><mi>i</mi></msub>" in formula(r"\max_i x")
+    assert "<msub><mi>max</mi><mi>i</mi></msub> <mi>x</mi>" in formula(r"\max_i x")
+    assert "<msub><mi>T</mi><mrow><mi>max</mi></mrow></msub>" in formula(r"T_{\max}")
 
 
 def _whole(text: str) -> str:
