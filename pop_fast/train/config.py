@@ -31,7 +31,7 @@ PRESETS: Final = {"paper": 1.0, "quick": QUICK_SCALER}
 QUICK_BLUR_MIN_PIXELS: Final = 11.0
 
 # what may differ between a checkpoint and the run that resumes it: it does not reach a single bit of the parameters.
-# log_every is not among it: where Gaussians per pixel are counted, tile lists are cut otherwise and sums round otherwise
+# log_every is not among it: where Gaussians per pixel are counted, tile lists are cut and sums rounded otherwise
 _FREE: Final = frozenset(
     {
         *("data", "result_dir", "eval_steps", "save_steps", "checkpoint_every", "keep_checkpoints"),
