@@ -270,6 +270,8 @@ def pulls_at(params, factor=1.0):
 
 
 rates = {name: 5.0 * rate for name, rate in learning_rates(0, 4.0).items()}
+# round Gaussians have no gradient by rotation but rounding's, which Adam would follow
+rates["quats"] = 0.0
 zero = {name: np.zeros_like(value) for name, value in params.items()}
 moments = zero, zero
 logged = []
@@ -321,7 +323,7 @@ one, other = (
     adam_step(params, params_vjp(params, gradients, np.zeros(50)), zero, zero, 1, rates)[0]
     for gradients in (whole, tenth)
 )
-for name in ("means", "scales", "opacities", "sh0"):
+for name in params:
     assert np.allclose(one[name], other[name], rtol=1e-6, atol=1e-9)
 assert np.allclose(tenth.means2d, 0.1 * whole.means2d, rtol=1e-9, atol=1e-15)
 assert (rest_error(l1, 0.5), rest_error(lambda *both: 0.1 * l1(*both), 0.5)) == (0.0, 0.8)

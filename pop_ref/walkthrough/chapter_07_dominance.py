@@ -253,6 +253,8 @@ target[np.hypot(x - 0.5, y + 0.5) < 0.5] = 0.95, 0.8, 0.2
 config = replace(POP, theta_blur=THETA_HERE, grow_on_gradient=False)
 rates = {name: 4.0 * rate for name, rate in learning_rates(0, 4.0).items()}
 rates["sh0"] *= 10.0
+# round Gaussians have no gradient by rotation but rounding's, which Adam would follow
+rates["quats"] = 0.0
 rng = np.random.default_rng(3)
 corners = np.array([[-0.75, -0.75], [0.75, -0.75], [-0.75, 0.75], [0.75, 0.75]])
 rows = rows_from_params(
@@ -299,9 +301,9 @@ picture(
 
 # %% [markdown]
 # At first everybody is too large and the number doubles; a split opens holes, which the training between two events
-# closes. As the counts come down growth slows to an eighth per event, at a little over $2/\theta$ Gaussians. No budget
-# was set and no gradient asked: the threshold is the budget. In the paper the rule is active from step 3,000 to 7,000
-# only, beside the gradient rule.
+# closes. As the counts come down growth slows to under a tenth per event, at a little over $2/\theta$ Gaussians. No
+# budget was set and no gradient asked: the threshold is the budget. In the paper the rule is active from step 3,000 to
+# 7,000 only, beside the gradient rule.
 
 # %%
 sizes = [n for n, _ in history]
@@ -309,10 +311,10 @@ largest = [int(view.dominant_counts.max()) for _, view in history]
 print("Gaussians before each event:", sizes)
 print("largest count:              ", largest)
 assert sizes[:2] == [4, 8]
-assert sizes[-1] < 1.13 * sizes[-2]
+assert sizes[-1] < 1.1 * sizes[-2]
 assert 2.0 / THETA_HERE < sizes[-1] < 2.5 / THETA_HERE
 assert largest[0] > 14 * THETA_HERE * SMALL**2
-assert largest[-1] < 3 * THETA_HERE * SMALL**2
+assert largest[-1] < 2 * THETA_HERE * SMALL**2
 assert np.sum(history[-1][1].dominant_counts > 0) > 1.0 / THETA_HERE
 assert l2(history[-1][1].image, target) < 0.5 * l2(history[0][1].image, target)
 assert (POP.blur_start_iter, POP.blur_stop_iter, POP.grow_on_gradient) == (3000, 7000, True)
