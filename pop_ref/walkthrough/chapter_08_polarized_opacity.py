@@ -126,8 +126,8 @@ assert steps_until(0.9, 0.5, -1e-3) == steps_until(0.9, 0.5, -1e-9)
 # every step. Estimate after how many steps it is back over 1/2.
 
 # %% answer
-# 4.6 / 0.05 = 92 steps of a learning rate each; in fact 69, because the logit's gradient, o (1 - o) times that,
-# grows with the opacity, and Adam's running size lags behind
+# $4.6 / 0.05 = 92$ steps of a learning rate each. In fact it is 69, because the logit's gradient, $o (1 - o)$ times
+# that, grows with the opacity, and Adam's running size lags behind.
 assert steps_until(0.5, 0.01, -1e-9) == 69
 
 # %% [markdown]
@@ -165,8 +165,8 @@ assert POP.prune_opa == 0.005
 
 
 # %% answer
-# the mean gradient is -f / 250 + (1 - f) / 750, which is negative for f > 1/4: whoever dominates in more views than
-# the average Gaussian goes up, the rest goes down, even what is merely outside most views
+# The mean gradient is $-f/250 + (1 - f)/750$, which is negative for $f > 1/4$: whoever dominates in more views than
+# the average Gaussian goes up, the rest goes down, even what is merely outside most views.
 def mean_gradient(f, n_views=100):
     total = 0.0
     for view in range(n_views):
@@ -392,6 +392,6 @@ for camera in cameras:
 # threshold 0.005, for $\lambda = 10^{-3}$ and for $\lambda = 10^{-6}$?
 
 # %% answer
-# 132 in both cases: to Adam only the sign counts, so for the unseen the weight of the prior means nothing. the
-# weight matters where photographs pull as well
+# 132 in both cases: to Adam only the sign counts, so for the unseen the weight of the prior means nothing. The
+# weight matters where photographs pull as well.
 assert steps_until(0.005, 0.1, 1e-3 / 750) == steps_until(0.005, 0.1, 1e-6 / 750) == 132
