@@ -87,7 +87,12 @@ def build_stage(check: Check) -> dict[str, Any]:
 
 def laws_stage(check: Check) -> dict[str, Any]:
     """Hold every law of the kit, gradients and thresholds among them, to the CUDA backend."""
-    return _pytest(check, str(GPU_TESTS), *(f"--ignore={GPU_TESTS / name}" for name in STEPS))
+    return _laws(check, "columns atomics")
+
+
+def laws_of_splats_stage(check: Check) -> dict[str, Any]:
+    """Hold the laws to the other backward family, which is no one's default and rounds more behind opaque splats."""
+    return _laws(check, "splats")
 
 
 def steps_stage(check: Check) -> dict[str, Any]:
@@ -174,10 +179,15 @@ def train_one(path: Path, limit: float, steps_scaler: float, backend: str = "cud
     return {**found, **result, "seconds": found["seconds"], "seconds_training": told["seconds"]}
 
 
-def _pytest(check: Check, *arguments: str) -> dict[str, Any]:
+def _laws(check: Check, kinds: str) -> dict[str, Any]:
+    ignored = (f"--ignore={GPU_TESTS / name}" for name in STEPS)
+    return _pytest(check, str(GPU_TESTS), *ignored, POP_CUDA_KINDS=kinds)
+
+
+def _pytest(check: Check, *arguments: str, **environment: str) -> dict[str, Any]:
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments]
     # without a GPU everything would be skipped, which is no pass
-    return _needs_a_gpu(run(command, check.left, OMP_NUM_THREADS="4"))
+    return _needs_a_gpu(run(command, check.left, OMP_NUM_THREADS="4", **environment))
 
 
 def _needs_a_gpu(found: dict[str, Any]) -> dict[str, Any]:
@@ -188,6 +198,7 @@ def _needs_a_gpu(found: dict[str, Any]) -> dict[str, Any]:
 STAGES: dict[str, Callable[[Check], dict[str, Any]]] = {
     "build": build_stage,
     "laws": laws_stage,
+    "laws_of_splats": laws_of_splats_stage,
     "steps": steps_stage,
     "sanitizer": sanitizer_stage,
     "gsplat": gsplat_stage,

@@ -147,7 +147,8 @@ struct Passing {
     Real left;  // worth of all light from this splat on: splats, background and what is left
 };
 
-// v_alpha = T worth - left_after / (1 - alpha): subtracts what the recurrence above adds up from the back
+// v_alpha = T worth - left_after / (1 - alpha): subtracts what the recurrence above adds up from the back. Behind opaque
+// splats little is left of much, and carries the rounding of all of it: about ten times the other family's error there.
 template <bool ABS, class Real, int CH>
 POP_HD void pass_pixel(Passing<Real>& pixel, const Blended<Real>& splat, const Real* color, const Real* v_color,
                        Real px, Real py, const BlendConstants<Real>& constants, Real* sums) {

@@ -113,6 +113,31 @@ def test_rasterization_and_its_gradients_give_the_same_bits_twice(gpu):
         assert torch.equal(value, grads[1][name]), name
 
 
+# the splats' family subtracts its way forward from all of the light
+@pytest.mark.parametrize(("family", "allowed"), [("columns", 5e-6), ("splats", 1e-4)])
+def test_gradients_around_an_opaque_splat_keep_their_digits(gpu, family, allowed):
+    from cuda_ext.ops import rasterization as on_gpu
+    from pop_fast.rasterization import rasterization as on_cpu
+
+    def gradient(function, device, dtype, **options):
+        def made(values):
+            return torch.tensor(values, dtype=dtype, device=device)
+
+        # a thousandth of the light passes the second splat, which is as wide as the image and black
+        means = made([[0.08, 0.08, 2.5], [0.06, 0.06, 1.0], [0.06, 0.06, 1.0]]).requires_grad_()
+        image, _, _ = function(
+            means, made([[1.0, 0.0, 0.0, 0.0]] * 3), made([[0.3] * 3, [0.125] * 3, [8.0] * 3]), made([0.5, 0.5, 1.0]),
+            made([[0.75, 0.625, 0.5], [0.5] * 3, [0.5] * 3]), made([torch.eye(4).tolist()]),
+            made([[[8.0, 0.0, 2.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]]]), 4, 8, **options,
+        )  # fmt: skip
+        (image[0] * torch.linspace(-1, 1, 96, dtype=dtype, device=device).reshape(8, 4, 3)).sum().backward()
+        return means.grad.double().cpu()
+
+    expected = gradient(on_cpu, "cpu", torch.float64)
+    found = gradient(on_gpu, gpu, torch.float32, family=family)
+    assert float((found - expected).abs().max() / expected.abs().max()) < allowed
+
+
 @pytest.mark.parametrize("options", [{"counts": True}, {"profile": "inria"}])
 def test_lists_of_the_callers_tiles_go_back_as_the_warps_own_do(gpu, options):
     from cuda_ext.ops import rasterization as on_gpu
