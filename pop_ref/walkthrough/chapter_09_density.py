@@ -286,6 +286,8 @@ picture(
 # SSIM out (`lambda_ssim=0`), since its window is in pixels.
 
 # %% answer
+# The loss is a mean and does not know the resolution, so its derivative by half an image does not either. A pixel that
+# is half as long moves the picture half as much.
 measured = {}
 for size in (24, 48):
     wish = drawn(params_of("0.3 0.0 0.6 0.6 0.9 blue"), camera_of(size)).image
@@ -297,7 +299,6 @@ for size in (24, 48):
     )
     measured[size] = np.array([np.hypot(*v.means2d[0]), one.grad_sum[0]])
 per_px, per_half_image = measured[48] / measured[24]
-# the loss is a mean and does not know the resolution; a pixel that is half as long moves the picture half as much
 assert abs(per_px - 0.5) < 0.03
 assert abs(per_half_image - 1.0) < 0.06
 
@@ -309,6 +310,8 @@ assert abs(per_half_image - 1.0) < 0.06
 
 
 # %% answer
+# Between 110 and 150, whatever the weight: Adam divides by the size of the gradient. Only where photographs pull too
+# does the weight decide who wins.
 def steps_to_prune(lambda_pop):
     x, m, v, step = {"o": logit(np.array([0.1]))}, {"o": np.zeros(1)}, {"o": np.zeros(1)}, 0
     while (o := opacities_from_logits(x["o"]))[0] >= density.POP.prune_opa:
@@ -320,6 +323,5 @@ def steps_to_prune(lambda_pop):
     return step
 
 
-# Adam divides by the size of the gradient: only where photographs pull too does the weight decide who wins
 assert steps_to_prune(1e-3) == steps_to_prune(1e-6)
 assert 110 < steps_to_prune(1e-3) < 150

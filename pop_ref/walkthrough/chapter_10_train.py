@@ -279,10 +279,10 @@ print(*sorted(path.name for path in report.parent.iterdir() if path != report))
 # split and pruned.
 
 # %% answer
+# A clone adds one. A split puts two children in the place of one parent, and adds one too.
 for name in stats:
     n = len(capture.points)
     for record in records[name]:
-        # a split puts two children in the place of one parent
         n += record.get("cloned", 0) + record.get("split", 0) - record.get("pruned", 0)
         assert record["num_gaussians"] == n
     assert n == stats[name]["num_GS"]
@@ -293,6 +293,7 @@ for name in stats:
 # A record holds the loss and its terms. Put the loss together by eq. 9. Until when is the prior in it?
 
 # %% answer
+# $L = 0.99\,L_2 + 0.01\,L_{\mathrm{DSSIM}}$, and before step 150 the weighted prior, which is recorded as `pop`.
 for record in records["prior"]:
     whole = 0.99 * record["l2"] + 0.01 * record["d_ssim"] + record.get("pop", 0.0)
     assert abs(whole - record["loss"]) < 1e-5
@@ -305,8 +306,8 @@ assert not any("pop" in record for record in records["none"])
 # Compute the PSNR of the held-out view from the picture that was kept. Why is it not exactly what `stats` says?
 
 # %% answer
+# The picture that was kept is rounded to 8 bit; the number is measured before that.
 psnr = -10.0 * np.log10(np.mean((render - photo) ** 2))
 told = float(kept["psnr"])
-# the picture is rounded to 8 bit, the number is measured before
 assert psnr != told
 assert abs(psnr - told) < 0.05

@@ -297,6 +297,8 @@ assert (oracle.n_traversed >= oracle.n_blended).all()
 # 20 and 0.6 px, turned by 40 degrees) near pixel (1600, 900) and round the coefficients to float32 in both frames.
 
 # %% answer
+# The terms of the exponent are of the size of $1600^2 A$ there and cancel almost wholly. From the tile's centre they
+# are of the size of $8^2 A$.
 turn = np.deg2rad(40.0)
 R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
 covars = (R @ np.diag([20.0**2, 0.6**2]) @ R.T)[None]
@@ -315,7 +317,6 @@ def in_float32(origin):
     return np.abs(rounded @ there - exact).max()
 
 
-# the terms are of the size of 1600^2 A and cancel almost wholly; from the tile's centre they are of the size of 8^2 A
 assert in_float32(middle) < 1e-4
 assert in_float32(np.zeros(2)) > 1e-2
 
@@ -326,12 +327,12 @@ assert in_float32(np.zeros(2)) > 1e-2
 # the six moments? Compute it, and hold it to the oracle's `v_means2d_abs`.
 
 # %% answer
+# No: the absolute value is not linear, so all 256 pixels are needed. The sum is never smaller than the signed one.
 wanted = composite_vjp(splats, [ids], TILE, TILE, TILE, v_of_tile, background=white)
 u, v, A, B, C = (column[:, None] for column in (u, v, A, B, C))
 along_x = np.abs(G * (A * (u - x) + B * (v - y))).sum(axis=1)
 along_y = np.abs(G * (B * (u - x) + C * (v - y))).sum(axis=1)
 absolute = np.stack([along_x, along_y], axis=1)
 assert np.allclose(absolute, wanted.v_means2d_abs, rtol=1e-9, atol=1e-11)
-# the absolute value is not linear, so all 256 pixels are needed; it is never smaller than the signed sum
 assert (absolute >= np.abs(v_means2d) - 1e-12).all()
 assert absolute.sum() > 2.0 * np.abs(v_means2d).sum()

@@ -17,7 +17,7 @@ from pygments.formatters.html import HtmlFormatter
 from pygments.lexers.python import PythonLexer
 
 from pop_ref.walkthrough.cells import FOLDER, Cell, Chapter, ChapterError
-from pop_ref.walkthrough.folding import Part, parts, said_and_done
+from pop_ref.walkthrough.folding import parts, said_and_done
 from pop_ref.walkthrough.pages import Outcome, Picture
 from pop_ref.walkthrough.style import VARIABLES
 
@@ -112,28 +112,25 @@ def _cell(chapter: Chapter, name: str, outcome: Outcome) -> str:
         return _prose(chapter, cell)
     said, code = said_and_done(cell.text) if cell.kind == "answer" else ("", cell.text)
     shown = [_prose(chapter, Cell("prose", said, cell.line))] if said else []
-    every = parts(code)
-    # code that draws at a cell's end goes under its picture
-    n_before = len(every) - 1 if every[-1].draws else len(every)
-    shown += [_part(part) for part in every[:n_before]]
+    plain, drawing = (
+        "\n\n".join(part.text for part in parts(code) if part.draws is draws)
+        for draws in (False, True)
+    )
+    if plain:
+        shown.append(_code(plain))
     if outcome.printed.strip():
         shown.append(f'<pre class="printed">{escape(outcome.printed.rstrip())}</pre>')
     for i, each in enumerate(outcome.pictures):
         shown.append(_figure(chapter, cell, f"{name}-{i}", each))
-    shown += [_part(part) for part in every[n_before:]]
+    # how a picture is drawn is a footnote to it
+    if drawing:
+        shown.append(_folded("The code that draws", _code(drawing), ' class="drawing"'))
     whole = "".join(shown)
-    if cell.kind == "answer":
-        return f"<details><summary>Answer</summary>{whole}</details>"
-    return whole
+    return _folded("Answer", whole) if cell.kind == "answer" else whole
 
 
-def _part(part: Part) -> str:
-    code = _code(part.text)
-    return (
-        f'<details class="drawing"><summary>The code that draws</summary>{code}</details>'
-        if part.draws
-        else code
-    )
+def _folded(title: str, body: str, attributes: str = "") -> str:
+    return f"<details{attributes}><summary>{title}</summary>{body}</details>"
 
 
 def _code(text: str) -> str:
