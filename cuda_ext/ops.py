@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -40,6 +40,14 @@ def rasterization(
     camera_model: Literal["pinhole", "ortho", "fisheye", "ftheta"] = "pinhole",
     segmented: bool = False,
     covars: Tensor | None = None,
+    with_ut: bool = False,
+    with_eval3d: bool = False,
+    radial_coeffs: Tensor | None = None,
+    tangential_coeffs: Tensor | None = None,
+    thin_prism_coeffs: Tensor | None = None,
+    ftheta_coeffs: Any = None,
+    rolling_shutter: Any = None,
+    viewmats_rs: Tensor | None = None,
     *,
     profile: str | Profile = "paper",
     dominance: bool = False,
@@ -66,6 +74,14 @@ def rasterization(
             "camera_model": (camera_model, "pinhole", "undistort the images first; `pop train` does it"),
             "segmented": (segmented, False, "there is one sort"),
             "covars": (covars, None, "give quats and scales"),
+            "with_ut": (with_ut, False, "only the EWA projection is implemented"),
+            "with_eval3d": (with_eval3d, False, "splats are evaluated in screen space"),
+            "radial_coeffs": (radial_coeffs, None, "undistort the images first"),
+            "tangential_coeffs": (tangential_coeffs, None, "undistort the images first"),
+            "thin_prism_coeffs": (thin_prism_coeffs, None, "undistort the images first"),
+            "ftheta_coeffs": (ftheta_coeffs, None, "undistort the images first"),
+            "rolling_shutter": (rolling_shutter, None, "only global shutters"),
+            "viewmats_rs": (viewmats_rs, None, "only global shutters"),
         }
     )
     if render_mode not in RENDER_MODES:

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
+from pop_fast.backends import get_backend
 from pop_fast.raster_frame import Frame, Scene
 from pop_fast.raster_inputs import (
     RENDER_MODES,
@@ -61,8 +62,9 @@ def rasterization(
     profile: str | Profile = "paper",
     dominance: bool = False,
     counts: bool = False,
+    backend: Literal["fast", "cuda"] = "fast",
 ) -> tuple[Tensor, Tensor, RenderMeta]:
-    """Render Gaussians into C images on the CPU, with gsplat 1.5.3's signature, results and meta keys.
+    """Render Gaussians into C images, with gsplat 1.5.3's signature, results and meta keys.
 
     Differentiable in means, quats, scales, opacities, colors, viewmats, covars and backgrounds; not in Ks.
 
@@ -104,6 +106,7 @@ def rasterization(
         profile: constants and strictness: "paper", "gsplat_1_5", "gsplat_1_6", "inria", or a `Profile`.
         dominance: compute the dominance keys of meta in the same pass; else they cost one more when first read.
         counts: likewise for n_contrib and n_traversed.
+        backend: "fast" renders on the CPU, "cuda" on the GPU that holds the tensors (`cuda_ext.ops.rasterization`).
 
     Returns:
         Images [..., C, H, W, X], not clamped; alphas [..., C, H, W, 1]; meta with gsplat's keys and `dominant_ids`
@@ -113,7 +116,12 @@ def rasterization(
     Raises:
         ValueError: an input's shape, type or value is wrong; the message names it and its index.
         NotImplementedError: an argument is not supported.
+        PopError: the backend cannot run here; says why and what to do.
     """
+    if backend != "fast":
+        given = dict(locals())
+        del given["backend"]
+        return get_backend(backend).rasterization(**given)  # type: ignore[return-value]
     check_supported(
         {
             "sparse_grad": (sparse_grad, False, "gradients are dense"),

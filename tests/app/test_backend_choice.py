@@ -11,6 +11,7 @@ import torch
 from pop_fast.backends import get_backend
 from pop_fast.cli.train import check_backend
 from pop_fast.errors import PopError
+from pop_fast.rasterization import rasterization
 from pop_fast.strategies import POPStrategy
 from pop_fast.train import Trainer
 from pop_fast.train.choose import choose_backend, make_trainer
@@ -88,6 +89,9 @@ def test_cuda_asked_for_in_vain_is_one_sentence_before_anything_is_read(pop: Pop
         this_machine()
     with pytest.raises(PopError, match="backend 'cuda' cannot run: the CUDA extension is not built"):
         get_backend("cuda").rasterization()
+    one = torch.ones(1, 3)
+    with pytest.raises(PopError, match="backend 'cuda' cannot run: the CUDA extension is not built"):
+        rasterization(one, one, one, one, one, one, one, 4, 4, backend="cuda")
 
 
 @pytest.mark.usefixtures("with_gpu")

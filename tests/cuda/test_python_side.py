@@ -162,6 +162,20 @@ def test_rasterization_refuses_what_it_does_not_support_and_names_what_is_wrong(
         rasterization(**rows)
 
 
+def test_the_signature_is_the_cpus():
+    import inspect
+
+    from cuda_ext.ops import rasterization as on_gpu
+    from pop_fast.rasterization import rasterization as on_cpu
+
+    ours, theirs = (inspect.signature(function).parameters for function in (on_gpu, on_cpu))
+    positional = [name for name, p in theirs.items() if p.kind is not p.KEYWORD_ONLY]
+    assert list(ours)[: len(positional)] == positional
+    assert all(ours[name].default == theirs[name].default for name in positional)
+    # `backend` is how the one calls the other
+    assert set(theirs) - set(ours) == {"backend"}
+
+
 def test_spills_and_registers_are_read_from_the_compilers_words():
     (use,) = parse_ptxas("blend_forward.cu", PTXAS)
     assert (use.registers, use.shared, use.stack, use.spill_stores, use.spill_loads) == (55, 6144, 8, 4, 16)

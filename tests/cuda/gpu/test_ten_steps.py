@@ -69,6 +69,31 @@ def test_two_runs_give_the_same_bits(gpu):
         assert torch.equal(value, second[name]), name
 
 
+def test_a_trainer_of_ones_own_learns_through_the_autograd_functions(gpu):
+    from pop_fast.rasterization import rasterization
+
+    scene = training_scene()
+    leaves = {name: value.to(gpu).clone().requires_grad_() for name, value in scene.params.items()}
+    optimizer = torch.optim.Adam([{"params": [leaves[name]], "lr": 5 * LR[name]} for name in leaves])
+    photographs = torch.stack(scene.photographs).to(gpu).float() / 255.0
+    losses = []
+    for _ in range(STEPS):
+        image, alphas, meta = rasterization(
+            leaves["means"], leaves["quats"], leaves["scales"].exp(), torch.sigmoid(leaves["opacities"]),
+            torch.cat((leaves["sh0"], leaves["shN"]), 1), scene.viewmats.to(gpu), scene.Ks.to(gpu), WIDTH, HEIGHT,
+            sh_degree=3, packed=False, backend="cuda",
+        )  # fmt: skip
+        meta["means2d"].retain_grad()
+        loss = (image - photographs).square().mean()
+        loss.backward()
+        assert bool(meta["means2d"].grad.any())
+        assert alphas.shape == (3, HEIGHT, WIDTH, 1)
+        optimizer.step()
+        optimizer.zero_grad()
+        losses.append(loss.item())
+    assert losses[-1] < 0.95 * losses[0]
+
+
 def test_steps_launched_anew_are_the_replayed_steps(gpu):
     replayed, launched = (_fused(training_scene(), gpu, replay=replay)[1] for replay in (True, False))
     for name, value in replayed.items():
