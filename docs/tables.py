@@ -1,25 +1,41 @@
-"""The tables of README.md that are made from the sources and from runs.
+"""The tables of README.md and docs/MUTANTS.md, which are made from the sources and from runs.
 
 python docs/tables.py            print them
-python docs/tables.py --write    put them into README.md, between their marks
-python docs/tables.py --check    exit with 1 when README.md holds others
+python docs/tables.py --write    put them into README.md, between their marks, and write docs/MUTANTS.md
+python docs/tables.py --check    exit with 1 when either holds something else
 """
 
 from __future__ import annotations
 
+import json
 import runpy
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from stages import ROOT, STAGES, files, functions, laws
 
+from pop_ref.conformance.abilities import STAGES as LAW_STAGES
+from pop_ref.conformance.mutants import MUTANTS
+from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER
 from pop_ref.notation import SYMBOLS
 
 README = ROOT / "README.md"
+MUTANT_LIST = ROOT / "docs" / "MUTANTS.md"
+CARDS = ROOT / "benchmarks" / "results" / "scorecards"
+# the judged, in the order of their columns, and the card that each stands on
+JUDGED = {
+    "pop_fast float64": ("pop_fast.json", "fast64"),
+    "pop_fast float32": ("pop_fast.json", "fast32"),
+    "host mirror float64": ("host_mirror.json", "mirror64"),
+    "host mirror float32": ("host_mirror.json", "mirror32"),
+    "gsplat torch float64": ("gsplat.json", "gsplat-torch64"),
+    "gsplat torch float32": ("gsplat.json", "gsplat-torch32"),
+}
 
 
 def rosetta() -> str:
@@ -63,11 +79,73 @@ def results() -> str:
     return str(runpy.run_path(str(ROOT / "benchmarks" / "results_table.py"))["table"]())
 
 
+def scorecards() -> str:
+    """Make the table of what the kit found: rows are stages, cells say laws passed, failed and skipped."""
+    columns = [card(file)["summary"][backend] for file, backend in JUDGED.values()]
+    rows = [[stage, *(_counts(column[stage]) for column in columns)] for stage in LAW_STAGES]
+    total = [{key: sum(column[s][key] for s in LAW_STAGES) for key in column[LAW_STAGES[0]]} for column in columns]
+    head = ["stage", *JUDGED]
+    return _table(head, [*rows, ["**all**", *(f"**{_counts(count)}**" for count in total)]])
+
+
+def card(file: str) -> dict[str, Any]:
+    """Read a scorecard."""
+    return dict(json.loads((CARDS / file).read_text(encoding="utf-8")))
+
+
+def _counts(count: dict[str, int]) -> str:
+    if not count["passed"] + count["failed"]:
+        return f"– ({count['skipped']})"
+    broken = f", {count['failed']} broken" if count["failed"] else ""
+    return f"{count['passed']}{broken}" + (f" ({count['skipped']})" if count["skipped"] else "")
+
+
+def broken_laws() -> str:
+    """List the laws that a judged backend breaks."""
+    lines = []
+    for title, (file, backend) in JUDGED.items():
+        for outcomes in card(file)["laws"][backend].values():
+            names = [law for law, came in outcomes.items() if came.startswith("failed")]
+            lines += [f"- {title}: {law.replace('_', ' ')}" for law in names]
+    return "\n".join(lines) or "None is broken."
+
+
+def kit() -> str:
+    """Say how much the kit holds."""
+    return (
+        f"{len(every_law())} laws in {len(LAW_STAGES)} stages; {len(MUTANTS)} mutants, every one of them killed by a "
+        f"named law within the `ci` profile: [{MUTANT_LIST.name}]({MUTANT_LIST.relative_to(ROOT).as_posix()})."
+    )
+
+
+def mutants() -> str:
+    """Make the list of mutants: what happened to whom, and the law that notices."""
+    laws = every_law()
+    rows = [
+        [m.name.replace("_", " "), m.story, f"`{m.file}`", laws[m.law].stage, m.law.partition(":")[2].replace("_", " ")]
+        for m in MUTANTS
+    ]
+    return MUTANT_HEAD.format(n=len(MUTANTS)) + _table(["mutant", "what happened", "file", "stage", "killed by"], rows)
+
+
+MUTANT_HEAD = """# Mutants
+
+Made by `python docs/tables.py --write`; a test holds it to the code.
+
+{n} copies of the oracle, each with one line broken as somebody once broke it. A kit that lets one live is not worth
+its time, so for each a law is named that breaks on it within the `ci` profile; `tests/meta/test_mutants.py` tries them
+all. `python -m pop_ref.conformance.mutants` puts them on trial again, `--every` lists all laws that notice.
+
+"""
+
 TABLES: dict[str, Callable[[], str]] = {
     "rosetta": rosetta,
     "conventions": conventions,
     "profiles": profiles,
     "results": results,
+    "kit": kit,
+    "scorecards": scorecards,
+    "broken": broken_laws,
 }
 
 
@@ -100,10 +178,13 @@ def main(words: list[str]) -> int:
     readme = README.read_text(encoding="utf-8")
     if "--write" in words:
         README.write_text(with_tables(readme), encoding="utf-8")
-    elif with_tables(readme) != readme:
-        print("README.md: a table is not what sources and runs say; run 'python docs/tables.py --write'")
-        return 1
-    return 0
+        MUTANT_LIST.write_text(f"{mutants()}\n", encoding="utf-8")
+        return 0
+    stale = [README.name] if with_tables(readme) != readme else []
+    stale += [MUTANT_LIST.name] if MUTANT_LIST.read_text(encoding="utf-8") != f"{mutants()}\n" else []
+    for name in stale:
+        print(f"{name}: a table is not what sources and runs say; run 'python docs/tables.py --write'")
+    return 1 if stale else 0
 
 
 if __name__ == "__main__":

@@ -171,6 +171,8 @@ class _Recorder:
 
         option: Any = config.getoption
         self.path = Path(option("--scorecard"))
+        if self.path.suffix not in (".json", ".html"):
+            raise pytest.UsageError(f"scorecard {self.path} must end in .json or .html")
         single = option("--rasterizer") or option("--stages")
         how = f", {option('--dtype')}, profile {option('--profile')}" if single else ""
         self.card = Scorecard(f"{_chosen(config) or 'oracle'}{how}")

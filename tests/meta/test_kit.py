@@ -203,6 +203,7 @@ def test_a_session_that_judges_nothing_is_left_alone(tmp_path: Path) -> None:
         (("--rasterizer", "math:exp", "--profile", "gsplat_2"), "profile 'gsplat_2' is unknown; use one of paper"),
         (("--adapter", "pathlib:Path"), "pathlib:Path makes no adapter: it has no dtype"),
         (("--backend", "gsplt"), "backend 'gsplt' is unknown; use one of oracle, fast64"),
+        (("--scorecard", "card.txt"), "scorecard card.txt must end in .json or .html"),
         (("--stage", "order"), "invalid choice: 'order' (choose from"),
     ],
     ids=lambda value: value[1] if isinstance(value, tuple) else None,

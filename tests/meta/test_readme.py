@@ -15,6 +15,11 @@ from types import ModuleType
 import pytest
 
 from pop_fast.cli import COMMANDS
+from pop_ref.conformance.abilities import STAGES as LAW_STAGES
+from pop_ref.conformance.backends import ELSEWHERE, SHIPPED
+from pop_ref.conformance.mutants.trial import every_law
+from pop_ref.conformance.plugin import pytest_addoption
+from pop_ref.constants import PROFILES
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -111,6 +116,47 @@ def test_every_command_of_the_readme_is_understood(line: str, capsys: pytest.Cap
     else:
         importlib.import_module("pop_fast.cli.arguments").parse(module.Args, rest, name)
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("line", [line for line in shell_lines() if line.startswith("pytest ")])
+def test_every_option_of_the_kit_exists(line: str) -> None:
+    known = pytest.Parser(_ispytest=True)
+    pytest_addoption(known)
+    words = shlex.split(line, comments=True)[1:]
+    assert words[:2] == ["--pyargs", "pop_ref.conformance"]
+    given = known.parse_known_args(words[2:])
+    assert not given.file_or_dir
+    assert given.profile in PROFILES
+    assert set(given.stage) <= set(LAW_STAGES)
+    assert set(given.backend) <= {*SHIPPED, *ELSEWHERE}
+
+
+def test_the_list_of_mutants_is_current() -> None:
+    assert f"{tables.mutants()}\n" == tables.MUTANT_LIST.read_text(encoding="utf-8"), (
+        "run 'python docs/tables.py --write'"
+    )
+
+
+@pytest.mark.parametrize("file", sorted({file for file, _ in tables.JUDGED.values()}))
+def test_every_law_stands_on_every_scorecard(file: str) -> None:
+    expected = {(law.stage, law.name) for law in every_law().values()}
+    told = tables.card(file)
+    assert set(told["laws"]) == {backend for name, backend in tables.JUDGED.values() if name == file}
+    for backend, stages_of in told["laws"].items():
+        found = {(stage, law) for stage, laws in stages_of.items() for law in laws}
+        assert found == expected, f"{file}: judge {backend} again"
+        for stage, laws in stages_of.items():
+            outcomes = [came.split(":")[0] for came in laws.values()]
+            counted = {outcome: outcomes.count(outcome) for outcome in ("passed", "failed", "skipped")}
+            assert told["summary"][backend][stage] == counted
+    assert told["made"]["hypothesis profile"] == "ci"
+
+
+def test_our_own_backends_break_no_law() -> None:
+    for file in ("pop_fast.json", "host_mirror.json"):
+        for column in tables.card(file)["summary"].values():
+            assert sum(count["failed"] for count in column.values()) == 0
+            assert sum(count["passed"] for count in column.values()) > 100
 
 
 @pytest.mark.parametrize("line", [line for line in shell_lines() if line.startswith("make ")])
