@@ -122,7 +122,13 @@ def mutants() -> str:
     """Make the list of mutants: what happened to whom, and the law that notices."""
     laws = every_law()
     rows = [
-        [m.name.replace("_", " "), m.story, f"`{m.file}`", laws[m.law].stage, m.law.partition(":")[2].replace("_", " ")]
+        [
+            m.name.replace("_", " "),
+            m.story.replace("|", "\\|"),
+            f"`{m.file}`",
+            laws[m.law].stage,
+            m.law.partition(":")[2].replace("_", " "),
+        ]
         for m in MUTANTS
     ]
     return MUTANT_HEAD.format(n=len(MUTANTS)) + _table(["mutant", "what happened", "file", "stage", "killed by"], rows)
