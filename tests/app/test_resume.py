@@ -155,6 +155,15 @@ def test_ctrl_c_writes_a_checkpoint_of_the_step_it_came_at(tmp_path):
     assert [number for number, _ in ckpt.list_checkpoints(tmp_path)] == [6]
 
 
+@pytest.fixture
+def ctrl_c():
+    # a session in the background may have been started with it ignored
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("ctrl_c")
 def test_a_second_ctrl_c_is_obeyed_at_once_and_handlers_are_put_back():
     before = signal.getsignal(signal.SIGINT)
 
