@@ -20,7 +20,10 @@ def torch_stages() -> dict[str, Callable[..., Any]]:
     """Return gsplat's torch functions under the oracle's names, one camera, no batch."""
     impl: Any = importlib.import_module("gsplat.cuda._torch_impl")
     torch: Any = importlib.import_module("torch")
+    return _world_stages(impl, torch) | _screen_stages(impl, torch)
 
+
+def _world_stages(impl: Any, torch: Any) -> dict[str, Callable[..., Any]]:
     def covars_from_quats_scales(quats: Any, scales: Any) -> Any:
         return impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)[0]
 
@@ -40,6 +43,21 @@ def torch_stages() -> dict[str, Callable[..., Any]]:
     def project_means(means_cam: Any, K: Any, width: int, height: int, profile: Profile | None = None) -> Any:
         return impl._persp_proj(means_cam[None], _identities(means_cam)[None], K[None], width, height)[0][0]
 
+    def _identities(means: Any) -> Any:
+        return torch.eye(3, dtype=means.dtype, device=means.device).expand(len(means), 3, 3)
+
+    return {
+        "rotmats_from_quats": impl._quat_to_rotmat,
+        "covars_from_quats_scales": covars_from_quats_scales,
+        "sh_basis": sh_basis,
+        "colors_from_sh": colors_from_sh,
+        "means_cam_from_means": means_cam_from_means,
+        "covars_cam_from_covars": covars_cam_from_covars,
+        "project_means": project_means,
+    }
+
+
+def _screen_stages(impl: Any, torch: Any) -> dict[str, Callable[..., Any]]:
     def conics_from_covars2d(covars2d: Any) -> Any:
         return _seen_straight_on(covars2d, 0.0)[3][0]
 
@@ -68,21 +86,7 @@ def torch_stages() -> dict[str, Callable[..., Any]]:
         starts = impl._isect_offset_encode(keys, 1, *grid).flatten().tolist()
         return [ids[a:b].tolist() for a, b in itertools.pairwise([*starts, len(ids)])]
 
-    def _identities(means: Any) -> Any:
-        return torch.eye(3, dtype=means.dtype, device=means.device).expand(len(means), 3, 3)
-
-    return {
-        "rotmats_from_quats": impl._quat_to_rotmat,
-        "covars_from_quats_scales": covars_from_quats_scales,
-        "sh_basis": sh_basis,
-        "colors_from_sh": colors_from_sh,
-        "means_cam_from_means": means_cam_from_means,
-        "covars_cam_from_covars": covars_cam_from_covars,
-        "project_means": project_means,
-        "conics_from_covars2d": conics_from_covars2d,
-        "compensations": compensations,
-        "tile_lists": tile_lists,
-    }
+    return {"conics_from_covars2d": conics_from_covars2d, "compensations": compensations, "tile_lists": tile_lists}
 
 
 def gsplat_torch(name: str, dtype: str) -> TorchAdapter:
