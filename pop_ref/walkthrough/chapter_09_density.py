@@ -2,7 +2,7 @@
 # # 9. Clone, split, prune, reset: why POP needs no reset
 #
 # Training changes not only the Gaussians but how many there are. At the end of this chapter you know who is cloned, who
-# is split and who is pruned, what happens to the optimiser's memory when rows come and go, what an opacity reset does
+# is split and who is pruned, what happens to the optimizer's memory when rows come and go, what an opacity reset does
 # to a picture, and what the Polarized Opacity Prior does in its place.
 #
 # ## Who is asking for help
@@ -150,9 +150,9 @@ picture(
 )
 
 # %% [markdown]
-# ## Rows, and what the optimiser remembers of them
+# ## Rows, and what the optimizer remembers of them
 #
-# To the optimiser a Gaussian is a row of every parameter tensor, and for each tensor Adam keeps two more of its shape:
+# To the optimizer a Gaussian is a row of every parameter tensor, and for each tensor Adam keeps two more of its shape:
 # $m$, a running mean of the gradient, and $v$, one of its square (Kingma and Ba 2015). A row operation moves all three
 # together. Survivors keep their bits; newcomers start with zero moments; Adam's step counter belongs to the tensor and
 # runs on. Where $m$ and $v$ are left behind, every Gaussian behind the first gap goes on with a stranger's momentum:
