@@ -137,7 +137,7 @@ class Adapter:
             splats, lists, camera.width, camera.height, size, scene.background, scene.profile
         )
         told = {f.name: getattr(drawn, f.name, None) for f in fields(View)}
-        return View(**{**told, "radii": splats.radii, "means2d": splats.means2d})
+        return View(**{**told, **_shown(splats)})
 
     def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
         """Return cotangents by name: means, quats, scales, opacities, sh, and those of viewmat, background, means2d,
@@ -183,6 +183,10 @@ def under(scene: Scene, profile: Profile | None) -> Scene:
         K[:2, 2] = centre
         changes |= {"K": K, "means": scene.gaussians.means + aside @ viewmat[:2, :3]}
     return scene.but(**changes)
+
+
+def _shown(splats: Any) -> dict[str, Any]:
+    return {name: getattr(splats, name) for name in ("radii", "means2d", "depths", "conics")}
 
 
 def _projected(scene: Scene) -> tuple[Splats, list[list[int]]]:
@@ -245,9 +249,7 @@ class OracleAdapter(Adapter):
         """Draw a scene with `render.render`."""
         drawn = self.full_render(scene)
         common = {f.name: getattr(drawn, f.name) for f in fields(View) if hasattr(drawn, f.name)}
-        return View(
-            **common, **{name: getattr(drawn.splats, name) for name in ("radii", "means2d", "depths", "conics")}
-        )
+        return View(**common, **_shown(drawn.splats))
 
     def full_render(self, scene: Scene) -> Any:
         """Draw a scene and return the oracle's own `Render`, with the splats and tile lists."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import sys
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -19,7 +20,10 @@ from pop_ref.conformance.backends import ELSEWHERE, Absent, Unavailable, made_by
 from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.inria_adapter import inria
 from pop_ref.conformance.law import missing
+from pop_ref.conformance.mutants import MUTANTS, living
 from pop_ref.conformance.mutants.trial import every_law, obeys
+from pop_ref.conformance.scenes import scene_as_code
+from pop_ref.conformance.telling import tell
 from pop_ref.conformance.torch_adapter import TorchAdapter
 from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER
 from pop_ref.constants import PROFILES as ALL_PROFILES
@@ -210,6 +214,41 @@ def test_blending_alone_is_judged_by_the_laws_of_images_and_gradients() -> None:
     assert adapter.has(GRADIENTS)
     assert not broken(adapter, IMAGE, GRADIENT, BACKGROUND)
     assert broken(ForgetsBackground(), GRADIENT, BACKGROUND) == [BACKGROUND]
+
+
+class ForgetsOpaqueSplats(Blending):
+    def composite(self, splats: Any, lists: Any, *rest: Any) -> Any:  # type: ignore[override]
+        return composite(splats, [[i for i in ids if splats.opacities[i] < 1.0] for ids in lists], *rest)
+
+
+def test_a_failure_is_told_by_elimination_where_stages_are_hidden() -> None:
+    seen = golden_scene()
+    text = tell("test_some_law", ForgetsOpaqueSplats(), {"scene": seen})
+    assert (
+        "first stage that differs: depths, means2d, conics are the oracle's, so it is alpha, order or blending" in text
+    )
+    assert re.search(r"first pixel that differs: T_final, pixel \(\d+, \d+\): oracle 0\.\d+, backend 0\.\d+", text)
+    assert "first Gaussian: as soon as Gaussian 1 is added to those in front of it" in text
+    text = tell("test_some_law", ForgetsBackground(), {"scene": seen})
+    assert "first Gaussian: as soon as there is no Gaussian: image, pixel (0, 0): oracle [0.125, 0.25, 0.5]" in text
+
+
+def test_the_scene_that_is_told_is_the_first_that_differs() -> None:
+    other = golden_scene().rows([0])
+    text = tell("test_some_law", ForgetsOpaqueSplats(), {"one": other, "both": golden_scene()})
+    assert text.endswith(scene_as_code(golden_scene()))
+    text = tell("test_some_law", Blending(), {"one": other})
+    assert "stages, pixels and gradients of its scenes are the oracle's; the law breaks in what it compares" in text
+    assert "draws no scene" in tell("test_some_law", OneStage(), {})
+
+
+def test_a_wrong_gradient_of_a_right_image_is_told() -> None:
+    by_name = {mutant.name: mutant for mutant in MUTANTS}
+    with living(by_name["conic_off_diagonal_twice"]) as backend:
+        text = tell("test_some_law", backend, {"scene": golden_scene()})
+    assert "first pixel" not in text
+    assert re.search(r"first gradient that differs: v_scales, Gaussian \d, entry \[\d\]: oracle \S+, backend \S+", text)
+    assert "nearest decision: D" in text
 
 
 def test_an_adapter_is_found_by_its_path_and_must_be_one() -> None:
