@@ -52,6 +52,9 @@ class Args:
     ]
 
 
+_NAMED: Final = 8  # names that a line gives
+
+
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     action = parse(Args, argv, "vectors", examples=_EXAMPLES).action
@@ -79,6 +82,7 @@ def _check(args: Check) -> int:
             print(f"  {verdict.vector}: off by {verdict.worst:.3g}, allowed {verdict.allowed:.3g}; {verdict.told}")
     for title, names in (("not there", found.absent), ("no result for", found.missing), ("unknown", found.strange)):
         if names:
-            print(f"{title}, not judged: {', '.join(names)}")
+            more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+            print(f"{title}, not judged: {', '.join(names[:_NAMED])}{more}")
     print(f"{len(found.failed)} of {len(found.verdicts)} arrays fail" if found.failed else "all that is there passes")
     return 1 if found.failed else 0
