@@ -178,8 +178,8 @@ print("largest |m| of the means, row by row:", largest.round(5).tolist())
 # opacities are lowered to at most 0.01 (the paper writes $o_i \to 0$, section 3.1), so that only what is needed climbs
 # back. Watch it with geometry standing still, opacities and colours learning. Six splats form a wall, which is all that
 # the photograph shows; six are hidden behind it, two are haze before it. One run resets at step 80 and at 160. The
-# other has the prior of chapter 8 instead, with a weight that makes $\lambda_{\mathrm{POP}}$ times
-# the number of steps what it is in the paper: a push adds up.
+# other has the prior of [chapter 8](chapter_08_polarized_opacity.py) instead, with a weight that makes
+# $\lambda_{\mathrm{POP}}$ times the number of steps what it is in the paper: a push adds up.
 
 # %%
 WIDTH, HEIGHT, STEPS = 10, 6, 240

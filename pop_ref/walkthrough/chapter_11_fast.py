@@ -171,7 +171,8 @@ picture(
 # ## Backward with one number per pixel
 #
 # Let $g$ be the gradient of the loss by a pixel's colour. The gradient by $\alpha_k$ compares the splat's colour with
-# the colour behind it, $b_k$, which is everything after $k$ as seen without $k$ (derivative of eq. 1, chapter 5):
+# the colour behind it, $b_k$, which is everything after $k$ as seen without $k$ (derivative of eq. 1, [chapter
+# 5](chapter_05_backward_by_hand.py)):
 #
 # $$\frac{\partial L}{\partial \alpha_k} = T_k \, (c_k - b_k) \cdot g .$$
 #
