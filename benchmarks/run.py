@@ -37,7 +37,7 @@ from pop_fast.data import Capture, load_capture
 from pop_fast.rasterization import rasterization
 from pop_fast.tiles import tile_lists
 from pop_fast.train import TrainConfig, Trainer
-from pop_fast.train.environment import reproducible
+from pop_fast.train.environment import keep_freed_memory, reproducible
 from pop_ref.render import render, render_vjp
 from pop_ref.types import Camera, Gaussians
 
@@ -251,6 +251,7 @@ def main() -> None:
     parser.add_argument("--factor", type=int, default=1)
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
+    keep_freed_memory()  # as `pop train` does
     result: dict[str, Any] = {"machine": machine(), "gate": gate()}
     wanted = {given.only} if given.only else {"raster", "iteration", "memory", "capture"}
     if "raster" in wanted:

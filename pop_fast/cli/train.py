@@ -23,6 +23,7 @@ from pop_fast.report import write_report
 from pop_fast.train.choose import choose_backend, make_trainer
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.device_plan import unsupported
+from pop_fast.train.environment import keep_freed_memory
 
 _EXAMPLES: Final = """
     pop train scene                          POP, the paper's 30,000 steps, results in out/scene_pop
@@ -82,6 +83,7 @@ def run(argv: Sequence[str]) -> int:
     check_output(folder, options)
     config, chosen = choose_backend(config, options.resume)
     check_backend(config)
+    keep_freed_memory()
     start = time.perf_counter()
     capture = open_capture(config, options)
     loading = time.perf_counter() - start

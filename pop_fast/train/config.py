@@ -62,7 +62,7 @@ class TrainConfig:
         result_dir: where the run writes.
         method: "pop", or "adc" for plain density control with opacity reset (3DGS as gsplat runs it).
         preset: "paper" is the whole schedule; "quick" a tenth of it, for a CPU, in which a Gaussian must dominate at
-            least `QUICK_BLUR_MIN_PIXELS` pixels to count as blur.
+            least `QUICK_BLUR_MIN_PIXELS` pixels to count as blur, and none is pruned for its size.
         steps_scaler: multiplies every step number of the schedule; None takes the preset's.
         max_steps: training steps, one view each.
         seed: of the view order, the initial rotations and the split noise.
@@ -182,8 +182,10 @@ class TrainConfig:
     def resolved(self) -> TrainConfig:
         """Return the same run with the scaler worked into every step number (and itself 1)."""
         by = self.scaler
-        pop = self.pop.scaled(by)
+        pop, adc = self.pop.scaled(by), self.adc.scaled(by)
         if self.preset == "quick":
+            # what a big Gaussian covered, a sky above all, does not grow back in so few steps: see benchmarks/NOTES.md
+            pop, adc = replace(pop, prune_too_big=False), replace(adc, prune_too_big=False)
             pop = replace(pop, blur_min_pixels=max(pop.blur_min_pixels, QUICK_BLUR_MIN_PIXELS))
 
         def scaled(step: int) -> int:
@@ -199,7 +201,7 @@ class TrainConfig:
             eval_steps=tuple(scaled(step) for step in self.eval_steps),
             save_steps=tuple(scaled(step) for step in self.save_steps),
             pop=pop,
-            adc=self.adc.scaled(by),
+            adc=adc,
         )
 
     def to_json(self) -> str:

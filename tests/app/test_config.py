@@ -51,8 +51,16 @@ def test_shrinking_multiplies_every_step_number_and_no_rate():
     assert (quick.pop.blur_start_iter, quick.pop.blur_stop_iter, quick.pop.pop_stop_iter) == (300, 700, 1500)
     assert (quick.adc.reset_every, quick.adc.refine_stop_iter) == (300, 1500)
     assert quick.lr == LearningRates()
+    assert not quick.pop.prune_too_big
+    assert not quick.adc.prune_too_big
     assert quick.resolved() == quick
     assert TrainConfig(preset="quick", steps_scaler=0.5).resolved().max_steps == 15_000
+
+
+def test_a_shrunk_paper_schedule_still_prunes_by_size():
+    shrunk = TrainConfig(steps_scaler=0.1).resolved()
+    assert shrunk.pop.prune_too_big
+    assert shrunk.adc.prune_too_big
 
 
 def test_max_steps_alone_cuts_the_schedule_short():
@@ -152,7 +160,7 @@ def test_a_resumed_run_must_share_what_reaches_the_bits_and_only_that():
 
 
 def test_two_ways_to_say_the_same_schedule_are_the_same_run():
-    spelled_out = TrainConfig(steps_scaler=0.1, pop=POPStrategy(blur_min_pixels=11.0))
+    spelled_out = TrainConfig(steps_scaler=0.1, pop=POPStrategy(blur_min_pixels=11.0, prune_too_big=False))
     assert TrainConfig(preset="quick").digest() == spelled_out.digest()
     assert TrainConfig(preset="quick").digest() != TrainConfig(steps_scaler=0.1).digest()
 
