@@ -1,9 +1,10 @@
-"""Time the CUDA backend: rasterization forward and backward by family, dominance, the fused step, and gsplat beside it.
+"""Time the CUDA backend: rasterization, dominance, the fused step and each of its kernels; gsplat beside it.
 
-    python benchmarks/gpu_kernels.py out.json [--cases 270k_1.6MP]
+    python benchmarks/gpu_kernels.py out.json [--cases 270k_1.6MP] [--runs out/garden_pop ...]
 
-Correctness first: the gradients of the two families must agree before anything is timed. Times are medians of CUDA
-events after warm-up, in milliseconds.
+Correctness first: the gradients of the two backward families must agree before anything is timed. Times are medians of
+CUDA events after warm-up, in milliseconds. Beside every kernel stand what it has to do at least and its floor on this
+card (`gpu_floors`); `ratios` are gsplat's times over ours, on the same tensors in the same run.
 """
 
 from __future__ import annotations
@@ -13,21 +14,24 @@ import importlib.util
 import json
 import statistics
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
-from gpu_scenes import CASES, GpuCase, activated_scene
+from gpu_floors import Card, floors, measured_card
+from gpu_gsplat import gsplat_iteration
+from gpu_scenes import CASES, GpuCase, activated_scene, trained_scene
+from gpu_steps import kernel_times, whole_step
+from torch import Tensor
 
 import cuda_ext
 from cuda_ext.ops import rasterization
-from cuda_ext.resident import ResidentViews
-from cuda_ext.train_settings import Phase, StepSettings
-from cuda_ext.train_step import FusedTrainer
 
 WARM_UP, REPEATS, STEPS = 5, 50, 200
 LEAVES = ("means", "quats", "scales", "opacities", "sh")
+FAMILIES = ("columns", "splats")
 
 
 def timed(run: Callable[[], Any]) -> float:
@@ -56,7 +60,7 @@ def forward_backward(
 ) -> dict[str, float]:
     """Time the forward pass alone, and forward and backward together."""
     leaves = {**scene, **{name: scene[name].clone().requires_grad_() for name in LEAVES}}
-    v = torch.rand((1, case.height, case.width, 3), device="cuda")
+    v = torch.rand((1, case.height, case.width, 3), device=scene["means"].device)
 
     def forward() -> None:
         with torch.no_grad():
@@ -68,25 +72,13 @@ def forward_backward(
         (draw(function, leaves, case, **options)[0] * v).sum().backward()
 
     alone, together = timed(forward), timed(both)
-    return {"forward_ms": alone, "forward_backward_ms": together}
-
-
-def loads(scene: dict[str, Any], case: GpuCase) -> dict[str, float]:
-    """Count what there is to do: instances, splats blended and visited a pixel."""
-    _, _, meta = draw(rasterization, scene, case, counts=True)
-    visible = int((meta["radii"] > 0).all(-1).sum())
-    return {
-        "visible": visible,
-        "instances_16px": len(meta["flatten_ids"]),
-        "blended_per_pixel": float(meta["n_contrib"].float().mean()),
-        "visited_per_pixel": float(meta["n_traversed"].float().mean()),
-    }
+    return {"forward_ms": alone, "forward_backward_ms": together, "backward_ms": together - alone}
 
 
 def families_agree(scene: dict[str, Any], case: GpuCase) -> dict[str, float]:
     """Compare the gradients of the two families: the largest difference over the largest gradient."""
     found: list[dict[str, Any]] = []
-    for family in ("columns", "splats"):
+    for family in FAMILIES:
         leaves = {**scene, **{name: scene[name].clone().requires_grad_() for name in LEAVES}}
         draw(rasterization, leaves, case, family=family)[0].square().mean().backward()
         found.append({name: leaves[name].grad for name in LEAVES})
@@ -97,72 +89,87 @@ def families_agree(scene: dict[str, Any], case: GpuCase) -> dict[str, float]:
     return apart
 
 
-def fused_step(scene: dict[str, Any], case: GpuCase, family: str, deterministic: bool) -> dict[str, float]:
-    """Time whole training iterations at a fixed number of Gaussians, with and without dominance."""
-    params = {
-        "means": scene["means"].clone(),
-        "scales": scene["scales"].log(),
-        "quats": scene["quats"].clone(),
-        "opacities": torch.logit(scene["opacities"].clamp(1e-4, 1 - 1e-4)),
-        "sh0": scene["sh"][:, :1].contiguous(),
-        "shN": scene["sh"][:, 1:].contiguous(),
+def photograph_of(scene: dict[str, Tensor], case: GpuCase) -> Tensor:
+    """Make a photograph that differs from the scene's render everywhere, so that no gradient is zero."""
+    image = draw(rasterization, scene, case)[0][0]
+    g = torch.Generator(device=image.device).manual_seed(1)
+    noise = 0.1 * torch.randn(image.shape, generator=g, device=image.device)
+    return ((image + noise).clamp(0.0, 1.0) * 255.0).to(torch.uint8)
+
+
+def by_kernel(scene: dict[str, Tensor], case: GpuCase, photograph: Tensor, card: Card, family: str) -> dict[str, Any]:
+    """Time every kernel of a POP step, beside its work and floor."""
+    times, loads = kernel_times(scene, photograph, STEPS // 4, family=family)
+    least = floors(loads, card)
+    pixels = loads.pixels
+    return {
+        "loads": asdict(loads),
+        "evaluated_per_pixel": loads.evaluated / pixels,
+        "contributing_per_pixel": loads.contributing / pixels,
+        "kernels": {name: {"ms": ms, **least.get(name, {})} for name, ms in times.items()},
+        "sum_ms": sum(times.values()),
+        "floor_ms": sum(entry["floor_ms"] for entry in least.values()),
     }
-    m, v = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))
-    image = (draw(rasterization, scene, case)[0][0].clamp(0, 1) * 255).to(torch.uint8)
-    device = torch.device("cuda")
-    views = ResidentViews([image], scene["viewmats"], scene["Ks"], None, "valid", device)
-    lr = dict.fromkeys(params, 1e-6)
-    settings = StepSettings(lr, 4 * STEPS, family=family, deterministic=deterministic)
-    trainer = FusedTrainer(params, m, v, views, [0] * (4 * STEPS), settings)
-    found: dict[str, float] = {}
-    for k, tells in enumerate((True, False)):
-        trainer.run((2 * k + 1) * STEPS, Phase(3, tells, tells, tells))
-        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-        start.record()
-        trainer.run((2 * k + 2) * STEPS, Phase(3, tells, tells, tells))
-        end.record()
-        end.synchronize()
-        found["step_with_pop_ms" if tells else "step_ms"] = start.elapsed_time(end) / STEPS
-    return found
 
 
-def measure(case: GpuCase) -> dict[str, Any]:
+def measure(case: GpuCase, scene: dict[str, Tensor], card: Card) -> dict[str, Any]:
     """Measure one case."""
-    scene = activated_scene(case, torch.device("cuda"))
-    result: dict[str, Any] = {"loads": loads(scene, case), "families_differ": families_agree(scene, case)}
-    for family in ("columns", "splats"):
+    result: dict[str, Any] = {"families_differ": families_agree(scene, case)}
+    photograph = photograph_of(scene, case)
+    for family in FAMILIES:
+        result[f"{family}_by_kernel"] = by_kernel(scene, case, photograph, card, family)
         for deterministic in (True, False):
             options = {"family": family, "deterministic": deterministic}
             name = f"{family}{'' if deterministic else '_atomic'}"
             result[name] = forward_backward(rasterization, scene, case, **options)
-            result[name] |= fused_step(scene, case, family, deterministic)
+            result[name] |= whole_step(scene, photograph, STEPS, **options)
     result["with_dominance"] = forward_backward(rasterization, scene, case, dominance=True)
+    ours, told = result["columns"], result["with_dominance"]
+    result["dominance_share"] = told["forward_ms"] / ours["forward_ms"] - 1.0
+    result["deterministic_costs_ms"] = ours["step_ms"] - result["columns_atomic"]["step_ms"]
     if importlib.util.find_spec("gsplat") is not None:
         import gsplat
 
         result["gsplat_version"] = gsplat.__version__
-        result["gsplat"] = forward_backward(gsplat.rasterization, scene, case)
-    result["peak_MiB"] = torch.cuda.max_memory_allocated() / 2**20
+        theirs = forward_backward(gsplat.rasterization, scene, case)
+        theirs |= gsplat_iteration(gsplat.rasterization, scene, case, photograph, timed)
+        result["gsplat"] = theirs
+        names = ("forward_ms", "backward_ms", "forward_backward_ms", "step_ms")
+        result["ratios"] = {name.removesuffix("_ms"): theirs[name] / ours[name] for name in names}
+    if torch.cuda.is_available():
+        result["peak_MiB"] = torch.cuda.max_memory_allocated() / 2**20
+        torch.cuda.reset_peak_memory_stats()
     return result
+
+
+def scenes(names: list[str] | None, runs: list[Path], device: torch.device) -> Iterator[tuple[GpuCase, dict[str, Any]]]:
+    """Make the scenes asked for, one at a time."""
+    for case in CASES:
+        if names is None or case.name in names:
+            yield case, activated_scene(case, device)
+    for folder in runs:
+        yield trained_scene(folder, device)
 
 
 def main() -> int:
     """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path, help="the JSON file")
-    parser.add_argument("--cases", nargs="+", choices=[case.name for case in CASES], help="default: all")
+    parser.add_argument("--cases", nargs="*", choices=[case.name for case in CASES], help="default: all")
+    parser.add_argument("--runs", nargs="*", type=Path, default=[], help="results of `pop train`, timed as well")
     args = parser.parse_args()
     reason = cuda_ext.why_not()
     if reason is not None:
         print(f"gpu_kernels: {reason}", file=sys.stderr)
         return 2
-    results: dict[str, Any] = {"gpu": torch.cuda.get_device_name(), "torch": torch.__version__, "cases": {}}
-    for case in CASES:
-        if args.cases is None or case.name in args.cases:
-            torch.cuda.reset_peak_memory_stats()
-            results["cases"][case.name] = measure(case)
-            args.out.write_text(json.dumps(results, indent=1) + "\n")
-            print(json.dumps({case.name: results["cases"][case.name]}, indent=1), flush=True)
+    device = torch.device("cuda")
+    card = measured_card(device)
+    results: dict[str, Any] = {"gpu": torch.cuda.get_device_name(), "torch": torch.__version__, "card": asdict(card)}
+    results["cases"] = {}
+    for case, scene in scenes(args.cases, args.runs, device):
+        results["cases"][case.name] = measure(case, scene, card)
+        args.out.write_text(json.dumps(results, indent=1) + "\n")
+        print(json.dumps({case.name: results["cases"][case.name]}, indent=1), flush=True)
     return 0
 
 

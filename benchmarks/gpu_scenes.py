@@ -1,11 +1,14 @@
-"""Synthetic scenes for the GPU with the loads of trained ones: Gaussians, pixels and list lengths in the same range."""
+"""What the GPU is timed on: synthetic scenes with the loads of trained ones, and trained scenes themselves."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor
+
+from pop_fast.cli.splat import CaptureOptions, load_splat, open_capture
 
 
 @dataclass(frozen=True)
@@ -16,7 +19,7 @@ class GpuCase:
         name: of the case.
         n: Gaussians.
         width, height: px.
-        size: median standard deviation on the screen, px.
+        size: median standard deviation on the screen, px; 0 for a trained scene, which is not made from it.
     """
 
     name: str
@@ -62,3 +65,27 @@ def activated_scene(case: GpuCase, device: torch.device, seed: int = 0) -> dict[
         "viewmats": torch.eye(4, device=device)[None],
         "Ks": K[None],
     }
+
+
+def trained_scene(folder: Path, device: torch.device) -> tuple[GpuCase, dict[str, Tensor]]:
+    """Return the last checkpoint of a `pop train` result, as its first held-out view sees it, and its case.
+
+    Raises:
+        PopError: the folder is no result, or its capture is not where it was.
+    """
+    splat = load_splat(folder)
+    capture, config = open_capture(splat, CaptureOptions())
+    view = (*capture.test_views(config.test_every), *capture.views)[0]
+    p = {name: value.to(device) for name, value in splat.params.items()}
+    shN = torch.zeros((len(p["means"]), 15, 3), device=device)
+    shN[:, : p["shN"].shape[1]] = p["shN"]
+    scene = {
+        "means": p["means"],
+        "quats": p["quats"],
+        "scales": p["scales"].exp(),
+        "opacities": p["opacities"].sigmoid(),
+        "sh": torch.cat((p["sh0"], shN), 1),
+        "viewmats": torch.tensor(view.viewmat, dtype=torch.float32, device=device)[None],
+        "Ks": torch.tensor(view.K, dtype=torch.float32, device=device)[None],
+    }
+    return GpuCase(folder.name, len(p["means"]), view.width, view.height, 0.0), scene

@@ -1,4 +1,4 @@
-"""Everything that only a GPU can tell, in stages, into one JSON file: build, laws, steps, sanitizer, bench, training.
+"""Everything that only a GPU can tell, in stages, into one JSON file: build, laws, steps, sanitizer, training, bench.
 
     python -m cuda_ext.gpu_check out.json [--stages build laws ...] [--captures DIR ...] [--limit-s 540]
 
@@ -137,11 +137,13 @@ def gsplat_stage(check: Check) -> dict[str, Any]:
 
 
 def bench_stage(check: Check) -> dict[str, Any]:
-    """Time every kernel and the whole step, beside gsplat where it is installed."""
+    """Time every kernel and the whole step, beside gsplat where it is installed, also on what stage train has made."""
     target = OUT / "bench.json"
     target.parent.mkdir(parents=True, exist_ok=True)
     target.unlink(missing_ok=True)
-    command = [sys.executable, str(ROOT / "benchmarks" / "gpu_kernels.py"), str(target)]
+    commit = first_line(["git", "rev-parse", "--short", "HEAD"])
+    runs = sorted(str(file.parent) for file in OUT.glob(f"*_cuda_*_{commit}/cfg.json"))
+    command = [sys.executable, str(ROOT / "benchmarks" / "gpu_kernels.py"), str(target), "--runs", *runs]
     found = run(command, check.left, PYTHONPATH=python_path(ROOT, SITE))
     if target.exists():
         # case by case: also what was measured before the time was up
@@ -201,9 +203,9 @@ STAGES: dict[str, Callable[[Check], dict[str, Any]]] = {
     "laws_of_splats": laws_of_splats_stage,
     "steps": steps_stage,
     "sanitizer": sanitizer_stage,
+    "train": train_stage,
     "gsplat": gsplat_stage,
     "bench": bench_stage,
-    "train": train_stage,
 }
 
 

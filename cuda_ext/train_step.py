@@ -131,6 +131,20 @@ class FusedTrainer:
         """Return what the steps from `first` to before `last` told; `run` must have taken them in this session."""
         return [StepValues(*row) for row in self._history[first:last].tolist()]
 
+    @property
+    def n_instances(self) -> int:
+        """How many list entries the last step had."""
+        return int(self.state[N_INSTANCES])
+
+    @property
+    def radii(self) -> Tensor:
+        """Extents of the last step's splats, px, 0 where culled. [N, 2] int32"""
+        return self._splat["radii"]
+
+    def told_maps(self) -> dict[tuple[int, int], dict[str, Tensor]]:
+        """Return, by image size, what the last step of a phase that tells dominant Gaussians told of every pixel."""
+        return {size: frame.told for size, frame in self._frames.items()}
+
     def _recover(self) -> int:
         """Handle what halted the device, and return the step to go on from."""
         flags = self.state.tolist()

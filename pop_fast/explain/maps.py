@@ -45,6 +45,15 @@ def view_maps(scene: ExplainedView) -> list[Map]:
     render, photo = as_uint8(scene.image.numpy()), scene.view.image
     error = error_magnitude(render, photo)
     shares = _shares(scene)
+    pulls = scaled(
+        "pop_pull",
+        "Where POP pulls",
+        "weight of Gaussians that POP pulls up, less weight of those it pushes down",
+        shares[1],
+        "coolwarm",
+        1.0,
+        -1.0,
+    )
     return [
         Map("render", "Render", "what the splat shows, clamped to [0, 1]", render),
         Map("photo", "Photograph", "what it should show", photo),
@@ -74,15 +83,7 @@ def view_maps(scene: ExplainedView) -> list[Map]:
             1.0,
         ),
         _dots(scene, render),
-        scaled(
-            "pop_pull",
-            "Where POP pulls",
-            "weight of Gaussians that POP pulls up, less weight of those it pushes down",
-            shares[1],
-            "coolwarm",
-            1.0,
-            -1.0,
-        ),
+        *([pulls] if scene.lambda_pop > 0.0 else []),
     ]
 
 

@@ -106,6 +106,7 @@ def _stages(e: PixelExplanation, drawn: Sequence[Row], pictures: dict[str, np.nd
             ("dominant_ids", "dominant Gaussian"),
             ("pop_pull", "where POP pulls"),
         )
+        if key in pictures
     )
     return (
         f'<section class="duo {kind}"><figure>{stage(e, drawn, whole, (0, 0, e.width, e.height), box)}'
@@ -133,6 +134,7 @@ def _light(e: PixelExplanation) -> str:
     )
 
 
+_POP_COLUMN = ("POP", "derivative of the weighted POP term; up: it raises the opacity")
 _COLUMNS = (
     ("#", "place in the tile's list"),
     ("id", "the Gaussian"),
@@ -149,15 +151,17 @@ _COLUMNS = (
     ("dL/dalpha", "photometric, here"),
     ("dL/do", "photometric, through this pixel"),
     ("dL/do view", "photometric, through the whole view"),
-    ("POP", "derivative of the weighted POP term; up: it raises the opacity"),
-    ("net", "where both together, over the whole view, move the opacity"),
+    _POP_COLUMN,
+    ("net", "where the whole objective, over the whole view, moves the opacity"),
 )
 
 
 def _walk(e: PixelExplanation) -> str:
     chosen = weighty(e, 30)
-    head = "".join(f'<th title="{escape(about)}">{name}</th>' for name, about in _COLUMNS)
-    rows = "".join(_row(row, row.rank in chosen) for row in e.rows)
+    has_pop = e.lambda_pop > 0.0
+    columns = [column for column in _COLUMNS if has_pop or column != _POP_COLUMN]
+    head = "".join(f'<th title="{escape(about)}">{name}</th>' for name, about in columns)
+    rows = "".join(_row(row, row.rank in chosen, has_pop) for row in e.rows)
     pop = ""
     if e.lambda_pop:
         pop = (
@@ -173,7 +177,7 @@ def _walk(e: PixelExplanation) -> str:
     )
 
 
-def _row(row: Row, chosen: bool) -> str:
+def _row(row: Row, chosen: bool, has_pop: bool) -> str:
     blended = row.status == "blended"
     kinds = [row.status, *["dominant"] * row.dominant, *["faint"] * (blended and not chosen)]
     pill = '<span class="pill">D8</span>' if row.dominant else ""
@@ -196,7 +200,8 @@ def _row(row: Row, chosen: bool) -> str:
     else:
         body += f'<td class="why" colspan="6">{row.status}, {escape(row.reason)}</td>'
     pull = "" if row.pop == "none" else f'<span class="{row.pop}">{row.pop} {abs(row.v_opacity_pop):.1e}</span>'
-    body += f'<td>{row.v_opacity_view:+.1e}</td><td>{pull}</td><td class="{row.net}">{row.net}</td>'
+    pull = f"<td>{pull}</td>" if has_pop else ""
+    body += f'<td>{row.v_opacity_view:+.1e}</td>{pull}<td class="{row.net}">{row.net}</td>'
     return f'<tr class="{" ".join(kinds)}" data-id="{row.id}">{body}</tr>'
 
 

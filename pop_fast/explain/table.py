@@ -9,10 +9,8 @@ from pop_fast.explain.model import PixelExplanation, Row
 
 WIDTH = 120
 _KEPT = 20
-_HEAD = (
-    "    #      id  depth   dist     G   raw alpha     T weight  colour r g b    sum r g b       dL/dalpha  dL/do"
-    "        POP"
-)
+_HEAD = "    #      id  depth   dist     G   raw alpha     T weight  colour r g b    sum r g b       dL/dalpha  dL/do"
+_HEAD_POP = "        POP"
 
 
 def table(explanation: PixelExplanation, everything: bool = False) -> str:
@@ -23,12 +21,13 @@ def table(explanation: PixelExplanation, everything: bool = False) -> str:
         everything: all entries; else those that matter, and one line for each stretch of faint ones.
     """
     e = explanation
-    lines = [*_above(e), "", _HEAD, "-" * WIDTH]
+    has_pop = e.lambda_pop > 0.0
+    lines = [*_above(e), "", _HEAD + _HEAD_POP * has_pop, "-" * WIDTH]
     chosen = {row.rank for row in e.rows} if everything else weighty(e)
     stretch: list[Row] = []
     for row in e.rows:
         if row.rank in chosen:
-            lines += [*_folded(stretch), _line(row)]
+            lines += [*_folded(stretch), _line(row, has_pop)]
             stretch = []
         else:
             stretch.append(row)
@@ -71,7 +70,7 @@ def _above(e: PixelExplanation) -> Iterator[str]:
     yield f"loss {e.objective}{term}; photometric part {e.loss:.3e}, dL/dcolour {pulls}"
 
 
-def _line(row: Row) -> str:
+def _line(row: Row, has_pop: bool) -> str:
     depth = f"{row.depth:.3f}" if row.depth < 100.0 else f"{row.depth:.0f}"
     line = f"{'*' if row.dominant else ' '}{row.rank:4d} {row.id:7d} {depth:>6} {row.distance:6.1f} "
     line += f"{number(row.falloff)} {number(row.alpha_raw)} {number(row.alpha)}{'^' if row.clamped else ' '}"
@@ -79,7 +78,7 @@ def _line(row: Row) -> str:
         return f"{line} {row.status}, {row.reason}"[:WIDTH]
     return (
         f"{line}{number(row.T)} {number(row.weight)}  {rgb(row.color)}  {rgb(row.cumulative)} "
-        f"{row.v_alpha:+9.1e} {row.v_opacity:+8.1e} {_pop(row)}"
+        f"{row.v_alpha:+9.1e} {row.v_opacity:+8.1e}{f' {_pop(row)}' * has_pop}"
     )
 
 

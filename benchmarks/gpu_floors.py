@@ -1,0 +1,105 @@
+"""What each kernel of a training step has to do at least: bytes, instructions, and the time that a card needs for them.
+
+The counts a pair and a Gaussian are those of the kernels' inner loops at their best; a floor is the larger of the time
+for the bytes at the bandwidth that this card copies with and that for the instructions at its full issue rate.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from dataclasses import dataclass
+
+import torch
+
+LANES_PER_SM = 128
+ROW = 48  # bytes of a packed splat, and of a gradient slot
+PARAMETERS = 59  # floats of a Gaussian
+GEOMETRY = 11  # of these, what a culled Gaussian is read for
+
+
+@dataclass(frozen=True)
+class Loads:
+    """What a step has to do.
+
+    Attributes:
+        gaussians: all of them.
+        visible: those with an extent on the screen.
+        instances: pairs of a splat and a 16 x 8 tile that it reaches.
+        evaluated: pairs of a list entry and a pixel up to where the last pixel of the tile stops.
+        contributing: of these, those that are blended.
+        pixels: of the image.
+    """
+
+    gaussians: int
+    visible: int
+    instances: int
+    evaluated: int
+    contributing: int
+    pixels: int
+
+
+@dataclass(frozen=True)
+class Card:
+    """What a card can do: bytes copied and lane instructions issued, per second."""
+
+    bytes_per_s: float
+    instructions_per_s: float
+
+
+def measured_card(device: torch.device, copied: int = 1 << 30) -> Card:
+    """Measure the bandwidth of a copy of so many bytes, and ask for processors and their clock."""
+    source = torch.zeros(copied, dtype=torch.uint8, device=device)
+    target = torch.empty_like(source)
+    best = float("inf")
+    for _ in range(5):
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        start.record()
+        target.copy_(source)
+        end.record()
+        end.synchronize()
+        best = min(best, start.elapsed_time(end))
+    lanes = torch.cuda.get_device_properties(device).multi_processor_count * LANES_PER_SM
+    return Card(2e3 * copied / best, lanes * _clock_hz())
+
+
+def _clock_hz() -> float:
+    """Return the highest clock that the driver allows; a tenth less is usual under load."""
+    tool = shutil.which("nvidia-smi")
+    if tool is None:
+        return 1e9
+    query = [tool, "--query-gpu=clocks.max.sm", "--format=csv,noheader,nounits"]
+    told = subprocess.run(query, capture_output=True, text=True, check=False).stdout.split()
+    return 1e6 * float(told[0]) if told else 1e9
+
+
+def work(loads: Loads) -> dict[str, tuple[float, float]]:
+    """Return bytes and lane instructions of every kernel of a step, by the kernel's name."""
+    n, seen, entries, pixels = loads.gaussians, loads.visible, loads.instances, loads.pixels
+    E, C = loads.evaluated, loads.contributing
+    adam = 4 * 3 * PARAMETERS * 2  # parameter and both moments, read and written
+    return {
+        "project": (4 * (GEOMETRY * (n - seen) + PARAMETERS * seen) + ROW * n, 0.0),
+        # four passes of an 8-byte pair over 32-bit depths, extents read, counts written
+        "count_instances": ((4 * 16 + ROW + 8) * n, 0.0),
+        # emitted once, two passes of a 6-byte pair over 16-bit tiles, ids and slots written
+        "make_tile_lists": ((6 + 2 * 12 + 12) * entries, 0.0),
+        "pack_records": (2 * ROW * n, 0.0),
+        "blend_forward": ((ROW + 4) * entries + 20 * pixels, 8.0 * E + 9.0 * C),
+        "photometric": (8 * 12 * pixels, 236.0 * 3 * pixels),
+        # a slot an entry, written once and read once
+        "blend_backward": ((3 * ROW + 8) * entries + 20 * pixels, 18.0 * E + 22.0 * C),
+        "update": ((adam + ROW) * n, 0.0),
+    }
+
+
+def floors(loads: Loads, card: Card) -> dict[str, dict[str, float]]:
+    """Return bytes, instructions and the floor in ms of every kernel."""
+    return {
+        name: {
+            "bytes": float(moved),
+            "instructions": issued,
+            "floor_ms": 1e3 * max(moved / card.bytes_per_s, issued / card.instructions_per_s),
+        }
+        for name, (moved, issued) in work(loads).items()
+    }

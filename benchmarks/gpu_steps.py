@@ -1,0 +1,133 @@
+"""The fused training step on the GPU, whole and kernel by kernel."""
+
+from __future__ import annotations
+
+import statistics
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from gpu_floors import Loads
+from torch import Tensor
+
+from cuda_ext import train_step
+from cuda_ext.resident import ResidentViews
+from cuda_ext.train_settings import Phase, StepSettings
+from cuda_ext.train_step import FusedTrainer
+
+PLAIN, POP = Phase(3, False, False, False), Phase(3, True, True, True)
+# what a step launches, in order (`FusedTrainer._launch`)
+KERNELS = (
+    *("begin_step", "project", "count_instances", "make_tile_lists", "pack_records", "blend_forward", "photometric"),
+    *("blend_backward", "count_important", "update", "end_step", "clear"),
+)
+HEAD_START = 2_000_000  # cycles the GPU waits before a step, so that it never waits for the host within one
+
+
+def raw_params(scene: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return the raw parameters of an activated scene."""
+    return {
+        "means": scene["means"].clone(),
+        "scales": scene["scales"].log(),
+        "quats": scene["quats"].clone(),
+        "opacities": torch.logit(scene["opacities"].clamp(1e-4, 1 - 1e-4)),
+        "sh0": scene["sh"][:, :1].contiguous(),
+        "shN": scene["sh"][:, 1:].contiguous(),
+    }
+
+
+def make_trainer(scene: dict[str, Tensor], photograph: Tensor, max_steps: int, **settings: Any) -> FusedTrainer:
+    """Make a trainer whose steps all see one view, with rates so small that the scene stays as it is."""
+    params = raw_params(scene)
+    m, v = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))
+    device = scene["means"].device
+    views = ResidentViews([photograph], scene["viewmats"], scene["Ks"], None, "valid", device)
+    chosen = StepSettings(dict.fromkeys(params, 1e-9), max_steps, **settings)
+    return FusedTrainer(params, m, v, views, [0] * max_steps, chosen)
+
+
+def whole_step(scene: dict[str, Tensor], photograph: Tensor, steps: int, **settings: Any) -> dict[str, float]:
+    """Time whole training iterations as they are run in training, with and without what POP asks for."""
+    trainer = make_trainer(scene, photograph, 4 * steps, **settings)
+    found: dict[str, float] = {}
+    for k, (name, phase) in enumerate({"step_with_pop_ms": POP, "step_ms": PLAIN}.items()):
+        trainer.run((2 * k + 1) * steps, phase)
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        start.record()
+        trainer.run((2 * k + 2) * steps, phase)
+        end.record()
+        end.synchronize()
+        found[name] = start.elapsed_time(end) / steps
+    return found
+
+
+def step_loads(trainer: FusedTrainer) -> Loads:
+    """Count what the trainer's last step had to do; it must have told dominant Gaussians."""
+    ((size, told),) = trainer.told_maps().items()
+    width, height = size
+    tiles = torch.nn.functional.pad(told["n_traversed"], (0, -width % 16, 0, -height % 8)).view(-(-height // 8), 8, -1)
+    longest = tiles.view(tiles.shape[0], 8, -1, 16).amax((1, 3))
+    return Loads(
+        trainer.n,
+        int((trainer.radii > 0).all(1).sum()),
+        trainer.n_instances,
+        int(longest.long().sum()) * 16 * 8,
+        int(told["n_blended"].long().sum()),
+        width * height,
+    )
+
+
+@dataclass
+class _TimedKernels:
+    """The kernels, each between two events."""
+
+    kernels: Any
+    spans: dict[str, list[tuple[Any, Any]]] = field(default_factory=lambda: defaultdict(list))
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self.kernels, name)
+        return self._timed(name, found) if name in KERNELS else found
+
+    def _timed(self, name: str, launch: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*arguments: Any) -> Any:
+            if name == "begin_step":
+                torch.cuda._sleep(HEAD_START)
+            start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+            start.record()
+            result = launch(*arguments)
+            end.record()
+            self.spans[name].append((start, end))
+            return result
+
+        return run
+
+
+@contextmanager
+def _timed_kernels() -> Iterator[_TimedKernels]:
+    load = train_step.load
+    timed = _TimedKernels(load())
+    train_step.load = lambda: timed
+    try:
+        yield timed
+    finally:
+        train_step.load = load
+
+
+def kernel_times(
+    scene: dict[str, Tensor], photograph: Tensor, steps: int, **settings: Any
+) -> tuple[dict[str, float], Loads]:
+    """Return the median time of every kernel of a POP step in ms, launched one by one, and what the step has to do."""
+    trainer = make_trainer(scene, photograph, 2 * steps, replay=False, **settings)
+    trainer.run(steps, POP)
+    with _timed_kernels() as timed:
+        trainer.run(2 * steps, POP)
+    torch.cuda.synchronize()
+    calls = {name: len(spans) // steps for name, spans in timed.spans.items()}
+    times = {
+        name: calls[name] * statistics.median(start.elapsed_time(end) for start, end in spans)
+        for name, spans in timed.spans.items()
+    }
+    return times, step_loads(trainer)
