@@ -5,8 +5,8 @@ coefficients f per (splat, tile). The constant and linear coefficients cancel fo
 the tile, so they are computed in float64 and rounded once; what is left within a tile is of the order of the exponent
 itself.
 
-The transpose needs the same six moments of G = alpha dL/dalpha, M = sum_p G p: every geometric gradient is linear in
-them.
+The transpose needs the same six moments of G = alpha dL/dalpha, M = sum_p G p. Moved from the tile's centre to the
+splat's they can be added up over tiles, and every geometric gradient of the splat is linear in the sums.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.layout import columns
-from pop_fast.tiles import TileLists
+from pop_fast.tile_groups import BLOCK, PackedLists
 
 _LOG2_E = math.log2(math.e)
 NULL_EXPONENT = -1e4  # 2 to this power is 0 in float32 and float64: entries that pad a list blend nothing
@@ -26,52 +26,57 @@ NULL_EXPONENT = -1e4  # 2 to this power is 0 in float32 and float64: entries tha
 
 @dataclass(frozen=True)
 class Entries:
-    """What the pairs of one tile-list entry share: centre relative to the tile's centre, conic, opacity. Each [I].
+    """What the pairs of one tile-list entry share, in float64, in the order of packed lists; padding has splat N.
 
     Attributes:
-        u: px.
-        v: px.
-        a: conic xx, px^-2.
-        b: conic xy, px^-2.
-        c: conic yy, px^-2.
-        opacity: of the splat.
+        lists: the packed lists.
+        u: splat's centre from the tile's centre, px. [8 B]
+        v: px. [8 B]
     """
 
+    lists: PackedLists
     u: Tensor
     v: Tensor
-    a: Tensor
-    b: Tensor
-    c: Tensor
-    opacity: Tensor
+
+    @classmethod
+    def of(cls, means2d: Tensor, lists: PackedLists) -> Entries:
+        """Gather where each entry's splat lies, seen from its tile."""
+        x, y = (_with_padding(t, 0.0).index_select(0, lists.ids) for t in columns(means2d))
+        size, tile = lists.tile_size, lists.block_tiles
+        row = torch.div(tile, lists.tiles_x, rounding_mode="floor")
+        x.view(-1, BLOCK).sub_((((tile - row * lists.tiles_x) * size).to(x.dtype) + 0.5 * size)[:, None])
+        y.view(-1, BLOCK).sub_(((row * size).to(x.dtype) + 0.5 * size)[:, None])
+        return cls(lists, x, y)
 
 
-def entries_of_lists(means2d: Tensor, conics: Tensor, opacities: Tensor, lists: TileLists) -> Entries:
-    """Gather, in float64, what each tile-list entry needs."""
-    tile = lists.entry_tiles
-    ids = lists.ids
-    row = torch.div(tile, lists.tiles_x, rounding_mode="floor")
-    half = 0.5 * lists.tile_size
-    x, y, a, b, c, o = (t.double().index_select(0, ids) for t in (*columns(means2d), *columns(conics), opacities))
-    u = x - ((tile - row * lists.tiles_x) * lists.tile_size + half)
-    v = y - (row * lists.tile_size + half)
-    return Entries(u, v, a, b, c, o)
+def exponent_coefficients(entries: Entries, conics: Tensor, opacities: Tensor) -> Tensor:
+    """Return the six coefficients of log2(alpha) of every entry, such that padding blends nothing. [6, 8 B] float64
+
+    Args:
+        entries: of the tile lists.
+        conics: inverse screen covariances, px^-2. [N, 3]
+        opacities: [N]
+    """
+    u, v, ids = entries.u, entries.v, entries.lists.ids
+    scaled = (_with_padding(t, 0.0).mul_(_LOG2_E) for t in columns(conics))
+    a, b, c = (t.index_select(0, ids) for t in scaled)
+    rows = torch.empty((6, len(ids)), dtype=torch.float64)
+    constant, gx, gy = rows[0], rows[1], rows[2]
+    torch.mul(a, u, out=gx).addcmul_(b, v)
+    torch.mul(b, u, out=gy).addcmul_(c, v)
+    torch.index_select(_with_padding(torch.log2(opacities.double()), NULL_EXPONENT), 0, ids, out=constant)
+    constant.addcmul_(gx, u, value=-0.5).addcmul_(gy, v, value=-0.5)
+    torch.mul(a, -0.5, out=rows[3])
+    torch.neg(b, out=rows[4])
+    torch.mul(c, -0.5, out=rows[5])
+    return rows
 
 
-def exponent_coefficients(entries: Entries, dtype: torch.dtype) -> Tensor:
-    """Return the six coefficients of log2(alpha) of every entry, and one last row that blends nothing. [I + 1, 6]"""
-    e = entries
-    gx = e.a * e.u + e.b * e.v
-    gy = e.b * e.u + e.c * e.v
-    constant = torch.log2(e.opacity) - (0.5 * _LOG2_E) * (gx * e.u + gy * e.v)
-    rows = torch.zeros((6, len(e.u) + 1), dtype=torch.float64)
-    rows[0, :-1] = constant
-    rows[0, -1] = NULL_EXPONENT
-    torch.mul(gx, _LOG2_E, out=rows[1, :-1])
-    torch.mul(gy, _LOG2_E, out=rows[2, :-1])
-    torch.mul(e.a, -0.5 * _LOG2_E, out=rows[3, :-1])
-    torch.mul(e.b, -_LOG2_E, out=rows[4, :-1])
-    torch.mul(e.c, -0.5 * _LOG2_E, out=rows[5, :-1])
-    return rows.T.to(dtype)
+def _with_padding(values: Tensor, padding: float) -> Tensor:
+    """Return values as float64, with one more that padding takes. [N + 1]"""
+    longer = torch.empty(len(values) + 1, dtype=torch.float64)
+    longer[:-1], longer[-1] = values, padding
+    return longer
 
 
 def pixel_basis(tile_size: int, dtype: torch.dtype) -> Tensor:
@@ -82,14 +87,32 @@ def pixel_basis(tile_size: int, dtype: torch.dtype) -> Tensor:
     return torch.stack((torch.ones_like(x), x, y, x * x, x * y, y * y))
 
 
-def entry_gradients(entries: Entries, moments: Tensor) -> tuple[Tensor, ...]:
-    """Turn the six moments of G ([6, I]) into gradients to screen centre (2), conic (3) and opacity."""
-    e = entries
-    m0, mx, my, mxx, mxy, myy = moments
-    du, dv = e.u * m0 - mx, e.v * m0 - my
-    v_x = -(e.a * du + e.b * dv)
-    v_y = -(e.b * du + e.c * dv)
-    v_a = -0.5 * (e.u * (du - mx) + mxx)
-    v_b = -(e.u * dv - e.v * mx + mxy)
-    v_c = -0.5 * (e.v * (dv - my) + myy)
-    return v_x, v_y, v_a, v_b, v_c, m0 / e.opacity
+def centred_moments(entries: Entries, moments: Tensor) -> Tensor:
+    """Turn the six moments of G about the tiles' centres ([6, 8 B]) into those about the splats' centres. float64"""
+    u, v = entries.u, entries.v
+    m0, mx, my, mxx, mxy, myy = found = moments.double()
+    # about the splat's centre, with the signs of (splat - pixel); in place, so what is read last comes last
+    du, dv = torch.mul(u, m0).sub_(mx), torch.mul(v, m0).sub_(my)
+    mxx.addcmul_(u, du).addcmul_(u, mx, value=-1.0)
+    mxy.addcmul_(u, dv).addcmul_(v, mx, value=-1.0)
+    myy.addcmul_(v, dv).addcmul_(v, my, value=-1.0)
+    mx.copy_(du)
+    my.copy_(dv)
+    return found
+
+
+def splat_gradients(moments: Tensor, conics: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Turn each splat's centred moments ([6, N]) into gradients to screen centre, conic and opacity, component rows.
+
+    Returns:
+        [2, N], [3, N] and [N], float64.
+    """
+    a, b, c = (t.double() for t in columns(conics))
+    m0, du, dv, duu, duv, dvv = moments
+    centre = torch.stack((-(a * du + b * dv), -(b * du + c * dv)))
+    # a splat without opacity blends nothing: its moment is 0
+    return (
+        centre,
+        torch.stack((-0.5 * duu, -duv, -0.5 * dvv)),
+        m0 / opacities.double().masked_fill(opacities == 0.0, 1.0),
+    )

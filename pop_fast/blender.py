@@ -16,7 +16,7 @@ number per pixel, B, the light from behind dotted with the pixel's gradient:
 
     q[k] = colour[k] . v_image - B;  B += alpha[k] q[k];  G[k] = weight[k] q[k]
 
-G = alpha dL/dalpha; its six moments over a tile's pixels give every geometric gradient (`alpha.entry_gradients`).
+G = alpha dL/dalpha; its six moments over a tile's pixels give every geometric gradient (`alpha.splat_gradients`).
 There is no division by 1 - alpha.
 """
 
@@ -32,7 +32,7 @@ from torch import Tensor
 from pop_fast import workspace
 from pop_fast.dominance import Dominance
 from pop_fast.lit import Lit
-from pop_fast.tile_groups import CHUNK, TileGroup
+from pop_fast.tile_groups import BLOCK, TileGroup
 from pop_fast.transmittance import Stop, below, count_passed, weights_of_alphas
 from pop_ref.constants import Profile
 
@@ -44,13 +44,13 @@ class Step:
     """One blended step, as the transpose needs it.
 
     Attributes:
-        slots: entry numbers, the null entry where a list is padded. [n, K]
+        blocks: of eight entries each, the null block where a list has ended. [n, K / 8]
         rows: which of the group's tiles took part: the first `n` of these, or of all when None.
         light: T before the step; belongs to the workspace. [n, P]
         stopping: of the tiles that took part, those where a pixel stopped; None for "treat all so".
     """
 
-    slots: Tensor
+    blocks: Tensor
     rows: Tensor | None
     light: Tensor
     stopping: Tensor | None
@@ -84,7 +84,7 @@ class Blender:
     """The fixed numbers of a blend.
 
     Attributes:
-        table: per entry, the exponent's coefficients, the colours and a 1; the null entry last. [I + 1, 6 + D + 1]
+        table: per entry, the exponent's coefficients, the colours and a 1, in blocks of eight. [B, 8, 6 + D + 1]
         basis: pixel basis. [6, P]
         profile: constants and strictness.
         clamps: whether any alpha can pass the ceiling.
@@ -107,10 +107,10 @@ class Blender:
         steps: list[Step] = []
         start, n_pairs, crowded = 0, 0, False
         with workspace.slabs(2, group.slab, self.table.dtype) as slabs:
-            while start < len(group.reached) * CHUNK and (n := lit.count_below(group.reached[start // CHUNK])) > 0:
-                slots = group.slots(lit.rows, n, start, group.step_length(start, n))
-                entries, light = self._entries(slots), lit["light"][:n]
-                alpha, weight = _shaped(slabs, slots, group.n_pixels)
+            while start < len(group.reached) and (n := lit.count_below(group.reached[start])) > 0:
+                blocks = group.blocks(lit.rows, n, start, group.step_blocks(start, n))
+                entries, light = self._entries(blocks), lit["light"][:n]
+                alpha, weight = _shaped(slabs, entries, group.n_pixels)
                 self._alphas(entries, alpha)
                 before = workspace.copy(light)
                 if counted:
@@ -121,11 +121,11 @@ class Blender:
                 if counted:
                     lit["n_blended"][:n].add_((weight > 0.0).sum(1))
                 if dominance:
-                    dominant.see(weight, start, lit["best"][:n], lit["codes"][:n], alpha)
-                start += slots.shape[1]
+                    dominant.see(weight, start * BLOCK, lit["best"][:n], lit["codes"][:n], alpha)
+                start += blocks.shape[1]
                 n_pairs += weight.numel()
                 if keep:
-                    steps.append(Step(slots, lit.rows, before, stopping))
+                    steps.append(Step(blocks, lit.rows, before, stopping))
                 else:
                     workspace.give(before)
                 lit.drop(n, light, COMPACT_BELOW)
@@ -135,7 +135,7 @@ class Blender:
         size = (len(group.tiles), self.basis.shape[1])
         states = {
             "light": self.basis.new_ones(size),
-            "image": self.basis.new_zeros((size[0], self.table.shape[1] - 6, size[1])),
+            "image": self.basis.new_zeros((size[0], self.table.shape[2] - 6, size[1])),
         }
         if counted:
             states |= {name: torch.zeros(size, dtype=torch.int64) for name in ("n_blended", "n_passed")}
@@ -156,9 +156,9 @@ class Blender:
             n_pairs,
         )
 
-    def _entries(self, slots: Tensor) -> Tensor:
+    def _entries(self, blocks: Tensor) -> Tensor:
         """Gather a step's rows of the table. [n, K, 6 + D + 1]"""
-        return self.table.index_select(0, slots.view(-1)).view(*slots.shape, self.table.shape[1])
+        return self.table.index_select(0, blocks.view(-1)).view(len(blocks), -1, self.table.shape[2])
 
     def _alphas(self, entries: Tensor, alpha: Tensor) -> None:
         flat = alpha.view(-1, alpha.shape[2])
@@ -174,17 +174,17 @@ class Blender:
         """Pull the cotangent of a group's image ([G, D + 1, P]) back to its entries, step by step, back to front.
 
         Yields:
-            Entry numbers [n K] and their rows [n K, 6 + D (+ 2)]: six moments of G, the gradient to the
+            Blocks [n K / 8] and their rows [n K / 8, 8, 6 + D (+ 2)]: six moments of G, the gradient to the
             colours and, when asked for, the sums of absolute gradients along x and y.
         """
         lit = Lit({"behind": v_image.new_zeros((v_image.shape[0], v_image.shape[2])), "v": v_image})
         with workspace.slabs(3, group.slab, self.table.dtype) as slabs:
             for step in reversed(blend.steps):
                 lit.select(step.rows)
-                n = len(step.slots)
+                n = len(step.blocks)
                 v, behind = lit["v"][:n], lit["behind"][:n]
-                entries = self._entries(step.slots)
-                alpha, weight, q = _shaped(slabs, step.slots, group.n_pixels)
+                entries = self._entries(step.blocks)
+                alpha, weight, q = _shaped(slabs, entries, group.n_pixels)
                 self._alphas(entries, alpha)
                 light = workspace.copy(step.light)
                 crowded = step.stopping is None
@@ -197,7 +197,8 @@ class Blender:
                 # nothing lies behind a pixel that had stopped before this step
                 torch.ops.aten.threshold_backward.grad_input(behind, step.light, 0.0, grad_input=behind)
                 workspace.give(step.light)
-                yield step.slots.view(-1), self._rows(entries, alpha, weight, q, v, absolute)
+                rows = self._rows(entries, alpha, weight, q, v, absolute)
+                yield step.blocks.view(-1), rows.view(-1, BLOCK, rows.shape[1])
 
     def _rows(self, entries: Tensor, alpha: Tensor, weight: Tensor, q: Tensor, v: Tensor, absolute: bool) -> Tensor:
         n_colors, n_rows = v.shape[1] - 1, q.shape[0] * q.shape[1]
@@ -236,5 +237,6 @@ class Blender:
         return torch.stack([(g * (c @ self.basis)).abs_().sum(1) for c in along])
 
 
-def _shaped(slabs: list[Tensor], slots: Tensor, n_pixels: int) -> list[Tensor]:
-    return [slab[: slots.numel() * n_pixels].view(*slots.shape, n_pixels) for slab in slabs]
+def _shaped(slabs: list[Tensor], entries: Tensor, n_pixels: int) -> list[Tensor]:
+    n, length, _ = entries.shape
+    return [slab[: n * length * n_pixels].view(n, length, n_pixels) for slab in slabs]

@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pop_fast.alpha import Entries, entries_of_lists, entry_gradients, exponent_coefficients, pixel_basis
+from pop_fast.alpha import Entries, centred_moments, exponent_coefficients, pixel_basis, splat_gradients
 from pop_fast.blender import Blender, GroupBlend
-from pop_fast.layout import from_columns
-from pop_fast.tile_groups import TileGroup, tile_groups
+from pop_fast.tile_groups import BLOCK, PackedLists, TileGroup, tile_groups
 from pop_fast.tiles import TileLists
 from pop_ref.constants import PAPER, Profile
 
@@ -108,15 +107,15 @@ class _Composite(torch.autograd.Function):
         ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, options: _Options
     ) -> tuple[Tensor | None, ...]:
         lists, profile, dtype = options.lists, options.profile, means2d.dtype
-        entries = entries_of_lists(means2d, conics, opacities, lists)
+        entries = Entries.of(means2d, PackedLists.of(lists, len(means2d)))
         blender = Blender(
-            _table(entries, colors, lists.ids),
+            _table(exponent_coefficients(entries, conics, opacities), colors, entries.lists.ids),
             pixel_basis(lists.tile_size, dtype),
             profile,
             bool((opacities > profile.alpha_ceiling).any()),
         )
-        groups = tile_groups(lists)
-        canvas = _Canvas(options, colors.shape[1] + 1, dtype)
+        groups = tile_groups(entries.lists)
+        canvas = _Canvas(options, entries.lists, colors.shape[1] + 1, dtype)
         blends: list[GroupBlend | None] = []
         pairs = 0
         for group in groups:
@@ -125,6 +124,7 @@ class _Composite(torch.autograd.Function):
             pairs += blend.n_pairs
             blends.append(blend)
         ctx.saved, ctx.options = _Saved(len(means2d), entries, blender, groups, blends), options
+        ctx.save_for_backward(conics, opacities)
         outputs = canvas.images()
         ctx.mark_non_differentiable(*(o for o in outputs[2:] if o is not None))
         ctx.set_materialize_grads(False)
@@ -141,24 +141,23 @@ class _Composite(torch.autograd.Function):
             # what an earlier backward of the same graph used up is blended again
             blend, saved.blends[i] = saved.blends[i] or saved.blender.blend(group), None
             gradients.add(group, blend, tiles.index_select(0, group.tiles))
-        return (*gradients.of_splats(), None)
+        return (*gradients.of_splats(*ctx.saved_tensors), None)
 
 
-def _table(entries: Entries, colors: Tensor, ids: Tensor) -> Tensor:
-    """Put what a pair needs of its entry into one row: coefficients, colours, a 1; the null entry's row is last."""
-    coefficients = exponent_coefficients(entries, colors.dtype)
-    table = colors.new_zeros((len(ids) + 1, 6 + colors.shape[1] + 1))
-    table[:, :6] = coefficients
-    table[:-1, 6:-1] = colors[ids]
-    table[:-1, -1] = 1.0
-    return table
+def _table(coefficients: Tensor, colors: Tensor, ids: Tensor) -> Tensor:
+    """Put what a pair needs of its entry into one row: coefficients, colours, a 1; padding has any colour."""
+    table = colors.new_empty((len(ids), 6 + colors.shape[1] + 1))
+    table[:, :6] = coefficients.T
+    table[:, 6:-1] = torch.cat((colors, colors.new_zeros((1, colors.shape[1])))).index_select(0, ids)
+    table[:, -1] = 1.0
+    return table.view(-1, BLOCK, table.shape[1])
 
 
 class _Canvas:
     """The image in tiles, filled group by group."""
 
-    def __init__(self, options: _Options, channels: int, dtype: torch.dtype) -> None:
-        self.options = options
+    def __init__(self, options: _Options, packed: PackedLists, channels: int, dtype: torch.dtype) -> None:
+        self.options, self.packed = options, packed
         lists = options.lists
         n_tiles, n_pixels = lists.tiles_x * lists.tiles_y, lists.tile_size**2
         self.image = torch.zeros((n_tiles, channels, n_pixels), dtype=dtype)
@@ -173,7 +172,7 @@ class _Canvas:
             places, weights = blend.dominant_places, blend.dominant_weights
             assert places is not None
             assert weights is not None
-            ids = self.options.lists.ids[places.clamp_min(0) + group.firsts[:, None]]
+            ids = self.packed.ids[places.clamp_min(0) + BLOCK * group.first_blocks[:, None]]
             self.ids.index_copy_(0, group.tiles, ids.masked_fill_(places < 0, -1))
             self.weights.index_copy_(0, group.tiles, weights)
         if self.blended is not None and self.traversed is not None:
@@ -181,7 +180,8 @@ class _Canvas:
             assert blend.n_passed is not None
             self.blended.index_copy_(0, group.tiles, blend.n_blended.to(torch.int32))
             # a pixel that stopped has also looked at the entry that stopped it; padding is passed but does not count
-            traversed = torch.minimum(blend.n_passed + 1, group.lengths[:, None])
+            lengths = self.options.lists.lengths[group.tiles]
+            traversed = torch.minimum(blend.n_passed + 1, lengths[:, None])
             self.traversed.index_copy_(0, group.tiles, traversed.to(torch.int32))
 
     def images(self) -> tuple[Tensor | None, ...]:
@@ -202,7 +202,7 @@ def _tiles_of_cotangents(
 ) -> Tensor:
     """Cut the cotangents of image and alphas into tiles. [tiles, D + 1, P]"""
     lists, size = options.lists, options.lists.tile_size
-    channels = blender.table.shape[1] - 6
+    channels = blender.table.shape[2] - 6
     whole = blender.basis.new_zeros((lists.tiles_y * size, lists.tiles_x * size, channels))
     if v_image is not None:
         whole[: options.height, : options.width, :-1] = v_image
@@ -216,34 +216,31 @@ class _Gradients:
     """Gradients of splats, gathered group by group."""
 
     def __init__(self, saved: _Saved, options: _Options) -> None:
-        self.saved, self.options = saved, options
-        self.n_colors = saved.blender.table.shape[1] - 7
-        self.n_absolute = 0 if options.absgrad_sink is None else 2
-        # one row an entry, and one for the null entry, into which padding falls
+        self.saved, self.sink = saved, options.absgrad_sink
         table = saved.blender.table
-        self.rows = table.new_zeros((len(table), 6 + self.n_colors + self.n_absolute))
+        self.n_colors = table.shape[2] - 7
+        # of every entry; zero where no step came
+        self.rows = table.new_zeros((*table.shape[:2], 6 + self.n_colors + 2 * (self.sink is not None)))
 
     def add(self, group: TileGroup, blend: GroupBlend, v_image: Tensor) -> None:
-        for entries, rows in self.saved.blender.transpose(group, blend, v_image, self.n_absolute > 0):
-            self.rows.index_copy_(0, entries, rows)
+        for blocks, rows in self.saved.blender.transpose(group, blend, v_image, self.sink is not None):
+            self.rows.index_copy_(0, blocks, rows)
 
-    def of_splats(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def of_splats(self, conics: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Sum over the entries of each splat: gradients to means2d, conics, opacities, colors."""
-        columns = self.rows[:-1].T.contiguous()
-        geometry = entry_gradients(self.saved.entries, columns[:6])
-        v_x, v_y, v_a, v_b, v_c, v_o = (self._summed(row) for row in geometry)
-        colors = [self._summed(row) for row in columns[6 : 6 + self.n_colors]]
-        if self.options.absgrad_sink is not None:
-            absolute = [self._summed(row) for row in columns[6 + self.n_colors :]]
-            self.options.absgrad_sink.add_(from_columns(absolute, (2,)))
-        return (
-            from_columns((v_x, v_y), (2,)),
-            from_columns((v_a, v_b, v_c), (3,)),
-            v_o,
-            from_columns(colors, (self.n_colors,)),
-        )
+        columns = self.rows.view(-1, self.rows.shape[2]).T.contiguous()
+        moments = self._summed(centred_moments(self.saved.entries, columns[:6]))
+        centres, of_conics, of_opacities = splat_gradients(moments, conics, opacities)
+        rest = self._summed(columns[6:])
+        if self.sink is not None:
+            self.sink.add_(rest[self.n_colors :].T)
+        dtype = columns.dtype
+        return centres.to(dtype).T, of_conics.to(dtype).T, of_opacities.to(dtype), rest[: self.n_colors].T
 
-    def _summed(self, row: Tensor) -> Tensor:
+    def _summed(self, columns: Tensor) -> Tensor:
         # one serial pass a component: the order of the sum, and so its bits, never change
-        total = self.rows.new_zeros(self.saved.n_splats)
-        return total.index_add_(0, self.options.lists.ids, row.to(total.dtype))
+        ids = self.saved.entries.lists.ids
+        totals = columns.new_zeros((len(columns), self.saved.n_splats + 1))
+        for total, column in zip(totals, columns, strict=True):
+            total.index_add_(0, ids, column)
+        return totals[:, :-1]

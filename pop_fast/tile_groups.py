@@ -1,7 +1,8 @@
-"""Tiles in groups of similar list length, their lists padded to rectangles.
+"""Tile lists cut into blocks of eight entries, and tiles in groups of similar list length.
 
 Every operation of the blend runs over a group: a few hundred tiles, eight list entries, all pixels of a tile. Sorting
 tiles by list length keeps the padding small, and lets the tiles whose lists have ended drop off the end of the group.
+A block's entries lie side by side, so that a step gathers and scatters one stretch of memory a block, not one an entry.
 """
 
 from __future__ import annotations
@@ -13,9 +14,41 @@ from torch import Tensor
 
 from pop_fast.tiles import TileLists
 
-CHUNK = 8  # list entries blended per step, where many tiles are
-LONGEST = 4  # chunks that a step takes at most, where few are
+BLOCK = 8  # list entries that are moved together, and blended per step where many tiles are
+LONGEST = 4  # blocks that a step takes at most, where few are
 PAIRS_PER_THREAD = 1 << 18  # (entry, pixel) pairs of a step: more than its overhead, and little enough for the caches
+
+
+@dataclass(frozen=True)
+class PackedLists:
+    """Tile lists in which every tile begins a new block; the last block, and what is left of the others, is padding.
+
+    Attributes:
+        ids: splat of every entry, the number of splats for padding. [8 B] int64
+        block_tiles: tile of every block. [B] int64
+        first_blocks: each tile's first block. [tiles]
+        n_blocks: each tile's number of blocks. [tiles]
+        tile_size: px.
+        tiles_x: tiles in a row.
+    """
+
+    ids: Tensor
+    block_tiles: Tensor
+    first_blocks: Tensor
+    n_blocks: Tensor
+    tile_size: int
+    tiles_x: int
+
+    @classmethod
+    def of(cls, lists: TileLists, n_splats: int) -> PackedLists:
+        """Pack the lists."""
+        n_blocks = (lists.lengths + (BLOCK - 1)) >> 3
+        first_blocks = n_blocks.cumsum(0) - n_blocks
+        tiles = torch.repeat_interleave(n_blocks)
+        ids = torch.full((BLOCK * (len(tiles) + 1),), n_splats)
+        moved = (BLOCK * first_blocks - lists.offsets[:-1]).index_select(0, lists.entry_tiles)
+        ids.index_copy_(0, moved.add_(torch.arange(len(moved))), lists.ids)
+        return cls(ids, torch.cat((tiles, tiles.new_zeros(1))), first_blocks, n_blocks, lists.tile_size, lists.tiles_x)
 
 
 @dataclass(frozen=True)
@@ -24,60 +57,61 @@ class TileGroup:
 
     Attributes:
         tiles: tile numbers. [G]
-        firsts: number of each tile's first entry. [G]
-        lengths: list length of each tile, descending. [G]
-        reached: for each chunk of the lists, how many tiles' lists reach it.
-        null_entry: number of the entry that blends nothing.
+        first_blocks: number of each tile's first block. [G]
+        n_blocks: blocks of each tile's list, descending. [G]
+        reached: for each block of the lists, how many tiles' lists reach it.
+        null_block: number of a block of padding.
         n_pixels: of a tile.
     """
 
     tiles: Tensor
-    firsts: Tensor
-    lengths: Tensor
+    first_blocks: Tensor
+    n_blocks: Tensor
     reached: list[int]
-    null_entry: int
+    null_block: int
     n_pixels: int
 
     @property
     def slab(self) -> int:
         """Return how many pairs a step has at most."""
-        return len(self.tiles) * CHUNK * self.n_pixels
+        return len(self.tiles) * BLOCK * self.n_pixels
 
-    def step_length(self, start: int, n: int) -> int:
-        """Return how many entries the step from `start` takes when `n` tiles take part, a multiple of CHUNK.
+    def step_blocks(self, start: int, n: int) -> int:
+        """Return how many blocks of each list the step from block `start` takes when `n` tiles take part.
 
         Few tiles take longer steps, so that the overhead of a step has pairs to be spread over.
         """
-        left = len(self.reached) - start // CHUNK
-        return CHUNK * min(left, max(1, min(LONGEST, len(self.tiles) // (2 * n))))
+        return min(len(self.reached) - start, max(1, min(LONGEST, len(self.tiles) // (2 * n))))
 
-    def slots(self, rows: Tensor | None, n: int, start: int, length: int) -> Tensor:
-        """Return the entry numbers of a step, the null entry where a list has ended.
+    def blocks(self, rows: Tensor | None, n: int, start: int, count: int) -> Tensor:
+        """Return the blocks of a step, the null block where a list has ended.
 
         Args:
             rows: tiles to choose from, as places in the group; all when None.
             n: how many of them take part, from the first.
-            start: place in the lists where the step begins.
-            length: entries that it takes.
+            start: block of the lists where the step begins.
+            count: blocks that it takes.
 
         Returns:
-            [n, length]
+            [n, count]
         """
         chosen = slice(n) if rows is None else rows[:n]
-        place = torch.arange(start, start + length)
-        return torch.where(place < self.lengths[chosen, None], self.firsts[chosen, None] + place, self.null_entry)
+        place = torch.arange(start, start + count)
+        return torch.where(
+            place < self.n_blocks[chosen, None], self.first_blocks[chosen, None] + place, self.null_block
+        )
 
 
-def tile_groups(lists: TileLists) -> list[TileGroup]:
+def tile_groups(lists: PackedLists) -> list[TileGroup]:
     """Group the tiles whose lists are not empty."""
-    lengths, order = torch.sort(lists.lengths, descending=True, stable=True)
-    n_filled, n_pixels = int((lengths > 0).sum()), lists.tile_size**2
-    size = max(1, PAIRS_PER_THREAD * torch.get_num_threads() // (CHUNK * n_pixels))
-    parts = zip(order[:n_filled].split(size), lengths[:n_filled].split(size), strict=True)
+    n_blocks, order = torch.sort(lists.n_blocks, descending=True, stable=True)
+    n_filled, n_pixels = int((n_blocks > 0).sum()), lists.tile_size**2
+    size = max(1, PAIRS_PER_THREAD * torch.get_num_threads() // (BLOCK * n_pixels))
+    parts = zip(order[:n_filled].split(size), n_blocks[:n_filled].split(size), strict=True)
     return [_group(tiles, of_tiles, lists) for tiles, of_tiles in parts if len(tiles)]
 
 
-def _group(tiles: Tensor, lengths: Tensor, lists: TileLists) -> TileGroup:
-    starts = torch.arange(0, int(lengths[0]), CHUNK)
-    reached = (lengths[:, None] > starts).sum(0).tolist()
-    return TileGroup(tiles, lists.offsets[tiles], lengths, reached, len(lists.ids), lists.tile_size**2)
+def _group(tiles: Tensor, n_blocks: Tensor, lists: PackedLists) -> TileGroup:
+    reached = (n_blocks[:, None] > torch.arange(int(n_blocks[0]))).sum(0).tolist()
+    null_block = len(lists.block_tiles) - 1
+    return TileGroup(tiles, lists.first_blocks[tiles], n_blocks, reached, null_block, lists.tile_size**2)
