@@ -44,7 +44,7 @@ cuda: setup  ## compile the CUDA extension (needs nvcc; no GPU)
 	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python -m cuda_ext.build
 
 emulate: setup  ## run the CUDA kernels' own source on the host, warp by warp: every law, training steps (minutes)
-	POP_EMULATED_LAWS=1 POP_CUDA_KINDS="columns atomics" $(BIN)/python -m pytest -q tests/cuda/emulated
+	POP_EMULATED_LAWS=1 POP_CUDA_KINDS="columns atomics splats" $(BIN)/python -m pytest -q tests/cuda/emulated
 
 gpu-check: cuda  ## every law, times, training on CAPTURES="a b"; one JSON file, a stage at a time (needs a GPU)
 	$(BIN)/python -m cuda_ext.gpu_check $(or $(OUT),benchmarks/results/gpu_check.json) \

@@ -91,7 +91,7 @@ def laws_stage(check: Check) -> dict[str, Any]:
 
 
 def laws_of_splats_stage(check: Check) -> dict[str, Any]:
-    """Hold the laws to the other backward family, which is no one's default and rounds more behind opaque splats."""
+    """Hold the laws to the other backward family, which is not the default."""
     return _laws(check, "splats")
 
 

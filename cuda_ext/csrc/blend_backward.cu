@@ -2,7 +2,7 @@
 //
 // columns: one warp a tile of 16 x 8 pixels, back to front; a lane owns four pixels, and a splat's sums are added over the
 //     lanes by a transposed butterfly, about one shuffle a value.
-// splats: one warp a bucket of 32 list entries, front to back; a lane owns a splat and keeps its sums in registers, and
+// splats: one warp a bucket of 32 list entries, back to front; a lane owns a splat and keeps its sums in registers, and
 //     the tile's pixels travel through the lanes. Needs the forward pass's checkpoints.
 //
 // A row of sums goes to its instance's slot, by exactly one warp, so nothing is added in an order that varies; or, where
@@ -103,7 +103,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
 template <int CH>
 struct BucketPixel {
     float v_color[CH];
-    float T, left;
+    Passing<float> behind;
     int last;
 };
 
@@ -131,14 +131,19 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
         BucketPixel<CH> p = {};
         p.last = inside ? blend.last[pixel] : 0;
         if (p.last > first) {
-            p.T = checkpoint[k * WARP + lane];
-            p.left = blend.v_T_final == nullptr ? 0.0f : blend.v_T_final[pixel] * blend.T_final[pixel];
+            const bool goes_on = p.last > first + WARP;
+            const float T_final = blend.T_final[pixel];
+            const float v_T = blend.v_T_final == nullptr ? 0.0f : blend.v_T_final[pixel];
+            float later[CH];
 #pragma unroll
             for (int c = 0; c < CH; ++c) {
                 p.v_color[c] = blend.v_image[CH * pixel + c];
-                const float before = checkpoint[(1 + c) * TILE_PIXELS + k * WARP + lane];
-                p.left += (blend.image[CH * pixel + c] - before) * p.v_color[c];
+                later[c] = checkpoint[(1 + c) * TILE_PIXELS + k * WARP + lane];
             }
+            const float worth = worth_behind<CH>(blend, p.v_color, v_T);
+            const float* next = checkpoint + (1 + CH) * TILE_PIXELS;
+            p.behind = {T_final, worth};
+            if (goes_on) p.behind = passing_behind<float, CH>(next[k * WARP + lane], T_final, later, p.v_color, worth);
         }
         pixels[warp][k * WARP + lane] = p;
         last = max(last, p.last);
@@ -161,13 +166,13 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
     Passing<float> passing = {0.0f, 0.0f};
     if (last > first)
         for (int step = 0; step < TILE_PIXELS + WARP - 1; ++step) {
-            // the pixel that the lane in front has just left
-            passing.T = __shfl_up_sync(FULL_WARP, passing.T, 1);
-            passing.left = __shfl_up_sync(FULL_WARP, passing.left, 1);
-            const int p = step - lane;
+            // the pixel that the lane behind has just left
+            passing.T = __shfl_down_sync(FULL_WARP, passing.T, 1);
+            passing.behind = __shfl_down_sync(FULL_WARP, passing.behind, 1);
+            const int p = step - (WARP - 1 - lane);
             if (p < 0 || p >= TILE_PIXELS) continue;
             const BucketPixel<CH>& pixel = pixels[warp][p];
-            if (lane == 0) passing = {pixel.T, pixel.left};
+            if (lane == WARP - 1) passing = pixel.behind;
             if (position >= pixel.last) continue;
             const int owner = p & (WARP - 1);
             const float px = float(tile.x + lane_x(owner)) + 0.5f;

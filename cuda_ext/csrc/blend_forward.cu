@@ -10,6 +10,34 @@ namespace {
 // entries between two looks at whether any pixel of the warp still takes splats
 constexpr int LOOK_EVERY = 8;
 
+// Where a lane's pixels keep what family "splats" reads of a bucket: T before it, then the colour that later buckets
+// blended. Until the list is done, the colour is what this bucket blended.
+template <int CH>
+__device__ __forceinline__ float* checkpoint_of(const TileLists& lists, const BlendForward& blend, int list, int bucket,
+                                                int lane) {
+    return blend.checkpoints + size_t(lists.bucket_begin[list] + bucket) * (1 + CH) * TILE_PIXELS + lane;
+}
+
+// Turn what every bucket blended into what those behind it blended; `column` comes with the last one's colour and goes
+// with the whole.
+template <int CH>
+__device__ __forceinline__ void sum_from_the_back(const TileLists& lists, const BlendForward& blend, int list,
+                                                  int n_buckets, int lane, ForwardColumn<float, CH, COLUMN_ROWS>& column) {
+    for (int bucket = n_buckets - 1; bucket >= 0; --bucket) {
+        float* kept = checkpoint_of<CH>(lists, blend, list, bucket, lane) + TILE_PIXELS;
+        const bool last = bucket == n_buckets - 1;
+#pragma unroll
+        for (int k = 0; k < COLUMN_ROWS; ++k)
+#pragma unroll
+            for (int c = 0; c < CH; ++c) {
+                float& place = kept[c * TILE_PIXELS + k * WARP];
+                const float own = last ? 0.0f : place;
+                place = last ? 0.0f : column.color[k][c];
+                column.color[k][c] += own;
+            }
+    }
+}
+
 template <int CH, bool TELL, bool CHECKPOINT>
 __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
     blend_forward_kernel(TileLists lists, BlendForward blend, BlendConstants<float> constants, int n_warp_tiles) {
@@ -27,17 +55,23 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
     ForwardColumn<float, CH, COLUMN_ROWS> column;
     Instruments<float, COLUMN_ROWS> told;
     start_forward<TELL>(column, told, rows);
+    int n_buckets = 0;
     for (int first = begin; first < end; first += WARP) {
         if (!__any_sync(FULL_WARP, column.open)) break;
         if (CHECKPOINT) {
-            float* out = blend.checkpoints + size_t(lists.bucket_begin[tile.list] + (first - begin) / WARP) *
-                                                 (1 + CH) * TILE_PIXELS + lane;
+            float* here = checkpoint_of<CH>(lists, blend, tile.list, n_buckets, lane);
 #pragma unroll
             for (int k = 0; k < COLUMN_ROWS; ++k) {
-                out[k * WARP] = column.T[k];
+                here[k * WARP] = column.T[k];
+                if (n_buckets == 0) continue;
+                float* before = here - ptrdiff_t(1 + CH) * TILE_PIXELS;
 #pragma unroll
-                for (int c = 0; c < CH; ++c) out[(1 + c) * TILE_PIXELS + k * WARP] = column.color[k][c];
+                for (int c = 0; c < CH; ++c) {
+                    before[(1 + c) * TILE_PIXELS + k * WARP] = column.color[k][c];
+                    column.color[k][c] = 0.0f;
+                }
             }
+            ++n_buckets;
         }
         __syncwarp();
         if (first + lane < end) {
@@ -59,6 +93,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
             blend_forward<TELL>(column, told, record.splat(), color, id, px, py, first - begin + j, constants);
         }
     }
+    if (CHECKPOINT) sum_from_the_back<CH>(lists, blend, tile.list, n_buckets, lane, column);
 
 #pragma unroll
     for (int k = 0; k < COLUMN_ROWS; ++k) {

@@ -140,15 +140,24 @@ POP_HD bool blend_backward(BackwardColumn<Real, CH, ROWS>& column, const Blended
     return any;
 }
 
-// A pixel on its way through the splats of a bucket, front to back: the other family, one splat a lane.
+// A pixel on its way through the splats of a bucket, back to front: the other family, one splat a lane.
 template <class Real>
 struct Passing {
-    Real T;     // transmittance before the splat
-    Real left;  // worth of all light from this splat on: splats, background and what is left
+    Real T;       // transmittance behind the splat that is visited next
+    Real behind;  // what the light that passes that splat is worth
 };
 
-// v_alpha = T worth - left_after / (1 - alpha): subtracts what the recurrence above adds up from the back. Behind opaque
-// splats little is left of much, and carries the rounding of all of it: about ten times the other family's error there.
+// The pixel as it leaves its last splat of a bucket, by what the forward pass left at the bucket's end: transmittance,
+// and the colour that later buckets blended. That colour is a sum from the back: taking what lies in front off the
+// whole image would leave the rounding of all of it where little is left, and an opaque splat then divides by 1 - alpha.
+template <class Real, int CH>
+POP_HD Passing<Real> passing_behind(Real T, Real T_final, const Real* later, const Real* v_color, Real worth_behind) {
+    Real left = T_final * worth_behind;
+    POP_UNROLL
+    for (int c = 0; c < CH; ++c) left += later[c] * v_color[c];
+    return {T, left * reciprocal(T)};
+}
+
 template <bool ABS, class Real, int CH>
 POP_HD void pass_pixel(Passing<Real>& pixel, const Blended<Real>& splat, const Real* color, const Real* v_color,
                        Real px, Real py, const BlendConstants<Real>& constants, Real* sums) {
@@ -159,17 +168,18 @@ POP_HD void pass_pixel(Passing<Real>& pixel, const Blended<Real>& splat, const R
     const Real unclamped = mul(splat.opacity, power_of_two(-exponent));
     const Real alpha = min_of(constants.ceiling, unclamped);
     if (alpha < constants.floor) return;
-    const Real weight = mul(pixel.T, alpha), remains = add(Real(1), -alpha);
+    const Real T = pixel.T * reciprocal(add(Real(1), -alpha));
+    const Real weight = T * alpha;
     Real worth = Real(0);
     POP_UNROLL
     for (int c = 0; c < CH; ++c) {
         worth += color[c] * v_color[c];
         sums[c] += weight * v_color[c];
     }
-    const Real left_after = pixel.left - weight * worth;
-    const Real v_alpha = pixel.T * worth - left_after * reciprocal(remains);
-    pixel.left = left_after;
-    pixel.T = mul(pixel.T, remains);
+    const Real gain = worth - pixel.behind;
+    const Real v_alpha = T * gain;
+    pixel.behind += alpha * gain;
+    pixel.T = T;
     const Real G = unclamped > constants.gradient_ceiling ? Real(0) : unclamped * v_alpha;  // B3
     sums[CH + M0] += G;
     sums[CH + MX] += G * dx;

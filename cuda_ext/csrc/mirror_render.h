@@ -3,6 +3,7 @@
 #pragma once
 
 #include <algorithm>
+#include <array>
 #include <numeric>
 #include <vector>
 
@@ -172,30 +173,44 @@ template <class Real>
 void backward_by_splats(const Frame<Real>& frame, const Arguments<Real>& a, std::vector<Real>& sums) {
     for_each_column(frame, [&](const std::vector<int>& list, int x, int y, int rows) {
         for (int k = 0; k < rows; ++k) {
-            ForwardColumn<Real, CH, 1> column, again;
+            ForwardColumn<Real, CH, 1> column;
             Instruments<Real, 1> told;
             const Real px = Real(x) + Real(0.5), py = Real(y + k) + Real(0.5);
             start_forward<false>(column, told, 1);
-            for (size_t j = 0; j < list.size(); ++j)
+            // the forward kernel's checkpoints: T before each bucket, and what the buckets behind it blended
+            std::vector<Real> T;
+            std::vector<std::array<Real, CH>> later;
+            for (size_t j = 0; j < list.size(); ++j) {
+                if (j % BUCKET == 0) {
+                    T.push_back(column.T[0]);
+                    later.push_back({});
+                }
                 blend_forward<false>(column, told, frame.blended[list[j]], &frame.colors[list[j]].x, 0, px, py, int(j),
                                      frame.constants);
+                if (j % BUCKET == BUCKET - 1 || j + 1 == list.size())
+                    for (int c = 0; c < CH; ++c) {
+                        later.back()[c] = column.color[0][c];
+                        column.color[0][c] = Real(0);
+                    }
+            }
+            std::array<Real, CH> sum = {};
+            for (size_t bucket = later.size(); bucket-- > 0;)
+                for (int c = 0; c < CH; ++c) {
+                    const Real own = later[bucket][c];
+                    later[bucket][c] = sum[c];
+                    sum[c] += own;
+                }
             const long long p = (long long)(y + k) * frame.grid.width + x;
             const Real* v_color = a.in[V_IMAGE] + CH * p;
-            Real total = a.in[V_T_FINAL][p] * column.T[0];
-            for (int c = 0; c < CH; ++c)
-                total += fused(column.T[0], a.in[BACKGROUND][c], column.color[0][c]) * v_color[c];
-            start_forward<false>(again, told, 1);
-            Passing<Real> pixel = {};
-            for (int j = 0; j < column.last[0]; ++j) {
-                if (j % BUCKET == 0) {  // the forward kernel's checkpoint
-                    pixel = {again.T[0], total};
-                    for (int c = 0; c < CH; ++c) pixel.left -= again.color[0][c] * v_color[c];
-                }
-                const Blended<Real>& splat = frame.blended[list[j]];
-                const Real* color = &frame.colors[list[j]].x;
-                pass_pixel<true, Real, CH>(pixel, splat, color, v_color, px, py, frame.constants,
-                                           &sums[size_t(N_SUMS) * list[j]]);
-                blend_forward<false>(again, told, splat, color, 0, px, py, j, frame.constants);
+            Real worth = a.in[V_T_FINAL][p];
+            for (int c = 0; c < CH; ++c) worth += a.in[BACKGROUND][c] * v_color[c];
+            Passing<Real> pixel = {column.T[0], worth};
+            for (int j = column.last[0] - 1; j >= 0; --j) {
+                const size_t bucket = size_t(j) / BUCKET;
+                if (j % BUCKET == BUCKET - 1 && j + 1 < column.last[0])
+                    pixel = passing_behind<Real, CH>(T[bucket + 1], column.T[0], later[bucket].data(), v_color, worth);
+                pass_pixel<true, Real, CH>(pixel, frame.blended[list[j]], &frame.colors[list[j]].x, v_color, px, py,
+                                           frame.constants, &sums[size_t(N_SUMS) * list[j]]);
             }
         }
     });

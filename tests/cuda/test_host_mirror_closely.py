@@ -92,7 +92,7 @@ def test_both_backward_families_give_the_same_gradients(scene):
     columns = MirrorAdapter(FOLDER, np.float64).gradients(scene, v_image, v_T_final)
     splats = MirrorAdapter(FOLDER, np.float64, per_splat=True).gradients(scene, v_image, v_T_final)
     for name, value in columns.items():
-        np.testing.assert_allclose(splats[name], value, rtol=0, atol=1e-8 * (1.0 + np.max(np.abs(value), initial=0.0)))
+        np.testing.assert_allclose(splats[name], value, rtol=0, atol=1e-12 * (1.0 + np.max(np.abs(value), initial=0.0)))
 
 
 @given(scene=scenes(max_gaussians=5))

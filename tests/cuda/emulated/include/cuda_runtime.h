@@ -120,6 +120,11 @@ T __shfl_up_sync(unsigned mask, T value, int by) {
 }
 
 template <class T>
+T __shfl_down_sync(unsigned mask, T value, int by) {
+    return emulated::shuffled(mask, value, emulated::lane() + by);
+}
+
+template <class T>
 T __shfl_xor_sync(unsigned mask, T value, int with) {
     return emulated::shuffled(mask, value, emulated::lane() ^ with);
 }
