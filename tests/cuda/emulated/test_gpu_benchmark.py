@@ -47,7 +47,10 @@ def bench(gpu, monkeypatch):
 
     for name, value in {"WARM_UP": 1, "REPEATS": 2, "STEPS": 4}.items():
         monkeypatch.setattr(gpu_kernels, name, value)
-    return gpu_kernels
+    monkeypatch.delitem(sys.modules, "gsplat", raising=False)
+    yield gpu_kernels
+    # a stand-in is not left to other tests
+    sys.modules.pop("gsplat", None)
 
 
 def numbers(tree):
@@ -67,7 +70,6 @@ def test_every_number_of_the_benchmark_is_measured(bench, gpu, monkeypatch, tmp_
     words = 'from pop_fast.rasterization import rasterization\n\n__version__ = "stand-in"\n'
     (tmp_path / "gsplat.py").write_text(words)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.delitem(sys.modules, "gsplat", raising=False)
     case = GpuCase("tiny", 40, 40, 24, 4.0)
     scene = activated_scene(case, gpu)
     found = bench.measure(case, scene, measured_card(gpu, copied=1 << 16))
