@@ -42,7 +42,7 @@ class PackedLists:
     @classmethod
     def of(cls, lists: TileLists, n_splats: int) -> PackedLists:
         """Pack the lists."""
-        n_blocks = (lists.lengths + (BLOCK - 1)) >> 3
+        n_blocks = (lists.lengths + (BLOCK - 1)) // BLOCK
         first_blocks = n_blocks.cumsum(0) - n_blocks
         tiles = torch.repeat_interleave(n_blocks)
         ids = torch.full((BLOCK * (len(tiles) + 1),), n_splats)

@@ -51,8 +51,8 @@ def keep_freed_memory() -> bool:
     """Let the C library keep memory that was freed, for this process and from now on.
 
     By default glibc hands every large block back to the system and asks for it anew; the system then fills each page
-    with zeros when it is first touched. In a training step that fills and frees a few hundred MB, it takes longer than
-    the arithmetic does: a tenth to a sixth of the step (benchmarks/NOTES.md).
+    with zeros when it is first touched. A training step fills and frees a few hundred MB, and this is a tenth to a
+    sixth of its time (benchmarks/NOTES.md).
 
     Returns:
         Whether the C library takes such settings; others than glibc do not, and nothing changes.
