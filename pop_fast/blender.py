@@ -4,11 +4,11 @@ Meaning: `pop_ref.compositing`.
 One step of the blend takes a group of tiles, K list entries and all pixels of a tile, in this order:
 
     alpha = 2^(coefficients @ basis), 0 under the floor (D5), the ceiling at most (D6)
-    weight[k] = T alpha[k];  T -= weight[k];  where T passes the stop (D7): T = weight[k] = alpha[k] = 0
-    image += colours @ weight
+    T[k + 1] = T[k] - T[k] alpha[k];  where T[k + 1] passes the stop (D7): alpha[k] = 0
+    weight[k] = T[k] alpha[k];  image += colours @ weight
 
-T is the light that is still worth blending into: it falls to 0 at the terminating splat, and with it the weights of
-all behind it. Few tiles have a pixel that stops in a given step: only those are run again with the third rule.
+T is the light that is still worth blending into. It never grows, so that the alphas of the terminating splat and of
+all behind it become 0 at once; at the end of the step a T that passed the stop becomes 0, too.
 
 Nothing of a step is kept but the light before it, 4 bytes for K pairs: the transpose makes alphas and weights anew
 in buffers that stay in the cache, which is cheaper than a way through memory and back. It goes back to front with one
@@ -47,13 +47,11 @@ class Step:
         blocks: of eight entries each, the null block where a list has ended. [n, K / 8]
         rows: which of the group's tiles took part: the first `n` of these, or of all when None.
         light: T before the step; belongs to the workspace. [n, P]
-        stopping: of the tiles that took part, those where a pixel stopped; None for "treat all so".
     """
 
     blocks: Tensor
     rows: Tensor | None
     light: Tensor
-    stopping: Tensor | None
 
 
 @dataclass
@@ -105,18 +103,18 @@ class Blender:
         lit = self._lit(group, counted, dominance)
         dominant = Dominance(self.table.dtype)
         steps: list[Step] = []
-        start, n_pairs, crowded = 0, 0, False
+        start, n_pairs = 0, 0
         with workspace.slabs(2, group.slab, self.table.dtype) as slabs:
             while start < len(group.reached) and (n := lit.count_below(group.reached[start])) > 0:
                 blocks = group.blocks(lit.rows, n, start, group.step_blocks(start, n))
                 entries, light = self._entries(blocks), lit["light"][:n]
-                alpha, weight = _shaped(slabs, entries, group.n_pixels)
+                alpha, lights = _shaped(slabs, entries, group.n_pixels)
                 self._alphas(entries, alpha)
-                before = workspace.copy(light)
                 if counted:
                     lit["n_passed"][:n].add_(count_passed(alpha, light, self.stop))
-                stopping = weights_of_alphas(alpha, weight, light, before, self.stop, crowded)
-                crowded = stopping is None
+                before = workspace.copy(light)
+                weight = self._weights(alpha, lights, before)
+                torch.ops.aten.threshold.out(lights[:, -1], self.stop.at, 0.0, out=light)
                 lit["image"][:n].baddbmm_(entries[:, :, 6:].transpose(1, 2), weight)
                 if counted:
                     lit["n_blended"][:n].add_((weight > 0.0).sum(1))
@@ -125,7 +123,7 @@ class Blender:
                 start += blocks.shape[1]
                 n_pairs += weight.numel()
                 if keep:
-                    steps.append(Step(blocks, lit.rows, before, stopping))
+                    steps.append(Step(blocks, lit.rows, before))
                 else:
                     workspace.give(before)
                 lit.drop(n, light, COMPACT_BELOW)
@@ -168,13 +166,17 @@ class Blender:
         if self.clamps:
             flat.clamp_max_(self.profile.alpha_ceiling)
 
+    def _weights(self, alpha: Tensor, lights: Tensor, before: Tensor) -> Tensor:
+        lights[:, 0] = before
+        return weights_of_alphas(alpha, lights, self.stop)
+
     def transpose(
         self, group: TileGroup, blend: GroupBlend, v_image: Tensor, absolute: bool
     ) -> Iterator[tuple[Tensor, Tensor]]:
         """Pull the cotangent of a group's image ([G, D + 1, P]) back to its entries, step by step, back to front.
 
         Yields:
-            Blocks [n K / 8] and their rows [n K / 8, 8, 6 + D (+ 2)]: six moments of G, the gradient to the
+            Blocks [n K / 8] and their rows [n K / 8, 6 + D (+ 2), 8]: six moments of G, the gradient to the
             colours and, when asked for, the sums of absolute gradients along x and y.
         """
         lit = Lit({"behind": v_image.new_zeros((v_image.shape[0], v_image.shape[2])), "v": v_image})
@@ -184,12 +186,9 @@ class Blender:
                 n = len(step.blocks)
                 v, behind = lit["v"][:n], lit["behind"][:n]
                 entries = self._entries(step.blocks)
-                alpha, weight, q = _shaped(slabs, entries, group.n_pixels)
+                alpha, lights, q = _shaped(slabs, entries, group.n_pixels)
                 self._alphas(entries, alpha)
-                light = workspace.copy(step.light)
-                crowded = step.stopping is None
-                weights_of_alphas(alpha, weight, light, step.light, self.stop, crowded, step.stopping)
-                workspace.give(light)
+                weight = self._weights(alpha, lights, step.light)
                 torch.bmm(entries[:, :, 6:], v, out=q)
                 for a, q_k in zip(reversed(alpha.unbind(1)), reversed(q.unbind(1)), strict=True):
                     q_k.sub_(behind)
@@ -197,22 +196,23 @@ class Blender:
                 # nothing lies behind a pixel that had stopped before this step
                 torch.ops.aten.threshold_backward.grad_input(behind, step.light, 0.0, grad_input=behind)
                 workspace.give(step.light)
-                rows = self._rows(entries, alpha, weight, q, v, absolute)
-                yield step.blocks.view(-1), rows.view(-1, BLOCK, rows.shape[1])
+                yield step.blocks.view(-1), self._rows(entries, alpha, weight, q, v, absolute)
 
     def _rows(self, entries: Tensor, alpha: Tensor, weight: Tensor, q: Tensor, v: Tensor, absolute: bool) -> Tensor:
         n_colors, n_rows = v.shape[1] - 1, q.shape[0] * q.shape[1]
-        rows = q.new_empty((n_rows, 6 + n_colors + 2 * absolute))
-        by_color = torch.bmm(v[:, :-1], weight.transpose(1, 2)).transpose(1, 2)
-        rows.view(*q.shape[:2], -1)[:, :, 6 : 6 + n_colors] = by_color
+        rows = q.new_empty((len(q), q.shape[1] // BLOCK, 6 + n_colors + 2 * absolute, BLOCK))
+        # [n, D, K] and, below, [6, n K], each cut into blocks
+        by_color = torch.bmm(v[:, :-1], weight.transpose(1, 2)).view(len(q), n_colors, -1, BLOCK)
+        rows[:, :, 6 : 6 + n_colors] = by_color.transpose(1, 2)
+        rows = rows.view(-1, rows.shape[2], BLOCK)
         g = q.mul_(weight)
         flat = entries.view(n_rows, entries.shape[2])[:, :6]
         if self.clamps:
             self._pass_ceiling(flat, alpha, g)
         pairs = g.view(n_rows, g.shape[2])
-        rows[:, :6] = torch.mm(self.basis, pairs.T).T
+        rows[:, :6] = torch.mm(self.basis, pairs.T).view(6, -1, BLOCK).transpose(0, 1)
         if absolute:
-            rows[:, 6 + n_colors :] = self._absolute(flat, pairs).T
+            rows[:, 6 + n_colors :] = self._absolute(flat, pairs).view(2, -1, BLOCK).transpose(0, 1)
         return rows
 
     def _pass_ceiling(self, coefficients: Tensor, alpha: Tensor, g: Tensor) -> None:
@@ -238,5 +238,7 @@ class Blender:
 
 
 def _shaped(slabs: list[Tensor], entries: Tensor, n_pixels: int) -> list[Tensor]:
+    """Shape a step's slabs: alphas [n, K, P], lights [n, K + 1, P] and, if there is a third, another like the first."""
     n, length, _ = entries.shape
-    return [slab[: n * length * n_pixels].view(n, length, n_pixels) for slab in slabs]
+    lengths = (length, length + 1, length)
+    return [slab[: n * k * n_pixels].view(n, k, n_pixels) for slab, k in zip(slabs, lengths, strict=False)]

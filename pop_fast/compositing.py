@@ -220,7 +220,7 @@ class _Gradients:
         table = saved.blender.table
         self.n_colors = table.shape[2] - 7
         # of every entry; zero where no step came
-        self.rows = table.new_zeros((*table.shape[:2], 6 + self.n_colors + 2 * (self.sink is not None)))
+        self.rows = table.new_zeros((len(table), 6 + self.n_colors + 2 * (self.sink is not None), BLOCK))
 
     def add(self, group: TileGroup, blend: GroupBlend, v_image: Tensor) -> None:
         for blocks, rows in self.saved.blender.transpose(group, blend, v_image, self.sink is not None):
@@ -228,7 +228,7 @@ class _Gradients:
 
     def of_splats(self, conics: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Sum over the entries of each splat: gradients to means2d, conics, opacities, colors."""
-        columns = self.rows.view(-1, self.rows.shape[2]).T.contiguous()
+        columns = self.rows.transpose(0, 1).reshape(self.rows.shape[1], -1)
         moments = self._summed(centred_moments(self.saved.entries, columns[:6]))
         centres, of_conics, of_opacities = splat_gradients(moments, conics, opacities)
         rest = self._summed(columns[6:])

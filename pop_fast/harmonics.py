@@ -95,7 +95,7 @@ def evaluate_sh(sh: Tensor, dirs: Tensor, degree: int) -> Evaluation:
     n_sh = _n_sh(degree)
     if sh.shape[1] < n_sh:
         raise ValueError(f"sh has {sh.shape[1]} coefficients; degree {degree} needs {n_sh}")
-    rows = sh[:, :n_sh].reshape(len(sh), 3 * n_sh).T.contiguous().view(n_sh, 3, len(sh))
+    rows = sh[:, :n_sh].permute(1, 2, 0).contiguous()
     components = dirs.T
     norms = torch.sqrt((components * components).sum(0))
     unit = components / norms

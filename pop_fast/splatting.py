@@ -200,9 +200,9 @@ class _Projection(torch.autograd.Function):
 class _Colors(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, sh: Tensor, means: Tensor, viewmat: Tensor, degree: int, visible: Tensor) -> Tensor:
-        chosen = means[visible]
+        chosen = means.index_select(0, visible)
         dirs = view_dirs(chosen, viewmat)
-        evaluation = evaluate_sh(sh[visible], dirs, degree)
+        evaluation = evaluate_sh(sh.index_select(0, visible), dirs, degree)
         ctx.save_for_backward(sh, means, viewmat, visible)
         ctx.chosen, ctx.evaluation = chosen, evaluation
         colors = sh.new_zeros((3, len(sh)))
@@ -213,9 +213,9 @@ class _Colors(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, v_colors: Tensor) -> tuple[Tensor | None, ...]:
         sh, means, viewmat, visible = ctx.saved_tensors
-        v_sh_rows, v_dirs = evaluate_sh_vjp(ctx.evaluation, v_colors.T[:, visible])
+        v_sh_rows, v_dirs = evaluate_sh_vjp(ctx.evaluation, v_colors.T.index_select(1, visible))
         v_rows, v_viewmat = view_dirs_vjp(ctx.chosen, viewmat, v_dirs)
         v_sh = torch.zeros_like(sh, memory_format=torch.contiguous_format)
-        v_sh[:, : v_sh_rows.shape[1]].index_copy_(0, visible, v_sh_rows)
+        v_sh[:, : v_sh_rows.shape[1]].index_copy_(0, visible, v_sh_rows.contiguous())
         v_means = torch.zeros_like(means).index_copy_(0, visible, v_rows)
         return v_sh, v_means, v_viewmat if ctx.needs_input_grad[2] else None, None, None

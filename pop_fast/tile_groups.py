@@ -73,8 +73,8 @@ class TileGroup:
 
     @property
     def slab(self) -> int:
-        """Return how many pairs a step has at most."""
-        return len(self.tiles) * BLOCK * self.n_pixels
+        """Return how many pairs a step has at most, with one more row a tile."""
+        return len(self.tiles) * (BLOCK + 1) * self.n_pixels
 
     def step_blocks(self, start: int, n: int) -> int:
         """Return how many blocks of each list the step from block `start` takes when `n` tiles take part.

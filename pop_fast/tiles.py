@@ -80,9 +80,10 @@ def tile_lists(
     rects = tile_rects(means2d, radii, width, height, tile_size, profile)
     x0, y0, x1, y1 = columns(rects)
     rows = ((x1 > x0) & (y1 > y0)).nonzero().squeeze(1)
-    rows = rows[_depth_order(depths.index_select(0, rows))]
-    left, top, columns_of_tiles = x0[rows], y0[rows], (x1 - x0)[rows]
-    counts = columns_of_tiles * (y1 - y0)[rows]
+    rows = rows.index_select(0, _depth_order(depths.index_select(0, rows)))
+    left, top, right, bottom = (edge.index_select(0, rows) for edge in (x0, y0, x1, y1))
+    columns_of_tiles = right - left
+    counts = columns_of_tiles * (bottom - top)
     # entry e is the k-th tile of its splat's rectangle
     splat = torch.repeat_interleave(counts)
     k = (torch.arange(len(splat)) - (counts.cumsum(0) - counts).index_select(0, splat)).to(torch.int32)
@@ -100,7 +101,7 @@ def tile_lists(
     order = torch.sort(tile.to(torch.int16 if n_tiles < 2**15 else torch.int32), stable=True).indices
     offsets = torch.zeros(n_tiles + 1, dtype=torch.int64)
     torch.cumsum(torch.bincount(tile, minlength=n_tiles), 0, out=offsets[1:])
-    return TileLists(ids[order], offsets, tile_size, tiles_x, tiles_y)
+    return TileLists(ids.index_select(0, order), offsets, tile_size, tiles_x, tiles_y)
 
 
 def _span(center: Tensor, radius: Tensor, n_tiles: int, tile_size: int, profile: Profile) -> tuple[Tensor, Tensor]:
