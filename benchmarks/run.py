@@ -235,6 +235,14 @@ def machine() -> dict[str, Any]:
     }
 
 
+def write_json(path: Path, result: dict[str, Any]) -> None:
+    """Write results beside and rename, so that a file is whole or not there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_suffix(".part")
+    beside.write_text(json.dumps(result, indent=2) + "\n")
+    os.replace(beside, path)
+
+
 def _gradient(leaf: Tensor) -> Tensor:
     assert leaf.grad is not None
     return leaf.grad
@@ -262,10 +270,7 @@ def main() -> None:
         result["memory"] = measure_memory()
     if "capture" in wanted and given.capture:
         result["capture"] = time_capture(given.capture, given.factor, given.repeats)
-    given.out.parent.mkdir(parents=True, exist_ok=True)
-    beside = given.out.with_suffix(".part")
-    beside.write_text(json.dumps(result, indent=2) + "\n")
-    os.replace(beside, given.out)
+    write_json(given.out, result)
     print(json.dumps(result, indent=2))
 
 

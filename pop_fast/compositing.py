@@ -238,9 +238,6 @@ class _Gradients:
         return centres.to(dtype).T, of_conics.to(dtype).T, of_opacities.to(dtype), rest[: self.n_colors].T
 
     def _summed(self, columns: Tensor) -> Tensor:
-        # one serial pass a component: the order of the sum, and so its bits, never change
-        ids = self.saved.entries.lists.ids
+        # threads share the components, and each of these is summed in order: the bits never change
         totals = columns.new_zeros((len(columns), self.saved.n_splats + 1))
-        for total, column in zip(totals, columns, strict=True):
-            total.index_add_(0, ids, column)
-        return totals[:, :-1]
+        return totals.scatter_add_(1, self.saved.entries.lists.ids.expand_as(columns), columns)[:, :-1]

@@ -92,10 +92,12 @@ def tile_lists(
     row_of_rect = (k.to(torch.float32) / per_row).to(torch.int32)
     tile_x = left.to(torch.int32).index_select(0, splat) + k - row_of_rect * per_row
     tile_y = top.to(torch.int32).index_select(0, splat) + row_of_rect
-    ids = rows.index_select(0, splat)
     if conics is not None and opacities is not None:
-        touched = _touches(means2d, conics, opacities, ids, tile_x, tile_y, tile_size, profile).nonzero().squeeze(1)
-        ids, tile_x, tile_y = (t.index_select(0, touched) for t in (ids, tile_x, tile_y))
+        # by way of the depth order, so that what is gathered for the entries lies close together
+        shapes = [t.index_select(0, rows) for t in (*columns(means2d), *columns(conics), opacities)]
+        touched = _touches(shapes, splat, tile_x, tile_y, tile_size, profile).nonzero().squeeze(1)
+        splat, tile_x, tile_y = (t.index_select(0, touched) for t in (splat, tile_x, tile_y))
+    ids = rows.index_select(0, splat)
     tile = tile_y * tiles_x + tile_x
     n_tiles = tiles_x * tiles_y
     order = torch.sort(tile.to(torch.int16 if n_tiles < 2**15 else torch.int32), stable=True).indices
@@ -121,22 +123,14 @@ def _depth_order(depths: Tensor) -> Tensor:
 
 
 def _touches(
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    ids: Tensor,
-    tile_x: Tensor,
-    tile_y: Tensor,
-    tile_size: int,
-    profile: Profile,
+    shapes: list[Tensor], splat: Tensor, tile_x: Tensor, tile_y: Tensor, tile_size: int, profile: Profile
 ) -> Tensor:
     """Tell for each entry whether some pixel centre of the tile may reach alpha >= alpha_floor; errs towards True.
 
     sigma is convex, so its smallest value over the rectangle of pixel centres is 0 at an inside centre, and else lies
     on one of the two edges that face the centre, where it is a parabola.
     """
-    x, y, a, b, c = (t.contiguous().index_select(0, ids) for t in (*columns(means2d), *columns(conics)))
-    limit = torch.log(opacities / profile.alpha_floor).index_select(0, ids)
+    x, y, a, b, c, limit = (t.index_select(0, splat) for t in (*shapes[:5], torch.log(shapes[5] / profile.alpha_floor)))
     left = (tile_x * tile_size).to(x.dtype) + 0.5 - x
     top = (tile_y * tile_size).to(x.dtype) + 0.5 - y
     right, bottom = left + (tile_size - 1), top + (tile_size - 1)

@@ -1,0 +1,166 @@
+"""Time this checkout against another one, turn about in one process, so that a noisy machine is as noisy for both.
+
+    git worktree add /tmp/before HEAD~1
+    python benchmarks/turn_about.py /tmp/before                    whole training steps and the blend, all cases
+    python benchmarks/turn_about.py /tmp/before --only blend --repeats 40
+
+Each repeat runs one checkout and then the other, in changing order, and gives one ratio, this / other; what is reported
+is the median of the ratios and their quartiles. Nothing is timed unless the two render the same image. What a checkout
+imports only when it is called comes from this one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+HERE = Path(__file__).resolve().parent
+PACKAGES = ("pop_fast", "pop_ref", "cuda_ext", "cases", "run")
+SAME = 1e-4  # the largest difference of two images, of colours around 1
+
+Times = tuple[float, ...]
+
+
+class Checkout:
+    """The package as one checkout has it, beside any other that is loaded already."""
+
+    def __init__(self, root: Path) -> None:
+        """Import from a checkout.
+
+        Raises:
+            SystemExit: there is no package in the folder.
+        """
+        if not (root / "pop_fast" / "rasterization.py").exists():
+            raise SystemExit(f"{root} has no pop_fast/rasterization.py; give the root of a checkout")
+        for name in [name for name in sys.modules if name.split(".")[0] in PACKAGES]:
+            del sys.modules[name]
+        sys.path[:0] = [str(root), str(HERE)]
+        try:
+            self.run = importlib.import_module("run")
+            found = Path(str(importlib.import_module("pop_fast").__file__)).resolve()
+        finally:
+            del sys.path[:2]
+        if root.resolve() not in found.parents:
+            raise SystemExit(f"asked for pop_fast of {root}, but Python found {found}")
+        self.cases: Any = importlib.import_module("cases")
+
+    def blend(self, name: str, tile: int) -> tuple[Callable[[], Times], Callable[[], Tensor]]:
+        """Return what times a forward and a backward of the blend of a case, and what renders it."""
+        case = next(c for c in self.cases.RASTER_CASES if c.name == name)
+        scene, size = self.cases.gaussians_of(case), (case.width, case.height)
+        with torch.no_grad():
+            _, _, meta = self.run.rasterization(**scene, width=size[0], height=size[1], sh_degree=3, packed=False)
+        splat = {key: meta[key][0].detach().clone() for key in ("means2d", "conics", "opacities", "radii", "depths")}
+        inputs = [splat[key].requires_grad_() for key in ("means2d", "conics", "opacities")]
+        colors = torch.rand(case.n, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
+        exact = {"conics": splat["conics"].detach(), "opacities": splat["opacities"].detach()}
+        where = (splat["means2d"].detach(), splat["radii"], splat["depths"], *size, tile)
+        lists = self.run.tile_lists(*where, **exact)
+
+        def once() -> Times:
+            start = time.perf_counter()
+            image = self.run.composite(*inputs, colors, lists, *size).image
+            middle = time.perf_counter()
+            image.square().mean().backward()
+            return middle - start, time.perf_counter() - middle
+
+        return once, lambda: self.run.composite(*inputs, colors, lists, *size).image.detach()
+
+    def step(self, name: str, folder: str) -> tuple[Callable[[], Times], Callable[[], Tensor]]:
+        """Return what times a training step of a case, and what renders its first view."""
+        case = next(c for c in self.cases.ITERATION_CASES if c.name == name)
+        scene = self.cases.gaussians_of(case)
+        config = self.run.TrainConfig(result_dir=folder, sh_interval=1, log_every=10**9, progress=False)
+        trainer = self.run.Trainer(config, self.cases.capture_of(case))
+        with torch.no_grad():
+            trainer.params["scales"].copy_(scene["scales"].log())
+            trainer.params["opacities"].copy_(torch.logit(scene["opacities"].clamp(1e-4, 1.0 - 1e-4)))
+        first = trainer.train_step().rendered.image.detach()
+
+        def once() -> Times:
+            start = time.perf_counter()
+            trainer.train_step()
+            return (time.perf_counter() - start,)
+
+        return once, lambda: first
+
+
+def compare(this: Any, other: Any, parts: tuple[str, ...], repeats: int) -> dict[str, Any]:
+    """Run two timed calls turn about.
+
+    Returns:
+        For each part: medians in ms, and the median and quartiles of the ratios, this / other.
+
+    Raises:
+        SystemExit: they do not render the same.
+    """
+    difference = float((this[1]() - other[1]()).abs().max())
+    if not difference <= SAME:
+        raise SystemExit(f"the checkouts' images differ by {difference:.1e}, more than {SAME:.0e}; nothing was timed")
+    times: tuple[list[Times], list[Times]] = ([], [])
+    for _ in range(3):
+        this[0]()
+        other[0]()
+    for turn in range(repeats):
+        for which in (0, 1) if turn % 2 else (1, 0):
+            times[which].append((this[0], other[0])[which]())
+    found: dict[str, Any] = {}
+    for i, part in enumerate(parts):
+        mine, its = ([taken[i] for taken in of] for of in times)
+        quartiles = statistics.quantiles((a / b for a, b in zip(mine, its, strict=True)), n=4)
+        found[part] = {
+            "this_ms": 1e3 * statistics.median(mine),
+            "other_ms": 1e3 * statistics.median(its),
+            "ratio": quartiles[1],
+            "ratio_quartiles": [quartiles[0], quartiles[2]],
+        }
+    return found
+
+
+def main() -> None:
+    """Compare, print, and write what was asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("other", type=Path, help="root of the other checkout")
+    parser.add_argument("--only", choices=("blend", "step"), default=None)
+    parser.add_argument("--repeats", type=int, default=25)
+    parser.add_argument("--threads", type=int, default=os.cpu_count())
+    parser.add_argument("--out", type=Path, default=None, help="JSON file")
+    given = parser.parse_args()
+    torch.set_num_threads(given.threads)
+    other, this = Checkout(given.other), Checkout(HERE.parent)
+    this.run.keep_freed_memory()
+    timed: dict[str, dict[str, Any]] = {}
+    with this.run.reproducible(given.threads), tempfile.TemporaryDirectory() as folder:
+        if given.only != "step":
+            for case in this.cases.RASTER_CASES:
+                for tile in (16, 8):
+                    pair = (this.blend(case.name, tile), other.blend(case.name, tile))
+                    timed[f"blend {case.name}, {tile} px"] = compare(*pair, ("forward", "backward"), given.repeats)
+        if given.only != "blend":
+            for case in this.cases.ITERATION_CASES:
+                pair = (this.step(case.name, f"{folder}/{case.name}"), other.step(case.name, f"{folder}/{case.name}-"))
+                timed[f"step {case.name}"] = compare(*pair, ("step",), given.repeats)
+    for name, parts in timed.items():
+        for part, found in parts.items():
+            low, high = found["ratio_quartiles"]
+            print(
+                f"{name:28s} {part:9s} {found['other_ms']:7.1f} -> {found['this_ms']:7.1f} ms, "
+                f"ratio {found['ratio']:.3f} ({low:.3f} to {high:.3f})"
+            )
+    if given.out:
+        this.run.write_json(given.out, {"machine": this.run.machine(), "repeats": given.repeats, "timed": timed})
+
+
+if __name__ == "__main__":
+    main()
