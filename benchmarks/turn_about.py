@@ -5,8 +5,7 @@
     python benchmarks/turn_about.py /tmp/before --only blend --repeats 40
 
 Each repeat runs one checkout and then the other, in changing order, and gives one ratio, this / other; what is reported
-is the median of the ratios and their quartiles. Nothing is timed unless the two render the same image. What a checkout
-imports only when it is called comes from this one.
+is the median of the ratios and their quartiles. Nothing is timed unless the two render the same image.
 """
 
 from __future__ import annotations
@@ -18,8 +17,10 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -43,23 +44,31 @@ class Checkout:
         """
         if not (root / "pop_fast" / "rasterization.py").exists():
             raise SystemExit(f"{root} has no pop_fast/rasterization.py; give the root of a checkout")
-        for name in [name for name in sys.modules if name.split(".")[0] in PACKAGES]:
-            del sys.modules[name]
-        sys.path[:0] = [str(root), str(HERE)]
-        try:
-            self.run = importlib.import_module("run")
+        self.root, self._modules = root, dict[str, ModuleType]()
+        with self.imports():
+            self.run: Any = importlib.import_module("run")
+            self.cases: Any = importlib.import_module("cases")
             found = Path(str(importlib.import_module("pop_fast").__file__)).resolve()
-        finally:
-            del sys.path[:2]
         if root.resolve() not in found.parents:
             raise SystemExit(f"asked for pop_fast of {root}, but Python found {found}")
-        self.cases: Any = importlib.import_module("cases")
+
+    @contextmanager
+    def imports(self) -> Iterator[None]:
+        """Let what is imported meanwhile, also by functions when they are called, be this checkout's."""
+        _forget()
+        sys.modules.update(self._modules)
+        path, sys.path[:0] = list(sys.path), [str(self.root), str(HERE)]
+        try:
+            yield
+        finally:
+            sys.path[:] = path
+            self._modules = _forget()
 
     def blend(self, name: str, tile: int) -> tuple[Callable[[], Times], Callable[[], Tensor]]:
         """Return what times a forward and a backward of the blend of a case, and what renders it."""
         case = next(c for c in self.cases.RASTER_CASES if c.name == name)
         scene, size = self.cases.gaussians_of(case), (case.width, case.height)
-        with torch.no_grad():
+        with self.imports(), torch.no_grad():
             _, _, meta = self.run.rasterization(**scene, width=size[0], height=size[1], sh_degree=3, packed=False)
         splat = {key: meta[key][0].detach().clone() for key in ("means2d", "conics", "opacities", "radii", "depths")}
         inputs = [splat[key].requires_grad_() for key in ("means2d", "conics", "opacities")]
@@ -68,32 +77,43 @@ class Checkout:
         where = (splat["means2d"].detach(), splat["radii"], splat["depths"], *size, tile)
         lists = self.run.tile_lists(*where, **exact)
 
-        def once() -> Times:
-            start = time.perf_counter()
-            image = self.run.composite(*inputs, colors, lists, *size).image
-            middle = time.perf_counter()
-            image.square().mean().backward()
-            return middle - start, time.perf_counter() - middle
+        def render() -> Tensor:
+            return self.run.composite(*inputs, colors, lists, *size).image
 
-        return once, lambda: self.run.composite(*inputs, colors, lists, *size).image.detach()
+        def once() -> Times:
+            with self.imports():
+                start = time.perf_counter()
+                image = render()
+                middle = time.perf_counter()
+                image.square().mean().backward()
+                return middle - start, time.perf_counter() - middle
+
+        return once, lambda: render().detach()
 
     def step(self, name: str, folder: str) -> tuple[Callable[[], Times], Callable[[], Tensor]]:
         """Return what times a training step of a case, and what renders its first view."""
         case = next(c for c in self.cases.ITERATION_CASES if c.name == name)
         scene = self.cases.gaussians_of(case)
         config = self.run.TrainConfig(result_dir=folder, sh_interval=1, log_every=10**9, progress=False)
-        trainer = self.run.Trainer(config, self.cases.capture_of(case))
-        with torch.no_grad():
-            trainer.params["scales"].copy_(scene["scales"].log())
-            trainer.params["opacities"].copy_(torch.logit(scene["opacities"].clamp(1e-4, 1.0 - 1e-4)))
-        first = trainer.train_step().rendered.image.detach()
+        with self.imports():
+            trainer = self.run.Trainer(config, self.cases.capture_of(case))
+            with torch.no_grad():
+                trainer.params["scales"].copy_(scene["scales"].log())
+                trainer.params["opacities"].copy_(torch.logit(scene["opacities"].clamp(1e-4, 1.0 - 1e-4)))
+            first = trainer.train_step().rendered.image.detach()
 
         def once() -> Times:
-            start = time.perf_counter()
-            trainer.train_step()
-            return (time.perf_counter() - start,)
+            with self.imports():
+                start = time.perf_counter()
+                trainer.train_step()
+                return (time.perf_counter() - start,)
 
         return once, lambda: first
+
+
+def _forget() -> dict[str, ModuleType]:
+    """Take the packages' modules out of Python's table, so that the next import reads files, and return them."""
+    return {name: sys.modules.pop(name) for name in list(sys.modules) if name.split(".")[0] in PACKAGES}
 
 
 def compare(this: Any, other: Any, parts: tuple[str, ...], repeats: int) -> dict[str, Any]:

@@ -10,6 +10,8 @@ from torch import Tensor
 from pop_fast.layout import columns, from_columns
 from pop_ref.constants import PAPER, Profile
 
+_RADIX = 1 << 15  # integers from which torch sorts by digits, up to six times faster than it sorts fewer
+
 
 @dataclass(frozen=True)
 class TileLists:
@@ -100,7 +102,7 @@ def tile_lists(
     ids = rows.index_select(0, splat)
     tile = tile_y * tiles_x + tile_x
     n_tiles = tiles_x * tiles_y
-    order = torch.sort(tile.to(torch.int16 if n_tiles < 2**15 else torch.int32), stable=True).indices
+    order = _stable_order(tile.to(torch.int16 if n_tiles < 2**15 else torch.int32))
     offsets = torch.zeros(n_tiles + 1, dtype=torch.int64)
     torch.cumsum(torch.bincount(tile, minlength=n_tiles), 0, out=offsets[1:])
     return TileLists(ids.index_select(0, order), offsets, tile_size, tiles_x, tiles_y)
@@ -118,8 +120,17 @@ def _span(center: Tensor, radius: Tensor, n_tiles: int, tile_size: int, profile:
 
 
 def _depth_order(depths: Tensor) -> Tensor:
-    bits = torch.int32 if depths.dtype == torch.float32 else torch.int64
-    return torch.sort(depths.contiguous().view(bits), stable=True).indices
+    return _stable_order(depths.contiguous().view(torch.int32 if depths.dtype == torch.float32 else torch.int64))
+
+
+def _stable_order(keys: Tensor) -> Tensor:
+    n = len(keys)
+    if _RADIX // 8 < n < _RADIX:
+        # padding stays behind, as the sort is stable
+        padded = keys.new_full((_RADIX,), torch.iinfo(keys.dtype).max)
+        padded[:n] = keys
+        keys = padded
+    return torch.sort(keys, stable=True).indices[:n]
 
 
 def _touches(
