@@ -222,7 +222,6 @@ def machine() -> dict[str, Any]:
         model = next(
             (line.split(":")[1].strip() for line in info.read_text().splitlines() if "model name" in line), model
         )
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
     return {
         "cpu": model,
         "cores": os.cpu_count(),
@@ -231,8 +230,14 @@ def machine() -> dict[str, Any]:
         "torch": torch.__version__,
         "capability": torch.backends.cpu.get_cpu_capability(),
         "python": platform.python_version(),
-        "commit": commit.stdout.strip(),
+        "commit": commit(Path(__file__).resolve().parent),
     }
+
+
+def commit(checkout: Path) -> str:
+    """Return the commit that a checkout is at, empty where git does not know it."""
+    asked = ["git", "-C", str(checkout), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip()
 
 
 def write_json(path: Path, result: dict[str, Any]) -> None:

@@ -179,7 +179,9 @@ def main() -> None:
                 f"ratio {found['ratio']:.3f} ({low:.3f} to {high:.3f})"
             )
     if given.out:
-        this.run.write_json(given.out, {"machine": this.run.machine(), "repeats": given.repeats, "timed": timed})
+        other_commit = this.run.commit(given.other)
+        found = {"machine": this.run.machine(), "other_commit": other_commit, "repeats": given.repeats, "timed": timed}
+        this.run.write_json(given.out, found)
 
 
 if __name__ == "__main__":
