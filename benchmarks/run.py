@@ -32,10 +32,10 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from cases import GATE_CASE, ITERATION_CASES, MEMORY_CASE, RASTER_CASES, Case, capture_of, gaussians_of
 
-from pop_fast.compositing import composite
+from pop_fast.compositing import Composite, composite
 from pop_fast.data import Capture, load_capture
 from pop_fast.rasterization import rasterization
-from pop_fast.tiles import tile_lists
+from pop_fast.tiles import TileLists, tile_lists
 from pop_fast.train import TrainConfig, Trainer
 from pop_fast.train.environment import keep_freed_memory, reproducible
 from pop_ref.render import render, render_vjp
@@ -104,7 +104,6 @@ def time_raster(case: Case, repeats: int) -> dict[str, Any]:
         kept["image"].square().mean().backward()
 
     meta = rasterization(**arguments, counts=True)[2]
-    pixels = case.width * case.height
     return {
         **asdict(case),
         "forward_ms": median_ms(lambda: forward(False), repeats),
@@ -114,24 +113,30 @@ def time_raster(case: Case, repeats: int) -> dict[str, Any]:
         "contributing_per_pixel": float(meta["n_contrib"].float().mean()),
         "list_entries_per_pixel": float(meta["n_traversed"].float().mean()),
         "visible": int((meta["radii"] > 0).all(-1).sum()),
-        "blend": [time_blend(case, scene, tile, pixels, repeats) for tile in (16, 8)],
+        "blend": [time_blend(case, tile, repeats) for tile in (16, 8)],
     }
 
 
-def time_blend(case: Case, scene: dict[str, Tensor], tile: int, pixels: int, repeats: int) -> dict[str, float]:
-    """Time blending and its transpose alone, per evaluated (Gaussian, pixel) pair."""
-    size = (case.width, case.height)
+def blend_of(case: Case, tile: int) -> tuple[TileLists, Callable[[], Composite]]:
+    """Return a case's tile lists, and what blends it, differentiably, and nothing else."""
+    scene, size = gaussians_of(case), (case.width, case.height)
     with torch.no_grad():
         _, _, meta = rasterization(**scene, width=size[0], height=size[1], sh_degree=3, packed=False)
     names = ("means2d", "conics", "opacities")
     splats = [meta[name][0].detach().clone().requires_grad_() for name in names]
-    colors = torch.rand(case.n, 3, requires_grad=True)
+    colors = torch.rand(case.n, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
     exact = {"conics": meta["conics"][0], "opacities": meta["opacities"][0]}
     lists = tile_lists(meta["means2d"][0], meta["radii"][0], meta["depths"][0], *size, tile, **exact)
+    return lists, lambda: composite(*splats, colors, lists, *size)
+
+
+def time_blend(case: Case, tile: int, repeats: int) -> dict[str, float]:
+    """Time blending and its transpose alone, per evaluated (Gaussian, pixel) pair."""
+    lists, blend = blend_of(case, tile)
     kept: dict[str, Any] = {}
 
     def forward() -> None:
-        kept["blend"] = composite(*splats, colors, lists, *size)
+        kept["blend"] = blend()
 
     def both() -> None:
         forward()
@@ -142,7 +147,7 @@ def time_blend(case: Case, scene: dict[str, Tensor], tile: int, pixels: int, rep
     return {
         "tile": tile,
         "entries": len(lists.ids),
-        "pairs_per_pixel": pairs / pixels,
+        "pairs_per_pixel": pairs / (case.width * case.height),
         "forward_ns_per_pair": 1e6 * ahead / pairs,
         "forward_backward_ns_per_pair": 1e6 * whole / pairs,
     }
@@ -150,34 +155,38 @@ def time_blend(case: Case, scene: dict[str, Tensor], tile: int, pixels: int, rep
 
 def time_iteration(case: Case, repeats: int) -> dict[str, Any]:
     """Time whole training steps of POP on a synthetic capture with `case.n` Gaussians."""
-    scene = gaussians_of(case)
-
-    def prepare(trainer: Trainer) -> None:
-        with torch.no_grad():
-            trainer.params["scales"].copy_(scene["scales"].log())
-            trainer.params["opacities"].copy_(torch.logit(scene["opacities"].clamp(1e-4, 1.0 - 1e-4)))
-
-    return {**asdict(case), **_time_steps(capture_of(case), repeats, prepare)}
+    with tempfile.TemporaryDirectory() as folder:
+        return {**asdict(case), **_time_steps(trainer_of(case, folder), capture_of(case), repeats)}
 
 
 def time_capture(path: str, factor: int, repeats: int) -> dict[str, Any]:
     """Time training steps of POP from the sparse points of a real capture, all bands active."""
     capture = load_capture(path, factor=factor)
     view = capture.views[0]
-    return {"capture": capture.name, "width": view.width, "height": view.height, **_time_steps(capture, repeats)}
-
-
-def _time_steps(
-    capture: Capture, repeats: int, prepare: Callable[[Trainer], None] = lambda trainer: None
-) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
-        config = TrainConfig(result_dir=str(Path(folder) / "run"), sh_interval=1, log_every=10**9, progress=False)
-        trainer = Trainer(config, capture)
-        prepare(trainer)
-        with reproducible(torch.get_num_threads()):
-            # what SSIM needs of a photograph is made at its first visit, so every photograph is visited once before
-            step_ms = median_ms(trainer.train_step, repeats, warm_up=len(capture.views))
-            pairs = trainer.train_step().rendered.info["n_pairs"]
+        steps = _time_steps(_trainer(capture, folder), capture, repeats)
+    return {"capture": capture.name, "width": view.width, "height": view.height, **steps}
+
+
+def trainer_of(case: Case, folder: str) -> Trainer:
+    """Return a trainer whose Gaussians are a case's, of which some are opaque and their sizes differ."""
+    scene, trainer = gaussians_of(case), _trainer(capture_of(case), folder)
+    with torch.no_grad():
+        trainer.params["scales"].copy_(scene["scales"].log())
+        trainer.params["opacities"].copy_(torch.logit(scene["opacities"].clamp(1e-4, 1.0 - 1e-4)))
+    return trainer
+
+
+def _trainer(capture: Capture, folder: str) -> Trainer:
+    config = TrainConfig(result_dir=str(Path(folder) / "run"), sh_interval=1, log_every=10**9, progress=False)
+    return Trainer(config, capture)
+
+
+def _time_steps(trainer: Trainer, capture: Capture, repeats: int) -> dict[str, Any]:
+    with reproducible(torch.get_num_threads()):
+        # what SSIM needs of a photograph is made at its first visit, so every photograph is visited once before
+        step_ms = median_ms(trainer.train_step, repeats, warm_up=len(capture.views))
+        pairs = trainer.train_step().rendered.info["n_pairs"]
     view = capture.views[0]
     return {
         "iteration_ms": step_ms,

@@ -47,7 +47,6 @@ class Checkout:
         self.root, self._modules = root, dict[str, ModuleType]()
         with self.imports():
             self.run: Any = importlib.import_module("run")
-            self.cases: Any = importlib.import_module("cases")
             found = Path(str(importlib.import_module("pop_fast").__file__)).resolve()
         if root.resolve() not in found.parents:
             raise SystemExit(f"asked for pop_fast of {root}, but Python found {found}")
@@ -66,40 +65,23 @@ class Checkout:
 
     def blend(self, name: str, tile: int) -> tuple[Callable[[], Times], Callable[[], Tensor]]:
         """Return what times a forward and a backward of the blend of a case, and what renders it."""
-        case = next(c for c in self.cases.RASTER_CASES if c.name == name)
-        scene, size = self.cases.gaussians_of(case), (case.width, case.height)
-        with self.imports(), torch.no_grad():
-            _, _, meta = self.run.rasterization(**scene, width=size[0], height=size[1], sh_degree=3, packed=False)
-        splat = {key: meta[key][0].detach().clone() for key in ("means2d", "conics", "opacities", "radii", "depths")}
-        inputs = [splat[key].requires_grad_() for key in ("means2d", "conics", "opacities")]
-        colors = torch.rand(case.n, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
-        exact = {"conics": splat["conics"].detach(), "opacities": splat["opacities"].detach()}
-        where = (splat["means2d"].detach(), splat["radii"], splat["depths"], *size, tile)
-        lists = self.run.tile_lists(*where, **exact)
-
-        def render() -> Tensor:
-            return self.run.composite(*inputs, colors, lists, *size).image
+        with self.imports():
+            _, composite = self.run.blend_of(self._case(name), tile)
 
         def once() -> Times:
             with self.imports():
                 start = time.perf_counter()
-                image = render()
+                image = composite().image
                 middle = time.perf_counter()
                 image.square().mean().backward()
                 return middle - start, time.perf_counter() - middle
 
-        return once, lambda: render().detach()
+        return once, lambda: composite().image.detach()
 
     def step(self, name: str, folder: str) -> tuple[Callable[[], Times], Callable[[], Tensor]]:
         """Return what times a training step of a case, and what renders its first view."""
-        case = next(c for c in self.cases.ITERATION_CASES if c.name == name)
-        scene = self.cases.gaussians_of(case)
-        config = self.run.TrainConfig(result_dir=folder, sh_interval=1, log_every=10**9, progress=False)
         with self.imports():
-            trainer = self.run.Trainer(config, self.cases.capture_of(case))
-            with torch.no_grad():
-                trainer.params["scales"].copy_(scene["scales"].log())
-                trainer.params["opacities"].copy_(torch.logit(scene["opacities"].clamp(1e-4, 1.0 - 1e-4)))
+            trainer = self.run.trainer_of(self._case(name), folder)
             first = trainer.train_step().rendered.image.detach()
 
         def once() -> Times:
@@ -109,6 +91,9 @@ class Checkout:
                 return (time.perf_counter() - start,)
 
         return once, lambda: first
+
+    def _case(self, name: str) -> Any:
+        return next(case for case in self.run.RASTER_CASES if case.name == name)
 
 
 def _forget() -> dict[str, ModuleType]:
@@ -163,12 +148,12 @@ def main() -> None:
     timed: dict[str, dict[str, Any]] = {}
     with this.run.reproducible(given.threads), tempfile.TemporaryDirectory() as folder:
         if given.only != "step":
-            for case in this.cases.RASTER_CASES:
+            for case in this.run.RASTER_CASES:
                 for tile in (16, 8):
                     pair = (this.blend(case.name, tile), other.blend(case.name, tile))
                     timed[f"blend {case.name}, {tile} px"] = compare(*pair, ("forward", "backward"), given.repeats)
         if given.only != "blend":
-            for case in this.cases.ITERATION_CASES:
+            for case in this.run.ITERATION_CASES:
                 pair = (this.step(case.name, f"{folder}/{case.name}"), other.step(case.name, f"{folder}/{case.name}-"))
                 timed[f"step {case.name}"] = compare(*pair, ("step",), given.repeats)
     for name, parts in timed.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from pathlib import Path
 
 import pytest
@@ -51,3 +52,22 @@ def test_nothing_is_timed_where_the_images_differ(turn_about):
 def test_a_folder_that_is_no_checkout_is_named(turn_about, tmp_path):
     with pytest.raises(SystemExit, match=rf"{tmp_path} has no pop_fast/rasterization.py"):
         turn_about.Checkout(tmp_path)
+
+
+def test_what_a_function_imports_when_it_is_called_is_its_own_checkouts(turn_about, tmp_path, monkeypatch):
+    (tmp_path / "run.py").write_text("def name():\n    from pop_fast.late import NAME\n    return NAME\n")
+    for name in ("one", "other"):
+        package = tmp_path / name / "pop_fast"
+        package.mkdir(parents=True)
+        for file, words in {"__init__": "", "rasterization": "", "late": f"NAME = {name!r}\n"}.items():
+            (package / f"{file}.py").write_text(words)
+    monkeypatch.setattr(turn_about, "HERE", tmp_path)
+    loaded = turn_about._forget()
+    try:
+        one, other = (turn_about.Checkout(tmp_path / name) for name in ("one", "other"))
+        for checkout, expected in [(one, "one"), (other, "other"), (one, "one")]:
+            with checkout.imports():
+                assert checkout.run.name() == expected
+    finally:
+        turn_about._forget()
+        sys.modules.update(loaded)
