@@ -11,7 +11,8 @@ TORCH := $(shell sed -n 's/^\(torch==.*\)/\1/p' constraints.txt)
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
 
-setup: $(STAMP)  ## make .venv and install everything into it
+setup: $(STAMP)  ## make .venv, install everything into it, compile the CPU blend where there is a C++ compiler
+	@$(BIN)/python -m pop_fast.compiled.build --if-possible
 
 # torch goes first and by exact version: left to the resolver, pip picks the newest build and its gigabytes of CUDA.
 $(STAMP): pyproject.toml constraints.txt
@@ -56,4 +57,5 @@ docs-check: setup  ## fail when a table, name, path or command in README.md is n
 
 clean:  ## remove what was built here; .venv stays
 	rm -rf out build dist .pytest_cache .ruff_cache .hypothesis htmlcov .coverage
+	rm -f pop_fast/compiled/_*.so
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +

@@ -1,4 +1,5 @@
-"""Backends by name: "fast" (this package, CPU), "cuda" (cuda_ext), "ref" (the oracle, slow).
+"""Backends by name: "fast" (this package in torch, CPU), "compiled" (the same with a blend in C++), "cuda" (cuda_ext),
+"ref" (the oracle, slow).
 
 A backend offers `rasterization()` with gsplat's signature and this project's meta keys. Which one runs is a value that
 is passed; nothing is patched, so two can be alive in one process and be compared in one assertion.
@@ -49,9 +50,7 @@ class _Registered:
         return self.reason()
 
     def rasterization(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        reason = self.reason()
-        if reason is not None:
-            raise PopError(f"backend {self.name!r} cannot run: {reason}")
+        require_backend(self.name)
         return self.load()(*args, **kwargs)
 
 
@@ -59,6 +58,18 @@ def _load_fast() -> Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]:
     from pop_fast.rasterization import rasterization
 
     return rasterization
+
+
+def _load_compiled() -> Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]:
+    from pop_fast.compiled.rasterization import rasterization
+
+    return rasterization
+
+
+def _why_not_compiled() -> str | None:
+    from pop_fast.compiled import why_not
+
+    return why_not()
 
 
 def _load_ref() -> Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]:
@@ -81,6 +92,7 @@ def _why_not_cuda() -> str | None:
 
 _BACKENDS: dict[str, Backend] = {
     "fast": _Registered("fast", _load_fast, lambda: None),
+    "compiled": _Registered("compiled", _load_compiled, _why_not_compiled),
     "cuda": _Registered("cuda", _load_cuda, _why_not_cuda),
     "ref": _Registered("ref", _load_ref, lambda: None),
 }
@@ -100,3 +112,14 @@ def get_backend(name: str) -> Backend:
     if name not in _BACKENDS:
         raise PopError(f"backend {name!r} is unknown; use one of {', '.join(_BACKENDS)}")
     return _BACKENDS[name]
+
+
+def require_backend(name: str) -> None:
+    """Make sure that a backend can run here.
+
+    Raises:
+        PopError: it is unknown, or cannot; says why and what to do.
+    """
+    reason = get_backend(name).why_not()
+    if reason is not None:
+        raise PopError(f"backend {name!r} cannot run: {reason}")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from pop_fast.compositing import Composite, composite
+from pop_fast.compositing import Composite
 from pop_fast.dominance import dominant_counts
 from pop_fast.raster_meta import RenderMeta, intersections
 from pop_fast.splatting import Splats, View, colors_of_view, project
@@ -82,6 +83,7 @@ class Frame:
         render_mode: as `rasterization` takes it.
         packed: whether meta holds visible rows only.
         absgrad: whether to sum absolute gradients.
+        composite: blends; `pop_fast.compositing.composite`, or another with its parameters.
     """
 
     scene: Scene
@@ -92,6 +94,7 @@ class Frame:
     render_mode: str
     packed: bool
     absgrad: bool
+    composite: Callable[..., Composite]
 
     def render(self, backgrounds: Tensor | None, dominance: bool, counts: bool) -> tuple[Tensor, Tensor, RenderMeta]:
         """Return images, alphas and meta."""
@@ -186,7 +189,7 @@ class Frame:
         lists = tile_lists(
             rows.means2d.detach(), rows.radii, rows.depths.detach(), width, height, size, profile, **exact
         )
-        return composite(
+        return self.composite(
             rows.means2d,
             rows.conics,
             rows.opacities,

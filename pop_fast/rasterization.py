@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, Literal
 
 from torch import Tensor
 
-from pop_fast.backends import get_backend
+from pop_fast.backends import get_backend, require_backend
+from pop_fast.compositing import Composite, composite
 from pop_fast.raster_frame import Frame, Scene
 from pop_fast.raster_inputs import (
     RENDER_MODES,
@@ -62,7 +64,7 @@ def rasterization(
     profile: str | Profile = "paper",
     dominance: bool = False,
     counts: bool = False,
-    backend: Literal["fast", "cuda"] = "fast",
+    backend: Literal["fast", "compiled", "cuda"] = "fast",
 ) -> tuple[Tensor, Tensor, RenderMeta]:
     """Render Gaussians into C images, with gsplat 1.5.3's signature, results and meta keys.
 
@@ -106,7 +108,8 @@ def rasterization(
         profile: constants and strictness: "paper", "gsplat_1_5", "gsplat_1_6", "inria", or a `Profile`.
         dominance: compute the dominance keys of meta in the same pass; else they cost one more when first read.
         counts: likewise for n_contrib and n_traversed.
-        backend: "fast" renders on the CPU, "cuda" on the GPU that holds the tensors (`cuda_ext.ops.rasterization`).
+        backend: "fast" renders on the CPU, "compiled" too, with the blend in C++ (`pop_fast.compiled`), "cuda" on the
+            GPU that holds the tensors (`cuda_ext.ops.rasterization`).
 
     Returns:
         Images [..., C, H, W, X], not clamped; alphas [..., C, H, W, 1]; meta with gsplat's keys and `dominant_ids`
@@ -118,7 +121,7 @@ def rasterization(
         NotImplementedError: an argument is not supported.
         PopError: the backend cannot run here; says why and what to do.
     """
-    if backend != "fast":
+    if backend not in ("fast", "compiled"):
         given = dict(locals())
         del given["backend"]
         return get_backend(backend).rasterization(**given)  # type: ignore[return-value]
@@ -167,5 +170,16 @@ def rasterization(
     )
     chosen = resolved_profile(profile, near_plane, far_plane, eps2d)
     view = View(Ks, width, height, chosen, rasterize_mode == "antialiased", radius_clip)
-    frame = Frame(scene, (*batch, n_cameras), view, tile_size, sh_degree, render_mode, packed, absgrad)
+    options = (tile_size, sh_degree, render_mode, packed, absgrad)
+    frame = Frame(scene, (*batch, n_cameras), view, *options, _blend_of(backend))
     return frame.render(backgrounds, dominance, counts)
+
+
+def _blend_of(backend: str) -> Callable[..., Composite]:
+    """Return what blends for a backend on the CPU."""
+    if backend == "fast":
+        return composite
+    require_backend(backend)
+    from pop_fast.compiled.compositing import composite as compiled_composite
+
+    return compiled_composite

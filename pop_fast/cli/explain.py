@@ -56,7 +56,7 @@ class Args(CaptureOptions):
     maps: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Also write the view's maps into this new folder, one PNG each."""
     diff: Annotated[tuple[str, str] | None, tyro.conf.arg(metavar="A B")] = None
-    """Also compare two profiles or backends (fast, ref, cuda) on the view and at the pixel."""
+    """Also compare two profiles or backends (fast, compiled, ref, cuda) on the view and at the pixel."""
     overwrite: bool = False
     """Replace the folder of maps when it is there."""
 

@@ -14,7 +14,7 @@ from pop_fast.train.training_run import TrainingRun
 
 
 def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConfig, str]:
-    """Settle backend "auto": "cuda" where a GPU, the build and the settings allow it, else "fast".
+    """Settle backend "auto": "cuda" where a GPU, the build and the settings allow it, else "compiled" or "fast".
 
     A run that is gone on with keeps the backend that it was begun with.
 
@@ -37,7 +37,10 @@ def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConf
         reason = unsupported(config.resolved())
     if reason is None:
         return replace(config, backend="cuda"), "backend cuda: a GPU and the build are here"
-    return replace(config, backend="fast"), f"backend fast (CPU): {reason}"
+    not_compiled = get_backend("compiled").why_not()
+    if not_compiled is None:
+        return replace(config, backend="compiled"), f"backend compiled (CPU): {reason}"
+    return replace(config, backend="fast"), f"backend fast (CPU): {not_compiled}; {reason}"
 
 
 def make_trainer(config: TrainConfig, capture: Capture, **options: Any) -> TrainingRun:

@@ -66,8 +66,9 @@ class TrainConfig:
         steps_scaler: multiplies every step number of the schedule; None takes the preset's.
         max_steps: training steps, one view each.
         seed: of the view order, the initial rotations and the split noise.
-        backend: what renders and trains: "fast" (CPU), "cuda", "ref" (the oracle, slow), or "auto": "cuda" where a GPU
-            and the build are there, else "fast".
+        backend: what renders and trains: "fast" (CPU), "compiled" (CPU, with the blend in C++), "cuda", "ref" (the
+            oracle, slow), or "auto": "cuda" where a GPU and the build are there, else "compiled" where that was
+            compiled, else "fast".
         profile: the rasterizer's constants: "paper", "gsplat_1_5", "gsplat_1_6" or "inria".
         antialiased: render with opacity compensation (Mip-Splatting) instead of classically.
         factor: photographs are shrunk by it.
@@ -109,7 +110,7 @@ class TrainConfig:
     steps_scaler: float | None = None
     max_steps: int = 30_000
     seed: int = 42
-    backend: Literal["auto", "fast", "cuda", "ref"] = "auto"
+    backend: Literal["auto", "fast", "compiled", "cuda", "ref"] = "auto"
     profile: Literal["paper", "gsplat_1_5", "gsplat_1_6", "inria"] = "paper"
     antialiased: bool = False
     factor: int = 1

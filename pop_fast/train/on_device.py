@@ -95,15 +95,17 @@ def words_for_memory() -> Iterator[None]:
 def renderer(name: str) -> tuple[Backend, str | None]:
     """Return the backend for CPU tensors under a name of settings, and a note where another one stands in for it.
 
-    "auto" is "cuda" where it can run, else "fast"; results trained by "cuda" are drawn by "fast" on other machines.
+    "auto" is the first of "cuda", "compiled" and "fast" that can run; results trained by one of these that cannot are
+    drawn by the next.
 
     Raises:
         PopError: the name is unknown.
     """
-    if name not in ("auto", "cuda"):
+    if name not in ("auto", "cuda", "compiled"):
         return get_backend(name), None
-    cuda = get_backend("cuda")
-    reason = cuda.why_not()
-    if reason is None:
-        return OnDevice(cuda, torch.device("cuda", torch.cuda.current_device())), None
-    return get_backend("fast"), None if name == "auto" else f"backend 'fast' stands in for 'cuda': {reason}"
+    if name != "compiled" and get_backend("cuda").available():
+        return OnDevice(get_backend("cuda"), torch.device("cuda", torch.cuda.current_device())), None
+    drawing = get_backend("compiled" if get_backend("compiled").available() else "fast")
+    if name in ("auto", drawing.name):
+        return drawing, None
+    return drawing, f"backend {drawing.name!r} stands in for {name!r}: {get_backend(name).why_not()}"

@@ -43,7 +43,7 @@ class Trainer(TrainingRun):
     """
 
     def __init__(self, config: TrainConfig, capture: Capture, **options: Any) -> None:
-        """Prepare a run; see `TrainingRun`. Backend "auto" is "fast" here."""
+        """Prepare a run; see `TrainingRun`. Backend "auto" is "fast" here; `choose_backend` looks for a faster one."""
         super().__init__(replace(config, backend="fast") if config.backend == "auto" else config, capture, **options)
         self._objective = Objective(self.config, self._train)
 

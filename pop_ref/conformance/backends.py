@@ -14,6 +14,8 @@ from pop_ref.constants import PAPER, Profile
 # what this project's own tests judge everywhere, and what else the kit knows how to judge where it can run
 SHIPPED = ("oracle", "fast64", "fast32")
 ELSEWHERE = (
+    "compiled64",
+    "compiled32",
     "mirror64",
     "mirror32",
     "cuda",
@@ -79,6 +81,11 @@ def shipped(name: str) -> Any:
 
 def _elsewhere(name: str) -> Any:
     kit = "pop_ref.conformance"
+    if name.startswith("compiled"):
+        reason = importlib.import_module("pop_fast.compiled").why_not()
+        if reason is not None:
+            raise Unavailable(reason)
+        return adapter_for("pop_fast.compiled.rasterization:rasterization", name, None, f"float{name[-2:]}")
     if name.startswith("mirror"):
         reason = importlib.import_module("cuda_ext.host_mirror").find_compiler() is None
         if reason:

@@ -24,6 +24,13 @@ from tests.app.stand_in import stand_in_hardware
 from tests.app.tiny import tiny_capture, tiny_config
 
 NOT_BUILT = "the CUDA extension is not built; run `pop build-cuda`"
+NOT_COMPILED = "the CPU blend is not compiled"
+
+
+@pytest.fixture(autouse=True)
+def _without_compiled_blend(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a machine without a C++ compiler; `test_build_cpu` tells what there is with one."""
+    monkeypatch.setattr("pop_fast.compiled.why_not", lambda: NOT_COMPILED)
 
 
 @pytest.fixture
@@ -50,7 +57,7 @@ def test_auto_is_cuda_where_it_can_run_and_says_why_where_it_cannot(monkeypatch,
     assert choose_backend(config)[0].backend == "cuda"
     monkeypatch.setattr("cuda_ext.why_not", lambda: NOT_BUILT)
     chosen, line = choose_backend(config)
-    assert (chosen.backend, line) == ("fast", f"backend fast (CPU): {NOT_BUILT}")
+    assert (chosen.backend, line) == ("fast", f"backend fast (CPU): {NOT_COMPILED}; {NOT_BUILT}")
 
 
 @pytest.mark.usefixtures("with_gpu")
@@ -116,8 +123,8 @@ def test_a_run_on_a_gpu_from_the_command_line(pop: Pop, shared_capture: Path, tm
 
 
 def test_a_result_of_a_gpu_can_be_measured_without_one(pop: Pop, result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (result / "cfg.json").read_text()
-    (result / "cfg.json").write_text(text.replace('"backend": "fast"', '"backend": "cuda"'))
+    given = {**settings(result), "backend": "cuda"}
+    (result / "cfg.json").write_text(json.dumps(given))
     monkeypatch.setattr("cuda_ext.why_not", lambda: NOT_BUILT)
     outcome = pop("eval", result)
     assert outcome.status == 0, outcome.err

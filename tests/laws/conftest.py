@@ -8,13 +8,12 @@ import pytest
 
 pytest.register_assert_rewrite("pop_ref.conformance.laws")
 
-from pop_ref.conformance.backends import SHIPPED, shipped  # noqa: E402  asserts must be rewritten first
-from pop_ref.conformance.plugin import parametrize_backends  # noqa: E402
-from pop_ref.conformance.poison import poisoned_allocations  # noqa: E402
+from pop_ref.conformance.poison import poisoned_allocations  # noqa: E402  asserts must be rewritten first
+from tests.judged import judge_own_backends  # noqa: E402
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    parametrize_backends(metafunc, [shipped(name) for name in SHIPPED])
+    judge_own_backends(metafunc)
 
 
 @pytest.fixture(autouse=True, scope="module")

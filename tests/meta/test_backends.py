@@ -63,7 +63,7 @@ def broken(backend: Any, *paths: str) -> list[str]:
 
 
 def test_an_unknown_name_is_answered_with_those_that_are_known() -> None:
-    with pytest.raises(ValueError, match="backend 'gsplt' is unknown; use one of oracle, fast64, fast32, mirror64"):
+    with pytest.raises(ValueError, match="backend 'gsplt' is unknown; use one of oracle, fast64, fast32, compiled64"):
         shipped("gsplt")
 
 

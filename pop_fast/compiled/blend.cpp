@@ -1,0 +1,94 @@
+// The compiled blend: `forward` and `backward` for float and double, called through ctypes. Tiles are shared out to
+// threads one after the other, and each writes what is its own, so that the bits do not depend on the threads.
+
+#include <atomic>
+#include <thread>
+#include <vector>
+
+#include "backward.h"
+#include "forward.h"
+
+namespace pop {
+
+// GOMP_parallel of the OpenMP runtime that torch brought along: its threads are awake already. Null elsewhere.
+using Fork = void (*)(void (*)(void *), void *, unsigned, unsigned);
+
+template <class Work> void on_all_threads(Fork fork, int64_t threads, Work work) {
+  const auto call = [](void *given) { (*static_cast<Work *>(given))(); };
+  if (threads <= 1) {
+    work();
+  } else if (fork) {
+    fork(call, &work, unsigned(threads), 0);
+  } else {
+    std::vector<std::thread> others;
+    for (int64_t k = 1; k < threads; k++) others.emplace_back(call, &work);
+    work();
+    for (auto &other : others) other.join();
+  }
+}
+
+// Call f(first, last) for parts of n until none is left; `make()` is what a thread works with.
+template <class Make, class F> void share(Fork fork, int64_t threads, int64_t n, int64_t part, Make make, F f) {
+  std::atomic<int64_t> next{0};
+  on_all_threads(fork, threads, [&] {
+    auto own = make();
+    for (int64_t first; (first = next.fetch_add(part)) < n;) f(own, first, std::min(n, first + part));
+  });
+}
+
+template <class Real> std::vector<Splat> splats_of(const Blend<Real> &blend, Fork fork) {
+  const double log2_e = 1.4426950408889634;
+  std::vector<Splat> splats(blend.n);
+  const auto nothing = [] { return 0; };
+  share(fork, blend.threads, blend.n, 4096, nothing, [&](int, int64_t first, int64_t last) {
+    for (int64_t i = first; i < last; i++) {
+      const Real *mean = blend.means2d + 2 * i, *conic = blend.conics + 3 * i;
+      // the logarithm of 0 is -inf: under every floor
+      splats[i] = {double(mean[0]),          double(mean[1]),          log2_e * double(conic[0]),
+                   log2_e * double(conic[1]), log2_e * double(conic[2]), std::log2(double(blend.opacities[i]))};
+    }
+  });
+  return splats;
+}
+
+constexpr int64_t TILES_AT_A_TIME = 4;
+
+template <class Real> void forward(const Blend<Real> &blend, Fork fork) {
+  const std::vector<Splat> splats = splats_of(blend, fork);
+  const Pixels<Real> pixels(int(blend.tile_size));
+  const auto make = [&] { return Canvas<Real>(pixels, blend.channels); };
+  share(fork, blend.threads, blend.tiles(), TILES_AT_A_TIME, make, [&](Canvas<Real> &own, int64_t first, int64_t last) {
+    for (int64_t tile = first; tile < last; tile++)
+      blend.channels == 3 ? blend_tile<Real, 3>(blend, splats.data(), pixels, tile, own)
+                          : blend_tile<Real, 0>(blend, splats.data(), pixels, tile, own);
+  });
+}
+
+template <class Real> void backward(const Blend<Real> &blend, Fork fork) {
+  const std::vector<Splat> splats = splats_of(blend, fork);
+  const Pixels<Real> pixels(int(blend.tile_size));
+  const auto make = [&] { return Transpose<Real>(pixels, blend.channels); };
+  share(fork, blend.threads, blend.tiles(), TILES_AT_A_TIME, make,
+        [&](Transpose<Real> &own, int64_t first, int64_t last) {
+          for (int64_t tile = first; tile < last; tile++)
+            blend.channels == 3 ? transpose_tile<Real, 3>(blend, splats.data(), pixels, tile, own)
+                                : transpose_tile<Real, 0>(blend, splats.data(), pixels, tile, own);
+        });
+  const int64_t part = std::max<int64_t>(1, (blend.n + blend.threads - 1) / blend.threads);
+  share(fork, blend.threads, blend.n, part, [] { return 0; },
+        [&](int, int64_t first, int64_t last) { add_up(blend, first, last); });
+}
+
+}  // namespace pop
+
+extern "C" {
+void pop_forward_float32(const pop::Blend<float> *blend, pop::Fork fork) { pop::forward(*blend, fork); }
+void pop_forward_float64(const pop::Blend<double> *blend, pop::Fork fork) { pop::forward(*blend, fork); }
+void pop_backward_float32(const pop::Blend<float> *blend, pop::Fork fork) { pop::backward(*blend, fork); }
+void pop_backward_float64(const pop::Blend<double> *blend, pop::Fork fork) { pop::backward(*blend, fork); }
+int64_t pop_blend_bytes() { return int64_t(sizeof(pop::Blend<float>)); }
+int64_t pop_chunk() { return pop::CHUNK; }
+int64_t pop_padded_pixels(int64_t tile_size, int64_t bytes) {
+  return bytes == 8 ? pop::Pixels<double>(int(tile_size)).padded() : pop::Pixels<float>(int(tile_size)).padded();
+}
+}

@@ -1,0 +1,109 @@
+"""Compile the CPU blend, when asked: one call of a C++ compiler, into this package's folder.
+
+    python -m pop_fast.compiled.build [--if-possible]
+
+The library's name holds a digest of its source, the compiler's options and the processor's features, because it is
+compiled for exactly the processor that it is compiled on: what was built for another one is never loaded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+from cuda_ext.host_mirror import find_compiler
+
+HERE: Final = Path(__file__).resolve().parent
+SOURCES: Final = ("lanes.h", "tile.h", "forward.h", "backward.h", "blend.cpp")
+FLAGS: Final = ("-std=c++17", "-O3", "-march=native", "-fPIC", "-shared", "-pthread")
+
+
+class BuildError(RuntimeError):
+    """There is no compiler, or it failed; the message says what to do."""
+
+
+@cache
+def library_path() -> Path:
+    """Return where the library of this version is on this processor, whether or not it has been compiled."""
+    digest = hashlib.sha256("\n".join((*FLAGS, platform.system(), processor_features())).encode())
+    for name in SOURCES:
+        digest.update((HERE / name).read_bytes())
+    return HERE / f"_blend_{digest.hexdigest()[:16]}.so"
+
+
+def processor_features() -> str:
+    """Return what the system says of the processor's kind and instructions."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text(encoding="utf-8").splitlines():
+            if line.lower().startswith(("flags", "features")):
+                return f"{platform.machine()} {line}"
+    return f"{platform.machine()} {platform.processor()}"
+
+
+def build(verbose: bool = False) -> Path:
+    """Compile the library, unless it is there; libraries of other versions of the source are removed.
+
+    Args:
+        verbose: print the compiler's command.
+
+    Returns:
+        The library's file.
+
+    Raises:
+        BuildError: no compiler was found, it failed, or the folder cannot be written to.
+    """
+    library = library_path()
+    if library.exists():
+        return library
+    compiler = find_compiler()
+    if compiler is None:
+        raise BuildError("no C++ compiler was found; install g++ or clang++, or set CXX to one's path")
+    try:
+        # beside and then renamed, so that nobody loads half a library
+        descriptor, partial = tempfile.mkstemp(dir=HERE, prefix="_partial_", suffix=".so")
+    except OSError as error:
+        raise BuildError(f"{HERE} cannot be written to ({error.strerror}); install the package for yourself") from error
+    os.close(descriptor)
+    command = [compiler, *FLAGS, "-o", partial, str(HERE / "blend.cpp")]
+    if verbose:
+        print(" ".join(command))
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            tail = "\n".join(done.stderr.splitlines()[-20:])
+            raise BuildError(f"compiling the CPU blend failed; {' '.join(command)} said:\n{tail}")
+        os.chmod(partial, 0o644)
+        os.replace(partial, library)
+    finally:
+        Path(partial).unlink(missing_ok=True)
+    for other in HERE.glob("_blend_*.so"):
+        if other != library:
+            other.unlink(missing_ok=True)
+    return library
+
+
+def main() -> int:
+    """Compile from the command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--if-possible", action="store_true", help="say why it cannot be compiled, and succeed")
+    parser.add_argument("--verbose", action="store_true", help="show the compiler's command")
+    args = parser.parse_args()
+    try:
+        print(build(args.verbose))
+    except BuildError as error:
+        print(f"the CPU blend is not compiled, and backend fast stands in: {error}", file=sys.stderr)
+        return 0 if args.if_possible else 1
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

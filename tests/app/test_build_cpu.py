@@ -1,0 +1,156 @@
+"""Compiling the CPU blend, and what there is without it."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from cuda_ext.host_mirror import find_compiler
+from pop_fast import compiled
+from pop_fast.backends import get_backend
+from pop_fast.cli.doctor import backends
+from pop_fast.compiled import build as building
+from pop_fast.compiled.library import open_library
+from pop_fast.errors import PopError
+from pop_fast.train.choose import choose_backend
+from pop_fast.train.on_device import renderer
+from tests.app.conftest import Pop
+from tests.app.tiny import tiny_config
+
+NO_GPU = "there is no GPU in this test"
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="there is no C++ compiler")
+
+
+@pytest.fixture
+def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A package whose blend was never compiled."""
+    for name in building.SOURCES:
+        (tmp_path / name).write_bytes((building.HERE / name).read_bytes())
+    monkeypatch.setattr(building, "HERE", tmp_path)
+    building.library_path.cache_clear()
+    yield tmp_path
+    building.library_path.cache_clear()
+
+
+@pytest.fixture(autouse=True)
+def _without_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cuda_ext.why_not", lambda: NO_GPU)
+
+
+def compiler(folder: Path, script: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put a program in the compiler's place."""
+    path = folder / "compiler"
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv("CXX", str(path))
+
+
+@needs_compiler
+def test_it_is_compiled_once_and_older_versions_go(fresh: Path, pop: Pop) -> None:
+    assert "run `pop build-cpu`" in (compiled.why_not() or "")
+    (fresh / "_blend_0123456789abcdef.so").write_bytes(b"of an older version")
+    outcome = pop("build-cpu")
+    (library,) = fresh.glob("*.so")
+    assert (outcome.status, outcome.out) == (0, f"{library}\n")
+    assert compiled.available()
+    made = library.stat().st_mtime_ns
+    assert pop("build-cpu").status == 0
+    assert library.stat().st_mtime_ns == made
+
+
+@needs_compiler
+def test_a_change_of_the_source_asks_for_a_new_build(fresh: Path) -> None:
+    before = building.library_path()
+    with (fresh / "lanes.h").open("a") as file:
+        file.write("// changed\n")
+    building.library_path.cache_clear()
+    assert building.library_path() != before
+
+
+def test_another_processor_asks_for_a_new_build(fresh: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = building.library_path()
+    monkeypatch.setattr(building, "processor_features", lambda: "another one")
+    building.library_path.cache_clear()
+    assert building.library_path() != before
+    assert not compiled.available()
+
+
+def test_without_a_compiler_it_says_which_to_install(
+    fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(building, "find_compiler", lambda: None)
+    outcome = pop("build-cpu")
+    assert outcome.status == 2
+    assert outcome.err == "pop: error: no C++ compiler was found; install g++ or clang++, or set CXX to one's path\n"
+    # as `make setup` calls it, where it may be missing
+    monkeypatch.setattr("sys.argv", ["build", "--if-possible"])
+    assert building.main() == 0
+    assert "backend fast stands in: no C++ compiler was found" in capsys.readouterr().err
+    monkeypatch.setattr("sys.argv", ["build"])
+    assert building.main() == 1
+
+
+def test_a_compiler_that_fails_is_quoted_and_leaves_nothing(
+    fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiler(fresh, "echo 'lanes.h:1: error: no such vectors' >&2; exit 1", monkeypatch)
+    outcome = pop("build-cpu")
+    assert outcome.status == 2
+    assert "compiling the CPU blend failed" in outcome.err
+    assert "error: no such vectors" in outcome.out
+    assert not list(fresh.glob("*.so"))
+
+
+def test_a_library_that_does_not_load_is_a_sentence(fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch) -> None:
+    compiler(fresh, 'while [ "$1" != "-o" ]; do shift; done; echo "no library" > "$2"', monkeypatch)
+    outcome = pop("build-cpu")
+    assert outcome.status == 2
+    assert "the compiled CPU blend does not load" in outcome.err
+    with pytest.raises(PopError, match="backend 'compiled' cannot run: the compiled CPU blend does not load"):
+        get_backend("compiled").rasterization()
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write anywhere")
+def test_a_folder_that_cannot_be_written_to_is_named(fresh: Path, pop: Pop) -> None:
+    fresh.chmod(0o555)
+    outcome = pop("build-cpu")
+    fresh.chmod(0o755)
+    assert outcome.status == 2
+    assert f"{fresh} cannot be written to" in outcome.err
+
+
+def test_a_library_of_another_layout_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not compiled.available():
+        pytest.skip(compiled.why_not() or "")
+    monkeypatch.setattr("pop_fast.compiled.library.ctypes.sizeof", lambda _: 8)
+    with pytest.raises(OSError, match="arguments of another layout"):
+        open_library.__wrapped__(str(building.library_path()))
+
+
+def test_auto_takes_it_where_it_is_and_says_how_to_get_it_where_it_is_not(
+    fresh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen, line = choose_backend(tiny_config(tmp_path))
+    assert chosen.backend == "fast"
+    assert line.startswith("backend fast (CPU): the CPU blend is not compiled")
+    assert line.endswith(f"run `pop build-cpu`; {NO_GPU}")
+    (finding,) = (found for found in backends() if found.name == "backend compiled")
+    assert finding.state == "off"
+    assert "`pop build-cpu`" in finding.found
+    monkeypatch.setattr("pop_fast.compiled.why_not", lambda: None)
+    chosen, line = choose_backend(tiny_config(tmp_path))
+    assert (chosen.backend, line) == ("compiled", f"backend compiled (CPU): {NO_GPU}")
+
+
+def test_results_trained_with_it_are_drawn_without_it(fresh: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawing, note = renderer("compiled")
+    assert drawing.name == "fast"
+    assert note is not None
+    assert note.startswith("backend 'fast' stands in for 'compiled': the CPU blend is not compiled")
+    monkeypatch.setattr("pop_fast.compiled.why_not", lambda: None)
+    assert (renderer("compiled")[0].name, renderer("compiled")[1]) == ("compiled", None)
+    assert (renderer("auto")[0].name, renderer("auto")[1]) == ("compiled", None)
+    assert renderer("cuda")[1] == f"backend 'compiled' stands in for 'cuda': {NO_GPU}"

@@ -1,0 +1,190 @@
+"""The compiled blend's own promises; the laws judge its numbers, and here they are held beside those of torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from pop_fast import compiled
+from pop_fast.compositing import Composite
+from pop_fast.compositing import composite as composite_in_torch
+from pop_fast.tiles import TileLists, tile_lists
+from pop_ref.constants import INRIA, PAPER, Profile
+
+pytestmark = pytest.mark.skipif(not compiled.available(), reason=compiled.why_not() or "")
+
+WIDTH, HEIGHT = 45, 38
+
+
+@dataclass(frozen=True)
+class Splats:
+    """What a blend takes, and the lists of one tile size."""
+
+    means2d: Tensor
+    conics: Tensor
+    opacities: Tensor
+    colors: Tensor
+    lists: TileLists
+
+    @property
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.means2d, self.conics, self.opacities, self.colors
+
+
+def splats(tile_size: int = 8, channels: int = 3, n: int = 120, dtype: torch.dtype = torch.float64) -> Splats:
+    """Draw splats of which some are opaque, some invisible, some larger than a tile and some off the screen."""
+    generator = torch.Generator().manual_seed(7)
+
+    def uniform(*size: int) -> Tensor:
+        return torch.rand(size, generator=generator, dtype=torch.float64)
+
+    means2d = uniform(n, 2) * torch.tensor([WIDTH + 16.0, HEIGHT + 16.0]) - 8.0
+    sigma = 0.6 + 7.0 * uniform(n, 2) ** 3
+    turn = (1.8 * uniform(n) - 0.9) / sigma.prod(1)
+    conics = torch.stack((1.0 / sigma[:, 0] ** 2, turn, 1.0 / sigma[:, 1] ** 2), 1)
+    opacities = uniform(n)
+    opacities[:8], opacities[8:16] = 1.0, 0.0
+    radii = torch.ceil(4.0 * sigma.amax(1, keepdim=True).expand(n, 2) * 2.3).to(torch.int32)
+    drawn = [tensor.to(dtype) for tensor in (means2d, conics, opacities, uniform(n, channels))]
+    lists = tile_lists(drawn[0], radii, uniform(n).to(dtype), WIDTH, HEIGHT, tile_size)
+    return Splats(*drawn, lists)
+
+
+def blended(
+    composite, given: Splats, profile: Profile = PAPER, *, light: bool = True, sink: Tensor | None = None
+) -> tuple[Composite, list[Tensor]]:
+    """Blend with every extra, and pull a cotangent back."""
+    leaves = [tensor.clone().requires_grad_() for tensor in given.tensors]
+    extras = {"dominance": True, "counts": True, "absgrad_sink": sink}
+    found = composite(*leaves, given.lists, WIDTH, HEIGHT, profile, **extras)
+    generator = torch.Generator().manual_seed(11)
+    v_image = torch.randn(found.image.shape, generator=generator, dtype=torch.float64).to(found.image.dtype)
+    v_alphas = torch.randn(found.alphas.shape, generator=generator, dtype=torch.float64).to(found.image.dtype)
+    total = (found.image * v_image).sum() + (found.alphas * v_alphas).sum() * light
+    total.backward()
+    return found, [leaf.grad for leaf in leaves]
+
+
+def native(*args, **kwargs) -> Composite:
+    from pop_fast.compiled.compositing import composite
+
+    return composite(*args, **kwargs)
+
+
+def assert_as_in_torch(given: Splats, profile: Profile = PAPER) -> None:
+    sinks = [torch.zeros_like(given.means2d) for _ in range(2)]
+    (mine, gradients), (its, expected) = (
+        blended(composite, given, profile, sink=sink)
+        for composite, sink in zip((native, composite_in_torch), sinks, strict=True)
+    )
+    assert float(its.alphas.detach().max()) > 0.3
+    assert all(float(v.abs().max()) > 1e-3 for v in expected)
+    for name in ("image", "alphas", "dominant_weights"):
+        torch.testing.assert_close(getattr(mine, name), getattr(its, name), rtol=0.0, atol=1e-12)
+    for name in ("dominant_ids", "n_blended", "n_traversed"):
+        assert torch.equal(getattr(mine, name), getattr(its, name)), name
+    for mine_v, v in zip((*gradients, sinks[0]), (*expected, sinks[1]), strict=True):
+        torch.testing.assert_close(mine_v, v, rtol=0.0, atol=1e-12 * float(v.abs().max()))
+
+
+@pytest.mark.parametrize("tile_size", [1, 4, 5, 8, 16, 64])
+def test_any_tile_size_blends_as_in_torch(tile_size: int) -> None:
+    assert_as_in_torch(splats(tile_size))
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 9])
+def test_any_number_of_channels_blends_as_in_torch(channels: int) -> None:
+    assert_as_in_torch(splats(channels=channels))
+
+
+CEILINGS = [PAPER, replace(PAPER, alpha_ceiling=0.7), replace(INRIA, alpha_ceiling=0.7)]
+
+
+@pytest.mark.parametrize("profile", CEILINGS, ids=["paper", "low ceiling, no gradient", "low ceiling, passed through"])
+def test_every_profile_blends_as_in_torch(profile: Profile) -> None:
+    assert_as_in_torch(splats(), profile)
+
+
+def test_lists_longer_than_a_chunk_blend_as_in_torch() -> None:
+    given = splats(16, n=900)
+    assert int(given.lists.lengths.max()) > 200
+    faint = replace_opacities(given, 0.05)
+    assert_as_in_torch(faint)
+    assert_as_in_torch(given)
+
+
+def replace_opacities(given: Splats, factor: float) -> Splats:
+    return replace(given, opacities=given.opacities * factor)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_bits_do_not_depend_on_the_number_of_threads(dtype: torch.dtype) -> None:
+    given, before = splats(n=400, dtype=dtype), torch.get_num_threads()
+    results = []
+    try:
+        for threads in (1, 2, 3, 7):
+            torch.set_num_threads(threads)
+            found, gradients = blended(native, given)
+            results.append([found.image.detach(), found.alphas.detach(), found.dominant_ids, *gradients])
+    finally:
+        torch.set_num_threads(before)
+    for others in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], others, strict=True))
+
+
+def test_threads_of_its_own_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    from pop_fast.compiled import compositing
+
+    given, open_library = splats(n=400), compositing.open_library
+    found, gradients = blended(native, given)
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        monkeypatch.setattr(compositing, "open_library", lambda path: replace(open_library(path), fork=None))
+        own, of_own = blended(native, given)
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(found.image, own.image)
+    assert all(torch.equal(a, b) for a, b in zip(gradients, of_own, strict=True))
+
+
+def test_nothing_to_blend_is_black() -> None:
+    given = splats()
+    empty = replace(given, lists=replace(given.lists, ids=given.lists.ids[:0], offsets=given.lists.offsets * 0))
+    found, gradients = blended(native, empty)
+    assert not found.image.any()
+    assert not found.alphas.any()
+    assert found.n_pairs == 0
+    assert bool((found.dominant_ids == -1).all())
+    assert not any(v.any() for v in gradients)
+
+
+def test_a_second_transpose_of_the_same_graph_gives_the_same_bits() -> None:
+    given = splats()
+    leaves = [tensor.clone().requires_grad_() for tensor in given.tensors]
+    loss = native(*leaves, given.lists, WIDTH, HEIGHT).image.square().sum()
+    first = torch.autograd.grad(loss, leaves, retain_graph=True)
+    assert all(torch.equal(a, b) for a, b in zip(first, torch.autograd.grad(loss, leaves), strict=True))
+
+
+def test_the_light_alone_has_a_gradient() -> None:
+    given = splats()
+    leaf = given.opacities.clone().requires_grad_()
+    inputs = (given.means2d, given.conics, leaf, given.colors)
+    (mine,) = torch.autograd.grad(native(*inputs, given.lists, WIDTH, HEIGHT).alphas.sum(), leaf)
+    (its,) = torch.autograd.grad(composite_in_torch(*inputs, given.lists, WIDTH, HEIGHT).alphas.sum(), leaf)
+    torch.testing.assert_close(mine, its, rtol=0.0, atol=1e-12 * float(its.abs().max()))
+
+
+def test_pairs_are_counted_where_pixels_are_lit() -> None:
+    faint = replace_opacities(splats(8, n=30), 0.01)
+    found, _ = blended(native, faint)
+    # nothing stops, so that every entry meets every row of its tile that lies in the image, eight pixels at a time
+    rows = [min(8, HEIGHT - 8 * (tile // faint.lists.tiles_x)) for tile in range(len(faint.lists.lengths))]
+    assert found.n_pairs == sum(8 * n * length for n, length in zip(rows, faint.lists.lengths.tolist(), strict=True))
+    dense = splats(8, n=900)
+    stopped, _ = blended(native, dense)
+    assert 0 < stopped.n_pairs < len(dense.lists.ids) * 64
