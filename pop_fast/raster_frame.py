@@ -10,11 +10,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pop_fast.compositing import Composite
+from pop_fast.compositing import Composite, composite
 from pop_fast.dominance import dominant_counts
 from pop_fast.raster_meta import RenderMeta, intersections
 from pop_fast.splatting import Splats, View, colors_of_view, project
-from pop_fast.tiles import tile_lists
+from pop_fast.tiles import TileLists, tile_lists
 
 SMALL_TILE, LARGE_TILE = 8, 16  # px
 SMALL_TILE_BELOW = 14.0  # px, root mean square extent of the visible splats; see benchmarks/NOTES.md
@@ -71,6 +71,19 @@ class Rows:
 
 
 @dataclass(frozen=True)
+class Stages:
+    """The stages that a backend may have its own of.
+
+    Attributes:
+        tile_lists: as `pop_fast.tiles.tile_lists`.
+        composite: as `pop_fast.compositing.composite`.
+    """
+
+    tile_lists: Callable[..., TileLists] = tile_lists
+    composite: Callable[..., Composite] = composite
+
+
+@dataclass(frozen=True)
 class Frame:
     """One call of `rasterization`.
 
@@ -83,7 +96,7 @@ class Frame:
         render_mode: as `rasterization` takes it.
         packed: whether meta holds visible rows only.
         absgrad: whether to sum absolute gradients.
-        composite: blends; `pop_fast.compositing.composite`, or another with its parameters.
+        stages: of the backend.
     """
 
     scene: Scene
@@ -94,7 +107,7 @@ class Frame:
     render_mode: str
     packed: bool
     absgrad: bool
-    composite: Callable[..., Composite]
+    stages: Stages
 
     def render(self, backgrounds: Tensor | None, dominance: bool, counts: bool) -> tuple[Tensor, Tensor, RenderMeta]:
         """Return images, alphas and meta."""
@@ -186,10 +199,10 @@ class Frame:
         # pixel are left out, and small splats are listed in small tiles
         exact = {} if counts else {"conics": rows.conics.detach(), "opacities": rows.opacities.detach()}
         size = self.tile_size if counts or profile.extent == "square" else _blend_tile(rows.radii)
-        lists = tile_lists(
+        lists = self.stages.tile_lists(
             rows.means2d.detach(), rows.radii, rows.depths.detach(), width, height, size, profile, **exact
         )
-        return self.composite(
+        return self.stages.composite(
             rows.means2d,
             rows.conics,
             rows.opacities,

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any, Literal
 
 from torch import Tensor
 
 from pop_fast.backends import get_backend, require_backend
-from pop_fast.compositing import Composite, composite
-from pop_fast.raster_frame import Frame, Scene
+from pop_fast.raster_frame import Frame, Scene, Stages
 from pop_fast.raster_inputs import (
     RENDER_MODES,
     check_cameras,
@@ -171,15 +169,15 @@ def rasterization(
     chosen = resolved_profile(profile, near_plane, far_plane, eps2d)
     view = View(Ks, width, height, chosen, rasterize_mode == "antialiased", radius_clip)
     options = (tile_size, sh_degree, render_mode, packed, absgrad)
-    frame = Frame(scene, (*batch, n_cameras), view, *options, _blend_of(backend))
+    frame = Frame(scene, (*batch, n_cameras), view, *options, _stages_of(backend))
     return frame.render(backgrounds, dominance, counts)
 
 
-def _blend_of(backend: str) -> Callable[..., Composite]:
-    """Return what blends for a backend on the CPU."""
+def _stages_of(backend: str) -> Stages:
     if backend == "fast":
-        return composite
+        return Stages()
     require_backend(backend)
-    from pop_fast.compiled.compositing import composite as compiled_composite
+    from pop_fast.compiled.compositing import composite
+    from pop_fast.compiled.tiles import tile_lists
 
-    return compiled_composite
+    return Stages(tile_lists, composite)

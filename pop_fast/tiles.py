@@ -82,7 +82,7 @@ def tile_lists(
     rects = tile_rects(means2d, radii, width, height, tile_size, profile)
     x0, y0, x1, y1 = columns(rects)
     rows = ((x1 > x0) & (y1 > y0)).nonzero().squeeze(1)
-    rows = rows.index_select(0, _depth_order(depths.index_select(0, rows)))
+    rows = rows.index_select(0, depth_order(depths.index_select(0, rows)))
     left, top, right, bottom = (edge.index_select(0, rows) for edge in (x0, y0, x1, y1))
     columns_of_tiles = right - left
     counts = columns_of_tiles * (bottom - top)
@@ -119,7 +119,8 @@ def _span(center: Tensor, radius: Tensor, n_tiles: int, tile_size: int, profile:
     return first.clamp(0, n_tiles), last.clamp(0, n_tiles)
 
 
-def _depth_order(depths: Tensor) -> Tensor:
+def depth_order(depths: Tensor) -> Tensor:
+    """Return the order of positive depths, front to back; equal ones keep theirs (D4). [N] int64"""
     return _stable_order(depths.contiguous().view(torch.int32 if depths.dtype == torch.float32 else torch.int64))
 
 

@@ -1,40 +1,14 @@
-// The compiled blend: `forward` and `backward` for float and double, called through ctypes. Tiles are shared out to
-// threads one after the other, and each writes what is its own, so that the bits do not depend on the threads.
+// The compiled stages for float and double, called through ctypes: tile lists, the blend and its transpose. Tiles are
+// shared out to threads one after the other, and each writes what is its own, so that no bit depends on the threads.
 
-#include <atomic>
-#include <thread>
 #include <vector>
 
 #include "backward.h"
 #include "forward.h"
+#include "lists.h"
+#include "threads.h"
 
 namespace pop {
-
-// GOMP_parallel of the OpenMP runtime that torch brought along: its threads are awake already. Null elsewhere.
-using Fork = void (*)(void (*)(void *), void *, unsigned, unsigned);
-
-template <class Work> void on_all_threads(Fork fork, int64_t threads, Work work) {
-  const auto call = [](void *given) { (*static_cast<Work *>(given))(); };
-  if (threads <= 1) {
-    work();
-  } else if (fork) {
-    fork(call, &work, unsigned(threads), 0);
-  } else {
-    std::vector<std::thread> others;
-    for (int64_t k = 1; k < threads; k++) others.emplace_back(call, &work);
-    work();
-    for (auto &other : others) other.join();
-  }
-}
-
-// Call f(first, last) for parts of n until none is left; `make()` is what a thread works with.
-template <class Make, class F> void share(Fork fork, int64_t threads, int64_t n, int64_t part, Make make, F f) {
-  std::atomic<int64_t> next{0};
-  on_all_threads(fork, threads, [&] {
-    auto own = make();
-    for (int64_t first; (first = next.fetch_add(part)) < n;) f(own, first, std::min(n, first + part));
-  });
-}
 
 template <class Real> std::vector<Splat> splats_of(const Blend<Real> &blend, Fork fork) {
   const double log2_e = 1.4426950408889634;
@@ -86,6 +60,9 @@ void pop_forward_float32(const pop::Blend<float> *blend, pop::Fork fork) { pop::
 void pop_forward_float64(const pop::Blend<double> *blend, pop::Fork fork) { pop::forward(*blend, fork); }
 void pop_backward_float32(const pop::Blend<float> *blend, pop::Fork fork) { pop::backward(*blend, fork); }
 void pop_backward_float64(const pop::Blend<double> *blend, pop::Fork fork) { pop::backward(*blend, fork); }
+void pop_lists_float32(const pop::Lists<float> *lists, pop::Fork fork) { pop::list_tiles(*lists, fork); }
+void pop_lists_float64(const pop::Lists<double> *lists, pop::Fork fork) { pop::list_tiles(*lists, fork); }
+int64_t pop_lists_bytes() { return int64_t(sizeof(pop::Lists<float>)); }
 int64_t pop_blend_bytes() { return int64_t(sizeof(pop::Blend<float>)); }
 int64_t pop_chunk() { return pop::CHUNK; }
 int64_t pop_padded_pixels(int64_t tile_size, int64_t bytes) {

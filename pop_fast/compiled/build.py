@@ -22,7 +22,7 @@ from typing import Final
 from cuda_ext.host_mirror import find_compiler
 
 HERE: Final = Path(__file__).resolve().parent
-SOURCES: Final = ("lanes.h", "tile.h", "forward.h", "backward.h", "blend.cpp")
+SOURCES: Final = ("lanes.h", "threads.h", "lists.h", "tile.h", "forward.h", "backward.h", "blend.cpp")
 FLAGS: Final = ("-std=c++17", "-O3", "-march=native", "-fPIC", "-shared", "-pthread")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,8 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pop_fast.compiled.build import library_path
-from pop_fast.compiled.library import Blend, Library, open_library
+from pop_fast.compiled.library import Blend, BlendBackward, call_library, this_library
 from pop_fast.compositing import Composite
 from pop_fast.tiles import TileLists
 from pop_fast.transmittance import Stop, below
@@ -73,100 +71,80 @@ class _Options:
     absgrad_sink: Tensor | None
 
 
-class _Call:
-    """One call of the library: its arguments, and the tensors that they point into."""
-
-    def __init__(self, inputs: tuple[Tensor, ...], options: _Options) -> None:
-        lists, profile, dtype = options.lists, options.profile, inputs[0].dtype
-        self._tensors: list[Tensor] = []
-        self._bytes = dtype.itemsize
-        self._arguments = Blend(
-            n=len(inputs[0]),
-            channels=inputs[3].shape[1],
-            tiles_x=lists.tiles_x,
-            tiles_y=lists.tiles_y,
-            tile_size=lists.tile_size,
-            width=options.width,
-            height=options.height,
-            threads=torch.get_num_threads(),
-            alpha_floor=below(profile.alpha_floor, dtype),
-            alpha_ceiling=profile.alpha_ceiling,
-            stop=Stop.of(profile, dtype).at,
-            ceiling_passes=profile.ceiling_gradient != "zero",
-        )
-        names = ("means2d", "conics", "opacities", "colors")
-        self.give(**{name: tensor.contiguous() for name, tensor in zip(names, inputs, strict=True)})
-        self.give(ids=lists.ids.contiguous(), offsets=lists.offsets.contiguous())
-
-    def give(self, **tensors: Tensor | None) -> None:
-        """Let arguments point into tensors, which live as long as the call."""
-        for name, tensor in tensors.items():
-            if tensor is not None:
-                self._tensors.append(tensor)
-                setattr(self._arguments, name, tensor.data_ptr())
-
-    def run(self, kind: str, library: Library) -> None:
-        function = {"forward": library.forward, "backward": library.backward}[kind][self._bytes]
-        function(ctypes.byref(self._arguments), library.fork)
-
-
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, options: _Options
     ) -> tuple[Tensor | None, ...]:
-        inputs, library = (means2d, conics, opacities, colors), open_library(str(library_path()))
+        inputs, lists = (means2d, conics, opacities, colors), options.lists
         size = (options.height, options.width)
-        image, alphas = colors.new_empty((*size, colors.shape[1])), colors.new_empty(size)
-        reached = {"n_reached": _whole(options.lists.lengths), "n_pairs": _whole(options.lists.lengths)}
-        asked: dict[str, Tensor | None] = {
+        results = {
+            "image": colors.new_empty((*size, colors.shape[1])),
+            "alphas": colors.new_empty(size),
             "dominant_ids": torch.empty(size, dtype=torch.int64) if options.dominance else None,
             "dominant_weights": colors.new_empty(size) if options.dominance else None,
             "n_blended": torch.empty(size, dtype=torch.int32) if options.counts else None,
             "n_traversed": torch.empty(size, dtype=torch.int32) if options.counts else None,
         }
-        kept = _lights(options.lists, library, colors) if options.keep else {}
-        call = _Call(inputs, options)
-        call.give(image=image, alphas=alphas, **reached, **asked, **kept)
-        call.run("forward", library)
-        ctx.options, ctx.kept = options, {**kept, "n_reached": reached["n_reached"]}
+        n_pairs, n_reached = (torch.empty_like(lists.lengths) for _ in range(2))
+        kept = {"n_reached": n_reached, **(_lights(lists, colors) if options.keep else {})}
+        given = {**_arguments(inputs, options), **results, **kept, "n_pairs": n_pairs}
+        call_library(Blend, means2d.dtype, _numbers(inputs, options), given)
+        ctx.options, ctx.kept = options, kept
         ctx.save_for_backward(*inputs)
-        ctx.mark_non_differentiable(*(tensor for tensor in asked.values() if tensor is not None))
+        ctx.mark_non_differentiable(*(tensor for tensor in list(results.values())[2:] if tensor is not None))
         ctx.set_materialize_grads(False)
-        return (image, alphas, *asked.values(), reached["n_pairs"].sum())
+        return (*results.values(), n_pairs.sum())
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
         options: _Options = ctx.options
-        inputs = ctx.saved_tensors
+        inputs, sink = ctx.saved_tensors, options.absgrad_sink
         # component rows, as the projection's transpose takes them
-        found = [x.new_empty(x.shape[::-1]) for x in inputs]
-        sink = options.absgrad_sink
+        found = {name: tensor.new_empty(tensor.shape[::-1]) for name, tensor in zip(_RESULTS, inputs, strict=True)}
         absolute = None if sink is None else sink.new_empty(sink.shape[::-1])
         columns = 6 + inputs[3].shape[1] + 2 * (sink is not None)
-        call = _Call(inputs, options)
-        call.give(
-            v_image=None if v_image is None else v_image.contiguous(),
-            v_alphas=None if v_alphas is None else v_alphas.contiguous(),
-            rows=inputs[0].new_empty((len(options.lists.ids), columns)),
-            absgrad=absolute,
-            **dict(zip(("v_means2d", "v_conics", "v_opacities", "v_colors"), found, strict=True)),
-            **ctx.kept,
-        )
-        call.run("backward", open_library(str(library_path())))
+        rows = inputs[0].new_empty((len(options.lists.ids), columns))
+        given = {"v_image": v_image, "v_alphas": v_alphas, "rows": rows, "absgrad": absolute}
+        given = {**_arguments(inputs, options), **given, **found, **ctx.kept}
+        call_library(BlendBackward, inputs[0].dtype, _numbers(inputs, options), given)
         if sink is not None and absolute is not None:
             sink.add_(absolute.T)
-        means2d, conics, opacities, colors = found
-        return means2d.T, conics.T, opacities, colors.T, None
+        v_means2d, v_conics, v_opacities, v_colors = found.values()
+        return v_means2d.T, v_conics.T, v_opacities, v_colors.T, None
 
 
-def _whole(like: Tensor) -> Tensor:
-    return torch.empty_like(like, dtype=torch.int64)
+_RESULTS = ("v_means2d", "v_conics", "v_opacities", "v_colors")
 
 
-def _lights(lists: TileLists, library: Library, like: Tensor) -> dict[str, Tensor]:
+def _arguments(inputs: tuple[Tensor, ...], options: _Options) -> dict[str, Tensor | None]:
+    means2d, conics, opacities, colors = inputs
+    splats = {"means2d": means2d, "conics": conics, "opacities": opacities, "colors": colors}
+    return {**splats, "ids": options.lists.ids, "offsets": options.lists.offsets}
+
+
+def _numbers(inputs: tuple[Tensor, ...], options: _Options) -> dict[str, float]:
+    lists, profile, dtype = options.lists, options.profile, inputs[0].dtype
+    return {
+        "n": len(inputs[0]),
+        "channels": inputs[3].shape[1],
+        "tiles_x": lists.tiles_x,
+        "tiles_y": lists.tiles_y,
+        "tile_size": lists.tile_size,
+        "width": options.width,
+        "height": options.height,
+        "threads": torch.get_num_threads(),
+        "alpha_floor": below(profile.alpha_floor, dtype),
+        "alpha_ceiling": profile.alpha_ceiling,
+        "stop": Stop.of(profile, dtype).at,
+        "ceiling_passes": profile.ceiling_gradient != "zero",
+    }
+
+
+def _lights(lists: TileLists, like: Tensor) -> dict[str, Tensor]:
     """Return room for the light before every chunk of entries, and where each tile's begins."""
+    library = this_library()
     chunks = (lists.lengths + (library.chunk - 1)) // library.chunk
     pixels = library.padded_pixels(lists.tile_size, like.dtype.itemsize)
     return {"first_chunks": chunks.cumsum(0) - chunks, "lights": like.new_empty(int(chunks.sum()) * pixels)}

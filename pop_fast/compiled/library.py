@@ -1,74 +1,123 @@
-"""The compiled library through ctypes: the layout of what it is given, and its functions."""
+"""The compiled library through ctypes: the layouts of what its functions are given, and how they are called."""
 
 from __future__ import annotations
 
 import ctypes
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
+from pop_fast.compiled.build import library_path
+
 _POINTER, _WHOLE, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+
+
+def _fields(kind: Any, *names: str) -> tuple[tuple[str, Any], ...]:
+    return tuple((name, kind) for name in names)
+
+
+class Lists(ctypes.Structure):
+    """`pop::Lists` of lists.h, where every field is explained, in its order."""
+
+    _fields_ = (
+        *_fields(_POINTER, "means2d", "conics", "opacities", "rects", "order", "candidates"),
+        *_fields(_WHOLE, "n", "m", "tiles_x", "tiles_y", "tile_size", "threads"),
+        *_fields(_REAL, "alpha_floor"),
+        *_fields(_POINTER, "tiles", "ids", "offsets"),
+    )
 
 
 class Blend(ctypes.Structure):
     """`pop::Blend` of tile.h, where every field is explained, in its order."""
 
     _fields_ = (
-        *((name, _POINTER) for name in ("means2d", "conics", "opacities", "colors", "ids", "offsets", "first_chunks")),
-        *((name, _WHOLE) for name in ("n", "channels", "tiles_x", "tiles_y", "tile_size", "width", "height")),
-        ("threads", _WHOLE),
-        *((name, _REAL) for name in ("alpha_floor", "alpha_ceiling", "stop")),
-        ("ceiling_passes", _WHOLE),
-        *((name, _POINTER) for name in ("lights", "n_reached", "n_pairs", "image", "alphas")),
-        *((name, _POINTER) for name in ("dominant_ids", "dominant_weights", "n_blended", "n_traversed")),
-        *((name, _POINTER) for name in ("v_image", "v_alphas", "rows")),
-        *((name, _POINTER) for name in ("v_means2d", "v_conics", "v_opacities", "v_colors", "absgrad")),
+        *_fields(_POINTER, "means2d", "conics", "opacities", "colors", "ids", "offsets", "first_chunks"),
+        *_fields(_WHOLE, "n", "channels", "tiles_x", "tiles_y", "tile_size", "width", "height", "threads"),
+        *_fields(_REAL, "alpha_floor", "alpha_ceiling", "stop"),
+        *_fields(_WHOLE, "ceiling_passes"),
+        *_fields(_POINTER, "lights", "n_reached", "n_pairs", "image", "alphas"),
+        *_fields(_POINTER, "dominant_ids", "dominant_weights", "n_blended", "n_traversed"),
+        *_fields(_POINTER, "v_image", "v_alphas", "rows"),
+        *_fields(_POINTER, "v_means2d", "v_conics", "v_opacities", "v_colors", "absgrad"),
     )
+
+
+class BlendBackward(Blend):
+    """The same, for the transpose."""
+
+
+_NAMES: dict[type[ctypes.Structure], str] = {Lists: "lists", Blend: "forward", BlendBackward: "backward"}
 
 
 @dataclass(frozen=True)
 class Library:
-    """The functions of the library.
+    """What is in the library.
 
     Attributes:
-        forward: by the number of bytes of a float.
-        backward: likewise.
-        chunk: list entries after which the light is written down.
+        functions: by layout and type.
+        chunk: list entries after which the blend writes down the light.
         padded_pixels: pixels of a tile of that size, padded to whole vectors of floats of so many bytes.
         fork: starts the threads, or None.
     """
 
-    forward: dict[int, Callable[..., None]]
-    backward: dict[int, Callable[..., None]]
+    functions: dict[tuple[type[ctypes.Structure], torch.dtype], Callable[..., None]]
     chunk: int
     padded_pixels: Callable[[int, int], int]
     fork: Any
 
 
+def call_library(
+    layout: type[ctypes.Structure],
+    dtype: torch.dtype,
+    numbers: Mapping[str, float],
+    tensors: Mapping[str, Tensor | None],
+) -> None:
+    """Call the function of a layout.
+
+    Args:
+        layout: of its arguments; fields that are not given are 0 or null.
+        dtype: float32 or float64.
+        numbers: fields that are numbers.
+        tensors: fields that are pointers; what is not contiguous is copied, and so must not be a result.
+    """
+    library = this_library()
+    # the arguments only point: these are what they point into, and live until the function has returned
+    held = {name: tensor.contiguous() for name, tensor in tensors.items() if tensor is not None}
+    arguments = layout(**numbers, **{name: tensor.data_ptr() for name, tensor in held.items()})
+    library.functions[layout, dtype](ctypes.byref(arguments), library.fork)
+
+
+def this_library() -> Library:
+    """Return the library of this version; `pop_fast.compiled.why_not` tells whether there is one."""
+    return open_library(str(library_path()))
+
+
 @cache
 def open_library(path: str) -> Library:
-    """Load the library.
+    """Load a library.
 
     Raises:
         OSError: it is missing, does not load, or was not made from the same source as this module.
     """
     loaded = ctypes.CDLL(path)
-    for name in ("pop_blend_bytes", "pop_chunk", "pop_padded_pixels"):
-        function = getattr(loaded, name)
-        function.restype = _WHOLE
+    for name in ("pop_lists_bytes", "pop_blend_bytes", "pop_chunk", "pop_padded_pixels"):
+        getattr(loaded, name).restype = _WHOLE
     loaded.pop_padded_pixels.argtypes = (_WHOLE, _WHOLE)
-    if loaded.pop_blend_bytes() != ctypes.sizeof(Blend):
+    if (loaded.pop_lists_bytes(), loaded.pop_blend_bytes()) != (ctypes.sizeof(Lists), ctypes.sizeof(Blend)):
         raise OSError(f"{path} expects arguments of another layout")
-    found: dict[str, dict[int, Callable[..., None]]] = {"forward": {}, "backward": {}}
-    for kind, functions in found.items():
-        for size in (4, 8):
-            function = getattr(loaded, f"pop_{kind}_float{8 * size}")
-            function.argtypes, function.restype = (ctypes.POINTER(Blend), _POINTER), None
-            functions[size] = function
-    return Library(found["forward"], found["backward"], loaded.pop_chunk(), loaded.pop_padded_pixels, _fork())
+    functions: dict[tuple[type[ctypes.Structure], torch.dtype], Callable[..., None]] = {}
+    for layout, name in _NAMES.items():
+        for dtype in (torch.float32, torch.float64):
+            function = getattr(loaded, f"pop_{name}_{str(dtype).removeprefix('torch.')}")
+            function.argtypes, function.restype = (_POINTER, _POINTER), None
+            functions[layout, dtype] = function
+    return Library(functions, loaded.pop_chunk(), loaded.pop_padded_pixels, _fork())
 
 
 def _fork() -> Any:

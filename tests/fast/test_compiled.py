@@ -1,4 +1,4 @@
-"""The compiled blend's own promises; the laws judge its numbers, and here they are held beside those of torch."""
+"""The compiled stages' own promises; the laws judge its numbers, and here they are held beside those of torch."""
 
 from __future__ import annotations
 
@@ -136,14 +136,14 @@ def test_the_bits_do_not_depend_on_the_number_of_threads(dtype: torch.dtype) -> 
 
 
 def test_threads_of_its_own_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    from pop_fast.compiled import compositing
+    from pop_fast.compiled import library
 
-    given, open_library = splats(n=400), compositing.open_library
+    given, without_torchs = splats(n=400), replace(library.this_library(), fork=None)
     found, gradients = blended(native, given)
     before = torch.get_num_threads()
     torch.set_num_threads(3)
     try:
-        monkeypatch.setattr(compositing, "open_library", lambda path: replace(open_library(path), fork=None))
+        monkeypatch.setattr(library, "this_library", lambda: without_torchs)
         own, of_own = blended(native, given)
     finally:
         torch.set_num_threads(before)
@@ -188,3 +188,37 @@ def test_pairs_are_counted_where_pixels_are_lit() -> None:
     dense = splats(8, n=900)
     stopped, _ = blended(native, dense)
     assert 0 < stopped.n_pairs < len(dense.lists.ids) * 64
+
+
+@pytest.mark.parametrize("profile", [PAPER, INRIA], ids=lambda profile: profile.name)
+@pytest.mark.parametrize("exact", [True, False], ids=["entries that reach no pixel left out", "whole rectangles"])
+@pytest.mark.parametrize("tile_size", [4, 8, 16])
+def test_tile_lists_are_those_of_torch(tile_size: int, exact: bool, profile: Profile) -> None:
+    from pop_fast.compiled.tiles import tile_lists as native_lists
+
+    generator = torch.Generator().manual_seed(3)
+    given = splats(n=700)
+    # a quarter of equal depths, and culled splats among the others
+    depths = 1.0 + torch.randint(0, 500, (700,), generator=generator, dtype=torch.float64)
+    radii = torch.randint(-3, 24, (700, 2), generator=generator, dtype=torch.int32).clamp_min(0)
+    shapes = {"conics": given.conics, "opacities": given.opacities} if exact else {}
+    arguments = (given.means2d, radii, depths, WIDTH, HEIGHT, tile_size, profile)
+    its, before = tile_lists(*arguments, **shapes), torch.get_num_threads()
+    assert len(its.ids) > 500
+    try:
+        for threads in (1, 2, 5):
+            torch.set_num_threads(threads)
+            mine = native_lists(*arguments, **shapes)
+            assert torch.equal(mine.ids, its.ids)
+            assert torch.equal(mine.offsets, its.offsets)
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_no_splat_on_the_screen_makes_empty_lists() -> None:
+    from pop_fast.compiled.tiles import tile_lists as native_lists
+
+    given = splats(n=5)
+    lists = native_lists(given.means2d, torch.zeros(5, 2, dtype=torch.int32), torch.ones(5), WIDTH, HEIGHT, 8)
+    assert len(lists.ids) == 0
+    assert lists.offsets.tolist() == [0] * (6 * 5 + 1)
