@@ -4,24 +4,25 @@
     python benchmarks/run.py --only raster            one part: raster, iteration, memory, capture
     python benchmarks/run.py --capture DIR --factor 4 also training steps on a real capture
 
-Every time is the median of `--repeats` runs in one process after warm-up; threads, machine and load are written beside
-it. A speed is never reported on a red gate.
+Every time is the median of `--repeats` runs in one process after warm-up, in which the backends take turns, so that the
+ratios hold on a noisy machine; threads, machine and load are written beside. No speed is reported on a red gate.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import platform
 import resource
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,9 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from cases import GATE_CASE, ITERATION_CASES, MEMORY_CASE, RASTER_CASES, Case, capture_of, gaussians_of
+from timing import turns_ms
 
+from pop_fast.backends import backend_names, get_backend
 from pop_fast.compositing import Composite, composite
 from pop_fast.data import Capture, load_capture
 from pop_fast.rasterization import rasterization
@@ -45,11 +48,16 @@ SCENE = ("means", "quats", "scales", "opacities", "colors")
 GATE = {torch.float64: 1e-10, torch.float32: 5e-5}
 
 
+def backends() -> tuple[str, ...]:
+    """Return the CPU backends that can run here, the slowest first."""
+    return tuple(name for name in ("fast", "compiled") if name in backend_names() and get_backend(name).available())
+
+
 def gate() -> dict[str, float]:
-    """Compare image and gradients with the oracle; raise SystemExit where they differ.
+    """Compare every backend's image and gradients with the oracle; raise SystemExit where they differ.
 
     Returns:
-        The worst difference of each type, relative to each array's largest entry.
+        The worst difference of each backend and type, relative to each array's largest entry.
     """
     exact = gaussians_of(GATE_CASE, torch.float64)
     arrays = [exact[name].numpy() for name in SCENE]
@@ -59,57 +67,47 @@ def gate() -> dict[str, float]:
     v = render_vjp(Gaussians(*arrays), camera, v_image)
     expected = [image, v.means, v.quats, v.scales, v.opacities, v.sh]
     worst: dict[str, float] = {}
-    for dtype, bound in GATE.items():
+    for backend, (dtype, bound) in itertools.product(backends(), GATE.items()):
         given = {name: value.detach().to(dtype, copy=True) for name, value in exact.items()}
         leaves = {name: given[name].requires_grad_() for name in SCENE}
         size = {"width": GATE_CASE.width, "height": GATE_CASE.height, "sh_degree": 3}
-        fast, _, _ = rasterization(**{**given, **leaves}, **size)
+        fast, _, _ = get_backend(backend).rasterization(**{**given, **leaves}, **size)
         (fast[0] * torch.tensor(v_image, dtype=dtype)).sum().backward()
         found = [fast[0].detach(), *(_gradient(leaf) for leaf in leaves.values())]
         error = max(
             float(np.abs(a.double().numpy() - b).max() / np.abs(b).max()) for a, b in zip(found, expected, strict=True)
         )
-        worst[str(dtype)] = error
+        worst[f"{backend} {dtype}"] = error
         if not error <= bound:
             raise SystemExit(
-                f"gate: {dtype} differs from the oracle by {error:.2e}, more than {bound:.0e}; nothing was timed"
+                f"gate: {backend} {dtype} differs from the oracle by {error:.2e}, more than {bound:.0e}; "
+                f"nothing was timed"
             )
     return worst
 
 
-def median_ms(run: Callable[[], Any], repeats: int, warm_up: int = 3) -> float:
-    """Return the median time of a call, ms."""
-    for _ in range(warm_up):
-        run()
-    times: list[float] = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - start)
-    return 1e3 * statistics.median(times)
-
-
 def time_raster(case: Case, repeats: int) -> dict[str, Any]:
-    """Time `rasterization()` and, apart from it, the blend alone in 16 and 8 pixel tiles."""
+    """Time `rasterization()` and, apart from it, the blend alone in 16 and 8 pixel tiles; every backend in turns."""
     scene = gaussians_of(case)
     leaves = {name: scene[name].requires_grad_() for name in SCENE}
     arguments = {**scene, **leaves, "width": case.width, "height": case.height, "sh_degree": 3, "packed": False}
-    kept: dict[str, Any] = {}
 
-    def forward(dominance: bool) -> None:
-        kept["image"], _, kept["meta"] = rasterization(**arguments, dominance=dominance)
+    def forward(backend: str, dominance: bool) -> Tensor:
+        return get_backend(backend).rasterization(**arguments, dominance=dominance)[0]
 
-    def both(dominance: bool) -> None:
-        forward(dominance)
-        kept["image"].square().mean().backward()
+    def both(backend: str, dominance: bool) -> None:
+        forward(backend, dominance).square().mean().backward()
 
-    meta = rasterization(**arguments, counts=True)[2]
+    def timed(what: Callable[[str, bool], Any], dominance: bool) -> dict[str, float]:
+        return turns_ms({name: partial(what, name, dominance) for name in backends()}, repeats)
+
+    meta = get_backend("fast").rasterization(**arguments, counts=True)[2]
     return {
         **asdict(case),
-        "forward_ms": median_ms(lambda: forward(False), repeats),
-        "forward_dominance_ms": median_ms(lambda: forward(True), repeats),
-        "forward_backward_ms": median_ms(lambda: both(False), repeats),
-        "forward_backward_dominance_ms": median_ms(lambda: both(True), repeats),
+        "forward_ms": timed(forward, False),
+        "forward_dominance_ms": timed(forward, True),
+        "forward_backward_ms": timed(both, False),
+        "forward_backward_dominance_ms": timed(both, True),
         "contributing_per_pixel": float(meta["n_contrib"].float().mean()),
         "list_entries_per_pixel": float(meta["n_traversed"].float().mean()),
         "visible": int((meta["radii"] > 0).all(-1).sum()),
@@ -117,7 +115,7 @@ def time_raster(case: Case, repeats: int) -> dict[str, Any]:
     }
 
 
-def blend_of(case: Case, tile: int) -> tuple[TileLists, Callable[[], Composite]]:
+def blend_of(case: Case, tile: int, backend: str = "fast") -> tuple[TileLists, Callable[[], Composite]]:
     """Return a case's tile lists, and what blends it, differentiably, and nothing else."""
     scene, size = gaussians_of(case), (case.width, case.height)
     with torch.no_grad():
@@ -127,36 +125,39 @@ def blend_of(case: Case, tile: int) -> tuple[TileLists, Callable[[], Composite]]
     colors = torch.rand(case.n, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
     exact = {"conics": meta["conics"][0], "opacities": meta["opacities"][0]}
     lists = tile_lists(meta["means2d"][0], meta["radii"][0], meta["depths"][0], *size, tile, **exact)
-    return lists, lambda: composite(*splats, colors, lists, *size)
+    blend = composite
+    if backend == "compiled":
+        from pop_fast.compiled.compositing import composite as blend
+    return lists, lambda: blend(*splats, colors, lists, *size)
 
 
-def time_blend(case: Case, tile: int, repeats: int) -> dict[str, float]:
-    """Time blending and its transpose alone, per evaluated (Gaussian, pixel) pair."""
-    lists, blend = blend_of(case, tile)
-    kept: dict[str, Any] = {}
+def time_blend(case: Case, tile: int, repeats: int) -> dict[str, Any]:
+    """Time blending and its transpose alone, per evaluated (Gaussian, pixel) pair; every backend in turns."""
+    blends = {name: blend_of(case, tile, name) for name in backends()}
 
-    def forward() -> None:
-        kept["blend"] = blend()
+    def both(blend: Callable[[], Composite]) -> None:
+        blend().image.square().mean().backward()
 
-    def both() -> None:
-        forward()
-        kept["blend"].image.square().mean().backward()
-
-    ahead, whole = median_ms(forward, repeats), median_ms(both, repeats)
-    pairs = kept["blend"].n_pairs
+    ahead = turns_ms({name: blend for name, (_, blend) in blends.items()}, repeats)
+    whole = turns_ms({name: partial(both, blend) for name, (_, blend) in blends.items()}, repeats)
+    pairs = {name: blend().n_pairs for name, (_, blend) in blends.items()}
     return {
         "tile": tile,
-        "entries": len(lists.ids),
-        "pairs_per_pixel": pairs / (case.width * case.height),
-        "forward_ns_per_pair": 1e6 * ahead / pairs,
-        "forward_backward_ns_per_pair": 1e6 * whole / pairs,
+        "entries": len(blends["fast"][0].ids),
+        "pairs_per_pixel": {name: n / (case.width * case.height) for name, n in pairs.items()},
+        "forward_ms": ahead,
+        "forward_backward_ms": whole,
+        "forward_ns_per_pair": {name: 1e6 * ahead[name] / n for name, n in pairs.items()},
+        "forward_backward_ns_per_pair": {name: 1e6 * whole[name] / n for name, n in pairs.items()},
     }
 
 
 def time_iteration(case: Case, repeats: int) -> dict[str, Any]:
-    """Time whole training steps of POP on a synthetic capture with `case.n` Gaussians."""
+    """Time whole training steps of POP on a synthetic capture with `case.n` Gaussians; every backend in turns."""
+    capture = capture_of(case)
     with tempfile.TemporaryDirectory() as folder:
-        return {**asdict(case), **_time_steps(trainer_of(case, folder), capture_of(case), repeats)}
+        trainers = {name: trainer_of(case, f"{folder}/{name}", name) for name in backends()}
+        return {**asdict(case), **_time_steps(trainers, capture, repeats)}
 
 
 def time_capture(path: str, factor: int, repeats: int) -> dict[str, Any]:
@@ -164,52 +165,55 @@ def time_capture(path: str, factor: int, repeats: int) -> dict[str, Any]:
     capture = load_capture(path, factor=factor)
     view = capture.views[0]
     with tempfile.TemporaryDirectory() as folder:
-        steps = _time_steps(_trainer(capture, folder), capture, repeats)
+        trainers = {name: _trainer(capture, f"{folder}/{name}", name) for name in backends()}
+        steps = _time_steps(trainers, capture, repeats)
     return {"capture": capture.name, "width": view.width, "height": view.height, **steps}
 
 
-def trainer_of(case: Case, folder: str) -> Trainer:
+def trainer_of(case: Case, folder: str, backend: str = "fast") -> Trainer:
     """Return a trainer whose Gaussians are a case's, of which some are opaque and their sizes differ."""
-    scene, trainer = gaussians_of(case), _trainer(capture_of(case), folder)
+    scene, trainer = gaussians_of(case), _trainer(capture_of(case), folder, backend)
     with torch.no_grad():
         trainer.params["scales"].copy_(scene["scales"].log())
         trainer.params["opacities"].copy_(torch.logit(scene["opacities"].clamp(1e-4, 1.0 - 1e-4)))
     return trainer
 
 
-def _trainer(capture: Capture, folder: str) -> Trainer:
-    config = TrainConfig(result_dir=str(Path(folder) / "run"), sh_interval=1, log_every=10**9, progress=False)
+def _trainer(capture: Capture, folder: str, backend: Any) -> Trainer:
+    at = str(Path(folder) / "run")
+    config = TrainConfig(result_dir=at, sh_interval=1, log_every=10**9, progress=False, backend=backend)
     return Trainer(config, capture)
 
 
-def _time_steps(trainer: Trainer, capture: Capture, repeats: int) -> dict[str, Any]:
+def _time_steps(trainers: dict[str, Trainer], capture: Capture, repeats: int) -> dict[str, Any]:
     with reproducible(torch.get_num_threads()):
         # what SSIM needs of a photograph is made at its first visit, so every photograph is visited once before
-        step_ms = median_ms(trainer.train_step, repeats, warm_up=len(capture.views))
-        pairs = trainer.train_step().rendered.info["n_pairs"]
+        steps = {name: trainer.train_step for name, trainer in trainers.items()}
+        taken = turns_ms(steps, repeats, warm_up=len(capture.views))
+        pairs = trainers["fast"].train_step().rendered.info["n_pairs"]
     view = capture.views[0]
     return {
-        "iteration_ms": step_ms,
-        "num_gaussians": len(trainer.params["means"]),
+        "iteration_ms": taken,
+        "num_gaussians": len(trainers["fast"].params["means"]),
         "pairs_per_pixel": pairs / (view.width * view.height),
     }
 
 
-def measure_memory() -> dict[str, Any]:
+def measure_memory(backend: str) -> dict[str, Any]:
     """Measure, in a process of its own, the peak memory of one render and its backward."""
-    code = "import run; run.render_once(run.MEMORY_CASE)"
+    code = f"import run; run.render_once(run.MEMORY_CASE, {backend!r})"
     here = Path(__file__).resolve().parent
     done = subprocess.run([sys.executable, "-c", code], cwd=here, capture_output=True, text=True, check=True)
-    return {**asdict(MEMORY_CASE), **json.loads(done.stdout)}
+    return {"backend": backend, **asdict(MEMORY_CASE), **json.loads(done.stdout)}
 
 
-def render_once(case: Case) -> None:
+def render_once(case: Case, backend: str) -> None:
     """Render a case and its backward once, and print the peak memory of this process as JSON."""
     scene = gaussians_of(case)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     leaves = {name: scene[name].requires_grad_() for name in SCENE}
     start = time.perf_counter()
-    image, _, meta = rasterization(
+    image, _, meta = get_backend(backend).rasterization(
         **{**scene, **leaves}, width=case.width, height=case.height, sh_degree=3, packed=False, dominance=True
     )
     image.square().mean().backward()
@@ -281,7 +285,7 @@ def main() -> None:
     if "iteration" in wanted:
         result["iteration"] = [time_iteration(case, given.repeats) for case in ITERATION_CASES]
     if "memory" in wanted:
-        result["memory"] = measure_memory()
+        result["memory"] = [measure_memory(name) for name in backends()]
     if "capture" in wanted and given.capture:
         result["capture"] = time_capture(given.capture, given.factor, given.repeats)
     write_json(given.out, result)

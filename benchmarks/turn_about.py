@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 HERE = Path(__file__).resolve().parent
-PACKAGES = ("pop_fast", "pop_ref", "cuda_ext", "cases", "run")
+PACKAGES = ("pop_fast", "pop_ref", "cuda_ext", "cases", "run", "timing")
 SAME = 1e-4  # the largest difference of two images, of colours around 1
 
 Times = tuple[float, ...]
@@ -63,10 +63,10 @@ class Checkout:
             sys.path[:] = path
             self._modules = _forget()
 
-    def blend(self, name: str, tile: int) -> tuple[Callable[[], Times], Callable[[], Tensor]]:
+    def blend(self, name: str, tile: int, backend: str) -> tuple[Callable[[], Times], Callable[[], Tensor]]:
         """Return what times a forward and a backward of the blend of a case, and what renders it."""
         with self.imports():
-            _, composite = self.run.blend_of(self._case(name), tile)
+            _, composite = self.run.blend_of(self._case(name), tile, backend)
 
         def once() -> Times:
             with self.imports():
@@ -78,10 +78,10 @@ class Checkout:
 
         return once, lambda: composite().image.detach()
 
-    def step(self, name: str, folder: str) -> tuple[Callable[[], Times], Callable[[], Tensor]]:
+    def step(self, name: str, folder: str, backend: str) -> tuple[Callable[[], Times], Callable[[], Tensor]]:
         """Return what times a training step of a case, and what renders its first view."""
         with self.imports():
-            trainer = self.run.trainer_of(self._case(name), folder)
+            trainer = self.run.trainer_of(self._case(name), folder, backend)
             first = trainer.train_step().rendered.image.detach()
 
         def once() -> Times:
@@ -138,6 +138,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("other", type=Path, help="root of the other checkout")
     parser.add_argument("--only", choices=("blend", "step"), default=None)
+    parser.add_argument("--backend", choices=("fast", "compiled"), default="fast", help="of both checkouts")
     parser.add_argument("--repeats", type=int, default=25)
     parser.add_argument("--threads", type=int, default=os.cpu_count())
     parser.add_argument("--out", type=Path, default=None, help="JSON file")
@@ -150,11 +151,13 @@ def main() -> None:
         if given.only != "step":
             for case in this.run.RASTER_CASES:
                 for tile in (16, 8):
-                    pair = (this.blend(case.name, tile), other.blend(case.name, tile))
+                    pair = [checkout.blend(case.name, tile, given.backend) for checkout in (this, other)]
                     timed[f"blend {case.name}, {tile} px"] = compare(*pair, ("forward", "backward"), given.repeats)
         if given.only != "blend":
             for case in this.run.ITERATION_CASES:
-                pair = (this.step(case.name, f"{folder}/{case.name}"), other.step(case.name, f"{folder}/{case.name}-"))
+                folders = (f"{folder}/{case.name}", f"{folder}/{case.name}-")
+                both = zip((this, other), folders, strict=True)
+                pair = [checkout.step(case.name, where, given.backend) for checkout, where in both]
                 timed[f"step {case.name}"] = compare(*pair, ("step",), given.repeats)
     for name, parts in timed.items():
         for part, found in parts.items():
@@ -165,7 +168,8 @@ def main() -> None:
             )
     if given.out:
         other_commit = this.run.commit(given.other)
-        found = {"machine": this.run.machine(), "other_commit": other_commit, "repeats": given.repeats, "timed": timed}
+        how = {"machine": this.run.machine(), "other_commit": other_commit, "backend": given.backend}
+        found = {**how, "repeats": given.repeats, "timed": timed}
         this.run.write_json(given.out, found)
 
 
