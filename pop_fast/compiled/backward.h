@@ -14,11 +14,11 @@ namespace pop {
 template <class Real> struct Transpose {
   const int padded, strips;
   std::vector<Real> v, behind, alphas, weights;
-  std::vector<uint8_t> blends;  // whether an entry blends into a strip. [CHUNK, strips]
+  const uint64_t *marks = nullptr;  // of the forward pass: in which strips the chunk's entries may blend
 
   Transpose(const Pixels<Real> &pixels, int64_t channels)
       : padded(pixels.padded()), strips(pixels.strips), v((channels + 1) * padded), behind(padded),
-        alphas(CHUNK * padded), weights(CHUNK * padded), blends(CHUNK * strips) {}
+        alphas(CHUNK * padded), weights(CHUNK * padded) {}
 
   void begin(const Blend<Real> &blend, const Place<Real> &place) {
     const int64_t D = blend.channels;
@@ -30,17 +30,19 @@ template <class Real> struct Transpose {
     });
   }
 
+  bool marked(int k, int strip) const { return marks[k] >> (strip % 64) & 1; }
+
   void blend_again(const Limits<Real> &limits, const Pixels<Real> &pixels, const Entries<Real> &entries,
-                   const Real *lights) {
+                   const Real *lights, const uint64_t *of_forward) {
+    marks = of_forward;
     for (int strip = 0; strip < strips; strip++) {
       const int at = strip * LANES<Real>;
       const Vec<Real> x = load(&pixels.x[at]), y = load(&pixels.y[at]);
-      Vec<Real> T = load(lights + at), alpha, weight;
-      const bool lit = any(T > Real(0));
+      Vec<Real> T = load(lights + at);
       for (int k = 0; k < entries.count; k++) {
-        uint8_t &mark = blends[k * strips + strip];
-        mark = lit && take(limits, entries.f[k], x, y, T, alpha, weight) && any(weight > Real(0));
-        if (!mark) continue;
+        if (!marked(k, strip)) continue;
+        Vec<Real> alpha{}, weight{};
+        take(limits, entries.f[k], x, y, T, alpha, weight);
         store(&alphas[k * padded + at], alpha);
         store(&weights[k * padded + at], weight);
       }
@@ -68,7 +70,7 @@ void entry_row(const Blend<Real> &blend, const Limits<Real> &limits, const Pixel
   Vec<Real> m{}, mx{}, my{}, mxx{}, mxy{}, myy{}, along_x{}, along_y{}, colors[D ? D : 1]{};
   std::fill(row, row + blend.columns(), Real(0));
   for (int strip = 0; strip < state.strips; strip++) {
-    if (!state.blends[k * state.strips + strip]) continue;
+    if (!state.marked(k, strip)) continue;
     const int at = strip * LANES<Real>;
     const Vec<Real> alpha = load(&state.alphas[k * state.padded + at]);
     const Vec<Real> weight = load(&state.weights[k * state.padded + at]);
@@ -121,7 +123,8 @@ void transpose_tile(const Blend<Real> &blend, const Splat *splats, const Pixels<
   for (int64_t chunk = n_chunks - 1; chunk >= 0; chunk--) {
     const int64_t first = place.begin + chunk * CHUNK;
     entries.gather(blend, splats, place, first, std::min<int64_t>(CHUNK, place.begin + reached - first));
-    state.blend_again(limits, pixels, entries, blend.lights + (blend.first_chunks[tile] + chunk) * state.padded);
+    state.blend_again(limits, pixels, entries, blend.lights + (blend.first_chunks[tile] + chunk) * state.padded,
+                      blend.strips + first);
     for (int k = entries.count - 1; k >= 0; k--)
       entry_row<Real, D>(blend, limits, pixels, entries, k, state, blend.rows + (first + k) * blend.columns());
   }

@@ -147,4 +147,8 @@ def _lights(lists: TileLists, like: Tensor) -> dict[str, Tensor]:
     library = this_library()
     chunks = (lists.lengths + (library.chunk - 1)) // library.chunk
     pixels = library.padded_pixels(lists.tile_size, like.dtype.itemsize)
-    return {"first_chunks": chunks.cumsum(0) - chunks, "lights": like.new_empty(int(chunks.sum()) * pixels)}
+    return {
+        "first_chunks": chunks.cumsum(0) - chunks,
+        "lights": like.new_empty(int(chunks.sum()) * pixels),
+        "strips": torch.empty_like(lists.ids),
+    }

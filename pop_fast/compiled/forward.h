@@ -39,7 +39,8 @@ template <class Number> inline auto load_whole(const Number *from) {
 // Blend some entries into one strip. D channels, known to the compiler unless 0.
 template <class Real, int D>
 void blend_strip(const Blend<Real> &blend, const Limits<Real> &limits, const Pixels<Real> &pixels,
-                 const Entries<Real> &entries, int64_t place_in_list, int at, Canvas<Real> &canvas) {
+                 const Entries<Real> &entries, int64_t place_in_list, int at, Canvas<Real> &canvas, uint64_t *marks) {
+  const uint64_t mark = uint64_t(1) << (at / LANES<Real> % 64);
   const Vec<Real> x = load(&pixels.x[at]), y = load(&pixels.y[at]);
   Vec<Real> T = load(&canvas.T[at]), sum_of_weights = load(&canvas.alphas[at]), colors[D ? D : 1];
   for (int d = 0; d < D; d++) colors[d] = load(&canvas.colors[d * canvas.padded + at]);
@@ -50,6 +51,7 @@ void blend_strip(const Blend<Real> &blend, const Limits<Real> &limits, const Pix
     }
     Vec<Real> alpha, weight;
     if (!take(limits, entries.f[k], x, y, T, alpha, weight)) continue;
+    marks[k] |= mark;
     sum_of_weights += weight;
     for (int d = 0; d < D; d++) colors[d] += weight * entries.color[k][d];
     for (int d = 0; !D && d < blend.channels; d++) {
@@ -103,15 +105,17 @@ void blend_tile(const Blend<Real> &blend, const Splat *splats, const Pixels<Real
   int64_t at = place.begin, pairs = 0;
   for (; at < place.end && canvas.lit(); at += entries.count) {
     entries.gather(blend, splats, place, at, std::min<int64_t>(CHUNK, place.end - at));
+    uint64_t marks[CHUNK] = {};
     if (blend.lights) {
       const int64_t chunk = blend.first_chunks[tile] + (at - place.begin) / CHUNK;
       std::copy(canvas.T.begin(), canvas.T.end(), blend.lights + chunk * canvas.padded);
     }
     for (int strip = 0; strip < pixels.strips; strip++) {
       if (!canvas.lit(strip)) continue;
-      blend_strip<Real, D>(blend, limits, pixels, entries, at - place.begin, strip * LANES<Real>, canvas);
+      blend_strip<Real, D>(blend, limits, pixels, entries, at - place.begin, strip * LANES<Real>, canvas, marks);
       pairs += int64_t(entries.count) * std::min(LANES<Real>, pixels.count - strip * LANES<Real>);
     }
+    if (blend.strips) std::copy(marks, marks + entries.count, blend.strips + at);
   }
   blend.n_reached[tile] = at - place.begin;
   blend.n_pairs[tile] = pairs;

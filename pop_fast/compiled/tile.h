@@ -21,6 +21,7 @@ template <class Real> struct Blend {
   double alpha_floor, alpha_ceiling, stop;  // alpha > floor is blended, T > stop goes on: strictness is folded in
   int64_t ceiling_passes;                   // B3: whether the gradient goes through the ceiling
   Real *lights;                             // T before every chunk, for the transpose. [chunks, strips, lanes]
+  uint64_t *strips;                         // in which strips an entry may blend, likewise: bit strip % 64. [entries]
   int64_t *n_reached, *n_pairs;             // entries blended before all pixels had stopped; pairs. [tiles]
   Real *image, *alphas;                     // [H, W, D], [H, W]
   int64_t *dominant_ids;                    // D8. [H, W]
@@ -84,6 +85,8 @@ template <class Real> struct Entries {
     count = int(n);
     const double x = place.left + 0.5 * place.size, y = place.top + 0.5 * place.size;
     for (int k = 0; k < count; k++) {
+      // the next chunk is asked for while this one is worked on
+      __builtin_prefetch(&splats[blend.ids[std::min(first + CHUNK + k, place.end - 1)]]);
       const int64_t id = blend.ids[first + k];
       const Splat &s = splats[id];
       const double du = s.x - x, dv = s.y - y, gx = s.a * du + s.b * dv, gy = s.b * du + s.c * dv;
