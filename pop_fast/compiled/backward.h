@@ -30,21 +30,20 @@ template <class Real> struct Transpose {
     });
   }
 
-  bool marked(int k, int strip) const { return marks[k] >> (strip % 64) & 1; }
-
   void blend_again(const Limits<Real> &limits, const Pixels<Real> &pixels, const Entries<Real> &entries,
                    const Real *lights, const uint64_t *of_forward) {
     marks = of_forward;
+    Real *to_alphas = alphas.data(), *to_weights = weights.data();
     for (int strip = 0; strip < strips; strip++) {
       const int at = strip * LANES<Real>;
       const Vec<Real> x = load(&pixels.x[at]), y = load(&pixels.y[at]);
       Vec<Real> T = load(lights + at);
       for (int k = 0; k < entries.count; k++) {
-        if (!marked(k, strip)) continue;
+        if (!(of_forward[k] >> (strip % 64) & 1)) continue;
         Vec<Real> alpha{}, weight{};
         take(limits, entries.f[k], x, y, T, alpha, weight);
-        store(&alphas[k * padded + at], alpha);
-        store(&weights[k * padded + at], weight);
+        store(to_alphas + k * padded + at, alpha);
+        store(to_weights + k * padded + at, weight);
       }
     }
   }
@@ -65,29 +64,32 @@ inline Vec<Real> through_ceiling(const Blend<Real> &blend, Real ceiling, const R
 template <class Real, int D>
 void entry_row(const Blend<Real> &blend, const Limits<Real> &limits, const Pixels<Real> &pixels,
                const Entries<Real> &entries, int k, Transpose<Real> &state, Real *row) {
-  const int64_t channels = blend.channels;
-  const Real *f = entries.f[k], *color = entries.color[k];
+  const int64_t channels = D ? D : blend.channels;
+  const int padded = state.padded, strips = state.strips;
+  const uint64_t marks = state.marks[k];
+  if (!D || !marks) std::fill(row, row + blend.columns(), Real(0));
+  if (!marks) return;
+  const Real *f = entries.f[k], *color = entries.color[k], *all_x = pixels.x.data(), *all_y = pixels.y.data();
+  const Real *alphas = &state.alphas[k * padded], *weights = &state.weights[k * padded], *all_v = state.v.data();
+  Real *all_behind = state.behind.data();
   Vec<Real> m{}, mx{}, my{}, mxx{}, mxy{}, myy{}, along_x{}, along_y{}, colors[D ? D : 1]{};
-  std::fill(row, row + blend.columns(), Real(0));
-  for (int strip = 0; strip < state.strips; strip++) {
-    if (!state.marked(k, strip)) continue;
+  for (int strip = 0; strip < strips; strip++) {
+    if (!(marks >> (strip % 64) & 1)) continue;
     const int at = strip * LANES<Real>;
-    const Vec<Real> alpha = load(&state.alphas[k * state.padded + at]);
-    const Vec<Real> weight = load(&state.weights[k * state.padded + at]);
-    const Vec<Real> behind = load(&state.behind[at]);
-    Vec<Real> q = load(&state.v[channels * state.padded + at]) - behind;
+    const Vec<Real> alpha = load(alphas + at), weight = load(weights + at), behind = load(all_behind + at);
+    Vec<Real> q = load(all_v + channels * padded + at) - behind;
     for (int d = 0; d < D; d++) {
-      const Vec<Real> v = load(&state.v[d * state.padded + at]);
+      const Vec<Real> v = load(all_v + d * padded + at);
       q += v * color[d];
       colors[d] += weight * v;
     }
     for (int64_t d = 0; !D && d < channels; d++) {
-      const Vec<Real> v = load(&state.v[d * state.padded + at]);
+      const Vec<Real> v = load(all_v + d * padded + at);
       q += v * color[d];
       row[6 + d] += sum<Real>(weight * v);
     }
-    store(&state.behind[at], behind + alpha * q);
-    const Vec<Real> x = load(&pixels.x[at]), y = load(&pixels.y[at]);
+    store(all_behind + at, behind + alpha * q);
+    const Vec<Real> x = load(all_x + at), y = load(all_y + at);
     const Vec<Real> G = through_ceiling(blend, limits.ceiling, f, x, y, alpha, weight * q);
     const Vec<Real> dx = entries.u[k] - x, dy = entries.v[k] - y;
     m += G;
@@ -113,8 +115,7 @@ void entry_row(const Blend<Real> &blend, const Limits<Real> &limits, const Pixel
 }
 
 template <class Real, int D>
-void transpose_tile(const Blend<Real> &blend, const Splat *splats, const Pixels<Real> &pixels, int64_t tile,
-                    Transpose<Real> &state) {
+void transpose_tile(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_t tile, Transpose<Real> &state) {
   const Place<Real> place(blend, tile);
   const Limits<Real> limits(blend);
   const int64_t reached = blend.n_reached[tile], n_chunks = (reached + CHUNK - 1) / CHUNK;
@@ -122,7 +123,7 @@ void transpose_tile(const Blend<Real> &blend, const Splat *splats, const Pixels<
   Entries<Real> entries;
   for (int64_t chunk = n_chunks - 1; chunk >= 0; chunk--) {
     const int64_t first = place.begin + chunk * CHUNK;
-    entries.gather(blend, splats, place, first, std::min<int64_t>(CHUNK, place.begin + reached - first));
+    entries.gather(blend, place, first, std::min<int64_t>(CHUNK, place.begin + reached - first));
     state.blend_again(limits, pixels, entries, blend.lights + (blend.first_chunks[tile] + chunk) * state.padded,
                       blend.strips + first);
     for (int k = entries.count - 1; k >= 0; k--)

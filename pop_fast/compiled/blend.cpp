@@ -1,8 +1,6 @@
 // The compiled stages for float and double, called through ctypes: tile lists, the blend and its transpose. Tiles are
 // shared out to threads one after the other, and each writes what is its own, so that no bit depends on the threads.
 
-#include <vector>
-
 #include "backward.h"
 #include "forward.h"
 #include "lists.h"
@@ -10,43 +8,40 @@
 
 namespace pop {
 
-template <class Real> std::vector<Splat> splats_of(const Blend<Real> &blend, Fork fork) {
+template <class Real> void make_splats(const Blend<Real> &blend, Fork fork) {
   const double log2_e = 1.4426950408889634;
-  std::vector<Splat> splats(blend.n);
   const auto nothing = [] { return 0; };
   share(fork, blend.threads, blend.n, 4096, nothing, [&](int, int64_t first, int64_t last) {
     for (int64_t i = first; i < last; i++) {
       const Real *mean = blend.means2d + 2 * i, *conic = blend.conics + 3 * i;
       // the logarithm of 0 is -inf: under every floor
-      splats[i] = {double(mean[0]),          double(mean[1]),          log2_e * double(conic[0]),
-                   log2_e * double(conic[1]), log2_e * double(conic[2]), std::log2(double(blend.opacities[i]))};
+      blend.splats[i] = {double(mean[0]),           double(mean[1]),           log2_e * double(conic[0]),
+                         log2_e * double(conic[1]), log2_e * double(conic[2]), std::log2(double(blend.opacities[i]))};
     }
   });
-  return splats;
 }
 
 constexpr int64_t TILES_AT_A_TIME = 4;
 
 template <class Real> void forward(const Blend<Real> &blend, Fork fork) {
-  const std::vector<Splat> splats = splats_of(blend, fork);
+  make_splats(blend, fork);
   const Pixels<Real> pixels(int(blend.tile_size));
   const auto make = [&] { return Canvas<Real>(pixels, blend.channels); };
   share(fork, blend.threads, blend.tiles(), TILES_AT_A_TIME, make, [&](Canvas<Real> &own, int64_t first, int64_t last) {
     for (int64_t tile = first; tile < last; tile++)
-      blend.channels == 3 ? blend_tile<Real, 3>(blend, splats.data(), pixels, tile, own)
-                          : blend_tile<Real, 0>(blend, splats.data(), pixels, tile, own);
+      blend.channels == 3 ? blend_tile<Real, 3>(blend, pixels, tile, own)
+                          : blend_tile<Real, 0>(blend, pixels, tile, own);
   });
 }
 
 template <class Real> void backward(const Blend<Real> &blend, Fork fork) {
-  const std::vector<Splat> splats = splats_of(blend, fork);
   const Pixels<Real> pixels(int(blend.tile_size));
   const auto make = [&] { return Transpose<Real>(pixels, blend.channels); };
   share(fork, blend.threads, blend.tiles(), TILES_AT_A_TIME, make,
         [&](Transpose<Real> &own, int64_t first, int64_t last) {
           for (int64_t tile = first; tile < last; tile++)
-            blend.channels == 3 ? transpose_tile<Real, 3>(blend, splats.data(), pixels, tile, own)
-                                : transpose_tile<Real, 0>(blend, splats.data(), pixels, tile, own);
+            blend.channels == 3 ? transpose_tile<Real, 3>(blend, pixels, tile, own)
+                                : transpose_tile<Real, 0>(blend, pixels, tile, own);
         });
   const int64_t part = std::max<int64_t>(1, (blend.n + blend.threads - 1) / blend.threads);
   share(fork, blend.threads, blend.n, part, [] { return 0; },

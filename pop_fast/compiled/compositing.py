@@ -87,7 +87,8 @@ class _Composite(torch.autograd.Function):
             "n_traversed": torch.empty(size, dtype=torch.int32) if options.counts else None,
         }
         n_pairs, n_reached = (torch.empty_like(lists.lengths) for _ in range(2))
-        kept = {"n_reached": n_reached, **(_lights(lists, colors) if options.keep else {})}
+        splats = torch.empty((len(means2d), 6), dtype=torch.float64)
+        kept = {"n_reached": n_reached, "splats": splats, **(_lights(lists, colors) if options.keep else {})}
         given = {**_arguments(inputs, options), **results, **kept, "n_pairs": n_pairs}
         call_library(Blend, means2d.dtype, _numbers(inputs, options), given)
         ctx.options, ctx.kept = options, kept

@@ -96,15 +96,14 @@ template <class Real> void write(const Blend<Real> &blend, const Place<Real> &pl
 }
 
 template <class Real, int D>
-void blend_tile(const Blend<Real> &blend, const Splat *splats, const Pixels<Real> &pixels, int64_t tile,
-                Canvas<Real> &canvas) {
+void blend_tile(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_t tile, Canvas<Real> &canvas) {
   const Place<Real> place(blend, tile);
   const Limits<Real> limits(blend);
   canvas.clear(place);
   Entries<Real> entries;
   int64_t at = place.begin, pairs = 0;
   for (; at < place.end && canvas.lit(); at += entries.count) {
-    entries.gather(blend, splats, place, at, std::min<int64_t>(CHUNK, place.end - at));
+    entries.gather(blend, place, at, std::min<int64_t>(CHUNK, place.end - at));
     uint64_t marks[CHUNK] = {};
     if (blend.lights) {
       const int64_t chunk = blend.first_chunks[tile] + (at - place.begin) / CHUNK;

@@ -41,7 +41,7 @@ class Blend(ctypes.Structure):
         *_fields(_WHOLE, "n", "channels", "tiles_x", "tiles_y", "tile_size", "width", "height", "threads"),
         *_fields(_REAL, "alpha_floor", "alpha_ceiling", "stop"),
         *_fields(_WHOLE, "ceiling_passes"),
-        *_fields(_POINTER, "lights", "strips", "n_reached", "n_pairs", "image", "alphas"),
+        *_fields(_POINTER, "splats", "lights", "strips", "n_reached", "n_pairs", "image", "alphas"),
         *_fields(_POINTER, "dominant_ids", "dominant_weights", "n_blended", "n_traversed"),
         *_fields(_POINTER, "v_image", "v_alphas", "rows"),
         *_fields(_POINTER, "v_means2d", "v_conics", "v_opacities", "v_colors", "absgrad"),

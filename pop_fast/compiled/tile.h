@@ -12,6 +12,11 @@ namespace pop {
 
 constexpr int CHUNK = 16;  // list entries after which the light of every pixel is written down for the transpose
 
+// What the exponent needs of a splat, once a render: log2(alpha) = log2_opacity - (a dx^2 + c dy^2) / 2 - b dx dy.
+struct Splat {
+  double x, y, a, b, c, log2_opacity;
+};
+
 // Everything of one call; eight bytes each, in the order of `library.py`. Null where a result is not asked for.
 template <class Real> struct Blend {
   const Real *means2d, *conics, *opacities, *colors;  // [N, 2], [N, 3], [N], [N, D]
@@ -20,6 +25,7 @@ template <class Real> struct Blend {
   int64_t n, channels, tiles_x, tiles_y, tile_size, width, height, threads;
   double alpha_floor, alpha_ceiling, stop;  // alpha > floor is blended, T > stop goes on: strictness is folded in
   int64_t ceiling_passes;                   // B3: whether the gradient goes through the ceiling
+  Splat *splats;                            // the forward pass makes them, and the transpose takes them. [N]
   Real *lights;                             // T before every chunk, for the transpose. [chunks, strips, lanes]
   uint64_t *strips;                         // in which strips an entry may blend, likewise: bit strip % 64. [entries]
   int64_t *n_reached, *n_pairs;             // entries blended before all pixels had stopped; pairs. [tiles]
@@ -34,11 +40,6 @@ template <class Real> struct Blend {
 
   int64_t tiles() const { return tiles_x * tiles_y; }
   int64_t columns() const { return 6 + channels + (absgrad ? 2 : 0); }
-};
-
-// What the exponent needs of a splat, once a call: log2(alpha) = log2_opacity - (a dx^2 + c dy^2) / 2 - b dx dy.
-struct Splat {
-  double x, y, a, b, c, log2_opacity;
 };
 
 // Pixel centres from the tile's centre, padded to whole strips of lanes.
@@ -81,14 +82,14 @@ template <class Real> struct Entries {
   Real f[CHUNK][6], u[CHUNK], v[CHUNK];  // u, v: splat's centre from the tile's
   const Real *color[CHUNK];
 
-  void gather(const Blend<Real> &blend, const Splat *splats, const Place<Real> &place, int64_t first, int64_t n) {
+  void gather(const Blend<Real> &blend, const Place<Real> &place, int64_t first, int64_t n) {
     count = int(n);
     const double x = place.left + 0.5 * place.size, y = place.top + 0.5 * place.size;
     for (int k = 0; k < count; k++) {
       // the next chunk is asked for while this one is worked on
-      __builtin_prefetch(&splats[blend.ids[std::min(first + CHUNK + k, place.end - 1)]]);
+      __builtin_prefetch(&blend.splats[blend.ids[std::min(first + CHUNK + k, place.end - 1)]]);
       const int64_t id = blend.ids[first + k];
-      const Splat &s = splats[id];
+      const Splat &s = blend.splats[id];
       const double du = s.x - x, dv = s.y - y, gx = s.a * du + s.b * dv, gy = s.b * du + s.c * dv;
       const double coefficients[6] = {s.log2_opacity - 0.5 * (gx * du + gy * dv), gx, gy, -0.5 * s.a, -s.b, -0.5 * s.c};
       for (int j = 0; j < 6; j++) f[k][j] = Real(coefficients[j]);
