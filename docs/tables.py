@@ -27,10 +27,13 @@ from pop_ref.notation import SYMBOLS
 README = ROOT / "README.md"
 MUTANT_LIST = ROOT / "docs" / "MUTANTS.md"
 CARDS = ROOT / "benchmarks" / "results" / "scorecards"
+CPU_TIMES = ROOT / "benchmarks" / "results" / "cpu.json"
 # the judged, in the order of their columns, and the card that each stands on
 JUDGED = {
     "pop_fast float64": ("pop_fast.json", "fast64"),
     "pop_fast float32": ("pop_fast.json", "fast32"),
+    "compiled float64": ("compiled.json", "compiled64"),
+    "compiled float32": ("compiled.json", "compiled32"),
     "host mirror float64": ("host_mirror.json", "mirror64"),
     "host mirror float32": ("host_mirror.json", "mirror32"),
     "gsplat torch float64": ("gsplat.json", "gsplat-torch64"),
@@ -110,6 +113,31 @@ def broken_laws() -> str:
     return "\n".join(lines) or "None is broken."
 
 
+def speed() -> str:
+    """Make the table of CPU times, each pair of them taken in turns in one process."""
+    timed = json.loads(CPU_TIMES.read_text(encoding="utf-8"))
+    rows = []
+    for case in timed["iteration"]:
+        size = f"{case['width']}x{case['height']}, {case['n']:,} Gaussians"
+        rows.append(_speed_row(f"training step of POP, {size}", case["iteration_ms"]))
+    for case in timed["raster"]:
+        size = f"{case['width']}x{case['height']}, {case['n']:,} Gaussians"
+        rows.append(_speed_row(f"render, {size}", case["forward_ms"]))
+        rows.append(_speed_row(f"render and backward, {size}", case["forward_backward_ms"]))
+        for blend in case["blend"]:
+            ns = {name: f"{value:.1f} ns a pair" for name, value in blend["forward_backward_ns_per_pair"].items()}
+            ratio = blend["forward_backward_ms"]["compiled / fast"]
+            what = f"blend and backward alone, {size}, {blend['tile']} px tiles"
+            rows.append([what, ns["fast"], ns["compiled"], f"{ratio:.2f}"])
+    machine = timed["machine"]
+    table = _table(["", "`fast`", "`compiled`", "ratio of times"], rows)
+    return f"{table}\n\n{machine['cpu']}, {machine['threads']} threads, torch {machine['torch']}."
+
+
+def _speed_row(what: str, ms: dict[str, float]) -> list[str]:
+    return [what, f"{ms['fast']:.0f} ms", f"{ms['compiled']:.0f} ms", f"{ms['compiled / fast']:.2f}"]
+
+
 def kit() -> str:
     """Say how much the kit holds."""
     return (
@@ -148,6 +176,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "rosetta": rosetta,
     "conventions": conventions,
     "profiles": profiles,
+    "speed": speed,
     "results": results,
     "kit": kit,
     "scorecards": scorecards,

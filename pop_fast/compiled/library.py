@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import re
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -129,7 +130,8 @@ def _fork() -> Any:
     if not sys.platform.startswith("linux"):
         return None
     lines = Path("/proc/self/maps").read_text(encoding="utf-8").splitlines()
-    files = {line.split(maxsplit=5)[-1] for line in lines if "/torch/lib/" in line and "libgomp" in line}
+    # wheels keep it in torch/lib or torch.libs; other packages bring their own, whose threads would be asleep
+    files = {line.split(maxsplit=5)[-1] for line in lines if re.search(r"/torch(/lib|\.libs)/libgomp", line)}
     for file in sorted(files):
         function = getattr(ctypes.CDLL(file), "GOMP_parallel", None)
         if function is not None:
