@@ -23,7 +23,9 @@ from cuda_ext.host_mirror import find_compiler
 
 HERE: Final = Path(__file__).resolve().parent
 SOURCES: Final = ("lanes.h", "threads.h", "lists.h", "tile.h", "forward.h", "backward.h", "blend.cpp")
-FLAGS: Final = ("-std=c++17", "-O3", "-march=native", "-fPIC", "-shared", "-pthread")
+FLAGS: Final = ("-std=c++17", "-O3", "-fPIC", "-shared", "-pthread")
+# for this processor, as compilers of different kinds and ages spell it; the last resort is any processor of its kind
+TUNING: Final = (("-march=native",), ("-mcpu=native",), ())
 
 
 class BuildError(RuntimeError):
@@ -33,7 +35,7 @@ class BuildError(RuntimeError):
 @cache
 def library_path() -> Path:
     """Return where the library of this version is on this processor, whether or not it has been compiled."""
-    digest = hashlib.sha256("\n".join((*FLAGS, platform.system(), processor_features())).encode())
+    digest = hashlib.sha256("\n".join((*FLAGS, *map(str, TUNING), platform.system(), processor_features())).encode())
     for name in SOURCES:
         digest.update((HERE / name).read_bytes())
     return HERE / f"_blend_{digest.hexdigest()[:16]}.so"
@@ -73,14 +75,8 @@ def build(verbose: bool = False) -> Path:
     except OSError as error:
         raise BuildError(f"{HERE} cannot be written to ({error.strerror}); install the package for yourself") from error
     os.close(descriptor)
-    command = [compiler, *FLAGS, "-o", partial, str(HERE / "blend.cpp")]
-    if verbose:
-        print(" ".join(command))
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            tail = "\n".join(done.stderr.splitlines()[-20:])
-            raise BuildError(f"compiling the CPU blend failed; {' '.join(command)} said:\n{tail}")
+        _compile(compiler, partial, verbose)
         os.chmod(partial, 0o644)
         os.replace(partial, library)
     finally:
@@ -89,6 +85,21 @@ def build(verbose: bool = False) -> Path:
         if other != library:
             other.unlink(missing_ok=True)
     return library
+
+
+def _compile(compiler: str, library: str, verbose: bool) -> None:
+    failures: list[str] = []
+    for tuning in TUNING:
+        command = [compiler, *FLAGS, *tuning, "-o", library, str(HERE / "blend.cpp")]
+        if verbose:
+            print(" ".join(command))
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode == 0:
+            return
+        tail = "\n".join(done.stderr.splitlines()[-20:])
+        failures.append(f"{' '.join(command)} said:\n{tail}")
+    # without tuning there is the least that can go wrong
+    raise BuildError(f"compiling the CPU blend failed; {failures[-1]}")
 
 
 def main() -> int:

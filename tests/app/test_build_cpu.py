@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from pathlib import Path
@@ -104,6 +105,18 @@ def test_a_compiler_that_fails_is_quoted_and_leaves_nothing(
     assert not list(fresh.glob("*.so"))
 
 
+@needs_compiler
+def test_a_compiler_that_does_not_know_the_processor_makes_code_for_any(
+    fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = find_compiler()
+    compiler(fresh, f'case "$*" in *=native*) echo "unknown value" >&2; exit 1;; esac; exec {real} "$@"', monkeypatch)
+    outcome = pop("build-cpu", "--verbose")
+    assert outcome.status == 0, outcome.err
+    assert [line.count("native") for line in outcome.out.splitlines()] == [1, 1, 0, 0]
+    assert compiled.available()
+
+
 def test_a_library_that_does_not_load_is_a_sentence(fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch) -> None:
     compiler(fresh, 'while [ "$1" != "-o" ]; do shift; done; echo "no library" > "$2"', monkeypatch)
     outcome = pop("build-cpu")
@@ -113,13 +126,15 @@ def test_a_library_that_does_not_load_is_a_sentence(fresh: Path, pop: Pop, monke
         get_backend("compiled").rasterization()
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write anywhere")
-def test_a_folder_that_cannot_be_written_to_is_named(fresh: Path, pop: Pop) -> None:
-    fresh.chmod(0o555)
+@needs_compiler
+def test_a_folder_that_cannot_be_written_to_is_named(fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**_: object) -> tuple[int, str]:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    monkeypatch.setattr(building.tempfile, "mkstemp", refuse)
     outcome = pop("build-cpu")
-    fresh.chmod(0o755)
     assert outcome.status == 2
-    assert f"{fresh} cannot be written to" in outcome.err
+    assert f"{fresh} cannot be written to (Permission denied); install the package for yourself" in outcome.err
 
 
 def test_a_library_of_another_layout_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
