@@ -1,4 +1,4 @@
-"""The blend of `pop_fast.compositing` in C++, several times as fast, where it has been compiled.
+"""Tile lists and the blend of `pop_fast` in C++, several times as fast, where they have been compiled.
 
 Everything else of the backend "compiled" is that of "fast". Importing this package imports neither torch nor the
 library, and compiles nothing: `pop build-cpu` (`python -m pop_fast.compiled.build`, and `make setup` where there is a
@@ -7,7 +7,7 @@ compiler) does that, when it is asked to.
 
 from __future__ import annotations
 
-from functools import cache
+_loaded: set[str] = set()
 
 
 def available() -> bool:
@@ -20,17 +20,16 @@ def why_not() -> str | None:
     from pop_fast.compiled.build import library_path
 
     path = library_path()
+    # what is loaded stays, also when an update has removed its file under a training that goes on
+    if str(path) in _loaded:
+        return None
     if not path.exists():
         return "the CPU blend is not compiled for this version and this processor; run `pop build-cpu`"
-    return _why_not_loaded(str(path))
-
-
-@cache
-def _why_not_loaded(path: str) -> str | None:
     from pop_fast.compiled.library import open_library
 
     try:
-        open_library(path)
+        open_library(str(path))
     except OSError as error:
         return f"the compiled CPU blend does not load ({error}); compile it again: `pop build-cpu`"
+    _loaded.add(str(path))
     return None

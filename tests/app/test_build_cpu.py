@@ -63,6 +63,15 @@ def test_it_is_compiled_once_and_older_versions_go(fresh: Path, pop: Pop) -> Non
 
 
 @needs_compiler
+def test_a_run_that_has_it_loaded_goes_on_when_an_update_removes_it(fresh: Path, pop: Pop) -> None:
+    assert pop("build-cpu").status == 0
+    for library in fresh.glob("*.so"):
+        library.unlink()
+    assert compiled.available()
+    assert get_backend("compiled").why_not() is None
+
+
+@needs_compiler
 def test_a_change_of_the_source_asks_for_a_new_build(fresh: Path) -> None:
     before = building.library_path()
     with (fresh / "lanes.h").open("a") as file:
