@@ -11,7 +11,7 @@ TORCH := $(shell sed -n 's/^\(torch==.*\)/\1/p' constraints.txt)
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
 
-setup: $(STAMP)  ## make .venv, install everything into it, compile the CPU blend where there is a C++ compiler
+setup: $(STAMP)  ## make .venv, install everything into it, compile the CPU kernels where there is a C++ compiler
 	@$(BIN)/python -m pop_fast.compiled.build --if-possible
 
 # torch goes first and by exact version: left to the resolver, pip picks the newest build and its gigabytes of CUDA.

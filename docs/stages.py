@@ -31,7 +31,7 @@ STAGES = (
     Stage("falloff and alpha of one splat at one pixel", "eqs. 1, 11", ("alpha",)),
     Stage("blending with early ray termination", "eq. 1", ("compositing", "pixel"), ("compiled/compositing.py",)),
     Stage("dominant Gaussians", "eq. 5", ("dominance",)),
-    Stage("a whole view", "eq. 1", ("render", "splatting"), ("rasterization.py",)),
+    Stage("a whole view", "eq. 1", ("render", "splatting"), ("rasterization.py", "compiled/splatting.py")),
     Stage("L1, L2, SSIM and both objectives", "eqs. 2, 4, 9", ("losses", "ssim")),
     Stage("importance mask and POP loss", "eqs. 7, 8", ("polarization",)),
     Stage("density control", "eqs. 3, 6", ("density", "density_config", "density_rows")),

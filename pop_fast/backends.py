@@ -1,4 +1,4 @@
-"""Backends by name: "fast" (this package in torch, CPU), "compiled" (the same with a blend in C++), "cuda" (cuda_ext),
+"""Backends by name: "fast" (this package in torch, CPU), "compiled" (the same with C++ kernels), "cuda" (cuda_ext),
 "ref" (the oracle, slow).
 
 A backend offers `rasterization()` with gsplat's signature and this project's meta keys. Which one runs is a value that

@@ -75,10 +75,12 @@ class Stages:
     """The stages that a backend may have its own of.
 
     Attributes:
+        colors_of_view: as `pop_fast.splatting.colors_of_view`.
         tile_lists: as `pop_fast.tiles.tile_lists`.
         composite: as `pop_fast.compositing.composite`.
     """
 
+    colors_of_view: Callable[..., Tensor] = colors_of_view
     tile_lists: Callable[..., TileLists] = tile_lists
     composite: Callable[..., Composite] = composite
 
@@ -138,7 +140,8 @@ class Frame:
         if degree is None:
             return colors
         means, viewmats = _items(scene.means), _items(scene.viewmats)
-        return [colors_of_view(colors[i], means[i // n], viewmats[i], degree, rows) for i, rows in enumerate(visible)]
+        color = self.stages.colors_of_view
+        return [color(colors[i], means[i // n], viewmats[i], degree, rows) for i, rows in enumerate(visible)]
 
     def _unpacked(self, splats: list[Splats], colors: list[Tensor]) -> tuple[RenderMeta, list[Rows]]:
         names = ("means2d", "depths", "conics", "opacities", "radii")

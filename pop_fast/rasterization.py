@@ -106,7 +106,7 @@ def rasterization(
         profile: constants and strictness: "paper", "gsplat_1_5", "gsplat_1_6", "inria", or a `Profile`.
         dominance: compute the dominance keys of meta in the same pass; else they cost one more when first read.
         counts: likewise for n_contrib and n_traversed.
-        backend: "fast" renders on the CPU, "compiled" too, with the blend in C++ (`pop_fast.compiled`), "cuda" on the
+        backend: "fast" renders on the CPU, "compiled" too, with kernels in C++ (`pop_fast.compiled`), "cuda" on the
             GPU that holds the tensors (`cuda_ext.ops.rasterization`).
 
     Returns:
@@ -178,6 +178,7 @@ def _stages_of(backend: str) -> Stages:
         return Stages()
     require_backend(backend)
     from pop_fast.compiled.compositing import composite
+    from pop_fast.compiled.splatting import colors_of_view
     from pop_fast.compiled.tiles import tile_lists
 
-    return Stages(tile_lists, composite)
+    return Stages(colors_of_view, tile_lists, composite)

@@ -1,4 +1,4 @@
-"""`pop build-cpu`: compile the blend for this machine's processor."""
+"""`pop build-cpu`: compile the CPU kernels for this machine's processor."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _EXAMPLES: Final = """
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Compile the CPU blend with g++, clang++ or the compiler that CXX names. Nothing else compiles it but `make`.
+    """Compile the CPU kernels with g++, clang++ or the compiler that CXX names. Nothing else compiles them but `make`.
 
-    It takes some seconds and makes training about twice as fast. It is compiled for exactly this processor, and has to
-    be compiled again after an update.
+    It takes some seconds and makes training two to three times as fast. They are compiled for exactly this processor,
+    and have to be compiled again after an update.
     """
 
     verbose: bool = False

@@ -1,4 +1,4 @@
-"""Tile lists and the blend of `pop_fast` in C++, several times as fast, where they have been compiled.
+"""Harmonics, tile lists and the blend of `pop_fast` in C++, several times as fast, where they have been compiled.
 
 Everything else of the backend "compiled" is that of "fast". Importing this package imports neither torch nor the
 library, and compiles nothing: `pop build-cpu` (`python -m pop_fast.compiled.build`, and `make setup` where there is a
@@ -24,12 +24,12 @@ def why_not() -> str | None:
     if str(path) in _loaded:
         return None
     if not path.exists():
-        return "the CPU blend is not compiled for this version and this processor; run `pop build-cpu`"
+        return "the CPU kernels are not compiled for this version and this processor; run `pop build-cpu`"
     from pop_fast.compiled.library import open_library
 
     try:
         open_library(str(path))
     except OSError as error:
-        return f"the compiled CPU blend does not load ({error}); compile it again: `pop build-cpu`"
+        return f"the compiled CPU kernels do not load ({error}); compile them again: `pop build-cpu`"
     _loaded.add(str(path))
     return None

@@ -1,7 +1,8 @@
-// The compiled stages for float and double, called through ctypes: tile lists, the blend and its transpose. Tiles are
-// shared out to threads one after the other, and each writes what is its own, so that no bit depends on the threads.
+// The compiled stages for float and double, called through ctypes: colours, tile lists, the blend and its transpose. Tiles
+// are shared out to threads one after the other, and each writes what is its own, so that no bit depends on the threads.
 
 #include "backward.h"
+#include "colors.h"
 #include "forward.h"
 #include "lists.h"
 #include "threads.h"
@@ -57,6 +58,11 @@ void pop_backward_float32(const pop::Blend<float> *blend, pop::Fork fork) { pop:
 void pop_backward_float64(const pop::Blend<double> *blend, pop::Fork fork) { pop::backward(*blend, fork); }
 void pop_lists_float32(const pop::Lists<float> *lists, pop::Fork fork) { pop::list_tiles(*lists, fork); }
 void pop_lists_float64(const pop::Lists<double> *lists, pop::Fork fork) { pop::list_tiles(*lists, fork); }
+void pop_colors_float32(const pop::Colors<float> *colors, pop::Fork fork) { pop::color_forward(*colors, fork); }
+void pop_colors_float64(const pop::Colors<double> *colors, pop::Fork fork) { pop::color_forward(*colors, fork); }
+void pop_colors_backward_float32(const pop::Colors<float> *colors, pop::Fork fork) { pop::color_backward(*colors, fork); }
+void pop_colors_backward_float64(const pop::Colors<double> *colors, pop::Fork fork) { pop::color_backward(*colors, fork); }
+int64_t pop_colors_bytes() { return int64_t(sizeof(pop::Colors<float>)); }
 int64_t pop_lists_bytes() { return int64_t(sizeof(pop::Lists<float>)); }
 int64_t pop_blend_bytes() { return int64_t(sizeof(pop::Blend<float>)); }
 int64_t pop_chunk() { return pop::CHUNK; }

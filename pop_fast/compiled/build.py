@@ -1,4 +1,4 @@
-"""Compile the CPU blend, when asked: one call of a C++ compiler, into this package's folder.
+"""Compile the CPU kernels, when asked: one call of a C++ compiler, into this package's folder.
 
     python -m pop_fast.compiled.build [--if-possible]
 
@@ -19,10 +19,14 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
+import cuda_ext
 from cuda_ext.host_mirror import find_compiler
 
 HERE: Final = Path(__file__).resolve().parent
-SOURCES: Final = ("lanes.h", "threads.h", "lists.h", "tile.h", "forward.h", "backward.h", "blend.cpp")
+SOURCES: Final = ("colors.h", "lanes.h", "threads.h", "lists.h", "tile.h", "forward.h", "backward.h", "blend.cpp")
+# one Gaussian's arithmetic is that of the CUDA kernels
+CUDA: Final = Path(cuda_ext.__file__).resolve().parent
+SHARED: Final = ("csrc/real.cuh", "csrc/profile.cuh", "csrc/camera.cuh", "csrc/harmonics.cuh")
 FLAGS: Final = ("-std=c++17", "-O3", "-fPIC", "-shared", "-pthread")
 # for this processor, as compilers of different kinds and ages spell it; the last resort is any processor of its kind
 TUNING: Final = (("-march=native",), ("-mcpu=native",), ())
@@ -36,8 +40,8 @@ class BuildError(RuntimeError):
 def library_path() -> Path:
     """Return where the library of this version is on this processor, whether or not it has been compiled."""
     digest = hashlib.sha256("\n".join((*FLAGS, *map(str, TUNING), platform.system(), processor_features())).encode())
-    for name in SOURCES:
-        digest.update((HERE / name).read_bytes())
+    for source in (*(HERE / name for name in SOURCES), *(CUDA / name for name in SHARED)):
+        digest.update(source.read_bytes())
     return HERE / f"_blend_{digest.hexdigest()[:16]}.so"
 
 
@@ -90,7 +94,7 @@ def build(verbose: bool = False) -> Path:
 def _compile(compiler: str, library: str, verbose: bool) -> None:
     failures: list[str] = []
     for tuning in TUNING:
-        command = [compiler, *FLAGS, *tuning, "-o", library, str(HERE / "blend.cpp")]
+        command = [compiler, *FLAGS, *tuning, f"-I{CUDA.parent}", "-o", library, str(HERE / "blend.cpp")]
         if verbose:
             print(" ".join(command))
         done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -99,7 +103,7 @@ def _compile(compiler: str, library: str, verbose: bool) -> None:
         tail = "\n".join(done.stderr.splitlines()[-20:])
         failures.append(f"{' '.join(command)} said:\n{tail}")
     # without tuning there is the least that can go wrong
-    raise BuildError(f"compiling the CPU blend failed; {failures[-1]}")
+    raise BuildError(f"compiling the CPU kernels failed; {failures[-1]}")
 
 
 def main() -> int:
@@ -111,7 +115,7 @@ def main() -> int:
     try:
         print(build(args.verbose))
     except BuildError as error:
-        print(f"the CPU blend is not compiled, and backend fast stands in: {error}", file=sys.stderr)
+        print(f"the CPU kernels are not compiled, and backend fast stands in: {error}", file=sys.stderr)
         return 0 if args.if_possible else 1
     return 0
 

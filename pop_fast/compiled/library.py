@@ -23,6 +23,20 @@ def _fields(kind: Any, *names: str) -> tuple[tuple[str, Any], ...]:
     return tuple((name, kind) for name in names)
 
 
+class Colors(ctypes.Structure):
+    """`pop::Colors` of colors.h, where every field is explained, in its order."""
+
+    _fields_ = (
+        *_fields(_POINTER, "sh", "means", "viewmat", "visible"),
+        *_fields(_WHOLE, "n", "n_visible", "n_sh", "degree", "threads"),
+        *_fields(_POINTER, "colors", "v_colors", "v_sh", "v_dirs"),
+    )
+
+
+class ColorsBackward(Colors):
+    """The same, for the transpose."""
+
+
 class Lists(ctypes.Structure):
     """`pop::Lists` of lists.h, where every field is explained, in its order."""
 
@@ -53,7 +67,13 @@ class BlendBackward(Blend):
     """The same, for the transpose."""
 
 
-_NAMES: dict[type[ctypes.Structure], str] = {Lists: "lists", Blend: "forward", BlendBackward: "backward"}
+_NAMES: dict[type[ctypes.Structure], str] = {
+    Colors: "colors",
+    ColorsBackward: "colors_backward",
+    Lists: "lists",
+    Blend: "forward",
+    BlendBackward: "backward",
+}
 
 
 @dataclass(frozen=True)
@@ -107,10 +127,11 @@ def open_library(path: str) -> Library:
         OSError: it is missing, does not load, or was not made from the same source as this module.
     """
     loaded = ctypes.CDLL(path)
-    for name in ("pop_lists_bytes", "pop_blend_bytes", "pop_chunk", "pop_padded_pixels"):
+    sizes = {"pop_colors_bytes": Colors, "pop_lists_bytes": Lists, "pop_blend_bytes": Blend}
+    for name in (*sizes, "pop_chunk", "pop_padded_pixels"):
         getattr(loaded, name).restype = _WHOLE
     loaded.pop_padded_pixels.argtypes = (_WHOLE, _WHOLE)
-    if (loaded.pop_lists_bytes(), loaded.pop_blend_bytes()) != (ctypes.sizeof(Lists), ctypes.sizeof(Blend)):
+    if any(getattr(loaded, name)() != ctypes.sizeof(layout) for name, layout in sizes.items()):
         raise OSError(f"{path} expects arguments of another layout")
     functions: dict[tuple[type[ctypes.Structure], torch.dtype], Callable[..., None]] = {}
     for layout, name in _NAMES.items():

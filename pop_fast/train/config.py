@@ -66,7 +66,7 @@ class TrainConfig:
         steps_scaler: multiplies every step number of the schedule; None takes the preset's.
         max_steps: training steps, one view each.
         seed: of the view order, the initial rotations and the split noise.
-        backend: what renders and trains: "fast" (CPU), "compiled" (CPU, with the blend in C++), "cuda", "ref" (the
+        backend: what renders and trains: "fast" (CPU), "compiled" (CPU, with kernels in C++), "cuda", "ref" (the
             oracle, slow), or "auto": "cuda" where a GPU and the build are there, else "compiled" where that was
             compiled, else "fast".
         profile: the rasterizer's constants: "paper", "gsplat_1_5", "gsplat_1_6" or "inria".

@@ -24,7 +24,7 @@ from tests.app.stand_in import stand_in_hardware
 from tests.app.tiny import tiny_capture, tiny_config
 
 NOT_BUILT = "the CUDA extension is not built; run `pop build-cuda`"
-NOT_COMPILED = "the CPU blend is not compiled"
+NOT_COMPILED = "the CPU kernels are not compiled"
 
 
 @pytest.fixture(autouse=True)

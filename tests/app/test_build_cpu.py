@@ -1,4 +1,4 @@
-"""Compiling the CPU blend, and what there is without it."""
+"""Compiling the CPU kernels, and what there is without it."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_a_compiler_that_fails_is_quoted_and_leaves_nothing(
     compiler(fresh, "echo 'lanes.h:1: error: no such vectors' >&2; exit 1", monkeypatch)
     outcome = pop("build-cpu")
     assert outcome.status == 2
-    assert "compiling the CPU blend failed" in outcome.err
+    assert "compiling the CPU kernels failed" in outcome.err
     assert "error: no such vectors" in outcome.out
     assert not list(fresh.glob("*.so"))
 
@@ -130,8 +130,8 @@ def test_a_library_that_does_not_load_is_a_sentence(fresh: Path, pop: Pop, monke
     compiler(fresh, 'while [ "$1" != "-o" ]; do shift; done; echo "no library" > "$2"', monkeypatch)
     outcome = pop("build-cpu")
     assert outcome.status == 2
-    assert "the compiled CPU blend does not load" in outcome.err
-    with pytest.raises(PopError, match="backend 'compiled' cannot run: the compiled CPU blend does not load"):
+    assert "the compiled CPU kernels do not load" in outcome.err
+    with pytest.raises(PopError, match="backend 'compiled' cannot run: the compiled CPU kernels do not load"):
         get_backend("compiled").rasterization()
 
 
@@ -159,7 +159,7 @@ def test_auto_takes_it_where_it_is_and_says_how_to_get_it_where_it_is_not(
 ) -> None:
     chosen, line = choose_backend(tiny_config(tmp_path))
     assert chosen.backend == "fast"
-    assert line.startswith("backend fast (CPU): the CPU blend is not compiled")
+    assert line.startswith("backend fast (CPU): the CPU kernels are not compiled")
     assert line.endswith(f"run `pop build-cpu`; {NO_GPU}")
     (finding,) = (found for found in backends() if found.name == "backend compiled")
     assert finding.state == "off"
@@ -173,7 +173,7 @@ def test_results_trained_with_it_are_drawn_without_it(fresh: Path, monkeypatch: 
     drawing, note = renderer("compiled")
     assert drawing.name == "fast"
     assert note is not None
-    assert note.startswith("backend 'fast' stands in for 'compiled': the CPU blend is not compiled")
+    assert note.startswith("backend 'fast' stands in for 'compiled': the CPU kernels are not compiled")
     monkeypatch.setattr("pop_fast.compiled.why_not", lambda: None)
     assert (renderer("compiled")[0].name, renderer("compiled")[1]) == ("compiled", None)
     assert (renderer("auto")[0].name, renderer("auto")[1]) == ("compiled", None)
