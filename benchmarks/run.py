@@ -115,8 +115,8 @@ def time_raster(case: Case, repeats: int) -> dict[str, Any]:
     }
 
 
-def blend_of(case: Case, tile: int, backend: str = "fast") -> tuple[TileLists, Callable[[], Composite]]:
-    """Return a case's tile lists, and what blends it, differentiably, and nothing else."""
+def blend_of(case: Case, tile: int, backend: str = "fast") -> tuple[TileLists, list[Tensor], Callable[[], Composite]]:
+    """Return a case's tile lists, its splats, and what blends them, differentiably, and nothing else."""
     scene, size = gaussians_of(case), (case.width, case.height)
     with torch.no_grad():
         _, _, meta = rasterization(**scene, width=size[0], height=size[1], sh_degree=3, packed=False)
@@ -128,19 +128,22 @@ def blend_of(case: Case, tile: int, backend: str = "fast") -> tuple[TileLists, C
     blend = composite
     if backend == "compiled":
         from pop_fast.compiled.compositing import composite as blend
-    return lists, lambda: blend(*splats, colors, lists, *size)
+    return lists, [*splats, colors], lambda: blend(*splats, colors, lists, *size)
 
 
 def time_blend(case: Case, tile: int, repeats: int) -> dict[str, Any]:
     """Time blending and its transpose alone, per evaluated (Gaussian, pixel) pair; every backend in turns."""
     blends = {name: blend_of(case, tile, name) for name in backends()}
 
-    def both(blend: Callable[[], Composite]) -> None:
-        blend().image.square().mean().backward()
+    # a cotangent that is there already: what a loss costs is not the blend's
+    v_image = torch.randn((case.height, case.width, 3), generator=torch.Generator().manual_seed(1))
 
-    ahead = turns_ms({name: blend for name, (_, blend) in blends.items()}, repeats)
-    whole = turns_ms({name: partial(both, blend) for name, (_, blend) in blends.items()}, repeats)
-    pairs = {name: blend().n_pairs for name, (_, blend) in blends.items()}
+    def both(splats: list[Tensor], blend: Callable[[], Composite]) -> None:
+        torch.autograd.grad(blend().image, splats, v_image)
+
+    ahead = turns_ms({name: blend for name, (_, _, blend) in blends.items()}, repeats)
+    whole = turns_ms({name: partial(both, splats, blend) for name, (_, splats, blend) in blends.items()}, repeats)
+    pairs = {name: blend().n_pairs for name, (_, _, blend) in blends.items()}
     return {
         "tile": tile,
         "entries": len(blends["fast"][0].ids),

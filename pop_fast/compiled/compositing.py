@@ -76,7 +76,9 @@ class _Composite(torch.autograd.Function):
     def forward(
         ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, options: _Options
     ) -> tuple[Tensor | None, ...]:
-        inputs, lists = (means2d, conics, opacities, colors), options.lists
+        # once for both directions
+        inputs = tuple(tensor.contiguous() for tensor in (means2d, conics, opacities, colors))
+        lists = options.lists
         size = (options.height, options.width)
         results = {
             "image": colors.new_empty((*size, colors.shape[1])),
