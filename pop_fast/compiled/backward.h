@@ -1,7 +1,7 @@
 // Pull the cotangent of a tile back to its entries. Meaning: `pop_ref.compositing.composite_vjp`.
 //
-// Alphas and weights are made anew from the light before every chunk, front to back; then the chunk is gone through back
-// to front with one number a pixel, B, the light from behind dotted with the pixel's cotangent:
+// Alphas and weights are made anew from the light before every chunk, front to back; then the chunk is gone through
+// back to front with one number a pixel, B, the light from behind dotted with the pixel's cotangent:
 //     q = colour . v - B;  B += alpha q;  G = weight q = alpha dL/dalpha
 // Six moments of G about the splat's centre give every geometric gradient of the splat, and can be added up over tiles.
 #pragma once

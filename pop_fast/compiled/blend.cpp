@@ -1,5 +1,6 @@
-// The compiled stages for float and double, called through ctypes: colours, tile lists, the blend and its transpose. Tiles
-// are shared out to threads one after the other, and each writes what is its own, so that no bit depends on the threads.
+// The compiled stages for float and double, called through ctypes: colours, tile lists, the blend and its transpose.
+// Tiles are shared out to threads one after the other, and each writes what is its own, so that no bit depends on the
+// number of threads.
 
 #include "backward.h"
 #include "colors.h"
@@ -11,8 +12,7 @@ namespace pop {
 
 template <class Real> void make_splats(const Blend<Real> &blend, Fork fork) {
   const double log2_e = 1.4426950408889634;
-  const auto nothing = [] { return 0; };
-  share(fork, blend.threads, blend.n, 4096, nothing, [&](int, int64_t first, int64_t last) {
+  share(fork, blend.threads, blend.n, 4096, [&](int64_t first, int64_t last) {
     for (int64_t i = first; i < last; i++) {
       const Real *mean = blend.means2d + 2 * i, *conic = blend.conics + 3 * i;
       // the logarithm of 0 is -inf: under every floor
@@ -45,23 +45,23 @@ template <class Real> void backward(const Blend<Real> &blend, Fork fork) {
                                 : transpose_tile<Real, 0>(blend, pixels, tile, own);
         });
   const int64_t part = std::max<int64_t>(1, (blend.n + blend.threads - 1) / blend.threads);
-  share(fork, blend.threads, blend.n, part, [] { return 0; },
-        [&](int, int64_t first, int64_t last) { add_up(blend, first, last); });
+  share(fork, blend.threads, blend.n, part, [&](int64_t first, int64_t last) { add_up(blend, first, last); });
 }
 
 }  // namespace pop
 
+#define POP_STAGE(name, Layout, function)                                                               \
+  void pop_##name##_float32(const pop::Layout<float> *given, pop::Fork fork) { pop::function(*given, fork); } \
+  void pop_##name##_float64(const pop::Layout<double> *given, pop::Fork fork) { pop::function(*given, fork); }
+
 extern "C" {
-void pop_forward_float32(const pop::Blend<float> *blend, pop::Fork fork) { pop::forward(*blend, fork); }
-void pop_forward_float64(const pop::Blend<double> *blend, pop::Fork fork) { pop::forward(*blend, fork); }
-void pop_backward_float32(const pop::Blend<float> *blend, pop::Fork fork) { pop::backward(*blend, fork); }
-void pop_backward_float64(const pop::Blend<double> *blend, pop::Fork fork) { pop::backward(*blend, fork); }
-void pop_lists_float32(const pop::Lists<float> *lists, pop::Fork fork) { pop::list_tiles(*lists, fork); }
-void pop_lists_float64(const pop::Lists<double> *lists, pop::Fork fork) { pop::list_tiles(*lists, fork); }
-void pop_colors_float32(const pop::Colors<float> *colors, pop::Fork fork) { pop::color_forward(*colors, fork); }
-void pop_colors_float64(const pop::Colors<double> *colors, pop::Fork fork) { pop::color_forward(*colors, fork); }
-void pop_colors_backward_float32(const pop::Colors<float> *colors, pop::Fork fork) { pop::color_backward(*colors, fork); }
-void pop_colors_backward_float64(const pop::Colors<double> *colors, pop::Fork fork) { pop::color_backward(*colors, fork); }
+POP_STAGE(colors, Colors, color_forward)
+POP_STAGE(colors_backward, Colors, color_backward)
+POP_STAGE(lists, Lists, list_tiles)
+POP_STAGE(forward, Blend, forward)
+POP_STAGE(backward, Blend, backward)
+
+// what `library.py` compares and asks for
 int64_t pop_colors_bytes() { return int64_t(sizeof(pop::Colors<float>)); }
 int64_t pop_lists_bytes() { return int64_t(sizeof(pop::Lists<float>)); }
 int64_t pop_blend_bytes() { return int64_t(sizeof(pop::Blend<float>)); }

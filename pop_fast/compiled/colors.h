@@ -34,7 +34,7 @@ template <class Real> void color_forward(const Colors<Real> &given, Fork fork) {
   const Camera<Real> camera = given.camera();
   const int64_t n = given.n;
   std::fill(given.colors, given.colors + 3 * n, Real(0));
-  share(fork, given.threads, given.n_visible, GAUSSIANS_AT_A_TIME, [] { return 0; }, [&](int, int64_t first, int64_t last) {
+  share(fork, given.threads, given.n_visible, GAUSSIANS_AT_A_TIME, [&](int64_t first, int64_t last) {
     for (int64_t k = first; k < last; k++) {
       const int64_t i = given.visible[k];
       const Vec3<Real> color = color_from_sh(given.row(i), view_dir(given.mean(i), camera), int(given.degree));
@@ -56,7 +56,7 @@ template <class Real> void color_backward(const Colors<Real> &given, Fork fork) 
     std::fill(given.v_dirs + 3 * from, given.v_dirs + 3 * to, Real(0));
   };
   zero(0, given.n_visible > 0 ? given.visible[0] : given.n);
-  share(fork, given.threads, given.n_visible, GAUSSIANS_AT_A_TIME, [] { return 0; }, [&](int, int64_t first, int64_t last) {
+  share(fork, given.threads, given.n_visible, GAUSSIANS_AT_A_TIME, [&](int64_t first, int64_t last) {
     for (int64_t k = first; k < last; k++) {
       const int64_t i = given.visible[k], next = k + 1 < given.n_visible ? given.visible[k + 1] : given.n;
       const Real *v = given.v_colors + 3 * i;

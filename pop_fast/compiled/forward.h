@@ -9,7 +9,7 @@ namespace pop {
 template <class Real> struct Canvas {
   const int padded;
   std::vector<Real> T, alphas, colors, best;
-  std::vector<typename std::conditional<sizeof(Real) == 8, int64_t, int32_t>::type> winner, blended, traversed;
+  std::vector<Whole<Real>> winner, blended, traversed;
 
   Canvas(const Pixels<Real> &pixels, int64_t channels)
       : padded(pixels.padded()), T(padded), alphas(padded), colors(channels * padded), best(padded), winner(padded),
@@ -30,12 +30,6 @@ template <class Real> struct Canvas {
   }
 };
 
-template <class Number> inline auto load_whole(const Number *from) {
-  typename std::conditional<sizeof(Number) == 8, Mask<double>, Mask<float>>::type v;
-  std::memcpy(&v, from, sizeof v);
-  return v;
-}
-
 // Blend some entries into one strip. D channels, known to the compiler unless 0.
 template <class Real, int D>
 void blend_strip(const Blend<Real> &blend, const Limits<Real> &limits, const Pixels<Real> &pixels,
@@ -46,8 +40,8 @@ void blend_strip(const Blend<Real> &blend, const Limits<Real> &limits, const Pix
   for (int d = 0; d < D; d++) colors[d] = load(&canvas.colors[d * canvas.padded + at]);
   for (int k = 0; k < entries.count; k++) {
     if (blend.n_traversed) {
-      const auto before = load_whole(&canvas.traversed[at]) - (T > Real(0));
-      std::memcpy(&canvas.traversed[at], &before, sizeof before);
+      Whole<Real> *visits = &canvas.traversed[at];
+      store_whole<Real>(visits, load_whole<Real>(visits) - (T > Real(0)));
     }
     Vec<Real> alpha, weight;
     if (!take(limits, entries.f[k], x, y, T, alpha, weight)) continue;
@@ -61,16 +55,13 @@ void blend_strip(const Blend<Real> &blend, const Limits<Real> &limits, const Pix
     if (blend.dominant_ids) {
       // strictly larger: on equal weights the entry in front keeps the pixel
       const Vec<Real> best = load(&canvas.best[at]);
-      const Mask<Real> wins = weight > best, winner = load_whole(&canvas.winner[at]);
+      const Mask<Real> wins = weight > best, this_one = Mask<Real>{} + Whole<Real>(place_in_list + k);
       store(&canvas.best[at], wins ? weight : best);
-      const Mask<Real> now = wins ? Mask<Real>{} + typename std::remove_reference<decltype(winner[0])>::type(
-                                                       place_in_list + k)
-                                  : winner;
-      std::memcpy(&canvas.winner[at], &now, sizeof now);
+      store_whole<Real>(&canvas.winner[at], wins ? this_one : load_whole<Real>(&canvas.winner[at]));
     }
     if (blend.n_blended) {
-      const auto now = load_whole(&canvas.blended[at]) - (weight > Real(0));
-      std::memcpy(&canvas.blended[at], &now, sizeof now);
+      Whole<Real> *count = &canvas.blended[at];
+      store_whole<Real>(count, load_whole<Real>(count) - (weight > Real(0)));
     }
   }
   store(&canvas.T[at], T);

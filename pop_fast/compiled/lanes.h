@@ -9,15 +9,18 @@ namespace pop {
 
 template <class Real> struct Lanes;
 template <> struct Lanes<float> {
+  using whole = int32_t;
   typedef float vec __attribute__((vector_size(64)));
   typedef int32_t mask __attribute__((vector_size(64)));
 };
 template <> struct Lanes<double> {
+  using whole = int64_t;
   typedef double vec __attribute__((vector_size(64)));
   typedef int64_t mask __attribute__((vector_size(64)));
 };
+template <class Real> using Whole = typename Lanes<Real>::whole;  // an integer as wide
 template <class Real> using Vec = typename Lanes<Real>::vec;
-template <class Real> using Mask = typename Lanes<Real>::mask;  // -1 where true
+template <class Real> using Mask = typename Lanes<Real>::mask;  // such integers; as a condition -1 where true
 template <class Real> constexpr int LANES = 64 / sizeof(Real);
 
 template <class To, class From> inline To bits_of(const From &from) {
@@ -34,6 +37,14 @@ template <class Real> inline Vec<Real> load(const Real *from) {
 }
 
 template <class Real> inline void store(Real *to, Vec<Real> v) { std::memcpy(to, &v, sizeof v); }
+
+template <class Real> inline Mask<Real> load_whole(const Whole<Real> *from) {
+  Mask<Real> v;
+  std::memcpy(&v, from, sizeof v);
+  return v;
+}
+
+template <class Real> inline void store_whole(Whole<Real> *to, Mask<Real> v) { std::memcpy(to, &v, sizeof v); }
 
 template <class Real> inline Vec<Real> all(Real x) { return Vec<Real>{} + x; }
 

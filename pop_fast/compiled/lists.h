@@ -14,7 +14,8 @@ namespace pop {
 template <class Real> struct Lists {
   const Real *means2d, *conics, *opacities;  // [N, 2], [N, 3], [N]; conics null: no entry is left out
   const int64_t *rects;                      // half-open tile rectangles x0, y0, x1, y1. [4, N]
-  const int64_t *order, *candidates;         // splats with a rectangle, front to back; tiles before each one's. [M], [M + 1]
+  const int64_t *order;                      // splats with a rectangle, front to back. [M]
+  const int64_t *candidates;                 // tiles of the rectangles before each one's. [M + 1]
   int64_t n, m, tiles_x, tiles_y, tile_size, threads;
   double alpha_floor;
   int32_t *tiles;          // tile of every candidate, -1 where it is left out. [candidates]
@@ -52,16 +53,18 @@ template <class Real> void find_tiles(const Lists<Real> &lists, int64_t first, i
   const int64_t n = lists.n;
   for (int64_t i = first; i < last; i++) {
     const int64_t id = lists.order[i];
-    const int64_t x0 = lists.rects[id], y0 = lists.rects[n + id], x1 = lists.rects[2 * n + id], y1 = lists.rects[3 * n + id];
+    const int64_t x0 = lists.rects[id], y0 = lists.rects[n + id];
+    const int64_t x1 = lists.rects[2 * n + id], y1 = lists.rects[3 * n + id];
     const Real x = lists.means2d[2 * id], y = lists.means2d[2 * id + 1];
     const Real *conic = lists.conics ? lists.conics + 3 * id : nullptr;
+    const Real extent = Real(lists.tile_size - 1);
     const Real limit = conic ? std::log(lists.opacities[id] / Real(lists.alpha_floor)) : Real(0);
     int32_t *tile = lists.tiles + lists.candidates[i];
     for (int64_t row = y0; row < y1; row++)
       for (int64_t column = x0; column < x1; column++, tile++) {
         const Real left = Real(column * lists.tile_size) + Real(0.5) - x;
         const Real top = Real(row * lists.tile_size) + Real(0.5) - y;
-        const bool listed = !conic || touches(conic[0], conic[1], conic[2], limit, left, top, Real(lists.tile_size - 1));
+        const bool listed = !conic || touches(conic[0], conic[1], conic[2], limit, left, top, extent);
         *tile = listed ? int32_t(row * lists.tiles_x + column) : -1;
         if (listed) counts[*tile]++;
       }
@@ -77,8 +80,7 @@ template <class Real> void list_tiles(const Lists<Real> &lists, Fork fork) {
     const int64_t before = lists.candidates[lists.m] / parts * part;
     bounds[part] = std::lower_bound(lists.candidates, lists.candidates + lists.m, before) - lists.candidates;
   }
-  const auto nothing = [] { return 0; };
-  share(fork, lists.threads, parts, 1, nothing, [&](int, int64_t part, int64_t) {
+  share(fork, lists.threads, parts, 1, [&](int64_t part, int64_t) {
     find_tiles(lists, bounds[part], bounds[part + 1], &starts[part * n_tiles]);
   });
   int64_t total = 0;
@@ -91,7 +93,7 @@ template <class Real> void list_tiles(const Lists<Real> &lists, Fork fork) {
     }
   }
   lists.offsets[n_tiles] = total;
-  share(fork, lists.threads, parts, 1, nothing, [&](int, int64_t part, int64_t) {
+  share(fork, lists.threads, parts, 1, [&](int64_t part, int64_t) {
     int64_t *next = &starts[part * n_tiles];
     for (int64_t i = bounds[part]; i < bounds[part + 1]; i++)
       for (int64_t k = lists.candidates[i]; k < lists.candidates[i + 1]; k++)

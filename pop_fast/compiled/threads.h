@@ -35,4 +35,9 @@ template <class Make, class F> void share(Fork fork, int64_t threads, int64_t n,
   });
 }
 
+// The same for work that needs nothing of its own: f(first, last).
+template <class F> void share(Fork fork, int64_t threads, int64_t n, int64_t part, F f) {
+  share(fork, threads, n, part, [] { return 0; }, [&](int, int64_t first, int64_t last) { f(first, last); });
+}
+
 }  // namespace pop
