@@ -52,6 +52,7 @@ def composite(
     dominance: bool = False,
     counts: bool = False,
     absgrad_sink: Tensor | None = None,
+    function: type[torch.autograd.Function] | None = None,
 ) -> Composite:
     """Blend every tile's list front to back, over black. See `pop_ref.compositing.composite`.
 
@@ -69,19 +70,22 @@ def composite(
         dominance: also find dominant ids.
         counts: also count blended and traversed entries.
         absgrad_sink: [N, 2], to which the transpose adds the sum over pixels of |dL/dmeans2d|.
+        function: what blends, from the four tensors and `BlendOptions`; None takes torch's.
 
     Returns:
         The blended view; `image` and `alphas` are differentiable.
     """
     inputs = (means2d, conics, opacities, colors)
     keep = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
-    options = _Options(lists, width, height, profile, dominance, counts, keep, absgrad_sink)
-    image, alphas, ids, weights, blended, traversed, pairs = _Composite.apply(*inputs, options)
+    options = BlendOptions(lists, width, height, profile, dominance, counts, keep, absgrad_sink)
+    image, alphas, ids, weights, blended, traversed, pairs = (function or _Composite).apply(*inputs, options)
     return Composite(image, alphas, ids, weights, blended, traversed, int(pairs))
 
 
 @dataclass(frozen=True)
-class _Options:
+class BlendOptions:
+    """What `composite` is given beside the tensors, and whether a transpose may follow (`keep`)."""
+
     lists: TileLists
     width: int
     height: int
@@ -104,7 +108,7 @@ class _Saved:
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, options: _Options
+        ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, options: BlendOptions
     ) -> tuple[Tensor | None, ...]:
         lists, profile, dtype = options.lists, options.profile, means2d.dtype
         entries = Entries.of(means2d, PackedLists.of(lists, len(means2d)))
@@ -134,7 +138,7 @@ class _Composite(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
         saved: _Saved = ctx.saved
-        options: _Options = ctx.options
+        options: BlendOptions = ctx.options
         gradients = _Gradients(saved, options)
         tiles = _tiles_of_cotangents(v_image, v_alphas, options, saved.blender)
         for i, group in enumerate(saved.groups):
@@ -156,7 +160,7 @@ def _table(coefficients: Tensor, colors: Tensor, ids: Tensor) -> Tensor:
 class _Canvas:
     """The image in tiles, filled group by group."""
 
-    def __init__(self, options: _Options, packed: PackedLists, channels: int, dtype: torch.dtype) -> None:
+    def __init__(self, options: BlendOptions, packed: PackedLists, channels: int, dtype: torch.dtype) -> None:
         self.options, self.packed = options, packed
         lists = options.lists
         n_tiles, n_pixels = lists.tiles_x * lists.tiles_y, lists.tile_size**2
@@ -198,7 +202,7 @@ class _Canvas:
 
 
 def _tiles_of_cotangents(
-    v_image: Tensor | None, v_alphas: Tensor | None, options: _Options, blender: Blender
+    v_image: Tensor | None, v_alphas: Tensor | None, options: BlendOptions, blender: Blender
 ) -> Tensor:
     """Cut the cotangents of image and alphas into tiles. [tiles, D + 1, P]"""
     lists, size = options.lists, options.lists.tile_size
@@ -215,7 +219,7 @@ def _tiles_of_cotangents(
 class _Gradients:
     """Gradients of splats, gathered group by group."""
 
-    def __init__(self, saved: _Saved, options: _Options) -> None:
+    def __init__(self, saved: _Saved, options: BlendOptions) -> None:
         self.saved, self.sink = saved, options.absgrad_sink
         table = saved.blender.table
         self.n_colors = table.shape[2] - 7

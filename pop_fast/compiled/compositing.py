@@ -1,8 +1,13 @@
-"""Blend splats into an image by the compiled library, differentiably. Meaning: `pop_ref.compositing`."""
+"""Blend splats into an image by the compiled library, differentiably. Meaning: `pop_ref.compositing`.
+
+Optimizations: in C++ (`forward.h`, `backward.h`), sixteen pixels at a time in float32, tiles shared out to threads;
+entries that lie under the alpha floor for all sixteen are passed over; what is kept for the transpose is the light of
+every pixel before every sixteenth entry.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -10,71 +15,16 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pop_fast.compiled.library import Blend, BlendBackward, call_library, this_library
-from pop_fast.compositing import Composite
+from pop_fast.compositing import BlendOptions
+from pop_fast.compositing import composite as composite_in_torch
 from pop_fast.tiles import TileLists
 from pop_fast.transmittance import Stop, below
-from pop_ref.constants import PAPER, Profile
-
-
-def composite(
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    lists: TileLists,
-    width: int,
-    height: int,
-    profile: Profile = PAPER,
-    *,
-    dominance: bool = False,
-    counts: bool = False,
-    absgrad_sink: Tensor | None = None,
-) -> Composite:
-    """Blend every tile's list front to back, over black. See `pop_ref.compositing.composite`.
-
-    Optimizations: in C++ (`forward.h`, `backward.h`), sixteen pixels at a time in float32, tiles shared out to threads;
-    entries that lie under the alpha floor for all sixteen are passed over; what is kept for the transpose is the light
-    of every pixel before every sixteenth entry.
-
-    Args:
-        means2d: screen centres, px. [N, 2]
-        conics: inverse screen covariances, px^-2. [N, 3]
-        opacities: [N]
-        colors: any number of channels. [N, D]
-        lists: what each tile blends.
-        width: px.
-        height: px.
-        profile: constants and strictness.
-        dominance: also find dominant ids.
-        counts: also count blended and traversed entries.
-        absgrad_sink: [N, 2], to which the transpose adds the sum over pixels of |dL/dmeans2d|.
-
-    Returns:
-        The blended view; `image` and `alphas` are differentiable.
-    """
-    inputs = (means2d, conics, opacities, colors)
-    keep = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
-    options = _Options(lists, width, height, profile, dominance, counts, keep, absgrad_sink)
-    image, alphas, ids, weights, blended, traversed, pairs = _Composite.apply(*inputs, options)
-    return Composite(image, alphas, ids, weights, blended, traversed, int(pairs))
-
-
-@dataclass(frozen=True)
-class _Options:
-    lists: TileLists
-    width: int
-    height: int
-    profile: Profile
-    dominance: bool
-    counts: bool
-    keep: bool
-    absgrad_sink: Tensor | None
 
 
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, options: _Options
+        ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, options: BlendOptions
     ) -> tuple[Tensor | None, ...]:
         # once for both directions
         inputs = tuple(tensor.contiguous() for tensor in (means2d, conics, opacities, colors))
@@ -102,7 +52,7 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
-        options: _Options = ctx.options
+        options: BlendOptions = ctx.options
         inputs, sink = ctx.saved_tensors, options.absgrad_sink
         # component rows, as the projection's transpose takes them
         found = {name: tensor.new_empty(tensor.shape[::-1]) for name, tensor in zip(_RESULTS, inputs, strict=True)}
@@ -121,13 +71,13 @@ class _Composite(torch.autograd.Function):
 _RESULTS = ("v_means2d", "v_conics", "v_opacities", "v_colors")
 
 
-def _arguments(inputs: tuple[Tensor, ...], options: _Options) -> dict[str, Tensor | None]:
+def _arguments(inputs: tuple[Tensor, ...], options: BlendOptions) -> dict[str, Tensor | None]:
     means2d, conics, opacities, colors = inputs
     splats = {"means2d": means2d, "conics": conics, "opacities": opacities, "colors": colors}
     return {**splats, "ids": options.lists.ids, "offsets": options.lists.offsets}
 
 
-def _numbers(inputs: tuple[Tensor, ...], options: _Options) -> dict[str, float]:
+def _numbers(inputs: tuple[Tensor, ...], options: BlendOptions) -> dict[str, float]:
     lists, profile, dtype = options.lists, options.profile, inputs[0].dtype
     return {
         "n": len(inputs[0]),
@@ -155,3 +105,6 @@ def _lights(lists: TileLists, like: Tensor) -> dict[str, Tensor]:
         "lights": like.new_empty(int(chunks.sum()) * pixels),
         "strips": torch.empty_like(lists.ids),
     }
+
+
+composite = partial(composite_in_torch, function=_Composite)

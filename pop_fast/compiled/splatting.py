@@ -24,7 +24,7 @@ def colors_of_view(sh: Tensor, means: Tensor, viewmat: Tensor, degree: int, visi
         degree: bands to use.
         visible: rows to evaluate, ascending. [V] int64
     """
-    return _Colors.apply(sh, means, viewmat, degree, visible)  # type: ignore[no-any-return]
+    return _Colors.apply(sh, means, viewmat, degree, visible)
 
 
 class _Colors(torch.autograd.Function):

@@ -8,15 +8,17 @@ import pytest
 
 pytest.register_assert_rewrite("pop_ref.conformance.laws")
 
-from pop_ref.conformance.poison import poisoned_allocations  # noqa: E402  asserts must be rewritten first
-from tests.judged import judge_own_backends  # noqa: E402
 
-
+# what follows is imported in the functions, after asserts have been registered to be rewritten
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    from tests.judged import judge_own_backends
+
     judge_own_backends(metafunc)
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _allocations_are_poisoned() -> Iterator[None]:
+    from pop_ref.conformance.poison import poisoned_allocations
+
     with poisoned_allocations("pop_fast"):
         yield
