@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 
 from pop_ref.conformance.abilities import STAGES
+from pop_ref.conformance.backends import ELSEWHERE, SHIPPED
 from pop_ref.conformance.mutants.trial import every_law
 
 FILE = Path(__file__).with_name("LAWS.md")
@@ -19,8 +21,8 @@ pytest --pyargs pop_ref.conformance --rasterizer my.module:rasterization --profi
 
 `--rasterizer` names a function with gsplat's signature, `--stages` a package whose modules carry the oracle's function
 names, `--adapter` a class derived from `pop_ref.conformance.Adapter`, for single stages or another signature, and
-`--backend` an adapter that comes with the kit: oracle, fast64, fast32, mirror64, mirror32, cuda, gsplat,
-gsplat-torch64, gsplat-torch32, diff-gaussian-rasterization; what is not installed is skipped with the reason.
+`--backend` an adapter that comes with the kit; what is not installed is skipped with the reason. There are:
+BACKENDS
 
 `--profile` says which constants a rasterizer has; `--dtype float64` charges double precision; `--stage compositing`
 keeps the laws of one stage. `HYPOTHESIS_PROFILE` is `dev`, `ci` or `thorough`. What an implementation does not offer is
@@ -55,7 +57,8 @@ oracle's outcomes with the doubtful decisions taken either way.
 def catalogue() -> str:
     """Return the list as Markdown."""
     laws = every_law().values()
-    parts = [HEAD, f"## {len(laws)} laws\n"]
+    backends = textwrap.fill(", ".join((*SHIPPED, *ELSEWHERE)) + ".", width=120, break_on_hyphens=False)
+    parts = [HEAD.replace("BACKENDS", backends), f"## {len(laws)} laws\n"]
     for stage in STAGES:
         names = sorted(law.name for law in laws if law.stage == stage)
         parts.append(f"### {stage}\n\n" + "\n".join(f"- {name.replace('_', ' ')}" for name in names) + "\n")
