@@ -2,11 +2,13 @@
 
 Every loss is one autograd node that makes its gradient together with its value: losses are scalars, so backward is one
 product, and what is kept for it is one image. `moments=target_moments(target)` spares the part of SSIM that depends on
-the photograph alone. Derivatives are taken by the render only; a target that requires a gradient is refused.
+the photograph alone; `dissimilarity` is what computes SSIM, by default `pop_fast.ssim.mean_dissimilarity`. Derivatives
+are taken by the render only; a target that requires a gradient is refused.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -18,6 +20,8 @@ __all__ = ["Padding", "TargetMoments", "target_moments", "ssim_map", "l1", "l1_v
 __all__ += ["ssim", "ssim_vjp", "d_ssim", "d_ssim_vjp"]
 __all__ += ["photometric_3dgs", "photometric_3dgs_vjp", "photometric_pop", "photometric_pop_vjp"]
 
+Dissimilarity = Callable[..., tuple[Tensor, Tensor | None]]
+
 
 class _Terms(NamedTuple):
     """`pixel_weight * (l1 or l2) + d_ssim_weight * (1 - ssim) + constant`; a weight of None leaves the term out."""
@@ -26,6 +30,7 @@ class _Terms(NamedTuple):
     pixel_weight: float | None = None
     d_ssim_weight: float | None = None
     constant: float = 0.0
+    dissimilarity: Dissimilarity = mean_dissimilarity
 
 
 _SSIM = _Terms(d_ssim_weight=-1.0, constant=1.0)
@@ -57,12 +62,14 @@ def ssim(
     padding: Padding = "valid",
     mask: Tensor | None = None,
     moments: TargetMoments | None = None,
+    *,
+    dissimilarity: Dissimilarity = mean_dissimilarity,
 ) -> Tensor:
     """See `pop_ref.ssim.ssim`.
 
     Optimizations: see `pop_fast.ssim`; `moments` of the target may be passed.
     """
-    return _loss(image, target, _SSIM, padding, mask, moments)
+    return _loss(image, target, _SSIM._replace(dissimilarity=dissimilarity), padding, mask, moments)
 
 
 def ssim_vjp(
@@ -84,9 +91,12 @@ def d_ssim(
     mask: Tensor | None = None,
     halved: bool = False,
     moments: TargetMoments | None = None,
+    *,
+    dissimilarity: Dissimilarity = mean_dissimilarity,
 ) -> Tensor:
     """See `pop_ref.ssim.d_ssim`."""
-    return _loss(image, target, _Terms(d_ssim_weight=0.5 if halved else 1.0), padding, mask, moments)
+    terms = _Terms(d_ssim_weight=0.5 if halved else 1.0, dissimilarity=dissimilarity)
+    return _loss(image, target, terms, padding, mask, moments)
 
 
 def d_ssim_vjp(
@@ -111,12 +121,15 @@ def photometric_3dgs(
     halved: bool = False,
     l1_scale: float = 1.0,
     moments: TargetMoments | None = None,
+    *,
+    dissimilarity: Dissimilarity = mean_dissimilarity,
 ) -> Tensor:
     """See `pop_ref.losses.photometric_3dgs`.
 
     Optimizations: both terms and their gradients in one autograd node.
     """
-    terms = _Terms("l1", (1.0 - lambda_ssim) * l1_scale, lambda_ssim * (0.5 if halved else 1.0))
+    weights = ((1.0 - lambda_ssim) * l1_scale, lambda_ssim * (0.5 if halved else 1.0))
+    terms = _Terms("l1", *weights, dissimilarity=dissimilarity)
     return _loss(image, target, terms, padding, mask, moments)
 
 
@@ -145,12 +158,15 @@ def photometric_pop(
     halved: bool = False,
     l2_scale: float = 1.0,
     moments: TargetMoments | None = None,
+    *,
+    dissimilarity: Dissimilarity = mean_dissimilarity,
 ) -> Tensor:
     """See `pop_ref.losses.photometric_pop`.
 
     Optimizations: both terms and their gradients in one autograd node.
     """
-    terms = _Terms("l2", (1.0 - lambda_ssim) * l2_scale, lambda_ssim * (0.5 if halved else 1.0))
+    weights = ((1.0 - lambda_ssim) * l2_scale, lambda_ssim * (0.5 if halved else 1.0))
+    terms = _Terms("l2", *weights, dissimilarity=dissimilarity)
     return _loss(image, target, terms, padding, mask, moments)
 
 
@@ -218,7 +234,7 @@ def _value_and_gradient(
         if moments is None:
             moments = target_moments(target, padding)
         weight = terms.d_ssim_weight if want_grad else None
-        dissimilarity, grad = mean_dissimilarity(difference, moments, mask, weight)
+        dissimilarity, grad = terms.dissimilarity(difference, moments, mask, weight)
         value = value + terms.d_ssim_weight * dissimilarity
     if terms.pixel_weight is not None:
         n = image.numel() if mask is None else max(int(mask.sum()), 1) * image.shape[2]

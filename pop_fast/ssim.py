@@ -44,7 +44,7 @@ C1 = 0.01**2
 C2 = 0.03**2
 # values per band and map, 1 MB in float32: smaller bands are too short for the threads, larger ones leave the caches
 _BAND_VALUES = 1 << 18
-_REACH = WINDOW_SIZE - 1
+REACH = WINDOW_SIZE - 1
 
 
 def gaussian_window() -> Tensor:
@@ -81,7 +81,7 @@ class TargetMoments:
 def target_moments(target: Tensor, padding: Padding = "valid") -> TargetMoments:
     """Blur a photograph and its square, for any number of renders to be compared with it."""
     check_size(target, padding)
-    channels, border = target.shape[2], _border(padding)
+    channels, border = target.shape[2], border_of(padding)
     # in float64: this is where the textbook form would lose its digits, and it is done once per view
     y = target.double().reshape(target.shape[0], -1)
     padded = torch.nn.functional.pad(y, (border * channels, border * channels, border, border))
@@ -114,13 +114,13 @@ def mean_dissimilarity(
     """
     channels = difference.shape[2]
     d = difference.reshape(len(difference), -1)
-    kept = None if mask is None else _kept_windows(mask, moments.padding, channels, d.dtype)
+    kept = None if mask is None else kept_windows(mask, moments.padding, channels, d.dtype)
     n = moments.mu_y.numel() if kept is None else int(kept.sum())
     if n == 0:
         return d.new_zeros(()), None if weight is None else torch.zeros_like(difference)
     total = d.new_zeros((), dtype=torch.float64)
     rows, cols = moments.mu_y.shape
-    margin = _REACH - _border(moments.padding)
+    margin = REACH - border_of(moments.padding)
     partials = None if weight is None else d.new_zeros((3, rows + 2 * margin, cols + 2 * margin * channels))
     for band in _bands(rows, cols):
         dissimilarity, v_band = _compare_rows(d, moments, band, None if weight is None else weight / n)
@@ -147,7 +147,8 @@ def check_size(image: Tensor, padding: Padding) -> None:
         )
 
 
-def _border(padding: Padding) -> int:
+def border_of(padding: Padding) -> int:
+    """Return how many pixels of black are put around an image."""
     return WINDOW_SIZE // 2 if padding == "same" else 0
 
 
@@ -158,7 +159,7 @@ def _bands(rows: int, cols: int) -> list[slice]:
 
 def _blur(maps: Tensor, channels: int) -> Tensor:
     """Sum maps [M, H, L] under every whole window: [M, H - 10, L - 10 channels]."""
-    rows, cols = maps.shape[1] - _REACH, maps.shape[2] - _REACH * channels
+    rows, cols = maps.shape[1] - REACH, maps.shape[2] - REACH * channels
     down = maps[:, :rows] * _TAPS[0]
     for i in range(1, WINDOW_SIZE):
         down.add_(maps[:, i : i + rows], alpha=_TAPS[i])
@@ -192,9 +193,9 @@ def _compare_rows(
 
 def _products(d: Tensor, moments: TargetMoments, band: slice) -> Tensor:
     """Return d, d² and d y on the rows that a band's windows read, with the zero border of "same". [3, ., .]"""
-    border, y = _border(moments.padding), moments.target.reshape(len(d), -1)
+    border, y = border_of(moments.padding), moments.target.reshape(len(d), -1)
     side = border * moments.target.shape[2]
-    top, bottom = band.start - border, band.stop - border + _REACH
+    top, bottom = band.start - border, band.stop - border + REACH
     first, last = max(top, 0), min(bottom, len(d))
     shape = (3, bottom - top, d.shape[1] + 2 * side)
     maps = d.new_zeros(shape) if border else d.new_empty(shape)
@@ -209,13 +210,14 @@ def _gather(d: Tensor, target: Tensor, partials: Tensor) -> Tensor:
     """Return the gradient: each pixel gathers from all windows over it. The window is symmetric, so this is a blur."""
     v_x, y = torch.empty_like(d), target.reshape(len(d), -1)
     for band in _bands(*d.shape):
-        by_mu, by_half_dd, by_dy = _blur(partials[:, band.start : band.stop + _REACH], target.shape[2]).unbind(0)
+        by_mu, by_half_dd, by_dy = _blur(partials[:, band.start : band.stop + REACH], target.shape[2]).unbind(0)
         torch.addcmul(by_mu, d[band], by_half_dd, out=v_x[band])
         v_x[band].addcmul_(y[band], by_dy)
     return v_x
 
 
-def _kept_windows(mask: Tensor, padding: Padding, channels: int, dtype: torch.dtype) -> Tensor:
+def kept_windows(mask: Tensor, padding: Padding, channels: int, dtype: torch.dtype) -> Tensor:
+    """Return 1 for every window and channel whose centre the mask [H, W] keeps, 0 for the others. [h, w D]"""
     margin = WINDOW_SIZE // 2
     centres = mask[margin:-margin, margin:-margin] if padding == "valid" else mask
     return centres.repeat_interleave(channels, dim=1).to(dtype)

@@ -12,11 +12,11 @@ from pop_ref.conformance.plugin import parametrize_backends
 
 
 def judge_own_backends(metafunc: pytest.Metafunc) -> None:
-    """Run a law over the oracle and `pop_fast`, in torch and, where the law renders, with the compiled blend.
+    """Run a law over the oracle and `pop_fast`, in torch and, where a compiled stage is in it, in C++, too.
 
-    Up to the blend that is the same code, so that laws of earlier stages have nothing to judge there.
+    Every other stage is the same code there, so that its laws have nothing to judge.
     """
     stated = getattr(metafunc.function, "law", None)
     compiled: list[Any] = [shipped_or_absent(name) for name in ("compiled64", "compiled32")]
-    rendering = [b for b in compiled if isinstance(b, Absent) or not (stated and missing(b, stated.needs))]
-    parametrize_backends(metafunc, [*map(shipped, SHIPPED), *rendering])
+    concerned = [b for b in compiled if isinstance(b, Absent) or not (stated and missing(b, stated.needs))]
+    parametrize_backends(metafunc, [*map(shipped, SHIPPED), *concerned])

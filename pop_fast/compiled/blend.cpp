@@ -6,6 +6,7 @@
 #include "colors.h"
 #include "forward.h"
 #include "lists.h"
+#include "ssim.h"
 #include "threads.h"
 
 namespace pop {
@@ -60,11 +61,17 @@ POP_STAGE(colors_backward, Colors, color_backward)
 POP_STAGE(lists, Lists, list_tiles)
 POP_STAGE(forward, Blend, forward)
 POP_STAGE(backward, Blend, backward)
+POP_STAGE(ssim, Ssim, dissimilarity)
 
 // what `library.py` compares and asks for
 int64_t pop_colors_bytes() { return int64_t(sizeof(pop::Colors<float>)); }
 int64_t pop_lists_bytes() { return int64_t(sizeof(pop::Lists<float>)); }
 int64_t pop_blend_bytes() { return int64_t(sizeof(pop::Blend<float>)); }
+int64_t pop_ssim_bytes() { return int64_t(sizeof(pop::Ssim<float>)); }
+int64_t pop_window_rows() { return pop::WINDOW_ROWS; }
+int64_t pop_padded_line(int64_t length, int64_t bytes) {
+  return bytes == 8 ? pop::padded_line<double>(length) : pop::padded_line<float>(length);
+}
 int64_t pop_chunk() { return pop::CHUNK; }
 int64_t pop_padded_pixels(int64_t tile_size, int64_t bytes) {
   return bytes == 8 ? pop::Pixels<double>(int(tile_size)).padded() : pop::Pixels<float>(int(tile_size)).padded();

@@ -67,12 +67,24 @@ class BlendBackward(Blend):
     """The same, for the transpose."""
 
 
+class Ssim(ctypes.Structure):
+    """`pop::Ssim` of ssim.h, where every field is explained, in its order."""
+
+    _fields_ = (
+        *_fields(_POINTER, "difference", "target", "mu_y", "s_yy", "kept"),
+        *_fields(_WHOLE, "height", "width", "channels", "border", "stride", "threads"),
+        *_fields(_REAL, "weight"),
+        *_fields(_POINTER, "totals", "partials", "gradient"),
+    )
+
+
 _NAMES: dict[type[ctypes.Structure], str] = {
     Colors: "colors",
     ColorsBackward: "colors_backward",
     Lists: "lists",
     Blend: "forward",
     BlendBackward: "backward",
+    Ssim: "ssim",
 }
 
 
@@ -84,12 +96,16 @@ class Library:
         functions: by layout and type.
         chunk: list entries after which the blend writes down the light.
         padded_pixels: pixels of a tile of that size, padded to whole vectors of floats of so many bytes.
+        window_rows: rows of SSIM's windows whose total is one number.
+        padded_line: numbers from one row of maps to the next, for rows of that many numbers of so many bytes.
         fork: starts the threads, or None.
     """
 
     functions: dict[tuple[type[ctypes.Structure], torch.dtype], Callable[..., None]]
     chunk: int
     padded_pixels: Callable[[int, int], int]
+    window_rows: int
+    padded_line: Callable[[int, int], int]
     fork: Any
 
 
@@ -127,10 +143,10 @@ def open_library(path: str) -> Library:
         OSError: it is missing, does not load, or was not made from the same source as this module.
     """
     loaded = ctypes.CDLL(path)
-    sizes = {"pop_colors_bytes": Colors, "pop_lists_bytes": Lists, "pop_blend_bytes": Blend}
-    for name in (*sizes, "pop_chunk", "pop_padded_pixels"):
+    sizes = {f"pop_{layout.__name__.lower()}_bytes": layout for layout in (Colors, Lists, Blend, Ssim)}
+    for name in (*sizes, "pop_chunk", "pop_padded_pixels", "pop_window_rows", "pop_padded_line"):
         getattr(loaded, name).restype = _WHOLE
-    loaded.pop_padded_pixels.argtypes = (_WHOLE, _WHOLE)
+    loaded.pop_padded_pixels.argtypes = loaded.pop_padded_line.argtypes = (_WHOLE, _WHOLE)
     if any(getattr(loaded, name)() != ctypes.sizeof(layout) for name, layout in sizes.items()):
         raise OSError(f"{path} expects arguments of another layout")
     functions: dict[tuple[type[ctypes.Structure], torch.dtype], Callable[..., None]] = {}
@@ -139,7 +155,8 @@ def open_library(path: str) -> Library:
             function = getattr(loaded, f"pop_{name}_{str(dtype).removeprefix('torch.')}")
             function.argtypes, function.restype = (_POINTER, _POINTER), None
             functions[layout, dtype] = function
-    return Library(functions, loaded.pop_chunk(), loaded.pop_padded_pixels, _fork())
+    numbers = (loaded.pop_chunk(), loaded.pop_padded_pixels, loaded.pop_window_rows(), loaded.pop_padded_line)
+    return Library(functions, *numbers, _fork())
 
 
 def _fork() -> Any:

@@ -85,7 +85,8 @@ def _elsewhere(name: str) -> Any:
         reason = importlib.import_module("pop_fast.compiled").why_not()
         if reason is not None:
             raise Unavailable(reason)
-        return adapter_for("pop_fast.compiled.rasterization:rasterization", name, None, f"float{name[-2:]}")
+        package = "pop_fast.compiled"
+        return adapter_for(f"{package}.rasterization:rasterization", name, package, f"float{name[-2:]}")
     if name.startswith("mirror"):
         reason = importlib.import_module("cuda_ext.host_mirror").find_compiler() is None
         if reason:
