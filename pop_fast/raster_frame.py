@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from pop_fast.compositing import Composite, composite
+from pop_fast.compositing import Composite
 from pop_fast.dominance import dominant_counts
 from pop_fast.raster_meta import RenderMeta, intersections
-from pop_fast.splatting import Splats, View, colors_of_view, project
-from pop_fast.tiles import TileLists, tile_lists
+from pop_fast.raster_stages import Stages
+from pop_fast.splatting import Splats, View
 
 SMALL_TILE, LARGE_TILE = 8, 16  # px
 SMALL_TILE_BELOW = 14.0  # px, root mean square extent of the visible splats; see benchmarks/NOTES.md
@@ -71,21 +70,6 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Stages:
-    """The stages that a backend may have its own of.
-
-    Attributes:
-        colors_of_view: as `pop_fast.splatting.colors_of_view`.
-        tile_lists: as `pop_fast.tiles.tile_lists`.
-        composite: as `pop_fast.compositing.composite`.
-    """
-
-    colors_of_view: Callable[..., Tensor] = colors_of_view
-    tile_lists: Callable[..., TileLists] = tile_lists
-    composite: Callable[..., Composite] = composite
-
-
-@dataclass(frozen=True)
 class Frame:
     """One call of `rasterization`.
 
@@ -129,7 +113,7 @@ class Frame:
         scene, n = self.scene, self.scene.n_cameras
         scenes = list(zip(_items(scene.means), _items(scene.covars), _items(scene.opacities), strict=True))
         return [
-            project(*scenes[i // n], viewmat, replace(self.view, K=K))
+            self.stages.project(*scenes[i // n], viewmat, replace(self.view, K=K))
             for i, (viewmat, K) in enumerate(zip(_items(scene.viewmats), scene.Ks, strict=True))
         ]
 

@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from pop_fast.backends import get_backend, require_backend
-from pop_fast.raster_frame import Frame, Scene, Stages
+from pop_fast.backends import get_backend
+from pop_fast.raster_frame import Frame, Scene
 from pop_fast.raster_inputs import (
     RENDER_MODES,
     check_cameras,
@@ -19,7 +19,8 @@ from pop_fast.raster_inputs import (
     resolved_profile,
 )
 from pop_fast.raster_meta import RenderMeta
-from pop_fast.splatting import View, covariances
+from pop_fast.raster_stages import stages_of
+from pop_fast.splatting import View
 from pop_ref.constants import Profile
 
 
@@ -149,11 +150,11 @@ def rasterization(
     if backgrounds is not None:
         n_plain = 3 if sh_degree is not None else colors.shape[-1]
         check_tensor("backgrounds", backgrounds, (*batch, n_cameras, n_plain), means.dtype)
-    n = means.shape[-2]
+    n, stages = means.shape[-2], stages_of(backend)
     if covars is None:
         assert quats is not None
         assert scales is not None
-        covars = covariances(quats.reshape(-1, 4), scales.reshape(-1, 3))
+        covars = stages.covariances(quats.reshape(-1, 4), scales.reshape(-1, 3))
     n_scenes = math.prod(batch)
     n_images = n_scenes * n_cameras
     scene = Scene(
@@ -169,16 +170,5 @@ def rasterization(
     chosen = resolved_profile(profile, near_plane, far_plane, eps2d)
     view = View(Ks, width, height, chosen, rasterize_mode == "antialiased", radius_clip)
     options = (tile_size, sh_degree, render_mode, packed, absgrad)
-    frame = Frame(scene, (*batch, n_cameras), view, *options, _stages_of(backend))
+    frame = Frame(scene, (*batch, n_cameras), view, *options, stages)
     return frame.render(backgrounds, dominance, counts)
-
-
-def _stages_of(backend: str) -> Stages:
-    if backend == "fast":
-        return Stages()
-    require_backend(backend)
-    from pop_fast.compiled.compositing import composite
-    from pop_fast.compiled.splatting import colors_of_view
-    from pop_fast.compiled.tiles import tile_lists
-
-    return Stages(colors_of_view, tile_lists, composite)

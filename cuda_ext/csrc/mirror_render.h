@@ -243,8 +243,9 @@ void render_vjp(Arguments<Real>& a) {
         Vec3<Real> v_sum;
         const Vec3<Real> v_dir = color_from_sh_vjp(sh_row(a, i), view_dir(vec3(a.in[MEANS], i), frame.camera),
                                                    a.integers[DEGREE], Vec3<Real>{m[0], m[1], m[2]}, basis, v_sum);
-        const GaussianVjp<Real> g = project_one_vjp(gaussian(a, i), frame.camera, a.profile, frame.options, v.v_mean2d,
-                                                    v.v_conic, v.v_opacity, Real(0), v_dir, v_viewmat);
+        const SplatCotangents<Real> of_splat = {v.v_mean2d, Real(0), v.v_conic, v.v_opacity, Real(0)};
+        const GaussianVjp<Real> g =
+            project_one_vjp(gaussian(a, i), frame.camera, a.profile, frame.options, of_splat, v_dir, v_viewmat);
         put(a.out[0], i, g.v_mean);
         put(a.out[1], i, g.v_quat);
         put(a.out[2], i, g.v_scale);

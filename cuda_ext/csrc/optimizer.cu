@@ -140,8 +140,8 @@ __device__ __forceinline__ void make_gradients(const UpdateArrays& a, const View
         const Vec3<float> v_dir = color_from_sh_vjp(sh, view_dir(g.mean, camera), settings.sh_degree,
                                                     Vec3<float>{row[0], row[1], row[2]}, basis, v_sum);
         ViewmatVjp<float> unused = {};
-        v = project_one_vjp(g, camera, settings.profile, settings.options, of.v_mean2d, of.v_conic, of.v_opacity, 0.0f,
-                            v_dir, unused);
+        const SplatCotangents<float> of_splat = {of.v_mean2d, 0.0f, of.v_conic, of.v_opacity, 0.0f};
+        v = project_one_vjp(g, camera, settings.profile, settings.options, of_splat, v_dir, unused);
         v_mean2d = of.v_mean2d;
     }
     if (a.lambda_pop != 0.0f)

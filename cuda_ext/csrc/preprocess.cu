@@ -132,9 +132,9 @@ __global__ void __launch_bounds__(PROJECT_BLOCK)
                                       Vec3<float>{c[0], c[1], c[2]}, basis, v_sum);
         }
         const float *u = of.v_means2d + 2 * i, *q = of.v_conics + 3 * i;
-        v = project_one_vjp(g, camera, settings.profile, settings.options, Vec2<float>{u[0], u[1]},
-                            Conic<float>{q[0], q[1], q[2]}, of.v_opacities[i],
-                            v_depths == nullptr ? 0.0f : v_depths[i], v_dir, v_viewmat);
+        const SplatCotangents<float> of_splat = {
+            {u[0], u[1]}, v_depths == nullptr ? 0.0f : v_depths[i], {q[0], q[1], q[2]}, of.v_opacities[i], 0.0f};
+        v = project_one_vjp(g, camera, settings.profile, settings.options, of_splat, v_dir, v_viewmat);
     }
     if (row_exists) {
         store3(gradients.v_means, i, v.v_mean);

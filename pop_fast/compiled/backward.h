@@ -30,7 +30,7 @@ template <class Real> struct Transpose {
     });
   }
 
-  void blend_again(const Limits<Real> &limits, const Pixels<Real> &pixels, const Entries<Real> &entries,
+  void blend_again(const Thresholds<Real> &thresholds, const Pixels<Real> &pixels, const Entries<Real> &entries,
                    const Real *lights, const uint64_t *of_forward) {
     marks = of_forward;
     Real *to_alphas = alphas.data(), *to_weights = weights.data();
@@ -41,7 +41,7 @@ template <class Real> struct Transpose {
       for (int k = 0; k < entries.count; k++) {
         if (!(of_forward[k] >> (strip % 64) & 1)) continue;
         Vec<Real> alpha{}, weight{};
-        take(limits, entries.f[k], x, y, T, alpha, weight);
+        take(thresholds, entries.f[k], x, y, T, alpha, weight);
         store(to_alphas + k * padded + at, alpha);
         store(to_weights + k * padded + at, weight);
       }
@@ -62,7 +62,7 @@ inline Vec<Real> through_ceiling(const Blend<Real> &blend, Real ceiling, const R
 
 // One entry's row: moments of G, gradient to the colours, sums of |G dlog(alpha)/dx| and |..dy|. D as in blend_strip.
 template <class Real, int D>
-void entry_row(const Blend<Real> &blend, const Limits<Real> &limits, const Pixels<Real> &pixels,
+void entry_row(const Blend<Real> &blend, const Thresholds<Real> &thresholds, const Pixels<Real> &pixels,
                const Entries<Real> &entries, int k, Transpose<Real> &state, Real *row) {
   const int64_t channels = D ? D : blend.channels;
   const int padded = state.padded, strips = state.strips;
@@ -90,7 +90,7 @@ void entry_row(const Blend<Real> &blend, const Limits<Real> &limits, const Pixel
     }
     store(all_behind + at, behind + alpha * q);
     const Vec<Real> x = load(all_x + at), y = load(all_y + at);
-    const Vec<Real> G = through_ceiling(blend, limits.ceiling, f, x, y, alpha, weight * q);
+    const Vec<Real> G = through_ceiling(blend, thresholds.ceiling, f, x, y, alpha, weight * q);
     const Vec<Real> dx = entries.u[k] - x, dy = entries.v[k] - y;
     m += G;
     mx += G * dx;
@@ -117,17 +117,17 @@ void entry_row(const Blend<Real> &blend, const Limits<Real> &limits, const Pixel
 template <class Real, int D>
 void transpose_tile(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_t tile, Transpose<Real> &state) {
   const Place<Real> place(blend, tile);
-  const Limits<Real> limits(blend);
+  const Thresholds<Real> thresholds(blend);
   const int64_t reached = blend.n_reached[tile], n_chunks = (reached + CHUNK - 1) / CHUNK;
   state.begin(blend, place);
   Entries<Real> entries;
   for (int64_t chunk = n_chunks - 1; chunk >= 0; chunk--) {
     const int64_t first = place.begin + chunk * CHUNK;
     entries.gather(blend, place, first, std::min<int64_t>(CHUNK, place.begin + reached - first));
-    state.blend_again(limits, pixels, entries, blend.lights + (blend.first_chunks[tile] + chunk) * state.padded,
+    state.blend_again(thresholds, pixels, entries, blend.lights + (blend.first_chunks[tile] + chunk) * state.padded,
                       blend.strips + first);
     for (int k = entries.count - 1; k >= 0; k--)
-      entry_row<Real, D>(blend, limits, pixels, entries, k, state, blend.rows + (first + k) * blend.columns());
+      entry_row<Real, D>(blend, thresholds, pixels, entries, k, state, blend.rows + (first + k) * blend.columns());
   }
 }
 

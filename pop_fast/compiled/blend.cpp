@@ -6,6 +6,7 @@
 #include "colors.h"
 #include "forward.h"
 #include "lists.h"
+#include "projection.h"
 #include "ssim.h"
 #include "threads.h"
 
@@ -56,6 +57,10 @@ template <class Real> void backward(const Blend<Real> &blend, Fork fork) {
   void pop_##name##_float64(const pop::Layout<double> *given, pop::Fork fork) { pop::function(*given, fork); }
 
 extern "C" {
+POP_STAGE(covariances, Covariances, covariances)
+POP_STAGE(covariances_backward, Covariances, covariances_backward)
+POP_STAGE(projection, Projection, projection)
+POP_STAGE(projection_backward, Projection, projection_backward)
 POP_STAGE(colors, Colors, color_forward)
 POP_STAGE(colors_backward, Colors, color_backward)
 POP_STAGE(lists, Lists, list_tiles)
@@ -64,6 +69,9 @@ POP_STAGE(backward, Blend, backward)
 POP_STAGE(ssim, Ssim, dissimilarity)
 
 // what `library.py` compares and asks for
+int64_t pop_covariances_bytes() { return int64_t(sizeof(pop::Covariances<float>)); }
+int64_t pop_projection_bytes() { return int64_t(sizeof(pop::Projection<float>)); }
+int64_t pop_rows_at_a_time() { return pop::ROWS_AT_A_TIME; }
 int64_t pop_colors_bytes() { return int64_t(sizeof(pop::Colors<float>)); }
 int64_t pop_lists_bytes() { return int64_t(sizeof(pop::Lists<float>)); }
 int64_t pop_blend_bytes() { return int64_t(sizeof(pop::Blend<float>)); }

@@ -24,12 +24,18 @@ from cuda_ext.host_mirror import find_compiler
 
 HERE: Final = Path(__file__).resolve().parent
 SOURCES: Final = (
-    *("colors.h", "lanes.h", "threads.h", "lists.h", "tile.h", "forward.h", "backward.h", "ssim.h"),
-    "blend.cpp",
+    *("projection.h", "colors.h", "lists.h", "tile.h", "forward.h", "backward.h", "ssim.h"),
+    *("lanes.h", "threads.h", "blend.cpp"),
 )
 # one Gaussian's arithmetic is that of the CUDA kernels
 CUDA: Final = Path(cuda_ext.__file__).resolve().parent
-SHARED: Final = ("csrc/real.cuh", "csrc/profile.cuh", "csrc/camera.cuh", "csrc/harmonics.cuh", "csrc/ssim.cuh")
+SHARED: Final = tuple(
+    f"csrc/{name}.cuh"
+    for name in (
+        *("real", "profile", "activations", "covariance", "camera", "projection", "footprint", "tiles", "splatting"),
+        *("harmonics", "ssim"),
+    )
+)
 FLAGS: Final = ("-std=c++17", "-O3", "-fPIC", "-shared", "-pthread")
 # for this processor, as compilers of different kinds and ages spell it; the last resort is any processor of its kind
 TUNING: Final = (("-march=native",), ("-mcpu=native",), ())

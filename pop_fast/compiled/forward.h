@@ -32,7 +32,7 @@ template <class Real> struct Canvas {
 
 // Blend some entries into one strip. D channels, known to the compiler unless 0.
 template <class Real, int D>
-void blend_strip(const Blend<Real> &blend, const Limits<Real> &limits, const Pixels<Real> &pixels,
+void blend_strip(const Blend<Real> &blend, const Thresholds<Real> &thresholds, const Pixels<Real> &pixels,
                  const Entries<Real> &entries, int64_t place_in_list, int at, Canvas<Real> &canvas, uint64_t *marks) {
   const uint64_t mark = uint64_t(1) << (at / LANES<Real> % 64);
   const Vec<Real> x = load(&pixels.x[at]), y = load(&pixels.y[at]);
@@ -44,7 +44,7 @@ void blend_strip(const Blend<Real> &blend, const Limits<Real> &limits, const Pix
       store_whole<Real>(visits, load_whole<Real>(visits) - (T > Real(0)));
     }
     Vec<Real> alpha, weight;
-    if (!take(limits, entries.f[k], x, y, T, alpha, weight)) continue;
+    if (!take(thresholds, entries.f[k], x, y, T, alpha, weight)) continue;
     marks[k] |= mark;
     sum_of_weights += weight;
     for (int d = 0; d < D; d++) colors[d] += weight * entries.color[k][d];
@@ -89,7 +89,7 @@ template <class Real> void write(const Blend<Real> &blend, const Place<Real> &pl
 template <class Real, int D>
 void blend_tile(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_t tile, Canvas<Real> &canvas) {
   const Place<Real> place(blend, tile);
-  const Limits<Real> limits(blend);
+  const Thresholds<Real> thresholds(blend);
   canvas.clear(place);
   Entries<Real> entries;
   int64_t at = place.begin, pairs = 0;
@@ -102,7 +102,7 @@ void blend_tile(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_t ti
     }
     for (int strip = 0; strip < pixels.strips; strip++) {
       if (!canvas.lit(strip)) continue;
-      blend_strip<Real, D>(blend, limits, pixels, entries, at - place.begin, strip * LANES<Real>, canvas, marks);
+      blend_strip<Real, D>(blend, thresholds, pixels, entries, at - place.begin, strip * LANES<Real>, canvas, marks);
       pairs += int64_t(entries.count) * std::min(LANES<Real>, pixels.count - strip * LANES<Real>);
     }
     if (blend.strips) std::copy(marks, marks + entries.count, blend.strips + at);

@@ -23,6 +23,39 @@ def _fields(kind: Any, *names: str) -> tuple[tuple[str, Any], ...]:
     return tuple((name, kind) for name in names)
 
 
+class Covariances(ctypes.Structure):
+    """`pop::Covariances` of projection.h, where every field is explained, in its order."""
+
+    _fields_ = (
+        *_fields(_POINTER, "quats", "scales"),
+        *_fields(_WHOLE, "n", "threads"),
+        *_fields(_POINTER, "covars", "v_covars", "v_quats", "v_scales"),
+    )
+
+
+class CovariancesBackward(Covariances):
+    """The same, for the transpose."""
+
+
+class Projection(ctypes.Structure):
+    """`pop::Projection` of projection.h, where every field is explained, in its order."""
+
+    _fields_ = (
+        *_fields(_POINTER, "means", "covars", "opacities", "viewmat", "K"),
+        *_fields(_WHOLE, "n", "threads", "width", "height", "tile_size"),
+        *_fields(_WHOLE, "near_inclusive", "centred", "inria_clamp", "square", "antialiased"),
+        *_fields(_REAL, "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas", "alpha_floor"),
+        *_fields(_REAL, "radius_clip"),
+        *_fields(_POINTER, "means2d", "depths", "conics", "blended", "factors", "radii"),
+        *_fields(_POINTER, "v_means2d", "v_depths", "v_conics", "v_blended", "v_factors"),
+        *_fields(_POINTER, "v_means", "v_covars", "v_opacities", "v_viewmats"),
+    )
+
+
+class ProjectionBackward(Projection):
+    """The same, for the transpose."""
+
+
 class Colors(ctypes.Structure):
     """`pop::Colors` of colors.h, where every field is explained, in its order."""
 
@@ -79,6 +112,10 @@ class Ssim(ctypes.Structure):
 
 
 _NAMES: dict[type[ctypes.Structure], str] = {
+    Covariances: "covariances",
+    CovariancesBackward: "covariances_backward",
+    Projection: "projection",
+    ProjectionBackward: "projection_backward",
     Colors: "colors",
     ColorsBackward: "colors_backward",
     Lists: "lists",
@@ -98,6 +135,7 @@ class Library:
         padded_pixels: pixels of a tile of that size, padded to whole vectors of floats of so many bytes.
         window_rows: rows of SSIM's windows whose total is one number.
         padded_line: numbers from one row of maps to the next, for rows of that many numbers of so many bytes.
+        rows_at_a_time: Gaussians whose share of the camera's gradient is one sum.
         fork: starts the threads, or None.
     """
 
@@ -106,6 +144,7 @@ class Library:
     padded_pixels: Callable[[int, int], int]
     window_rows: int
     padded_line: Callable[[int, int], int]
+    rows_at_a_time: int
     fork: Any
 
 
@@ -143,8 +182,10 @@ def open_library(path: str) -> Library:
         OSError: it is missing, does not load, or was not made from the same source as this module.
     """
     loaded = ctypes.CDLL(path)
-    sizes = {f"pop_{layout.__name__.lower()}_bytes": layout for layout in (Colors, Lists, Blend, Ssim)}
-    for name in (*sizes, "pop_chunk", "pop_padded_pixels", "pop_window_rows", "pop_padded_line"):
+    layouts = (Covariances, Projection, Colors, Lists, Blend, Ssim)
+    sizes = {f"pop_{layout.__name__.lower()}_bytes": layout for layout in layouts}
+    numbers = ("chunk", "padded_pixels", "window_rows", "padded_line", "rows_at_a_time")
+    for name in (*sizes, *(f"pop_{number}" for number in numbers)):
         getattr(loaded, name).restype = _WHOLE
     loaded.pop_padded_pixels.argtypes = loaded.pop_padded_line.argtypes = (_WHOLE, _WHOLE)
     if any(getattr(loaded, name)() != ctypes.sizeof(layout) for name, layout in sizes.items()):
@@ -155,8 +196,15 @@ def open_library(path: str) -> Library:
             function = getattr(loaded, f"pop_{name}_{str(dtype).removeprefix('torch.')}")
             function.argtypes, function.restype = (_POINTER, _POINTER), None
             functions[layout, dtype] = function
-    numbers = (loaded.pop_chunk(), loaded.pop_padded_pixels, loaded.pop_window_rows(), loaded.pop_padded_line)
-    return Library(functions, *numbers, _fork())
+    return Library(
+        functions,
+        loaded.pop_chunk(),
+        loaded.pop_padded_pixels,
+        loaded.pop_window_rows(),
+        loaded.pop_padded_line,
+        loaded.pop_rows_at_a_time(),
+        _fork(),
+    )
 
 
 def _fork() -> Any:

@@ -1,4 +1,7 @@
-"""Colours of a view by the compiled library. Meaning: `pop_ref.splatting`."""
+"""Covariances, projection and colours by the compiled library. Meaning: `pop_ref.splatting`.
+
+The arithmetic of one Gaussian is the one that the CUDA kernels run (`cuda_ext/csrc/splatting.cuh`, `harmonics.cuh`).
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,30 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pop_fast.camera import view_dirs_vjp
-from pop_fast.compiled.library import Colors, ColorsBackward, call_library
+from pop_fast.compiled.library import (
+    Colors,
+    ColorsBackward,
+    Covariances,
+    CovariancesBackward,
+    Projection,
+    ProjectionBackward,
+    call_library,
+    this_library,
+)
+from pop_fast.splatting import Splats, View
+
+
+def covariances(quats: Tensor, scales: Tensor) -> Tensor:
+    """See `pop_fast.splatting.covariances`."""
+    return _Covariances.apply(quats, scales)
+
+
+def project(means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: View) -> Splats:
+    """See `pop_fast.splatting.project`; rows of culled Gaussians hold 0, but for depths and opacities.
+
+    Optimizations: one pass over the Gaussians forward and one backward, which compute everything in between anew.
+    """
+    return Splats(*_Projection.apply(means, covars, opacities, viewmat, view))
 
 
 def colors_of_view(sh: Tensor, means: Tensor, viewmat: Tensor, degree: int, visible: Tensor) -> Tensor:
@@ -25,6 +51,90 @@ def colors_of_view(sh: Tensor, means: Tensor, viewmat: Tensor, degree: int, visi
         visible: rows to evaluate, ascending. [V] int64
     """
     return _Colors.apply(sh, means, viewmat, degree, visible)
+
+
+class _Covariances(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, quats: Tensor, scales: Tensor) -> Tensor:
+        covars = quats.new_empty((len(quats), 3, 3))
+        given = {"quats": quats, "scales": scales, "covars": covars}
+        call_library(Covariances, quats.dtype, {"n": len(quats), "threads": torch.get_num_threads()}, given)
+        ctx.save_for_backward(quats, scales)
+        return covars
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_covars: Tensor) -> tuple[Tensor, Tensor]:
+        quats, scales = ctx.saved_tensors
+        v_quats, v_scales = quats.new_empty(quats.shape), scales.new_empty(scales.shape)
+        given = {"quats": quats, "scales": scales, "v_covars": v_covars, "v_quats": v_quats, "v_scales": v_scales}
+        call_library(CovariancesBackward, quats.dtype, {"n": len(quats), "threads": torch.get_num_threads()}, given)
+        return v_quats, v_scales
+
+
+class _Projection(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: View
+    ) -> tuple[Tensor | None, ...]:
+        n = len(means)
+        results = {
+            "means2d": means.new_empty((n, 2)),
+            "depths": means.new_empty(n),
+            "conics": means.new_empty((n, 3)),
+            "blended": means.new_empty(n),
+            "radii": torch.empty((n, 2), dtype=torch.int32),
+            "factors": means.new_empty(n) if view.antialiased else None,
+        }
+        given = {"means": means, "covars": covars, "opacities": opacities, "viewmat": viewmat, "K": view.K}
+        call_library(Projection, means.dtype, _projection_numbers(n, view), {**given, **results})
+        ctx.view, ctx.radii = view, results["radii"]
+        ctx.save_for_backward(means, covars, opacities, viewmat)
+        ctx.mark_non_differentiable(results["radii"])
+        return tuple(results.values())
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any,
+        v_means2d: Tensor,
+        v_depths: Tensor,
+        v_conics: Tensor,
+        v_blended: Tensor,
+        _v_radii: None,
+        v_factors: Tensor | None,
+    ) -> tuple[Tensor | None, ...]:
+        means, covars, opacities, viewmat = ctx.saved_tensors
+        n_parts = -(-len(means) // this_library().rows_at_a_time)
+        found = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in (means, covars, opacities)]
+        v_viewmats = means.new_empty((n_parts, 3, 4)) if ctx.needs_input_grad[3] else None
+        given = {"means": means, "covars": covars, "opacities": opacities, "viewmat": viewmat, "K": ctx.view.K}
+        given |= {"v_means2d": v_means2d.T, "v_depths": v_depths, "v_conics": v_conics.T, "v_blended": v_blended}
+        given |= {"v_factors": v_factors, "radii": ctx.radii, "v_viewmats": v_viewmats}
+        given |= dict(zip(("v_means", "v_covars", "v_opacities"), found, strict=True))
+        call_library(ProjectionBackward, means.dtype, _projection_numbers(len(means), ctx.view), given)
+        if v_viewmats is None:
+            return (*found, None, None)
+        v_viewmat = torch.zeros_like(viewmat)
+        v_viewmat[:3] = v_viewmats.sum(0, dtype=torch.float64)
+        return (*found, v_viewmat, None)
+
+
+def _projection_numbers(n: int, view: View) -> dict[str, float]:
+    profile = view.profile
+    names = ("tile_size", "near_inclusive", "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas")
+    return {
+        **{name: getattr(profile, name) for name in (*names, "alpha_floor")},
+        "centred": profile.principal_point == "centred",
+        "inria_clamp": profile.clamp_gradient == "inria",
+        "square": profile.extent == "square",
+        "antialiased": view.antialiased,
+        "radius_clip": view.radius_clip,
+        "width": view.width,
+        "height": view.height,
+        "n": n,
+        "threads": torch.get_num_threads(),
+    }
 
 
 class _Colors(torch.autograd.Function):

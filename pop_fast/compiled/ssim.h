@@ -18,9 +18,10 @@ template <class Real> struct Ssim {
   const Real *difference, *target;  // render minus photograph, 0 where it is masked; photograph. [H, W D]
   const Real *mu_y, *s_yy;          // the photograph's moments under every window. [h, w D]
   const Real *kept;                 // 1 for windows that count, 0 for others; null: all count. [h, w D]
-  int64_t height, width, channels, border, stride, threads;  // border: pixels of black around the image; stride: of padded lines
-  double weight;                                             // factor on the gradient
-  double *totals;                                            // sums of 1 - S, for every WINDOW_ROWS rows of windows
+  int64_t height, width, channels;
+  int64_t border, stride, threads;  // pixels of black around the image; from one padded line to the next
+  double weight;                    // factor on the gradient
+  double *totals;                   // sums of 1 - S, for every WINDOW_ROWS rows of windows
   Real *partials;  // derivatives by the moments, with a margin of zeros; null: no gradient. [3, H + 10, stride]
   Real *gradient;  // [H, W D]
 
@@ -70,7 +71,8 @@ template <class Real> struct Blur {
     for (auto &line : lines) line.assign(size_t(stride), Real(0));
   }
 
-  template <class F> void operator()(const Real *const maps[3], int64_t stride, int64_t channels, int64_t columns, F f) {
+  template <class F>
+  void operator()(const Real *const maps[3], int64_t stride, int64_t channels, int64_t columns, F f) {
     for (int map = 0; map < 3; map++)
       for (int64_t k = 0; k < stride; k += LANES<Real>) {
         Vec<Real> v = {};
@@ -174,23 +176,25 @@ template <class Real> void gather_rows(const Ssim<Real> &given, Blur<Real> &blur
   const int64_t width = given.line();
   for (int64_t r = first; r < last; r++) {
     const Real *const maps[3] = {given.partial(0, r), given.partial(1, r), given.partial(2, r)};
-    blur(maps, given.stride, given.channels, width, [&](int64_t k, Vec<Real> by_mu, Vec<Real> by_half_dd, Vec<Real> by_dy) {
+    const auto pixels = [&](int64_t k, Vec<Real> by_mu, Vec<Real> by_half_dd, Vec<Real> by_dy) {
       const int64_t at = r * width + k, n = width - k;
       const Vec<Real> d = load_some(given.difference + at, n), y = load_some(given.target + at, n);
       store_some(given.gradient + at, by_mu + d * by_half_dd + y * by_dy, n);
-    });
+    };
+    blur(maps, given.stride, given.channels, width, pixels);
   }
 }
 
 template <class Real> void dissimilarity(const Ssim<Real> &given, Fork fork) {
+  const int64_t margin = given.margin(), rows = given.rows();
   const auto products = [&] { return Products<Real>(given.stride); };
-  share(fork, given.threads, given.rows(), WINDOW_ROWS, products, [&](Products<Real> &own, int64_t first, int64_t last) {
+  share(fork, given.threads, rows, WINDOW_ROWS, products, [&](Products<Real> &own, int64_t first, int64_t last) {
     given.totals[first / WINDOW_ROWS] = compare_rows(given, own, first, last);
   });
   if (!given.partials) return;
   for (int map = 0; map < 3; map++) {
-    std::fill(given.partial(map, 0), given.partial(map, given.margin()), Real(0));
-    std::fill(given.partial(map, given.margin() + given.rows()), given.partial(map, given.height + given.REACH), Real(0));
+    std::fill(given.partial(map, 0), given.partial(map, margin), Real(0));
+    std::fill(given.partial(map, margin + rows), given.partial(map + 1, 0), Real(0));
   }
   const auto blur = [&] { return Blur<Real>(given.stride); };
   share(fork, given.threads, given.height, WINDOW_ROWS, blur,

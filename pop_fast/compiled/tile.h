@@ -105,10 +105,10 @@ template <class Real> inline Vec<Real> exponent(const Real *f, Vec<Real> x, Vec<
 }
 
 // D5, D6, D7 in the type that is computed in.
-template <class Real> struct Limits {
+template <class Real> struct Thresholds {
   Real floor, ceiling, stop, skip;
 
-  explicit Limits(const Blend<Real> &blend)
+  explicit Thresholds(const Blend<Real> &blend)
       : floor(Real(blend.alpha_floor)), ceiling(Real(blend.alpha_ceiling)), stop(Real(blend.stop)),
         // surely under the floor, whatever exponent and power were rounded to
         skip(std::log2(floor) - Real(0.01)) {}
@@ -117,15 +117,15 @@ template <class Real> struct Limits {
 // Blend one entry into one strip: T goes down; alpha and weight are 0 from where a pixel stops.
 // Returns false, and leaves alpha and weight alone, where the entry is under the floor in all lanes.
 template <class Real>
-inline bool take(const Limits<Real> &limits, const Real *f, Vec<Real> x, Vec<Real> y, Vec<Real> &T, Vec<Real> &alpha,
-                 Vec<Real> &weight) {
+inline bool take(const Thresholds<Real> &thresholds, const Real *f, Vec<Real> x, Vec<Real> y, Vec<Real> &T,
+                 Vec<Real> &alpha, Vec<Real> &weight) {
   const Vec<Real> e = exponent(f, x, y), none = all(Real(0));
-  if (!any(e > limits.skip)) return false;
+  if (!any(e > thresholds.skip)) return false;
   alpha = exp2_of(e);
-  alpha = alpha > limits.ceiling ? all(limits.ceiling) : alpha;
-  alpha = alpha > limits.floor ? alpha : none;
+  alpha = alpha > thresholds.ceiling ? all(thresholds.ceiling) : alpha;
+  alpha = alpha > thresholds.floor ? alpha : none;
   const Vec<Real> next = T - T * alpha;
-  const Mask<Real> lives = next > limits.stop;
+  const Mask<Real> lives = next > thresholds.stop;
   weight = lives ? T * alpha : none;
   alpha = lives ? alpha : none;
   T = lives ? next : none;

@@ -11,7 +11,6 @@ from torch import Tensor
 from pop_fast import compiled
 from pop_fast.compositing import Composite
 from pop_fast.compositing import composite as composite_in_torch
-from pop_fast.splatting import colors_of_view
 from pop_fast.tiles import TileLists, tile_lists
 from pop_ref.constants import INRIA, PAPER, Profile
 
@@ -223,38 +222,3 @@ def test_no_splat_on_the_screen_makes_empty_lists() -> None:
     lists = native_lists(given.means2d, torch.zeros(5, 2, dtype=torch.int32), torch.ones(5), WIDTH, HEIGHT, 8)
     assert len(lists.ids) == 0
     assert lists.offsets.tolist() == [0] * (6 * 5 + 1)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_colours_of_a_view_are_those_of_torch(degree: int) -> None:
-    from pop_fast.compiled.splatting import colors_of_view as native_colors
-
-    generator = torch.Generator().manual_seed(5)
-    # more than a thread takes at a time, coefficients of bands that are not evaluated, colours under 0
-    n = 3000
-    sh = torch.randn(n, 16, 3, generator=generator, dtype=torch.float64)
-    means = torch.randn(n, 3, generator=generator, dtype=torch.float64)
-    viewmat = torch.linalg.qr(torch.randn(4, 4, generator=generator, dtype=torch.float64))[0]
-    visible = (torch.rand(n, generator=generator) < 0.7).nonzero().squeeze(1)
-    v_colors = torch.randn(n, 3, generator=generator, dtype=torch.float64)
-    results = []
-    for stage in (colors_of_view, native_colors):
-        leaves = [tensor.clone().requires_grad_() for tensor in (sh, means, viewmat)]
-        colors = stage(*leaves, degree, visible)
-        results.append([colors.detach(), *torch.autograd.grad(colors, leaves, v_colors)])
-    assert bool((results[0][0] == 0.0).all(1).any())
-    assert bool((results[0][0][visible] == 0.0).any())
-    for its, mine in zip(*results, strict=True):
-        torch.testing.assert_close(mine, its, rtol=0.0, atol=1e-12 * max(1.0, float(its.abs().max())))
-
-
-@pytest.mark.parametrize("shown", [[], [0], [6], [2, 3]])
-def test_gradients_of_unseen_gaussians_are_zero(shown: list[int]) -> None:
-    from pop_fast.compiled.splatting import colors_of_view as native_colors
-
-    sh, means = torch.ones(7, 4, 3, requires_grad=True), torch.rand(7, 3, requires_grad=True)
-    colors = native_colors(sh, means, torch.eye(4), 1, torch.tensor(shown, dtype=torch.int64))
-    v_sh, v_means = torch.autograd.grad(colors.sum(), (sh, means))
-    assert v_sh.flatten(1).any(1).nonzero().squeeze(1).tolist() == shown
-    assert set(v_means.any(1).nonzero().squeeze(1).tolist()) <= set(shown)
-    assert bool(v_means.isfinite().all())
