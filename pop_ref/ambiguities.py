@@ -223,9 +223,9 @@ AMBIGUITIES: Final = (
         "A28",
         "M",
         'What is "div = n" in the comparison of L1 and L2?',
-        "L1 / n beside an unchanged D-SSIM",
-        _RECIPE,
-        ("Recipe.pixel_scale = 0.5", "Recipe.lambda_ssim = 0.0"),
+        "L1 / n beside an unchanged D-SSIM, n from 1 to 100",
+        "pop_ref.recipes:L1_DIVIDED",
+        ("Recipe.lambda_ssim = 0.0",),
     ),
     Ambiguity(
         "A29",

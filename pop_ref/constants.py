@@ -11,6 +11,10 @@ source and tests:
 
 Gradient kinks: B1 frustum clamp in J, B2 colour clamp at 0, B3 alpha ceiling, B4 loss kinks.
 
+The ceiling of 0.99 is the number that float32 kernels hold, 0.9900000095367432. Two splats at it would leave
+9.99998e-5, under the stop, so the second ends the pixel. Under float64's own 0.99 they would leave the square of
+0.010000000000000009, over the stop, and the second would be blended.
+
 Sources: diff-gaussian-rasterization 59f5f77 (`inria`), gsplat v1.5.0-1.5.3 (`gsplat_1_5`), gsplat main from 2026-03
 (`gsplat_1_6`: clamp 0.99), the POP paper section 3.1 (transmittance stop `T <= 1e-4`).
 """
@@ -19,6 +23,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from typing import Final, Literal
+
+import numpy as np
 
 DECISIONS: Final = {
     "D1": "near plane: is the centre in front of it",
@@ -56,7 +62,7 @@ class Profile:
             "square" is Inria's square of 3 standard deviations of the larger axis (D2).
         extent_sigmas: upper bound of the extent in standard deviations (D2).
         alpha_floor: alpha under it is skipped (D5).
-        alpha_ceiling: alpha is clamped to it (D6).
+        alpha_ceiling: alpha is clamped to it (D6); 0.99 is float32's, see the module's text.
         ceiling_gradient: "zero" stops the gradient of a clamped alpha, "pass" lets it through (B3).
         transmittance_stop: the transmittance at which a pixel ends (D7).
         stop_inclusive: True stops at `T <= transmittance_stop`, False at `T <` (D7).
@@ -100,7 +106,10 @@ GSPLAT_1_5: Final = Profile(
     tile_size=16,
 )
 
-GSPLAT_1_6: Final = replace(GSPLAT_1_5, name="gsplat_1_6", alpha_ceiling=0.99)
+# what two splats at it leave decides D7, so it has to be the 0.99 that the kernels hold
+_CEILING_99: Final = float(np.float32(0.99))
+
+GSPLAT_1_6: Final = replace(GSPLAT_1_5, name="gsplat_1_6", alpha_ceiling=_CEILING_99)
 
 PAPER: Final = replace(GSPLAT_1_5, name="paper")
 
@@ -116,7 +125,7 @@ INRIA: Final = Profile(
     extent="square",
     extent_sigmas=3.0,
     alpha_floor=1.0 / 255.0,
-    alpha_ceiling=0.99,
+    alpha_ceiling=_CEILING_99,
     ceiling_gradient="pass",
     transmittance_stop=1e-4,
     stop_inclusive=False,
@@ -143,7 +152,7 @@ def profile_named(name: str) -> Profile:
 
     Example:
         >>> profile_named("gsplat_1_6").alpha_ceiling
-        0.99
+        0.9900000095367432
     """
     if name not in PROFILES:
         raise ValueError(f"profile {name!r} is unknown; use one of {', '.join(PROFILES)}")

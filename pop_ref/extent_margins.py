@@ -40,7 +40,7 @@ def extent_margins(m: Magnitudes, width: int, height: int, profile: Profile) -> 
     """Measure D2 and D3 of one Gaussian in front of the camera.
 
     A Gaussian is kept if all conditions hold, so the distance is the smallest of the conditions' when it is kept and
-    the largest of the failing ones' when it is culled.
+    the largest of the failing ones' when it is culled. Of numbers that overflowed nothing is known: the distance is 0.
 
     Source: the conditions of `footprint.radii_from_covars2d`, `footprint.on_screen` and `tiles.tile_rects`.
     Departs: nothing.
@@ -61,11 +61,16 @@ def extent_margins(m: Magnitudes, width: int, height: int, profile: Profile) -> 
         >>> extent_margins(m, 8, 8, PAPER).outer
         (0, 0, 1, 1)
     """
+    reaches = _reaches(m, profile)
+    if not all(math.isfinite(number.value) for number in (*m.mean2d, m.det, *reaches)):
+        # what has overflowed may be anywhere, or nowhere
+        return ExtentMargins(
+            0.0, math.inf, math.inf, (0, 0, *grid_size(width, height, profile.tile_size)), (0, 0, 0, 0)
+        )
     conditions = [(m.det.value > 0.0, distance(m.det, Rounded(0.0)))]
     if profile.extent == "opacity_aware":
         floor = constant(profile.alpha_floor)
         conditions.append((m.opacity.value >= floor.value, distance(m.opacity, floor)))
-    reaches = _reaches(m, profile)
     radii = [max(1, math.ceil(reach.value)) for reach in reaches]
     axes = [_Axis(m.mean2d[0], radii[0], width), _Axis(m.mean2d[1], radii[1], height)]
     for axis in axes:

@@ -2,7 +2,8 @@
 
 For a screen covariance [[a, b], [b, c]] the conic is its inverse (c, -b, a) / (a c - b^2), kept as (xx, xy, yy) with
 the off-diagonal once. Where the determinant is not positive, which rounding does to huge or needle splats, there is no
-ellipse: the conic is zero and the splat is culled (D2).
+ellipse: the conic is zero and the splat is culled (D2). The `inria` profile departs from Inria's code here on purpose:
+that skips a determinant of exactly 0 only and draws the hyperbola of a negative one, whose sign is rounding's choice.
 """
 
 from __future__ import annotations
@@ -128,7 +129,7 @@ def conics_from_covars2d(covars2d: Float64[np.ndarray, "N 2 2"]) -> Float64[np.n
     """Invert screen covariances: `(xx, xy, yy) = (c, -b, a) / (a c - b^2)` of [[a, b], [b, c]].
 
     Source: Kerbl et al. 2023 (3DGS), eq. 4 in two dimensions; POP paper, eq. 11.
-    Departs: where the determinant is <= 0 the conic is zero (D2); Inria tests only == 0.
+    Departs: where the determinant is <= 0 the conic is zero (D2), in every profile; Inria's code tests only == 0.
 
     Args:
         covars2d: screen covariances after the low-pass, px^2.
@@ -192,7 +193,8 @@ def radii_from_covars2d(
 
     Source: gsplat v1.5 ("opacity_aware"); Kerbl et al. 2023 (3DGS), section 6, and its code ("square").
     Departs: the paper speaks of the 99 % confidence interval; the code uses 3 standard deviations and bounds the
-        discriminant of lambda_max from below by 0.1 (D2).
+        discriminant of lambda_max from below by 0.1 (D2). A determinant < 0 culls in every profile, in `inria` too,
+        whose own code culls only == 0: see the module's text.
 
     Args:
         covars2d: screen covariances after the low-pass, px^2.
@@ -212,7 +214,8 @@ def radii_from_covars2d(
         opacity = float(opacities[i])
         if _det(covars2d[i]) > 0.0 and (profile.extent == "square" or opacity >= profile.alpha_floor):
             reach_x, reach_y = _reach(covars2d[i], opacity, profile)
-            radii[i] = min(math.ceil(reach_x), _LARGEST_RADIUS), min(math.ceil(reach_y), _LARGEST_RADIUS)
+            # the smaller first: infinity has no ceiling
+            radii[i] = math.ceil(min(_LARGEST_RADIUS, reach_x)), math.ceil(min(_LARGEST_RADIUS, reach_y))
     return radii
 
 

@@ -10,6 +10,7 @@ thresholds by it.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -83,7 +84,7 @@ def constant(value: float) -> Rounded:
         >>> constant(0.5), constant(0.01)
         (Rounded(0.5, 0.0), Rounded(0.01, 0.01))
     """
-    return _rounded(value, 0.0)
+    return Rounded(value) if math.isinf(value) else _rounded(value, 0.0)
 
 
 def distance(operand: Rounded, threshold: Rounded) -> float:
@@ -97,14 +98,18 @@ def distance(operand: Rounded, threshold: Rounded) -> float:
         threshold: the other side.
 
     Returns:
-        The distance; infinite where both sides are exact, since then the comparison cannot flip, tie or not.
+        The distance; infinite where both sides are exact, since then the comparison cannot flip, tie or not; 0 where
+        a side has overflowed, since then nothing is known.
 
     Example:
         >>> distance(Rounded(1.5, 0.25), Rounded(1.0)), distance(Rounded(1.0), Rounded(1.0))
         (2.0, inf)
     """
     error = operand.error + threshold.error
-    return abs(operand.value - threshold.value) / error if error > 0.0 else math.inf
+    if error == 0.0:
+        return math.inf
+    gap = abs(operand.value - threshold.value) / error
+    return 0.0 if math.isnan(gap) else gap
 
 
 def depths_magnitudes(gaussians: Gaussians, camera: Camera) -> list[Rounded]:
@@ -174,53 +179,56 @@ def splat_magnitudes(
     opacity = Rounded(float(gaussians.opacities[i]))
     if antialiased:
         det0 = a0 * c0 - b * b
-        usable = det0.value > 0.0 and det.value > 0.0
-        opacity = opacity * (det0 / det).sqrt() if usable else Rounded(0.0, math.sqrt(det0.error / abs(det.value)))
+        unknown = Rounded(0.0, det0.error / abs(det.value) if det.value != 0.0 else math.inf).sqrt()
+        opacity = opacity * (det0 / det).sqrt() if det0.value > 0.0 and det.value > 0.0 else unknown
     conic = (c / det, -b / det, a / det) if det.value > 0.0 else (zero, zero, zero)
     return Magnitudes(z, (fx * ratios[0] + cx, fy * ratios[1] + cy), ratios, (a, b, c), det, conic, opacity)
 
 
 def colors_magnitudes(
-    gaussians: Gaussians, camera: Camera, degree: int
-) -> tuple[Float64[np.ndarray, "N 3"], Float64[np.ndarray, "N 3"]]:
+    gaussians: Gaussians, ids: Sequence[int], camera: Camera, degree: int
+) -> tuple[Float64[np.ndarray, "V 3"], Float64[np.ndarray, "V 3"]]:
     """Evaluate colours before their clamp at 0 (B2), and bound their rounding.
 
     Source: Higham 2002, section 3.3.
     Departs: nothing.
 
     Args:
-        gaussians: activated, none at the camera's centre.
+        gaussians: activated.
+        ids: which ones, none of them at the camera's centre.
         camera: the view.
         degree: 0, 1, 2 or 3.
 
     Returns:
-        `sum_k Y_k sh_k + 0.5`, and its error in units of eps.
+        `sum_k Y_k sh_k + 0.5`, and its error in units of eps, one row for each of `ids`.
 
     Example:
         >>> g = Gaussians([[0, 0, 4]], [[1, 0, 0, 0]], [[1, 1, 1]], [0.5], [[[0, 0, 0]]])
-        >>> colors_magnitudes(g, Camera(np.eye(4), np.eye(3), 1, 1), 0)[0]
+        >>> colors_magnitudes(g, [0], Camera(np.eye(4), np.eye(3), 1, 1), 0)[0]
         array([[0.5, 0.5, 0.5]])
     """
     center = camera_center(camera.viewmat)
     center_error = 4.0 * np.abs(camera.viewmat[:3, :3].T) @ np.abs(camera.viewmat[:3, 3])
     n_sh = (degree + 1) ** 2
-    sums, errors = np.zeros((len(gaussians), 3)), np.zeros((len(gaussians), 3))
-    for i in range(len(gaussians)):
+    sums, errors = np.zeros((len(ids), 3)), np.zeros((len(ids), 3))
+    for row, i in enumerate(ids):
         d = gaussians.means[i] - center
         norm = math.hypot(*d.tolist())
         unit = (d / norm)[None]
         unit_error = float(np.linalg.norm(center_error + np.abs(d))) / norm + 2.0
         sh = gaussians.sh[i, :n_sh]
         basis = sh_basis(unit, degree)[0]
-        sums[i] = basis @ sh + 0.5
+        sums[row] = basis @ sh + 0.5
         for k in range(3):
             sensitivity = float(np.linalg.norm(sh_basis_vjp(unit, degree, sh[None, :, k])))
-            errors[i, k] = 8.0 * (np.abs(basis) @ np.abs(sh[:, k])) + sensitivity * unit_error + abs(sums[i, k])
+            errors[row, k] = 8.0 * (np.abs(basis) @ np.abs(sh[:, k])) + sensitivity * unit_error + abs(sums[row, k])
     return sums, errors
 
 
 def _rounded(value: float, inherited: float) -> Rounded:
-    exact = inherited == 0.0 and (not math.isfinite(value) or in_float32(value))
+    if not math.isfinite(value):
+        return Rounded(value, math.inf)
+    exact = inherited == 0.0 and in_float32(value)
     return Rounded(value, inherited if exact else inherited + abs(value))
 
 

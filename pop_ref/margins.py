@@ -199,15 +199,17 @@ def _note_kinks(
     centred = profile.principal_point == "centred"
     centers = (camera.width / 2.0, camera.height / 2.0) if centred else (camera.K[0, 2], camera.K[1, 2])
     degree = math.isqrt(gaussians.sh.shape[1]) - 1 if sh_degree is None else sh_degree
-    sums, errors = colors_magnitudes(gaussians, camera, degree)
-    for i in np.flatnonzero(image.splats.visible).tolist():
+    # a Gaussian at the camera's centre has no direction, hence no colour, and is culled
+    seen: list[int] = np.flatnonzero(image.splats.visible).tolist()
+    sums, errors = colors_magnitudes(gaussians, seen, camera, degree)
+    for i, doubt in zip(seen, np.abs(sums) / errors, strict=True):
         m = magnitudes[i]
         assert m is not None
         for k, size in enumerate((camera.width, camera.height)):
             focal = Rounded(float(camera.K[k, k]))
             for limit in frustum_limits(focal, Rounded(float(centers[k])), size, profile):
                 book.note("B1", (i,), distance(m.ratios[k], limit))
-        book.note("B2", (i,), float(np.min(np.abs(sums[i]) / errors[i])))
+        book.note("B2", (i,), float(np.min(doubt)))
 
 
 def _note_pixels(

@@ -55,7 +55,7 @@ def adam_step(
 
     Args:
         params: arrays by name.
-        grads: gradient of the loss, keys and shapes as `params`.
+        grads: gradient of the loss, shapes as `params`; a key of `params` that it lacks is passed through untouched.
         m: first moments.
         v: second moments.
         step: number of this update, from 1.
@@ -78,9 +78,7 @@ def adam_step(
     if step < 1:
         raise ValueError(f"step is {step}; Adam's updates count from 1")
     beta1, beta2 = betas
-    new_params: dict[str, np.ndarray] = {}
-    new_m: dict[str, np.ndarray] = {}
-    new_v: dict[str, np.ndarray] = {}
+    new_params, new_m, new_v = dict(params), dict(m), dict(v)
     for name, g in grads.items():
         new_m[name] = m[name] + (1.0 - beta1) * (g - m[name])
         new_v[name] = beta2 * v[name] + (1.0 - beta2) * g * g
@@ -115,7 +113,7 @@ def learning_rates(step: int, scene_scale: float, max_steps: int = MAX_STEPS) ->
     """List every parameter's learning rate at a step; only the positions' changes, and none with the loss (A21).
 
     Source: Kerbl et al. 2023; values of gsplat's trainer.
-    Departs: Inria's code since October 2024 uses 0.025 for opacities.
+    Departs: Inria's code since October 2024 uses 0.025 for opacities (`recipes.RECIPES["3DGS"]`).
 
     Args:
         step: from 0.

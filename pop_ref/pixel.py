@@ -87,9 +87,9 @@ def stops(next_T: float, profile: Profile = PAPER) -> bool:
     """Tell whether a pixel ends before the splat that would leave `next_T` (D7).
 
     Source: POP paper, section 3.1: early ray termination at `T_{i+1} <= 1e-4`.
-    Departs: Inria stops at `<`; everyone leaves the terminating splat unblended (D7). Under a ceiling of 0.99 two
-        opaque splats leave 0.01^2, the stop itself: float32, whose 0.99 is a little larger, stops there in both forms,
-        and float64 in neither. `margins` calls such a pixel doubtful. Under `paper`'s 0.999 nothing is in doubt.
+    Departs: Inria stops at `<`; everyone leaves the terminating splat unblended (D7). In every profile the second of
+        two opaque splats is the terminating one: they would leave 1e-6 under a ceiling of 0.999, and 9.99998e-5 under
+        the 0.99 of float32, which the profiles therefore hold (see `constants`).
 
     Args:
         next_T: the transmittance that would be left behind the splat.

@@ -1,4 +1,12 @@
-"""What a training minimises and when, and the rows of the paper's ablation tables under their names.
+"""What a training minimises and when: POP, the rows of the paper's ablation tables, and two baselines, by name.
+
+"3DGS" is Inria's code since October 2024, with whose counts the paper's row of that name agrees: renderer, loss, SSIM
+padding, selection at the threshold, opacity rate. What a recipe cannot say stays as in every training here: steps count
+from 0, and population edits follow Adam, where Inria's come before it and lose that step's update. "gsplat" is the
+default strategy of gsplat 1.5.
+
+`L1_DIVIDED[n]` is "L1 div = n" of the paper's comparison of L1 and L2, `0.99 L1 / n + 0.01 D-SSIM`, otherwise as "L2":
+no blur, no POP, no reset (A28).
 
 Labels decided here: A1, A10, A12, A13, A20, A22, A24, A28, A29.
 """
@@ -8,9 +16,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
-from pop_ref.constants import PAPER, Profile
+from pop_ref.constants import INRIA, PAPER, Profile
 from pop_ref.density_config import ADC, POP, DensityConfig
-from pop_ref.optimizer import MAX_STEPS, SH_DEGREE_INTERVAL
+from pop_ref.optimizer import LEARNING_RATES, MAX_STEPS, SH_DEGREE_INTERVAL
 from pop_ref.ssim import Padding
 
 
@@ -31,6 +39,7 @@ class Recipe:
         pop_views: "current" takes importance from the current view, "window" from all views since the last event (A1).
         pop_over: "all" sums over all Gaussians, "visible" over those the view shows (A12).
         density: of the population.
+        opacity_rate: learning rate of the opacities.
         max_steps: length of the training, over which the positions' learning rate decays.
         sh_interval: steps between two raises of the harmonics' degree.
         profile: of the renderer (A24).
@@ -48,6 +57,7 @@ class Recipe:
     pop_views: Literal["current", "window"] = "current"
     pop_over: Literal["all", "visible"] = "all"
     density: DensityConfig = POP
+    opacity_rate: float = LEARNING_RATES["opacities"]
     max_steps: int = MAX_STEPS
     sh_interval: int = SH_DEGREE_INTERVAL
     profile: Profile = PAPER
@@ -63,5 +73,16 @@ RECIPES: Final = {
     "L2+Blur": Recipe(lambda_pop=0.0),
     "L2+POP": Recipe(density=_NO_BLUR),
     "Reset": Recipe(lambda_pop=0.0, density=replace(POP, reset_every=3000)),
-    "3DGS": Recipe(pixelwise="l1", lambda_ssim=0.2, lambda_pop=0.0, density=ADC),
+    "3DGS": Recipe(
+        pixelwise="l1",
+        lambda_ssim=0.2,
+        padding="same",
+        lambda_pop=0.0,
+        density=replace(ADC, inclusive=True),
+        opacity_rate=0.025,
+        profile=INRIA,
+    ),
+    "gsplat": Recipe(pixelwise="l1", lambda_ssim=0.2, lambda_pop=0.0, density=ADC),
 }
+
+L1_DIVIDED: Final = {n: replace(RECIPES["L2"], pixelwise="l1", pixel_scale=1.0 / n) for n in (1, 2, 5, 10, 20, 50, 100)}

@@ -48,7 +48,8 @@ class Training:
     """The state of a training between two steps.
 
     Attributes:
-        rows: raw parameters ("means", "scales", "quats", "opacities", "sh0", "shN") and Adam's moments.
+        rows: raw parameters ("means", "scales", "quats", "opacities", "sh0", "shN") and Adam's moments; any other key
+            is not trained, and goes with its row.
         statistics: of the current densification window.
         step: number of the next step, from 0.
     """
@@ -119,7 +120,7 @@ def train_step(
     loss, v_image, v_opacities = objective(view, gaussians, target, state, recipe)
     gradients = render_vjp(gaussians, camera, v_image, sh_degree=degree, profile=recipe.profile)
     grads = params_vjp(rows.params, gradients, v_opacities)
-    rates = learning_rates(step, scene_scale, recipe.max_steps)
+    rates = {**learning_rates(step, scene_scale, recipe.max_steps), "opacities": recipe.opacity_rate}
     rows = Rows(*adam_step(rows.params, grads, rows.m, rows.v, step + 1, rates))
     seen = (gradients.means2d, view.splats.visible, view.dominant_counts, camera.width, camera.height)
     statistics = accumulate(state.statistics, *seen, recipe.density)
@@ -169,7 +170,7 @@ def params_vjp(
         v_opacities: what the POP term adds for the opacities.
 
     Returns:
-        Gradients, keys and shapes as `params`.
+        Gradients, shapes as `params`, of the keys that `gaussians_from_params` reads.
 
     Example:
         >>> params = {"means": np.zeros((1, 3)), "quats": np.ones((1, 4)), "scales": np.zeros((1, 3)),

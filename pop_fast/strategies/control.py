@@ -43,6 +43,7 @@ class DensityControl:
         refine_stop_iter: step from which nothing is collected and nothing changes.
         refine_every: steps between changes.
         reset_every: steps between opacity resets; 0 never resets.
+        reset_opa: what a reset lowers opacities to; gsplat couples it to `prune_opa`, as twice that.
         reset_at_zero: also reset at step 0, as gsplat 1.1 to 1.5.2 did.
         pause_refine_after_reset: steps after a reset in which the population stays.
         inclusive: grow at `>=` (3DGS) instead of `>` (gsplat).
@@ -63,6 +64,7 @@ class DensityControl:
     refine_stop_iter: int = 15_000
     refine_every: int = 100
     reset_every: int = 0
+    reset_opa: float = 0.01
     reset_at_zero: bool = False
     pause_refine_after_reset: int = 0
     inclusive: bool = False
@@ -157,7 +159,7 @@ class DensityControl:
             if self.verbose:
                 print(f"step {step}: {state['event']}, {len(params['means'])} Gaussians")
         if self.is_reset_step(step):
-            ops.reset_opacities(params, optimizers, ceiling=2.0 * self.prune_opa)
+            ops.reset_opacities(params, optimizers, ceiling=self.reset_opa)
             state["event"] = {**(state["event"] or {"cloned": 0, "split": 0, "pruned": 0}), "reset": True}
 
     def _more_steps(self) -> tuple[str, ...]:

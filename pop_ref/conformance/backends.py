@@ -88,9 +88,9 @@ def _elsewhere(name: str) -> Any:
         package = "pop_fast.compiled"
         return adapter_for(f"{package}.rasterization:rasterization", name, package, f"float{name[-2:]}")
     if name.startswith("mirror"):
-        reason = importlib.import_module("cuda_ext.host_mirror").find_compiler() is None
-        if reason:
-            raise Unavailable("the host mirror needs a C++ compiler; install g++ or set CXX")
+        compiler = importlib.import_module("cuda_ext.compiler")
+        if compiler.find_compiler() is None:
+            raise Unavailable(f"the host mirror needs one: {compiler.no_compiler()}")
         return importlib.import_module(f"{kit}.mirror_adapter").mirror(name)
     if name == "cuda":
         reason = importlib.import_module("cuda_ext").why_not()

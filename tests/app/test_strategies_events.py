@@ -76,11 +76,16 @@ def test_transparent_gaussians_are_pruned_and_oversized_ones_only_after_step_300
     assert len(params["means"]) == 3
 
 
-def test_a_reset_lowers_opacities_to_twice_the_prune_threshold_and_forgets_their_moments_only():
+@pytest.mark.parametrize("prune_opa", [0.005, 0.002])
+@pytest.mark.parametrize("ceiling", [0.01, 0.25])
+def test_a_reset_lowers_opacities_to_its_ceiling_and_forgets_their_moments_only(ceiling: float, prune_opa: float):
     params, optimizers = make(3)
     other = [x.clone() for x in moments(optimizers, params, "scales")]
-    run_event(ADCStrategy(), params, optimizers, make_info(3), 3000)
-    assert torch.allclose(torch.sigmoid(params["opacities"]), torch.tensor(0.01))
+    run_event(ADCStrategy(reset_opa=ceiling, prune_opa=prune_opa), params, optimizers, make_info(3), 3000)
+    assert torch.allclose(torch.sigmoid(params["opacities"]), torch.tensor(ceiling))
+    # the ceiling is the oracle's, and like there no multiple of the pruning threshold
+    config = oracle.DensityConfig(reset_every=3000, prune_opa=prune_opa)
+    assert ADCStrategy(prune_opa=prune_opa).reset_opa == config.reset_opa == 0.01
     first, second, steps = moments(optimizers, params, "opacities")
     assert not first.any()
     assert not second.any()

@@ -81,6 +81,21 @@ def test_a_step_does_not_touch_the_state_it_starts_from() -> None:
     assert state.statistics.n_views == 0
 
 
+def test_a_key_that_is_not_trained_goes_with_its_row() -> None:
+    params = {**PARAMS, "tags": np.arange(10.0)}
+    state, _ = trained(params, 1, RECIPES["POP"])
+    assert np.array_equal(state.rows.params["tags"], np.arange(10.0))
+    assert not np.array_equal(state.rows.params["means"], PARAMS["means"])
+    assert set(state.rows.params) == set(state.rows.m) == set(state.rows.v) == set(params)
+    # and through events that clone, split and prune
+    tagged, _ = trained(params, 10, ten_losses.RECIPE)
+    plain, _ = trained(PARAMS, 10, ten_losses.RECIPE)
+    assert len(tagged.rows) == len(plain.rows) != 10
+    assert set(tagged.rows.params["tags"]) < set(range(10))
+    for name in PARAMS:
+        assert np.array_equal(tagged.rows.params[name], plain.rows.params[name])
+
+
 def test_statistics_come_from_the_same_forward_pass_as_the_loss() -> None:
     state, _ = train_step(start(PARAMS), CAMERAS[0], PHOTOS[0], 1.0, ten_losses.draws)
     view = render(gaussians_from_params(PARAMS), CAMERAS[0], sh_degree=0)
@@ -136,7 +151,7 @@ def test_the_pop_term_may_leave_out_what_the_view_does_not_show() -> None:
 def test_l2_may_give_way_to_the_objective_of_3dgs() -> None:
     recipe = replace(RECIPES["L2"], l2_stop_iter=7)
     assert objective_at(6, recipe)[2][0] == objective_at(0, RECIPES["L2"])[2][0]
-    assert objective_at(7, recipe)[2][0] == objective_at(0, RECIPES["3DGS"])[2][0]
+    assert objective_at(7, recipe)[2][0] == objective_at(0, RECIPES["gsplat"])[2][0]
 
 
 def test_recipes_are_the_rows_of_the_ablation_tables() -> None:
@@ -155,8 +170,9 @@ def test_recipes_are_the_rows_of_the_ablation_tables() -> None:
         "L2+POP": (False, True, False),
         "Reset": (True, False, True),
         "3DGS": (False, False, True),
+        "gsplat": (False, False, True),
     }
-    assert [name for name, recipe in RECIPES.items() if recipe.pixelwise == "l1"] == ["3DGS"]
+    assert [name for name, recipe in RECIPES.items() if recipe.pixelwise == "l1"] == ["3DGS", "gsplat"]
 
 
 def test_an_event_and_a_reset_of_one_step_happen_in_that_order() -> None:
