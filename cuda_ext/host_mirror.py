@@ -7,22 +7,14 @@ from __future__ import annotations
 
 import hashlib
 import os
-import shutil
 import subprocess
 from pathlib import Path
+
+from cuda_ext.compiler import find_compiler, no_compiler
 
 HERE = Path(__file__).resolve().parent
 # contraction would let the compiler round differently from the kernels, which fuse only where they say so
 FLAGS = ("-std=c++17", "-O1", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC")
-
-
-def find_compiler() -> str | None:
-    """Return the path of a C++17 compiler (CXX first, then g++, clang++, c++), or None."""
-    for name in (os.environ.get("CXX"), "g++", "clang++", "c++"):
-        found = shutil.which(name) if name else None
-        if found:
-            return found
-    return None
 
 
 def mirror_sources() -> list[Path]:
@@ -48,8 +40,8 @@ def build_mirror(folder: Path) -> Path:
     """
     compiler = find_compiler()
     if compiler is None:
-        raise RuntimeError("no C++ compiler was found; install g++ or set CXX")
-    digest = hashlib.sha256(" ".join((compiler, *FLAGS)).encode())
+        raise RuntimeError(no_compiler())
+    digest = hashlib.sha256(" ".join((*compiler, *FLAGS)).encode())
     for source in mirror_sources():
         digest.update(source.read_bytes())
     library = folder / f"pop_mirror_{digest.hexdigest()[:16]}.so"
@@ -58,7 +50,7 @@ def build_mirror(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     # beside and then renamed, so that two test processes cannot load half a library
     partial = library.with_suffix(f".{os.getpid()}")
-    command = [compiler, *FLAGS, "-x", "c++", str(HERE / "host_mirror.cpp"), "-o", str(partial)]
+    command = [*compiler, *FLAGS, "-x", "c++", str(HERE / "host_mirror.cpp"), "-o", str(partial)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr}")

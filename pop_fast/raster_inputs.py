@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pop_ref.constants import GSPLAT_1_5, Profile, profile_named
 
+LARGEST_TILE = 4096  # px; no image needs more, and what a tile works with grows with its square
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 
 
@@ -88,6 +89,8 @@ def check_cameras(
     for name, value in {"width": width, "height": height, "tile_size": tile_size}.items():
         if value < 1:
             raise ValueError(f"{name} is {value}; it must be >= 1")
+    if tile_size > LARGEST_TILE:
+        raise ValueError(f"tile_size is {tile_size}; it must be <= {LARGEST_TILE}")
     rotations = viewmats.detach()[..., :3, :3].double()
     off = (rotations @ rotations.transpose(-1, -2) - torch.eye(3, dtype=torch.float64)).abs().amax((-1, -2))
     rigid = (off < 1e-3) & (torch.linalg.det(rotations) > 0.0)

@@ -154,7 +154,8 @@ def _touches(
     horizontal, size_h = _sigma_and_size(a, b, c, along_x, edge_y)
     # needles cancel: the slack grows with the terms that were subtracted
     slack = 1e-3 + 1e-5 * torch.maximum(size_v, size_h)
-    return torch.minimum(vertical, horizontal) <= limit + slack
+    # what overflowed on the way is not a number, and listed
+    return ~(torch.minimum(vertical, horizontal) > limit + slack)
 
 
 def _sigma_and_size(a: Tensor, b: Tensor, c: Tensor, dx: Tensor, dy: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""Harmonics, tile lists and the blend of `pop_fast` in C++, several times as fast, where they have been compiled.
+"""Projection, harmonics, tile lists, blend and D-SSIM of `pop_fast` in C++, where they have been compiled.
 
 Everything else of the backend "compiled" is that of "fast". Importing this package imports neither torch nor the
 library, and compiles nothing: `pop build-cpu` (`python -m pop_fast.compiled.build`, and `make setup` where there is a

@@ -52,9 +52,23 @@ template <class Real> void backward(const Blend<Real> &blend, Fork fork) {
 
 }  // namespace pop
 
-#define POP_STAGE(name, Layout, function)                                                               \
-  void pop_##name##_float32(const pop::Layout<float> *given, pop::Fork fork) { pop::function(*given, fork); } \
-  void pop_##name##_float64(const pop::Layout<double> *given, pop::Fork fork) { pop::function(*given, fork); }
+// Whether it ran to its end: what throws here is out of memory, and an exception must not leave C.
+template <class F> int ran(F f) noexcept {
+  try {
+    f();
+    return 1;
+  } catch (...) {
+    return 0;
+  }
+}
+
+#define POP_STAGE(name, Layout, function)                                        \
+  int pop_##name##_float32(const pop::Layout<float> *given, pop::Fork fork) {    \
+    return ran([&] { pop::function(*given, fork); });                            \
+  }                                                                              \
+  int pop_##name##_float64(const pop::Layout<double> *given, pop::Fork fork) {   \
+    return ran([&] { pop::function(*given, fork); });                            \
+  }
 
 extern "C" {
 POP_STAGE(covariances, Covariances, covariances)

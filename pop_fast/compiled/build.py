@@ -9,6 +9,7 @@ compiled for exactly the processor that it is compiled on: what was built for an
 from __future__ import annotations
 
 import argparse
+import ctypes
 import hashlib
 import os
 import platform
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import Final
 
 import cuda_ext
-from cuda_ext.host_mirror import find_compiler
+from cuda_ext.compiler import find_compiler, no_compiler
 
 HERE: Final = Path(__file__).resolve().parent
 SOURCES: Final = (
@@ -48,24 +49,35 @@ class BuildError(RuntimeError):
 @cache
 def library_path() -> Path:
     """Return where the library of this version is on this processor, whether or not it has been compiled."""
-    digest = hashlib.sha256("\n".join((*FLAGS, *map(str, TUNING), platform.system(), processor_features())).encode())
-    for source in (*(HERE / name for name in SOURCES), *(CUDA / name for name in SHARED)):
-        digest.update(source.read_bytes())
-    return HERE / f"_blend_{digest.hexdigest()[:16]}.so"
+    source = hashlib.sha256()
+    for path in (*(HERE / name for name in SOURCES), *(CUDA / name for name in SHARED)):
+        source.update(path.read_bytes())
+    return HERE / f"_blend_{source.hexdigest()[:16]}_{_machine()}.so"
 
 
-def processor_features() -> str:
-    """Return what the system says of the processor's kind and instructions."""
+def _machine() -> str:
+    """Return a digest of what the library is compiled for."""
+    words = (*FLAGS, *map(str, _tuning()), platform.system(), processor_features() or platform.machine())
+    return hashlib.sha256("\n".join(words).encode()).hexdigest()[:8]
+
+
+def processor_features() -> str | None:
+    """Return what the system says of the processor's kind and instructions, or None where it does not."""
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         for line in cpuinfo.read_text(encoding="utf-8").splitlines():
             if line.lower().startswith(("flags", "features")):
                 return f"{platform.machine()} {line}"
-    return f"{platform.machine()} {platform.processor()}"
+    return None
+
+
+def _tuning() -> tuple[tuple[str, ...], ...]:
+    # where nothing tells processors apart, the library must run on all of them
+    return TUNING if processor_features() else ((),)
 
 
 def build(verbose: bool = False) -> Path:
-    """Compile the library, unless it is there; libraries of other versions of the source are removed.
+    """Compile the library, unless it is there and loads; this processor's of other versions of the source are removed.
 
     Args:
         verbose: print the compiler's command.
@@ -77,11 +89,11 @@ def build(verbose: bool = False) -> Path:
         BuildError: no compiler was found, it failed, or the folder cannot be written to.
     """
     library = library_path()
-    if library.exists():
+    if library.exists() and _loads(library):
         return library
     compiler = find_compiler()
     if compiler is None:
-        raise BuildError("no C++ compiler was found; install g++ or clang++, or set CXX to one's path")
+        raise BuildError(no_compiler())
     try:
         # beside and then renamed, so that nobody loads half a library
         descriptor, partial = tempfile.mkstemp(dir=HERE, prefix="_partial_", suffix=".so")
@@ -92,18 +104,29 @@ def build(verbose: bool = False) -> Path:
         _compile(compiler, partial, verbose)
         os.chmod(partial, 0o644)
         os.replace(partial, library)
+    except OSError as error:
+        raise BuildError(f"compiling the CPU kernels failed: {' '.join(compiler)}, {library}: {error}") from error
     finally:
         Path(partial).unlink(missing_ok=True)
-    for other in HERE.glob("_blend_*.so"):
+    # those of other processors stay: an installation may be shared by several machines
+    for other in HERE.glob(f"_blend_*_{_machine()}.so"):
         if other != library:
             other.unlink(missing_ok=True)
     return library
 
 
-def _compile(compiler: str, library: str, verbose: bool) -> None:
+def _loads(library: Path) -> bool:
+    try:
+        ctypes.CDLL(str(library))
+    except OSError:
+        return False
+    return True
+
+
+def _compile(compiler: list[str], library: str, verbose: bool) -> None:
     failures: list[str] = []
-    for tuning in TUNING:
-        command = [compiler, *FLAGS, *tuning, f"-I{CUDA.parent}", "-o", library, str(HERE / "blend.cpp")]
+    for tuning in _tuning():
+        command = [*compiler, *FLAGS, *tuning, f"-I{CUDA.parent}", "-o", library, str(HERE / "blend.cpp")]
         if verbose:
             print(" ".join(command))
         done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -43,8 +43,9 @@ class _Composite(torch.autograd.Function):
         kept = {"n_reached": n_reached, "splats": splats, **(_lights(lists, colors) if options.keep else {})}
         given = {**_arguments(inputs, options), **results, **kept, "n_pairs": n_pairs}
         call_library(Blend, means2d.dtype, _numbers(inputs, options), given)
-        ctx.options, ctx.kept = options, kept
-        ctx.save_for_backward(*inputs)
+        # saved, not held: autograd lets go of them with the graph
+        ctx.options, ctx.kept = options, tuple(kept)
+        ctx.save_for_backward(*inputs, *kept.values())
         ctx.mark_non_differentiable(*(tensor for tensor in list(results.values())[2:] if tensor is not None))
         ctx.set_materialize_grads(False)
         return (*results.values(), n_pairs.sum())
@@ -53,14 +54,14 @@ class _Composite(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
         options: BlendOptions = ctx.options
-        inputs, sink = ctx.saved_tensors, options.absgrad_sink
+        inputs, kept, sink = ctx.saved_tensors[:4], ctx.saved_tensors[4:], options.absgrad_sink
         # component rows, as the projection's transpose takes them
         found = {name: tensor.new_empty(tensor.shape[::-1]) for name, tensor in zip(_RESULTS, inputs, strict=True)}
         absolute = None if sink is None else sink.new_empty(sink.shape[::-1])
         columns = 6 + inputs[3].shape[1] + 2 * (sink is not None)
         rows = inputs[0].new_empty((len(options.lists.ids), columns))
         given = {"v_image": v_image, "v_alphas": v_alphas, "rows": rows, "absgrad": absolute}
-        given = {**_arguments(inputs, options), **given, **found, **ctx.kept}
+        given = {**_arguments(inputs, options), **given, **found, **dict(zip(ctx.kept, kept, strict=True))}
         call_library(BlendBackward, inputs[0].dtype, _numbers(inputs, options), given)
         if sink is not None and absolute is not None:
             sink.add_(absolute.T)

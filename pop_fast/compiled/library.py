@@ -139,7 +139,7 @@ class Library:
         fork: starts the threads, or None.
     """
 
-    functions: dict[tuple[type[ctypes.Structure], torch.dtype], Callable[..., None]]
+    functions: dict[tuple[type[ctypes.Structure], torch.dtype], Callable[..., int]]
     chunk: int
     padded_pixels: Callable[[int, int], int]
     window_rows: int
@@ -161,12 +161,16 @@ def call_library(
         dtype: float32 or float64.
         numbers: fields that are numbers.
         tensors: fields that are pointers; what is not contiguous is copied, and so must not be a result.
+
+    Raises:
+        MemoryError: there was none for what the threads work with.
     """
     library = this_library()
     # the arguments only point: these are what they point into, and live until the function has returned
     held = {name: tensor.contiguous() for name, tensor in tensors.items() if tensor is not None}
     arguments = layout(**numbers, **{name: tensor.data_ptr() for name, tensor in held.items()})
-    library.functions[layout, dtype](ctypes.byref(arguments), library.fork)
+    if not library.functions[layout, dtype](ctypes.byref(arguments), library.fork):
+        raise MemoryError(f"the compiled CPU kernels ran out of memory in stage {_NAMES[layout]}")
 
 
 def this_library() -> Library:
@@ -190,11 +194,11 @@ def open_library(path: str) -> Library:
     loaded.pop_padded_pixels.argtypes = loaded.pop_padded_line.argtypes = (_WHOLE, _WHOLE)
     if any(getattr(loaded, name)() != ctypes.sizeof(layout) for name, layout in sizes.items()):
         raise OSError(f"{path} expects arguments of another layout")
-    functions: dict[tuple[type[ctypes.Structure], torch.dtype], Callable[..., None]] = {}
+    functions: dict[tuple[type[ctypes.Structure], torch.dtype], Callable[..., int]] = {}
     for layout, name in _NAMES.items():
         for dtype in (torch.float32, torch.float64):
             function = getattr(loaded, f"pop_{name}_{str(dtype).removeprefix('torch.')}")
-            function.argtypes, function.restype = (_POINTER, _POINTER), None
+            function.argtypes, function.restype = (_POINTER, _POINTER), ctypes.c_int
             functions[layout, dtype] = function
     return Library(
         functions,

@@ -45,7 +45,8 @@ inline bool touches(Real a, Real b, Real c, Real limit, Real left, Real top, Rea
   const Least<Real> horizontal = least_on_line(c, b, a, y, left, right);
   // needles cancel: the slack grows with the terms that were subtracted
   const Real slack = Real(1e-3) + Real(1e-5) * std::max(vertical.size, horizontal.size);
-  return std::min(vertical.sigma, horizontal.sigma) <= limit + slack;
+  // what overflowed on the way is not a number, and listed
+  return !(vertical.sigma > limit + slack && horizontal.sigma > limit + slack);
 }
 
 // Find the tiles of the splats from `first` to before `last` in depth order, and count them by tile.

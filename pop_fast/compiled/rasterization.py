@@ -1,4 +1,4 @@
-"""`rasterization()` with the compiled blend: `pop_fast.rasterization.rasterization` with backend="compiled"."""
+"""`rasterization()` with the compiled stages: `pop_fast.rasterization.rasterization` with backend="compiled"."""
 
 from __future__ import annotations
 

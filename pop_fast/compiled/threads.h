@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <atomic>
 #include <cstdint>
+#include <new>
 #include <thread>
 #include <vector>
 
@@ -12,18 +13,33 @@ namespace pop {
 // GOMP_parallel of the OpenMP runtime that torch brought along: its threads are awake already. Null elsewhere.
 using Fork = void (*)(void (*)(void *), void *, unsigned, unsigned);
 
+// Runs `work` on every thread; what one of them throws ends the call once all are back.
 template <class Work> void on_all_threads(Fork fork, int64_t threads, Work work) {
-  const auto call = [](void *given) { (*static_cast<Work *>(given))(); };
+  std::atomic<bool> failed{false};
+  auto guarded = [&]() noexcept {
+    try {
+      work();
+    } catch (...) {
+      failed = true;
+    }
+  };
+  using Guarded = decltype(guarded);
+  const auto call = [](void *given) { (*static_cast<Guarded *>(given))(); };
   if (threads <= 1) {
-    work();
+    guarded();
   } else if (fork) {
-    fork(call, &work, unsigned(threads), 0);
+    fork(call, &guarded, unsigned(threads), 0);
   } else {
     std::vector<std::thread> others;
-    for (int64_t k = 1; k < threads; k++) others.emplace_back(call, &work);
-    work();
+    try {
+      for (int64_t k = 1; k < threads; k++) others.emplace_back(call, &guarded);
+    } catch (...) {
+      // the system has no more threads: those that there are share the work
+    }
+    guarded();
     for (auto &other : others) other.join();
   }
+  if (failed) throw std::bad_alloc();
 }
 
 // Call f(first, last) for parts of n until none is left; `make()` is what a thread works with.

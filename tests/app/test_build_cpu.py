@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cuda_ext.host_mirror import find_compiler
+from cuda_ext.compiler import find_compiler
 from pop_fast import compiled
 from pop_fast.backends import get_backend
 from pop_fast.cli.doctor import backends
@@ -52,7 +52,9 @@ def compiler(folder: Path, script: str, monkeypatch: pytest.MonkeyPatch) -> None
 @needs_compiler
 def test_it_is_compiled_once_and_older_versions_go(fresh: Path, pop: Pop) -> None:
     assert "run `pop build-cpu`" in (compiled.why_not() or "")
-    (fresh / "_blend_0123456789abcdef.so").write_bytes(b"of an older version")
+    older = building.library_path().name.split("_")
+    older[2] = "0123456789abcdef"
+    (fresh / "_".join(older)).write_bytes(b"of an older version")
     outcome = pop("build-cpu")
     (library,) = fresh.glob("*.so")
     assert (outcome.status, outcome.out) == (0, f"{library}\n")
@@ -80,12 +82,68 @@ def test_a_change_of_the_source_asks_for_a_new_build(fresh: Path) -> None:
     assert building.library_path() != before
 
 
-def test_another_processor_asks_for_a_new_build(fresh: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = building.library_path()
+@needs_compiler
+def test_another_processor_asks_for_a_new_build_and_leaves_the_first_ones(
+    fresh: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = building.build()
     monkeypatch.setattr(building, "processor_features", lambda: "another one")
     building.library_path.cache_clear()
     assert building.library_path() != before
     assert not compiled.available()
+    assert building.build() != before
+    assert before.exists()
+
+
+@needs_compiler
+def test_a_processor_that_nothing_is_known_of_gets_code_for_any(
+    fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(building, "processor_features", lambda: None)
+    building.library_path.cache_clear()
+    outcome = pop("build-cpu", "--verbose")
+    assert outcome.status == 0, outcome.err
+    assert "native" not in outcome.out
+    assert compiled.available()
+
+
+@needs_compiler
+def test_a_library_that_no_longer_loads_is_compiled_again(fresh: Path, pop: Pop) -> None:
+    building.library_path().write_bytes(b"of a system that is gone")
+    assert "compile them again: `pop build-cpu`" in (compiled.why_not() or "")
+    assert pop("build-cpu").status == 0
+    assert compiled.available()
+
+
+@needs_compiler
+def test_the_compiler_that_is_asked_for_is_the_one_that_runs(
+    fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CXX", "clang++-of-tomorrow")
+    outcome = pop("build-cpu")
+    assert outcome.status == 2
+    assert "CXX is 'clang++-of-tomorrow', which is not on this machine" in outcome.err
+    monkeypatch.setenv("CXX", f"env {(find_compiler_without_cxx() or ['g++'])[0]}")
+    outcome = pop("build-cpu", "--verbose")
+    assert outcome.status == 0, outcome.err
+    assert outcome.out.split()[0].endswith("/env")
+
+
+def find_compiler_without_cxx() -> list[str] | None:
+    with pytest.MonkeyPatch.context() as without:
+        without.delenv("CXX", raising=False)
+        return find_compiler()
+
+
+def test_a_compiler_that_does_not_run_is_named(fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch) -> None:
+    junk = fresh / "junk"
+    junk.write_bytes(bytes(64))
+    junk.chmod(0o755)
+    monkeypatch.setenv("CXX", str(junk))
+    outcome = pop("build-cpu")
+    assert outcome.status == 2
+    assert str(junk) in outcome.err
+    assert not list(fresh.glob("*.so"))
 
 
 def test_without_a_compiler_it_says_which_to_install(
@@ -118,7 +176,7 @@ def test_a_compiler_that_fails_is_quoted_and_leaves_nothing(
 def test_a_compiler_that_does_not_know_the_processor_makes_code_for_any(
     fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = find_compiler()
+    real = " ".join(find_compiler() or [])
     compiler(fresh, f'case "$*" in *=native*) echo "unknown value" >&2; exit 1;; esac; exec {real} "$@"', monkeypatch)
     outcome = pop("build-cpu", "--verbose")
     assert outcome.status == 0, outcome.err

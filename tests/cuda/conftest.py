@@ -10,7 +10,7 @@ import pytest
 
 pytest.register_assert_rewrite("pop_ref.conformance.laws")
 
-from cuda_ext.host_mirror import find_compiler  # noqa: E402  asserts must be rewritten first
+from cuda_ext.compiler import find_compiler  # noqa: E402  asserts must be rewritten first
 from pop_ref.conformance.backends import shipped  # noqa: E402
 from pop_ref.conformance.plugin import parametrize_backends  # noqa: E402
 

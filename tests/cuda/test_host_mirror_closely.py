@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuda_ext.host_mirror import find_compiler
+from cuda_ext.compiler import find_compiler
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.cases import CASES, cotangent_like, rounded, sensitivity, transposed
 from pop_ref.conformance.golden import golden_scene

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
+from textwrap import dedent
 
 import pytest
 import torch
@@ -11,6 +15,8 @@ from torch import Tensor
 from pop_fast import compiled
 from pop_fast.compositing import Composite
 from pop_fast.compositing import composite as composite_in_torch
+from pop_fast.raster_inputs import check_cameras
+from pop_fast.raster_stages import stages_of
 from pop_fast.tiles import TileLists, tile_lists
 from pop_ref.constants import INRIA, PAPER, Profile
 
@@ -149,6 +155,59 @@ def test_threads_of_its_own_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) 
         torch.set_num_threads(before)
     assert torch.equal(found.image, own.image)
     assert all(torch.equal(a, b) for a, b in zip(gradients, of_own, strict=True))
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the limit on memory is Linux's")
+def test_running_out_of_memory_is_an_error_and_not_the_end(tmp_path: Path) -> None:
+    program = """
+        import resource, torch
+        from pop_fast.rasterization import rasterization
+
+        def render(tile_size):
+            means, quats = torch.tensor([[0.0, 0.0, 4.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+            Ks = torch.tensor([[[20.0, 0.0, 8.0], [0.0, 20.0, 8.0], [0.0, 0.0, 1.0]]])
+            splat = (means, quats, torch.ones(1, 3), torch.ones(1), torch.ones(1, 3))
+            extras = {"tile_size": tile_size, "counts": True, "backend": "compiled"}
+            return rasterization(*splat, torch.eye(4)[None], Ks, 16, 16, **extras)
+
+        render(16)
+        used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (used + 2**28, used + 2**28))
+        try:
+            render(4096)
+        except (MemoryError, RuntimeError) as error:
+            print(type(error).__name__, bool(render(16)[0].any()))
+    """
+    done = subprocess.run([sys.executable, "-c", dedent(program)], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "MemoryError True\n"
+
+
+def test_what_is_kept_for_the_transpose_goes_with_it() -> None:
+    given = splats(n=400)
+    leaf = given.opacities.clone().requires_grad_()
+    found = native(given.means2d, given.conics, leaf, given.colors, given.lists, WIDTH, HEIGHT)
+    node = found.image.grad_fn
+    names = [name for name in node.kept if name == "lights"]
+    assert names == ["lights"]
+    assert not any(isinstance(value, Tensor) for value in vars(node).values())
+    found.image.sum().backward()
+    with pytest.raises(RuntimeError, match="after they have already been freed"):
+        _ = node.saved_tensors
+
+
+def test_a_tile_that_no_memory_holds_is_refused() -> None:
+    with pytest.raises(ValueError, match="tile_size is 65536; it must be <= 4096"):
+        check_cameras(torch.eye(4)[None], torch.eye(3)[None], 16, 16, 65536, (), torch.float32)
+
+
+@pytest.mark.parametrize("lists", ["fast", "compiled"])
+def test_a_splat_whose_conic_vanished_is_listed_everywhere(lists: str) -> None:
+    listing = stages_of(lists).tile_lists
+    conics, radii = torch.zeros(1, 3), torch.full((1, 2), 10**6, dtype=torch.int32)
+    shape = {"conics": conics, "opacities": torch.tensor([0.5])}
+    found = listing(torch.zeros(1, 2), radii, torch.ones(1), WIDTH, HEIGHT, 16, PAPER, **shape)
+    assert found.lengths.tolist() == [1] * 9
 
 
 def test_nothing_to_blend_is_black() -> None:

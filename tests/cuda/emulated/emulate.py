@@ -22,7 +22,7 @@ from typing import Any
 import pytest
 
 import cuda_ext
-from cuda_ext.host_mirror import find_compiler
+from cuda_ext.compiler import find_compiler
 
 HERE, CUDA_EXT = Path(__file__).parent, Path(cuda_ext.__file__).parent
 # _setjmp and _longjmp switch fibers, which a fortified longjmp takes for an accident
@@ -87,7 +87,7 @@ def build(folder: Path) -> Path:
     assert compiler is not None
     roots = [CUDA_EXT / "csrc", CUDA_EXT, HERE]
     files = sorted(f for root in roots for f in root.rglob("*") if f.suffix in (".cu", ".cuh", ".h", ".cpp"))
-    digest = hashlib.sha256(" ".join((compiler, sys.version, nanobind.__version__, *FLAGS)).encode())
+    digest = hashlib.sha256(" ".join((*compiler, sys.version, nanobind.__version__, *FLAGS)).encode())
     for file in files:
         digest.update(file.read_bytes())
     library = folder / f"emulated_{digest.hexdigest()[:16]}" / "_kernels.so"
@@ -108,7 +108,7 @@ def build(folder: Path) -> Path:
     flags = [*FLAGS, *(f"-I{path}" for path in (*folders, sysconfig.get_paths()["include"]))]
     partial = work / "_kernels.so"
     done = subprocess.run(
-        [compiler, *flags, *map(str, sources), "-o", str(partial)], capture_output=True, text=True, check=False
+        [*compiler, *flags, *map(str, sources), "-o", str(partial)], capture_output=True, text=True, check=False
     )
     if done.returncode != 0:
         raise RuntimeError(f"the kernels cannot be compiled for the host:\n{done.stderr[-4000:]}")

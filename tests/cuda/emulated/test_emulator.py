@@ -69,7 +69,8 @@ def test_a_missing_barrier_and_torn_warps_are_seen(tmp_path: Path) -> None:
     flags = [flag for flag in FLAGS if flag not in ("-shared", "-fPIC")]
     compiler = emulate.find_compiler()
     assert compiler is not None
-    command = [compiler, *flags, f"-I{HERE / 'include'}", str(source), str(HERE / "emulator.cpp"), "-o", str(program)]
+    sources = [str(source), str(HERE / "emulator.cpp")]
+    command = [*compiler, *flags, f"-I{HERE / 'include'}", *sources, "-o", str(program)]
     subprocess.run(command, check=True)
     done = subprocess.run([program], capture_output=True, text=True, check=True)
     right_with_a_barrier, wrong_without, *words = done.stdout.split("\n")[0].split() + done.stdout.splitlines()[1:]
