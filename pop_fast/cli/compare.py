@@ -12,7 +12,8 @@ import tyro
 from pop_fast.cli.arguments import parse
 from pop_fast.errors import PopError
 from pop_fast.report.compare import markdown, plain, row
-from pop_fast.report.source import read_config, read_last_stats
+from pop_fast.report.source import read_last_stats
+from pop_fast.train.results import read_config
 
 _EXAMPLES: Final = """
     pop compare out/scene_pop out/scene_adc

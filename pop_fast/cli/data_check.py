@@ -14,6 +14,7 @@ from pop_fast.cli import examine
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.doctor import memory_bytes
 from pop_fast.cli.progress import bars
+from pop_fast.io.jpeg import jpeg_damage
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +60,9 @@ def look_over(root: Path) -> list[examine.Finding]:
         for photo in pool.map(lambda shot: examine.read_photo(root, shot), shots):
             photos.append(photo)
             progress("looking at photographs", len(photos), len(shots))
-    findings += examine.about_photos(photos, root)
+    with jpeg_damage([photo.path for photo in photos if photo.path is not None]) as damage:
+        findings += examine.about_photos(photos, root)
+    findings += [examine.Finding("bad", "photographs", message) for message in damage.values()]
     findings += examine.about_masks(photos, root)
     findings += examine.about_points(shots, cloud)
     findings += examine.about_reprojection(root)

@@ -21,7 +21,7 @@ from pop_fast.train.config import TrainConfig
 from pop_fast.train.environment import reproducible
 from pop_fast.train.evaluate import evaluate
 from pop_fast.train.lpips import LPIPS
-from pop_fast.train.metrics import population
+from pop_fast.train.metrics import population, too_small
 from pop_fast.train.on_device import renderer
 from pop_fast.train.results import ResultFolder
 from pop_fast.train.views import ViewTensors
@@ -61,6 +61,9 @@ def run(argv: Sequence[str]) -> int:
     views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
     if not views:
         raise PopError(f"{capture.name}: holds no view out; give --test-every 8 or another number over 0")
+    small = too_small(views)
+    if small is not None:
+        raise PopError(f"{capture.name}: {small}; use larger images (a lower --factor)")
     stats = measure_splat(splat, config, views, nets)
     if args.per_view:
         for name, numbers in stats["per_view"].items():

@@ -35,22 +35,20 @@ class Args(CaptureOptions):
     out: Annotated[Path, tyro.conf.arg(metavar="FILE|DIR")]
     """Where to: a .ply, a .splat, or with --layout inria a new folder."""
     layout: Literal["file", "inria"] = "file"
-    """"inria" writes point_cloud/, cameras.json, cfg_args, held-out renders and results.json, as many tools expect."""
+    """"inria" writes point_cloud/, cameras.json, cfg_args, and held-out renders, as many tools expect."""
     frame: Literal["capture", "training"] | None = None
     """World frame of the output; by default the capture's own for a result, and the file's own for a lone file."""
     drop_invisible: bool = False
     """Leave out Gaussians with opacity under 1/255: no renderer shows them."""
     overwrite: bool = False
-    """Replace what is already there."""
+    """Replace the file, or the folder where it holds nothing but an earlier export."""
 
 
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "export", examples=_EXAMPLES)
-    if args.layout == "file" and args.out.suffix.lower() not in (".ply", ".splat"):
-        raise PopError(f"{args.out}: the name must end in .ply or .splat; for a folder give --layout inria")
-    if args.layout == "file" and args.out.exists() and not args.overwrite:
-        raise PopError(f"{args.out}: exists; pass --overwrite or another --out")
+    if args.layout == "file":
+        check_file(args)
     splat = load_splat(args.splat)
     if args.layout == "inria":
         capture, config = open_capture(splat, args)
@@ -67,6 +65,22 @@ def run(argv: Sequence[str]) -> int:
         save_ply(args.out, splat.params, splat.config.antialiased)
     print(f"{n:,} Gaussians, {args.out.stat().st_size / 2**20:.1f} MiB -> {args.out}")
     return 0
+
+
+def check_file(args: Args) -> None:
+    """Check that one file may be written where it is asked for.
+
+    Raises:
+        PopError: another kind of file, something that is not to be replaced, or the splat itself.
+    """
+    if args.out.suffix.lower() not in (".ply", ".splat"):
+        raise PopError(f"{args.out}: the name must end in .ply or .splat; for a folder give --layout inria")
+    if args.out.is_dir():
+        raise PopError(f"{args.out}: a folder of this name is in the way; choose another --out")
+    if args.out.exists() and args.splat.exists() and args.out.samefile(args.splat):
+        raise PopError(f"{args.out}: is the splat that is read; choose another --out")
+    if args.out.exists() and not args.overwrite:
+        raise PopError(f"{args.out}: exists; pass --overwrite or another --out")
 
 
 def in_frame(splat: Splat, args: Args) -> Splat:

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
-from pop_fast.cli.render import rendered
+from pop_fast.cli.render import paths_read, rendered
 from pop_fast.cli.splat import Splat
 from pop_fast.data import Capture, View, to_capture_frame
 from pop_fast.io.atomic import folder_atomically
 from pop_fast.io.images import write_png
 from pop_fast.io.ply import save_ply
 from pop_fast.train.views import ViewTensors
+
+_BY: Final = "exported_by='pop export'"
+_FILES: Final = re.compile(
+    r"cfg_args|cameras\.json|point_cloud/iteration_\d+/point_cloud\.ply|test/ours_\d+/(renders|gt)/\d{5,}\.png"
+)
 
 
 def write_inria_folder(splat: Splat, capture: Capture, out: Path, overwrite: bool) -> None:
@@ -27,12 +34,16 @@ def write_inria_folder(splat: Splat, capture: Capture, out: Path, overwrite: boo
         splat: what to write, in the frame of `capture`.
         capture: its cameras and photographs.
         out: the folder to make.
-        overwrite: replace an existing folder.
+        overwrite: replace a folder that an earlier export wrote, if nothing else is in it.
+
+    Raises:
+        PopError: `out` is there and may not be replaced, or cannot be written.
     """
     transform = capture.world_transform
     steps = 30_000 if splat.step is None else splat.step + 1
     held_out = capture.test_views(splat.config.test_every)
-    with folder_atomically(out, overwrite) as folder:
+    keeps = paths_read(splat, Path(splat.config.data), capture)
+    with folder_atomically(out, overwrite, keeps=keeps, recognise=_exported_to(out)) as folder:
         params = to_capture_frame(splat.params, transform)
         save_ply(folder / "point_cloud" / f"iteration_{steps}" / "point_cloud.ply", params, splat.config.antialiased)
         cameras = [_camera(i, view, transform, capture.world_scale) for i, view in enumerate(capture.views)]
@@ -42,6 +53,15 @@ def write_inria_folder(splat: Splat, capture: Capture, out: Path, overwrite: boo
         for i, (view, frame) in enumerate(zip(held_out, frames, strict=True)):
             write_png(folder / "test" / f"ours_{steps}" / "renders" / f"{i:05d}.png", frame)
             write_png(folder / "test" / f"ours_{steps}" / "gt" / f"{i:05d}.png", view.image)
+
+
+def _exported_to(folder: Path) -> Callable[[Path], bool]:
+    """Tell which files of a folder an earlier export wrote; none where another trainer left the folder."""
+    try:
+        ours = _BY in (folder / "cfg_args").read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        ours = False
+    return lambda file: ours and _FILES.fullmatch(file.as_posix()) is not None
 
 
 def _camera(index: int, view: View, transform: np.ndarray, scale: float) -> dict[str, Any]:
@@ -72,4 +92,5 @@ def _cfg_args(splat: Splat, out: Path) -> str:
         "source_path": splat.config.data,
         "white_background": splat.config.background == (1.0, 1.0, 1.0),
     }
-    return f"Namespace({', '.join(f'{name}={value!r}' for name, value in settings.items())})"
+    # last comes a setting that no script asks for: it tells our exports from folders that took days to train
+    return f"Namespace({', '.join(f'{name}={value!r}' for name, value in settings.items())}, {_BY})"

@@ -1,9 +1,15 @@
-"""`pop render`: held-out views as pictures, or a camera path as pictures or a video."""
+"""`pop render`: held-out views as pictures, or a camera path as pictures or a video.
+
+Beside the pictures lies renders.json: what was rendered, and which file shows which view. It is also how a folder of
+pictures is known as this command's own, so that --overwrite replaces nothing else.
+"""
 
 from __future__ import annotations
 
+import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final, Literal
@@ -17,14 +23,16 @@ from pop_fast.cli.arguments import parse
 from pop_fast.cli.splat import CaptureOptions, Splat, load_splat, open_capture
 from pop_fast.data import Capture
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import folder_atomically
+from pop_fast.io.atomic import folder_atomically, write_atomically
 from pop_fast.io.images import write_png
+from pop_fast.io.names import inside, picture_names
 from pop_fast.paths import VideoFile, camera_path
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.environment import reproducible
 from pop_fast.train.on_device import renderer
 from pop_fast.train.views import ViewTensors, render_view
 
+_INDEX: Final = "renders.json"
 _EXAMPLES: Final = """
     pop render out/scene_pop --out views                     the held-out views, one PNG each
     pop render out/scene_pop --path orbit --video orbit.mp4  a video around the scene
@@ -39,7 +47,7 @@ class Args(CaptureOptions):
     splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|PLY")]
     """What to render."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Write one PNG a view into this new folder."""
+    """Write one PNG a view into this new folder, and renders.json, which lists them."""
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write a video: .mp4, .webm or .avi."""
     path: Literal["views", "orbit", "ellipse", "interpolate"] = "views"
@@ -49,7 +57,7 @@ class Args(CaptureOptions):
     fps: float = 30.0
     """Frames a second of a video."""
     overwrite: bool = False
-    """Replace what is already there."""
+    """Replace the video, and the folder where it holds nothing but an earlier render."""
 
 
 def run(argv: Sequence[str]) -> int:
@@ -57,28 +65,96 @@ def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "render", examples=_EXAMPLES)
     if args.out is None and args.video is None:
         raise PopError("nothing to write; give --out DIR for pictures, --video FILE for a video, or both")
-    if args.video is not None and args.video.exists() and not args.overwrite:
-        raise PopError(f"{args.video}: exists; pass --overwrite or another --video")
+    video = planned_video(args)
     splat = load_splat(args.splat)
     capture, config = open_capture(splat, args)
     views = planned_views(capture, config, args.path, args.frames)
+    if video is not None:
+        check_one_size(video, views)
     frames = rendered(splat, config, views)
     if args.out is None:
-        written = write_video(frames, args.video, args.fps)
+        written = write_video(frames, video)
     else:
-        with folder_atomically(args.out, args.overwrite) as folder:
-            pictures = write_pictures(frames, views, folder)
-            written = write_video(pictures, args.video, args.fps)
+        keeps = paths_read(splat, Path(config.data), capture)
+        with folder_atomically(args.out, args.overwrite, keeps=keeps, recognise=listed_in(args.out)) as folder:
+            files = picture_names([view.name for view in views])
+            written = write_video(write_pictures(frames, files, folder), video)
+            listing = [{"view": view.name, "file": file.as_posix()} for view, file in zip(views, files, strict=True)]
+            index = {"splat": str(splat.path), "capture": capture.name, "path": args.path, "renders": listing}
+            text = json.dumps(index, indent=2) + "\n"
+            write_atomically(folder / _INDEX, lambda file: file.write(text.encode()))
     targets = " and ".join(str(target) for target in (args.out, args.video) if target is not None)
     print(f"{written} views of {capture.name} -> {targets}")
     return 0
+
+
+def planned_video(args: Args) -> VideoFile | None:
+    """Check the video that was asked for before the long work begins.
+
+    Raises:
+        PopError: its name, its rate or its place will not do, or it is there and may not be replaced.
+    """
+    if args.video is None:
+        return None
+    video = VideoFile(args.video, args.fps)
+    if args.out is not None and args.video.resolve().is_relative_to(args.out.resolve()):
+        raise PopError(
+            f"{args.video}: lies in --out {args.out}, which holds pictures only; give --video another folder"
+        )
+    if args.video.exists() and not args.overwrite:
+        raise PopError(f"{args.video}: exists; pass --overwrite or another --video")
+    return video
+
+
+def check_one_size(video: VideoFile, views: Sequence[ViewTensors]) -> None:
+    """Check that all views make frames of one size.
+
+    Raises:
+        PopError: they do not.
+    """
+    # in pairs of pixels, as an odd last row or column is left out of a video
+    sizes = {tuple(side // 2 for side in view.photo.shape[:2]): view for view in reversed(views)}
+    if len(sizes) > 1:
+        some = list(sizes.values())[:2]
+        told = ", ".join(f"{view.name} is {view.photo.shape[1]} x {view.photo.shape[0]} px" for view in some)
+        raise PopError(
+            f"{video.path}: the views have {len(sizes)} sizes ({told}) and a video has one; "
+            "write pictures with --out DIR, or film a path with --path orbit"
+        )
+
+
+def paths_read(splat: Splat, root: Path, capture: Capture) -> list[Path]:
+    """List what the rendering of a splat reads: it, its result folder, the capture and where its photographs lie.
+
+    Args:
+        splat: what is rendered.
+        root: the capture's folder.
+        capture: the capture.
+
+    Returns:
+        Files and folders; no output may take the place of one.
+    """
+    own = [splat.path] if splat.folder is None else [splat.path, splat.folder]
+    # listed names may lead out of the capture, and so may its links
+    listed = {(root / view.name).parent for view in capture.views}
+    return [*own, root, *sorted(listed), *(entry for entry in sorted(root.iterdir()) if entry.is_symlink())]
+
+
+def listed_in(folder: Path) -> Callable[[Path], bool]:
+    """Tell which files of a folder an earlier render wrote: those that its renders.json lists, and that itself."""
+    try:
+        index = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
+        files = {_INDEX, *(str(entry["file"]) for entry in index["renders"])}
+    except (OSError, ValueError, TypeError, KeyError):
+        files = set()  # not there, or not this command's: then nothing in the folder is known to be
+    return lambda file: file.as_posix() in files
 
 
 def planned_views(capture: Capture, config: TrainConfig, path: str, frames: int) -> list[ViewTensors]:
     """Choose the cameras: the held-out views, or a path with the size and lens of the first training view.
 
     Raises:
-        PopError: there is nothing to render.
+        PopError: there is nothing to render, or too little to make the path of.
     """
     if path == "views":
         views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
@@ -86,6 +162,14 @@ def planned_views(capture: Capture, config: TrainConfig, path: str, frames: int)
             raise PopError(f"{capture.name}: holds no view out; give --test-every 8, or --path orbit")
         return views
     train = capture.train_views(config.test_every)
+    needed = 2 if path == "interpolate" else 1
+    if len(train) < needed:
+        raise PopError(
+            f"{capture.name}: --path {path} needs {needed} or more training views and there are {len(train)}; "
+            f"hold fewer out with --test-every 0{', or take --path orbit' if train else ''}"
+        )
+    if frames < 1:
+        raise PopError(f"frames is {frames}; give --frames 1 or more")
     lens = train[0]
     blank = torch.zeros((lens.height, lens.width, 3), dtype=torch.uint8)
     K = torch.from_numpy(lens.K).float()[None]
@@ -108,22 +192,19 @@ def rendered(splat: Splat, config: TrainConfig, views: Sequence[ViewTensors]) ->
             yield (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
 
 
-def write_pictures(frames: Iterator[np.ndarray], views: Sequence[ViewTensors], folder: Path) -> Iterator[np.ndarray]:
-    """Write each frame as PNG under its view's name, and hand it on."""
-    for frame, view in zip(frames, views, strict=True):
-        write_png(folder / Path(view.name).with_suffix(".png"), frame)
+def write_pictures(frames: Iterator[np.ndarray], files: Sequence[Path], folder: Path) -> Iterator[np.ndarray]:
+    """Write each frame as PNG under its name in the folder, and hand it on."""
+    for frame, file in zip(frames, files, strict=True):
+        write_png(inside(folder, file), frame)
         yield frame
 
 
-def write_video(frames: Iterator[np.ndarray], path: Path | None, fps: float) -> int:
-    """Write frames to a video, or just take them where `path` is None; returns how many there were."""
+def write_video(frames: Iterator[np.ndarray], video: VideoFile | None) -> int:
+    """Write frames to a video, or just take them where `video` is None; returns how many there were."""
     count = 0
-    if path is None:
-        for _ in frames:
-            count += 1
-        return count
-    with VideoFile(path, fps) as video:
+    with video or nullcontext():
         for frame in frames:
-            video.add(frame)
+            if video is not None:
+                video.add(frame)
             count += 1
     return count

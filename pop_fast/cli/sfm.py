@@ -34,7 +34,7 @@ class Args:
     seed: int = 0
     """Of every random choice."""
     overwrite: bool = False
-    """Replace an existing result."""
+    """Replace an earlier result of pop sfm; a folder that holds anything else is left alone."""
 
 
 def run(argv: Sequence[str]) -> int:

@@ -15,14 +15,14 @@ from torch import Tensor
 from pop_fast.cli.progress import bars
 from pop_fast.data import Capture, load_capture
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import write_atomically
 from pop_fast.io.ply import is_antialiased, load_ply
 from pop_fast.train.checkpoint import list_checkpoints
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.model import KEYS, first_non_finite
+from pop_fast.train.results import read_config
 from pop_fast.train.schedule import active_sh_degree
 
-_RECORD = "capture.json"
+RECORD = "capture.json"
 _SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
 
 
@@ -82,21 +82,25 @@ class CaptureRecord:
     world_transform: list[list[float]] = field(default_factory=lambda: np.eye(4).tolist())
 
 
-def write_record(folder: Path, record: CaptureRecord) -> None:
-    """Write capture.json into a result folder."""
-    text = json.dumps(asdict(record), indent=2) + "\n"
-    write_atomically(folder / _RECORD, lambda file: file.write(text.encode()))
+def record_text(record: CaptureRecord) -> str:
+    """Return what capture.json holds."""
+    return json.dumps(asdict(record), indent=2) + "\n"
 
 
 def read_record(folder: Path | None) -> CaptureRecord | None:
-    """Read capture.json, or None where there is none."""
-    path = folder / _RECORD if folder else None
+    """Read capture.json, or None where there is none.
+
+    Raises:
+        PopError: it is damaged; names it.
+    """
+    path = folder / RECORD if folder else None
     if path is None or not path.is_file():
         return None
     try:
         return CaptureRecord(**json.loads(path.read_text(encoding="utf-8")))
-    except (json.JSONDecodeError, TypeError) as error:
-        raise PopError(f"{path}: is not what 'pop train' writes ({error}); remove it and give --capture DIR") from error
+    except (ValueError, TypeError) as error:
+        fix = "remove it, and say again how to read the capture (--images, --missing)"
+        raise PopError(f"{path}: is not what 'pop train' writes ({error}); {fix}") from error
 
 
 def load_splat(path: Path) -> Splat:
@@ -111,18 +115,19 @@ def load_splat(path: Path) -> Splat:
         raise PopError(f"{path}: no such file or folder; give a result folder, a checkpoint (.pt) or a PLY")
     folder = path.resolve().parent.parent
     owner = folder if (folder / "cfg.json").is_file() else None
-    config = _config(owner) if owner else TrainConfig()
-    if path.suffix == ".ply":
+    config = read_config(owner) if owner else TrainConfig()
+    kind = path.suffix.lower()
+    if kind == ".ply":
         config = replace(config, antialiased=is_antialiased(path))
         return Splat(path=path, params=load_ply(path), config=config, folder=owner)
-    if path.suffix == ".pt":
+    if kind == ".pt":
         params, step = _read_checkpoint(path)
         return Splat(path=path, params=params, config=config, step=step, folder=owner)
     raise PopError(f"{path}: is neither a result folder nor a checkpoint (.pt) nor a .ply")
 
 
 def _from_folder(folder: Path) -> Splat:
-    config = _config(folder)
+    config = read_config(folder)
     checkpoints = list_checkpoints(folder)
     if checkpoints:
         params, step = _read_checkpoint(checkpoints[-1][1])
@@ -131,13 +136,6 @@ def _from_folder(folder: Path) -> Splat:
     if not plys:
         raise PopError(f"{folder}: holds no checkpoint and no PLY yet; train longer, or continue with --resume")
     return Splat(path=plys[-1], params=load_ply(plys[-1]), config=config, folder=folder)
-
-
-def _config(folder: Path) -> TrainConfig:
-    path = folder / "cfg.json"
-    if not path.is_file():
-        raise PopError(f"{folder}: has no cfg.json, so it is not a result of 'pop train'")
-    return TrainConfig.from_json(path.read_text(encoding="utf-8"))
 
 
 def _read_checkpoint(path: Path) -> tuple[dict[str, Tensor], int | None]:
@@ -184,6 +182,8 @@ def open_capture(splat: Splat, options: CaptureOptions) -> tuple[Capture, TrainC
     data = str(options.capture or splat.config.data)
     if not data:
         raise PopError(f"{splat.path}: nothing says which capture it shows; give --capture DIR")
+    if options.capture is None and not Path(data).is_dir():
+        raise PopError(f"{splat.path}: was trained on {data}, which is not there; give --capture DIR")
     changes: dict[str, Any] = {"data": data}
     if options.factor is not None:
         changes["factor"] = options.factor

@@ -7,6 +7,7 @@ import sys
 import time
 import typing
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -16,14 +17,16 @@ from pop_fast.backends import get_backend
 from pop_fast.cli import EXIT_INTERRUPTED
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.progress import bars
-from pop_fast.cli.splat import CaptureRecord, write_record
+from pop_fast.cli.splat import RECORD, CaptureRecord, read_record, record_text
 from pop_fast.data import Capture, load_capture
 from pop_fast.errors import PopError
 from pop_fast.report import write_report
+from pop_fast.train.checkpoint import list_checkpoints
 from pop_fast.train.choose import choose_backend, make_trainer
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.device_plan import unsupported
 from pop_fast.train.environment import keep_freed_memory
+from pop_fast.train.results import ResultFolder
 
 _EXAMPLES: Final = """
     pop train scene                          POP, the paper's 30,000 steps, results in out/scene_pop
@@ -58,8 +61,9 @@ class _Run:
     DATA is a folder with a COLMAP model (sparse/0), with transforms.json, or with photographs alone.
 
     Attributes:
-        resume: go on from the last checkpoint in the output folder, to the same bits as without the interruption.
-        overwrite: replace the results in the output folder.
+        resume: go on from the last checkpoint in the output folder, to the same bits as without the interruption; start
+            where there is none.
+        overwrite: replace the results in the output folder, once the first step has been taken.
         missing: what to do about photographs that are listed but absent.
         images: read the photographs from this folder of the capture.
         ignore_masks: do not use the capture's masks (where white means keep).
@@ -81,6 +85,7 @@ def run(argv: Sequence[str]) -> int:
     config, options = arguments(argv)
     folder = Path(config.result_dir)
     check_output(folder, options)
+    options = as_begun(folder, options)
     config, chosen = choose_backend(config, options.resume)
     check_backend(config)
     keep_freed_memory()
@@ -92,14 +97,18 @@ def run(argv: Sequence[str]) -> int:
     print(f"{capture.name}: {capture.source}; {_plan(config)}")
     print(chosen)
     how = {"resume": options.resume, "overwrite": options.overwrite, "loading_seconds": loading}
-    trainer = make_trainer(config, capture, **how)
+    beside = {RECORD: record_text(_record(capture, options))}
+    # absolute, so that the result can be looked at from another folder too
+    trainer = make_trainer(replace(config, data=str(Path(config.data).absolute())), capture, beside=beside, **how)
+    if options.resume:
+        print(_resumption(folder))
     try:
         stats = trainer.run()
     except KeyboardInterrupt:
-        write_record(folder, _record(capture, options))
-        print(f"pop: stopped after step {trainer.step}; the same command with --resume goes on", file=sys.stderr)
+        stopped = f"stopped after step {trainer.step}; the same command with --resume goes on"
+        nothing = "stopped before the first step; nothing was written"
+        print(f"pop: {stopped if trainer.step else nothing}", file=sys.stderr)
         return EXIT_INTERRUPTED
-    write_record(folder, _record(capture, options))
     report = write_report(folder)
     print(summary(stats))
     print(f"report: {report}")
@@ -119,9 +128,9 @@ def arguments(argv: Sequence[str]) -> tuple[TrainConfig, Any]:
     settings = {field.name: getattr(args, field.name) for field in dataclasses.fields(TrainConfig)}
     config = TrainConfig(**settings)
     if args.quiet:
-        config = dataclasses.replace(config, progress=False)
+        config = replace(config, progress=False)
     if not config.result_dir:
-        config = dataclasses.replace(config, result_dir=f"out/{Path(config.data).resolve().name}_{config.method}")
+        config = replace(config, result_dir=f"out/{Path(config.data).resolve().name}_{config.method}")
     return config, args
 
 
@@ -170,15 +179,42 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 
 
 def check_output(folder: Path, options: Any) -> None:
-    """Refuse an output folder that is in use before the minutes of loading, not after.
+    """Refuse an output folder that cannot be written to before the minutes of loading, not after.
 
     Raises:
-        PopError: the folder exists, holds something, and neither --resume nor --overwrite was given.
+        PopError: as `ResultFolder.check`, or both --resume and --overwrite were given.
     """
     if options.resume and options.overwrite:
         raise PopError("--resume and --overwrite exclude each other; choose one")
-    if folder.is_dir() and any(folder.iterdir()) and not (options.resume or options.overwrite):
-        raise PopError(f"{folder}: exists and is not empty; pass --resume, --overwrite or another --out")
+    if ResultFolder(folder).check(options.resume, options.overwrite):
+        print(f"note: {folder}: an --overwrite was cut short; the results that it had set aside are back")
+
+
+def as_begun(folder: Path, options: Any) -> Any:
+    """Read the capture of a run that is gone on with as it was read before, where the command does not say.
+
+    Args:
+        folder: the result folder.
+        options: a `_Run`; without `resume` it is returned as it is.
+
+    Raises:
+        PopError: capture.json is damaged.
+    """
+    record = read_record(folder) if options.resume else None
+    if record is None:
+        return options
+    return replace(
+        options,
+        images=options.images or record.images,
+        missing=record.missing if options.missing == _Run.missing else options.missing,
+        ignore_masks=options.ignore_masks or not record.masks,
+        source=record.source if options.source == _Run.source else options.source,
+    )
+
+
+def _resumption(folder: Path) -> str:
+    found = list_checkpoints(folder)
+    return f"going on from step {found[-1][0] + 1:,}" if found else f"nothing to resume in {folder}: starting anew"
 
 
 def check_backend(config: TrainConfig) -> None:

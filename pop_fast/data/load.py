@@ -9,15 +9,16 @@ from typing import Literal
 import numpy as np
 
 from pop_fast.data.capture import Capture, Progress, View
-from pop_fast.data.colmap import find_model, read_model
+from pop_fast.data.colmap import find_models, read_model
 from pop_fast.data.normalize import normalizing_transform, transform_points, transform_viewmats
-from pop_fast.data.photos import photo_folder, run_sfm
+from pop_fast.data.notes import about_other_models, about_random_points, about_unplaced
+from pop_fast.data.photos import photo_folder, photographs, run_sfm
 from pop_fast.data.random_points import random_points
 from pop_fast.data.shots import Cloud, Shot
 from pop_fast.data.transforms import find_transforms, read_transforms
 from pop_fast.data.views import PhotoOptions, read_views
 from pop_fast.errors import CaptureError
-from pop_fast.io.images import IMAGE_SUFFIXES, list_images
+from pop_fast.io.images import find_image, unreadable_photographs
 
 __all__ = ["load_capture"]
 
@@ -41,8 +42,9 @@ def load_capture(
 ) -> Capture:
     """Load photographs, cameras and sparse points of a capture.
 
-    `source="auto"` takes the first that is there: a COLMAP model (`sparse/0`, `sparse`, `colmap/sparse/0`, or the
-    folder itself), `transforms.json` or Blender's `transforms_train.json`, a bare folder of photographs.
+    `source="auto"` takes the first that is there: a COLMAP model (the largest in `sparse` and its subfolders, else in
+    `colmap/sparse`, else the folder itself), `transforms.json` or Blender's `transforms_train.json`, a bare folder of
+    photographs.
 
     Args:
         path: the capture's folder.
@@ -72,12 +74,14 @@ def load_capture(
     if missing not in ("error", "skip"):
         raise CaptureError(f"missing is {missing!r}; it must be 'error' or 'skip'")
     options = PhotoOptions(int(factor), masks, missing, _background(background), images)
-    listing, shots, cloud, made_from = _read_listing(root, source, sfm, progress)
+    listing, shots, cloud, made_from, notes = _read_listing(root, source, sfm, progress)
     if len(shots) < 2:
         raise CaptureError(f"{listing}: has {len(shots)} view(s) with a known camera; a scene needs two or more")
     if made_from == "COLMAP model":
         shots = _beside_the_model(root, shots, images)
-    views, notes = read_views(root, listing, shots, options, progress)
+        notes += about_unplaced(root / (images or shots[0].folder), shots)
+    views, more = read_views(root, listing, shots, options, progress)
+    notes += more
     if len(views) < 2:
         raise CaptureError(
             f"{listing}: {len(views)} view(s) are left of {len(shots)}; a scene needs two or more: restore them"
@@ -93,30 +97,28 @@ def _background(color: tuple[float, float, float]) -> tuple[float, float, float]
 
 def _read_listing(
     root: Path, source: Source, sfm: bool, progress: Progress | None
-) -> tuple[Path, list[Shot], Cloud | None, str]:
-    model = find_model(root) if source in ("auto", "colmap") else None
-    if model is None and source == "photos":
-        model = _from_photos(root, sfm, progress)
-    if model is not None:
-        return model, *read_model(model), "COLMAP model"
+) -> tuple[Path, list[Shot], Cloud | None, str, list[str]]:
+    models = find_models(root) if source in ("auto", "colmap") else []
+    if models:
+        return models[0][0], *read_model(models[0][0]), "COLMAP model", about_other_models(root, models)
     found = find_transforms(root) if source in ("auto", "transforms") else []
     if found:
-        return found[0], *read_transforms(found), found[0].name
+        return found[0], *read_transforms(found), found[0].name, []
     if source == "colmap":
         raise CaptureError(
-            f"{root}: has no COLMAP model in sparse/0, sparse or colmap/sparse/0; run pop sfm, or COLMAP"
+            f"{root}: has no COLMAP model in sparse, sparse/0 or colmap/sparse/0; run pop sfm, or COLMAP"
         )
     if source == "transforms":
         raise CaptureError(f"{root}: has no transforms.json and no transforms_train.json; choose another --source")
     model = _from_photos(root, sfm, progress)
-    return model, *read_model(model), "COLMAP model"
+    return model, *read_model(model), "COLMAP model", []
 
 
 def _beside_the_model(root: Path, shots: list[Shot], images: str | None) -> list[Shot]:
     """Look for a COLMAP model's photographs in `images`, or in the capture itself where there is no such folder."""
     if (root / (images or "images")).is_dir():
         return shots
-    if images is None and any(path.suffix.lower() in IMAGE_SUFFIXES for path in root.iterdir()):
+    if images is None and any(find_image(root, shot.file) for shot in shots):
         return [replace(shot, folder="") for shot in shots]
     raise CaptureError(
         f"{root / (images or 'images')}: no such folder; name the one with the photographs: --images NAME"
@@ -125,11 +127,10 @@ def _beside_the_model(root: Path, shots: list[Shot], images: str | None) -> list
 
 def _from_photos(root: Path, sfm: bool, progress: Progress | None) -> Path:
     photos = photo_folder(root)
-    count = len(list_images(photos))
+    count = len(photographs(photos))
     if count == 0:
-        raise CaptureError(
-            f"{root}: has no photographs, no COLMAP model and no transforms.json; give the folder of a capture"
-        )
+        hint = unreadable_photographs(photos) or "give the folder of a capture"
+        raise CaptureError(f"{root}: has no photographs, no COLMAP model and no transforms.json; {hint}")
     if not sfm:
         raise CaptureError(
             f"{root}: has {count} photographs but nothing says where they were taken; run pop sfm {root} first"
@@ -161,6 +162,7 @@ def _assemble(
             source = f"{made_from}: {len(views)} views, {len(cloud)} points"
         else:
             cloud = random_points(views, points, seed)
+            notes = notes + about_random_points(views, len(cloud), points)
             source = f"{made_from}: {len(views)} views, no points: {len(cloud)} random ones (seed {seed})"
     except CaptureError as error:
         raise CaptureError(f"{listing}: {error}") from error

@@ -20,11 +20,13 @@ import pycolmap
 
 from pop_fast.data.capture import Progress
 from pop_fast.data.colmap import quiet_colmap
+from pop_fast.data.sfm_files import recognise_result, write_list
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import folder_atomically
-from pop_fast.io.images import list_images, read_image
+from pop_fast.io.images import list_images, read_image, unreadable_photographs
+from pop_fast.io.jpeg import sound_jpegs
 
-__all__ = ["SfmResult", "photo_folder", "run_sfm"]
+__all__ = ["SfmResult", "photo_folder", "photographs", "run_sfm"]
 
 _EXHAUSTIVE_UP_TO = 60
 _NEIGHBOURS = 10
@@ -57,6 +59,11 @@ def photo_folder(root: Path) -> Path:
     return root / "images" if (root / "images").is_dir() else root
 
 
+def photographs(folder: Path) -> list[Path]:
+    """List the photographs of a folder and its subfolders, sorted by relative name; `masks` holds none."""
+    return [path for path in list_images(folder) if path.relative_to(folder).parts[0] != "masks"]
+
+
 def run_sfm(
     photo_dir: str | Path,
     out_dir: str | Path | None = None,
@@ -73,43 +80,62 @@ def run_sfm(
     Args:
         photo_dir: the photographs, in subfolders too.
         out_dir: the capture to make, with copies of the photographs in `images`. Without it, `sparse/0` is written
-            beside the photographs: in the parent of a folder named `images`, else in `photo_dir` itself.
+            beside the photographs: in the parent of a folder named `images`, else in `photo_dir` itself; and there too
+            where `photo_dir` is given as `out_dir`.
         progress: called with (stage, done, total) while features, matches and cameras are found.
         max_size: longest side at which features are looked for, px; cameras are always in full size.
         camera_model: COLMAP's name.
         single_camera: all photographs share one camera; by default when they are all of one size.
         seed: of every random choice.
-        overwrite: replace an existing result.
+        overwrite: replace an existing result, where it is nothing but that.
 
     Raises:
-        CaptureError: fewer than two photographs, a damaged one, or no model that holds two of them.
+        CaptureError: fewer than two photographs, a damaged one, no model that holds two of them, or a result that would
+            take the place of photographs or of files that are not its own.
     """
     photos = Path(photo_dir)
     if not photos.is_dir():
         raise CaptureError(f"{photos}: no such folder; give the folder with the photographs")
-    beside = photos.resolve().parent if photos.resolve().name == "images" else photos.resolve()
-    capture = Path(out_dir) if out_dir is not None else beside
-    names = [path.relative_to(photos) for path in list_images(photos) if path.relative_to(photos).parts[0] != "masks"]
+    capture, target = _place(photos, out_dir)
+    names = [path.relative_to(photos) for path in photographs(photos) if not path.resolve().is_relative_to(target)]
     if len(names) < 2:
-        raise CaptureError(f"{photos}: has {len(names)} photograph(s); a scene needs two or more that overlap")
+        hint = unreadable_photographs(photos) or "a scene needs two or more that overlap"
+        raise CaptureError(f"{photos}: has {len(names)} photograph(s); {hint}")
     if single_camera is None:
         single_camera = len(_sizes(photos, names, progress)) == 1
-    in_place = capture.resolve() == beside
-    with folder_atomically(capture / "sparse" if in_place else capture, overwrite) as folder:
-        model = folder / "0" if in_place else folder / "sparse" / "0"
+    in_place = target != capture.resolve()
+    own = recognise_result(capture.resolve(), target)
+    with folder_atomically(target, overwrite, recognise=own) as folder:
+        sparse = folder if in_place else folder / "sparse"
         with tempfile.TemporaryDirectory(prefix="pop_sfm_") as work, quiet_colmap():
             job = _Job(photos, _stage(photos, names, Path(work)), Path(work), progress)
             best = _find_cameras(job, camera_model, single_camera, max_size, seed)
             for image in best.images.values():
                 image.name = names[int(Path(image.name).stem)].as_posix()
-            model.mkdir(parents=True)
-            best.write_binary(model)
+            (sparse / "0").mkdir(parents=True)
+            best.write_binary(sparse / "0")
         if not in_place:
             for name in names:
                 (folder / "images" / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(photos / name, folder / "images" / name)
+        write_list(sparse, folder, "sparse/" if in_place else "")
     error = float(best.compute_mean_reprojection_error())
     return SfmResult(capture, best.num_reg_images(), len(names), best.num_points3D(), error)
+
+
+def _place(photos: Path, out_dir: str | Path | None) -> tuple[Path, Path]:
+    """Say where the capture is made, and which folder is replaced for it: `sparse` in place, else the whole capture."""
+    given = photos.resolve()
+    beside = given.parent if given.name == "images" else given
+    capture = Path(out_dir) if out_dir is not None else beside
+    in_place = capture.resolve() in (beside, given)
+    if not in_place and given.is_relative_to(capture.resolve()):
+        raise CaptureError(
+            f"{capture}: holds the photographs of {photos}, which a new capture there would replace; "
+            "choose another --out, or none to write sparse/0 beside them"
+        )
+    target = capture.resolve() / "sparse" if in_place else capture.resolve()
+    return capture, target
 
 
 @dataclass(frozen=True)
@@ -143,8 +169,9 @@ def _stage(photos: Path, names: list[Path], work: Path) -> list[str]:
 def _sizes(photos: Path, names: list[Path], progress: Progress | None) -> set[tuple[int, int]]:
     """Read all photographs once: damaged ones are found before the long work begins."""
     sizes: set[tuple[int, int]] = set()
-    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
-        for done, shape in enumerate(pool.map(lambda name: read_image(photos / name).shape, names), start=1):
+    files = [photos / name for name in names]
+    with sound_jpegs(files), ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
+        for done, shape in enumerate(pool.map(lambda file: read_image(file).shape, files), start=1):
             sizes.add((shape[1], shape[0]))
             if progress is not None:
                 progress("checking photographs", done, len(names))

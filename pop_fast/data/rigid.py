@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import pycolmap
 
-__all__ = ["nearest_rigid"]
+from pop_fast.io.points import FARTHEST
+
+__all__ = ["nearest_rigid", "rigid_from_quat"]
 
 # files hold single precision or a few digits; anything further off is another kind of matrix
 _TOLERANCE = 1e-3
+# a quaternion that is shorter is no direction any more, only what is left of rounding or of a corrupt file
+_SHORTEST = 1e-6
 
 
 def nearest_rigid(matrix: np.ndarray) -> np.ndarray:
@@ -17,12 +22,15 @@ def nearest_rigid(matrix: np.ndarray) -> np.ndarray:
         matrix: float64 [4, 4]; rigid but for the rounding of a file.
 
     Raises:
-        ValueError: NaN or Inf, a last row other than 0 0 0 1, a scale, shear or reflection. The message continues
-            "<matrix> ...".
+        ValueError: NaN, Inf or an absurd distance, a last row other than 0 0 0 1, a scale, shear or reflection. The
+            message continues "<matrix> ...".
     """
     if not np.all(np.isfinite(matrix)):
         row, column = (int(i) for i in np.argwhere(~np.isfinite(matrix))[0])
         raise ValueError(f"[{row}][{column}] is {matrix[row, column]}; every entry must be finite")
+    if np.abs(matrix).max() > FARTHEST:
+        row, column = (int(i) for i in np.argwhere(np.abs(matrix) > FARTHEST)[0])
+        raise ValueError(f"[{row}][{column}] is {matrix[row, column]}; it must be within {FARTHEST:.0e}")
     if np.abs(matrix[3] - np.array([0.0, 0.0, 0.0, 1.0])).max() > _TOLERANCE:
         raise ValueError(f"has the last row {matrix[3].tolist()}; it must be [0, 0, 0, 1]")
     linear = matrix[:3, :3]
@@ -36,4 +44,29 @@ def nearest_rigid(matrix: np.ndarray) -> np.ndarray:
     rigid = np.eye(4)
     rigid[:3, :3] = U @ Vt
     rigid[:3, 3] = matrix[:3, 3]
+    return rigid
+
+
+def rigid_from_quat(quat: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """Build [R t; 0 1] from a quaternion of any norm, R that of quat / |quat|. float64 [4, 4]
+
+    Args:
+        quat: wxyz. float64 [4]
+        translation: float64 [3]
+
+    Raises:
+        ValueError: NaN or Inf, a quaternion of norm zero, or an absurd distance.
+    """
+    if not np.all(np.isfinite(quat)) or np.abs(quat).max() < _SHORTEST:
+        raise ValueError(f"its quaternion QW QX QY QZ is {quat.tolist()}; it must be finite and not zero")
+    if not np.all(np.abs(translation) <= FARTHEST):
+        raise ValueError(
+            f"its translation TX TY TZ is {translation.tolist()}; it must be finite and within {FARTHEST:.0e}"
+        )
+    # divided by its largest entry first, so that no square overflows
+    unit = quat / np.abs(quat).max()
+    unit = unit / np.linalg.norm(unit)
+    rigid = np.eye(4)
+    rigid[:3, :3] = pycolmap.Rotation3d(unit[[1, 2, 3, 0]]).matrix()
+    rigid[:3, 3] = translation
     return rigid

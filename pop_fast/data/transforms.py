@@ -26,6 +26,10 @@ __all__ = ["find_transforms", "read_transforms"]
 
 _POINTS = ("sparse_pc.ply", "points3D.ply", "points3d.ply")
 _RADIAL = ("k1", "k2", "k3", "k4")
+# px; more than any photograph has, and less than what a corrupt number would ask for
+_WIDEST = 1_000_000
+# what is measured in pixels of the size w x h; without it, only a field of view can be used
+_IN_PIXELS = ("fl_x", "fl_y", "cx", "cy")
 _MODELS = ("OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE", "perspective")
 
 
@@ -57,8 +61,10 @@ def read_transforms(paths: list[Path]) -> tuple[list[Shot], Cloud | None]:
         listing = _load(path)
         split = cast("Split | None", path.stem.partition("_")[2] or None)
         shots += _read_listing(path, listing, split)
-        if "ply_file_path" in listing:
-            named = path.parent / str(listing["ply_file_path"])
+        points = listing.get("ply_file_path")
+        if points is not None and not isinstance(points, str):
+            raise CaptureError(f"{path}: ply_file_path is {_short(points)}; it must be the relative name of a PLY file")
+        named = path.parent / points if points else named
     names = sorted(shot.name for shot in shots)
     twice = [a for a, b in itertools.pairwise(names) if a == b]
     if twice:
@@ -69,8 +75,11 @@ def read_transforms(paths: list[Path]) -> tuple[list[Shot], Cloud | None]:
 
 def _load(path: Path) -> dict[str, Any]:
     try:
-        listing = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        listing = json.loads(path.read_text(encoding="utf-8-sig"))
+    except RecursionError:
+        raise CaptureError(f"{path}: is nested too deeply to be a list of frames; write it again") from None
+    # besides what JSON and UTF-8 do not allow, whole numbers of thousands of digits
+    except ValueError as error:
         raise CaptureError(f"{path}: is not valid JSON ({error}); write it again or repair it there") from error
     except OSError as error:
         raise CaptureError(f"{path}: could not be read: {error.strerror}") from error
@@ -93,12 +102,19 @@ def _read_listing(path: Path, listing: dict[str, Any], split: Split | None) -> l
                 continue
             own = splits.get(name, "test")
         mask = path.parent / str(frame["mask_path"]) if frame.get("mask_path") else None
-        fields = {**listing, **frame}
+        fields = _fields(listing, frame)
         angle = _angle(where, fields)
         camera = None if angle is not None else _camera(where, fields, index + 1)
         folder, file = name.split("/", 1) if "/" in name and not name.startswith("/") else ("", name)
         shots.append(Shot(name, folder, file, camera, _viewmat(where, frame), angle, mask, own))
     return shots
+
+
+def _fields(listing: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
+    """Merge a frame's own fields over the file's; its own field of view replaces the file's focal lengths too."""
+    over = {"camera_angle_x": ("fl_x", "fl_y", "camera_angle_y"), "camera_angle_y": ("fl_y",)}
+    replaced = {name for angle, names in over.items() if angle in frame for name in names}
+    return {**{name: value for name, value in listing.items() if name not in replaced}, **frame}
 
 
 def _named_splits(path: Path, listing: dict[str, Any]) -> dict[str, Split]:
@@ -110,8 +126,10 @@ def _named_splits(path: Path, listing: dict[str, Any]) -> dict[str, Split]:
     listed = {Path(str(f.get("file_path"))).as_posix() for f in listing["frames"] if isinstance(f, dict)}
     in_turn: tuple[Split, ...] = ("train", "val", "test")
     for split in in_turn:
-        names = listing.get(f"{split}_filenames", [])
-        for name in names:
+        names = listing.get(f"{split}_filenames")
+        if names is not None and not isinstance(names, list):
+            raise CaptureError(f"{path}: {split}_filenames is {_short(names)}; it must be a list of file_path entries")
+        for name in names or []:
             name = Path(str(name)).as_posix()
             if name not in listed:
                 raise CaptureError(f"{path}: {split}_filenames names {name}, which no frame has as its file_path")
@@ -123,7 +141,7 @@ def _viewmat(where: str, frame: dict[str, Any]) -> np.ndarray:
     field = f"{where}: transform_matrix"
     try:
         pose = np.array(frame.get("transform_matrix"), dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pose = np.zeros(0)
     if pose.shape == (3, 4):
         pose = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])
@@ -144,8 +162,8 @@ def _camera(where: str, fields: dict[str, Any], camera_id: int) -> Any:
     """Build the camera of a frame: its own fields before the file's."""
     number = _Numbers(where, fields)
     width, height = int(number("w")), int(number("h"))
-    if width < 1 or height < 1:
-        raise CaptureError(f"{where}: w x h is {width} x {height}; both must be at least 1")
+    if not (1 <= width <= _WIDEST and 1 <= height <= _WIDEST):
+        raise CaptureError(f"{where}: w x h is {width} x {height}; both must be at least 1 and at most {_WIDEST}")
     model = "OPENCV_FISHEYE" if fields.get("is_fisheye") else str(fields.get("camera_model", "OPENCV"))
     if model not in _MODELS:
         raise CaptureError(f"{where}: camera_model is {model!r}; use one of {', '.join(_MODELS)}, or a COLMAP model")
@@ -165,7 +183,8 @@ def _angle(where: str, fields: dict[str, Any]) -> float | None:
     number = _Numbers(where, fields)
     if "w" in fields or "h" in fields:
         return None
-    if "fl_x" in fields or "camera_angle_x" not in fields or any(fields.get(k) for k in _RADIAL):
+    measured = any(name in fields for name in _IN_PIXELS) or any(fields.get(k) for k in _RADIAL)
+    if measured or "camera_angle_x" not in fields:
         raise CaptureError(f"{where}: w and h are absent; they give the size that the intrinsics are measured in")
     angle = number("camera_angle_x")
     if not 0.0 < angle < math.pi:
@@ -208,6 +227,15 @@ class _Numbers:
 
     def __call__(self, name: str, default: float | None = None) -> float:
         value = self.fields.get(name, default)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise CaptureError(f"{self.where}: {name} is {value!r}; it must be a finite number")
-        return float(value)
+        try:
+            number = math.nan if isinstance(value, bool | str) or value is None else float(value)
+        except (TypeError, OverflowError):
+            number = math.nan
+        if not math.isfinite(number):
+            raise CaptureError(f"{self.where}: {name} is {_short(value)}; it must be a finite number")
+        return number
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -25,6 +25,7 @@ from pop_fast.data.shots import Shot
 from pop_fast.data.undistort import Undistortion, undistortion
 from pop_fast.errors import CaptureError
 from pop_fast.io.images import find_image, read_image, read_mask
+from pop_fast.io.jpeg import sound_jpegs
 
 __all__ = ["PhotoOptions", "read_views"]
 
@@ -69,7 +70,7 @@ def read_views(
     photos, notes = _locate(root, listing, shots, options)
     rectify = _rectifier()
     views: list[View] = []
-    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
+    with sound_jpegs([photo.path for photo in photos]), ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
         jobs = [pool.submit(_read, photo, options, rectify) for photo in photos]
         try:
             for job in jobs:
@@ -105,6 +106,9 @@ def _locate(root: Path, listing: Path, shots: Sequence[Shot], options: PhotoOpti
     if masks and not any(photo.mask for photo in photos):
         raise CaptureError(f"{masks}: holds no mask named as a photograph (<name>.png or <name>.jpg.png); rename them")
     notes = [f"{len(absent)} of {len(shots)} listed images are absent and were skipped"] if absent else []
+    unmasked = [photo.path for photo in photos if photo.mask is None]
+    if 0 < len(unmasked) < len(photos):
+        notes.append(f"{len(unmasked)} of {len(photos)} photographs have no mask and count whole, first {unmasked[0]}")
     return photos, notes
 
 

@@ -10,14 +10,18 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
 
 from pop_fast.errors import PopError
 
-__all__ = ["folder_atomically", "write_atomically"]
+__all__ = ["file_atomically", "folder_atomically", "write_atomically"]
+
+_NAMED = 3  # files of somebody else that a message names
+_LITTER = {".DS_Store", "Thumbs.db", "desktop.ini"}  # what file browsers leave in every folder that they show
 
 _REASONS = {
     errno.ENOSPC: "the disk is full; free some space or choose another output folder",
@@ -45,55 +49,131 @@ def write_atomically(path: str | os.PathLike[str], writer: Callable[[BinaryIO], 
             target is then as it was, and nothing is left beside it. Errors of `writer` itself pass through, likewise.
     """
     path = Path(path)
-    with _os_errors_name(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _sweep(path)
-        partial = _partial(path)
-        try:
-            with open(partial, "wb") as file:
-                writer(file)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(partial, path)
-        except BaseException:
-            partial.unlink(missing_ok=True)
-            raise
-        _sync_folder(path.parent)
+    with _beside(path) as partial:
+        with open(partial, "wb") as file:
+            writer(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
 
 
 @contextmanager
-def folder_atomically(path: str | os.PathLike[str], overwrite: bool = False) -> Iterator[Path]:
+def file_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Let a library that opens its file by name write one file whole or not at all.
+
+    Args:
+        path: the file to make or to replace; missing parent folders are made.
+
+    Yields:
+        Where to write: a file of the same name in a hidden folder beside `path`, for libraries that read the ending.
+
+    Raises:
+        PopError: as `write_atomically`. Errors of the block pass through, and `path` is then as it was.
+    """
+    path = Path(path)
+    with _beside(path) as partial:
+        partial.mkdir()
+        yield partial / path.name
+        _sync(partial / path.name)
+        os.replace(partial / path.name, path)
+
+
+@contextmanager
+def folder_atomically(
+    path: str | os.PathLike[str],
+    overwrite: bool = False,
+    *,
+    keeps: Iterable[str | os.PathLike[str]] = (),
+    recognise: Callable[[Path], bool] | None = None,
+) -> Iterator[Path]:
     """Fill a folder under another name and rename it to `path` only when the block ends without an error.
 
     Args:
-        path: the folder to make; missing parents are made.
+        path: the folder to make; missing parents are made, and a link to a folder is followed.
         overwrite: replace an existing folder; it stays untouched until the new one is complete.
+        keeps: files and folders that the block reads: a folder that is one of them or holds one is never replaced.
+        recognise: tells of a file of an existing folder, by its path relative to `path`, whether the caller wrote it. A
+            folder with any other file in it is never replaced, and that is said before the block begins. Without it, a
+            folder is replaced when all of its files are written anew, which is known only when the block has ended.
 
     Yields:
         The folder to fill, beside `path`.
 
     Raises:
-        PopError: `path` exists, is not an empty folder and `overwrite` is not set; or the operating system refused.
-            `path` is then as it was. Errors of the block pass through, likewise.
+        PopError: `path` exists, is not an empty folder, and `overwrite` is not set or the folder must not be replaced;
+            or the operating system refused. `path` is then as it was. Errors of the block pass through, likewise.
+
+    Example:
+        with folder_atomically(out, overwrite, keeps=[photos], recognise=lambda file: file.suffix == ".png") as folder:
+            write_png(folder / "a.png", picture)
     """
     path = Path(path)
+    # renamed is the folder itself and not a link to it, and ".." has no name to put a partial beside
+    path = path.resolve() if path.is_symlink() or path.name in ("", "..") else path
+    inputs = [Path(kept) for kept in keeps]
+    _check_replaceable(path, overwrite, inputs, recognise)
+    with _beside(path) as partial:
+        partial.mkdir()
+        yield partial
+        for file in sorted(partial.rglob("*")):
+            _sync(file)
+        # once more: others may have put files there while the block ran
+        _check_replaceable(path, overwrite, inputs, recognise or (lambda file: (partial / file).is_file()))
+        _swap_in(partial, path)
+
+
+def _check_replaceable(
+    path: Path, overwrite: bool, inputs: Iterable[Path], recognise: Callable[[Path], bool] | None
+) -> None:
+    """Raise PopError where a folder may not be put at `path`: what is there is not this caller's to remove."""
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise PopError(f"{path}: a file of this name is in the way; remove it or choose another output folder")
+    real = path.resolve()
+    if Path.cwd().is_relative_to(real):
+        raise PopError(f"{path}: is or holds the folder that this command runs in; choose another output folder")
+    if not any(path.iterdir()):
+        return
+    for kept in inputs:
+        if kept.resolve().is_relative_to(real):
+            what = "is" if kept.resolve() == real else f"holds {kept}, which is"
+            raise PopError(f"{path}: {what} read by this command, so it is not replaced; choose another output folder")
+    foreign = [] if recognise is None else list(islice((f for f in _files(path) if not recognise(f)), _NAMED + 1))
+    if foreign:
+        names = ", ".join(file.as_posix() for file in foreign[:_NAMED]) + (", ..." if len(foreign) > _NAMED else "")
+        raise PopError(
+            f"{path}: holds what this command did not write ({names}), so it is not replaced; "
+            "choose another output folder, or move these files away"
+        )
+    if not overwrite:
+        limit = ", which replaces only files that are written anew" if recognise is None else ""
+        raise PopError(f"{path}: the folder exists and is not empty; choose another or pass --overwrite{limit}")
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """List everything under a folder but folders and litter, links too, relative to it and in order."""
+
+    def unreadable(error: OSError) -> None:
+        raise error  # what cannot be looked into must not count as empty
+
+    for here, folders, files in os.walk(folder, onerror=unreadable):
+        folders.sort()
+        links = [name for name in folders if os.path.islink(os.path.join(here, name))]
+        yield from (Path(here, name).relative_to(folder) for name in sorted({*files, *links} - _LITTER))
+
+
+@contextmanager
+def _beside(path: Path) -> Iterator[Path]:
+    """Name a partial beside `path` for the block to make and rename; nothing of it is left, whatever happens."""
     with _os_errors_name(path):
-        if path.exists() and not path.is_dir():
-            raise PopError(f"{path}: a file of this name is in the way; remove it or choose another output folder")
-        if path.exists() and any(path.iterdir()) and not overwrite:
-            raise PopError(f"{path}: the folder exists and is not empty; choose another or pass --overwrite")
         path.parent.mkdir(parents=True, exist_ok=True)
         _sweep(path)
         partial = _partial(path)
-        partial.mkdir()
         try:
             yield partial
-            for file in sorted(partial.rglob("*")):
-                _sync(file)
-            _swap_in(partial, path)
-        except BaseException:
-            shutil.rmtree(partial, ignore_errors=True)
-            raise
+        finally:
+            _remove(partial)
         _sync_folder(path.parent)
 
 
@@ -124,7 +204,14 @@ def _sweep(path: Path) -> None:
         if left.name.startswith(prefix) and parts[0].isdigit() and parts[1:] == ["partial"]:
             pid = int(parts[0])
             if pid == os.getpid() or not _alive(pid):
-                shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
+                _remove(left)
+
+
+def _remove(left: Path) -> None:
+    if left.is_dir() and not left.is_symlink():
+        shutil.rmtree(left, ignore_errors=True)
+    else:
+        left.unlink(missing_ok=True)
 
 
 def _alive(pid: int) -> bool:
@@ -165,7 +252,12 @@ def _os_errors_name(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         reason = _REASONS.get(error.errno or 0)
+        partial = _partial(path).name
+        where = str(error.filename or path)
         if reason is None:
-            raise
-        where = str(error.filename or path).replace(_partial(path).name, path.name)
+            if partial not in where:
+                raise
+            reason = f"{error.strerror}; choose another path"
+        # what the user named, not what stands in for it until it is whole
+        where = where.replace(os.path.join(partial, path.name), path.name).replace(partial, path.name)
         raise PopError(f"{where}: could not be written: {reason}") from error

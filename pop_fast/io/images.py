@@ -17,10 +17,21 @@ import numpy as np
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import write_atomically
 
-__all__ = ["IMAGE_SUFFIXES", "find_image", "list_images", "read_image", "read_mask", "write_png"]
+__all__ = [
+    "FIX",
+    "IMAGE_SUFFIXES",
+    "find_image",
+    "list_images",
+    "read_image",
+    "read_mask",
+    "unreadable_photographs",
+    "write_png",
+]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-_FIX = "copy it again from its source, or remove it from the capture"
+# what telephones and cameras write and OpenCV cannot read: HEIF and raw formats
+_UNREADABLE = (".heic", ".heif", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
+FIX = "copy it again from its source, or remove it from the capture"
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -34,6 +45,18 @@ def list_images(folder: Path) -> list[Path]:
             and not any(part.startswith(".") for part in path.relative_to(folder).parts)
         ),
         key=lambda path: path.relative_to(folder).as_posix(),
+    )
+
+
+def unreadable_photographs(folder: Path) -> str | None:
+    """Say how many photographs of a folder are in a format that is not read, and how to convert them; None if none."""
+    found = [path.suffix for path in folder.rglob("*") if path.suffix.lower() in _UNREADABLE and path.is_file()]
+    if not found:
+        return None
+    kind = max(set(found), key=found.count)
+    return (
+        f"{len(found)} files are {kind[1:].upper()} or the like, which is not read: convert them to JPEG first, "
+        f"for example with ImageMagick: magick mogrify -format jpg *{kind}"
     )
 
 
@@ -139,7 +162,7 @@ def _decode(path: Path) -> np.ndarray:
         raise CaptureError(f"{path}: could not be read: {error.strerror}; check the file's permissions") from error
     defect = _defect(data)
     if defect:
-        raise CaptureError(f"{path}: {defect}; {_FIX}")
+        raise CaptureError(f"{path}: {defect}; {FIX}")
     try:
         # IMREAD_UNCHANGED keeps alpha and 16 bit, and leaves the EXIF orientation alone
         with _QUIET:
@@ -147,7 +170,7 @@ def _decode(path: Path) -> np.ndarray:
     except cv2.error:
         image = None
     if image is None or image.size == 0:
-        raise CaptureError(f"{path}: is not an image that OpenCV can decode, or is corrupt; {_FIX}")
+        raise CaptureError(f"{path}: is not an image that OpenCV can decode, or is corrupt; {FIX}")
     if image.dtype == np.uint16:
         return ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if image.dtype != np.uint8:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Final
@@ -11,13 +12,24 @@ import cv2
 import numpy as np
 
 from pop_fast.errors import PopError
+from pop_fast.io.atomic import file_atomically
 
 # vp9 first: the wheels of opencv carry its encoder and browsers play it; mpeg-4 part 2 where a build lacks vp9
 _CODECS: Final = {".mp4": ("vp09", "mp4v"), ".webm": ("VP90",), ".avi": ("MJPG",)}
+# frames a second that all of these containers can store; beyond them encoders fail, round to another rate, or hang
+_FPS: Final = (0.5, 600.0)
 
 
 class VideoFile:
     """A video under construction: frames go to a hidden file beside `path`, which appears when the block ends well.
+
+    Args:
+        path: the file to make or to replace: .mp4, .webm or .avi; missing parent folders are made.
+        fps: frames a second, from 0.5 to 600.
+
+    Raises:
+        PopError: at once, for a name or a rate that no video can have; when frames are added, for one of another size;
+            when the block ends, for a file that does not play to its last frame. `path` is then as it was.
 
     Example:
         with VideoFile(Path("path.mp4"), fps=30) as video:
@@ -27,39 +39,89 @@ class VideoFile:
     def __init__(self, path: Path, fps: float = 30.0) -> None:
         if path.suffix.lower() not in _CODECS:
             raise PopError(f"{path}: the video's name must end in {', '.join(_CODECS)}")
+        if path.is_dir():
+            raise PopError(f"{path}: a folder of this name is in the way; give the video another name")
+        if not _FPS[0] <= fps <= _FPS[1]:
+            raise PopError(f"{path}: fps is {fps}; it must be a number from {_FPS[0]:g} to {_FPS[1]:g}, such as 30")
         self.path = path
         self.fps = fps
-        self._part = path.with_name(f".{path.stem}.part{path.suffix.lower()}")
+        self._count = 0
+        self._steps = ExitStack()
+        self._part = path
         self._writer: cv2.VideoWriter | None = None
         self._size: tuple[int, int] | None = None
 
     def __enter__(self) -> VideoFile:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._part = self._steps.enter_context(file_atomically(self.path))
+        # what goes wrong is found by playing the file and raised as one line; the libraries' own log would add dozens
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+        level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        self._steps.callback(cv2.utils.logging.setLogLevel, level)
+        self._steps.push(self._finish)
         return self
 
     def add(self, frame: np.ndarray) -> None:
         """Append one frame, uint8 RGB [H, W, 3]; an odd last row or column is dropped, as encoders want even sizes."""
-        height, width = frame.shape[0] // 2 * 2, frame.shape[1] // 2 * 2
-        if self._writer is None:
-            self._size = (width, height)
-            self._writer = self._open(self._size)
-        if (width, height) != self._size:
-            raise ValueError(f"frame is {width} x {height}; the first one was {self._size}")
-        self._writer.write(np.ascontiguousarray(frame[:height, :width, ::-1]))
+        size = (frame.shape[1] // 2 * 2, frame.shape[0] // 2 * 2)
+        if self._writer is None or self._size is None:
+            if min(size) == 0:
+                raise PopError(f"{self.path}: frames are {_pixels(frame)}; a video needs 2 x 2 or more")
+            self._size = size
+            self._writer = self._open(size)
+        if size != self._size:
+            first = f"{self._size[0]} x {self._size[1]} px"
+            raise PopError(
+                f"{self.path}: frame {self._count} is {_pixels(frame)}, the first was {first}; a video has one size: "
+                "use views of one size, or make a video of each"
+            )
+        self._writer.write(np.ascontiguousarray(frame[: size[1], : size[0], ::-1]))
+        self._count += 1
 
     def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool | None:
+        return self._steps.__exit__(kind, error, trace)
+
+    def _finish(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._writer is not None:
             self._writer.release()
-        if kind is None and self._part.exists():
-            os.replace(self._part, self.path)
-        else:
-            self._part.unlink(missing_ok=True)
+        if kind is not None:
+            return
+        if self._count == 0:
+            raise PopError(f"{self.path}: no frame was added; a video needs one or more")
+        # the encoder reports no failed write, neither of a frame nor of the index at the end
+        whole = frames_in(self._part)
+        if whole != self._count:
+            raise PopError(
+                f"{self.path}: only {whole} of {self._count} frames could be read back after writing; the disk may be "
+                "full: free some space, or choose another folder for the video"
+            )
 
     def _open(self, size: tuple[int, int]) -> cv2.VideoWriter:
         for codec in _CODECS[self.path.suffix.lower()]:
             writer = cv2.VideoWriter(str(self._part), cv2.VideoWriter.fourcc(*codec), self.fps, size)
             if writer.isOpened():
                 return writer
+        # an encoder that cannot write fails in the same way: this raises where the disk is at fault
+        self._part.write_bytes(bytes(4096))
         raise PopError(f"{self.path}: this build of OpenCV has no encoder for {self.path.suffix}; try another ending")
+
+
+def frames_in(path: Path) -> int:
+    """Play a video from its start and count the frames that can be decoded; 0 for what is no video."""
+    # of a damaged file the other readers print bytes to the terminal
+    reader = cv2.CAP_FFMPEG if cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG) else cv2.CAP_ANY
+    video = cv2.VideoCapture(str(path), reader)
+    try:
+        count = 0
+        while video.read()[0]:
+            count += 1
+        return count
+    finally:
+        video.release()
+
+
+def _pixels(frame: np.ndarray) -> str:
+    return f"{frame.shape[1]} x {frame.shape[0]} px"

@@ -31,7 +31,8 @@ def row(stats: Mapping[str, Any]) -> list[str]:
 
     steps = stats.get("step")
     method = str(stats.get("method", "–"))
-    threads = f", {stats['threads']} threads" if "threads" in stats else ""
+    machine = [str(stats.get("machine", "–")), *([stats["backend"]] if "backend" in stats else [])]
+    machine += [f"{stats['threads']} threads"] if "threads" in stats else []
     return [
         str(stats.get("capture", "–")),
         _METHODS.get(method, method),
@@ -43,7 +44,7 @@ def row(stats: Mapping[str, Any]) -> list[str]:
         cell("{:.1f} / {:.1f}", "n_blended", "n_traversed"),
         cell("{:.0%} / {:.0%}", "opacity_above_0.9", "opacity_below_0.1"),
         cell("{:,.0f}", "seconds"),
-        f"{stats.get('machine', '–')}{threads}",
+        ", ".join(machine),
     ]
 
 

@@ -15,6 +15,7 @@ from pop_fast.errors import PopError
 from pop_fast.report.curves import Window
 from pop_fast.report.model import Histogram, ReportData, Tile, View
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.results import read_config
 
 MIB: Final = 2**20
 # float32 numbers of a Gaussian: as gsplat's checkpoints hold it, and as Inria's PLY does (with three zero normals)
@@ -56,14 +57,6 @@ def read_result(folder: Path) -> ReportData:
 
 
 _EVENT_COLUMNS: Final = ("step", "cloned", "split", "pruned", "reset", "num_gaussians")
-
-
-def read_config(folder: Path) -> TrainConfig:
-    """Read cfg.json."""
-    path = folder / "cfg.json"
-    if not path.is_file():
-        raise PopError(f"{folder}: has no cfg.json, so it is not a result of 'pop train'")
-    return TrainConfig.from_json(path.read_text(encoding="utf-8"))
 
 
 def read_records(folder: Path) -> list[dict[str, Any]]:

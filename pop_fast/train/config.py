@@ -24,6 +24,7 @@ from typing import Any, Final, Literal
 from pop_fast.errors import PopError
 from pop_fast.strategies import ADCStrategy, POPStrategy
 from pop_fast.train.jsonable import from_plain, to_plain
+from pop_fast.train.limits import check_values
 
 QUICK_SCALER: Final = 0.1
 PRESETS: Final = {"paper": 1.0, "quick": QUICK_SCALER}
@@ -143,24 +144,7 @@ class TrainConfig:
     progress: bool = True
 
     def __post_init__(self) -> None:
-        for name, smallest in _AT_LEAST.items():
-            value = getattr(self, name)
-            if value < smallest:
-                raise PopError(f"{name} is {value}; it must be at least {smallest}")
-        if self.sh_degree > 3:
-            raise PopError(f"sh_degree is {self.sh_degree}; it must be 0, 1, 2 or 3")
-        if not 0.0 < self.init_opacity < 1.0:
-            raise PopError(f"init_opacity is {self.init_opacity}; it must lie between 0 and 1")
-        for name in ("init_scale", "photometric_divisor", "steps_scaler"):
-            value = getattr(self, name)
-            if value is not None and not value > 0.0:
-                raise PopError(f"{name} is {value}; it must be > 0")
-        if self.l2_stop_iter is not None and self.l2_stop_iter < 0:
-            raise PopError(f"l2_stop_iter is {self.l2_stop_iter}; it must be at least 0")
-        if self.lambda_ssim is not None and not 0.0 <= self.lambda_ssim <= 1.0:
-            raise PopError(f"lambda_ssim is {self.lambda_ssim}; it must lie in [0, 1]")
-        if any(not 0.0 <= value <= 1.0 for value in self.background):
-            raise PopError(f"background is {list(self.background)}; every channel must lie in [0, 1]")
+        check_values(self)
 
     @property
     def scaler(self) -> float:
@@ -236,21 +220,6 @@ class TrainConfig:
     def digest(self) -> str:
         """Hash the settings that decide the result's bits."""
         return hashlib.sha256(json.dumps(self.binding(), sort_keys=True).encode()).hexdigest()
-
-
-_AT_LEAST: Final = {
-    "max_steps": 1,
-    "factor": 1,
-    "sh_degree": 0,
-    "sh_interval": 1,
-    "test_every": 0,
-    "threads": 0,
-    "checkpoint_every": 0,
-    "keep_checkpoints": 1,
-    "log_every": 1,
-    "max_renders": 0,
-    "target_cache_mb": 0,
-}
 
 
 def first_difference(ours: dict[str, Any], theirs: dict[str, Any]) -> tuple[str, Any, Any] | None:

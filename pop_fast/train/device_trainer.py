@@ -117,7 +117,7 @@ class DeviceTrainer(TrainingRun):
             # a row that is not finite halts the device, so that the parameters still say which entry it is
             self.step = self._stepper.step
             self._require_finite()
-            raise PopError(f"{error}; the latest checkpoint is kept") from error
+            raise PopError(f"{error}; {self._what_is_left}") from error
         self.step = end
 
     def _change(self, step: int) -> dict[str, Any] | None:
@@ -171,7 +171,7 @@ class DeviceTrainer(TrainingRun):
             loss = told.objective + told.pop
             if not math.isfinite(loss):
                 self._require_finite()
-                raise PopError(f"the loss of view {view.name} is {loss} at step {step}; the latest checkpoint is kept")
+                raise PopError(f"the loss of view {view.name} is {loss} at step {step}; {self._what_is_left}")
             changed = event if step == last else None
             if step % self.config.log_every != 0 and changed is None:
                 continue

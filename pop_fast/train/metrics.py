@@ -11,7 +11,9 @@ import torch
 from torch import Tensor
 
 from pop_fast.losses import ssim
+from pop_fast.ssim import WINDOW_SIZE
 from pop_fast.train.lpips import LPIPS, VARIANTS
+from pop_fast.train.views import ViewTensors
 
 NO_LPIPS = "no weights were given (lpips_vgg, lpips_alex)"
 ALPHA_FLOOR = 1.0 / 255.0
@@ -49,6 +51,14 @@ def measure(image: Tensor, target: Tensor, mask: Tensor | None = None, nets: Seq
     whole = image if mask is None else torch.where(mask[..., None], image, target)
     lpips = {variant: net(whole, target, variant) for net in nets for variant in VARIANTS[net.net]}
     return ViewMetrics(psnr(image, target, mask), float(ssim(whole, target, padding="valid")), lpips)
+
+
+def too_small(views: Sequence[ViewTensors]) -> str | None:
+    """Say which view is the first that SSIM finds no whole window in, or None."""
+    for view in views:
+        if min(view.width, view.height) < WINDOW_SIZE:
+            return f"{view.name} is {view.width} x {view.height} px, and SSIM needs {WINDOW_SIZE} x {WINDOW_SIZE}"
+    return None
 
 
 def average(views: Sequence[ViewMetrics], nets: Sequence[LPIPS]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
 
+from pop_fast.activations import scales_from_log_scales
 from pop_fast.train.config import LearningRates
 
 KEYS: Final = ("means", "scales", "quats", "opacities", "sh0", "shN")
@@ -53,3 +54,11 @@ def first_non_finite(tensors: Mapping[str, Tensor]) -> tuple[str, list[int], flo
             index = [int(i) for i in bad[0]]
             return name, index, float(tensor[tuple(index)])
     return None
+
+
+def first_unusable(params: Mapping[str, Tensor]) -> tuple[str, list[int], float] | None:
+    """Return name, index and value of the first raw parameter that cannot be rendered, or None.
+
+    That is one which is not finite, or a scale whose exponential is not.
+    """
+    return first_non_finite(params) or first_non_finite({"scales": scales_from_log_scales(params["scales"])})

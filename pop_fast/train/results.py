@@ -1,6 +1,7 @@
 """The folder that a run writes, laid out as gsplat's trainer does.
 
     cfg.json                        the settings, before `steps_scaler`
+    capture.json                    how `pop train` read the capture, and its training frame
     metrics.jsonl                   one record every `log_every` steps and at every change of the population
     ckpts/ckpt_{step}_rank0.pt      checkpoints; `step` counts from 0 here and below, so 30,000 steps end at 29999
     ply/point_cloud_{step}.ply      Gaussians in Inria's layout
@@ -21,7 +22,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +34,10 @@ from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.train.config import TrainConfig
 
+# cfg.json is the first to step aside and the first to be written anew: where it is, the new run has begun
 _OURS = ("cfg.json", "metrics.jsonl", "ckpts", "ply", "stats", "renders", "report_data", "report.html", "capture.json")
+# holds what a new run replaces while that is being done
+_ASIDE = ".replaced"
 OPACITY_BINS = 100
 
 
@@ -41,34 +47,96 @@ class ResultFolder:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._metrics: Any = None
+        self._waiting: list[bytes] = []
 
-    def claim(self, resume: bool, overwrite: bool) -> None:
-        """Make the folder this run's own: new, emptied of results, or left as it is to go on with.
+    def check(self, resume: bool, overwrite: bool) -> bool:
+        """Refuse a folder that a run may not write to; nothing is written or removed yet.
+
+        Args:
+            resume: the run goes on with what is there.
+            overwrite: the run replaces what is there, when it begins.
+
+        Returns:
+            True when an earlier replacement had been cut short and the results that it had set aside are back.
 
         Raises:
             PopError: the folder is in use and neither `resume` nor `overwrite` is set, or it is not a result folder.
         """
         if self.path.exists() and not self.path.is_dir():
             raise PopError(f"{self.path}: is a file; choose another result folder")
-        used = self.path.is_dir() and any(self.path.iterdir())
+        came_back = self._recover()
+        used = self._is_used()
         if used and not resume and not overwrite:
             raise PopError(f"{self.path}: exists and is not empty; pass --resume, --overwrite or another result folder")
         if used and not (self.path / "cfg.json").is_file():
             raise PopError(f"{self.path}: has no cfg.json, so it is not a result folder; choose another")
-        if overwrite and not resume:
-            self._remove_results()
+        return came_back
 
-    def write_config(self, config: TrainConfig) -> None:
-        """Write cfg.json."""
-        write_atomically(self.path / "cfg.json", lambda file: file.write(config.to_json().encode()))
+    def begin(self, config: TrainConfig, beside: Mapping[str, str], opacities: np.ndarray, overwrite: bool) -> None:
+        """Write what a run has from its start, in place of earlier results: all of it, or the folder is as it was.
 
-    def _remove_results(self) -> None:
-        for name in _OURS:
-            target = self.path / name
-            if target.is_dir():
-                shutil.rmtree(target)
-            else:
-                target.unlink(missing_ok=True)
+        Args:
+            config: the settings, for cfg.json.
+            beside: other texts, by file name.
+            opacities: of the first Gaussians. [N]
+            overwrite: earlier results go; without it nothing but a run without checkpoints may be there.
+
+        Raises:
+            PopError: the operating system refused; the folder is as it was.
+        """
+        exists = self.path.exists()
+        alone = overwrite or not self._is_used()
+        if overwrite and exists:
+            self._set_aside()
+        try:
+            self.write_settings(config, beside)
+            self.open_metrics(keep_bytes=0)
+            self.write_opacities(-1, opacities)
+        except BaseException:
+            self.close()
+            if alone:
+                for name in _OURS:
+                    _remove(self.path / name)
+                self._recover()
+            if not exists and self.path.is_dir() and not any(self.path.iterdir()):
+                self.path.rmdir()
+            raise
+        # what cannot be removed now is removed by the next run in this folder
+        shutil.rmtree(self.path / _ASIDE, ignore_errors=True)
+
+    def write_settings(self, config: TrainConfig, beside: Mapping[str, str]) -> None:
+        """Write cfg.json, then other texts by file name."""
+        for name, text in {"cfg.json": config.to_json(), **beside}.items():
+            write_atomically(self.path / name, lambda file, text=text: file.write(text.encode()))
+
+    def _is_used(self) -> bool:
+        return self.path.is_dir() and any(self.path.iterdir())
+
+    def _set_aside(self) -> None:
+        aside = self.path / _ASIDE
+        try:
+            aside.mkdir()
+            for name in _OURS:
+                if (self.path / name).exists():
+                    os.replace(self.path / name, aside / name)
+        except BaseException:
+            self._recover()
+            raise
+
+    def _recover(self) -> bool:
+        """Undo a replacement that was cut short, or finish it; True when the old results came back."""
+        aside = self.path / _ASIDE
+        if not aside.is_dir():
+            return False
+        undo = not (self.path / "cfg.json").exists()
+        if undo:
+            # cfg.json comes back last, so that this too may be cut short and done again
+            for name in reversed(_OURS):
+                if (aside / name).exists():
+                    _remove(self.path / name)
+                    os.replace(aside / name, self.path / name)
+        _remove(aside)
+        return undo
 
     def open_metrics(self, keep_bytes: int) -> None:
         """Open metrics.jsonl to append, cut to what a checkpoint vouches for."""
@@ -81,10 +149,16 @@ class ResultFolder:
         self._metrics = open(path, "r+b", buffering=0)  # noqa: SIM115 - stays open as long as the run
         self._metrics.truncate(keep_bytes)
         self._metrics.seek(keep_bytes)
+        self._metrics.write(b"".join(self._waiting))
+        self._waiting.clear()
 
     def log(self, record: dict[str, Any]) -> None:
-        """Append a record."""
-        self._metrics.write((json.dumps(record) + "\n").encode())
+        """Append a record; before metrics.jsonl is open it waits."""
+        line = (json.dumps(record) + "\n").encode()
+        if self._metrics is None:
+            self._waiting.append(line)
+        else:
+            self._metrics.write(line)
 
     def flush_metrics(self) -> int:
         """Hand all records to the operating system and return the length of the file."""
@@ -119,6 +193,28 @@ class ResultFolder:
         """Write the histogram of opacities after a step; -1 for before the first."""
         counts, edges = np.histogram(opacities, bins=OPACITY_BINS, range=(0.0, 1.0))
         self.write_arrays(f"opacity_step{step}", step=step, counts=counts, edges=edges)
+
+
+def read_config(folder: Path) -> TrainConfig:
+    """Read cfg.json.
+
+    Raises:
+        PopError: it is absent or damaged, or a setting in it is unknown or out of range; names file and field.
+    """
+    path = folder / "cfg.json"
+    if not path.is_file():
+        raise PopError(f"{folder}: has no cfg.json, so it is not a result of 'pop train'")
+    try:
+        return TrainConfig.from_json(path.read_text(encoding="utf-8"))
+    except (PopError, UnicodeDecodeError) as error:
+        raise PopError(f"{path}: {error}; mend the file, copy it again or train again") from error
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _finite(value: Any) -> Any:

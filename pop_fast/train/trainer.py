@@ -63,7 +63,7 @@ class Trainer(TrainingRun):
         value = loss.item()
         if not math.isfinite(value):
             self._require_finite()
-            raise PopError(f"the loss of view {view.name} is {value} at step {step}; the latest checkpoint is kept")
+            raise PopError(f"the loss of view {view.name} is {value} at step {step}; {self._what_is_left}")
         self._adam(step, degree)
         self.strategy.step_post_backward(self.params, self.optimizers, self.state, step, rendered.info)
         self.step += 1

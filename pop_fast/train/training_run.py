@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import Parameter
@@ -25,7 +26,8 @@ from pop_fast.train.environment import reproducible, run_facts, versions
 from pop_fast.train.evaluate import evaluate
 from pop_fast.train.lpips import load_nets
 from pop_fast.train.metrics import population
-from pop_fast.train.model import KEYS, first_non_finite, make_optimizers
+from pop_fast.train.model import KEYS, first_unusable, make_optimizers
+from pop_fast.train.preflight import check_start, check_views
 from pop_fast.train.results import ResultFolder
 from pop_fast.train.schedule import ViewOrder, active_sh_degree
 from pop_fast.train.signals import stop_requests
@@ -52,6 +54,7 @@ class TrainingRun:
         resume: bool = False,
         overwrite: bool = False,
         loading_seconds: float = 0.0,
+        beside: Mapping[str, str] | None = None,
         backend: Backend | None = None,
     ) -> None:
         """Prepare a run; nothing is written yet.
@@ -60,15 +63,16 @@ class TrainingRun:
             config: the settings.
             capture: the photographs and cameras.
             resume: go on from the latest checkpoint of `config.result_dir`, or start where there is none.
-            overwrite: remove the results of an earlier run in `config.result_dir`.
+            overwrite: replace the results of an earlier run in `config.result_dir`, once the first step has been taken.
             loading_seconds: how long reading the capture took, for the statistics.
+            beside: texts to write beside cfg.json, by file name.
             backend: what renders; None takes the one that `config` names.
 
         Raises:
             PopError: the capture cannot be trained on, weights are missing, or the backend is not available.
         """
         self._given, self.config = config, config.resolved()
-        self._resume, self._overwrite = resume, overwrite
+        self._resume, self._overwrite, self._beside = resume, overwrite, beside or {}
         self._backend = get_backend(config.backend) if backend is None else backend
         if not self._backend.available():
             raise PopError(f"backend {config.backend!r} is not available: {self._backend.why_not()}")
@@ -76,12 +80,14 @@ class TrainingRun:
         self._test = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
         if not self._train:
             raise PopError(f"{capture.name}: has no view to train on; lower test_every or set it to 0")
+        check_views(self.config, capture.name, self._train, self._test)
         self._nets = load_nets(config.lpips_vgg, config.lpips_alex, [(view.height, view.width) for view in self._test])
         self._capture = capture
         self._scene_scale = capture.scene_scale()
         self._order = ViewOrder(len(self._train), self.config.seed)
         self._results = ResultFolder(self.config.result_dir)
         initial = initialize_params(capture, self.config.seed, self.config.init_opacity, self.config.init_scale)
+        check_start(capture.name, initial)
         self.params = {key: Parameter(initial[key]) for key in KEYS}
         self.optimizers = make_optimizers(self.params, self.config.lr, self._scene_scale)
         self.strategy = self.config.strategy
@@ -91,16 +97,21 @@ class TrainingRun:
         self._train_seconds = 0.0
         self._loading_seconds = loading_seconds
         self._started = 0.0
+        # the first Gaussians' opacities while the folder is still as it was found
+        self._unwritten: np.ndarray | None = None
 
     def run(self) -> dict[str, Any]:
         """Train to the end.
+
+        A run that is not gone on with writes nothing, and replaces nothing, before it has taken a step: one that cannot
+        take any leaves the folder as it was.
 
         Returns:
             The statistics of the last step, as in stats/val_step{step}.json.
 
         Raises:
             PopError: the folder is in use, a checkpoint does not fit, or a number is no longer finite.
-            KeyboardInterrupt: after Ctrl-C or SIGTERM, when a checkpoint has been written.
+            KeyboardInterrupt: after Ctrl-C or SIGTERM, when a checkpoint has been written; or at once after the second.
         """
         self._started = time.perf_counter()
         with reproducible(self.config.threads), stop_requests() as stop:
@@ -111,20 +122,24 @@ class TrainingRun:
                 self._results.close()
 
     def _begin(self) -> None:
-        self._results.claim(self._resume, self._overwrite)
+        self._results.check(self._resume, self._overwrite)
         found = ckpt.list_checkpoints(self._results.path) if self._resume else []
         if found:
             self._restore(found[-1][1])
-        self._results.write_config(self._given)
-        if not found:
-            self._results.open_metrics(keep_bytes=0)
-            self._results.write_opacities(-1, self._opacities().numpy())
+            self._results.write_settings(self._given, self._beside)
+        else:
+            self._unwritten = self._opacities().numpy()
 
     def _loop(self, stop: threading.Event) -> dict[str, Any]:
         config = self.config
         with tqdm(total=config.max_steps, initial=self.step, disable=None if config.progress else True) as bar:
             while self.step < config.max_steps:
                 self._advance(bar)
+                if self._unwritten is not None:
+                    # a rate can be so high that the first step is the last; that is no reason to replace anything
+                    self._require_finite()
+                    self._results.begin(self._given, self._beside, self._unwritten, self._overwrite)
+                    self._unwritten = None
                 self._milestones(self.step - 1)
                 if stop.is_set() and self.step < config.max_steps:
                     self._save()
@@ -218,13 +233,17 @@ class TrainingRun:
     def _opacities(self) -> Tensor:
         return opacities_from_logits(self.params["opacities"].detach().cpu())
 
+    @property
+    def _what_is_left(self) -> str:
+        return "the latest checkpoint is kept" if self._unwritten is None else "nothing was written"
+
     def _require_finite(self) -> None:
-        found = first_non_finite(self._detached())
+        found = first_unusable(self._detached())
         if found:
             name, index, value = found
             raise PopError(
-                f"{name}{index} is {value} after {self.step} steps; the latest checkpoint is kept: lower the learning "
-                f"rate of {name} and start again, or look at the photographs and masks of the capture"
+                f"{name}{index} is {value} after {self.step} steps; {self._what_is_left}: lower the learning rate of "
+                f"{name} and start again, or look at the photographs and masks of the capture"
             )
 
 

@@ -59,15 +59,13 @@ def cloud(count: int = 20) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def write_model(
-    folder: Path,
+def make_model(
     names: Sequence[str],
     viewmats: np.ndarray,
     cameras: Sequence[Any] | None = None,
-    binary: bool = True,
     points: tuple[np.ndarray, np.ndarray] | None = None,
-) -> None:
-    """Write a COLMAP model; one camera for all images, or one each."""
+) -> Any:
+    """Make a `pycolmap.Reconstruction`; one camera for all images, or one each."""
     cameras = list(cameras or [camera()])
     model = pycolmap.Reconstruction()
     for number, one in enumerate(cameras, start=1):
@@ -79,6 +77,14 @@ def write_model(
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(viewmat[:3]))
     for xyz, rgb in zip(*(points or cloud()), strict=True):
         model.add_point3D(xyz, pycolmap.Track(), rgb)
+    return model
+
+
+def write_model(
+    folder: Path, names: Sequence[str], viewmats: np.ndarray, *about: Any, binary: bool = True, **more: Any
+) -> None:
+    """Write the COLMAP model that `make_model` makes."""
+    model = make_model(names, viewmats, *about, **more)
     folder.mkdir(parents=True, exist_ok=True)
     model.write_binary(folder) if binary else model.write_text(folder)
 

@@ -1,4 +1,4 @@
-"""Files and folders appear whole or not at all."""
+"""Files appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from typing import BinaryIO
 
 import pytest
 
-from pop_fast.io.atomic import folder_atomically, write_atomically
+from pop_fast.io.atomic import file_atomically, write_atomically
 from tests.app.captures import assert_one_line
+from tests.app.damage import contents
 
 
 def fail_with(number: int):
@@ -122,70 +123,30 @@ def test_what_a_living_writer_has_begun_is_not_swept_up(tmp_path: Path) -> None:
     assert begun.read_bytes() == b"theirs"
 
 
-def test_a_folder_appears_only_when_its_block_ends(tmp_path: Path) -> None:
-    target = tmp_path / "out" / "folder"
-    with folder_atomically(target) as folder:
-        (folder / "sub").mkdir()
-        (folder / "sub" / "a.txt").write_text("a")
+def test_a_file_that_a_library_writes_by_name_appears_when_its_block_ends(tmp_path: Path) -> None:
+    target = tmp_path / "out" / "a.mp4"
+    with file_atomically(target) as part:
+        assert part.name == "a.mp4"
+        part.write_bytes(b"new")
         assert not target.exists()
-    assert (target / "sub" / "a.txt").read_text() == "a"
-    assert os.listdir(target.parent) == ["folder"]
+    assert target.read_bytes() == b"new"
+    assert os.listdir(target.parent) == ["a.mp4"]
 
 
-def test_a_failing_block_leaves_no_folder(tmp_path: Path) -> None:
-    def fill() -> None:
-        with folder_atomically(tmp_path / "new") as folder:
-            (folder / "a.txt").write_text("a")
-            raise KeyError("in the middle")
+def test_a_block_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
+    target = tmp_path / "a.mp4"
+    target.write_bytes(b"old")
+
+    def half(error: Exception) -> None:
+        with file_atomically(target) as part:
+            part.write_bytes(b"half")
+            raise error
 
     with pytest.raises(KeyError):
-        fill()
-    assert os.listdir(tmp_path) == []
-
-
-def test_a_full_disk_in_a_block_is_named_and_leaves_no_folder(tmp_path: Path) -> None:
-    def fill() -> None:
-        with folder_atomically(tmp_path / "new") as folder:
-            raise OSError(errno.ENOSPC, "No space left on device", str(folder / "points.bin"))
-
-    assert_one_line(fill, str(tmp_path / "new" / "points.bin"), "disk is full")
-    assert os.listdir(tmp_path) == []
-
-
-def test_an_error_about_another_file_passes_through_a_block(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError), folder_atomically(tmp_path / "new"):
-        (tmp_path / "absent").read_bytes()
-
-
-def test_an_existing_folder_is_kept_unless_it_may_be_replaced(tmp_path: Path) -> None:
-    target = tmp_path / "folder"
-    target.mkdir()
-    (target / "old.txt").write_text("old")
-
-    def fill(overwrite: bool) -> None:
-        with folder_atomically(target, overwrite) as folder:
-            (folder / "new.txt").write_text("new")
-            assert (target / "old.txt").read_text() == "old"
-
-    assert_one_line(lambda: fill(False), str(target), "--overwrite")
-    assert os.listdir(target) == ["old.txt"]
-    fill(True)
-    assert os.listdir(target) == ["new.txt"]
-    assert os.listdir(tmp_path) == ["folder"]
-
-
-def test_an_empty_folder_is_filled_without_being_asked(tmp_path: Path) -> None:
-    (tmp_path / "folder").mkdir()
-    with folder_atomically(tmp_path / "folder") as folder:
-        (folder / "new.txt").write_text("new")
-    assert os.listdir(tmp_path / "folder") == ["new.txt"]
-
-
-def test_a_file_in_the_way_of_a_folder_is_named(tmp_path: Path) -> None:
-    (tmp_path / "x").write_text("")
-
-    def fill() -> None:
-        with folder_atomically(tmp_path / "x", overwrite=True):
-            pass
-
-    assert_one_line(fill, str(tmp_path / "x"), "in the way")
+        half(KeyError("in the middle"))
+    part = tmp_path / f".a.mp4.{os.getpid()}.partial" / "a.mp4"
+    told = f"{target}: could not be written: "
+    assert_one_line(lambda: half(OSError(errno.EROFS, "Read-only file system", str(part))), told + "the file system is")
+    assert_one_line(lambda: half(OSError(errno.EIO, "I/O error", str(part))), told + "I/O error; choose another path")
+    assert contents(tmp_path) == {target: b"old"}
+    assert os.listdir(tmp_path) == ["a.mp4"]

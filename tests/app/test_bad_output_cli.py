@@ -71,3 +71,27 @@ def test_a_full_disk_leaves_nothing_half_written(
 def test_a_folder_that_may_not_be_written_is_named(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
     (tmp_path / "locked").mkdir(mode=0o500)
     says(pop("train", shared_capture, "--out", tmp_path / "locked" / "r", *TRAIN), "locked", "permission denied")
+
+
+def test_a_video_that_the_disk_has_no_room_for_leaves_the_old_one(
+    pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["render", shared_result, "--path", "orbit", "--frames", "3", "--video", tmp_path / "clip.mp4"]
+    assert pop(*words).status == 0
+    before = contents(tmp_path)
+    release = cv2.VideoWriter.release
+
+    class Full(cv2.VideoWriter):
+        """An encoder on a full disk: it says nothing, and half of the file is missing."""
+
+        def __init__(self, path: str, *rest: object) -> None:
+            super().__init__(path, *rest)
+            self.path = Path(path)
+
+        def release(self) -> None:
+            release(self)
+            truncate(self.path)
+
+    monkeypatch.setattr(cv2, "VideoWriter", Full)
+    says(pop(*words, "--overwrite"), f"{tmp_path / 'clip.mp4'}: only 0 of 3 frames", "free some space")
+    assert contents(tmp_path) == before

@@ -110,3 +110,35 @@ def test_an_unknown_setting_in_cfg_json_is_named(pop: Pop, result: Path) -> None
     config = json.loads((result / "cfg.json").read_text())
     (result / "cfg.json").write_text(json.dumps({**config, "colour": 1}))
     says(pop("eval", result), "config.colour", "not a setting")
+
+
+@pytest.mark.parametrize("text", ["", "{oops", '{"max_steps": 0}'], ids=["empty", "not JSON", "out of range"])
+@pytest.mark.parametrize("command", ["eval", "compare", "report"])
+def test_a_damaged_cfg_json_is_named_by_its_path(pop: Pop, result: Path, command: str, text: str) -> None:
+    (result / "cfg.json").write_text(text)
+    says(pop(command, result), str(result / "cfg.json"), "mend the file")
+
+
+def test_a_cfg_json_in_another_encoding_is_named(pop: Pop, result: Path) -> None:
+    (result / "cfg.json").write_bytes("{}".encode("utf-16"))
+    says(pop("eval", result), str(result / "cfg.json"), "mend the file")
+
+
+def test_a_capture_that_is_no_longer_there_is_asked_for(pop: Pop, capture: Path, result: Path) -> None:
+    config = json.loads((result / "cfg.json").read_text())
+    (result / "cfg.json").write_text(json.dumps({**config, "data": str(capture.parent / "gone")}))
+    says(pop("eval", result), str(capture.parent / "gone"), "not there", "--capture DIR")
+    assert pop("eval", result, "--capture", capture).status == 0
+
+
+def test_held_out_views_too_small_to_be_measured_are_named(pop: Pop, shared_result: Path) -> None:
+    checkpoint = shared_result / "ckpts" / "ckpt_29_rank0.pt"
+    says(pop("eval", checkpoint, "--factor", "4"), "view_000.png is 10 x 8 px", "lower --factor")
+
+
+def test_endings_may_be_written_in_capitals(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
+    for source in (shared_result / "ply" / "point_cloud_29.ply", shared_result / "ckpts" / "ckpt_29_rank0.pt"):
+        loud = tmp_path / f"LOUD{source.suffix.upper()}"
+        loud.write_bytes(source.read_bytes())
+        outcome = pop("export", loud, "--out", tmp_path / f"{source.suffix[1:]}.splat")
+        assert outcome.status == 0, outcome.err

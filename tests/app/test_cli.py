@@ -15,8 +15,8 @@ from pop_fast.cli import COMMANDS, main
 from pop_fast.cli.errors import describe
 from pop_fast.cli.train import arguments, rename_aliases
 from pop_fast.errors import PopError
-from pop_fast.train import Trainer
 from tests.app.conftest import TRAIN, Pop
+from tests.app.interruptions import interrupt
 
 
 def test_the_overview_lists_every_subcommand_without_importing_torch() -> None:
@@ -135,14 +135,15 @@ def test_a_bare_folder_of_photographs_is_placed_then_trained_on_and_the_end_is_t
 def test_ctrl_c_says_how_to_go_on_and_exits_with_130(
     pop: Pop, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(self: Trainer) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Trainer, "run", interrupted)
+    interrupt(monkeypatch, at=10)
     outcome = pop("train", shared_capture, "--out", tmp_path / "r", *TRAIN)
     assert outcome.status == 130
-    assert (tmp_path / "r" / "capture.json").is_file()
-    assert outcome.err.strip() == "pop: stopped after step 0; the same command with --resume goes on"
+    assert outcome.err.strip() == "pop: stopped after step 10; the same command with --resume goes on"
+    interrupt(monkeypatch, at=0)
+    outcome = pop("train", shared_capture, "--out", tmp_path / "s", *TRAIN)
+    assert outcome.status == 130
+    assert outcome.err.strip() == "pop: stopped before the first step; nothing was written"
+    assert not (tmp_path / "s").exists()
 
 
 def test_eval_repeats_the_numbers_of_training(pop: Pop, shared_result: Path, tmp_path: Path) -> None:

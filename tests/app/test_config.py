@@ -132,11 +132,29 @@ def test_settings_go_through_json_unchanged(config):
         ({"sh_degree": 4}, r"sh_degree is 4"),
         ({"init_opacity": 1}, r"init_opacity is 1\.0"),
         ({"lambda_ssim": 1.5}, r"lambda_ssim is 1\.5"),
+        ({"steps_scaler": float("inf")}, r"steps_scaler is inf; it must be > 0 and finite"),
+        ({"steps_scaler": 1e300}, r"steps_scaler is 1e\+300; it must be at most 1000000"),
+        ({"init_scale": float("inf")}, r"init_scale is inf; it must be > 0 and finite"),
+        ({"photometric_divisor": float("inf")}, r"photometric_divisor is inf"),
+        ({"lr": {"means": -1}}, r"lr\.means is -1\.0; it must be >= 0 and finite"),
+        ({"lr": {"means": float("nan")}}, r"lr\.means is nan"),
+        ({"lr": {"means_decay": -1}}, r"lr\.means_decay is -1\.0; it must be > 0 and finite"),
+        ({"lr": {"means_decay": 0}}, r"lr\.means_decay is 0\.0; it must be > 0"),
+        ({"pop": {"lambda_pop": float("nan")}}, r"pop\.lambda_pop is nan; it must be >= 0 and finite"),
+        ({"pop": {"prune_opa": 2}}, r"pop\.prune_opa is 2\.0; it must lie in \[0, 1\]"),
+        ({"adc": {"grow_grad2d": float("inf")}}, r"adc\.grow_grad2d is inf"),
     ],
 )
 def test_bad_settings_are_named(change, message):
     with pytest.raises(PopError, match=message):
         TrainConfig.from_json(json.dumps(change))
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(LearningRates)])
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
+def test_every_learning_rate_is_finite_and_not_negative(name, value):
+    with pytest.raises(PopError, match=rf"lr\.{name} is {value}; it must be"):
+        TrainConfig(lr=LearningRates(**{name: value}))
 
 
 def test_what_is_not_json_is_said_with_its_place():

@@ -118,9 +118,14 @@ def test_an_existing_folder_is_replaced_only_on_request(tmp_path: Path) -> None:
     target, tiny = tmp_path / "demo", {"views": 4, "width": 16, "height": 16}
     target.mkdir()
     (target / "mine.txt").write_text("mine")
+    assert_one_line(lambda: make_demo(target, overwrite=True, **tiny), str(target), "did not write (mine.txt)")
+    assert [path.name for path in target.iterdir()] == ["mine.txt"]
+    (target / "mine.txt").unlink()
+    make_demo(target, **tiny)
+    before = (target / "images").stat().st_mtime_ns
     assert_one_line(lambda: make_demo(target, **tiny), str(target), "--overwrite")
     make_demo(target, overwrite=True, **tiny)
-    assert not (target / "mine.txt").exists()
+    assert (target / "images").stat().st_mtime_ns != before
 
 
 @pytest.mark.parametrize("size", [{"views": 3}, {"width": 8}, {"height": 0}])

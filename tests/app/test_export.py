@@ -15,6 +15,7 @@ from pop_fast.data import load_capture
 from pop_fast.data.colmap import read_model
 from pop_fast.io.ply import load_ply, save_ply
 from tests.app.conftest import Pop
+from tests.app.damage import contents, says
 
 
 def exported(pop: Pop, *words: object) -> str:
@@ -110,9 +111,11 @@ def test_inria_s_cameras_are_those_of_the_colmap_model(
     [
         (["--out", "x.obj"], "must end in .ply or .splat"),
         (["--out", "there.ply"], "exists; pass --overwrite"),
-        (["--out", "full", "--layout", "inria"], "--overwrite"),
+        (["--out", "full", "--layout", "inria"], "full: holds what this command did not write (notes.txt)"),
+        (["--out", "full", "--layout", "inria", "--overwrite"], "did not write (notes.txt)"),
+        (["--out", "full.ply", "--overwrite"], "full.ply: a folder of this name is in the way; choose another --out"),
     ],
-    ids=["unknown ending", "file in the way", "folder in the way"],
+    ids=["unknown ending", "file in the way", "folder in the way", "folder of somebody else", "folder for a file"],
 )
 def test_what_cannot_be_exported_is_said_and_nothing_is_written(
     pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], part: str
@@ -120,6 +123,7 @@ def test_what_cannot_be_exported_is_said_and_nothing_is_written(
     (tmp_path / "there.ply").write_text("mine")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
+    (tmp_path / "full.ply").mkdir()
     monkeypatch.chdir(tmp_path)
     before = sorted(tmp_path.rglob("*"))
     outcome = pop("export", shared_result, *words)
@@ -127,3 +131,51 @@ def test_what_cannot_be_exported_is_said_and_nothing_is_written(
     assert part in outcome.err
     assert sorted(tmp_path.rglob("*")) == before
     assert (tmp_path / "there.ply").read_text() == "mine"
+
+
+def test_an_earlier_export_in_inria_s_layout_is_replaced_only_when_asked(
+    pop: Pop, shared_result: Path, tmp_path: Path
+) -> None:
+    words = ["export", shared_result, "--layout", "inria", "--out", tmp_path / "inria"]
+    assert pop(*words).status == 0
+    before = contents(tmp_path)
+    (tmp_path / "inria" / "test" / "ours_30" / "gt" / "00001.png").write_bytes(b"of a longer test set")
+    says(pop(*words), "inria: the folder exists and is not empty; choose another or pass --overwrite")
+    assert pop(*words, "--overwrite").status == 0
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("damage", ["another trainer's", "measured", "no cfg_args"])
+def test_an_inria_folder_that_is_not_just_our_export_is_never_replaced(
+    pop: Pop, shared_result: Path, tmp_path: Path, damage: str
+) -> None:
+    words = ["export", shared_result, "--layout", "inria", "--out", tmp_path / "inria"]
+    assert pop(*words).status == 0
+    settings = tmp_path / "inria" / "cfg_args"
+    if damage == "another trainer's":
+        settings.write_text(settings.read_text().replace(", exported_by='pop export'", ""))
+    elif damage == "measured":
+        (tmp_path / "inria" / "results.json").write_text("{}")
+    else:
+        settings.unlink()
+    before = contents(tmp_path)
+    said = {"measured": "(results.json)", "no cfg_args": "(cameras.json"}.get(damage, "(cameras.json, cfg_args")
+    says(pop(*words, "--overwrite"), "inria: holds what this command did not write", said, "move these files away")
+    assert contents(tmp_path) == before
+
+
+def test_an_export_takes_the_place_of_nothing_that_it_reads(
+    pop: Pop, capture: Path, result: Path, tmp_path: Path
+) -> None:
+    words = ["export", result, "--capture", capture, "--overwrite", "--layout", "inria", "--out"]
+    assert pop(*words, tmp_path / "inria").status == 0
+    before = contents(tmp_path)
+    says(pop(*words, capture), f"{capture}: is read by this command, so it is not replaced")
+    says(pop(*words, result), f"{result}: holds", "read by this command")
+    lone = tmp_path / "inria" / "point_cloud" / "iteration_30" / "point_cloud.ply"
+    again = ["export", lone, "--capture", capture, "--own-frame", "--overwrite"]
+    says(
+        pop(*again, "--layout", "inria", "--out", tmp_path / "inria"), "inria: holds", "point_cloud.ply, which is read"
+    )
+    says(pop(*again, "--out", lone), "point_cloud.ply: is the splat that is read; choose another --out")
+    assert contents(tmp_path) == before

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -13,6 +16,8 @@ from hypothesis import strategies as st
 from pop_fast.errors import PopError
 from pop_fast.paths import PATHS, VideoFile, camera_path, interpolate, orbit
 from pop_fast.paths.cameras import camera_centers, focus_point, look_at, mean_up
+from pop_fast.paths.video import frames_in
+from tests.app.captures import assert_one_line
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -100,16 +105,98 @@ def test_a_video_holds_the_frames_that_were_added(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["clip.mp4"]
 
 
-def _film_two_sizes(path: Path) -> None:
-    with VideoFile(path) as video:
-        video.add(np.zeros((16, 16, 3), np.uint8))
-        video.add(np.zeros((16, 8, 3), np.uint8))
+def film(path: Path, *sizes: tuple[int, int], fps: float = 30.0) -> None:
+    with VideoFile(path, fps) as video:
+        for i, (width, height) in enumerate(sizes):
+            video.add(np.random.default_rng(i).integers(0, 256, (height, width, 3), dtype=np.uint8))
 
 
-def test_a_video_that_fails_half_way_leaves_no_file(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="frame is 8 x 16"):
-        _film_two_sizes(tmp_path / "clip.mp4")
-    assert list(tmp_path.iterdir()) == []
+@pytest.mark.parametrize("name", ["clip.mp4", "clip.webm", "clip.AVI"])
+@pytest.mark.parametrize("fps", [0.5, 29.97, 600.0])
+def test_every_kind_of_video_plays_to_its_last_frame(tmp_path: Path, name: str, fps: float) -> None:
+    film(tmp_path / "new" / name, *[(32, 16)] * 5, fps=fps)
+    assert frames_in(tmp_path / "new" / name) == 5
+    assert os.listdir(tmp_path / "new") == [name]
+
+
+@pytest.mark.parametrize(
+    ("sizes", "told"),
+    [
+        ([(16, 16), (8, 16)], "frame 1 is 8 x 16 px, the first was 16 x 16 px; a video has one size: use views of one"),
+        ([(1, 16)], "frames are 1 x 16 px; a video needs 2 x 2 or more"),
+        ([], "no frame was added; a video needs one or more"),
+    ],
+    ids=["two sizes", "no size", "no frame"],
+)
+def test_a_video_that_fails_half_way_leaves_the_old_file(
+    tmp_path: Path, sizes: list[tuple[int, int]], told: str
+) -> None:
+    path = tmp_path / "clip.mp4"
+    path.write_bytes(b"old")
+    assert_one_line(lambda: film(path, *sizes), f"{path}: {told}")
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["clip.mp4"]
+
+
+@pytest.mark.parametrize("fps", [0.0, -1.0, 0.4, 601.0, float("nan"), float("inf")])
+def test_a_rate_that_no_video_can_have_is_refused_at_once(tmp_path: Path, fps: float) -> None:
+    assert_one_line(lambda: VideoFile(tmp_path / "clip.mp4", fps), f"fps is {fps}", "from 0.5 to 600, such as 30")
+
+
+def test_a_folder_in_the_way_of_a_video_is_named(tmp_path: Path) -> None:
+    (tmp_path / "clip.mp4").mkdir()
+    assert_one_line(lambda: VideoFile(tmp_path / "clip.mp4"), "clip.mp4: a folder of this name is in the way")
+
+
+_LIMITED = """
+import resource, signal, sys
+from pathlib import Path
+import numpy as np
+from pop_fast.paths import VideoFile
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
+with VideoFile(Path(sys.argv[1])) as video:
+    for i in range(12):
+        video.add(np.random.default_rng(i).integers(0, 256, (64, 64, 3), dtype=np.uint8))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX resource limits")
+@pytest.mark.parametrize(
+    ("name", "room", "told"),
+    [
+        ("clip.mp4", 0, "could not be written: "),
+        ("clip.mp4", 4096, "only 0 of 12 frames could be read back after writing; the disk may be full: free some"),
+        ("clip.webm", 4096, "of 12 frames could be read back after writing; the disk may be full: free some space"),
+        ("clip.avi", 4096, "of 12 frames could be read back after writing; the disk may be full: free some space"),
+    ],
+)
+def test_a_video_that_the_disk_has_no_room_for_is_told_and_leaves_the_old_file(
+    tmp_path: Path, name: str, room: int, told: str
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(b"old")
+    words = [sys.executable, "-c", _LIMITED, str(path), str(room)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith(f"pop_fast.errors.PopError: {path}: ")
+    assert told in last
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == [name]
+
+
+@pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may write anywhere")
+def test_a_video_in_a_folder_that_may_not_be_written_is_named_as_the_user_named_it(tmp_path: Path) -> None:
+    (tmp_path / "locked").mkdir(mode=0o500)
+    path = tmp_path / "locked" / "clip.mp4"
+    assert_one_line(lambda: film(path, (16, 16)), f"{path}: could not be written: permission denied")
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a folder where nobody can write")
+def test_a_video_that_cannot_be_placed_is_named_as_the_user_named_it() -> None:
+    path = Path("/proc/self/clip.mp4")
+    assert_one_line(lambda: film(path, (16, 16)), f"{path}: could not be written: ", "choose another path")
 
 
 def test_an_unknown_video_ending_names_the_known_ones(tmp_path: Path) -> None:

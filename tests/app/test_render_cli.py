@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+import json
+import os
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+from pop_fast.paths.video import frames_in
+from tests.app.captures import (
+    camera,
+    edit_transforms,
+    photograph,
+    ring,
+    transforms_capture,
+    write_model,
+    write_photograph,
+)
 from tests.app.conftest import Pop
+from tests.app.damage import contents, says
 
 
 def read(path: Path) -> np.ndarray:
@@ -21,7 +35,7 @@ def test_held_out_views_are_rendered_to_the_same_bytes_as_in_training(
     outcome = pop("render", shared_result, "--out", tmp_path / "views")
     assert outcome.status == 0, outcome.err
     assert "1 views of toy" in outcome.out
-    assert [path.name for path in (tmp_path / "views").iterdir()] == ["view_000.png"]
+    assert sorted(os.listdir(tmp_path / "views")) == ["renders.json", "view_000.png"]
     kept = np.load(shared_result / "report_data" / "val_step29_0000.npz")
     np.testing.assert_array_equal(read(tmp_path / "views" / "view_000.png"), kept["render"])
 
@@ -33,7 +47,7 @@ def test_a_path_gives_as_many_pictures_and_frames_as_asked(
     words = ["--path", path, "--frames", "3", "--out", tmp_path / "frames", "--video", tmp_path / "clip.mp4"]
     outcome = pop("render", shared_result, *words)
     assert outcome.status == 0, outcome.err
-    pictures = sorted((tmp_path / "frames").iterdir())
+    pictures = sorted((tmp_path / "frames").glob("*.png"))
     assert [p.name for p in pictures] == [f"{path}_{i:04d}.png" for i in range(3)]
     assert all(read(p).shape == (32, 40, 3) for p in pictures)
     assert len({p.read_bytes() for p in pictures}) == 3
@@ -51,10 +65,25 @@ def test_a_video_alone_leaves_no_pictures(pop: Pop, shared_result: Path, tmp_pat
     [
         ([], "give --out DIR for pictures, --video FILE"),
         (["--video", "clip.gif"], "must end in .mp4, .webm, .avi"),
-        (["--out", "r", "--path", "orbit", "--frames", "0"], "n_frames is 0"),
+        (["--video", "clip.mp4", "--fps", "0"], "clip.mp4: fps is 0.0; it must be a number from 0.5 to 600"),
+        (["--video", "clip.mp4", "--fps", "nan"], "clip.mp4: fps is nan; it must be a number from 0.5 to 600"),
+        (["--out", "r", "--video", "r/clip.mp4"], "r/clip.mp4: lies in --out r, which holds pictures only"),
+        (["--out", "r", "--path", "orbit", "--frames", "0"], "frames is 0; give --frames 1 or more"),
         (["--out", "r", "--test-every", "0"], "holds no view out"),
+        (["--out", "r", "--path", "orbit", "--test-every", "1"], "needs 1 or more training views and there are 0"),
+        (["--out", "."], "the folder that this command runs in; choose another output folder"),
     ],
-    ids=["nothing to write", "unknown video", "no frames", "no held-out views"],
+    ids=[
+        "nothing to write",
+        "unknown video",
+        "no rate",
+        "a rate that is no number",
+        "the video among the pictures",
+        "no frames",
+        "no held-out views",
+        "no training views",
+        "the folder that one is in",
+    ],
 )
 def test_what_cannot_be_rendered_is_said_and_nothing_is_written(
     pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], part: str
@@ -67,14 +96,133 @@ def test_what_cannot_be_rendered_is_said_and_nothing_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_there_is_replaced_only_when_asked(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
+def test_an_earlier_video_is_replaced_only_when_asked(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
     (tmp_path / "clip.mp4").write_text("mine")
-    (tmp_path / "views").mkdir()
-    (tmp_path / "views" / "notes.txt").write_text("mine")
-    assert "--overwrite" in pop("render", shared_result, "--video", tmp_path / "clip.mp4").err
-    assert "--overwrite" in pop("render", shared_result, "--out", tmp_path / "views").err
-    assert (tmp_path / "clip.mp4").read_text() == (tmp_path / "views" / "notes.txt").read_text() == "mine"
-    words = ["--video", tmp_path / "clip.mp4", "--out", tmp_path / "views", "--overwrite"]
-    assert pop("render", shared_result, *words).status == 0
-    assert [p.name for p in (tmp_path / "views").iterdir()] == ["view_000.png"]
-    assert (tmp_path / "clip.mp4").stat().st_size > 100
+    says(pop("render", shared_result, "--video", tmp_path / "clip.mp4"), "clip.mp4", "exists; pass --overwrite")
+    assert (tmp_path / "clip.mp4").read_text() == "mine"
+    assert pop("render", shared_result, "--video", tmp_path / "clip.mp4", "--overwrite").status == 0
+    assert frames_in(tmp_path / "clip.mp4") == 1
+
+
+def test_the_index_of_a_render_names_the_file_of_every_view(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
+    assert pop("render", shared_result, "--out", tmp_path / "r", "--path", "orbit", "--frames", "2").status == 0
+    assert json.loads((tmp_path / "r" / "renders.json").read_text()) == {
+        "splat": str(shared_result / "ckpts" / "ckpt_29_rank0.pt"),
+        "capture": "toy",
+        "path": "orbit",
+        "renders": [{"view": f"orbit_{i:04d}", "file": f"orbit_{i:04d}.png"} for i in range(2)],
+    }
+
+
+def test_an_earlier_render_is_replaced_only_when_asked(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
+    words = ["render", shared_result, "--out", tmp_path / "r"]
+    assert pop(*words, "--path", "orbit", "--frames", "2").status == 0
+    before = contents(tmp_path)
+    says(pop(*words), str(tmp_path / "r"), "exists and is not empty; choose another or pass --overwrite")
+    assert contents(tmp_path) == before
+    assert pop(*words, "--overwrite").status == 0
+    assert sorted(os.listdir(tmp_path / "r")) == ["renders.json", "view_000.png"]
+
+
+@pytest.mark.parametrize("words", [(), ("--overwrite",)], ids=["unasked", "asked"])
+def test_a_folder_with_anything_of_somebody_else_is_never_replaced(
+    pop: Pop, shared_result: Path, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    assert pop("render", shared_result, "--out", tmp_path / "r").status == 0
+    (tmp_path / "r" / "raw").mkdir()
+    (tmp_path / "r" / "raw" / "a.dng").write_text("mine")
+    before = contents(tmp_path)
+    outcome = pop("render", shared_result, "--out", tmp_path / "r", *words)
+    says(outcome, str(tmp_path / "r"), "did not write (raw/a.dng)", "choose another output folder, or move these files")
+    assert "--overwrite" not in outcome.err
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("index", [None, "[]", '{"renders": 3}', "{", '{"renders": [{}]}'])
+def test_pictures_without_an_index_of_this_command_are_somebody_else_s(
+    pop: Pop, shared_result: Path, tmp_path: Path, index: str | None
+) -> None:
+    (tmp_path / "r").mkdir()
+    (tmp_path / "r" / "view_000.png").write_text("mine")
+    if index is not None:
+        (tmp_path / "r" / "renders.json").write_text(index)
+    before = contents(tmp_path)
+    says(pop("render", shared_result, "--out", tmp_path / "r", "--overwrite"), "did not write", "view_000.png")
+    assert contents(tmp_path) == before
+
+
+def test_what_is_read_is_never_replaced(pop: Pop, capture: Path, result: Path, tmp_path: Path) -> None:
+    before = contents(tmp_path)
+    words = ["render", result, "--capture", capture, "--overwrite", "--out"]
+    says(pop(*words, result), f"{result}: holds", "ckpt_29_rank0.pt, which is read by this command")
+    says(pop(*words, capture), f"{capture}: is read by this command")
+    says(pop(*words, tmp_path), f"{tmp_path}: holds", "choose another output folder")
+    says(pop(*words, capture / "images"), "did not write (view_000.png, view_001.png, view_002.png, ...)")
+    assert contents(tmp_path) == before
+
+
+def test_renders_never_take_the_place_of_photographs_outside_the_capture(
+    pop: Pop, shared_result: Path, tmp_path: Path
+) -> None:
+    scene = transforms_capture(tmp_path / "scene", 8)
+    for i in range(8):
+        write_photograph(tmp_path / "away" / f"{i}.png", photograph(i))
+
+    def lead_out(listing: dict[str, Any]) -> None:
+        for i, frame in enumerate(listing["frames"]):
+            frame["file_path"] = f"../away/{i}.png" if i % 2 else str(tmp_path / "away" / f"{i}.png")
+
+    edit_transforms(scene, lead_out)
+    before = contents(tmp_path)
+    outcome = pop("render", shared_result, "--capture", scene, "--test-every", "1", "--out", tmp_path / "r")
+    assert outcome.status == 0, outcome.err
+    after = contents(tmp_path)
+    assert {path: after.get(path) for path in before} == before
+    new = sorted(path.relative_to(tmp_path).as_posix() for path in set(after) - set(before))
+    assert new == [*(f"r/{i}.png" for i in (0, 2, 4, 6)), *(f"r/away/{i}.png" for i in (1, 3, 5, 7)), "r/renders.json"]
+
+
+def test_every_view_has_a_file_of_its_own(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
+    names = ["cam.00", "cam.08", "x.jpg", "x.png"]
+    scene = transforms_capture(tmp_path / "scene", 4)
+    for i, name in enumerate(names):
+        stored = name if name.startswith("x") else f"{name}.png"
+        write_photograph(scene / "images" / stored, photograph(i))
+    edit_transforms(
+        scene, lambda d: [d["frames"][i].update(file_path=f"images/{name}") for i, name in enumerate(names)]
+    )
+    outcome = pop("render", shared_result, "--capture", scene, "--test-every", "1", "--out", tmp_path / "r")
+    assert "4 views" in outcome.out, outcome.err
+    listed = json.loads((tmp_path / "r" / "renders.json").read_text())["renders"]
+    assert [entry["view"] for entry in listed] == [f"images/{name}" for name in names]
+    assert [entry["file"] for entry in listed] == [f"images/{name}.png" for name in names]
+    assert sorted(os.listdir(tmp_path / "r" / "images")) == sorted(f"{name}.png" for name in names)
+
+
+def test_a_video_of_views_of_two_sizes_is_refused_with_a_way_out(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
+    lenses = [camera(), camera(params=(36.0, 35.0, 15.5, 20.25), width=30, height=40)] * 2
+    for i, lens in enumerate(lenses):
+        write_photograph(tmp_path / "scene" / "images" / f"{i}.png", photograph(i, lens.width, lens.height))
+    write_model(tmp_path / "scene" / "sparse" / "0", [f"{i}.png" for i in range(4)], ring(4), lenses)
+    words = ["render", shared_result, "--capture", tmp_path / "scene", "--test-every", "1"]
+    says(
+        pop(*words, "--video", tmp_path / "clip.mp4"),
+        "clip.mp4: the views have 2 sizes (1.png is 30 x 40 px, 0.png is 40 x 30 px)",
+        "write pictures with --out DIR, or film a path with --path orbit",
+    )
+    assert os.listdir(tmp_path) == ["scene"]
+    assert pop(*words, "--out", tmp_path / "r").status == 0
+
+
+def test_a_path_through_one_training_view_is_refused_with_a_way_out(
+    pop: Pop, shared_result: Path, tmp_path: Path
+) -> None:
+    scene = transforms_capture(tmp_path / "scene", 2)
+    words = ["render", shared_result, "--capture", scene, "--test-every", "2", "--out", tmp_path / "r", "--path"]
+    says(
+        pop(*words, "interpolate"),
+        "scene: --path interpolate needs 2 or more training views and there are 1",
+        "hold fewer out with --test-every 0, or take --path orbit",
+    )
+    assert not (tmp_path / "r").exists()
+    assert pop(*words, "orbit", "--frames", "2").status == 0

@@ -1,0 +1,58 @@
+"""Remember which files structure from motion wrote, so that replacing its result never removes anything else.
+
+The list lies beside the model as `sparse/sfm.sha256`, in the format of `sha256sum`, with paths relative to the capture.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+__all__ = ["recognise_result", "write_list"]
+
+_LIST = "sfm.sha256"
+
+
+def write_list(sparse: Path, folder: Path, prefix: str = "") -> None:
+    """List every file of a new result.
+
+    Args:
+        sparse: the new folder `sparse`, where the list is written.
+        folder: what was written, all of it.
+        prefix: what to put before the paths relative to `folder`, so that they are relative to the capture.
+    """
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    lines = [f"{_sha256(path)}  {prefix}{path.relative_to(folder).as_posix()}\n" for path in files]
+    (sparse / _LIST).write_text("".join(lines), encoding="utf-8", errors="surrogateescape")
+
+
+def recognise_result(capture: Path, target: Path) -> Callable[[Path], bool]:
+    """Make a test of whether a file, by its path relative to `target`, is as structure from motion wrote it.
+
+    Args:
+        capture: the capture's folder.
+        target: the folder that is to be replaced: the capture itself or its folder `sparse`.
+    """
+    written = _read_list(capture / "sparse" / _LIST)
+
+    def recognise(file: Path) -> bool:
+        path = target / file
+        if path.is_symlink():
+            return False
+        name = path.relative_to(capture).as_posix()
+        return name == f"sparse/{_LIST}" or (name in written and written[name] == _sha256(path))
+
+    return recognise
+
+
+def _read_list(path: Path) -> dict[str, str]:
+    if not path.is_file():
+        return {}
+    lines = path.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+    return {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
+
+
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,76 @@
+"""Which values the settings of a run may have; a refusal is one line that names the setting as `pop train` does."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from typing import Any, Final
+
+from pop_fast.errors import PopError
+
+_AT_LEAST: Final = {
+    "max_steps": 1,
+    "factor": 1,
+    "sh_degree": 0,
+    "sh_interval": 1,
+    "test_every": 0,
+    "threads": 0,
+    "checkpoint_every": 0,
+    "keep_checkpoints": 1,
+    "log_every": 1,
+    "max_renders": 0,
+    "target_cache_mb": 0,
+    "l2_stop_iter": 0,
+}
+# numbers that are divided by, or of which a logarithm is taken
+_OVER_ZERO: Final = ("steps_scaler", "init_scale", "photometric_divisor", "lr.means_decay")
+_SHARES: Final = ("lambda_ssim", "pop.prune_opa", "adc.prune_opa", "pop.theta_blur")
+# step numbers times this are still far from where a float ends
+_LARGEST_SCALER: Final = 1e6
+
+
+def check_values(config: Any) -> None:
+    """Check every setting of a run.
+
+    Args:
+        config: a `TrainConfig`, or a dataclass with the same settings.
+
+    Raises:
+        PopError: a setting is out of range or, being a number, not finite.
+    """
+    values = dict(_flat(config))
+    for name, smallest in _AT_LEAST.items():
+        if values[name] is not None and values[name] < smallest:
+            raise PopError(f"{name} is {values[name]}; it must be at least {smallest}")
+    if values["sh_degree"] > 3:
+        raise PopError(f"sh_degree is {values['sh_degree']}; it must be 0, 1, 2 or 3")
+    if not 0.0 < values["init_opacity"] < 1.0:
+        raise PopError(f"init_opacity is {values['init_opacity']}; it must lie between 0 and 1")
+    if any(not 0.0 <= value <= 1.0 for value in values["background"]):
+        raise PopError(f"background is {list(values['background'])}; every channel must lie in [0, 1]")
+    for name in (*_OVER_ZERO, *_SHARES, *(name for name, value in values.items() if isinstance(value, float))):
+        if values[name] is not None:
+            _check_number(name, values[name])
+    if (values["steps_scaler"] or 0.0) > _LARGEST_SCALER:
+        raise PopError(f"steps_scaler is {values['steps_scaler']}; it must be at most {_LARGEST_SCALER:.0f}")
+
+
+def _check_number(name: str, value: float) -> None:
+    if name in _SHARES:
+        right, meaning = 0.0 <= value <= 1.0, "lie in [0, 1]"
+    elif name in _OVER_ZERO:
+        right, meaning = 0.0 < value < math.inf, "be > 0 and finite"
+    else:
+        right, meaning = 0.0 <= value < math.inf, "be >= 0 and finite"
+    if not right:
+        raise PopError(f"{name} is {value}; it must {meaning}")
+
+
+def _flat(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for field in fields(config):
+        value = getattr(config, field.name)
+        if is_dataclass(value):
+            yield from _flat(value, f"{prefix}{field.name}.")
+        else:
+            yield f"{prefix}{field.name}", value
