@@ -58,7 +58,7 @@ _IGNORED: Final = frozenset({"--eval"})  # Inria: hold out every 8th view; here 
 class _Run:
     """Fit a splat to a capture or a folder of photographs.
 
-    DATA is a folder with a COLMAP model (sparse/0), with transforms.json, or with photographs alone.
+    DATA is a folder with a COLMAP model (the largest in sparse), with transforms.json, or with photographs alone.
 
     Attributes:
         resume: go on from the last checkpoint in the output folder, to the same bits as without the interruption; start

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -79,17 +80,21 @@ def test_a_video_that_the_disk_has_no_room_for_leaves_the_old_one(
     words = ["render", shared_result, "--path", "orbit", "--frames", "3", "--video", tmp_path / "clip.mp4"]
     assert pop(*words).status == 0
     before = contents(tmp_path)
-    release = cv2.VideoWriter.release
+    open_writer = cv2.VideoWriter
 
-    class Full(cv2.VideoWriter):
+    class Full:
         """An encoder on a full disk: it says nothing, and half of the file is missing."""
 
-        def __init__(self, path: str, *rest: object) -> None:
-            super().__init__(path, *rest)
-            self.path = Path(path)
+        fourcc = staticmethod(cv2.VideoWriter.fourcc)
+
+        def __init__(self, path: str, *rest: Any) -> None:
+            self.path, self.writer = Path(path), open_writer(path, *rest)
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self.writer, name)
 
         def release(self) -> None:
-            release(self)
+            self.writer.release()
             truncate(self.path)
 
     monkeypatch.setattr(cv2, "VideoWriter", Full)

@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
+from pop_fast.cli.render import write_pictures
+from pop_fast.errors import PopError
 from pop_fast.paths.video import frames_in
 from tests.app.captures import (
     camera,
@@ -180,6 +182,14 @@ def test_renders_never_take_the_place_of_photographs_outside_the_capture(
     assert {path: after.get(path) for path in before} == before
     new = sorted(path.relative_to(tmp_path).as_posix() for path in set(after) - set(before))
     assert new == [*(f"r/{i}.png" for i in (0, 2, 4, 6)), *(f"r/away/{i}.png" for i in (1, 3, 5, 7)), "r/renders.json"]
+
+
+def test_no_picture_is_written_outside_its_folder(tmp_path: Path) -> None:
+    (tmp_path / "r").mkdir()
+    frames = write_pictures(iter([np.zeros((2, 2, 3), np.uint8)]), [Path("../a.png")], tmp_path / "r")
+    with pytest.raises(PopError, match="leads out"):
+        next(frames)
+    assert os.listdir(tmp_path) == ["r"]
 
 
 def test_every_view_has_a_file_of_its_own(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
