@@ -27,7 +27,7 @@ COMMANDS: Final = {
     "sfm": "find the cameras of a folder of photographs (pycolmap)",
     "demo": "write the built-in demo capture, made from a seed",
     "data check": "look a capture over before training: sizes, pairing, masks, memory",
-    "build-cpu": "compile the CPU kernels: two to three times the speed (needs a C++ compiler)",
+    "build-cpu": "compile the CPU kernels: about three times the speed (needs a C++ compiler)",
     "build-cuda": "compile the CUDA extension (needs nvcc)",
     "vectors": "write the conformance vectors for ports in other languages, and check a port's results",
     "doctor": "say what is installed, what is missing and how to get it",

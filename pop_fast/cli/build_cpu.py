@@ -21,7 +21,7 @@ _EXAMPLES: Final = """
 class Args:
     """Compile the CPU kernels with g++, clang++ or the compiler that CXX names. Nothing else compiles them but `make`.
 
-    It takes some seconds and makes training two to three times as fast. They are compiled for exactly this processor,
+    It takes some seconds and makes training about three times as fast. They are compiled for exactly this processor,
     and have to be compiled again after an update.
     """
 

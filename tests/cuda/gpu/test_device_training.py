@@ -130,5 +130,5 @@ def test_a_number_that_is_not_finite_is_found_on_the_device(hardware, tmp_path):
         return found
 
     trainer._change = poisoned
-    with pytest.raises(ValueError, match=r"quats\[7, 2\] is nan after 5 steps; the latest checkpoint is kept"):
+    with pytest.raises(ValueError, match=r"quats\[7, 2\] is nan after 5 steps; nothing was written"):
         trainer.run()
