@@ -85,7 +85,7 @@ def rasterization(
         eps2d: low-pass, px^2; at gsplat's default the profile's own value is used.
         sh_degree: bands to evaluate, or None when `colors` are colours.
         packed: whether meta holds rows of visible (camera, Gaussian) pairs only.
-        tile_size: px; the image does not depend on it, except in profile "inria".
+        tile_size: px, up to 4096; the image does not depend on it, except in profile "inria".
         backgrounds: colours behind everything, without depth. [..., C, D]
         render_mode: colours, depth (D), expected depth (ED), or colours and then depth as the last channel.
         sparse_grad: only False.

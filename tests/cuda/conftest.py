@@ -8,10 +8,11 @@ from typing import Any
 
 import pytest
 
+from cuda_ext.compiler import find_compiler
+
 pytest.register_assert_rewrite("pop_ref.conformance.laws")
 
-from cuda_ext.compiler import find_compiler  # noqa: E402  asserts must be rewritten first
-from pop_ref.conformance.backends import shipped  # noqa: E402
+from pop_ref.conformance.backends import shipped  # noqa: E402  asserts must be rewritten first
 from pop_ref.conformance.plugin import parametrize_backends  # noqa: E402
 
 
