@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 TORCH := $(shell sed -n 's/^\(torch==.*\)/\1/p' constraints.txt)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo walkthrough test lint bench cuda emulate gpu-check docs-check clean
+.PHONY: help setup demo walkthrough test explore lint bench cuda emulate gpu-check docs-check clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
@@ -31,6 +31,11 @@ walkthrough: setup  ## run the twelve chapters and write their pages with pictur
 
 test: setup  ## run every test
 	$(BIN)/python -m pytest
+
+explore: setup  ## run the tests that draw examples with fresh ones, once for each of SEEDS="1 2 3"
+	@broken=; for seed in $(or $(SEEDS),$$(date +%s)); do \
+		HYPOTHESIS_PROFILE=explore $(BIN)/python -m pytest -q -m hypothesis --hypothesis-seed=$$seed || broken="$$broken $$seed"; \
+	done; test -z "$$broken" || { echo "broken with --hypothesis-seed:$$broken"; exit 1; }
 
 lint: setup  ## ruff (rules and format) and pyright
 	$(BIN)/ruff check .

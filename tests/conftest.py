@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 
-from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 
 # not the innermost loops, where the check costs more than the work, and not the dataclasses, which check themselves
@@ -18,8 +17,6 @@ SHAPES_CHECKED = tuple(
 )
 install_import_hook(SHAPES_CHECKED, "beartype.beartype")
 
-_COMMON = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow, HealthCheck.data_too_large]}
-settings.register_profile("dev", max_examples=25, **_COMMON)
-settings.register_profile("ci", max_examples=50, derandomize=True, print_blob=True, **_COMMON)
-settings.register_profile("thorough", max_examples=500, **_COMMON)
-settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "dev"))
+from pop_ref.conformance.examples import load_profile  # noqa: E402  after the hook, which must see pop_ref imported
+
+load_profile(os.environ.get("HYPOTHESIS_PROFILE", "dev"))

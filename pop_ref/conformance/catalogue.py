@@ -25,9 +25,10 @@ names, `--adapter` a class derived from `pop_ref.conformance.Adapter`, for singl
 BACKENDS
 
 `--profile` says which constants a rasterizer has; `--dtype float64` charges double precision; `--stage compositing`
-keeps the laws of one stage. `HYPOTHESIS_PROFILE` is `dev`, `ci` or `thorough`. What an implementation does not offer is
-skipped by name. A failing law prints the first stage, Gaussian, pixel or gradient that differs, the values on both
-sides, the nearest decision with its margin, and a scene to paste, which is also saved as npz (`--failures DIR`;
+keeps the laws of one stage. `HYPOTHESIS_PROFILE` is `dev`, `ci` or `thorough`, which draw the same examples on every
+machine, or `explore`, which draws anew (`--hypothesis-seed N`). What an implementation does not offer is skipped by
+name. A failing law prints the first stage, Gaussian, pixel or gradient that differs, the values on both sides, the
+nearest decision with its margin, and a scene to paste, which is also saved as npz (`--failures DIR`;
 `scene_files.load_scene` reads it). `--scorecard card.html`, or `.json`, sums up by stage.
 
 An adapter defines what there is, under the oracle's names, on arrays. With `composite` alone the oracle projects and
