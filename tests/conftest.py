@@ -12,7 +12,7 @@ SHAPES_CHECKED = tuple(
     for module in (
         *("activations", "covariance", "harmonics", "camera", "projection", "footprint", "tiles", "compositing"),
         *("dominance", "splatting", "render", "losses", "ssim", "polarization", "density", "density_rows"),
-        *("optimizer", "training", "margins", "extent_margins"),
+        *("loss_magnitudes", "optimizer", "training", "margins", "extent_margins"),
     )
 )
 install_import_hook(SHAPES_CHECKED, "beartype.beartype")

@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture.providers import CONSTANTS_CACHE, HypothesisProvider
 from hypothesis.internal.constants_ast import Constants
 
-EXAMPLES: Final = {"dev": 25, "ci": 50, "thorough": 500, "explore": 50}
+EXAMPLES: Final = {"dev": 25, "ci": 50, "thorough": 500, "explore": 25}
 
 
 def load_profile(name: str) -> None:

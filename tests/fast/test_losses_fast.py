@@ -1,139 +1,19 @@
-"""The fast losses against the oracle, in both precisions, and what autograd makes of them."""
+"""The fast losses: their options, masks, bands and threads, and what autograd makes of them."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator
-from contextlib import contextmanager
-from types import ModuleType
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pop_fast import compiled, losses, ssim
 from pop_fast.compiled import losses as compiled_losses
-from pop_ref import losses as oracle
 from pop_ref import ssim as oracle_ssim
+from tests.fast.loss_cases import Case, bands_of, both
 
 NAMES = ("l1", "l2", "ssim", "d_ssim", "photometric_3dgs", "photometric_pop")
-PADDED = NAMES[2:]
 COMPILED = pytest.mark.skipif(not compiled.available(), reason=compiled.why_not() or "")
-EVERYWHERE = [
-    *(pytest.param(losses, name, id=name) for name in NAMES),
-    *(pytest.param(compiled_losses, name, id=f"compiled {name}", marks=COMPILED) for name in PADDED),
-]
 FLOAT64 = 1e-12
-# twice the worst that 11,000 random cases of the strategy below needed, of torch and of the compiled stage alike.
-# values: relative, but for ssim, which is rounded where it is a difference from 1; gradients: relative to their largest
-FLOAT32 = {
-    "l1": (4e-7, 1.2e-7),
-    "l2": (4e-7, 2.6e-7),
-    "ssim": (2.7e-7, 1.8e-6),
-    "d_ssim": (4e-7, 1.8e-6),
-    "photometric_3dgs": (5e-7, 1.1e-6),
-    "photometric_pop": (4.8e-7, 2.8e-7),
-}
-# the covariance with a flat photograph is 0, and what rounding leaves of it is compared with SSIM's small constant C2
-FLOAT32_FLAT = {
-    **FLOAT32,
-    "ssim": (6.2e-7, 6.8e-5),
-    "d_ssim": (6.3e-7, 6.8e-5),
-    "photometric_3dgs": (5e-7, 2.5e-5),
-    "photometric_pop": (4.8e-7, 1.5e-6),
-}
-
-
-@contextmanager
-def bands_of(values: int) -> Iterator[None]:
-    before = ssim._BAND_VALUES
-    ssim._BAND_VALUES = values
-    try:
-        yield
-    finally:
-        ssim._BAND_VALUES = before
-
-
-class Case(NamedTuple):
-    """A pair of images to compare; small when printed."""
-
-    height: int = 12
-    width: int = 12
-    channels: int = 3
-    kind: str = "noisy"
-    seed: int = 0
-    masked: bool = False
-    padding: str = "valid"
-
-    def images(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return a render and a photograph whose values float32 holds exactly."""
-        rng = np.random.default_rng(self.seed)
-        y = rng.random((self.height, self.width, self.channels))
-        if self.kind == "flat":
-            y = np.full_like(y, 0.75)
-        if self.kind == "black and white":
-            y = np.round(y)
-        noise = {"close": 1e-3, "equal": 0.0}.get(self.kind, 0.25)
-        x = rng.random(y.shape) if self.kind == "unrelated" else y + noise * rng.normal(size=y.shape)
-        return x.astype(np.float32).astype(np.float64), y.astype(np.float32).astype(np.float64)
-
-    def tensors(self, dtype: torch.dtype = torch.float32) -> tuple[torch.Tensor, torch.Tensor]:
-        x, y = self.images()
-        return torch.tensor(x, dtype=dtype), torch.tensor(y, dtype=dtype)
-
-    def mask(self) -> np.ndarray | None:
-        return np.random.default_rng(self.seed).random((self.height, self.width)) < 0.75 if self.masked else None
-
-    def options(self, name: str) -> dict[str, str]:
-        return {} if name in ("l1", "l2") else {"padding": self.padding}
-
-
-def cases() -> st.SearchStrategy[Case]:
-    common = {
-        "channels": st.sampled_from([3, 1, 4]),
-        "kind": st.sampled_from(["noisy", "close", "equal", "flat", "black and white", "unrelated"]),
-        "seed": st.integers(0, 2**16),
-        "masked": st.booleans(),
-    }
-    whole, any_size = st.integers(11, 24), st.integers(1, 24)
-    inside = st.builds(Case, whole, whole, **common, padding=st.just("valid"))
-    return inside | st.builds(Case, any_size, any_size, **common, padding=st.just("same"))
-
-
-def both(
-    name: str, case: Case, dtype: torch.dtype, module: ModuleType = losses, **options
-) -> tuple[float, np.ndarray, float, np.ndarray]:
-    """Return value and gradient of the oracle, then of the fast loss."""
-    options, (x, y), mask = {**case.options(name), **options}, case.images(), case.mask()
-    value = getattr(oracle, name)(x, y, mask=mask, **options)
-    v_image = getattr(oracle, name + "_vjp")(x, y, 1.0, mask=mask, **options)
-    image = torch.tensor(x, dtype=dtype, requires_grad=True)
-    kept = None if mask is None else torch.tensor(mask)
-    loss = getattr(module, name)(image, torch.tensor(y, dtype=dtype), mask=kept, **options)
-    loss.backward()
-    assert loss.dtype == image.grad.dtype == dtype
-    return value, v_image, loss.item(), image.grad.numpy()
-
-
-@pytest.mark.parametrize(("module", "name"), EVERYWHERE)
-@given(case=cases(), band=st.sampled_from([1, 1 << 18]))
-def test_loss_and_gradient_are_the_oracles_in_float64(module: ModuleType, name: str, case: Case, band: int) -> None:
-    with bands_of(band):
-        value, v_image, loss, grad = both(name, case, torch.float64, module)
-    assert loss == pytest.approx(value, rel=FLOAT64, abs=FLOAT64)
-    np.testing.assert_allclose(grad, v_image, rtol=0.0, atol=FLOAT64 * max(np.max(np.abs(v_image)), 1.0 / grad.size))
-
-
-@pytest.mark.parametrize(("module", "name"), EVERYWHERE)
-@given(case=cases())
-def test_loss_and_gradient_are_the_oracles_to_rounding_in_float32(module: ModuleType, name: str, case: Case) -> None:
-    value, v_image, loss, grad = both(name, case, torch.float32, module)
-    of_value, of_gradient = (FLOAT32_FLAT if case.kind == "flat" else FLOAT32)[name]
-    assert abs(loss - value) <= of_value * (1.0 if name == "ssim" else abs(value)) + 1e-12
-    largest = float(np.max(np.abs(v_image)))
-    np.testing.assert_allclose(grad, v_image, rtol=0.0, atol=of_gradient * largest + 1e-12 / grad.size)
 
 
 @pytest.mark.parametrize(("name", "scale"), [("photometric_3dgs", "l1_scale"), ("photometric_pop", "l2_scale")])
@@ -181,7 +61,7 @@ def test_similarity_maps_are_the_oracles(padding: str) -> None:
     x, y = Case(20, 14, seed=3).images()
     with bands_of(1):
         ours = losses.ssim_map(torch.tensor(x), torch.tensor(y), padding)
-    np.testing.assert_allclose(ours.numpy(), oracle.ssim_map(x, y, padding), atol=FLOAT64)
+    np.testing.assert_allclose(ours.numpy(), oracle_ssim.ssim_map(x, y, padding), atol=FLOAT64)
 
 
 def test_window_and_constants_are_the_oracles() -> None:

@@ -146,7 +146,10 @@ LADDER = (
     "training.objective",
     "training.control",
 )
-DOCTESTS = ("constants.profile_named", "notation.symbol_named", "magnitudes.distance", "magnitudes.colors_magnitudes")
+DOCTESTS = (
+    *("constants.profile_named", "notation.symbol_named", "magnitudes.distance", "magnitudes.colors_magnitudes"),
+    *("loss_magnitudes.d_ssim_magnitudes", "loss_magnitudes.pixelwise_magnitudes"),
+)
 
 
 def _breaks(check: Callable[[], None]) -> bool:
