@@ -32,7 +32,9 @@ STAGES = (
     Stage("blending with early ray termination", "eq. 1", ("compositing", "pixel"), ("compiled/compositing.py",)),
     Stage("dominant Gaussians", "eq. 5", ("dominance",)),
     Stage("a whole view", "eq. 1", ("render", "splatting"), ("rasterization.py", "compiled/splatting.py")),
-    Stage("L1, L2, SSIM and both objectives", "eqs. 2, 4, 9", ("losses", "ssim"), ("compiled/ssim.py",)),
+    Stage(
+        "L1, L2, SSIM and both objectives", "eqs. 2, 4, 9", ("losses", "ssim", "loss_magnitudes"), ("compiled/ssim.py",)
+    ),
     Stage("importance mask and POP loss", "eqs. 7, 8", ("polarization",)),
     Stage("density control", "eqs. 3, 6", ("density", "density_config", "density_rows")),
     Stage("Adam and its schedules", "4.1", ("optimizer",), ("train/model.py", "train/schedule.py")),
