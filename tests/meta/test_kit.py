@@ -10,10 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
+from pop_ref.conformance.backends import Absent, shipped_or_absent
 from pop_ref.conformance.compare import assert_close, assert_same_bits
 from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.mutants import MUTANTS, living
+from pop_ref.conformance.mutants.trial import law_named
 from pop_ref.conformance.poison import POISONED_INTEGER, poisoned_allocations
 from pop_ref.conformance.scene_files import load_scene, save_scene
 from pop_ref.conformance.scenes import Scene, cotangents, rounded_to, scene_as_code
@@ -22,6 +25,7 @@ from pop_ref.conformance.strategies import FLOOR, scenes
 from pop_ref.conformance.telling import tell
 from pop_ref.conformance.tolerances import TABLE
 from pop_ref.constants import INRIA
+from pop_ref.types import Camera, Gaussians
 
 ROOT = Path(__file__).resolve().parents[2]
 SEEN = settings(max_examples=200, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
@@ -268,3 +272,30 @@ def test_a_stranger_with_gsplats_signature_is_judged_by_what_it_offers(
     assert done.returncode == (1 if shift else 0), done.stdout + done.stderr
     if shift:
         assert "a_round_splat_on_the_axis_looks_as_the_formula_says" in done.stdout
+
+
+@pytest.mark.parametrize("name", ["fast32", "compiled32"])
+@pytest.mark.parametrize(
+    "law",
+    [
+        "the_background_gradient_is_the_cotangent_seen_through_the_remaining_light",
+        "the_colour_gradient_is_what_the_colour_adds_to_the_image",
+    ],
+)
+def test_no_law_compares_a_render_with_a_gradient_where_rounding_decides(law: str, name: str) -> None:
+    # the alpha of the nearer splat at pixel (2, 2) is the floor to 6e-8, and tiles of another size round it to its
+    # other side
+    backend = shipped_or_absent(name)
+    if isinstance(backend, Absent):
+        pytest.skip(backend.reason)
+    K = [[8.0, 0.0, 2.0], [0.0, 8.0, 2.0], [0.0, 0.0, 1.0]]
+    gaussians = Gaussians(
+        means=[[0.078125, 0.078125, 2.5], [0.0625, 0.0625, 1.0]],
+        quats=[[1.0, 0.0, 0.0, 0.0]] * 2,
+        scales=[[0.3125] * 3, [0.125] * 3],
+        opacities=[0.5, 1.0 / 255.0],
+        sh=[[[1.0, 0.5, 0.25]], [[0.0, 0.0, 0.0]]],
+    )
+    scene = Scene(gaussians, Camera(np.eye(4), np.array(K), 4, 4), tile_size=4)
+    sentence = law_named(f"test_gradients:{law}").sentence
+    settings(max_examples=1, database=None)(given(scene=st.just(scene))(lambda scene: sentence(backend, scene=scene)))()

@@ -20,6 +20,7 @@ from pop_ref.conformance.verdicts import charged, require
 
 plain = scenes(anchored=True, size=plain_sizes(), max_gaussians=4)
 banded = scenes(anchored=True, size=plain_sizes(), max_gaussians=3, max_degree=3)
+SIGNAL = ("means", "scales", "opacities", "sh")
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 
 
@@ -27,9 +28,28 @@ def _pulled(backend, seen):
     """Return gradients for the standard cotangents, after making sure that there is something to pull."""
     v_image, v_T_final = cotangents(seen)
     g = backend.gradients(seen, v_image, v_T_final)
-    for name in ("means", "scales", "opacities", "sh"):
-        assert np.any(g[name] != 0.0), f"the gradient of {name} is zero everywhere; the law would say nothing"
+    _assert_signal(g)
     return g, v_image, v_T_final
+
+
+def _pulled_where_certain(backend, seen, charges):
+    """Return gradients for cotangents of those pixels alone at which no decision is in doubt.
+
+    A gradient and a render may come from different code of the backend; where rounding decides, each decides by itself.
+    """
+    v_image, v_T_final = cotangents(seen)
+    v_image, v_T_final = v_image * charges.certain[..., None], v_T_final * charges.certain
+    g = backend.gradients(seen, v_image, v_T_final)
+    if np.all(charges.certain):
+        _assert_signal(g)
+    else:
+        assume(all(np.any(g[name] != 0.0) for name in SIGNAL))
+    return g, v_image, v_T_final
+
+
+def _assert_signal(g):
+    for name in SIGNAL:
+        assert np.any(g[name] != 0.0), f"the gradient of {name} is zero everywhere; the law would say nothing"
 
 
 @law("gradients", GRADIENTS, scene=scenes(max_degree=1))
@@ -107,8 +127,8 @@ def test_moving_world_and_camera_together_has_no_gradient(backend, scene):
 
 @law("gradients", RENDER, GRADIENTS, scene=plain)
 def test_the_background_gradient_is_the_cotangent_seen_through_the_remaining_light(backend, scene):
-    seen = backend.sees(scene)
-    g, v_image, _ = _pulled(backend, seen)
+    seen, charges = charged(backend, scene)
+    g, v_image, _ = _pulled_where_certain(backend, seen, charges)
     require(backend, g, "background")
     T_final = backend.render(seen).T_final
     expected = np.einsum("hw,hwc->c", T_final, v_image)
@@ -122,7 +142,7 @@ def test_the_colour_gradient_is_what_the_colour_adds_to_the_image(backend, scene
     n = len(scene.gaussians)
     bright = colored(scene, np.full((n, 3), 1.0))
     seen, charges = charged(backend, bright)
-    g, v_image, v_T_final = _pulled(backend, seen)
+    g, v_image, v_T_final = _pulled_where_certain(backend, seen, charges)
     bounds = gradient_charges(seen, charges, v_image, v_T_final)["sh"]
     for i in range(n):
         brighter = np.full((n, 3), 1.0)
