@@ -80,7 +80,7 @@ struct TileLists {
     unsigned* splat_count;     // [n], its slots
     int* bucket_begin;         // [n_tiles], first bucket of 32 list entries of a tile; null where no one asks
     int* bucket_tile;          // [capacity / 32 + n_tiles]
-    void* workspace;
+    uint8_t* workspace;
     size_t workspace_bytes;
     bool exact;                // drop tiles that no pixel centre reaches
 };

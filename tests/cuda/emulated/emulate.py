@@ -122,6 +122,9 @@ class Kernels:
     def __init__(self, module: types.ModuleType) -> None:
         self._module, self.tape = module, None
 
+    def __dir__(self) -> list[str]:
+        return dir(self._module)
+
     def __getattr__(self, name: str) -> Any:
         found = getattr(self._module, name)
         if self.tape is None or not callable(found) or isinstance(found, type) or name in _QUERIES:
