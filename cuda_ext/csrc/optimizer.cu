@@ -24,7 +24,7 @@ __global__ void begin_step_kernel(Schedule schedule, StepConstants* constants, D
     const int k = threadIdx.x, step = state->step, view = schedule.views[step];
     if (k == 0) {
         state->view = view;
-        state->n_important = 0;
+        state->n_important = state->n_others = 0;
     }
     if (k < 16) schedule.viewmat[k] = schedule.viewmats[16 * view + k];
     if (k < 9) schedule.K[k] = schedule.Ks[9 * view + k];
@@ -62,29 +62,34 @@ __global__ void __launch_bounds__(SUM_BLOCK) end_step_kernel(StepRecord record, 
     }
     sums = block_sums(sums);
     if (threadIdx.x > 0) return;
-    const int important = state->n_important;
+    const int important = state->n_important, others = state->n_others;
     record.values[V_POP] =
         record.pop_sums == nullptr
             ? 0.0f
-            : record.lambda_pop * (sums.x / float(max(important, 1)) + sums.y / float(max(record.n - important, 1)));
+            : record.lambda_pop * (sums.x / float(max(important, 1)) + sums.y / float(max(others, 1)));
     for (int k = 0; k < N_VALUES; ++k) record.history[size_t(N_VALUES) * state->step + k] = record.values[k];
     ++state->step;
 }
 
-__global__ void __launch_bounds__(SUM_BLOCK)
-    count_important_kernel(int n, const int* dominant_counts, const float* logits, float* pop_sums,
-                           DeviceState* state) {
+__global__ void __launch_bounds__(SUM_BLOCK) count_important_kernel(PopTerm term, DeviceState* state) {
     const int i = blockIdx.x * blockDim.x + threadIdx.x;
-    const bool important = i < n && dominant_counts[i] > 0;
-    const unsigned hits = __ballot_sync(FULL_WARP, important);
-    // an integer: the order of additions does not matter
-    if ((threadIdx.x & (WARP - 1)) == 0 && hits) atomicAdd(&state->n_important, __popc(hits));
+    PopSide side = PopSide::absent;
+    if (i < term.n && (term.radii == nullptr || term.radii[2 * i] > 0)) {
+        const bool before = term.window_counts != nullptr && term.window_counts[i] > 0;
+        side = before || term.dominant_counts[i] > 0 ? PopSide::important : PopSide::other;
+    }
+    if (i < term.n) term.sides[i] = uint8_t(side);
+    const bool important = side == PopSide::important;
+    const unsigned up = __ballot_sync(FULL_WARP, important), down = __ballot_sync(FULL_WARP, side == PopSide::other);
+    // integers: the order of additions does not matter
+    if ((threadIdx.x & (WARP - 1)) == 0 && up) atomicAdd(&state->n_important, __popc(up));
+    if ((threadIdx.x & (WARP - 1)) == 0 && down) atomicAdd(&state->n_others, __popc(down));
     // 1 - o is the opacity of the negated logit
-    const float o = i < n ? opacity_from_logit(important ? -logits[i] : logits[i]) : 0.0f;
+    const float o = side == PopSide::absent ? 0.0f : opacity_from_logit(important ? -term.logits[i] : term.logits[i]);
     const float2 sums = block_sums(important ? float2{o, 0.0f} : float2{0.0f, o});
     if (threadIdx.x > 0) return;
-    pop_sums[2 * blockIdx.x] = sums.x;
-    pop_sums[2 * blockIdx.x + 1] = sums.y;
+    term.sums[2 * blockIdx.x] = sums.x;
+    term.sums[2 * blockIdx.x + 1] = sums.y;
 }
 
 // gradients of a block's rows, as its threads leave them for the update
@@ -109,8 +114,10 @@ __device__ __forceinline__ void note_statistics(const UpdateArrays& a, int i, bo
         a.n_visible[i] += 1;
     }
     if (a.dominant_sum != nullptr && a.dominant_counts != nullptr) a.dominant_sum[i] += a.dominant_counts[i];
-    if (a.blurred != nullptr && a.dominant_counts != nullptr && float(a.dominant_counts[i]) > a.blur_pixels)
-        a.blurred[i] = 1;
+    if (a.blurred != nullptr && a.dominant_counts != nullptr) {
+        const bool blurred = float(a.dominant_counts[i]) > a.blur_pixels;
+        if (blurred || a.blur_own_view) a.blurred[i] = blurred;
+    }
 }
 
 __device__ __forceinline__ void make_gradients(const UpdateArrays& a, const ViewArrays& view,
@@ -145,7 +152,7 @@ __device__ __forceinline__ void make_gradients(const UpdateArrays& a, const View
         v_mean2d = of.v_mean2d;
     }
     if (a.lambda_pop != 0.0f)
-        v.v_opacity += pop_loss_vjp_one(a.dominant_counts[i] > 0, state->n_important, a.n, a.lambda_pop);
+        v.v_opacity += pop_loss_vjp_one(PopSide(a.pop_sides[i]), state->n_important, state->n_others, a.lambda_pop);
     note_statistics(a, i, seen, v_mean2d, view);
     const Vec3<float> v_logs = scale_from_log_scale_vjp(logs, v.v_scale);
     const float rows[N_GROUPS - 2][4] = {{v.v_mean.x, v.v_mean.y, v.v_mean.z, 0.0f},
@@ -210,10 +217,9 @@ void end_step(const StepRecord& record, DeviceState* state, cudaStream_t stream)
 
 int important_blocks(int n) { return blocks_for(n, SUM_BLOCK); }
 
-void count_important(int n, const int* dominant_counts, const float* logits, float* pop_sums, DeviceState* state,
-                     cudaStream_t stream) {
-    if (n == 0) return;
-    count_important_kernel<<<important_blocks(n), SUM_BLOCK, 0, stream>>>(n, dominant_counts, logits, pop_sums, state);
+void count_important(const PopTerm& term, DeviceState* state, cudaStream_t stream) {
+    if (term.n == 0) return;
+    count_important_kernel<<<important_blocks(term.n), SUM_BLOCK, 0, stream>>>(term, state);
     POP_LAUNCHED("count_important_kernel");
 }
 

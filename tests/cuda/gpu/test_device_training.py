@@ -107,12 +107,12 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(hardware, method, tmp_path,
 
 
 def test_buffers_that_overflow_between_views_of_several_sizes_lose_nothing(hardware, tmp_path, monkeypatch):
-    from cuda_ext import train_step
+    from cuda_ext import capacity
 
     capture = mixed_sizes(tiny_capture())
     whole = DeviceTrainer(tiny_config(tmp_path / "whole"), capture, hardware=hardware)
     whole.run()
-    monkeypatch.setattr(train_step, "FIRST_GUESS", (0, 1))
+    monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 1))
     cramped = DeviceTrainer(tiny_config(tmp_path / "cramped"), capture, hardware=hardware)
     assert cramped.run()["instance_buffers_grown"] > 0
     for key, value in whole.params.items():

@@ -100,23 +100,15 @@ def test_steps_launched_anew_are_the_replayed_steps(gpu):
         assert torch.equal(value, launched[name]), name
 
 
-def test_buffers_that_overflow_grow_and_nothing_is_lost(gpu):
+def test_buffers_that_overflow_grow_and_nothing_is_lost(gpu, monkeypatch):
+    from cuda_ext import capacity
+
     expected = _fused(training_scene(), gpu)[1]
-    _, small, cramped = _fused_from_one_instance(training_scene(), gpu)
+    monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 1))
+    _, small, cramped = _fused(training_scene(), gpu)
     assert cramped.grown > 0
     for name, value in expected.items():
         assert torch.equal(value, small[name]), name
-
-
-def _fused_from_one_instance(scene, device):
-    from cuda_ext import train_step
-
-    per_gaussian, least = train_step.FIRST_GUESS
-    train_step.FIRST_GUESS = (0, 1)
-    try:
-        return _fused(scene, device)
-    finally:
-        train_step.FIRST_GUESS = (per_gaussian, least)
 
 
 def test_rasterization_and_its_gradients_give_the_same_bits_twice(gpu):
