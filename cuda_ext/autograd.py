@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +14,17 @@ from torch.autograd.function import once_differentiable
 from cuda_ext import load
 from cuda_ext.arrays import Settings, empty, fill, pointer, stream_of
 from cuda_ext.lists import LOWER, TileBuffers, splat_struct
+
+
+def _where_the_cotangents_are(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """Make a transpose run with its tensors' device as the current one, on which kernels run, whoever calls it."""
+
+    @functools.wraps(backward)
+    def there(ctx: Any, *cotangents: Any) -> Any:
+        with torch.cuda.device_of(next(v for v in cotangents if v is not None)):
+            return backward(ctx, *cotangents)
+
+    return there
 
 
 def _gaussian_struct(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor | None) -> Any:
@@ -49,6 +62,7 @@ class Project(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
+    @_where_the_cotangents_are
     def backward(ctx: Any, *cotangents: Any) -> tuple[Tensor | None, ...]:
         v_means2d, v_depths, v_conics, v_opacities, _, v_colors = cotangents
         means, quats, scales, opacities, sh, viewmat, K, radii = ctx.saved_tensors
@@ -211,6 +225,7 @@ class Blend(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
+    @_where_the_cotangents_are
     def backward(ctx: Any, *cotangents: Any) -> tuple[Tensor | None, ...]:
         v_image, v_T_final = cotangents
         blended = ctx.blended

@@ -27,10 +27,6 @@ inline cudaError_t cudaDriverGetVersion(int* version) {
     *version = CUDART_VERSION;
     return cudaSuccess;
 }
-inline cudaError_t cudaMemsetAsync(void* data, int value, size_t bytes, cudaStream_t) {
-    std::memset(data, value, bytes);
-    return cudaSuccess;
-}
 
 struct float2 {
     float x, y;
@@ -52,7 +48,9 @@ extern dim3 thread_index, block_index, block_size, grid_size;
 
 enum class Meeting { sync, ballot, shuffle, match };
 
-void launch(dim3 grid, dim3 block, const std::function<void()>& kernel);
+void launch(const char* name, dim3 grid, dim3 block, const std::function<void()>& kernel);
+// what a CUDA graph of these calls would consist of
+void count_nodes(const char* name, int times);
 // wait for the lanes of the mask that have not left; everyone finds all values in `all`. Returns who took part.
 unsigned meet_warp(unsigned mask, Meeting kind, uint64_t value, uint64_t* all);
 void meet_block();
@@ -85,6 +83,12 @@ T shuffled(unsigned mask, T value, int source) {
 }
 
 }  // namespace emulated
+
+inline cudaError_t cudaMemsetAsync(void* data, int value, size_t bytes, cudaStream_t) {
+    emulated::count_nodes("memset", 1);
+    std::memset(data, value, bytes);
+    return cudaSuccess;
+}
 
 #define threadIdx ::emulated::thread_index
 #define blockIdx ::emulated::block_index
