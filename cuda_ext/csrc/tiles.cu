@@ -143,6 +143,8 @@ __global__ void emit_kernel(TileLists lists, SplatArrays splats, Profile<float> 
     const int first_rank = rank - int(threadIdx.x & (WARP - 1));
     visit_tiles(f, lists.grid, lists.exact, [&](int owner, int tile, unsigned number) {
         const unsigned slot = lists.offsets[first_rank + owner] + number;
+        // never, unless this pass saw more tiles than the one that counted: then not in somebody else's memory
+        if (slot >= unsigned(lists.capacity)) return;
         keys[slot] = Key(tile);
         lists.slots[0][slot] = slot;
         lists.slot_splat[slot] = lists.order[1][first_rank + owner];

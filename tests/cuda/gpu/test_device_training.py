@@ -41,6 +41,12 @@ CASES = {
     "losses": ({"l2_stop_iter": 4, "d_ssim_halved": True, "ssim_padding": "same"}, lambda capture: capture),
     "inria": ({"profile": "inria", "photometric_divisor": 2.0}, lambda capture: capture),
     "gsplat": ({"profile": "gsplat_1_6", "sh_interval": 2}, lambda capture: capture),
+    "visible": ({"pop": {"pop_over": "visible"}}, lambda capture: capture),
+    "window": (
+        {"pop": {"pop_views": "window", "refine_start_iter": 8, "refine_stop_iter": 7}},
+        lambda capture: capture,
+    ),
+    "own view": ({"pop": {"blur_window": "own_view"}}, masked),
 }
 
 
@@ -52,11 +58,12 @@ def records(folder):
 def test_steps_are_the_cpus_under_every_setting(hardware, case, tmp_path):
     changes, edit = CASES[case]
     # a population that stays, and rates at which rounding does not grow
-    settings = {"max_steps": 8, "log_every": 1, "pop": POPStrategy(**STILL, pop_stop_iter=6), "checkpoint_every": 0}
+    pop = POPStrategy(**{**STILL, "pop_stop_iter": 6, **changes.get("pop", {})})
+    settings = {"max_steps": 8, "log_every": 1, "checkpoint_every": 0, **changes, "pop": pop}
     capture = edit(tiny_capture())
     rates = replace(tiny_config("x").lr, quats=0.0)
-    expected = Trainer(tiny_config(tmp_path / "cpu", lr=rates, **settings, **changes), capture).run()
-    on_gpu = tiny_config(tmp_path / "gpu", lr=rates, **settings, **changes)
+    expected = Trainer(tiny_config(tmp_path / "cpu", lr=rates, **settings), capture).run()
+    on_gpu = tiny_config(tmp_path / "gpu", lr=rates, **settings)
     found = DeviceTrainer(on_gpu, capture, hardware=hardware).run()
     for ours, theirs in zip(records(tmp_path / "gpu"), records(tmp_path / "cpu"), strict=True):
         assert ours.pop("view") == theirs.pop("view")

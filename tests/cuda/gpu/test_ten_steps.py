@@ -8,6 +8,15 @@ torch = pytest.importorskip("torch")
 
 from .scene import HEIGHT, LR, STEPS, WIDTH, TrainingScene, training_scene  # noqa: E402  torch first
 
+THETA = 0.02
+# of A12, A1 and A2 in pop_ref/ambiguities.py
+READINGS = (
+    {"pop_over": "visible"},
+    {"pop_views": "window"},
+    {"pop_over": "visible", "pop_views": "window"},
+    {"blur_window": "own_view"},
+)
+
 
 def fused_trainer(scene: TrainingScene, device, **options):
     """Return rows (parameters and moments) and the trainer of them."""
@@ -80,14 +89,20 @@ def test_buffers_that_overflow_grow_and_nothing_is_lost(gpu, monkeypatch):
         assert torch.equal(value, small[name]), name
 
 
-def _on_the_cpu(scene: TrainingScene):
-    from pop_fast.losses import photometric_pop
-    from pop_fast.polarization import importance_mask, pop_loss
-    from pop_fast.rasterization import rasterization
+def _on_the_cpu(scene: TrainingScene, **readings):
+    """Take the steps with the strategy that `pop train` takes, its statistics collected and nothing grown.
 
+    Returns:
+        Losses, POP terms, parameters and the strategy's state.
+    """
+    from pop_fast.losses import photometric_pop
+    from pop_fast.rasterization import rasterization
+    from pop_fast.strategies import POPStrategy
+
+    strategy = POPStrategy(refine_start_iter=STEPS, blur_start_iter=0, theta_blur=THETA, **readings)
     params = {name: value.clone().requires_grad_() for name, value in scene.params.items()}
     optimizer = torch.optim.Adam([{"params": [params[name]], "lr": LR[name]} for name in params], eps=1e-15)
-    losses = []
+    state, losses, terms = strategy.initialize_state(), [], []
     for step in range(STEPS):
         view = scene.order[step]
         opacities = torch.sigmoid(params["opacities"])
@@ -97,24 +112,62 @@ def _on_the_cpu(scene: TrainingScene):
             WIDTH, HEIGHT, sh_degree=3, packed=False, dominance=True,
         )  # fmt: skip
         loss = photometric_pop(image[0], scene.photographs[view].float() / 255.0)
+        term = strategy.regularizer(opacities, state, step, meta)
+        assert term is not None
         losses.append(loss.item())
-        (loss + 0.001 * pop_loss(opacities, importance_mask(meta["dominant_counts"][0]))).backward()
+        terms.append(term.item())
+        strategy.step_pre_backward(params, {}, state, step, meta)
+        (loss + term).backward()
         optimizer.step()
         optimizer.zero_grad()
-    return losses, {name: value.detach() for name, value in params.items()}
+        strategy.step_post_backward(params, {}, state, step, meta)
+    return losses, terms, {name: value.detach() for name, value in params.items()}, state
 
 
 @pytest.mark.parametrize("family", ["columns", "splats"])
 def test_ten_fused_steps_are_the_cpus_ten_steps(gpu, family):
     scene = training_scene()
     losses, params, _ = _fused(scene, gpu, family=family)
-    expected, wanted = _on_the_cpu(scene)
+    expected, _, wanted, _ = _on_the_cpu(scene)
     assert expected[-1] < expected[0]
     torch.testing.assert_close(torch.tensor(losses), torch.tensor(expected), rtol=1e-4, atol=1e-6)
     for name, value in wanted.items():
-        # where a gradient is rounding, Adam turns its sign into a whole step; compare what nearly all rows do
-        apart = (params[name].cpu() - value).abs() > 0.1 * LR[name] * STEPS
-        assert apart.float().mean() < 0.01, name
+        assert _apart(params[name], value, name) < 0.01, name
+
+
+def _apart(found, wanted, name) -> float:
+    """Return the share of entries that differ by a tenth of all steps together.
+
+    Where a gradient is rounding, Adam turns its sign into a whole step: what nearly all rows do is compared.
+    """
+    return float(((found.cpu() - wanted).abs() > 0.1 * LR[name] * STEPS).float().mean())
+
+
+@pytest.mark.parametrize("family", ["columns", "splats"])
+@pytest.mark.parametrize("reading", READINGS, ids=lambda reading: "-".join(reading.values()))
+def test_ten_fused_steps_under_another_reading_are_the_cpus(gpu, reading, family):
+    scene, strong = training_scene(), {"lambda_pop": 0.05}
+    # no view shows all, and one shows others than the two beside it
+    scene.params["means"][:16, 2] *= -1.0
+    scene.viewmats[2, 0, 3] = 1.5
+    window = reading.get("pop_views") == "window"
+    losses, params, trainer = _fused(scene, gpu, window, family=family, theta_blur=THETA, **strong, **reading)
+    expected, terms, wanted, state = _on_the_cpu(scene, **strong, **reading)
+    torch.testing.assert_close(torch.tensor(losses), torch.tensor(expected), rtol=1e-4, atol=1e-6)
+    told = torch.tensor([values.pop for values in trainer.told(0, STEPS)])
+    torch.testing.assert_close(told, torch.tensor(terms), rtol=1e-4, atol=1e-6)
+    for name, value in wanted.items():
+        assert _apart(params[name], value, name) < 0.01, name
+    found = trainer.statistics
+    assert torch.equal(found.blurred.bool().cpu(), state["blurred"])
+    if window:
+        assert torch.equal(found.dominant_sum.long().cpu(), state["dominant_sum"])
+    # and the reading matters here
+    *_, usual, usual_state = _on_the_cpu(scene, **strong)
+    if "blur_window" in reading:
+        assert 0 < int(state["blurred"].sum()) < int(usual_state["blurred"].sum())
+    else:
+        assert _apart(usual["opacities"], wanted["opacities"], "opacities") > 0.05
 
 
 @pytest.mark.graph
