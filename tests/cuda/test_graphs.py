@@ -144,3 +144,19 @@ def test_flags_come_in_the_order_of_the_steps_and_no_copy_is_overwritten_before_
         found.append(watch.take()[0])
     assert found == list(range(10))
     assert waited == [k % 3 for k in range(10)]
+
+
+@pytest.mark.parametrize(("reason", "first"), [(None, ["graph", "other"]), ("no GPU", ["other", "graph"])])
+def test_graph_tests_go_first_where_there_is_a_gpu(monkeypatch, reason, first):
+    import cuda_ext
+    from tests.cuda.gpu.conftest import FOLDER, pytest_collection_modifyitems
+
+    def item(name, folder=FOLDER):
+        return SimpleNamespace(name=name, path=folder / "test.py", get_closest_marker=lambda kind: name == kind or None)
+
+    monkeypatch.setattr(cuda_ext, "why_not", lambda: reason)
+    items = [item("other"), item("graph"), item("graph", FOLDER.parent / "emulated")]
+    emulated = items[2]
+    pytest_collection_modifyitems(items)
+    assert [each.name for each in items[:2]] == first
+    assert items[2] is emulated

@@ -12,7 +12,7 @@ torch = pytest.importorskip("torch")
 
 from cuda_ext.train_settings import Phase  # noqa: E402  torch first
 from tests.cuda.gpu.scene import HEIGHT, STEPS, WIDTH, training_scene  # noqa: E402
-from tests.cuda.gpu.test_ten_steps import fused_trainer  # noqa: E402
+from tests.cuda.gpu.steps import fused_trainer  # noqa: E402
 
 from . import emulate  # noqa: E402
 from .conftest import FOLDER  # noqa: E402

@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch")
 from pop_ref.constants import PAPER  # noqa: E402
 
 from .scene import STEPS, N, training_scene  # noqa: E402  torch first
-from .test_ten_steps import fused_trainer  # noqa: E402
+from .steps import fused_trainer  # noqa: E402
 
 # 30,000 x 30,000 tiles of 16 x 8 px; a splat that covers them all has as many instances
 ACROSS, PER_SPLAT = 30_000, 900_000_000

@@ -6,45 +6,13 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from .scene import HEIGHT, LR, STEPS, WIDTH, TrainingScene, training_scene  # noqa: E402  torch first
-
-THETA = 0.02
-# of A12, A1 and A2 in pop_ref/ambiguities.py
-READINGS = (
-    {"pop_over": "visible"},
-    {"pop_views": "window"},
-    {"pop_over": "visible", "pop_views": "window"},
-    {"blur_window": "own_view"},
-)
-
-
-def fused_trainer(scene: TrainingScene, device, **options):
-    """Return rows (parameters and moments) and the trainer of them."""
-    from cuda_ext.resident import ResidentViews
-    from cuda_ext.train_settings import StepSettings
-    from cuda_ext.train_step import FusedTrainer
-
-    params = {name: value.to(device).clone() for name, value in scene.params.items()}
-    m, v = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))
-    views = ResidentViews(scene.photographs, scene.viewmats, scene.Ks, None, "valid", device)
-    settings = StepSettings(LR, STEPS, means_decay=1.0, **options)
-    return (params, m, v), FusedTrainer(params, m, v, views, scene.order, settings)
-
-
-def _fused(scene: TrainingScene, device, window: bool = False, **options):
-    from cuda_ext.train_settings import Phase
-
-    (params, _, _), trainer = fused_trainer(scene, device, **options)
-    losses = []
-    for step in range(STEPS):
-        trainer.run(step + 1, Phase(3, True, True, True, window=window))
-        losses.append(float(trainer.values[2]))
-    return losses, params, trainer
+from .scene import HEIGHT, LR, STEPS, WIDTH, training_scene  # noqa: E402  torch first
+from .steps import apart, fused, fused_trainer, on_the_cpu  # noqa: E402
 
 
 @pytest.mark.graph
 def test_steps_launched_anew_are_the_replayed_steps(gpu):
-    replayed, launched = (_fused(training_scene(), gpu, replay=replay)[1] for replay in (True, False))
+    replayed, launched = (fused(training_scene(), gpu, replay=replay)[1] for replay in (True, False))
     for name, value in replayed.items():
         assert torch.equal(value, launched[name]), name
 
@@ -81,98 +49,28 @@ def test_graphs_of_several_sizes_and_phases_are_replayed_in_turn(gpu, options):
 def test_buffers_that_overflow_grow_and_nothing_is_lost(gpu, monkeypatch):
     from cuda_ext import capacity
 
-    expected = _fused(training_scene(), gpu)[1]
+    expected = fused(training_scene(), gpu)[1]
     monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 1))
-    _, small, cramped = _fused(training_scene(), gpu)
+    _, small, cramped = fused(training_scene(), gpu)
     assert cramped.grown > 0
     for name, value in expected.items():
         assert torch.equal(value, small[name]), name
 
 
-def _on_the_cpu(scene: TrainingScene, **readings):
-    """Take the steps with the strategy that `pop train` takes, its statistics collected and nothing grown.
-
-    Returns:
-        Losses, POP terms, parameters and the strategy's state.
-    """
-    from pop_fast.losses import photometric_pop
-    from pop_fast.rasterization import rasterization
-    from pop_fast.strategies import POPStrategy
-
-    strategy = POPStrategy(refine_start_iter=STEPS, blur_start_iter=0, theta_blur=THETA, **readings)
-    params = {name: value.clone().requires_grad_() for name, value in scene.params.items()}
-    optimizer = torch.optim.Adam([{"params": [params[name]], "lr": LR[name]} for name in params], eps=1e-15)
-    state, losses, terms = strategy.initialize_state(), [], []
-    for step in range(STEPS):
-        view = scene.order[step]
-        opacities = torch.sigmoid(params["opacities"])
-        image, _, meta = rasterization(
-            params["means"], params["quats"], params["scales"].exp(), opacities,
-            torch.cat((params["sh0"], params["shN"]), 1), scene.viewmats[view][None], scene.Ks[view][None],
-            WIDTH, HEIGHT, sh_degree=3, packed=False, dominance=True,
-        )  # fmt: skip
-        loss = photometric_pop(image[0], scene.photographs[view].float() / 255.0)
-        term = strategy.regularizer(opacities, state, step, meta)
-        assert term is not None
-        losses.append(loss.item())
-        terms.append(term.item())
-        strategy.step_pre_backward(params, {}, state, step, meta)
-        (loss + term).backward()
-        optimizer.step()
-        optimizer.zero_grad()
-        strategy.step_post_backward(params, {}, state, step, meta)
-    return losses, terms, {name: value.detach() for name, value in params.items()}, state
-
-
 @pytest.mark.parametrize("family", ["columns", "splats"])
 def test_ten_fused_steps_are_the_cpus_ten_steps(gpu, family):
     scene = training_scene()
-    losses, params, _ = _fused(scene, gpu, family=family)
-    expected, _, wanted, _ = _on_the_cpu(scene)
+    losses, params, _ = fused(scene, gpu, family=family)
+    expected, _, wanted, _ = on_the_cpu(scene)
     assert expected[-1] < expected[0]
     torch.testing.assert_close(torch.tensor(losses), torch.tensor(expected), rtol=1e-4, atol=1e-6)
     for name, value in wanted.items():
-        assert _apart(params[name], value, name) < 0.01, name
-
-
-def _apart(found, wanted, name) -> float:
-    """Return the share of entries that differ by a tenth of all steps together.
-
-    Where a gradient is rounding, Adam turns its sign into a whole step: what nearly all rows do is compared.
-    """
-    return float(((found.cpu() - wanted).abs() > 0.1 * LR[name] * STEPS).float().mean())
-
-
-@pytest.mark.parametrize("family", ["columns", "splats"])
-@pytest.mark.parametrize("reading", READINGS, ids=lambda reading: "-".join(reading.values()))
-def test_ten_fused_steps_under_another_reading_are_the_cpus(gpu, reading, family):
-    scene, strong = training_scene(), {"lambda_pop": 0.05}
-    # no view shows all, and one shows others than the two beside it
-    scene.params["means"][:16, 2] *= -1.0
-    scene.viewmats[2, 0, 3] = 1.5
-    window = reading.get("pop_views") == "window"
-    losses, params, trainer = _fused(scene, gpu, window, family=family, theta_blur=THETA, **strong, **reading)
-    expected, terms, wanted, state = _on_the_cpu(scene, **strong, **reading)
-    torch.testing.assert_close(torch.tensor(losses), torch.tensor(expected), rtol=1e-4, atol=1e-6)
-    told = torch.tensor([values.pop for values in trainer.told(0, STEPS)])
-    torch.testing.assert_close(told, torch.tensor(terms), rtol=1e-4, atol=1e-6)
-    for name, value in wanted.items():
-        assert _apart(params[name], value, name) < 0.01, name
-    found = trainer.statistics
-    assert torch.equal(found.blurred.bool().cpu(), state["blurred"])
-    if window:
-        assert torch.equal(found.dominant_sum.long().cpu(), state["dominant_sum"])
-    # and the reading matters here
-    *_, usual, usual_state = _on_the_cpu(scene, **strong)
-    if "blur_window" in reading:
-        assert 0 < int(state["blurred"].sum()) < int(usual_state["blurred"].sum())
-    else:
-        assert _apart(usual["opacities"], wanted["opacities"], "opacities") > 0.05
+        assert apart(params[name], value, name) < 0.01, name
 
 
 @pytest.mark.graph
 def test_two_runs_give_the_same_bits(gpu):
-    first, second = (_fused(training_scene(), gpu)[1] for _ in range(2))
+    first, second = (fused(training_scene(), gpu)[1] for _ in range(2))
     for name, value in first.items():
         assert torch.equal(value, second[name]), name
 
