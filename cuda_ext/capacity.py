@@ -49,7 +49,7 @@ class Capacity:
         """Bring rooms back to what is needed; the number of Gaussians is `n` from now on."""
         # clones and children of splits add to the need, in proportion at most; who is pruned was hardly there
         more = max(n / self._n, 1.0) if self._n else 1.0
-        self._seen = [round(more * seen) for seen in self._seen]
+        self._seen = [min(round(more * seen), MOST) for seen in self._seen]
         self._n = n
         for size, room in self._rooms.items():
             need = self._need(size)

@@ -98,3 +98,11 @@ def test_a_need_beyond_the_kernels_numbers_stays_what_it_is_and_one_below_gets_w
     assert capacity.room(BIG) == MOST
     capacity.overflowed(0, 2**31 - 1)
     assert capacity.room(BIG) == 2**31 - 1
+
+
+def test_what_a_doubled_population_may_need_is_not_refused_before_it_is_needed():
+    capacity = Capacity([BIG])
+    capacity.settle(1000)
+    capacity.note(0, MOST - 5)
+    capacity.settle(2000)
+    assert capacity.room(BIG) == MOST
