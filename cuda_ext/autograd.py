@@ -20,7 +20,6 @@ def _gaussian_struct(means: Tensor, quats: Tensor, scales: Tensor, opacities: Te
     )
     if sh is not None:
         made.sh_first, made.sh_first_stride = sh.data_ptr(), 3 * sh.shape[1]
-        made.sh_rest, made.sh_rest_stride = sh.data_ptr() + 3 * sh.element_size(), 3 * sh.shape[1]
     return made
 
 

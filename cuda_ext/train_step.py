@@ -100,7 +100,7 @@ class FusedTrainer:
         self._frames: dict[tuple[int, int], _Frame] = {}
         self._steps: dict[tuple[int, int, Phase], Callable[[], None]] = {}
         self.statistics = Statistics.zeros(n, self.device)
-        shapes = {"means2d": (n, 2), "depths": (n,), "conics": (n, 3), "opacities": (n,), "colors": (n, 3)}
+        shapes = {"means2d": (n, 2), "depths": (n,), "conics": (n, 3), "opacities": (n,)}
         self._splat = {name: empty("the splats", LOWER, shape, self.device) for name, shape in shapes.items()}
         self._splat["radii"] = empty("the splats", LOWER, (n, 2), self.device, torch.int32)
         self._records = empty("packed splats", LOWER, (max(n, 1), load().RECORD), self.device)
@@ -213,13 +213,13 @@ class FusedTrainer:
         kernels, s, state, stream = load(), self.settings, self.state.data_ptr(), stream_of(self.device)
         render = self._render(size, phase.sh_degree)
         profile, project, lists = render.kernel_profile(), render.project_settings(), frame.lists.struct
-        splats = splat_struct(**self._splat)
+        # packed for blending as they are projected: nothing else reads their colours
+        splats = fill(splat_struct(**self._splat, colors=None), records=self._records)
         view = fill(kernels.View(), viewmat=self._viewmat, K=self._K, width=size[0], height=size[1])
         kernels.begin_step(self._schedule(), self._constants.data_ptr(), state, stream)
         kernels.project(self._gaussians(), view, project, splats, state, stream)
         kernels.count_instances(lists, splats, profile, state, stream)
         kernels.make_tile_lists(lists, splats, profile, state, stream)
-        kernels.pack_records(self.n, 3, splats, s.profile.alpha_floor, self._records.data_ptr(), stream)
         shared = {key: frame.work.get(key) for key in ("T_final", "last", "checkpoints")}
         drawn = {"channels": 3, "records": self._records, "background": self._background, "image": frame.image}
         forward = fill(kernels.BlendForward(), **drawn, **shared)

@@ -138,6 +138,7 @@ inline unsigned __match_any_sync(unsigned mask, int value) {
     return same;
 }
 
+inline unsigned __umulhi(unsigned a, unsigned b) { return unsigned((uint64_t(a) * b) >> 32); }
 inline int __popc(unsigned value) { return __builtin_popcount(value); }
 inline int __ffs(unsigned value) { return __builtin_ffs(int(value)); }
 inline unsigned __float_as_uint(float value) { return emulated::value_of<unsigned>(emulated::bits_of(value)); }
