@@ -41,14 +41,18 @@ __device__ __forceinline__ Photograph photograph_of(const Photographs& all, cons
             all.shares[2 * view + 1], all.moments == nullptr ? nullptr : all.moments[view]};
 }
 
-__device__ __forceinline__ bool kept(const Photograph& photo, size_t pixel) {
-    return photo.mask == nullptr || photo.mask[pixel] != 0;
+__device__ __forceinline__ bool kept(const Photograph& photo, unsigned pixel) {
+    return photo.mask == nullptr || __ldg(photo.mask + pixel) != 0;
 }
 
-// render and photograph at a pixel's channel; the photograph where the mask leaves the render out
-__device__ __forceinline__ float2 compared(const Photograph& photo, const float* image, size_t value, bool keep) {
-    const float target = float(photo.image[value]) * BYTE;
-    return {keep ? image[value] : target, target};
+// Indices of pixels and of their values are unsigned and 32 bits wide: added to a plane that all threads share, each
+// takes one instruction, a 64-bit index about three.
+__device__ __forceinline__ unsigned value_of(unsigned pixel) { return unsigned(CHANNELS) * pixel; }
+
+// render and photograph; the photograph where the mask leaves the render out
+__device__ __forceinline__ float2 compared(const float* image, const uint8_t* photograph, unsigned value, bool keep) {
+    const float target = float(__ldg(photograph + value)) * BYTE;
+    return {keep ? __ldg(image + value) : target, target};
 }
 
 // The pixels of a block and around it, as a thread meets them while the tile is filled: it fills floats THREADS apart of
@@ -67,7 +71,9 @@ struct Halo {
     }
 
     static __device__ __forceinline__ int place(int k) { return THREADS * k + int(threadIdx.x); }
-    static __device__ __forceinline__ bool fills(int k) { return place(k) < HALO * PITCH; }
+    static __device__ __forceinline__ bool fills(int k) {
+        return THREADS * (k + 1) <= HALO * PITCH || place(k) < HALO * PITCH;
+    }
 };
 
 // A run across: RUN blurred values of every map, beside one another. inputs(at, values) gives four values of each map,
@@ -157,7 +163,8 @@ __global__ void __launch_bounds__(THREADS)
     const Photograph photo = photograph_of(photographs, state);
     const int left = blockIdx.x * SIDE, top = blockIdx.y * SIDE, m = settings.margin;
     const int col = threadIdx.x % SIDE, row = RUN * (threadIdx.x / SIDE), x = left + col;
-    const size_t plane = size_t(loss.width) * loss.height, first_pixel = size_t(top + row) * loss.width + x;
+    const size_t plane = size_t(loss.width) * loss.height;
+    const unsigned first_pixel = unsigned(top + row) * loss.width + x;
     const Halo halo(left, top, loss.width, loss.height);
     unsigned keep = 0, counts = 0;
 #pragma unroll
@@ -168,15 +175,19 @@ __global__ void __launch_bounds__(THREADS)
     for (int k = 0; k < RUN; ++k) {
         const int y = top + row + k;
         const bool inner = x >= m && x < loss.width - m && y >= m && y < loss.height - m;
-        if (inner && kept(photo, first_pixel + size_t(k) * loss.width)) counts |= 1u << k;
+        if (inner && kept(photo, first_pixel + unsigned(k * loss.width))) counts |= 1u << k;
     }
     Sums sums = {0.0f, 0.0f, 0.0f};
+    const float* image = loss.image;
+    const uint8_t* photograph = photo.image;
+    float *mu_y = photo.moments, *yy = mu_y + CHANNELS * plane;
+    float *v_mu = loss.windows, *v_xx = v_mu + plane, *v_xy = v_xx + plane;
     for (int c = 0; c < CHANNELS; ++c) {
 #pragma unroll
         for (int k = 0; k < SLOTS; ++k) {
             float2 p = {0.0f, 0.0f};
             if (halo.pixel[k] >= 0)
-                p = compared(photo, loss.image, size_t(CHANNELS) * halo.pixel[k] + c, (keep >> k) & 1u);
+                p = compared(image, photograph, value_of(halo.pixel[k]), (keep >> k) & 1u);
             if (!Halo::fills(k)) continue;
             if (RENDER) render[Halo::place(k)] = p.x;
             target[Halo::place(k)] = p.y;
@@ -205,28 +216,29 @@ __global__ void __launch_bounds__(THREADS)
 #pragma unroll
         for (int k = 0; k < RUN; ++k) {
             if (k >= rows_inside) break;
-            const size_t pixel = first_pixel + size_t(k) * loss.width;
-            float* mu_y = photo.moments + c * plane + pixel;
-            float* yy = mu_y + CHANNELS * plane;
+            const unsigned pixel = first_pixel + unsigned(k * loss.width);
             if (!RENDER) {
-                *mu_y = blur[FIRST_OF_TARGET + Y][k];
-                *yy = blur[FIRST_OF_TARGET + YY][k];
+                mu_y[pixel] = blur[FIRST_OF_TARGET + Y][k];
+                yy[pixel] = blur[FIRST_OF_TARGET + YY][k];
                 continue;
             }
-            const WindowMoments<float> w = {blur[X][k], TARGET ? blur[FIRST_OF_TARGET + Y][k] : *mu_y, blur[XX][k],
-                                            TARGET ? blur[FIRST_OF_TARGET + YY][k] : *yy, blur[XY][k]};
-            const WindowSsim<float> s = (counts >> k) & 1u ? compare_window(w) : WindowSsim<float>{};
-            float* out = loss.windows + size_t(CHANNELS) * c * plane + pixel;
-            out[0] = s.v_mu;
-            out[plane] = s.v_xx;
-            out[2 * plane] = s.v_xy;
+            const WindowMoments<float> w = {blur[X][k], TARGET ? blur[FIRST_OF_TARGET + Y][k] : __ldg(mu_y + pixel), blur[XX][k],
+                                            TARGET ? blur[FIRST_OF_TARGET + YY][k] : __ldg(yy + pixel), blur[XY][k]};
+            const bool count = (counts >> k) & 1u;
+            const WindowSsim<float> s = compare_window(w);
+            v_mu[pixel] = count ? s.v_mu : 0.0f;
+            v_xx[pixel] = count ? s.v_xx : 0.0f;
+            v_xy[pixel] = count ? s.v_xy : 0.0f;
             const int at = PITCH * (row + k + SSIM_REACH) + col + SSIM_REACH;
             const float d = render[at] - target[at], e = clamped(render[at], 0.0f, 1.0f) - target[at];
-            sums.similarity += s.S;
+            sums.similarity += count ? s.S : 0.0f;
             sums.difference += settings.pixelwise == Pixelwise::l2 ? d * d : fabsf(d);
             sums.square += e * e;
         }
         __syncthreads();
+        ++image, ++photograph;
+        mu_y += plane, yy += plane;
+        v_mu += CHANNELS * plane, v_xx += CHANNELS * plane, v_xy += CHANNELS * plane;
     }
     if (!RENDER) return;
     const Sums total = block_sums(sums);
@@ -268,21 +280,24 @@ __global__ void __launch_bounds__(THREADS)
     if (blockIdx.x == 0 && blockIdx.y == 0) tell_values(photo, loss, settings, gridDim.x * gridDim.y);
     const int left = blockIdx.x * SIDE, top = blockIdx.y * SIDE;
     const int col = threadIdx.x % SIDE, row = RUN * (threadIdx.x / SIDE), x = left + col;
-    const size_t plane = size_t(loss.width) * loss.height, first_pixel = size_t(top + row) * loss.width + x;
+    const size_t plane = size_t(loss.width) * loss.height;
+    const unsigned first_pixel = unsigned(top + row) * loss.width + x;
     const int rows_inside = x < loss.width ? min(RUN, loss.height - top - row) : 0;
     const Halo halo(left, top, loss.width, loss.height);
     unsigned keep = 0;
 #pragma unroll
     for (int k = 0; k < RUN; ++k)
-        if (k < rows_inside && kept(photo, first_pixel + size_t(k) * loss.width)) keep |= 1u << k;
+        if (k < rows_inside && kept(photo, first_pixel + unsigned(k * loss.width))) keep |= 1u << k;
+    const float *image = loss.image, *windows[MAPS] = {loss.windows, loss.windows + plane, loss.windows + 2 * plane};
+    const uint8_t* photograph = photo.image;
+    float* v_image = loss.v_image;
     for (int c = 0; c < CHANNELS; ++c) {
-        const float* windows = loss.windows + size_t(CHANNELS) * c * plane;
 #pragma unroll
         for (int k = 0; k < SLOTS; ++k) {
             float v[MAPS] = {};
             if (halo.pixel[k] >= 0)
 #pragma unroll
-                for (int d = 0; d < MAPS; ++d) v[d] = windows[d * plane + halo.pixel[k]];
+                for (int d = 0; d < MAPS; ++d) v[d] = windows[d][unsigned(halo.pixel[k])];
             if (!Halo::fills(k)) continue;
 #pragma unroll
             for (int d = 0; d < MAPS; ++d) derivatives[d][Halo::place(k)] = v[d];
@@ -298,8 +313,8 @@ __global__ void __launch_bounds__(THREADS)
 #pragma unroll
         for (int k = 0; k < RUN; ++k) {
             if (k >= rows_inside) break;
-            const size_t value = CHANNELS * (first_pixel + size_t(k) * loss.width) + c;
-            const float2 p = compared(photo, loss.image, value, (keep >> k) & 1u);
+            const unsigned value = value_of(first_pixel + unsigned(k * loss.width));
+            const float2 p = compared(image, photograph, value, (keep >> k) & 1u);
             const float difference = p.x - p.y;
             // B4: sign(0) = 0
             const float sign = float(difference > 0.0f) - float(difference < 0.0f);
@@ -307,9 +322,12 @@ __global__ void __launch_bounds__(THREADS)
             const float of_windows = pixel_from_windows(p.x, p.y, v[0][k], v[1][k], v[2][k]);
             const float sum = settings.pixelwise_weight * photo.pixel_share * of_pixel -
                               settings.ssim_weight * photo.window_share * of_windows;
-            loss.v_image[value] = (keep >> k) & 1u ? sum : 0.0f;
+            v_image[value] = (keep >> k) & 1u ? sum : 0.0f;
         }
         __syncthreads();
+        ++image, ++photograph, ++v_image;
+#pragma unroll
+        for (int d = 0; d < MAPS; ++d) windows[d] += CHANNELS * plane;
     }
 }
 
