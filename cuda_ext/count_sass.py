@@ -46,7 +46,7 @@ KERNELS = {
     "fill_tail_kernel": ("32 instances", 256),
     "gather_rows_kernel": ("32 floats", 256),
     "pack_kernel": ("32 Gaussians", 256),
-    "pixels_kernel": ("32 pixels", 256),
+    "pixels_kernel": ("128 pixels", 256),
     "project_backward_kernel": ("32 Gaussians", 128),
     "project_kernel": ("32 Gaussians", 128),
     "ranges_kernel": ("32 instances", 256),
@@ -57,8 +57,7 @@ KERNELS = {
     "sum_slots_kernel": ("Gaussian", 256),
     "total_kernel": ("step", 1),
     "update_kernel": ("32 Gaussians", 128),
-    "values_kernel": ("image", 256),
-    "windows_kernel": ("32 pixels", 256),
+    "windows_kernel": ("128 pixels", 256),
 }
 # a comment at the end of a loop's line says what one iteration of a warp is, and how often it is passed where that is
 # fixed: "// per record", "// per coefficient, 45 times"

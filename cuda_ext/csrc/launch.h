@@ -40,8 +40,8 @@ struct GaussianArrays {
     bool raw;
 };
 
-// colors may be given instead of computed: then sh_first is null and project leaves them alone; where records are packed
-// at once, colors may be null
+// colors may be given instead of computed: then sh_first is null and project leaves them alone; where records are
+// packed at once, colors may be null
 struct SplatArrays {
     float* means2d;    // [n, 2]
     float* depths;     // [n]

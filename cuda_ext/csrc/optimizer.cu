@@ -1,6 +1,11 @@
 // The last stage of a fused step: preprocess backward, POP's pull, density statistics and dense Adam in one kernel. A
-// thread owns a Gaussian while gradients are made; then the block owns its rows, so that parameters and moments are read
-// and written in whole lines. Gradients never reach memory.
+// lane owns a Gaussian while gradients are made; then the warp owns the rows of its 32 Gaussians, so that parameters
+// and moments are read and written in pieces of 16 bytes. Gradients never reach memory, no warp waits for another.
+//
+// What bounds the update is memory: 59 floats a Gaussian with both moments, read and written, are 1,416 bytes, 0.09 ms
+// for 270,000 Gaussians at 4.2 TB/s. A warp makes five trips there: what makes gradients, the short rows, and three
+// times a third of the harmonics, and in each no load waits for another. That is 5 to 11 KB on their way for a warp; 16
+// warps fit a multiprocessor by the registers that gradients take, and about 25 KB keep its share of the memory busy.
 
 #include "cuda_check.h"
 #include "density.cuh"
@@ -92,8 +97,8 @@ __global__ void __launch_bounds__(SUM_BLOCK)
     pop_sums[2 * blockIdx.x + 1] = sums.y;
 }
 
-// What a warp keeps while its lanes make gradients: first coefficients of the bands beyond the first, then gradients, as
-// the rows lie in memory.
+// What a warp keeps: the coefficients of the bands beyond the first, which give way to their gradients, and the
+// gradients of the other rows as these lie in memory.
 template <int DEGREE>
 struct Staged {
     WarpRows<ACTIVE<DEGREE, false>> rest;
@@ -106,7 +111,8 @@ struct Staged {
 // the stores of the groups before it do not hold these loads up
 __device__ __forceinline__ AdamStep<float> adam_step_of(const UpdateArrays& a, int group) {
     const AdamStep<float>* s = a.constants->adam + group;
-    return {__ldg(&s->rate), __ldg(&s->root), __ldg(&s->beta1_rest), __ldg(&s->beta2), __ldg(&s->beta2_rest), __ldg(&s->eps)};
+    return {__ldg(&s->rate),  __ldg(&s->root),       __ldg(&s->beta1_rest),
+            __ldg(&s->beta2), __ldg(&s->beta2_rest), __ldg(&s->eps)};
 }
 
 // one piece of a group's rows with its moments
@@ -246,8 +252,8 @@ __device__ __forceinline__ void update_short_rows(const UpdateArrays& a, int fir
                        reinterpret_cast<const float4*>(staged.rows(group))[lane], adam_step_of(a, group));
 }
 
-// Adam on the bands beyond the first. Bands above the active degree have had no gradient yet: their moments are zero and
-// Adam would not move them.
+// Adam on the bands beyond the first. Bands above the active degree have had no gradient yet: their moments are zero
+// and Adam would not move them.
 template <int DEGREE>
 __device__ __forceinline__ void update_long_rows(const UpdateArrays& a, const RowStride& stride, int first, int rows,
                                                  const Staged<DEGREE>& staged) {
@@ -264,7 +270,7 @@ __device__ __forceinline__ void update_long_rows(const UpdateArrays& a, const Ro
                 adam_float(group, base + at, staged_float<FLOATS>(staged.rest, at, stride), step);
         return;
     }
-    for (int begin = 4 * lane; begin < total; begin += 4 * WARP * AT_ONCE) {
+    for (int begin = 4 * lane; begin < total; begin += 4 * WARP * AT_ONCE) {  // per 16 floats of a lane
         Piece held[AT_ONCE];
         bool counts[AT_ONCE];
 #pragma unroll

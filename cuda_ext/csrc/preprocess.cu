@@ -1,4 +1,9 @@
 // Gaussians to splats, one thread a Gaussian: activations, projection, culls, harmonics; and the packing for blending.
+//
+// What bounds projection is memory: 44 bytes of every Gaussian and 192 of harmonics of those that are seen, 36 bytes
+// written of each and a record of 48 of those seen, about 0.02 ms for 270,000 Gaussians. A warp makes three trips: the
+// camera's matrices with the geometry, then the rows of harmonics that are wanted, in two parts of six pieces of 16
+// bytes a lane.
 
 #include "cuda_check.h"
 #include "gaussian_rows.cuh"

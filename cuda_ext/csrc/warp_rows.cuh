@@ -1,9 +1,9 @@
-// How a warp moves the harmonics of its 32 Gaussians between memory and shared memory, so that a lane can go through its
-// own row: in pieces of 16 bytes, neighbouring lanes at neighbouring addresses, many loads before the first use.
+// How a warp moves the harmonics of its 32 Gaussians between memory and shared memory, so that a lane can go through
+// its own row: in pieces of 16 bytes, neighbouring lanes at neighbouring addresses, many loads before the first use.
 //
-// Alignment: a piece needs an address that is a multiple of 16. A warp's rows begin 32 rows after the last warp's, which
-// is a multiple of 128 bytes whatever the stride, so that the first row decides for all. Rows that begin elsewhere, and
-// the last warp where it is not full, go float by float.
+// Alignment: a piece needs an address that is a multiple of 16. A warp's rows begin 32 rows behind the last warp's, a
+// multiple of 128 bytes whatever the stride, so that the first row decides for all. Rows that begin elsewhere, and the
+// last warp where it is not full, go float by float.
 #pragma once
 
 #include "kernel_tools.cuh"
@@ -34,7 +34,7 @@ struct WarpRows<0> {
 
 struct RowStride {
     int floats;
-    unsigned inverse;  // 2^32 / floats, rounded up: the quotient of any index in a warp's rows is the high half of a product
+    unsigned inverse;  // 2^32 / floats, rounded up: an index in a warp's rows is divided by a multiplication
 
     __device__ __forceinline__ int row(int at) const { return int(__umulhi(unsigned(at), inverse)); }
 };
@@ -61,7 +61,7 @@ __device__ __forceinline__ bool as_in_memory(const RowStride& stride) {
     return FLOATS % 2 == 1 && stride.floats == FLOATS;
 }
 
-// Read the rows of the mask; `source` is the warp's first row. All lanes must call it; __syncwarp before the rows are read.
+// Read the rows of the mask; `source` is the warp's first row. All lanes must call it, and then __syncwarp.
 template <int AT_ONCE, int FLOATS>
 __device__ __forceinline__ void read_rows(const float* __restrict__ source, const RowStride& stride, int rows,
                                           unsigned mask, WarpRows<FLOATS>& to) {
@@ -75,7 +75,7 @@ __device__ __forceinline__ void read_rows(const float* __restrict__ source, cons
         return;
     }
     const bool plain = as_in_memory<FLOATS>(stride);
-    for (int first = 4 * lane; first < total; first += 4 * WARP * AT_ONCE) {
+    for (int first = 4 * lane; first < total; first += 4 * WARP * AT_ONCE) {  // per pieces of a lane at once
         float4 piece[AT_ONCE];
         bool counts[AT_ONCE];
 #pragma unroll
