@@ -108,7 +108,7 @@ struct Staged {
     __device__ __forceinline__ const float* rows(int group) const { return short_rows + WARP * floats_before(group); }
 };
 
-// the stores of the groups before it do not hold these loads up
+// by read-only loads, which no store before them holds up
 __device__ __forceinline__ AdamStep<float> adam_step_of(const UpdateArrays& a, int group) {
     const AdamStep<float>* s = a.constants->adam + group;
     return {__ldg(&s->rate),  __ldg(&s->root),       __ldg(&s->beta1_rest),
@@ -125,15 +125,18 @@ __device__ __forceinline__ Piece load_piece(const AdamGroup& group, size_t at) {
             *reinterpret_cast<const float4*>(group.v + at)};
 }
 
+// an instruction of its own: the compiler takes some plain assignments apart into floats
+__device__ __forceinline__ void store_piece(float* p, float4 v) { __stwb(reinterpret_cast<float4*>(p), v); }
+
 __device__ __forceinline__ void adam_piece(const AdamGroup& group, size_t at, Piece p, float4 g,
                                            const AdamStep<float>& step) {
     adam_one(p.param.x, p.m.x, p.v.x, g.x, step);
     adam_one(p.param.y, p.m.y, p.v.y, g.y, step);
     adam_one(p.param.z, p.m.z, p.v.z, g.z, step);
     adam_one(p.param.w, p.m.w, p.v.w, g.w, step);
-    *reinterpret_cast<float4*>(group.param + at) = p.param;
-    *reinterpret_cast<float4*>(group.m + at) = p.m;
-    *reinterpret_cast<float4*>(group.v + at) = p.v;
+    store_piece(group.param + at, p.param);
+    store_piece(group.m + at, p.m);
+    store_piece(group.v + at, p.v);
 }
 
 __device__ __forceinline__ void adam_float(const AdamGroup& group, size_t at, float g, const AdamStep<float>& step) {
@@ -228,16 +231,23 @@ template <int DEGREE>
 __device__ __forceinline__ void update_short_rows(const UpdateArrays& a, int first, int rows,
                                                   const Staged<DEGREE>& staged) {
     const int lane = threadIdx.x & (WARP - 1);
+    // the groups' steps differ in their rates alone
+    AdamStep<float> step = adam_step_of(a, 0);
+    float rates[G_SHN];
     bool pieces = rows == WARP;
 #pragma unroll
-    for (int group = 0; group < G_SHN; ++group) pieces = pieces && group_in_pieces(a.groups[group]);
+    for (int group = 0; group < G_SHN; ++group) {
+        rates[group] = __ldg(&a.constants->adam[group].rate);
+        pieces = pieces && group_in_pieces(a.groups[group]);
+    }
     if (!pieces) {
 #pragma unroll
-        for (int group = 0; group < G_SHN; ++group)
+        for (int group = 0; group < G_SHN; ++group) {
+            step.rate = rates[group];
 #pragma unroll 1
             for (int at = lane; at < rows * row_floats(group); at += WARP)
-                adam_float(a.groups[group], size_t(first) * row_floats(group) + at, staged.rows(group)[at],
-                           adam_step_of(a, group));
+                adam_float(a.groups[group], size_t(first) * row_floats(group) + at, staged.rows(group)[at], step);
+        }
         return;
     }
     Piece held[G_SHN];
@@ -246,10 +256,12 @@ __device__ __forceinline__ void update_short_rows(const UpdateArrays& a, int fir
         if (lane < WARP / 4 * row_floats(group))
             held[group] = load_piece(a.groups[group], size_t(first) * row_floats(group) + 4 * lane);
 #pragma unroll
-    for (int group = 0; group < G_SHN; ++group)
+    for (int group = 0; group < G_SHN; ++group) {
+        step.rate = rates[group];
         if (lane < WARP / 4 * row_floats(group))
             adam_piece(a.groups[group], size_t(first) * row_floats(group) + 4 * lane, held[group],
-                       reinterpret_cast<const float4*>(staged.rows(group))[lane], adam_step_of(a, group));
+                       reinterpret_cast<const float4*>(staged.rows(group))[lane], step);
+    }
 }
 
 // Adam on the bands beyond the first. Bands above the active degree have had no gradient yet: their moments are zero

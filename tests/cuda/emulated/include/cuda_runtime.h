@@ -149,6 +149,11 @@ T __ldg(const T* address) {
 }
 
 template <class T>
+void __stwb(T* address, T value) {
+    *address = value;
+}
+
+template <class T>
 T atomicAdd(T* address, T value) {
     const T before = *address;
     *address = before + value;
