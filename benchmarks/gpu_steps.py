@@ -21,7 +21,7 @@ from cuda_ext.train_step import FusedTrainer
 PLAIN, POP = Phase(3, False, False, False), Phase(3, True, True, True)
 # what a step launches, in order (`StepProgram.launch`)
 KERNELS = (
-    *("begin_step", "project", "count_instances", "make_tile_lists", "pack_records", "blend_forward", "photometric"),
+    *("begin_step", "project", "count_instances", "make_tile_lists", "blend_forward", "photometric"),
     *("blend_backward", "count_important", "update", "end_step"),
 )
 HEAD_START = 2_000_000  # cycles the GPU waits before a step, so that it never waits for the host within one

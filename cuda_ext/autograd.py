@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from cuda_ext import load
-from cuda_ext.arrays import Settings, empty, fill, pointer, stream_of
+from cuda_ext.arrays import Settings, empty, fill, stream_of
 from cuda_ext.lists import LOWER, TileBuffers, splat_struct
 
 
@@ -32,9 +32,7 @@ def _gaussian_struct(means: Tensor, quats: Tensor, scales: Tensor, opacities: Te
         load().Gaussians(), n=len(means), means=means, quats=quats, scales=scales, opacities=opacities, raw=False
     )
     if sh is not None:
-        first = pointer("colors", sh)
-        made.sh_first, made.sh_first_stride = first, 3 * sh.shape[1]
-        made.sh_rest, made.sh_rest_stride = first + 3 * sh.element_size(), 3 * sh.shape[1]
+        fill(made, sh_first=sh, sh_first_stride=3 * sh.shape[1])
     return made
 
 

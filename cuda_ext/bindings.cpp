@@ -68,6 +68,7 @@ void bind_rows(nb::module_& m) {
     POINTER(splats, SplatArrays, opacities);
     POINTER(splats, SplatArrays, colors);
     POINTER(splats, SplatArrays, radii);
+    POINTER(splats, SplatArrays, records);
 
     nb::class_<SplatGradients> of_splats(m, "SplatGradients", nb::dynamic_attr());
     of_splats.def(nb::init<>());

@@ -102,7 +102,7 @@ class Population:
     def make(cls, params: Rows, m: Rows, v: Rows) -> Population:
         """Allocate what belongs to the rows; statistics start from nothing."""
         kernels, n, device = load(), len(params["means"]), params["means"].device
-        shapes = {"means2d": (n, 2), "depths": (n,), "conics": (n, 3), "opacities": (n,), "colors": (n, 3)}
+        shapes = {"means2d": (n, 2), "depths": (n,), "conics": (n, 3), "opacities": (n,)}
         splats = {name: empty("the splats", LOWER, shape, device) for name, shape in shapes.items()}
         splats["radii"] = empty("the splats", LOWER, (n, 2), device, torch.int32)
         rows = max(n, 1)

@@ -32,7 +32,8 @@ class StepProgram:
         kernels, (width, height) = load(), frame.size
         render = shared.render(frame.size, phase.sh_degree)
         self._profile, self._project = render.kernel_profile(), render.project_settings()
-        self._splats = splat_struct(**rows.splats)
+        # packed for blending as they are projected: nothing else reads their colours
+        self._splats = fill(splat_struct(**rows.splats, colors=None), records=rows.records)
         self._view = fill(kernels.View(), viewmat=shared.viewmat, K=shared.K, width=width, height=height)
         self._schedule, self._gaussians = _schedule(shared), _gaussians(rows)
         self._photographs, self._objective = shared.views.photographs(), _objective(shared, phase)
@@ -51,8 +52,6 @@ class StepProgram:
         kernels.count_instances(lists, splats, profile, state, stream)
         counts = self._frame.told["dominant_counts"] if self._phase.tells else None
         kernels.make_tile_lists(lists, splats, profile, pointer("dominant_counts", counts, "int32"), state, stream)
-        floor, records = shared.settings.profile.alpha_floor, pointer("records", rows.records)
-        kernels.pack_records(len(rows), 3, splats, floor, records, stream)
         kernels.blend_forward(lists, self._forward, profile, stream)
         kernels.photometric(self._photographs, self._loss, self._objective, state, stream)
         if not shared.settings.deterministic:

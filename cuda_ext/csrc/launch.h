@@ -34,13 +34,14 @@ struct GaussianArrays {
     const float* quats;      // [n, 4]
     const float* scales;     // [n, 3], logarithms where raw
     const float* opacities;  // [n], logits where raw
-    const float* sh_first;   // [n, sh_first_stride]
-    const float* sh_rest;    // [n, sh_rest_stride]
+    const float* sh_first;   // [n, sh_first_stride]: the first band, or all where sh_rest is null
+    const float* sh_rest;    // [n, sh_rest_stride], bands beyond the first, or null
     int sh_first_stride, sh_rest_stride;  // floats a row
     bool raw;
 };
 
-// colors may be given instead of computed: then sh_first is null and project leaves them alone
+// colors may be given instead of computed: then sh_first is null and project leaves them alone; where records are
+// packed at once, colors may be null
 struct SplatArrays {
     float* means2d;    // [n, 2]
     float* depths;     // [n]
@@ -48,6 +49,7 @@ struct SplatArrays {
     float* opacities;  // [n]
     float* colors;     // [n, channels]
     int* radii;        // [n, 2]
+    float* records;    // [n, RECORD], packed for blending where seen; null where colors are given or packed later
 };
 
 struct ViewArrays {

@@ -142,6 +142,7 @@ inline unsigned __match_any_sync(unsigned mask, int value) {
     return same;
 }
 
+inline unsigned __umulhi(unsigned a, unsigned b) { return unsigned((uint64_t(a) * b) >> 32); }
 inline int __popc(unsigned value) { return __builtin_popcount(value); }
 inline int __ffs(unsigned value) { return __builtin_ffs(int(value)); }
 inline unsigned __float_as_uint(float value) { return emulated::value_of<unsigned>(emulated::bits_of(value)); }
@@ -149,6 +150,11 @@ inline unsigned __float_as_uint(float value) { return emulated::value_of<unsigne
 template <class T>
 T __ldg(const T* address) {
     return *address;
+}
+
+template <class T>
+void __stwb(T* address, T value) {
+    *address = value;
 }
 
 template <class T>
