@@ -79,12 +79,12 @@ def work(loads: Loads) -> dict[str, tuple[float, float]]:
     E, C = loads.evaluated, loads.contributing
     adam = 4 * 3 * PARAMETERS * 2  # parameter and both moments, read and written
     return {
-        "project": (4 * (GEOMETRY * (n - seen) + PARAMETERS * seen) + ROW * n, 0.0),
+        # 36 bytes for the lists, and a packed splat where one is seen
+        "project": (4 * (GEOMETRY * (n - seen) + PARAMETERS * seen) + 36 * n + ROW * seen, 0.0),
         # four passes of an 8-byte pair over 32-bit depths, extents read, counts written
         "count_instances": ((4 * 16 + ROW + 8) * n, 0.0),
         # emitted once, two passes of a 6-byte pair over 16-bit tiles, ids and slots written
         "make_tile_lists": ((6 + 2 * 12 + 12) * entries, 0.0),
-        "pack_records": (2 * ROW * n, 0.0),
         "blend_forward": ((ROW + 4) * entries + 20 * pixels, 8.0 * E + 9.0 * C),
         "photometric": (8 * 12 * pixels, 236.0 * 3 * pixels),
         # a slot an entry, written once and read once

@@ -13,16 +13,16 @@ import torch
 from gpu_floors import Loads
 from torch import Tensor
 
-from cuda_ext import train_step
+from cuda_ext import step_program
 from cuda_ext.resident import ResidentViews
 from cuda_ext.train_settings import Phase, StepSettings
 from cuda_ext.train_step import FusedTrainer
 
 PLAIN, POP = Phase(3, False, False, False), Phase(3, True, True, True)
-# what a step launches, in order (`FusedTrainer._launch`)
+# what a step launches, in order (`StepProgram.launch`)
 KERNELS = (
-    *("begin_step", "project", "count_instances", "make_tile_lists", "pack_records", "blend_forward", "photometric"),
-    *("blend_backward", "count_important", "update", "end_step", "clear"),
+    *("begin_step", "project", "count_instances", "make_tile_lists", "blend_forward", "photometric"),
+    *("blend_backward", "count_important", "update", "end_step"),
 )
 HEAD_START = 2_000_000  # cycles the GPU waits before a step, so that it never waits for the host within one
 
@@ -107,13 +107,13 @@ class _TimedKernels:
 
 @contextmanager
 def _timed_kernels() -> Iterator[_TimedKernels]:
-    load = train_step.load
+    load = step_program.load
     timed = _TimedKernels(load())
-    train_step.load = lambda: timed
+    step_program.load = lambda: timed
     try:
         yield timed
     finally:
-        train_step.load = load
+        step_program.load = load
 
 
 def kernel_times(

@@ -36,18 +36,27 @@ def on_gpu(tensor: Tensor) -> bool:
     return tensor.device.type == "cuda"
 
 
-def pointer(name: str, tensor: Tensor | None, dtype: torch.dtype = torch.float32) -> int:
+def pointer(name: str, tensor: Tensor | None, dtypes: str = "float32") -> int:
     """Return a tensor's address, 0 for None.
 
+    Args:
+        name: what an error calls it.
+        tensor: whose address.
+        dtypes: names of the types that the kernels read there, between spaces.
+
     Raises:
-        ValueError: it is not a contiguous CUDA tensor of that type.
+        ValueError: it is not a contiguous CUDA tensor of such a type.
     """
     if tensor is None:
         return 0
     if not on_gpu(tensor):
         raise ValueError(f"{name} is on {tensor.device}; backend 'cuda' needs it on the GPU: use {name}.cuda()")
-    if tensor.dtype != dtype:
-        raise ValueError(f"{name} has dtype {tensor.dtype}; backend 'cuda' needs {dtype}")
+    found = str(tensor.dtype).removeprefix("torch.")
+    if found not in dtypes.split():
+        raise ValueError(
+            f"{name} has dtype {found}; the kernels read {' or '.join(dtypes.split())} there: "
+            f"use {name}.to(torch.{dtypes.split()[-1]})"
+        )
     if not tensor.is_contiguous():
         raise ValueError(f"{name} is not contiguous; use {name}.contiguous()")
     return tensor.data_ptr()
@@ -57,15 +66,29 @@ def fill(struct: Any, **fields: Any) -> Any:
     """Set a struct's fields, tensors by address and numbers as they are, and return it.
 
     The struct keeps the tensors: an address is no use when its memory has been handed to somebody else.
+
+    Raises:
+        ValueError: a tensor is not what the kernels read there; see `pointer`.
+        TypeError: the struct has no such field, or it is a number's and a tensor was given.
     """
-    kept = struct.__dict__.setdefault("kept", {})
+    kind = type(struct)
+    dtypes, kept = getattr(kind, "dtypes", {}), struct.__dict__.setdefault("kept", {})
     for name, value in fields.items():
-        if isinstance(value, Tensor):
+        if name in dtypes:
+            setattr(struct, name, pointer(name, value, dtypes[name]))
             kept[name] = value
-            setattr(struct, name, pointer(name, value, value.dtype))
+        elif not hasattr(kind, name):
+            # without this check the name would become an attribute that no kernel reads
+            raise TypeError(f"{kind.__name__} has no field {name}; it has {', '.join(_fields(kind))}")
+        elif isinstance(value, Tensor):
+            raise TypeError(f"{kind.__name__}.{name} is a number, not a tensor")
         else:
-            setattr(struct, name, 0 if value is None else value)
+            setattr(struct, name, value)
     return struct
+
+
+def _fields(kind: Any) -> list[str]:
+    return [name for name in dir(kind) if not name.startswith(("_", "set_")) and name != "dtypes"]
 
 
 def empty(

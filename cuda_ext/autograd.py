@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,13 +16,23 @@ from cuda_ext.arrays import Settings, empty, fill, stream_of
 from cuda_ext.lists import LOWER, TileBuffers, splat_struct
 
 
+def _where_the_cotangents_are(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """Make a transpose run with its tensors' device as the current one, on which kernels run, whoever calls it."""
+
+    @functools.wraps(backward)
+    def there(ctx: Any, *cotangents: Any) -> Any:
+        with torch.cuda.device_of(next(v for v in cotangents if v is not None)):
+            return backward(ctx, *cotangents)
+
+    return there
+
+
 def _gaussian_struct(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor | None) -> Any:
     made = fill(
         load().Gaussians(), n=len(means), means=means, quats=quats, scales=scales, opacities=opacities, raw=False
     )
     if sh is not None:
-        made.sh_first, made.sh_first_stride = sh.data_ptr(), 3 * sh.shape[1]
-        made.sh_rest, made.sh_rest_stride = sh.data_ptr() + 3 * sh.element_size(), 3 * sh.shape[1]
+        fill(made, sh_first=sh, sh_first_stride=3 * sh.shape[1])
     return made
 
 
@@ -48,6 +60,7 @@ class Project(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
+    @_where_the_cotangents_are
     def backward(ctx: Any, *cotangents: Any) -> tuple[Tensor | None, ...]:
         v_means2d, v_depths, v_conics, v_opacities, _, v_colors = cotangents
         means, quats, scales, opacities, sh, viewmat, K, radii = ctx.saved_tensors
@@ -210,6 +223,7 @@ class Blend(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
+    @_where_the_cotangents_are
     def backward(ctx: Any, *cotangents: Any) -> tuple[Tensor | None, ...]:
         v_image, v_T_final = cotangents
         blended = ctx.blended

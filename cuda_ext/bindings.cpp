@@ -68,6 +68,7 @@ void bind_rows(nb::module_& m) {
     POINTER(splats, SplatArrays, opacities);
     POINTER(splats, SplatArrays, colors);
     POINTER(splats, SplatArrays, radii);
+    POINTER(splats, SplatArrays, records);
 
     nb::class_<SplatGradients> of_splats(m, "SplatGradients", nb::dynamic_attr());
     of_splats.def(nb::init<>());
@@ -164,8 +165,9 @@ void bind_functions(nb::module_& m) {
     m.def("count_instances", [](const TileLists& l, const SplatArrays& s, const Profile<float>& p, P state, P stream) {
         count_instances(l, s, p, as_state(state), as_stream(stream));
     });
-    m.def("make_tile_lists", [](const TileLists& l, const SplatArrays& s, const Profile<float>& p, P state, P stream) {
-        make_tile_lists(l, s, p, as_state(state), as_stream(stream));
+    m.def("make_tile_lists", [](const TileLists& l, const SplatArrays& s, const Profile<float>& p, P dominant_counts,
+                                P state, P stream) {
+        make_tile_lists(l, s, p, reinterpret_cast<int*>(dominant_counts), as_state(state), as_stream(stream));
     });
     m.def("blend_forward", [](const TileLists& l, const BlendForward& b, const Profile<float>& p, P stream) {
         blend_forward(l, b, p, as_stream(stream));
@@ -192,9 +194,8 @@ void bind_functions(nb::module_& m) {
         begin_step(s, reinterpret_cast<StepConstants*>(constants), as_state(state), as_stream(stream));
     });
     m.def("important_blocks", &important_blocks);
-    m.def("count_important", [](int n, P counts, P logits, P sums, P state, P stream) {
-        count_important(n, reinterpret_cast<const int*>(counts), reinterpret_cast<const float*>(logits),
-                        reinterpret_cast<float*>(sums), as_state(state), as_stream(stream));
+    m.def("count_important", [](const PopTerm& term, P state, P stream) {
+        count_important(term, as_state(state), as_stream(stream));
     });
     m.def("update", [](const UpdateArrays& a, const ViewArrays& v, const ProjectSettings& s, const SplatArrays& splats,
                        P state, P stream) { update(a, v, s, splats, as_state(state), as_stream(stream)); });

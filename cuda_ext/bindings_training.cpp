@@ -49,15 +49,27 @@ void bind_training(nb::module_& m) {
     VALUE(record, StepRecord, n);
     VALUE(record, StepRecord, lambda_pop);
 
+    nb::class_<PopTerm> term(m, "PopTerm", nb::dynamic_attr());
+    term.def(nb::init<>());
+    VALUE(term, PopTerm, n);
+    POINTER(term, PopTerm, dominant_counts);
+    POINTER(term, PopTerm, window_counts);
+    POINTER(term, PopTerm, radii);
+    POINTER(term, PopTerm, logits);
+    POINTER(term, PopTerm, sides);
+    POINTER(term, PopTerm, sums);
+
     nb::class_<UpdateArrays> update(m, "UpdateArrays", nb::dynamic_attr());
     update.def(nb::init<>());
     VALUE(update, UpdateArrays, n);
     VALUE(update, UpdateArrays, n_rest);
     VALUE(update, UpdateArrays, lambda_pop);
     VALUE(update, UpdateArrays, blur_pixels);
+    VALUE(update, UpdateArrays, blur_own_view);
     POINTER(update, UpdateArrays, constants);
     POINTER(update, UpdateArrays, sums);
     POINTER(update, UpdateArrays, dominant_counts);
+    POINTER(update, UpdateArrays, pop_sides);
     POINTER(update, UpdateArrays, grad_sum);
     POINTER(update, UpdateArrays, n_visible);
     POINTER(update, UpdateArrays, dominant_sum);

@@ -19,6 +19,7 @@ from cuda_ext.arrays import (
     new_state,
     stream_of,
 )
+from cuda_ext.capacity import MOST
 
 WARP_TILE = (16, 8)  # px, what a warp blends
 BUCKET = 32
@@ -62,8 +63,11 @@ class TileBuffers:
         """
         if capacity <= self.capacity:
             return
-        if capacity >= 2**31:
-            raise CudaMemoryError(f"the tile lists would have {capacity:,} entries, more than 2^31; lower {LOWER}")
+        if capacity > MOST:
+            # a count stops at 2^31 - 1, so that it says "at least"
+            raise CudaMemoryError(
+                f"the tile lists would have {capacity:,} entries or more; the kernels number {MOST:,}: lower {LOWER}"
+            )
         self.capacity = capacity
         self.struct.capacity = capacity
         wide = self.n_tiles >= 0xFFFF
@@ -157,5 +161,5 @@ def make_lists(
             f"{told[BAD_ROW]} of means, quats, scales, opacities and colors for NaN, inf and numbers near 1e38"
         )
     buffers.reserve(told[N_INSTANCES])
-    kernels.make_tile_lists(buffers.struct, splats, profile, state.data_ptr(), stream)
+    kernels.make_tile_lists(buffers.struct, splats, profile, 0, state.data_ptr(), stream)
     return buffers

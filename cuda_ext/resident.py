@@ -98,6 +98,11 @@ class ResidentViews:
         return torch.tensor([tensor.data_ptr() for tensor in tensors], dtype=torch.int64, device=self.device)
 
     def _fill_moments(self) -> None:
+        # kernels run on the current device, which need not be the photographs'
+        with torch.cuda.device_of(self.viewmats):
+            self._launch_moments()
+
+    def _launch_moments(self) -> None:
         kernels, state = load(), new_state(self.device)
         settings = fill(kernels.LossSettings(), margin=self._margin)
         for k, (width, height) in enumerate(self.sizes):

@@ -28,6 +28,10 @@ class StepSettings:
         d_ssim_halved: (1 - SSIM) / 2 instead of 1 - SSIM.
         pixelwise_scale: multiplies the L1 or L2 term.
         lambda_pop: weight of the POP term where it is on.
+        pop_views: who dominates a pixel of the "current" view is important, or of any view of the "window".
+        pop_over: the POP term averages over "all" Gaussians, or over those "visible" in the view.
+        blur_window: under "any_view" a blur flag stays up, under "own_view" it is the last view's alone, under "sum"
+            the caller makes it of the summed counts.
         theta_blur: share of the image a Gaussian must dominate to be blurred.
         blur_min_pixels: and at least so many pixels.
         background: colour behind everything.
@@ -43,6 +47,9 @@ class StepSettings:
     d_ssim_halved: bool = False
     pixelwise_scale: float = 1.0
     lambda_pop: float = 0.001
+    pop_views: str = "current"
+    pop_over: str = "all"
+    blur_window: str = "any_view"
     theta_blur: float = 2e-5
     blur_min_pixels: float = 0.0
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -71,6 +78,7 @@ class Phase(NamedTuple):
         blur: dominant pixels are collected.
         l1: L1 instead of L2.
         lambda_ssim: weight of D-SSIM; the rest, to 1, is that of L1 or L2.
+        window: dominant pixels are summed over the window for the POP term, also where blur is not asked for.
     """
 
     sh_degree: int
@@ -79,11 +87,12 @@ class Phase(NamedTuple):
     blur: bool
     l1: bool = False
     lambda_ssim: float = 0.01
+    window: bool = False
 
     @property
     def tells(self) -> bool:
         """Whether dominant Gaussians are asked for."""
-        return self.pop or self.blur
+        return self.pop or self.blur or self.window
 
 
 class StepValues(NamedTuple):

@@ -97,8 +97,9 @@ struct ShRow {
     }
 };
 
-template <class Real>
-POP_HD Vec3<Real> unclamped_color(ShRow<Real> sh, const Real basis[MAX_BASIS], int n_sh) {
+// `Row` is a ShRow, or what a kernel has instead, with the same `at`
+template <class Real, class Row>
+POP_HD Vec3<Real> unclamped_color(const Row& sh, const Real basis[MAX_BASIS], int n_sh) {
     Vec3<Real> color = {Real(0), Real(0), Real(0)};
     POP_UNROLL
     for (int k = 0; k < MAX_BASIS; ++k) {
@@ -113,8 +114,8 @@ POP_HD Vec3<Real> unclamped_color(ShRow<Real> sh, const Real basis[MAX_BASIS], i
 }
 
 // B2: clamped at 0
-template <class Real>
-POP_HD Vec3<Real> color_from_sh(ShRow<Real> sh, Vec3<Real> dir, int degree) {
+template <class Real, class Row>
+POP_HD Vec3<Real> color_from_sh(const Row& sh, Vec3<Real> dir, int degree) {
     Real basis[MAX_BASIS];
     basis_one(unit_dir(dir), degree, basis);
     const Vec3<Real> unclamped = unclamped_color(sh, basis, (degree + 1) * (degree + 1));
@@ -122,8 +123,8 @@ POP_HD Vec3<Real> color_from_sh(ShRow<Real> sh, Vec3<Real> dir, int degree) {
 }
 
 // basis and v_sum are left to the caller: v_sh_k = basis_k v_sum is an outer product that need not be stored
-template <class Real>
-POP_HD Vec3<Real> color_from_sh_vjp(ShRow<Real> sh, Vec3<Real> dir, int degree, Vec3<Real> v_color,
+template <class Real, class Row>
+POP_HD Vec3<Real> color_from_sh_vjp(const Row& sh, Vec3<Real> dir, int degree, Vec3<Real> v_color,
                                     Real basis[MAX_BASIS], Vec3<Real>& v_sum) {
     const Vec3<Real> u = unit_dir(dir);
     const int n_sh = (degree + 1) * (degree + 1);

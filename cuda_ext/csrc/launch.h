@@ -18,14 +18,14 @@ constexpr int MAX_CHANNELS = 4;
 
 // Flags and counts that the device keeps; the host reads them one step late.
 struct DeviceState {
-    int overflow;            // instances that did not fit; every later step does nothing while > 0
+    int overflow;            // instances where they did not fit; every later step does nothing while > 0
     int n_instances;
     int n_buckets;
-    int n_important;         // Gaussians with a dominant pixel, for the POP term
+    int n_important;         // Gaussians on each side of the POP term
     int bad_row;             // the first Gaussian with a value that is not finite, or INT_MAX
     int step;                // of the fused training step, from 0
     int view;                // the photograph of this step
-    int sh_degree;
+    int n_others;
 };
 
 struct GaussianArrays {
@@ -34,13 +34,14 @@ struct GaussianArrays {
     const float* quats;      // [n, 4]
     const float* scales;     // [n, 3], logarithms where raw
     const float* opacities;  // [n], logits where raw
-    const float* sh_first;   // [n, sh_first_stride]
-    const float* sh_rest;    // [n, sh_rest_stride]
+    const float* sh_first;   // [n, sh_first_stride]: the first band, or all where sh_rest is null
+    const float* sh_rest;    // [n, sh_rest_stride], bands beyond the first, or null
     int sh_first_stride, sh_rest_stride;  // floats a row
     bool raw;
 };
 
-// colors may be given instead of computed: then sh_first is null and project leaves them alone
+// colors may be given instead of computed: then sh_first is null and project leaves them alone; where records are
+// packed at once, colors may be null
 struct SplatArrays {
     float* means2d;    // [n, 2]
     float* depths;     // [n]
@@ -48,6 +49,7 @@ struct SplatArrays {
     float* opacities;  // [n]
     float* colors;     // [n, channels]
     int* radii;        // [n, 2]
+    float* records;    // [n, RECORD], packed for blending where seen; null where colors are given or packed later
 };
 
 struct ViewArrays {
@@ -62,7 +64,7 @@ struct ProjectSettings {
     int sh_degree;
 };
 
-// Lists of splats by tile. `capacity` instances fit; what does not is counted in state->overflow.
+// Lists of splats by tile. `capacity` instances fit; if there are more, nothing is listed and state->overflow counts them.
 struct TileLists {
     int n, capacity, n_tiles;
     TileGrid grid;
@@ -80,7 +82,7 @@ struct TileLists {
     unsigned* splat_count;     // [n], its slots
     int* bucket_begin;         // [n_tiles], first bucket of 32 list entries of a tile; null where no one asks
     int* bucket_tile;          // [capacity / 32 + n_tiles]
-    void* workspace;
+    uint8_t* workspace;
     size_t workspace_bytes;
     bool exact;                // drop tiles that no pixel centre reaches
 };
@@ -149,11 +151,13 @@ void project(const GaussianArrays& gaussians, const ViewArrays& view, const Proj
 void pack_records(int n, int channels, const SplatArrays& splats, float alpha_floor, float* records,
                   cudaStream_t stream);
 size_t tile_workspace(int n, int capacity, int n_tiles);
-// sorts by depth and counts instances into state->n_instances; make_tile_lists goes on from there
+// Sorts by depth and counts; make_tile_lists goes on from there. state->n_instances is written by the first where the
+// lists have no capacity yet, else by the second; it stops at INT_MAX.
 void count_instances(const TileLists& lists, const SplatArrays& splats, const Profile<float>& profile,
                      DeviceState* state, cudaStream_t stream);
+// dominant_counts: [n], set to zero on the way for blend_forward; null for none
 void make_tile_lists(const TileLists& lists, const SplatArrays& splats, const Profile<float>& profile,
-                     DeviceState* state, cudaStream_t stream);
+                     int* dominant_counts, DeviceState* state, cudaStream_t stream);
 void blend_forward(const TileLists& lists, const BlendForward& blend, const Profile<float>& profile,
                    cudaStream_t stream);
 void blend_backward(const TileLists& lists, const BlendBackward& blend, const Profile<float>& profile,

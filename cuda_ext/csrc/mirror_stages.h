@@ -142,7 +142,8 @@ const Entry<Real>* stage_table() {
                  for (int k = 0; k < a.integers[2]; ++k) compete(best, int(a.ids[1][k]), a.in[0][k]);
                  a.ids[0][i] = best.id),
         POP_ROWS("pop_loss_vjp",
-                 a.out[0][i] = pop_loss_vjp_one(a.ids[0][i] != 0, a.integers[2], a.integers[3], a.numbers[0])),
+                 a.out[0][i] = pop_loss_vjp_one(a.ids[0][i] != 0 ? PopSide::important : PopSide::other, a.integers[2],
+                                                a.integers[3] - a.integers[2], a.numbers[0])),
         POP_ROWS("adam_step", const AdamStep<Real> step = adam_step_at<Real>(a.integers[2], a.numbers[0], a.numbers[1],
                                                                              a.numbers[2], a.numbers[3]);
                  a.out[0][i] = a.in[0][i]; a.out[1][i] = a.in[1][i]; a.out[2][i] = a.in[2][i];

@@ -1,10 +1,15 @@
 // The last stage of a fused step: preprocess backward, POP's pull, density statistics and dense Adam in one kernel. A
-// thread owns a Gaussian while gradients are made; then the block owns its rows, so that parameters and moments are read
-// and written in whole lines. Gradients never reach memory.
+// lane owns a Gaussian while gradients are made; then the warp owns the rows of its 32 Gaussians, so that parameters
+// and moments are read and written in pieces of 16 bytes. Gradients never reach memory, no warp waits for another.
+//
+// What bounds the update is memory: 59 floats a Gaussian with both moments, read and written, are 1,416 bytes, 0.09 ms
+// for 270,000 Gaussians at 4.2 TB/s. A warp makes five trips there: what makes gradients, the short rows, and three
+// times a third of the harmonics, and in each no load waits for another. That is 5 to 11 KB on their way for a warp; 16
+// warps fit a multiprocessor by the registers that gradients take, and about 25 KB keep its share of the memory busy.
 
 #include "cuda_check.h"
 #include "density.cuh"
-#include "kernel_tools.cuh"
+#include "gaussian_rows.cuh"
 #include "polarization.cuh"
 #include "train.h"
 
@@ -19,12 +24,17 @@ constexpr __host__ __device__ int row_floats(int group) {
     return group == G_QUATS ? 4 : group == G_OPACITIES ? 1 : 3;
 }
 
+// of these groups, the floats of a Gaussian that lie before a group's
+constexpr __host__ __device__ int floats_before(int group) {
+    return group == 0 ? 0 : floats_before(group - 1) + row_floats(group - 1);
+}
+
 __global__ void begin_step_kernel(Schedule schedule, StepConstants* constants, DeviceState* state) {
     if (halted(state)) return;
     const int k = threadIdx.x, step = state->step, view = schedule.views[step];
     if (k == 0) {
         state->view = view;
-        state->n_important = 0;
+        state->n_important = state->n_others = 0;
     }
     if (k < 16) schedule.viewmat[k] = schedule.viewmats[16 * view + k];
     if (k < 9) schedule.K[k] = schedule.Ks[9 * view + k];
@@ -62,39 +72,79 @@ __global__ void __launch_bounds__(SUM_BLOCK) end_step_kernel(StepRecord record, 
     }
     sums = block_sums(sums);
     if (threadIdx.x > 0) return;
-    const int important = state->n_important;
+    const int important = state->n_important, others = state->n_others;
     record.values[V_POP] =
         record.pop_sums == nullptr
             ? 0.0f
-            : record.lambda_pop * (sums.x / float(max(important, 1)) + sums.y / float(max(record.n - important, 1)));
+            : record.lambda_pop * (sums.x / float(max(important, 1)) + sums.y / float(max(others, 1)));
     for (int k = 0; k < N_VALUES; ++k) record.history[size_t(N_VALUES) * state->step + k] = record.values[k];
     ++state->step;
 }
 
-__global__ void __launch_bounds__(SUM_BLOCK)
-    count_important_kernel(int n, const int* dominant_counts, const float* logits, float* pop_sums,
-                           DeviceState* state) {
+__global__ void __launch_bounds__(SUM_BLOCK) count_important_kernel(PopTerm term, DeviceState* state) {
     const int i = blockIdx.x * blockDim.x + threadIdx.x;
-    const bool important = i < n && dominant_counts[i] > 0;
-    const unsigned hits = __ballot_sync(FULL_WARP, important);
-    // an integer: the order of additions does not matter
-    if ((threadIdx.x & (WARP - 1)) == 0 && hits) atomicAdd(&state->n_important, __popc(hits));
+    PopSide side = PopSide::absent;
+    if (i < term.n && (term.radii == nullptr || term.radii[2 * i] > 0)) {
+        const bool before = term.window_counts != nullptr && term.window_counts[i] > 0;
+        side = before || term.dominant_counts[i] > 0 ? PopSide::important : PopSide::other;
+    }
+    if (i < term.n) term.sides[i] = uint8_t(side);
+    const bool important = side == PopSide::important;
+    const unsigned up = __ballot_sync(FULL_WARP, important), down = __ballot_sync(FULL_WARP, side == PopSide::other);
+    // integers: the order of additions does not matter
+    if ((threadIdx.x & (WARP - 1)) == 0 && up) atomicAdd(&state->n_important, __popc(up));
+    if ((threadIdx.x & (WARP - 1)) == 0 && down) atomicAdd(&state->n_others, __popc(down));
     // 1 - o is the opacity of the negated logit
-    const float o = i < n ? opacity_from_logit(important ? -logits[i] : logits[i]) : 0.0f;
+    const float o = side == PopSide::absent ? 0.0f : opacity_from_logit(important ? -term.logits[i] : term.logits[i]);
     const float2 sums = block_sums(important ? float2{o, 0.0f} : float2{0.0f, o});
     if (threadIdx.x > 0) return;
-    pop_sums[2 * blockIdx.x] = sums.x;
-    pop_sums[2 * blockIdx.x + 1] = sums.y;
+    term.sums[2 * blockIdx.x] = sums.x;
+    term.sums[2 * blockIdx.x + 1] = sums.y;
 }
 
-// gradients of a block's rows, as its threads leave them for the update
+// What a warp keeps: the coefficients of the bands beyond the first, which give way to their gradients, and the
+// gradients of the other rows as these lie in memory.
+template <int DEGREE>
 struct Staged {
-    float rows[N_GROUPS - 2][4][BLOCK];  // means, scales, quats, opacities, by component
-    float basis[MAX_BASIS][BLOCK];
-    float v_sum[3][BLOCK];
+    WarpRows<ACTIVE<DEGREE, false>> rest;
+    alignas(16) float short_rows[WARP * floats_before(G_SHN)];
+
+    __device__ __forceinline__ float* rows(int group) { return short_rows + WARP * floats_before(group); }
+    __device__ __forceinline__ const float* rows(int group) const { return short_rows + WARP * floats_before(group); }
 };
 
-__device__ __forceinline__ void adam_at(const AdamGroup& group, size_t at, float g, const AdamStep<float>& step) {
+// by read-only loads, which no store before them holds up
+__device__ __forceinline__ AdamStep<float> adam_step_of(const UpdateArrays& a, int group) {
+    const AdamStep<float>* s = a.constants->adam + group;
+    return {__ldg(&s->rate),  __ldg(&s->root),       __ldg(&s->beta1_rest),
+            __ldg(&s->beta2), __ldg(&s->beta2_rest), __ldg(&s->eps)};
+}
+
+// one piece of a group's rows with its moments
+struct Piece {
+    float4 param, m, v;
+};
+
+__device__ __forceinline__ Piece load_piece(const AdamGroup& group, size_t at) {
+    return {*reinterpret_cast<const float4*>(group.param + at), *reinterpret_cast<const float4*>(group.m + at),
+            *reinterpret_cast<const float4*>(group.v + at)};
+}
+
+// an instruction of its own: the compiler takes some plain assignments apart into floats
+__device__ __forceinline__ void store_piece(float* p, float4 v) { __stwb(reinterpret_cast<float4*>(p), v); }
+
+__device__ __forceinline__ void adam_piece(const AdamGroup& group, size_t at, Piece p, float4 g,
+                                           const AdamStep<float>& step) {
+    adam_one(p.param.x, p.m.x, p.v.x, g.x, step);
+    adam_one(p.param.y, p.m.y, p.v.y, g.y, step);
+    adam_one(p.param.z, p.m.z, p.v.z, g.z, step);
+    adam_one(p.param.w, p.m.w, p.v.w, g.w, step);
+    store_piece(group.param + at, p.param);
+    store_piece(group.m + at, p.m);
+    store_piece(group.v + at, p.v);
+}
+
+__device__ __forceinline__ void adam_float(const AdamGroup& group, size_t at, float g, const AdamStep<float>& step) {
     float param = group.param[at], m = group.m[at], v = group.v[at];
     adam_one(param, m, v, g, step);
     group.param[at] = param;
@@ -102,98 +152,183 @@ __device__ __forceinline__ void adam_at(const AdamGroup& group, size_t at, float
     group.v[at] = v;
 }
 
-__device__ __forceinline__ void note_statistics(const UpdateArrays& a, int i, bool seen, Vec2<float> v_mean2d,
-                                                const ViewArrays& view) {
-    if (a.grad_sum != nullptr && seen) {
-        a.grad_sum[i] += densification_gradient(v_mean2d, view.width, view.height);
-        a.n_visible[i] += 1;
-    }
-    if (a.dominant_sum != nullptr && a.dominant_counts != nullptr) a.dominant_sum[i] += a.dominant_counts[i];
-    if (a.blurred != nullptr && a.dominant_counts != nullptr && float(a.dominant_counts[i]) > a.blur_pixels)
-        a.blurred[i] = 1;
+__device__ __forceinline__ bool group_in_pieces(const AdamGroup& group) {
+    return in_pieces(group.param) && in_pieces(group.m) && in_pieces(group.v);
 }
 
+// what a lane reads of its Gaussian before anything is made of it
+struct Given {
+    GaussianRow<float> raw;
+    Vec3<float> first;  // harmonics
+    float4 sums[3];     // RECORD floats
+    Conic<float> conic;
+    float opacity;      // of the splat
+    bool seen;
+    PopSide side;
+    int dominant_count, dominant_sum, n_visible;
+    float grad_sum;
+};
+
+__device__ __forceinline__ Given load_given(const UpdateArrays& a, const SplatArrays& splats, int i) {
+    Given given;
+    given.raw = load_gaussian(a.groups[G_MEANS].param, a.groups[G_QUATS].param, a.groups[G_SCALES].param,
+                              a.groups[G_OPACITIES].param, i);
+    given.first = load3(a.groups[G_SH0].param, i);
+    const float4* sums = reinterpret_cast<const float4*>(a.sums + size_t(RECORD) * i);
+#pragma unroll
+    for (int k = 0; k < 3; ++k) given.sums[k] = __ldg(sums + k);
+    const Vec3<float> q = load3(splats.conics, i);
+    given.conic = {q.x, q.y, q.z};
+    given.opacity = splats.opacities[i];
+    given.seen = splats.radii[2 * size_t(i)] > 0;
+    given.side = a.lambda_pop != 0.0f ? PopSide(a.pop_sides[i]) : PopSide::absent;
+    given.dominant_count = a.dominant_counts != nullptr ? a.dominant_counts[i] : 0;
+    given.dominant_sum = a.dominant_sum != nullptr ? a.dominant_sum[i] : 0;
+    given.n_visible = a.n_visible != nullptr ? a.n_visible[i] : 0;
+    given.grad_sum = a.grad_sum != nullptr ? a.grad_sum[i] : 0.0f;
+    return given;
+}
+
+__device__ __forceinline__ void note_statistics(const UpdateArrays& a, int i, const Given& given, Vec2<float> v_mean2d,
+                                                const ViewArrays& view) {
+    if (a.grad_sum != nullptr && given.seen) {
+        a.grad_sum[i] = given.grad_sum + densification_gradient(v_mean2d, view.width, view.height);
+        a.n_visible[i] = given.n_visible + 1;
+    }
+    if (a.dominant_counts == nullptr) return;
+    if (a.dominant_sum != nullptr) a.dominant_sum[i] = given.dominant_sum + given.dominant_count;
+    const bool blurred = float(given.dominant_count) > a.blur_pixels;
+    if (a.blurred != nullptr && (blurred || a.blur_own_view)) a.blurred[i] = blurred;
+}
+
+template <int DEGREE>
 __device__ __forceinline__ void make_gradients(const UpdateArrays& a, const ViewArrays& view,
-                                               const ProjectSettings& settings, const SplatArrays& splats,
-                                               const DeviceState* state, int i, Staged& staged) {
-    const int t = threadIdx.x;
-    const float *mean = a.groups[G_MEANS].param + 3 * i, *quat = a.groups[G_QUATS].param + 4 * i,
-                *log_scale = a.groups[G_SCALES].param + 3 * i;
-    const Vec3<float> logs = {log_scale[0], log_scale[1], log_scale[2]};
-    const float logit = a.groups[G_OPACITIES].param[i];
-    const bool seen = splats.radii[2 * i] > 0;
+                                               const ProjectSettings& settings, const Camera<float>& camera,
+                                               int n_important, int n_others, int i, const Given& given,
+                                               Staged<DEGREE>& staged) {
+    const int lane = threadIdx.x & (WARP - 1);
     GaussianVjp<float> v = {};
-    Vec3<float> v_sum = {0.0f, 0.0f, 0.0f};
+    Vec3<float> v_first = {0.0f, 0.0f, 0.0f};
     Vec2<float> v_mean2d = {0.0f, 0.0f};
-    float basis[MAX_BASIS] = {};
-    if (seen) {
-        const GaussianRow<float> g = {{mean[0], mean[1], mean[2]},
-                                      {quat[0], quat[1], quat[2], quat[3]},
-                                      scale_from_log_scale(logs),
-                                      opacity_from_logit(logit)};
-        const Camera<float> camera =
-            camera_from_matrices(view.viewmat, view.K, view.width, view.height, settings.profile.centred);
-        const float *row = a.sums + size_t(RECORD) * i, *q = splats.conics + 3 * i;
-        const SplatVjp<float> of =
-            splat_vjp_from_moments<false>(row + 3, Conic<float>{q[0], q[1], q[2]}, splats.opacities[i]);
-        const ShRow<float> sh = {a.groups[G_SH0].param + 3 * i, a.groups[G_SHN].param + size_t(3) * a.n_rest * i};
-        const Vec3<float> v_dir = color_from_sh_vjp(sh, view_dir(g.mean, camera), settings.sh_degree,
-                                                    Vec3<float>{row[0], row[1], row[2]}, basis, v_sum);
-        ViewmatVjp<float> unused = {};
+    float* rest = staged.rest.row(lane);
+    if (given.seen) {
+        const float4* s = given.sums;
+        const float moments[RECORD - 3] = {s[0].w, s[1].x, s[1].y, s[1].z, s[1].w, s[2].x, s[2].y, s[2].z, s[2].w};
+        const SplatVjp<float> of = splat_vjp_from_moments<false>(moments, given.conic, given.opacity);
         const SplatCotangents<float> of_splat = {of.v_mean2d, 0.0f, of.v_conic, of.v_opacity, 0.0f};
-        v = project_one_vjp(g, camera, settings.profile, settings.options, of_splat, v_dir, unused);
+        const Vec3<float> v_color = {s[0].x, s[0].y, s[0].z};
+        ViewmatVjp<float> unused = {};
+        v_first = given.first;
+        v = gaussian_vjp<DEGREE>(activated(given.raw), camera, settings, of_splat, v_color, v_first, rest, unused);
         v_mean2d = of.v_mean2d;
+    } else {
+#pragma unroll
+        for (int k = 0; k < ACTIVE<DEGREE, false>; ++k) rest[k] = 0.0f;
     }
     if (a.lambda_pop != 0.0f)
-        v.v_opacity += pop_loss_vjp_one(a.dominant_counts[i] > 0, state->n_important, a.n, a.lambda_pop);
-    note_statistics(a, i, seen, v_mean2d, view);
-    const Vec3<float> v_logs = scale_from_log_scale_vjp(logs, v.v_scale);
-    const float rows[N_GROUPS - 2][4] = {{v.v_mean.x, v.v_mean.y, v.v_mean.z, 0.0f},
-                                         {v_logs.x, v_logs.y, v_logs.z, 0.0f},
-                                         {v.v_quat.w, v.v_quat.x, v.v_quat.y, v.v_quat.z},
-                                         {opacity_from_logit_vjp(logit, v.v_opacity), 0.0f, 0.0f, 0.0f}};
-#pragma unroll
-    for (int group = 0; group < N_GROUPS - 2; ++group)
-#pragma unroll
-        for (int k = 0; k < row_floats(group); ++k) staged.rows[group][k][t] = rows[group][k];
-#pragma unroll
-    for (int k = 0; k < MAX_BASIS; ++k) staged.basis[k][t] = basis[k];
-    staged.v_sum[0][t] = v_sum.x;
-    staged.v_sum[1][t] = v_sum.y;
-    staged.v_sum[2][t] = v_sum.z;
+        v.v_opacity += pop_loss_vjp_one(given.side, n_important, n_others, a.lambda_pop);
+    note_statistics(a, i, given, v_mean2d, view);
+    store3(staged.rows(G_MEANS), lane, v.v_mean);
+    store3(staged.rows(G_SCALES), lane, scale_from_log_scale_vjp(given.raw.scale, v.v_scale));
+    reinterpret_cast<float4*>(staged.rows(G_QUATS))[lane] = {v.v_quat.w, v.v_quat.x, v.v_quat.y, v.v_quat.z};
+    staged.rows(G_OPACITIES)[lane] = opacity_from_logit_vjp(given.raw.opacity, v.v_opacity);
+    store3(staged.rows(G_SH0), lane, v_first);
 }
 
-template <int GROUP>
-__device__ __forceinline__ void update_group(const UpdateArrays& a, int first, int rows, const Staged& staged) {
-    constexpr int K = row_floats(GROUP);
-    const AdamStep<float> step = a.constants->adam[GROUP];
-    for (int e = threadIdx.x; e < rows * K; e += BLOCK) {
-        const int row = e / K, k = e % K;
-        const float g = GROUP == G_SH0 ? staged.basis[0][row] * staged.v_sum[k][row] : staged.rows[GROUP % 4][k][row];
-        adam_at(a.groups[GROUP], size_t(first) * K + e, g, step);
+// Adam on the five groups whose rows are short: a piece of each to a lane, all read before the first is used
+template <int DEGREE>
+__device__ __forceinline__ void update_short_rows(const UpdateArrays& a, int first, int rows,
+                                                  const Staged<DEGREE>& staged) {
+    const int lane = threadIdx.x & (WARP - 1);
+    // the groups' steps differ in their rates alone
+    AdamStep<float> step = adam_step_of(a, 0);
+    float rates[G_SHN];
+    bool pieces = rows == WARP;
+#pragma unroll
+    for (int group = 0; group < G_SHN; ++group) {
+        rates[group] = __ldg(&a.constants->adam[group].rate);
+        pieces = pieces && group_in_pieces(a.groups[group]);
+    }
+    if (!pieces) {
+#pragma unroll
+        for (int group = 0; group < G_SHN; ++group) {
+            step.rate = rates[group];
+#pragma unroll 1
+            for (int at = lane; at < rows * row_floats(group); at += WARP)
+                adam_float(a.groups[group], size_t(first) * row_floats(group) + at, staged.rows(group)[at], step);
+        }
+        return;
+    }
+    Piece held[G_SHN];
+#pragma unroll
+    for (int group = 0; group < G_SHN; ++group)
+        if (lane < WARP / 4 * row_floats(group))
+            held[group] = load_piece(a.groups[group], size_t(first) * row_floats(group) + 4 * lane);
+#pragma unroll
+    for (int group = 0; group < G_SHN; ++group) {
+        step.rate = rates[group];
+        if (lane < WARP / 4 * row_floats(group))
+            adam_piece(a.groups[group], size_t(first) * row_floats(group) + 4 * lane, held[group],
+                       reinterpret_cast<const float4*>(staged.rows(group))[lane], step);
     }
 }
 
-__global__ void __launch_bounds__(BLOCK) update_kernel(UpdateArrays a, ViewArrays view, ProjectSettings settings,
-                                                       SplatArrays splats, const DeviceState* state) {
-    __shared__ Staged staged;
-    if (halted(state)) return;
-    const int first = blockIdx.x * BLOCK, i = first + threadIdx.x, rows = min(BLOCK, a.n - first);
-    if (i < a.n) make_gradients(a, view, settings, splats, state, i, staged);
-    __syncthreads();
-    update_group<G_MEANS>(a, first, rows, staged);
-    update_group<G_SCALES>(a, first, rows, staged);
-    update_group<G_QUATS>(a, first, rows, staged);
-    update_group<G_OPACITIES>(a, first, rows, staged);
-    update_group<G_SH0>(a, first, rows, staged);
-    // bands above the active degree have had no gradient yet: their moments are zero and Adam would not move them
-    const int active = 3 * ((settings.sh_degree + 1) * (settings.sh_degree + 1) - 1);
-    const AdamStep<float> step = a.constants->adam[G_SHN];
-    for (int e = threadIdx.x; e < rows * active; e += BLOCK) {
-        const int row = e / active, k = e % active;
-        const float g = staged.basis[1 + k / 3][row] * staged.v_sum[k % 3][row];
-        adam_at(a.groups[G_SHN], size_t(first + row) * 3 * a.n_rest + k, g, step);
+// Adam on the bands beyond the first. Bands above the active degree have had no gradient yet: their moments are zero
+// and Adam would not move them.
+template <int DEGREE>
+__device__ __forceinline__ void update_long_rows(const UpdateArrays& a, const RowStride& stride, int first, int rows,
+                                                 const Staged<DEGREE>& staged) {
+    constexpr int FLOATS = ACTIVE<DEGREE, false>, AT_ONCE = 4;
+    static_assert(FLOATS > 0);
+    const AdamGroup& group = a.groups[G_SHN];
+    const AdamStep<float> step = adam_step_of(a, G_SHN);
+    const int lane = threadIdx.x & (WARP - 1), total = rows * stride.floats;
+    const size_t base = size_t(first) * stride.floats;
+    if (rows < WARP || !group_in_pieces(group)) {
+#pragma unroll 1
+        for (int at = lane; at < total; at += WARP)
+            if (staged_at<FLOATS>(at, stride) >= 0)
+                adam_float(group, base + at, staged_float<FLOATS>(staged.rest, at, stride), step);
+        return;
     }
+    for (int begin = 4 * lane; begin < total; begin += 4 * WARP * AT_ONCE) {  // per 16 floats of a lane
+        Piece held[AT_ONCE];
+        bool counts[AT_ONCE];
+#pragma unroll
+        for (int k = 0; k < AT_ONCE; ++k) {
+            const int at = begin + 4 * WARP * k;
+            counts[k] = at < total && piece_counts<FLOATS>(at, stride, FULL_WARP);
+            if (counts[k]) held[k] = load_piece(group, base + at);
+        }
+#pragma unroll
+        for (int k = 0; k < AT_ONCE; ++k) {
+            const int at = begin + 4 * WARP * k;
+            if (counts[k]) adam_piece(group, base + at, held[k], staged_piece<FLOATS>(staged.rest, at, stride), step);
+        }
+    }
+}
+
+template <int DEGREE>
+__global__ void __launch_bounds__(BLOCK, 4)
+    update_kernel(UpdateArrays a, ViewArrays view, ProjectSettings settings, SplatArrays splats, RowStride stride,
+                  const DeviceState* state) {
+    __shared__ Staged<DEGREE> of_warps[BLOCK / WARP];
+    const int lane = threadIdx.x & (WARP - 1), warp = threadIdx.x / WARP;
+    const int first = blockIdx.x * BLOCK + warp * WARP, rows = min(WARP, a.n - first);
+    if (rows <= 0 || halted(state)) return;
+    Staged<DEGREE>& staged = of_warps[warp];
+    const Camera<float> camera = camera_of(view, settings);
+    const int n_important = state->n_important, n_others = state->n_others;
+    Given given = {};
+    if (lane < rows) given = load_given(a, splats, first + lane);
+    if constexpr (DEGREE > 0)
+        read_rows<12>(a.groups[G_SHN].param + size_t(first) * stride.floats, stride, rows, FULL_WARP, staged.rest);
+    __syncwarp();
+    if (lane < rows) 
+        make_gradients<DEGREE>(a, view, settings, camera, n_important, n_others, first + lane, given, staged);
+    __syncwarp();
+    update_short_rows<DEGREE>(a, first, rows, staged);
+    if constexpr (DEGREE > 0) update_long_rows<DEGREE>(a, stride, first, rows, staged);
 }
 
 }  // namespace
@@ -210,17 +345,21 @@ void end_step(const StepRecord& record, DeviceState* state, cudaStream_t stream)
 
 int important_blocks(int n) { return blocks_for(n, SUM_BLOCK); }
 
-void count_important(int n, const int* dominant_counts, const float* logits, float* pop_sums, DeviceState* state,
-                     cudaStream_t stream) {
-    if (n == 0) return;
-    count_important_kernel<<<important_blocks(n), SUM_BLOCK, 0, stream>>>(n, dominant_counts, logits, pop_sums, state);
+void count_important(const PopTerm& term, DeviceState* state, cudaStream_t stream) {
+    if (term.n == 0) return;
+    count_important_kernel<<<important_blocks(term.n), SUM_BLOCK, 0, stream>>>(term, state);
     POP_LAUNCHED("count_important_kernel");
 }
 
 void update(const UpdateArrays& arrays, const ViewArrays& view, const ProjectSettings& settings,
             const SplatArrays& splats, DeviceState* state, cudaStream_t stream) {
     if (arrays.n == 0) return;
-    update_kernel<<<blocks_for(arrays.n, BLOCK), BLOCK, 0, stream>>>(arrays, view, settings, splats, state);
+    const RowStride stride = row_stride(3 * arrays.n_rest);
+    with_degree(settings.sh_degree, [&](auto degree) {
+        constexpr int DEGREE = decltype(degree)::value;
+        update_kernel<DEGREE>
+            <<<blocks_for(arrays.n, BLOCK), BLOCK, 0, stream>>>(arrays, view, settings, splats, stride, state);
+    });
     POP_LAUNCHED("update_kernel");
 }
 

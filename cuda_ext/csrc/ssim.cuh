@@ -32,7 +32,7 @@ struct WindowSsim {
 
 template <class Real>
 POP_HD WindowSsim<Real> compare_window(const WindowMoments<Real>& w) {
-    const Real C1 = Real(SSIM_C1), C2 = Real(SSIM_C2), one = Real(1), two = Real(2);
+    const Real C1 = Real(SSIM_C1), C2 = Real(SSIM_C2), two = Real(2);
     const Real mu_x = w.mu_x, mu_y = w.mu_y;
     const Real s_xx = w.xx - mu_x * mu_x;
     const Real s_yy = w.yy - mu_y * mu_y;
@@ -41,9 +41,11 @@ POP_HD WindowSsim<Real> compare_window(const WindowMoments<Real>& w) {
     const Real A2 = two * s_xy + C2;
     const Real B1 = mu_x * mu_x + mu_y * mu_y + C1;
     const Real B2 = s_xx + s_yy + C2;
-    const Real S = A1 * A2 / (B1 * B2);
-    const Real v_mu = two * mu_y * (A2 - A1) / (B1 * B2) - two * mu_x * S * (one / B1 - one / B2);
-    return {S, v_mu, -S / B2, two * A1 / (B1 * B2)};
+    // the oracle's quotients over one denominator: divisions would be most of the instructions
+    const Real inverse = reciprocal(B1 * B2);
+    const Real S = A1 * A2 * inverse;
+    const Real v_mu = two * (mu_y * (A2 - A1) - mu_x * S * (B2 - B1)) * inverse;
+    return {S, v_mu, -S * B1 * inverse, two * A1 * inverse};
 }
 
 // cotangent of a pixel x from the blurred derivatives of the windows that hold it

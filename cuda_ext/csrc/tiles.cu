@@ -2,8 +2,9 @@
 // sort the instances by tile. Both sorts are stable, so a list is ordered by (depth, index) (D3, D4).
 //
 // Slots are numbered splat by splat; the instance sort carries them as its payload, so that the backward pass can write
-// one row a slot without atomics and sum a splat's rows, which lie together. Instances beyond the capacity are counted
-// and dropped: the host sees state->overflow, grows the buffers and repeats the step, and until then nothing is updated.
+// one row a slot without atomics and sum a splat's rows, which lie together. Where there are more instances than the
+// buffers hold, nothing is listed and state->overflow says how many there are: the host makes room and repeats the step,
+// and until then nothing is updated. Their number can pass 2^32, so that it is added up with saturation.
 
 #include <cub/device/device_radix_sort.cuh>
 #include <cub/device/device_scan.cuh>
@@ -16,6 +17,12 @@ namespace pop {
 namespace {
 
 constexpr int BLOCK = 256, SMALL_RECT = 8;
+
+// Addition that stops at the largest number instead of beginning again at zero. Of numbers >= 0 it is associative, which
+// a scan asks for, and whatever is below the limit is exact: no need to scan 64 bits.
+struct SaturatedSum {
+    __host__ __device__ unsigned operator()(unsigned a, unsigned b) const { return a + b < a ? UINT_MAX : a + b; }
+};
 
 __global__ void depth_keys_kernel(int n, SplatArrays splats, unsigned* keys, unsigned* order) {
     const int i = blockIdx.x * blockDim.x + threadIdx.x;
@@ -92,54 +99,67 @@ __global__ void count_kernel(TileLists lists, SplatArrays splats, Profile<float>
     const int rank = blockIdx.x * blockDim.x + threadIdx.x;
     Footprint f = {};
     if (rank < lists.n) f = footprint_of(lists.order[1][rank], splats, lists.grid, profile);
-    const unsigned found = visit_tiles(f, lists.grid, lists.exact, [](int, int, unsigned) {});
+    unsigned found = unsigned(n_tiles_in(f.rect));
+    if (lists.exact) found = visit_tiles(f, lists.grid, true, [](int, int, unsigned) {});
     if (rank < lists.n) lists.counts[rank] = found;
 }
 
-__global__ void total_kernel(TileLists lists, DeviceState* state) {
-    const unsigned total = lists.offsets[lists.n - 1] + lists.counts[lists.n - 1];
-    state->n_instances = int(total);
-    if (lists.capacity > 0 && total > unsigned(lists.capacity)) state->overflow = int(total);
+// how many instances there are, INT_MAX for that many or more
+__device__ __forceinline__ int n_instances(const TileLists& lists) {
+    if (lists.n == 0) return 0;
+    const unsigned total = SaturatedSum()(lists.offsets[lists.n - 1], lists.counts[lists.n - 1]);
+    return int(min(total, unsigned(INT_MAX)));
 }
 
+__global__ void total_kernel(TileLists lists, DeviceState* state) { state->n_instances = n_instances(lists); }
+
+// Everything that is due between scan and sort: the instances, what sorts behind every tile in the rest of the buffers,
+// the tiles' empty ranges, the counts that the blend adds to, and the number of instances for the host.
 template <class Key>
-__global__ void emit_kernel(TileLists lists, SplatArrays splats, Profile<float> profile) {
-    const int rank = blockIdx.x * blockDim.x + threadIdx.x;
+__global__ void emit_kernel(TileLists lists, SplatArrays splats, Profile<float> profile, int* dominant_counts,
+                            DeviceState* state) {
+    const int rank = blockIdx.x * blockDim.x + threadIdx.x, threads = gridDim.x * blockDim.x;
+    const int total = n_instances(lists);
+    // after an earlier halt the view may be that of another size of image: its numbers mean nothing
+    const bool before = halted(state), listed = !before && total <= lists.capacity;
+    if (rank == 0 && !before) {
+        state->n_instances = total;
+        if (!listed) state->overflow = total;
+    }
+    for (int tile = rank; tile < lists.n_tiles; tile += threads) lists.tile_begin[tile] = lists.tile_end[tile] = 0;
+    Key* keys = static_cast<Key*>(lists.tile_keys[0]);
+    for (long long k = total + (long long)(rank); listed && k < lists.capacity; k += threads) {
+        keys[k] = Key(lists.n_tiles);
+        lists.slots[0][k] = unsigned(k);
+    }
     Footprint f = {};
     if (rank < lists.n) {
         const unsigned splat = lists.order[1][rank];
-        f = footprint_of(splat, splats, lists.grid, profile);
-        lists.splat_begin[splat] = lists.offsets[rank];
-        lists.splat_count[splat] = lists.counts[rank];
+        if (listed) f = footprint_of(splat, splats, lists.grid, profile);
+        lists.splat_begin[splat] = listed ? lists.offsets[rank] : 0;
+        lists.splat_count[splat] = listed ? lists.counts[rank] : 0;
+        if (dominant_counts != nullptr) dominant_counts[splat] = 0;
     }
     const int first_rank = rank - int(threadIdx.x & (WARP - 1));
     visit_tiles(f, lists.grid, lists.exact, [&](int owner, int tile, unsigned number) {
         const unsigned slot = lists.offsets[first_rank + owner] + number;
+        // never, unless this pass saw more tiles than the one that counted: then not in somebody else's memory
         if (slot >= unsigned(lists.capacity)) return;
-        static_cast<Key*>(lists.tile_keys[0])[slot] = Key(tile);
+        keys[slot] = Key(tile);
         lists.slots[0][slot] = slot;
         lists.slot_splat[slot] = lists.order[1][first_rank + owner];
     });
 }
 
-// what is left of the buffers must sort behind every tile
-template <class Key>
-__global__ void fill_tail_kernel(TileLists lists, const DeviceState* state) {
-    const int k = blockIdx.x * blockDim.x + threadIdx.x;
-    if (k >= lists.capacity || k < state->n_instances) return;
-    static_cast<Key*>(lists.tile_keys[0])[k] = Key(lists.n_tiles);
-    lists.slots[0][k] = unsigned(k);
-}
-
 template <class Key>
 __global__ void ranges_kernel(TileLists lists, const DeviceState* state) {
-    const int k = blockIdx.x * blockDim.x + threadIdx.x;
-    if (k >= min(lists.capacity, state->n_instances)) return;
+    const int k = blockIdx.x * blockDim.x + threadIdx.x, total = state->n_instances;
+    if (k >= total || halted(state)) return;
     const Key* keys = static_cast<const Key*>(lists.tile_keys[1]);
     const int tile = int(keys[k]);
     lists.listed[k] = lists.slot_splat[lists.slots[1][k]];
     if (k == 0 || int(keys[k - 1]) != tile) lists.tile_begin[tile] = k;
-    if (k + 1 == min(lists.capacity, state->n_instances) || int(keys[k + 1]) != tile) lists.tile_end[tile] = k + 1;
+    if (k + 1 == total || int(keys[k + 1]) != tile) lists.tile_end[tile] = k + 1;
 }
 
 __global__ void buckets_kernel(TileLists lists, DeviceState* state) {
@@ -165,19 +185,32 @@ int bits_for(int largest) {
 
 template <class Key>
 void sort_instances(const TileLists& lists, const SplatArrays& splats, const Profile<float>& profile,
-                    DeviceState* state, cudaStream_t stream) {
-    const int blocks = blocks_for(lists.capacity, BLOCK);
-    emit_kernel<Key><<<blocks_for(lists.n, BLOCK), BLOCK, 0, stream>>>(lists, splats, profile);
+                    int* dominant_counts, DeviceState* state, cudaStream_t stream) {
+    emit_kernel<Key>
+        <<<blocks_for(lists.n, BLOCK), BLOCK, 0, stream>>>(lists, splats, profile, dominant_counts, state);
     POP_LAUNCHED("emit_kernel");
-    fill_tail_kernel<Key><<<blocks, BLOCK, 0, stream>>>(lists, state);
-    POP_LAUNCHED("fill_tail_kernel");
     size_t bytes = lists.workspace_bytes;
     POP_CUDA(cub::DeviceRadixSort::SortPairs(
         lists.workspace, bytes, static_cast<const Key*>(lists.tile_keys[0]), static_cast<Key*>(lists.tile_keys[1]),
         static_cast<const unsigned*>(lists.slots[0]), lists.slots[1], lists.capacity, 0, bits_for(lists.n_tiles),
         stream));
-    ranges_kernel<Key><<<blocks, BLOCK, 0, stream>>>(lists, state);
+    ranges_kernel<Key><<<blocks_for(lists.capacity, BLOCK), BLOCK, 0, stream>>>(lists, state);
     POP_LAUNCHED("ranges_kernel");
+}
+
+void order_and_count(const TileLists& lists, const SplatArrays& splats, const Profile<float>& profile,
+                     cudaStream_t stream) {
+    const int blocks = blocks_for(lists.n, BLOCK);
+    depth_keys_kernel<<<blocks, BLOCK, 0, stream>>>(lists.n, splats, lists.depth_keys[0], lists.order[0]);
+    POP_LAUNCHED("depth_keys_kernel");
+    size_t bytes = lists.workspace_bytes;
+    POP_CUDA(cub::DeviceRadixSort::SortPairs(lists.workspace, bytes, lists.depth_keys[0], lists.depth_keys[1],
+                                             lists.order[0], lists.order[1], lists.n, 0, 32, stream));
+    count_kernel<<<blocks, BLOCK, 0, stream>>>(lists, splats, profile);
+    POP_LAUNCHED("count_kernel");
+    bytes = lists.workspace_bytes;
+    POP_CUDA(cub::DeviceScan::ExclusiveScan(lists.workspace, bytes, lists.counts, lists.offsets, SaturatedSum(),
+                                            0u, lists.n, stream));
 }
 
 }  // namespace
@@ -190,7 +223,7 @@ size_t tile_workspace(int n, int capacity, int n_tiles) {
     POP_CUDA(cub::DeviceRadixSort::SortPairs(nullptr, depth, u, u, u, u, n));
     POP_CUDA(cub::DeviceRadixSort::SortPairs(nullptr, tiles16, k16, k16, u, u, capacity));
     POP_CUDA(cub::DeviceRadixSort::SortPairs(nullptr, tiles32, u, u, u, u, capacity));
-    POP_CUDA(cub::DeviceScan::ExclusiveSum(nullptr, scan, u, u, n));
+    POP_CUDA(cub::DeviceScan::ExclusiveScan(nullptr, scan, u, u, SaturatedSum(), 0u, n));
     POP_CUDA(cub::DeviceScan::ExclusiveSum(nullptr, buckets, i, i, n_tiles));
     size_t most = 1;
     for (size_t bytes : {depth, tiles16, tiles32, scan, buckets}) most = bytes > most ? bytes : most;
@@ -199,31 +232,22 @@ size_t tile_workspace(int n, int capacity, int n_tiles) {
 
 void count_instances(const TileLists& lists, const SplatArrays& splats, const Profile<float>& profile,
                      DeviceState* state, cudaStream_t stream) {
-    POP_CUDA(cudaMemsetAsync(&state->n_instances, 0, sizeof(int), stream));
-    if (lists.n == 0) return;
-    const int blocks = blocks_for(lists.n, BLOCK);
-    depth_keys_kernel<<<blocks, BLOCK, 0, stream>>>(lists.n, splats, lists.depth_keys[0], lists.order[0]);
-    POP_LAUNCHED("depth_keys_kernel");
-    size_t bytes = lists.workspace_bytes;
-    POP_CUDA(cub::DeviceRadixSort::SortPairs(lists.workspace, bytes, lists.depth_keys[0], lists.depth_keys[1],
-                                             lists.order[0], lists.order[1], lists.n, 0, 32, stream));
-    count_kernel<<<blocks, BLOCK, 0, stream>>>(lists, splats, profile);
-    POP_LAUNCHED("count_kernel");
-    bytes = lists.workspace_bytes;
-    POP_CUDA(cub::DeviceScan::ExclusiveSum(lists.workspace, bytes, lists.counts, lists.offsets, lists.n, stream));
+    if (lists.n > 0) order_and_count(lists, splats, profile, stream);
+    // a caller without buffers is about to ask how many there are; one with buffers is told when they are filled
+    if (lists.n > 0 && lists.capacity > 0) return;
     total_kernel<<<1, 1, 0, stream>>>(lists, state);
     POP_LAUNCHED("total_kernel");
 }
 
 void make_tile_lists(const TileLists& lists, const SplatArrays& splats, const Profile<float>& profile,
-                     DeviceState* state, cudaStream_t stream) {
-    POP_CUDA(cudaMemsetAsync(lists.tile_begin, 0, sizeof(int) * lists.n_tiles, stream));
-    POP_CUDA(cudaMemsetAsync(lists.tile_end, 0, sizeof(int) * lists.n_tiles, stream));
-    if (lists.n > 0 && lists.capacity > 0) {
-        if (lists.n_tiles < 0xffff)
-            sort_instances<uint16_t>(lists, splats, profile, state, stream);
-        else
-            sort_instances<unsigned>(lists, splats, profile, state, stream);
+                     int* dominant_counts, DeviceState* state, cudaStream_t stream) {
+    if (lists.n == 0 || lists.capacity == 0) {
+        POP_CUDA(cudaMemsetAsync(lists.tile_begin, 0, sizeof(int) * lists.n_tiles, stream));
+        POP_CUDA(cudaMemsetAsync(lists.tile_end, 0, sizeof(int) * lists.n_tiles, stream));
+    } else if (lists.n_tiles < 0xffff) {
+        sort_instances<uint16_t>(lists, splats, profile, dominant_counts, state, stream);
+    } else {
+        sort_instances<unsigned>(lists, splats, profile, dominant_counts, state, stream);
     }
     if (lists.bucket_begin == nullptr) return;
     const int blocks = blocks_for(lists.n_tiles, BLOCK);

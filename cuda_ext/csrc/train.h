@@ -64,6 +64,7 @@ struct UpdateArrays {
     const StepConstants* constants;
     const float* sums;           // [n, RECORD]
     const int* dominant_counts;  // [n] or null
+    const uint8_t* pop_sides;    // [n], a PopSide each; read where lambda_pop is not 0
     float lambda_pop;            // 0 leaves the POP term out
     // density statistics, each may be null
     float* grad_sum;
@@ -71,6 +72,18 @@ struct UpdateArrays {
     int* dominant_sum;
     uint8_t* blurred;
     float blur_pixels;           // a view's count above it blurs
+    bool blur_own_view;          // the flag is this view's alone; else it stays up until the next event (A2)
+};
+
+// who takes part in the POP term, on which side, and what their terms come to
+struct PopTerm {
+    int n;
+    const int* dominant_counts;  // [n]
+    const int* window_counts;    // [n], of the window's views before this one; null where this view alone decides (A1)
+    const int* radii;            // [n, 2]; null where all take part, not only those that the view shows (A12)
+    const float* logits;         // [n]
+    uint8_t* sides;              // [n], a PopSide each
+    float* sums;                 // [important_blocks(n), 2], of 1 - o over the important and of o over the others
 };
 
 // what end_step keeps of a step
@@ -89,9 +102,8 @@ void target_moments(const Photographs& photographs, const LossArrays& loss, cons
 void photometric(const Photographs& photographs, const LossArrays& loss, const LossSettings& settings,
                  const DeviceState* state, cudaStream_t stream);
 void begin_step(const Schedule& schedule, StepConstants* constants, DeviceState* state, cudaStream_t stream);
-// pop_sums: [important_blocks(n), 2], sums of 1 - o over the important and of o over the others
-void count_important(int n, const int* dominant_counts, const float* logits, float* pop_sums, DeviceState* state,
-                     cudaStream_t stream);
+// also counts both sides, into state->n_important and n_others
+void count_important(const PopTerm& term, DeviceState* state, cudaStream_t stream);
 void update(const UpdateArrays& arrays, const ViewArrays& view, const ProjectSettings& settings,
             const SplatArrays& splats, DeviceState* state, cudaStream_t stream);
 void end_step(const StepRecord& record, DeviceState* state, cudaStream_t stream);

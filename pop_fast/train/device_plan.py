@@ -20,12 +20,6 @@ def unsupported(config: TrainConfig) -> str | None:
     }
     if config.method == "adc":
         known["refine_scale2d_stop_iter"] = (config.adc.refine_scale2d_stop_iter, 0)
-    else:
-        known["pop_views"] = (config.pop.pop_views, "current")
-        known["pop_over"] = (config.pop.pop_over, "all")
-        # the last view alone would have to be told apart from those before it
-        window = config.pop.blur_window
-        known["blur_window"] = (window, "any_view" if window == "own_view" else window)
     for name, (value, supported) in known.items():
         if value != supported:
             return (
@@ -59,6 +53,9 @@ def step_settings(config: TrainConfig, scene_scale: float) -> StepSettings:
         d_ssim_halved=config.d_ssim_halved,
         pixelwise_scale=1.0 / config.photometric_divisor,
         lambda_pop=pop.lambda_pop,
+        pop_views=pop.pop_views,
+        pop_over=pop.pop_over,
+        blur_window=pop.blur_window,
         theta_blur=pop.theta_blur,
         blur_min_pixels=pop.blur_min_pixels,
         background=config.background,
@@ -81,6 +78,7 @@ def phase_at(config: TrainConfig, step: int) -> Phase:
         blur=on and collects and step <= pop.blur_stop_iter,
         l1=kind == "l1",
         lambda_ssim=weight,
+        window=on and collects and pop.pop_views == "window",
     )
 
 

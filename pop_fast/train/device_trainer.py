@@ -135,12 +135,14 @@ class DeviceTrainer(TrainingRun):
         if phase.statistics:
             state["grad2d"], state["count"] = found.grad_sum.clone(), found.n_visible.to(found.grad_sum.dtype)
             state["views"] += len(views)
+        pop, summed = self.config.pop, phase.blur and self.config.pop.blur_window == "sum"
+        if summed or phase.window:
+            state["dominant_sum"] = found.dominant_sum.long()
         if not phase.blur:
             return
-        if self.config.pop.blur_window == "sum":
-            pop, height, width = self.config.pop, views[-1].height, views[-1].width
+        if summed:
+            height, width = views[-1].height, views[-1].width
             theta = max(pop.theta_blur, pop.blur_min_pixels / (height * width))
-            state["dominant_sum"] = found.dominant_sum.long()
             state["blurred"] = blur_set(state["dominant_sum"], width, height, theta)
         else:
             state["blurred"] = found.blurred.bool()

@@ -26,7 +26,11 @@ class Stepper(Protocol):
 
     step: int
     grown: int
-    statistics: Statistics
+
+    @property
+    def statistics(self) -> Statistics:
+        """What density control reads."""
+        ...
 
     def rebind(self, params: Rows, m: Rows, v: Rows) -> None:
         """Take new rows after a density event; statistics start from nothing."""

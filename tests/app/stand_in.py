@@ -82,7 +82,9 @@ class StandIn:
         loss, pop = photometric, 0.0
         if phase.pop:
             assert counts is not None
-            term = s.lambda_pop * pop_loss(opacities, importance_mask(counts))
+            before = self.statistics.dominant_sum if s.pop_views == "window" else 0
+            visible = (info["radii"][0] > 0).all(-1) if s.pop_over == "visible" else None
+            term = s.lambda_pop * pop_loss(opacities, importance_mask(counts + before), visible)
             loss, pop = photometric + term, float(term.detach())
         info["means2d"].retain_grad()
         loss.backward()
@@ -132,10 +134,12 @@ class StandIn:
             norms = torch.linalg.vector_norm(grads * unit, dim=-1)
             found.grad_sum.add_(norms.masked_fill_(~visible, 0.0).sum(0))
             found.n_visible.add_(visible.sum(0))
-        if phase.blur:
+        if phase.blur or phase.window:
             assert counts is not None
             found.dominant_sum.add_(counts.int())
-            found.blurred.logical_or_(counts > self.settings.blur_pixels(view.width, view.height))
+        if phase.blur:
+            blurred = counts > self.settings.blur_pixels(view.width, view.height)
+            found.blurred.copy_(blurred if self.settings.blur_window == "own_view" else found.blurred.bool() | blurred)
 
 
 def stand_in_hardware() -> Hardware:

@@ -55,6 +55,10 @@ CASES = {
         tiny_capture,
     ),
     "summed": (with_pop(blur_window="sum", blur_min_pixels=40.0), tiny_capture),
+    "window": (with_pop(pop_views="window", lambda_pop=0.05), tiny_capture),
+    "window after growth": (with_pop(pop_views="window", refine_stop_iter=18, blur_stop_iter=9), half_masked),
+    "visible": (with_pop(pop_over="visible", lambda_pop=0.05), tiny_capture),
+    "own view": (with_pop(blur_window="own_view"), tiny_capture),
     "phases": (with_pop(pop_start_iter=5, pop_stop_iter=13, blur_stop_iter=9, refine_stop_iter=18), tiny_capture),
     "reset": ({"method": "adc", "adc": replace(tiny_config("x").adc, reset_every=7)}, tiny_capture),
 }
@@ -209,9 +213,6 @@ def test_a_full_gpu_says_what_to_lower(error, tmp_path, monkeypatch):
     ("changes", "words"),
     [
         (with_pop(absgrad=True), "pop.absgrad = False only, not True"),
-        (with_pop(pop_views="window"), "pop.pop_views = 'current' only, not 'window'"),
-        (with_pop(pop_over="visible"), "pop.pop_over = 'all' only, not 'visible'"),
-        (with_pop(blur_window="own_view"), "pop.blur_window = 'any_view' only, not 'own_view'"),
         ({"method": "adc", "adc": ADCStrategy(refine_scale2d_stop_iter=9)}, "adc.refine_scale2d_stop_iter = 0 only"),
         ({"method": "adc", "adc": ADCStrategy(absgrad=True)}, "adc.absgrad = False only, not True"),
     ],

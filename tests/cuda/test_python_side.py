@@ -176,6 +176,15 @@ def test_the_signature_is_the_cpus():
     assert set(theirs) - set(ours) == {"backend"}
 
 
+def test_the_laws_of_antialiased_mode_judge_every_kind_of_the_cuda_backend():
+    from pop_ref.conformance.abilities import ANTIALIASING, PROFILES
+    from tests.cuda.gpu.conftest import cuda_backends
+
+    backends = cuda_backends("cpu", "cuda")
+    assert {backend.name for backend in backends} == {"cuda32-columns", "cuda32-splats", "cuda32-atomics"}
+    assert all(backend.has(need) for backend in backends for need in (ANTIALIASING, PROFILES))
+
+
 def test_spills_and_registers_are_read_from_the_compilers_words():
     (use,) = parse_ptxas("blend_forward.cu", PTXAS)
     assert (use.registers, use.shared, use.stack, use.spill_stores, use.spill_loads) == (55, 6144, 8, 4, 16)

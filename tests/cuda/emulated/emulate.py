@@ -6,6 +6,7 @@ is, bindings included, against headers that stand in for CUDA's. Device pointers
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import hashlib
 import importlib.util
@@ -33,7 +34,7 @@ FLAGS += tuple(os.environ.get("POP_EMULATED_FLAGS", "").split())
 FLAGS += ("-fvisibility=hidden", "-Wno-attributes", '-DPOP_CUDA_ARCHS="emulated"', "-DNB_DOMAIN=emulated")
 _LAUNCH = re.compile(r"([A-Za-z_]\w*(?:<[\w\s,:]*>)?)\s*<<<")
 # what the host asks and gets answered at once, also while a graph is captured
-_QUERIES = frozenset({"tile_workspace", "loss_blocks", "important_blocks", "driver_version"})
+QUERIES = frozenset({"tile_workspace", "loss_blocks", "important_blocks", "driver_version"})
 
 
 def why_not() -> str | None:
@@ -54,7 +55,8 @@ def translated(text: str) -> str:
         grid, block, *_ = _split(text[match.end() : end])
         first = text.index("(", end)
         last = _closing(text, first)
-        call = f"::emulated::launch(({grid}), ({block}), [&] {{ {match.group(1)}{text[first : last + 1]}; }})"
+        name = match.group(1).split("<")[0]
+        call = f'::emulated::launch("{name}", ({grid}), ({block}), [&] {{ {match.group(1)}{text[first : last + 1]}; }})'
         text = text[: match.start()] + call + text[last + 1 :]
     return text
 
@@ -122,11 +124,21 @@ class Kernels:
     def __init__(self, module: types.ModuleType) -> None:
         self._module, self.tape = module, None
 
+    def __dir__(self) -> list[str]:
+        return dir(self._module)
+
     def __getattr__(self, name: str) -> Any:
         found = getattr(self._module, name)
-        if self.tape is None or not callable(found) or isinstance(found, type) or name in _QUERIES:
+        if self.tape is None or not callable(found) or isinstance(found, type) or name in QUERIES:
             return found
         return lambda *arguments: self.tape.append((found, arguments))
+
+
+def nodes(library: Path) -> dict[str, int]:
+    """Return how many nodes of a graph what was launched since the last call would be, by their kernels' names."""
+    ask = ctypes.CDLL(str(library)).emulated_nodes
+    ask.restype = ctypes.c_char_p
+    return {name: int(times) for name, times in (line.split() for line in ask().decode().splitlines())}
 
 
 class NoWaiting:

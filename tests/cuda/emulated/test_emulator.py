@@ -57,8 +57,8 @@ int main() {
 def test_launches_are_read_whatever_stands_in_them():
     text = "f<3, true>\n    <<<blocks_for(n, 4), dim3(a, b), 0, stream>>>(x(1, 2),\n y); g<<<1, 2, 0, s>>>();"
     assert translated(text) == (
-        "::emulated::launch((blocks_for(n, 4)), ( dim3(a, b)), [&] { f<3, true>(x(1, 2),\n y); }); "
-        "::emulated::launch((1), ( 2), [&] { g(); });"
+        '::emulated::launch("f", (blocks_for(n, 4)), ( dim3(a, b)), [&] { f<3, true>(x(1, 2),\n y); }); '
+        '::emulated::launch("g", (1), ( 2), [&] { g(); });'
     )
 
 

@@ -83,7 +83,7 @@ def test_every_number_of_the_benchmark_is_measured(bench, gpu, monkeypatch, tmp_
     timed = found["columns_by_kernel"]["kernels"]
     assert set(timed) == set(KERNELS)
     assert {name for name, entry in timed.items() if "floor_ms" in entry} == {
-        *("project", "count_instances", "make_tile_lists", "pack_records", "blend_forward", "photometric"),
+        *("project", "count_instances", "make_tile_lists", "blend_forward", "photometric"),
         *("blend_backward", "update"),
     }
     assert set(found["ratios"]) == {"forward", "backward", "forward_backward", "step"}

@@ -41,6 +41,12 @@ CASES = {
     "losses": ({"l2_stop_iter": 4, "d_ssim_halved": True, "ssim_padding": "same"}, lambda capture: capture),
     "inria": ({"profile": "inria", "photometric_divisor": 2.0}, lambda capture: capture),
     "gsplat": ({"profile": "gsplat_1_6", "sh_interval": 2}, lambda capture: capture),
+    "visible": ({"pop": {"pop_over": "visible"}}, lambda capture: capture),
+    "window": (
+        {"pop": {"pop_views": "window", "refine_start_iter": 8, "refine_stop_iter": 7}},
+        lambda capture: capture,
+    ),
+    "own view": ({"pop": {"blur_window": "own_view"}}, masked),
 }
 
 
@@ -52,11 +58,12 @@ def records(folder):
 def test_steps_are_the_cpus_under_every_setting(hardware, case, tmp_path):
     changes, edit = CASES[case]
     # a population that stays, and rates at which rounding does not grow
-    settings = {"max_steps": 8, "log_every": 1, "pop": POPStrategy(**STILL, pop_stop_iter=6), "checkpoint_every": 0}
+    pop = POPStrategy(**{**STILL, "pop_stop_iter": 6, **changes.get("pop", {})})
+    settings = {"max_steps": 8, "log_every": 1, "checkpoint_every": 0, **changes, "pop": pop}
     capture = edit(tiny_capture())
     rates = replace(tiny_config("x").lr, quats=0.0)
-    expected = Trainer(tiny_config(tmp_path / "cpu", lr=rates, **settings, **changes), capture).run()
-    on_gpu = tiny_config(tmp_path / "gpu", lr=rates, **settings, **changes)
+    expected = Trainer(tiny_config(tmp_path / "cpu", lr=rates, **settings), capture).run()
+    on_gpu = tiny_config(tmp_path / "gpu", lr=rates, **settings)
     found = DeviceTrainer(on_gpu, capture, hardware=hardware).run()
     for ours, theirs in zip(records(tmp_path / "gpu"), records(tmp_path / "cpu"), strict=True):
         assert ours.pop("view") == theirs.pop("view")
@@ -107,12 +114,12 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(hardware, method, tmp_path,
 
 
 def test_buffers_that_overflow_between_views_of_several_sizes_lose_nothing(hardware, tmp_path, monkeypatch):
-    from cuda_ext import train_step
+    from cuda_ext import capacity
 
     capture = mixed_sizes(tiny_capture())
     whole = DeviceTrainer(tiny_config(tmp_path / "whole"), capture, hardware=hardware)
     whole.run()
-    monkeypatch.setattr(train_step, "FIRST_GUESS", (0, 1))
+    monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 1))
     cramped = DeviceTrainer(tiny_config(tmp_path / "cramped"), capture, hardware=hardware)
     assert cramped.run()["instance_buffers_grown"] > 0
     for key, value in whole.params.items():

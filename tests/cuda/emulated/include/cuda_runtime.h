@@ -27,10 +27,6 @@ inline cudaError_t cudaDriverGetVersion(int* version) {
     *version = CUDART_VERSION;
     return cudaSuccess;
 }
-inline cudaError_t cudaMemsetAsync(void* data, int value, size_t bytes, cudaStream_t) {
-    std::memset(data, value, bytes);
-    return cudaSuccess;
-}
 
 struct float2 {
     float x, y;
@@ -52,7 +48,9 @@ extern dim3 thread_index, block_index, block_size, grid_size;
 
 enum class Meeting { sync, ballot, shuffle, match };
 
-void launch(dim3 grid, dim3 block, const std::function<void()>& kernel);
+void launch(const char* name, dim3 grid, dim3 block, const std::function<void()>& kernel);
+// what a CUDA graph of these calls would consist of
+void count_nodes(const char* name, int times);
 // wait for the lanes of the mask that have not left; everyone finds all values in `all`. Returns who took part.
 unsigned meet_warp(unsigned mask, Meeting kind, uint64_t value, uint64_t* all);
 void meet_block();
@@ -85,6 +83,12 @@ T shuffled(unsigned mask, T value, int source) {
 }
 
 }  // namespace emulated
+
+inline cudaError_t cudaMemsetAsync(void* data, int value, size_t bytes, cudaStream_t) {
+    emulated::count_nodes("memset", 1);
+    std::memset(data, value, bytes);
+    return cudaSuccess;
+}
 
 #define threadIdx ::emulated::thread_index
 #define blockIdx ::emulated::block_index
@@ -138,6 +142,7 @@ inline unsigned __match_any_sync(unsigned mask, int value) {
     return same;
 }
 
+inline unsigned __umulhi(unsigned a, unsigned b) { return unsigned((uint64_t(a) * b) >> 32); }
 inline int __popc(unsigned value) { return __builtin_popcount(value); }
 inline int __ffs(unsigned value) { return __builtin_ffs(int(value)); }
 inline unsigned __float_as_uint(float value) { return emulated::value_of<unsigned>(emulated::bits_of(value)); }
@@ -145,6 +150,11 @@ inline unsigned __float_as_uint(float value) { return emulated::value_of<unsigne
 template <class T>
 T __ldg(const T* address) {
     return *address;
+}
+
+template <class T>
+void __stwb(T* address, T value) {
+    *address = value;
 }
 
 template <class T>

@@ -1,4 +1,4 @@
-// CUB's sums of all entries before each.
+// CUB's scans: what all entries before each one come to.
 #pragma once
 
 #include <cuda_runtime.h>
@@ -6,20 +6,26 @@
 namespace cub {
 
 struct DeviceScan {
-    template <class T>
-    static cudaError_t ExclusiveSum(void* workspace, size_t& bytes, const T* in, T* out, int n,
-                                    cudaStream_t = nullptr) {
+    template <class T, class Operation>
+    static cudaError_t ExclusiveScan(void* workspace, size_t& bytes, const T* in, T* out, Operation operation, T total,
+                                     int n, cudaStream_t = nullptr) {
         if (workspace == nullptr) {
             bytes = 1;
             return cudaSuccess;
         }
-        T total = 0;
+        emulated::count_nodes("DeviceScan", 2);
         for (int k = 0; k < n; ++k) {
             const T value = in[k];
             out[k] = total;
-            total += value;
+            total = operation(total, value);
         }
         return cudaSuccess;
+    }
+
+    template <class T>
+    static cudaError_t ExclusiveSum(void* workspace, size_t& bytes, const T* in, T* out, int n,
+                                    cudaStream_t stream = nullptr) {
+        return ExclusiveScan(workspace, bytes, in, out, std::plus<T>(), T(0), n, stream);
     }
 };
 

@@ -1,0 +1,125 @@
+"""What a step asks of a GPU: how many nodes its graph has, when one is captured, and on which device it all is."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from contextlib import contextmanager
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from cuda_ext.train_settings import Phase  # noqa: E402  torch first
+from tests.cuda.gpu.scene import HEIGHT, STEPS, WIDTH, training_scene  # noqa: E402
+from tests.cuda.gpu.steps import fused_trainer  # noqa: E402
+
+from . import emulate  # noqa: E402
+from .conftest import FOLDER  # noqa: E402
+
+POP = Phase(3, True, True, True)
+SORTS_AND_SCANS = {"DeviceRadixSort", "DeviceScan", "memset"}
+
+
+def nodes_of_a_step(gpu, phase, **settings):
+    _, trainer = fused_trainer(training_scene(), gpu, **settings)
+    trainer.run(1, phase)
+    emulate.nodes(emulate.build(FOLDER))
+    trainer.run(2, phase)
+    return emulate.nodes(emulate.build(FOLDER))
+
+
+def test_a_step_is_few_kernels_each_launched_once(gpu):
+    found = nodes_of_a_step(gpu, POP)
+    own = {name: times for name, times in found.items() if name not in SORTS_AND_SCANS}
+    assert set(own.values()) == {1}
+    # with 22 of sorts and scan, whatever a photograph's size: it was 44 with clears, a total and a packing of their own
+    assert len(own) <= 15, sorted(own)
+
+
+def test_nothing_is_cleared_by_a_launch_of_its_own(gpu):
+    found = nodes_of_a_step(gpu, POP)
+    # depths are sorted by 32 bits, the scene's 15 tiles by 4; all memsets are the sorts' own
+    assert found["memset"] == (2 + 4) + (2 + 1)
+    assert found["DeviceRadixSort"] == (2 + 4) + (2 + 1)
+    assert found["DeviceScan"] == 2
+
+
+def test_a_step_without_dominance_does_not_count_importance(gpu):
+    assert "count_important_kernel" not in nodes_of_a_step(gpu, Phase(3, False, False, False))
+
+
+def test_a_step_is_captured_when_its_kind_comes_again_and_once(gpu, monkeypatch):
+    from cuda_ext import train_step
+
+    captured, captures = train_step.captured, []
+
+    def counting(launch, device):
+        captures.append(launch)
+        return captured(launch, device)
+
+    monkeypatch.setattr(train_step, "captured", counting)
+    scene = training_scene()
+    # three views of three sizes: a kind is a size and a phase
+    scene.photographs = [image[: HEIGHT - k, : WIDTH - k].contiguous() for k, image in enumerate(scene.photographs)]
+    (params, m, v), trainer = fused_trainer(scene, gpu)
+    trainer.run(3, POP)
+    assert len(captures) == 0
+    trainer.run(4, POP)
+    assert len(captures) == 1
+    trainer.run(7, POP)
+    assert len(captures) == 3
+    trainer.rebind(params, m, v)
+    trainer.run(STEPS, POP)
+    assert len(captures) == 3
+    assert Counter(map(scene.order[7:].count, range(3))) == {1: 3}
+
+
+@pytest.fixture
+def guarded(gpu, monkeypatch):
+    """Fail on a launch outside of `torch.cuda.device_of(a tensor)`, as a launch on another GPU would."""
+    kernels, depth = sys.modules["cuda_ext._kernels"], []
+
+    @contextmanager
+    def device_of(tensor):
+        assert isinstance(tensor, torch.Tensor)
+        depth.append(tensor)
+        yield
+        depth.pop()
+
+    class Guarded:
+        def __getattr__(self, name):
+            found = getattr(kernels, name)
+            if not callable(found) or isinstance(found, type) or name in emulate.QUERIES:
+                return found
+
+            def launch(*arguments):
+                assert depth, f"{name} is launched on whatever device is current"
+                return found(*arguments)
+
+            return launch
+
+    monkeypatch.setitem(sys.modules, "cuda_ext._kernels", Guarded())
+    monkeypatch.setattr(torch.cuda, "device_of", device_of)
+    return gpu
+
+
+def test_fused_steps_are_launched_on_the_tensors_device(guarded):
+    for replay in (True, False):
+        _, trainer = fused_trainer(training_scene(), guarded, replay=replay)
+        trainer.run(STEPS, POP)
+
+
+def test_a_render_and_its_gradients_are_launched_on_the_tensors_device(guarded):
+    from cuda_ext.ops import rasterization
+
+    scene = training_scene()
+    p = {name: value.requires_grad_() for name, value in scene.params.items()}
+    image, _, meta = rasterization(
+        p["means"], p["quats"], p["scales"].exp(), torch.sigmoid(p["opacities"]), p["sh0"], scene.viewmats[:1],
+        scene.Ks[:1], WIDTH, HEIGHT, sh_degree=0,
+    )  # fmt: skip
+    image.sum().backward()
+    assert bool(p["means"].grad.any())
+    for key in ("isect_offsets", "n_traversed", "dominant_counts"):
+        assert meta[key] is not None

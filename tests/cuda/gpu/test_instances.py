@@ -1,0 +1,125 @@
+"""How many (splat, tile) instances there are: counts that pass what an int holds, and room that follows the need."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from pop_ref.constants import PAPER  # noqa: E402
+
+from .scene import STEPS, N, training_scene  # noqa: E402  torch first
+from .steps import fused_trainer  # noqa: E402
+
+# 30,000 x 30,000 tiles of 16 x 8 px; a splat that covers them all has as many instances
+ACROSS, PER_SPLAT = 30_000, 900_000_000
+INT_MAX = 2**31 - 1
+
+
+def wide_splats(gpu, n, lists):
+    """Return splats that cover every tile of a huge grid, and the lists' struct made ready to count them."""
+    from cuda_ext import load
+    from cuda_ext.arrays import fill
+    from cuda_ext.lists import splat_struct
+
+    kernels = load()
+    lists.n, lists.exact = n, False
+    lists.set_grid(16 * ACROSS, 8 * ACROSS, 16, 8)
+    assert lists.n_tiles == PER_SPLAT
+    names = ("depth_keys", "depth_keys_sorted", "order_unsorted", "order", "counts", "offsets")
+    for name in (*names, "splat_begin", "splat_count"):
+        fill(lists, **{name: torch.zeros(n, dtype=torch.int32, device=gpu)})
+    lists.workspace_bytes = kernels.tile_workspace(n, 1024, PER_SPLAT)
+    fill(lists, workspace=torch.zeros(lists.workspace_bytes, dtype=torch.uint8, device=gpu))
+    middle = torch.tensor([8.0 * ACROSS, 4.0 * ACROSS], device=gpu).repeat(n, 1)
+    return splat_struct(
+        middle,
+        torch.arange(1.0, n + 1, device=gpu),
+        torch.ones((n, 3), device=gpu),
+        torch.ones(n, device=gpu),
+        torch.full((n, 2), 16 * ACROSS, dtype=torch.int32, device=gpu),
+        None,
+    )
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 5, 6, 9, 10])
+def test_instances_beyond_an_int_are_the_largest_int_and_not_few(gpu, n):
+    from cuda_ext import load
+    from cuda_ext.arrays import N_INSTANCES, kernel_profile, new_state, stream_of
+
+    kernels, state = load(), new_state(gpu)
+    lists = kernels.TileLists()
+    splats = wide_splats(gpu, n, lists)
+    kernels.count_instances(lists, splats, kernel_profile(PAPER, 16), state.data_ptr(), stream_of(gpu))
+    assert state[N_INSTANCES] == min(n * PER_SPLAT, INT_MAX)
+
+
+@pytest.mark.parametrize("before", [2**31 - 40, 2**31 - 1, 2**31, 2**32 - 1])
+def test_a_count_that_passes_an_int_halts_the_device_and_lists_nothing(gpu, before):
+    from cuda_ext import load
+    from cuda_ext.arrays import N_INSTANCES, OVERFLOW, kernel_profile, stream_of
+
+    state, buffers, splats = counted(gpu)
+    buffers.reserve(1024)
+    # the last splat's slots as they are behind a multitude of others
+    offsets = buffers.tensor("offsets")
+    offsets[-1] = before if before <= INT_MAX else before - 2**32
+    buffers.tensor("counts")[-1] = 45
+    kernels, profile = load(), kernel_profile(PAPER, 16)
+    kernels.make_tile_lists(buffers.struct, splats, profile, 0, state.data_ptr(), stream_of(gpu))
+    assert state[OVERFLOW] == state[N_INSTANCES] == INT_MAX
+    for name in ("splat_count", "tile_begin", "tile_end"):
+        assert not buffers.tensor(name).any(), name
+
+
+def counted(gpu):
+    """Return the state, the lists and the splats of the training scene, which has been counted."""
+    from cuda_ext import load
+    from cuda_ext.arrays import kernel_profile, new_state, stream_of
+    from cuda_ext.lists import TileBuffers, splat_struct
+
+    g = torch.Generator().manual_seed(0)
+    made = {
+        "means2d": torch.rand((N, 2), generator=g) * 40.0,
+        "depths": torch.rand(N, generator=g) + 1.0,
+        "conics": torch.tensor([0.1, 0.0, 0.1]).repeat(N, 1),
+        "opacities": torch.full((N,), 0.5),
+        "radii": torch.full((N, 2), 9, dtype=torch.int32),
+    }
+    splats = splat_struct(**{name: value.to(gpu) for name, value in made.items()}, colors=None)
+    state, buffers = new_state(gpu), TileBuffers(N, 48, 36, (16, 8), True, gpu, buckets=False)
+    profile = kernel_profile(PAPER, 16)
+    load().count_instances(buffers.struct, splats, profile, state.data_ptr(), stream_of(gpu))
+    return state, buffers, splats
+
+
+def test_more_entries_than_the_kernels_can_number_are_refused_in_one_line(gpu):
+    from cuda_ext.arrays import CudaMemoryError
+
+    _, buffers, _ = counted(gpu)
+    with pytest.raises(CudaMemoryError, match=r"would have 2,147,483,647 entries or more; .* lower the number"):
+        buffers.reserve(INT_MAX)
+
+
+def test_room_shrinks_after_a_phase_of_fat_splats_and_the_steps_stay_the_same(gpu, monkeypatch):
+    from cuda_ext import capacity
+    from cuda_ext.train_settings import Phase
+
+    monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 64))
+    phase, scene = Phase(3, True, True, True), training_scene()
+    fat = {**scene.params, "scales": scene.params["scales"] + 1.5}
+    (params, m, v), trainer = fused_trainer(replace(scene, params=fat), gpu)
+    trainer.run(3, phase)
+    ((size, wide),) = trainer.capacities.items()
+    assert trainer.grown > 0
+    params["scales"].copy_(scene.params["scales"] - 0.5)
+    trainer.rebind(params, m, v)
+    trainer.run(6, phase)
+    assert trainer.capacities[size] == wide
+    grown, thin = trainer.grown, trainer.n_instances
+    trainer.rebind(params, m, v)
+    trainer.run(STEPS, phase)
+    assert thin <= trainer.capacities[size] < 0.5 * wide
+    assert trainer.grown == grown

@@ -1,0 +1,44 @@
+"""Ten steps on the GPU beside the CPU's under other readings of what the paper leaves open (A1, A2, A12)."""
+
+from __future__ import annotations
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from .scene import STEPS, training_scene  # noqa: E402  torch first
+from .steps import THETA, apart, fused, on_the_cpu  # noqa: E402
+
+READINGS = (
+    {"pop_over": "visible"},
+    {"pop_views": "window"},
+    {"pop_over": "visible", "pop_views": "window"},
+    {"blur_window": "own_view"},
+)
+
+
+@pytest.mark.parametrize("family", ["columns", "splats"])
+@pytest.mark.parametrize("reading", READINGS, ids=lambda reading: "-".join(reading.values()))
+def test_ten_fused_steps_under_another_reading_are_the_cpus(gpu, reading, family):
+    scene, strong = training_scene(), {"lambda_pop": 0.05}
+    # no view shows all, and one shows others than the two beside it
+    scene.params["means"][:16, 2] *= -1.0
+    scene.viewmats[2, 0, 3] = 1.5
+    window = reading.get("pop_views") == "window"
+    losses, params, trainer = fused(scene, gpu, window, family=family, theta_blur=THETA, **strong, **reading)
+    expected, terms, wanted, state = on_the_cpu(scene, **strong, **reading)
+    torch.testing.assert_close(torch.tensor(losses), torch.tensor(expected), rtol=1e-4, atol=1e-6)
+    told = torch.tensor([values.pop for values in trainer.told(0, STEPS)])
+    torch.testing.assert_close(told, torch.tensor(terms), rtol=1e-4, atol=1e-6)
+    for name, value in wanted.items():
+        assert apart(params[name], value, name) < 0.01, name
+    found = trainer.statistics
+    assert torch.equal(found.blurred.bool().cpu(), state["blurred"])
+    if window:
+        assert torch.equal(found.dominant_sum.long().cpu(), state["dominant_sum"])
+    # and the reading matters here
+    *_, usual, usual_state = on_the_cpu(scene, **strong)
+    if "blur_window" in reading:
+        assert 0 < int(state["blurred"].sum()) < int(usual_state["blurred"].sum())
+    else:
+        assert apart(usual["opacities"], wanted["opacities"], "opacities") > 0.05

@@ -1,0 +1,108 @@
+"""Rows of harmonics of every width and place in memory: projected, their gradients, and Adam's moments after a step.
+
+70 Gaussians are two full warps, which read pieces of 16 bytes, and a part of one, which reads floats.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from .scene import HEIGHT, LR, WIDTH, TrainingScene, training_scene  # noqa: E402  torch first
+
+N = 70
+# active degree, bands beyond the first in memory; the last is wider than any degree needs
+DEGREES = [(0, 0), (0, 15), (1, 3), (1, 15), (2, 8), (2, 15), (3, 15), (3, 17)]
+
+
+def _scene(n_rest: int) -> TrainingScene:
+    scene = training_scene()
+    params = {name: value[:N].clone() for name, value in scene.params.items()}
+    params["means"][::5, 2] = -1.0  # behind the camera
+    g = torch.Generator().manual_seed(n_rest)
+    params["shN"] = torch.randn((N, n_rest, 3), generator=g) * 0.1
+    return TrainingScene(params, scene.viewmats, scene.Ks, scene.photographs, scene.order)
+
+
+def _moved(value: torch.Tensor, floats: int) -> torch.Tensor:
+    """Copy a tensor to an address so many floats behind one that is a multiple of 16."""
+    place = torch.zeros(value.numel() + 4, dtype=value.dtype, device=value.device)
+    moved = place[floats : floats + value.numel()].view(value.shape)
+    assert moved.data_ptr() % 16 == 4 * floats
+    return moved.copy_(value)
+
+
+def _moments(scene: TrainingScene, device, degree: int, floats: int = 0):
+    """Take a step on the device and return Adam's first moments, a tenth of the gradients, and the parameters."""
+    from cuda_ext.resident import ResidentViews
+    from cuda_ext.train_settings import Phase, StepSettings
+    from cuda_ext.train_step import FusedTrainer
+
+    params = {name: _moved(value.to(device), floats) for name, value in scene.params.items()}
+    m, v = ({name: _moved(torch.zeros_like(value), floats) for name, value in params.items()} for _ in range(2))
+    views = ResidentViews(scene.photographs, scene.viewmats, scene.Ks, None, "valid", device)
+    trainer = FusedTrainer(params, m, v, views, scene.order, StepSettings(LR, 1, means_decay=1.0))
+    trainer.run(1, Phase(degree, False, False, False))
+    return {name: value.cpu() for name, value in m.items()}, {name: value.cpu() for name, value in params.items()}
+
+
+def _draw(function, scene: TrainingScene, sh: torch.Tensor, device, degree: int):
+    leaves = {name: value.to(device).clone().requires_grad_() for name, value in scene.params.items()}
+    image, _, _ = function(
+        leaves["means"], leaves["quats"], leaves["scales"].exp(), torch.sigmoid(leaves["opacities"]), sh,
+        scene.viewmats[:1].to(device), scene.Ks[:1].to(device), WIDTH, HEIGHT, sh_degree=degree, packed=False,
+    )  # fmt: skip
+    return image[0], leaves
+
+
+@pytest.mark.parametrize(("degree", "n_rest"), DEGREES)
+def test_a_steps_gradients_are_the_cpus_at_every_degree(gpu, degree, n_rest):
+    from pop_fast.losses import photometric_pop
+    from pop_fast.rasterization import rasterization
+
+    scene = _scene(n_rest)
+    found, after = _moments(scene, gpu, degree)
+    sh = {name: scene.params[name].clone().requires_grad_() for name in ("sh0", "shN")}
+    image, leaves = _draw(rasterization, scene, torch.cat((sh["sh0"], sh["shN"]), 1), "cpu", degree)
+    photometric_pop(image, scene.photographs[scene.order[0]].float() / 255.0).backward()
+    for name, leaf in (leaves | sh).items():
+        wanted = torch.zeros_like(leaf) if leaf.grad is None else 0.1 * leaf.grad
+        torch.testing.assert_close(found[name], wanted, rtol=2e-3, atol=1e-4 * float(wanted.abs().max() if wanted.numel() else 0))
+        assert name == "shN" or bool(wanted.any()), f"{name} has no gradient"
+    active = (degree + 1) ** 2 - 1
+    assert degree == 0 or bool(found["shN"][:, :active].any())
+    assert not bool(found["shN"][:, active:].any())
+    assert torch.equal(after["shN"][:, active:], scene.params["shN"][:, active:])
+
+
+@pytest.mark.parametrize(("degree", "n_rest"), [(1, 15), (3, 15)])
+def test_rows_that_begin_anywhere_take_the_same_step(gpu, degree, n_rest):
+    scene = _scene(n_rest)
+    expected, places = _moments(scene, gpu, degree), range(1, 4)
+    for found in (_moments(scene, gpu, degree, floats) for floats in places):
+        for one, other in zip(expected, found, strict=True):
+            for name, value in one.items():
+                torch.testing.assert_close(other[name], value, rtol=1e-6, atol=1e-7 * float(value.abs().max()))
+
+
+@pytest.mark.parametrize("floats", [0, 1])
+@pytest.mark.parametrize(("degree", "n_rest"), DEGREES)
+def test_coefficients_of_any_width_and_place_give_the_cpus_image_and_gradient(gpu, degree, n_rest, floats):
+    from cuda_ext.ops import rasterization as on_gpu
+    from pop_fast.rasterization import rasterization as on_cpu
+
+    scene = _scene(n_rest)
+    whole = torch.cat((scene.params["sh0"], scene.params["shN"]), 1)
+    weights = torch.linspace(-1, 1, WIDTH * HEIGHT * 3).reshape(HEIGHT, WIDTH, 3)
+    images, grads = [], []
+    for function, device in ((on_cpu, "cpu"), (on_gpu, gpu)):
+        sh = _moved(whole.to(device), floats).requires_grad_()
+        image, leaves = _draw(function, scene, sh, device, degree)
+        (image * weights.to(device)).sum().backward()
+        images.append(image.detach().cpu())
+        grads.append({"sh": sh.grad.cpu()} | {k: v.grad.cpu() for k, v in leaves.items() if v.grad is not None})
+    torch.testing.assert_close(images[1], images[0], rtol=1e-4, atol=1e-5)
+    for name, value in grads[0].items():
+        torch.testing.assert_close(grads[1][name], value, rtol=1e-3, atol=1e-4 * float(value.abs().max()))
+    assert bool(grads[0]["sh"][:, : (degree + 1) ** 2].any(0).all())
