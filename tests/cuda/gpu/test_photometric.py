@@ -63,7 +63,9 @@ def test_values_and_gradient_are_those_of_float64(gpu, size, padding, l1, masked
 
 def test_a_mask_that_keeps_nothing_compares_nothing(gpu):
     photograph, image, _ = _photographs(40, 40, False)
-    values, v_image = _found(gpu, photograph, image, torch.zeros(40, 40, dtype=torch.bool), "valid", False, (1, 1), True)
+    values, v_image = _found(
+        gpu, photograph, image, torch.zeros(40, 40, dtype=torch.bool), "valid", False, (1, 1), True
+    )
     assert values.tolist() == [0.0, 1.0, 0.0, 0.0]
     assert not bool(v_image.any())
 
