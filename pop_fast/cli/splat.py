@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import torch
 import tyro
 from torch import Tensor
 
@@ -16,14 +15,12 @@ from pop_fast.cli.progress import bars
 from pop_fast.data import Capture, load_capture
 from pop_fast.errors import PopError
 from pop_fast.io.ply import is_antialiased, load_ply
-from pop_fast.train.checkpoint import list_checkpoints
+from pop_fast.train.checkpoint import list_checkpoints, load_splats
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.model import KEYS, first_non_finite
 from pop_fast.train.results import read_config
 from pop_fast.train.schedule import active_sh_degree
 
 RECORD = "capture.json"
-_SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +118,7 @@ def load_splat(path: Path) -> Splat:
         config = replace(config, antialiased=is_antialiased(path))
         return Splat(path=path, params=load_ply(path), config=config, folder=owner)
     if kind == ".pt":
-        params, step = _read_checkpoint(path)
+        params, step = load_splats(path)
         return Splat(path=path, params=params, config=config, step=step, folder=owner)
     raise PopError(f"{path}: is neither a result folder nor a checkpoint (.pt) nor a .ply")
 
@@ -130,46 +127,12 @@ def _from_folder(folder: Path) -> Splat:
     config = read_config(folder)
     checkpoints = list_checkpoints(folder)
     if checkpoints:
-        params, step = _read_checkpoint(checkpoints[-1][1])
+        params, step = load_splats(checkpoints[-1][1])
         return Splat(path=checkpoints[-1][1], params=params, config=config, step=step, folder=folder)
     plys = sorted((folder / "ply").glob("point_cloud_*.ply"), key=lambda p: (len(p.name), p.name))
     if not plys:
         raise PopError(f"{folder}: holds no checkpoint and no PLY yet; train longer, or continue with --resume")
     return Splat(path=plys[-1], params=load_ply(plys[-1]), config=config, folder=folder)
-
-
-def _read_checkpoint(path: Path) -> tuple[dict[str, Tensor], int | None]:
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise PopError(f"{path}: cannot be read as a checkpoint; copy it again, or use another one") from error
-    splats: Any = content.get("splats", {}) if isinstance(content, dict) else {}
-    absent = [key for key in KEYS if key not in splats]
-    if absent:
-        raise PopError(f"{path}: has no splats.{absent[0]}, so it is no checkpoint of 'pop train' or gsplat")
-    _check_shapes(path, splats)
-    params = {key: splats[key].detach().float() for key in KEYS}
-    bad = first_non_finite(params)
-    if bad:
-        raise PopError(f"{path}: splats.{bad[0]}{bad[1]} is {bad[2]}; every entry must be finite: use an earlier one")
-    step = content.get("step")
-    return params, step if isinstance(step, int) else None
-
-
-def _check_shapes(path: Path, splats: Any) -> None:
-    n: int | None = None
-    for name, tail in _SHAPES.items():
-        value = splats[name]
-        if not isinstance(value, Tensor) or not value.is_floating_point():
-            found = str(value.dtype) if isinstance(value, Tensor) else type(value).__name__
-            raise PopError(f"{path}: splats.{name} is {found}; it must be a tensor of floats")
-        n = len(value) if n is None and value.dim() > 0 else n
-        want = [n, *tail]
-        if name == "shN" and value.dim() == 3 and value.shape[1] in (0, 3, 8):
-            want[1] = value.shape[1]
-        if list(value.shape) != want:
-            bands = " (or 0, 3 or 8 in place of 15)" if name == "shN" else ""
-            raise PopError(f"{path}: splats.{name} has shape {list(value.shape)}; it must be {want}{bands}")
 
 
 def open_capture(splat: Splat, options: CaptureOptions) -> tuple[Capture, TrainConfig]:

@@ -16,7 +16,7 @@ from plyfile import PlyData, PlyElement
 
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
-from pop_fast.io.points import read_vertices
+from pop_fast.io.ply_rows import column, read_header, read_vertices
 
 __all__ = ["is_antialiased", "load_ply", "save_ply", "save_splat"]
 
@@ -92,7 +92,7 @@ def load_ply(path: str | os.PathLike[str]) -> dict[str, torch.Tensor]:
         PopError: the file is absent, truncated or corrupt, is no splat, or holds NaN, Inf or a zero quaternion.
     """
     path = Path(path)
-    _, rows = read_vertices(path)
+    rows = read_vertices(path)
     names = set(rows.dtype.names or ())
     needed = [c for c in _COLUMNS if not c.startswith(("n", "f_rest"))]
     absent = [name for name in needed if name not in names]
@@ -102,8 +102,8 @@ def load_ply(path: str | os.PathLike[str]) -> dict[str, torch.Tensor]:
     if count not in (0, 9, 24, 45) or any(f"f_rest_{i}" not in names for i in range(count)):
         raise PopError(f"{path}: vertex has {count} f_rest properties; there must be 0, 9, 24 or 45, without a gap")
 
-    def column(*wanted: str) -> np.ndarray:
-        stacked = np.stack([rows[name].astype(np.float32) for name in wanted], axis=1)
+    def columns(*wanted: str) -> np.ndarray:
+        stacked = np.stack([column(path, rows, name, np.float32) for name in wanted], axis=1)
         bad = np.argwhere(~np.isfinite(stacked))
         if len(bad):
             row, which = (int(i) for i in bad[0])
@@ -114,18 +114,18 @@ def load_ply(path: str | os.PathLike[str]) -> dict[str, torch.Tensor]:
     rest = np.zeros((n, 15, 3), np.float32)
     if count:
         rest[:, : count // 3] = (
-            column(*(f"f_rest_{i}" for i in range(count))).reshape(n, 3, count // 3).transpose(0, 2, 1)
+            columns(*(f"f_rest_{i}" for i in range(count))).reshape(n, 3, count // 3).transpose(0, 2, 1)
         )
-    quats = column(*(f"rot_{i}" for i in range(4)))
+    quats = columns(*(f"rot_{i}" for i in range(4)))
     if n and not quats.any(axis=1).all():
         row = int(np.argmin(quats.any(axis=1)))
         raise PopError(f"{path}: vertex[{row}].rot is a zero quaternion; write [1, 0, 0, 0] for no rotation")
     arrays = {
-        "means": column("x", "y", "z"),
-        "scales": column(*(f"scale_{i}" for i in range(3))),
+        "means": columns("x", "y", "z"),
+        "scales": columns(*(f"scale_{i}" for i in range(3))),
         "quats": quats,
-        "opacities": column("opacity")[:, 0],
-        "sh0": column(*(f"f_dc_{i}" for i in range(3)))[:, None, :],
+        "opacities": columns("opacity")[:, 0],
+        "sh0": columns(*(f"f_dc_{i}" for i in range(3)))[:, None, :],
         "shN": rest,
     }
     return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}
@@ -133,8 +133,8 @@ def load_ply(path: str | os.PathLike[str]) -> dict[str, torch.Tensor]:
 
 def is_antialiased(path: str | os.PathLike[str]) -> bool:
     """Tell whether a PLY file asks to be drawn with antialiasing: its comment `SplatRenderMode: mip`."""
-    ply, _ = read_vertices(Path(path))
-    return any(comment.strip().startswith(_MODE) and comment.split()[-1] == "mip" for comment in ply.comments)
+    comments = read_header(Path(path)).comments
+    return any(comment.startswith(_MODE) and comment.split()[-1] == "mip" for comment in comments)
 
 
 def save_splat(path: str | os.PathLike[str], params: dict[str, torch.Tensor]) -> int:

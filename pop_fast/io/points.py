@@ -2,49 +2,19 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyParseError
 
 from pop_fast.errors import PopError
+from pop_fast.io.ply_rows import column, read_vertices
 
-__all__ = ["FARTHEST", "find_bad_coordinate", "read_points", "read_vertices"]
+__all__ = ["FARTHEST", "find_bad_coordinate", "read_points"]
 
 # the square of a distance must stay a number in single precision, and a scene of this size is a corrupt file
 FARTHEST = 1e15
 # a float colour may lie a little over 1 without being one of those up to 255
 _BRIGHTEST = 2.0
-
-
-def read_vertices(path: Path) -> tuple[PlyData, np.ndarray]:
-    """Read a PLY file, ASCII or binary of either byte order, and return it with the rows of its element `vertex`.
-
-    Raises:
-        PopError: absent, truncated, corrupt, or without vertices as element.
-    """
-    try:
-        ply = _read_ply(path)
-        return ply, np.array(ply["vertex"].data)
-    except FileNotFoundError:
-        raise PopError(f"{path}: the PLY file is absent; check the path") from None
-    except KeyError:
-        raise PopError(f"{path}: has no element 'vertex'; it is not a point cloud or a splat") from None
-    except (PlyParseError, ValueError, IndexError, EOFError, OverflowError, MemoryError, TypeError) as error:
-        raise PopError(f"{path}: the PLY file is truncated or corrupt: {error}; copy or write it again") from error
-    except OSError as error:
-        raise PopError(f"{path}: could not be read: {error.strerror}; check the path and its permissions") from error
-
-
-def _read_ply(path: Path) -> PlyData:
-    try:
-        return PlyData.read(str(path))
-    except UnicodeDecodeError:
-        # plyfile reads headers as ASCII, and comments are written in any language
-        head, end, rows = path.read_bytes().partition(b"\nend_header")
-        head = bytes(byte if byte < 128 else ord("?") for byte in head)
-        return PlyData.read(io.BytesIO(head + end + rows))
 
 
 def find_bad_coordinate(xyz: np.ndarray) -> tuple[int, int] | None:
@@ -61,12 +31,12 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         PopError: as `read_vertices`; a coordinate is absent, NaN, Inf or absurd, or a colour is none of these.
     """
-    _, rows = read_vertices(path)
+    rows = read_vertices(path)
     names = rows.dtype.names or ()
     for name in "xyz":
         if name not in names:
             raise PopError(f"{path}: vertex has no property {name!r}; a point cloud needs x, y and z")
-    xyz = np.stack([rows[name].astype(np.float64) for name in "xyz"], axis=1)
+    xyz = np.stack([column(path, rows, name, np.float64) for name in "xyz"], axis=1)
     bad = find_bad_coordinate(xyz)
     if bad is not None:
         row, axis = bad
@@ -82,7 +52,7 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def _colors(path: Path, rows: np.ndarray) -> np.ndarray:
     names = ("red", "green", "blue")
     fractions = any(rows.dtype[name].kind == "f" for name in names)
-    rgb = np.stack([rows[name].astype(np.float64) for name in names], axis=1)
+    rgb = np.stack([column(path, rows, name, np.float64) for name in names], axis=1)
     bad = np.argwhere(~((rgb >= 0.0) & (rgb <= 65535.0)))
     if len(bad):
         row, which = (int(i) for i in bad[0])

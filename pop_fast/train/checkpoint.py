@@ -1,7 +1,8 @@
 """Checkpoints: all that a run needs to go on with the same bits, in one file that is written whole or not at all.
 
 The file is a dict that `torch.load(weights_only=True)` reads, so loading one cannot run code. `splats` and `step` are
-gsplat's keys: its trainer evaluates these files as they are.
+gsplat's keys: its trainer evaluates these files as they are. What is read is checked first, bit by bit against its
+checksums and entry by entry (`checkpoint_checks`), so that a damaged or forged file ends in a sentence.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -21,11 +22,14 @@ from torch.optim import Optimizer
 from pop_fast.data.capture import Capture
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
+from pop_fast.io.torch_file import read_torch_file
 from pop_fast.strategies.base import State
+from pop_fast.train.checkpoint_checks import check_content, check_splats, shown
 from pop_fast.train.config import TrainConfig, first_difference
 
 FORMAT = 1
 _NAME = re.compile(r"ckpt_(\d+)_rank0\.pt")
+_DAMAGED = "remove the file to go on from the one before it"
 _NEEDED = (
     "format",
     "step",
@@ -64,34 +68,98 @@ def prune_checkpoints(result_dir: Path, keep_last: int, keep_steps: set[int]) ->
 
 
 def save_checkpoint(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a checkpoint; a reader finds the old file or the new one, never a part."""
-    write_atomically(path, lambda file: torch.save({"format": FORMAT, **content}, file))
+    """Write a checkpoint; a reader finds the old file or the new one, never a part.
+
+    Raises:
+        PopError: the operating system refused, as when the disk is full; names the file and what to do.
+    """
+
+    def write(file: BinaryIO) -> None:
+        try:
+            torch.save({"format": FORMAT, **content}, file)
+        except RuntimeError as error:
+            # torch says at which byte writing failed, and not why
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from error
+            raise
+
+    write_atomically(path, write)
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint.
+    """Read a checkpoint of a training run, checked.
 
     Raises:
-        PopError: the file is absent, damaged, of another format, or not a checkpoint of a training run.
+        PopError: the file is absent, damaged, of another format, not a checkpoint of a training run, or holds what none
+            can have written; names the entry and what to do.
     """
-    if not path.is_file():
-        raise PopError(f"{path}: there is no such checkpoint")
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise PopError(f"{path}: cannot be read as a checkpoint; remove it to go on from the one before") from error
+    earlier = earlier_checkpoint(path)
+    instead = f"to go on from {earlier.name}" if earlier else "and train again, or copy it again if you have another"
+    fix = f"remove it {instead}"
+    content = read_torch_file(path, fix)
     missing = [key for key in _NEEDED if not isinstance(content, dict) or key not in content]
     if missing:
-        raise PopError(f"{path}: has no {missing[0]!r}, so it is not a checkpoint of 'pop train'")
-    if content["format"] != FORMAT:
-        raise PopError(f"{path}: has format {content['format']}; this version reads format {FORMAT}")
+        raise PopError(f"{path}: has no {missing[0]!r}, so it is not a checkpoint of 'pop train'; {fix}")
+    if type(content["format"]) is not int or content["format"] != FORMAT:
+        raise PopError(f"{path}: has format {shown(content['format'])}; this version reads format {FORMAT}")
+    named = _NAME.fullmatch(path.name)
+    try:
+        content = check_content(content)
+        if named and content["step"] != int(named[1]):
+            raise ValueError(f"step is {content['step']}; it must be {named[1]}, as the file's name says")
+    except ValueError as error:
+        raise PopError(f"{path}: {error}; {fix}") from error
     return content
 
 
+def load_splats(path: Path) -> tuple[dict[str, Tensor], int | None]:
+    """Read the raw parameters of a checkpoint, ours or gsplat's, as float32, and its step where it tells one.
+
+    Raises:
+        PopError: the file is absent or damaged, or the parameters are; names the entry and what to do.
+    """
+    earlier = earlier_checkpoint(path)
+    fix = f"use an earlier one ({earlier})" if earlier else "copy it again, or use another one"
+    content = read_torch_file(path, fix)
+    try:
+        if not isinstance(content, dict) or "splats" not in content:
+            raise ValueError("has no splats, so it is no checkpoint of 'pop train' or gsplat")
+        params = check_splats(content["splats"])
+    except ValueError as error:
+        raise PopError(f"{path}: {error}; {fix}") from error
+    step = content.get("step")
+    return params, step if type(step) is int and step >= 0 else None
+
+
+def earlier_checkpoint(path: Path) -> Path | None:
+    """Return the checkpoint of the same run before this one, or None where there is none."""
+    match, found = _NAME.fullmatch(path.name), list_checkpoints(path.parent.parent)
+    if match is None or path not in [other for _, other in found]:
+        return None
+    return next((other for step, other in reversed(found) if step < int(match[1])), None)
+
+
 def check_fits(
-    path: Path, content: Mapping[str, Any], config: TrainConfig, fingerprint: Mapping[str, str], threads: int
+    path: Path,
+    content: Mapping[str, Any],
+    config: TrainConfig,
+    fingerprint: Mapping[str, str],
+    threads: int,
+    n_views: int,
 ) -> None:
-    """Raise PopError when a checkpoint belongs to other settings or another capture; name what differs."""
+    """Check that a checkpoint belongs to a run.
+
+    Args:
+        path: of the checkpoint.
+        content: what it holds, checked.
+        config: the run's settings.
+        fingerprint: of the run's capture.
+        threads: of one operation.
+        n_views: how many the run trains on.
+
+    Raises:
+        PopError: it belongs to other settings or another capture, or cannot be of this run; names what differs.
+    """
     ours = {**config.binding(), "threads": threads}
     found = first_difference(ours, {**content["config"], "threads": content["threads"]})
     if found:
@@ -107,6 +175,15 @@ def check_fits(
                 f"{path}: was written for another capture: the {name} differ ({str(theirs)[:12]}, here {ours[:12]}); "
                 "use the same photographs and model, or another result folder"
             )
+    last, known = config.resolved().max_steps - 1, config.strategy.initialize_state().keys()
+    order, odd = content["view_order"]["order"], sorted(known ^ content["strategy"].keys())
+    if content["step"] > last:
+        raise PopError(f"{path}: step is {content['step']}; it must be at most {last}, the run's last: {_DAMAGED}")
+    if len(order) not in (0, n_views):
+        raise PopError(f"{path}: view_order.order has {len(order)} views; it must have {n_views}: {_DAMAGED}")
+    if odd:
+        what = "missing" if odd[0] in known else "unknown"
+        raise PopError(f"{path}: strategy.{odd[0]} is {what}; it must hold {', '.join(known)}: {_DAMAGED}")
 
 
 def capture_fingerprint(capture: Capture, test_every: int) -> dict[str, str]:

@@ -209,7 +209,8 @@ class TrainingRun:
 
     def _restore(self, path: Path) -> None:
         content = ckpt.load_checkpoint(path)
-        ckpt.check_fits(path, content, self._given, self._fingerprint(), torch.get_num_threads())
+        threads, n_views = torch.get_num_threads(), len(self._train)
+        ckpt.check_fits(path, content, self._given, self._fingerprint(), threads, n_views)
         self.params = {key: Parameter(content["splats"][key]) for key in KEYS}
         self.optimizers = make_optimizers(self.params, self.config.lr, self._scene_scale)
         ckpt.unpack_optimizers(self.optimizers, content["optimizers"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
+import importlib
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -17,7 +17,7 @@ from pop_ref.conformance.mirror_library import Mirror
 from pop_ref.conformance.mirror_stages import STAGES
 from pop_ref.conformance.scenes import Scene
 
-FOLDER = Path(tempfile.gettempdir()) / "pop_mirror"
+FOLDER: Path = importlib.import_module("cuda_ext.library_folder").library_folder()
 
 
 def mirror(name: str) -> MirrorAdapter:

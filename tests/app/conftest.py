@@ -10,6 +10,10 @@ from pathlib import Path
 import pytest
 
 from pop_fast.cli import main
+from pop_fast.train import Trainer
+from pop_fast.train import checkpoint as ckpt
+from tests.app.interruptions import interrupt
+from tests.app.tiny import tiny_capture, tiny_config
 
 
 @dataclass(frozen=True)
@@ -65,3 +69,15 @@ def shared_result(shared_capture: Path, tmp_path_factory: pytest.TempPathFactory
 def result(shared_result: Path, tmp_path: Path) -> Path:
     """A copy of the tiny result that a test may damage or add to."""
     return Path(shutil.copytree(shared_result, tmp_path / "result"))
+
+
+@pytest.fixture(scope="session")
+def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of thirty steps that was left after eleven: two checkpoints, after the fifth and the tenth."""
+    folder = tmp_path_factory.mktemp("stopped")
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt(patch, at=11)
+        with pytest.raises(KeyboardInterrupt):
+            Trainer(tiny_config(folder), tiny_capture()).run()
+    assert [step for step, _ in ckpt.list_checkpoints(folder)] == [4, 9]
+    return folder

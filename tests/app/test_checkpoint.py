@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from pop_fast.data.capture import Capture
 from pop_fast.errors import PopError
 from pop_fast.train import Trainer
 from pop_fast.train import checkpoint as ckpt
+from tests.app.children import in_a_child
 from tests.app.tiny import tiny_capture, tiny_config
 
 
@@ -139,6 +141,30 @@ def test_a_failed_write_leaves_the_old_checkpoint(tmp_path):
     before = path.read_bytes()
     with pytest.raises(Exception, match="pickle"):
         ckpt.save_checkpoint(path, {"a": lambda: 0})
+    assert path.read_bytes() == before
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+SAVE_UNDER_A_LIMIT = """
+import resource, signal, sys
+from pathlib import Path
+import torch
+from pop_fast.train.checkpoint import save_checkpoint
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
+save_checkpoint(Path(sys.argv[1]), {"a": torch.ones(1000), "b": torch.ones(100_000)})
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits are set as Linux has them")
+@pytest.mark.parametrize("limit", [0, 10, 3000, 5000, 100_000, 404_900])
+def test_a_write_that_the_system_cuts_off_is_a_sentence(tmp_path, limit):
+    path = tmp_path / "ckpts" / "ckpt_1_rank0.pt"
+    ckpt.save_checkpoint(path, {"a": torch.ones(3)})
+    before = path.read_bytes()
+    outcome = in_a_child(SAVE_UNDER_A_LIMIT, path, limit)
+    last = outcome.err.splitlines()[-1]
+    assert last.startswith(f"pop_fast.errors.PopError: {path}: could not be written: the file is larger than")
     assert path.read_bytes() == before
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import os
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,13 @@ import pytest
 
 pytest.register_assert_rewrite("pop_ref.conformance.laws")
 
+from cuda_ext.library_folder import library_folder  # noqa: E402  asserts must be rewritten first
 from pop_ref.conformance.plugin import parametrize_backends  # noqa: E402  asserts must be rewritten first
 from tests.cuda.gpu.conftest import cuda_backends  # noqa: E402
 
 from . import emulate  # noqa: E402
 
-FOLDER = Path(tempfile.gettempdir()) / "pop_emulated"
+FOLDER = library_folder(Path(__file__).parent)
 LAWS = bool(os.environ.get("POP_EMULATED_LAWS"))
 
 
