@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from plyfile import PlyData, PlyParseError
 
 from pop_fast.errors import PopError
+
+if TYPE_CHECKING:
+    from plyfile import PlyData
 
 __all__ = ["FARTHEST", "find_bad_coordinate", "read_points", "read_vertices"]
 
@@ -24,6 +27,9 @@ def read_vertices(path: Path) -> tuple[PlyData, np.ndarray]:
     Raises:
         PopError: absent, truncated, corrupt, or without vertices as element.
     """
+    # not at the top: training reads and writes everything else without it
+    from plyfile import PlyParseError
+
     try:
         ply = _read_ply(path)
         return ply, np.array(ply["vertex"].data)
@@ -38,6 +44,8 @@ def read_vertices(path: Path) -> tuple[PlyData, np.ndarray]:
 
 
 def _read_ply(path: Path) -> PlyData:
+    from plyfile import PlyData
+
     try:
         return PlyData.read(str(path))
     except UnicodeDecodeError:
