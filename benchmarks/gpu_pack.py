@@ -81,7 +81,8 @@ def pack_capture(source: Path, folder: Path, pixels: float) -> Path:
         image, K = _shrunk(view, pixels)
         cv2.imwrite(str(target / "images" / name), image[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
         high, wide = image.shape[:2]
-        cameras.append(f"{k} PINHOLE {wide} {high} {K[0, 0]!r} {K[1, 1]!r} {K[0, 2]!r} {K[1, 2]!r}".replace("np.", ""))
+        lens = " ".join(map(repr, [*np.diag(K)[:2].tolist(), *K[:2, 2].tolist()]))
+        cameras.append(f"{k} PINHOLE {wide} {high} {lens}")
         x, y, z, w = Rotation.from_matrix(view.viewmat[:3, :3]).as_quat().tolist()
         place = " ".join(map(repr, [w, x, y, z, *view.viewmat[:3, 3].tolist()]))
         # every camera has a line of observations, which is empty
@@ -103,8 +104,9 @@ def _shrunk(view: View, pixels: float) -> tuple[np.ndarray, np.ndarray]:
 
 def _points(capture: Capture) -> list[str]:
     """Write the points without tracks, evenly thinned where there are very many."""
-    step = max(1, -(-len(capture.points) // MOST_POINTS))
-    rows = zip(capture.points[::step].tolist(), capture.colors[::step].tolist(), strict=True)
+    n = len(capture.points)
+    kept = np.linspace(0, n - 1, min(n, MOST_POINTS)).astype(np.int64)
+    rows = zip(capture.points[kept].tolist(), capture.points_rgb[kept].tolist(), strict=True)
     return [f"{k} {x:.6g} {y:.6g} {z:.6g} {r} {g} {b} 0" for k, ((x, y, z), (r, g, b)) in enumerate(rows, start=1)]
 
 
