@@ -24,7 +24,7 @@ from typing import Any
 import torch
 from gpu_floors import Card, floors, measured_card
 from gpu_profile import kernel_sums
-from gpu_scenes import CASES, TINY, GpuCase, scenes
+from gpu_scenes import CASES, FULL_SIZE, TINY, GpuCase, scenes
 from gpu_steps import kernel_times, step_kernels, whole_step
 from torch import Tensor
 
@@ -193,6 +193,7 @@ def arguments(summary: str | None) -> argparse.Namespace:
     names = [case.name for case in (*CASES, TINY)]
     parser.add_argument("--cases", nargs="*", choices=names, help="synthetic ones; default: all but tiny")
     parser.add_argument("--device", default="cuda", help="where tensors are; the emulated kernels take cpu")
+    parser.add_argument("--full-size", type=float, default=FULL_SIZE, help="px, which smaller scenes are enlarged to")
     parser.add_argument("--scenes", nargs="*", type=Path, default=[], help="packed scenes (npz), timed as well")
     return parser.parse_args()
 
@@ -218,7 +219,7 @@ def over_scenes(
     measured: Callable[[GpuCase, dict[str, Tensor], Record], None],
 ) -> int:
     """Measure one scene after the other; return the exit status, 1 where something of one failed."""
-    for name, make in scenes(args.cases, args.scenes, device):
+    for name, make in scenes(args.cases, args.scenes, device, args.full_size):
         result: dict[str, Any] = {}
         record = Record(result, lambda: write_json(args.out, results))
         results["cases"][name] = result

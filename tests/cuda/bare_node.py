@@ -7,9 +7,11 @@ packages; it has no network, and none of the small packages that `pip install po
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import sysconfig
+import zipfile
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
@@ -50,3 +52,42 @@ def bare_environment(**changes: str) -> dict[str, str]:
     """Return this process's environment without what would lead Python back to this checkout or its packages."""
     dropped = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "OUT")
     return {**{name: value for name, value in os.environ.items() if name not in dropped}, **changes}
+
+
+def copy_of_the_tree(root: Path, folder: Path) -> Path:
+    """Copy what git knows of a checkout, and what it would not ignore, without `.git`."""
+    listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    names = subprocess.run(listed, cwd=root, check=True, capture_output=True, text=True).stdout.split("\0")
+    for name in filter(None, names):
+        if (root / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(root / name, folder / name)
+    return folder
+
+
+def installed_wheel(name: str, folder: Path) -> Path:
+    """Make a wheel of a package that is installed here, as `pip download` would have fetched it."""
+    found = distribution(name)
+    target = folder / f"{found.metadata['Name'].replace('-', '_')}-{found.version}-py3-none-any.whl"
+    with zipfile.ZipFile(target, "w") as wheel:
+        for path in found.files or ():
+            if path.parts[0] != ".." and path.suffix != ".pyc" and path.name not in ("INSTALLER", "REQUESTED"):
+                wheel.write(str(found.locate_file(path)), path.as_posix())
+    return target
+
+
+def stand_in_gsplat(folder: Path) -> Path:
+    """Make a wheel whose `gsplat.rasterization` is the CPU's, and whose kernels are compiled at once."""
+    target = folder / "gsplat-0.0-py3-none-any.whl"
+    files = {
+        "gsplat/__init__.py": 'from pop_fast.rasterization import rasterization\n\n__version__ = "stand-in"\n',
+        "gsplat/cuda/__init__.py": "",
+        "gsplat/cuda/_backend.py": "_C = object()\n",
+        "gsplat-0.0.dist-info/METADATA": "Metadata-Version: 2.1\nName: gsplat\nVersion: 0.0\n",
+        "gsplat-0.0.dist-info/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+    }
+    listed = "".join(f"{name},,\n" for name in (*files, "gsplat-0.0.dist-info/RECORD"))
+    with zipfile.ZipFile(target, "w") as wheel:
+        for name, text in {**files, "gsplat-0.0.dist-info/RECORD": listed}.items():
+            wheel.writestr(name, text)
+    return target
