@@ -7,15 +7,17 @@ import os
 import shutil
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from cuda_ext.gpu_check_budget import Share
 from cuda_ext.gpu_check_outcomes import FILE, outcomes
 from cuda_ext.gpu_check_tools import ROOT, Command, python_path, read_json, run
 
+NOTHING: Mapping[str, str] = MappingProxyType({})
 STEPS = ("test_ten_steps.py", "test_device_training.py")
 SMOKE = tuple(
     f"test_ten_steps.py::test_{name}"
@@ -76,8 +78,14 @@ class Check:
         rehearse = [str(ROOT / "tests" / "cuda" / "emulated" / "rehearse.py")] if self.rehearsal else []
         return [sys.executable, *rehearse, *words]
 
-    def run(self, words: list[str], limit: float, stop: signal.Signals = signal.SIGTERM, **over: str) -> dict[str, Any]:
-        """Run a command that finds the repository and the packed wheels."""
+    def run(
+        self,
+        words: list[str],
+        limit: float,
+        over: Mapping[str, str] = NOTHING,
+        stop: signal.Signals = signal.SIGTERM,
+    ) -> dict[str, Any]:
+        """Run a command that finds the repository and the packed wheels, with `over` put over its environment."""
         path = python_path(ROOT, self.site)
         return run(words, limit, self.log, {"PYTHONPATH": path, "PYTHONUNBUFFERED": "1", **over}, stop)
 
@@ -124,7 +132,7 @@ def gsplat_stage(check: Check) -> dict[str, Any]:
     if compiled["status"] != 0:
         reason = "gsplat was not compiled: its words are under `compilation`; name build and gsplat alone in a call"
         return _skipped(reason) | {"compilation": compiled}
-    found = _benchmark(check, "gpu_gsplat.py", 0.4 * check.seconds, **_of_gsplat(check))
+    found = _benchmark(check, "gpu_gsplat.py", 0.4 * check.seconds, _of_gsplat(check))
     return found | {"compilation": compiled}
 
 
@@ -155,8 +163,8 @@ def sanitizer_stage(check: Check) -> dict[str, Any]:
         # torch's cache of memory hides accesses beyond an array's end; API errors are torch's own questions
         before = (tool, "--tool", kind, "--report-api-errors", "no", "--error-exitcode", "9")
         limit = (check.seconds - found["seconds"]) / (len(kinds) - k)
-        options = {"before": before, "limit": limit, "PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
-        one = _pytest(check, f"sanitizer_{kind}", WATCHED, **options)
+        name, uncached = f"sanitizer_{kind}", {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
+        one = _pytest(check, name, WATCHED, before=before, limit=limit, over=uncached)
         if "Device not supported" in one["output"]:
             one = {**one, "status": 0, "skipped": "compute-sanitizer does not support this device here"}
         found |= {kind: one, "status": found["status"] or one["status"]}
@@ -210,12 +218,12 @@ def _of_gsplat(check: Check) -> dict[str, str]:
     return {"TORCH_EXTENSIONS_DIR": str(check.work / "torch_extensions"), "MAX_JOBS": jobs}
 
 
-def _benchmark(check: Check, script: str, limit: float, **over: str) -> dict[str, Any]:
+def _benchmark(check: Check, script: str, limit: float, over: Mapping[str, str] = NOTHING) -> dict[str, Any]:
     target = check.out / f"{script.removesuffix('.py')}.json"
     target.unlink(missing_ok=True)
     words = [str(ROOT / "benchmarks" / script), str(target), "--scenes", *check.scenes()]
     words += ["--device", "cpu", "--cases", "tiny", "--full-size", "3000"] if check.rehearsal else []
-    found = check.run(check.python(*words), limit, **over)
+    found = check.run(check.python(*words), limit, over)
     # case by case: also what was measured before the time was up
     return found | {"results": read_json(target)}
 
@@ -224,11 +232,11 @@ def _laws(check: Check, name: str, kinds: str) -> dict[str, Any]:
     if check.rehearsal:
         # all are collected, few are run
         few = ("-k", LAWS_REHEARSED)
-        return _pytest(check, name, LAWS, *few, POP_CUDA_KINDS=kinds, POP_EMULATED_LAWS="1")
+        return _pytest(check, name, LAWS, *few, over={"POP_CUDA_KINDS": kinds, "POP_EMULATED_LAWS": "1"})
     # the oracle takes most of the time, so that several processes share the GPU without waiting for it
     workers = min((os.cpu_count() or 2) // 2, 8)
     several = ("-n", str(workers)) if workers > 1 and importlib.util.find_spec("xdist") else ()
-    return _pytest(check, name, LAWS, *several, POP_CUDA_KINDS=kinds)
+    return _pytest(check, name, LAWS, *several, over={"POP_CUDA_KINDS": kinds})
 
 
 LAWS = tuple(f"test_gpu_{name}.py" for name in ("whole", "compositing", "dominance", "gradients", "agreement"))
@@ -241,7 +249,7 @@ def _pytest(
     *options: str,
     before: tuple[str, ...] = (),
     limit: float | None = None,
-    **over: str,
+    over: Mapping[str, str] = NOTHING,
 ) -> dict[str, Any]:
     """Run tests of the GPU's folder, or of the emulator's twin of it, and add up how they ended."""
     folder = ROOT / "tests" / "cuda" / ("emulated" if check.rehearsal else "gpu")
@@ -251,7 +259,7 @@ def _pytest(
     words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "cuda_ext.gpu_check_outcomes"]
     over = {"OMP_NUM_THREADS": "1" if check.rehearsal else "4", FILE: str(told), **over}
     # interrupted, pytest says what it has seen so far
-    found = check.run([*before, *words, *options, *chosen], limit or check.seconds, signal.SIGINT, **over)
+    found = check.run([*before, *words, *options, *chosen], limit or check.seconds, over, signal.SIGINT)
     found["tests"] = outcomes(told)
     # without a GPU everything is skipped, which is no pass
     return found | {"status": found["status"] or int(found["tests"]["passed"] == 0)}
