@@ -23,6 +23,7 @@ from __future__ import annotations
 import argparse
 import os
 import platform
+import signal
 import subprocess
 import sys
 import tempfile
@@ -92,8 +93,6 @@ def run_stages(names: list[str], limit: float, check: Check, report: dict[str, A
             failed.append(name)
         if words != "ok":
             print(found.get("skipped") or found.get("output", "")[-1500:], flush=True)
-    for command in check.beside.values():
-        command.wait(0.0)
     report["complete"] = True
     write_json(path, report)
     return failed
@@ -167,10 +166,17 @@ def main(argv: list[str] | None = None) -> int:
         *(tuple(folder.resolve() for folder in args.captures), args.steps_scaler, commit, args.rehearse),
         note=lambda found: None,
     )
-    failed = run_stages(args.stages or list(JOBS[args.job]), args.limit_s, check, report, path)
+    try:
+        failed = run_stages(args.stages or list(JOBS[args.job]), args.limit_s, check, report, path)
+    finally:
+        # what runs beside the stages is not left behind
+        for command in check.beside.values():
+            command.kill()
     print(f"{path}: {'failed: ' + ', '.join(failed) if failed else 'every stage ran'}", flush=True)
     return 1 if failed else 0
 
 
 if __name__ == "__main__":
+    # a job that is ended takes its commands, which have sessions of their own, along
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     sys.exit(main())

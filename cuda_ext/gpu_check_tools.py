@@ -60,11 +60,15 @@ class Command:
             except subprocess.TimeoutExpired:
                 status = -1
             # compilers and tests have children of their own
-            self._kill()
+            self.kill()
             status = status if status > 0 else 124
+        except BaseException:
+            self.kill()
+            raise
         return {"status": status, "seconds": round(time.monotonic() - self._start, 1), "output": self._words()}
 
-    def _kill(self) -> None:
+    def kill(self) -> None:
+        """End it and its children at once."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -117,6 +119,26 @@ def test_a_command_is_asked_to_stop_before_it_is_made_to(tmp_path):
     assert found["seconds"] < 30.0
     # each command's words stand in the log, and only its own in what is returned
     assert (tmp_path / "log").read_text().count("$ ") == 3
+
+
+def test_a_job_that_is_ended_takes_its_commands_along(tmp_path):
+    mark = tmp_path / "begun"
+    child = f"import pathlib, time; pathlib.Path({str(mark)!r}).write_text('x'); time.sleep(60)"
+    code = (
+        "import signal, sys, pathlib; from cuda_ext.gpu_check_tools import Command;"
+        "signal.signal(signal.SIGTERM, lambda *_: sys.exit(143));"
+        f"command = Command([sys.executable, '-c', {child!r}], pathlib.Path({str(tmp_path / 'log')!r}));"
+        "print(command._process.pid, flush=True); command.wait(50.0)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], cwd=gpu_check_tools.ROOT, stdout=subprocess.PIPE) as job:
+        assert job.stdout is not None
+        child_id = int(job.stdout.readline())
+        while not mark.exists():
+            time.sleep(0.1)
+        job.terminate()
+        assert job.wait(20.0) == 143
+    with pytest.raises(ProcessLookupError):
+        os.kill(child_id, 0)
 
 
 def test_a_command_runs_beside_others(tmp_path):
