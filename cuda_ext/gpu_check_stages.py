@@ -182,6 +182,10 @@ def train_stage(check: Check) -> dict[str, Any]:
     captures = [*packed, *check.captures]
     if not captures:
         return _skipped("no captures were given (--captures DIR ...) or brought along")
+    if importlib.util.find_spec("tyro") is None and not (check.site / "tyro").is_dir():
+        return _skipped(
+            "`pop train` needs tyro, which is neither installed nor among the wheels that were brought along"
+        )
     found: dict[str, Any] = {"status": 0, "seconds": 0.0, "runs": {}}
     for k, path in enumerate(captures):
         one = train_one(check, path, (check.seconds - found["seconds"]) / (len(captures) - k))

@@ -186,6 +186,12 @@ def test_a_training_that_cannot_be_says_why_and_the_next_is_begun(tmp_path):
     assert "no captures" in gpu_check_stages.train_stage(check(tmp_path))["skipped"]
 
 
+def test_a_training_without_the_package_of_the_command_line_is_skipped(tmp_path, monkeypatch):
+    monkeypatch.setattr(gpu_check_stages.importlib.util, "find_spec", lambda name: None)
+    found = gpu_check_stages.train_stage(check(tmp_path, captures=(tmp_path,)))
+    assert (found["status"], "needs tyro" in found["skipped"]) == (0, True)
+
+
 def test_gsplat_that_was_not_compiled_is_told_and_is_no_failure(tmp_path):
     assert "not among the wheels" in gpu_check_stages.gsplat_stage(check(tmp_path))["skipped"]
     command = [sys.executable, "-c", "raise SystemExit('nvcc does not know this')"]
