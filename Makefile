@@ -56,9 +56,10 @@ sass: setup  ## count the kernels' machine instructions into benchmarks/results/
 emulate: setup  ## run the CUDA kernels' own source on the host, warp by warp: every law, training steps (minutes)
 	POP_EMULATED_LAWS=1 POP_CUDA_KINDS="columns atomics splats" $(BIN)/python -m pytest -q tests/cuda/emulated
 
-gpu-check: cuda  ## every law, times, training on CAPTURES="a b"; one JSON file, a stage at a time (needs a GPU)
-	$(BIN)/python -m cuda_ext.gpu_check $(or $(OUT),benchmarks/results/gpu_check.json) \
-		$(if $(STAGES),--stages $(STAGES)) $(if $(CAPTURES),--captures $(CAPTURES))
+# no environment is made and nothing installed: it runs on a node with a GPU, torch and nvcc, and writes to $$OUT
+gpu-check:  ## JOB=1: build, smoke, times; JOB=2: laws, steps, sanitizer, training on CAPTURES="a b" (needs a GPU)
+	$(PYTHON) -m cuda_ext.gpu_check $(if $(JOB),--job $(JOB)) $(if $(STAGES),--stages $(STAGES)) \
+		$(if $(CAPTURES),--captures $(CAPTURES))
 
 docs-check: setup  ## fail when a table, name, path or command in README.md is no longer true
 	$(BIN)/python -m pytest -q tests/meta/test_readme.py

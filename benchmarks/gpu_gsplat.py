@@ -1,24 +1,33 @@
-"""gsplat's training iteration on the same tensors, built to its advantage.
+"""Time gsplat beside the CUDA backend, on the same tensors in the same process, one after the other.
 
-Its rasterization under autograd, as its trainer calls it, and torch's fused Adam. For the loss it is given this
-project's own kernel, which its wheel has nothing to match with, so that the ratio tells of the rest.
+    python benchmarks/gpu_gsplat.py out.json [--cases 270k_1.6MP] [--scenes packed/scenes/garden.npz ...]
+
+gsplat's training iteration is built to its advantage: its rasterization under autograd, as its trainer calls it, and
+torch's fused Adam. For the loss it is given this project's own kernel, which its wheel has nothing to match with, so
+that the ratio tells of the rest. `ratios` are its times over ours, `kernel_ratios` those of the sums of kernel times.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from typing import Any
 
 import torch
+from gpu_kernels import STEPS, Record, arguments, draw, forward_backward, over_scenes, photograph_of, timed
+from gpu_profile import kernel_sums
 from gpu_scenes import GpuCase
-from gpu_steps import raw_params
+from gpu_steps import raw_params, step_kernels, whole_step
 from torch import Tensor
 
+import cuda_ext
 from cuda_ext import load
 from cuda_ext.arrays import fill, new_state, stream_of
+from cuda_ext.ops import rasterization
 from cuda_ext.resident import MARGIN, ResidentViews
 
 LAMBDA_SSIM = 0.01
+COMPARED = ("forward", "forward_backward", "step")
 
 
 class FusedLoss:
@@ -50,12 +59,8 @@ class FusedLoss:
 
 
 def gsplat_iteration(
-    rasterization: Callable[..., Any],
-    scene: dict[str, Tensor],
-    case: GpuCase,
-    photograph: Tensor,
-    timed: Callable[[Callable[[], Any]], float],
-) -> dict[str, float]:
+    rasterize: Callable[..., Any], scene: dict[str, Tensor], case: GpuCase, photograph: Tensor
+) -> dict[str, Any]:
     """Time loss, optimizer and whole iteration."""
     params = {name: value.requires_grad_() for name, value in raw_params(scene).items()}
     optimizers = [torch.optim.Adam([value], lr=1e-9, eps=1e-15, fused=True) for value in params.values()]
@@ -64,10 +69,8 @@ def gsplat_iteration(
     def render() -> Tensor:
         scales, opacities = torch.exp(params["scales"]), torch.sigmoid(params["opacities"])
         sh = torch.cat((params["sh0"], params["shN"]), 1)
-        views = (scene["viewmats"], scene["Ks"], case.width, case.height)
-        return rasterization(
-            params["means"], params["quats"], scales, opacities, sh, *views, sh_degree=3, packed=False
-        )[0]
+        leaves = {**scene, **params, "scales": scales, "opacities": opacities, "sh": sh}
+        return draw(rasterize, leaves, case)[0]
 
     def update() -> None:
         for optimizer in optimizers:
@@ -80,8 +83,50 @@ def gsplat_iteration(
         for optimizer in optimizers:
             optimizer.zero_grad(set_to_none=True)
 
-    whole = timed(iteration)
+    whole, kernels = timed(iteration), kernel_sums(iteration)
     image = render()
     image.backward(torch.zeros_like(image))
     fixed = image.detach()[0].contiguous()
-    return {"step_ms": whole, "optimizer_ms": timed(update), "loss_ms": timed(lambda: loss.v_image(fixed))}
+    times = {"step_ms": whole, "optimizer_ms": timed(update), "loss_ms": timed(lambda: loss.v_image(fixed))}
+    return {**times, "step_kernels": kernels}
+
+
+def beside(case: GpuCase, scene: dict[str, Tensor], theirs: Callable[..., Any], record: Record) -> None:
+    """Measure both sides of one case, and their ratios."""
+    photograph = photograph_of(scene, case)
+
+    def ours_measured() -> dict[str, Any]:
+        found = forward_backward(rasterization, scene, case) | whole_step(scene, photograph, STEPS)
+        return found | {"step_kernels": step_kernels(scene, photograph)}
+
+    def theirs_measured() -> dict[str, Any]:
+        return forward_backward(theirs, scene, case) | gsplat_iteration(theirs, scene, case, photograph)
+
+    ours, other = record.part("ours", ours_measured), record.part("gsplat", theirs_measured)
+    if ours is None or other is None:
+        return
+    record.part("ratios", lambda: {name: other[f"{name}_ms"] / ours[f"{name}_ms"] for name in COMPARED})
+    sums = [{name: found[f"{name}_kernels"].get("kernels_ms") for name in COMPARED} for found in (ours, other)]
+    both = {name: sums[1][name] / sums[0][name] for name in COMPARED if sums[0][name] and sums[1][name]}
+    record.part("kernel_ratios", lambda: both or {"skipped": "the profiler saw no kernels"})
+
+
+def main() -> int:
+    """Run the comparison from the command line."""
+    args = arguments(__doc__)
+    reason = cuda_ext.why_not()
+    if reason is not None:
+        print(f"gpu_gsplat: {reason}", file=sys.stderr)
+        return 2
+    import gsplat
+
+    results: dict[str, Any] = {"gsplat": gsplat.__version__, "cases": {}}
+
+    def measured(case: GpuCase, scene: dict[str, Tensor], record: Record) -> None:
+        beside(case, scene, gsplat.rasterization, record)
+
+    return over_scenes(args, results, torch.device(args.device), measured)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from gpu_floors import Loads
+from gpu_profile import kernel_sums
 from torch import Tensor
 
 from cuda_ext import step_program
@@ -24,7 +25,7 @@ KERNELS = (
     *("begin_step", "project", "count_instances", "make_tile_lists", "blend_forward", "photometric"),
     *("blend_backward", "count_important", "update", "end_step"),
 )
-HEAD_START = 2_000_000  # cycles the GPU waits before a step, so that it never waits for the host within one
+HEAD_START = 5_000_000  # cycles the GPU waits before a step, longer than Python needs to launch one
 
 
 def raw_params(scene: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -62,6 +63,13 @@ def whole_step(scene: dict[str, Tensor], photograph: Tensor, steps: int, **setti
         end.synchronize()
         found[name] = start.elapsed_time(end) / steps
     return found
+
+
+def step_kernels(scene: dict[str, Tensor], photograph: Tensor, steps: int = 20, **settings: Any) -> dict[str, Any]:
+    """Add up the times of a replayed plain step's kernels by the profiler."""
+    trainer = make_trainer(scene, photograph, 3 * steps, **settings)
+    trainer.run(steps, PLAIN)
+    return kernel_sums(lambda: trainer.run(trainer.step + 1, PLAIN), calls=steps)
 
 
 def step_loads(trainer: FusedTrainer) -> Loads:

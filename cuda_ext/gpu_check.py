@@ -1,65 +1,58 @@
-"""Everything that only a GPU can tell, in stages, into one JSON file: build, laws, steps, sanitizer, training, bench.
+"""Everything that only a GPU can tell, in two jobs of limited length, for a bare GPU node: no network, no pip, no git.
 
-    python -m cuda_ext.gpu_check out.json [--stages build laws ...] [--captures DIR ...] [--limit-s 540]
+    python3 -m cuda_ext.gpu_check            job 1: build, a smoke of half a minute, the benchmark, gsplat beside it
+    python3 -m cuda_ext.gpu_check --job 2    job 2: laws, steps, sanitizer, training
 
-The file is written after every stage, and what earlier calls put into it stays, so that several calls of limited length
-can fill it; a training that is cut off goes on in the next call. A stage that fails takes nothing from the others. Exit
-status 1 when one failed.
+What has to be there: Python 3.11 or newer with torch for CUDA, NumPy, nanobind, hypothesis and pytest, cmake, nvcc.
+Results go to the folder named first, else to $OUT, else to out/gpu_check/results: one JSON file a job, and beside it
+what its stages wrote while they ran. Nothing need survive between the jobs: each builds first, and keeps what it finds
+built. A stage that fails or runs out of time is told with the reason, and the next one runs.
+
+What travels is made beforehand, where there is a network, by --pack FOLDER, and read by --packed FOLDER:
+    scenes/NAME.npz    trained Gaussians and their cameras, of every folder under --runs
+    captures/NAME/     photographs as JPEG, shrunk to --pixels, with cameras and points in COLMAP's text files, of every
+                       folder under --captures
+    wheels/*.whl       pure Python: beartype, plyfile, tyro, typeguard, docstring-parser, typing-extensions, jaxtyping,
+                       wadler-lindig, gsplat (which compiles its kernels on the node)
+    manifest.json      the commit, and every file's size and SHA-256
+All of it, with the repository's own files, must be under 64 MiB. Every part of it may be absent.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import platform
-import shutil
+import signal
+import subprocess
 import sys
+import tempfile
 import time
 import traceback
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cuda_ext
-from cuda_ext.gpu_check_tools import ROOT, first_line, python_path, run, write_json
+from cuda_ext.gpu_check_budget import SHORTEST, Budget
+from cuda_ext.gpu_check_stages import JOBS, SHARES, STAGES, Check
+from cuda_ext.gpu_check_tools import ROOT, first_line, python_path, read_json, write_json
 
-GPU_TESTS = ROOT / "tests" / "cuda" / "gpu"
-STEPS = ("test_ten_steps.py", "test_device_training.py")
-OUT = ROOT / "out" / "gpu_check"
-SITE = OUT / "site"  # gsplat, for the comparison alone
-_POP = "from pop_fast.cli import main; raise SystemExit(main())"
-# what a training run is judged by
-_TOLD = ("step", "seconds", "seconds_loading", "seconds_total", "num_GS", "num_GS_above_floor", "psnr", "ssim", "views")
-_TOLD += ("gpu", "gpu_memory_bytes", "instance_buffers_grown")
+PLACE = ROOT / "out" / "gpu_check"
+PACKED = ROOT / "out" / "gpu_pack"
+COMMIT = "POP_COMMIT"
 
 
-@dataclass(frozen=True)
-class Check:
-    """What the stages share.
-
-    Attributes:
-        end: when all stages must be done, by `time.monotonic`.
-        captures: folders to train on.
-        steps_scaler: of the paper's 30,000 steps.
-        gsplat: what pip is to install for the comparison: a name or a wheel's path.
-        note: keeps what a stage has found so far.
-    """
-
-    end: float
-    captures: tuple[Path, ...]
-    steps_scaler: float
-    gsplat: str
-    note: Callable[[dict[str, Any]], None]
-
-    @property
-    def left(self) -> float:
-        """Seconds that are left."""
-        return self.end - time.monotonic()
+def commit_of(packed: Path | None) -> str:
+    """Return the commit: what the environment says, git, or what was packed; else "unknown"."""
+    told = os.environ.get(COMMIT, "")
+    if not told and (ROOT / ".git").exists():
+        told = first_line(["git", "rev-parse", "HEAD"]) or ""
+    if not told and packed is not None:
+        told = str(read_json(packed / "manifest.json").get("commit", ""))
+    return told or "unknown"
 
 
-def environment() -> dict[str, Any]:
+def environment(commit: str) -> dict[str, Any]:
     """Describe the machine, the driver, the versions and the commit."""
     query = ["nvidia-smi", "--query-gpu=name,driver_version,memory.total,clocks.max.sm", "--format=csv,noheader"]
     told: dict[str, Any] = {
@@ -67,190 +60,123 @@ def environment() -> dict[str, Any]:
         "cpu": platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
         "python": platform.python_version(),
-        "commit": first_line(["git", "rev-parse", "HEAD"]),
-        "dirty": bool(first_line(["git", "status", "--porcelain"])),
+        "commit": commit,
     }
+    if (ROOT / ".git").exists():
+        told["dirty"] = first_line(["git", "status", "--porcelain"]) is not None
     try:
-        import torch
+        from importlib.metadata import version
 
-        told["torch"] = torch.__version__
+        told["torch"] = version("torch")
     except ImportError:
         told["torch"] = None
     return told
 
 
-def build_stage(check: Check) -> dict[str, Any]:
-    """Build the extension for this machine's GPU."""
-    found = run([sys.executable, "-m", "cuda_ext.build", "--jobs", str(os.cpu_count() or 2)], check.left)
-    return _needs_a_gpu(found)
-
-
-def laws_stage(check: Check) -> dict[str, Any]:
-    """Hold every law of the kit, gradients and thresholds among them, to the CUDA backend."""
-    return _laws(check, "columns atomics")
-
-
-def laws_of_splats_stage(check: Check) -> dict[str, Any]:
-    """Hold the laws to the other backward family, which is not the default."""
-    return _laws(check, "splats")
-
-
-def steps_stage(check: Check) -> dict[str, Any]:
-    """Take ten training steps beside the CPU, the same bits twice, overflows, and short trainings beside the CPU's."""
-    return _pytest(check, *(str(GPU_TESTS / name) for name in STEPS))
-
-
-def sanitizer_stage(check: Check) -> dict[str, Any]:
-    """Run compute-sanitizer's memcheck and racecheck over a render and its gradients; note where it cannot run."""
-    tool = shutil.which("compute-sanitizer")
-    if tool is None:
-        return {"status": 0, "seconds": 0.0, "skipped": "compute-sanitizer is not installed"}
-    found: dict[str, Any] = {"status": 0, "seconds": 0.0}
-    test = f"{GPU_TESTS / STEPS[0]}::test_rasterization_and_its_gradients_give_the_same_bits_twice"
-    share = check.left / 2
-    for kind in ("memcheck", "racecheck"):
-        command = [tool, "--tool", kind, "--error-exitcode", "9", sys.executable, "-m", "pytest", "-q", test]
-        one = run(command, min(share, check.left))
-        if "Device not supported" in one["output"]:
-            one = {**one, "status": 0, "skipped": "compute-sanitizer does not support this device here"}
-        found |= {kind: one, "status": found["status"] or one["status"], "seconds": found["seconds"] + one["seconds"]}
-        check.note(found)
-    return found
-
-
-def gsplat_stage(check: Check) -> dict[str, Any]:
-    """Get gsplat to compare with, into a folder of its own; where that cannot be, keep the reason: it is no failure."""
-    probe = [sys.executable, "-c", "import gsplat; print(gsplat.__version__)"]
-    pip = [sys.executable, "-m", "pip", "install", "-q", "--upgrade", "--target", str(SITE)]
-    path = {"PYTHONPATH": python_path(SITE)}
-    found = run(probe, check.left, **path)
-    if found["status"] != 0:
-        # not its dependencies: torch, which is here, would come along once more
-        found = run([*pip, "--no-deps", check.gsplat], check.left)
-        found = found if found["status"] else run([*pip, "jaxtyping", "rich", "ninja"], check.left)
-        found = found if found["status"] else run(probe, check.left, **path)
-    lines = [line for line in found["output"].splitlines() if line.strip()]
-    last = lines[-1] if lines else "no words"
-    if found["status"] == 0:
-        return {**found, "version": last}
-    return {**found, "status": 0, "skipped": f"gsplat cannot be installed here: {last}"}
-
-
-def bench_stage(check: Check) -> dict[str, Any]:
-    """Time every kernel and the whole step, beside gsplat where it is installed, also on what stage train has made."""
-    target = OUT / "bench.json"
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.unlink(missing_ok=True)
-    commit = first_line(["git", "rev-parse", "--short", "HEAD"])
-    runs = sorted(str(file.parent) for file in OUT.glob(f"*_cuda_*_{commit}/cfg.json"))
-    command = [sys.executable, str(ROOT / "benchmarks" / "gpu_kernels.py"), str(target), "--runs", *runs]
-    found = run(command, check.left, PYTHONPATH=python_path(ROOT, SITE))
-    if target.exists():
-        # case by case: also what was measured before the time was up
-        found["results"] = json.loads(target.read_text())
-    return _needs_a_gpu(found)
-
-
-def train_stage(check: Check) -> dict[str, Any]:
-    """Train POP on every capture as `pop train --backend cuda` does; seconds, Gaussians, PSNR, SSIM."""
-    if not check.captures:
-        return {"status": 0, "seconds": 0.0, "skipped": "no captures were given (--captures DIR ...)"}
-    found: dict[str, Any] = {"status": 0, "seconds": 0.0, "runs": {}}
-    for path in check.captures:
-        one = train_one(path, check.left, check.steps_scaler)
-        found["runs"][path.name] = one
-        found |= {"status": found["status"] or one["status"], "seconds": round(found["seconds"] + one["seconds"], 1)}
-        check.note(found)
-    return found
-
-
-def train_one(path: Path, limit: float, steps_scaler: float, backend: str = "cuda") -> dict[str, Any]:
-    """Train on one capture, or go on with the training of an earlier call at the same commit."""
-    commit = first_line(["git", "rev-parse", "--short", "HEAD"])
-    folder = OUT / f"{path.name}_{backend}_{steps_scaler:g}_{commit}"
-    words = ["train", str(path), "--out", str(folder), "--backend", backend, "--steps-scaler", str(steps_scaler)]
-    words += ["--quiet", "--max-renders", "1", *(["--resume"] if (folder / "cfg.json").exists() else [])]
-    found = run([sys.executable, "-c", _POP, *words], limit)
-    if found["status"] == 130:
-        return {**found, "status": 124, "note": "the time was up; the next call goes on from the checkpoint"}
-    stats = sorted((folder / "stats").glob("val_step*.json"), key=lambda file: int(file.stem.split("step")[1]))
-    if found["status"] != 0 or not stats:
-        return {**found, "status": found["status"] or 1}
-    told = json.loads(stats[-1].read_text())
-    result = {name: told.get(name) for name in _TOLD}
-    return {**found, **result, "seconds": found["seconds"], "seconds_training": told["seconds"]}
-
-
-def _laws(check: Check, kinds: str) -> dict[str, Any]:
-    ignored = (f"--ignore={GPU_TESTS / name}" for name in STEPS)
-    return _pytest(check, str(GPU_TESTS), *ignored, POP_CUDA_KINDS=kinds)
-
-
-def _pytest(check: Check, *arguments: str, **environment: str) -> dict[str, Any]:
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments]
-    # without a GPU everything would be skipped, which is no pass
-    return _needs_a_gpu(run(command, check.left, OMP_NUM_THREADS="4", **environment))
-
-
-def _needs_a_gpu(found: dict[str, Any]) -> dict[str, Any]:
-    reason = cuda_ext.why_not()
-    return {**found, "why_not": reason, "status": found["status"] or int(reason is not None)}
-
-
-STAGES: dict[str, Callable[[Check], dict[str, Any]]] = {
-    "build": build_stage,
-    "laws": laws_stage,
-    "laws_of_splats": laws_of_splats_stage,
-    "steps": steps_stage,
-    "sanitizer": sanitizer_stage,
-    "train": train_stage,
-    "gsplat": gsplat_stage,
-    "bench": bench_stage,
-}
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the stages from the command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("out", type=Path, help="the JSON file; stages of earlier calls in it are kept")
-    parser.add_argument("--stages", nargs="+", choices=list(STAGES), default=list(STAGES), help="which, in this order")
-    parser.add_argument("--limit-s", type=float, default=540.0, help="seconds for all stages of this call together")
-    parser.add_argument("--captures", nargs="*", type=Path, default=[], help="folders to train on, for stage train")
-    parser.add_argument("--steps-scaler", type=float, default=1.0, help="of 30,000 steps, for stage train")
-    parser.add_argument("--gsplat", default="gsplat", help="what pip installs for the comparison, or a wheel's path")
-    args = parser.parse_args(argv)
-    report: dict[str, Any] = json.loads(args.out.read_text()) if args.out.exists() else {"stages": {}}
-    report["environment"] = environment()
-    end = time.monotonic() + args.limit_s
+def run_stages(names: list[str], limit: float, check: Check, report: dict[str, Any], path: Path) -> list[str]:
+    """Run stages in order, each in its share of the time, and write down what each found; return those that failed."""
+    budget = Budget(limit, SHARES, names)
     failed: list[str] = []
-    for name in args.stages:
+    report["stages"] |= {name: {"status": None, "state": "not begun"} for name in names}
+    write_json(path, report)
+    for name in names:
 
         def note(found: dict[str, Any], name: str = name) -> None:
             report["stages"][name] = found
-            write_json(args.out, report)
+            write_json(path, report)
 
-        check = Check(end, tuple(path.resolve() for path in args.captures), args.steps_scaler, args.gsplat, note)
-        found = _held(STAGES[name], check)
+        found = _held(name, replace(check, seconds=budget.seconds(name), note=note))
         note(found)
         words = "skipped" if "skipped" in found else "ok" if found["status"] == 0 else "FAILED"
         print(f"{name}: {words} in {found['seconds']} s", flush=True)
         if found["status"] != 0:
             failed.append(name)
         if words != "ok":
-            print(found.get("skipped") or found.get("why_not") or found.get("output", ""), flush=True)
-    return 1 if failed else 0
+            print(found.get("skipped") or found.get("output", "")[-1500:], flush=True)
+    report["complete"] = True
+    write_json(path, report)
+    return failed
 
 
-def _held(stage: Callable[[Check], dict[str, Any]], check: Check) -> dict[str, Any]:
+def _held(name: str, check: Check) -> dict[str, Any]:
     """Run a stage; what it raises is kept, and does not reach the other stages."""
-    if check.left < 1.0:
+    if check.seconds < SHORTEST:
         return {"status": 124, "seconds": 0.0, "output": "no time was left; name the stage in another call"}
     start = time.monotonic()
+    check.note({"status": None, "state": "begun", "seconds_given": round(check.seconds, 1)})
     try:
-        return stage(check)
+        return STAGES[name](check)
     except Exception:
         return {"status": 1, "seconds": round(time.monotonic() - start, 1), "output": traceback.format_exc()}
 
 
+def _results_folder(given: Path | None) -> Path:
+    folder = given or Path(os.environ.get("OUT") or PLACE / "results")
+    if folder.exists() and not folder.is_dir():
+        raise SystemExit(f"gpu_check: {folder} is a file; name a folder for the results")
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder.resolve()
+
+
+def _pack(folder: Path, args: argparse.Namespace) -> int:
+    """Let the packing script, which needs the whole program, do its work."""
+    words = [str(ROOT / "benchmarks" / "gpu_pack.py"), str(folder), "--pixels", str(args.pixels)]
+    words += ["--runs", *map(str, args.runs), "--captures", *map(str, args.captures)]
+    words += ["--no-wheels"] if args.no_wheels else []
+    done = subprocess.run([sys.executable, *words], env={**os.environ, "PYTHONPATH": python_path(ROOT)}, check=False)
+    return done.returncode
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python3 -m cuda_ext.gpu_check", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("out", type=Path, nargs="?", help="the folder of results; default: $OUT")
+    parser.add_argument("--job", type=int, choices=list(JOBS), default=1, help="which of the two; default 1")
+    parser.add_argument("--stages", nargs="+", choices=list(STAGES), help="others than the job's, in this order")
+    parser.add_argument("--limit-s", type=float, default=560.0, help="seconds for all stages together; default 560")
+    parser.add_argument("--packed", type=Path, help="what was brought along; default: out/gpu_pack, if it is there")
+    parser.add_argument("--captures", nargs="*", type=Path, default=[], help="folders to train on, or to pack")
+    parser.add_argument("--steps-scaler", type=float, default=1.0, help="of 30,000 steps, for stage train")
+    parser.add_argument("--rehearse", action="store_true", help="without a GPU: emulate the kernels, on tiny cases")
+    parser.add_argument("--pack", type=Path, metavar="FOLDER", help="make what travels, and run nothing")
+    parser.add_argument("--runs", nargs="*", type=Path, default=[], help="results of `pop train` to pack")
+    parser.add_argument("--pixels", type=float, default=4e5, help="of a packed photograph, at most; default 400,000")
+    parser.add_argument("--no-wheels", action="store_true", help="pack no wheels: nothing is downloaded")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run a job, or pack what it takes along, from the command line."""
+    args = _parser().parse_args(argv)
+    if args.pack is not None:
+        return _pack(args.pack.resolve(), args)
+    out = _results_folder(args.out)
+    packed = args.packed or (PACKED if PACKED.is_dir() else None)
+    if packed is not None and not packed.is_dir():
+        raise SystemExit(f"gpu_check: {packed}: no such folder; make it with --pack, or leave --packed out")
+    commit = commit_of(packed)
+    path = out / f"gpu_check_{args.job}.json"
+    report: dict[str, Any] = {"stages": {}, **read_json(path)}
+    report |= {"job": args.job, "complete": False, "rehearsal": args.rehearse, "limit_s": args.limit_s}
+    report["environment"] = environment(commit)
+    check = Check(
+        *(0.0, out, PLACE if os.access(ROOT, os.W_OK) else Path(tempfile.mkdtemp(prefix="gpu_check_"))),
+        *(path.with_suffix(".log"), packed.resolve() if packed else None),
+        *(tuple(folder.resolve() for folder in args.captures), args.steps_scaler, commit, args.rehearse),
+        note=lambda found: None,
+    )
+    try:
+        failed = run_stages(args.stages or list(JOBS[args.job]), args.limit_s, check, report, path)
+    finally:
+        # what runs beside the stages is not left behind
+        for command in check.beside.values():
+            command.kill()
+    print(f"{path}: {'failed: ' + ', '.join(failed) if failed else 'every stage ran'}", flush=True)
+    return 1 if failed else 0
+
+
 if __name__ == "__main__":
+    # a job that is ended takes its commands, which have sessions of their own, along
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     sys.exit(main())

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 
-from jaxtyping import install_import_hook
+import pytest
 
 # not the innermost loops, where the check costs more than the work, and not the dataclasses, which check themselves
 SHAPES_CHECKED = tuple(
@@ -15,7 +16,20 @@ SHAPES_CHECKED = tuple(
         *("loss_magnitudes", "optimizer", "training", "margins", "extent_margins"),
     )
 )
-install_import_hook(SHAPES_CHECKED, "beartype.beartype")
+CHECKERS = ("beartype", "jaxtyping")
+# a bare GPU node has neither: there the tests run unchecked, and the summary says so
+UNCHECKED = [name for name in CHECKERS if importlib.util.find_spec(name) is None]
+if not UNCHECKED:
+    from jaxtyping import install_import_hook
+
+    install_import_hook(SHAPES_CHECKED, "beartype.beartype")
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say, also under -q, that shapes were not checked."""
+    if UNCHECKED:
+        terminalreporter.write_line(f"shapes were NOT checked: {' and '.join(UNCHECKED)} not installed")
+
 
 from pop_ref.conformance.examples import load_profile  # noqa: E402  after the hook, which must see pop_ref imported
 

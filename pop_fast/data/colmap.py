@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 
 from pop_fast.data.colmap_binary import count_images_binary, read_binary
 from pop_fast.data.colmap_records import ImageRecord, Model
 from pop_fast.data.colmap_text import count_images_text, read_text
+from pop_fast.data.pinhole import require_colmap
 from pop_fast.data.rigid import rigid_from_quat
 from pop_fast.data.shots import Cloud, Shot
 from pop_fast.errors import CaptureError
@@ -65,12 +65,13 @@ def _count_images(model: Path) -> int:
 @contextmanager
 def quiet_colmap() -> Iterator[None]:
     """Keep COLMAP's own log off the terminal: what matters of it is raised as one line."""
-    before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
+    log = require_colmap().logging
+    before = log.minloglevel
+    log.minloglevel = int(log.Level.FATAL)
     try:
         yield
     finally:
-        pycolmap.logging.minloglevel = before
+        log.minloglevel = before
 
 
 def read_model(model: Path) -> tuple[list[Shot], Cloud]:

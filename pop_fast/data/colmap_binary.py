@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from pop_fast.data.colmap_records import ImageRecord, Model, make_camera, model_names, parameter_count
+from pop_fast.data.colmap_records import ImageRecord, Model, model_name, model_names, parameter_count
+from pop_fast.data.pinhole import make_camera
 from pop_fast.errors import CaptureError
 
 __all__ = ["count_images_binary", "read_binary"]
@@ -97,11 +98,11 @@ def _read(path: Path, record: Callable[[_Cursor], Any]) -> list[Any]:
 
 def _camera(cursor: _Cursor) -> Any:
     camera_id, model, width, height = cursor.read("<IiQQ")
-    known = model_names()
-    if model not in known:
-        raise ValueError(f"camera {camera_id} has the unknown camera model {model} (known: 0 to {max(known)})")
-    params = cursor.read(f"<{parameter_count(known[model])}d")
-    return make_camera(camera_id, known[model], width, height, list(params))
+    name = model_name(model)
+    if name is None:
+        raise ValueError(f"camera {camera_id} has the unknown camera model {model} (known: 0 to {max(model_names())})")
+    params = cursor.read(f"<{parameter_count(name)}d")
+    return make_camera(camera_id, name, width, height, list(params))
 
 
 def _image(cursor: _Cursor) -> ImageRecord:

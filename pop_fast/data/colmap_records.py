@@ -7,9 +7,10 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import pycolmap
 
-__all__ = ["ImageRecord", "Model", "make_camera", "model_names", "parameter_count"]
+from pop_fast.data.pinhole import PINHOLES, require_colmap
+
+__all__ = ["ImageRecord", "Model", "model_name", "model_names", "parameter_count"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +37,7 @@ class Model:
     """Cameras, images and points of a model.
 
     Attributes:
-        cameras: `pycolmap.Camera` by id.
+        cameras: as `pop_fast.data.pinhole.make_camera` makes them, by id.
         images: in the order of the file.
         point_ids: uint64 [P]
         xyz: float64 [P, 3]
@@ -53,17 +54,22 @@ class Model:
 @cache
 def model_names() -> dict[int, str]:
     """List COLMAP's camera models by their number."""
-    models = pycolmap.CameraModelId.__members__.items()
+    models = require_colmap().CameraModelId.__members__.items()
     return {int(model): name for name, model in models if int(model) >= 0}
+
+
+def model_name(number: int) -> str | None:
+    """Return the name of a camera model, or None where no model has that number."""
+    for name, (own, _) in PINHOLES.items():
+        if own == number:
+            return name
+    return model_names().get(number)
 
 
 @cache
 def parameter_count(name: str) -> int:
     """Tell how many parameters a camera model has."""
-    probe = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId.__members__[name], 1.0, 1, 1)
-    return len(probe.params)
-
-
-def make_camera(camera_id: int, model: str, width: int, height: int, params: list[float]) -> Any:
-    """Build a `pycolmap.Camera`, whose fields are not judged yet."""
-    return pycolmap.Camera(camera_id=camera_id, model=model, width=width, height=height, params=params)
+    if name in PINHOLES:
+        return max(PINHOLES[name][1]) + 1
+    models = require_colmap()
+    return len(models.Camera.create_from_model_id(1, models.CameraModelId.__members__[name], 1.0, 1, 1).params)

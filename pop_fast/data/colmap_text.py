@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from pop_fast.data.colmap_records import ImageRecord, Model, make_camera, model_names, parameter_count
+from pop_fast.data.colmap_records import ImageRecord, Model, model_names, parameter_count
+from pop_fast.data.pinhole import PINHOLES, make_camera
 from pop_fast.errors import CaptureError
 
 __all__ = ["count_images_text", "read_text"]
@@ -126,7 +127,7 @@ def _is_number(word: str) -> bool:
 
 def _camera(line: _Line) -> Any:
     model = line.words[1]
-    if model not in model_names().values():
+    if model not in PINHOLES and model not in model_names().values():
         raise CaptureError(f"{line.where}: MODEL is {model!r}; use one of {', '.join(model_names().values())}")
     words = line.words[4].split()
     if len(words) != parameter_count(model):

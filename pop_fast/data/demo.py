@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from pop_fast.data.capture import Progress
 from pop_fast.data.colmap import quiet_colmap
 from pop_fast.data.demo_scene import Scene, make_scene
 from pop_fast.data.demo_tracer import first_hits, render_view
+from pop_fast.data.pinhole import require_colmap
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import folder_atomically
 from pop_fast.io.images import write_png
@@ -57,6 +57,8 @@ def make_demo(
     """
     if views < 4 or min(width, height) < 16:
         raise CaptureError(f"the demo was asked for with {views} views of {width}x{height}; use 4 and 16x16 or more")
+    # asked for before the minutes of tracing, not after
+    require_colmap()
     scene = make_scene(seed)
     generator = np.random.default_rng([seed, 2])
     viewmats = _orbit(generator, views)
@@ -186,6 +188,7 @@ def _sees(scene: Scene, viewmat: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def _write_model(folder: Path, viewmats: np.ndarray, K: np.ndarray, size: tuple[int, int], survey: _Survey) -> None:
     """Write cameras, poses, points and tracks as a COLMAP model."""
+    pycolmap = require_colmap()
     model = pycolmap.Reconstruction()
     params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
     camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=size[0], height=size[1], params=params)

@@ -16,10 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pycolmap
-
 from pop_fast.data.capture import Progress
 from pop_fast.data.colmap import quiet_colmap
+from pop_fast.data.pinhole import require_colmap
 from pop_fast.data.sfm_files import recognise_result, write_list
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import folder_atomically
@@ -191,6 +190,7 @@ def _find_cameras(job: _Job, camera_model: str, single_camera: bool, max_size: i
 
 def _extract(job: _Job, camera_model: str, single_camera: bool, max_size: int) -> None:
     """Find features, a few photographs at a time, so that progress can be told and an interrupt is heard."""
+    pycolmap = require_colmap()
     if camera_model not in pycolmap.CameraModelId.__members__ or camera_model == "INVALID":
         known = ", ".join(name for name in pycolmap.CameraModelId.__members__ if name != "INVALID")
         raise CaptureError(f"camera_model is {camera_model!r}; use one of {known}")
@@ -225,6 +225,7 @@ def _pairs(n: int) -> list[tuple[int, int]]:
 
 
 def _match(job: _Job, seed: int) -> None:
+    pycolmap = require_colmap()
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     pairs = _pairs(len(job.names))
@@ -243,6 +244,7 @@ def _match(job: _Job, seed: int) -> None:
 
 
 def _map(job: _Job, seed: int) -> Any:
+    pycolmap = require_colmap()
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = seed
     options.mapper.random_seed = seed

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import pycolmap
+from scipy.spatial.transform import Rotation
 
 from pop_fast.io.points import FARTHEST
 
@@ -67,6 +67,6 @@ def rigid_from_quat(quat: np.ndarray, translation: np.ndarray) -> np.ndarray:
     unit = quat / np.abs(quat).max()
     unit = unit / np.linalg.norm(unit)
     rigid = np.eye(4)
-    rigid[:3, :3] = pycolmap.Rotation3d(unit[[1, 2, 3, 0]]).matrix()
+    rigid[:3, :3] = Rotation.from_quat(unit[[1, 2, 3, 0]]).as_matrix()
     rigid[:3, 3] = translation
     return rigid

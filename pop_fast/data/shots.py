@@ -21,7 +21,7 @@ class Shot:
         name: as listed; unique, and what views are sorted by.
         folder: the image folder, relative to the capture; "" for the capture itself.
         file: relative name in that folder; the extension may differ from the file's.
-        camera: a `pycolmap.Camera`, or None where only the field of view is known.
+        camera: a `PinholeCamera` or `pycolmap.Camera`, or None where only the field of view is known.
         viewmat: world -> camera, rigid. float64 [4, 4]
         angle_x: horizontal field of view in radians, where `camera` is None.
         mask: the mask file that the list names, if any.

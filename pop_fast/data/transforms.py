@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 import numpy as np
-import pycolmap
 
 from pop_fast.data.capture import Split
+from pop_fast.data.pinhole import make_camera
 from pop_fast.data.rigid import nearest_rigid
 from pop_fast.data.shots import Cloud, Shot
 from pop_fast.errors import CaptureError
@@ -175,7 +175,7 @@ def _camera(where: str, fields: dict[str, Any], camera_id: int) -> Any:
         raise CaptureError(f"{where}: has focal lengths {focal_x}, {focal_y}; both must be > 0")
     pinhole = [focal_x, focal_y, number("cx", width / 2), number("cy", height / 2)]
     name, lens = _lens(where, model, number)
-    return pycolmap.Camera(camera_id=camera_id, model=name, width=width, height=height, params=pinhole + lens)
+    return make_camera(camera_id, name, width, height, pinhole + lens)
 
 
 def _angle(where: str, fields: dict[str, Any]) -> float | None:
@@ -216,7 +216,9 @@ def _lens(
     p1, p2 = number("p1", 0.0), number("p2", 0.0)
     if k3:
         return "FULL_OPENCV", [k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]
-    return "OPENCV", [k1, k2, p1, p2]
+    if k1 or k2 or p1 or p2:
+        return "OPENCV", [k1, k2, p1, p2]
+    return "PINHOLE", []
 
 
 class _Numbers:

@@ -54,7 +54,7 @@ class Undistortion:
 
 
 def intrinsics(camera: Any) -> np.ndarray:
-    """Read the pinhole part of a `pycolmap.Camera`: focal lengths and principal point, px. float64 [3, 3]"""
+    """Read the pinhole part of a camera: focal lengths and principal point, px. float64 [3, 3]"""
     K = np.eye(3)
     K[0, 0], K[1, 1] = camera.focal_length_x, camera.focal_length_y
     K[0, 2], K[1, 2] = camera.principal_point_x, camera.principal_point_y
@@ -65,7 +65,7 @@ def undistortion(camera: Any, width: int, height: int) -> Undistortion:
     """Plan the undistortion of photographs stored at width x height px, whatever size the camera was calibrated at.
 
     Args:
-        camera: a `pycolmap.Camera` of any perspective model.
+        camera: a `PinholeCamera`, or a `pycolmap.Camera` of any perspective model.
         width: of the stored photograph, px.
         height: likewise.
 

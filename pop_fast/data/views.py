@@ -18,9 +18,9 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-import pycolmap
 
 from pop_fast.data.capture import Progress, View
+from pop_fast.data.pinhole import make_camera
 from pop_fast.data.shots import Shot
 from pop_fast.data.undistort import Undistortion, undistortion
 from pop_fast.errors import CaptureError
@@ -131,8 +131,7 @@ def _rectifier() -> Any:
     def remembered(
         model: str, params: tuple[float, ...], size: tuple[int, int], stored: tuple[int, int]
     ) -> Undistortion:
-        camera: Any = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params))
-        return undistortion(camera, *stored)
+        return undistortion(make_camera(0, model, *size, list(params)), *stored)
 
     def rectify(camera: Any, width: int, height: int) -> Undistortion:
         return remembered(camera.model_name, tuple(camera.params), (camera.width, camera.height), (width, height))
@@ -168,7 +167,7 @@ def _read(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
 def _camera_from_angle(angle_x: float, width: int, height: int) -> Any:
     focal = 0.5 * width / math.tan(0.5 * angle_x)
     params = [focal, focal, width / 2, height / 2]
-    return pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
+    return make_camera(0, "PINHOLE", width, height, params)
 
 
 def _check_shape(path: Path, what: str, size: tuple[int, int], whose: str, other: tuple[int, int]) -> None:

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyElement
 
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
@@ -73,11 +72,14 @@ def save_ply(
         arrays["quats"],
     ]
     table = np.ascontiguousarray(np.concatenate(columns, axis=1), dtype="<f4")
-    rows = table.view([(name, "<f4") for name in _COLUMNS]).reshape(n)
-    comments = [f"{_MODE} {'mip' if antialiased else 'default'}"]
-    ply = PlyData([PlyElement.describe(rows, "vertex")], text=False, byte_order="<", comments=comments)
-    write_atomically(path, ply.write)
+    write_atomically(path, lambda file: file.write(_header(n, antialiased) + table.tobytes()))
     return before, n
+
+
+def _header(n: int, antialiased: bool) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {_MODE} {'mip' if antialiased else 'default'}"]
+    lines += [f"element vertex {n}", *(f"property float {name}" for name in _COLUMNS), "end_header", ""]
+    return "\n".join(lines).encode("ascii")
 
 
 def load_ply(path: str | os.PathLike[str]) -> dict[str, torch.Tensor]:

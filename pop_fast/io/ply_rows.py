@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from plyfile import PlyData, PlyParseError
 
 from pop_fast.errors import PopError
 
@@ -97,12 +96,10 @@ def read_vertices(path: Path) -> np.ndarray:
         read = header.elements[: names.index("vertex") + 1]
         if header.order and not any(element.lists for element in read):
             return _block(header, read, data)
-        # plyfile reads headers as ASCII, and comments are written in any language
-        head = bytes(byte if byte < 128 else ord("?") for byte in data[: header.length])
-        return PlyData.read(io.BytesIO(head + data[header.length :]))["vertex"].data
+        return _row_by_row(header, data)
     except OSError as error:
         raise PopError(f"{path}: could not be read: {error.strerror}; check the path and its permissions") from error
-    except (PlyParseError, ValueError, IndexError, OverflowError, MemoryError, TypeError) as error:
+    except (ValueError, IndexError, OverflowError, MemoryError, TypeError) as error:
         raise PopError(f"{path}: the PLY file is truncated or corrupt: {error}; copy or write it again") from error
 
 
@@ -115,6 +112,18 @@ def column(path: Path, rows: np.ndarray, name: str, kind: type) -> np.ndarray:
     if rows.dtype[name].kind == "O":
         raise PopError(f"{path}: vertex.{name} is a list; it must be one number a vertex")
     return rows[name].astype(kind)
+
+
+def _row_by_row(header: Header, data: bytes) -> np.ndarray:
+    # not at the top: what this program writes itself is read without it
+    from plyfile import PlyData, PlyParseError
+
+    # it reads headers as ASCII, and comments are written in any language
+    head = bytes(byte if byte < 128 else ord("?") for byte in data[: header.length])
+    try:
+        return PlyData.read(io.BytesIO(head + data[header.length :]))["vertex"].data
+    except PlyParseError as error:
+        raise ValueError(str(error)) from error
 
 
 def _block(header: Header, read: tuple[Element, ...], data: bytes) -> np.ndarray:

@@ -81,7 +81,7 @@ def test_what_is_absent_follows_from_the_rest(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "model", "terms"),
     [
-        ({}, "OPENCV", [0.0, 0.0, 0.0, 0.0]),
+        ({}, "PINHOLE", []),
         ({"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4}, "OPENCV", [0.1, 0.2, 0.3, 0.4]),
         ({"k1": 0.1, "k3": 0.5, "p1": 0.3}, "FULL_OPENCV", [0.1, 0.0, 0.3, 0.0, 0.5, 0.0, 0.0, 0.0]),
         ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.4}, "OPENCV_FISHEYE", [0.1, 0.0, 0.0, 0.4]),

@@ -1,23 +1,30 @@
-"""The check of everything that needs a GPU, on a machine without one: its stages, its file, its limits."""
+"""The check of everything that needs a GPU, on a machine without one: its stages, its files, its limits."""
 
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
 
-from cuda_ext import gpu_check
-from cuda_ext.gpu_check import Check, main, train_one
-from cuda_ext.gpu_check_tools import run, write_json
+from cuda_ext import gpu_check, gpu_check_stages, gpu_check_tools
+from cuda_ext.gpu_check import commit_of, main
+from cuda_ext.gpu_check_budget import MARGIN, Budget, Share
+from cuda_ext.gpu_check_outcomes import outcomes
+from cuda_ext.gpu_check_stages import JOBS, SHARES, STAGES, Check, train_one
+from cuda_ext.gpu_check_tools import Command, first_line, run, write_json
 from pop_fast.cli import main as pop
 
 
-def check(limit: float = 60.0, **changes: object) -> Check:
-    shared = {"captures": (), "steps_scaler": 1.0, "gsplat": "gsplat", "note": lambda found: None, **changes}
-    return Check(time.monotonic() + limit, **shared)  # type: ignore[arg-type]
+def check(folder: Path, **changes: object) -> Check:
+    shared = {"seconds": 60.0, "out": folder, "work": folder / "work", "log": folder / "log", "packed": None}
+    shared |= {"captures": (), "steps_scaler": 1.0, "commit": "c0ffee", "rehearsal": False, "note": lambda found: None}
+    return Check(**{**shared, **changes})  # type: ignore[arg-type]
 
 
 @pytest.fixture
@@ -25,61 +32,140 @@ def stages(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     """Stages in the place of the real ones, which would compile."""
     made: dict[str, object] = {}
     monkeypatch.setattr(gpu_check, "STAGES", made)
-    monkeypatch.setattr(gpu_check, "environment", lambda: {"gpu": "none"})
+    monkeypatch.setattr(gpu_check, "environment", lambda commit: {"commit": commit})
     return made
 
 
+def report(folder: Path, job: int = 1) -> dict[str, dict[str, dict[str, object]]]:
+    return json.loads((folder / f"gpu_check_{job}.json").read_text())
+
+
 def test_a_stage_that_fails_takes_nothing_from_the_others(stages, tmp_path, capsys):
-    out = tmp_path / "new" / "check.json"
+    out = tmp_path / "new"
 
     def raises(check):
-        assert json.loads(out.read_text())["stages"]["build"] == {"status": 0, "seconds": 1.0}
+        assert report(out)["stages"]["build"] == {"status": 0, "seconds": 1.0}
+        assert report(out)["stages"]["bench"] == {"status": None, "state": "not begun"}
         check.note({"status": 0, "seconds": 0.5, "half": True})
-        assert json.loads(out.read_text())["stages"]["laws"]["half"]
+        assert report(out)["stages"]["laws"]["half"]
+        assert not report(out)["complete"]
         raise OSError("the card fell off")
 
     stages |= {"build": lambda check: {"status": 0, "seconds": 1.0}, "laws": raises}
     stages |= {"bench": lambda check: {"status": 0, "seconds": 2.0, "skipped": "nothing to do"}}
     assert main([str(out), "--stages", "build", "laws", "bench"]) == 1
-    report = json.loads(out.read_text())
-    assert report["environment"] == {"gpu": "none"}
-    assert list(report["stages"]) == ["build", "laws", "bench"]
-    assert "the card fell off" in report["stages"]["laws"]["output"]
+    found = report(out)
+    assert found["complete"]
+    assert list(found["stages"]) == ["build", "laws", "bench"]
+    assert "the card fell off" in found["stages"]["laws"]["output"]
     assert "laws: FAILED" in capsys.readouterr().out
     # a later call fills the same file
     stages["laws"] = lambda check: {"status": 0, "seconds": 3.0}
     assert main([str(out), "--stages", "laws"]) == 0
-    assert [stage["status"] for stage in json.loads(out.read_text())["stages"].values()] == [0, 0, 0]
+    assert [stage["status"] for stage in report(out)["stages"].values()] == [0, 0, 0]
+
+
+def test_results_go_where_the_environment_says(stages, tmp_path, monkeypatch):
+    stages["build"] = lambda check: {"status": 0, "seconds": 1.0}
+    monkeypatch.setenv("OUT", str(tmp_path / "results"))
+    assert main(["--stages", "build"]) == 0
+    assert report(tmp_path / "results")["stages"]["build"]["status"] == 0
+    assert main([str(tmp_path / "named"), "--stages", "build", "--job", "2"]) == 0
+    assert report(tmp_path / "named", 2)["job"] == 2
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SystemExit, match="is a file; name a folder"):
+        main([str(tmp_path / "file"), "--stages", "build"])
 
 
 def test_a_call_without_time_says_so_for_every_stage(stages, tmp_path):
     stages["build"] = lambda check: pytest.fail("it must not be begun")
-    assert main([str(tmp_path / "c.json"), "--limit-s", "0", "--stages", "build"]) == 1
-    assert "no time was left" in json.loads((tmp_path / "c.json").read_text())["stages"]["build"]["output"]
+    assert main([str(tmp_path), "--limit-s", "0", "--stages", "build"]) == 1
+    assert "no time was left" in report(tmp_path)["stages"]["build"]["output"]
 
 
-def test_a_command_is_asked_to_stop_before_it_is_made_to(monkeypatch):
-    monkeypatch.setattr("cuda_ext.gpu_check_tools.GRACE", 5.0)
+def test_no_stage_takes_what_later_ones_need():
+    shares = {"build": Share(100, 300), "bench": Share(120, 1e9), "gsplat": Share(60, 1e9)}
+    budget = Budget(560.0, shares, list(shares))
+    assert budget.seconds("build") == pytest.approx(300.0, abs=0.5)
+    assert budget.seconds("bench") == pytest.approx(560.0 - MARGIN - 60.0, abs=0.5)
+    assert budget.seconds("gsplat") == pytest.approx(560.0 - MARGIN, abs=0.5)
+    # a short call starves none either
+    short = Budget(100.0 + MARGIN, shares, list(shares))
+    kept = 0.9 * 100.0 / 280.0
+    assert short.seconds("build") == pytest.approx(100.0 - 180.0 * kept, abs=0.5)
+    assert short.seconds("bench") == pytest.approx(100.0 - 60.0 * kept, abs=0.5)
+    for job in JOBS.values():
+        # however long the stages before it take, each is left its least
+        assert sum(SHARES[name].least for name in job) < 500.0
+    assert set(STAGES) == set(SHARES) == {name for job in JOBS.values() for name in job}
+
+
+def test_a_command_is_asked_to_stop_before_it_is_made_to(tmp_path):
     polite = (
         "import signal, sys, time; signal.signal(signal.SIGTERM, lambda *a: (print('a checkpoint'), sys.exit(130)));"
         "print('begun', flush=True); time.sleep(60)"
     )
-    found = run([sys.executable, "-c", polite], 7.0)
+    found = run([sys.executable, "-c", polite], 8.0, tmp_path / "log")
     assert found["status"] == 130
     assert found["output"].split("\n")[:2] == ["begun", "a checkpoint"]
-    monkeypatch.setattr("cuda_ext.gpu_check_tools.GRACE", 0.5)
+    interrupted = "import time\ntry: time.sleep(60)\nexcept KeyboardInterrupt: print('a summary'); raise SystemExit(2)"
+    found = run([sys.executable, "-c", interrupted], 6.0, tmp_path / "log", stop=signal.SIGINT)
+    assert (found["status"], found["output"]) == (2, "a summary\n")
     deaf = (
         "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('begun', flush=True); time.sleep(60)"
     )
-    found = run([sys.executable, "-c", deaf], 2.5)
+    found = run([sys.executable, "-c", deaf], 4.0, tmp_path / "log")
     assert found["status"] == 124
     assert found["seconds"] < 30.0
+    # each command's words stand in the log, and only its own in what is returned
+    assert (tmp_path / "log").read_text().count("$ ") == 3
 
 
-def test_a_training_is_reported_with_its_loading_apart(tmp_path, monkeypatch):
-    monkeypatch.setattr(gpu_check, "OUT", tmp_path / "out")
+def test_a_job_that_is_ended_takes_its_commands_along(tmp_path):
+    mark = tmp_path / "begun"
+    child = f"import pathlib, time; pathlib.Path({str(mark)!r}).write_text('x'); time.sleep(60)"
+    code = (
+        "import signal, sys, pathlib; from cuda_ext.gpu_check_tools import Command;"
+        "signal.signal(signal.SIGTERM, lambda *_: sys.exit(143));"
+        f"command = Command([sys.executable, '-c', {child!r}], pathlib.Path({str(tmp_path / 'log')!r}));"
+        "print(command._process.pid, flush=True); command.wait(50.0)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], cwd=gpu_check_tools.ROOT, stdout=subprocess.PIPE) as job:
+        assert job.stdout is not None
+        child_id = int(job.stdout.readline())
+        while not mark.exists():
+            time.sleep(0.1)
+        job.terminate()
+        assert job.wait(20.0) == 143
+    with pytest.raises(ProcessLookupError):
+        os.kill(child_id, 0)
+
+
+def test_a_command_runs_beside_others(tmp_path):
+    beside = Command([sys.executable, "-c", "print('compiled')"], tmp_path / "log", {"A": "b"})
+    found = run([sys.executable, "-c", "print('measured')"], 30.0, tmp_path / "other")
+    assert (found["status"], found["output"]) == (0, "measured\n")
+    assert beside.wait(30.0)["output"] == "compiled\n"
+
+
+def test_a_commit_is_known_without_git(tmp_path, monkeypatch):
+    monkeypatch.setattr(gpu_check, "ROOT", tmp_path)
+    monkeypatch.delenv(gpu_check.COMMIT, raising=False)
+    assert commit_of(None) == commit_of(tmp_path) == "unknown"
+    write_json(tmp_path / "manifest.json", {"commit": "c0ffee"})
+    assert commit_of(tmp_path) == "c0ffee"
+    monkeypatch.setenv(gpu_check.COMMIT, "beef")
+    assert commit_of(tmp_path) == "beef"
+    # what a failing command says is no answer
+    monkeypatch.setattr(gpu_check_tools, "ROOT", tmp_path)
+    assert first_line(["git", "-C", str(tmp_path), "rev-parse", "HEAD"]) is None
+    assert first_line(["no-such-command"]) is None
+    assert first_line(["printf", "one\ntwo\n"]) == "one"
+
+
+def test_a_training_is_reported_with_its_loading_apart(tmp_path):
     assert pop(["demo", str(tmp_path / "toy"), "--views", "8", "--width", "40", "--height", "32"]) == 0
-    one = train_one(tmp_path / "toy", 120.0, 0.001, backend="fast")
+    one = train_one(check(tmp_path, steps_scaler=0.001), tmp_path / "toy", 120.0, backend="fast")
     assert one["status"] == 0, one["output"]
     assert one["step"] == 29
     assert one["psnr"] > 5.0
@@ -89,23 +175,53 @@ def test_a_training_is_reported_with_its_loading_apart(tmp_path, monkeypatch):
     assert one["seconds_loading"] > 0.0
 
 
-def test_a_training_that_cannot_be_says_why_and_the_next_is_begun(tmp_path, monkeypatch):
-    monkeypatch.setattr(gpu_check, "OUT", tmp_path / "out")
+def test_a_training_that_cannot_be_says_why_and_the_next_is_begun(tmp_path):
     notes: list[dict[str, object]] = []
     missing = (tmp_path / "a", tmp_path / "b")
-    found = gpu_check.train_stage(check(captures=missing, note=lambda told: notes.append(json.loads(json.dumps(told)))))
+    shared = check(tmp_path, captures=missing, note=lambda told: notes.append(json.loads(json.dumps(told))))
+    found = gpu_check_stages.train_stage(shared)
     assert found["status"] != 0
     assert [list(note["runs"]) for note in notes] == [["a"], ["a", "b"]]  # type: ignore[call-overload]
     assert all("pop: error: " in one["output"] for one in found["runs"].values())
-    assert "no captures" in gpu_check.train_stage(check())["skipped"]
+    assert "no captures" in gpu_check_stages.train_stage(check(tmp_path))["skipped"]
 
 
-def test_gsplat_that_cannot_be_installed_is_no_failure(monkeypatch):
-    monkeypatch.setattr(gpu_check, "run", lambda *a, **k: {"status": 1, "seconds": 0.1, "output": "x\nno network\n"})
-    found = gpu_check.gsplat_stage(check())
-    assert (found["status"], found["skipped"]) == (0, "gsplat cannot be installed here: no network")
-    monkeypatch.setattr(gpu_check, "run", lambda *a, **k: {"status": 0, "seconds": 0.1, "output": "1.5.3\n"})
-    assert gpu_check.gsplat_stage(check())["version"] == "1.5.3"
+def test_a_training_without_the_package_of_the_command_line_is_skipped(tmp_path, monkeypatch):
+    monkeypatch.setattr(gpu_check_stages.importlib.util, "find_spec", lambda name: None)
+    found = gpu_check_stages.train_stage(check(tmp_path, captures=(tmp_path,)))
+    assert (found["status"], "needs tyro" in found["skipped"]) == (0, True)
+
+
+def test_gsplat_that_was_not_compiled_is_told_and_is_no_failure(tmp_path):
+    assert "not among the wheels" in gpu_check_stages.gsplat_stage(check(tmp_path))["skipped"]
+    command = [sys.executable, "-c", "raise SystemExit('nvcc does not know this')"]
+    failing = Command(command, tmp_path / "compilation.log")
+    found = gpu_check_stages.gsplat_stage(check(tmp_path, beside={"gsplat": failing}))
+    assert (found["status"], "was not compiled" in found["skipped"]) == (0, True)
+    assert "nvcc does not know this" in found["compilation"]["output"]
+
+
+def test_outcomes_are_those_of_the_tests(tmp_path, monkeypatch):
+    """Every test is written down when it ends, a file that cannot be imported too; nothing but skips is no pass."""
+    (tmp_path / "tests" / "cuda" / "gpu").mkdir(parents=True)
+    monkeypatch.setattr(gpu_check_stages, "ROOT", tmp_path)
+    text = "import pytest\ndef test_a(): pass\ndef test_b(): assert 1 == 2\n@pytest.mark.skip(reason='no GPU')\n"
+    (tmp_path / "tests" / "cuda" / "gpu" / "test_x.py").write_text(text + "def test_c(): pass\n")
+    (tmp_path / "tests" / "cuda" / "gpu" / "test_y.py").write_text("import nothing_of_that_name\n")
+    root = str(gpu_check_tools.ROOT)
+    monkeypatch.setenv("PYTHONPATH", root)
+    found = gpu_check_stages._pytest(check(tmp_path), "laws", ("test_x.py",))
+    assert found["status"] == 1
+    told = found["tests"]
+    assert [told[name] for name in ("passed", "failed", "skipped")] == [1, 1, 1]
+    assert told["failures"][0]["test"].endswith("::test_b")
+    assert "assert 1 == 2" in told["failures"][0]["words"]
+    assert "no GPU" in str(told["skipped_for"])
+    found = gpu_check_stages._pytest(check(tmp_path), "laws", ("test_x.py",), "-k", "test_c")
+    assert (found["status"], found["tests"]["passed"]) == (1, 0)
+    found = gpu_check_stages._pytest(check(tmp_path), "laws", ("test_y.py",))
+    assert "nothing_of_that_name" in found["tests"]["failures"][0]["words"]
+    assert outcomes(tmp_path / "absent.jsonl")["passed"] == 0
 
 
 def test_a_file_is_written_whole(tmp_path: Path) -> None:
@@ -113,3 +229,17 @@ def test_a_file_is_written_whole(tmp_path: Path) -> None:
     with pytest.raises(TypeError):
         write_json(tmp_path / "a.json", {"k": object()})
     assert json.loads((tmp_path / "a.json").read_text()) == {"k": 1}
+
+
+def test_the_whole_call_ends_before_its_limit(stages, tmp_path):
+    """A stage that never ends is cut off, and the file is complete with the stages after it."""
+    deaf = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60)"
+    stages["bench"] = lambda check: check.run([sys.executable, "-c", deaf], check.seconds)
+    stages["gsplat"] = lambda check: {"status": 0, "seconds": check.seconds}
+    start = time.monotonic()
+    assert main([str(tmp_path), "--limit-s", "18", "--stages", "bench", "gsplat"]) == 1
+    assert time.monotonic() - start < 18.0
+    found = report(tmp_path)
+    assert found["complete"]
+    assert found["stages"]["bench"]["status"] == 124
+    assert found["stages"]["gsplat"]["seconds"] > 3.0

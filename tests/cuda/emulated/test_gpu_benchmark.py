@@ -5,75 +5,61 @@ from __future__ import annotations
 import json
 import math
 import sys
-import time
 import types
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 import pop_fast.rasterization
 from pop_fast.cli import main
-from pop_fast.cli.splat import load_splat
 from tests.app.captures import HEIGHT, WIDTH, colmap_capture
 
+from .rehearse import stand_in_card
+
 BENCHMARKS = Path(__file__).resolve().parents[3] / "benchmarks"
-
-
-class StandInEvent:
-    """A CUDA event where everything is done at once."""
-
-    def __init__(self, enable_timing=False):
-        self.at = None
-
-    def record(self):
-        self.at = time.perf_counter()
-
-    def synchronize(self):
-        assert self.at is not None
-
-    def elapsed_time(self, end):
-        return 1e3 * (end.at - self.at)
+STAND_IN = 'from pop_fast.rasterization import rasterization\n\n__version__ = "stand-in"\n'
 
 
 @pytest.fixture
 def bench(gpu, monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
-    monkeypatch.setattr(torch.cuda, "Event", StandInEvent)
-    monkeypatch.setattr(torch.cuda, "_sleep", lambda cycles: None)
-    properties = types.SimpleNamespace(multi_processor_count=2)
-    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: properties)
+    stand_in_card(monkeypatch)
+    import gpu_gsplat
     import gpu_kernels
 
     for name, value in {"WARM_UP": 1, "REPEATS": 2, "STEPS": 4}.items():
         monkeypatch.setattr(gpu_kernels, name, value)
+    monkeypatch.setattr(gpu_gsplat, "STEPS", 4)
     monkeypatch.delitem(sys.modules, "gsplat", raising=False)
     yield gpu_kernels
     # a stand-in is not left to other tests
     sys.modules.pop("gsplat", None)
 
 
+def run(module, monkeypatch, out, *words):
+    """Run a benchmark's command line; return its status and its file."""
+    command = [module.__name__, str(out), "--device", "cpu", "--full-size", "3000", "--cases", "tiny", *words]
+    monkeypatch.setattr(sys, "argv", command)
+    status = module.main()
+    return status, json.loads(out.read_text())
+
+
 def numbers(tree):
     for value in tree.values():
         if isinstance(value, dict):
             yield from numbers(value)
-        elif not isinstance(value, str):
+        elif value is not None and not isinstance(value, str):
             yield value
 
 
 def test_every_number_of_the_benchmark_is_measured(bench, gpu, monkeypatch, tmp_path):
-    from gpu_floors import measured_card
-    from gpu_scenes import GpuCase, activated_scene
     from gpu_steps import KERNELS
 
-    # the CPU's rasterization has gsplat's signature
-    words = 'from pop_fast.rasterization import rasterization\n\n__version__ = "stand-in"\n'
-    (tmp_path / "gsplat.py").write_text(words)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    case = GpuCase("tiny", 40, 40, 24, 4.0)
-    scene = activated_scene(case, gpu)
-    found = bench.measure(case, scene, measured_card(gpu, copied=1 << 16))
-    json.dumps(found)
+    status, told = run(bench, monkeypatch, tmp_path / "bench.json")
+    assert (status, list(told["cases"])) == (0, ["tiny"])
+    found = told["cases"]["tiny"]
     assert all(math.isfinite(number) for number in numbers(found))
     loads = found["columns_by_kernel"]["loads"]
     assert 0 < loads["visible"] <= loads["gaussians"] == 40
@@ -86,37 +72,108 @@ def test_every_number_of_the_benchmark_is_measured(bench, gpu, monkeypatch, tmp_
         *("project", "count_instances", "make_tile_lists", "blend_forward", "photometric"),
         *("blend_backward", "update"),
     }
-    assert set(found["ratios"]) == {"forward", "backward", "forward_backward", "step"}
     for family in ("columns", "columns_atomic", "splats", "splats_atomic"):
         assert found[family]["step_with_pop_ms"] > 0.0
+    assert found["columns"]["step_kernels"].keys() == {"skipped"}
+
+
+def test_gsplat_is_measured_beside_the_same_case(bench, monkeypatch, tmp_path):
+    import gpu_gsplat
+
+    # the CPU's rasterization has gsplat's signature
+    (tmp_path / "gsplat.py").write_text(STAND_IN)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    sums = iter(range(1, 100))
+    for module in (bench, gpu_gsplat, sys.modules["gpu_steps"]):
+        monkeypatch.setattr(module, "kernel_sums", lambda run, calls=1: (run() and None) or {"kernels_ms": next(sums)})
+    status, told = run(gpu_gsplat, monkeypatch, tmp_path / "beside.json")
+    assert (status, told["gsplat"]) == (0, "stand-in")
+    found = told["cases"]["tiny"]
+    ours, theirs = found["ours"], found["gsplat"]
+    assert found["ratios"]["forward"] == theirs["forward_ms"] / ours["forward_ms"]
+    kernels = theirs["step_kernels"]["kernels_ms"] / ours["step_kernels"]["kernels_ms"]
+    assert found["kernel_ratios"]["step"] == kernels
+
+
+def test_what_fails_is_told_and_takes_nothing_from_the_rest(bench, monkeypatch, tmp_path):
+    """A part, a case and a scene that cannot be: each is told, and what comes after it is measured."""
+
+    def raises(*arguments, **options):
+        raise SystemExit("the families do not compile")
+
+    monkeypatch.setattr(bench, "families_differ", raises)
+    monkeypatch.setattr(bench, "photograph_of", raises)
+    (tmp_path / "broken.npz").write_text("no zip")
+    status, told = run(bench, monkeypatch, tmp_path / "bench.json", "--scenes", str(tmp_path / "broken.npz"))
+    assert status == 1
+    assert list(told["cases"]) == ["tiny", "broken", "broken_enlarged"]
+    assert set(told["cases"]["tiny"]["failed"]) == {"families_differ", "photograph"}
+    assert "the families do not compile" in told["cases"]["tiny"]["failed"]["photograph"]
+    assert set(told["cases"]["broken"]["failed"]) == {"scene"}
+
+
+def test_families_that_differ_are_told_beside_the_times(bench, monkeypatch):
+    parts = bench.Record({}, lambda: None)
+    monkeypatch.setattr(bench, "families_differ", lambda scene, case: {"means": float("nan")})
+    monkeypatch.setattr(bench, "photograph_of", lambda scene, case: None)
+    bench.measure(None, {}, None, parts)
+    assert "differ by nan" in parts.result["failed"]["families_differ"]
+
+
+def test_kernel_times_are_added_up_by_name(bench):
+    from gpu_profile import summed
+
+    def event(name, us, device=torch.autograd.DeviceType.CUDA, annotation=False):
+        span = types.SimpleNamespace(elapsed_us=lambda: us)
+        return types.SimpleNamespace(name=name, device_type=device, time_range=span, is_user_annotation=annotation)
+
+    events = [event("blend", 500.0), event("blend", 300.0), event("Memset", 200.0), event("spin_kernel", 9e6)]
+    events += [event("Optimizer.step", 800.0, annotation=True), event("aten::mul", 70.0, torch.autograd.DeviceType.CPU)]
+    found = summed(events, 2)
+    assert found == {"kernels_ms": pytest.approx(0.5), "launches": 1.5, "largest": {"blend": 0.4, "Memset": 0.1}}
+    assert "saw no kernels" in summed([], 1)["skipped"]
 
 
 def test_the_loss_that_gsplat_is_given_is_the_objective(bench, gpu):
     from gpu_gsplat import LAMBDA_SSIM, FusedLoss
-    from gpu_scenes import GpuCase, activated_scene
+    from gpu_scenes import TINY, activated_scene
 
     from pop_fast.losses import photometric_pop
 
-    case = GpuCase("tiny", 5, 40, 24, 4.0)
     g = torch.Generator().manual_seed(3)
     photograph = torch.randint(0, 256, (24, 40, 3), generator=g, dtype=torch.uint8)
     image = torch.rand((24, 40, 3), generator=g)
-    found = FusedLoss(activated_scene(case, gpu), photograph).v_image(image)
+    found = FusedLoss(activated_scene(TINY, gpu), photograph).v_image(image)
     leaf = image.double().requires_grad_()
     photometric_pop(leaf, photograph.double() / 255.0, LAMBDA_SSIM).backward()
     torch.testing.assert_close(found.double(), leaf.grad, rtol=1e-3, atol=1e-3 * float(leaf.grad.abs().max()))
 
 
-def test_a_trained_scene_is_what_the_run_left_behind(bench, gpu, tmp_path, capsys):
-    from gpu_scenes import trained_scene
+def test_a_packed_scene_is_what_the_run_left_behind(bench, gpu, tmp_path, capsys):
+    from gpu_pack import pack_scene
+    from gpu_scenes import packed_scene
 
-    capture, run = colmap_capture(tmp_path / "scene"), tmp_path / "run"
-    words = ["train", str(capture), "--out", str(run), "--max-steps", "3", "--backend", "fast", "--quiet"]
+    from pop_fast.cli.splat import load_splat
+
+    capture, folder = colmap_capture(tmp_path / "scene"), tmp_path / "run"
+    words = ["train", str(capture), "--out", str(folder), "--max-steps", "3", "--backend", "fast", "--quiet"]
     assert main(words) == 0, capsys.readouterr()
-    case, scene = trained_scene(run, gpu)
-    params = load_splat(run).params
+    path = pack_scene(folder, tmp_path)
+    case, scene = packed_scene(path, gpu)
+    params = load_splat(folder).params
     assert (case.name, case.n, case.width, case.height) == ("run", len(params["means"]), WIDTH, HEIGHT)
     torch.testing.assert_close(torch.logit(scene["opacities"]), params["opacities"], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(scene["sh"][:, :1], params["sh0"], rtol=1e-3, atol=1e-3)
     assert scene["sh"].shape == (case.n, 16, 3)
+    assert scene["photograph"].shape == (HEIGHT, WIDTH, 3)
     image = bench.draw(pop_fast.rasterization.rasterization, scene, case)[0]
     assert image.std() > 0.01
+    # the same picture, larger
+    large_case, large = packed_scene(path, gpu, 4.0 * WIDTH * HEIGHT)
+    assert (large_case.width / WIDTH, large_case.height / HEIGHT) == pytest.approx((2.0, 2.0), rel=0.4)
+    drawn = bench.draw(pop_fast.rasterization.rasterization, large, large_case)[0][0]
+    shrunk = torch.nn.functional.interpolate(drawn.permute(2, 0, 1)[None], (HEIGHT, WIDTH), mode="area")[0]
+    assert float((shrunk.permute(1, 2, 0) - image[0]).abs().mean()) < 0.5 * float(image.std())
+    assert packed_scene(path, gpu, 1.5 * WIDTH * HEIGHT) is None
+    with np.load(path) as file:
+        assert len(file["viewmats"]) == len(file["Ks"]) == len(file["sizes"])

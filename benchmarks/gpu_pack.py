@@ -1,0 +1,196 @@
+"""Make what a bare GPU node cannot fetch: trained scenes as npz, shrunk captures, wheels, and a list of all of it.
+
+    python benchmarks/gpu_pack.py FOLDER [--runs out/garden_pop ...] [--captures data/garden ...] [--pixels 400000]
+
+`python3 -m cuda_ext.gpu_check --pack FOLDER` runs this; its help says what the folder holds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import math
+import platform
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cuda_ext.gpu_check import commit_of
+from cuda_ext.gpu_check_tools import ROOT, write_json
+from pop_fast.cli.splat import CaptureOptions, load_splat, open_capture
+from pop_fast.data import Capture, View, load_capture
+from pop_fast.errors import PopError
+
+LIMIT: Final = 64 * 2**20  # bytes that travel, with the repository's own files
+QUALITY: Final = 92  # of a photograph's JPEG
+MOST_POINTS: Final = 100_000  # of a capture
+# pure Python, by the names that pip knows them by; gsplat compiles its kernels where it is installed
+WHEELS: Final = ("beartype", "plyfile", "tyro", "typeguard", "docstring-parser", "typing-extensions", "jaxtyping")
+WHEELS += ("wadler-lindig", "gsplat")
+
+
+def pack_scene(run: Path, folder: Path) -> Path:
+    """Write a result of `pop train` as a packed scene: its last checkpoint, its held-out cameras, the first photograph.
+
+    Raises:
+        PopError: it is no result, or its capture is not where it was.
+    """
+    splat = load_splat(run)
+    capture, config = open_capture(splat, CaptureOptions())
+    views = capture.test_views(config.test_every) or capture.views
+    p = {name: value.numpy() for name, value in splat.params.items()}
+    sh = np.zeros((len(p["means"]), 16, 3), np.float16)
+    sh[:, :1], sh[:, 1 : 1 + p["shN"].shape[1]] = p["sh0"], p["shN"]
+    target = folder / f"{run.resolve().name}.npz"
+    np.savez_compressed(
+        target,
+        means=p["means"],
+        quats=p["quats"],
+        scales=np.exp(p["scales"]),
+        opacities=1.0 / (1.0 + np.exp(-p["opacities"])),
+        sh=sh,
+        viewmats=np.stack([view.viewmat for view in views]).astype(np.float32),
+        Ks=np.stack([view.K for view in views]).astype(np.float32),
+        sizes=np.array([(view.width, view.height) for view in views], np.int32),
+        photograph=views[0].image,
+    )
+    return target
+
+
+def pack_capture(source: Path, folder: Path, pixels: float) -> Path:
+    """Write a capture with photographs of at most so many pixels, undistorted, as JPEG beside a COLMAP text model.
+
+    Raises:
+        CaptureError: the capture cannot be read.
+    """
+    capture = load_capture(source, masks=False, normalize=False)
+    target = folder / source.resolve().name
+    (target / "images").mkdir(parents=True)
+    (target / "sparse" / "0").mkdir(parents=True)
+    cameras: list[str] = []
+    images: list[str] = []
+    for k, view in enumerate(capture.views, start=1):
+        name = f"{k:04d}.jpg"
+        image, K = _shrunk(view, pixels)
+        cv2.imwrite(str(target / "images" / name), image[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        high, wide = image.shape[:2]
+        lens = " ".join(map(repr, [*np.diag(K)[:2].tolist(), *K[:2, 2].tolist()]))
+        cameras.append(f"{k} PINHOLE {wide} {high} {lens}")
+        x, y, z, w = Rotation.from_matrix(view.viewmat[:3, :3]).as_quat().tolist()
+        place = " ".join(map(repr, [w, x, y, z, *view.viewmat[:3, 3].tolist()]))
+        # every camera has a line of observations, which is empty
+        images.append(f"{k} {place} {k} {name}\n")
+    for name, lines in (("cameras", cameras), ("images", images), ("points3D", _points(capture))):
+        (target / "sparse" / "0" / f"{name}.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return target
+
+
+def _shrunk(view: View, pixels: float) -> tuple[np.ndarray, np.ndarray]:
+    by = min(1.0, math.sqrt(pixels / (view.width * view.height)))
+    size = (max(round(by * view.width), 1), max(round(by * view.height), 1))
+    K = view.K.copy()
+    if by == 1.0:
+        return view.image, K
+    K[:2] *= np.array([size[0] / view.width, size[1] / view.height])[:, None]
+    return cv2.resize(view.image, size, interpolation=cv2.INTER_AREA), K
+
+
+def _points(capture: Capture) -> list[str]:
+    """Write the points without tracks, evenly thinned where there are very many."""
+    n = len(capture.points)
+    kept = np.linspace(0, n - 1, min(n, MOST_POINTS)).astype(np.int64)
+    rows = zip(capture.points[kept].tolist(), capture.points_rgb[kept].tolist(), strict=True)
+    return [f"{k} {x:.6g} {y:.6g} {z:.6g} {r} {g} {b} 0" for k, ((x, y, z), (r, g, b)) in enumerate(rows, start=1)]
+
+
+def fetch_wheels(folder: Path) -> list[str]:
+    """Download the wheels, each for itself; return what could not be had."""
+    absent: list[str] = []
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in WHEELS:
+        pip = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:"]
+        done = subprocess.run([*pip, "-d", str(folder), name], capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            words = done.stderr.strip().splitlines() or ["no words"]
+            absent.append(f"{name}: {words[-1]}")
+    for wheel in folder.glob("*.whl"):
+        if not wheel.name.endswith("-none-any.whl"):
+            absent.append(f"{wheel.name}: is not pure Python, and may not run on the node")
+            wheel.unlink()
+    return absent
+
+
+def write_manifest(folder: Path, absent: list[str]) -> int:
+    """List every file with its size and digest; return the bytes of the pack and of the repository together."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "manifest.json")
+    listed = {
+        path.relative_to(folder).as_posix(): {
+            "bytes": path.stat().st_size,
+            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        }
+        for path in files
+    }
+    packed, own = sum(entry["bytes"] for entry in listed.values()), _repository_bytes()
+    versions = {"python": platform.python_version(), "numpy": np.__version__}
+    content = {"commit": commit_of(None), "packed_bytes": packed, "repository_bytes": own, "limit_bytes": LIMIT}
+    write_json(folder / "manifest.json", {**content, "made_with": versions, "absent": absent, "files": listed})
+    return packed + own
+
+
+def _repository_bytes() -> int:
+    """Add up what git tracks, or where there is no git everything but what was built."""
+    done = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if done.returncode == 0:
+        paths = [ROOT / name for name in done.stdout.split("\0") if name]
+    else:
+        paths = [p for p in ROOT.rglob("*") if not {"out", "build", ".venv"} & set(p.relative_to(ROOT).parts)]
+    return sum(path.stat().st_size for path in paths if path.is_file())
+
+
+def main() -> int:
+    """Pack from the command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path, help="is made anew; it must not hold anything else")
+    parser.add_argument("--runs", nargs="*", type=Path, default=[], help="results of `pop train`")
+    parser.add_argument("--captures", nargs="*", type=Path, default=[], help="captures to train on")
+    parser.add_argument("--pixels", type=float, default=4e5, help="of a packed photograph, at most")
+    parser.add_argument("--no-wheels", action="store_true", help="download nothing")
+    args = parser.parse_args()
+    folder: Path = args.folder
+    if folder.exists() and any(folder.iterdir()) and not (folder / "manifest.json").is_file():
+        print(f"gpu_pack: {folder}: holds files that no pack has; name another folder", file=sys.stderr)
+        return 2
+    shutil.rmtree(folder, ignore_errors=True)
+    (folder / "scenes").mkdir(parents=True)
+    absent: list[str] = []
+    for what, sources in (("run", args.runs), ("capture", args.captures)):
+        for source in sources:
+            try:
+                made = (
+                    pack_scene(source, folder / "scenes")
+                    if what == "run"
+                    else pack_capture(source, folder / "captures", args.pixels)
+                )
+                print(f"{what} {source}: {made.relative_to(folder)}")
+            except PopError as error:
+                absent.append(f"{what} {source}: {error}")
+    absent += [] if args.no_wheels else fetch_wheels(folder / "wheels")
+    total = write_manifest(folder, absent)
+    for words in absent:
+        print(f"gpu_pack: absent: {words}", file=sys.stderr)
+    print(json.dumps({"packed with the repository, MiB": round(total / 2**20, 1), "of": LIMIT // 2**20}))
+    if total > LIMIT:
+        print("gpu_pack: too much to travel: pack fewer captures, or smaller photographs (--pixels)", file=sys.stderr)
+        return 1
+    return 1 if absent else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
