@@ -152,11 +152,50 @@ __device__ __forceinline__ Sums block_sums(Sums value) {
     return total;
 }
 
+template <bool RENDER, bool TARGET>
+constexpr int N_MAPS = (RENDER ? N_OF_RENDER : 0) + (TARGET ? N_OF_TARGET : 0);
+
+// one channel of render and photograph; `keep` has the bits of the thread's pixels that no mask leaves out
+template <bool RENDER>
+__device__ __forceinline__ void fill_tiles(const Halo& halo, unsigned keep, const float* image,
+                                           const uint8_t* photograph, float* render, float* target) {
+#pragma unroll
+    for (int k = 0; k < SLOTS; ++k) {
+        float2 p = {0.0f, 0.0f};
+        if (halo.pixel[k] >= 0) p = compared(image, photograph, value_of(halo.pixel[k]), (keep >> k) & 1u);
+        if (!Halo::fills(k)) continue;
+        if (RENDER) render[Halo::place(k)] = p.x;
+        target[Halo::place(k)] = p.y;
+    }
+}
+
+// what is blurred, of four neighbouring values
+template <bool RENDER, bool TARGET>
+__device__ __forceinline__ void four_products(const float* render, const float* target,
+                                              float (&values)[N_MAPS<RENDER, TARGET>][4]) {
+    constexpr int FIRST_OF_TARGET = N_MAPS<RENDER, TARGET> - N_OF_TARGET;
+    float x[4], y[4];
+    if (RENDER) four_of(render, x);
+    four_of(target, y);
+#pragma unroll
+    for (int j = 0; j < 4; ++j) {
+        if (RENDER) {
+            values[X][j] = x[j];
+            values[XX][j] = x[j] * x[j];
+            values[XY][j] = x[j] * y[j];
+        }
+        if (TARGET) {
+            values[FIRST_OF_TARGET + Y][j] = y[j];
+            values[FIRST_OF_TARGET + YY][j] = y[j] * y[j];
+        }
+    }
+}
+
 // RENDER: compare with the render. TARGET: blur the photograph, for the comparison or, without it, to keep.
 template <bool RENDER, bool TARGET>
 __global__ void __launch_bounds__(THREADS, 4)
     windows_kernel(Photographs photographs, LossArrays loss, LossSettings settings, const DeviceState* state) {
-    constexpr int MAPS = (RENDER ? N_OF_RENDER : 0) + (TARGET ? N_OF_TARGET : 0), FIRST_OF_TARGET = MAPS - N_OF_TARGET;
+    constexpr int MAPS = N_MAPS<RENDER, TARGET>, FIRST_OF_TARGET = MAPS - N_OF_TARGET;
     alignas(16) __shared__ float render[RENDER ? HALO * PITCH : 4];
     alignas(16) __shared__ float target[HALO * PITCH];
     alignas(16) __shared__ float rows[MAPS][HALO][SIDE];
@@ -184,32 +223,10 @@ __global__ void __launch_bounds__(THREADS, 4)
     float *mu_y = photo.moments, *yy = mu_y + CHANNELS * plane;
     float *v_mu = loss.windows, *v_xx = v_mu + plane, *v_xy = v_xx + plane;
     for (int c = 0; c < CHANNELS; ++c) {  // per channel of four pixels, 3 times
-#pragma unroll
-        for (int k = 0; k < SLOTS; ++k) {
-            float2 p = {0.0f, 0.0f};
-            if (halo.pixel[k] >= 0)
-                p = compared(image, photograph, value_of(halo.pixel[k]), (keep >> k) & 1u);
-            if (!Halo::fills(k)) continue;
-            if (RENDER) render[Halo::place(k)] = p.x;
-            target[Halo::place(k)] = p.y;
-        }
+        fill_tiles<RENDER>(halo, keep, image, photograph, render, target);
         __syncthreads();
         blur_across<MAPS>(rows, [&](int at, float (&values)[MAPS][4]) {
-            float x4[4], y4[4];
-            if (RENDER) four_of(render + at, x4);
-            four_of(target + at, y4);
-#pragma unroll
-            for (int j = 0; j < 4; ++j) {
-                if (RENDER) {
-                    values[X][j] = x4[j];
-                    values[XX][j] = x4[j] * x4[j];
-                    values[XY][j] = x4[j] * y4[j];
-                }
-                if (TARGET) {
-                    values[FIRST_OF_TARGET + Y][j] = y4[j];
-                    values[FIRST_OF_TARGET + YY][j] = y4[j] * y4[j];
-                }
-            }
+            four_products<RENDER, TARGET>(render + (RENDER ? at : 0), target + at, values);
         });
         __syncthreads();
         float blur[MAPS][RUN] = {};
