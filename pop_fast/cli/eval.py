@@ -16,7 +16,7 @@ from pop_fast.cli.splat import CaptureOptions, Splat, load_splat, open_capture
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.report import write_report
-from pop_fast.report.source import read_json
+from pop_fast.report.source import read_stats
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.environment import reproducible
 from pop_fast.train.evaluate import evaluate
@@ -96,7 +96,7 @@ def _nets(args: Args, config: TrainConfig) -> list[LPIPS]:
 def _record(folder: Path, step: int, stats: dict[str, Any]) -> None:
     results = ResultFolder(folder)
     path = results.stats_path("val", step)
-    before = read_json(path) if path.is_file() else {"step": step}
+    before = read_stats(path) if path.is_file() else {"step": step}
     results.write_stats("val", step, {**before, **stats})
     write_report(folder)
 

@@ -95,7 +95,7 @@ def read_record(folder: Path | None) -> CaptureRecord | None:
         return None
     try:
         return CaptureRecord(**json.loads(path.read_text(encoding="utf-8")))
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         fix = "remove it, and say again how to read the capture (--images, --missing)"
         raise PopError(f"{path}: is not what 'pop train' writes ({error}); {fix}") from error
 

@@ -31,7 +31,7 @@ def row(stats: Mapping[str, Any]) -> list[str]:
 
     steps = stats.get("step")
     method = str(stats.get("method", "–"))
-    machine = [str(stats.get("machine", "–")), *([stats["backend"]] if "backend" in stats else [])]
+    machine = [str(stats.get("machine", "–")), *([stats["backend"]] if stats.get("backend") else [])]
     machine += [f"{stats['threads']} threads"] if "threads" in stats else []
     return [
         str(stats.get("capture", "–")),

@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from pop_fast.errors import PopError
+from pop_fast.io.read_back import check_record, parse_json, read_arrays, read_json
 from pop_fast.report.curves import Window
 from pop_fast.report.model import Histogram, ReportData, Tile, View
 from pop_fast.train.config import TrainConfig
@@ -22,6 +23,16 @@ MIB: Final = 2**20
 BYTES_CKPT: Final = 59 * 4
 BYTES_PLY: Final = 62 * 4
 _METHODS: Final = {"pop": "POP", "adc": "Plain density control (3DGS)"}
+_AGAIN: Final = "remove the file, or train again"
+_COUNTS: Final = {"counts": ("iu", 1)}
+_VIEW: Final = {
+    "name": ("U", 0),
+    "render": ("u", 3),
+    "photo": ("u", 3),
+    "psnr": ("f", 0),
+    "ssim": ("f", 0),
+    "dominant_ids?": ("i", 2),
+}
 _SMOOTH: Final = 0.03  # width of the running means, as a share of the records
 
 
@@ -64,15 +75,13 @@ def read_records(folder: Path) -> list[dict[str, Any]]:
     path = folder / "metrics.jsonl"
     if not path.is_file():
         return []
-    lines = path.read_text(encoding="utf-8").splitlines()
+    lines = path.read_bytes().split(b"\n")
     records: list[dict[str, Any]] = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            records.append(json.loads(line))
-        except json.JSONDecodeError as error:
-            if number == len(lines):
-                break
-            raise PopError(f"{path}: line {number} is not JSON: {error.msg}; train again to write it anew") from error
+    # behind the last line's end stands nothing, or what a kill left of a line
+    for number, line in enumerate(lines[:-1], start=1):
+        where = f"{path}: line {number}"
+        record = parse_json(line.decode("utf-8", "replace"), where, _AGAIN)
+        records.append(check_record(record, where, _AGAIN, needed=("step",)))
     return records
 
 
@@ -82,19 +91,18 @@ def read_last_stats(folder: Path) -> dict[str, Any]:
     for kind in ("train", "val"):
         numbered = _numbered(folder / "stats", rf"{kind}_step(\d+)\.json")
         if numbered:
-            merged |= read_json(numbered[-1][1])
+            merged |= read_stats(numbered[-1][1])
     return merged
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file that holds an object."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise PopError(f"{path}: is not JSON ({error}); write it again with 'pop eval'") from error
-    if not isinstance(content, dict):
-        raise PopError(f"{path}: holds {type(content).__name__}; it must be an object")
-    return content
+def read_stats(path: Path) -> dict[str, Any]:
+    """Read one file of statistics.
+
+    Raises:
+        PopError: it is damaged; names the entry.
+    """
+    fix = "write it again with 'pop eval'"
+    return check_record(read_json(path, fix), str(path), fix)
 
 
 def headline(stats: Mapping[str, Any]) -> list[Tile]:
@@ -107,14 +115,14 @@ def headline(stats: Mapping[str, Any]) -> list[Tile]:
         tiles.append(Tile("LPIPS", f"{stats['lpips']:.4f}", "", str(stats.get("lpips_net", ""))))
     elif "lpips" in stats:
         tiles.append(Tile("LPIPS", "–", "", str(stats.get("lpips_reason", "not measured"))))
-    if "num_GS" in stats:
+    if stats.get("num_GS") is not None:
         n = int(stats["num_GS"])
         left = stats.get("num_GS_above_floor")
         tiles.append(Tile("Gaussians", f"{n:,}", "", "" if left is None else f"{int(left):,} with opacity ≥ 1/255"))
         as_ply = f"as PLY {n * BYTES_PLY / MIB:.1f} ({BYTES_PLY} B)"
         tiles.append(Tile("Size", f"{n * BYTES_CKPT / MIB:.1f}", "MiB", f"{BYTES_CKPT} B each; {as_ply}"))
     if stats.get("n_blended") is not None:
-        traversed = f"{stats['n_traversed']:.1f} traversed"
+        traversed = "" if stats.get("n_traversed") is None else f"{stats['n_traversed']:.1f} traversed"
         tiles.append(Tile("Gaussians per pixel", f"{stats['n_blended']:.1f}", "blended", traversed))
     return tiles + _cost_tiles(stats)
 
@@ -162,7 +170,7 @@ def _curves(records: Sequence[Mapping[str, Any]], folder: Path) -> dict[str, tup
             steps, values = (list(column) for column in zip(*points, strict=True))
             curves[name] = steps, running_mean(values, window) if smooth else values
     measured = [
-        (step, read_json(path).get("psnr")) for step, path in _numbered(folder / "stats", r"val_step(\d+)\.json")
+        (step, read_stats(path).get("psnr")) for step, path in _numbered(folder / "stats", r"val_step(\d+)\.json")
     ]
     held_out = [(float(step + 1), float(psnr)) for step, psnr in measured if psnr is not None]
     if held_out:
@@ -202,8 +210,9 @@ def _windows(run: TrainConfig) -> list[Window]:
 def _histograms(folder: Path, max_steps: int) -> Iterator[Histogram]:
     numbered = _numbered(folder / "report_data", r"opacity_step(-?\d+)\.npz")
     for place, (step, path) in enumerate(numbered):
-        with _arrays(path) as arrays:
-            counts = arrays["counts"]
+        counts = read_arrays(path, _COUNTS, _AGAIN)["counts"]
+        if len(counts) % 2:
+            raise PopError(f"{path}: counts has {len(counts)} bins, which no run writes; {_AGAIN}")
         last = place == len(numbered) - 1 and step + 1 >= max_steps
         title = "start" if step < 0 else "end" if last else f"iteration {step + 1:,}"
         # two of the file's bins make one bar: 50 bars are readable, and 0.1 and 0.9 stay bin edges
@@ -212,15 +221,15 @@ def _histograms(folder: Path, max_steps: int) -> Iterator[Histogram]:
 
 def _views(folder: Path) -> Iterator[View]:
     for path in _last_view_files(folder):
-        with _arrays(path) as a:
-            yield View(str(a["name"]), a["render"], a["photo"], float(a["psnr"]), float(a["ssim"]))
+        a = read_arrays(path, _VIEW, _AGAIN)
+        yield View(str(a["name"]), a["render"], a["photo"], float(a["psnr"]), float(a["ssim"]))
 
 
 def _dominant(folder: Path) -> tuple[str, np.ndarray, np.ndarray] | None:
     for path in _last_view_files(folder):
-        with _arrays(path) as a:
-            if "dominant_ids" in a:
-                return str(a["name"]), a["dominant_ids"], a["render"]
+        a = read_arrays(path, _VIEW, _AGAIN)
+        if "dominant_ids" in a:
+            return str(a["name"]), a["dominant_ids"], a["render"]
     return None
 
 
@@ -230,13 +239,6 @@ def _last_view_files(folder: Path) -> list[Path]:
     found = [(m, p) for p in data.iterdir() if (m := pattern.fullmatch(p.name))] if data.is_dir() else []
     last = max((int(m[1]) for m, _ in found), default=-1)
     return [path for _, path in sorted((int(m[2]), path) for m, path in found if int(m[1]) == last)]
-
-
-def _arrays(path: Path) -> Any:
-    try:
-        return np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise PopError(f"{path}: is damaged ({error}); remove it, or train again") from error
 
 
 def _numbered(folder: Path, pattern: str) -> list[tuple[int, Path]]:

@@ -204,6 +204,8 @@ class TrainConfig:
             plain = json.loads(text)
         except json.JSONDecodeError as error:
             raise PopError(f"config is not JSON: {error.msg} at line {error.lineno}, column {error.colno}") from error
+        except (ValueError, RecursionError) as error:
+            raise PopError(f"config is not JSON that can be read: {error}") from error
         return from_plain(cls, plain, "config")
 
     def binding(self) -> dict[str, Any]:

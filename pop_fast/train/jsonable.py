@@ -9,6 +9,8 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 from pop_fast.errors import PopError
 
 T = TypeVar("T")
+# up to here a float holds every whole number
+_LARGEST = 2**53
 
 
 def to_plain(value: Any) -> Any:
@@ -59,6 +61,8 @@ def _value(hint: Any, value: Any, where: str) -> Any:
 
 
 def _scalar(hint: Any, value: Any, where: str) -> Any:
+    if isinstance(value, int) and abs(value) > _LARGEST:
+        raise PopError(f"{where} is a number beyond 2^53; no setting is as large")
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if not isinstance(value, hint) or (hint is not bool and isinstance(value, bool)):

@@ -32,6 +32,7 @@ import numpy as np
 
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
+from pop_fast.io.read_back import read_json
 from pop_fast.train.config import TrainConfig
 
 # cfg.json is the first to step aside and the first to be written anew: where it is, the new run has begun
@@ -179,7 +180,7 @@ class ResultFolder:
     def read_stats(self, kind: str, step: int) -> dict[str, Any] | None:
         """Read what `write_stats` wrote, or None."""
         path = self.stats_path(kind, step)
-        return json.loads(path.read_text()) if path.is_file() else None
+        return read_json(path, "remove the file to measure again") if path.is_file() else None
 
     def stats_path(self, kind: str, step: int) -> Path:
         """Return the name of a stats file."""

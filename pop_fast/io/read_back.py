@@ -1,0 +1,116 @@
+"""Read what a run has written, JSON and arrays, and refuse what it cannot have written by file and field."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from pop_fast.errors import PopError
+
+__all__ = ["check_record", "parse_json", "read_arrays", "read_json"]
+
+_TEXTS: Final = frozenset({"method", "capture", "machine", "backend", "lpips_net", "lpips_reason", "view"})
+_NUMBERS: Final = frozenset(
+    {
+        *("step", "num_GS", "num_GS_above_floor", "opacity_below_0.1", "opacity_above_0.9", "psnr", "ssim", "lpips"),
+        *("n_blended", "n_traversed", "views", "threads", "seconds", "seconds_total", "seconds_loading"),
+        *("memory_bytes", "mem", "ellipse_time", "loss", "pop", "num_gaussians", "cloned", "split", "pruned"),
+    }
+)
+# what is drawn is squared, and its logarithm taken and undone
+_LARGEST: Final = 1e150
+
+
+def read_json(path: Path, fix: str) -> dict[str, Any]:
+    """Read a JSON file that holds an object.
+
+    Raises:
+        PopError: it cannot be read or holds something else; ends in `fix`.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise PopError(f"{path}: is not JSON ({error}); {fix}") from error
+    content = parse_json(text, f"{path}:", fix)
+    if not isinstance(content, dict):
+        raise PopError(f"{path}: holds {type(content).__name__}; it must be an object; {fix}")
+    return content
+
+
+def parse_json(text: str, where: str, fix: str) -> Any:
+    """Parse JSON.
+
+    Raises:
+        PopError: it is not JSON, or nested deeper or with longer numbers than Python reads.
+    """
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise PopError(f"{where} is not JSON ({error}); {fix}") from error
+
+
+def check_record(record: Any, where: str, fix: str, needed: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Return a record of statistics whose known entries are the numbers and texts that a run writes, or null.
+
+    Raises:
+        PopError: names the entry as `where: entry`.
+    """
+    if not isinstance(record, dict):
+        raise PopError(f"{where}: holds {type(record).__name__}; it must be an object; {fix}")
+    for key in needed:
+        if record.get(key) is None:
+            raise PopError(f"{where}: has no {key}; {fix}")
+    for key, value in record.items():
+        if value is None:
+            continue
+        if key in _TEXTS and not isinstance(value, str):
+            raise PopError(f"{where}: {key} is {_shown(value)}; it must be a text; {fix}")
+        if key in _NUMBERS and not _is_number(value, whole=key in needed):
+            raise PopError(f"{where}: {key} is {_shown(value)}; it must be a number; {fix}")
+        if key == "versions" and not isinstance(value, dict):
+            raise PopError(f"{where}: {key} is {_shown(value)}; it must be an object; {fix}")
+    return record
+
+
+def _is_number(value: Any, whole: bool) -> bool:
+    if whole or isinstance(value, int):
+        return type(value) is int and abs(value) <= _LARGEST
+    return isinstance(value, float) and not _LARGEST < abs(value) < math.inf
+
+
+def _shown(value: Any) -> str:
+    text = repr(value) if isinstance(value, (str, float, bool)) else type(value).__name__
+    return text if len(text) <= 40 else f"{text[:40]}..."
+
+
+def read_arrays(path: Path, forms: Mapping[str, tuple[str, int]], fix: str) -> dict[str, np.ndarray]:
+    """Read arrays from an .npz file.
+
+    Args:
+        path: the file.
+        forms: by name the kinds that an array may have, as in `numpy.dtype.kind`, and how many axes it has; a name with
+            a "?" behind it may be absent.
+        fix: what to do about a damaged file.
+
+    Raises:
+        PopError: it is damaged, or an array is absent or of another form; names it.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files if name in forms or f"{name}?" in forms}
+    # a damaged zip ends in errors of many kinds
+    except Exception as error:
+        raise PopError(f"{path}: is damaged ({error}); {fix}") from error
+    for name, (kinds, axes) in forms.items():
+        found = arrays.get(name.removesuffix("?"))
+        if found is None and name.endswith("?"):
+            continue
+        if found is None or found.dtype.kind not in kinds or found.ndim != axes or found.size == 0:
+            what = "absent" if found is None else f"{found.dtype} {list(found.shape)}"
+            raise PopError(f"{path}: {name.removesuffix('?')} is {what}, which no run writes; {fix}")
+    return arrays
