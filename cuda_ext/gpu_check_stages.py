@@ -33,7 +33,8 @@ SMOKE += ("test_smoke.py",)
 WATCHED = ("test_ten_steps.py::test_rasterization_and_its_gradients_give_the_same_bits_twice", "test_smoke.py")
 LAWS_REHEARSED = "remaining_light_lies"
 _TRAIN = "from pop_fast.cli import main; raise SystemExit(main())"
-_COMPILE = "from gsplat.cuda._backend import _C; assert _C is not None, 'gsplat found no CUDA toolkit'"
+_COMPILE = "import time; t = time.time(); from gsplat.cuda._backend import _C; print(round(time.time() - t), 's');"
+_COMPILE += "assert _C is not None, 'gsplat found no CUDA toolkit'"
 # what a training run is judged by
 _TOLD = ("step", "seconds", "seconds_loading", "seconds_total", "num_GS", "num_GS_above_floor", "psnr", "ssim", "views")
 _TOLD += ("gpu", "gpu_memory_bytes", "instance_buffers_grown")
