@@ -102,7 +102,7 @@ def photograph_of(scene: dict[str, Tensor], case: GpuCase) -> Tensor:
 
 def by_kernel(scene: dict[str, Tensor], photograph: Tensor, card: Card, family: str) -> dict[str, Any]:
     """Time every kernel of a POP step, beside its work and floor."""
-    times, loads = kernel_times(scene, photograph, STEPS // 4, family=family)
+    times, loads = kernel_times(scene, photograph, max(STEPS // 4, 1), family=family)
     least = floors(loads, card)
     pixels = loads.pixels
     return {
@@ -160,7 +160,7 @@ def measure(case: GpuCase, scene: dict[str, Tensor], card: Card, record: Record)
             def both(options: dict[str, Any] = options) -> dict[str, Any]:
                 found = forward_backward(rasterization, scene, case, **options)
                 found |= whole_step(scene, photograph, STEPS, **options)
-                return found | {"step_kernels": step_kernels(scene, photograph, **options)}
+                return found | {"step_kernels": step_kernels(scene, photograph, max(STEPS // 10, 1), **options)}
 
             record.part(name, both)
     record.part("with_dominance", lambda: forward_backward(rasterization, scene, case, dominance=True))

@@ -65,7 +65,7 @@ def whole_step(scene: dict[str, Tensor], photograph: Tensor, steps: int, **setti
     return found
 
 
-def step_kernels(scene: dict[str, Tensor], photograph: Tensor, steps: int = 20, **settings: Any) -> dict[str, Any]:
+def step_kernels(scene: dict[str, Tensor], photograph: Tensor, steps: int, **settings: Any) -> dict[str, Any]:
     """Add up the times of a replayed plain step's kernels by the profiler."""
     trainer = make_trainer(scene, photograph, 3 * steps, **settings)
     trainer.run(steps, PLAIN)

@@ -34,7 +34,8 @@ from pathlib import Path
 from typing import Any
 
 from cuda_ext.gpu_check_budget import SHORTEST, Budget
-from cuda_ext.gpu_check_stages import JOBS, SHARES, STAGES, Check
+from cuda_ext.gpu_check_shared import Check
+from cuda_ext.gpu_check_stages import JOBS, SHARES, STAGES
 from cuda_ext.gpu_check_tools import ROOT, first_line, python_path, read_json, write_json
 
 PLACE = ROOT / "out" / "gpu_check"

@@ -12,11 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from cuda_ext import gpu_check, gpu_check_stages, gpu_check_tools
+from cuda_ext import gpu_check, gpu_check_stages, gpu_check_tests, gpu_check_tools
 from cuda_ext.gpu_check import commit_of, main
 from cuda_ext.gpu_check_budget import MARGIN, Budget, Share
 from cuda_ext.gpu_check_outcomes import outcomes
-from cuda_ext.gpu_check_stages import JOBS, SHARES, STAGES, Check, train_one
+from cuda_ext.gpu_check_shared import Check
+from cuda_ext.gpu_check_stages import JOBS, SHARES, STAGES, train_one
 from cuda_ext.gpu_check_tools import Command, first_line, run, write_json
 from pop_fast.cli import main as pop
 
@@ -204,22 +205,22 @@ def test_gsplat_that_was_not_compiled_is_told_and_is_no_failure(tmp_path):
 def test_outcomes_are_those_of_the_tests(tmp_path, monkeypatch):
     """Every test is written down when it ends, a file that cannot be imported too; nothing but skips is no pass."""
     (tmp_path / "tests" / "cuda" / "gpu").mkdir(parents=True)
-    monkeypatch.setattr(gpu_check_stages, "ROOT", tmp_path)
+    monkeypatch.setattr(gpu_check_tests, "ROOT", tmp_path)
     text = "import pytest\ndef test_a(): pass\ndef test_b(): assert 1 == 2\n@pytest.mark.skip(reason='no GPU')\n"
     (tmp_path / "tests" / "cuda" / "gpu" / "test_x.py").write_text(text + "def test_c(): pass\n")
     (tmp_path / "tests" / "cuda" / "gpu" / "test_y.py").write_text("import nothing_of_that_name\n")
     root = str(gpu_check_tools.ROOT)
     monkeypatch.setenv("PYTHONPATH", root)
-    found = gpu_check_stages._pytest(check(tmp_path), "laws", ("test_x.py",))
+    found = gpu_check_tests._pytest(check(tmp_path), "laws", ("test_x.py",))
     assert found["status"] == 1
     told = found["tests"]
     assert [told[name] for name in ("passed", "failed", "skipped")] == [1, 1, 1]
     assert told["failures"][0]["test"].endswith("::test_b")
     assert "assert 1 == 2" in told["failures"][0]["words"]
     assert "no GPU" in str(told["skipped_for"])
-    found = gpu_check_stages._pytest(check(tmp_path), "laws", ("test_x.py",), "-k", "test_c")
+    found = gpu_check_tests._pytest(check(tmp_path), "laws", ("test_x.py",), "-k", "test_c")
     assert (found["status"], found["tests"]["passed"]) == (1, 0)
-    found = gpu_check_stages._pytest(check(tmp_path), "laws", ("test_y.py",))
+    found = gpu_check_tests._pytest(check(tmp_path), "laws", ("test_y.py",))
     assert "nothing_of_that_name" in found["tests"]["failures"][0]["words"]
     assert outcomes(tmp_path / "absent.jsonl")["passed"] == 0
 
