@@ -15,13 +15,19 @@ from cuda_ext.gpu_check_shared import NOTHING, Check, skipped
 from cuda_ext.gpu_check_tools import ROOT
 
 LAWS = tuple(f"test_gpu_{name}.py" for name in ("whole", "compositing", "dominance", "gradients", "agreement"))
-STEPS = ("test_ten_steps.py", "test_device_training.py")
+STEPS = tuple(
+    f"test_{name}.py"
+    for name in ("ten_steps", "struct_fields", "instances", "readings", "rows", "photometric", "device_training")
+)
 SMOKE = tuple(
     f"test_ten_steps.py::test_{name}"
     for name in (
         # replayed graphs first: nothing but a GPU can run them
-        *("steps_launched_anew_are_the_replayed_steps", "two_runs_give_the_same_bits"),
-        *("buffers_that_overflow_grow_and_nothing_is_lost", "ten_fused_steps_are_the_cpus_ten_steps"),
+        "steps_launched_anew_are_the_replayed_steps",
+        "graphs_of_several_sizes_and_phases_are_replayed_in_turn",
+        "two_runs_give_the_same_bits",
+        "buffers_that_overflow_grow_and_nothing_is_lost",
+        "ten_fused_steps_are_the_cpus_ten_steps",
     )
 )
 SMOKE += ("test_smoke.py",)
@@ -46,7 +52,10 @@ def laws_of_splats_stage(check: Check) -> dict[str, Any]:
 
 
 def steps_stage(check: Check) -> dict[str, Any]:
-    """Take ten training steps beside the CPU, the same bits twice, overflows, and short trainings beside the CPU's."""
+    """Take ten training steps beside the CPU, the same bits twice, overflows, and short trainings beside the CPU's.
+
+    And hold single kernels, rows of every place and size, and other readings of the paper, to the CPU.
+    """
     few = ("-k", "anew or twice or (events and pop)") if check.rehearsal else ()
     return _pytest(check, "steps", STEPS, *few)
 

@@ -244,3 +244,9 @@ def test_the_whole_call_ends_before_its_limit(stages, tmp_path):
     assert found["complete"]
     assert found["stages"]["bench"]["status"] == 124
     assert found["stages"]["gsplat"]["seconds"] > 3.0
+
+
+def test_every_test_that_needs_a_gpu_is_run_by_a_stage() -> None:
+    there = {file.name for file in (gpu_check_tools.ROOT / "tests" / "cuda" / "gpu").glob("test_*.py")}
+    assert {*gpu_check_tests.LAWS, *gpu_check_tests.STEPS, "test_smoke.py"} == there
+    assert {test.partition("::")[0] for test in gpu_check_tests.SMOKE} <= there
