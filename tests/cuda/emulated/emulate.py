@@ -12,6 +12,7 @@ import hashlib
 import importlib.util
 import os
 import re
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -87,8 +88,9 @@ def build(folder: Path) -> Path:
 
     compiler = find_compiler()
     assert compiler is not None
-    roots = [CUDA_EXT / "csrc", CUDA_EXT, HERE]
-    files = sorted(f for root in roots for f in root.rglob("*") if f.suffix in (".cu", ".cuh", ".h", ".cpp"))
+    # not what was compiled before, which lies below these folders
+    there = [*CUDA_EXT.glob("*"), *(CUDA_EXT / "csrc").rglob("*"), *HERE.glob("*"), *(HERE / "include").rglob("*")]
+    files = sorted(file for file in there if file.suffix in (".cu", ".cuh", ".h", ".cpp"))
     digest = hashlib.sha256(" ".join((*compiler, sys.version, nanobind.__version__, *FLAGS)).encode())
     for file in files:
         digest.update(file.read_bytes())
@@ -115,6 +117,7 @@ def build(folder: Path) -> Path:
     if done.returncode != 0:
         raise RuntimeError(f"the kernels cannot be compiled for the host:\n{done.stderr[-4000:]}")
     partial.replace(library)
+    shutil.rmtree(work)
     return library
 
 

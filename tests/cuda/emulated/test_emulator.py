@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from . import emulate
+from .conftest import FOLDER
 from .emulate import FLAGS, HERE, translated
 
 PROGRAM = r"""
@@ -80,3 +81,21 @@ def test_a_missing_barrier_and_torn_warps_are_seen(tmp_path: Path) -> None:
         "a value is read from a lane that does not take part",
         "a launch of no threads",
     ]
+
+
+@pytest.mark.skipif(emulate.why_not() is not None, reason=str(emulate.why_not()))
+def test_what_was_compiled_is_not_among_the_sources_of_what_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    def name_of_library() -> str:
+        # one that seems to be there is not compiled
+        return emulate.build(FOLDER).parent.name
+
+    monkeypatch.setattr(Path, "exists", lambda path: path.name == "_kernels.so")
+    first = name_of_library()
+    leftover = FOLDER / "a_leftover" / "kernels.cu"
+    leftover.parent.mkdir(parents=True)
+    leftover.write_text("// of an earlier build\n")
+    try:
+        assert name_of_library() == first
+    finally:
+        leftover.unlink()
+        leftover.parent.rmdir()
