@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 TORCH := $(shell sed -n 's/^\(torch==.*\)/\1/p' constraints.txt)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo walkthrough test lint bench cuda emulate gpu-check docs-check clean
+.PHONY: help setup demo walkthrough test lint bench cuda sass emulate gpu-check docs-check clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
@@ -43,6 +43,10 @@ bench: setup  ## check the fast path against the oracle, then time it
 cuda: setup  ## compile the CUDA extension (needs nvcc; no GPU)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[cuda-build]'
 	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python -m cuda_ext.build
+
+sass: setup  ## count the kernels' machine instructions into benchmarks/results/sass.json (needs nvcc; no GPU)
+	$(BIN)/python -m pip install --quiet -e '.[sass]'
+	$(BIN)/python -m cuda_ext.count_sass --json benchmarks/results/sass.json
 
 emulate: setup  ## run the CUDA kernels' own source on the host, warp by warp: every law, training steps (minutes)
 	POP_EMULATED_LAWS=1 POP_CUDA_KINDS="columns atomics splats" $(BIN)/python -m pytest -q tests/cuda/emulated

@@ -88,14 +88,14 @@ def demangled(names: list[str]) -> list[str]:
     return [re.sub(r"\(.*", "", re.sub(r"\((?:int|bool)\)", "", line)) for line in short]
 
 
-def compile_and_read(nvcc: str, source: Path, arch: str, folder: Path) -> list[KernelUse]:
-    """Compile one file for one architecture.
+def compile_and_read(nvcc: str, source: Path, arch: str, folder: Path, output: str = "-c") -> list[KernelUse]:
+    """Compile one file for one architecture; `output` is nvcc's flag, "-cubin" for the device's code alone.
 
     Raises:
         RuntimeError: it does not compile; nvcc's words are in the message.
     """
     target = folder / f"{source.stem}.{arch}.o"
-    command = [nvcc, *NVCC_FLAGS, f"-arch={arch}", "-Xptxas", "-v", "-c", str(source), "-o", str(target)]
+    command = [nvcc, *NVCC_FLAGS, f"-arch={arch}", "-Xptxas", "-v", output, str(source), "-o", str(target)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise RuntimeError(f"{source.name} does not compile for {arch}:\n{done.stderr}")

@@ -63,10 +63,10 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
     last = begin + warp_max(last);
     // entries behind every pixel's last splat have no gradient, but their slots are read
     if (!ATOMIC)
-        for (int entry = last; entry < end; ++entry)
+        for (int entry = last; entry < end; ++entry)  // per unused entry
             if (lane < N) row_of(lists, blend, tile, entry)[lane] = 0.0f;
 
-    for (int top = last; top > begin; top -= WARP) {
+    for (int top = last; top > begin; top -= WARP) {  // per 32 records
         const int count = min(WARP, top - begin);
         __syncwarp();
         if (lane < count) {
@@ -79,7 +79,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
             staged_rows[warp][lane] = ATOMIC ? splat : lists.slots[1][entry] * tile.parts + tile.part;
         }
         __syncwarp();
-        for (int j = 0; j < count; ++j) {
+        for (int j = 0; j < count; ++j) {  // per record
             const Record record = {staged[warp][j][0], staged[warp][j][1], staged[warp][j][2]};
             float color[CH], sums[N];
             record.color<CH>(color);
@@ -165,7 +165,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
     for (int k = 0; k < N; ++k) sums[k] = 0.0f;
     Passing<float> passing = {0.0f, 0.0f};
     if (last > first)
-        for (int step = 0; step < TILE_PIXELS + WARP - 1; ++step) {
+        for (int step = 0; step < TILE_PIXELS + WARP - 1; ++step) {  // per step
             // the pixel that the lane behind has just left
             passing.T = __shfl_down_sync(FULL_WARP, passing.T, 1);
             passing.behind = __shfl_down_sync(FULL_WARP, passing.behind, 1);
@@ -200,7 +200,7 @@ __global__ void sum_slots_kernel(TileLists lists, BlendBackward blend, int parts
     const int quarter = lane & 3;
     float4 total = {0.0f, 0.0f, 0.0f, 0.0f};
     if (quarter < RECORD / 4)
-        for (size_t row = begin + lane / 4; row < end; row += WARP / 4) {
+        for (size_t row = begin + lane / 4; row < end; row += WARP / 4) {  // per 8 slots
             const float4 v = reinterpret_cast<const float4*>(blend.rows + RECORD * row)[quarter];
             total = {total.x + v.x, total.y + v.y, total.z + v.z, total.w + v.w};
         }

@@ -23,7 +23,7 @@ __device__ __forceinline__ float* checkpoint_of(const TileLists& lists, const Bl
 template <int CH>
 __device__ __forceinline__ void sum_from_the_back(const TileLists& lists, const BlendForward& blend, int list,
                                                   int n_buckets, int lane, ForwardColumn<float, CH, COLUMN_ROWS>& column) {
-    for (int bucket = n_buckets - 1; bucket >= 0; --bucket) {
+    for (int bucket = n_buckets - 1; bucket >= 0; --bucket) {  // per bucket
         float* kept = checkpoint_of<CH>(lists, blend, list, bucket, lane) + TILE_PIXELS;
         const bool last = bucket == n_buckets - 1;
 #pragma unroll
@@ -56,7 +56,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
     Instruments<float, COLUMN_ROWS> told;
     start_forward<TELL>(column, told, rows);
     int n_buckets = 0;
-    for (int first = begin; first < end; first += WARP) {
+    for (int first = begin; first < end; first += WARP) {  // per 32 records
         if (!__any_sync(FULL_WARP, column.open)) break;
         if (CHECKPOINT) {
             float* here = checkpoint_of<CH>(lists, blend, tile.list, n_buckets, lane);
@@ -84,7 +84,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
         }
         __syncwarp();
         const int count = min(WARP, end - first);
-        for (int j = 0; j < count; ++j) {
+        for (int j = 0; j < count; ++j) {  // per record
             if (j % LOOK_EVERY == 0 && !__any_sync(FULL_WARP, column.open)) break;
             const Record record = {staged[warp][j][0], staged[warp][j][1], staged[warp][j][2]};
             float color[CH];
