@@ -142,7 +142,10 @@ class FusedTrainer:
         return self._splat["radii"]
 
     def told_maps(self) -> dict[tuple[int, int], dict[str, Tensor]]:
-        """Return, by image size, what the last step of a phase that tells dominant Gaussians told of every pixel."""
+        """Return, by image size, what the last step of a phase that tells dominant Gaussians told of every pixel.
+
+        How many splats it blended and visited is among it where `settings.counts` asked for that.
+        """
         return {size: frame.told for size, frame in self._frames.items()}
 
     def _recover(self) -> int:
@@ -185,7 +188,7 @@ class FusedTrainer:
         lists = TileBuffers(self.n, width, height, tile, exact, device, s.family == "splats" and exact)
         lists.reserve(self._capacity)
         shape = (height, width)
-        maps = ("dominant_ids", "n_blended", "n_traversed")
+        maps = ("dominant_ids", *(("n_blended", "n_traversed") if s.counts else ()))
         told = {name: empty("the image", "the image size", shape, device, torch.int32) for name in maps}
         told["dominant_weights"] = empty("the image", "the image size", shape, device)
         told["dominant_counts"] = torch.zeros(max(self.n, 1), dtype=torch.int32, device=device)

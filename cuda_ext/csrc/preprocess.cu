@@ -67,7 +67,7 @@ __global__ void pack_kernel(int n, int channels, SplatArrays splats, float alpha
     for (int c = 0; c < channels; ++c) color[c] = splats.colors[size_t(channels) * i + c];
     float4* row = reinterpret_cast<float4*>(records + size_t(RECORD) * i);
     row[0] = {s.x, s.y, s.hA, s.B};
-    row[1] = {s.hC, s.opacity, s.reach, color[0]};
+    row[1] = {s.hC, s.opacity, s.beyond, color[0]};
     row[2] = {color[1], color[2], color[3], 0.0f};
 }
 
