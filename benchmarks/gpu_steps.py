@@ -73,7 +73,7 @@ def step_kernels(scene: dict[str, Tensor], photograph: Tensor, steps: int, **set
 
 
 def step_loads(trainer: FusedTrainer) -> Loads:
-    """Count what the trainer's last step had to do; it must have told dominant Gaussians."""
+    """Count what the trainer's last step had to do; it must have told dominant Gaussians and counts."""
     ((size, told),) = trainer.told_maps().items()
     width, height = size
     tiles = torch.nn.functional.pad(told["n_traversed"], (0, -width % 16, 0, -height % 8)).view(-(-height // 8), 8, -1)
@@ -138,4 +138,6 @@ def kernel_times(
         name: calls[name] * statistics.median(start.elapsed_time(end) for start, end in spans)
         for name, spans in timed.spans.items()
     }
-    return times, step_loads(trainer)
+    counted = make_trainer(scene, photograph, 1, replay=False, counts=True, **settings)
+    counted.run(1, POP)
+    return times, step_loads(counted)

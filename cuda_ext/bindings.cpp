@@ -110,6 +110,7 @@ void bind_blend(nb::module_& m) {
     POINTER(lists, TileLists, listed);
     POINTER(lists, TileLists, tile_begin);
     POINTER(lists, TileLists, tile_end);
+    POINTER(lists, TileLists, tile_order);
     POINTER(lists, TileLists, splat_begin);
     POINTER(lists, TileLists, splat_count);
     POINTER(lists, TileLists, bucket_begin);

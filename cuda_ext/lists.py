@@ -50,7 +50,7 @@ class TileBuffers:
         names = ("depth_keys", "depth_keys_sorted", "order_unsorted", "order", "counts", "offsets")
         for name in (*names, "splat_begin", "splat_count"):
             self._allocate(name, (n,))
-        for name in ("tile_begin", "tile_end"):
+        for name in ("tile_begin", "tile_end", "tile_order"):
             self._allocate(name, (self.n_tiles,))
         self.capacity = -1
         self.reserve(0)

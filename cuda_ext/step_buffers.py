@@ -152,7 +152,7 @@ class Frame:
         lists = TileBuffers(n, *size, tile, exact, device, s.family == "splats" and exact)
         lists.reserve(capacity)
         shape = (size[1], size[0])
-        maps = ("dominant_ids", "n_blended", "n_traversed")
+        maps = ("dominant_ids", *(("n_blended", "n_traversed") if s.counts else ()))
         told = {name: empty("the image", "the image size", shape, device, torch.int32) for name in maps}
         told["dominant_weights"] = empty("the image", "the image size", shape, device)
         told["dominant_counts"] = torch.zeros(max(n, 1), dtype=torch.int32, device=device)

@@ -38,6 +38,7 @@ class StepSettings:
         profile, antialiased, family, deterministic: as in `cuda_ext.ops.rasterization`.
         betas, eps: Adam's.
         replay: replay steps as CUDA graphs; False launches every kernel anew, for debuggers and profilers.
+        counts: also tell how many splats every pixel blends and visits, which training does not read.
     """
 
     lr: Mapping[str, float]
@@ -60,6 +61,7 @@ class StepSettings:
     betas: tuple[float, float] = (0.9, 0.999)
     eps: float = 1e-15
     replay: bool = True
+    counts: bool = False
 
     def blur_pixels(self, width: int, height: int) -> float:
         """Return the whole number of pixels that a blurred Gaussian dominates more than."""

@@ -138,7 +138,10 @@ class FusedTrainer:
         return self._population.splats["radii"]
 
     def told_maps(self) -> dict[Size, dict[str, Tensor]]:
-        """Return, by image size, what the last step of a phase that tells dominant Gaussians told of every pixel."""
+        """Return, by image size, what the last step of a phase that tells dominant Gaussians told of every pixel.
+
+        How many splats it blended and visited is among it where `settings.counts` asked for that.
+        """
         return {size: frame.told for size, frame in self._frames.items()}
 
     @property

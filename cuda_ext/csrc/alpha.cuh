@@ -1,9 +1,9 @@
 // One splat at one pixel; beside pop_ref/alpha.py.
 //
 // Twice: as the oracle writes it, and as the kernels run it. The kernels' form folds log2(e) into the conic once per
-// splat and tile list entry, so that a pair costs two fused multiply-adds, a subtraction and a comparison before the
-// first pair that reaches exp2:
+// splat, so that a pair costs two fused multiply-adds, a subtraction and a comparison before the first that needs exp2:
 //     sigma log2(e) = hA dx^2 + dy (hC dy + B dx),    hA = A log2(e) / 2, B = B log2(e), hC = C log2(e) / 2.
+// That comparison is D5 as well: o 2^-x >= floor where x <= log2(o / floor), which is made once a splat.
 #pragma once
 
 #include "footprint.cuh"
@@ -66,17 +66,14 @@ POP_HD Vec2<Real> alpha_from_sigma_vjp(Real sigma, Real opacity, Real v_alpha, c
 // what the kernels ask of a profile, with every strictness turned into a number
 template <class Real>
 struct BlendConstants {
-    Real floor;             // D5
-    Real ceiling;           // D6
-    Real gradient_ceiling;  // B3: o exp(-sigma) above it passes no gradient
-    Real stop;              // D7: the pixel ends where next_T <= stop
+    Real ceiling;  // D6
+    Real stop;  // D7: the pixel ends where next_T <= stop
 };
 
 template <class Real>
 inline BlendConstants<Real> blend_constants(const Profile<Real>& profile) {
     const Real stop = profile.transmittance_stop;
-    return {profile.alpha_floor, profile.alpha_ceiling, profile.pass_ceiling ? Real(INFINITY) : profile.alpha_ceiling,
-            profile.stop_inclusive ? stop : Real(nextafter(stop, Real(0)))};
+    return {profile.alpha_ceiling, profile.stop_inclusive ? stop : Real(nextafter(stop, Real(0)))};
 }
 
 // a splat as the kernels blend it
@@ -85,15 +82,15 @@ struct Blended {
     Real x, y;
     Real hA, B, hC;
     Real opacity;
-    Real reach;  // sigma log2(e) beyond which alpha is certainly under the floor
+    Real beyond;  // the first sigma log2(e) at which alpha is under the floor; 0 where it is everywhere (D5)
 };
 
 template <class Real>
 POP_HD Blended<Real> blended_from_splat(Vec2<Real> mean2d, Conic<Real> conic, Real opacity, Real floor) {
     const Real half_log2_e = Real(0.5 * LOG2_E), log2_e = Real(LOG2_E);
-    // a little beyond the floor: the comparison of alpha itself decides (D5)
-    const Real reach = log2(opacity / floor) + Real(1e-3);
-    return {mean2d.x, mean2d.y, conic.xx * half_log2_e, conic.xy * log2_e, conic.yy * half_log2_e, opacity, reach};
+    const Real reach = log2(opacity / floor);
+    const Real beyond = reach >= Real(0) ? Real(nextafter(reach, Real(INFINITY))) : Real(0);
+    return {mean2d.x, mean2d.y, conic.xx * half_log2_e, conic.xy * log2_e, conic.yy * half_log2_e, opacity, beyond};
 }
 
 // sigma log2(e), from what a column of pixels shares

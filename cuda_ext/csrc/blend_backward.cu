@@ -30,8 +30,49 @@ __device__ __forceinline__ float* row_of(const TileLists& lists, const BlendBack
     return blend.rows + RECORD * (slot * tile.parts + tile.part);
 }
 
-template <int CH, bool ABS, bool ATOMIC>
-__global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
+// Entries behind every pixel's last splat have no gradient, but their slots are read. A lane clears a row, and asks for
+// the next slot without waiting for the stores.
+__device__ __forceinline__ void clear_unused(const TileLists& lists, const BlendBackward& blend, const WarpTile& tile,
+                                             int last, int end, int lane) {
+    const float4 zero = {0.0f, 0.0f, 0.0f, 0.0f};
+#pragma unroll 2
+    for (int entry = last + lane; entry < end; entry += WARP) {  // per 32 unused entries
+        const size_t slot = __ldg(lists.slots[1] + entry);
+        float4* row = reinterpret_cast<float4*>(blend.rows + RECORD * (slot * tile.parts + tile.part));
+#pragma unroll
+        for (int k = 0; k < RECORD / 4; ++k) row[k] = zero;
+    }
+}
+
+constexpr int HALF_WARP = WARP / 2;
+static_assert(HALF_WARP == WARP_TILE_W, "lanes half a warp apart share a column, and so dx");
+
+// Sums of two records at a time: first a lane adds its column's other half, of one record each; then a half warp adds up
+// its columns, with the moments along x made once a column.
+template <int CH, bool ABS>
+__device__ __forceinline__ float sum_of_pair(const ColumnSums<float, CH> (&pair)[2], const float (&dx)[2], int lane) {
+    constexpr int N = SumsOf<CH, ABS>::count;
+    const bool upper = lane & HALF_WARP;
+    const auto joined = [upper](float first, float second) {
+        return (upper ? second : first) + __shfl_xor_sync(FULL_WARP, upper ? first : second, HALF_WARP);
+    };
+    ColumnSums<float, CH> column;
+#pragma unroll
+    for (int c = 0; c < CH; ++c) column.v_color[c] = joined(pair[0].v_color[c], pair[1].v_color[c]);
+    column.m0 = joined(pair[0].m0, pair[1].m0);
+    column.my = joined(pair[0].my, pair[1].my);
+    column.myy = joined(pair[0].myy, pair[1].myy);
+    if (ABS) {
+        column.abs_x = joined(pair[0].abs_x, pair[1].abs_x);
+        column.abs_y = joined(pair[0].abs_y, pair[1].abs_y);
+    }
+    float sums[N];
+    sums_of_column<ABS>(column, upper ? dx[1] : dx[0], sums);
+    return TransposedSum<N, HALF_WARP / 2>::of(sums, lane);
+}
+
+template <int CH, bool ABS, bool PASS, bool ATOMIC>
+__global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK, CH < 4 && !ABS ? 7 : 0)
     columns_kernel(TileLists lists, BlendBackward blend, BlendConstants<float> constants, int n_warp_tiles) {
     constexpr int N = SumsOf<CH, ABS>::count;
     __shared__ float4 staged[WARPS_PER_BLOCK][WARP][RECORD / 4];
@@ -39,12 +80,11 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
     const int lane = threadIdx.x & (WARP - 1), warp = threadIdx.x / WARP;
     const int index = blockIdx.x * WARPS_PER_BLOCK + warp;
     if (index >= n_warp_tiles) return;
-    const WarpTile tile = warp_tile(lists.grid, index);
+    const WarpTile tile = warp_tile(lists, index);
     const int x = tile.x + lane_x(lane), y = tile.y + lane_y(lane);
     const int rows = x < lists.grid.width ? min(COLUMN_ROWS, lists.grid.height - y) : 0;
     const float px = float(x) + 0.5f, py = float(y) + 0.5f;
     const int begin = lists.tile_begin[tile.list], end = lists.tile_end[tile.list];
-    const int own_sum = sum_index<N>(lane);
 
     BackwardColumn<float, CH, COLUMN_ROWS> column;
     int last = 0;
@@ -61,14 +101,16 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
         last = max(last, column.last[k]);
     }
     last = begin + warp_max(last);
-    // entries behind every pixel's last splat have no gradient, but their slots are read
-    if (!ATOMIC)
-        for (int entry = last; entry < end; ++entry)  // per unused entry
-            if (lane < N) row_of(lists, blend, tile, entry)[lane] = 0.0f;
+    if (!ATOMIC) clear_unused(lists, blend, tile, last, end, lane);
 
+    // of a pair of records the first is summed by the lower half of the lanes, the other by the upper half
+    const int place_in_warp = opaque_lane(), half = place_in_warp / HALF_WARP;
+    const int own_sum = sum_index<N, HALF_WARP / 2>(place_in_warp);
     for (int top = last; top > begin; top -= WARP) {  // per 32 records
         const int count = min(WARP, top - begin);
         __syncwarp();
+        // a batch that is not full ends in a splat that reaches nothing
+        staged[warp][lane][1].z = 0.0f;
         if (lane < count) {
             const int entry = top - 1 - lane;
             const unsigned splat = lists.listed[entry];
@@ -79,22 +121,30 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
             staged_rows[warp][lane] = ATOMIC ? splat : lists.slots[1][entry] * tile.parts + tile.part;
         }
         __syncwarp();
-        for (int j = 0; j < count; ++j) {  // per record
-            const Record record = {staged[warp][j][0], staged[warp][j][1], staged[warp][j][2]};
-            float color[CH], sums[N];
-            record.color<CH>(color);
+        // lanes without a sum of their own, or without a second splat, store nothing
+        const int stored = own_sum < 0 ? 0 : count - half;
+        for (int j = 0; j < count; j += 2) {  // per record
+            ColumnSums<float, CH> sums[2];
+            float dx[2];
+            bool any[2];
 #pragma unroll
-            for (int k = 0; k < N; ++k) sums[k] = 0.0f;
-            const bool any = blend_backward<ABS>(column, record.splat(), color, px, py, top - 1 - j - begin, constants,
-                                                 sums);
-            const bool some = __any_sync(FULL_WARP, any);
-            if (ATOMIC && !some) continue;
-            const float total = some ? TransposedSum<N, WARP / 2>::of(sums, lane) : 0.0f;
-            if (own_sum < 0) continue;
+            for (int g = 0; g < 2; ++g) {
+                const Record record = {staged[warp][j + g][0], staged[warp][j + g][1], staged[warp][j + g][2]};
+                float color[CH];
+                record.color<CH>(color);
+                dx[g] = add(record.a.x, -px);
+                any[g] = blend_backward<ABS, PASS>(column, record.splat(), color, dx[g], py, top - 1 - j - g - begin,
+                                                   constants, sums[g]);
+            }
+            // nearly every pair of splats reaches some pixel: asking costs more than it saves, but for atomics
+            if (ATOMIC && !__any_sync(FULL_WARP, any[0] || any[1])) continue;
+            const float total = sum_of_pair<CH, ABS>(sums, dx, place_in_warp);
+            if (j >= stored) continue;
+            float* const place = (ATOMIC ? blend.sums : blend.rows) + size_t(RECORD) * staged_rows[warp][j + half] + own_sum;
             if (ATOMIC)
-                atomicAdd(blend.sums + size_t(RECORD) * staged_rows[warp][j] + own_sum, total);
+                atomicAdd(place, total);
             else
-                blend.rows[size_t(RECORD) * staged_rows[warp][j] + own_sum] = total;
+                *place = total;
         }
     }
 }
@@ -107,7 +157,7 @@ struct BucketPixel {
     int last;
 };
 
-template <int CH, bool ABS, bool ATOMIC>
+template <int CH, bool ABS, bool PASS, bool ATOMIC>
 __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
     splats_kernel(TileLists lists, BlendBackward blend, BlendConstants<float> constants, const DeviceState* state) {
     constexpr int N = SumsOf<CH, ABS>::count;
@@ -177,7 +227,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
             const int owner = p & (WARP - 1);
             const float px = float(tile.x + lane_x(owner)) + 0.5f;
             const float py = float(tile.y + lane_y(owner) + p / WARP) + 0.5f;
-            pass_pixel<ABS, float, CH>(passing, record.splat(), color, pixel.v_color, px, py, constants, sums);
+            pass_pixel<ABS, PASS, float, CH>(passing, record.splat(), color, pixel.v_color, px, py, constants, sums);
         }
     if (!exists) return;
     if (ATOMIC) {
@@ -214,18 +264,18 @@ __global__ void sum_slots_kernel(TileLists lists, BlendBackward blend, int parts
     if (lane < RECORD / 4) reinterpret_cast<float4*>(blend.sums + size_t(RECORD) * splat)[lane] = total;
 }
 
-template <int CH, bool ABS, bool ATOMIC>
+template <int CH, bool ABS, bool PASS, bool ATOMIC>
 void launch(const TileLists& lists, const BlendBackward& blend, const BlendConstants<float>& constants,
             const DeviceState* state, cudaStream_t stream) {
     const int threads = WARP * WARPS_PER_BLOCK;
     if (blend.family == Family::columns) {
         const int tiles = n_warp_tiles(lists.grid);
-        columns_kernel<CH, ABS, ATOMIC>
+        columns_kernel<CH, ABS, PASS, ATOMIC>
             <<<blocks_for(tiles, WARPS_PER_BLOCK), threads, 0, stream>>>(lists, blend, constants, tiles);
         POP_LAUNCHED("columns_kernel");
     } else {
         const int buckets = lists.capacity / WARP + lists.n_tiles;
-        splats_kernel<CH, ABS, ATOMIC>
+        splats_kernel<CH, ABS, PASS, ATOMIC>
             <<<blocks_for(buckets, WARPS_PER_BLOCK), threads, 0, stream>>>(lists, blend, constants, state);
         POP_LAUNCHED("splats_kernel");
     }
@@ -236,16 +286,25 @@ void launch(const TileLists& lists, const BlendBackward& blend, const BlendConst
     }
 }
 
-template <int CH>
+template <int CH, bool ABS, bool PASS>
 void launch(const TileLists& lists, const BlendBackward& blend, const BlendConstants<float>& constants,
             const DeviceState* state, cudaStream_t stream) {
-    const bool atomic = blend.gather == Gather::atomics;
-    if (blend.absolute)
-        atomic ? launch<CH, true, true>(lists, blend, constants, state, stream)
-               : launch<CH, true, false>(lists, blend, constants, state, stream);
+    if (blend.gather == Gather::atomics)
+        launch<CH, ABS, PASS, true>(lists, blend, constants, state, stream);
     else
-        atomic ? launch<CH, false, true>(lists, blend, constants, state, stream)
-               : launch<CH, false, false>(lists, blend, constants, state, stream);
+        launch<CH, ABS, PASS, false>(lists, blend, constants, state, stream);
+}
+
+template <int CH>
+void launch(const TileLists& lists, const BlendBackward& blend, const Profile<float>& profile, const DeviceState* state,
+            cudaStream_t stream) {
+    const BlendConstants<float> constants = blend_constants(profile);
+    if (blend.absolute)
+        profile.pass_ceiling ? launch<CH, true, true>(lists, blend, constants, state, stream)
+                             : launch<CH, true, false>(lists, blend, constants, state, stream);
+    else
+        profile.pass_ceiling ? launch<CH, false, true>(lists, blend, constants, state, stream)
+                             : launch<CH, false, false>(lists, blend, constants, state, stream);
 }
 
 }  // namespace
@@ -255,11 +314,10 @@ void blend_backward(const TileLists& lists, const BlendBackward& blend, const Pr
     const bool own_tiles = lists.grid.tile_w == WARP_TILE_W && lists.grid.tile_h == WARP_TILE_H;
     if (blend.family == Family::splats && (!own_tiles || blend.checkpoints == nullptr))
         throw std::invalid_argument("blend_backward: family splats needs 16 x 8 lists and checkpoints");
-    const BlendConstants<float> constants = blend_constants(profile);
     switch (blend.channels) {
-        case 1: return launch<1>(lists, blend, constants, state, stream);
-        case 3: return launch<3>(lists, blend, constants, state, stream);
-        case 4: return launch<4>(lists, blend, constants, state, stream);
+        case 1: return launch<1>(lists, blend, profile, state, stream);
+        case 3: return launch<3>(lists, blend, profile, state, stream);
+        case 4: return launch<4>(lists, blend, profile, state, stream);
         default: throw std::invalid_argument("blend_backward: channels must be 1, 3 or 4");
     }
 }

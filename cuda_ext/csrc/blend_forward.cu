@@ -7,8 +7,9 @@ namespace pop {
 
 namespace {
 
-// entries between two looks at whether any pixel of the warp still takes splats
-constexpr int LOOK_EVERY = 8;
+// records that are blended between two looks at whether any pixel of the warp still takes splats
+constexpr int GROUP = 4;
+static_assert(WARP % GROUP == 0, "groups fill a batch");
 
 // Where a lane's pixels keep what family "splats" reads of a bucket: T before it, then the colour that later buckets
 // blended. Until the list is done, the colour is what this bucket blended.
@@ -38,15 +39,20 @@ __device__ __forceinline__ void sum_from_the_back(const TileLists& lists, const 
     }
 }
 
-template <int CH, bool TELL, bool CHECKPOINT>
-__global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
+// blocks that must fit a multiprocessor at a time: as many as leave every value its register
+constexpr int least_blocks(int channels, Tell tell, bool checkpoint) {
+    const int wide = channels == MAX_CHANNELS, most = tell == Tell::everything;
+    return tell == Tell::nothing ? 8 - wide : 7 - most - checkpoint - 2 * wide;
+}
+
+template <int CH, Tell TELL, bool CHECKPOINT>
+__global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK, least_blocks(CH, TELL, CHECKPOINT))
     blend_forward_kernel(TileLists lists, BlendForward blend, BlendConstants<float> constants, int n_warp_tiles) {
     __shared__ float4 staged[WARPS_PER_BLOCK][WARP][RECORD / 4];
-    __shared__ unsigned staged_ids[TELL ? WARPS_PER_BLOCK : 1][WARP];
     const int lane = threadIdx.x & (WARP - 1), warp = threadIdx.x / WARP;
     const int index = blockIdx.x * WARPS_PER_BLOCK + warp;
     if (index >= n_warp_tiles) return;
-    const WarpTile tile = warp_tile(lists.grid, index);
+    const WarpTile tile = warp_tile(lists, index);
     const int x = tile.x + lane_x(lane), y = tile.y + lane_y(lane);
     const int rows = x < lists.grid.width ? min(COLUMN_ROWS, lists.grid.height - y) : 0;
     const float px = float(x) + 0.5f, py = float(y) + 0.5f;
@@ -55,9 +61,10 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
     ForwardColumn<float, CH, COLUMN_ROWS> column;
     Instruments<float, COLUMN_ROWS> told;
     start_forward<TELL>(column, told, rows);
+    const float4(*own)[RECORD / 4] = pinned_shared(staged[warp]);
     int n_buckets = 0;
     for (int first = begin; first < end; first += WARP) {  // per 32 records
-        if (!__any_sync(FULL_WARP, column.open)) break;
+        if (!__any_sync(FULL_WARP, is_open(column, constants.stop))) break;
         if (CHECKPOINT) {
             float* here = checkpoint_of<CH>(lists, blend, tile.list, n_buckets, lane);
 #pragma unroll
@@ -74,23 +81,27 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
             ++n_buckets;
         }
         __syncwarp();
+        // a batch that is not full ends in splats that reach nothing
+        staged[warp][lane][1].z = 0.0f;
         if (first + lane < end) {
-            const unsigned splat = lists.listed[first + lane];
-            const Record record = load_record(blend.records, splat);
+            const Record record = load_record(blend.records, lists.listed[first + lane]);
             staged[warp][lane][0] = record.a;
             staged[warp][lane][1] = record.b;
             staged[warp][lane][2] = record.c;
-            if (TELL) staged_ids[warp][lane] = splat;
         }
         __syncwarp();
         const int count = min(WARP, end - first);
-        for (int j = 0; j < count; ++j) {  // per record
-            if (j % LOOK_EVERY == 0 && !__any_sync(FULL_WARP, column.open)) break;
-            const Record record = {staged[warp][j][0], staged[warp][j][1], staged[warp][j][2]};
-            float color[CH];
-            record.color<CH>(color);
-            const int id = TELL ? int(staged_ids[warp][j]) : 0;
-            blend_forward<TELL>(column, told, record.splat(), color, id, px, py, first - begin + j, constants);
+        for (int j = 0; j < count; j += GROUP) {  // per record
+            if (!__any_sync(FULL_WARP, is_open(column, constants.stop))) break;
+#pragma unroll
+            for (int g = j; g < j + GROUP; ++g) {
+                const Record record = {own[g][0], own[g][1], own[g][2]};
+                float color[CH];
+                record.color<CH>(color);
+                // a pixel's winner is known by its place in the list until all are blended
+                const int place = first - begin + g;
+                blend_forward<TELL>(column, told, record.splat(), color, place, px, py, place, constants);
+            }
         }
     }
     if (CHECKPOINT) sum_from_the_back<CH>(lists, blend, tile.list, n_buckets, lane, column);
@@ -99,21 +110,25 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
     for (int k = 0; k < COLUMN_ROWS; ++k) {
         if (k >= rows) break;
         const size_t pixel = size_t(y + k) * lists.grid.width + x;
+        const float T = column.T_final[k];
 #pragma unroll
         for (int c = 0; c < CH; ++c) {
             const float behind = blend.background == nullptr ? 0.0f : __ldg(blend.background + c);
-            blend.image[CH * pixel + c] = fused(column.T[k], behind, column.color[k][c]);
+            blend.image[CH * pixel + c] = fused(T, behind, column.color[k][c]);
         }
-        blend.T_final[pixel] = column.T[k];
-        blend.last[pixel] = column.last[k];
-        if (TELL) {
+        blend.T_final[pixel] = T;
+        blend.last[pixel] = min(column.last[k], end - begin);
+        if (TELL != Tell::nothing) {
+            if (told.best[k].id >= 0) told.best[k].id = int(lists.listed[begin + told.best[k].id]);
             blend.dominant_ids[pixel] = told.best[k].id;
             blend.dominant_weights[pixel] = told.best[k].weight;
+        }
+        if (TELL == Tell::everything) {
             blend.n_blended[pixel] = told.n_blended[k];
-            blend.n_traversed[pixel] = told.n_traversed[k];
+            blend.n_traversed[pixel] = min(column.last[k] + 1, end - begin);
         }
     }
-    if (TELL) {
+    if (TELL != Tell::nothing) {
         const bool masked = blend.masks != nullptr && !halted(blend.state);
         const uint8_t* mask = masked ? blend.masks[blend.state->view] : nullptr;
         // neighbours mostly agree on the winner: one integer addition a group of equal winners, in any order
@@ -127,7 +142,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
     }
 }
 
-template <int CH, bool TELL>
+template <int CH, Tell TELL>
 void launch(const TileLists& lists, const BlendForward& blend, const BlendConstants<float>& constants,
             cudaStream_t stream) {
     const int tiles = n_warp_tiles(lists.grid), blocks = blocks_for(tiles, WARPS_PER_BLOCK);
@@ -142,10 +157,12 @@ void launch(const TileLists& lists, const BlendForward& blend, const BlendConsta
 template <int CH>
 void launch(const TileLists& lists, const BlendForward& blend, const BlendConstants<float>& constants,
             cudaStream_t stream) {
-    if (blend.dominant_ids != nullptr)
-        launch<CH, true>(lists, blend, constants, stream);
+    if (blend.dominant_ids == nullptr)
+        launch<CH, Tell::nothing>(lists, blend, constants, stream);
+    else if (blend.n_blended == nullptr)
+        launch<CH, Tell::dominant>(lists, blend, constants, stream);
     else
-        launch<CH, false>(lists, blend, constants, stream);
+        launch<CH, Tell::everything>(lists, blend, constants, stream);
 }
 
 }  // namespace

@@ -21,17 +21,19 @@ struct SumsOf {
 
 template <class Real, int CH, int ROWS>
 struct ForwardColumn {
-    Real T[ROWS];
+    Real T[ROWS];      // transmittance behind all splats that were reached: at most the stop once one is not blended
+    Real T_final[ROWS];  // behind those that were blended
     Real color[ROWS][CH];
-    int last[ROWS];  // list position behind the last blended splat; 0 where none was
-    unsigned open;   // bit k: pixel k still takes splats
+    int last[ROWS];  // list position of the splat that stopped the pixel, or behind the last
 };
 
-// what only some instantiations keep
+// what a forward pass tells beside the image
+enum class Tell { nothing, dominant, everything };
+
 template <class Real, int ROWS>
 struct Instruments {
     Dominant<Real> best[ROWS];
-    int n_blended[ROWS], n_traversed[ROWS];
+    int n_blended[ROWS];  // with Tell::everything
 };
 
 template <class Real, int CH, int ROWS>
@@ -42,102 +44,129 @@ struct BackwardColumn {
     int last[ROWS];
 };
 
-template <bool TELL, class Real, int CH, int ROWS>
+template <Tell TELL, class Real, int CH, int ROWS>
 POP_HD void start_forward(ForwardColumn<Real, CH, ROWS>& column, Instruments<Real, ROWS>& told, int rows_inside) {
-    column.open = 0u;
     POP_UNROLL
     for (int k = 0; k < ROWS; ++k) {
-        column.T[k] = Real(1);
+        column.T[k] = k < rows_inside ? Real(1) : Real(0);
+        column.T_final[k] = Real(1);
         column.last[k] = 0;
         POP_UNROLL
         for (int c = 0; c < CH; ++c) column.color[k][c] = Real(0);
-        if (k < rows_inside) column.open |= 1u << k;
-        if (TELL) {
-            told.best[k] = no_dominant<Real>();
-            told.n_blended[k] = told.n_traversed[k] = 0;
-        }
+        if (TELL != Tell::nothing) told.best[k] = no_dominant<Real>();
+        if (TELL == Tell::everything) told.n_blended[k] = 0;
     }
 }
 
-// px, py: the first pixel's centre; position: the splat's place in the list
-template <bool TELL, class Real, int CH, int ROWS>
+template <class Real, int CH, int ROWS>
+POP_HD bool is_open(const ForwardColumn<Real, CH, ROWS>& column, Real stop) {
+    Real largest = column.T[0];
+    POP_UNROLL
+    for (int k = 1; k < ROWS; ++k) largest = most(largest, column.T[k]);
+    return largest > stop;
+}
+
+// Without branches, so that the pixels' exponentials overlap: nearly every splat of a tile's list reaches some pixel of
+// a row of its warp. x, y: the first pixel's centre; position: the splat's place in the list; id: what the winner of a
+// pixel is known by.
+template <Tell TELL, class Real, int CH, int ROWS>
 POP_HD void blend_forward(ForwardColumn<Real, CH, ROWS>& column, Instruments<Real, ROWS>& told,
-                          const Blended<Real>& splat, const Real* color, int id, Real px, Real py, int position,
+                          const Blended<Real>& splat, const Real* color, int id, Real x, Real y, int position,
                           const BlendConstants<Real>& constants) {
-    const Real dx = add(splat.x, -px);
+    const Real dx = add(splat.x, -x);
     const Real squared_x = mul(mul(splat.hA, dx), dx), cross = mul(splat.B, dx);
     POP_UNROLL
     for (int k = 0; k < ROWS; ++k) {
-        const bool open = (column.open >> k) & 1u;
-        if (TELL && open) told.n_traversed[k] = position + 1;
-        const Real dy = add(splat.y, -(py + Real(k)));
+        const Real dy = add(splat.y, -(y + Real(k)));
         const Real exponent = exponent_in_column(squared_x, cross, splat.hC, dy);
-        if (!open || exponent > splat.reach || exponent < Real(0)) continue;
-        const Real alpha = min_of(constants.ceiling, mul(splat.opacity, power_of_two(-exponent)));  // D6
-        if (alpha < constants.floor) continue;                                                      // D5
-        const Real T = column.T[k];
-        const Real next_T = mul(T, add(Real(1), -alpha));
-        if (next_T <= constants.stop) {  // D7: this splat is not blended
-            column.open &= ~(1u << k);
-            continue;
+        const Real clamped = least(constants.ceiling, mul(splat.opacity, power_of_two(-exponent)));  // D6
+        const Real alpha = within(exponent, splat.beyond) ? clamped : Real(0);                       // D5
+        const Real T = column.T[k], weight = mul(T, alpha);
+        column.T[k] = fused(-alpha, T, T);
+        // D7: a splat that takes T to the stop is not blended, and none behind it is, since T never grows
+        const bool goes_on = column.T[k] > constants.stop;
+        if (goes_on) {
+            column.T_final[k] = column.T[k];
+            column.last[k] = position + 1;
+            POP_UNROLL
+            for (int c = 0; c < CH; ++c) column.color[k][c] = fused(weight, color[c], column.color[k][c]);
         }
-        const Real weight = mul(T, alpha);
-        POP_UNROLL
-        for (int c = 0; c < CH; ++c) column.color[k][c] = fused(weight, color[c], column.color[k][c]);
-        if (TELL) {
-            ++told.n_blended[k];
-            compete(told.best[k], id, weight);
-        }
-        column.last[k] = position + 1;
-        column.T[k] = next_T;
+        if (TELL == Tell::everything) told.n_blended[k] += goes_on & (alpha > Real(0));
+        if (TELL != Tell::nothing) compete(told.best[k], id, goes_on ? weight : Real(0));
     }
 }
 
-// One splat, back to front: sums[0..CH) += weight v_color, then the moments. Returns whether any pixel took part.
-template <bool ABS, class Real, int CH, int ROWS>
+// One splat's sums over a column, whose pixels share dx.
+template <class Real, int CH>
+struct ColumnSums {
+    Real v_color[CH];
+    Real m0, my, myy;
+    Real abs_x, abs_y;
+};
+
+// The cotangent of the exponent, less its sign; where alpha is clamped it passes only if the profile says so (B3).
+template <bool PASS, class Real>
+POP_HD Real exponent_cotangent(Real unclamped, Real ceiling, Real weight, Real T, Real gain) {
+    if (PASS) return unclamped * (T * gain);
+    return unclamped > ceiling ? Real(0) : weight * gain;
+}
+
+// One splat, back to front, without branches as in blend_forward. Returns whether any pixel took part.
+template <bool ABS, bool PASS, class Real, int CH, int ROWS>
 POP_HD bool blend_backward(BackwardColumn<Real, CH, ROWS>& column, const Blended<Real>& splat, const Real* color,
-                           Real px, Real py, int position, const BlendConstants<Real>& constants, Real* sums) {
-    const Real dx = add(splat.x, -px);
+                           Real dx, Real y, int position, const BlendConstants<Real>& constants,
+                           ColumnSums<Real, CH>& sums) {
     const Real squared_x = mul(mul(splat.hA, dx), dx), cross = mul(splat.B, dx);
-    Real m0 = Real(0), my = Real(0), myy = Real(0);
+    sums.abs_x = sums.abs_y = Real(0);
     bool any = false;
     POP_UNROLL
     for (int k = 0; k < ROWS; ++k) {
-        const Real dy = add(splat.y, -(py + Real(k)));
+        const Real dy = add(splat.y, -(y + Real(k)));
         const Real exponent = exponent_in_column(squared_x, cross, splat.hC, dy);
-        if (position >= column.last[k] || exponent > splat.reach || exponent < Real(0)) continue;
-        const Real unclamped = mul(splat.opacity, power_of_two(-exponent));
-        const Real alpha = min_of(constants.ceiling, unclamped);
-        if (alpha < constants.floor) continue;
-        any = true;
+        const bool reached = (position < column.last[k]) & within(exponent, splat.beyond);
+        any |= reached;
+        const Real unclamped = reached ? mul(splat.opacity, power_of_two(-exponent)) : Real(0);
+        const Real alpha = least(constants.ceiling, unclamped);
         const Real T = column.T[k] * reciprocal(add(Real(1), -alpha));
+        // an approximate 1 / 1 must not add up over the splats that do not take part
+        if (reached) column.T[k] = T;
         const Real weight = T * alpha;
-        Real worth = Real(0);
+        Real gain = -column.behind[k];
         POP_UNROLL
         for (int c = 0; c < CH; ++c) {
-            worth += color[c] * column.v_color[k][c];
-            sums[c] += weight * column.v_color[k][c];
+            gain += color[c] * column.v_color[k][c];
+            const Real v_color = weight * column.v_color[k][c];
+            sums.v_color[c] = k == 0 ? v_color : sums.v_color[c] + v_color;
         }
-        const Real gain = worth - column.behind[k];
-        const Real v_alpha = T * gain;
         column.behind[k] += alpha * gain;
-        column.T[k] = T;
-        const Real G = unclamped > constants.gradient_ceiling ? Real(0) : unclamped * v_alpha;  // B3
-        m0 += G;
-        my += G * dy;
-        myy += G * dy * dy;
+        const Real G = exponent_cotangent<PASS>(unclamped, constants.ceiling, weight, T, gain), G_dy = G * dy;
+        // the first is not added to a zero, which costs as much as another
+        sums.m0 = k == 0 ? G : sums.m0 + G;
+        sums.my = k == 0 ? G_dy : sums.my + G_dy;
+        sums.myy = k == 0 ? G_dy * dy : sums.myy + G_dy * dy;
         if (ABS) {
-            sums[CH + ABS_X] += fabs(G * (Real(2) * splat.hA * dx + splat.B * dy));
-            sums[CH + ABS_Y] += fabs(G * (splat.B * dx + Real(2) * splat.hC * dy));
+            sums.abs_x += fabs(G * (Real(2) * splat.hA * dx + splat.B * dy));
+            sums.abs_y += fabs(G * (splat.B * dx + Real(2) * splat.hC * dy));
         }
     }
-    sums[CH + M0] += m0;
-    sums[CH + MX] += m0 * dx;
-    sums[CH + MY] += my;
-    sums[CH + MXX] += m0 * dx * dx;
-    sums[CH + MXY] += my * dx;
-    sums[CH + MYY] += myy;
     return any;
+}
+
+// The colour cotangents, then the moments, of a column at dx.
+template <bool ABS, class Real, int CH>
+POP_HD void sums_of_column(const ColumnSums<Real, CH>& column, Real dx, Real* sums) {
+    POP_UNROLL
+    for (int c = 0; c < CH; ++c) sums[c] = column.v_color[c];
+    sums[CH + M0] = column.m0;
+    sums[CH + MX] = column.m0 * dx;
+    sums[CH + MY] = column.my;
+    sums[CH + MXX] = column.m0 * dx * dx;
+    sums[CH + MXY] = column.my * dx;
+    sums[CH + MYY] = column.myy;
+    if (ABS) {
+        sums[CH + ABS_X] = column.abs_x;
+        sums[CH + ABS_Y] = column.abs_y;
+    }
 }
 
 // A pixel on its way through the splats of a bucket, back to front: the other family, one splat a lane.
@@ -158,35 +187,33 @@ POP_HD Passing<Real> passing_behind(Real T, Real T_final, const Real* later, con
     return {T, left * reciprocal(T)};
 }
 
-template <bool ABS, class Real, int CH>
+template <bool ABS, bool PASS, class Real, int CH>
 POP_HD void pass_pixel(Passing<Real>& pixel, const Blended<Real>& splat, const Real* color, const Real* v_color,
                        Real px, Real py, const BlendConstants<Real>& constants, Real* sums) {
     const Real dx = add(splat.x, -px), dy = add(splat.y, -py);
     const Real squared_x = mul(mul(splat.hA, dx), dx), cross = mul(splat.B, dx);
     const Real exponent = exponent_in_column(squared_x, cross, splat.hC, dy);
-    if (exponent > splat.reach || exponent < Real(0)) return;
+    if (!within(exponent, splat.beyond)) return;
     const Real unclamped = mul(splat.opacity, power_of_two(-exponent));
-    const Real alpha = min_of(constants.ceiling, unclamped);
-    if (alpha < constants.floor) return;
+    const Real alpha = least(constants.ceiling, unclamped);
     const Real T = pixel.T * reciprocal(add(Real(1), -alpha));
     const Real weight = T * alpha;
-    Real worth = Real(0);
+    Real gain = -pixel.behind;
     POP_UNROLL
     for (int c = 0; c < CH; ++c) {
-        worth += color[c] * v_color[c];
+        gain += color[c] * v_color[c];
         sums[c] += weight * v_color[c];
     }
-    const Real gain = worth - pixel.behind;
-    const Real v_alpha = T * gain;
     pixel.behind += alpha * gain;
     pixel.T = T;
-    const Real G = unclamped > constants.gradient_ceiling ? Real(0) : unclamped * v_alpha;  // B3
+    const Real G = exponent_cotangent<PASS>(unclamped, constants.ceiling, weight, T, gain);
+    const Real G_dx = G * dx, G_dy = G * dy;
     sums[CH + M0] += G;
-    sums[CH + MX] += G * dx;
-    sums[CH + MY] += G * dy;
-    sums[CH + MXX] += G * dx * dx;
-    sums[CH + MXY] += G * dx * dy;
-    sums[CH + MYY] += G * dy * dy;
+    sums[CH + MX] += G_dx;
+    sums[CH + MY] += G_dy;
+    sums[CH + MXX] += G_dx * dx;
+    sums[CH + MXY] += G_dx * dy;
+    sums[CH + MYY] += G_dy * dy;
     if (ABS) {
         sums[CH + ABS_X] += fabs(G * (Real(2) * splat.hA * dx + splat.B * dy));
         sums[CH + ABS_Y] += fabs(G * (splat.B * dx + Real(2) * splat.hC * dy));

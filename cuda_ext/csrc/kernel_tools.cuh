@@ -12,7 +12,7 @@ constexpr unsigned FULL_WARP = 0xffffffffu;
 constexpr int WARP = 32, COLUMN_ROWS = 4, WARPS_PER_BLOCK = 4;
 static_assert(WARP * COLUMN_ROWS == TILE_PIXELS, "a lane owns a column of four pixels");
 
-// a record: x, y, hA, B | hC, opacity, reach, c0 | c1, c2, c3, unused
+// a record: x, y, hA, B | hC, opacity, beyond, c0 | c1, c2, c3, unused
 struct Record {
     float4 a, b, c;
 
@@ -39,27 +39,51 @@ struct WarpTile {
 };
 
 // of whole list tiles, also where they stick out of the image: every part of a list's gradient slots has its warp
-__device__ __forceinline__ int warp_tiles_x(const TileGrid& grid) { return grid.tiles_x * (grid.tile_w / WARP_TILE_W); }
-
-inline int n_warp_tiles(const TileGrid& grid) {
-    return grid.tiles_x * (grid.tile_w / WARP_TILE_W) * grid.tiles_y * (grid.tile_h / WARP_TILE_H);
+POP_HD int warp_tiles_of_a_list(const TileGrid& grid) {
+    return (grid.tile_w / WARP_TILE_W) * (grid.tile_h / WARP_TILE_H);
 }
 
-__device__ __forceinline__ WarpTile warp_tile(const TileGrid& grid, int index) {
-    const int across = warp_tiles_x(grid);
-    const int x = index % across * WARP_TILE_W, y = index / across * WARP_TILE_H;
-    const int in_x = x % grid.tile_w / WARP_TILE_W, in_y = y % grid.tile_h / WARP_TILE_H;
-    const int per_row = grid.tile_w / WARP_TILE_W;
-    return {x, y, y / grid.tile_h * grid.tiles_x + x / grid.tile_w, in_y * per_row + in_x,
-            per_row * (grid.tile_h / WARP_TILE_H)};
+inline int n_warp_tiles(const TileGrid& grid) { return grid.tiles_x * grid.tiles_y * warp_tiles_of_a_list(grid); }
+
+// the tile of a warp, longest lists first
+__device__ __forceinline__ WarpTile warp_tile(const TileLists& lists, int index) {
+    const TileGrid& grid = lists.grid;
+    const int parts = warp_tiles_of_a_list(grid), across = grid.tile_w / WARP_TILE_W;
+    const int list = int(lists.tile_order[index / parts]), part = index % parts;
+    return {list % grid.tiles_x * grid.tile_w + part % across * WARP_TILE_W,
+            list / grid.tiles_x * grid.tile_h + part / across * WARP_TILE_H, list, part, parts};
 }
 
 // the column of a lane: x across, two halves of four rows
 __device__ __forceinline__ int lane_x(int lane) { return lane & (WARP_TILE_W - 1); }
 __device__ __forceinline__ int lane_y(int lane) { return (lane / WARP_TILE_W) * COLUMN_ROWS; }
 
-// Sum N values over a warp with N + about 4 shuffles: at every step half of the values go to the other half of the
-// lanes. Afterwards lane `owner` of value k holds its sum; see sum_index.
+// The lane, as a number that the compiler knows nothing of: it then asks for a bit of it with one instruction, where it
+// takes three for a bit of threadIdx. All lanes of the warp must call it.
+__device__ __forceinline__ int opaque_lane() {
+    const int lane = threadIdx.x & (WARP - 1);
+    return __shfl_sync(FULL_WARP, lane, lane);
+}
+
+// Keep a number that all lanes share in a register, where the compiler would make it anew at every use: it cannot see
+// through a shuffle. All lanes of the warp must call it.
+template <class T>
+__device__ __forceinline__ T pinned(T value) {
+    return __shfl_sync(FULL_WARP, value, 0);
+}
+
+// the same for an address in shared memory, which is made of four numbers on sm_90
+template <class T>
+__device__ __forceinline__ T* pinned_shared(T* address) {
+#ifdef __CUDA_ARCH__
+    return static_cast<T*>(__cvta_shared_to_generic(pinned(unsigned(__cvta_generic_to_shared(address)))));
+#else
+    return address;
+#endif
+}
+
+// Sum N values over 2 MASK lanes with N + about 4 shuffles: at every step half of the values go to the other half of the
+// lanes, and one that is left over is summed in both. Afterwards a lane holds the sum that sum_index tells.
 template <int N, int MASK>
 struct TransposedSum {
     static __device__ __forceinline__ float of(float (&v)[N], int lane) {
@@ -68,8 +92,9 @@ struct TransposedSum {
         float kept[KEPT];
 #pragma unroll
         for (int k = 0; k < KEPT; ++k) {
-            const float low = v[k], high = k + KEPT < N ? v[k + KEPT] : 0.0f;
-            kept[k] = (upper ? high : low) + __shfl_xor_sync(FULL_WARP, upper ? low : high, MASK);
+            const bool paired = k + KEPT < N;
+            const float high = v[paired ? k + KEPT : k];
+            kept[k] = (upper ? high : v[k]) + __shfl_xor_sync(FULL_WARP, upper ? v[k] : high, MASK);
         }
         return TransposedSum<KEPT, MASK / 2>::of(kept, lane);
     }
@@ -78,29 +103,26 @@ struct TransposedSum {
 template <int N>
 struct TransposedSum<N, 0> {
     static __device__ __forceinline__ float of(float (&v)[N], int) {
-        static_assert(N == 1, "more values than a warp has lanes");
+        static_assert(N == 1, "more values than lanes");
         return v[0];
     }
 };
 
-// the value that a lane holds after TransposedSum<N, 16>, or -1 where it holds a copy or padding
-template <int N>
+// the value that a lane holds after TransposedSum<N, MASK>, or -1 where it holds a copy
+template <int N, int MASK>
 __device__ __forceinline__ int sum_index(int lane) {
-    int first = 0, count = N, size = N;
-    bool copy = false;
+    int index[N], size = N;
 #pragma unroll
-    for (int mask = WARP / 2; mask > 0; mask /= 2) {
+    for (int k = 0; k < N; ++k) index[k] = k;
+#pragma unroll
+    for (int mask = MASK; mask > 0; mask /= 2) {
         const int kept = (size + 1) / 2;
-        const bool upper = lane & mask;
-        if (size == 1) {
-            copy = copy || upper;  // a plain sum from here on: both halves hold it
-        } else {
-            first += upper ? kept : 0;
-            count = upper ? count - kept : min(count, kept);
-        }
+#pragma unroll
+        for (int k = 0; k < N; ++k)
+            if (k < kept && (lane & mask)) index[k] = k + kept < size ? index[k + kept] : -1;
         size = kept;
     }
-    return copy || count <= 0 ? -1 : first;
+    return index[0];
 }
 
 // After an overflow or a bad row a fused step does nothing until the host has seen to it: the views of the steps behind

@@ -78,6 +78,7 @@ struct TileLists {
     unsigned* listed;          // [capacity], splats tile by tile, front to back
     int* tile_begin;           // [n_tiles]
     int* tile_end;             // [n_tiles]
+    unsigned* tile_order;      // [n_tiles], tiles by the length of their lists, longest first
     unsigned* splat_begin;     // [n], first slot of a splat
     unsigned* splat_count;     // [n], its slots
     int* bucket_begin;         // [n_tiles], first bucket of 32 list entries of a tile; null where no one asks
@@ -93,14 +94,14 @@ struct BlendForward {
     const float* background;  // [channels] or null
     float* image;             // [H, W, channels]
     float* T_final;           // [H, W]
-    int* last;                // [H, W]
+    int* last;                // [H, W], list position of the splat that stopped a pixel, or the list's length
     float* checkpoints;       // [buckets, 1 + channels, TILE_PIXELS] or null
-    // instruments, all or none
+    // instruments: the dominant ones together or not at all, the counts of splats with them or not at all
     int* dominant_ids;
     float* dominant_weights;
+    int* dominant_counts;     // [n], zeroed by the caller
     int* n_blended;
     int* n_traversed;
-    int* dominant_counts;     // [n], zeroed by the caller
     // pixels that a mask leaves out are not counted: one mask a view [H, W], picked by state->view; null counts all
     const uint8_t* const* masks;
     const DeviceState* state;  // read with masks
@@ -158,6 +159,8 @@ void count_instances(const TileLists& lists, const SplatArrays& splats, const Pr
 // dominant_counts: [n], set to zero on the way for blend_forward; null for none
 void make_tile_lists(const TileLists& lists, const SplatArrays& splats, const Profile<float>& profile,
                      int* dominant_counts, DeviceState* state, cudaStream_t stream);
+// fills lists.tile_order; make_tile_lists calls it
+void order_tiles(const TileLists& lists, cudaStream_t stream);
 void blend_forward(const TileLists& lists, const BlendForward& blend, const Profile<float>& profile,
                    cudaStream_t stream);
 void blend_backward(const TileLists& lists, const BlendBackward& blend, const Profile<float>& profile,

@@ -62,7 +62,7 @@ void list_splats(Frame<Real>& frame, const Arguments<Real>& a) {
     for (int i : order) {
         const SplatRow<Real>& s = frame.splats[i];
         const TileRect rect = tile_rect(s.mean2d, s.radii, grid, a.profile);
-        const Real reach = frame.blended[i].reach * Real(LN_2);
+        const Real reach = frame.blended[i].beyond * Real(LN_2) + Real(1e-3);
         for (int y = rect.y0; y < rect.y1; ++y)
             for (int x = rect.x0; x < rect.x1; ++x) {
                 const Conic<Real>& q = s.conic;
@@ -108,10 +108,10 @@ void for_each_column(const Frame<Real>& frame, F f) {
 template <class Real>
 void forward_column(const Frame<Real>& frame, const std::vector<int>& list, int x, int y, int rows,
                     ForwardColumn<Real, CH, ROWS>& column, Instruments<Real, ROWS>& told) {
-    start_forward<true>(column, told, rows);
-    for (size_t k = 0; k < list.size() && column.open; ++k)
-        blend_forward<true>(column, told, frame.blended[list[k]], &frame.colors[list[k]].x, list[k],
-                            Real(x) + Real(0.5), Real(y) + Real(0.5), int(k), frame.constants);
+    start_forward<Tell::everything>(column, told, rows);
+    for (size_t k = 0; k < list.size() && is_open(column, frame.constants.stop); ++k)
+        blend_forward<Tell::everything>(column, told, frame.blended[list[k]], &frame.colors[list[k]].x, list[k],
+                                        Real(x) + Real(0.5), Real(y) + Real(0.5), int(k), frame.constants);
 }
 
 // out: image, T_final, dominant_weights, means2d, depths, conics, opacities
@@ -126,12 +126,12 @@ void render(Arguments<Real>& a) {
         for (int k = 0; k < rows; ++k) {
             const long long p = (long long)(y + k) * frame.grid.width + x;
             for (int c = 0; c < CH; ++c)
-                a.out[0][CH * p + c] = fused(column.T[k], a.in[BACKGROUND][c], column.color[k][c]);
-            a.out[1][p] = column.T[k];
+                a.out[0][CH * p + c] = fused(column.T_final[k], a.in[BACKGROUND][c], column.color[k][c]);
+            a.out[1][p] = column.T_final[k];
             a.out[2][p] = told.best[k].weight;
             a.ids[0][p] = told.best[k].id;
             a.ids[1][p] = told.n_blended[k];
-            a.ids[2][p] = told.n_traversed[k];
+            a.ids[2][p] = std::min(column.last[k] + 1, int(list.size()));
             if (told.best[k].id >= 0) ++a.ids[3][told.best[k].id];
         }
     });
@@ -146,7 +146,7 @@ void render(Arguments<Real>& a) {
     }
 }
 
-template <class Real>
+template <bool PASS, class Real>
 void backward_by_columns(const Frame<Real>& frame, const Arguments<Real>& a, std::vector<Real>& sums) {
     for_each_column(frame, [&](const std::vector<int>& list, int x, int y, int rows) {
         ForwardColumn<Real, CH, ROWS> forward;
@@ -155,7 +155,7 @@ void backward_by_columns(const Frame<Real>& frame, const Arguments<Real>& a, std
         BackwardColumn<Real, CH, ROWS> column = {};
         for (int k = 0; k < rows; ++k) {
             const long long p = (long long)(y + k) * frame.grid.width + x;
-            column.T[k] = forward.T[k];
+            column.T[k] = forward.T_final[k];
             column.last[k] = forward.last[k];
             column.behind[k] = a.in[V_T_FINAL][p];
             for (int c = 0; c < CH; ++c) {
@@ -163,20 +163,27 @@ void backward_by_columns(const Frame<Real>& frame, const Arguments<Real>& a, std
                 column.behind[k] += a.in[BACKGROUND][c] * column.v_color[k][c];
             }
         }
-        for (int k = int(list.size()) - 1; k >= 0; --k)
-            blend_backward<true>(column, frame.blended[list[k]], &frame.colors[list[k]].x, Real(x) + Real(0.5),
-                                 Real(y) + Real(0.5), k, frame.constants, &sums[size_t(N_SUMS) * list[k]]);
+        for (int k = int(list.size()) - 1; k >= 0; --k) {
+            const Blended<Real>& splat = frame.blended[list[k]];
+            const Real dx = add(splat.x, -(Real(x) + Real(0.5)));
+            ColumnSums<Real, CH> of_column = {};
+            blend_backward<true, PASS>(column, splat, &frame.colors[list[k]].x, dx, Real(y) + Real(0.5), k,
+                                       frame.constants, of_column);
+            Real of_splat[N_SUMS];
+            sums_of_column<true>(of_column, dx, of_splat);
+            for (int j = 0; j < N_SUMS; ++j) sums[size_t(N_SUMS) * list[k] + j] += of_splat[j];
+        }
     });
 }
 
-template <class Real>
+template <bool PASS, class Real>
 void backward_by_splats(const Frame<Real>& frame, const Arguments<Real>& a, std::vector<Real>& sums) {
     for_each_column(frame, [&](const std::vector<int>& list, int x, int y, int rows) {
         for (int k = 0; k < rows; ++k) {
             ForwardColumn<Real, CH, 1> column;
             Instruments<Real, 1> told;
             const Real px = Real(x) + Real(0.5), py = Real(y + k) + Real(0.5);
-            start_forward<false>(column, told, 1);
+            start_forward<Tell::nothing>(column, told, 1);
             // the forward kernel's checkpoints: T before each bucket, and what the buckets behind it blended
             std::vector<Real> T;
             std::vector<std::array<Real, CH>> later;
@@ -185,8 +192,8 @@ void backward_by_splats(const Frame<Real>& frame, const Arguments<Real>& a, std:
                     T.push_back(column.T[0]);
                     later.push_back({});
                 }
-                blend_forward<false>(column, told, frame.blended[list[j]], &frame.colors[list[j]].x, 0, px, py, int(j),
-                                     frame.constants);
+                blend_forward<Tell::nothing>(column, told, frame.blended[list[j]], &frame.colors[list[j]].x, 0, px,
+                                             py, int(j), frame.constants);
                 if (j % BUCKET == BUCKET - 1 || j + 1 == list.size())
                     for (int c = 0; c < CH; ++c) {
                         later.back()[c] = column.color[0][c];
@@ -204,13 +211,13 @@ void backward_by_splats(const Frame<Real>& frame, const Arguments<Real>& a, std:
             const Real* v_color = a.in[V_IMAGE] + CH * p;
             Real worth = a.in[V_T_FINAL][p];
             for (int c = 0; c < CH; ++c) worth += a.in[BACKGROUND][c] * v_color[c];
-            Passing<Real> pixel = {column.T[0], worth};
+            Passing<Real> pixel = {column.T_final[0], worth};
             for (int j = column.last[0] - 1; j >= 0; --j) {
                 const size_t bucket = size_t(j) / BUCKET;
                 if (j % BUCKET == BUCKET - 1 && j + 1 < column.last[0])
-                    pixel = passing_behind<Real, CH>(T[bucket + 1], column.T[0], later[bucket].data(), v_color, worth);
-                pass_pixel<true, Real, CH>(pixel, frame.blended[list[j]], &frame.colors[list[j]].x, v_color, px, py,
-                                           frame.constants, &sums[size_t(N_SUMS) * list[j]]);
+                    pixel = passing_behind<Real, CH>(T[bucket + 1], column.T_final[0], later[bucket].data(), v_color, worth);
+                pass_pixel<true, PASS, Real, CH>(pixel, frame.blended[list[j]], &frame.colors[list[j]].x, v_color, px,
+                                                 py, frame.constants, &sums[size_t(N_SUMS) * list[j]]);
             }
         }
     });
@@ -222,16 +229,16 @@ void render_vjp(Arguments<Real>& a) {
     const Frame<Real> frame = make_frame(a);
     std::vector<Real> sums(size_t(N_SUMS) * a.n, Real(0));
     if (a.integers[PER_SPLAT])
-        backward_by_splats(frame, a, sums);
+        a.profile.pass_ceiling ? backward_by_splats<true>(frame, a, sums) : backward_by_splats<false>(frame, a, sums);
     else
-        backward_by_columns(frame, a, sums);
+        a.profile.pass_ceiling ? backward_by_columns<true>(frame, a, sums) : backward_by_columns<false>(frame, a, sums);
     for_each_column(frame, [&](const std::vector<int>& list, int x, int y, int rows) {
         ForwardColumn<Real, CH, ROWS> column;
         Instruments<Real, ROWS> told;
         forward_column(frame, list, x, y, rows, column, told);
         for (int k = 0; k < rows; ++k)
             for (int c = 0; c < CH; ++c)
-                a.out[6][c] += column.T[k] * a.in[V_IMAGE][CH * ((long long)(y + k) * frame.grid.width + x) + c];
+                a.out[6][c] += column.T_final[k] * a.in[V_IMAGE][CH * ((long long)(y + k) * frame.grid.width + x) + c];
     });
     ViewmatVjp<Real> v_viewmat = zero_viewmat<Real>();
     for (long long i = 0; i < a.n; ++i) {

@@ -137,7 +137,7 @@ const Entry<Real>* stage_table() {
                  const Real exponent = exponent_in_column(mul(mul(s.hA, dx), dx), mul(s.B, dx), s.hC, dy);
                  const Real alpha = min_of(a.profile.alpha_ceiling, mul(s.opacity, power_of_two(-exponent)));
                  a.out[0][i] = alpha;
-                 a.ids[0][i] = exponent > s.reach || exponent < Real(0) || alpha < a.profile.alpha_floor),
+                 a.ids[0][i] = !within(exponent, s.beyond)),
         POP_ROWS("dominant_id", Dominant<Real> best = no_dominant<Real>();
                  for (int k = 0; k < a.integers[2]; ++k) compete(best, int(a.ids[1][k]), a.in[0][k]);
                  a.ids[0][i] = best.id),

@@ -27,7 +27,7 @@ __device__ __forceinline__ void store_record(float* records, int i, const Blende
                                              const float color[MAX_CHANNELS]) {
     float4* row = reinterpret_cast<float4*>(records + size_t(RECORD) * i);
     row[0] = {s.x, s.y, s.hA, s.B};
-    row[1] = {s.hC, s.opacity, s.reach, color[0]};
+    row[1] = {s.hC, s.opacity, s.beyond, color[0]};
     row[2] = {color[1], color[2], color[3], 0.0f};
 }
 

@@ -5,6 +5,7 @@
 #pragma once
 
 #include <math.h>
+#include <string.h>
 
 #ifdef __CUDACC__
 #define POP_HD __host__ __device__ __forceinline__
@@ -50,6 +51,12 @@ template <class Real>
 POP_HD Real min_of(Real a, Real b) {
     return b < a ? b : a;
 }
+
+// the same, one instruction on the device; not for code that a CPU's vectors are made of
+POP_HD float least(float a, float b) { return fminf(a, b); }
+POP_HD double least(double a, double b) { return fmin(a, b); }
+POP_HD float most(float a, float b) { return fmaxf(a, b); }
+POP_HD double most(double a, double b) { return fmax(a, b); }
 
 template <class Real>
 POP_HD Real max_of(Real a, Real b) {
@@ -116,6 +123,22 @@ POP_HD float reciprocal(float x) {
 }
 
 POP_HD double reciprocal(double x) { return 1.0 / x; }
+
+// a float's bits: of two that are not negative the larger has the larger bits, and negative ones and NaN have larger
+// bits than any number that is neither
+POP_HD unsigned bits_of(float x) {
+#ifdef __CUDA_ARCH__
+    return __float_as_uint(x);
+#else
+    unsigned bits;
+    memcpy(&bits, &x, sizeof bits);
+    return bits;
+#endif
+}
+
+// 0 <= x < limit, for limit >= 0; not for a NaN. For floats one comparison.
+POP_HD bool within(float x, float limit) { return bits_of(x) < bits_of(limit); }
+POP_HD bool within(double x, double limit) { return x >= 0.0 && x < limit; }
 
 template <class Real>
 POP_HD Real dot(Vec3<Real> a, Vec3<Real> b) {

@@ -249,6 +249,7 @@ void make_tile_lists(const TileLists& lists, const SplatArrays& splats, const Pr
     } else {
         sort_instances<unsigned>(lists, splats, profile, dominant_counts, state, stream);
     }
+    order_tiles(lists, stream);
     if (lists.bucket_begin == nullptr) return;
     const int blocks = blocks_for(lists.n_tiles, BLOCK);
     bucket_counts_kernel<<<blocks, BLOCK, 0, stream>>>(lists);
