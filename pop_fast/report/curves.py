@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -112,7 +113,8 @@ class _Axes:
             pad = max(0.05 * (self.high - self.low), 0.02)
             self.low, self.high = self.low - pad, self.high + pad
         else:
-            span = high - low or abs(high) or 1.0
+            # wide enough that its margins are not rounded away, as those of the smallest numbers are
+            span = max(high - low or abs(high) or 1.0, sys.float_info.min)
             self.low = 0.0 if chart.zero and low >= 0 else low - 0.06 * span
             self.high = high + 0.08 * span
         self.x_stop = max(chart.x_stop, 1.0)

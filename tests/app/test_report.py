@@ -175,6 +175,10 @@ def test_any_values_draw_without_leaving_the_plot(values: list[float], log: bool
     assert all(0.0 <= y <= 220.0 for y in heights)
 
 
+def test_an_axis_of_the_smallest_number_has_a_length() -> None:
+    assert 'cy="' in draw(Chart("tiny", [Series("s", [0], [5e-324], "red", dots=True)], 1, [], [], False, False))
+
+
 def test_a_bar_taller_than_its_axis_is_cut_and_says_so() -> None:
     svg = draw_histogram("h", [0.0, 1.0, 0.0], 0.2, "red", ["note"])
     assert "100 %" in svg

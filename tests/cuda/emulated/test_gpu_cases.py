@@ -22,7 +22,7 @@ def test_the_predicted_case_is_what_was_predicted(gpu, monkeypatch):
     whole, case = CASES[0], CASES[0].smaller(BY)
     assert (whole.n, whole.width * whole.height) == (270_000, pytest.approx(1.6e6, rel=0.01))
     photograph = torch.zeros((case.height, case.width, 3), dtype=torch.uint8)
-    trainer = make_trainer(activated_scene(case, gpu), photograph, 2, replay=False)
+    trainer = make_trainer(activated_scene(case, gpu), photograph, 2, replay=False, counts=True)
     trainer.run(1, POP)
     loads = step_loads(trainer)
     assert loads.visible * BY**2 == pytest.approx(VISIBLE, rel=0.05)
