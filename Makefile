@@ -49,9 +49,10 @@ cuda: setup  ## compile the CUDA extension (needs nvcc; no GPU)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[cuda-build]'
 	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python -m cuda_ext.build
 
-sass: setup  ## count the kernels' machine instructions into benchmarks/results/sass.json (needs nvcc; no GPU)
+sass: setup  ## count the kernels' machine instructions into benchmarks (needs nvcc; no GPU)
 	$(BIN)/python -m pip install --quiet -e '.[sass]'
 	$(BIN)/python -m cuda_ext.count_sass --json benchmarks/results/sass.json
+	$(BIN)/python benchmarks/gpu_predictions.py --write
 
 emulate: setup  ## run the CUDA kernels' own source on the host, warp by warp: every law, training steps (minutes)
 	POP_EMULATED_LAWS=1 POP_CUDA_KINDS="columns atomics splats" $(BIN)/python -m pytest -q tests/cuda/emulated

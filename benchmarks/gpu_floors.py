@@ -1,14 +1,17 @@
 """What each kernel of a training step has to do at least: bytes, instructions, and the time that a card needs for them.
 
-The counts a pair and a Gaussian are those of the kernels' inner loops at their best; a floor is the larger of the time
-for the bytes at the bandwidth that this card copies with and that for the instructions at its full issue rate.
+The blend's instructions are counted in its machine code for sm_90 (`results/sass.json`), the loss's are estimated from
+its loops there; a floor is the larger of the time for the bytes at the bandwidth that this card copies with and that
+for the instructions at its full issue rate.
 """
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 
@@ -16,6 +19,10 @@ LANES_PER_SM = 128
 ROW = 48  # bytes of a packed splat, and of a gradient slot
 PARAMETERS = 59  # floats of a Gaussian
 GEOMETRY = 11  # of these, what a culled Gaussian is read for
+LANE_PIXELS = 4  # pixels that a lane of the blend evaluates a splat at
+SASS = json.loads((Path(__file__).resolve().parent / "results" / "sass.json").read_text(encoding="utf-8"))
+# what a POP step launches
+FORWARD, BACKWARD = "blend_forward_kernel<3, 1, false>", "columns_kernel<3, false, false, false>"
 
 
 @dataclass(frozen=True)
@@ -73,10 +80,17 @@ def _clock_hz() -> float:
     return 1e6 * float(told[0]) if told else 1e9
 
 
+def instructions_a_pair(kernel: str, arch: str = "sm_90") -> float:
+    """Return what a lane issues for one splat at one pixel, by the count of the kernel's loop over records."""
+    (entry,) = (entry for entry in SASS["kernels"] if (entry["kernel"], entry["arch"]) == (kernel, arch))
+    (loop,) = (loop for loop in entry["loops"] if loop["per"] == "record")
+    return loop["all"] / loop["iterations"] / LANE_PIXELS
+
+
 def work(loads: Loads) -> dict[str, tuple[float, float]]:
     """Return bytes and lane instructions of every kernel of a step, by the kernel's name."""
     n, seen, entries, pixels = loads.gaussians, loads.visible, loads.instances, loads.pixels
-    E, C = loads.evaluated, loads.contributing
+    evaluated = loads.evaluated
     adam = 4 * 3 * PARAMETERS * 2  # parameter and both moments, read and written
     return {
         # 36 bytes for the lists, and a packed splat where one is seen
@@ -85,10 +99,11 @@ def work(loads: Loads) -> dict[str, tuple[float, float]]:
         "count_instances": ((4 * 16 + ROW + 8) * n, 0.0),
         # emitted once, two passes of a 6-byte pair over 16-bit tiles, ids and slots written
         "make_tile_lists": ((6 + 2 * 12 + 12) * entries, 0.0),
-        "blend_forward": ((ROW + 4) * entries + 20 * pixels, 8.0 * E + 9.0 * C),
-        "photometric": (8 * 12 * pixels, 236.0 * 3 * pixels),
+        "blend_forward": ((ROW + 4) * entries + 20 * pixels, instructions_a_pair(FORWARD) * evaluated),
+        # a pixel and channel: 215 for its window, 162 for its gradient
+        "photometric": (8 * 12 * pixels, (215.0 + 162.0) * 3 * pixels),
         # a slot an entry, written once and read once
-        "blend_backward": ((3 * ROW + 8) * entries + 20 * pixels, 18.0 * E + 22.0 * C),
+        "blend_backward": ((3 * ROW + 8) * entries + 20 * pixels, instructions_a_pair(BACKWARD) * evaluated),
         "update": ((adam + ROW) * n, 0.0),
     }
 

@@ -88,6 +88,11 @@ def demangled(names: list[str]) -> list[str]:
     return [re.sub(r"\(.*", "", re.sub(r"\((?:int|bool|Tell)\)", "", line)) for line in short]
 
 
+def is_own(mangled: str) -> bool:
+    """Tell our own kernels from CUB's, which may name our types among their parameters."""
+    return mangled.startswith("_ZN3pop")
+
+
 def compile_and_read(nvcc: str, source: Path, arch: str, folder: Path, output: str = "-c") -> list[KernelUse]:
     """Compile one file for one architecture; `output` is nvcc's flag, "-cubin" for the device's code alone.
 
@@ -115,7 +120,7 @@ def check(archs: list[str], jobs: int = 1, only: str = "") -> list[KernelUse]:
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(jobs) as pool:
         work = [(nvcc, source, arch, Path(folder)) for arch in archs for source in sources]
         uses = [use for found in pool.map(lambda args: compile_and_read(*args), work) for use in found]
-    own = [use for use in uses if "3pop" in use.kernel]
+    own = [use for use in uses if is_own(use.kernel)]
     names = demangled([use.kernel for use in own])
     return [KernelUse(**{**asdict(use), "kernel": name}) for use, name in zip(own, names, strict=True)]
 

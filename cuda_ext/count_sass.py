@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cuda_ext.check_ptxas import CSRC, KernelUse, compile_and_read, demangled
+from cuda_ext.check_ptxas import CSRC, KernelUse, compile_and_read, demangled, is_own
 from cuda_ext.sass import Code, Flow, Loop, find_loops, loop_line, outside_loops, parse_sass
 from cuda_ext.toolkit import find_nvcc, nvcc_version
 
@@ -194,7 +194,7 @@ def kernel_entry(code: Code, use: KernelUse, sources: dict[str, list[str]]) -> d
 def count_file(nvcc: str, nvdisasm: str, source: Path, arch: str, folder: Path) -> list[dict[str, Any]]:
     """Compile one file for one architecture and describe its own kernels; CUB's are left out."""
     uses = {use.kernel: use for use in compile_and_read(nvcc, source, arch, folder, "-cubin")}
-    codes = [code for code in disassemble(nvdisasm, folder / f"{source.stem}.{arch}.o") if "3pop" in code.name]
+    codes = [code for code in disassemble(nvdisasm, folder / f"{source.stem}.{arch}.o") if is_own(code.name)]
     sources = {path.name: path.read_text(encoding="utf-8").splitlines() for path in CSRC.iterdir()}
     names = demangled([code.name for code in codes])
     found = []

@@ -7,6 +7,10 @@
 //
 // A row of sums goes to its instance's slot, by exactly one warp, so nothing is added in an order that varies; or, where
 // memory is short, by atomic addition to the splat.
+//
+// Both are bounded by the issue of instructions: columns by four pixels a lane, about four fifths, and the sums over
+// lanes; splats by what a pair costs and by the steps that fill and drain a warp. sum_slots is bounded by the latency of
+// memory, a few rows a splat. Counts: benchmarks/NOTES.md, `make sass`.
 
 #include "cuda_check.h"
 #include "kernel_tools.cuh"
@@ -109,17 +113,17 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK, CH < 4 && !ABS ? 7 : 0)
     for (int top = last; top > begin; top -= WARP) {  // per 32 records
         const int count = min(WARP, top - begin);
         __syncwarp();
-        // a batch that is not full ends in a splat that reaches nothing
-        staged[warp][lane][1].z = 0.0f;
+        // a batch that is not full ends in a splat of zeros, which reaches nothing
+        Record record = {};
         if (lane < count) {
             const int entry = top - 1 - lane;
             const unsigned splat = lists.listed[entry];
-            const Record record = load_record(blend.records, splat);
-            staged[warp][lane][0] = record.a;
-            staged[warp][lane][1] = record.b;
-            staged[warp][lane][2] = record.c;
+            record = load_record(blend.records, splat);
             staged_rows[warp][lane] = ATOMIC ? splat : lists.slots[1][entry] * tile.parts + tile.part;
         }
+        staged[warp][lane][0] = record.a;
+        staged[warp][lane][1] = record.b;
+        staged[warp][lane][2] = record.c;
         __syncwarp();
         // lanes without a sum of their own, or without a second splat, store nothing
         const int stored = own_sum < 0 ? 0 : count - half;

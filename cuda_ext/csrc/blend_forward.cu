@@ -1,4 +1,8 @@
 // Blending, front to back: one warp a tile of 16 x 8 pixels, a lane owns a column of four. No barrier crosses a warp.
+//
+// Bounded by the issue of instructions: a record is read from shared memory by all lanes at once, and what is left is
+// arithmetic on registers, half of it multiplications and additions. Next to it stands the special function unit, which
+// takes eight cycles for the exponentials of a warp. Counts: benchmarks/NOTES.md, `make sass`.
 
 #include "cuda_check.h"
 #include "kernel_tools.cuh"
@@ -42,7 +46,7 @@ __device__ __forceinline__ void sum_from_the_back(const TileLists& lists, const 
 // blocks that must fit a multiprocessor at a time: as many as leave every value its register
 constexpr int least_blocks(int channels, Tell tell, bool checkpoint) {
     const int wide = channels == MAX_CHANNELS, most = tell == Tell::everything;
-    return tell == Tell::nothing ? 8 - wide : 7 - most - checkpoint - 2 * wide;
+    return tell == Tell::nothing ? 8 - checkpoint - wide : 7 - checkpoint - most - 2 * wide;
 }
 
 template <int CH, Tell TELL, bool CHECKPOINT>
@@ -81,14 +85,12 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK, least_blocks(CH, TELL, 
             ++n_buckets;
         }
         __syncwarp();
-        // a batch that is not full ends in splats that reach nothing
-        staged[warp][lane][1].z = 0.0f;
-        if (first + lane < end) {
-            const Record record = load_record(blend.records, lists.listed[first + lane]);
-            staged[warp][lane][0] = record.a;
-            staged[warp][lane][1] = record.b;
-            staged[warp][lane][2] = record.c;
-        }
+        // a batch that is not full ends in splats of zeros, which reach nothing
+        Record record = {};
+        if (first + lane < end) record = load_record(blend.records, lists.listed[first + lane]);
+        staged[warp][lane][0] = record.a;
+        staged[warp][lane][1] = record.b;
+        staged[warp][lane][2] = record.c;
         __syncwarp();
         const int count = min(WARP, end - first);
         for (int j = 0; j < count; j += GROUP) {  // per record

@@ -67,7 +67,7 @@ POP_HD bool is_open(const ForwardColumn<Real, CH, ROWS>& column, Real stop) {
 }
 
 // Without branches, so that the pixels' exponentials overlap: nearly every splat of a tile's list reaches some pixel of
-// a row of its warp. x, y: the first pixel's centre; position: the splat's place in the list; id: what the winner of a
+// a row of its warp. A splat that is not within reach is blended with weight 0: its colour must be finite. x, y: the first pixel's centre; position: the splat's place in the list; id: what the winner of a
 // pixel is known by.
 template <Tell TELL, class Real, int CH, int ROWS>
 POP_HD void blend_forward(ForwardColumn<Real, CH, ROWS>& column, Instruments<Real, ROWS>& told,

@@ -137,6 +137,18 @@ def test_every_kernel_of_the_sources_is_committed_for_both_architectures() -> No
         assert {entry["kernel"].split("<")[0] for entry in told if entry["arch"] == arch} == set(written)
 
 
+def test_the_notes_hold_what_the_counts_give(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(COUNTS.parents[1]))
+    import gpu_predictions
+
+    assert gpu_predictions.main(["--check"]) == 0
+    # twice the issue rate halves what is bound by it
+    slow = gpu_predictions.floors(gpu_predictions.CASE, gpu_predictions.H200)
+    twice = gpu_predictions.Card(gpu_predictions.H200.bytes_per_s, 2.0 * gpu_predictions.H200.instructions_per_s)
+    fast = gpu_predictions.floors(gpu_predictions.CASE, twice)
+    assert fast["blend_backward"]["floor_ms"] == pytest.approx(slow["blend_backward"]["floor_ms"] / 2.0)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(find_nvcc() is None or find_nvdisasm() is None, reason="no nvcc or no nvdisasm: nothing to count")
 def test_the_committed_counts_are_those_of_the_sources() -> None:

@@ -1,0 +1,126 @@
+"""What the kernels' machine code allows, before any card has run it: the two CUDA tables of NOTES.md.
+
+    python benchmarks/gpu_predictions.py            print them
+    python benchmarks/gpu_predictions.py --write    put them into NOTES.md, between their marks
+    python benchmarks/gpu_predictions.py --check    exit with 1 when NOTES.md holds others
+
+The first holds counts (`results/sass.json`, made by `make sass`). The second is computed from them and from the bytes
+of `gpu_floors`, for one case on an H200:
+
+    predicted = max(lane instructions / issue rate, bytes / bandwidth) / USED + NODE * nodes of the graph
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from gpu_floors import SASS, Card, Loads, floors
+
+NOTES = Path(__file__).resolve().parent / "NOTES.md"
+# 132 processors of 128 lanes at the clock that an H200 holds under load; the bandwidth that a copy reaches on it
+H200 = Card(4.2e12, 132 * 128 * 1.755e9)
+# 270,000 Gaussians, 160,000 of them visible, 1.6 MP, 120 evaluated and 35 contributing pairs a pixel
+CASE = Loads(270_000, 160_000, 2_000_000, 192_000_000, 56_000_000, 1_600_000)
+# assumed: the share of the issue slots, or of the bandwidth, that a kernel keeps busy; what a node costs beside it, ms
+USED, NODE = 0.7, 0.004
+# kernels, sorting passes and fills that a POP step launches, by the function that launches them
+NODES = {
+    "begin_step": 1,
+    "project": 1,
+    "count_instances": 14,
+    "make_tile_lists": 13,
+    "blend_forward": 1,
+    "photometric": 2,
+    "blend_backward": 2,
+    "count_important": 1,
+    "update": 1,
+    "end_step": 1,
+}
+# the instantiations that training takes, and what else is compared with them
+SHOWN = {
+    "project_kernel<3, false>": "project",
+    "blend_forward_kernel<3, 0, false>": "blend forward",
+    "blend_forward_kernel<3, 1, false>": "blend forward with dominant ids",
+    "blend_forward_kernel<3, 2, false>": "the same with counts of splats",
+    "columns_kernel<3, false, false, false>": "blend backward, columns",
+    "columns_kernel<3, false, false, true>": "the same, atomic",
+    "splats_kernel<3, false, false, false>": "blend backward, splats",
+    "sum_slots_kernel": "sum of gradient slots",
+    "tile_order_kernel": "order of tiles",
+    "windows_kernel<true, false>": "loss, windows",
+    "pixels_kernel": "loss, pixels",
+    "update_kernel<3>": "update",
+}
+
+
+def an_iteration(kernel: dict[str, Any]) -> str:
+    """Say what an iteration of a kernel's loop over records, steps or slots issues, or what its whole body does."""
+    for loop in kernel["loops"]:
+        if loop["per"] in ("record", "step", "8 slots"):
+            least, most = (loop[name] / loop["iterations"] for name in ("always", "all"))
+            span = f"{most:.0f}" if most - least < 1 else f"{least:.0f} to {most:.0f}"
+            pair = f", {most / 4:.0f} a pair" if loop["per"] == "record" else ""
+            return f"{span} per {loop['per']}{pair}"
+    return f"{kernel['instructions']} in all, per {kernel['per']}"
+
+
+def machine_code(sass: dict[str, Any]) -> str:
+    """Make the table of counted instructions."""
+    head = "| kernel | instructions of a warp, sm_80 | sm_90 | registers | shared memory, bytes | warps a processor |"
+    lines = [head, "|---|---|---|---|---|---|"]
+    found = {(entry["kernel"], entry["arch"]): entry for entry in sass["kernels"]}
+    for kernel, title in SHOWN.items():
+        both = [found[kernel, arch] for arch in ("sm_80", "sm_90")]
+        registers, shared, warps = (
+            " / ".join(dict.fromkeys(str(one[name]) for one in both)) for name in ("registers", "shared", "warps")
+        )
+        lines.append(
+            f"| {title} | {an_iteration(both[0])} | {an_iteration(both[1])} | {registers} | {shared} | {warps} |"
+        )
+    return "\n".join(lines)
+
+
+def predictions() -> str:
+    """Make the table of predicted times."""
+    lines = ["| step | bound by | floor at full use, ms | predicted, ms | measured |", "|---|---|---|---|---|"]
+    total = least = 0.0
+    known = floors(CASE, H200)
+    for name, nodes in NODES.items():
+        entry = known.get(name, {"bytes": 0.0, "instructions": 0.0, "floor_ms": 0.0})
+        predicted = entry["floor_ms"] / USED + NODE * nodes
+        issued = entry["instructions"] / H200.instructions_per_s > entry["bytes"] / H200.bytes_per_s
+        bound = "issue" if issued else "memory"
+        bound = "latency" if NODE * nodes > predicted / 2 else bound
+        lines.append(f"| `{name}` | {bound} | {entry['floor_ms']:.3f} | {predicted:.3f} | not run |")
+        total, least = total + predicted, least + entry["floor_ms"]
+    lines.append(f"| whole step, {sum(NODES.values())} graph nodes | | {least:.2f} | {total:.2f} | not run |")
+    return "\n".join(lines)
+
+
+def with_tables(text: str) -> str:
+    """Put both tables between their marks."""
+    for name, table in (("machine code", machine_code(SASS)), ("predictions", predictions())):
+        begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
+        head, rest = text.split(begin)
+        text = head + begin + table + "\n" + end + rest.split(end)[1]
+    return text
+
+
+def main(words: list[str]) -> int:
+    """Run the script."""
+    text = NOTES.read_text(encoding="utf-8")
+    if words == ["--write"]:
+        NOTES.write_text(with_tables(text), encoding="utf-8")
+    elif words == ["--check"]:
+        if with_tables(text) != text:
+            print("NOTES.md: the CUDA tables are not what the counts give; run gpu_predictions.py --write")
+            return 1
+    else:
+        print(machine_code(SASS), predictions(), sep="\n\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
