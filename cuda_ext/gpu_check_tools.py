@@ -41,16 +41,17 @@ class Command:
             words, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT, env=environment, start_new_session=True
         )
 
-    def wait(self, limit: float, stop: signal.Signals = signal.SIGTERM) -> dict[str, Any]:
+    def wait(self, limit: float, stop: signal.Signals = signal.SIGTERM, grace: float | None = None) -> dict[str, Any]:
         """Wait for its end, at most `limit` seconds.
 
         A command whose time is up is asked to stop first, by the signal `stop`, so that it can leave a checkpoint or
-        its summary; its status is its own answer, or 124.
+        its summary; its status is its own answer, or 124. It has the last `grace` seconds of the limit to answer: a
+        quarter of it and `GRACE` at most, if nothing else is said.
 
         Returns:
             Its `status`, its `seconds` so far and the end of its words, `output`.
         """
-        grace = min(GRACE, limit / 4)
+        grace = min(GRACE, limit / 4) if grace is None else grace
         try:
             status = self._process.wait(max(limit - grace, 0.0))
         except subprocess.TimeoutExpired:

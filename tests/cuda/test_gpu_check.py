@@ -101,23 +101,29 @@ def test_no_stage_takes_what_later_ones_need():
     assert set(STAGES) == set(SHARES) == {name for job in JOBS.values() for name in job}
 
 
+def begun(code: str, tmp_path: Path) -> Command:
+    """Begin a command, and wait until it has made the file that it is to make when it is ready to be stopped."""
+    ready = tmp_path / "ready"
+    ready.unlink(missing_ok=True)
+    command = Command(
+        [sys.executable, "-c", f"import pathlib, signal, sys, time\n{code}", str(ready)], tmp_path / "log"
+    )
+    while not ready.exists():
+        time.sleep(0.05)
+    return command
+
+
 def test_a_command_is_asked_to_stop_before_it_is_made_to(tmp_path):
-    polite = (
-        "import signal, sys, time; signal.signal(signal.SIGTERM, lambda *a: (print('a checkpoint'), sys.exit(130)));"
-        "print('begun', flush=True); time.sleep(60)"
-    )
-    found = run([sys.executable, "-c", polite], 8.0, tmp_path / "log")
-    assert found["status"] == 130
-    assert found["output"].split("\n")[:2] == ["begun", "a checkpoint"]
-    interrupted = "import time\ntry: time.sleep(60)\nexcept KeyboardInterrupt: print('a summary'); raise SystemExit(2)"
-    found = run([sys.executable, "-c", interrupted], 6.0, tmp_path / "log", stop=signal.SIGINT)
-    assert (found["status"], found["output"]) == (2, "a summary\n")
-    deaf = (
-        "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('begun', flush=True); time.sleep(60)"
-    )
-    found = run([sys.executable, "-c", deaf], 4.0, tmp_path / "log")
-    assert found["status"] == 124
-    assert found["seconds"] < 30.0
+    wait = "print('begun', flush=True); pathlib.Path(sys.argv[1]).touch(); time.sleep(600)"
+    polite = f"signal.signal(signal.SIGTERM, lambda *_: (print('a checkpoint'), sys.exit(130)))\n{wait}"
+    found = begun(polite, tmp_path).wait(60.0, grace=60.0)
+    assert (found["status"], found["output"]) == (130, "begun\na checkpoint\n")
+    interrupted = f"try: {wait}\nexcept KeyboardInterrupt: print('a summary'); raise SystemExit(2)"
+    found = begun(interrupted, tmp_path).wait(60.0, signal.SIGINT, grace=60.0)
+    assert (found["status"], found["output"]) == (2, "begun\na summary\n")
+    deaf = f"signal.signal(signal.SIGTERM, signal.SIG_IGN)\n{wait}"
+    found = begun(deaf, tmp_path).wait(0.5, grace=0.5)
+    assert (found["status"], found["output"]) == (124, "begun\n")
     # each command's words stand in the log, and only its own in what is returned
     assert (tmp_path / "log").read_text().count("$ ") == 3
 
