@@ -76,7 +76,9 @@ def environment(commit: str) -> dict[str, Any]:
 
 def run_stages(names: list[str], limit: float, check: Check, report: dict[str, Any], path: Path) -> list[str]:
     """Run stages in order, each in its share of the time, and write down what each found; return those that failed."""
-    budget = Budget(limit, SHARES, names)
+    # how long emulated kernels take says nothing: only the limit ends them
+    shares = {name: replace(share, most=limit) for name, share in SHARES.items()} if check.rehearsal else SHARES
+    budget = Budget(limit, shares, names)
     failed: list[str] = []
     report["stages"] |= {name: {"status": None, "state": "not begun"} for name in names}
     write_json(path, report)

@@ -144,7 +144,7 @@ SHARES = {
     "bench": Share(120, 330),
     "gsplat": Share(60, 1e9),
     "laws": Share(90, 150),
-    "steps": Share(45, 90),
+    "steps": Share(45, 150),
     "sanitizer": Share(40, 90),
     "train": Share(90, 250),
     "laws_of_splats": Share(20, 1e9),

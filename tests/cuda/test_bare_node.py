@@ -63,7 +63,9 @@ def gpu_check(python: Path, tree: Path, *words: str, **environment: str) -> subp
 
 
 def job(node: tuple[Path, Path], number: int, out: Path, *words: str, **environment: str) -> dict[str, Any]:
-    done = gpu_check(*node, "--rehearse", "--job", str(number), *words, OUT=str(out), **environment)
+    # no stage is cut off because the machine is busy
+    plenty = ("--limit-s", "5000")
+    done = gpu_check(*node, "--rehearse", "--job", str(number), *plenty, *words, OUT=str(out), **environment)
     report = json.loads((out / f"gpu_check_{number}.json").read_text())
     assert done.returncode == 0, (done.stdout, done.stderr, (out / f"gpu_check_{number}.log").read_text()[-4000:])
     assert report["complete"]
