@@ -103,8 +103,8 @@ def test_cuda_asked_for_in_vain_is_one_sentence_before_anything_is_read(pop: Pop
 
 @pytest.mark.usefixtures("with_gpu")
 def test_settings_that_the_device_does_not_know_are_refused_before_anything_is_read(tmp_path):
-    with pytest.raises(PopError, match=r"pop\.pop_over = 'all' only"):
-        check_backend(tiny_config(tmp_path, backend="cuda", pop=POPStrategy(pop_over="visible")))
+    with pytest.raises(PopError, match=r"pop\.absgrad = False only, not True; use --backend fast"):
+        check_backend(tiny_config(tmp_path, backend="cuda", pop=POPStrategy(absgrad=True)))
 
 
 @pytest.mark.usefixtures("with_gpu")
