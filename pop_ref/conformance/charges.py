@@ -30,6 +30,8 @@ class Layer:
         sigma, e_sigma: the exponent.
         raw, e_raw: opacity times falloff before the ceiling.
         alpha, e_alpha: after it.
+        e_expanded: charge of alpha where the exponent is expanded about a tile's centre: its terms are those of an
+            offset half a tile longer, and cancel.
         taken: at or over the floor, so blended if the light reaches it.
         doubtful: whether it is taken is within reach of rounding (D1, D2, D5).
         seen: the pixel had not ended.
@@ -49,6 +51,7 @@ class Layer:
     e_raw: np.ndarray
     alpha: np.ndarray
     e_alpha: np.ndarray
+    e_expanded: np.ndarray
     taken: np.ndarray
     doubtful: np.ndarray
     seen: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -68,6 +71,7 @@ class PixelCharges:
         layers: splats front to back.
         reach: eps of the dtype times REACH.
         image, T_final: charges. [H, W, 3], [H, W]
+        dominant_weight: charge of the dominant weight, exponents expanded about tile centres. [H, W]
         absolute: sum of weights times absolute colours, background included. [H, W, 3]
         doubts: decision label -> where it is within reach of rounding: D1, D4, D5, D6, D7, D8. [H, W]
     """
@@ -78,6 +82,7 @@ class PixelCharges:
     reach: float
     image: np.ndarray
     T_final: np.ndarray
+    dominant_weight: np.ndarray
     absolute: np.ndarray
     doubts: dict[str, np.ndarray]
 
@@ -119,11 +124,13 @@ class PixelCharges:
 class _State:
     T: np.ndarray
     T_error: np.ndarray
+    T_expanded: np.ndarray
     image: np.ndarray
     absolute: np.ndarray
     alive: np.ndarray
     best: np.ndarray
     e_best: np.ndarray
+    e_best_expanded: np.ndarray
 
 
 def charge(scene: Scene, dtype: Any, tile_lists: list[list[int]] | None = None) -> PixelCharges:
@@ -138,8 +145,9 @@ def charge(scene: Scene, dtype: Any, tile_lists: list[list[int]] | None = None) 
     screen = screen_charges(scene, reach)
     H, W = scene.camera.height, scene.camera.width
     doubts = {label: np.zeros((H, W), dtype=bool) for label in ("D1", "D4", "D5", "D6", "D7", "D8")}
-    state = _State(np.ones((H, W)), np.zeros((H, W)), np.zeros((H, W, 3)), np.zeros((H, W, 3)),
-                   np.ones((H, W), dtype=bool), np.zeros((H, W)), np.zeros((H, W)))  # fmt: skip
+    none = np.zeros((H, W))
+    state = _State(np.ones((H, W)), none, none, np.zeros((H, W, 3)), np.zeros((H, W, 3)),
+                   np.ones((H, W), dtype=bool), none, none, none)  # fmt: skip
     layers = []
     for i in np.lexsort((np.arange(len(screen.depths)), screen.depths)).tolist():
         if screen.kept[i] or screen.near[i]:
@@ -150,7 +158,8 @@ def charge(scene: Scene, dtype: Any, tile_lists: list[list[int]] | None = None) 
     background = np.abs(scene.background)
     image = state.image + background * (state.T_error + state.T)[..., None] + state.absolute
     absolute = state.absolute + background * state.T[..., None]
-    charges = PixelCharges(scene, screen, layers, reach, image, state.T_error, absolute, doubts)
+    weight = state.e_best_expanded
+    charges = PixelCharges(scene, screen, layers, reach, image, state.T_error, weight, absolute, doubts)
     _doubt_depths(charges)
     return charges
 
@@ -188,7 +197,11 @@ def _layer(i: int, scene: Scene, s: ScreenCharges, reach: float, listed: np.ndar
         doubtful |= raw >= profile.alpha_floor * (1.0 - reach)
     alpha = np.minimum(raw, profile.alpha_ceiling)
     e_alpha = np.where(raw > profile.alpha_ceiling, 1.0, e_raw)
-    return Layer(i, dx, dy, e_dx, e_dy, sigma, e_sigma, raw, e_raw, alpha, e_alpha, taken, doubtful)
+    half = 0.5 * (scene.tile_size or profile.tile_size)
+    far_x, far_y = np.abs(dx) + half, np.abs(dy) + half
+    expanded = 0.5 * (abs(A) * far_x * far_x + abs(C) * far_y * far_y) + abs(B) * far_x * far_y
+    e_expanded = np.where(raw > profile.alpha_ceiling, 1.0, e_raw + raw * expanded)
+    return Layer(i, dx, dy, e_dx, e_dy, sigma, e_sigma, raw, e_raw, alpha, e_alpha, e_expanded, taken, doubtful)
 
 
 def _blend(
@@ -208,6 +221,10 @@ def _blend(
     doubts["D8"] |= blended & (np.abs(weight - state.best) <= reach * (e_weight + state.e_best))
     wins = blended & (weight > state.best)
     state.best, state.e_best = np.where(wins, weight, state.best), np.where(wins, e_weight, state.e_best)
+    e_expanded = state.T * layer.e_expanded + state.T_expanded * alpha + state.T * alpha
+    state.e_best_expanded = np.where(wins, e_expanded, state.e_best_expanded)
+    e_next_expanded = state.T_expanded * (1.0 - alpha) + state.T * layer.e_expanded + 2.0 * next_T
+    state.T_expanded = np.where(blended, e_next_expanded, state.T_expanded)
     share = np.where(blended, weight, 0.0)[..., None]
     color = np.abs(s.colors[layer.id])
     state.absolute = state.absolute + share * color

@@ -96,7 +96,7 @@ TABLE: Final[dict[str, Tolerance]] = {
     "agreement.v_viewmat": Tolerance(units=0.15, worst=0.015),
     "agreement.view_dirs": Tolerance(units=1.5, worst=0.16),
     "agreement.view_dirs_vjp": Tolerance(units=1.5, worst=0.18),
-    "agreement.weight": Tolerance(units=15, worst=1.5),
+    "agreement.weight": Tolerance(units=8, worst=0.8),
     "alpha.alpha": Tolerance(units=1, worst=0),
     "alpha.falloff": Tolerance(units=2, worst=0.19),
     "alpha.gradient": Tolerance(units=3, worst=0.31),

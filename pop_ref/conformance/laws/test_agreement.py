@@ -151,7 +151,7 @@ def test_dominant_ids_and_weights_are_the_oracles(backend, scene):
     expected, view = ORACLE.render(seen), backend.render(seen)
     sure = charges.decided
     assert_same_bits("winner", view.dominant_ids[sure], expected.dominant_ids[sure])
-    magnitude = charges.T_final + 1.0
+    magnitude = charges.dominant_weight + 1.0
     at = charges.certain
     weights = (view.dominant_weights[at], expected.dominant_weights[at])
     assert_close("agreement.weight", *weights, magnitude[at], backend.dtype, against_oracle=True)
