@@ -37,8 +37,18 @@ class Command:
 
     @staticmethod
     def _begin(words: Sequence[str], file: IO[bytes], environment: dict[str, str]) -> subprocess.Popen[bytes]:
+        def listen() -> None:
+            # what a shell starts in the background ignores interruptions, and so would its children
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+
         return subprocess.Popen(
-            words, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT, env=environment, start_new_session=True
+            words,
+            cwd=ROOT,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            env=environment,
+            start_new_session=True,
+            preexec_fn=listen,
         )
 
     def wait(self, limit: float, stop: signal.Signals = signal.SIGTERM, grace: float | None = None) -> dict[str, Any]:
