@@ -129,7 +129,8 @@ class _Axes:
     def y_ticks(self) -> list[float]:
         if not self.log:
             return nice_ticks(self.low, self.high, 4)
-        decades = range(math.floor(self.low), math.ceil(self.high) + 1)
+        # those that a number can have
+        decades = range(max(math.floor(self.low), -323), min(math.ceil(self.high), 308) + 1)
         steps = (1.0, 2.0, 5.0) if self.high - self.low < 2.5 else (1.0,)
         ticks = [m * 10.0**d for d in decades for m in steps]
         return [t for t in ticks if self.low <= math.log10(t) <= self.high]

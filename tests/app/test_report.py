@@ -175,8 +175,10 @@ def test_any_values_draw_without_leaving_the_plot(values: list[float], log: bool
     assert all(0.0 <= y <= 220.0 for y in heights)
 
 
-def test_an_axis_of_the_smallest_number_has_a_length() -> None:
-    assert 'cy="' in draw(Chart("tiny", [Series("s", [0], [5e-324], "red", dots=True)], 1, [], [], False, False))
+@pytest.mark.parametrize("value", [5e-324, 1e300])
+@pytest.mark.parametrize("log", [False, True])
+def test_very_small_and_very_large_numbers_have_an_axis(value: float, log: bool) -> None:
+    assert 'cy="' in draw(Chart("one", [Series("s", [0], [value], "red", dots=True)], 1, [], [], log, False))
 
 
 def test_a_bar_taller_than_its_axis_is_cut_and_says_so() -> None:
