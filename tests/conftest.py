@@ -31,6 +31,9 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.write_line(f"shapes were NOT checked: {' and '.join(UNCHECKED)} not installed")
 
 
-from pop_ref.conformance.examples import load_profile  # noqa: E402  after the hook, which must see pop_ref imported
+def pytest_configure() -> None:
+    """Choose how many examples are drawn, before any test is collected."""
+    # not at the top: the hook above must see pop_ref imported
+    from pop_ref.conformance.examples import load_profile
 
-load_profile(os.environ.get("HYPOTHESIS_PROFILE", "dev"))
+    load_profile(os.environ.get("HYPOTHESIS_PROFILE", "dev"))

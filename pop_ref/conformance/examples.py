@@ -46,10 +46,10 @@ def load_profile(name: str) -> None:
 def _leave_out_mined_constants() -> None:
     """Have Hypothesis find no constants in local modules; there is no setting for it."""
     try:
-        from hypothesis.internal.conjecture.providers import CONSTANTS_CACHE, HypothesisProvider
+        from hypothesis.internal.conjecture import providers
         from hypothesis.internal.constants_ast import Constants
     except ImportError:
         # before 6.131 it looked for none; should a later release keep them elsewhere, a test of this project fails
         return
-    HypothesisProvider._local_constants = Constants()  # type: ignore[assignment]
-    CONSTANTS_CACHE.cache.clear()
+    providers._get_local_constants = Constants
+    providers.CONSTANTS_CACHE.cache.clear()

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-pytest.importorskip("torch")
-
 from cuda_ext.capacity import GROWTH, MOST, Capacity
 
 BIG, SMALL = (1000, 800), (500, 400)
@@ -14,6 +12,14 @@ BIG, SMALL = (1000, 800), (500, 400)
 def drawn(capacity, counts):
     for view, count in enumerate(counts):
         capacity.note(view, count)
+
+
+def of_one_view(instances: int) -> Capacity:
+    """Return what is known after a step of 1,000 Gaussians had so many instances."""
+    capacity = Capacity([BIG])
+    capacity.settle(1000)
+    capacity.note(0, instances)
+    return capacity
 
 
 def test_the_first_room_is_a_guess_and_never_nothing():
@@ -48,9 +54,7 @@ def test_the_heaviest_view_counts_although_the_last_window_passed_it_by():
 
 
 def test_a_need_that_varies_a_little_moves_no_memory():
-    capacity = Capacity([BIG])
-    capacity.settle(1000)
-    capacity.note(0, 10_000)
+    capacity = of_one_view(10_000)
     capacity.settle(1000)
     rooms = set()
     for count in (10_500, 9500, 11_000, 8000, 12_000, 10_000) * 5:
@@ -62,9 +66,7 @@ def test_a_need_that_varies_a_little_moves_no_memory():
 
 
 def test_a_population_that_doubles_has_room_before_it_overflows():
-    capacity = Capacity([BIG])
-    capacity.settle(1000)
-    capacity.note(0, 10_000)
+    capacity = of_one_view(10_000)
     capacity.settle(2000)
     assert capacity.room(BIG) >= 20_000 * 1.2
 

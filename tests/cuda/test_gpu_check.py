@@ -25,7 +25,7 @@ from pop_fast.cli import main as pop
 def check(folder: Path, **changes: object) -> Check:
     shared = {"seconds": 60.0, "out": folder, "work": folder / "work", "log": folder / "log", "packed": None}
     shared |= {"captures": (), "steps_scaler": 1.0, "commit": "c0ffee", "rehearsal": False, "note": lambda found: None}
-    return Check(**{**shared, **changes})  # type: ignore[arg-type]
+    return Check(**{**shared, **changes})
 
 
 @pytest.fixture

@@ -7,10 +7,9 @@ from contextlib import contextmanager
 from types import SimpleNamespace
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from cuda_ext.graphs import Watch, captured  # noqa: E402  torch first
+from cuda_ext.graphs import Watch, captured
 
 
 class Recorder:

@@ -8,14 +8,13 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 import cuda_ext
 from cuda_ext import build as build_module
 from cuda_ext.build import BuildError
 from cuda_ext.check_ptxas import KernelUse, as_table, offenders, parse_ptxas
 from cuda_ext.toolkit import find_nvcc
-
-torch = pytest.importorskip("torch")
 
 PTXAS = """
 ptxas info    : Compiling entry function '_ZN3pop20blend_forward_kernelE' for 'sm_90'

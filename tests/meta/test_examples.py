@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pop_ref.conformance.examples import EXAMPLES, load_profile
+from pop_ref.conformance.examples import EXAMPLES
 
 ROOT = Path(__file__).resolve().parents[2]
 UNHEARD_OF = (0.1234567, -77123.25, 31.0625)
@@ -47,15 +47,10 @@ def test_the_constants_of_a_local_module_are_not_drawn(tmp_path: Path, monkeypat
 
 @pytest.mark.parametrize("profile", [name for name in EXAMPLES if name != "explore"])
 def test_every_profile_but_explore_ignores_seeds_and_what_earlier_runs_kept(profile: str) -> None:
-    before = settings.default
-    try:
-        load_profile(profile)
-        assert settings.default.derandomize
-        assert settings.default.database is None
-    finally:
-        settings._current_profile = None  # type: ignore[attr-defined]
-        load_profile(os.environ.get("HYPOTHESIS_PROFILE", "dev"))
-    assert settings.default.max_examples == before.max_examples
+    kept = settings.get_profile(profile)
+    assert kept.derandomize
+    assert kept.database is None
+    assert kept.max_examples == EXAMPLES[profile]
 
 
 def test_exploring_draws_by_the_seed(tmp_path: Path) -> None:

@@ -13,9 +13,10 @@ from typing import Any
 
 import pytest
 
+from cuda_ext.library_folder import library_folder
+
 pytest.register_assert_rewrite("pop_ref.conformance.laws")
 
-from cuda_ext.library_folder import library_folder  # noqa: E402  asserts must be rewritten first
 from pop_ref.conformance.plugin import parametrize_backends  # noqa: E402  asserts must be rewritten first
 from tests.cuda.gpu.conftest import cuda_backends  # noqa: E402
 

@@ -7,15 +7,14 @@ from collections import Counter
 from contextlib import contextmanager
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
+from cuda_ext.train_settings import Phase
+from tests.cuda.gpu.scene import HEIGHT, STEPS, WIDTH, training_scene
+from tests.cuda.gpu.steps import fused_trainer
 
-from cuda_ext.train_settings import Phase  # noqa: E402  torch first
-from tests.cuda.gpu.scene import HEIGHT, STEPS, WIDTH, training_scene  # noqa: E402
-from tests.cuda.gpu.steps import fused_trainer  # noqa: E402
-
-from . import emulate  # noqa: E402
-from .conftest import FOLDER  # noqa: E402
+from . import emulate
+from .conftest import FOLDER
 
 POP = Phase(3, True, True, True)
 SORTS_AND_SCANS = {"DeviceRadixSort", "DeviceScan", "memset"}

@@ -8,14 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from pop_fast.strategies import ADCStrategy, POPStrategy  # noqa: E402  torch first
-from pop_fast.train import Trainer  # noqa: E402
-from pop_fast.train import checkpoint as ckpt  # noqa: E402
-from pop_fast.train.device_trainer import DeviceTrainer  # noqa: E402
-from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config  # noqa: E402
+from pop_fast.strategies import ADCStrategy, POPStrategy
+from pop_fast.train import Trainer
+from pop_fast.train import checkpoint as ckpt
+from pop_fast.train.device_trainer import DeviceTrainer
+from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config
 
 COMPARED = ("loss", "pop", "psnr", "d_ssim", "l1", "l2", "lr_means", "num_gaussians")
 STILL = {"refine_stop_iter": 0}

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
+from pop_ref.constants import PAPER
 
-from pop_ref.constants import PAPER  # noqa: E402
-
-from .scene import STEPS, N, training_scene  # noqa: E402  torch first
-from .steps import fused_trainer  # noqa: E402
+from .scene import STEPS, N, training_scene
+from .steps import fused_trainer
 
 # 30,000 x 30,000 tiles of 16 x 8 px; a splat that covers them all has as many instances
 ACROSS, PER_SPLAT = 30_000, 900_000_000

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import pytest
-
-torch = pytest.importorskip("torch")
+import torch
 
 SIZES = [(11, 12), (32, 32), (33, 31), (21, 70), (70, 43)]
 

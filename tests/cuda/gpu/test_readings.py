@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from .scene import STEPS, training_scene  # noqa: E402  torch first
-from .steps import THETA, apart, fused, on_the_cpu  # noqa: E402
+from .scene import STEPS, training_scene
+from .steps import THETA, apart, fused, on_the_cpu
 
 READINGS = (
     {"pop_over": "visible"},

@@ -6,10 +6,9 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from .scene import HEIGHT, LR, WIDTH, TrainingScene, training_scene  # noqa: E402  torch first
+from .scene import HEIGHT, LR, WIDTH, TrainingScene, training_scene
 
 N = 70
 # active degree, bands beyond the first in memory; the last is wider than any degree needs

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
+from pop_ref.render import render
+from pop_ref.types import Camera, Gaussians
 
-from pop_ref.render import render  # noqa: E402  torch first
-from pop_ref.types import Camera, Gaussians  # noqa: E402
-
-from .scene import HEIGHT, LR, WIDTH, training_scene  # noqa: E402
+from .scene import HEIGHT, LR, WIDTH, training_scene
 
 
 @pytest.mark.parametrize("family", ["columns", "splats"])

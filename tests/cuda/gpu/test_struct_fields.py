@@ -6,10 +6,9 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-import cuda_ext  # noqa: E402  torch first
+import cuda_ext
 
 EVERY_TYPE = ("float32", "float64", "float16", "int64", "int32", "int16", "uint8", "bool")
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from .scene import HEIGHT, LR, STEPS, WIDTH, training_scene  # noqa: E402  torch first
-from .steps import apart, fused, fused_trainer, on_the_cpu  # noqa: E402
+from .scene import HEIGHT, LR, STEPS, WIDTH, training_scene
+from .steps import apart, fused, fused_trainer, on_the_cpu
 
 
 @pytest.mark.graph
