@@ -1,7 +1,7 @@
 // Pull the cotangent of a tile back to its entries. Meaning: `pop_ref.compositing.composite_vjp`.
 //
-// Alphas and weights are made anew from the light before every chunk, front to back; then the chunk is gone through
-// back to front with one number a pixel, B, the light from behind dotted with the pixel's cotangent:
+// Alphas and weights are made anew from T before every chunk, front to back; then the chunk is gone through back to
+// front with one number a pixel, B, the colour from behind dotted with the pixel's cotangent:
 //     q = colour . v - B;  B += alpha q;  G = weight q = alpha dL/dalpha
 // Six moments of G about the splat's centre give every geometric gradient of the splat, and can be added up over tiles.
 #pragma once
@@ -10,71 +10,85 @@
 
 namespace pop {
 
-// A tile's cotangents, the light from behind, and a chunk's alphas and weights.
+// A tile's cotangents, the colour from behind, a chunk's alphas and weights, and what its entries sum up in each lane.
 template <class Real> struct Transpose {
   const int padded, strips;
-  std::vector<Real> v, behind, alphas, weights;
-  const uint64_t *marks = nullptr;  // of the forward pass: in which strips the chunk's entries may blend
+  std::vector<Real> v, behind, alphas, weights, sums;
+  std::vector<uint64_t> marks;  // in which strips an entry blends. [entries of a chunk, words]
+  Entries<Real> entries;
+  Rows<Real> rows;
 
   Transpose(const Pixels<Real> &pixels, int64_t channels)
       : padded(pixels.padded()), strips(pixels.strips), v((channels + 1) * padded), behind(padded),
-        alphas(CHUNK * padded), weights(CHUNK * padded) {}
+        alphas(CHUNK * padded), weights(CHUNK * padded), sums((channels + 8) * CHUNK * LANES<Real>),
+        marks(CHUNK * words()), rows(pixels.size) {}
+
+  int words() const { return (strips + 63) / 64; }
 
   void begin(const Blend<Real> &blend, const Place<Real> &place) {
-    const int64_t D = blend.channels;
+    const int64_t D = blend.channels, n = place.columns();
     std::fill(v.begin(), v.end(), Real(0));
     std::fill(behind.begin(), behind.end(), Real(0));
-    place.each_pixel([&](int64_t pixel, int64_t from) {
-      for (int64_t d = 0; blend.v_image && d < D; d++) v[d * padded + pixel] = blend.v_image[from * D + d];
-      if (blend.v_alphas) v[D * padded + pixel] = blend.v_alphas[from];
+    place.each_row([&](int64_t pixel, int64_t from) {
+      for (int64_t d = 0; blend.v_image && d < D; d++) {
+        const Real *line = blend.v_image + from * blend.pixel_stride + d * blend.channel_stride;
+        for (int64_t x = 0; x < n; x++) v[d * padded + pixel + x] = line[x * blend.pixel_stride];
+      }
+      if (blend.v_alphas) std::copy_n(blend.v_alphas + from, n, &v[D * padded + pixel]);
     });
   }
 
-  void blend_again(const Thresholds<Real> &thresholds, const Pixels<Real> &pixels, const Entries<Real> &entries,
-                   const Real *lights, const uint64_t *of_forward) {
-    marks = of_forward;
+  // of one column of a chunk's rows: the sums in every lane. [entries of a chunk, lanes]
+  Real *column(int64_t j) { return &sums[j * CHUNK * LANES<Real>]; }
+
+  template <bool ROW>
+  void blend_again(const Thresholds<Real> &thresholds, const Pixels<Real> &pixels, const Real *lights,
+                   const uint16_t *reached) {
+    std::fill(marks.begin(), marks.end(), 0);
     Real *to_alphas = alphas.data(), *to_weights = weights.data();
     for (int strip = 0; strip < strips; strip++) {
       const int at = strip * LANES<Real>;
       const Vec<Real> x = load(&pixels.x[at]), y = load(&pixels.y[at]);
       Vec<Real> T = load(lights + at);
-      for (int k = 0; k < entries.count; k++) {
-        if (!(of_forward[k] >> (strip % 64) & 1)) continue;
-        Vec<Real> alpha{}, weight{};
-        take(thresholds, entries.f[k], x, y, T, alpha, weight);
+      each_marked(reached[strip], [&](int k) {
+        marks[k * words() + strip / 64] |= uint64_t(1) << strip % 64;
+        Vec<Real> alpha, weight;
+        take(thresholds, exponent<Real, ROW>(entries, rows, strip, k, x, y), T, alpha, weight);
         store(to_alphas + k * padded + at, alpha);
         store(to_weights + k * padded + at, weight);
-      }
+      });
     }
+  }
+
+  bool marked(int k) const {
+    for (int word = 0; word < words(); word++)
+      if (marks[k * words() + word]) return true;
+    return false;
   }
 };
 
 // B3: what the ceiling lets through of G. G carries the clamped alpha; where the gradient passes as if nothing had been
 // clamped, the chain rule wants the raw one.
 template <class Real>
-inline Vec<Real> through_ceiling(const Blend<Real> &blend, Real ceiling, const Real *f, Vec<Real> x, Vec<Real> y,
-                                 Vec<Real> alpha, Vec<Real> G) {
+inline Vec<Real> through_ceiling(const Blend<Real> &blend, Real ceiling, Vec<Real> e, Vec<Real> alpha, Vec<Real> G) {
   const Mask<Real> clamped = alpha >= ceiling;
-  if (!any(clamped)) return G;
   if (!blend.ceiling_passes) return clamped ? all(Real(0)) : G;
-  return clamped ? G * (exp2_of(exponent(f, x, y)) / ceiling) : G;
+  return clamped ? G * (exp2_of(e) / ceiling) : G;
 }
 
-// One entry's row: moments of G, gradient to the colours, sums of |G dlog(alpha)/dx| and |..dy|. D as in blend_strip.
-template <class Real, int D>
-void entry_row(const Blend<Real> &blend, const Thresholds<Real> &thresholds, const Pixels<Real> &pixels,
-               const Entries<Real> &entries, int k, Transpose<Real> &state, Real *row) {
+// One entry's sums in every lane: moments of G, gradient to the colours, |G dlog2(alpha)/dx| and |..dy|.
+template <class Real, int D, bool ROW>
+void entry_sums(const Blend<Real> &blend, const Thresholds<Real> &thresholds, const Pixels<Real> &pixels, int k,
+                Transpose<Real> &state) {
   const int64_t channels = D ? D : blend.channels;
-  const int padded = state.padded, strips = state.strips;
-  const uint64_t marks = state.marks[k];
-  if (!D || !marks) std::fill(row, row + blend.columns(), Real(0));
-  if (!marks) return;
-  const Real *f = entries.f[k], *color = entries.color[k], *all_x = pixels.x.data(), *all_y = pixels.y.data();
+  const int padded = state.padded;
+  const Entries<Real> &entries = state.entries;
+  const Real *color = D ? entries.rgb[k] : entries.color[k], *all_x = pixels.x.data(), *all_y = pixels.y.data();
   const Real *alphas = &state.alphas[k * padded], *weights = &state.weights[k * padded], *all_v = state.v.data();
+  const Real u = entries.u[k], v_center = entries.v[k];
   Real *all_behind = state.behind.data();
   Vec<Real> m{}, mx{}, my{}, mxx{}, mxy{}, myy{}, along_x{}, along_y{}, colors[D ? D : 1]{};
-  for (int strip = 0; strip < strips; strip++) {
-    if (!(marks >> (strip % 64) & 1)) continue;
+  const auto of_strip = [&](int strip) {
     const int at = strip * LANES<Real>;
     const Vec<Real> alpha = load(alphas + at), weight = load(weights + at), behind = load(all_behind + at);
     Vec<Real> q = load(all_v + channels * padded + at) - behind;
@@ -85,50 +99,94 @@ void entry_row(const Blend<Real> &blend, const Thresholds<Real> &thresholds, con
     }
     for (int64_t d = 0; !D && d < channels; d++) {
       const Vec<Real> v = load(all_v + d * padded + at);
+      Real *sum = state.column(6 + d) + k * LANES<Real>;
       q += v * color[d];
-      row[6 + d] += sum<Real>(weight * v);
+      store(sum, load(sum) + weight * v);
     }
     store(all_behind + at, behind + alpha * q);
-    const Vec<Real> x = load(all_x + at), y = load(all_y + at);
-    const Vec<Real> G = through_ceiling(blend, thresholds.ceiling, f, x, y, alpha, weight * q);
-    const Vec<Real> dx = entries.u[k] - x, dy = entries.v[k] - y;
+    const Vec<Real> x = load(all_x + at), y = load(all_y + at), dx = u - x;
+    Vec<Real> G = weight * q;
+    if (any(alpha >= thresholds.ceiling))
+      G = through_ceiling(blend, thresholds.ceiling, exponent<Real, ROW>(entries, state.rows, strip, k, x, y), alpha, G);
+    const Vec<Real> Gx = G * dx;
     m += G;
-    mx += G * dx;
-    my += G * dy;
-    mxx += G * dx * dx;
-    mxy += G * dx * dy;
-    myy += G * dy * dy;
+    mx += Gx;
+    mxx += Gx * dx;
+    if constexpr (ROW) {
+      const Real dy = v_center - all_y[at], dy_dy = dy * dy;
+      my += G * dy;
+      mxy += Gx * dy;
+      myy += G * dy_dy;
+    } else {
+      const Vec<Real> dy = v_center - y, Gy = G * dy;
+      my += Gy;
+      mxy += Gx * dy;
+      myy += Gy * dy;
+    }
     if (blend.absgrad) {
-      const Vec<Real> by_x = G * (x * (2 * f[3]) + (y * f[4] + f[1])), by_y = G * (y * (2 * f[5]) + (x * f[4] + f[2]));
+      const auto f = [&](int j) { return entries.f[j][k]; };
+      const Vec<Real> by_x = G * (x * (2 * f(3)) + (y * f(4) + f(1))), by_y = G * (y * (2 * f(5)) + (x * f(4) + f(2)));
       along_x += by_x < Real(0) ? -by_x : by_x;
       along_y += by_y < Real(0) ? -by_y : by_y;
     }
+  };
+  for (int word = 0; word < state.words(); word++) {
+    uint64_t strips = state.marks[k * state.words() + word];
+    for (; strips; strips &= strips - 1) of_strip(64 * word + __builtin_ctzll(strips));
   }
   const Vec<Real> *moments[6] = {&m, &mx, &my, &mxx, &mxy, &myy};
-  for (int j = 0; j < 6; j++) row[j] = sum<Real>(*moments[j]);
-  for (int d = 0; d < D; d++) row[6 + d] = sum<Real>(colors[d]);
+  for (int j = 0; j < 6; j++) store(state.column(j) + k * LANES<Real>, *moments[j]);
+  for (int d = 0; d < D; d++) store(state.column(6 + d) + k * LANES<Real>, colors[d]);
   if (blend.absgrad) {
-    const Real ln2 = Real(0.6931471805599453);  // the coefficients are those of log2(alpha)
-    row[6 + channels] = ln2 * sum<Real>(along_x);
-    row[7 + channels] = ln2 * sum<Real>(along_y);
+    store(state.column(6 + channels) + k * LANES<Real>, along_x);
+    store(state.column(7 + channels) + k * LANES<Real>, along_y);
   }
 }
 
-template <class Real, int D>
+// Write the rows of a chunk's entries from their sums in every lane; those of entries that blend nowhere are 0.
+template <class Real>
+void write_rows(const Blend<Real> &blend, int64_t first, int n, const Transpose<Real> &state, Real *const to[CHUNK]) {
+  const int64_t columns = blend.columns();
+  for (int64_t j = 0; j < columns; j++) {
+    Real found[CHUNK];
+    sums_of_rows(&state.sums[j * CHUNK * LANES<Real>], found);
+    // the coefficients are those of log2(alpha)
+    const Real unit = j >= 6 + blend.channels ? Real(0.6931471805599453) : Real(1);
+    for (int k = 0; k < n; k++) to[k][j] = unit * found[k];
+  }
+}
+
+template <class Real, int D, bool ROW>
 void transpose_tile(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_t tile, Transpose<Real> &state) {
   const Place<Real> place(blend, tile);
   const Thresholds<Real> thresholds(blend);
-  const int64_t reached = blend.n_reached[tile], n_chunks = (reached + CHUNK - 1) / CHUNK;
+  const int64_t n_reached = blend.n_reached[tile], n_chunks = (n_reached + CHUNK - 1) / CHUNK;
   state.begin(blend, place);
-  Entries<Real> entries;
   for (int64_t chunk = n_chunks - 1; chunk >= 0; chunk--) {
-    const int64_t first = place.begin + chunk * CHUNK;
-    entries.gather(blend, place, first, std::min<int64_t>(CHUNK, place.begin + reached - first));
-    state.blend_again(thresholds, pixels, entries, blend.lights + (blend.first_chunks[tile] + chunk) * state.padded,
-                      blend.strips + first);
-    for (int k = entries.count - 1; k >= 0; k--)
-      entry_row<Real, D>(blend, thresholds, pixels, entries, k, state, blend.rows + (first + k) * blend.columns());
+    const int64_t first = place.begin + chunk * CHUNK, at = blend.first_chunks[tile] + chunk;
+    const int n = int(std::min<int64_t>(CHUNK, place.begin + n_reached - first));
+    state.entries.gather(blend, place, first, n);
+    if (ROW) state.rows.expand(state.entries, pixels);
+    state.template blend_again<ROW>(thresholds, pixels, blend.lights + at * state.padded,
+                                    blend.reached + at * state.strips);
+    Real *rows[CHUNK];
+    for (int k = n - 1; k >= 0; k--) {
+      rows[k] = blend.rows + blend.slot(first + k) * blend.columns();
+      if (!D || !state.marked(k))
+        for (int64_t j = 0; j < blend.columns(); j++)
+          std::fill_n(state.column(j) + k * LANES<Real>, LANES<Real>, Real(0));
+      if (state.marked(k)) entry_sums<Real, D, ROW>(blend, thresholds, pixels, k, state);
+    }
+    write_rows(blend, first, n, state, rows);
   }
+}
+
+// The transpose of one tile for what is given.
+template <class Real>
+auto transpose_tile_function(const Blend<Real> &blend, const Pixels<Real> &pixels)
+    -> void (*)(const Blend<Real> &, const Pixels<Real> &, int64_t, Transpose<Real> &) {
+  if (blend.channels != 3) return transpose_tile<Real, 0, false>;
+  return pixels.strips_are_rows() ? transpose_tile<Real, 3, true> : transpose_tile<Real, 3, false>;
 }
 
 // Add up the rows of every entry of the splats from `first` to before `last`, in the order of the lists, in double.

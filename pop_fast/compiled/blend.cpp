@@ -13,14 +13,9 @@
 namespace pop {
 
 template <class Real> void make_splats(const Blend<Real> &blend, Fork fork) {
-  const double log2_e = 1.4426950408889634;
   share(fork, blend.threads, blend.n, 4096, [&](int64_t first, int64_t last) {
-    for (int64_t i = first; i < last; i++) {
-      const Real *mean = blend.means2d + 2 * i, *conic = blend.conics + 3 * i;
-      // the logarithm of 0 is -inf: under every floor
-      blend.splats[i] = {double(mean[0]),           double(mean[1]),           log2_e * double(conic[0]),
-                         log2_e * double(conic[1]), log2_e * double(conic[2]), std::log2(double(blend.opacities[i]))};
-    }
+    for (int64_t i = first; i < last; i++)
+      blend.splats[i] = splat_of(blend.means2d + 2 * i, blend.conics + 3 * i, blend.opacities[i]);
   });
 }
 
@@ -30,21 +25,19 @@ template <class Real> void forward(const Blend<Real> &blend, Fork fork) {
   make_splats(blend, fork);
   const Pixels<Real> pixels(int(blend.tile_size));
   const auto make = [&] { return Canvas<Real>(pixels, blend.channels); };
+  const auto one_tile = blend_tile_function<Real>(blend, pixels);
   share(fork, blend.threads, blend.tiles(), TILES_AT_A_TIME, make, [&](Canvas<Real> &own, int64_t first, int64_t last) {
-    for (int64_t tile = first; tile < last; tile++)
-      blend.channels == 3 ? blend_tile<Real, 3>(blend, pixels, tile, own)
-                          : blend_tile<Real, 0>(blend, pixels, tile, own);
+    for (int64_t tile = first; tile < last; tile++) one_tile(blend, pixels, tile, own);
   });
 }
 
 template <class Real> void backward(const Blend<Real> &blend, Fork fork) {
   const Pixels<Real> pixels(int(blend.tile_size));
   const auto make = [&] { return Transpose<Real>(pixels, blend.channels); };
+  const auto one_tile = transpose_tile_function<Real>(blend, pixels);
   share(fork, blend.threads, blend.tiles(), TILES_AT_A_TIME, make,
         [&](Transpose<Real> &own, int64_t first, int64_t last) {
-          for (int64_t tile = first; tile < last; tile++)
-            blend.channels == 3 ? transpose_tile<Real, 3>(blend, pixels, tile, own)
-                                : transpose_tile<Real, 0>(blend, pixels, tile, own);
+          for (int64_t tile = first; tile < last; tile++) one_tile(blend, pixels, tile, own);
         });
   const int64_t part = std::max<int64_t>(1, (blend.n + blend.threads - 1) / blend.threads);
   share(fork, blend.threads, blend.n, part, [&](int64_t first, int64_t last) { add_up(blend, first, last); });
@@ -95,6 +88,7 @@ int64_t pop_padded_line(int64_t length, int64_t bytes) {
   return bytes == 8 ? pop::padded_line<double>(length) : pop::padded_line<float>(length);
 }
 int64_t pop_chunk() { return pop::CHUNK; }
+int64_t pop_lanes(int64_t bytes) { return 64 / bytes; }
 int64_t pop_padded_pixels(int64_t tile_size, int64_t bytes) {
   return bytes == 8 ? pop::Pixels<double>(int(tile_size)).padded() : pop::Pixels<float>(int(tile_size)).padded();
 }

@@ -92,19 +92,22 @@ def _numbers(inputs: tuple[Tensor, ...], options: BlendOptions) -> dict[str, flo
         "alpha_floor": below(profile.alpha_floor, dtype),
         "alpha_ceiling": profile.alpha_ceiling,
         "stop": Stop.of(profile, dtype).at,
+        "pixel_stride": inputs[3].shape[1],
+        "channel_stride": 1,
         "ceiling_passes": profile.ceiling_gradient != "zero",
     }
 
 
 def _lights(lists: TileLists, like: Tensor) -> dict[str, Tensor]:
-    """Return room for the light before every chunk of entries, and where each tile's begins."""
+    """Return space for T before every chunk of entries, which of them reach which strips, and where each tile's begin."""
     library = this_library()
     chunks = (lists.lengths + (library.chunk - 1)) // library.chunk
     pixels = library.padded_pixels(lists.tile_size, like.dtype.itemsize)
+    n_pixels = int(chunks.sum()) * pixels
     return {
         "first_chunks": chunks.cumsum(0) - chunks,
-        "lights": like.new_empty(int(chunks.sum()) * pixels),
-        "strips": torch.empty_like(lists.ids),
+        "lights": like.new_empty(n_pixels),
+        "reached": torch.empty(n_pixels // library.lanes(like.dtype.itemsize), dtype=torch.int16),
     }
 
 

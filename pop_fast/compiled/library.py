@@ -87,12 +87,14 @@ class Blend(ctypes.Structure):
     _fields_ = (
         *_fields(_POINTER, "means2d", "conics", "opacities", "colors", "ids", "offsets", "first_chunks"),
         *_fields(_WHOLE, "n", "channels", "tiles_x", "tiles_y", "tile_size", "width", "height", "threads"),
+        *_fields(_WHOLE, "pixel_stride", "channel_stride"),
         *_fields(_REAL, "alpha_floor", "alpha_ceiling", "stop"),
         *_fields(_WHOLE, "ceiling_passes"),
-        *_fields(_POINTER, "splats", "lights", "strips", "n_reached", "n_pairs", "image", "alphas"),
+        *_fields(_POINTER, "splats", "lights", "reached", "n_reached", "n_pairs", "image", "alphas"),
         *_fields(_POINTER, "dominant_ids", "dominant_weights", "n_blended", "n_traversed"),
         *_fields(_POINTER, "v_image", "v_alphas", "rows"),
         *_fields(_POINTER, "v_means2d", "v_conics", "v_opacities", "v_colors", "absgrad"),
+        *_fields(_POINTER, "slots", "dominant_counts", "kept"),
     )
 
 
@@ -133,6 +135,7 @@ class Library:
         functions: by layout and type.
         chunk: list entries after which the blend writes down the light.
         padded_pixels: pixels of a tile of that size, padded to whole vectors of floats of so many bytes.
+        lanes: numbers of so many bytes in a vector.
         window_rows: rows of SSIM's windows whose total is one number.
         padded_line: numbers from one row of maps to the next, for rows of that many numbers of so many bytes.
         rows_at_a_time: Gaussians whose share of the camera's gradient is one sum.
@@ -142,6 +145,7 @@ class Library:
     functions: dict[tuple[type[ctypes.Structure], torch.dtype], Callable[..., int]]
     chunk: int
     padded_pixels: Callable[[int, int], int]
+    lanes: Callable[[int], int]
     window_rows: int
     padded_line: Callable[[int, int], int]
     rows_at_a_time: int
@@ -188,9 +192,10 @@ def open_library(path: str) -> Library:
     loaded = ctypes.CDLL(path)
     layouts = (Covariances, Projection, Colors, Lists, Blend, Ssim)
     sizes = {f"pop_{layout.__name__.lower()}_bytes": layout for layout in layouts}
-    numbers = ("chunk", "padded_pixels", "window_rows", "padded_line", "rows_at_a_time")
+    numbers = ("chunk", "padded_pixels", "lanes", "window_rows", "padded_line", "rows_at_a_time")
     for name in (*sizes, *(f"pop_{number}" for number in numbers)):
         getattr(loaded, name).restype = _WHOLE
+    loaded.pop_lanes.argtypes = (_WHOLE,)
     loaded.pop_padded_pixels.argtypes = loaded.pop_padded_line.argtypes = (_WHOLE, _WHOLE)
     if any(getattr(loaded, name)() != ctypes.sizeof(layout) for name, layout in sizes.items()):
         raise OSError(f"{path} expects arguments of another layout")
@@ -204,6 +209,7 @@ def open_library(path: str) -> Library:
         functions,
         loaded.pop_chunk(),
         loaded.pop_padded_pixels,
+        loaded.pop_lanes,
         loaded.pop_window_rows(),
         loaded.pop_padded_line,
         loaded.pop_rows_at_a_time(),
