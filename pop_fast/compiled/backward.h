@@ -145,7 +145,7 @@ void entry_sums(const Blend<Real> &blend, const Thresholds<Real> &thresholds, co
 
 // Write the rows of a chunk's entries from their sums in every lane; those of entries that blend nowhere are 0.
 template <class Real>
-void write_rows(const Blend<Real> &blend, int64_t first, int n, const Transpose<Real> &state, Real *const to[CHUNK]) {
+void write_rows(const Blend<Real> &blend, int n, const Transpose<Real> &state, Real *const to[CHUNK]) {
   const int64_t columns = blend.columns();
   for (int64_t j = 0; j < columns; j++) {
     Real found[CHUNK];
@@ -177,7 +177,7 @@ void transpose_tile(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_
           std::fill_n(state.column(j) + k * LANES<Real>, LANES<Real>, Real(0));
       if (state.marked(k)) entry_sums<Real, D, ROW>(blend, thresholds, pixels, k, state);
     }
-    write_rows(blend, first, n, state, rows);
+    write_rows(blend, n, state, rows);
   }
 }
 

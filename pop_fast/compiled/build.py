@@ -26,7 +26,7 @@ from cuda_ext.compiler import find_compiler, no_compiler
 HERE: Final = Path(__file__).resolve().parent
 SOURCES: Final = (
     *("projection.h", "colors.h", "lists.h", "tile.h", "forward.h", "backward.h", "ssim.h"),
-    *("lanes.h", "threads.h", "blend.cpp"),
+    *("lanes.h", "threads.h", "pool.h", "step.h", "step.cpp", "blend.cpp"),
 )
 # one Gaussian's arithmetic is that of the CUDA kernels
 CUDA: Final = Path(cuda_ext.__file__).resolve().parent
@@ -34,10 +34,12 @@ SHARED: Final = tuple(
     f"csrc/{name}.cuh"
     for name in (
         *("real", "profile", "activations", "covariance", "camera", "projection", "footprint", "tiles", "splatting"),
-        *("harmonics", "ssim"),
+        *("harmonics", "ssim", "optimizer", "density", "polarization"),
     )
 )
-FLAGS: Final = ("-std=c++17", "-O3", "-fPIC", "-shared", "-pthread")
+# roots and comparisons of many numbers at once neither set errno nor stop at a NaN
+FLAGS: Final = ("-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-pthread")
+UNITS: Final = ("blend.cpp", "step.cpp")
 # for this processor, as compilers of different kinds and ages spell it; the last resort is any processor of its kind
 TUNING: Final = (("-march=native",), ("-mcpu=native",), ())
 
@@ -126,7 +128,7 @@ def _loads(library: Path) -> bool:
 def _compile(compiler: list[str], library: str, verbose: bool) -> None:
     failures: list[str] = []
     for tuning in _tuning():
-        command = [*compiler, *FLAGS, *tuning, f"-I{CUDA.parent}", "-o", library, str(HERE / "blend.cpp")]
+        command = [*compiler, *FLAGS, *tuning, f"-I{CUDA.parent}", "-o", library, *(str(HERE / unit) for unit in UNITS)]
         if verbose:
             print(" ".join(command))
         done = subprocess.run(command, capture_output=True, text=True, check=False)

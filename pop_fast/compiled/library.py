@@ -152,6 +152,40 @@ class Library:
     fork: Any
 
 
+@dataclass(frozen=True)
+class StepperFunctions:
+    """The functions of step.cpp: make a stepper for so many threads, let go of it, take a step, its memory in bytes."""
+
+    open: Callable[[int], int | None]
+    close: Callable[[int], None]
+    step: Callable[..., int]
+    bytes: Callable[[int], int]
+
+
+def stepper_functions(given_bytes: int) -> StepperFunctions:
+    """Return the functions that take whole training steps.
+
+    Args:
+        given_bytes: size of the caller's layout of `pop::StepGiven`.
+
+    Raises:
+        OSError: the library has another layout.
+    """
+    path = str(library_path())
+    this_library()
+    loaded = ctypes.CDLL(path)
+    loaded.pop_step_given_bytes.restype = _WHOLE
+    if loaded.pop_step_given_bytes() != given_bytes:
+        raise OSError(f"{path} expects arguments of another layout")
+    loaded.pop_stepper_open.argtypes, loaded.pop_stepper_open.restype = (_WHOLE,), _POINTER
+    loaded.pop_stepper_close.argtypes, loaded.pop_stepper_close.restype = (_POINTER,), None
+    loaded.pop_stepper_step.argtypes, loaded.pop_stepper_step.restype = (_POINTER, _POINTER), ctypes.c_int
+    loaded.pop_stepper_bytes.argtypes, loaded.pop_stepper_bytes.restype = (_POINTER,), _WHOLE
+    return StepperFunctions(
+        loaded.pop_stepper_open, loaded.pop_stepper_close, loaded.pop_stepper_step, loaded.pop_stepper_bytes
+    )
+
+
 def call_library(
     layout: type[ctypes.Structure],
     dtype: torch.dtype,

@@ -1,0 +1,261 @@
+"""The whole training step in C++: from raw parameters to Adam's update, without a torch operation in between.
+
+`NativeTrainer` takes steps on tensors that it updates in place, and collects what density control reads; it has the
+interface of `cuda_ext.train_step.FusedTrainer`. Meaning: `pop_ref.training.train_step`; the order of work is explained
+in `step.h`. Results are the same bits for any number of threads.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import weakref
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+import torch
+from torch import Tensor
+
+from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, StepValues
+from pop_fast.compiled.library import stepper_functions
+from pop_fast.ssim import TargetMoments, border_of, kept_windows, target_moments
+from pop_fast.transmittance import Stop, below
+
+PARTS: Final = ("see", "list", "blend", "compare", "gather", "transpose", "update")
+_POINTER, _WHOLE, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+
+
+def _fields(kind: Any, *names: str) -> tuple[tuple[str, Any], ...]:
+    return tuple((name, kind) for name in names)
+
+
+class StepGiven(ctypes.Structure):
+    """`pop::StepGiven` of step.h, where every field is explained, in its order."""
+
+    _fields_ = (
+        *_fields(_POINTER * len(GROUPS), "params", "m", "v"),
+        *_fields(_WHOLE, "n", "n_rest"),
+        *_fields(_POINTER, "viewmat", "K", "target", "mu_y", "s_yy", "kept", "kept_windows"),
+        *_fields(_WHOLE, "width", "height", "n_kept", "n_windows"),
+        *_fields(_WHOLE, "near_inclusive", "centred", "inria_clamp", "square", "antialiased", "ceiling_passes"),
+        *_fields(_REAL, "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas", "alpha_floor"),
+        *_fields(_REAL, "floor_below", "alpha_ceiling", "stop"),
+        *_fields(_REAL * 3, "background"),
+        *_fields(_WHOLE, "degree", "border", "l1"),
+        *_fields(_REAL, "pixel_weight", "ssim_weight", "lambda_pop"),
+        *_fields(_WHOLE, "dominance", "pop_window", "pop_visible", "blur_own_view"),
+        *_fields(_REAL, "blur_pixels"),
+        *_fields(_REAL * len(GROUPS), "lr"),
+        *_fields(_REAL, "beta1", "beta2", "eps"),
+        *_fields(_WHOLE, "adam_step"),
+        *_fields(_POINTER, "grad_sum", "n_visible", "dominant_sum", "blurred"),
+        *_fields(_POINTER, "values", "seconds", "bad_row"),
+    )
+
+
+class TrainingView(Protocol):
+    """A photograph with its camera, as `pop_fast.train.views.ViewTensors`."""
+
+    photo: Tensor
+    mask: Tensor | None
+    viewmat: Tensor
+    K: Tensor
+
+
+@dataclass(frozen=True)
+class _Target:
+    """A view as the step takes it: planes of channels, float32."""
+
+    viewmat: Tensor
+    K: Tensor
+    target: Tensor
+    mu_y: Tensor
+    s_yy: Tensor
+    kept: Tensor | None
+    kept_windows: Tensor | None
+
+    @classmethod
+    def of(cls, view: TrainingView, padding: Any) -> _Target:
+        moments: TargetMoments = target_moments(view.photo.float().div_(255.0), padding)
+        height, width, channels = moments.target.shape
+
+        def planes(maps: Tensor) -> Tensor:
+            return maps.reshape(len(maps), -1, channels).permute(2, 0, 1).contiguous()
+
+        mask = view.mask
+        return cls(
+            view.viewmat.reshape(4, 4).float().contiguous(),
+            view.K.reshape(3, 3).float().contiguous(),
+            planes(moments.target),
+            planes(moments.mu_y),
+            planes(moments.s_yy),
+            None if mask is None else mask.contiguous(),
+            None if mask is None else kept_windows(mask, padding, 1, torch.float32).contiguous(),
+        )
+
+    @property
+    def bytes(self) -> int:
+        """Memory of what was made of the photograph."""
+        return sum(maps.numel() * maps.element_size() for maps in (self.target, self.mu_y, self.s_yy))
+
+
+class NativeTrainer:
+    """Takes training steps on CPU tensors.
+
+    Args:
+        params: raw float32 tensors by gsplat's keys, updated in place.
+        m, v: Adam's moments, likewise.
+        views: photographs and cameras.
+        order: the view of every step, at least `settings.max_steps` long.
+        settings: objective and update.
+        step: the step to begin at.
+        threads: None takes torch's number.
+        cache_mb: memory for what is made of photographs; the others' is made anew at every visit, to the same bits.
+
+    Attributes:
+        step: steps taken.
+        seconds: by part of the step (`PARTS`), since it was made.
+    """
+
+    def __init__(
+        self,
+        params: Mapping[str, Tensor],
+        m: Mapping[str, Tensor],
+        v: Mapping[str, Tensor],
+        views: Sequence[TrainingView],
+        order: Sequence[int],
+        settings: StepSettings,
+        step: int = 0,
+        *,
+        threads: int | None = None,
+        cache_mb: float = 1024,
+    ) -> None:
+        self.settings, self.step = settings, step
+        self._views, self._order = views, list(order)
+        self._targets: dict[int, _Target] = {}
+        self._cache_left = cache_mb * 2**20
+        self._functions = stepper_functions(ctypes.sizeof(StepGiven))
+        self._stepper = self._functions.open(torch.get_num_threads() if threads is None else threads)
+        if not self._stepper:
+            raise MemoryError("there is no memory for the native training step")
+        weakref.finalize(self, self._functions.close, self._stepper)
+        self._given = StepGiven()
+        self._values = torch.zeros(len(StepValues._fields), dtype=torch.float64)
+        self._seconds = torch.zeros(len(PARTS), dtype=torch.float64)
+        self._bad_row = torch.full((1,), -1, dtype=torch.int64)
+        self._history: dict[int, StepValues] = {}
+        self._describe()
+        self.rebind(params, m, v)
+
+    def rebind(self, params: Mapping[str, Tensor], m: Mapping[str, Tensor], v: Mapping[str, Tensor]) -> None:
+        """Take new rows after a density event; statistics start from nothing.
+
+        Raises:
+            ValueError: a tensor is not float32, not contiguous, or not on the CPU.
+        """
+        given, n = self._given, len(params["means"])
+        for name, group in (("params", params), ("m", m), ("v", v)):
+            for k, key in enumerate(GROUPS):
+                tensor = group[key]
+                if tensor.dtype != torch.float32 or not tensor.is_contiguous() or tensor.device.type != "cpu":
+                    raise ValueError(f"{name}[{key!r}] must be a contiguous float32 tensor on the CPU")
+                getattr(given, name)[k] = tensor.data_ptr()
+        # the arguments only point
+        self._rows = (dict(params), dict(m), dict(v))
+        given.n, given.n_rest = n, params["shN"].shape[1]
+        self.statistics = Statistics.zeros(n, torch.device("cpu"))
+
+    @property
+    def params(self) -> Mapping[str, Tensor]:
+        """Raw parameters by gsplat's keys."""
+        return self._rows[0]
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Seconds that each part of the steps took so far."""
+        return dict(zip(PARTS, self._seconds.tolist(), strict=True))
+
+    @property
+    def bytes(self) -> int:
+        """Memory that a step works in, the parameters and photographs not counted."""
+        return self._functions.bytes(self._stepper)
+
+    def run(self, until: int, phase: Phase) -> None:
+        """Take steps until the counter stands at `until`, all of one phase.
+
+        Raises:
+            ValueError: a Gaussian is no longer finite; the message names its row and step.
+            MemoryError: there is not enough.
+        """
+        self._history = {}
+        self._set_phase(phase)
+        while self.step < until:
+            self._take(self._order[self.step], phase)
+            self.step += 1
+
+    def told(self, first: int, last: int) -> list[StepValues]:
+        """Return what the steps from `first` to before `last` were like; the last `run` must have taken them."""
+        return [self._history[step] for step in range(first, last)]
+
+    def _describe(self) -> None:
+        """Set what stays the same over a run."""
+        given, settings, profile = self._given, self.settings, self.settings.profile
+        for name in ("near_inclusive", "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas"):
+            setattr(given, name, getattr(profile, name))
+        given.alpha_floor, given.alpha_ceiling = profile.alpha_floor, profile.alpha_ceiling
+        given.centred = profile.principal_point == "centred"
+        given.inria_clamp = profile.clamp_gradient == "inria"
+        given.square = profile.extent == "square"
+        given.antialiased = settings.antialiased
+        given.ceiling_passes = profile.ceiling_gradient != "zero"
+        given.floor_below = below(profile.alpha_floor, torch.float32)
+        given.stop = Stop.of(profile, torch.float32).at
+        given.background = (_REAL * 3)(*settings.background)
+        given.border = border_of(settings.padding)
+        given.pop_visible, given.pop_window = settings.pop_over == "visible", settings.pop_views == "window"
+        given.blur_own_view = settings.blur_window == "own_view"
+        (given.beta1, given.beta2), given.eps = settings.betas, settings.eps
+        given.lr = (_REAL * len(GROUPS))(*(settings.lr[key] for key in GROUPS))
+        given.values, given.seconds = self._values.data_ptr(), self._seconds.data_ptr()
+        given.bad_row = self._bad_row.data_ptr()
+
+    def _set_phase(self, phase: Phase) -> None:
+        given, settings, found = self._given, self.settings, self.statistics
+        given.degree, given.l1 = phase.sh_degree, phase.l1
+        given.pixel_weight = (1.0 - phase.lambda_ssim) * settings.pixelwise_scale
+        given.ssim_weight = phase.lambda_ssim * (0.5 if settings.d_ssim_halved else 1.0)
+        given.lambda_pop = settings.lambda_pop if phase.pop else 0.0
+        given.dominance = phase.tells
+        summed = phase.window or (phase.blur and settings.blur_window == "sum")
+        blurs = phase.blur and settings.blur_window != "sum"
+        given.grad_sum = found.grad_sum.data_ptr() if phase.statistics else None
+        given.n_visible = found.n_visible.data_ptr() if phase.statistics else None
+        given.dominant_sum = found.dominant_sum.data_ptr() if summed else None
+        given.blurred = found.blurred.data_ptr() if blurs else None
+
+    def _take(self, index: int, phase: Phase) -> None:
+        given, settings, view = self._given, self.settings, self._target(index)
+        for name in ("viewmat", "K", "target", "mu_y", "s_yy"):
+            setattr(given, name, getattr(view, name).data_ptr())
+        given.height, given.width = view.target.shape[1:]
+        given.kept = None if view.kept is None else view.kept.data_ptr()
+        given.kept_windows = None if view.kept_windows is None else view.kept_windows.data_ptr()
+        given.n_kept = given.width * given.height if view.kept is None else int(view.kept.sum())
+        given.n_windows = view.mu_y[0].numel() if view.kept_windows is None else int(view.kept_windows.sum())
+        given.blur_pixels = settings.blur_pixels(given.width, given.height)
+        decay = settings.means_decay ** min(self.step / settings.max_steps, 1.0)
+        given.lr[0], given.adam_step = settings.lr["means"] * decay, self.step + 1
+        if not self._functions.step(self._stepper, ctypes.byref(given)):
+            raise MemoryError("the native training step ran out of memory")
+        if self._bad_row[0] >= 0:
+            raise ValueError(f"step {self.step}: Gaussian {int(self._bad_row)} has a value that is not finite")
+        self._history[self.step] = StepValues(*self._values.tolist())
+
+    def _target(self, index: int) -> _Target:
+        if index in self._targets:
+            return self._targets[index]
+        made = _Target.of(self._views[index], self.settings.padding)
+        if made.bytes <= self._cache_left:
+            self._cache_left -= made.bytes
+            self._targets[index] = made
+        return made

@@ -1,0 +1,172 @@
+// One step of training: what it is given, and what it keeps from one step to the next.
+//
+// The step in order, every line shared out to the threads (`step.cpp`):
+//     see         a Gaussian's splat, colour, and the tiles it reaches
+//     list        depth order; each tile's list, front to back
+//     blend       the picture tile by tile, who dominates it, its difference from the photograph
+//     compare     SSIM and its derivatives by the windows' moments
+//     gather      the gradient with respect to the picture
+//     transpose   tile by tile back to the entries of the lists
+//     update      entries added up, back to raw parameters, the POP term, statistics of density control, Adam
+// The arithmetic of one Gaussian is the one that the CUDA kernels run. Every sum is over parts that do not depend on the
+// number of threads, so that no bit does.
+#pragma once
+
+#include <chrono>
+#include <cstdint>
+#include <memory>
+#include <vector>
+
+#include "backward.h"
+#include "cuda_ext/csrc/optimizer.cuh"
+#include "cuda_ext/csrc/splatting.cuh"
+#include "forward.h"
+#include "pool.h"
+#include "ssim.h"
+
+namespace pop {
+
+enum StepGroup { MEANS, SCALES, QUATS, OPACITIES, SH0, SHN, GROUPS };
+enum StepPart { SEE, LIST, BLEND, COMPARE, GATHER, TRANSPOSE, UPDATE, PARTS };
+enum StepValue { PIXELWISE, SSIM, OBJECTIVE, SQUARE, POP, VALUES };
+
+constexpr int STEP_TILE = 16;  // a row of a tile is one vector of floats
+
+// Everything of one step; eight bytes each, in the order of `native_step.py`.
+struct StepGiven {
+  float *params[GROUPS], *m[GROUPS], *v[GROUPS];  // raw parameters by `StepGroup`, and Adam's moments
+  int64_t n, n_rest;                              // Gaussians; bands beyond the first
+  const float *viewmat, *K;                       // [4, 4], [3, 3]
+  const float *target, *mu_y, *s_yy;              // photograph and its moments under SSIM's windows. [3, H, W], [3, h, w]
+  const uint8_t *kept;                            // nonzero for pixels that count; null: all do. [H, W]
+  const float *kept_windows;                      // 1 for windows that count, else 0; null: all do. [h, w]
+  int64_t width, height, n_kept, n_windows;       // pixels, windows that count
+  int64_t near_inclusive, centred, inria_clamp, square, antialiased, ceiling_passes;  // see profile.cuh
+  double near_plane, far_plane, eps2d, frustum_margin, extent_sigmas, alpha_floor;
+  double floor_below, alpha_ceiling, stop;        // as in `Blend`
+  double background[3];
+  int64_t degree, border, l1;                     // active band; black pixels around the image for SSIM; L1 instead of L2
+  double pixel_weight, ssim_weight, lambda_pop;   // lambda_pop is 0 where the POP term is off
+  int64_t dominance, pop_window, pop_visible, blur_own_view;  // dominance: counts are made
+  double blur_pixels;                             // a view's count above it blurs
+  double lr[GROUPS], beta1, beta2, eps;
+  int64_t adam_step;                              // from 1
+  float *grad_sum;                                // statistics of density control, each null where not asked for. [N]
+  int32_t *n_visible, *dominant_sum;
+  uint8_t *blurred;
+  double *values;                                 // by `StepValue`
+  double *seconds;                                // by `StepPart`, added to
+  int64_t *bad_row;                               // first Gaussian that is not finite, or -1
+};
+
+// A Gaussian as one camera sees it, and where its entries are.
+struct Seen {
+  float x, y, a, b, c, opacity, limit, depth;  // screen centre, conic, effective opacity, log(opacity / floor), camera z
+  int32_t x0, y0, x1, y1;                      // tiles, half open
+  uint64_t tiles;                              // those of them that it reaches, where they are 64 at most
+  int32_t n, first;                            // entries, -1 where it is culled; the first one's slot in its part
+};
+
+constexpr int64_t ROWS = 256;       // Gaussians in a part
+constexpr int64_t ROW_BLOCK = 64;   // whose gradients are held at once
+constexpr int SHORT = 14;           // floats of a row besides the bands beyond the first
+
+// What one thread works with.
+struct Worker {
+  Canvas<float> canvas;
+  Transpose<float> transpose;
+  Products<float> products;
+  Blur<float> blur;
+  std::vector<float> gradients;  // of ROW_BLOCK Gaussians, parameter by parameter
+  Worker(const Pixels<float> &pixels, int64_t stride, int64_t n_rest)
+      : canvas(pixels, 3), transpose(pixels, 3), products(stride), blur(stride),
+        gradients(size_t(ROW_BLOCK * (SHORT + 3 * n_rest))) {}
+};
+
+// Numbers that keep their memory while they need no more of it; what a step leaves in it means nothing to the next.
+template <class T> class Buffer {
+public:
+  T *get(int64_t n) {
+    if (n > size) {
+      // an eighth more than needed: lists grow a little from step to step
+      size = n + n / 8;
+      numbers.reset();
+      numbers.reset(static_cast<T *>(::operator new(size_t(size) * sizeof(T), std::align_val_t(64))));
+    }
+    return numbers.get();
+  }
+  const T &operator[](int64_t i) const { return numbers.get()[i]; }
+  int64_t bytes() const { return size * int64_t(sizeof(T)); }
+
+private:
+  struct Free {
+    void operator()(T *p) const { ::operator delete(p, std::align_val_t(64)); }
+  };
+  std::unique_ptr<T, Free> numbers;
+  int64_t size = 0;
+};
+
+class Stepper {
+public:
+  explicit Stepper(int64_t threads) : pool(threads), pixels(STEP_TILE) {}
+  void step(const StepGiven &given);
+  int64_t bytes() const;
+
+private:
+  Pool pool;
+  Pixels<float> pixels;
+  std::vector<std::unique_ptr<Worker>> workers;
+  int64_t worker_stride = 0, worker_rest = -1;
+  // of Gaussians
+  Buffer<Seen> seen;
+  Buffer<Splat> splats;
+  Buffer<float> colors;
+  Buffer<int32_t> counts;
+  Buffer<uint64_t> keys, sorted;
+  std::vector<int64_t> part_visible, part_slots;
+  // of tiles and entries
+  std::vector<int64_t> starts, offsets, first_chunks, n_reached;
+  Buffer<int64_t> ids;
+  Buffer<int32_t> slots;
+  Buffer<float> lights, rows;
+  Buffer<uint16_t> reached;
+  // of pixels
+  Buffer<float> difference, alphas, partials, v_image, v_alphas;
+  std::vector<double> tile_sums, window_sums, pop_sums;
+
+  // of the step that is taken
+  const StepGiven *given = nullptr;
+  Camera<float> camera;
+  Profile<float> profile;
+  ProjectOptions<float> options;
+  AdamStep<float> adam_steps[GROUPS];
+  Blend<float> blend;
+  int64_t n_visible = 0, n_slots = 0, n_chunks = 0, n_important = 0, n_others = 0;
+
+  void begin();
+  template <class F> void timed(StepPart part, F f);
+  void see();
+  void see_rows(int64_t first, int64_t last);
+  bool see_row(int64_t i, Seen &to);
+  void reach_tiles(Seen &of) const;
+  template <class F> void each_tile(const Seen &of, F f) const;
+  void list();
+  void sort_by_depth();
+  void blend_tiles();
+  void differ(int64_t tile, float *alphas);
+  Ssim<float> ssim_of(int channel);
+  void compare();
+  void gather();
+  void gather_rows(Worker &own, int64_t first, int64_t last);
+  void transpose_tiles();
+  void count_sides();
+  int side_of(int64_t i) const;
+  void update();
+  float *gradients_of(Worker &own, StepGroup group) const;
+  void update_block(Worker &own, int64_t first, int64_t last, double *pop_sum);
+  void gradient_of_row(int64_t i, int64_t row, Worker &own);
+  void adam(StepGroup group, const float *gradient, int64_t first, int64_t n);
+  void finish();
+};
+
+}  // namespace pop
