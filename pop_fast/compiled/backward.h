@@ -165,7 +165,7 @@ void transpose_tile(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_
   for (int64_t chunk = n_chunks - 1; chunk >= 0; chunk--) {
     const int64_t first = place.begin + chunk * CHUNK, at = blend.first_chunks[tile] + chunk;
     const int n = int(std::min<int64_t>(CHUNK, place.begin + n_reached - first));
-    state.entries.gather(blend, place, first, n);
+    state.entries.gather(blend, place, first, n, first - CHUNK);
     if (ROW) state.rows.expand(state.entries, pixels);
     state.template blend_again<ROW>(thresholds, pixels, blend.lights + at * state.padded,
                                     blend.reached + at * state.strips);

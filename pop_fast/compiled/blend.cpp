@@ -15,7 +15,8 @@ namespace pop {
 template <class Real> void make_splats(const Blend<Real> &blend, Fork fork) {
   share(fork, blend.threads, blend.n, 4096, [&](int64_t first, int64_t last) {
     for (int64_t i = first; i < last; i++)
-      blend.splats[i] = splat_of(blend.means2d + 2 * i, blend.conics + 3 * i, blend.opacities[i]);
+      blend.splats[i] = splat_of(blend.means2d + 2 * i, blend.conics + 3 * i, blend.opacities[i],
+                                 blend.colors + blend.channels * i, blend.channels);
   });
 }
 
@@ -88,6 +89,7 @@ int64_t pop_padded_line(int64_t length, int64_t bytes) {
   return bytes == 8 ? pop::padded_line<double>(length) : pop::padded_line<float>(length);
 }
 int64_t pop_chunk() { return pop::CHUNK; }
+int64_t pop_splat_bytes() { return int64_t(sizeof(pop::Splat)); }
 int64_t pop_lanes(int64_t bytes) { return 64 / bytes; }
 int64_t pop_padded_pixels(int64_t tile_size, int64_t bytes) {
   return bytes == 8 ? pop::Pixels<double>(int(tile_size)).padded() : pop::Pixels<float>(int(tile_size)).padded();

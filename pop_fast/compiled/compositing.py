@@ -39,7 +39,7 @@ class _Composite(torch.autograd.Function):
             "n_traversed": torch.empty(size, dtype=torch.int32) if options.counts else None,
         }
         n_pairs, n_reached = (torch.empty_like(lists.lengths) for _ in range(2))
-        splats = torch.empty((len(means2d), 6), dtype=torch.float64)
+        splats = _aligned(len(means2d), this_library().splat_bytes)
         kept = {"n_reached": n_reached, "splats": splats, **(_lights(lists, colors) if options.keep else {})}
         given = {**_arguments(inputs, options), **results, **kept, "n_pairs": n_pairs}
         call_library(Blend, means2d.dtype, _numbers(inputs, options), given)
@@ -96,6 +96,13 @@ def _numbers(inputs: tuple[Tensor, ...], options: BlendOptions) -> dict[str, flo
         "channel_stride": 1,
         "ceiling_passes": profile.ceiling_gradient != "zero",
     }
+
+
+def _aligned(n: int, each: int) -> Tensor:
+    """Return bytes for n records that begin where lines of the cache do."""
+    room = torch.empty((n + 1) * each, dtype=torch.uint8)
+    skip = -room.data_ptr() % each
+    return room[skip : skip + n * each]
 
 
 def _lights(lists: TileLists, like: Tensor) -> dict[str, Tensor]:

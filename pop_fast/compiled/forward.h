@@ -137,7 +137,7 @@ void blend_tile(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_t ti
   Entries<Real> &entries = canvas.entries;
   int64_t at = place.begin, pairs = 0;
   for (; at < place.end && canvas.lit(); at += entries.count) {
-    entries.gather(blend, place, at, std::min<int64_t>(CHUNK, place.end - at));
+    entries.gather(blend, place, at, std::min<int64_t>(CHUNK, place.end - at), at + CHUNK);
     canvas.rows.expand(entries, pixels);
     canvas.rows.look(entries, pixels, thresholds);
     const int64_t chunk = blend.lights ? blend.first_chunks[tile] + (at - place.begin) / CHUNK : 0;

@@ -135,6 +135,7 @@ class Library:
         functions: by layout and type.
         chunk: list entries after which the blend writes down the light.
         padded_pixels: pixels of a tile of that size, padded to whole vectors of floats of so many bytes.
+        splat_bytes: size of what blending keeps of a splat, and its alignment.
         lanes: numbers of so many bytes in a vector.
         window_rows: rows of SSIM's windows whose total is one number.
         padded_line: numbers from one row of maps to the next, for rows of that many numbers of so many bytes.
@@ -145,6 +146,7 @@ class Library:
     functions: dict[tuple[type[ctypes.Structure], torch.dtype], Callable[..., int]]
     chunk: int
     padded_pixels: Callable[[int, int], int]
+    splat_bytes: int
     lanes: Callable[[int], int]
     window_rows: int
     padded_line: Callable[[int, int], int]
@@ -226,7 +228,7 @@ def open_library(path: str) -> Library:
     loaded = ctypes.CDLL(path)
     layouts = (Covariances, Projection, Colors, Lists, Blend, Ssim)
     sizes = {f"pop_{layout.__name__.lower()}_bytes": layout for layout in layouts}
-    numbers = ("chunk", "padded_pixels", "lanes", "window_rows", "padded_line", "rows_at_a_time")
+    numbers = ("chunk", "padded_pixels", "splat_bytes", "lanes", "window_rows", "padded_line", "rows_at_a_time")
     for name in (*sizes, *(f"pop_{number}" for number in numbers)):
         getattr(loaded, name).restype = _WHOLE
     loaded.pop_lanes.argtypes = (_WHOLE,)
@@ -243,6 +245,7 @@ def open_library(path: str) -> Library:
         functions,
         loaded.pop_chunk(),
         loaded.pop_padded_pixels,
+        loaded.pop_splat_bytes(),
         loaded.pop_lanes,
         loaded.pop_window_rows(),
         loaded.pop_padded_line,

@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <type_traits>
 #include <utility>
 
 #include "cuda_ext/csrc/density.cuh"
@@ -47,6 +48,14 @@ ShRow<float> harmonics_of(const StepGiven &given, int64_t i) {
 }
 
 int64_t parts_of(int64_t n, int64_t part) { return (n + part - 1) / part; }
+
+// Call with the degree as a constant.
+template <class Call> void with_degree(int64_t degree, Call call) {
+  if (degree == 0) return call(std::integral_constant<int, 0>());
+  if (degree == 1) return call(std::integral_constant<int, 1>());
+  if (degree == 2) return call(std::integral_constant<int, 2>());
+  call(std::integral_constant<int, 3>());
+}
 
 // A bit pattern that is ordered as the floats are.
 uint32_t ordered_bits(float x) {
@@ -114,7 +123,6 @@ void Stepper::begin() {
   n_reached.resize(n_tiles);
   tile_sums.resize(3 * n_tiles);
   blend.splats = splats.get(g.n);
-  blend.colors = colors.get(3 * g.n);
   blend.offsets = offsets.data();
   blend.first_chunks = first_chunks.data();
   blend.n_reached = n_reached.data();
@@ -145,7 +153,9 @@ void Stepper::see() {
   part_visible.assign(n_parts, 0);
   part_slots.assign(n_parts + 1, 0);
   keys.get(given->n);
-  pool.share(given->n, ROWS, [&](int, int64_t first, int64_t last) { see_rows(first, last); });
+  with_degree(given->degree, [&](auto degree) {
+    pool.share(given->n, ROWS, [&](int, int64_t first, int64_t last) { see_rows<degree()>(first, last); });
+  });
   for (int64_t part = 0; part < n_parts; part++)
     if (part_visible[part] < 0) {
       *given->bad_row = -part_visible[part] - 1;
@@ -154,7 +164,7 @@ void Stepper::see() {
 }
 
 // The visible ones' keys begin where the part's Gaussians do.
-void Stepper::see_rows(int64_t first, int64_t last) {
+template <int DEGREE> void Stepper::see_rows(int64_t first, int64_t last) {
   Seen *const all = seen.get(given->n);
   int32_t *const count = counts.get(given->n);
   uint64_t *const key = keys.get(given->n) + first;
@@ -167,7 +177,7 @@ void Stepper::see_rows(int64_t first, int64_t last) {
       if (bad < 0) bad = i;
       continue;
     }
-    if (!see_row(i, row)) continue;
+    if (!see_row<DEGREE>(i, row)) continue;
     row.first = int32_t(slot);
     slot += row.n;
     if (row.n > 0) key[visible++] = uint64_t(ordered_bits(row.depth)) << 32 | uint64_t(i);
@@ -176,14 +186,14 @@ void Stepper::see_rows(int64_t first, int64_t last) {
   part_slots[first / ROWS] = slot;
 }
 
-[[gnu::flatten]] bool Stepper::see_row(int64_t i, Seen &to) {
+template <int DEGREE> [[gnu::flatten]] bool Stepper::see_row(int64_t i, Seen &to) {
   const GaussianRow<float> g = gaussian_of(*given, i);
   const SplatRow<float> splat = project_one(g, camera, profile, options);
   if (splat.radii.x <= 0) return false;
   const float mean2d[2] = {splat.mean2d.x, splat.mean2d.y}, conic[3] = {splat.conic.xx, splat.conic.xy, splat.conic.yy};
-  blend.splats[i] = splat_of(mean2d, conic, splat.opacity);
-  put(colors.get(3 * given->n) + 3 * i,
-      color_from_sh(harmonics_of(*given, i), view_dir(g.mean, camera), int(given->degree)));
+  float color[3];
+  put(color, color_from_sh(harmonics_of(*given, i), view_dir(g.mean, camera), DEGREE));
+  blend.splats[i] = splat_of(mean2d, conic, splat.opacity, color, 3);
   const TileGrid grid = grid_of(int(given->width), int(given->height), STEP_TILE, STEP_TILE);
   const TileRect rect = tile_rect(splat.mean2d, splat.radii, grid, profile);
   to = {mean2d[0], mean2d[1], conic[0], conic[1], conic[2], splat.opacity, 0.0f, splat.depth,
@@ -432,9 +442,12 @@ void Stepper::count_sides() {
 void Stepper::update() {
   count_sides();
   pop_sums.assign(size_t(2 * parts_of(given->n, ROWS)), 0.0);
-  pool.share(given->n, ROWS, [&](int thread, int64_t first, int64_t last) {
-    for (int64_t block = first; block < last; block += ROW_BLOCK)
-      update_block(*workers[size_t(thread)], block, std::min(last, block + ROW_BLOCK), &pop_sums[size_t(2 * (first / ROWS))]);
+  with_degree(given->degree, [&](auto degree) {
+    pool.share(given->n, ROWS, [&](int thread, int64_t first, int64_t last) {
+      Worker &own = *workers[size_t(thread)];
+      for (int64_t block = first; block < last; block += ROW_BLOCK)
+        update_block<degree()>(own, block, std::min(last, block + ROW_BLOCK), &pop_sums[size_t(2 * (first / ROWS))]);
+    });
   });
 }
 
@@ -445,12 +458,12 @@ float *Stepper::gradients_of(Worker &own, StepGroup group) const {
   return own.gradients.data() + ROW_BLOCK * before;
 }
 
-void Stepper::update_block(Worker &own, int64_t first, int64_t last, double *pop_sum) {
+template <int DEGREE> void Stepper::update_block(Worker &own, int64_t first, int64_t last, double *pop_sum) {
   const StepGiven &g = *given;
   std::fill(own.gradients.begin(), own.gradients.end(), 0.0f);
   float *const v_logits = gradients_of(own, OPACITIES);
   for (int64_t i = first; i < last; i++) {
-    if (seen[i].n >= 0) gradient_of_row(i, i - first, own);
+    if (seen[i].n >= 0) gradient_of_row<DEGREE>(i, i - first, own);
     if (blend.dominant_counts) {
       const int32_t count = blend.dominant_counts[i];
       if (g.lambda_pop != 0.0) {
@@ -476,7 +489,7 @@ void Stepper::update_block(Worker &own, int64_t first, int64_t last, double *pop
   for (int64_t i = first; i < last && active > 0; i++) adam(SHN, gradients_of(own, SHN) + row * (i - first), row * i, active);
 }
 
-[[gnu::flatten]] void Stepper::gradient_of_row(int64_t i, int64_t row, Worker &own) {
+template <int DEGREE> [[gnu::flatten]] void Stepper::gradient_of_row(int64_t i, int64_t row, Worker &own) {
   const StepGiven &g = *given;
   const Seen &of = seen[i];
   double sums[COLUMNS] = {};
@@ -498,7 +511,7 @@ void Stepper::update_block(Worker &own, int64_t first, int64_t last, double *pop
   float basis[MAX_BASIS];
   Vec3<float> v_sum;
   const Vec3<float> v_color = {float(sums[6]), float(sums[7]), float(sums[8])};
-  const Vec3<float> v_dir = color_from_sh_vjp(harmonics_of(g, i), view_dir(gaussian.mean, camera), int(g.degree),
+  const Vec3<float> v_dir = color_from_sh_vjp(harmonics_of(g, i), view_dir(gaussian.mean, camera), DEGREE,
                                               v_color, basis, v_sum);
   ViewmatVjp<float> unused = {};
   const GaussianVjp<float> v = project_one_vjp(gaussian, camera, profile, options, v_splat, v_dir, unused);
@@ -513,8 +526,7 @@ void Stepper::update_block(Worker &own, int64_t first, int64_t last, double *pop
   gradients_of(own, OPACITIES)[row] = opacity_from_logit_vjp(g.params[OPACITIES][i], v.v_opacity);
   put(gradients_of(own, SH0) + 3 * row, {basis[0] * v_sum.x, basis[0] * v_sum.y, basis[0] * v_sum.z});
   float *const v_rest = gradients_of(own, SHN) + 3 * g.n_rest * row;
-  const int64_t bands = std::min<int64_t>(g.n_rest, (g.degree + 1) * (g.degree + 1) - 1);
-  for (int64_t k = 0; k < bands; k++)
+  for (int64_t k = 0; k < (DEGREE + 1) * (DEGREE + 1) - 1; k++)
     put(v_rest + 3 * k, {basis[k + 1] * v_sum.x, basis[k + 1] * v_sum.y, basis[k + 1] * v_sum.z});
 }
 
@@ -545,7 +557,7 @@ void Stepper::finish() {
 }
 
 int64_t Stepper::bytes() const {
-  return seen.bytes() + splats.bytes() + colors.bytes() + counts.bytes() + keys.bytes() + sorted.bytes() + ids.bytes() +
+  return seen.bytes() + splats.bytes() + counts.bytes() + keys.bytes() + sorted.bytes() + ids.bytes() +
          slots.bytes() + lights.bytes() + rows.bytes() + reached.bytes() + difference.bytes() + alphas.bytes() +
          partials.bytes() + v_image.bytes() + v_alphas.bytes();
 }

@@ -120,7 +120,6 @@ private:
   // of Gaussians
   Buffer<Seen> seen;
   Buffer<Splat> splats;
-  Buffer<float> colors;
   Buffer<int32_t> counts;
   Buffer<uint64_t> keys, sorted;
   std::vector<int64_t> part_visible, part_slots;
@@ -146,8 +145,8 @@ private:
   void begin();
   template <class F> void timed(StepPart part, F f);
   void see();
-  void see_rows(int64_t first, int64_t last);
-  bool see_row(int64_t i, Seen &to);
+  template <int DEGREE> void see_rows(int64_t first, int64_t last);
+  template <int DEGREE> bool see_row(int64_t i, Seen &to);
   void reach_tiles(Seen &of) const;
   template <class F> void each_tile(const Seen &of, F f) const;
   void list();
@@ -163,8 +162,8 @@ private:
   int side_of(int64_t i) const;
   void update();
   float *gradients_of(Worker &own, StepGroup group) const;
-  void update_block(Worker &own, int64_t first, int64_t last, double *pop_sum);
-  void gradient_of_row(int64_t i, int64_t row, Worker &own);
+  template <int DEGREE> void update_block(Worker &own, int64_t first, int64_t last, double *pop_sum);
+  template <int DEGREE> void gradient_of_row(int64_t i, int64_t row, Worker &own);
   void adam(StepGroup group, const float *gradient, int64_t first, int64_t n);
   void finish();
 };

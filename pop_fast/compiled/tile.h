@@ -8,6 +8,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 #include <vector>
 
 #include "lanes.h"
@@ -16,16 +17,20 @@ namespace pop {
 
 constexpr int CHUNK = 16;  // list entries at a time, after which T of every pixel is written down for the transpose
 
-// What the exponent needs of a splat, once a render: log2(alpha) = log2_opacity - (a dx^2 + c dy^2) / 2 - b dx dy.
-struct Splat {
+// What blending needs of a splat, once a render: log2(alpha) = log2_opacity - (a dx^2 + c dy^2) / 2 - b dx dy.
+struct alignas(64) Splat {
   double x, y, a, b, c, log2_opacity;
+  float rgb[4];  // of three channels of floats, which lie in the same line of the cache so
 };
 
-template <class Real> inline Splat splat_of(const Real *mean2d, const Real *conic, Real opacity) {
+template <class Real>
+inline Splat splat_of(const Real *mean2d, const Real *conic, Real opacity, const Real *color, int64_t channels) {
   const double log2_e = 1.4426950408889634;
   // the logarithm of 0 is -inf: under every floor
-  return {double(mean2d[0]),          double(mean2d[1]),          log2_e * double(conic[0]),
-          log2_e * double(conic[1]), log2_e * double(conic[2]), std::log2(double(opacity))};
+  Splat splat = {double(mean2d[0]),          double(mean2d[1]),          log2_e * double(conic[0]),
+                 log2_e * double(conic[1]), log2_e * double(conic[2]), std::log2(double(opacity)), {}};
+  for (int d = 0; channels == 3 && d < 3; d++) splat.rgb[d] = float(color[d]);
+  return splat;
 }
 
 // Everything of one call; eight bytes each, in the order of `library.py`. Null where a result is not asked for.
@@ -118,13 +123,13 @@ template <class Real> struct Entries {
   alignas(64) Real rgb[CHUNK][4];                    // where there are three channels
   const Real *color[CHUNK];
 
-  void gather(const Blend<Real> &blend, const Place<Real> &place, int64_t first, int64_t n) {
+  // n entries from `first` on; those from `next` on are asked for while these are worked on
+  void gather(const Blend<Real> &blend, const Place<Real> &place, int64_t first, int64_t n, int64_t next) {
     count = int(n);
     const double x = place.left + 0.5 * place.size, y = place.top + 0.5 * place.size;
     alignas(64) double su[CHUNK], sv[CHUNK], a[CHUNK], b[CHUNK], c[CHUNK], top[CHUNK];
     for (int k = 0; k < CHUNK; k++) {
-      // the next chunk is asked for while this one is worked on
-      __builtin_prefetch(&blend.splats[blend.ids[std::min(first + CHUNK + k, place.end - 1)]]);
+      __builtin_prefetch(&blend.splats[blend.ids[std::clamp(next + k, place.begin, place.end - 1)]]);
       // the last chunk of a list is filled up with its last entry, and nobody looks at these
       const int64_t id = blend.ids[first + std::min<int64_t>(k, n - 1)];
       const Splat &s = blend.splats[id];
@@ -134,8 +139,13 @@ template <class Real> struct Entries {
       b[k] = s.b;
       c[k] = s.c;
       top[k] = s.log2_opacity;
-      color[k] = blend.colors + id * blend.channels;
-      for (int d = 0; blend.channels == 3 && d < 3; d++) rgb[k][d] = color[k][d];
+      if (blend.channels != 3) {
+        color[k] = blend.colors + id * blend.channels;
+      } else if (sizeof(Real) == 4) {
+        std::memcpy(rgb[k], s.rgb, sizeof s.rgb);
+      } else {
+        std::copy_n(blend.colors + 3 * id, 3, rgb[k]);
+      }
     }
     for (int k = 0; k < CHUNK; k++) {
       const double du = su[k] - x, dv = sv[k] - y, gx = a[k] * du + b[k] * dv, gy = b[k] * du + c[k] * dv;
