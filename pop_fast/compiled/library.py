@@ -156,11 +156,11 @@ class Library:
 
 @dataclass(frozen=True)
 class StepperFunctions:
-    """The functions of step.cpp: make a stepper for so many threads, let go of it, take a step, its memory in bytes."""
+    """The functions of step.cpp: make a stepper for so many threads, let go of it, take steps, its memory in bytes."""
 
     open: Callable[[int], int | None]
     close: Callable[[int], None]
-    step: Callable[..., int]
+    steps: Callable[..., int]
     bytes: Callable[[int], int]
 
 
@@ -181,10 +181,10 @@ def stepper_functions(given_bytes: int) -> StepperFunctions:
         raise OSError(f"{path} expects arguments of another layout")
     loaded.pop_stepper_open.argtypes, loaded.pop_stepper_open.restype = (_WHOLE,), _POINTER
     loaded.pop_stepper_close.argtypes, loaded.pop_stepper_close.restype = (_POINTER,), None
-    loaded.pop_stepper_step.argtypes, loaded.pop_stepper_step.restype = (_POINTER, _POINTER), ctypes.c_int
+    loaded.pop_stepper_steps.argtypes, loaded.pop_stepper_steps.restype = (_POINTER, _POINTER, _WHOLE), _WHOLE
     loaded.pop_stepper_bytes.argtypes, loaded.pop_stepper_bytes.restype = (_POINTER,), _WHOLE
     return StepperFunctions(
-        loaded.pop_stepper_open, loaded.pop_stepper_close, loaded.pop_stepper_step, loaded.pop_stepper_bytes
+        loaded.pop_stepper_open, loaded.pop_stepper_close, loaded.pop_stepper_steps, loaded.pop_stepper_bytes
     )
 
 

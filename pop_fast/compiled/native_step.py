@@ -21,6 +21,8 @@ from pop_fast.compiled.library import stepper_functions
 from pop_fast.ssim import TargetMoments, border_of, kept_windows, target_moments
 from pop_fast.transmittance import Stop, below
 
+# steps that are taken before Python is asked again: Ctrl-C, a progress bar
+LONGEST: Final = 10
 PARTS: Final = ("see", "list", "blend", "compare", "gather", "transpose", "update")
 _POINTER, _WHOLE, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 
@@ -140,7 +142,6 @@ class NativeTrainer:
             raise MemoryError("there is no memory for the native training step")
         weakref.finalize(self, self._functions.close, self._stepper)
         self._given = StepGiven()
-        self._values = torch.zeros(len(StepValues._fields), dtype=torch.float64)
         self._seconds = torch.zeros(len(PARTS), dtype=torch.float64)
         self._bad_row = torch.full((1,), -1, dtype=torch.int64)
         self._history: dict[int, StepValues] = {}
@@ -190,8 +191,7 @@ class NativeTrainer:
         self._history = {}
         self._set_phase(phase)
         while self.step < until:
-            self._take(self._order[self.step], phase)
-            self.step += 1
+            self._take(min(until - self.step, LONGEST))
 
     def told(self, first: int, last: int) -> list[StepValues]:
         """Return what the steps from `first` to before `last` were like; the last `run` must have taken them."""
@@ -216,7 +216,7 @@ class NativeTrainer:
         given.blur_own_view = settings.blur_window == "own_view"
         (given.beta1, given.beta2), given.eps = settings.betas, settings.eps
         given.lr = (_REAL * len(GROUPS))(*(settings.lr[key] for key in GROUPS))
-        given.values, given.seconds = self._values.data_ptr(), self._seconds.data_ptr()
+        given.seconds = self._seconds.data_ptr()
         given.bad_row = self._bad_row.data_ptr()
 
     def _set_phase(self, phase: Phase) -> None:
@@ -233,8 +233,26 @@ class NativeTrainer:
         given.dominant_sum = found.dominant_sum.data_ptr() if summed else None
         given.blurred = found.blurred.data_ptr() if blurs else None
 
-    def _take(self, index: int, phase: Phase) -> None:
-        given, settings, view = self._given, self.settings, self._target(index)
+    def _take(self, n: int) -> None:
+        values = torch.zeros((n, len(StepValues._fields)), dtype=torch.float64)
+        # held until the steps have been taken: the arguments only point
+        views = [self._target(self._order[step]) for step in range(self.step, self.step + n)]
+        steps = (StepGiven * n)()
+        for k, view in enumerate(views):
+            self._set_step(self.step + k, view)
+            self._given.values = values[k].data_ptr()
+            steps[k] = self._given
+        taken = self._functions.steps(self._stepper, steps, n)
+        if taken < 0:
+            raise MemoryError("the native training step ran out of memory")
+        for k in range(taken):
+            self._history[self.step + k] = StepValues(*values[k].tolist())
+        self.step += taken
+        if taken < n:
+            raise ValueError(f"step {self.step}: Gaussian {int(self._bad_row)} has a value that is not finite")
+
+    def _set_step(self, step: int, view: _Target) -> None:
+        given, settings = self._given, self.settings
         for name in ("viewmat", "K", "target", "mu_y", "s_yy"):
             setattr(given, name, getattr(view, name).data_ptr())
         given.height, given.width = view.target.shape[1:]
@@ -243,13 +261,8 @@ class NativeTrainer:
         given.n_kept = given.width * given.height if view.kept is None else int(view.kept.sum())
         given.n_windows = view.mu_y[0].numel() if view.kept_windows is None else int(view.kept_windows.sum())
         given.blur_pixels = settings.blur_pixels(given.width, given.height)
-        decay = settings.means_decay ** min(self.step / settings.max_steps, 1.0)
-        given.lr[0], given.adam_step = settings.lr["means"] * decay, self.step + 1
-        if not self._functions.step(self._stepper, ctypes.byref(given)):
-            raise MemoryError("the native training step ran out of memory")
-        if self._bad_row[0] >= 0:
-            raise ValueError(f"step {self.step}: Gaussian {int(self._bad_row)} has a value that is not finite")
-        self._history[self.step] = StepValues(*self._values.tolist())
+        decay = settings.means_decay ** min(step / settings.max_steps, 1.0)
+        given.lr[0], given.adam_step = settings.lr["means"] * decay, step + 1
 
     def _target(self, index: int) -> _Target:
         if index in self._targets:

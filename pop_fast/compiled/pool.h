@@ -1,20 +1,40 @@
 // Threads that live as long as a training and sleep between its steps.
 //
-// Work is taken part by part from a shared counter, so that a thread which the system has put aside holds up no more
-// than the part it is at. A thread that has nothing to do looks for more for some microseconds, which is shorter than
-// falling asleep and being woken, and then sleeps: it takes no processor from whoever else needs one.
+// A plan is a row of works, each cut into parts. Threads take part after part; whoever ends a work's last part begins
+// the next work, so that no thread leads: one that the system has put aside, or not yet woken, holds up no more than the
+// part it is at. A thread that has nothing to do looks for more for some microseconds, which is shorter than falling
+// asleep and being woken, and then sleeps: it takes no processor from whoever else needs one.
 #pragma once
 
 #include <algorithm>
 #include <atomic>
+#include <chrono>
 #include <condition_variable>
 #include <cstdint>
+#include <functional>
 #include <mutex>
 #include <new>
 #include <thread>
 #include <vector>
 
 namespace pop {
+
+// f(thread, first, last) for every part of n.
+struct Work {
+  int64_t n = 0, part = 1;
+  std::function<void(int, int64_t, int64_t)> f;
+
+  int64_t parts() const { return (n + part - 1) / part; }
+  void do_part(int thread, int64_t index) const { f(thread, index * part, std::min(n, (index + 1) * part)); }
+};
+
+// What is done with one work after the other.
+class Plan {
+public:
+  virtual ~Plan() = default;
+  // Do what must be done by one thread alone, and say what can be shared next; false when there is no more.
+  virtual bool next(Work &work) = 0;
+};
 
 class Pool {
 public:
@@ -31,41 +51,21 @@ public:
     {
       const std::lock_guard<std::mutex> lock(mutex);
       closed = true;
-      round++;
     }
-    wake.notify_all();
+    changed.notify_all();
     for (auto &other : others) other.join();
   }
 
   int64_t size() const { return int64_t(others.size()) + 1; }
 
-  // Call f(thread, first, last) for parts of n until none is left; what is thrown by one ends the call once all are back.
-  template <class F> void share(int64_t n, int64_t part, F f) {
-    if (n <= 0) return;
-    next = 0;
-    failed = false;
-    auto parts = [&](int thread) {
-      try {
-        for (int64_t first; (first = next.fetch_add(part)) < n;) f(thread, first, std::min(n, first + part));
-      } catch (...) {
-        failed = true;
-        next = n;
-      }
-    };
-    if (others.empty() || n <= part) {
-      parts(0);
-    } else {
-      using Parts = decltype(parts);
-      call = [](void *given, int thread) { (*static_cast<Parts *>(given))(thread); };
-      given = &parts;
-      at_work = int(others.size());
-      {
-        const std::lock_guard<std::mutex> lock(mutex);
-        round++;
-      }
-      wake.notify_all();
-      parts(0);
-      wait_for([&] { return at_work.load() == 0; }, done);
+  // Do all works of a plan; what is thrown by one ends the call once no thread works on it.
+  void run(Plan &given) {
+    plan = &given;
+    failed = ended = false;
+    begin_next();
+    while (!ended) {
+      take_parts(0);
+      wait_for([&] { return ended.load() || untaken.load() > 0; });
     }
     if (failed) throw std::bad_alloc();
   }
@@ -73,13 +73,78 @@ public:
 private:
   std::vector<std::thread> others;
   std::mutex mutex;
-  std::condition_variable wake, done;
-  std::atomic<uint64_t> round{0};
-  std::atomic<int64_t> next{0};
-  std::atomic<int> at_work{0};
-  std::atomic<bool> failed{false}, closed{false};
-  void (*call)(void *, int) = nullptr;
-  void *given = nullptr;
+  std::condition_variable changed;
+  // whoever takes one off the parts that nobody has taken may read what the work is: that stays until all are done
+  std::atomic<int64_t> untaken{0}, undone{0};
+  std::atomic<bool> failed{false}, ended{false}, closed{false};
+  Plan *plan = nullptr;
+  Work work;
+
+  // By one thread at a time: whoever ended the last part, or the caller at the start.
+  void begin_next() {
+    bool more = false;
+    try {
+      do more = !failed && plan->next(work);
+      while (more && work.parts() == 0);
+    } catch (...) {
+      failed = true;
+      more = false;
+    }
+    if (more) undone = work.parts();
+    {
+      // under the lock, so that whoever is about to sleep has not looked just before
+      const std::lock_guard<std::mutex> lock(mutex);
+      if (more) {
+        untaken = work.parts();
+      } else {
+        ended = true;
+      }
+    }
+    if (!others.empty()) changed.notify_all();
+  }
+
+  // What a thread knows of how it gets along with others.
+  struct Turn {
+    using Clock = std::chrono::steady_clock;
+    Clock::time_point last = Clock::now(), since = last, crowded_until = last;
+
+    // Between two parts. On a crowded machine a thread that stays until its turn is over is put aside in the middle of a
+    // part, for which all others then wait; one that lets go a little before keeps its share and holds up nobody.
+    void between_parts() {
+      const auto now = Clock::now();
+      if (now - last > std::chrono::milliseconds(2)) {
+        crowded_until = now + std::chrono::seconds(1);
+        since = now;
+      }
+      last = now;
+      if (now > crowded_until || now - since < std::chrono::microseconds(1000)) return;
+      std::this_thread::sleep_for(std::chrono::microseconds(1));
+      last = since = Clock::now();
+    }
+  };
+
+  void take_parts(int thread) {
+    static thread_local Turn turn;
+    turn.last = turn.since = Turn::Clock::now();
+    for (int64_t left = untaken.load(); left > 0;) {
+      if (!untaken.compare_exchange_weak(left, left - 1)) continue;
+      try {
+        work.do_part(thread, work.parts() - left);
+      } catch (...) {
+        failed = true;
+      }
+      if (undone.fetch_sub(1) == 1) begin_next();
+      turn.between_parts();
+      left = untaken.load();
+    }
+  }
+
+  void work_until_closed(int thread) {
+    while (!closed) {
+      wait_for([&] { return closed.load() || untaken.load() > 0; });
+      take_parts(thread);
+    }
+  }
 
   static void pause() {
 #if defined(__x86_64__) || defined(__i386__)
@@ -87,27 +152,13 @@ private:
 #endif
   }
 
-  template <class Condition> void wait_for(Condition holds, std::condition_variable &signal) {
+  template <class Condition> void wait_for(Condition holds) {
     for (int look = 0; look < 600; look++) {
       if (holds()) return;
       pause();
     }
     std::unique_lock<std::mutex> lock(mutex);
-    signal.wait(lock, holds);
-  }
-
-  void work_until_closed(int thread) {
-    for (uint64_t seen = 0;;) {
-      wait_for([&] { return round.load() != seen; }, wake);
-      seen = round.load();
-      if (closed) return;
-      call(given, thread);
-      if (at_work.fetch_sub(1) == 1) {
-        // under the lock, so that whoever is about to sleep has not looked just before
-        const std::lock_guard<std::mutex> lock(mutex);
-        done.notify_one();
-      }
-    }
+    changed.wait(lock, holds);
   }
 };
 

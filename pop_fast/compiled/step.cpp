@@ -65,24 +65,60 @@ uint32_t ordered_bits(float x) {
 
 }  // namespace
 
-template <class F> void Stepper::timed(StepPart part, F f) {
-  const auto start = std::chrono::steady_clock::now();
-  f();
-  given->seconds[part] += std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+int64_t Stepper::steps(const StepGiven *first, int64_t n) {
+  given = first;
+  last_given = first + n;
+  stage = 0;
+  pool.run(*this);
+  return given - first;
 }
 
-void Stepper::step(const StepGiven &arguments) {
-  given = &arguments;
-  begin();
-  timed(SEE, [&] { see(); });
-  if (*given->bad_row >= 0) return;
-  timed(LIST, [&] { list(); });
-  timed(BLEND, [&] { blend_tiles(); });
-  timed(COMPARE, [&] { compare(); });
-  timed(GATHER, [&] { gather(); });
-  timed(TRANSPOSE, [&] { transpose_tiles(); });
-  timed(UPDATE, [&] { update(); });
-  finish();
+bool Stepper::next(Work &work) {
+  if (given == last_given) return false;
+  book_time();
+  switch (stage++) {
+  case 0:
+    begin();
+    work = see();
+    return true;
+  case 1:
+    if (!all_finite()) return false;
+    sort_by_depth();
+    work = count_entries();
+    return true;
+  case 2:
+    work = place_entries();
+    return true;
+  case 3:
+    work = blend_tiles();
+    return true;
+  case 4:
+    work = compare();
+    return true;
+  case 5:
+    work = gather();
+    return true;
+  case 6:
+    work = transpose_tiles();
+    return true;
+  case 7:
+    count_sides();
+    work = update();
+    return true;
+  default:
+    finish();
+    given++;
+    stage = 0;
+    return next(work);
+  }
+}
+
+// Add the time since the last work began to what that was a part of.
+void Stepper::book_time() {
+  constexpr StepPart part_of[] = {SEE, LIST, LIST, BLEND, COMPARE, GATHER, TRANSPOSE, UPDATE};
+  const auto now = std::chrono::steady_clock::now();
+  if (stage > 0) given->seconds[part_of[stage - 1]] += std::chrono::duration<double>(now - stage_began).count();
+  stage_began = now;
 }
 
 void Stepper::begin() {
@@ -137,30 +173,41 @@ void Stepper::begin() {
   counts.get(g.n);
   if (g.dominance) blend.dominant_counts = counts.get(g.n);
 
-  const int64_t stride = padded_line<float>(g.width + Ssim<float>::REACH);
-  if (workers.empty() || worker_stride != stride || worker_rest != g.n_rest) {
-    workers.clear();
-    for (int64_t k = 0; k < pool.size(); k++) workers.push_back(std::make_unique<Worker>(pixels, stride, g.n_rest));
-    worker_stride = stride;
-    worker_rest = g.n_rest;
-  }
+  make_workers();
+  for (int channel = 0; channel < 3; channel++) ssim[channel] = ssim_of(channel);
+}
+
+void Stepper::make_workers() {
+  const int64_t stride = padded_line<float>(given->width + Ssim<float>::REACH);
+  if (!workers.empty() && worker_stride == stride && worker_rest == given->n_rest) return;
+  workers.clear();
+  for (int64_t k = 0; k < pool.size(); k++)
+    workers.push_back(std::make_unique<Worker>(pixels, stride, given->n_rest));
+  worker_stride = stride;
+  worker_rest = given->n_rest;
 }
 
 // ---- see: from raw parameters to splats and colours
 
-void Stepper::see() {
+Work Stepper::see() {
   const int64_t n_parts = parts_of(given->n, ROWS);
-  part_visible.assign(n_parts, 0);
-  part_slots.assign(n_parts + 1, 0);
+  part_visible.assign(size_t(n_parts), 0);
+  part_slots.assign(size_t(n_parts), 0);
   keys.get(given->n);
+  Work work = {given->n, ROWS, {}};
   with_degree(given->degree, [&](auto degree) {
-    pool.share(given->n, ROWS, [&](int, int64_t first, int64_t last) { see_rows<degree()>(first, last); });
+    work.f = [this](int, int64_t first, int64_t last) { see_rows<decltype(degree)::value>(first, last); };
   });
-  for (int64_t part = 0; part < n_parts; part++)
-    if (part_visible[part] < 0) {
-      *given->bad_row = -part_visible[part] - 1;
-      return;
+  return work;
+}
+
+bool Stepper::all_finite() const {
+  for (const int64_t visible : part_visible)
+    if (visible < 0) {
+      *given->bad_row = -visible - 1;
+      return false;
     }
+  return true;
 }
 
 // The visible ones' keys begin where the part's Gaussians do.
@@ -247,75 +294,81 @@ void Stepper::sort_by_depth() {
   static_assert(PASSES % 2 == 1);
 }
 
-void Stepper::list() {
-  sort_by_depth();
-  n_slots = 0;
-  for (auto &slot : part_slots) n_slots += std::exchange(slot, n_slots);
-  const Seen *const all = seen.get(given->n);
-  const uint64_t *const order = sorted.get(given->n);
-  const int64_t n_tiles = blend.tiles(), n_parts = 4 * pool.size(), part = std::max<int64_t>(1, parts_of(n_visible, n_parts));
-  starts.assign(n_parts * n_tiles, 0);
-  // calls f(row, tile, slot) for the entries of a part of the Gaussians, front to back
-  const auto each_entry = [&](int64_t first, int64_t last, auto f) {
-    for (int64_t k = first; k < last; k++) {
-      const int64_t i = int64_t(uint32_t(order[k]));
-      const Seen &of = all[i];
-      int64_t slot = part_slots[i / ROWS] + of.first;
-      const int64_t across = of.x1 - of.x0;
-      if (across * (of.y1 - of.y0) <= 64)
-        for (uint64_t bits = of.tiles; bits; bits &= bits - 1) {
-          const int64_t bit = __builtin_ctzll(bits);
-          f(i, (of.y0 + bit / across) * blend.tiles_x + of.x0 + bit % across, slot++);
-        }
-      else
-        each_tile(of, [&](int64_t tile) { f(i, tile, slot++); });
+// Gaussians in depth order that are listed at a time; each part counts and places its own entries.
+int64_t Stepper::list_part() const { return std::max<int64_t>(1, parts_of(n_visible, 4 * pool.size())); }
+
+// Calls f(row, tile, slot) for the entries of some Gaussians, front to back.
+template <class F> void Stepper::each_entry(int64_t first, int64_t last, F f) const {
+  for (int64_t k = first; k < last; k++) {
+    const int64_t i = int64_t(uint32_t(sorted[k]));
+    const Seen &of = seen[i];
+    const int64_t across = of.x1 - of.x0;
+    int64_t slot = part_slots[size_t(i / ROWS)] + of.first;
+    if (across * (of.y1 - of.y0) > 64) {
+      each_tile(of, [&](int64_t tile) { f(i, tile, slot++); });
+      continue;
     }
-  };
-  pool.share(n_visible, part, [&](int, int64_t first, int64_t last) {
-    int64_t *count = &starts[first / part * n_tiles];
-    each_entry(first, last, [&](int64_t, int64_t tile, int64_t) { count[tile]++; });
-  });
-  int64_t total = 0;
-  n_chunks = 0;
-  for (int64_t tile = 0; tile < n_tiles; tile++) {
-    offsets[tile] = total;
-    first_chunks[tile] = n_chunks;
-    for (int64_t k = 0; k < n_parts; k++) total += std::exchange(starts[k * n_tiles + tile], total);
-    n_chunks += parts_of(total - offsets[tile], CHUNK);
+    for (uint64_t bits = of.tiles; bits; bits &= bits - 1) {
+      const int64_t bit = __builtin_ctzll(bits);
+      f(i, (of.y0 + bit / across) * blend.tiles_x + of.x0 + bit % across, slot++);
+    }
   }
-  offsets[n_tiles] = total;
+}
+
+Work Stepper::count_entries() {
+  int64_t n_slots = 0;
+  for (auto &slot : part_slots) n_slots += std::exchange(slot, n_slots);
+  const int64_t part = list_part(), n_tiles = blend.tiles();
+  starts.assign(size_t(parts_of(n_visible, part) * n_tiles), 0);
+  return {n_visible, part, [=](int, int64_t first, int64_t last) {
+            int64_t *const count = &starts[size_t(first / part * n_tiles)];
+            each_entry(first, last, [&](int64_t, int64_t tile, int64_t) { count[tile]++; });
+          }};
+}
+
+Work Stepper::place_entries() {
+  const int64_t part = list_part(), n_parts = parts_of(n_visible, part), n_tiles = blend.tiles();
+  int64_t total = 0, n_chunks = 0;
+  for (int64_t tile = 0; tile < n_tiles; tile++) {
+    offsets[size_t(tile)] = total;
+    first_chunks[size_t(tile)] = n_chunks;
+    for (int64_t k = 0; k < n_parts; k++) total += std::exchange(starts[size_t(k * n_tiles + tile)], total);
+    n_chunks += parts_of(total - offsets[size_t(tile)], CHUNK);
+  }
+  offsets[size_t(n_tiles)] = total;
   int64_t *const to_ids = ids.get(total);
   int32_t *const to_slots = slots.get(total);
-  pool.share(n_visible, part, [&](int, int64_t first, int64_t last) {
-    int64_t *next = &starts[first / part * n_tiles];
-    each_entry(first, last, [&](int64_t i, int64_t tile, int64_t slot) {
-      to_ids[next[tile]] = i;
-      to_slots[next[tile]++] = int32_t(slot);
-    });
-  });
   blend.ids = to_ids;
   blend.slots = to_slots;
   blend.lights = lights.get(n_chunks * pixels.padded());
   blend.reached = reached.get(n_chunks * pixels.strips);
   blend.rows = rows.get(total * COLUMNS);
+  return {n_visible, part, [=](int, int64_t first, int64_t last) {
+            int64_t *const next = &starts[size_t(first / part * n_tiles)];
+            each_entry(first, last, [&](int64_t i, int64_t tile, int64_t slot) {
+              to_ids[next[tile]] = i;
+              to_slots[next[tile]++] = int32_t(slot);
+            });
+          }};
 }
 
 // ---- blend: the picture, and its difference from the photograph
 
-void Stepper::blend_tiles() {
+Work Stepper::blend_tiles() {
   const auto one_tile = blend_tile_function<float>(blend, pixels);
-  pool.share(blend.tiles(), 2, [&](int thread, int64_t first, int64_t last) {
-    for (int64_t tile = first; tile < last; tile++) {
-      one_tile(blend, pixels, tile, workers[thread]->canvas);
-      differ(tile, blend.alphas);
-    }
-  });
+  return {blend.tiles(), 2, [=](int thread, int64_t first, int64_t last) {
+            for (int64_t tile = first; tile < last; tile++) {
+              one_tile(blend, pixels, tile, workers[size_t(thread)]->canvas);
+              differ(tile);
+            }
+          }};
 }
 
 // Turn a tile of the picture into its difference from the photograph, 0 where the mask leaves a pixel out, and sum up
 // |d|, d^2, and d^2 of the picture clamped to [0, 1].
-void Stepper::differ(int64_t tile, float *alphas) {
+void Stepper::differ(int64_t tile) {
   const StepGiven &g = *given;
+  const float *const alphas = blend.alphas;
   const Place<float> place(blend, tile);
   float absolute[STEP_TILE] = {}, squared[STEP_TILE] = {}, clamped_squared[STEP_TILE] = {};
   for (int channel = 0; channel < 3; channel++) {
@@ -366,8 +419,7 @@ Ssim<float> Stepper::ssim_of(int channel) {
   return of;
 }
 
-void Stepper::compare() {
-  const Ssim<float> ssim[3] = {ssim_of(0), ssim_of(1), ssim_of(2)};
+Work Stepper::compare() {
   const int64_t rows = ssim[0].rows(), margin = ssim[0].margin();
   for (const auto &of : ssim)
     for (int map = 0; map < 3; map++) {
@@ -375,16 +427,16 @@ void Stepper::compare() {
       std::fill(of.partial(map, margin + rows), of.partial(map + 1, 0), 0.0f);
     }
   window_sums.assign(size_t(3 * parts_of(rows, WINDOW_ROWS)), 0.0);
-  pool.share(rows, WINDOW_ROWS, [&](int thread, int64_t first, int64_t last) {
-    for (int channel = 0; channel < 3; channel++)
-      window_sums[size_t(3 * (first / WINDOW_ROWS) + channel)] =
-          compare_rows(ssim[channel], workers[size_t(thread)]->products, first, last);
-  });
+  return {rows, WINDOW_ROWS, [this](int thread, int64_t first, int64_t last) {
+            for (int channel = 0; channel < 3; channel++)
+              window_sums[size_t(3 * (first / WINDOW_ROWS) + channel)] =
+                  compare_rows(ssim[channel], workers[size_t(thread)]->products, first, last);
+          }};
 }
 
-void Stepper::gather() {
-  pool.share(given->height, WINDOW_ROWS,
-             [&](int thread, int64_t first, int64_t last) { gather_rows(*workers[size_t(thread)], first, last); });
+Work Stepper::gather() {
+  return {given->height, WINDOW_ROWS,
+          [this](int thread, int64_t first, int64_t last) { gather_rows(*workers[size_t(thread)], first, last); }};
 }
 
 void Stepper::gather_rows(Worker &own, int64_t first, int64_t last) {
@@ -394,7 +446,7 @@ void Stepper::gather_rows(Worker &own, int64_t first, int64_t last) {
   float *const v_alpha = blend.v_alphas ? v_alphas.get(n_pixels) : nullptr;
   if (v_alpha) std::fill(v_alpha + begin, v_alpha + end, 0.0f);
   for (int channel = 0; channel < 3; channel++) {
-    const Ssim<float> of = ssim_of(channel);
+    const Ssim<float> &of = ssim[channel];
     pop::gather_rows(of, own.blur, first, last);
     const float behind = float(g.background[channel]), *const d = of.difference;
     for (int64_t at = begin; at < end; at++) {
@@ -407,16 +459,16 @@ void Stepper::gather_rows(Worker &own, int64_t first, int64_t last) {
 
 // ---- transpose: back to the entries
 
-void Stepper::transpose_tiles() {
+Work Stepper::transpose_tiles() {
   const auto one_tile = transpose_tile_function<float>(blend, pixels);
-  pool.share(blend.tiles(), 2, [&](int thread, int64_t first, int64_t last) {
-    for (int64_t tile = first; tile < last; tile++) {
-      one_tile(blend, pixels, tile, workers[size_t(thread)]->transpose);
-      // what lies behind the last pixel's stop passes nothing back
-      for (int64_t entry = offsets[tile] + n_reached[tile]; entry < offsets[tile + 1]; entry++)
-        std::fill_n(blend.rows + COLUMNS * blend.slots[entry], COLUMNS, 0.0f);
-    }
-  });
+  return {blend.tiles(), 2, [=](int thread, int64_t first, int64_t last) {
+            for (int64_t tile = first; tile < last; tile++) {
+              one_tile(blend, pixels, tile, workers[size_t(thread)]->transpose);
+              // what lies behind the last pixel's stop passes nothing back
+              for (int64_t entry = offsets[size_t(tile)] + n_reached[size_t(tile)]; entry < offsets[size_t(tile) + 1]; entry++)
+                std::fill_n(blend.rows + COLUMNS * blend.slots[entry], COLUMNS, 0.0f);
+            }
+          }};
 }
 
 // ---- update: per Gaussian back to raw parameters, the POP term, statistics, Adam
@@ -439,16 +491,17 @@ void Stepper::count_sides() {
   }
 }
 
-void Stepper::update() {
-  count_sides();
+Work Stepper::update() {
   pop_sums.assign(size_t(2 * parts_of(given->n, ROWS)), 0.0);
+  Work work = {given->n, ROWS, {}};
   with_degree(given->degree, [&](auto degree) {
-    pool.share(given->n, ROWS, [&](int thread, int64_t first, int64_t last) {
-      Worker &own = *workers[size_t(thread)];
+    work.f = [this](int thread, int64_t first, int64_t last) {
+      double *const pop_sum = &pop_sums[size_t(2 * (first / ROWS))];
       for (int64_t block = first; block < last; block += ROW_BLOCK)
-        update_block<degree()>(own, block, std::min(last, block + ROW_BLOCK), &pop_sums[size_t(2 * (first / ROWS))]);
-    });
+        update_block<decltype(degree)::value>(*workers[size_t(thread)], block, std::min(last, block + ROW_BLOCK), pop_sum);
+    };
   });
+  return work;
 }
 
 // Parameter by parameter, ROW_BLOCK rows each.
@@ -576,13 +629,12 @@ void *pop_stepper_open(int64_t threads) {
 
 void pop_stepper_close(void *stepper) { delete static_cast<pop::Stepper *>(stepper); }
 
-// whether it ran to its end
-int pop_stepper_step(void *stepper, const pop::StepGiven *given) {
+// how many steps were taken: fewer where a row is not finite; -1 where there is no memory
+int64_t pop_stepper_steps(void *stepper, const pop::StepGiven *first, int64_t n) {
   try {
-    static_cast<pop::Stepper *>(stepper)->step(*given);
-    return 1;
+    return static_cast<pop::Stepper *>(stepper)->steps(first, n);
   } catch (...) {
-    return 0;
+    return -1;
   }
 }
 

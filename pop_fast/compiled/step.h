@@ -1,6 +1,6 @@
 // One step of training: what it is given, and what it keeps from one step to the next.
 //
-// The step in order, every line shared out to the threads (`step.cpp`):
+// The step in order, every line shared out to the threads (`step.cpp`), `list` in two goes:
 //     see         a Gaussian's splat, colour, and the tiles it reaches
 //     list        depth order; each tile's list, front to back
 //     blend       the picture tile by tile, who dominates it, its difference from the photograph
@@ -106,10 +106,12 @@ private:
   int64_t size = 0;
 };
 
-class Stepper {
+class Stepper : public Plan {
 public:
   explicit Stepper(int64_t threads) : pool(threads), pixels(STEP_TILE) {}
-  void step(const StepGiven &given);
+  // Take n steps, fewer where a row is found that is not finite, and return how many.
+  int64_t steps(const StepGiven *first, int64_t n);
+  bool next(Work &work) override;
   int64_t bytes() const;
 
 private:
@@ -134,33 +136,41 @@ private:
   std::vector<double> tile_sums, window_sums, pop_sums;
 
   // of the step that is taken
-  const StepGiven *given = nullptr;
+  const StepGiven *given = nullptr, *last_given = nullptr;
+  int stage = 0;
+  std::chrono::steady_clock::time_point stage_began;
   Camera<float> camera;
   Profile<float> profile;
   ProjectOptions<float> options;
   AdamStep<float> adam_steps[GROUPS];
   Blend<float> blend;
-  int64_t n_visible = 0, n_slots = 0, n_chunks = 0, n_important = 0, n_others = 0;
+  Ssim<float> ssim[3];
+  int64_t n_visible = 0, n_important = 0, n_others = 0;
 
+  void book_time();
   void begin();
-  template <class F> void timed(StepPart part, F f);
-  void see();
+  void make_workers();
+  Work see();
   template <int DEGREE> void see_rows(int64_t first, int64_t last);
   template <int DEGREE> bool see_row(int64_t i, Seen &to);
   void reach_tiles(Seen &of) const;
   template <class F> void each_tile(const Seen &of, F f) const;
-  void list();
+  bool all_finite() const;
   void sort_by_depth();
-  void blend_tiles();
-  void differ(int64_t tile, float *alphas);
+  int64_t list_part() const;
+  template <class F> void each_entry(int64_t first, int64_t last, F f) const;
+  Work count_entries();
+  Work place_entries();
+  Work blend_tiles();
+  void differ(int64_t tile);
   Ssim<float> ssim_of(int channel);
-  void compare();
-  void gather();
+  Work compare();
+  Work gather();
   void gather_rows(Worker &own, int64_t first, int64_t last);
-  void transpose_tiles();
+  Work transpose_tiles();
   void count_sides();
   int side_of(int64_t i) const;
-  void update();
+  Work update();
   float *gradients_of(Worker &own, StepGroup group) const;
   template <int DEGREE> void update_block(Worker &own, int64_t first, int64_t last, double *pop_sum);
   template <int DEGREE> void gradient_of_row(int64_t i, int64_t row, Worker &own);
