@@ -39,7 +39,7 @@ from pop_fast.compositing import Composite, composite
 from pop_fast.data import Capture, load_capture
 from pop_fast.rasterization import rasterization
 from pop_fast.tiles import TileLists, tile_lists
-from pop_fast.train import TrainConfig, Trainer
+from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.environment import keep_freed_memory, reproducible
 from pop_ref.render import render, render_vjp
 from pop_ref.types import Camera, Gaussians
@@ -173,7 +173,7 @@ def time_capture(path: str, factor: int, repeats: int) -> dict[str, Any]:
     return {"capture": capture.name, "width": view.width, "height": view.height, **steps}
 
 
-def trainer_of(case: Case, folder: str, backend: str = "fast") -> Trainer:
+def trainer_of(case: Case, folder: str, backend: str = "fast") -> TrainingRun:
     """Return a trainer whose Gaussians are a case's, of which some are opaque and their sizes differ."""
     scene, trainer = gaussians_of(case), _trainer(capture_of(case), folder, backend)
     with torch.no_grad():
@@ -182,13 +182,13 @@ def trainer_of(case: Case, folder: str, backend: str = "fast") -> Trainer:
     return trainer
 
 
-def _trainer(capture: Capture, folder: str, backend: Any) -> Trainer:
+def _trainer(capture: Capture, folder: str, backend: Any) -> TrainingRun:
     at = str(Path(folder) / "run")
     config = TrainConfig(result_dir=at, sh_interval=1, log_every=10**9, progress=False, backend=backend)
-    return Trainer(config, capture)
+    return TrainingRun(config, capture)
 
 
-def _time_steps(trainers: dict[str, Trainer], capture: Capture, repeats: int) -> dict[str, Any]:
+def _time_steps(trainers: dict[str, TrainingRun], capture: Capture, repeats: int) -> dict[str, Any]:
     with reproducible(torch.get_num_threads()):
         # what SSIM needs of a photograph is made at its first visit, so every photograph is visited once before
         steps = {name: trainer.train_step for name, trainer in trainers.items()}

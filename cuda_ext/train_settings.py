@@ -1,4 +1,4 @@
-"""What a fused training step depends on, and what it tells density control."""
+"""What a training step that runs as a whole depends on, and what it reports: to records and to density control."""
 
 from __future__ import annotations
 
@@ -92,20 +92,24 @@ class Phase(NamedTuple):
     window: bool = False
 
     @property
-    def tells(self) -> bool:
+    def dominance(self) -> bool:
         """Whether dominant Gaussians are asked for."""
         return self.pop or self.blur or self.window
 
 
-class StepValues(NamedTuple):
-    """What a step tells, in the kernels' order (csrc/train.h).
+class StepStats(NamedTuple):
+    """Measurements of one step, the first five in the kernels' order (csrc/train.h).
+
+    An engine need not measure all of them at every step; NaN stands for what it has not measured.
 
     Attributes:
         pixelwise: mean of the L1 or L2 term, without its weight.
         ssim: SSIM.
         objective: the photometric objective.
         square: mean square of the difference, the render clamped to [0, 1].
-        pop: the weighted POP term, 0 where it is off.
+        pop: the weighted regularizer of the strategy, as the POP term is, 0 where it is off.
+        n_blended: Gaussians that a pixel blends, on average.
+        n_traversed: entries of its tile's list that a pixel visits, on average.
     """
 
     pixelwise: float
@@ -113,6 +117,8 @@ class StepValues(NamedTuple):
     objective: float
     square: float
     pop: float
+    n_blended: float = math.nan
+    n_traversed: float = math.nan
 
 
 @dataclass

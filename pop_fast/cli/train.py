@@ -22,11 +22,12 @@ from pop_fast.data import Capture, load_capture
 from pop_fast.errors import PopError
 from pop_fast.report import write_report
 from pop_fast.train.checkpoint import list_checkpoints
-from pop_fast.train.choose import choose_backend, make_trainer
+from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.device_plan import unsupported
 from pop_fast.train.environment import keep_freed_memory
+from pop_fast.train.fused_stepper import unsupported
 from pop_fast.train.results import ResultFolder
+from pop_fast.train.training_run import TrainingRun
 
 _EXAMPLES: Final = """
     pop train scene                          POP, the paper's 30,000 steps, results in out/scene_pop
@@ -99,15 +100,15 @@ def run(argv: Sequence[str]) -> int:
     how = {"resume": options.resume, "overwrite": options.overwrite, "loading_seconds": loading}
     beside = {RECORD: record_text(_record(capture, options))}
     # absolute, so that the result can be looked at from another folder too
-    trainer = make_trainer(replace(config, data=str(Path(config.data).absolute())), capture, beside=beside, **how)
+    training = TrainingRun(replace(config, data=str(Path(config.data).absolute())), capture, beside=beside, **how)
     if options.resume:
         print(_resumption(folder))
     try:
-        stats = trainer.run()
+        stats = training.run()
     except KeyboardInterrupt:
-        stopped = f"stopped after step {trainer.step}; the same command with --resume goes on"
+        stopped = f"stopped after step {training.step}; the same command with --resume goes on"
         nothing = "stopped before the first step; nothing was written"
-        print(f"pop: {stopped if trainer.step else nothing}", file=sys.stderr)
+        print(f"pop: {stopped if training.step else nothing}", file=sys.stderr)
         return EXIT_INTERRUPTED
     report = write_report(folder)
     print(summary(stats))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pop_fast.strategies.adc import ADCStrategy
-from pop_fast.strategies.base import Strategy
+from pop_fast.strategies.base import StepEvent, Strategy
 from pop_fast.strategies.pop import POPStrategy
 
-__all__ = ["ADCStrategy", "POPStrategy", "Strategy"]
+__all__ = ["ADCStrategy", "POPStrategy", "StepEvent", "Strategy"]

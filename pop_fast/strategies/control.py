@@ -13,9 +13,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from pop_fast.density import Statistics, grow_masks, prune_mask
+from pop_fast.density import SPLIT_CHILDREN, Statistics, grow_masks, prune_mask
 from pop_fast.strategies import ops
-from pop_fast.strategies.base import Info, Optimizers, Params, State, check_layout
+from pop_fast.strategies.base import Info, Normals, Optimizers, Params, State, StepEvent, check_layout
 
 _NEEDED = ("means", "scales", "quats", "opacities")
 _STEPS = ("prune_too_big_after", "refine_start_iter", "refine_stop_iter", "reset_every", "pause_refine_after_reset")
@@ -93,7 +93,6 @@ class DensityControl:
             "views": 0,
             "scene_scale": float(scene_scale),
             "generator": generator,
-            "event": None,
         }
 
     def scaled(self, factor: float) -> Any:
@@ -124,43 +123,89 @@ class DensityControl:
         due = self.reset_every > 0 and step % self.reset_every == 0 and step < self.refine_stop_iter
         return due and (step > 0 or self.reset_at_zero)
 
+    def changes_after(self, step: int) -> bool:
+        """Tell whether the population is edited after this step."""
+        return self.is_refine_step(step) or self.is_reset_step(step)
+
+    def collects(self, step: int) -> bool:
+        """Tell whether screen gradients are collected at this step."""
+        return step < self.refine_stop_iter
+
+    def collects_blur(self, step: int) -> bool:
+        """Tell whether the blur flags of the window are collected at this step: there is no blur rule."""
+        return False
+
+    def collects_window(self, step: int) -> bool:
+        """Tell whether the dominated pixels of the window are summed for a regularizer: there is none."""
+        return False
+
+    def regularizes(self, step: int) -> bool:
+        """Tell whether `regularizer` adds a term to the loss at this step."""
+        return False
+
     def step_pre_backward(self, params: Params, optimizers: Optimizers, state: State, step: int, info: Info) -> None:
         """Ask autograd to keep the gradient of the screen centres."""
         if self.key_for_gradient not in info:
             raise ValueError(f"info has no {self.key_for_gradient!r}; pass the dict that rasterization() returns last")
-        if step < self.refine_stop_iter:
+        if self.collects(step):
             info[self.key_for_gradient].retain_grad()
 
     @torch.no_grad()
     def step_post_backward(
         self, params: Params, optimizers: Optimizers, state: State, step: int, info: Info, packed: bool = False
-    ) -> None:
+    ) -> StepEvent | None:
         """Collect statistics; at a refine step grow, prune and start a new window; at a reset step reset.
 
-        What happened is left in `state["event"]`: a dict that counts Gaussians cloned, split and pruned, or None.
+        Returns:
+            What happened to the population, or None where this is no step at which it changes.
         """
-        state["event"] = None
-        if step >= self.refine_stop_iter:
-            return
-        self._collect(params, state, step, info, packed)
-        self.change(params, optimizers, state, step)
+        self.collect(params, state, step, info, packed)
+        return self.change(params, optimizers, state, step)
 
     @torch.no_grad()
-    def change(self, params: Params, optimizers: Optimizers, state: State, step: int) -> None:
-        """Do what is due after a step whose statistics are collected; for trainers that collect them themselves.
+    def collect(self, params: Params, state: State, step: int, info: Info, packed: bool = False) -> None:
+        """Add what a view has shown to the window's statistics, which lie in `state`; none from `refine_stop_iter` on.
 
-        What happened is left in `state["event"]`, as by `step_post_backward`.
+        Args:
+            params: raw parameters, after the optimizers' step.
+            state: the strategy's state.
+            step: counts from 0.
+            info: what `rasterization()` returned last, after the backward pass.
+            packed: whether its rows are those of visible Gaussians alone.
         """
-        state["event"] = None
+        if self.collects(step):
+            self._collect(params, state, step, info, packed)
+
+    @torch.no_grad()
+    def change(
+        self, params: Params, optimizers: Optimizers, state: State, step: int, normals: Normals | None = None
+    ) -> StepEvent | None:
+        """Do what is due after a step whose statistics are collected.
+
+        Args:
+            params: raw parameters, replaced under their keys.
+            optimizers: one per key.
+            state: the strategy's state.
+            step: counts from 0.
+            normals: draws that place the children of a split; None takes them from the state's generator.
+
+        Returns:
+            What happened, or None where nothing is due.
+        """
+        if not self.changes_after(step):
+            return None
+        event = StepEvent()
         if self.is_refine_step(step):
-            state["event"] = self._grow(params, optimizers, state, step)
-            state["event"]["pruned"] = self._prune(params, optimizers, state, step)
+            draws = normals or (lambda n: standard_normals(state["generator"], n))
+            cloned, split = self._grow(params, optimizers, state, step, draws)
+            event = StepEvent(cloned, split, self._prune(params, optimizers, state, step))
             self._clear(state)
             if self.verbose:
-                print(f"step {step}: {state['event']}, {len(params['means'])} Gaussians")
+                print(f"step {step}: {event}, {len(params['means'])} Gaussians")
         if self.is_reset_step(step):
             ops.reset_opacities(params, optimizers, ceiling=self.reset_opa)
-            state["event"] = {**(state["event"] or {"cloned": 0, "split": 0, "pruned": 0}), "reset": True}
+            event = replace(event, reset=True)
+        return event
 
     def _more_steps(self) -> tuple[str, ...]:
         return ()
@@ -188,7 +233,9 @@ class DensityControl:
             state["grad2d"].add_(norms.masked_fill_(~visible, 0.0).sum(0))
             state["count"].add_(visible.sum(0))
 
-    def _grow(self, params: Params, optimizers: Optimizers, state: State, step: int) -> dict[str, Any]:
+    def _grow(
+        self, params: Params, optimizers: Optimizers, state: State, step: int, normals: Normals
+    ) -> tuple[int, int]:
         clones, splits = self._grow_masks(params, state, step)
         n_clones, n_splits = int(clones.sum()), int(splits.sum())
         if n_clones:
@@ -196,8 +243,8 @@ class DensityControl:
         if n_splits:
             # a clone of this event is never split in it
             padded = torch.cat([splits, splits.new_zeros(n_clones)])
-            ops.split(params, optimizers, state, padded, state["generator"], self.revised_opacity)
-        return {"cloned": n_clones, "split": n_splits}
+            ops.split(params, optimizers, state, padded, normals(n_splits), self.revised_opacity)
+        return n_clones, n_splits
 
     def _grow_masks(self, params: Params, state: State, step: int) -> tuple[Tensor, Tensor]:
         blurred = state.get("blurred")
@@ -226,6 +273,15 @@ class DensityControl:
         state["grad2d"].zero_()
         state["count"].zero_()
         state["views"] = 0
+
+
+def standard_normals(generator: torch.Generator, n: int) -> Tensor:
+    """Draw what places the children of n split parents: float32 on the CPU, whatever trains and in what precision.
+
+    Returns:
+        Standard normal draws. [2, n, 3]
+    """
+    return torch.randn((SPLIT_CHILDREN, n, 3), generator=generator, dtype=torch.float32)
 
 
 def visible_from_radii(radii: Tensor) -> Tensor:

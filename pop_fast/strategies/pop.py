@@ -81,8 +81,23 @@ class POPStrategy(DensityControl):
 
     def needs_dominance(self, step: int) -> bool:
         """Tell whether `info["dominant_counts"]` is read at this step: by the POP loss, the blur rule or a window."""
-        blur = step < self.refine_stop_iter and (step <= self.blur_stop_iter or self.pop_views == "window")
-        return self._pop_is_on(step) or blur
+        return self.regularizes(step) or self.collects_blur(step) or self.collects_window(step)
+
+    def theta_in(self, width: int, height: int) -> float:
+        """Return the share of a view's pixels over which a dominant Gaussian counts as blur."""
+        return max(self.theta_blur, self.blur_min_pixels / (height * width))
+
+    def collects_blur(self, step: int) -> bool:
+        """Tell whether the blur flags of the window are collected at this step."""
+        return self.collects(step) and step <= self.blur_stop_iter
+
+    def collects_window(self, step: int) -> bool:
+        """Tell whether the dominated pixels of the window are summed for the POP loss at this step."""
+        return self.collects(step) and self.pop_views == "window"
+
+    def regularizes(self, step: int) -> bool:
+        """Tell whether the POP loss is on at this step."""
+        return self.lambda_pop != 0.0 and self.pop_start_iter <= step < self.pop_stop_iter
 
     def regularizer(self, opacities: Tensor, state: State, step: int, info: Info) -> Tensor | None:
         """Return `lambda_pop * L_pop` of this view, or None when the term is off.
@@ -93,16 +108,13 @@ class POPStrategy(DensityControl):
             step: counts from 0.
             info: what `rasterization()` returned last; its `dominant_counts` decide who is important.
         """
-        if not self._pop_is_on(step):
+        if not self.regularizes(step):
             return None
         mask = importance_mask(dominant_counts(info).sum(0))
         if self.pop_views == "window" and state["dominant_sum"] is not None:
             mask = mask | importance_mask(state["dominant_sum"])
         visible = self._visible(info, len(mask)) if self.pop_over == "visible" else None
         return self.lambda_pop * pop_loss(opacities.reshape(-1), mask, visible=visible)
-
-    def _pop_is_on(self, step: int) -> bool:
-        return self.lambda_pop != 0.0 and self.pop_start_iter <= step < self.pop_stop_iter
 
     def _visible(self, info: Info, n: int) -> Tensor:
         if info.get("gaussian_ids") is None:
@@ -125,7 +137,7 @@ class POPStrategy(DensityControl):
 
     def _collect_blur(self, state: State, info: Info) -> None:
         height, width = int(info["height"]), int(info["width"])
-        theta = max(self.theta_blur, self.blur_min_pixels / (height * width))
+        theta = self.theta_in(width, height)
         if self.blur_window == "sum":
             state["blurred"] = blur_set(state["dominant_sum"], width, height, theta)
             return

@@ -16,9 +16,14 @@ from pop_fast.train.config import LearningRates
 KEYS: Final = ("means", "scales", "quats", "opacities", "sh0", "shN")
 
 
-def make_optimizers(params: Mapping[str, Parameter], lr: LearningRates, scene_scale: float) -> dict[str, Adam]:
-    """Make one dense Adam a parameter (betas 0.9 and 0.999, eps 1e-15), the means' rate in units of the scene."""
-    rates = {
+def learning_rates(lr: LearningRates, scene_scale: float) -> dict[str, float]:
+    """Return the learning rate of each parameter, the means' at step 0 and in world units.
+
+    Args:
+        lr: the settings.
+        scene_scale: the unit of the means' rate, world units.
+    """
+    return {
         "means": lr.means * scene_scale,
         "scales": lr.scales,
         "quats": lr.quats,
@@ -26,7 +31,22 @@ def make_optimizers(params: Mapping[str, Parameter], lr: LearningRates, scene_sc
         "sh0": lr.sh0,
         "shN": lr.sh_rest,
     }
-    return {key: Adam([params[key]], lr=rates[key], betas=(0.9, 0.999), eps=1e-15, fused=True) for key in KEYS}
+
+
+def make_optimizers(params: Mapping[str, Parameter], lr: LearningRates, scene_scale: float) -> dict[str, Adam]:
+    """Make one dense Adam a parameter (betas 0.9 and 0.999, eps 1e-15), moments zero, the counter of steps on the CPU.
+
+    Args:
+        params: by `KEYS`.
+        lr: the settings.
+        scene_scale: the unit of the means' learning rate, world units.
+    """
+    rates = learning_rates(lr, scene_scale)
+    made = {key: Adam([params[key]], lr=rates[key], betas=(0.9, 0.999), eps=1e-15, fused=True) for key in KEYS}
+    for key, optimizer in made.items():
+        moments = {name: torch.zeros_like(params[key].detach()) for name in ("exp_avg", "exp_avg_sq")}
+        optimizer.state[params[key]] = {"step": torch.zeros((), dtype=torch.float32), **moments}
+    return made
 
 
 def advance_idle(optimizer: Adam, param: Tensor) -> None:
@@ -35,12 +55,7 @@ def advance_idle(optimizer: Adam, param: Tensor) -> None:
     With g = m = v = 0 the update is `lr * 0 / (0 + eps) = 0` and m and v stay 0; the counter has to go on because the
     bias corrections `1 - beta^step` read it.
     """
-    state = optimizer.state[param]
-    if not state:
-        state["step"] = torch.zeros((), dtype=torch.float32)
-        state["exp_avg"] = torch.zeros_like(param)
-        state["exp_avg_sq"] = torch.zeros_like(param)
-    state["step"] += 1
+    optimizer.state[param]["step"] += 1
 
 
 def first_non_finite(tensors: Mapping[str, Tensor]) -> tuple[str, list[int], float] | None:

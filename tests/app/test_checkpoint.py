@@ -11,7 +11,7 @@ import torch
 
 from pop_fast.data.capture import Capture
 from pop_fast.errors import PopError
-from pop_fast.train import Trainer
+from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from tests.app.children import in_a_child
 from tests.app.tiny import tiny_capture, tiny_config
@@ -21,7 +21,7 @@ from tests.app.tiny import tiny_capture, tiny_config
 def stopped(tmp_path_factory):
     """A run of thirty steps, of which the checkpoint after the tenth is the last that is left."""
     folder = tmp_path_factory.mktemp("stopped")
-    trainer = Trainer(tiny_config(folder), tiny_capture())
+    trainer = TrainingRun(tiny_config(folder), tiny_capture())
     trainer._milestones = _stop_after(trainer, 10)
     with pytest.raises(KeyboardInterrupt):
         trainer.run()
@@ -41,7 +41,7 @@ def _stop_after(trainer, taken):
 
 def resume(folder, capture=None, **changes):
     config = replace(tiny_config(folder), **changes)
-    Trainer(config, capture or tiny_capture(), resume=True).run()
+    TrainingRun(config, capture or tiny_capture(), resume=True).run()
 
 
 @pytest.mark.parametrize(

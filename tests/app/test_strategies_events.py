@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pop_fast.strategies import ADCStrategy, POPStrategy
+from pop_fast.strategies import ADCStrategy, POPStrategy, StepEvent
 from pop_ref import density as oracle
 from pop_ref.density_rows import Rows as OracleRows
 from tests.app.populations import HEIGHT, KEYS, WIDTH, make, make_info, moments, packed, run_event
@@ -22,8 +22,9 @@ def test_small_gaussians_are_cloned_with_their_bits_and_large_ones_split_in_two(
     before = {key: value.detach().clone() for key, value in params.items()}
     first, second, steps = (x.clone() for x in moments(optimizers, params, "means"))
     grads = torch.tensor([[0.0, 0], [1.0, 0], [1.0, 0], [0.0, 0]])
-    state = run_event(POPStrategy(), params, optimizers, make_info(4, grads), step=600)
-    assert state["event"] == {"cloned": 1, "split": 1, "pruned": 0}
+    event = run_event(POPStrategy(), params, optimizers, make_info(4, grads), step=600)
+    assert event == StepEvent(cloned=1, split=1, pruned=0)
+    assert event.record() == {"cloned": 1, "split": 1, "pruned": 0}
     # survivors 0, 1, 3; the clone of 1; two children of 2
     assert len(params["means"]) == 6
     for key in KEYS:
@@ -111,9 +112,11 @@ def test_the_gradient_is_measured_in_half_images_and_averaged_over_visible_views
         if step < 3:
             grads[0] = 0.0
         info = make_info(2, grads, visible)
-        strategy.step_post_backward(params, optimizers, state, step, info)
+        event = strategy.step_post_backward(params, optimizers, state, step, info)
+        assert (event is None) == (step < 3)
     # 0 was seen three times and moved once; 1 was seen once and moved
-    assert state["event"]["cloned"] == 1
+    assert event is not None
+    assert event.cloned == 1
     assert torch.equal(params["means"][2], params["means"][1])
     assert not state["grad2d"].any()
     assert not state["count"].any()
@@ -150,12 +153,12 @@ def test_packed_and_unpacked_infos_give_the_same_bits(strategy):
             counts = torch.randint(0, 2, (2, 20), generator=g) * visible
             info = make_info(20, grads, visible, counts, cameras=2)
             info["radii"] = torch.randint(1, 9, (2, 20, 2), generator=g).int() * visible[..., None].int()
-            strategy.step_post_backward(
+            event = strategy.step_post_backward(
                 params, optimizers, state, step, packed(info) if is_packed else info, packed=is_packed
             )
-        results.append((params, state["event"]))
+        results.append((params, event))
     assert results[0][1] == results[1][1]
-    assert results[0][1]["cloned"] > 0
+    assert results[0][1].cloned > 0
     for key in KEYS:
         assert torch.equal(results[0][0][key], results[1][0][key])
 

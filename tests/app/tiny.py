@@ -15,8 +15,8 @@ import numpy as np
 
 from pop_fast.data.capture import Capture, View
 from pop_fast.strategies import ADCStrategy, POPStrategy
-from pop_fast.train import LearningRates, TrainConfig, Trainer
-from pop_fast.train.trainer import Step
+from pop_fast.train import LearningRates, TrainConfig, TrainingRun
+from pop_fast.train.records import Stretch
 
 WIDTH, HEIGHT = 32, 24
 N_POINTS = 60
@@ -59,6 +59,7 @@ def tiny_config(folder: Path | str, **changes: Any) -> TrainConfig:
         result_dir=str(folder),
         max_steps=30,
         seed=7,
+        backend="fast",
         test_every=5,
         sh_interval=6,
         pop=POPStrategy(**steps, **grow, blur_start_iter=8, blur_stop_iter=16, theta_blur=0.02, pop_stop_iter=24),
@@ -76,14 +77,14 @@ def tiny_config(folder: Path | str, **changes: Any) -> TrainConfig:
     return replace(base, **changes)
 
 
-class SlowTrainer(Trainer):
+class SlowRun(TrainingRun):
     """Leaves time to be stopped in."""
 
-    def train_step(self) -> Step:
-        """Take one step, and a breath."""
+    def take_steps(self, last: int) -> Stretch:
+        """Take a step, and a breath."""
         time.sleep(0.02)
-        return super().train_step()
+        return super().take_steps(last)
 
 
 if __name__ == "__main__":
-    SlowTrainer(tiny_config(sys.argv[1]), tiny_capture(), resume=sys.argv[2:] == ["resume"]).run()
+    SlowRun(tiny_config(sys.argv[1]), tiny_capture(), resume=sys.argv[2:] == ["resume"]).run()

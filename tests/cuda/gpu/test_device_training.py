@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from pop_fast.train.device_trainer import DeviceTrainer
 
 from pop_fast.strategies import ADCStrategy, POPStrategy
-from pop_fast.train import Trainer
+from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from pop_fast.train.device_trainer import DeviceTrainer
 from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config
 
 COMPARED = ("loss", "pop", "psnr", "d_ssim", "l1", "l2", "lr_means", "num_gaussians")
@@ -61,7 +61,7 @@ def test_steps_are_the_cpus_under_every_setting(hardware, case, tmp_path):
     settings = {"max_steps": 8, "log_every": 1, "checkpoint_every": 0, **changes, "pop": pop}
     capture = edit(tiny_capture())
     rates = replace(tiny_config("x").lr, quats=0.0)
-    expected = Trainer(tiny_config(tmp_path / "cpu", lr=rates, **settings), capture).run()
+    expected = TrainingRun(tiny_config(tmp_path / "cpu", lr=rates, **settings), capture).run()
     on_gpu = tiny_config(tmp_path / "gpu", lr=rates, **settings)
     found = DeviceTrainer(on_gpu, capture, hardware=hardware).run()
     for ours, theirs in zip(records(tmp_path / "gpu"), records(tmp_path / "cpu"), strict=True):
@@ -74,7 +74,7 @@ def test_steps_are_the_cpus_under_every_setting(hardware, case, tmp_path):
 
 @pytest.mark.parametrize("method", ["pop", "adc"])
 def test_events_come_when_the_cpus_come_and_change_about_as_many(hardware, method, tmp_path):
-    Trainer(tiny_config(tmp_path / "cpu", method=method), tiny_capture()).run()
+    TrainingRun(tiny_config(tmp_path / "cpu", method=method), tiny_capture()).run()
     DeviceTrainer(tiny_config(tmp_path / "gpu", method=method), tiny_capture(), hardware=hardware).run()
     ours, theirs = ([r for r in records(tmp_path / name) if "cloned" in r] for name in ("gpu", "cpu"))
     assert [event["step"] for event in ours] == [event["step"] for event in theirs]
