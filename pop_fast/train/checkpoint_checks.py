@@ -131,7 +131,8 @@ def _strategy(packed: Any, n: int, taken: int) -> dict[str, Any]:
                 _check_not_negative(checked[key], f"strategy.{key}")
     for key in found.keys() - _ROWS.keys() - {"generator", "views", "scene_scale"}:
         # of a strategy of other people
-        checked[key] = _plain(found[key], f"strategy.{shown(key).strip("'")}")
+        name = shown(key).strip("'")
+        checked[key] = _plain(found[key], f"strategy.{name}")
     if (found.get("grad2d") is None) != (found.get("count") is None):
         raise ValueError("strategy.grad2d and strategy.count must both be tensors or both be None")
     return checked
