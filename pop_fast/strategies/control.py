@@ -13,7 +13,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from pop_fast.density import Statistics, grow_masks, prune_mask
+from pop_fast.density import SPLIT_CHILDREN, Statistics, grow_masks, prune_mask
 from pop_fast.strategies import ops
 from pop_fast.strategies.base import Info, Optimizers, Params, State, check_layout
 
@@ -162,6 +162,18 @@ class DensityControl:
             ops.reset_opacities(params, optimizers, ceiling=self.reset_opa)
             state["event"] = {**(state["event"] or {"cloned": 0, "split": 0, "pruned": 0}), "reset": True}
 
+    def draws(self, state: State, n: int, like: Tensor) -> Tensor:
+        """Return standard normal draws for the children of `n` split Gaussians, from the state's generator. [2, n, 3]
+
+        Args:
+            state: the strategy's state.
+            n: how many are split.
+            like: a tensor of the type and on the device that the draws are for.
+        """
+        generator = state["generator"]
+        shape = (SPLIT_CHILDREN, n, 3)
+        return torch.randn(shape, generator=generator, dtype=like.dtype, device=generator.device).to(like.device)
+
     def _more_steps(self) -> tuple[str, ...]:
         return ()
 
@@ -196,7 +208,8 @@ class DensityControl:
         if n_splits:
             # a clone of this event is never split in it
             padded = torch.cat([splits, splits.new_zeros(n_clones)])
-            ops.split(params, optimizers, state, padded, state["generator"], self.revised_opacity)
+            normals = self.draws(state, n_splits, params["means"])
+            ops.split(params, optimizers, state, padded, normals, self.revised_opacity)
         return {"cloned": n_clones, "split": n_splits}
 
     def _grow_masks(self, params: Params, state: State, step: int) -> tuple[Tensor, Tensor]:

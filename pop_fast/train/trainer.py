@@ -14,9 +14,9 @@ from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.evaluate import gaussians_per_pixel
 from pop_fast.train.metrics import psnr
-from pop_fast.train.model import advance_idle
+from pop_fast.train.model import adam_step
 from pop_fast.train.objective import Objective
-from pop_fast.train.schedule import active_sh_degree, means_lr
+from pop_fast.train.schedule import active_sh_degree
 from pop_fast.train.training_run import TrainingRun
 from pop_fast.train.views import Rendered, ViewTensors, render_view
 
@@ -64,7 +64,7 @@ class Trainer(TrainingRun):
         if not math.isfinite(value):
             self._require_finite()
             raise PopError(f"the loss of view {view.name} is {value} at step {step}; {self._what_is_left}")
-        self._adam(step, degree)
+        adam_step(self.params, self.optimizers, config.lr, self._scene_scale, step, config.max_steps, degree)
         self.strategy.step_post_backward(self.params, self.optimizers, self.state, step, rendered.info)
         self.step += 1
         regularizer = None if term is None else term.item()
@@ -77,16 +77,6 @@ class Trainer(TrainingRun):
         except ValueError:
             self._require_finite()
             raise
-
-    def _adam(self, step: int, degree: int) -> None:
-        lr, group = self.config.lr, self.optimizers["means"].param_groups[0]
-        group["lr"] = means_lr(step, self.config.max_steps, lr.means * self._scene_scale, lr.means_decay)
-        for key, optimizer in self.optimizers.items():
-            if key == "shN" and degree == 0:
-                advance_idle(optimizer, self.params[key])
-            else:
-                optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
 
     def _advance(self, bar: tqdm) -> None:
         # a method of its own, so that this step's render is let go of before the next one is made
