@@ -37,7 +37,6 @@ from timing import turns_ms
 from pop_fast.backends import backend_names, get_backend
 from pop_fast.compositing import Composite, composite
 from pop_fast.data import Capture, load_capture
-from pop_fast.rasterization import rasterization
 from pop_fast.tiles import TileLists, tile_lists
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.environment import keep_freed_memory, reproducible
@@ -119,7 +118,9 @@ def blend_of(case: Case, tile: int, backend: str = "fast") -> tuple[TileLists, l
     """Return a case's tile lists, its splats, and what blends them, differentiably, and nothing else."""
     scene, size = gaussians_of(case), (case.width, case.height)
     with torch.no_grad():
-        _, _, meta = rasterization(**scene, width=size[0], height=size[1], sh_degree=3, packed=False)
+        _, _, meta = get_backend("fast").rasterization(
+            **scene, width=size[0], height=size[1], sh_degree=3, packed=False
+        )
     names = ("means2d", "conics", "opacities")
     splats = [meta[name][0].detach().clone().requires_grad_() for name in names]
     colors = torch.rand(case.n, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()

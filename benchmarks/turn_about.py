@@ -82,12 +82,12 @@ class Checkout:
         """Return what times a training step of a case, and what renders its first view."""
         with self.imports():
             trainer = self.run.trainer_of(self._case(name), folder, backend)
-            first = trainer.train_step().rendered.image.detach()
+            first, take = self.run.first_image(trainer), self.run.stepping(trainer)
 
         def once() -> Times:
             with self.imports():
                 start = time.perf_counter()
-                trainer.train_step()
+                take()
                 return (time.perf_counter() - start,)
 
         return once, lambda: first

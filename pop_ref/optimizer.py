@@ -14,7 +14,7 @@ Label decided here: A21 (no learning rate changes with the L2 loss).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -85,6 +85,43 @@ def adam_step(
         denominator = np.sqrt(new_v[name]) / np.sqrt(1.0 - beta2**step) + eps
         new_params[name] = params[name] - lr[name] / (1.0 - beta1**step) * new_m[name] / denominator
     return new_params, new_m, new_v
+
+
+def adam_steps(
+    params: Mapping[str, np.ndarray],
+    grads: Sequence[Mapping[str, np.ndarray]],
+    lr: Mapping[str, float],
+    betas: tuple[float, float] = BETAS,
+    eps: float = EPS,
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Take the updates 1, 2, ... from zero moments.
+
+    A parameter that an update has no gradient of waits, as the harmonics do while degree 0 is drawn. The counter goes
+    on all the same: t is the number of the update, not of the gradients that the parameter has had.
+
+    Source: Kingma and Ba 2015, algorithm 1.
+    Departs: nothing; a parameter that waits before its first gradient is one whose gradients so far were 0.
+
+    Args:
+        params: arrays by name.
+        grads: of each update, gradients by name.
+        lr: learning rate of each name.
+        betas: decay of the first and second moments.
+        eps: keeps the quotient finite.
+
+    Returns:
+        New parameters, new first moments, new second moments.
+
+    Example:
+        >>> x, m, _ = adam_steps({"x": np.array([1.0])}, [{}, {"x": np.array([8.0])}], {"x": 0.25})
+        >>> m["x"].round(12).tolist(), x["x"].round(3).tolist()
+        ([0.8], [0.814])
+    """
+    moved = dict(params)
+    m, v = ({name: np.zeros_like(array) for name, array in params.items()} for _ in range(2))
+    for step, given in enumerate(grads, start=1):
+        moved, m, v = adam_step(moved, given, m, v, step, lr, betas, eps)
+    return moved, m, v
 
 
 def means_learning_rate(step: int, scene_scale: float, max_steps: int = MAX_STEPS) -> float:

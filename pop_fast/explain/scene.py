@@ -133,7 +133,7 @@ def explain_view(
     del given["sh"]
     background = torch.tensor([config.background], dtype=torch.float64)
     settings = settings_of(view, config, torch.float64)
-    images, _, info = rasterization(**given, **settings, sh_degree=degree, backgrounds=background)
+    images, _, info = rasterization(**given, **settings, sh_degree=degree, backgrounds=background, backend="fast")
     image = images[0]
     loss = _photometric(image, view, config, step or 0)
     v_image, v_opacities = torch.autograd.grad(loss, (image, leaf))

@@ -88,6 +88,9 @@ def split(
         mask: the Gaussians to split. [N] bool
         normals: standard normal draws for the first and the second child of each, of any precision. [2, M, 3]
         revised_opacity: give the children `1 - sqrt(1 - o)`, so that two coincident ones equal the parent.
+
+    Raises:
+        ValueError: `normals` does not hold two draws for each selected Gaussian.
     """
     chosen = {key: value.detach()[mask] for key, value in params.items()}
     appended = split_children(chosen, normals.to(chosen["means"]), revised_opacity)

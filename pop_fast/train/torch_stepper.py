@@ -14,9 +14,8 @@ from cuda_ext.train_settings import Phase, StepStats
 from pop_fast.backends import Backend
 from pop_fast.strategies.base import State
 from pop_fast.train.evaluate import gaussians_per_pixel
-from pop_fast.train.model import advance_idle
+from pop_fast.train.model import adam_step
 from pop_fast.train.objective import Objective
-from pop_fast.train.schedule import means_lr
 from pop_fast.train.stepper import Task
 from pop_fast.train.views import Rendered, render_view
 
@@ -64,10 +63,12 @@ class TorchStepper:
         loss = objective if term is None else objective + term
         loss.backward()
         self._require_finite(loss, index, step)
-        self._adam(step, phase.sh_degree)
+        stats = self._measured(rendered, index, step, phase, objective, term)
+        config, scale = self._task.config, self._task.scene_scale
+        adam_step(params, optimizers, config.lr, scale, step, config.max_steps, phase.sh_degree)
         strategy.collect(params, state, step, rendered.info)
         self.step = step + 1
-        return self._measured(rendered, index, step, phase, objective, term)
+        return stats
 
     def _render(self, index: int, step: int, phase: Phase) -> Rendered:
         config, strategy = self._task.config, self._task.strategy
@@ -85,17 +86,6 @@ class TorchStepper:
     def _require_finite(self, loss: Tensor, index: int, step: int) -> None:
         if not math.isfinite(loss.item()):
             raise ValueError(f"the loss of view {self._task.views[index].name} is {loss.item()} at step {step}")
-
-    def _adam(self, step: int, sh_degree: int) -> None:
-        config, group = self._task.config, self._optimizers["means"].param_groups[0]
-        rate = config.lr.means * self._task.scene_scale
-        group["lr"] = means_lr(step, config.max_steps, rate, config.lr.means_decay)
-        for key, optimizer in self._optimizers.items():
-            if key == "shN" and sh_degree == 0:
-                advance_idle(optimizer, self._params[key])
-            else:
-                optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
 
     def _measured(
         self, rendered: Rendered, index: int, step: int, phase: Phase, objective: Tensor, term: Tensor | None
