@@ -81,8 +81,10 @@ class Checkout:
     def step(self, name: str, folder: str, backend: str) -> tuple[Callable[[], Times], Callable[[], Tensor]]:
         """Return what times a training step of a case, and what renders its first view."""
         with self.imports():
-            trainer = self.run.trainer_of(self._case(name), folder, backend)
-            first, take = self.run.first_image(trainer), self.run.stepping(trainer)
+            case = self._case(name)
+            training = self.run.run_of(case, folder, backend)
+            first = self.run.first_view(training, self.run.capture_of(case)).image
+            take = self.run.stepping(training)
 
         def once() -> Times:
             with self.imports():

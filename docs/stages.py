@@ -38,7 +38,7 @@ STAGES = (
     Stage("importance mask and POP loss", "eqs. 7, 8", ("polarization",)),
     Stage("density control", "eqs. 3, 6", ("density", "density_config", "density_rows")),
     Stage("Adam and its schedules", "4.1", ("optimizer",), ("train/model.py", "train/schedule.py")),
-    Stage("one training step", "eq. 9", ("training", "recipes"), ("train/trainer.py",)),
+    Stage("one training step", "eq. 9", ("training", "recipes"), ("train/torch_stepper.py",)),
     Stage(
         "distance of every decision from flipping", "–", ("margins", "extent_margins", "pixel_margins", "magnitudes")
     ),
