@@ -1,6 +1,6 @@
 """Adaptive density control as tensor operations. Meaning, order of rows and every switch: `pop_ref.density`.
 
-`config` is anything with the attributes of `pop_ref.density_config.DensityConfig` that a function reads, a strategy for
+`config` is anything with the attributes of `pop_ref.settings.DensityConfig` that a function reads, a strategy for
 example. Rows are dictionaries of tensors with one common first axis.
 """
 
@@ -57,9 +57,9 @@ def zero_statistics(n: int, dtype: torch.dtype = torch.float32, device: torch.de
     return Statistics(torch.zeros(n, dtype=dtype, device=device), counts, 0, counts.clone(), flags)
 
 
-def blur_set(dominant_counts: Tensor, width: int, height: int, theta_blur: float) -> Tensor:
+def blur_set(dominant_counts: Tensor, width: int, height: int, theta_blur: float, min_pixels: float = 0.0) -> Tensor:
     """See `pop_ref.density.blur_set`. Works for [N] and, view by view, for [C, N]."""
-    return dominant_counts > theta_blur * (height * width)
+    return dominant_counts > max(theta_blur * (height * width), min_pixels)
 
 
 def accumulate(
@@ -79,7 +79,7 @@ def accumulate(
     grads = torch.linalg.vector_norm(v_means2d * unit, dim=-1)
     dominant_sum = statistics.dominant_sum + dominant_counts
     tested = dominant_sum if config.blur_window == "sum" else dominant_counts
-    blurred = blur_set(tested, width, height, config.theta_blur)
+    blurred = blur_set(tested, width, height, config.theta_blur, config.blur_min_pixels)
     return Statistics(
         grad_sum=statistics.grad_sum + grads.masked_fill(~visible, 0.0),
         n_visible=statistics.n_visible + visible,

@@ -175,7 +175,7 @@ def check_fits(
                 f"{path}: was written for another capture: the {name} differ ({str(theirs)[:12]}, here {ours[:12]}); "
                 "use the same photographs and model, or another result folder"
             )
-    last, known = config.resolved().max_steps - 1, config.strategy.initialize_state().keys()
+    last, known = config.max_steps - 1, config.strategy.initialize_state().keys()
     order, odd = content["view_order"]["order"], sorted(known ^ content["strategy"].keys())
     if content["step"] > last:
         raise PopError(f"{path}: step is {content['step']}; it must be at most {last}, the run's last: {_DAMAGED}")

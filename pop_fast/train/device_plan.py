@@ -17,9 +17,8 @@ def unsupported(config: TrainConfig) -> str | None:
     known = {
         "absgrad": (plan.absgrad, False),
         "key_for_gradient": (plan.key_for_gradient, "means2d"),
+        "refine_scale2d_stop_iter": (plan.refine_scale2d_stop_iter, 0),
     }
-    if config.method == "adc":
-        known["refine_scale2d_stop_iter"] = (config.adc.refine_scale2d_stop_iter, 0)
     for name, (value, supported) in known.items():
         if value != supported:
             return (
@@ -36,17 +35,9 @@ def step_settings(config: TrainConfig, scene_scale: float) -> StepSettings:
         config: step numbers as they are run.
         scene_scale: the unit of the means' learning rate.
     """
-    lr, pop = config.lr, config.pop
-    rates = {
-        "means": lr.means * scene_scale,
-        "scales": lr.scales,
-        "quats": lr.quats,
-        "opacities": lr.opacities,
-        "sh0": lr.sh0,
-        "shN": lr.sh_rest,
-    }
+    lr, pop = config.lr, config.strategy
     return StepSettings(
-        rates,
+        {**lr.by_parameter(), "means": lr.means * scene_scale},
         config.max_steps,
         means_decay=lr.means_decay,
         padding=config.ssim_padding,
@@ -66,19 +57,18 @@ def step_settings(config: TrainConfig, scene_scale: float) -> StepSettings:
 
 def phase_at(config: TrainConfig, step: int) -> Phase:
     """Return what the step does."""
-    plan, pop = config.strategy, config.pop
+    plan = config.strategy
     collects = step < plan.refine_stop_iter
-    on = config.method == "pop"
-    pulls = on and pop.lambda_pop != 0.0 and pop.pop_start_iter <= step < pop.pop_stop_iter
+    pulls = plan.lambda_pop != 0.0 and plan.pop_start_iter <= step < plan.pop_stop_iter
     kind, weight = config.photometric_at(step)
     return Phase(
         sh_degree=active_sh_degree(step, config.sh_interval, config.sh_degree),
         pop=pulls,
         statistics=collects,
-        blur=on and collects and step <= pop.blur_stop_iter,
+        blur=collects and step <= plan.blur_stop_iter,
         l1=kind == "l1",
         lambda_ssim=weight,
-        window=on and collects and pop.pop_views == "window",
+        window=collects and plan.pop_views == "window",
     )
 
 
@@ -101,5 +91,5 @@ def stretch_end(config: TrainConfig, first: int) -> int:
 
 def _is_milestone(config: TrainConfig, taken: int) -> bool:
     due = config.checkpoint_every > 0 and taken % config.checkpoint_every == 0
-    planned = (*config.eval_steps, *config.save_steps, config.pop.blur_stop_iter, config.max_steps)
+    planned = (*config.eval_steps, *config.save_steps, config.strategy.blur_stop_iter, config.max_steps)
     return due or taken in planned

@@ -44,7 +44,7 @@ class DeviceTrainer(TrainingRun):
         Raises:
             PopError: there is no GPU or build to run on, or the fused step does not know a setting.
         """
-        reason = unsupported(config.resolved())
+        reason = unsupported(config)
         if reason is not None:
             raise PopError(reason)
         self._hardware = this_machine() if hardware is None else hardware
@@ -135,15 +135,15 @@ class DeviceTrainer(TrainingRun):
         if phase.statistics:
             state["grad2d"], state["count"] = found.grad_sum.clone(), found.n_visible.to(found.grad_sum.dtype)
             state["views"] += len(views)
-        pop, summed = self.config.pop, phase.blur and self.config.pop.blur_window == "sum"
+        plan, summed = self.config.strategy, phase.blur and self.config.strategy.blur_window == "sum"
         if summed or phase.window:
             state["dominant_sum"] = found.dominant_sum.long()
         if not phase.blur:
             return
         if summed:
             height, width = views[-1].height, views[-1].width
-            theta = max(pop.theta_blur, pop.blur_min_pixels / (height * width))
-            state["blurred"] = blur_set(state["dominant_sum"], width, height, theta)
+            bound = (plan.theta_blur, plan.blur_min_pixels)
+            state["blurred"] = blur_set(state["dominant_sum"], width, height, *bound)
         else:
             state["blurred"] = found.blurred.bool()
 

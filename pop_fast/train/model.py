@@ -11,22 +11,15 @@ from torch.nn import Parameter
 from torch.optim import Adam
 
 from pop_fast.activations import scales_from_log_scales
-from pop_fast.train.config import LearningRates
+from pop_ref.settings import BETAS, EPS, LearningRates
 
 KEYS: Final = ("means", "scales", "quats", "opacities", "sh0", "shN")
 
 
 def make_optimizers(params: Mapping[str, Parameter], lr: LearningRates, scene_scale: float) -> dict[str, Adam]:
-    """Make one dense Adam a parameter (betas 0.9 and 0.999, eps 1e-15), the means' rate in units of the scene."""
-    rates = {
-        "means": lr.means * scene_scale,
-        "scales": lr.scales,
-        "quats": lr.quats,
-        "opacities": lr.opacities,
-        "sh0": lr.sh0,
-        "shN": lr.sh_rest,
-    }
-    return {key: Adam([params[key]], lr=rates[key], betas=(0.9, 0.999), eps=1e-15, fused=True) for key in KEYS}
+    """Make one dense Adam a parameter , the means' rate in units of the scene."""
+    rates = {**lr.by_parameter(), "means": lr.means * scene_scale}
+    return {key: Adam([params[key]], lr=rates[key], betas=BETAS, eps=EPS, fused=True) for key in KEYS}
 
 
 def advance_idle(optimizer: Adam, param: Tensor) -> None:

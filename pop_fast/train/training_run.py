@@ -71,7 +71,7 @@ class TrainingRun:
         Raises:
             PopError: the capture cannot be trained on, weights are missing, or the backend is not available.
         """
-        self._given, self.config = config, config.resolved()
+        self.config = config
         self._resume, self._overwrite, self._beside = resume, overwrite, beside or {}
         self._backend = get_backend(config.backend) if backend is None else backend
         if not self._backend.available():
@@ -126,7 +126,7 @@ class TrainingRun:
         found = ckpt.list_checkpoints(self._results.path) if self._resume else []
         if found:
             self._restore(found[-1][1])
-            self._results.write_settings(self._given, self._beside)
+            self._results.write_settings(self.config, self._beside)
         else:
             self._unwritten = self._opacities().numpy()
 
@@ -138,7 +138,7 @@ class TrainingRun:
                 if self._unwritten is not None:
                     # a rate can be so high that the first step is the last; that is no reason to replace anything
                     self._require_finite()
-                    self._results.begin(self._given, self._beside, self._unwritten, self._overwrite)
+                    self._results.begin(self.config, self._beside, self._unwritten, self._overwrite)
                     self._unwritten = None
                 self._milestones(self.step - 1)
                 if stop.is_set() and self.step < config.max_steps:
@@ -155,7 +155,7 @@ class TrainingRun:
         """After a step (counted from 0): keep histograms, measure, write PLY and checkpoint when it is time."""
         config, taken = self.config, step + 1
         last = taken == config.max_steps
-        if taken == config.pop.blur_stop_iter or last:
+        if taken == config.strategy.blur_stop_iter or last:
             self._results.write_opacities(step, self._opacities().numpy())
         if taken in config.eval_steps or last:
             self._evaluate(step)
@@ -196,7 +196,7 @@ class TrainingRun:
             "optimizers": _on_cpu(ckpt.pack_optimizers(self.optimizers)),
             "strategy": _on_cpu(ckpt.pack_strategy(self.state)),
             "view_order": self._order.state_dict(),
-            "config": self._given.binding(),
+            "config": self.config.binding(),
             "capture": self._fingerprint(),
             "metrics_bytes": self._results.flush_metrics(),
             "seconds": {"train": self._train_seconds, "total": self._total_seconds},
@@ -210,7 +210,7 @@ class TrainingRun:
     def _restore(self, path: Path) -> None:
         content = ckpt.load_checkpoint(path)
         threads, n_views = torch.get_num_threads(), len(self._train)
-        ckpt.check_fits(path, content, self._given, self._fingerprint(), threads, n_views)
+        ckpt.check_fits(path, content, self.config, self._fingerprint(), threads, n_views)
         self.params = {key: Parameter(content["splats"][key]) for key in KEYS}
         self.optimizers = make_optimizers(self.params, self.config.lr, self._scene_scale)
         ckpt.unpack_optimizers(self.optimizers, content["optimizers"])

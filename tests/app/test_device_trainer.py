@@ -13,7 +13,7 @@ import torch
 from cuda_ext.arrays import CudaMemoryError
 from pop_fast.data.capture import Capture
 from pop_fast.errors import PopError
-from pop_fast.strategies import ADCStrategy, POPStrategy
+from pop_fast.strategies import POPStrategy
 from pop_fast.train import Trainer
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.device_plan import LONGEST, changes_after, phase_at, step_settings, stretch_end, unsupported
@@ -27,7 +27,12 @@ MEASURED = ("n_blended", "n_traversed")
 
 
 def with_pop(**changes):
-    return {"pop": replace(tiny_config("x").pop, **changes)}
+    return {"strategy": replace(tiny_config("x").strategy, **changes)}
+
+
+def with_gsplat(**changes):
+    strategy = tiny_config("x", method="gsplat").strategy
+    return {"method": "gsplat", "strategy": replace(strategy, **changes)}
 
 
 def half_masked() -> Capture:
@@ -46,7 +51,7 @@ def mixed_sizes() -> Capture:
 
 CASES = {
     "pop": ({}, tiny_capture),
-    "adc": ({"method": "adc"}, tiny_capture),
+    "gsplat": ({"method": "gsplat"}, tiny_capture),
     "masks": ({}, half_masked),
     "sizes": ({}, mixed_sizes),
     "background": ({"background": (0.25, 0.5, 1.0), "antialiased": True}, tiny_capture),
@@ -60,7 +65,7 @@ CASES = {
     "visible": (with_pop(pop_over="visible", lambda_pop=0.05), tiny_capture),
     "own view": (with_pop(blur_window="own_view"), tiny_capture),
     "phases": (with_pop(pop_start_iter=5, pop_stop_iter=13, blur_stop_iter=9, refine_stop_iter=18), tiny_capture),
-    "reset": ({"method": "adc", "adc": replace(tiny_config("x").adc, reset_every=7)}, tiny_capture),
+    "reset": (with_gsplat(reset_every=7), tiny_capture),
 }
 
 
@@ -116,7 +121,7 @@ def test_a_run_on_a_device_is_the_cpus_run(case, tmp_path):
         assert {key: mine[key] for key in wanted} == pytest.approx(wanted, rel=1e-5)
 
 
-@pytest.mark.parametrize("method", ["pop", "adc"])
+@pytest.mark.parametrize("method", ["pop", "gsplat"])
 def test_stopping_anywhere_and_going_on_changes_nothing(method, tmp_path):
     on_device(tmp_path / "whole", method=method).run()
     for place, stop_after in enumerate((3, 11, 13, 17, 29)):
@@ -164,7 +169,7 @@ def test_the_device_is_left_alone_between_events(tmp_path):
 
 
 def test_a_stretch_ends_where_something_is_due():
-    config = tiny_config("x", max_steps=9000, checkpoint_every=1000, pop=POPStrategy()).resolved()
+    config = tiny_config("x", max_steps=9000, checkpoint_every=1000, strategy=POPStrategy())
     first = 0
     while first < config.max_steps:
         end = stretch_end(config, first)
@@ -213,8 +218,8 @@ def test_a_full_gpu_says_what_to_lower(error, tmp_path, monkeypatch):
     ("changes", "words"),
     [
         (with_pop(absgrad=True), "pop.absgrad = False only, not True"),
-        ({"method": "adc", "adc": ADCStrategy(refine_scale2d_stop_iter=9)}, "adc.refine_scale2d_stop_iter = 0 only"),
-        ({"method": "adc", "adc": ADCStrategy(absgrad=True)}, "adc.absgrad = False only, not True"),
+        (with_gsplat(refine_scale2d_stop_iter=9), "gsplat.refine_scale2d_stop_iter = 0 only"),
+        (with_gsplat(absgrad=True), "gsplat.absgrad = False only, not True"),
     ],
 )
 def test_settings_that_the_device_does_not_know_are_refused_before_anything_starts(changes, words, tmp_path):
@@ -222,12 +227,12 @@ def test_settings_that_the_device_does_not_know_are_refused_before_anything_star
         on_device(tmp_path / "new", **changes)
     assert words in str(error.value)
     assert not (tmp_path / "new").exists()
-    assert unsupported(tiny_config("x").resolved()) is None
+    assert unsupported(tiny_config("x")) is None
 
 
 def test_the_fused_step_gets_the_learning_rates_in_its_own_words():
     config = tiny_config("x")
-    settings = step_settings(config.resolved(), 2.0)
+    settings = step_settings(config, 2.0)
     assert settings.lr["means"] == 2.0 * config.lr.means
     assert settings.lr["shN"] == config.lr.sh_rest
     assert set(settings.lr) == {"means", "scales", "quats", "opacities", "sh0", "shN"}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.strategies import ADCStrategy, POPStrategy
+from pop_fast.strategies import GsplatStrategy, POPStrategy
 from pop_fast.train import Trainer
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.device_trainer import DeviceTrainer
@@ -72,7 +72,7 @@ def test_steps_are_the_cpus_under_every_setting(hardware, case, tmp_path):
     assert found["n_blended"] == pytest.approx(expected["n_blended"], rel=0.02)
 
 
-@pytest.mark.parametrize("method", ["pop", "adc"])
+@pytest.mark.parametrize("method", ["pop", "gsplat"])
 def test_events_come_when_the_cpus_come_and_change_about_as_many(hardware, method, tmp_path):
     Trainer(tiny_config(tmp_path / "cpu", method=method), tiny_capture()).run()
     DeviceTrainer(tiny_config(tmp_path / "gpu", method=method), tiny_capture(), hardware=hardware).run()
@@ -85,9 +85,9 @@ def test_events_come_when_the_cpus_come_and_change_about_as_many(hardware, metho
     assert [event.get("reset") for event in ours] == [event.get("reset") for event in theirs]
 
 
-@pytest.mark.parametrize("method", ["pop", "adc"])
+@pytest.mark.parametrize("method", ["pop", "gsplat"])
 def test_an_interrupted_run_goes_on_to_the_same_bits(hardware, method, tmp_path, monkeypatch):
-    settings = {"method": method, "adc": replace(tiny_config("x").adc, reset_every=7)}
+    settings = {"method": method, "strategy": replace(tiny_config("x", method="gsplat").strategy, reset_every=7)}
     DeviceTrainer(tiny_config(tmp_path / "whole", **settings), tiny_capture(), hardware=hardware).run()
     for stop_after in (8, 16, 23):
         trainer = DeviceTrainer(
@@ -126,7 +126,7 @@ def test_buffers_that_overflow_between_views_of_several_sizes_lose_nothing(hardw
 
 
 def test_a_number_that_is_not_finite_is_found_on_the_device(hardware, tmp_path):
-    trainer = DeviceTrainer(tiny_config(tmp_path, adc=ADCStrategy()), tiny_capture(), hardware=hardware)
+    trainer = DeviceTrainer(tiny_config(tmp_path, strategy=GsplatStrategy()), tiny_capture(), hardware=hardware)
     change = trainer._change
 
     def poisoned(step):
