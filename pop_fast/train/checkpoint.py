@@ -177,7 +177,7 @@ def check_fits(
                 f"{path}: was written for another capture: the {name} differ ({str(theirs)[:12]}, here {ours[:12]}); "
                 "use the same photographs and model, or another result folder"
             )
-    last, order = config.resolved().max_steps - 1, content["view_order"]["order"]
+    last, order = config.max_steps - 1, content["view_order"]["order"]
     odd = sorted(set(known) ^ content["strategy"].keys())
     if content["step"] > last:
         raise PopError(f"{path}: step is {content['step']}; it must be at most {last}, the run's last: {_DAMAGED}")

@@ -32,7 +32,7 @@ def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConf
     if reason is None:
         from pop_fast.train.fused_stepper import unsupported
 
-        reason = unsupported(config.resolved())
+        reason = unsupported(config)
     if reason is None:
         return replace(config, backend="cuda"), "backend cuda: a GPU and the build are here"
     not_compiled = get_backend("compiled").why_not()
@@ -45,6 +45,6 @@ def _begun_with(folder: Path) -> Any:
     """Return the backend of the run in a folder, or None where there is none or its settings cannot be read."""
     path = folder / "cfg.json"
     try:
-        return json.loads(path.read_text(encoding="utf-8")).get("backend")
-    except (OSError, ValueError, AttributeError):
+        return json.loads(path.read_text(encoding="utf-8"))["resolved"]["backend"]
+    except (OSError, ValueError, KeyError, TypeError):
         return None

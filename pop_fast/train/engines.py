@@ -39,7 +39,7 @@ def engine_of(config: TrainConfig, own_strategy: bool = True) -> Engine:
         PopError: the backend is unknown or cannot run here, or does not know a setting.
     """
     if config.backend == "cuda":
-        reason = unsupported(config.resolved())
+        reason = unsupported(config)
         if not own_strategy:
             reason = "backend 'cuda' trains with the strategies of this package only; use --backend fast"
         if reason is not None:

@@ -110,7 +110,7 @@ class FusedStepper:
 
     def _take_statistics(self, found: Statistics, first: int, last: int, phase: Phase) -> None:
         """Copy what was collected into the strategy's state."""
-        state, pop = self._state, self.task.config.pop
+        state, pop = self._state, self.task.config.strategy
         if phase.statistics:
             state["grad2d"], state["count"] = found.grad_sum.clone(), found.n_visible.to(found.grad_sum.dtype)
             state["views"] += last - first
@@ -121,8 +121,8 @@ class FusedStepper:
             return
         if summed:
             view = self.task.views[self.task.order[last - 1]]
-            theta = pop.theta_in(view.width, view.height)
-            state["blurred"] = blur_set(state["dominant_sum"], view.width, view.height, theta)
+            bound = (view.width, view.height, pop.theta_blur, pop.blur_min_pixels)
+            state["blurred"] = blur_set(state["dominant_sum"], *bound)
         else:
             state["blurred"] = found.blurred.bool()
 
@@ -140,9 +140,8 @@ def unsupported(config: TrainConfig) -> str | None:
     known: dict[str, tuple[Any, Any]] = {
         "absgrad": (plan.absgrad, False),
         "key_for_gradient": (plan.key_for_gradient, "means2d"),
+        "refine_scale2d_stop_iter": (plan.refine_scale2d_stop_iter, 0),
     }
-    if config.method == "adc":
-        known["refine_scale2d_stop_iter"] = (config.adc.refine_scale2d_stop_iter, 0)
     for name, (value, supported) in known.items():
         if value != supported:
             return (
@@ -159,7 +158,7 @@ def step_settings(config: TrainConfig, scene_scale: float) -> StepSettings:
         config: step numbers as they are run.
         scene_scale: the unit of the means' learning rate.
     """
-    pop = config.pop
+    pop = config.strategy
     return StepSettings(
         learning_rates(config.lr, scene_scale),
         config.max_steps,

@@ -11,8 +11,8 @@ from torch.nn import Parameter
 from torch.optim import Adam
 
 from pop_fast.activations import scales_from_log_scales
-from pop_fast.train.config import LearningRates
 from pop_fast.train.schedule import means_lr
+from pop_ref.settings import BETAS, EPS, LearningRates
 
 KEYS: Final = ("means", "scales", "quats", "opacities", "sh0", "shN")
 
@@ -24,18 +24,11 @@ def learning_rates(lr: LearningRates, scene_scale: float) -> dict[str, float]:
         lr: the settings.
         scene_scale: the unit of the means' rate, world units.
     """
-    return {
-        "means": lr.means * scene_scale,
-        "scales": lr.scales,
-        "quats": lr.quats,
-        "opacities": lr.opacities,
-        "sh0": lr.sh0,
-        "shN": lr.sh_rest,
-    }
+    return {**lr.by_parameter(), "means": lr.means * scene_scale}
 
 
 def make_optimizers(params: Mapping[str, Parameter], lr: LearningRates, scene_scale: float) -> dict[str, Adam]:
-    """Make one dense Adam a parameter (betas 0.9 and 0.999, eps 1e-15), moments zero, the counter of steps on the CPU.
+    """Make one dense Adam a parameter, its moments zero, the counter of steps on the CPU.
 
     Args:
         params: raw parameters by name.
@@ -43,9 +36,7 @@ def make_optimizers(params: Mapping[str, Parameter], lr: LearningRates, scene_sc
         scene_scale: the unit of the means' learning rate, world units.
     """
     rates = learning_rates(lr, scene_scale)
-    made = {
-        key: Adam([param], lr=rates[key], betas=(0.9, 0.999), eps=1e-15, fused=True) for key, param in params.items()
-    }
+    made = {key: Adam([param], lr=rates[key], betas=BETAS, eps=EPS, fused=True) for key, param in params.items()}
     for key, optimizer in made.items():
         moments = {name: torch.zeros_like(params[key].detach()) for name in ("exp_avg", "exp_avg_sq")}
         optimizer.state[params[key]] = {"step": torch.zeros((), dtype=torch.float32), **moments}

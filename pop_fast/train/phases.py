@@ -54,5 +54,5 @@ def stretch_end(config: TrainConfig, strategy: DensityControl | ForeignStrategy,
 def is_milestone(config: TrainConfig, taken: int) -> bool:
     """Tell whether something is measured or written when so many steps have been taken."""
     due = config.checkpoint_every > 0 and taken % config.checkpoint_every == 0
-    planned = (*config.eval_steps, *config.save_steps, config.pop.blur_stop_iter, config.max_steps)
+    planned = (*config.eval_steps, *config.save_steps, config.strategy.blur_stop_iter, config.max_steps)
     return due or taken in planned

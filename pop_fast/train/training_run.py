@@ -93,8 +93,7 @@ class TrainingRun:
                 not know a setting.
         """
         self._engine = engine_of(choose_backend(config, resume)[0], strategy is None) if engine is None else engine
-        self._given = replace(config, backend=self._engine.name)
-        self.config = self._given.resolved()
+        self.config = replace(config, backend=self._engine.name)
         self._resume, self._overwrite, self._beside = resume, overwrite, beside or {}
         self._prepare_capture(capture, initial)
         self.optimizers = make_optimizers(self.params, self.config.lr, self._scene_scale)
@@ -153,7 +152,7 @@ class TrainingRun:
         found = ckpt.list_checkpoints(self._results.path) if self._resume else []
         if found:
             self._restore(found[-1][1])
-            self._results.write_settings(self._given, self._beside)
+            self._results.write_settings(self.config, self._beside)
         else:
             self._unwritten = self._opacities().numpy()
         start = time.perf_counter()
@@ -170,7 +169,7 @@ class TrainingRun:
                 if self._unwritten is not None:
                     # a rate can be so high that the first step is the last; that is no reason to replace anything
                     self._require_finite()
-                    self._results.begin(self._given, self._beside, self._unwritten, self._overwrite)
+                    self._results.begin(self.config, self._beside, self._unwritten, self._overwrite)
                     self._unwritten = None
                 self._milestones(self.step - 1)
                 if stop.is_set() and self.step < config.max_steps:
@@ -275,7 +274,7 @@ class TrainingRun:
         """After a step (counted from 0): keep histograms, measure, write PLY and checkpoint when it is time."""
         config, taken = self.config, step + 1
         last = taken == config.max_steps
-        if taken == config.pop.blur_stop_iter or last:
+        if taken == config.strategy.blur_stop_iter or last:
             self._results.write_opacities(step, self._opacities().numpy())
         if taken in config.eval_steps or last:
             self._evaluate(step)
@@ -322,7 +321,7 @@ class TrainingRun:
             "optimizers": _on_cpu(ckpt.pack_optimizers(self.optimizers)),
             "strategy": _on_cpu(ckpt.pack_strategy(self.state)),
             "view_order": self._order.state_dict(),
-            "config": self._given.binding(),
+            "config": self.config.binding(),
             "capture": self._fingerprint(),
             "metrics_bytes": self._results.flush_metrics(),
             "seconds": {"train": self._train_seconds, "total": self._total_seconds},
@@ -336,7 +335,7 @@ class TrainingRun:
     def _restore(self, path: Path) -> None:
         content = ckpt.load_checkpoint(path)
         threads, n_views = torch.get_num_threads(), len(self._train)
-        ckpt.check_fits(path, content, self._given, self._fingerprint(), threads, n_views, self.state.keys())
+        ckpt.check_fits(path, content, self.config, self._fingerprint(), threads, n_views, self.state.keys())
         self.params = {key: Parameter(content["splats"][key]) for key in KEYS}
         self.optimizers = make_optimizers(self.params, self.config.lr, self._scene_scale)
         ckpt.unpack_optimizers(self.optimizers, content["optimizers"])

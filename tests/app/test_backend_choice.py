@@ -60,7 +60,7 @@ def test_auto_is_cuda_where_it_can_run_and_says_why_where_it_cannot(monkeypatch,
 
 @pytest.mark.usefixtures("with_gpu")
 def test_auto_takes_the_cpu_for_settings_that_the_device_does_not_know(tmp_path):
-    chosen, line = choose_backend(tiny_config(tmp_path, backend="auto", pop=POPStrategy(absgrad=True)))
+    chosen, line = choose_backend(tiny_config(tmp_path, backend="auto", strategy=POPStrategy(absgrad=True)))
     assert chosen.backend == "fast"
     assert "pop.absgrad" in line
 
@@ -69,7 +69,7 @@ def test_auto_takes_the_cpu_for_settings_that_the_device_does_not_know(tmp_path)
 def test_a_run_is_gone_on_with_by_the_backend_it_was_begun_with(tmp_path):
     config = tiny_config(tmp_path, backend="auto")
     assert choose_backend(config, resume=True)[0].backend == "cuda"
-    (tmp_path / "cfg.json").write_text('{"backend": "fast"}')
+    (tmp_path / "cfg.json").write_text('{"given": null, "resolved": {"backend": "fast"}}')
     assert choose_backend(config, resume=True)[0].backend == "fast"
     assert choose_backend(config, resume=False)[0].backend == "cuda"
     (tmp_path / "cfg.json").write_text("[oops")
@@ -101,7 +101,7 @@ def test_cuda_asked_for_in_vain_is_one_sentence_before_anything_is_read(pop: Pop
 @pytest.mark.usefixtures("with_gpu")
 def test_settings_that_the_device_does_not_know_are_refused_before_anything_is_read(tmp_path):
     with pytest.raises(PopError, match=r"pop\.absgrad = False only, not True; use --backend fast"):
-        check_backend(tiny_config(tmp_path, backend="cuda", pop=POPStrategy(absgrad=True)))
+        check_backend(tiny_config(tmp_path, backend="cuda", strategy=POPStrategy(absgrad=True)))
 
 
 @pytest.mark.usefixtures("with_gpu")
@@ -110,7 +110,7 @@ def test_a_run_on_a_gpu_from_the_command_line(pop: Pop, shared_capture: Path, tm
     assert outcome.status == 0, outcome.err
     assert "backend cuda: a GPU and the build are here" in outcome.out
     assert " s on drift, loading " in outcome.out
-    assert settings(tmp_path / "r")["backend"] == "cuda"
+    assert settings(tmp_path / "r")["resolved"]["backend"] == "cuda"
     stats = json.loads((tmp_path / "r" / "stats" / "val_step0029.json").read_text())
     assert stats["gpu"] == "drift"
     assert stats["stepper"] == "cuda"
@@ -120,7 +120,8 @@ def test_a_run_on_a_gpu_from_the_command_line(pop: Pop, shared_capture: Path, tm
 
 
 def test_a_result_of_a_gpu_can_be_measured_without_one(pop: Pop, result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = {**settings(result), "backend": "cuda"}
+    given = settings(result)
+    given["resolved"]["backend"] = "cuda"
     (result / "cfg.json").write_text(json.dumps(given))
     monkeypatch.setattr("cuda_ext.why_not", lambda: NOT_BUILT)
     outcome = pop("eval", result)

@@ -10,7 +10,7 @@ import torch
 
 from cuda_ext.arrays import CudaMemoryError
 from pop_fast.errors import PopError
-from pop_fast.strategies import ADCStrategy, POPStrategy
+from pop_fast.strategies import POPStrategy
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.engines import LONGEST_ON_GPU
@@ -23,17 +23,22 @@ CLOCKS = ("it_per_s", "seconds")
 
 
 def with_pop(**changes):
-    return {"pop": replace(tiny_config("x").pop, **changes)}
+    return {"strategy": replace(tiny_config("x").strategy, **changes)}
+
+
+def with_gsplat(**changes):
+    strategy = tiny_config("x", method="gsplat").strategy
+    return {"method": "gsplat", "strategy": replace(strategy, **changes)}
 
 
 CASES = {
     "pop": {},
-    "adc": {"method": "adc"},
+    "gsplat": {"method": "gsplat"},
     "summed": with_pop(blur_window="sum", blur_min_pixels=40.0),
     "window": with_pop(pop_views="window", lambda_pop=0.05),
     "own view": with_pop(blur_window="own_view"),
     "phases": with_pop(pop_start_iter=5, pop_stop_iter=13, blur_stop_iter=9, refine_stop_iter=18),
-    "reset": {"method": "adc", "adc": replace(tiny_config("x").adc, reset_every=7)},
+    "reset": with_gsplat(reset_every=7),
 }
 
 
@@ -119,7 +124,7 @@ def test_the_device_is_left_alone_between_events(tmp_path):
 
 
 def test_a_stretch_ends_where_something_is_due():
-    config = tiny_config("x", max_steps=9000, checkpoint_every=1000, pop=POPStrategy()).resolved()
+    config = tiny_config("x", max_steps=9000, checkpoint_every=1000, strategy=POPStrategy())
     strategy, first = config.strategy, 0
     while first < config.max_steps:
         end = stretch_end(config, strategy, first, LONGEST_ON_GPU)
@@ -168,8 +173,8 @@ def test_a_full_gpu_says_what_to_lower(error, tmp_path, monkeypatch):
     ("changes", "words"),
     [
         (with_pop(absgrad=True), "pop.absgrad = False only, not True"),
-        ({"method": "adc", "adc": ADCStrategy(refine_scale2d_stop_iter=9)}, "adc.refine_scale2d_stop_iter = 0 only"),
-        ({"method": "adc", "adc": ADCStrategy(absgrad=True)}, "adc.absgrad = False only, not True"),
+        (with_gsplat(refine_scale2d_stop_iter=9), "gsplat.refine_scale2d_stop_iter = 0 only"),
+        (with_gsplat(absgrad=True), "gsplat.absgrad = False only, not True"),
     ],
 )
 def test_settings_that_the_device_does_not_know_are_refused_before_anything_starts(changes, words, tmp_path):
@@ -177,12 +182,12 @@ def test_settings_that_the_device_does_not_know_are_refused_before_anything_star
         TrainingRun(tiny_config(tmp_path / "new", backend="cuda", **changes), tiny_capture())
     assert words in str(error.value)
     assert not (tmp_path / "new").exists()
-    assert unsupported(tiny_config("x").resolved()) is None
+    assert unsupported(tiny_config("x")) is None
 
 
 def test_the_fused_step_gets_the_learning_rates_in_its_own_words():
     config = tiny_config("x")
-    settings = step_settings(config.resolved(), 2.0)
+    settings = step_settings(config, 2.0)
     assert settings.lr["means"] == 2.0 * config.lr.means
     assert settings.lr["shN"] == config.lr.sh_rest
     assert set(settings.lr) == {"means", "scales", "quats", "opacities", "sh0", "shN"}

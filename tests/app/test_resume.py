@@ -77,7 +77,7 @@ def records(folder):
     return [{key: value for key, value in line.items() if key not in CLOCKS} for line in lines]
 
 
-@pytest.fixture(scope="module", params=["pop", "adc"])
+@pytest.fixture(scope="module", params=["pop", "gsplat"])
 def uninterrupted(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
     run_to(folder, method=request.param)

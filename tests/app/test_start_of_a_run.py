@@ -169,7 +169,7 @@ def killed_and_killed_again(folder: Path, changes: int, more: int) -> tuple[bool
     assert not (folder / ".replaced").exists()
     # a run without a step may be lost, but never mixed with the one before it
     if files != as_bytes(old):
-        assert json.loads(files["cfg.json"])["seed"] == 7
+        assert json.loads(files["cfg.json"])["resolved"]["seed"] == 7
         assert b"old" not in files.values()
     return began, repaired, files == as_bytes(old)
 

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from pop_fast.strategies import ADCStrategy, POPStrategy, StepEvent
+from pop_fast.strategies import GsplatStrategy, POPStrategy, StepEvent
 from tests.app.populations import HEIGHT, WIDTH, make, make_info, packed, run_event
 
 
@@ -97,7 +97,7 @@ def test_the_regularizer_is_off_outside_its_steps_and_at_weight_0():
         (POPStrategy(lambda_pop=0), 0),
     ):
         assert strategy.regularizer(opacities, strategy.initialize_state(), step, info) is None
-    assert ADCStrategy().regularizer(opacities, {}, 0, info) is None
+    assert GsplatStrategy().regularizer(opacities, {}, 0, info) is None
 
 
 def test_importance_can_be_kept_for_the_window_and_the_loss_for_the_visible():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.strategies import ADCStrategy, POPStrategy
+from pop_fast.strategies import GsplatStrategy, POPStrategy
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config
@@ -39,12 +39,12 @@ CASES = {
     "losses": ({"l2_stop_iter": 4, "d_ssim_halved": True, "ssim_padding": "same"}, lambda capture: capture),
     "inria": ({"profile": "inria", "photometric_divisor": 2.0}, lambda capture: capture),
     "gsplat": ({"profile": "gsplat_1_6", "sh_interval": 2}, lambda capture: capture),
-    "visible": ({"pop": {"pop_over": "visible"}}, lambda capture: capture),
+    "visible": ({"strategy": {"pop_over": "visible"}}, lambda capture: capture),
     "window": (
-        {"pop": {"pop_views": "window", "refine_start_iter": 8, "refine_stop_iter": 7}},
+        {"strategy": {"pop_views": "window", "refine_start_iter": 8, "refine_stop_iter": 7}},
         lambda capture: capture,
     ),
-    "own view": ({"pop": {"blur_window": "own_view"}}, masked),
+    "own view": ({"strategy": {"blur_window": "own_view"}}, masked),
 }
 
 
@@ -56,8 +56,8 @@ def records(folder):
 def test_steps_are_the_cpus_under_every_setting(engine, case, tmp_path):
     changes, edit = CASES[case]
     # a population that stays, and rates at which rounding does not grow
-    pop = POPStrategy(**{**STILL, "pop_stop_iter": 6, **changes.get("pop", {})})
-    settings = {"max_steps": 8, "log_every": 1, "checkpoint_every": 0, **changes, "pop": pop}
+    pop = POPStrategy(**{**STILL, "pop_stop_iter": 6, **changes.get("strategy", {})})
+    settings = {"max_steps": 8, "log_every": 1, "checkpoint_every": 0, **changes, "strategy": pop}
     capture = edit(tiny_capture())
     rates = replace(tiny_config("x").lr, quats=0.0)
     expected = TrainingRun(tiny_config(tmp_path / "cpu", lr=rates, **settings), capture).run()
@@ -71,7 +71,7 @@ def test_steps_are_the_cpus_under_every_setting(engine, case, tmp_path):
     assert found["n_blended"] == pytest.approx(expected["n_blended"], rel=0.02)
 
 
-@pytest.mark.parametrize("method", ["pop", "adc"])
+@pytest.mark.parametrize("method", ["pop", "gsplat"])
 def test_events_come_when_the_cpus_come_and_change_about_as_many(engine, method, tmp_path):
     TrainingRun(tiny_config(tmp_path / "cpu", method=method), tiny_capture()).run()
     TrainingRun(tiny_config(tmp_path / "gpu", method=method), tiny_capture(), engine=engine).run()
@@ -84,9 +84,9 @@ def test_events_come_when_the_cpus_come_and_change_about_as_many(engine, method,
     assert [event.get("reset") for event in ours] == [event.get("reset") for event in theirs]
 
 
-@pytest.mark.parametrize("method", ["pop", "adc"])
+@pytest.mark.parametrize("method", ["pop", "gsplat"])
 def test_an_interrupted_run_goes_on_to_the_same_bits(engine, method, tmp_path, monkeypatch):
-    settings = {"method": method, "adc": replace(tiny_config("x").adc, reset_every=7)}
+    settings = {"method": method, "strategy": replace(tiny_config("x", method="gsplat").strategy, reset_every=7)}
     TrainingRun(tiny_config(tmp_path / "whole", **settings), tiny_capture(), engine=engine).run()
     for stop_after in (8, 16, 23):
         trainer = TrainingRun(
@@ -125,7 +125,7 @@ def test_buffers_that_overflow_between_views_of_several_sizes_lose_nothing(engin
 
 
 def test_a_number_that_is_not_finite_is_found_on_the_device(engine, tmp_path):
-    trainer = TrainingRun(tiny_config(tmp_path, adc=ADCStrategy()), tiny_capture(), engine=engine)
+    trainer = TrainingRun(tiny_config(tmp_path, strategy=GsplatStrategy()), tiny_capture(), engine=engine)
     take_steps = trainer.take_steps
 
     def poisoned(last):
