@@ -57,9 +57,17 @@ def zero_statistics(n: int, dtype: torch.dtype = torch.float32, device: torch.de
     return Statistics(torch.zeros(n, dtype=dtype, device=device), counts, 0, counts.clone(), flags)
 
 
-def blur_set(dominant_counts: Tensor, width: int, height: int, theta_blur: float, min_pixels: float = 0.0) -> Tensor:
+def blur_set(
+    dominant_counts: Tensor,
+    width: int,
+    height: int,
+    theta_blur: float,
+    min_pixels: float = 0.0,
+    kept_pixels: int | None = None,
+) -> Tensor:
     """See `pop_ref.density.blur_set`. Works for [N] and, view by view, for [C, N]."""
-    return dominant_counts > max(theta_blur * (height * width), min_pixels)
+    n_pixels = height * width if kept_pixels is None else kept_pixels
+    return dominant_counts > max(theta_blur * n_pixels, min_pixels)
 
 
 def accumulate(
@@ -70,6 +78,7 @@ def accumulate(
     width: int,
     height: int,
     config: Any,
+    kept_pixels: int | None = None,
 ) -> Statistics:
     """See `pop_ref.density.accumulate`.
 
@@ -79,7 +88,7 @@ def accumulate(
     grads = torch.linalg.vector_norm(v_means2d * unit, dim=-1)
     dominant_sum = statistics.dominant_sum + dominant_counts
     tested = dominant_sum if config.blur_window == "sum" else dominant_counts
-    blurred = blur_set(tested, width, height, config.theta_blur, config.blur_min_pixels)
+    blurred = blur_set(tested, width, height, config.theta_blur, config.blur_min_pixels, kept_pixels)
     return Statistics(
         grad_sum=statistics.grad_sum + grads.masked_fill(~visible, 0.0),
         n_visible=statistics.n_visible + visible,

@@ -142,7 +142,7 @@ class DeviceTrainer(TrainingRun):
             return
         if summed:
             height, width = views[-1].height, views[-1].width
-            bound = (plan.theta_blur, plan.blur_min_pixels)
+            bound = (plan.theta_blur, plan.blur_min_pixels, views[-1].kept_pixels)
             state["blurred"] = blur_set(state["dominant_sum"], width, height, *bound)
         else:
             state["blurred"] = found.blurred.bool()

@@ -138,7 +138,7 @@ class StandIn:
             assert counts is not None
             found.dominant_sum.add_(counts.int())
         if phase.blur:
-            blurred = counts > self.settings.blur_pixels(view.width, view.height)
+            blurred = counts > self.settings.blur_pixels(view.kept_pixels)
             found.blurred.copy_(blurred if self.settings.blur_window == "own_view" else found.blurred.bool() | blurred)
 
 

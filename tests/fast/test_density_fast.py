@@ -26,6 +26,7 @@ CONFIGS = st.builds(
     prune_scale3d=st.just(0.5),
     prune_opa=st.just(0.125),
     theta_blur=st.sampled_from([0.25, 0.5]),
+    blur_min_pixels=st.sampled_from([0.0, 5.0]),
     blur_window=st.sampled_from(["any_view", "sum", "own_view"]),
     blur_rule=st.sampled_from(["by_scale", "split"]),
     revised_opacity=st.booleans(),
@@ -60,9 +61,10 @@ def windows(
     for width, height in ((4, 4), (8, 4), (4, 2)):
         v_means2d = rng.choice([0.0, 0.125, 0.25], (n, 1)) * np.array([0.5, 0.0] if width == 8 else [0.0, 1.0])
         visible, counts = rng.random(n) < 0.75, rng.integers(0, 10, n)
-        theirs = oracle.accumulate(theirs, v_means2d, visible, counts, width, height, config)
+        kept = int(rng.integers(1, width * height)) if width == 8 else None
+        theirs = oracle.accumulate(theirs, v_means2d, visible, counts, width, height, config, kept)
         view = (torch.tensor(v_means2d, dtype=dtype), torch.tensor(visible), torch.tensor(counts))
-        ours = fast.accumulate(ours, *view, width, height, config)
+        ours = fast.accumulate(ours, *view, width, height, config, kept)
     return theirs, ours
 
 

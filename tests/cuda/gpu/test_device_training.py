@@ -40,12 +40,12 @@ CASES = {
     "losses": ({"l2_stop_iter": 4, "d_ssim_halved": True, "ssim_padding": "same"}, lambda capture: capture),
     "inria": ({"profile": "inria", "photometric_divisor": 2.0}, lambda capture: capture),
     "gsplat": ({"profile": "gsplat_1_6", "sh_interval": 2}, lambda capture: capture),
-    "visible": ({"pop": {"pop_over": "visible"}}, lambda capture: capture),
+    "visible": ({"strategy": {"pop_over": "visible"}}, lambda capture: capture),
     "window": (
-        {"pop": {"pop_views": "window", "refine_start_iter": 8, "refine_stop_iter": 7}},
+        {"strategy": {"pop_views": "window", "refine_start_iter": 8, "refine_stop_iter": 7}},
         lambda capture: capture,
     ),
-    "own view": ({"pop": {"blur_window": "own_view"}}, masked),
+    "own view": ({"strategy": {"blur_window": "own_view"}}, masked),
 }
 
 
@@ -57,8 +57,8 @@ def records(folder):
 def test_steps_are_the_cpus_under_every_setting(hardware, case, tmp_path):
     changes, edit = CASES[case]
     # a population that stays, and rates at which rounding does not grow
-    pop = POPStrategy(**{**STILL, "pop_stop_iter": 6, **changes.get("pop", {})})
-    settings = {"max_steps": 8, "log_every": 1, "checkpoint_every": 0, **changes, "pop": pop}
+    strategy = POPStrategy(**{**STILL, "pop_stop_iter": 6, **changes.get("strategy", {})})
+    settings = {"max_steps": 8, "log_every": 1, "checkpoint_every": 0, **changes, "strategy": strategy}
     capture = edit(tiny_capture())
     rates = replace(tiny_config("x").lr, quats=0.0)
     expected = Trainer(tiny_config(tmp_path / "cpu", lr=rates, **settings), capture).run()
