@@ -197,10 +197,10 @@ class TrainingRun:
             PopError: a number is no longer finite; names it.
         """
         start, first, before = time.perf_counter(), self.step, len(self.params["means"])
-        phase = phase_at(self.config, self.strategy, first)
+        phase, stepper = phase_at(self.config, self.strategy, first), self.stepper
         views = [self._train[self._order.next()].name for _ in range(first, last)]
         with words_for_memory():
-            stats = self._measured(self.stepper, first, last, phase)
+            stats = self._measured(stepper, first, last, phase)
             event = self._change(last - 1)
         after, seconds = len(self.params["means"]), time.perf_counter() - start
         return Stretch(first, phase, views, stats, event, before, after, seconds)
