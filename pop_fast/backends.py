@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import partial
+from typing import Any, Literal, Protocol
 
 from torch import Tensor
 
@@ -57,7 +58,7 @@ class _Registered:
 def _load_fast() -> Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]:
     from pop_fast.rasterization import rasterization
 
-    return rasterization
+    return partial(rasterization, backend="fast")
 
 
 def _load_compiled() -> Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]:
@@ -112,6 +113,17 @@ def get_backend(name: str) -> Backend:
     if name not in _BACKENDS:
         raise PopError(f"backend {name!r} is unknown; use one of {', '.join(_BACKENDS)}")
     return _BACKENDS[name]
+
+
+def fastest_backend(device: str) -> Literal["fast", "compiled", "cuda"]:
+    """Return the fastest backend for tensors on a kind of device that can run here.
+
+    Args:
+        device: as `torch.device.type` says it.
+    """
+    if device == "cuda":
+        return "cuda"
+    return "compiled" if get_backend("compiled").available() else "fast"
 
 
 def require_backend(name: str) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from pop_fast.errors import PopError
 from pop_fast.raster_inputs import check_cameras, check_colors, check_gaussians, check_tensor, resolved_profile
+from pop_fast.rasterization import rasterization as on_every_backend
 from pop_ref.constants import Profile
 from pop_ref.render import render, render_vjp
 from pop_ref.types import Camera, Gaussians, Render
@@ -41,18 +43,19 @@ def rasterization(
     profile: str | Profile = "paper",
     dominance: bool = True,
     counts: bool = True,
+    **others: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render harmonics, RGB, unpacked, with the oracle; see `pop_fast.rasterization.rasterization` for the arguments.
 
-    `dominance` and `counts` are accepted: the oracle always finds both.
+    `dominance` and `counts` are accepted: the oracle always finds both. `others` are the arguments of that signature
+    that the oracle does not know; they must be at their defaults.
 
     Raises:
+        TypeError: an argument is not one of that signature.
         ValueError: an input's shape, type or value is wrong.
         PopError: a mode the oracle does not offer behind this signature.
     """
-    for name, value, only in (("render_mode", render_mode, "RGB"), ("packed", packed, False)):
-        if value != only:
-            raise PopError(f"{name}={value!r}: backend 'ref' offers {only!r} only; use backend 'fast'")
+    _check_offered({**others, "render_mode": render_mode, "packed": packed})
     if sh_degree is None:
         raise PopError("sh_degree=None: backend 'ref' renders harmonics only; use backend 'fast'")
     batch = check_gaussians(means, quats, scales, opacities, None)
@@ -86,6 +89,18 @@ def rasterization(
         renders += made
     meta = _meta(renders, means2d, means.dtype)
     return torch.stack(images), torch.stack(alphas), {**meta, "width": width, "height": height, "tile_size": tile_size}
+
+
+def _check_offered(arguments: Mapping[str, Any]) -> None:
+    parameters = inspect.signature(on_every_backend).parameters
+    for name, value in arguments.items():
+        if name not in parameters:
+            raise TypeError(f"rasterization() got an unexpected keyword argument {name!r}")
+        # the oracle's meta has a row for every Gaussian; all channels are blended in one go, whatever their number
+        only = False if name == "packed" else parameters[name].default
+        if name != "channel_chunk" and value is not only and value != only:
+            given = "a tensor" if isinstance(value, Tensor) else repr(value)
+            raise PopError(f"{name}={given}: backend 'ref' offers {only!r} only; pass that, or use backend 'fast'")
 
 
 def _meta(renders: list[Render], means2d: Tensor, dtype: torch.dtype) -> dict[str, Any]:

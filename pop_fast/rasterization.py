@@ -1,4 +1,4 @@
-"""`rasterization()`: gsplat's drop-in for CPUs, judged by the oracle."""
+"""`rasterization()`: gsplat's drop-in, on CPUs and on the GPU, judged by the oracle."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from pop_fast.backends import get_backend
+from pop_fast.backends import fastest_backend, get_backend
 from pop_fast.raster_frame import Frame, Scene
 from pop_fast.raster_inputs import (
     RENDER_MODES,
@@ -63,7 +63,7 @@ def rasterization(
     profile: str | Profile = "paper",
     dominance: bool = False,
     counts: bool = False,
-    backend: Literal["fast", "compiled", "cuda"] = "fast",
+    backend: Literal["auto", "fast", "compiled", "cuda", "ref"] = "auto",
 ) -> tuple[Tensor, Tensor, RenderMeta]:
     """Render Gaussians into C images, with gsplat 1.5.3's signature, results and meta keys.
 
@@ -108,7 +108,9 @@ def rasterization(
         dominance: compute the dominance keys of meta in the same pass; else they cost one more when first read.
         counts: likewise for n_contrib and n_traversed.
         backend: "fast" renders on the CPU, "compiled" too, with kernels in C++ (`pop_fast.compiled`), "cuda" on the
-            GPU that holds the tensors (`cuda_ext.ops.rasterization`).
+            GPU that holds the tensors (`cuda_ext.ops.rasterization`), "ref" with the oracle (slow; harmonics, RGB and
+            `packed=False` only). "auto" takes the fastest that is there: "cuda" for tensors on a GPU, else "compiled"
+            where it is built, else "fast".
 
     Returns:
         Images [..., C, H, W, X], not clamped; alphas [..., C, H, W, 1]; meta with gsplat's keys and `dominant_ids`
@@ -118,8 +120,10 @@ def rasterization(
     Raises:
         ValueError: an input's shape, type or value is wrong; the message names it and its index.
         NotImplementedError: an argument is not supported.
-        PopError: the backend cannot run here; says why and what to do.
+        PopError: the backend is unknown, cannot run here, or does not offer an argument; says why and what to do.
     """
+    if backend == "auto":
+        backend = fastest_backend(means.device.type)
     if backend not in ("fast", "compiled"):
         given = dict(locals())
         del given["backend"]

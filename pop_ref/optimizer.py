@@ -14,26 +14,16 @@ Label decided here: A21 (no learning rate changes with the L2 loss).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
 
-BETAS: Final = (0.9, 0.999)
-EPS: Final = 1e-15
+from pop_ref.settings import BETAS, EPS, MAX_SH_DEGREE, LearningRates, Recipe
 
-LEARNING_RATES: Final = {
-    "means": 1.6e-4,
-    "scales": 5e-3,
-    "quats": 1e-3,
-    "opacities": 5e-2,
-    "sh0": 2.5e-3,
-    "shN": 2.5e-3 / 20.0,
-}
-MEANS_DECAY: Final = 0.01
-MAX_STEPS: Final = 30_000
-SH_DEGREE_INTERVAL: Final = 1000
-MAX_SH_DEGREE: Final = 3
+LEARNING_RATES: Final = LearningRates().by_parameter()
+MAX_STEPS: Final = Recipe.max_steps
+SH_DEGREE_INTERVAL: Final = Recipe.sh_interval
 
 
 def adam_step(
@@ -87,7 +77,46 @@ def adam_step(
     return new_params, new_m, new_v
 
 
-def means_learning_rate(step: int, scene_scale: float, max_steps: int = MAX_STEPS) -> float:
+def adam_steps(
+    params: Mapping[str, np.ndarray],
+    grads: Sequence[Mapping[str, np.ndarray]],
+    lr: Mapping[str, float],
+    betas: tuple[float, float] = BETAS,
+    eps: float = EPS,
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Take the updates 1, 2, ... from zero moments.
+
+    A parameter that an update has no gradient of waits, as the harmonics do while degree 0 is drawn. The counter goes
+    on all the same: t is the number of the update, not of the gradients that the parameter has had.
+
+    Source: Kingma and Ba 2015, algorithm 1.
+    Departs: nothing; a parameter that waits before its first gradient is one whose gradients so far were 0.
+
+    Args:
+        params: arrays by name.
+        grads: of each update, gradients by name.
+        lr: learning rate of each name.
+        betas: decay of the first and second moments.
+        eps: keeps the quotient finite.
+
+    Returns:
+        New parameters, new first moments, new second moments.
+
+    Example:
+        >>> x, m, _ = adam_steps({"x": np.array([1.0])}, [{}, {"x": np.array([8.0])}], {"x": 0.25})
+        >>> m["x"].round(12).tolist(), x["x"].round(3).tolist()
+        ([0.8], [0.814])
+    """
+    moved = dict(params)
+    m, v = ({name: np.zeros_like(array) for name, array in params.items()} for _ in range(2))
+    for step, given in enumerate(grads, start=1):
+        moved, m, v = adam_step(moved, given, m, v, step, lr, betas, eps)
+    return moved, m, v
+
+
+def means_learning_rate(
+    step: int, scene_scale: float, max_steps: int = MAX_STEPS, rates: LearningRates = Recipe.lr
+) -> float:
     """Decay the positions' learning rate log-linearly: `1.6e-4 scene_scale 0.01^(step / max_steps)`.
 
     Source: Kerbl et al. 2023, appendix C; gsplat's exponential decay.
@@ -97,6 +126,7 @@ def means_learning_rate(step: int, scene_scale: float, max_steps: int = MAX_STEP
         step: from 0; clipped to [0, max_steps].
         scene_scale: world units.
         max_steps: length of the training.
+        rates: at the start.
 
     Returns:
         The learning rate, world units.
@@ -106,19 +136,22 @@ def means_learning_rate(step: int, scene_scale: float, max_steps: int = MAX_STEP
         (0.00032, 3.2)
     """
     share = min(max(step / max_steps, 0.0), 1.0)
-    return LEARNING_RATES["means"] * scene_scale * MEANS_DECAY**share
+    return rates.means * scene_scale * rates.means_decay**share
 
 
-def learning_rates(step: int, scene_scale: float, max_steps: int = MAX_STEPS) -> dict[str, float]:
+def learning_rates(
+    step: int, scene_scale: float, max_steps: int = MAX_STEPS, rates: LearningRates = Recipe.lr
+) -> dict[str, float]:
     """List every parameter's learning rate at a step; only the positions' changes, and none with the loss (A21).
 
     Source: Kerbl et al. 2023; values of gsplat's trainer.
-    Departs: Inria's code since October 2024 uses 0.025 for opacities (`recipes.RECIPES["3DGS"]`).
+    Departs: Inria's code since October 2024 uses 0.025 for opacities (`settings.INRIA_RATES`).
 
     Args:
         step: from 0.
         scene_scale: world units.
         max_steps: length of the training.
+        rates: at the start.
 
     Returns:
         Learning rates by parameter name.
@@ -127,7 +160,7 @@ def learning_rates(step: int, scene_scale: float, max_steps: int = MAX_STEPS) ->
         >>> learning_rates(0, 1.0)["opacities"]
         0.05
     """
-    return {**LEARNING_RATES, "means": means_learning_rate(step, scene_scale, max_steps)}
+    return {**rates.by_parameter(), "means": means_learning_rate(step, scene_scale, max_steps, rates)}
 
 
 def sh_degree_at(step: int, interval: int = SH_DEGREE_INTERVAL, max_degree: int = MAX_SH_DEGREE) -> int:

@@ -73,12 +73,12 @@ def split(
     optimizers: Optimizers,
     state: State,
     mask: Tensor,
-    generator: torch.Generator | None = None,
+    normals: Tensor,
     revised_opacity: bool = False,
 ) -> None:
     """Replace every selected Gaussian by two, drawn from it and 1.6 times smaller.
 
-    `mean' = mean + R(q) (s * noise)`, `s' = s / 1.6`; rotation, colour and opacity are copied. Survivors come first,
+    `mean' = mean + R(q) (s * normals)`, `s' = s / 1.6`; rotation, colour and opacity are copied. Survivors come first,
     then all first children, then all second children.
 
     Args:
@@ -86,14 +86,14 @@ def split(
         optimizers: one per key.
         state: the strategy's state.
         mask: the Gaussians to split. [N] bool
-        generator: source of the noise; None takes torch's global one.
+        normals: standard normal draws for the first and the second child of each, of any precision. [2, M, 3]
         revised_opacity: give the children `1 - sqrt(1 - o)`, so that two coincident ones equal the parent.
+
+    Raises:
+        ValueError: `normals` does not hold two draws for each selected Gaussian.
     """
     chosen = {key: value.detach()[mask] for key, value in params.items()}
-    device = "cpu" if generator is None else generator.device
-    shape = (SPLIT_CHILDREN, *chosen["means"].shape)
-    noise = torch.randn(shape, generator=generator, dtype=chosen["means"].dtype, device=device).to(mask.device)
-    appended = split_children(chosen, noise, revised_opacity)
+    appended = split_children(chosen, normals.to(chosen["means"]), revised_opacity)
     sources = torch.nonzero(mask)[:, 0].repeat(SPLIT_CHILDREN)
     edit_rows(params, optimizers, state, keep=~mask, appended=appended, sources=sources)
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pop_fast.backends import Backend, get_backend
+from pop_fast.backends import Backend, fastest_backend, get_backend
 from pop_fast.errors import PopError
 
 _LESS = "use smaller images (--factor 2 or more), fewer Gaussians, or a card with more memory"
@@ -105,7 +105,7 @@ def renderer(name: str) -> tuple[Backend, str | None]:
         return get_backend(name), None
     if name != "compiled" and get_backend("cuda").available():
         return OnDevice(get_backend("cuda"), torch.device("cuda", torch.cuda.current_device())), None
-    drawing = get_backend("compiled" if get_backend("compiled").available() else "fast")
+    drawing = get_backend(fastest_backend("cpu"))
     if name in ("auto", drawing.name):
         return drawing, None
     return drawing, f"backend {drawing.name!r} stands in for {name!r}: {get_backend(name).why_not()}"

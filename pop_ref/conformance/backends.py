@@ -6,6 +6,7 @@ import importlib
 import os
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from pop_ref.conformance.adapter import Adapter, OracleAdapter
@@ -69,12 +70,10 @@ def shipped(name: str) -> Any:
     """
     if name == "oracle":
         return OracleAdapter()
-    if name in ("fast64", "fast32"):
-        return adapter_for("pop_fast.rasterization:rasterization", name, "pop_fast", f"float{name[-2:]}")
-    if name not in ELSEWHERE:
+    if name not in (*SHIPPED, *ELSEWHERE):
         raise ValueError(f"backend {name!r} is unknown; use one of {', '.join((*SHIPPED, *ELSEWHERE))}")
     try:
-        return _elsewhere(name)
+        return program(name, "pop_fast", "fast") if name.startswith("fast") else _elsewhere(name)
     except ModuleNotFoundError as error:
         raise Unavailable(f"{name} needs {error.name}, which is not installed") from error
 
@@ -85,8 +84,7 @@ def _elsewhere(name: str) -> Any:
         reason = importlib.import_module("pop_fast.compiled").why_not()
         if reason is not None:
             raise Unavailable(reason)
-        package = "pop_fast.compiled"
-        return adapter_for(f"{package}.rasterization:rasterization", name, package, f"float{name[-2:]}")
+        return program(name, "pop_fast", "compiled")
     if name.startswith("mirror"):
         compiler = importlib.import_module("cuda_ext.compiler")
         if compiler.find_compiler() is None:
@@ -107,6 +105,22 @@ def _elsewhere(name: str) -> Any:
     if name == "gsplat":
         return importlib.import_module(f"{kit}.gsplat_adapter").gsplat_cuda(name)
     return importlib.import_module(f"{kit}.inria_adapter").inria(name)
+
+
+def program(name: str, package: str, backend: str) -> Any:
+    """Return the adapter of a CPU backend of this program, or of a copy of it: what renders, and what trains with it.
+
+    Args:
+        name: how reports call it; it ends in 64 or 32.
+        package: "pop_fast", or a copy's name.
+        backend: of its `rasterization`: "fast", or "compiled", whose own stages stand in the package of that name.
+    """
+    from pop_ref.conformance.torch_adapter import TorchAdapter
+    from pop_ref.conformance.torch_training import training_stages
+
+    rasterization = partial(function_named(f"{package}.rasterization:rasterization"), backend=backend)
+    stages = package if backend == "fast" else f"{package}.{backend}"
+    return TorchAdapter(name, rasterization, stages, f"float{name[-2:]}", stages=training_stages(package))
 
 
 class Absent:

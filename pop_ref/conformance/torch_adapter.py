@@ -228,10 +228,11 @@ class TorchAdapter(Adapter):
             return self._torch.as_tensor(value.copy(), dtype=dtype, device=self._device)
         if isinstance(value, dict):
             return {key: self._tensor(each, own) for key, each in value.items()}
+        if isinstance(value, list):
+            return [self._tensor(each, own) for each in value]
         if own is not None and is_dataclass(value) and hasattr(own, type(value).__name__):
-            return getattr(own, type(value).__name__)(
-                *(self._tensor(getattr(value, f.name), own) for f in fields(value))
-            )
+            values = {f.name: self._tensor(getattr(value, f.name), own) for f in fields(value)}
+            return getattr(own, type(value).__name__)(**values)
         if inspect.isfunction(value):
             return lambda *args: self._tensor(value(*args), own)
         return value

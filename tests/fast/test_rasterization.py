@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,9 +12,9 @@ import torch
 from torch import Tensor
 
 from pop_fast import workspace
-from pop_fast.backends import backend_names, get_backend
+from pop_fast.backends import backend_names, fastest_backend, get_backend
 from pop_fast.errors import PopError
-from pop_fast.rasterization import rasterization
+from pop_fast.rasterization import rasterization as program
 
 WIDTH, HEIGHT, N = 21, 18, 24
 
@@ -30,6 +31,9 @@ GSPLAT_META = {
     "n_batches", "n_cameras",
 }
 # fmt: on
+
+# what is promised to the bit is promised of this backend
+rasterization = partial(program, backend="fast")
 
 
 def scene(seed: int = 0, dtype: torch.dtype = torch.float64, n: int = N, channels: int = 3) -> dict[str, Tensor]:
@@ -52,7 +56,7 @@ def cameras(count: int = 1, dtype: torch.dtype = torch.float64) -> dict[str, Ten
 
 
 def test_the_signature_begins_with_gsplat_1_5_3s() -> None:
-    parameters = inspect.signature(rasterization).parameters
+    parameters = inspect.signature(program).parameters
     assert list(parameters)[: len(GSPLAT_1_5_3)] == GSPLAT_1_5_3
     assert all(p.kind is p.KEYWORD_ONLY for name, p in parameters.items() if name not in GSPLAT_1_5_3)
 
@@ -280,6 +284,56 @@ def test_the_oracle_and_the_fast_path_are_both_backends() -> None:
         torch.testing.assert_close(fast, ref, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.parametrize("compiled", [False, True])
+def test_auto_is_the_default_and_takes_the_fastest_that_is_there(
+    compiled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pop_fast import compiled as kernels
+    from pop_fast import rasterization as module
+
+    asked: list[str] = []
+    stages = module.stages_of
+    monkeypatch.setattr(kernels, "why_not", lambda: None if compiled else "not compiled")
+    monkeypatch.setattr(module, "stages_of", lambda name: (asked.append(name), stages("fast"))[1])
+    image = program(**scene(), **cameras())[0]
+    assert asked == ["compiled" if compiled else "fast"]
+    assert torch.equal(image, rasterization(**scene(), **cameras())[0])
+    assert fastest_backend("cuda") == "cuda"
+    assert inspect.signature(program).parameters["backend"].default == "auto"
+
+
+def harmonics() -> dict[str, object]:
+    return {**scene(), **cameras(2), "colors": torch.ones((N, 4, 3), dtype=torch.float64), "sh_degree": 1}
+
+
+def test_the_oracle_renders_behind_the_same_arguments() -> None:
+    given = {**harmonics(), "packed": False, "absgrad": True, "channel_chunk": 8}
+    image, alphas, meta = program(**given, backend="ref")
+    expected = rasterization(**given)
+    torch.testing.assert_close(image, expected[0], rtol=0, atol=1e-12)
+    torch.testing.assert_close(alphas, expected[1], rtol=0, atol=1e-12)
+    assert torch.equal(meta["dominant_counts"], expected[2]["dominant_counts"])
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ({}, "packed=True: backend 'ref' offers False only; pass that, or use backend 'fast'"),
+        ({"packed": False, "radius_clip": 3.0}, "radius_clip=3.0: backend 'ref' offers 0.0 only"),
+        ({"packed": False, "covars": torch.ones(N, 3, 3)}, "covars=a tensor: backend 'ref' offers None only"),
+        ({"packed": False, "render_mode": "D"}, "render_mode='D': backend 'ref' offers 'RGB' only"),
+        ({"packed": False, "sh_degree": None}, "sh_degree=None: backend 'ref' renders harmonics only"),
+    ],
+    ids=["packed", "radius_clip", "covars", "render_mode", "sh_degree"],
+)
+def test_what_the_oracle_does_not_offer_is_said_in_one_line(argument: dict[str, object], said: str) -> None:
+    with pytest.raises(PopError, match=re.escape(said)) as caught:
+        program(**{**harmonics(), **argument}, backend="ref")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'colour'"):
+        get_backend("ref").rasterization(**harmonics(), colour=1)
+
+
 def test_a_backend_that_cannot_run_says_why_in_one_sentence() -> None:
     cuda = get_backend("cuda")
     if cuda.available():
@@ -293,3 +347,5 @@ def test_a_backend_that_cannot_run_says_why_in_one_sentence() -> None:
 def test_an_unknown_backend_is_an_error_that_lists_the_known() -> None:
     with pytest.raises(PopError, match="fast"):
         get_backend("metal")
+    with pytest.raises(PopError, match="backend 'metal' is unknown; use one of fast, compiled, cuda, ref"):
+        program(**scene(), **cameras(), backend="metal")  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""The ladder of ten losses, climbed by the torch path: renderer, losses, POP term, torch's Adam, density control."""
+"""The ladder of ten losses, climbed by what trains: renderer, losses, POP term, optimizers, density control."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast import density
 from pop_fast.losses import photometric_pop
 from pop_fast.polarization import importance_mask, pop_loss
 from pop_fast.rasterization import rasterization
+from pop_ref.conformance.torch_training import Rows, Statistics, Trainer
 from pop_ref.density import densifies_at
 from pop_ref.optimizer import learning_rates, sh_degree_at
 from tests.golden import ten_losses
@@ -19,26 +19,16 @@ from tests.golden.ten_losses import RECIPE, SCENE_SCALE, SIZE, STEPS, Rung
 RELATIVE = {torch.float64: 1e-9, torch.float32: 1.2e-6}
 
 
-def adam(rows: density.Rows, grads: dict[str, torch.Tensor], step: int) -> density.Rows:
-    """Take one step of torch's own Adam with these moments."""
-    rates = learning_rates(step, SCENE_SCALE, RECIPE.max_steps)
-    params, m, v = {}, {}, {}
-    for name, value in rows.params.items():
-        tensor = value.clone().requires_grad_()
-        tensor.grad = grads[name]
-        optimizer = torch.optim.Adam([tensor], lr=rates[name], betas=(0.9, 0.999), eps=1e-15)
-        optimizer.state[tensor] = {"step": torch.tensor(float(step)), "exp_avg": rows.m[name].clone()}
-        optimizer.state[tensor]["exp_avg_sq"] = rows.v[name].clone()
-        optimizer.step()
-        params[name] = tensor.detach()
-        m[name], v[name] = optimizer.state[tensor]["exp_avg"], optimizer.state[tensor]["exp_avg_sq"]
-    return density.Rows(params, m, v)
+def nothing_seen(params: dict[str, torch.Tensor]) -> Statistics:
+    n = len(params["means"])
+    counts, flags = torch.zeros(n, dtype=torch.int64), torch.zeros(n, dtype=torch.bool)
+    return Statistics(torch.zeros_like(params["opacities"]), counts, 0, counts, flags)
 
 
 def climb(dtype: torch.dtype) -> list[Rung]:
     first = {name: torch.tensor(array, dtype=dtype) for name, array in ten_losses.first_params().items()}
-    rows = density.rows_from_params(first)
-    statistics = density.zero_statistics(len(rows), dtype)
+    trainer = Trainer("pop_fast")
+    rows, statistics = trainer.rows_from_params(first), nothing_seen(first)
     rungs = []
     for step in range(STEPS):
         camera = ten_losses.cameras()[step % 3]
@@ -61,16 +51,18 @@ def climb(dtype: torch.dtype) -> list[Rung]:
             loss = loss + RECIPE.lambda_pop * pop_loss(opacities, importance_mask(counts))
         loss.backward()
         with torch.no_grad():
-            rows = adam(rows, {name: leaf.grad for name, leaf in leaves.items()}, step)
+            grads = {name: leaf.grad for name, leaf in leaves.items()}
+            rates = learning_rates(step, SCENE_SCALE, RECIPE.max_steps)
+            rows = Rows(*trainer.adam_step(rows.params, grads, rows.m, rows.v, step + 1, rates))
             seen = ((meta["radii"][0] > 0).all(-1), counts, SIZE, SIZE)
-            statistics = density.accumulate(statistics, meta["means2d"].grad[0], *seen, RECIPE.density)
+            statistics = trainer.accumulate(statistics, meta["means2d"].grad[0], *seen, RECIPE.density)
             if densifies_at(step, RECIPE.density):
-                rows, statistics = density.densify_and_prune(
+                rows, statistics = trainer.densify_and_prune(
                     *(rows, statistics, SCENE_SCALE, step),
                     lambda n: torch.tensor(ten_losses.draws(n), dtype=dtype),
                     RECIPE.density,
                 )
-        rungs.append(Rung(loss.item(), len(rows)))
+        rungs.append(Rung(loss.item(), len(rows.params["means"])))
     return rungs
 
 

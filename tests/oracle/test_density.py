@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from pop_ref.density import (
-    ADC,
+    GSPLAT,
     POP,
     DensityConfig,
     Rows,
@@ -95,6 +95,23 @@ def test_average_divides_by_visible_views_or_by_the_window() -> None:
 )
 def test_blur_threshold_is_two_hundred_thousandths_of_the_image(width: int, height: int, least: int) -> None:
     assert blur_set(np.array([least - 1, least]), width, height, POP.theta_blur).tolist() == [False, True]
+
+
+def test_a_least_number_of_pixels_is_exceeded_too_and_changes_nothing_where_the_share_is_more() -> None:
+    counts = np.array([10, 11, 20, 21])
+    assert blur_set(counts, 480, 270, 2e-5, min_pixels=10.0).tolist() == [False, True, True, True]
+    assert blur_set(counts, 1000, 1000, 2e-5, min_pixels=10.0).tolist() == [False, False, False, True]
+
+
+@pytest.mark.parametrize("reading", ["any_view", "sum", "own_view"])
+def test_where_a_mask_leaves_pixels_out_the_share_is_of_those_that_count(reading: str) -> None:
+    config = DensityConfig(theta_blur=0.25, blur_window=reading, blur_min_pixels=2.0)
+    nothing = (np.zeros((3, 2)), np.ones(3, bool), np.array([3, 5, 17]), 8, 8, config)
+    assert accumulate(zero_statistics(3), *nothing).blurred.tolist() == [False, False, True]
+    assert accumulate(zero_statistics(3), *nothing, kept_pixels=16).blurred.tolist() == [False, True, True]
+    # a mask that keeps next to nothing does not make every pixel blur
+    assert accumulate(zero_statistics(3), *nothing, kept_pixels=4).blurred.tolist() == [True, True, True]
+    assert blur_set(np.array([2, 3]), 8, 8, 0.25, 2.0, kept_pixels=4).tolist() == [False, True]
 
 
 def test_a_count_exactly_at_the_blur_threshold_is_not_blurred() -> None:
@@ -186,9 +203,9 @@ def test_calendar_has_144_events_41_with_blur_and_4_resets() -> None:
     blurred = [s for s in events if blurs_at(s, POP)]
     assert (len(blurred), blurred[0], blurred[-1]) == (41, 3000, 7000)
     assert [s for s in STEPS if resets_at(s, POP)] == []
-    assert [s for s in STEPS if resets_at(s, ADC)] == [3000, 6000, 9000, 12_000]
-    assert resets_at(0, replace(ADC, reset_at_zero=True))
-    assert not any(blurs_at(s, ADC) for s in STEPS)
+    assert [s for s in STEPS if resets_at(s, GSPLAT)] == [3000, 6000, 9000, 12_000]
+    assert resets_at(0, replace(GSPLAT, reset_at_zero=True))
+    assert not any(blurs_at(s, GSPLAT) for s in STEPS)
 
 
 def test_children_are_drawn_from_their_parent_and_1_6_times_smaller() -> None:

@@ -1,7 +1,7 @@
 """Row operations against a model that keeps each Gaussian as one dictionary: nothing may come apart.
 
 Every row carries a tag; its other values and its moments are functions of what happened to it, so a value that strays
-to another row shows at once. The machine runs over the oracle and over its torch twin.
+to another row shows at once. The machine runs over the oracle and over the row operations that train.
 """
 
 from __future__ import annotations
@@ -11,16 +11,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from pop_fast import density as fast
 from pop_ref import density as oracle
+from pop_ref.conformance.backends import shipped
 from pop_ref.optimizer import adam_step
 
-KEYS = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "tag": ()}
-LEARNING_RATE = {name: 0.0 if name == "tag" else 0.125 for name in KEYS}
+KEYS = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": ()}
+LEARNING_RATE = {name: 0.0 if name == "sh0" else 0.125 for name in KEYS}
 MOST_ROWS = 24
 
 
@@ -40,7 +39,7 @@ class Member:
 
 def member(tag: int) -> Member:
     wave = [math.sin(1.0 + tag + 3 * k) for k in range(4)]
-    params = {"means": wave[:3], "scales": wave[1:], "quats": wave, "opacities": [2.0 * wave[0]], "tag": [float(tag)]}
+    params = {"means": wave[:3], "scales": wave[1:], "quats": wave, "opacities": [2.0 * wave[0]], "sh0": [float(tag)]}
     return Member(params, *({name: [0.0] * len(value) for name, value in params.items()} for _ in range(2)))
 
 
@@ -56,10 +55,12 @@ def rotated(quat: list[float], point: list[float]) -> list[float]:
 class RowMachine(RuleBasedStateMachine):
     """Apply the same edits to arrays and to the model."""
 
-    ops: Any = oracle
+    def operation(self, name: str) -> Any:
+        return getattr(oracle, name)
 
-    def to_array(self, values: Any) -> Any:
-        return np.asarray(values)
+    def edit(self, name: str, *args: Any) -> None:
+        after = self.operation(name)(*args)
+        self.rows = oracle.Rows(after.params, after.m, after.v)
 
     @initialize(n=st.integers(0, 4))
     def start(self, n: int) -> None:
@@ -69,18 +70,18 @@ class RowMachine(RuleBasedStateMachine):
             name: np.array([g.params[name] for g in self.model], dtype=np.float64).reshape(n, *shape)
             for name, shape in KEYS.items()
         }
-        self.rows = self.ops.rows_from_params({name: self.to_array(array) for name, array in params.items()})
+        self.edit("rows_from_params", params)
 
     def chosen(self, data: st.DataObject) -> tuple[list[bool], Any]:
         n = len(self.model)
         picks = data.draw(st.lists(st.booleans(), min_size=n, max_size=n), label="mask")
-        return picks, self.to_array(np.array(picks, dtype=bool))
+        return picks, np.array(picks, dtype=bool)
 
     @rule(data=st.data())
     @precondition(lambda self: len(self.model) <= MOST_ROWS)
     def clone(self, data: st.DataObject) -> None:
         picks, mask = self.chosen(data)
-        self.rows = self.ops.clone_rows(self.rows, mask)
+        self.edit("clone_rows", self.rows, mask)
         self.model += [g.child() for g, pick in zip(self.model, picks, strict=True) if pick]
 
     @rule(data=st.data())
@@ -89,7 +90,7 @@ class RowMachine(RuleBasedStateMachine):
         picks, mask = self.chosen(data)
         n_split = sum(picks)
         normals = np.cos(np.arange(6.0 * n_split)).reshape(2, n_split, 3)
-        self.rows = self.ops.split_rows(self.rows, mask, self.to_array(normals))
+        self.edit("split_rows", self.rows, mask, normals)
         parents = [g for g, pick in zip(self.model, picks, strict=True) if pick]
         self.model = [g for g, pick in zip(self.model, picks, strict=True) if not pick]
         for child in range(2):
@@ -104,12 +105,12 @@ class RowMachine(RuleBasedStateMachine):
     @rule(data=st.data())
     def prune(self, data: st.DataObject) -> None:
         picks, mask = self.chosen(data)
-        self.rows = self.ops.prune_rows(self.rows, mask)
+        self.edit("prune_rows", self.rows, mask)
         self.model = [g for g, pick in zip(self.model, picks, strict=True) if not pick]
 
     @rule(ceiling=st.sampled_from([0.01, 0.25]))
     def reset(self, ceiling: float) -> None:
-        self.rows = self.ops.reset_opacities(self.rows, ceiling)
+        self.edit("reset_opacities", self.rows, ceiling)
         logit = math.log(ceiling / (1.0 - ceiling))
         for g in self.model:
             g.params["opacities"] = [min(g.params["opacities"][0], logit)]
@@ -122,7 +123,7 @@ class RowMachine(RuleBasedStateMachine):
         arrays = [{name: np.asarray(a) for name, a in part.items()} for part in self.parts()]
         grads = {name: np.cos(array) for name, array in arrays[0].items()}
         updated = adam_step(arrays[0], grads, arrays[1], arrays[2], self.updates, LEARNING_RATE)
-        self.rows = self.ops.Rows(*({name: self.to_array(a) for name, a in part.items()} for part in updated))
+        self.rows = oracle.Rows(*updated)
         for g in self.model:
             lists = [{name: np.array(value) for name, value in part.items()} for part in (g.params, g.m, g.v)]
             grads = {name: np.cos(value) for name, value in lists[0].items()}
@@ -142,15 +143,13 @@ class RowMachine(RuleBasedStateMachine):
                 assert array.shape == (len(self.model), *shape)
                 np.testing.assert_allclose(array, expected.reshape(array.shape), rtol=1e-10, atol=1e-12)
         # tags are never computed with, so they are exact
-        assert np.asarray(self.rows.params["tag"]).tolist() == [g.params["tag"][0] for g in self.model]
+        assert np.asarray(self.rows.params["sh0"]).tolist() == [g.params["sh0"][0] for g in self.model]
 
 
-class FastRowMachine(RowMachine):
-    ops: Any = fast
-
-    def to_array(self, values: Any) -> Any:
-        return torch.as_tensor(np.asarray(values))
+class TrainedRowMachine(RowMachine):
+    def operation(self, name: str) -> Any:
+        return shipped("fast64").stage(name)
 
 
 TestOracleRows = RowMachine.TestCase
-TestFastRows = FastRowMachine.TestCase
+TestTrainedRows = TrainedRowMachine.TestCase

@@ -10,47 +10,93 @@ from pop_ref.conformance.law import law
 from pop_ref.conformance.strategies import arrays_of, dyadic
 
 gradients = st.lists(dyadic(-2.0, 2.0), min_size=1, max_size=5)
+# of what trains; a program may treat each in its own way
+KEYS = ("means", "scales", "quats", "opacities", "sh0", "shN")
+RATES = {key: 2.0 ** -(2 + k) for k, key in enumerate(KEYS)}
+BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
 
 
-def _walk(backend, gradients, lr=0.25):
-    x, m, v = ({"x": np.zeros(1)} for _ in range(3))
+def recurrence(gradients, lr, first=1):
+    """Follow one number; the first gradient is that of update `first`."""
+    x = m = v = 0.0
+    for t, g in enumerate(gradients, start=first):
+        m, v = BETA1 * m + (1.0 - BETA1) * g, BETA2 * v + (1.0 - BETA2) * g * g
+        x -= lr * (m / (1.0 - BETA1**t)) / (np.sqrt(v / (1.0 - BETA2**t)) + EPS)
+    return x, m, v
+
+
+def _walk(backend, gradients, lr=None):
+    """Move one number of each parameter by the same gradients; return what became of each and of its moments."""
+    x, m, v = ({key: np.zeros(1) for key in KEYS} for _ in range(3))
     for step, g in enumerate(gradients, start=1):
-        x, m, v = backend.stage("adam_step")(x, {"x": np.array([g])}, m, v, step, {"x": lr})
-    return x["x"][0], m["x"][0], v["x"][0]
+        given = {key: np.array([g]) for key in KEYS}
+        x, m, v = backend.stage("adam_step")(x, given, m, v, step, lr or RATES)
+    return {key: (x[key][0], m[key][0], v[key][0]) for key in KEYS}
 
 
 @law("optimizer", "adam_step", gradients=gradients)
 def test_adam_follows_the_scalar_recurrence(backend, gradients):
-    x = m = v = 0.0
-    for step, g in enumerate(gradients, start=1):
-        m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g * g
-        x -= 0.25 * (m / (1.0 - 0.9**step)) / (np.sqrt(v / (1.0 - 0.999**step)) + 1e-15)
     found = _walk(backend, gradients)
-    assert_close("optimizer.adam", found, [x, m, v], np.array([1.0, 2.0, 4.0]) * len(gradients), backend.dtype)
+    for key, lr in RATES.items():
+        size = np.array([4.0 * lr, 2.0, 4.0]) * len(gradients)
+        assert_close("optimizer.adam", found[key], recurrence(gradients, lr), size, backend.dtype)
 
 
 @law("optimizer", "adam_step", gradients=gradients, power=st.integers(0, 8))
 def test_adam_forgets_the_scale_of_the_loss(backend, gradients, power):
-    scaled = _walk(backend, [g * 2.0**power for g in gradients])
-    assert_close("optimizer.scale", scaled[0], _walk(backend, gradients)[0], 4.0 * len(gradients), backend.dtype)
+    scaled, plain = _walk(backend, [g * 2.0**power for g in gradients]), _walk(backend, gradients)
+    for key, lr in RATES.items():
+        size = 16.0 * lr * len(gradients)
+        assert_close("optimizer.scale", scaled[key][0], plain[key][0], size, backend.dtype)
 
 
 @law("optimizer", "adam_step", g=dyadic(0.125, 4.0), lr=dyadic(0.125, 1.0))
 def test_the_first_step_has_the_length_of_the_learning_rate(backend, g, lr):
-    assert_close("optimizer.scale", _walk(backend, [g], lr)[0], -lr, 4.0, backend.dtype)
+    for x, _, _ in _walk(backend, [g], dict.fromkeys(KEYS, lr)).values():
+        assert_close("optimizer.scale", x, -lr, 4.0, backend.dtype)
+
+
+@law("optimizer", "adam_step", powers=st.lists(st.integers(-33, -13), min_size=1, max_size=4), sign=st.booleans())
+def test_gradients_of_any_smallness_take_whole_steps(backend, powers, sign):
+    # 1e-10 to 1e-4: eps stands outside the root, and it is far below all of them
+    gradients = [(-1.0 if sign else 1.0) * 2.0**power for power in powers]
+    found = _walk(backend, gradients)
+    for key, lr in RATES.items():
+        x, m, v = recurrence(gradients, lr)
+        assert_close("optimizer.adam", found[key][0], x, 4.0 * lr * len(gradients), backend.dtype)
+        assert_close("optimizer.adam", found[key][1:], [m, v], np.array([abs(m), v]) * len(gradients), backend.dtype)
+        assert abs(found[key][0]) > 0.25 * lr, "a small gradient took a small step"
 
 
 @law("optimizer", "adam_step", values=arrays_of((3, 2)))
 def test_rows_do_not_mix_and_rows_without_gradient_move_by_their_moments(backend, values):
     adam = backend.stage("adam_step")
-    params, m, v = {"x": values}, {"x": np.ones((3, 2))}, {"x": np.ones((3, 2))}
-    grads = {"x": np.zeros((3, 2))}
-    grads["x"][1] = 1.0
-    moved, new_m, _ = adam(params, grads, m, v, 4, {"x": 0.5})
-    alone, alone_m, _ = adam(*({"x": d["x"][1:2]} for d in (params, grads, m, v)), 4, {"x": 0.5})
-    assert_same_bits("one row alone", moved["x"][1:2], alone["x"])
-    assert_same_bits("moments of one row alone", new_m["x"][1:2], alone_m["x"])
-    assert np.all(moved["x"][0] < values[0])
+    params, m, v = ({key: array.copy() for key in KEYS} for array in (values, np.ones((3, 2)), np.ones((3, 2))))
+    grads = {key: np.zeros((3, 2)) for key in KEYS}
+    for grad in grads.values():
+        grad[1] = 1.0
+    moved, new_m, _ = adam(params, grads, m, v, 4, RATES)
+    alone, alone_m, _ = adam(*({key: d[key][1:2] for key in KEYS} for d in (params, grads, m, v)), 4, RATES)
+    for key in KEYS:
+        assert_same_bits(f"one row of {key} alone", moved[key][1:2], alone[key])
+        assert_same_bits(f"moments of one row of {key} alone", new_m[key][1:2], alone_m[key])
+        assert np.all(moved[key][0] < values[0])
+
+
+@law("optimizer", "adam_steps", waits=st.integers(1, 4), gradients=gradients)
+def test_harmonics_that_wait_do_not_move_and_their_counter_goes_on(backend, waits, gradients):
+    zero = {key: np.zeros(1) for key in KEYS}
+    others = {key: np.array([0.5]) for key in KEYS if key != "shN"}
+    x, m, v = backend.stage("adam_steps")(zero, [others] * waits, RATES)
+    assert_same_bits("harmonics that wait", [x["shN"], m["shN"], v["shN"]], np.zeros((3, 1)))
+    active = [{**others, "shN": np.array([g])} for g in gradients]
+    x, m, v = backend.stage("adam_steps")(zero, [*[others] * waits, *active], RATES)
+    for key, lr in RATES.items():
+        first, given = (waits + 1, gradients) if key == "shN" else (1, [0.5] * (waits + len(gradients)))
+        # corrections that count the waiting make a step larger, by 10 / sqrt(1000) a wait at most
+        size = np.array([4.0 * lr * (1.0 + waits), 2.0, 4.0]) * len(given)
+        found = (x[key][0], m[key][0], v[key][0])
+        assert_close("optimizer.adam", found, recurrence(given, lr, first), size, backend.dtype)
 
 
 @law("optimizer", "means_learning_rate", step=st.integers(0, 30_000), scale=dyadic(0.5, 8.0))

@@ -1,0 +1,270 @@
+"""Density control and Adam of a torch trainer as stage functions: what its strategy, its row operations and its
+optimizers do when it trains, under the oracle's names.
+
+A population is taken into the trainer's own form, parameters with one optimizer each whose moments are set, and back.
+torch and the trainer are imported when the stages are made, never when the kit is.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+from pop_ref.density_config import DensityConfig
+
+# of the Adam counter that rows are given, and of steps at which nothing but statistics happens
+COUNTER, QUIET_STEP = 7.0, 1
+# long enough that the means' rate has not begun to fall
+NO_DECAY = 1_000_000
+
+
+@dataclass(frozen=True)
+class Rows:
+    """`pop_ref.density_rows.Rows` of tensors."""
+
+    params: Mapping[str, Any]
+    m: Mapping[str, Any]
+    v: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """`pop_ref.density.Statistics` of tensors."""
+
+    grad_sum: Any
+    n_visible: Any
+    n_views: int
+    dominant_sum: Any
+    blurred: Any
+
+
+def training_stages(package: str) -> dict[str, Callable[..., Any]]:
+    """Return the stage functions, on tensors, of a trainer laid out as `pop_fast` is.
+
+    Args:
+        package: the trainer's.
+    """
+    trainer, density = Trainer(package), importlib.import_module(f"{package}.density")
+    # what a strategy decides by is a function already; everything else is what it does
+    decided = ("average_grads", "grow_masks", "prune_mask")
+    done = [name for name in vars(Trainer) if not name.startswith("_")]
+    return {name: getattr(density, name) for name in decided} | {name: getattr(trainer, name) for name in done}
+
+
+class Trainer:
+    """A trainer with the modules `strategies`, `strategies.ops`, `train.model`, `train.schedule` and `train.config`.
+
+    Every method has the name, the parameters and the meaning of a function of the oracle, on tensors.
+    """
+
+    def __init__(self, package: str) -> None:
+        self._torch: Any = importlib.import_module("torch")
+        self._ops: Any = importlib.import_module(f"{package}.strategies.ops")
+        self._model: Any = importlib.import_module(f"{package}.train.model")
+        self._schedule: Any = importlib.import_module(f"{package}.train.schedule")
+        self._config: Any = importlib.import_module(f"{package}.train.config")
+        self._Strategy: Any = importlib.import_module(f"{package}.strategies").POPStrategy
+
+    def rows_from_params(self, params: Mapping[str, Any]) -> Rows:
+        """See `pop_ref.density_rows.rows_from_params`."""
+        return self._rows(*self._population(params))
+
+    def clone_rows(self, rows: Rows, mask: Any) -> Rows:
+        """See `pop_ref.density_rows.clone_rows`."""
+        return self._edited(rows, self._ops.clone, mask)
+
+    def split_rows(self, rows: Rows, mask: Any, normals: Any, revised_opacity: bool = False) -> Rows:
+        """See `pop_ref.density_rows.split_rows`."""
+        return self._edited(rows, self._ops.split, mask, normals, revised_opacity)
+
+    def prune_rows(self, rows: Rows, mask: Any) -> Rows:
+        """See `pop_ref.density_rows.prune_rows`."""
+        return self._edited(rows, self._ops.prune, mask)
+
+    def reset_opacities(self, rows: Rows, ceiling: float = 0.01) -> Rows:
+        """See `pop_ref.density_rows.reset_opacities`."""
+        params, optimizers = self._population(rows.params, rows)
+        self._ops.reset_opacities(params, optimizers, ceiling)
+        return self._rows(params, optimizers)
+
+    def blur_set(self, dominant_counts: Any, width: int, height: int, theta_blur: float) -> Any:
+        """See `pop_ref.density.blur_set`."""
+        n, nothing = len(dominant_counts), self._torch.zeros((len(dominant_counts), 2))
+        config = DensityConfig(theta_blur=theta_blur, blur_window="own_view")
+        empty = Statistics(nothing[:, 0], nothing[:, 0], 0, dominant_counts, nothing[:, 0] > 0)
+        unseen = self._torch.zeros(n, dtype=self._torch.bool)
+        return self.accumulate(empty, nothing, unseen, dominant_counts, width, height, config).blurred
+
+    def accumulate(
+        self,
+        statistics: Statistics,
+        v_means2d: Any,
+        visible: Any,
+        dominant_counts: Any,
+        width: int,
+        height: int,
+        config: DensityConfig,
+        kept_pixels: int | None = None,
+    ) -> Statistics:
+        """See `pop_ref.density.accumulate`."""
+        strategy = self._strategy(config)
+        # a window that has seen nothing is as the strategy makes it
+        seen = statistics.n_views > 0
+        state = self._state(strategy, statistics, 1.0) if seen else strategy.initialize_state(1.0)
+        means2d = self._torch.zeros_like(v_means2d)[None].requires_grad_()
+        means2d.grad = v_means2d[None]
+        info = {
+            "means2d": means2d,
+            "radii": visible[None, :, None].expand(-1, -1, 2).int(),
+            "dominant_counts": dominant_counts[None],
+            "n_cameras": 1,
+            "width": width,
+            "height": height,
+            **({} if kept_pixels is None else {"kept_pixels": kept_pixels}),
+        }
+        params = {"means": self._torch.zeros_like(v_means2d)}
+        strategy.step_post_backward(params, {}, state, QUIET_STEP, info)
+        return self._statistics(state, statistics.grad_sum)
+
+    def densifies_at(self, step: int, config: DensityConfig) -> bool:
+        """See `pop_ref.density_config.densifies_at`."""
+        return bool(self._strategy(config).is_refine_step(step))
+
+    def resets_at(self, step: int, config: DensityConfig) -> bool:
+        """See `pop_ref.density_config.resets_at`."""
+        return bool(self._strategy(config).is_reset_step(step))
+
+    def densify_and_prune(
+        self,
+        rows: Rows,
+        statistics: Statistics,
+        scene_scale: float,
+        step: int,
+        normals: Callable[[int], Any],
+        config: DensityConfig,
+    ) -> tuple[Rows, Statistics]:
+        """See `pop_ref.density.densify_and_prune`."""
+        strategy = self._strategy(config)
+        params, optimizers = self._population(rows.params, rows)
+        state = self._state(strategy, statistics, scene_scale)
+        strategy.change(params, optimizers, state, step, normals)
+        return self._rows(params, optimizers), self._statistics(state, statistics.grad_sum)
+
+    def adam_step(
+        self,
+        params: Mapping[str, Any],
+        grads: Mapping[str, Any],
+        m: Mapping[str, Any],
+        v: Mapping[str, Any],
+        step: int,
+        lr: Mapping[str, float],
+    ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+        """See `pop_ref.optimizer.adam_step`; the trainer chooses betas and eps."""
+        leaves, optimizers = self._population(params, Rows(params, m, v), float(step - 1), lr)
+        self._move(leaves, optimizers, grads, lr)
+        moved = self._rows(leaves, optimizers)
+        return dict(moved.params), dict(moved.m), dict(moved.v)
+
+    def adam_steps(
+        self, params: Mapping[str, Any], grads: Sequence[Mapping[str, Any]], lr: Mapping[str, float]
+    ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+        """See `pop_ref.optimizer.adam_steps`; only the harmonics beyond the first band can wait."""
+        leaves, optimizers = self._population(params, lr=lr)
+        for given in grads:
+            self._move(leaves, optimizers, given, lr)
+        moved = self._rows(leaves, optimizers)
+        return dict(moved.params), dict(moved.m), dict(moved.v)
+
+    def learning_rates(self, step: int, scene_scale: float) -> dict[str, float]:
+        """See `pop_ref.optimizer.learning_rates`."""
+        lr, leaves = self._config.LearningRates(), {key: self._leaf(self._torch.zeros(1)) for key in self._model.KEYS}
+        optimizers = self._model.make_optimizers(leaves, lr, scene_scale)
+        self._model.adam_step(leaves, optimizers, lr, scene_scale, step, self._config.TrainConfig().max_steps, 0)
+        return {key: optimizer.param_groups[0]["lr"] for key, optimizer in optimizers.items()}
+
+    def means_learning_rate(self, step: int, scene_scale: float) -> float:
+        """See `pop_ref.optimizer.means_learning_rate`."""
+        return self.learning_rates(step, scene_scale)["means"]
+
+    def sh_degree_at(self, step: int) -> int:
+        """See `pop_ref.optimizer.sh_degree_at`."""
+        config = self._config.TrainConfig()
+        return int(self._schedule.active_sh_degree(step, config.sh_interval, config.sh_degree))
+
+    def _move(self, leaves: Any, optimizers: Any, grads: Mapping[str, Any], lr: Mapping[str, float]) -> None:
+        for key, grad in grads.items():
+            leaves[key].grad = grad.clone()
+        degree = 0 if "shN" in leaves and "shN" not in grads else 1
+        self._model.adam_step(leaves, optimizers, self._rates(lr), 1.0, 0, NO_DECAY, degree)
+
+    def _rates(self, lr: Mapping[str, float]) -> Any:
+        own = {"sh_rest" if key == "shN" else key: rate for key, rate in lr.items()}
+        return self._config.LearningRates(**own)
+
+    def _leaf(self, tensor: Any) -> Any:
+        return self._torch.nn.Parameter(tensor.clone())
+
+    def _population(
+        self,
+        params: Mapping[str, Any],
+        moments: Rows | None = None,
+        counter: float = COUNTER,
+        lr: Mapping[str, float] | None = None,
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return leaves and the trainer's optimizers of them, with these moments or as they are made."""
+        leaves = {key: self._leaf(value) for key, value in params.items()}
+        optimizers = self._model.make_optimizers(leaves, self._rates(lr or {}), 1.0)
+        if moments is not None:
+            for key, leaf in leaves.items():
+                optimizers[key].state[leaf] = {
+                    "step": self._torch.tensor(counter),
+                    "exp_avg": moments.m[key].clone(),
+                    "exp_avg_sq": moments.v[key].clone(),
+                }
+        return leaves, optimizers
+
+    def _rows(self, leaves: Mapping[str, Any], optimizers: Mapping[str, Any]) -> Rows:
+        """Return parameters and moments; an optimizer that has none yet will begin with zeros."""
+
+        def moments(name: str) -> dict[str, Any]:
+            return {
+                key: optimizers[key].state.get(leaf, {}).get(name, self._torch.zeros_like(leaf)).detach()
+                for key, leaf in leaves.items()
+            }
+
+        params = {key: leaf.detach() for key, leaf in leaves.items()}
+        return Rows(params, moments("exp_avg"), moments("exp_avg_sq"))
+
+    def _edited(self, rows: Rows, operation: Callable[..., None], *args: Any) -> Rows:
+        params, optimizers = self._population(rows.params, rows)
+        operation(params, optimizers, {}, *args)
+        return self._rows(params, optimizers)
+
+    def _strategy(self, config: DensityConfig) -> Any:
+        """Return the trainer's strategy under these settings."""
+        shared = {f.name for f in fields(self._Strategy)} & {f.name for f in fields(DensityConfig)}
+        return self._Strategy(**{name: getattr(config, name) for name in shared})
+
+    def _state(self, strategy: Any, statistics: Statistics, scene_scale: float) -> dict[str, Any]:
+        """Return the strategy's state with these statistics."""
+        return {
+            **strategy.initialize_state(scene_scale),
+            "grad2d": statistics.grad_sum.clone(),
+            "count": statistics.n_visible.to(statistics.grad_sum.dtype),
+            "views": statistics.n_views,
+            "blurred": statistics.blurred.clone(),
+            "dominant_sum": statistics.dominant_sum.clone(),
+        }
+
+    def _statistics(self, state: Mapping[str, Any], like: Any) -> Statistics:
+        none = self._torch.zeros_like(state["grad2d"])
+        blurred, won = state["blurred"], state["dominant_sum"]
+        return Statistics(
+            grad_sum=state["grad2d"].to(like.dtype),
+            n_visible=state["count"].long(),
+            n_views=state["views"],
+            dominant_sum=none.long() if won is None else won,
+            blurred=none.bool() if blurred is None else blurred,
+        )
