@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import torch
 from torch import Tensor
 
 from pop_fast.errors import PopError
@@ -29,7 +28,7 @@ def check_views(config: TrainConfig, name: str, train: Sequence[ViewTensors], te
     """
     for view in (*train, *test):
         try:
-            check_cameras(view.viewmat, view.K, view.width, view.height, 1, (), torch.float32)
+            check_cameras(view.viewmat, view.K, view.width, view.height, 1, (), view.viewmat.dtype)
         except ValueError as error:
             raise PopError(f"{name}: camera of {view.name}: {error}; mend it, or leave the view out") from error
     in_loss = too_small(train) if config.ssim_padding == "valid" else None

@@ -1,4 +1,4 @@
-"""A capture of four small photographs, and a schedule of 300 steps in which everything happens that a training knows."""
+"""Four small photographs, and a schedule of 300 steps in which everything happens that a training knows."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ WIDTH, HEIGHT, N_POINTS, STEPS = 24, 16, 14, 300
 
 DENSITY = DensityConfig(
     grow_grad2d=0.012,
-    grow_scale3d=0.045,
-    prune_opa=0.02,
-    prune_scale3d=0.2,
+    grow_scale3d=0.12,
+    prune_opa=0.06,
+    prune_scale3d=0.26,
     prune_too_big_after=60,
     refine_start_iter=10,
     refine_stop_iter=260,
     refine_every=12,
-    theta_blur=0.06,
+    theta_blur=0.1,
     blur_start_iter=96,
     blur_stop_iter=180,
     reset_every=70,
-    reset_opa=0.1,
+    reset_opa=0.2,
 )
 RECIPE = Recipe(
     density=DENSITY,
@@ -33,15 +33,22 @@ RECIPE = Recipe(
     lambda_pop=5e-3,
     pop_start_iter=20,
     pop_stop_iter=220,
-    l2_stop_iter=240,
+    l2_stop_iter=256,
     max_steps=STEPS,
     sh_interval=40,
 )
-# the ladder of ten steps, for engines of other precisions and in a hurry
+# the same in ten steps
 SHORT = replace(
     RECIPE,
     density=replace(
-        DENSITY, refine_start_iter=1, refine_stop_iter=9, refine_every=3, blur_start_iter=5, blur_stop_iter=7, reset_every=4
+        DENSITY,
+        grow_grad2d=0.0025,
+        refine_start_iter=1,
+        refine_stop_iter=9,
+        refine_every=3,
+        blur_start_iter=5,
+        blur_stop_iter=7,
+        reset_every=4,
     ),
     pop_start_iter=1,
     pop_stop_iter=8,
