@@ -16,13 +16,15 @@ from typing import Any, Final, Protocol
 import torch
 from torch import Tensor
 
-from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, StepValues
+from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, StepStats
 from pop_fast.compiled.library import stepper_functions
 from pop_fast.ssim import TargetMoments, border_of, kept_windows, target_moments
 from pop_fast.transmittance import Stop, below
 
 # steps that are taken before Python is asked again: Ctrl-C, a progress bar
 LONGEST: Final = 10
+# what the step measures, the first of `StepStats`
+N_VALUES: Final = 5
 PARTS: Final = ("see", "list", "blend", "compare", "gather", "transpose", "update")
 _POINTER, _WHOLE, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 
@@ -116,8 +118,10 @@ class NativeTrainer:
 
     Attributes:
         step: steps taken.
-        seconds: by part of the step (`PARTS`), since it was made.
+        grown: 0; what is too small grows before a step writes to it.
     """
+
+    grown = 0
 
     def __init__(
         self,
@@ -144,7 +148,7 @@ class NativeTrainer:
         self._given = StepGiven()
         self._seconds = torch.zeros(len(PARTS), dtype=torch.float64)
         self._bad_row = torch.full((1,), -1, dtype=torch.int64)
-        self._history: dict[int, StepValues] = {}
+        self._history: dict[int, StepStats] = {}
         self._describe()
         self.rebind(params, m, v)
 
@@ -193,8 +197,8 @@ class NativeTrainer:
         while self.step < until:
             self._take(min(until - self.step, LONGEST))
 
-    def told(self, first: int, last: int) -> list[StepValues]:
-        """Return what the steps from `first` to before `last` were like; the last `run` must have taken them."""
+    def step_stats(self, first: int, last: int) -> list[StepStats]:
+        """Return the measurements of the steps from `first` to before `last`; the last `run` must have taken them."""
         return [self._history[step] for step in range(first, last)]
 
     def _describe(self) -> None:
@@ -225,7 +229,7 @@ class NativeTrainer:
         given.pixel_weight = (1.0 - phase.lambda_ssim) * settings.pixelwise_scale
         given.ssim_weight = phase.lambda_ssim * (0.5 if settings.d_ssim_halved else 1.0)
         given.lambda_pop = settings.lambda_pop if phase.pop else 0.0
-        given.dominance = phase.tells
+        given.dominance = phase.dominance
         summed = phase.window or (phase.blur and settings.blur_window == "sum")
         blurs = phase.blur and settings.blur_window != "sum"
         given.grad_sum = found.grad_sum.data_ptr() if phase.statistics else None
@@ -234,7 +238,7 @@ class NativeTrainer:
         given.blurred = found.blurred.data_ptr() if blurs else None
 
     def _take(self, n: int) -> None:
-        values = torch.zeros((n, len(StepValues._fields)), dtype=torch.float64)
+        values = torch.zeros((n, N_VALUES), dtype=torch.float64)
         # held until the steps have been taken: the arguments only point
         views = [self._target(self._order[step]) for step in range(self.step, self.step + n)]
         steps = (StepGiven * n)()
@@ -246,7 +250,7 @@ class NativeTrainer:
         if taken < 0:
             raise MemoryError("the native training step ran out of memory")
         for k in range(taken):
-            self._history[self.step + k] = StepValues(*values[k].tolist())
+            self._history[self.step + k] = StepStats(*values[k].tolist())
         self.step += taken
         if taken < n:
             raise ValueError(f"step {self.step}: Gaussian {int(self._bad_row)} has a value that is not finite")
@@ -260,7 +264,7 @@ class NativeTrainer:
         given.kept_windows = None if view.kept_windows is None else view.kept_windows.data_ptr()
         given.n_kept = given.width * given.height if view.kept is None else int(view.kept.sum())
         given.n_windows = view.mu_y[0].numel() if view.kept_windows is None else int(view.kept_windows.sum())
-        given.blur_pixels = settings.blur_pixels(given.width, given.height)
+        given.blur_pixels = settings.blur_pixels(given.n_kept)
         decay = settings.means_decay ** min(step / settings.max_steps, 1.0)
         given.lr[0], given.adam_step = settings.lr["means"] * decay, step + 1
 

@@ -1,9 +1,11 @@
-"""Which engine takes the steps of a run: autograd over a backend's stages, or the fused step on a GPU."""
+"""Which engine takes the steps of a run: autograd over a backend's stages, the native step, the fused one on a GPU."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -12,7 +14,7 @@ from cuda_ext.train_settings import StepSettings
 from pop_fast.backends import get_backend
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.fused_stepper import Fused, FusedStepper, Rows, unsupported
+from pop_fast.train.fused_stepper import Fused, FusedStepper, MakeFused, Rows, unsupported
 from pop_fast.train.on_device import OnDevice
 from pop_fast.train.stepper import Engine, Task
 from pop_fast.train.torch_stepper import TorchStepper
@@ -20,6 +22,8 @@ from pop_fast.train.views import ViewTensors
 
 # so many steps at most before the host looks up from a GPU: Ctrl-C, the progress bar
 LONGEST_ON_GPU = 500
+# and from a CPU
+LONGEST_ON_CPU = 20
 # of the card's free memory, what the photographs' blurred values may take; the rest is for Gaussians and tile lists
 MOMENTS_SHARE = 0.25
 _BYTES_OF_MOMENTS = 24  # a pixel
@@ -28,8 +32,8 @@ _BYTES_OF_MOMENTS = 24  # a pixel
 def engine_of(config: TrainConfig, own_strategy: bool = True) -> Engine:
     """Return the engine for a run's backend and settings.
 
-    "cuda" is the fused step and nothing else; a setting that it does not know is refused. All other backends render on
-    the CPU, and their steps are torch's.
+    "cuda" is the fused step and nothing else; a setting that it does not know is refused. "compiled" is the native step
+    where that knows all settings, else autograd over compiled stages. All other backends' steps are torch's.
 
     Args:
         config: with a backend's name; "auto" is "fast" here, see `choose_backend`.
@@ -45,6 +49,8 @@ def engine_of(config: TrainConfig, own_strategy: bool = True) -> Engine:
         if reason is not None:
             raise PopError(reason)
         return cuda_engine()
+    if config.backend == "compiled" and own_strategy and unsupported(config) is None:
+        return native_engine()
     return torch_engine("fast" if config.backend == "auto" else config.backend)
 
 
@@ -58,6 +64,23 @@ def torch_engine(name: Literal["fast", "compiled", "ref"]) -> Engine:
     if not backend.available():
         raise PopError(f"backend {name!r} is not available: {backend.why_not()}")
     return Engine(name, torch.device("cpu"), backend, lambda task: TorchStepper(task, backend))
+
+
+def native_engine() -> Engine:
+    """Return the whole step in C++.
+
+    Raises:
+        PopError: it is not compiled.
+    """
+    engine = torch_engine("compiled")
+    return replace(engine, make_stepper=lambda task: FusedStepper(task, "native", LONGEST_ON_CPU, _native_trainer(task)))
+
+
+def _native_trainer(task: Task) -> MakeFused:
+    """Make the native step, with what it needs of the photographs in the memory that the settings give it."""
+    from pop_fast.compiled.native_step import NativeTrainer
+
+    return partial(NativeTrainer, cache_mb=task.config.target_cache_mb)
 
 
 def cuda_engine() -> Engine:
