@@ -140,9 +140,10 @@ def _speed_row(what: str, ms: dict[str, float]) -> list[str]:
 
 def kit() -> str:
     """Say how much the kit holds."""
+    where = f"[{MUTANT_LIST.name}]({MUTANT_LIST.relative_to(ROOT).as_posix()})"
     return (
         f"{len(every_law())} laws in {len(LAW_STAGES)} stages; {len(MUTANTS)} mutants of the oracle and {len(PROGRAM)} "
-        f"of the program that trains, every one of them killed by a named law within the `ci` profile: [{MUTANT_LIST.name}]({MUTANT_LIST.relative_to(ROOT).as_posix()})."
+        f"of the program that trains, every one of them killed by a named law within the `ci` profile: {where}."
     )
 
 
@@ -169,7 +170,8 @@ Made by `python docs/tables.py --write`; a test holds it to the code.
 
 {n} copies of the oracle and {programs} of the program that trains, each with one line broken as somebody once broke it.
 A kit that lets one live is not worth its time, so for each a law is named that breaks on it within the `ci` profile;
-`tests/meta/test_mutants.py` tries them all. `python -m pop_ref.conformance.mutants` puts them on trial again, `--every` lists all laws that notice.
+`tests/meta/test_mutants.py` tries them all. `python -m pop_ref.conformance.mutants` puts them on trial again, `--every`
+lists all laws that notice.
 
 """
 
