@@ -34,12 +34,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from cases import GATE_CASE, ITERATION_CASES, MEMORY_CASE, RASTER_CASES, Case, capture_of, gaussians_of
 from timing import turns_ms
 
+import pop_fast.train
 from pop_fast.backends import backend_names, get_backend
 from pop_fast.compositing import Composite, composite
 from pop_fast.data import Capture, load_capture
 from pop_fast.tiles import TileLists, tile_lists
-from pop_fast.train import TrainConfig, Trainer
+from pop_fast.train import TrainConfig
 from pop_fast.train.environment import keep_freed_memory, reproducible
+from pop_fast.train.views import Rendered, ViewTensors, render_view
 from pop_ref.render import render, render_vjp
 from pop_ref.types import Camera, Gaussians
 
@@ -160,8 +162,8 @@ def time_iteration(case: Case, repeats: int) -> dict[str, Any]:
     """Time whole training steps of POP on a synthetic capture with `case.n` Gaussians; every backend in turns."""
     capture = capture_of(case)
     with tempfile.TemporaryDirectory() as folder:
-        trainers = {name: trainer_of(case, f"{folder}/{name}", name) for name in backends()}
-        return {**asdict(case), **_time_steps(trainers, capture, repeats)}
+        runs = {name: run_of(case, f"{folder}/{name}", name) for name in backends()}
+        return {**asdict(case), **_time_steps(runs, capture, repeats)}
 
 
 def time_capture(path: str, factor: int, repeats: int) -> dict[str, Any]:
@@ -169,36 +171,49 @@ def time_capture(path: str, factor: int, repeats: int) -> dict[str, Any]:
     capture = load_capture(path, factor=factor)
     view = capture.views[0]
     with tempfile.TemporaryDirectory() as folder:
-        trainers = {name: _trainer(capture, f"{folder}/{name}", name) for name in backends()}
-        steps = _time_steps(trainers, capture, repeats)
+        runs = {name: _run(capture, f"{folder}/{name}", name) for name in backends()}
+        steps = _time_steps(runs, capture, repeats)
     return {"capture": capture.name, "width": view.width, "height": view.height, **steps}
 
 
-def trainer_of(case: Case, folder: str, backend: str = "fast") -> Trainer:
-    """Return a trainer whose Gaussians are a case's, of which some are opaque and their sizes differ."""
-    scene, trainer = gaussians_of(case), _trainer(capture_of(case), folder, backend)
+def run_of(case: Case, folder: str, backend: str = "fast") -> Any:
+    """Return a training run whose Gaussians are a case's, of which some are opaque and their sizes differ."""
+    scene, training = gaussians_of(case), _run(capture_of(case), folder, backend)
     with torch.no_grad():
-        trainer.params["scales"].copy_(scene["scales"].log())
-        trainer.params["opacities"].copy_(torch.logit(scene["opacities"].clamp(1e-4, 1.0 - 1e-4)))
-    return trainer
+        training.params["scales"].copy_(scene["scales"].log())
+        training.params["opacities"].copy_(torch.logit(scene["opacities"].clamp(1e-4, 1.0 - 1e-4)))
+    return training
 
 
-def _trainer(capture: Capture, folder: str, backend: Any) -> Trainer:
+def stepping(training: Any) -> Callable[[], Any]:
+    """Return what takes one step of a run."""
+    # `turn_about` calls this of checkouts too in which a run was called a trainer
+    return getattr(training, "train_step", None) or (lambda: training.take_steps(training.step + 1))
+
+
+def first_view(training: Any, capture: Capture) -> Rendered:
+    """Return the first view of a capture as a run's Gaussians are now."""
+    view = ViewTensors.of(capture.views[0])
+    with torch.no_grad():
+        return render_view(get_backend(training.config.backend), training.params, view, training.config, 0)
+
+
+def _run(capture: Capture, folder: str, backend: Any) -> Any:
     at = str(Path(folder) / "run")
     config = TrainConfig(result_dir=at, sh_interval=1, log_every=10**9, progress=False, backend=backend)
-    return Trainer(config, capture)
+    kind: Any = getattr(pop_fast.train, "TrainingRun", None) or vars(pop_fast.train)["Trainer"]
+    return kind(config, capture)
 
 
-def _time_steps(trainers: dict[str, Trainer], capture: Capture, repeats: int) -> dict[str, Any]:
+def _time_steps(runs: dict[str, Any], capture: Capture, repeats: int) -> dict[str, Any]:
     with reproducible(torch.get_num_threads()):
         # what SSIM needs of a photograph is made at its first visit, so every photograph is visited once before
-        steps = {name: trainer.train_step for name, trainer in trainers.items()}
-        taken = turns_ms(steps, repeats, warm_up=len(capture.views))
-        pairs = trainers["fast"].train_step().rendered.info["n_pairs"]
+        taken = turns_ms({name: stepping(run) for name, run in runs.items()}, repeats, warm_up=len(capture.views))
+        pairs = first_view(runs["fast"], capture).info["n_pairs"]
     view = capture.views[0]
     return {
         "iteration_ms": taken,
-        "num_gaussians": len(trainers["fast"].params["means"]),
+        "num_gaussians": len(runs["fast"].params["means"]),
         "pairs_per_pixel": pairs / (view.width * view.height),
     }
 

@@ -81,13 +81,15 @@ class Checkout:
     def step(self, name: str, folder: str, backend: str) -> tuple[Callable[[], Times], Callable[[], Tensor]]:
         """Return what times a training step of a case, and what renders its first view."""
         with self.imports():
-            trainer = self.run.trainer_of(self._case(name), folder, backend)
-            first = trainer.train_step().rendered.image.detach()
+            case = self._case(name)
+            training = self.run.run_of(case, folder, backend)
+            first = self.run.first_view(training, self.run.capture_of(case)).image
+            take = self.run.stepping(training)
 
         def once() -> Times:
             with self.imports():
                 start = time.perf_counter()
-                trainer.train_step()
+                take()
                 return (time.perf_counter() - start,)
 
         return once, lambda: first

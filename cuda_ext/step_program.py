@@ -50,7 +50,7 @@ class StepProgram:
         kernels.begin_step(self._schedule, pointer("constants", shared.constants), state, stream)
         kernels.project(self._gaussians, view, self._project, splats, state, stream)
         kernels.count_instances(lists, splats, profile, state, stream)
-        counts = self._frame.told["dominant_counts"] if self._phase.tells else None
+        counts = self._frame.told["dominant_counts"] if self._phase.dominance else None
         kernels.make_tile_lists(lists, splats, profile, pointer("dominant_counts", counts, "int32"), state, stream)
         kernels.blend_forward(lists, self._forward, profile, stream)
         kernels.photometric(self._photographs, self._loss, self._objective, state, stream)
@@ -101,7 +101,7 @@ def _blends(shared: Shared, rows: Population, frame: Frame, phase: Phase) -> tup
     passed = {key: frame.work.get(key) for key in ("T_final", "last", "checkpoints")}
     drawn = {"channels": 3, "records": rows.records, "background": shared.background, "image": frame.image, **passed}
     forward = fill(kernels.BlendForward(), **drawn)
-    if phase.tells:
+    if phase.dominance:
         fill(forward, **frame.told, masks=shared.views.masks, state=shared.state)
     backward = fill(kernels.BlendBackward(), **drawn, absolute=False, v_image=frame.work["v_image"])
     fill(backward, v_T_final=None, rows=frame.work.get("rows"), sums=rows.sums)
@@ -120,7 +120,7 @@ def _pop_term(shared: Shared, rows: Population, frame: Frame, phase: Phase) -> A
 def _update(shared: Shared, rows: Population, frame: Frame, phase: Phase) -> Any:
     s, found = shared.settings, rows.statistics
     made = fill(load().UpdateArrays(), n=len(rows), n_rest=rows.params["shN"].shape[1], sums=rows.sums)
-    counts = frame.told["dominant_counts"] if phase.tells else None
+    counts = frame.told["dominant_counts"] if phase.dominance else None
     fill(made, constants=shared.constants, dominant_counts=counts, pop_sides=rows.pop_sides)
     made.lambda_pop = s.lambda_pop if phase.pop else 0.0
     made.blur_pixels, made.blur_own_view = s.blur_pixels(*frame.size), s.blur_window == "own_view"

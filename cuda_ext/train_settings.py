@@ -1,4 +1,4 @@
-"""What a fused training step depends on, and what it tells density control."""
+"""What a training step that runs as a whole depends on, and what it reports: to records and to density control."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pop_ref.constants import PAPER, Profile
+from pop_ref.constants import Profile
+from pop_ref.settings import BETAS, EPS, DensityConfig, Recipe
 
 # in the kernels' order (csrc/train.h)
 GROUPS = ("means", "scales", "quats", "opacities", "sh0", "shN")
@@ -43,31 +44,30 @@ class StepSettings:
 
     lr: Mapping[str, float]
     max_steps: int
-    means_decay: float = 0.01
-    padding: str = "valid"
-    d_ssim_halved: bool = False
-    pixelwise_scale: float = 1.0
-    lambda_pop: float = 0.001
-    pop_views: str = "current"
-    pop_over: str = "all"
-    blur_window: str = "any_view"
-    theta_blur: float = 2e-5
-    blur_min_pixels: float = 0.0
+    means_decay: float = Recipe.lr.means_decay
+    padding: str = Recipe.padding
+    d_ssim_halved: bool = Recipe.d_ssim_halved
+    pixelwise_scale: float = Recipe.pixel_scale
+    lambda_pop: float = Recipe.lambda_pop
+    pop_views: str = Recipe.pop_views
+    pop_over: str = Recipe.pop_over
+    blur_window: str = DensityConfig.blur_window
+    theta_blur: float = DensityConfig.theta_blur
+    blur_min_pixels: float = DensityConfig.blur_min_pixels
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    profile: Profile = PAPER
+    profile: Profile = Recipe.profile
     antialiased: bool = False
     family: str = "columns"
     deterministic: bool = True
-    betas: tuple[float, float] = (0.9, 0.999)
-    eps: float = 1e-15
+    betas: tuple[float, float] = BETAS
+    eps: float = EPS
     replay: bool = True
     counts: bool = False
 
     def blur_pixels(self, width: int, height: int) -> float:
         """Return the whole number of pixels that a blurred Gaussian dominates more than."""
-        theta = max(self.theta_blur, self.blur_min_pixels / (height * width))
         # counts are whole, so that rounding down changes no comparison and a float holds the bound exactly
-        return float(math.floor(theta * (height * width)))
+        return float(math.floor(max(self.theta_blur * (height * width), self.blur_min_pixels)))
 
 
 class Phase(NamedTuple):
@@ -88,24 +88,28 @@ class Phase(NamedTuple):
     statistics: bool
     blur: bool
     l1: bool = False
-    lambda_ssim: float = 0.01
+    lambda_ssim: float = Recipe.lambda_ssim
     window: bool = False
 
     @property
-    def tells(self) -> bool:
+    def dominance(self) -> bool:
         """Whether dominant Gaussians are asked for."""
         return self.pop or self.blur or self.window
 
 
-class StepValues(NamedTuple):
-    """What a step tells, in the kernels' order (csrc/train.h).
+class StepStats(NamedTuple):
+    """Measurements of one step, the first five in the kernels' order (csrc/train.h).
+
+    An engine need not measure all of them at every step; NaN stands for what it has not measured.
 
     Attributes:
         pixelwise: mean of the L1 or L2 term, without its weight.
         ssim: SSIM.
         objective: the photometric objective.
         square: mean square of the difference, the render clamped to [0, 1].
-        pop: the weighted POP term, 0 where it is off.
+        pop: the weighted regularizer of the strategy, as the POP term is, 0 where it is off.
+        n_blended: Gaussians that a pixel blends, on average.
+        n_traversed: entries of its tile's list that a pixel visits, on average.
     """
 
     pixelwise: float
@@ -113,6 +117,8 @@ class StepValues(NamedTuple):
     objective: float
     square: float
     pop: float
+    n_blended: float = math.nan
+    n_traversed: float = math.nan
 
 
 @dataclass

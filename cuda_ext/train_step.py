@@ -21,7 +21,7 @@ from cuda_ext.graphs import Watch, captured
 from cuda_ext.resident import ResidentViews
 from cuda_ext.step_buffers import Frame, Population, Shared
 from cuda_ext.step_program import StepProgram
-from cuda_ext.train_settings import Phase, Statistics, StepSettings, StepValues
+from cuda_ext.train_settings import Phase, Statistics, StepSettings, StepStats
 
 LATE = 2  # steps between an overflow and its notice
 
@@ -103,9 +103,9 @@ class FusedTrainer:
             else:
                 self.step = self._recover()
 
-    def told(self, first: int, last: int) -> list[StepValues]:
-        """Return what the steps from `first` to before `last` told; `run` must have taken them in this session."""
-        return [StepValues(*row) for row in self._shared.history[first:last].tolist()]
+    def step_stats(self, first: int, last: int) -> list[StepStats]:
+        """Return the measurements of the steps from `first` to before `last`, which `run` must have taken here."""
+        return [StepStats(*row) for row in self._shared.history[first:last].tolist()]
 
     @property
     def n(self) -> int:
@@ -124,7 +124,7 @@ class FusedTrainer:
 
     @property
     def values(self) -> Tensor:
-        """What the last step told, in the order of `StepValues`."""
+        """What the last step told, in the order of `StepStats`."""
         return self._shared.values
 
     @property

@@ -38,14 +38,14 @@ STAGES = (
     Stage("importance mask and POP loss", "eqs. 7, 8", ("polarization",)),
     Stage("density control", "eqs. 3, 6", ("density", "density_config", "density_rows")),
     Stage("Adam and its schedules", "4.1", ("optimizer",), ("train/model.py", "train/schedule.py")),
-    Stage("one training step", "eq. 9", ("training", "recipes"), ("train/trainer.py",)),
+    Stage("one training step", "eq. 9", ("training", "recipes"), ("train/torch_stepper.py",)),
     Stage(
         "distance of every decision from flipping", "–", ("margins", "extent_margins", "pixel_margins", "magnitudes")
     ),
 )
 
 # modules of pop_ref that are data or types, not stages
-NOT_STAGES = frozenset({"__init__", "_shapes", "ambiguities", "constants", "notation", "types"})
+NOT_STAGES = frozenset({"__init__", "_shapes", "ambiguities", "constants", "notation", "settings", "types"})
 # stages whose laws stand in a file of another name: whole views, and what has a file of its own outside tests/laws
 LAWS_ELSEWHERE = {
     "render": "tests/laws/test_whole.py",

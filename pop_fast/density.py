@@ -1,7 +1,7 @@
 """Who is blurred, cloned, split and pruned, and what a split makes. Meaning and every switch: `pop_ref.density`.
 
 The strategies collect what these functions read, and edit the population as they say (`strategies.control`,
-`strategies.ops`). `config` is anything with the attributes of `pop_ref.density_config.DensityConfig` that a function
+`strategies.ops`). `config` is anything with the attributes of `pop_ref.settings.DensityConfig` that a function
 reads, a strategy for example.
 """
 
@@ -33,9 +33,9 @@ class Statistics:
     blurred: Tensor
 
 
-def blur_set(dominant_counts: Tensor, width: int, height: int, theta_blur: float) -> Tensor:
+def blur_set(dominant_counts: Tensor, width: int, height: int, theta_blur: float, min_pixels: float = 0.0) -> Tensor:
     """See `pop_ref.density.blur_set`. Works for [N] and, view by view, for [C, N]."""
-    return dominant_counts > theta_blur * (height * width)
+    return dominant_counts > max(theta_blur * (height * width), min_pixels)
 
 
 def average_grads(statistics: Statistics, config: Any) -> Tensor:

@@ -33,8 +33,10 @@ class Ambiguity:
     mark: str = ""
 
 
-_CONFIG: Final = "pop_ref.density_config:DensityConfig"
-_RECIPE: Final = "pop_ref.recipes:Recipe"
+_CONFIG: Final = "pop_ref.settings:DensityConfig"
+_TERM: Final = "pop_ref.settings:PopTerm"
+_PHOTOMETRIC: Final = "pop_ref.settings:Photometric"
+_RECIPE: Final = "pop_ref.settings:Recipe"
 _RECIPES: Final = "pop_ref.recipes:RECIPES"
 
 AMBIGUITIES: Final = (
@@ -43,7 +45,7 @@ AMBIGUITIES: Final = (
         "H",
         "Who is important: in one view, or over several?",
         "who dominates a pixel of the current view",
-        _RECIPE,
+        _TERM,
         ("Recipe.pop_views = window",),
     ),
     Ambiguity(
@@ -107,7 +109,7 @@ AMBIGUITIES: Final = (
         "H",
         "What does L2 average over, and is there a 1/2?",
         "pixels and channels, no 1/2; as eq. 4",
-        _RECIPE,
+        _PHOTOMETRIC,
         ("Recipe.pixel_scale = 0.5", "Recipe.pixel_scale = 3.0"),
     ),
     Ambiguity(
@@ -123,7 +125,7 @@ AMBIGUITIES: Final = (
         "H",
         "Does the POP loss sum over all Gaussians or over visible ones?",
         "over all, as eq. 8 prints",
-        _RECIPE,
+        _TERM,
         ("Recipe.pop_over = visible",),
     ),
     Ambiguity(
@@ -131,7 +133,7 @@ AMBIGUITIES: Final = (
         "M",
         "Is the POP loss on from the first step?",
         "yes, for steps 0 to 14999",
-        _RECIPE,
+        _TERM,
         ("Recipe.pop_start_iter = 500",),
     ),
     Ambiguity(
@@ -168,7 +170,7 @@ AMBIGUITIES: Final = (
         "H",
         "Does the L2 loss stay after 15k?",
         "yes, only POP is said to end",
-        _RECIPE,
+        _PHOTOMETRIC,
         ("Recipe.l2_stop_iter = 15000",),
     ),
     Ambiguity("A21", "L", "Do learning rates change with the L2 loss?", "no", "pop_ref.optimizer:learning_rates"),

@@ -8,7 +8,8 @@ Between two events each view adds to the window's statistics. At an event
     prune      opacity too low, or far too large
     forget     the window's statistics start again from zero (A3: row identities changed)
 
-The row operations are in `density_rows`, the constants and the calendar in `density_config`; both are re-exported here.
+The row operations are in `density_rows`, the constants in `settings`, the schedule in `density_config`; all are
+re-exported here.
 
 Labels decided here: A2, A3, A4, A8, A14, A16, A18, A23; which reading is taken is a field of `DensityConfig`.
 """
@@ -22,10 +23,10 @@ import numpy as np
 
 from pop_ref._shapes import Bool, Float64, Int64
 from pop_ref.activations import opacities_from_logits, scales_from_log_scales
-from pop_ref.density_config import ADC, POP, DensityConfig, blurs_at, densifies_at, resets_at
+from pop_ref.density_config import GSPLAT, POP, DensityConfig, blurs_at, densifies_at, resets_at
 from pop_ref.density_rows import Rows, clone_rows, prune_rows, reset_opacities, rows_from_params, split_rows
 
-__all__ = ["ADC", "POP", "DensityConfig", "blurs_at", "densifies_at", "resets_at"]
+__all__ = ["GSPLAT", "POP", "DensityConfig", "blurs_at", "densifies_at", "resets_at"]
 __all__ += ["Rows", "rows_from_params", "clone_rows", "split_rows", "prune_rows", "reset_opacities"]
 __all__ += ["Statistics", "zero_statistics", "accumulate", "average_grads", "blur_set"]
 __all__ += ["grow_masks", "prune_mask", "densify_and_prune"]
@@ -71,18 +72,19 @@ def zero_statistics(n: int) -> Statistics:
 
 
 def blur_set(
-    dominant_counts: Int64[np.ndarray, " N"], width: int, height: int, theta_blur: float
+    dominant_counts: Int64[np.ndarray, " N"], width: int, height: int, theta_blur: float, min_pixels: float = 0.0
 ) -> Bool[np.ndarray, " N"]:
-    """Select the Gaussians that dominate more of an image than a point should: `D > theta H W`, strictly.
+    """Select the Gaussians that dominate more of an image than a point should: `D > max(theta H W, min)`, strictly.
 
     Source: POP paper eq. 6; theta 2e-5, one tenth of Mini-Splatting's.
-    Departs: nothing.
+    Departs: the paper has no least number of pixels (`DensityConfig.blur_min_pixels`); it is 0 unless asked for.
 
     Args:
         dominant_counts: pixels that each Gaussian dominates.
         width: of the view, px (A18: each view's own size).
         height: of the view, px.
         theta_blur: share of the pixels.
+        min_pixels: and at least so many of them.
 
     Returns:
         True where a Gaussian is blurred.
@@ -91,7 +93,7 @@ def blur_set(
         >>> blur_set(np.array([2, 3]), width=16, height=8, theta_blur=1 / 64).tolist()
         [False, True]
     """
-    return dominant_counts > theta_blur * (height * width)
+    return dominant_counts > max(theta_blur * (height * width), min_pixels)
 
 
 def accumulate(
@@ -131,7 +133,7 @@ def accumulate(
     grads = np.sqrt((0.5 * width * v_means2d[:, 0]) ** 2 + (0.5 * height * v_means2d[:, 1]) ** 2)
     dominant_sum = statistics.dominant_sum + dominant_counts
     tested = dominant_sum if config.blur_window == "sum" else dominant_counts
-    blurred = blur_set(tested, width, height, config.theta_blur)
+    blurred = blur_set(tested, width, height, config.theta_blur, config.blur_min_pixels)
     if config.blur_window == "any_view":
         blurred = blurred | statistics.blurred
     return Statistics(

@@ -19,21 +19,11 @@ from typing import Final
 
 import numpy as np
 
-BETAS: Final = (0.9, 0.999)
-EPS: Final = 1e-15
+from pop_ref.settings import BETAS, EPS, MAX_SH_DEGREE, LearningRates, Recipe
 
-LEARNING_RATES: Final = {
-    "means": 1.6e-4,
-    "scales": 5e-3,
-    "quats": 1e-3,
-    "opacities": 5e-2,
-    "sh0": 2.5e-3,
-    "shN": 2.5e-3 / 20.0,
-}
-MEANS_DECAY: Final = 0.01
-MAX_STEPS: Final = 30_000
-SH_DEGREE_INTERVAL: Final = 1000
-MAX_SH_DEGREE: Final = 3
+LEARNING_RATES: Final = LearningRates().by_parameter()
+MAX_STEPS: Final = Recipe.max_steps
+SH_DEGREE_INTERVAL: Final = Recipe.sh_interval
 
 
 def adam_step(
@@ -124,7 +114,9 @@ def adam_steps(
     return moved, m, v
 
 
-def means_learning_rate(step: int, scene_scale: float, max_steps: int = MAX_STEPS) -> float:
+def means_learning_rate(
+    step: int, scene_scale: float, max_steps: int = MAX_STEPS, rates: LearningRates = Recipe.lr
+) -> float:
     """Decay the positions' learning rate log-linearly: `1.6e-4 scene_scale 0.01^(step / max_steps)`.
 
     Source: Kerbl et al. 2023, appendix C; gsplat's exponential decay.
@@ -134,6 +126,7 @@ def means_learning_rate(step: int, scene_scale: float, max_steps: int = MAX_STEP
         step: from 0; clipped to [0, max_steps].
         scene_scale: world units.
         max_steps: length of the training.
+        rates: at the start.
 
     Returns:
         The learning rate, world units.
@@ -143,19 +136,22 @@ def means_learning_rate(step: int, scene_scale: float, max_steps: int = MAX_STEP
         (0.00032, 3.2)
     """
     share = min(max(step / max_steps, 0.0), 1.0)
-    return LEARNING_RATES["means"] * scene_scale * MEANS_DECAY**share
+    return rates.means * scene_scale * rates.means_decay**share
 
 
-def learning_rates(step: int, scene_scale: float, max_steps: int = MAX_STEPS) -> dict[str, float]:
+def learning_rates(
+    step: int, scene_scale: float, max_steps: int = MAX_STEPS, rates: LearningRates = Recipe.lr
+) -> dict[str, float]:
     """List every parameter's learning rate at a step; only the positions' changes, and none with the loss (A21).
 
     Source: Kerbl et al. 2023; values of gsplat's trainer.
-    Departs: Inria's code since October 2024 uses 0.025 for opacities (`recipes.RECIPES["3DGS"]`).
+    Departs: Inria's code since October 2024 uses 0.025 for opacities (`settings.INRIA_RATES`).
 
     Args:
         step: from 0.
         scene_scale: world units.
         max_steps: length of the training.
+        rates: at the start.
 
     Returns:
         Learning rates by parameter name.
@@ -164,7 +160,7 @@ def learning_rates(step: int, scene_scale: float, max_steps: int = MAX_STEPS) ->
         >>> learning_rates(0, 1.0)["opacities"]
         0.05
     """
-    return {**LEARNING_RATES, "means": means_learning_rate(step, scene_scale, max_steps)}
+    return {**rates.by_parameter(), "means": means_learning_rate(step, scene_scale, max_steps, rates)}
 
 
 def sh_degree_at(step: int, interval: int = SH_DEGREE_INTERVAL, max_degree: int = MAX_SH_DEGREE) -> int:

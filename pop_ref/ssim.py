@@ -23,13 +23,12 @@ Label decided here: A11 (D-SSIM is 1 - SSIM).
 
 from __future__ import annotations
 
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
 from pop_ref._shapes import Bool, Float64
-
-Padding = Literal["valid", "same"]
+from pop_ref.settings import Padding
 
 WINDOW_SIZE: Final = 11
 WINDOW_SIGMA: Final = 1.5

@@ -40,6 +40,7 @@ from pop_ref.optimizer import adam_step, learning_rates, sh_degree_at
 from pop_ref.polarization import importance_mask, pop_loss, pop_loss_vjp
 from pop_ref.recipes import RECIPES, Recipe
 from pop_ref.render import RenderGradients, render, render_vjp
+from pop_ref.settings import LAMBDA_SSIM_3DGS
 from pop_ref.types import Camera, Gaussians, Render
 
 
@@ -120,7 +121,7 @@ def train_step(
     loss, v_image, v_opacities = objective(view, gaussians, target, state, recipe)
     gradients = render_vjp(gaussians, camera, v_image, sh_degree=degree, profile=recipe.profile)
     grads = params_vjp(rows.params, gradients, v_opacities)
-    rates = {**learning_rates(step, scene_scale, recipe.max_steps), "opacities": recipe.opacity_rate}
+    rates = learning_rates(step, scene_scale, recipe.max_steps, recipe.lr)
     rows = Rows(*adam_step(rows.params, grads, rows.m, rows.v, step + 1, rates))
     seen = (gradients.means2d, view.splats.visible, view.dominant_counts, camera.width, camera.height)
     statistics = accumulate(state.statistics, *seen, recipe.density)
@@ -218,7 +219,7 @@ def objective(
         (0.0005, [-0.001])
     """
     l1_again = recipe.l2_stop_iter is not None and state.step >= recipe.l2_stop_iter
-    lambda_ssim = 0.2 if l1_again else recipe.lambda_ssim
+    lambda_ssim = LAMBDA_SSIM_3DGS if l1_again else recipe.lambda_ssim
     options = (lambda_ssim, recipe.padding, None, recipe.d_ssim_halved, recipe.pixel_scale)
     if recipe.pixelwise == "l1" or l1_again:
         loss = losses.photometric_3dgs(view.image, target, *options)

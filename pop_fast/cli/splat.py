@@ -47,7 +47,7 @@ class Splat:
         degree = {0: 0, 3: 1, 8: 2, 15: 3}[self.params["shN"].shape[1]]
         if self.step is None or self.folder is None:
             return degree
-        return active_sh_degree(self.step, self.config.resolved().sh_interval, degree)
+        return active_sh_degree(self.step, self.config.sh_interval, degree)
 
 
 @dataclass(frozen=True, kw_only=True)

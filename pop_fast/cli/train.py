@@ -17,34 +17,39 @@ from pop_fast.backends import get_backend
 from pop_fast.cli import EXIT_INTERRUPTED
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.progress import bars
+from pop_fast.cli.said import PLAN, plan_of, said
 from pop_fast.cli.splat import RECORD, CaptureRecord, read_record, record_text
 from pop_fast.data import Capture, load_capture
 from pop_fast.errors import PopError
 from pop_fast.report import write_report
 from pop_fast.train.checkpoint import list_checkpoints
-from pop_fast.train.choose import choose_backend, make_trainer
+from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.device_plan import unsupported
 from pop_fast.train.environment import keep_freed_memory
+from pop_fast.train.fused_stepper import unsupported
+from pop_fast.train.presets import Given
 from pop_fast.train.results import ResultFolder
+from pop_fast.train.training_run import TrainingRun
 
 _EXAMPLES: Final = """
     pop train scene                          POP, the paper's 30,000 steps, results in out/scene_pop
     pop train scene --preset quick           a tenth of the schedule, for a CPU
     pop train photos --factor 4              a bare folder of photographs: cameras are found first
-    pop train scene --method adc             plain density control with opacity reset
+    pop train scene --method gsplat          the control: gsplat's default strategy, with opacity reset
+    pop train scene --method 3dgs            Inria's constants, learning rates, SSIM and rasterizer
     pop train scene --out out/a --resume     go on from the last checkpoint
     pop train scene --backend fast           on the CPU, also where a GPU is
-    pop train scene --pop.lambda-pop 0.01    any setting; --help-all lists them all
+    pop train scene --pop.lambda-pop 0.01    any setting, taken as it is; --help-all lists them all
 """
 
 # settings that --help shows; --help-all shows the rest
 _SHOWN: Final = frozenset(
     {
-        *("data", "result_dir", "method", "preset", "steps_scaler", "max_steps", "seed", "backend", "profile"),
+        *("data", "result_dir", "max_steps", "seed", "backend", "profile"),
         *("factor", "test_every", "antialiased", "background", "lpips_vgg", "lpips_alex"),
     }
 )
+_DOCUMENTED: Final = (Given, TrainConfig)
 # words of other trainers' command lines: Inria's, gsplat's
 _ALIASES: Final = {
     **dict.fromkeys(("-s", "--source-path", "--data-dir", "--data"), "DATA"),
@@ -99,15 +104,15 @@ def run(argv: Sequence[str]) -> int:
     how = {"resume": options.resume, "overwrite": options.overwrite, "loading_seconds": loading}
     beside = {RECORD: record_text(_record(capture, options))}
     # absolute, so that the result can be looked at from another folder too
-    trainer = make_trainer(replace(config, data=str(Path(config.data).absolute())), capture, beside=beside, **how)
+    training = TrainingRun(replace(config, data=str(Path(config.data).absolute())), capture, beside=beside, **how)
     if options.resume:
         print(_resumption(folder))
     try:
-        stats = trainer.run()
+        stats = training.run()
     except KeyboardInterrupt:
-        stopped = f"stopped after step {trainer.step}; the same command with --resume goes on"
+        stopped = f"stopped after step {training.step}; the same command with --resume goes on"
         nothing = "stopped before the first step; nothing was written"
-        print(f"pop: {stopped if trainer.step else nothing}", file=sys.stderr)
+        print(f"pop: {stopped if training.step else nothing}", file=sys.stderr)
         return EXIT_INTERRUPTED
     report = write_report(folder)
     print(summary(stats))
@@ -124,12 +129,14 @@ def arguments(argv: Sequence[str]) -> tuple[TrainConfig, Any]:
     words = rename_aliases(argv)
     short_help = "--help" in words or "-h" in words
     words = ["--help" if word == "--help-all" else word for word in words]
-    args = parse(_arguments_type(short_help), words, "train", examples=_EXAMPLES)
-    settings = {field.name: getattr(args, field.name) for field in dataclasses.fields(TrainConfig)}
-    config = TrainConfig(**settings)
+    # method, preset and scaler first: they decide the defaults of the rest, which --help shows
+    plan = plan_of(words)
+    base = TrainConfig.of(**plan, result_dir="")
+    args = parse(_arguments_type(base, plan, short_help), words, "train", examples=_EXAMPLES)
+    config = TrainConfig.of(**{name: getattr(args, name) for name in PLAN}, **said(args, base, words))
     if args.quiet:
         config = replace(config, progress=False)
-    if not config.result_dir:
+    if not args.result_dir:
         config = replace(config, result_dir=f"out/{Path(config.data).resolve().name}_{config.method}")
     return config, args
 
@@ -140,6 +147,7 @@ def rename_aliases(argv: Sequence[str]) -> list[str]:
     rest = list(argv)
     while rest:
         word = rest.pop(0)
+        word = word.replace("--adc.", "--gsplat.", 1) if word.startswith("--adc.") else word
         name, equals, value = word.partition("=")
         name = name.replace("_", "-") if name.startswith("--") else name
         target = _ALIASES.get(name)
@@ -152,13 +160,25 @@ def rename_aliases(argv: Sequence[str]) -> list[str]:
     return words
 
 
-def _arguments_type(short: bool) -> type:
-    """Make the class that tyro reads: every setting of `TrainConfig`, or only those that the short help shows."""
+def _arguments_type(base: TrainConfig, plan: dict[str, Any], short: bool) -> type:
+    """Make the class that tyro reads: every setting of `TrainConfig`, or only those that the short help shows.
+
+    Args:
+        base: the defaults.
+        plan: what they come from, as far as it was said.
+        short: hide what `_SHOWN` does not name.
+    """
+    kinds = typing.get_type_hints(Given)
+    kinds["method"] = Literal["pop", "gsplat", "3dgs", "adc"]
+    columns: list[Any] = [(name, kinds[name], plan.get(name, getattr(Given, name))) for name in PLAN]
     hints = typing.get_type_hints(TrainConfig)
-    columns: list[Any] = []
     for field in dataclasses.fields(TrainConfig):
-        kind = hints[field.name]
-        default: Any = dataclasses.field(default_factory=lambda field=field: _default(field))
+        if field.name == "given":
+            continue
+        kind: Any = hints[field.name]
+        default: Any = dataclasses.field(default_factory=lambda name=field.name: getattr(base, name))
+        if field.name == "strategy":
+            kind = Annotated[type(base.strategy), tyro.conf.arg(name=base.method)]
         if field.name == "data":
             kind, default = Annotated[kind, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")], dataclasses.field()
         elif field.name == "result_dir":
@@ -168,14 +188,10 @@ def _arguments_type(short: bool) -> type:
         elif short and field.name not in _SHOWN:
             kind = Annotated[kind, tyro.conf.Suppress]
         columns.append((field.name, kind, default))
-    documented = f"{_Run.__doc__}{(TrainConfig.__doc__ or '').partition('Attributes:')[2]}"
+    documented = str(_Run.__doc__) + "".join((kind.__doc__ or "").partition("Attributes:")[2] for kind in _DOCUMENTED)
     return dataclasses.make_dataclass(
         "TrainArguments", columns, bases=(_Run,), frozen=True, kw_only=True, namespace={"__doc__": documented}
     )
-
-
-def _default(field: dataclasses.Field[Any]) -> Any:
-    return field.default_factory() if field.default is dataclasses.MISSING else field.default  # type: ignore[misc]
 
 
 def check_output(folder: Path, options: Any) -> None:
@@ -226,7 +242,7 @@ def check_backend(config: TrainConfig) -> None:
     backend = get_backend(config.backend)
     if not backend.available():
         raise PopError(f"backend {config.backend!r} is not available: {backend.why_not()}")
-    reason = unsupported(config.resolved()) if config.backend == "cuda" else None
+    reason = unsupported(config) if config.backend == "cuda" else None
     if reason is not None:
         raise PopError(reason)
 
@@ -260,8 +276,7 @@ def _record(capture: Capture, options: Any) -> CaptureRecord:
 
 
 def _plan(config: TrainConfig) -> str:
-    run = config.resolved()
-    return f"{config.method}, {run.max_steps:,} steps, seed {config.seed} -> {config.result_dir}"
+    return f"{config.method}, {config.max_steps:,} steps, seed {config.seed} -> {config.result_dir}"
 
 
 def summary(stats: dict[str, Any]) -> str:

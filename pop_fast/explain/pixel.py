@@ -161,7 +161,7 @@ def _row(
 
 
 def _objective(config: TrainConfig, step: int) -> str:
-    kind, weight = config.resolved().photometric_at(step)
+    kind, weight = config.photometric_at(step)
     divided = "" if config.photometric_divisor == 1.0 else f"/{config.photometric_divisor:g}"
     return f"{1.0 - weight:g} {kind.upper()}{divided} + {weight:g} (1 - SSIM)"
 
@@ -169,7 +169,7 @@ def _objective(config: TrainConfig, step: int) -> str:
 def _pop_note(scene: ExplainedView) -> str:
     if scene.lambda_pop == 0.0:
         return "this objective has no POP term"
-    stop = scene.config.resolved().pop.pop_stop_iter
+    stop = scene.config.strategy.pop_stop_iter
     if scene.step is not None and scene.step >= stop:
         return f"in this run the POP term ended with step {stop - 1}; shown is what it would do now"
     return ""

@@ -138,8 +138,8 @@ def explain_view(
     loss = _photometric(image, view, config, step or 0)
     v_image, v_opacities = torch.autograd.grad(loss, (image, leaf))
     counts = _counts(info, view, len(leaf))
-    weight = config.resolved().pop.lambda_pop if config.method == "pop" else 0.0
-    visible = (info["radii"][0] > 0).all(1) if config.pop.pop_over == "visible" else None
+    weight = config.strategy.lambda_pop
+    visible = (info["radii"][0] > 0).all(1) if config.strategy.pop_over == "visible" else None
     v_pop = pop_loss_vjp(gaussians["opacities"], importance_mask(counts), weight, visible)
     return ExplainedView(
         view=view,
@@ -162,9 +162,10 @@ def with_objective(config: TrainConfig, objective: str) -> TrainConfig:
     """Choose the loss: "run" keeps the splat's own, "pop" and "3dgs" are those of paper eqs. 9 and 2."""
     if objective == "run":
         return config
-    return replace(
-        config, method="pop" if objective == "pop" else "adc", photometric="method", lambda_ssim=None, l2_stop_iter=None
-    )
+    plan = {} if config.given is None else {"preset": config.given.preset, "steps_scaler": config.given.steps_scaler}
+    other = TrainConfig.of(method=objective, **plan)
+    names = ("photometric", "photometric_divisor", "lambda_ssim", "l2_stop_iter", "strategy")
+    return replace(config, given=None, **{name: getattr(other, name) for name in names})
 
 
 def _wanted(info: Mapping[str, Any]) -> dict[str, Any]:
@@ -175,7 +176,7 @@ def _wanted(info: Mapping[str, Any]) -> dict[str, Any]:
 def _photometric(image: Tensor, view: View, config: TrainConfig, step: int) -> Tensor:
     target = torch.from_numpy(view.image).double() / 255.0
     mask = None if view.mask is None else torch.from_numpy(view.mask)
-    kind, weight = config.resolved().photometric_at(step)
+    kind, weight = config.photometric_at(step)
     loss = photometric_3dgs if kind == "l1" else photometric_pop
     return loss(
         image,

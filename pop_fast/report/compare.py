@@ -18,7 +18,7 @@ COLUMNS: Final = (
     "seconds",
     "machine",
 )
-_METHODS: Final = {"pop": "POP", "adc": "3DGS control"}
+_METHODS: Final = {"pop": "POP", "gsplat": "gsplat", "adc": "gsplat", "3dgs": "3DGS"}
 _TEXT: Final = frozenset({"capture", "method", "machine"})
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,7 +21,7 @@ MIB: Final = 2**20
 # float32 numbers of a Gaussian: as gsplat's checkpoints hold it, and as Inria's PLY does (with three zero normals)
 BYTES_CKPT: Final = 59 * 4
 BYTES_PLY: Final = 62 * 4
-_METHODS: Final = {"pop": "POP", "adc": "Plain density control (3DGS)"}
+_METHODS: Final = {"pop": "POP", "gsplat": "gsplat (default strategy)", "3dgs": "3DGS (Inria)"}
 _AGAIN: Final = "remove the file, or train again"
 _COUNTS: Final = {"counts": ("iu", 1)}
 _VIEW: Final = {
@@ -44,10 +43,9 @@ def read_result(folder: Path) -> ReportData:
     """
     config = read_config(folder)
     records = read_records(folder)
-    run = config.resolved()
     stats = read_last_stats(folder)
     method = _METHODS.get(config.method, config.method)
-    histograms = list(_histograms(folder, run.max_steps))
+    histograms = list(_histograms(folder, config.max_steps))
     views = list(_views(folder))
     dominant = _dominant(folder)
     events = [record for record in records if "cloned" in record or "reset" in record]
@@ -56,13 +54,13 @@ def read_result(folder: Path) -> ReportData:
         subtitle=" · ".join(filter(None, [method, _schedule_note(config), _views_note(stats), _machine(stats)])),
         headline=headline(stats),
         curves=_curves(records, folder),
-        max_steps=run.max_steps,
-        windows=_windows(run),
+        max_steps=config.max_steps,
+        windows=_windows(config),
         resets=[int(record["step"]) for record in events if record.get("reset")],
         histograms=histograms,
         dominant=dominant,
         views=views,
-        config=_flat(json.loads(config.to_json())),
+        config=_settings(config),
         events=[{key: event.get(key) for key in _EVENT_COLUMNS} for event in events],
     )
 
@@ -147,8 +145,11 @@ def _machine(stats: Mapping[str, Any]) -> str:
 
 
 def _schedule_note(config: TrainConfig) -> str:
-    steps = f"{config.resolved().max_steps:,} iterations"
-    return steps if config.scaler == 1.0 else f"{steps} (the paper's schedule times {config.scaler:g})"
+    steps = f"{config.max_steps:,} iterations"
+    given = config.given
+    if given is None or given.scaler == 1.0:
+        return steps
+    return f"{steps} (preset {given.preset}, the paper's schedule times {given.scaler:g})"
 
 
 def _views_note(stats: Mapping[str, Any]) -> str:
@@ -195,16 +196,16 @@ def thin_out(steps: list[float], values: list[float], most: int = 400) -> tuple[
     return [steps[i] for i in kept], [values[i] for i in kept]
 
 
-def _windows(run: TrainConfig) -> list[Window]:
-    plan = run.strategy
+def _windows(config: TrainConfig) -> list[Window]:
+    plan = config.strategy
     windows = [Window("density control", plan.refine_start_iter, plan.refine_stop_iter, "var(--density)")]
-    if run.method == "pop":
-        pop = run.pop
-        if pop.blur_stop_iter >= pop.blur_start_iter:
-            windows.append(Window("blur densification", pop.blur_start_iter, pop.blur_stop_iter, "var(--blur)"))
-        if pop.lambda_pop > 0.0:
-            windows.append(Window("POP loss", pop.pop_start_iter, pop.pop_stop_iter, "var(--pop)"))
-    return [Window(w.name, w.start, min(w.stop, run.max_steps), w.color) for w in windows if w.start < run.max_steps]
+    if plan.blur_stop_iter >= plan.blur_start_iter:
+        windows.append(Window("blur densification", plan.blur_start_iter, plan.blur_stop_iter, "var(--blur)"))
+    if plan.lambda_pop > 0.0:
+        windows.append(Window("POP loss", plan.pop_start_iter, plan.pop_stop_iter, "var(--pop)"))
+    return [
+        Window(w.name, w.start, min(w.stop, config.max_steps), w.color) for w in windows if w.start < config.max_steps
+    ]
 
 
 def _histograms(folder: Path, max_steps: int) -> Iterator[Histogram]:
@@ -248,8 +249,12 @@ def _numbered(folder: Path, pattern: str) -> list[tuple[int, Path]]:
     return sorted((int(match[1]), path) for match, path in found if match)
 
 
-def _flat(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in plain.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return flat
+def _settings(config: TrainConfig) -> dict[str, Any]:
+    given = config.given
+    if given is None:
+        return config.flat()
+    return {
+        "preset": given.preset,
+        "steps_scaler": given.scaler,
+        "scale_lambda_pop": given.scale_lambda_pop,
+    } | config.flat()

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from pop_fast.strategies.adc import ADCStrategy
-from pop_fast.strategies.base import Strategy
+from pop_fast.strategies.base import StepEvent, Strategy
+from pop_fast.strategies.control import DensityControl
+from pop_fast.strategies.gsplat import GsplatStrategy, InriaStrategy
 from pop_fast.strategies.pop import POPStrategy
 
-__all__ = ["ADCStrategy", "POPStrategy", "Strategy"]
+__all__ = ["DensityControl", "GsplatStrategy", "InriaStrategy", "POPStrategy", "StepEvent", "Strategy"]

@@ -9,12 +9,14 @@ optimizer per key. Every step it calls, in this order,
     strategy.step_post_backward(params, optimizers, state, step, info)
 
 `info` is the dict that `rasterization()` returns last. `step` counts from 0. A strategy is a dataclass of settings;
-everything that changes lives in `state`.
+everything that changes lives in `state`. What a step did to the population is returned, as a `StepEvent`; gsplat's own
+strategies return nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Callable, Mapping, MutableMapping
+from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 from torch import Tensor
@@ -24,6 +26,30 @@ Params: TypeAlias = MutableMapping[str, Any]
 Optimizers: TypeAlias = Mapping[str, Optimizer]
 State: TypeAlias = dict[str, Any]
 Info: TypeAlias = Mapping[str, Any]
+# given n, standard normal draws for the children of n split parents, on the CPU. -> [2, n, 3]
+Normals: TypeAlias = Callable[[int], Tensor]
+
+
+@dataclass(frozen=True)
+class StepEvent:
+    """What density control did to the population after a step.
+
+    Attributes:
+        cloned: Gaussians that were copied.
+        split: Gaussians that two smaller ones replaced.
+        pruned: Gaussians that were removed.
+        reset: whether all opacities were lowered.
+    """
+
+    cloned: int = 0
+    split: int = 0
+    pruned: int = 0
+    reset: bool = False
+
+    def record(self) -> dict[str, Any]:
+        """Return what a record of metrics.jsonl says about it; a reset is mentioned only where there was one."""
+        counts = {"cloned": self.cloned, "split": self.split, "pruned": self.pruned}
+        return {**counts, "reset": True} if self.reset else counts
 
 
 @runtime_checkable
@@ -44,8 +70,8 @@ class Strategy(Protocol):
 
     def step_post_backward(
         self, params: Params, optimizers: Optimizers, state: State, step: int, info: Info, packed: bool = False
-    ) -> None:
-        """Collect statistics and, when it is time, change the population."""
+    ) -> Any:
+        """Collect statistics and, when it is time, change the population; may return a `StepEvent`."""
         ...
 
 

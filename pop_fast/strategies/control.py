@@ -1,24 +1,31 @@
 """Adaptive density control: what 3DGS, gsplat and POP share.
 
 Every step the screen-space gradients are collected; every `refine_every` steps Gaussians that move too much are cloned
-(small ones) or split (large ones), and those that are transparent or too big are pruned. Sources: Kerbl et al. 2023
-section 5, gsplat 1.5's default strategy for the numbers, the order and the attribute names.
+(small ones) or split (large ones), and those that are transparent or too big are pruned. POP adds growth by blur and a
+term of the loss, gsplat the reset of opacities. Sources: Kerbl et al. 2023 section 5, gsplat 1.5's default strategy for
+the order and the attribute names, the POP paper section 3.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal, Self
 
 import torch
 from torch import Tensor
 
-from pop_fast.density import SPLIT_CHILDREN, Statistics, grow_masks, prune_mask
+from pop_fast.density import SPLIT_CHILDREN, Statistics, blur_set, blurs_at, grow_masks, prune_mask
+from pop_fast.polarization import importance_mask, pop_loss
 from pop_fast.strategies import ops
-from pop_fast.strategies.base import Info, Optimizers, Params, State, check_layout
+from pop_fast.strategies.base import Info, Normals, Optimizers, Params, State, StepEvent, check_layout
+from pop_fast.strategies.info import dominant_counts, visible_from_radii, visible_in
+from pop_ref.settings import DensityConfig, PopTerm, ScreenSizeRules
 
 _NEEDED = ("means", "scales", "quats", "opacities")
-_STEPS = ("prune_too_big_after", "refine_start_iter", "refine_stop_iter", "reset_every", "pause_refine_after_reset")
+_STEPS = ("prune_too_big_after", "refine_start_iter", "refine_stop_iter", "blur_start_iter", "blur_stop_iter")
+_MORE_STEPS = ("pop_start_iter", "pop_stop_iter", "refine_scale2d_stop_iter")
+# steps between a reset and what it has to be recovered from by; see `DensityControl.scaled`
+_RECOVERY = ("reset_every", "pause_refine_after_reset")
 # a shrunk schedule keeps at least so many steps between changes. They are not a share of the schedule: in them a window
 # collects enough views to average over, a fresh clone (which starts on top of its source, with no moments) moves away
 # from it, and the opacity of what is not needed falls under `prune_opa`. With 20 steps instead, on the fox capture at
@@ -26,50 +33,19 @@ _STEPS = ("prune_too_big_after", "refine_start_iter", "refine_stop_iter", "reset
 SHORTEST_REFINE_EVERY = 100
 
 
-@dataclass(kw_only=True)
-class DensityControl:
-    """Settings of adaptive density control, named as gsplat's default strategy names them.
+@dataclass(frozen=True, kw_only=True)
+class DensityControl(DensityConfig, PopTerm, ScreenSizeRules):
+    """Density control with every rule that a method may have; a method is a set of defaults.
+
+    The settings are those of `pop_ref.settings`, named as gsplat's default strategy names them where that has them.
 
     Attributes:
-        prune_opa: opacity under which a Gaussian is pruned.
-        grow_grad2d: mean screen gradient, in units of half an image, over which a Gaussian grows.
-        grad_denominator: that mean is over the "visible_views" of the window, as all code does, or over the whole
-            "window", as the formula is printed.
-        grow_scale3d: largest axis, in scene scales, up to which a Gaussian is cloned and over which it is split.
-        prune_scale3d: largest axis, in scene scales, over which a Gaussian is pruned.
-        prune_too_big: whether that rule applies at all.
-        prune_too_big_after: step after which it applies.
-        refine_start_iter: step after which the population changes.
-        refine_stop_iter: step from which nothing is collected and nothing changes.
-        refine_every: steps between changes.
-        reset_every: steps between opacity resets; 0 never resets.
-        reset_opa: what a reset lowers opacities to; gsplat couples it to `prune_opa`, as twice that.
-        reset_at_zero: also reset at step 0, as gsplat 1.1 to 1.5.2 did.
-        pause_refine_after_reset: steps after a reset in which the population stays.
-        inclusive: grow at `>=` (3DGS) instead of `>` (gsplat).
         absgrad: read `means2d.absgrad` (AbsGS) instead of `means2d.grad`.
-        revised_opacity: children of a split get `1 - sqrt(1 - o)` instead of `o`.
         verbose: print a line at every change.
         key_for_gradient: the entry of `info` whose gradient is read.
     """
 
-    prune_opa: float = 0.005
-    grow_grad2d: float = 0.0002
-    grad_denominator: Literal["visible_views", "window"] = "visible_views"
-    grow_scale3d: float = 0.01
-    prune_scale3d: float = 0.1
-    prune_too_big: bool = True
-    prune_too_big_after: int = 3000
-    refine_start_iter: int = 500
-    refine_stop_iter: int = 15_000
-    refine_every: int = 100
-    reset_every: int = 0
-    reset_opa: float = 0.01
-    reset_at_zero: bool = False
-    pause_refine_after_reset: int = 0
-    inclusive: bool = False
     absgrad: bool = False
-    revised_opacity: bool = False
     verbose: bool = False
     key_for_gradient: Literal["means2d", "gradient_2dgs"] = "means2d"
 
@@ -91,28 +67,69 @@ class DensityControl:
             "grad2d": None,
             "count": None,
             "views": 0,
+            "blurred": None,
+            "dominant_sum": None,
+            "radii": None,
             "scene_scale": float(scene_scale),
             "generator": generator,
-            "event": None,
         }
 
-    def scaled(self, factor: float) -> Any:
+    def scaled(self, factor: float) -> Self:
         """Return the same settings on a schedule `factor` times as long.
 
         Every step number is multiplied. `refine_every` is too, but not to under `SHORTEST_REFINE_EVERY` or what it is,
-        whichever is less: a shorter schedule has fewer changes, not more hasty ones.
+        whichever is less: a shorter schedule has fewer changes, not more hasty ones. Resets come no faster either: what
+        one takes away has to be regrown in steps, and those do not get shorter with the schedule.
         """
-        changed = {name: round(getattr(self, name) * factor) for name in (*_STEPS, *self._more_steps())}
+        changed = {name: _scaled(getattr(self, name), factor) for name in (*_STEPS, *_MORE_STEPS)}
+        changed |= {name: max(_scaled(getattr(self, name), factor), getattr(self, name)) for name in _RECOVERY}
         floor = min(SHORTEST_REFINE_EVERY, self.refine_every)
         return replace(self, **changed, refine_every=max(round(self.refine_every * factor), floor))
 
     def needs_dominance(self, step: int) -> bool:
-        """Tell whether `info["dominant_counts"]` is read at this step, so that a trainer can spare the work."""
-        return False
+        """Tell whether `info["dominant_counts"]` is read at this step: by the POP loss, the blur rule or a window."""
+        return self.regularizes(step) or self.collects_blur(step) or self.collects_window(step)
+
+    def regularizes(self, step: int) -> bool:
+        """Tell whether `regularizer` adds the POP loss at this step."""
+        return self.lambda_pop != 0.0 and self.pop_start_iter <= step < self.pop_stop_iter
+
+    def collects(self, step: int) -> bool:
+        """Tell whether screen gradients are collected at this step."""
+        return step < self.refine_stop_iter
+
+    def collects_blur(self, step: int) -> bool:
+        """Tell whether the blur flags of the window are collected at this step."""
+        return self.collects(step) and step <= self.blur_stop_iter
+
+    def collects_window(self, step: int) -> bool:
+        """Tell whether the dominated pixels of the window are summed for the POP loss at this step."""
+        return self.collects(step) and self.pop_views == "window"
+
+    def changes_after(self, step: int) -> bool:
+        """Tell whether the population is edited after this step."""
+        return self.is_refine_step(step) or self.is_reset_step(step)
 
     def regularizer(self, opacities: Tensor, state: State, step: int, info: Info) -> Tensor | None:
-        """Return the term that the method adds to the loss: none."""
-        return None
+        """Return `lambda_pop * L_pop` of this view, or None when the term is off.
+
+        Args:
+            opacities: activated opacities, in the graph. [N]
+            state: the strategy's state.
+            step: counts from 0.
+            info: what `rasterization()` returned last; its `dominant_counts` decide who is important.
+        """
+        if not self.regularizes(step):
+            return None
+        mask = importance_mask(dominant_counts(info).sum(0))
+        if self.pop_views == "window" and state["dominant_sum"] is not None:
+            mask = mask | importance_mask(state["dominant_sum"])
+        visible = visible_in(info, len(mask)) if self.pop_over == "visible" else None
+        return self.lambda_pop * pop_loss(opacities.reshape(-1), mask, visible=visible)
+
+    def is_blur_step(self, step: int) -> bool:
+        """Tell whether the change after this step looks at blur."""
+        return self.is_refine_step(step) and blurs_at(step, self)
 
     def is_refine_step(self, step: int) -> bool:
         """Tell whether the population changes after this step."""
@@ -128,54 +145,65 @@ class DensityControl:
         """Ask autograd to keep the gradient of the screen centres."""
         if self.key_for_gradient not in info:
             raise ValueError(f"info has no {self.key_for_gradient!r}; pass the dict that rasterization() returns last")
-        if step < self.refine_stop_iter:
+        if self.collects(step):
             info[self.key_for_gradient].retain_grad()
 
     @torch.no_grad()
     def step_post_backward(
         self, params: Params, optimizers: Optimizers, state: State, step: int, info: Info, packed: bool = False
-    ) -> None:
+    ) -> StepEvent | None:
         """Collect statistics; at a refine step grow, prune and start a new window; at a reset step reset.
 
-        What happened is left in `state["event"]`: a dict that counts Gaussians cloned, split and pruned, or None.
+        Returns:
+            What happened to the population, or None where this is no step at which it changes.
         """
-        state["event"] = None
-        if step >= self.refine_stop_iter:
-            return
-        self._collect(params, state, step, info, packed)
-        self.change(params, optimizers, state, step)
+        self.collect(params, state, step, info, packed)
+        return self.change(params, optimizers, state, step)
 
     @torch.no_grad()
-    def change(self, params: Params, optimizers: Optimizers, state: State, step: int) -> None:
-        """Do what is due after a step whose statistics are collected; for trainers that collect them themselves.
-
-        What happened is left in `state["event"]`, as by `step_post_backward`.
-        """
-        state["event"] = None
-        if self.is_refine_step(step):
-            state["event"] = self._grow(params, optimizers, state, step)
-            state["event"]["pruned"] = self._prune(params, optimizers, state, step)
-            self._clear(state)
-            if self.verbose:
-                print(f"step {step}: {state['event']}, {len(params['means'])} Gaussians")
-        if self.is_reset_step(step):
-            ops.reset_opacities(params, optimizers, ceiling=self.reset_opa)
-            state["event"] = {**(state["event"] or {"cloned": 0, "split": 0, "pruned": 0}), "reset": True}
-
-    def draws(self, state: State, n: int, like: Tensor) -> Tensor:
-        """Return standard normal draws for the children of `n` split Gaussians, from the state's generator. [2, n, 3]
+    def collect(self, params: Params, state: State, step: int, info: Info, packed: bool = False) -> None:
+        """Add what a view has shown to the window's statistics, which lie in `state`; none from `refine_stop_iter` on.
 
         Args:
+            params: raw parameters, after the optimizers' step.
             state: the strategy's state.
-            n: how many are split.
-            like: a tensor of the type and on the device that the draws are for.
+            step: counts from 0.
+            info: what `rasterization()` returned last, after the backward pass.
+            packed: whether its rows are those of visible Gaussians alone.
         """
-        generator = state["generator"]
-        shape = (SPLIT_CHILDREN, n, 3)
-        return torch.randn(shape, generator=generator, dtype=like.dtype, device=generator.device).to(like.device)
+        if self.collects(step):
+            self._collect(params, state, step, info, packed)
 
-    def _more_steps(self) -> tuple[str, ...]:
-        return ()
+    @torch.no_grad()
+    def change(
+        self, params: Params, optimizers: Optimizers, state: State, step: int, normals: Normals | None = None
+    ) -> StepEvent | None:
+        """Do what is due after a step whose statistics are collected.
+
+        Args:
+            params: raw parameters, replaced under their keys.
+            optimizers: one per key.
+            state: the strategy's state.
+            step: counts from 0.
+            normals: draws that place the children of a split; None takes them from the state's generator.
+
+        Returns:
+            What happened, or None where nothing is due.
+        """
+        if not self.changes_after(step):
+            return None
+        event = StepEvent()
+        if self.is_refine_step(step):
+            draws = normals or (lambda n: standard_normals(state["generator"], n))
+            cloned, split = self._grow(params, optimizers, state, step, draws)
+            event = StepEvent(cloned, split, self._prune(params, optimizers, state, step))
+            self._clear(state)
+            if self.verbose:
+                print(f"step {step}: {event}, {len(params['means'])} Gaussians")
+        if self.is_reset_step(step):
+            ops.reset_opacities(params, optimizers, ceiling=self.reset_opa)
+            event = replace(event, reset=True)
+        return event
 
     def _collect(self, params: Params, state: State, step: int, info: Info, packed: bool) -> None:
         n = len(params["means"])
@@ -199,8 +227,27 @@ class DensityControl:
             visible = visible_from_radii(info["radii"])
             state["grad2d"].add_(norms.masked_fill_(~visible, 0.0).sum(0))
             state["count"].add_(visible.sum(0))
+        if (self.blur_window == "sum" and self.collects_blur(step)) or self.collects_window(step):
+            counts = dominant_counts(info).sum(0)
+            state["dominant_sum"] = counts if state["dominant_sum"] is None else state["dominant_sum"] + counts
+        if self.collects_blur(step):
+            self._collect_blur(state, info)
+        if self.refine_scale2d_stop_iter > 0:
+            _collect_extents(state, info, packed)
 
-    def _grow(self, params: Params, optimizers: Optimizers, state: State, step: int) -> dict[str, Any]:
+    def _collect_blur(self, state: State, info: Info) -> None:
+        bound = (int(info["width"]), int(info["height"]), self.theta_blur, self.blur_min_pixels)
+        if self.blur_window == "sum":
+            state["blurred"] = blur_set(state["dominant_sum"], *bound)
+            return
+        blurred = blur_set(dominant_counts(info), *bound).any(0)
+        if self.blur_window == "any_view" and state["blurred"] is not None:
+            blurred |= state["blurred"]
+        state["blurred"] = blurred
+
+    def _grow(
+        self, params: Params, optimizers: Optimizers, state: State, step: int, normals: Normals
+    ) -> tuple[int, int]:
         clones, splits = self._grow_masks(params, state, step)
         n_clones, n_splits = int(clones.sum()), int(splits.sum())
         if n_clones:
@@ -208,9 +255,8 @@ class DensityControl:
         if n_splits:
             # a clone of this event is never split in it
             padded = torch.cat([splits, splits.new_zeros(n_clones)])
-            normals = self.draws(state, n_splits, params["means"])
-            ops.split(params, optimizers, state, padded, normals, self.revised_opacity)
-        return {"cloned": n_clones, "split": n_splits}
+            ops.split(params, optimizers, state, padded, normals(n_splits), self.revised_opacity)
+        return n_clones, n_splits
 
     def _grow_masks(self, params: Params, state: State, step: int) -> tuple[Tensor, Tensor]:
         blurred = state.get("blurred")
@@ -222,11 +268,15 @@ class DensityControl:
             dominant_sum=none,
             blurred=none if blurred is None else blurred,
         )
-        return grow_masks(statistics, torch.exp(params["scales"]), state["scene_scale"], step, self)
+        clones, splits = grow_masks(statistics, torch.exp(params["scales"]), state["scene_scale"], step, self)
+        return clones, splits | (state["radii"] > self.grow_scale2d) if step < self.refine_scale2d_stop_iter else splits
 
     def _prune_mask(self, params: Params, state: State, step: int) -> Tensor:
         opacities = torch.sigmoid(params["opacities"].flatten())
-        return prune_mask(opacities, torch.exp(params["scales"]), state["scene_scale"], step, self)
+        mask = prune_mask(opacities, torch.exp(params["scales"]), state["scene_scale"], step, self)
+        if self.prune_too_big_after < step < self.refine_scale2d_stop_iter:
+            mask |= state["radii"] > self.prune_scale2d
+        return mask
 
     def _prune(self, params: Params, optimizers: Optimizers, state: State, step: int) -> int:
         mask = self._prune_mask(params, state, step)
@@ -239,8 +289,34 @@ class DensityControl:
         state["grad2d"].zero_()
         state["count"].zero_()
         state["views"] = 0
+        state["blurred"] = state["dominant_sum"] = None
+        if state["radii"] is not None:
+            state["radii"].zero_()
 
 
-def visible_from_radii(radii: Tensor) -> Tensor:
-    """Return which Gaussians each camera sees: all extents > 0. [C, N, 2] (or [C, N] before gsplat 1.5) -> [C, N]"""
-    return (radii > 0).all(-1) if radii.dim() == 3 else radii > 0
+def standard_normals(generator: torch.Generator, n: int) -> Tensor:
+    """Draw what places the children of n split parents: float32 on the CPU, whatever trains and in what precision.
+
+    Returns:
+        Standard normal draws. [2, n, 3]
+    """
+    return torch.randn((SPLIT_CHILDREN, n, 3), generator=generator, dtype=torch.float32)
+
+
+def _scaled(step: int, factor: float) -> int:
+    # -1 is no step but "never"
+    return round(step * factor) if step > 0 else step
+
+
+def _collect_extents(state: State, info: Info, packed: bool) -> None:
+    """Keep the largest extent of each Gaussian, as a share of the longer image side."""
+    extents = info["radii"].to(state["grad2d"].dtype) / max(int(info["width"]), int(info["height"]))
+    if state["radii"] is None:
+        state["radii"] = torch.zeros_like(state["grad2d"])
+    if packed:
+        largest = extents.amax(-1) if extents.dim() == 2 else extents
+        state["radii"].scatter_reduce_(0, info["gaussian_ids"].long(), largest, "amax")
+    else:
+        largest = extents.amax(-1) if extents.dim() == 3 else extents
+        seen = largest.masked_fill(~visible_from_radii(info["radii"]), 0.0)
+        torch.maximum(state["radii"], seen.amax(0), out=state["radii"])

@@ -78,7 +78,7 @@ def split(
 ) -> None:
     """Replace every selected Gaussian by two, drawn from it and 1.6 times smaller.
 
-    `mean' = mean + R(q) (s * noise)`, `s' = s / 1.6`; rotation, colour and opacity are copied. Survivors come first,
+    `mean' = mean + R(q) (s * normals)`, `s' = s / 1.6`; rotation, colour and opacity are copied. Survivors come first,
     then all first children, then all second children.
 
     Args:
@@ -86,14 +86,14 @@ def split(
         optimizers: one per key.
         state: the strategy's state.
         mask: the Gaussians to split. [N] bool
-        normals: standard normal draws, those of the first children before those of the second. [2, M, 3]
+        normals: standard normal draws for the first and the second child of each, of any precision. [2, M, 3]
         revised_opacity: give the children `1 - sqrt(1 - o)`, so that two coincident ones equal the parent.
 
     Raises:
         ValueError: `normals` does not hold two draws for each selected Gaussian.
     """
     chosen = {key: value.detach()[mask] for key, value in params.items()}
-    appended = split_children(chosen, normals, revised_opacity)
+    appended = split_children(chosen, normals.to(chosen["means"]), revised_opacity)
     sources = torch.nonzero(mask)[:, 0].repeat(SPLIT_CHILDREN)
     edit_rows(params, optimizers, state, keep=~mask, appended=appended, sources=sources)
 

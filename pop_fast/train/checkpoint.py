@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -146,6 +146,7 @@ def check_fits(
     fingerprint: Mapping[str, str],
     threads: int,
     n_views: int,
+    known: Collection[str],
 ) -> None:
     """Check that a checkpoint belongs to a run.
 
@@ -156,6 +157,7 @@ def check_fits(
         fingerprint: of the run's capture.
         threads: of one operation.
         n_views: how many the run trains on.
+        known: what the state of the run's strategy holds.
 
     Raises:
         PopError: it belongs to other settings or another capture, or cannot be of this run; names what differs.
@@ -175,8 +177,8 @@ def check_fits(
                 f"{path}: was written for another capture: the {name} differ ({str(theirs)[:12]}, here {ours[:12]}); "
                 "use the same photographs and model, or another result folder"
             )
-    last, known = config.resolved().max_steps - 1, config.strategy.initialize_state().keys()
-    order, odd = content["view_order"]["order"], sorted(known ^ content["strategy"].keys())
+    last, order = config.max_steps - 1, content["view_order"]["order"]
+    odd = sorted(set(known) ^ content["strategy"].keys())
     if content["step"] > last:
         raise PopError(f"{path}: step is {content['step']}; it must be at most {last}, the run's last: {_DAMAGED}")
     if len(order) not in (0, n_views):

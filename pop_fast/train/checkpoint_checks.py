@@ -118,20 +118,34 @@ def _moments(packed: Any, name: str, param: Tensor, taken: int) -> dict[str, Ten
 
 
 def _strategy(packed: Any, n: int, taken: int) -> dict[str, Any]:
-    found = _mapping(packed, "strategy", ("grad2d", "count", "views", "scene_scale", "generator", "event"), others=True)
-    _whole(found["views"], "strategy.views", most=taken)
-    checked = {**found, "scene_scale": _number(found["scene_scale"], "strategy.scene_scale")}
-    checked["generator"] = _generator(found["generator"], "strategy.generator")
+    found = _mapping(packed, "strategy", ("generator",), others=True)
+    checked = {**found, "generator": _generator(found["generator"], "strategy.generator")}
+    if "views" in found:
+        _whole(found["views"], "strategy.views", most=taken)
+    if "scene_scale" in found:
+        checked["scene_scale"] = _number(found["scene_scale"], "strategy.scene_scale")
     for key in _ROWS.keys() & found.keys():
         if found[key] is not None:
             checked[key] = _own(_tensor(found[key], f"strategy.{key}", _ROWS[key]), [n], f"strategy.{key}")
             if checked[key].dtype != torch.bool:
                 _check_not_negative(checked[key], f"strategy.{key}")
-    if (found["grad2d"] is None) != (found["count"] is None):
+    for key in found.keys() - _ROWS.keys() - {"generator", "views", "scene_scale"}:
+        # of a strategy of other people
+        name = shown(key).strip("'")
+        checked[key] = _plain(found[key], f"strategy.{name}")
+    if (found.get("grad2d") is None) != (found.get("count") is None):
         raise ValueError("strategy.grad2d and strategy.count must both be tensors or both be None")
-    # what the last change did is told once, by the step that made it
-    _mapping(found["event"] or {}, "strategy.event", others=True)
     return checked
+
+
+def _plain(value: Any, name: str) -> Any:
+    """Check that a value is a plain one or a tensor of plain memory on the CPU."""
+    if isinstance(value, (str, int, float, bool, type(None))):
+        return value
+    if not isinstance(value, Tensor):
+        raise ValueError(f"{name} is {shown(value)}; it must be a plain value or a tensor")
+    found = _tensor(value, name)
+    return _own(found, list(found.shape), name)
 
 
 def _view_order(packed: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Which backend a run is done by, and the trainer that goes with it."""
+"""Which backend a run is done by."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pop_fast.backends import get_backend
-from pop_fast.data.capture import Capture
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.training_run import TrainingRun
 
 
 def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConfig, str]:
@@ -32,9 +30,9 @@ def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConf
         return replace(config, backend=begun), f"backend {begun}, with which the run was begun"
     reason = get_backend("cuda").why_not()
     if reason is None:
-        from pop_fast.train.device_plan import unsupported
+        from pop_fast.train.fused_stepper import unsupported
 
-        reason = unsupported(config.resolved())
+        reason = unsupported(config)
     if reason is None:
         return replace(config, backend="cuda"), "backend cuda: a GPU and the build are here"
     not_compiled = get_backend("compiled").why_not()
@@ -43,25 +41,10 @@ def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConf
     return replace(config, backend="fast"), f"backend fast (CPU): {not_compiled}; {reason}"
 
 
-def make_trainer(config: TrainConfig, capture: Capture, **options: Any) -> TrainingRun:
-    """Return the trainer of the backend that `config` names; see `TrainingRun` for the options.
-
-    Raises:
-        PopError: the backend cannot run here, or does not know a setting.
-    """
-    if config.backend == "cuda":
-        from pop_fast.train.device_trainer import DeviceTrainer
-
-        return DeviceTrainer(config, capture, **options)
-    from pop_fast.train.trainer import Trainer
-
-    return Trainer(config, capture, **options)
-
-
 def _begun_with(folder: Path) -> Any:
     """Return the backend of the run in a folder, or None where there is none or its settings cannot be read."""
     path = folder / "cfg.json"
     try:
-        return json.loads(path.read_text(encoding="utf-8")).get("backend")
-    except (OSError, ValueError, AttributeError):
+        return json.loads(path.read_text(encoding="utf-8"))["resolved"]["backend"]
+    except (OSError, ValueError, KeyError, TypeError):
         return None

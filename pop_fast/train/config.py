@@ -1,35 +1,24 @@
 """Everything a training run is decided by, as one frozen value that goes through JSON and back unchanged.
 
-The numbers are the paper's: 30,000 steps, POP loss and density control to 15,000, blur densification from 3,000 to
-7,000. A shorter run keeps the shape of that schedule: `steps_scaler` multiplies every step number in it.
-
-    what                                          scaled
-    max_steps                                     yes; the learning rate of the means decays over it, so that scales too
-    refine start and stop, reset, blur, POP, L2   yes
-    refine_every                                  up only: a shorter schedule has fewer changes, as far apart as ever
-                                                  (see `DensityControl.scaled`)
-    sh_interval, eval_steps, save_steps           yes
-    lambda_pop                                    divided: the prior's push adds up over its steps
-    learning rates, other weights, thresholds     no: Adam's step does not depend on the length of a run
-    checkpoint_every, log_every                   no: they are about time, not about the schedule
+A `TrainConfig` holds the values as they are run. `TrainConfig.of` makes one as the command line does: method, preset
+and `steps_scaler` give the defaults (see `pop_fast.train.presets`), and what is said besides wins, as it is said.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, field, replace
-from typing import Any, Final, Literal
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Final, Literal, Self
 
 from pop_fast.errors import PopError
-from pop_fast.strategies import ADCStrategy, POPStrategy
+from pop_fast.strategies import DensityControl, POPStrategy
 from pop_fast.train.jsonable import from_plain, to_plain
 from pop_fast.train.limits import check_values
+from pop_fast.train.presets import METHODS, MILESTONES, Given, defaults, laid_over, method_of
+from pop_ref.settings import LAMBDA_SSIM_3DGS, MAX_SH_DEGREE, LearningRates, Recipe
 
-QUICK_SCALER: Final = 0.1
-PRESETS: Final = {"paper": 1.0, "quick": QUICK_SCALER}
-# what theta_blur comes to in the smallest images of the paper (980 x 545); "quick" is for images smaller than those
-QUICK_BLUR_MIN_PIXELS: Final = 11.0
+__all__ = ["LearningRates", "TrainConfig", "first_difference"]
 
 # what may differ between a checkpoint and the run that resumes it: it does not reach a single bit of the parameters.
 # log_every is not among it: where Gaussians per pixel are counted, tile lists are cut and sums rounded otherwise
@@ -39,38 +28,23 @@ _FREE: Final = frozenset(
         *("max_renders", "progress", "lpips_vgg", "lpips_alex", "target_cache_mb"),
     }
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class LearningRates:
-    """Adam's learning rates; the means' is in scene scales and decays log-linearly to `means_decay` times itself."""
-
-    means: float = 1.6e-4
-    means_decay: float = 0.01
-    scales: float = 5e-3
-    quats: float = 1e-3
-    opacities: float = 5e-2
-    sh0: float = 2.5e-3
-    sh_rest: float = 2.5e-3 / 20
+# the two parts of cfg.json
+_GIVEN, _RESOLVED = "given", "resolved"
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """Settings of a training run. Step numbers are those of the full schedule, before `steps_scaler`.
+    """Settings of a training run, as they are run; the defaults are the paper's.
 
     Attributes:
         data: the capture: a COLMAP folder, a folder with transforms.json, or a folder of photographs.
         result_dir: where the run writes.
-        method: "pop", or "adc" for plain density control with opacity reset (3DGS as gsplat runs it).
-        preset: "paper" is the whole schedule; "quick" a tenth of it, for a CPU, in which a Gaussian must dominate at
-            least `QUICK_BLUR_MIN_PIXELS` pixels to count as blur, and none is pruned for its size.
-        steps_scaler: multiplies every step number of the schedule; None takes the preset's.
         max_steps: training steps, one view each.
         seed: of the view order, the initial rotations and the split noise.
         backend: what renders and trains: "fast" (CPU), "compiled" (CPU, with kernels in C++), "cuda", "ref" (the
             oracle, slow), or "auto": "cuda" where a GPU and the build are there, else "compiled" where that was
             compiled, else "fast".
-        profile: the rasterizer's constants: "paper", "gsplat_1_5", "gsplat_1_6" or "inria".
+        profile: the rasterizer's constants: "paper", "gsplat_1_5", "gsplat_1_6" or "inria" (that of method "3dgs").
         antialiased: render with opacity compensation (Mip-Splatting) instead of classically.
         factor: photographs are shrunk by it.
         test_every: every n-th view by file name is held out; 0 holds nothing out.
@@ -80,16 +54,15 @@ class TrainConfig:
         sh_interval: steps between bands, from band 0 at step 0.
         init_opacity: opacity of the first Gaussians.
         init_scale: multiplies their size, which is the distance to their three nearest neighbours.
-        photometric: "l1", "l2", or "method" for the method's own: l2 for pop (paper eq. 9), l1 for adc (eq. 2).
+        photometric: "l2" as in paper eq. 9, POP's, or "l1" as in eq. 2, that of the other methods.
         photometric_divisor: divides the L1 or L2 term, as in the paper's figure of L1/n against L2.
-        lambda_ssim: weight of 1 - SSIM; the rest is L1 or L2. None takes the method's own: 0.01 or 0.2.
+        lambda_ssim: weight of 1 - SSIM; the rest is L1 or L2. POP's is 0.01, that of the other methods 0.2.
         l2_stop_iter: step from which eq. 2 (L1, 0.2) takes over; None never, as the paper says of POP alone that it
             ends (A20).
-        ssim_padding: "valid" as gsplat, or "same" as 3DGS.
+        ssim_padding: "valid" as gsplat, or "same" as Inria (and method "3dgs").
         d_ssim_halved: (1 - SSIM) / 2 instead of 1 - SSIM.
         lr: learning rates.
-        pop: the POP strategy's settings.
-        adc: plain density control's settings.
+        strategy: density control and the POP term; its type says which method this is.
         threads: threads of one operation; results are the same bits for the same number. 0 takes all cores.
         eval_steps: after so many steps the held-out views are measured; the last step always counts.
         save_steps: after so many steps a PLY and a checkpoint are kept; the last step always counts.
@@ -102,14 +75,12 @@ class TrainConfig:
         lpips_alex: weights of LPIPS on AlexNet, likewise.
         target_cache_mb: memory for what SSIM needs of the photographs, kept between steps.
         progress: show a progress bar when standard error is a terminal.
+        given: what these values come from; None where they were written down one by one.
     """
 
     data: str = ""
     result_dir: str = "results"
-    method: Literal["pop", "adc"] = "pop"
-    preset: Literal["paper", "quick"] = "paper"
-    steps_scaler: float | None = None
-    max_steps: int = 30_000
+    max_steps: int = Recipe.max_steps
     seed: int = 42
     backend: Literal["auto", "fast", "compiled", "cuda", "ref"] = "auto"
     profile: Literal["paper", "gsplat_1_5", "gsplat_1_6", "inria"] = "paper"
@@ -118,22 +89,21 @@ class TrainConfig:
     test_every: int = 8
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     normalize: bool = True
-    sh_degree: int = 3
-    sh_interval: int = 1000
+    sh_degree: int = MAX_SH_DEGREE
+    sh_interval: int = Recipe.sh_interval
     init_opacity: float = 0.1
     init_scale: float = 1.0
-    photometric: Literal["method", "l1", "l2"] = "method"
-    photometric_divisor: float = 1.0
-    lambda_ssim: float | None = None
-    l2_stop_iter: int | None = None
-    ssim_padding: Literal["valid", "same"] = "valid"
-    d_ssim_halved: bool = False
-    lr: LearningRates = field(default_factory=LearningRates)
-    pop: POPStrategy = field(default_factory=POPStrategy)
-    adc: ADCStrategy = field(default_factory=ADCStrategy)
+    photometric: Literal["l1", "l2"] = Recipe.pixelwise
+    photometric_divisor: float = 1.0 / Recipe.pixel_scale
+    lambda_ssim: float = Recipe.lambda_ssim
+    l2_stop_iter: int | None = Recipe.l2_stop_iter
+    ssim_padding: Literal["valid", "same"] = Recipe.padding
+    d_ssim_halved: bool = Recipe.d_ssim_halved
+    lr: LearningRates = Recipe.lr
+    strategy: DensityControl = field(default_factory=POPStrategy)
     threads: int = 0
-    eval_steps: tuple[int, ...] = (7_000, 30_000)
-    save_steps: tuple[int, ...] = (7_000, 30_000)
+    eval_steps: tuple[int, ...] = MILESTONES
+    save_steps: tuple[int, ...] = MILESTONES
     checkpoint_every: int = 1_000
     keep_checkpoints: int = 2
     log_every: int = 25
@@ -142,63 +112,87 @@ class TrainConfig:
     lpips_alex: tuple[str, ...] = ()
     target_cache_mb: int = 1024
     progress: bool = True
+    given: Given | None = None
 
     def __post_init__(self) -> None:
         check_values(self)
+        if self.given is None:
+            return
+        promised = self._promised(self.given)
+        for name in defaults(self.given):
+            if getattr(self, name) != getattr(promised, name):
+                raise PopError(
+                    f"{name} is {getattr(self, name)}, but preset {self.given.preset!r} and what was said make it "
+                    f"{getattr(promised, name)}; say it with config.but({name}=...), or replace given=None too"
+                )
+
+    @classmethod
+    def of(cls, *, method: str = "pop", preset: str = "paper", **said: Any) -> Self:
+        """Make the settings of a method and a preset, except for what is said besides.
+
+        Args:
+            method: "pop", "gsplat" ("adc" is another name of it) or "3dgs".
+            preset: "paper" or "quick".
+            said: `steps_scaler` and `scale_lambda_pop` (see `Given`), and settings by name, taken as they are: those
+                of the strategy and the learning rates with a dot, `**{"pop.lambda_pop": 0.002}`, as a dict,
+                `lr={"opacities": 0.01}`, or whole.
+
+        Raises:
+            PopError: an unknown setting, or a value that it cannot have; names it.
+        """
+        plan = {name: said.pop(name, None) for name in ("steps_scaler", "scale_lambda_pop")}
+        given = Given.of(said, method=method, preset=preset, **plan)
+        return replace(cls._promised(given), given=given)
+
+    def but(self, **said: Any) -> Self:
+        """Return these settings with some said anew; those that nobody said stay the defaults they are."""
+        if self.given is None:
+            return replace(self, **said)
+        again = Given.of(said, method=self.given.method)
+        given = replace(self.given, settings={**self.given.settings, **again.settings})
+        free = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in (*defaults(given), *said, "given")}
+        return replace(self._promised(given), **free, given=given)
+
+    @classmethod
+    def _promised(cls, given: Given) -> Self:
+        """Build what a `Given` amounts to, without the label."""
+        plain = {name: to_plain(value) for name, value in {**_as_dict(cls()), **defaults(given)}.items()}
+        return cls._from_values(laid_over(plain, given), given.method)
+
+    @classmethod
+    def _from_values(cls, values: dict[str, Any], method: str) -> Self:
+        rest = {name: value for name, value in values.items() if name != "strategy"}
+        strategy = from_plain(METHODS[method].strategy, values.get("strategy", {}), f"config.{method}")
+        return replace(from_plain(cls, rest, "config", skipped=("given", "strategy")), strategy=strategy)
 
     @property
-    def scaler(self) -> float:
-        """What the schedule is multiplied by."""
-        return PRESETS[self.preset] if self.steps_scaler is None else self.steps_scaler
+    def method(self) -> str:
+        """The name of the method that is trained."""
+        return method_of(self.strategy)
 
     @property
-    def strategy(self) -> POPStrategy | ADCStrategy:
-        """The settings of the method that was chosen."""
-        return self.pop if self.method == "pop" else self.adc
+    def preset(self) -> str | None:
+        """The preset that gave the defaults; None where every value was written down."""
+        return None if self.given is None else self.given.preset
 
     def photometric_at(self, step: int) -> tuple[Literal["l1", "l2"], float]:
         """Return the pixel-wise loss of a step and the weight of 1 - SSIM; the rest of the weight, to 1, is its own."""
         if self.l2_stop_iter is not None and step >= self.l2_stop_iter:
-            return "l1", 0.2
-        pop = self.method == "pop"
-        weight = self.lambda_ssim if self.lambda_ssim is not None else 0.01 if pop else 0.2
-        return self.photometric if self.photometric != "method" else "l2" if pop else "l1", weight
-
-    def resolved(self) -> TrainConfig:
-        """Return the same run with the scaler worked into every step number (and itself 1)."""
-        by = self.scaler
-        pop, adc = self.pop.scaled(by), self.adc.scaled(by)
-        if self.preset == "quick":
-            # what a big Gaussian covered, a sky above all, does not grow back in so few steps: see benchmarks/NOTES.md
-            pop, adc = replace(pop, prune_too_big=False), replace(adc, prune_too_big=False)
-            pop = replace(pop, blur_min_pixels=max(pop.blur_min_pixels, QUICK_BLUR_MIN_PIXELS))
-
-        def scaled(step: int) -> int:
-            return max(round(step * by), 1)
-
-        return replace(
-            self,
-            preset="paper",
-            steps_scaler=None,
-            max_steps=scaled(self.max_steps),
-            sh_interval=scaled(self.sh_interval),
-            l2_stop_iter=None if self.l2_stop_iter is None else scaled(self.l2_stop_iter),
-            eval_steps=tuple(scaled(step) for step in self.eval_steps),
-            save_steps=tuple(scaled(step) for step in self.save_steps),
-            pop=pop,
-            adc=adc,
-        )
+            return "l1", LAMBDA_SSIM_3DGS
+        return self.photometric, self.lambda_ssim
 
     def to_json(self) -> str:
-        """Write the settings as JSON, in reading order."""
-        return json.dumps(to_plain(self), indent=2) + "\n"
+        """Write the settings as JSON, in reading order: as given (null where no preset was), and as they are run."""
+        given = None if self.given is None else self.given.to_plain()
+        resolved = {"method": self.method, **{n: to_plain(v) for n, v in _as_dict(self).items()}}
+        return json.dumps({_GIVEN: given, _RESOLVED: resolved}, indent=2) + "\n"
 
     @classmethod
-    def from_json(cls, text: str) -> TrainConfig:
-        """Read what `to_json` wrote; fields that are absent keep their default.
+    def from_json(cls, text: str) -> Self:
+        """Read what `to_json` wrote; settings that are absent keep their default.
 
         Raises:
-            PopError: not JSON, an unknown field, or a value of the wrong type; names the field.
+            PopError: not JSON, of an older layout, an unknown field, or a value of the wrong type; names the field.
         """
         try:
             plain = json.loads(text)
@@ -206,22 +200,40 @@ class TrainConfig:
             raise PopError(f"config is not JSON: {error.msg} at line {error.lineno}, column {error.colno}") from error
         except (ValueError, RecursionError) as error:
             raise PopError(f"config is not JSON that can be read: {error}") from error
-        return from_plain(cls, plain, "config")
+        if (
+            not isinstance(plain, dict)
+            or not isinstance(plain.get(_RESOLVED), dict)
+            or set(plain) != {_GIVEN, _RESOLVED}
+        ):
+            raise PopError(f"config is not {{{_GIVEN}, {_RESOLVED}}}, so it is of an older version of pop or damaged")
+        values = dict(plain[_RESOLVED])
+        method = values.pop("method", "pop")
+        if method not in METHODS:
+            raise PopError(f"config.method is {method!r}; it must be one of {', '.join(map(repr, METHODS))}")
+        config = cls._from_values(values, method)
+        given = plain.get(_GIVEN)
+        return config if given is None else replace(config, given=Given.from_plain(given, "config.given"))
 
     def binding(self) -> dict[str, Any]:
-        """Return the settings that a resumed run must share, flat, step numbers as they are run."""
-        plain = to_plain(self.resolved())
-        flat: dict[str, Any] = {}
-        other = "adc" if self.method == "pop" else "pop"
-        for name, value in plain.items():
-            if name in _FREE or name == other:
-                continue
-            flat |= {f"{name}.{key}": v for key, v in value.items()} if isinstance(value, dict) else {name: value}
+        """Return the settings that a resumed run must share, flat."""
+        return {name: value for name, value in self.flat().items() if name not in _FREE}
+
+    def flat(self) -> dict[str, Any]:
+        """Return all settings as they are run, as plain values by dotted name."""
+        flat: dict[str, Any] = {"method": self.method}
+        for name, value in _as_dict(self).items():
+            plain = to_plain(value)
+            group = self.method if name == "strategy" else name
+            flat |= {f"{group}.{key}": v for key, v in plain.items()} if isinstance(plain, dict) else {name: plain}
         return flat
 
     def digest(self) -> str:
         """Hash the settings that decide the result's bits."""
         return hashlib.sha256(json.dumps(self.binding(), sort_keys=True).encode()).hexdigest()
+
+
+def _as_dict(config: TrainConfig) -> dict[str, Any]:
+    return {f.name: getattr(config, f.name) for f in fields(config) if f.name != "given"}
 
 
 def first_difference(ours: dict[str, Any], theirs: dict[str, Any]) -> tuple[str, Any, Any] | None:

@@ -22,15 +22,21 @@ def to_plain(value: Any) -> Any:
     return value
 
 
-def from_plain(kind: type[T], plain: Any, where: str) -> T:
+def from_plain(kind: type[T], plain: Any, where: str, skipped: tuple[str, ...] = ()) -> T:
     """Build a dataclass from what `to_plain` made of it; absent fields keep their default.
+
+    Args:
+        kind: the dataclass.
+        plain: the values by name.
+        where: what errors call it.
+        skipped: fields that plain values cannot give.
 
     Raises:
         PopError: an unknown field, or a value of the wrong type; names it as `where.field`.
     """
     if not isinstance(plain, dict):
         raise PopError(f"{where} is {_shown(plain)}; it must be an object of settings")
-    hints = get_type_hints(kind)
+    hints = {name: hint for name, hint in get_type_hints(kind).items() if name not in skipped}
     for name in plain:
         if name not in hints:
             raise PopError(f"{where}.{name} is not a setting; the settings are {', '.join(hints)}")

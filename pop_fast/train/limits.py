@@ -24,10 +24,10 @@ _AT_LEAST: Final = {
     "l2_stop_iter": 0,
 }
 # numbers that are divided by, or of which a logarithm is taken
-_OVER_ZERO: Final = ("steps_scaler", "init_scale", "photometric_divisor", "lr.means_decay")
-_SHARES: Final = ("lambda_ssim", "pop.prune_opa", "adc.prune_opa", "pop.theta_blur")
-# step numbers times this are still far from where a float ends
-_LARGEST_SCALER: Final = 1e6
+_OVER_ZERO: Final = ("init_scale", "photometric_divisor", "lr.means_decay")
+# of the strategy, whose settings errors call by the method's name as the command line does
+_AT_LEAST_OF_STRATEGY: Final = {"refine_every": 1, "reset_every": 0, "pause_refine_after_reset": 0}
+_SHARES_OF_STRATEGY: Final = ("prune_opa", "theta_blur", "reset_opa")
 
 
 def check_values(config: Any) -> None:
@@ -39,8 +39,10 @@ def check_values(config: Any) -> None:
     Raises:
         PopError: a setting is out of range or, being a number, not finite.
     """
-    values = dict(_flat(config))
-    for name, smallest in _AT_LEAST.items():
+    values, method = dict(_flat(config)), config.method
+    shares = ("lambda_ssim", *(f"{method}.{name}" for name in _SHARES_OF_STRATEGY))
+    at_least = {**_AT_LEAST, **{f"{method}.{name}": least for name, least in _AT_LEAST_OF_STRATEGY.items()}}
+    for name, smallest in at_least.items():
         if values[name] is not None and values[name] < smallest:
             raise PopError(f"{name} is {values[name]}; it must be at least {smallest}")
     if values["sh_degree"] > 3:
@@ -49,15 +51,12 @@ def check_values(config: Any) -> None:
         raise PopError(f"init_opacity is {values['init_opacity']}; it must lie between 0 and 1")
     if any(not 0.0 <= value <= 1.0 for value in values["background"]):
         raise PopError(f"background is {list(values['background'])}; every channel must lie in [0, 1]")
-    for name in (*_OVER_ZERO, *_SHARES, *(name for name, value in values.items() if isinstance(value, float))):
-        if values[name] is not None:
-            _check_number(name, values[name])
-    if (values["steps_scaler"] or 0.0) > _LARGEST_SCALER:
-        raise PopError(f"steps_scaler is {values['steps_scaler']}; it must be at most {_LARGEST_SCALER:.0f}")
+    for name in (*_OVER_ZERO, *shares, *(name for name, value in values.items() if isinstance(value, float))):
+        _check_number(name, values[name], name in shares)
 
 
-def _check_number(name: str, value: float) -> None:
-    if name in _SHARES:
+def _check_number(name: str, value: float, is_share: bool) -> None:
+    if is_share:
         right, meaning = 0.0 <= value <= 1.0, "lie in [0, 1]"
     elif name in _OVER_ZERO:
         right, meaning = 0.0 < value < math.inf, "be > 0 and finite"
@@ -70,7 +69,9 @@ def _check_number(name: str, value: float) -> None:
 def _flat(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     for field in fields(config):
         value = getattr(config, field.name)
+        if field.name == "given":
+            continue
         if is_dataclass(value):
-            yield from _flat(value, f"{prefix}{field.name}.")
+            yield from _flat(value, f"{config.method if field.name == 'strategy' else field.name}.")
         else:
             yield f"{prefix}{field.name}", value

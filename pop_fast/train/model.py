@@ -11,25 +11,36 @@ from torch.nn import Parameter
 from torch.optim import Adam
 
 from pop_fast.activations import scales_from_log_scales
-from pop_fast.train.config import LearningRates
 from pop_fast.train.schedule import means_lr
+from pop_ref.settings import BETAS, EPS, LearningRates
 
 KEYS: Final = ("means", "scales", "quats", "opacities", "sh0", "shN")
 
 
+def learning_rates(lr: LearningRates, scene_scale: float) -> dict[str, float]:
+    """Return the learning rate of each parameter, the means' at step 0 and in world units.
+
+    Args:
+        lr: the settings.
+        scene_scale: the unit of the means' rate, world units.
+    """
+    return {**lr.by_parameter(), "means": lr.means * scene_scale}
+
+
 def make_optimizers(params: Mapping[str, Parameter], lr: LearningRates, scene_scale: float) -> dict[str, Adam]:
-    """Make one dense Adam a parameter (betas 0.9 and 0.999, eps 1e-15), the means' rate in units of the scene."""
-    rates = {
-        "means": lr.means * scene_scale,
-        "scales": lr.scales,
-        "quats": lr.quats,
-        "opacities": lr.opacities,
-        "sh0": lr.sh0,
-        "shN": lr.sh_rest,
-    }
-    return {
-        key: Adam([param], lr=rates[key], betas=(0.9, 0.999), eps=1e-15, fused=True) for key, param in params.items()
-    }
+    """Make one dense Adam a parameter, its moments zero, the counter of steps on the CPU.
+
+    Args:
+        params: raw parameters by name.
+        lr: the settings.
+        scene_scale: the unit of the means' learning rate, world units.
+    """
+    rates = learning_rates(lr, scene_scale)
+    made = {key: Adam([param], lr=rates[key], betas=BETAS, eps=EPS, fused=True) for key, param in params.items()}
+    for key, optimizer in made.items():
+        moments = {name: torch.zeros_like(params[key].detach()) for name in ("exp_avg", "exp_avg_sq")}
+        optimizer.state[params[key]] = {"step": torch.zeros((), dtype=torch.float32), **moments}
+    return made
 
 
 def adam_step(
@@ -67,12 +78,7 @@ def advance_idle(optimizer: Adam, param: Tensor) -> None:
     With g = m = v = 0 the update is `lr * 0 / (0 + eps) = 0` and m and v stay 0; the counter has to go on because the
     bias corrections `1 - beta^step` read it.
     """
-    state = optimizer.state[param]
-    if not state:
-        state["step"] = torch.zeros((), dtype=torch.float32)
-        state["exp_avg"] = torch.zeros_like(param)
-        state["exp_avg_sq"] = torch.zeros_like(param)
-    state["step"] += 1
+    optimizer.state[param]["step"] += 1
 
 
 def first_non_finite(tensors: Mapping[str, Tensor]) -> tuple[str, list[int], float] | None:

@@ -7,6 +7,7 @@ from types import ModuleType
 
 from torch import Tensor
 
+from cuda_ext.train_settings import Phase
 from pop_fast import losses
 from pop_fast.losses import TargetMoments, target_moments
 from pop_fast.train.config import TrainConfig
@@ -18,32 +19,37 @@ class Objective:
 
     What SSIM needs of a photograph alone is computed at its first visit and kept, for as many views as
     `target_cache_mb` has room for; the others compute it anew at every visit, to the same bits.
+
+    Args:
+        config: step numbers as they are run.
+        views: to train on.
+        backend: "compiled" for its losses; all others take torch's.
     """
 
-    def __init__(self, config: TrainConfig, views: Sequence[ViewTensors]) -> None:
+    def __init__(self, config: TrainConfig, views: Sequence[ViewTensors], backend: str) -> None:
         self._config = config
         self._views = views
         self._kept: dict[int, TargetMoments] = {}
         self._room = config.target_cache_mb * 2**20
-        self._losses = _losses_of(config.backend)
+        self._losses = _losses_of(backend)
 
-    def __call__(self, image: Tensor, index: int, step: int) -> Tensor:
-        """Return the loss of a render [H, W, 3] of view `index` at a step."""
+    def __call__(self, image: Tensor, index: int, phase: Phase) -> Tensor:
+        """Return the loss of a render [H, W, 3] of view `index`."""
         config, moments, mask = self._config, self._moments(index), self._views[index].mask
-        kind, weight = config.photometric_at(step)
-        common = (weight, config.ssim_padding, mask, config.d_ssim_halved, 1.0 / config.photometric_divisor)
-        if kind == "l1":
+        weight, scale = phase.lambda_ssim, 1.0 / config.photometric_divisor
+        common = (weight, config.ssim_padding, mask, config.d_ssim_halved, scale)
+        if phase.l1:
             return self._losses.photometric_3dgs(image, moments.target, *common, moments=moments)
         return self._losses.photometric_pop(image, moments.target, *common, moments=moments)
 
-    def terms(self, image: Tensor, index: int, step: int) -> dict[str, float]:
-        """Return the unweighted terms by name: l1 or l2, and d_ssim."""
-        config, moments, mask = self._config, self._moments(index), self._views[index].mask
-        kind, _ = config.photometric_at(step)
-        pixelwise = losses.l1 if kind == "l1" else losses.l2
-        compared = (image, moments.target, config.ssim_padding, mask, config.d_ssim_halved, moments)
-        structural = self._losses.d_ssim(*compared)
-        return {kind: float(pixelwise(image, moments.target, mask)), "d_ssim": float(structural)}
+    def measure(self, image: Tensor, index: int, l1: bool) -> tuple[float, float, float]:
+        """Return mean L1 or L2, SSIM, and the mean square of the difference with the render clamped to [0, 1]."""
+        moments, mask = self._moments(index), self._views[index].mask
+        target, padding = moments.target, self._config.ssim_padding
+        pixelwise = (losses.l1 if l1 else losses.l2)(image, target, mask)
+        d_ssim = self._losses.d_ssim(image, target, padding, mask, False, moments)
+        square = losses.l2(image.clamp(0.0, 1.0), target, mask)
+        return float(pixelwise), 1.0 - float(d_ssim), float(square)
 
     def _moments(self, index: int) -> TargetMoments:
         if index in self._kept:

@@ -1,10 +1,16 @@
-"""What a training run does whoever takes its steps: results, milestones, measurements, checkpoints, stop and go on."""
+"""A training run: schedule, densification steps, records, measurements and checkpoints; a `Stepper` takes its steps.
+
+Everything random comes from generators that are seeded by the config and saved in checkpoints; the same config,
+capture, engine, machine and number of threads give the same bits, whether a run was interrupted or not.
+"""
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,28 +20,37 @@ from torch import Tensor
 from torch.nn import Parameter
 from tqdm import tqdm
 
+from cuda_ext.train_settings import Phase, StepStats
 from pop_fast.activations import opacities_from_logits
-from pop_fast.backends import Backend, get_backend
 from pop_fast.data.capture import Capture
 from pop_fast.data.initialize import initialize_params
 from pop_fast.errors import PopError
 from pop_fast.io.ply import save_ply
+from pop_fast.strategies.base import StepEvent, Strategy
+from pop_fast.strategies.control import standard_normals
+from pop_fast.strategies.foreign import ForeignStrategy
 from pop_fast.train import checkpoint as ckpt
+from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.engines import engine_of
 from pop_fast.train.environment import reproducible, run_facts, versions
 from pop_fast.train.evaluate import evaluate
 from pop_fast.train.lpips import load_nets
 from pop_fast.train.metrics import population
 from pop_fast.train.model import KEYS, first_unusable, make_optimizers
+from pop_fast.train.on_device import words_for_memory
+from pop_fast.train.phases import phase_at, stretch_end
 from pop_fast.train.preflight import check_start, check_views
+from pop_fast.train.records import Stretch, record_of
 from pop_fast.train.results import ResultFolder
 from pop_fast.train.schedule import ViewOrder, active_sh_degree
 from pop_fast.train.signals import stop_requests
+from pop_fast.train.stepper import Engine, Stepper, Task
 from pop_fast.train.views import ViewTensors
 
 
 class TrainingRun:
-    """A run of one capture; `Trainer` and `DeviceTrainer` add how steps are taken.
+    """A run of one capture.
 
     Attributes:
         config: the settings, step numbers as they are run.
@@ -55,7 +70,9 @@ class TrainingRun:
         overwrite: bool = False,
         loading_seconds: float = 0.0,
         beside: Mapping[str, str] | None = None,
-        backend: Backend | None = None,
+        strategy: Strategy | None = None,
+        initial: Mapping[str, Tensor] | None = None,
+        engine: Engine | None = None,
     ) -> None:
         """Prepare a run; nothing is written yet.
 
@@ -66,39 +83,48 @@ class TrainingRun:
             overwrite: replace the results of an earlier run in `config.result_dir`, once the first step has been taken.
             loading_seconds: how long reading the capture took, for the statistics.
             beside: texts to write beside cfg.json, by file name.
-            backend: what renders; None takes the one that `config` names.
+            strategy: decides over the population in the place of the config's, by gsplat's protocol; on the CPU.
+            initial: raw parameters to start from; None makes them from the capture's points. Their precision is that of
+                the training; a GPU trains in float32 only.
+            engine: takes the steps; None takes the one for `config.backend`.
 
         Raises:
-            PopError: the capture cannot be trained on, weights are missing, or the backend is not available.
+            PopError: the capture cannot be trained on, weights are missing, or the backend is not available or does
+                not know a setting.
         """
-        self._given, self.config = config, config.resolved()
+        self._engine = engine_of(choose_backend(config, resume)[0], strategy is None) if engine is None else engine
+        self.config = replace(config, backend=self._engine.name)
         self._resume, self._overwrite, self._beside = resume, overwrite, beside or {}
-        self._backend = get_backend(config.backend) if backend is None else backend
-        if not self._backend.available():
-            raise PopError(f"backend {config.backend!r} is not available: {self._backend.why_not()}")
-        self._train = [ViewTensors.of(view) for view in capture.train_views(config.test_every)]
-        self._test = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
-        if not self._train:
-            raise PopError(f"{capture.name}: has no view to train on; lower test_every or set it to 0")
-        check_views(self.config, capture.name, self._train, self._test)
-        self._nets = load_nets(config.lpips_vgg, config.lpips_alex, [(view.height, view.width) for view in self._test])
-        self._capture = capture
-        self._scene_scale = capture.scene_scale()
-        self._order = ViewOrder(len(self._train), self.config.seed)
-        self._results = ResultFolder(self.config.result_dir)
-        initial = initialize_params(capture, self.config.seed, self.config.init_opacity, self.config.init_scale)
-        check_start(capture.name, initial)
-        self.params = {key: Parameter(initial[key]) for key in KEYS}
+        self._prepare_capture(capture, initial)
         self.optimizers = make_optimizers(self.params, self.config.lr, self._scene_scale)
-        self.strategy = self.config.strategy
+        self.strategy = self.config.strategy if strategy is None else ForeignStrategy(strategy)
         self.strategy.check_sanity(self.params, self.optimizers)
         self.state = self.strategy.initialize_state(self._scene_scale, seed=self.config.seed)
         self.step = 0
+        self._stepper: Stepper | None = None
         self._train_seconds = 0.0
         self._loading_seconds = loading_seconds
         self._started = 0.0
         # the first Gaussians' opacities while the folder is still as it was found
         self._unwritten: np.ndarray | None = None
+
+    def _prepare_capture(self, capture: Capture, initial: Mapping[str, Tensor] | None) -> None:
+        config = self.config
+        if initial is None:
+            initial = initialize_params(capture, config.seed, config.init_opacity, config.init_scale)
+        check_start(capture.name, initial)
+        self.params = {key: Parameter(initial[key]) for key in KEYS}
+        dtype = self.params["means"].dtype
+        self._train = [ViewTensors.of(view, dtype) for view in capture.train_views(config.test_every)]
+        self._test = [ViewTensors.of(view, dtype) for view in capture.test_views(config.test_every)]
+        if not self._train:
+            raise PopError(f"{capture.name}: has no view to train on; lower test_every or set it to 0")
+        check_views(config, capture.name, self._train, self._test)
+        self._nets = load_nets(config.lpips_vgg, config.lpips_alex, [(view.height, view.width) for view in self._test])
+        self._capture = capture
+        self._scene_scale = capture.scene_scale()
+        self._order = ViewOrder(len(self._train), config.seed)
+        self._results = ResultFolder(config.result_dir)
 
     def run(self) -> dict[str, Any]:
         """Train to the end.
@@ -126,19 +152,24 @@ class TrainingRun:
         found = ckpt.list_checkpoints(self._results.path) if self._resume else []
         if found:
             self._restore(found[-1][1])
-            self._results.write_settings(self._given, self._beside)
+            self._results.write_settings(self.config, self._beside)
         else:
             self._unwritten = self._opacities().numpy()
+        start = time.perf_counter()
+        self._stepper = self.stepper
+        self._loading_seconds += time.perf_counter() - start
 
     def _loop(self, stop: threading.Event) -> dict[str, Any]:
         config = self.config
         with tqdm(total=config.max_steps, initial=self.step, disable=None if config.progress else True) as bar:
             while self.step < config.max_steps:
-                self._advance(bar)
+                longest = self.stepper.longest
+                stretch = self.take_steps(stretch_end(config, self.strategy, self.step, longest))
+                self._log(stretch, bar)
                 if self._unwritten is not None:
                     # a rate can be so high that the first step is the last; that is no reason to replace anything
                     self._require_finite()
-                    self._results.begin(self._given, self._beside, self._unwritten, self._overwrite)
+                    self._results.begin(self.config, self._beside, self._unwritten, self._overwrite)
                     self._unwritten = None
                 self._milestones(self.step - 1)
                 if stop.is_set() and self.step < config.max_steps:
@@ -147,15 +178,103 @@ class TrainingRun:
         last = config.max_steps - 1
         return self._results.read_stats("val", last) or self._evaluate(last)
 
-    def _advance(self, bar: tqdm) -> None:
-        """Take one step or several, move `step`, and log."""
-        raise NotImplementedError
+    def take_steps(self, last: int) -> Stretch:
+        """Take the steps up to `last`, and the densification step that is due after them.
+
+        All are of one phase, and none but the last is followed by a densification step; see `phases.stretch_end`.
+
+        Args:
+            last: how many steps will have been taken, over `step`.
+
+        Returns:
+            What the steps measured and what became of the population.
+
+        Raises:
+            PopError: a number is no longer finite; names it.
+        """
+        start, first, before = time.perf_counter(), self.step, len(self.params["means"])
+        phase = phase_at(self.config, self.strategy, first)
+        views = [self._train[self._order.next()].name for _ in range(first, last)]
+        with words_for_memory():
+            stats = self._measured(self.stepper, first, last, phase)
+            event = self._change(last - 1)
+        after, seconds = len(self.params["means"]), time.perf_counter() - start
+        return Stretch(first, phase, views, stats, event, before, after, seconds)
+
+    def _measured(self, stepper: Stepper, first: int, last: int, phase: Phase) -> list[StepStats]:
+        try:
+            stats = stepper.steps(first, last, phase)
+        except ValueError as error:
+            if isinstance(error, PopError):
+                raise
+            # the step that fails changes nothing, so that the parameters still say which entry it is
+            self.step = stepper.step
+            self._require_finite()
+            raise PopError(f"{error}; {self._what_is_left}") from error
+        self.step = last
+        for step, found in enumerate(stats, first):
+            if not math.isfinite(found.objective + found.pop):
+                self._require_finite()
+                raise PopError(f"the loss of step {step} is {found.objective + found.pop}; {self._what_is_left}")
+        return stats
+
+    def _change(self, step: int) -> StepEvent | None:
+        """Let density control edit the population, if that is due."""
+        if not self.strategy.changes_after(step):
+            return None
+        event = self.strategy.change(self.params, self.optimizers, self.state, step, self.normals)
+        self.stepper.rebind(self.params, self.optimizers, self.state)
+        return event
+
+    def normals(self, n: int) -> Tensor:
+        """Draw what places the children of n split parents, the same numbers whatever takes the steps. [2, n, 3]"""
+        return standard_normals(self.state["generator"], n)
+
+    @property
+    def stepper(self) -> Stepper:
+        """What takes the steps; it is made at the first use, for the rows as they are then."""
+        if self._stepper is None:
+            self._place()
+            # the views of steps that were taken are not known any more
+            ahead = ViewOrder(len(self._train), self.config.seed)
+            ahead.load_state_dict(self._order.state_dict())
+            order = [0] * self.step + [ahead.next() for _ in range(self.step, self.config.max_steps)]
+            task = Task(self.config, self.strategy, self._train, order, self._scene_scale, self.step)
+            self._stepper = self._engine.make_stepper(task)
+            with words_for_memory():
+                self._stepper.rebind(self.params, self.optimizers, self.state)
+        return self._stepper
+
+    def _place(self) -> None:
+        """Move parameters, moments and statistics to the engine's device."""
+        device = self._engine.device
+        if device.type == "cpu":
+            return
+        moments = ckpt.pack_optimizers(self.optimizers)
+        with words_for_memory():
+            self.params = {key: Parameter(self.params[key].detach().to(device)) for key in KEYS}
+            self.optimizers = make_optimizers(self.params, self.config.lr, self._scene_scale)
+            for key, found in moments.items():
+                there = {name: value if name == "step" else value.to(device) for name, value in found.items()}
+                self.optimizers[key].state[self.params[key]] = there
+            for key, value in self.state.items():
+                self.state[key] = value.to(device) if isinstance(value, Tensor) else value
+
+    def _log(self, stretch: Stretch, bar: tqdm) -> None:
+        """Write the records of a stretch."""
+        for step in range(stretch.first, self.step):
+            record = record_of(stretch, step, self.config, self._scene_scale, self._train_seconds)
+            if record is not None:
+                self._results.log(record)
+                bar.set_postfix_str(f"PSNR {record['psnr']:.2f}, N {record['num_gaussians']:,}", refresh=False)
+        self._train_seconds += stretch.seconds
+        bar.update(self.step - stretch.first)
 
     def _milestones(self, step: int) -> None:
         """After a step (counted from 0): keep histograms, measure, write PLY and checkpoint when it is time."""
         config, taken = self.config, step + 1
         last = taken == config.max_steps
-        if taken == config.pop.blur_stop_iter or last:
+        if taken == config.strategy.blur_stop_iter or last:
             self._results.write_opacities(step, self._opacities().numpy())
         if taken in config.eval_steps or last:
             self._evaluate(step)
@@ -179,14 +298,20 @@ class TrainingRun:
         self._results.write_stats("train", step, {**stats, "ellipse_time": self._train_seconds})
         degree = active_sh_degree(step, config.sh_interval, config.sh_degree)
         folder = self._results if step + 1 == config.max_steps else None
-        stats |= evaluate(self._backend, self.params, self._test, config, degree, self._nets, folder, step)
+        stats |= evaluate(self._engine.backend, self.params, self._test, config, degree, self._nets, folder, step)
         stats["seconds_total"] = self._total_seconds
         self._results.write_stats("val", step, stats)
         return stats
 
     def _facts(self) -> dict[str, Any]:
-        facts = run_facts(self._backend.name, self._train_seconds, self._total_seconds)
-        return {**facts, "seconds_loading": self._loading_seconds}
+        stepper, engine = self.stepper, self._engine
+        return {
+            **run_facts(engine.backend.name, self._train_seconds, self._total_seconds),
+            "stepper": stepper.name,
+            "seconds_loading": self._loading_seconds,
+            **engine.facts(),
+            **stepper.facts(),
+        }
 
     def _save(self) -> None:
         self._require_finite()
@@ -196,7 +321,7 @@ class TrainingRun:
             "optimizers": _on_cpu(ckpt.pack_optimizers(self.optimizers)),
             "strategy": _on_cpu(ckpt.pack_strategy(self.state)),
             "view_order": self._order.state_dict(),
-            "config": self._given.binding(),
+            "config": self.config.binding(),
             "capture": self._fingerprint(),
             "metrics_bytes": self._results.flush_metrics(),
             "seconds": {"train": self._train_seconds, "total": self._total_seconds},
@@ -210,7 +335,7 @@ class TrainingRun:
     def _restore(self, path: Path) -> None:
         content = ckpt.load_checkpoint(path)
         threads, n_views = torch.get_num_threads(), len(self._train)
-        ckpt.check_fits(path, content, self._given, self._fingerprint(), threads, n_views)
+        ckpt.check_fits(path, content, self.config, self._fingerprint(), threads, n_views, self.state.keys())
         self.params = {key: Parameter(content["splats"][key]) for key in KEYS}
         self.optimizers = make_optimizers(self.params, self.config.lr, self._scene_scale)
         ckpt.unpack_optimizers(self.optimizers, content["optimizers"])
@@ -220,6 +345,7 @@ class TrainingRun:
         self._train_seconds = content["seconds"]["train"]
         self._started -= content["seconds"]["total"]
         self.step = content["step"] + 1
+        self._stepper = None
 
     @property
     def _total_seconds(self) -> float:

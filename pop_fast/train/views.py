@@ -22,8 +22,8 @@ class ViewTensors:
         name: relative file name.
         photo: uint8 [H, W, 3]
         mask: True where the photograph counts, or None. bool [H, W]
-        viewmat: world -> camera. float32 [1, 4, 4]
-        K: intrinsics, px. float32 [1, 3, 3]
+        viewmat: world -> camera, in the precision of the training. [1, 4, 4]
+        K: intrinsics, px, likewise. [1, 3, 3]
     """
 
     name: str
@@ -33,14 +33,14 @@ class ViewTensors:
     K: Tensor
 
     @classmethod
-    def of(cls, view: View) -> ViewTensors:
-        """Take over a view of a capture."""
+    def of(cls, view: View, dtype: torch.dtype = torch.float32) -> ViewTensors:
+        """Take over a view of a capture, its camera in a precision."""
         return cls(
             name=view.name,
             photo=torch.from_numpy(view.image),
             mask=None if view.mask is None else torch.from_numpy(view.mask),
-            viewmat=torch.from_numpy(view.viewmat).float()[None],
-            K=torch.from_numpy(view.K).float()[None],
+            viewmat=torch.from_numpy(view.viewmat).to(dtype)[None],
+            K=torch.from_numpy(view.K).to(dtype)[None],
         )
 
     @property
@@ -55,7 +55,7 @@ class ViewTensors:
 
     def target(self) -> Tensor:
         """Return the photograph as floats in [0, 1]. [H, W, 3]"""
-        return self.photo.float().div_(255.0)
+        return self.photo.to(self.viewmat.dtype).div_(255.0)
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,7 @@ def render_view(
     sh_degree: int,
     dominance: bool = False,
     counts: bool = False,
+    absgrad: bool = False,
 ) -> Rendered:
     """Render a view from raw parameters.
 
@@ -84,15 +85,16 @@ def render_view(
         backend: what renders.
         params: raw parameters.
         view: the camera, and the mask that `dominant_counts` are restricted to.
-        config: background, profile, antialiasing and absgrad are read.
+        config: background, profile and antialiasing are read.
         sh_degree: highest active colour band.
         dominance: dominant ids and counts will be read from `info`.
         counts: Gaussians per pixel will be read from `info`.
+        absgrad: so will the gradient of the screen centres summed of absolute values.
     """
     opacities = opacities_from_logits(params["opacities"])
     bands = (sh_degree + 1) ** 2
     sh = params["sh0"] if bands == 1 else torch.cat([params["sh0"], params["shN"][:, : bands - 1]], dim=1)
-    background = torch.tensor([config.background]) if any(config.background) else None
+    background = torch.tensor([config.background]).to(opacities) if any(config.background) else None
     colors, _, info = backend.rasterization(
         means=params["means"],
         quats=params["quats"],
@@ -106,7 +108,7 @@ def render_view(
         sh_degree=sh_degree,
         packed=False,
         backgrounds=background,
-        absgrad=config.strategy.absgrad,
+        absgrad=absgrad,
         rasterize_mode="antialiased" if config.antialiased else "classic",
         profile=config.profile,
         dominance=dominance,

@@ -265,9 +265,8 @@ class TorchAdapter(Adapter):
         if isinstance(value, list):
             return [self._tensor(each, own) for each in value]
         if own is not None and is_dataclass(value) and hasattr(own, type(value).__name__):
-            return getattr(own, type(value).__name__)(
-                *(self._tensor(getattr(value, f.name), own) for f in fields(value))
-            )
+            values = {f.name: self._tensor(getattr(value, f.name), own) for f in fields(value)}
+            return getattr(own, type(value).__name__)(**values)
         if inspect.isfunction(value):
             return lambda *args: self._tensor(value(*args), own)
         return value

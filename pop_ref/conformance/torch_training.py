@@ -144,10 +144,10 @@ class Trainer:
         config: DensityConfig,
     ) -> tuple[Rows, Statistics]:
         """See `pop_ref.density.densify_and_prune`."""
-        strategy = self._strategy(config, normals)
+        strategy = self._strategy(config)
         params, optimizers = self._population(rows.params, rows)
         state = self._state(strategy, statistics, scene_scale)
-        strategy.change(params, optimizers, state, step)
+        strategy.change(params, optimizers, state, step, normals)
         return self._rows(params, optimizers), self._statistics(state, statistics.grad_sum)
 
     def adam_step(
@@ -240,12 +240,10 @@ class Trainer:
         operation(params, optimizers, {}, *args)
         return self._rows(params, optimizers)
 
-    def _strategy(self, config: DensityConfig, normals: Callable[[int], Any] | None = None) -> Any:
-        """Return the trainer's strategy under these settings; children are placed by `normals` where it is given."""
+    def _strategy(self, config: DensityConfig) -> Any:
+        """Return the trainer's strategy under these settings."""
         shared = {f.name for f in fields(self._Strategy)} & {f.name for f in fields(DensityConfig)}
-        placed = {} if normals is None else {"draws": lambda _self, _state, n, _like: normals(n)}
-        kind = type("Strategy", (self._Strategy,), placed)
-        return kind(**{name: getattr(config, name) for name in shared})
+        return self._Strategy(**{name: getattr(config, name) for name in shared})
 
     def _state(self, strategy: Any, statistics: Statistics, scene_scale: float) -> dict[str, Any]:
         """Return the strategy's state with these statistics."""

@@ -183,8 +183,8 @@ print("largest |m| of the means, row by row:", largest.round(5).tolist())
 
 # %%
 WIDTH, HEIGHT, STEPS = 10, 6, 240
-assert density.ADC.reset_every == 3000
-assert density.ADC.reset_opa == 0.01
+assert density.GSPLAT.reset_every == 3000
+assert density.GSPLAT.reset_opa == 0.01
 rng = np.random.default_rng(1)
 wall = [(x, y) for y in (1.5, 4.5) for x in (1.5, 5.0, 8.5)]
 place = np.array([*wall, *wall, (3.0, 3.0), (7.0, 3.0)])

@@ -24,7 +24,7 @@ from pop_fast.data.capture import Capture, View
 from pop_fast.rasterization import rasterization
 from pop_fast.report import write_report
 from pop_fast.strategies import POPStrategy
-from pop_fast.train import LearningRates, TrainConfig, Trainer
+from pop_fast.train import LearningRates, TrainConfig, TrainingRun
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, MUTED, SECOND, THIRD, axes, show_image
 
@@ -116,7 +116,7 @@ assert POPStrategy().lambda_pop == 0.001
 assert TrainConfig().max_steps == 30_000
 config = TrainConfig(
     max_steps=200,
-    pop=strategy,
+    strategy=strategy,
     # fewer steps, longer ones
     lr=LearningRates(means=8e-4, scales=1e-2, opacities=0.1, sh0=2e-2),
     sh_degree=0,
@@ -133,8 +133,8 @@ home = Path(away.name)
 stats = {}
 for name, weight in (("prior", 0.02), ("none", 0.0)):
     pop = replace(strategy, lambda_pop=weight)
-    run = replace(config, result_dir=str(home / name), pop=pop)
-    stats[name] = Trainer(run, capture).run()
+    run = replace(config, result_dir=str(home / name), strategy=pop)
+    stats[name] = TrainingRun(run, capture).run()
     told = "{num_GS} Gaussians, {psnr:.1f} dB, {n_blended:.1f} blended per pixel"
     print(f"{name:5}", told.format(**stats[name]))
 

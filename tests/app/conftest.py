@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from pop_fast.cli import main
-from pop_fast.train import Trainer
+from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from tests.app.interruptions import interrupt
 from tests.app.tiny import tiny_capture, tiny_config
@@ -78,6 +78,6 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         interrupt(patch, at=11)
         with pytest.raises(KeyboardInterrupt):
-            Trainer(tiny_config(folder), tiny_capture()).run()
+            TrainingRun(tiny_config(folder), tiny_capture()).run()
     assert [step for step, _ in ckpt.list_checkpoints(folder)] == [4, 9]
     return folder

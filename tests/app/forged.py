@@ -120,10 +120,10 @@ FORGED: dict[str, tuple[Callable[[Content], Any], tuple[str, ...]]] = {
     "a parameter without memory": (to("splats.means", lambda m: m.to("meta")), ("splats.means is not a plain array",)),
     "parameters a list": (to("splats", [1]), ("splats is list",)),
     # the strategy's state
-    "no strategy's state": (to("strategy", {}), ("has no strategy.grad2d",)),
+    "no strategy's state": (to("strategy", {}), ("has no strategy.generator",)),
     "no random numbers": (without("strategy.generator"), ("has no strategy.generator",)),
     "no blur": (without("strategy.blurred"), ("strategy.blurred is missing",)),
-    "a state of other strategies": (to("strategy.radii", None), ("strategy.radii is unknown",)),
+    "a state of other strategies": (to("strategy.score", None), ("strategy.score is unknown",)),
     "sums of more rows": (to("strategy.grad2d", lambda g: torch.cat([g, g])), ("strategy.grad2d has shape",)),
     "sums of one row": (to("strategy.count", torch.ones(1)), ("strategy.count has shape [1]",)),
     "sums in double": (to("strategy.grad2d", lambda g: g.double()), ("strategy.grad2d is torch.float64",)),
@@ -139,7 +139,7 @@ FORGED: dict[str, tuple[Callable[[Content], Any], tuple[str, ...]]] = {
     "views true": (to("strategy.views", True), ("strategy.views is True",)),
     "a scene of no size": (to("strategy.scene_scale", NAN), ("strategy.scene_scale is nan",)),
     "a scene's size in words": (to("strategy.scene_scale", "1"), ("strategy.scene_scale is '1'",)),
-    "an event a list": (to("strategy.event", [1]), ("strategy.event is list",)),
+    "more in a strategy's state": (to("strategy.more", [1]), ("strategy.more is list",)),
     "random numbers too short": (
         to("strategy.generator", torch.zeros(7, dtype=torch.uint8)),
         ("generator has shape [7]",),

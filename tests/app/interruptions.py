@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from pop_fast.train import Trainer
+from pop_fast.train import TrainingRun
 
-_TRAIN_STEP = Trainer.train_step
+_TAKE_STEPS = TrainingRun.take_steps
 
 
 class Killed(BaseException):
@@ -23,12 +23,12 @@ class Killed(BaseException):
 def interrupt(monkeypatch: pytest.MonkeyPatch, at: int) -> None:
     """Let every run be left at once, without a checkpoint, when it has taken `at` steps."""
 
-    def stepping(trainer: Trainer) -> Any:
-        if trainer.step == at:
+    def stepping(training: TrainingRun, last: int) -> Any:
+        if training.step == at:
             raise KeyboardInterrupt
-        return _TRAIN_STEP(trainer)
+        return _TAKE_STEPS(training, last)
 
-    monkeypatch.setattr(Trainer, "train_step", stepping)
+    monkeypatch.setattr(TrainingRun, "take_steps", stepping)
 
 
 @contextmanager

@@ -65,5 +65,4 @@ def moments(optimizers, params, key):
 
 def run_event(strategy, params, optimizers, info, step: int, is_packed: bool = False, scene_scale: float = 1.0):
     state = strategy.initialize_state(scene_scale, seed=3)
-    strategy.step_post_backward(params, optimizers, state, step, info, packed=is_packed)
-    return state
+    return strategy.step_post_backward(params, optimizers, state, step, info, packed=is_packed)

@@ -15,7 +15,7 @@ VIEWS = ("a.png", "b.png")
 
 def write_result(folder: Path, method: str = "pop", steps: int = 300, **stats: Any) -> Path:
     """Write cfg.json, metrics.jsonl, stats and report_data of a made-up run of `steps` steps; returns the folder."""
-    config = TrainConfig(data="captures/toy", method=method, steps_scaler=steps / 30_000)  # type: ignore[arg-type]
+    config = TrainConfig.of(data="captures/toy", method=method, steps_scaler=steps / 30_000)
     for name in ("stats", "report_data"):
         (folder / name).mkdir(parents=True)
     (folder / "cfg.json").write_text(config.to_json())

@@ -13,14 +13,13 @@ from pop_fast.cli.train import check_backend
 from pop_fast.errors import PopError
 from pop_fast.rasterization import rasterization
 from pop_fast.strategies import POPStrategy
-from pop_fast.train import Trainer
-from pop_fast.train.choose import choose_backend, make_trainer
-from pop_fast.train.device_trainer import DeviceTrainer
-from pop_fast.train.hardware import this_machine
+from pop_fast.train import TrainingRun
+from pop_fast.train.choose import choose_backend
+from pop_fast.train.engines import cuda_engine
 from pop_fast.train.on_device import OnDevice, renderer, words_for_memory
 from pop_fast.train.views import ViewTensors, render_view
 from tests.app.conftest import TRAIN, Pop
-from tests.app.stand_in import stand_in_hardware
+from tests.app.drift import drift_engine
 from tests.app.tiny import tiny_capture, tiny_config
 
 NOT_BUILT = "the CUDA extension is not built; run `pop build-cuda`"
@@ -41,9 +40,9 @@ def without_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def with_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on a machine with a GPU and the build, whose part the stand-in plays."""
+    """As on a machine with a GPU and the build, whose part something else plays."""
     monkeypatch.setattr("cuda_ext.why_not", lambda: None)
-    monkeypatch.setattr("pop_fast.train.device_trainer.this_machine", stand_in_hardware)
+    monkeypatch.setattr("pop_fast.train.engines.cuda_engine", drift_engine)
 
 
 def settings(folder: Path) -> dict[str, object]:
@@ -51,8 +50,7 @@ def settings(folder: Path) -> dict[str, object]:
 
 
 def test_auto_is_cuda_where_it_can_run_and_says_why_where_it_cannot(monkeypatch, tmp_path):
-    config = tiny_config(tmp_path)
-    assert config.backend == "auto"
+    config = tiny_config(tmp_path, backend="auto")
     monkeypatch.setattr("cuda_ext.why_not", lambda: None)
     assert choose_backend(config)[0].backend == "cuda"
     monkeypatch.setattr("cuda_ext.why_not", lambda: NOT_BUILT)
@@ -62,16 +60,16 @@ def test_auto_is_cuda_where_it_can_run_and_says_why_where_it_cannot(monkeypatch,
 
 @pytest.mark.usefixtures("with_gpu")
 def test_auto_takes_the_cpu_for_settings_that_the_device_does_not_know(tmp_path):
-    chosen, line = choose_backend(tiny_config(tmp_path, pop=POPStrategy(absgrad=True)))
+    chosen, line = choose_backend(tiny_config(tmp_path, backend="auto", strategy=POPStrategy(absgrad=True)))
     assert chosen.backend == "fast"
     assert "pop.absgrad" in line
 
 
 @pytest.mark.usefixtures("with_gpu")
 def test_a_run_is_gone_on_with_by_the_backend_it_was_begun_with(tmp_path):
-    config = tiny_config(tmp_path)
+    config = tiny_config(tmp_path, backend="auto")
     assert choose_backend(config, resume=True)[0].backend == "cuda"
-    (tmp_path / "cfg.json").write_text('{"backend": "fast"}')
+    (tmp_path / "cfg.json").write_text('{"given": null, "resolved": {"backend": "fast"}}')
     assert choose_backend(config, resume=True)[0].backend == "fast"
     assert choose_backend(config, resume=False)[0].backend == "cuda"
     (tmp_path / "cfg.json").write_text("[oops")
@@ -79,12 +77,11 @@ def test_a_run_is_gone_on_with_by_the_backend_it_was_begun_with(tmp_path):
 
 
 @pytest.mark.usefixtures("with_gpu")
-def test_the_trainer_goes_with_the_backend(tmp_path):
-    config = tiny_config(tmp_path, max_steps=2)
-    kinds = {name: make_trainer(tiny_config(tmp_path, backend=name), tiny_capture()) for name in ("cuda", "fast")}
-    assert type(kinds["cuda"]) is DeviceTrainer
-    assert type(kinds["fast"]) is Trainer
-    assert Trainer(config, tiny_capture())._given.backend == "fast"
+def test_what_takes_the_steps_goes_with_the_backend(tmp_path):
+    for backend, stepper in (("cuda", "cuda"), ("fast", "torch"), ("auto", "cuda")):
+        training = TrainingRun(tiny_config(tmp_path, backend=backend), tiny_capture())
+        assert training.stepper.name == stepper
+        assert training.config.backend == ("fast" if stepper == "torch" else "cuda")
 
 
 @pytest.mark.usefixtures("without_gpu")
@@ -93,7 +90,7 @@ def test_cuda_asked_for_in_vain_is_one_sentence_before_anything_is_read(pop: Pop
     assert outcome.status == 2
     assert outcome.err == f"pop: error: backend 'cuda' is not available: {NOT_BUILT}\n"
     with pytest.raises(PopError, match="not built"):
-        this_machine()
+        cuda_engine()
     with pytest.raises(PopError, match="backend 'cuda' cannot run: the CUDA extension is not built"):
         get_backend("cuda").rasterization()
     one = torch.ones(1, 3)
@@ -104,7 +101,7 @@ def test_cuda_asked_for_in_vain_is_one_sentence_before_anything_is_read(pop: Pop
 @pytest.mark.usefixtures("with_gpu")
 def test_settings_that_the_device_does_not_know_are_refused_before_anything_is_read(tmp_path):
     with pytest.raises(PopError, match=r"pop\.absgrad = False only, not True; use --backend fast"):
-        check_backend(tiny_config(tmp_path, backend="cuda", pop=POPStrategy(absgrad=True)))
+        check_backend(tiny_config(tmp_path, backend="cuda", strategy=POPStrategy(absgrad=True)))
 
 
 @pytest.mark.usefixtures("with_gpu")
@@ -112,18 +109,19 @@ def test_a_run_on_a_gpu_from_the_command_line(pop: Pop, shared_capture: Path, tm
     outcome = pop("train", shared_capture, "--out", tmp_path / "r", *TRAIN)
     assert outcome.status == 0, outcome.err
     assert "backend cuda: a GPU and the build are here" in outcome.out
-    assert " s on stand-in, loading " in outcome.out
-    assert settings(tmp_path / "r")["backend"] == "cuda"
+    assert " s on drift, loading " in outcome.out
+    assert settings(tmp_path / "r")["resolved"]["backend"] == "cuda"
     stats = json.loads((tmp_path / "r" / "stats" / "val_step0029.json").read_text())
-    assert stats["gpu"] == "stand-in"
-    assert stats["psnr"] > 5.0
+    assert stats["gpu"] == "drift"
+    assert stats["stepper"] == "cuda"
     again = pop("train", shared_capture, "--out", tmp_path / "r", *TRAIN, "--resume")
     assert again.status == 0, again.err
     assert "backend cuda, with which the run was begun" in again.out
 
 
 def test_a_result_of_a_gpu_can_be_measured_without_one(pop: Pop, result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = {**settings(result), "backend": "cuda"}
+    given = settings(result)
+    given["resolved"]["backend"] = "cuda"
     (result / "cfg.json").write_text(json.dumps(given))
     monkeypatch.setattr("cuda_ext.why_not", lambda: NOT_BUILT)
     outcome = pop("eval", result)
@@ -133,7 +131,7 @@ def test_a_result_of_a_gpu_can_be_measured_without_one(pop: Pop, result: Path, m
 
 
 def test_images_and_what_is_told_of_them_come_back_from_the_device(tmp_path):
-    trainer = Trainer(tiny_config(tmp_path), tiny_capture())
+    trainer = TrainingRun(tiny_config(tmp_path), tiny_capture())
     view: ViewTensors = trainer._train[0]
     on = OnDevice(get_backend("fast"), torch.device("cpu"))
     there = render_view(on, trainer.params, view, trainer.config, 0, counts=True)

@@ -108,7 +108,7 @@ def test_a_result_that_was_never_saved_is_named(pop: Pop, result: Path) -> None:
 
 def test_an_unknown_setting_in_cfg_json_is_named(pop: Pop, result: Path) -> None:
     config = json.loads((result / "cfg.json").read_text())
-    (result / "cfg.json").write_text(json.dumps({**config, "colour": 1}))
+    (result / "cfg.json").write_text(json.dumps({**config, "resolved": {**config["resolved"], "colour": 1}}))
     says(pop("eval", result), "config.colour", "not a setting")
 
 
@@ -126,7 +126,9 @@ def test_a_cfg_json_in_another_encoding_is_named(pop: Pop, result: Path) -> None
 
 def test_a_capture_that_is_no_longer_there_is_asked_for(pop: Pop, capture: Path, result: Path) -> None:
     config = json.loads((result / "cfg.json").read_text())
-    (result / "cfg.json").write_text(json.dumps({**config, "data": str(capture.parent / "gone")}))
+    (result / "cfg.json").write_text(
+        json.dumps({**config, "resolved": {**config["resolved"], "data": str(capture.parent / "gone")}})
+    )
     says(pop("eval", result), str(capture.parent / "gone"), "not there", "--capture DIR")
     assert pop("eval", result, "--capture", capture).status == 0
 

@@ -11,7 +11,7 @@ import torch
 
 from pop_fast.data.capture import Capture
 from pop_fast.errors import PopError
-from pop_fast.train import Trainer
+from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from tests.app.children import in_a_child
 from tests.app.tiny import tiny_capture, tiny_config
@@ -21,7 +21,7 @@ from tests.app.tiny import tiny_capture, tiny_config
 def stopped(tmp_path_factory):
     """A run of thirty steps, of which the checkpoint after the tenth is the last that is left."""
     folder = tmp_path_factory.mktemp("stopped")
-    trainer = Trainer(tiny_config(folder), tiny_capture())
+    trainer = TrainingRun(tiny_config(folder), tiny_capture())
     trainer._milestones = _stop_after(trainer, 10)
     with pytest.raises(KeyboardInterrupt):
         trainer.run()
@@ -40,8 +40,7 @@ def _stop_after(trainer, taken):
 
 
 def resume(folder, capture=None, **changes):
-    config = replace(tiny_config(folder), **changes)
-    Trainer(config, capture or tiny_capture(), resume=True).run()
+    TrainingRun(tiny_config(folder, **changes), capture or tiny_capture(), resume=True).run()
 
 
 @pytest.mark.parametrize(
@@ -49,7 +48,7 @@ def resume(folder, capture=None, **changes):
     [
         ({"seed": 8}, r"was written with seed = 7, but this run has seed = 8"),
         ({"max_steps": 40}, r"max_steps = 30, but this run has max_steps = 40"),
-        ({"method": "adc"}, r"method = pop, but this run has method = adc"),
+        ({"method": "gsplat"}, r"method = pop, but this run has method = gsplat"),
         ({"threads": 2}, r"threads = 1, but this run has threads = 2"),
     ],
 )
@@ -63,7 +62,7 @@ def test_other_settings_are_refused_by_name(stopped, changes, message):
 def test_another_nested_setting_is_refused_by_name(stopped):
     config = tiny_config(stopped)
     with pytest.raises(PopError, match=r"pop\.theta_blur = 0\.02, but this run has pop\.theta_blur = 0\.5"):
-        resume(stopped, pop=replace(config.pop, theta_blur=0.5))
+        resume(stopped, strategy=replace(config.strategy, theta_blur=0.5))
 
 
 def _changed(what: str) -> Capture:

@@ -88,7 +88,7 @@ def test_underscores_and_hyphens_are_the_same() -> None:
     a, _ = arguments(["scene", "--steps_scaler", "0.5", "--pop.lambda_pop", "0.01", "--data_factor", "4"])
     b, _ = arguments(["scene", "--steps-scaler", "0.5", "--pop.lambda-pop", "0.01", "--factor", "4"])
     assert a == b
-    assert (a.pop.lambda_pop, a.factor) == (0.01, 4)
+    assert (a.strategy.lambda_pop, a.factor) == (0.01, 4)
 
 
 def test_values_are_never_taken_for_aliases() -> None:
@@ -96,7 +96,7 @@ def test_values_are_never_taken_for_aliases() -> None:
 
 
 def test_without_out_the_folder_is_named_after_data_and_method() -> None:
-    assert arguments(["captures/garden/", "--method", "adc"])[0].result_dir == "out/garden_adc"
+    assert arguments(["captures/garden/", "--method", "gsplat"])[0].result_dir == "out/garden_gsplat"
 
 
 def test_training_leaves_every_file_of_a_result(shared_result: Path) -> None:

@@ -13,14 +13,13 @@ import pytest
 import torch
 
 from pop_fast.errors import PopError
-from pop_fast.train import Trainer
+from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from pop_fast.train.training_run import TrainingRun
 from tests.app.children import pop_in_a_child
 from tests.app.conftest import Pop
 from tests.app.damage import contents, says
+from tests.app.drift import drift_engine
 from tests.app.forged import FORGED, INF, Content, forge, latest, to
-from tests.app.stand_in import stand_in_hardware
 from tests.app.tiny import tiny_capture, tiny_config
 
 
@@ -35,15 +34,13 @@ def forged(stopped: Path, tmp_path: Path) -> Path:
 
 
 def on_cpu(folder: Path) -> TrainingRun:
-    return Trainer(tiny_config(folder), tiny_capture(), resume=True)
+    return TrainingRun(tiny_config(folder), tiny_capture(), resume=True)
 
 
 def on_device(folder: Path) -> TrainingRun:
-    from pop_fast.train.device_trainer import DeviceTrainer
-
     # as a checkpoint of the CPU is read
     forge(folder, to("config.backend", "cuda"))
-    return DeviceTrainer(tiny_config(folder), tiny_capture(), hardware=stand_in_hardware(), resume=True)
+    return TrainingRun(tiny_config(folder), tiny_capture(), engine=drift_engine(), resume=True)
 
 
 @pytest.fixture
@@ -137,7 +134,7 @@ def test_going_on_from_the_checkpoint_before_ends_in_the_same_bits(forged: Path,
         ckpt.load_checkpoint(latest(forged))
     latest(forged).unlink()
     on_cpu(forged).run()
-    Trainer(tiny_config(tmp_path / "whole"), tiny_capture()).run()
+    TrainingRun(tiny_config(tmp_path / "whole"), tiny_capture()).run()
     ours, theirs = (ckpt.load_checkpoint(ckpt.checkpoint_path(f, 29)) for f in (forged, tmp_path / "whole"))
     assert all(torch.equal(ours["splats"][key], theirs["splats"][key]) for key in theirs["splats"])
 

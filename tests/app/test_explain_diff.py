@@ -41,7 +41,7 @@ def scene() -> ExplainedView:
 @pytest.mark.parametrize("equation", OPTIONS)
 def test_an_objective_is_the_papers_whatever_the_run_was_trained_with(equation: str) -> None:
     name, loss = OPTIONS[equation]
-    trained = TrainConfig(**MIXED, method="adc" if name == "pop" else "pop")
+    trained = TrainConfig.of(**MIXED, method="gsplat" if name == "pop" else "pop")
     view = explain_view(params(), VIEW, with_objective(trained, name))
     image = view.image.clone().requires_grad_(True)
     value = loss(image, torch.from_numpy(VIEW.image).double() / 255.0)

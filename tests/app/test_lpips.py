@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from pop_fast.errors import PopError
-from pop_fast.train import Trainer
+from pop_fast.train import TrainingRun
 from pop_fast.train.lpips import LPIPS, load_nets
 from pop_fast.train.metrics import average, measure
 from tests.app.tiny import tiny_capture, tiny_config
@@ -157,7 +157,7 @@ def test_pictures_too_small_for_the_nets_are_refused(weights):
 def test_views_too_small_for_lpips_are_refused_before_training(weights, tmp_path):
     config = tiny_config(tmp_path, lpips_alex=tuple(map(str, weights["alex"][2][2:])))
     with pytest.raises(PopError, match="32 x 24 px are too small for LPIPS"):
-        Trainer(config, tiny_capture())
+        TrainingRun(config, tiny_capture())
 
 
 def test_bad_weight_files_are_named(weights, tmp_path):

@@ -90,7 +90,7 @@ def test_schedule_windows_are_those_that_ran(html: str) -> None:
 
 
 def test_plain_density_control_shows_no_blur_and_no_pop_window(tmp_path: Path) -> None:
-    names = [window.name for window in read_result(write_result(tmp_path / "r", method="adc")).windows]
+    names = [window.name for window in read_result(write_result(tmp_path / "r", method="gsplat")).windows]
     assert names == ["density control"]
 
 

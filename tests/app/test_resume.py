@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pop_fast.train import Trainer
+from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.signals import stop_requests
 from tests.app.tiny import tiny_capture, tiny_config
@@ -26,15 +26,15 @@ CLOCKS = ("it_per_s", "seconds")
 
 def run_to(folder, stop_after=None, resume=False, method="pop"):
     """Train; leave at once, without any clean-up, after so many steps of the whole run."""
-    trainer = Trainer(tiny_config(folder, method=method), tiny_capture(), resume=resume)
-    step = trainer.train_step
+    trainer = TrainingRun(tiny_config(folder, method=method), tiny_capture(), resume=resume)
+    take_steps = trainer.take_steps
 
-    def stepping():
+    def stepping(last):
         if trainer.step == stop_after:
             raise KeyboardInterrupt
-        return step()
+        return take_steps(last)
 
-    trainer.train_step = stepping
+    trainer.take_steps = stepping
     if stop_after is None:
         trainer.run()
     else:
@@ -77,7 +77,7 @@ def records(folder):
     return [{key: value for key, value in line.items() if key not in CLOCKS} for line in lines]
 
 
-@pytest.fixture(scope="module", params=["pop", "adc"])
+@pytest.fixture(scope="module", params=["pop", "gsplat"])
 def uninterrupted(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
     run_to(folder, method=request.param)
@@ -96,13 +96,13 @@ def test_stopping_anywhere_and_going_on_changes_nothing(uninterrupted, tmp_path)
 def test_resuming_a_finished_run_returns_its_statistics_and_writes_nothing_anew(uninterrupted):
     method, folder = uninterrupted
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    stats = Trainer(tiny_config(folder, method=method), tiny_capture(), resume=True).run()
+    stats = TrainingRun(tiny_config(folder, method=method), tiny_capture(), resume=True).run()
     assert stats["step"] == 29
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
 def test_resuming_where_nothing_was_trained_starts(tmp_path):
-    trainer = Trainer(tiny_config(tmp_path / "new", max_steps=2), tiny_capture(), resume=True)
+    trainer = TrainingRun(tiny_config(tmp_path / "new", max_steps=2), tiny_capture(), resume=True)
     trainer.run()
     assert trainer.step == 2
 
@@ -139,16 +139,16 @@ def test_sigkill_at_random_moments_changes_nothing(tmp_path_factory, tmp_path):
 
 
 def test_ctrl_c_writes_a_checkpoint_of_the_step_it_came_at(tmp_path):
-    trainer = Trainer(tiny_config(tmp_path, checkpoint_every=0, save_steps=()), tiny_capture())
-    step = trainer.train_step
+    trainer = TrainingRun(tiny_config(tmp_path, checkpoint_every=0, save_steps=()), tiny_capture())
+    take_steps = trainer.take_steps
 
-    def interrupted():
-        done = step()
+    def interrupted(last):
+        done = take_steps(last)
         if trainer.step == 7:
             os.kill(os.getpid(), signal.SIGINT)
         return done
 
-    trainer.train_step = interrupted
+    trainer.take_steps = interrupted
     with pytest.raises(KeyboardInterrupt):
         trainer.run()
     assert trainer.step == 7

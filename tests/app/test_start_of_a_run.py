@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from pop_fast.errors import PopError
-from pop_fast.train import LearningRates, Trainer
+from pop_fast.train import LearningRates, TrainingRun
 from pop_fast.train.results import ResultFolder
 from tests.app.conftest import TRAIN, Pop
 from tests.app.damage import contents, says
@@ -78,28 +78,28 @@ def test_a_camera_that_cannot_be_rendered_is_named_before_the_first_step(tmp_pat
     views = list(capture.views)
     views[number] = replace(views[number], viewmat=np.diag([2.0, 1.0, 1.0, 1.0]))
     with pytest.raises(PopError, match=rf"tiny: camera of 0{number}\.png: viewmats.* must be rigid"):
-        Trainer(tiny_config(tmp_path / "r"), replace(capture, views=tuple(views)))
+        TrainingRun(tiny_config(tmp_path / "r"), replace(capture, views=tuple(views)))
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), PopError("view 3 is bad"), MemoryError()], ids=repr)
 def test_nothing_is_replaced_when_the_first_step_fails(
     tmp_path: Path, error: BaseException, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def failing(_: Trainer) -> None:
+    def failing(_: TrainingRun, last: int) -> None:
         raise error
 
-    monkeypatch.setattr(Trainer, "train_step", failing)
+    monkeypatch.setattr(TrainingRun, "take_steps", failing)
     folder = old_results(tmp_path / "r")
     for place, how in ((folder, {"overwrite": True}), (folder, {}), (tmp_path / "new", {})):
         with pytest.raises((type(error), PopError)):
-            Trainer(tiny_config(place), tiny_capture(), **how).run()
+            TrainingRun(tiny_config(place), tiny_capture(), **how).run()
     assert visible(folder) == as_bytes(OLD)
     assert not (tmp_path / "new").exists()
 
 
 def test_a_first_step_that_ruins_the_parameters_replaces_nothing(tmp_path: Path) -> None:
     folder = old_results(tmp_path / "r")
-    trainer = Trainer(tiny_config(folder, lr=LearningRates(scales=1e6)), tiny_capture(), overwrite=True)
+    trainer = TrainingRun(tiny_config(folder, lr=LearningRates(scales=1e6)), tiny_capture(), overwrite=True)
     with pytest.raises(PopError, match="nothing was written"):
         trainer.run()
     assert visible(folder) == as_bytes(OLD)
@@ -169,7 +169,7 @@ def killed_and_killed_again(folder: Path, changes: int, more: int) -> tuple[bool
     assert not (folder / ".replaced").exists()
     # a run without a step may be lost, but never mixed with the one before it
     if files != as_bytes(old):
-        assert json.loads(files["cfg.json"])["seed"] == 7
+        assert json.loads(files["cfg.json"])["resolved"]["seed"] == 7
         assert b"old" not in files.values()
     return began, repaired, files == as_bytes(old)
 
@@ -206,7 +206,7 @@ def test_results_that_a_kill_left_aside_come_back_with_a_note(pop: Pop, shared_c
 
 def test_a_run_that_replaced_another_has_the_bits_of_one_in_a_new_folder(tmp_path: Path) -> None:
     run_to(tmp_path / "new")
-    Trainer(tiny_config(old_results(tmp_path / "r")), tiny_capture(), overwrite=True).run()
+    TrainingRun(tiny_config(old_results(tmp_path / "r")), tiny_capture(), overwrite=True).run()
     assert_same_run(tmp_path / "r", tmp_path / "new")
 
 

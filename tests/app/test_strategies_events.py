@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pop_fast.strategies import ADCStrategy, POPStrategy
+from pop_fast.strategies import GsplatStrategy, POPStrategy, StepEvent
 from pop_ref import density as oracle
 from pop_ref.density_rows import Rows as OracleRows
 from tests.app.populations import HEIGHT, KEYS, WIDTH, make, make_info, moments, packed, run_event
@@ -22,8 +22,9 @@ def test_small_gaussians_are_cloned_with_their_bits_and_large_ones_split_in_two(
     before = {key: value.detach().clone() for key, value in params.items()}
     first, second, steps = (x.clone() for x in moments(optimizers, params, "means"))
     grads = torch.tensor([[0.0, 0], [1.0, 0], [1.0, 0], [0.0, 0]])
-    state = run_event(POPStrategy(), params, optimizers, make_info(4, grads), step=600)
-    assert state["event"] == {"cloned": 1, "split": 1, "pruned": 0}
+    event = run_event(POPStrategy(), params, optimizers, make_info(4, grads), step=600)
+    assert event == StepEvent(cloned=1, split=1, pruned=0)
+    assert event.record() == {"cloned": 1, "split": 1, "pruned": 0}
     # survivors 0, 1, 3; the clone of 1; two children of 2
     assert len(params["means"]) == 6
     for key in KEYS:
@@ -81,11 +82,11 @@ def test_transparent_gaussians_are_pruned_and_oversized_ones_only_after_step_300
 def test_a_reset_lowers_opacities_to_its_ceiling_and_forgets_their_moments_only(ceiling: float, prune_opa: float):
     params, optimizers = make(3)
     other = [x.clone() for x in moments(optimizers, params, "scales")]
-    run_event(ADCStrategy(reset_opa=ceiling, prune_opa=prune_opa), params, optimizers, make_info(3), 3000)
+    run_event(GsplatStrategy(reset_opa=ceiling, prune_opa=prune_opa), params, optimizers, make_info(3), 3000)
     assert torch.allclose(torch.sigmoid(params["opacities"]), torch.tensor(ceiling))
     # the ceiling is the oracle's, and like there no multiple of the pruning threshold
     config = oracle.DensityConfig(reset_every=3000, prune_opa=prune_opa)
-    assert ADCStrategy(prune_opa=prune_opa).reset_opa == config.reset_opa == 0.01
+    assert GsplatStrategy(prune_opa=prune_opa).reset_opa == config.reset_opa == 0.01
     first, second, steps = moments(optimizers, params, "opacities")
     assert not first.any()
     assert not second.any()
@@ -96,7 +97,7 @@ def test_a_reset_lowers_opacities_to_its_ceiling_and_forgets_their_moments_only(
 def test_a_reset_does_not_raise_opacities():
     params, optimizers = make(2, opacities=0.006)
     before = params["opacities"].detach().clone()
-    run_event(ADCStrategy(), params, optimizers, make_info(2), 3000)
+    run_event(GsplatStrategy(), params, optimizers, make_info(2), 3000)
     assert torch.equal(params["opacities"], before)
 
 
@@ -111,9 +112,11 @@ def test_the_gradient_is_measured_in_half_images_and_averaged_over_visible_views
         if step < 3:
             grads[0] = 0.0
         info = make_info(2, grads, visible)
-        strategy.step_post_backward(params, optimizers, state, step, info)
+        event = strategy.step_post_backward(params, optimizers, state, step, info)
+        assert (event is None) == (step < 3)
     # 0 was seen three times and moved once; 1 was seen once and moved
-    assert state["event"]["cloned"] == 1
+    assert event is not None
+    assert event.cloned == 1
     assert torch.equal(params["means"][2], params["means"][1])
     assert not state["grad2d"].any()
     assert not state["count"].any()
@@ -123,7 +126,7 @@ def test_inclusive_selects_a_gradient_at_the_threshold():
     for inclusive, n in ((False, 1), (True, 2)):
         params, optimizers = make(1)
         grads = torch.tensor([[2.0**-10, 0.0]])
-        strategy = ADCStrategy(inclusive=inclusive, grow_grad2d=2.0**-10 * WIDTH / 2)
+        strategy = GsplatStrategy(inclusive=inclusive, grow_grad2d=2.0**-10 * WIDTH / 2)
         run_event(strategy, params, optimizers, make_info(1, grads), 600)
         assert len(params["means"]) == n
 
@@ -136,7 +139,7 @@ def test_absgrad_reads_the_absolute_gradient():
     assert len(params["means"]) == 2
 
 
-@pytest.mark.parametrize("strategy", [POPStrategy(pop_views="window"), ADCStrategy(refine_scale2d_stop_iter=15_000)])
+@pytest.mark.parametrize("strategy", [POPStrategy(pop_views="window"), GsplatStrategy(refine_scale2d_stop_iter=15_000)])
 def test_packed_and_unpacked_infos_give_the_same_bits(strategy):
     g = torch.Generator().manual_seed(1)
     results = []
@@ -150,12 +153,12 @@ def test_packed_and_unpacked_infos_give_the_same_bits(strategy):
             counts = torch.randint(0, 2, (2, 20), generator=g) * visible
             info = make_info(20, grads, visible, counts, cameras=2)
             info["radii"] = torch.randint(1, 9, (2, 20, 2), generator=g).int() * visible[..., None].int()
-            strategy.step_post_backward(
+            event = strategy.step_post_backward(
                 params, optimizers, state, step, packed(info) if is_packed else info, packed=is_packed
             )
-        results.append((params, state["event"]))
+        results.append((params, event))
     assert results[0][1] == results[1][1]
-    assert results[0][1]["cloned"] > 0
+    assert results[0][1].cloned > 0
     for key in KEYS:
         assert torch.equal(results[0][0][key], results[1][0][key])
 
@@ -164,7 +167,7 @@ def test_extents_on_screen_split_and_prune_where_they_are_asked_for():
     params, optimizers = make(3)
     info = make_info(3)
     info["radii"] = torch.tensor([[[1, 1], [4, 1], [1, 20]]]).int()
-    run_event(ADCStrategy(refine_scale2d_stop_iter=15_000), params, optimizers, info, 3100)
+    run_event(GsplatStrategy(refine_scale2d_stop_iter=15_000), params, optimizers, info, 3100)
     # 0 stays, 1 (4/64 > 0.05) is split, 2 (20/64) is split, and its children inherit an extent that is pruned
     assert len(params["means"]) == 3
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from pop_fast.data.capture import Capture, View
-from pop_fast.strategies import ADCStrategy, POPStrategy
-from pop_fast.train import LearningRates, TrainConfig, Trainer
-from pop_fast.train.trainer import Step
+from pop_fast.strategies import GsplatStrategy, POPStrategy
+from pop_fast.train import LearningRates, TrainConfig, TrainingRun
+from pop_fast.train.records import Stretch
 
 WIDTH, HEIGHT = 32, 24
 N_POINTS = 60
@@ -51,18 +51,24 @@ def tiny_capture(seed: int = 0, n_views: int = 5, mask: np.ndarray | None = None
     return Capture("tiny", tuple(views), points, colors, source="made up")
 
 
-def tiny_config(folder: Path | str, **changes: Any) -> TrainConfig:
+def tiny_config(folder: Path | str, method: str = "pop", **changes: Any) -> TrainConfig:
     """Thirty steps, at high rates, with every kind of event: growth, blur, pruning, resets, all colour bands."""
     steps = {"refine_start_iter": 3, "refine_stop_iter": 24, "refine_every": 4, "prune_too_big_after": 8}
     grow = {"grow_grad2d": 3e-3, "grow_scale3d": 0.05}
-    base = TrainConfig(
+    strategies = {
+        "pop": POPStrategy(**steps, **grow, blur_start_iter=8, blur_stop_iter=16, theta_blur=0.02, pop_stop_iter=24),
+        "gsplat": GsplatStrategy(**steps, **grow, reset_every=12),
+    }
+    base = replace(
+        TrainConfig.of(method=method),
+        given=None,
+        strategy=strategies[method],
         result_dir=str(folder),
         max_steps=30,
         seed=7,
+        backend="fast",
         test_every=5,
         sh_interval=6,
-        pop=POPStrategy(**steps, **grow, blur_start_iter=8, blur_stop_iter=16, theta_blur=0.02, pop_stop_iter=24),
-        adc=ADCStrategy(**steps, **grow, reset_every=12),
         init_opacity=0.5,
         init_scale=0.5,
         lr=LearningRates(means=4e-3, scales=5e-2, opacities=0.1, sh0=0.1, sh_rest=5e-3),
@@ -76,14 +82,14 @@ def tiny_config(folder: Path | str, **changes: Any) -> TrainConfig:
     return replace(base, **changes)
 
 
-class SlowTrainer(Trainer):
+class SlowRun(TrainingRun):
     """Leaves time to be stopped in."""
 
-    def train_step(self) -> Step:
-        """Take one step, and a breath."""
+    def take_steps(self, last: int) -> Stretch:
+        """Take a step, and a breath."""
         time.sleep(0.02)
-        return super().train_step()
+        return super().take_steps(last)
 
 
 if __name__ == "__main__":
-    SlowTrainer(tiny_config(sys.argv[1]), tiny_capture(), resume=sys.argv[2:] == ["resume"]).run()
+    SlowRun(tiny_config(sys.argv[1]), tiny_capture(), resume=sys.argv[2:] == ["resume"]).run()

@@ -16,7 +16,9 @@ ROOMS = ("pop_ref", "pop_fast", "cuda_ext", "tests", "benchmarks", "paper_repro"
 FILES = sorted(p for room in ROOMS for p in (ROOT / room).rglob("*.py") if "__pycache__" not in p.parts)
 ORACLE = [p for p in sorted((ROOT / "pop_ref").glob("*.py")) if p.name != "__init__.py"]
 STAGES = {p.stem for p in ORACLE}
-SHARED_WITH_FAST = {"pop_ref.constants", "pop_ref.notation", "pop_ref.types"}
+# values without a formula, which every engine takes its defaults from
+VALUES = {"pop_ref.constants", "pop_ref.settings", "pop_ref.recipes"}
+SHARED_WITH_FAST = VALUES | {"pop_ref.notation", "pop_ref.types"}
 # rooms of the program whose work is to show what the oracle does
 SHOW_THE_ORACLE = ("pop_fast/explain/", "pop_fast/oracle_backend.py", "pop_fast/cli/vectors.py")
 
@@ -90,10 +92,17 @@ def test_the_program_takes_no_formula_from_the_oracle() -> None:
         assert not taken, f"{_name(path)} imports {sorted(taken)}; only {sorted(SHARED_WITH_FAST)} may be shared"
 
 
-def test_the_cuda_room_takes_constants_only() -> None:
+def test_the_cuda_room_takes_values_only() -> None:
     for path in sorted((ROOT / "cuda_ext").rglob("*.py")):
-        taken = {m for m in _imports(path) if m.split(".")[0] == "pop_ref"} - {"pop_ref.constants"}
+        taken = {m for m in _imports(path) if m.split(".")[0] == "pop_ref"} - VALUES
         assert not taken, f"{_name(path)} imports {sorted(taken)}"
+
+
+def test_what_every_engine_shares_is_values_and_no_formula() -> None:
+    for name in ("settings", "recipes"):
+        path = ROOT / "pop_ref" / f"{name}.py"
+        assert set(_imports(path)) <= {"__future__", "dataclasses", "typing", *VALUES}
+        assert not _public_functions(path)
 
 
 @pytest.mark.parametrize("room", ["benchmarks", "paper_repro"])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from pop_ref.density import (
-    ADC,
+    GSPLAT,
     POP,
     DensityConfig,
     Rows,
@@ -186,9 +186,9 @@ def test_calendar_has_144_events_41_with_blur_and_4_resets() -> None:
     blurred = [s for s in events if blurs_at(s, POP)]
     assert (len(blurred), blurred[0], blurred[-1]) == (41, 3000, 7000)
     assert [s for s in STEPS if resets_at(s, POP)] == []
-    assert [s for s in STEPS if resets_at(s, ADC)] == [3000, 6000, 9000, 12_000]
-    assert resets_at(0, replace(ADC, reset_at_zero=True))
-    assert not any(blurs_at(s, ADC) for s in STEPS)
+    assert [s for s in STEPS if resets_at(s, GSPLAT)] == [3000, 6000, 9000, 12_000]
+    assert resets_at(0, replace(GSPLAT, reset_at_zero=True))
+    assert not any(blurs_at(s, GSPLAT) for s in STEPS)
 
 
 def test_children_are_drawn_from_their_parent_and_1_6_times_smaller() -> None:

@@ -177,7 +177,7 @@ def test_recipes_are_the_rows_of_the_ablation_tables() -> None:
 
 def test_an_event_and_a_reset_of_one_step_happen_in_that_order() -> None:
     rows = start(PARAMS).rows
-    config = replace(density.ADC, reset_every=600, prune_opa=0.02)
+    config = replace(density.GSPLAT, reset_every=600, prune_opa=0.02)
     after, _ = control(rows, density.zero_statistics(len(rows)), 1.0, 600, ten_losses.draws, config)
     # were the reset first, its ceiling of 0.01 would put everybody under the pruning threshold
     assert len(after) == len(rows) - 1

@@ -60,9 +60,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 @pytest.fixture
-def hardware(gpu: Any) -> Any:
+def engine(gpu: Any) -> Any:
     """Return the emulated GPU as `pop train` takes one."""
-    from pop_fast.backends import get_backend
-    from pop_fast.train.hardware import Hardware, fused_stepper
 
-    return Hardware(gpu, get_backend("cuda"), fused_stepper, lambda: {"gpu": "emulated"})
+    return emulate.engine()

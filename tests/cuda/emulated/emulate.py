@@ -209,3 +209,16 @@ def install(patch: pytest.MonkeyPatch, library: Path) -> None:
     patch.setattr(torch, "empty_like", _rubbish(torch.empty_like))
     patch.setattr(train_step, "Watch", NoWaiting)
     patch.setattr(train_step, "captured", captured)
+
+
+def engine() -> Any:
+    """Return the emulated GPU, once it is installed, as `pop train` takes one."""
+    import torch
+
+    from pop_fast.backends import get_backend
+    from pop_fast.train.engines import cuda_stepper
+    from pop_fast.train.on_device import OnDevice
+    from pop_fast.train.stepper import Engine
+
+    device = torch.device("cpu")
+    return Engine("cuda", device, OnDevice(get_backend("cuda"), device), cuda_stepper, lambda: {"gpu": "emulated"})

@@ -48,18 +48,11 @@ def stand_in_card(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(torch.cuda, "get_device_name", lambda device=None: "emulated")
 
 
-def stand_in_hardware(patch: pytest.MonkeyPatch) -> None:
+def stand_in_engine(patch: pytest.MonkeyPatch) -> None:
     """Put the emulated GPU where `pop train` looks for one."""
-    import torch
+    from pop_fast.train import engines
 
-    from pop_fast.backends import get_backend
-    from pop_fast.train import device_trainer, hardware
-
-    def this_machine() -> hardware.Hardware:
-        device, backend = torch.device("cpu"), get_backend("cuda")
-        return hardware.Hardware(device, backend, hardware.fused_stepper, lambda: {"gpu": "emulated"})
-
-    patch.setattr(device_trainer, "this_machine", this_machine)
+    patch.setattr(engines, "cuda_engine", emulate.engine)
 
 
 def shorten_the_benchmark(patch: pytest.MonkeyPatch) -> None:
@@ -83,7 +76,7 @@ def main(words: list[str]) -> Any:
     stand_in_card(patch)
     sys.argv = words
     if words[0] == "-c":
-        stand_in_hardware(patch)
+        stand_in_engine(patch)
         sys.argv = ["-c", *words[2:]]
         return exec(compile(words[1], "<rehearsal>", "exec"), {"__name__": "__main__"})
     if words[0] == "-m":

@@ -79,8 +79,8 @@ def gpu() -> Any:
 
 
 @pytest.fixture
-def hardware(gpu: Any) -> Any:
+def engine(gpu: Any) -> Any:
     """Return the GPU as `pop train` finds it, or skip with the reason why there is none."""
-    from pop_fast.train.hardware import this_machine
+    from pop_fast.train.engines import cuda_engine
 
-    return this_machine()
+    return cuda_engine()

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.strategies import ADCStrategy, POPStrategy
-from pop_fast.train import Trainer
+from pop_fast.strategies import GsplatStrategy, POPStrategy
+from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from pop_fast.train.device_trainer import DeviceTrainer
 from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config
 
 COMPARED = ("loss", "pop", "psnr", "d_ssim", "l1", "l2", "lr_means", "num_gaussians")
@@ -40,12 +39,12 @@ CASES = {
     "losses": ({"l2_stop_iter": 4, "d_ssim_halved": True, "ssim_padding": "same"}, lambda capture: capture),
     "inria": ({"profile": "inria", "photometric_divisor": 2.0}, lambda capture: capture),
     "gsplat": ({"profile": "gsplat_1_6", "sh_interval": 2}, lambda capture: capture),
-    "visible": ({"pop": {"pop_over": "visible"}}, lambda capture: capture),
+    "visible": ({"strategy": {"pop_over": "visible"}}, lambda capture: capture),
     "window": (
-        {"pop": {"pop_views": "window", "refine_start_iter": 8, "refine_stop_iter": 7}},
+        {"strategy": {"pop_views": "window", "refine_start_iter": 8, "refine_stop_iter": 7}},
         lambda capture: capture,
     ),
-    "own view": ({"pop": {"blur_window": "own_view"}}, masked),
+    "own view": ({"strategy": {"blur_window": "own_view"}}, masked),
 }
 
 
@@ -54,16 +53,16 @@ def records(folder):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_steps_are_the_cpus_under_every_setting(hardware, case, tmp_path):
+def test_steps_are_the_cpus_under_every_setting(engine, case, tmp_path):
     changes, edit = CASES[case]
     # a population that stays, and rates at which rounding does not grow
-    pop = POPStrategy(**{**STILL, "pop_stop_iter": 6, **changes.get("pop", {})})
-    settings = {"max_steps": 8, "log_every": 1, "checkpoint_every": 0, **changes, "pop": pop}
+    pop = POPStrategy(**{**STILL, "pop_stop_iter": 6, **changes.get("strategy", {})})
+    settings = {"max_steps": 8, "log_every": 1, "checkpoint_every": 0, **changes, "strategy": pop}
     capture = edit(tiny_capture())
     rates = replace(tiny_config("x").lr, quats=0.0)
-    expected = Trainer(tiny_config(tmp_path / "cpu", lr=rates, **settings), capture).run()
+    expected = TrainingRun(tiny_config(tmp_path / "cpu", lr=rates, **settings), capture).run()
     on_gpu = tiny_config(tmp_path / "gpu", lr=rates, **settings)
-    found = DeviceTrainer(on_gpu, capture, hardware=hardware).run()
+    found = TrainingRun(on_gpu, capture, engine=engine).run()
     for ours, theirs in zip(records(tmp_path / "gpu"), records(tmp_path / "cpu"), strict=True):
         assert ours.pop("view") == theirs.pop("view")
         compared = {key: value for key, value in theirs.items() if key in COMPARED}
@@ -72,10 +71,10 @@ def test_steps_are_the_cpus_under_every_setting(hardware, case, tmp_path):
     assert found["n_blended"] == pytest.approx(expected["n_blended"], rel=0.02)
 
 
-@pytest.mark.parametrize("method", ["pop", "adc"])
-def test_events_come_when_the_cpus_come_and_change_about_as_many(hardware, method, tmp_path):
-    Trainer(tiny_config(tmp_path / "cpu", method=method), tiny_capture()).run()
-    DeviceTrainer(tiny_config(tmp_path / "gpu", method=method), tiny_capture(), hardware=hardware).run()
+@pytest.mark.parametrize("method", ["pop", "gsplat"])
+def test_events_come_when_the_cpus_come_and_change_about_as_many(engine, method, tmp_path):
+    TrainingRun(tiny_config(tmp_path / "cpu", method=method), tiny_capture()).run()
+    TrainingRun(tiny_config(tmp_path / "gpu", method=method), tiny_capture(), engine=engine).run()
     ours, theirs = ([r for r in records(tmp_path / name) if "cloned" in r] for name in ("gpu", "cpu"))
     assert [event["step"] for event in ours] == [event["step"] for event in theirs]
     first, wanted = ours[0], theirs[0]
@@ -85,26 +84,26 @@ def test_events_come_when_the_cpus_come_and_change_about_as_many(hardware, metho
     assert [event.get("reset") for event in ours] == [event.get("reset") for event in theirs]
 
 
-@pytest.mark.parametrize("method", ["pop", "adc"])
-def test_an_interrupted_run_goes_on_to_the_same_bits(hardware, method, tmp_path, monkeypatch):
-    settings = {"method": method, "adc": replace(tiny_config("x").adc, reset_every=7)}
-    DeviceTrainer(tiny_config(tmp_path / "whole", **settings), tiny_capture(), hardware=hardware).run()
+@pytest.mark.parametrize("method", ["pop", "gsplat"])
+def test_an_interrupted_run_goes_on_to_the_same_bits(engine, method, tmp_path, monkeypatch):
+    settings = {"method": method, "strategy": replace(tiny_config("x", method="gsplat").strategy, reset_every=7)}
+    TrainingRun(tiny_config(tmp_path / "whole", **settings), tiny_capture(), engine=engine).run()
     for stop_after in (8, 16, 23):
-        trainer = DeviceTrainer(
-            tiny_config(tmp_path / "parts", **settings), tiny_capture(), hardware=hardware, resume=stop_after > 8
+        trainer = TrainingRun(
+            tiny_config(tmp_path / "parts", **settings), tiny_capture(), engine=engine, resume=stop_after > 8
         )
-        advance = trainer._advance
+        take_steps = trainer.take_steps
 
-        def stepping(bar, trainer=trainer, advance=advance, stop_after=stop_after):
+        def stepping(last, trainer=trainer, take_steps=take_steps, stop_after=stop_after):
             if trainer.step >= stop_after:
                 raise KeyboardInterrupt
-            advance(bar)
+            return take_steps(last)
 
-        monkeypatch.setattr(trainer, "_advance", stepping)
+        monkeypatch.setattr(trainer, "take_steps", stepping)
         with pytest.raises(KeyboardInterrupt):
             trainer.run()
     config = tiny_config(tmp_path / "parts", **settings)
-    DeviceTrainer(config, tiny_capture(), hardware=hardware, resume=True).run()
+    TrainingRun(config, tiny_capture(), engine=engine, resume=True).run()
     ours, theirs = (ckpt.load_checkpoint(ckpt.checkpoint_path(tmp_path / name, 29)) for name in ("parts", "whole"))
     for key, value in theirs["splats"].items():
         assert torch.equal(ours["splats"][key], value), key
@@ -112,29 +111,29 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(hardware, method, tmp_path,
             assert torch.equal(ours["optimizers"][key][name], moment), (key, name)
 
 
-def test_buffers_that_overflow_between_views_of_several_sizes_lose_nothing(hardware, tmp_path, monkeypatch):
+def test_buffers_that_overflow_between_views_of_several_sizes_lose_nothing(engine, tmp_path, monkeypatch):
     from cuda_ext import capacity
 
     capture = mixed_sizes(tiny_capture())
-    whole = DeviceTrainer(tiny_config(tmp_path / "whole"), capture, hardware=hardware)
+    whole = TrainingRun(tiny_config(tmp_path / "whole"), capture, engine=engine)
     whole.run()
     monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 1))
-    cramped = DeviceTrainer(tiny_config(tmp_path / "cramped"), capture, hardware=hardware)
+    cramped = TrainingRun(tiny_config(tmp_path / "cramped"), capture, engine=engine)
     assert cramped.run()["instance_buffers_grown"] > 0
     for key, value in whole.params.items():
         assert torch.equal(cramped.params[key], value), key
 
 
-def test_a_number_that_is_not_finite_is_found_on_the_device(hardware, tmp_path):
-    trainer = DeviceTrainer(tiny_config(tmp_path, adc=ADCStrategy()), tiny_capture(), hardware=hardware)
-    change = trainer._change
+def test_a_number_that_is_not_finite_is_found_on_the_device(engine, tmp_path):
+    trainer = TrainingRun(tiny_config(tmp_path, strategy=GsplatStrategy()), tiny_capture(), engine=engine)
+    take_steps = trainer.take_steps
 
-    def poisoned(step):
-        found = change(step)
-        if step == 4:
+    def poisoned(last):
+        found = take_steps(last)
+        if last == 5:
             trainer.params["quats"].data[7, 2] = float("nan")
         return found
 
-    trainer._change = poisoned
+    trainer.take_steps = poisoned
     with pytest.raises(ValueError, match=r"quats\[7, 2\] is nan after 5 steps; nothing was written"):
         trainer.run()

@@ -45,7 +45,7 @@ def test_fused_steps_launched_one_by_one_give_the_same_bits_twice_and_learn(gpu)
         views = ResidentViews(scene.photographs, scene.viewmats, scene.Ks, None, "valid", gpu)
         trainer = FusedTrainer(params, m, v, views, [0] * 4, StepSettings(LR, 4, means_decay=1.0, replay=False))
         trainer.run(4, Phase(3, True, True, True))
-        losses = [values.objective for values in trainer.told(0, 4)]
+        losses = [values.objective for values in trainer.step_stats(0, 4)]
         assert losses[-1] < losses[0]
         found.append(params)
     for name, value in found[0].items():

@@ -1,0 +1,114 @@
+"""Which engine takes the steps of a run: autograd over a backend's stages, or the fused step on a GPU."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import torch
+
+from cuda_ext.train_settings import StepSettings
+from pop_fast.backends import get_backend
+from pop_fast.errors import PopError
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.fused_stepper import Fused, FusedStepper, Rows, unsupported
+from pop_fast.train.on_device import OnDevice
+from pop_fast.train.stepper import Engine, Task
+from pop_fast.train.torch_stepper import TorchStepper
+from pop_fast.train.views import ViewTensors
+
+# so many steps at most before the host looks up from a GPU: Ctrl-C, the progress bar
+LONGEST_ON_GPU = 500
+# of the card's free memory, what the photographs' blurred values may take; the rest is for Gaussians and tile lists
+MOMENTS_SHARE = 0.25
+_BYTES_OF_MOMENTS = 24  # a pixel
+
+
+def engine_of(config: TrainConfig, own_strategy: bool = True) -> Engine:
+    """Return the engine for a run's backend and settings.
+
+    "cuda" is the fused step and nothing else; a setting that it does not know is refused. All other backends render on
+    the CPU, and their steps are torch's.
+
+    Args:
+        config: with a backend's name; "auto" is "fast" here, see `choose_backend`.
+        own_strategy: whether the population's strategy is one of this package.
+
+    Raises:
+        PopError: the backend is unknown or cannot run here, or does not know a setting.
+    """
+    if config.backend == "cuda":
+        reason = unsupported(config)
+        if not own_strategy:
+            reason = "backend 'cuda' trains with the strategies of this package only; use --backend fast"
+        if reason is not None:
+            raise PopError(reason)
+        return cuda_engine()
+    return torch_engine("fast" if config.backend == "auto" else config.backend)
+
+
+def torch_engine(name: Literal["fast", "compiled", "ref"]) -> Engine:
+    """Return autograd over the stages of a backend for CPU tensors.
+
+    Raises:
+        PopError: it is unknown or cannot run here.
+    """
+    backend = get_backend(name)
+    if not backend.available():
+        raise PopError(f"backend {name!r} is not available: {backend.why_not()}")
+    return Engine(name, torch.device("cpu"), backend, lambda task: TorchStepper(task, backend))
+
+
+def cuda_engine() -> Engine:
+    """Return the fused step on torch's current GPU.
+
+    Raises:
+        PopError: backend "cuda" cannot run here.
+    """
+    backend = get_backend("cuda")
+    reason = backend.why_not()
+    if reason is not None:
+        raise PopError(f"backend 'cuda' is not available: {reason}")
+    # without it, torch's deterministic mode refuses the small products that place the children of a split
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    device = torch.device("cuda", torch.cuda.current_device())
+
+    def facts() -> dict[str, Any]:
+        memory = torch.cuda.max_memory_allocated(device)
+        return {"gpu": torch.cuda.get_device_name(device), "gpu_memory_bytes": memory}
+
+    return Engine("cuda", device, OnDevice(backend, device), cuda_stepper, facts)
+
+
+def cuda_stepper(task: Task) -> FusedStepper:
+    """Make what takes the steps on a GPU."""
+    return FusedStepper(task, "cuda", LONGEST_ON_GPU, _fused_trainer)
+
+
+def _fused_trainer(
+    params: Rows,
+    m: Rows,
+    v: Rows,
+    views: Sequence[ViewTensors],
+    order: Sequence[int],
+    settings: StepSettings,
+    step: int,
+) -> Fused:
+    """Make the fused step, with the photographs on the GPU."""
+    from cuda_ext.resident import ResidentViews
+    from cuda_ext.train_step import FusedTrainer
+
+    device = params["means"].device
+    pixels = sum(view.height * view.width for view in views)
+    free, _ = torch.cuda.mem_get_info(device)
+    resident = ResidentViews(
+        [view.photo for view in views],
+        torch.cat([view.viewmat for view in views]),
+        torch.cat([view.K for view in views]),
+        [view.mask for view in views],
+        settings.padding,
+        device,
+        cache_moments=_BYTES_OF_MOMENTS * pixels <= MOMENTS_SHARE * free,
+    )
+    return FusedTrainer(params, m, v, resident, order, settings, step)

@@ -1,0 +1,178 @@
+"""Training steps by something that takes a whole step by itself: the fused step on a GPU, or one like it.
+
+What it is told are rows, the photographs and `StepSettings`; it holds the statistics of density control in its own
+arrays, which are copied into the strategy's state after every stretch, in the strategy's own types.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Adam
+
+from cuda_ext.train_settings import Phase, Statistics, StepSettings, StepStats
+from pop_fast.density import blur_set
+from pop_fast.strategies.base import State
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.model import KEYS, learning_rates
+from pop_fast.train.stepper import Task
+from pop_fast.train.views import ViewTensors
+from pop_ref.constants import PROFILES
+
+Rows = Mapping[str, Tensor]
+
+
+class Fused(Protocol):
+    """What takes whole steps: `cuda_ext.train_step.FusedTrainer`, where each of these is explained."""
+
+    step: int
+    # how often a step was taken again because its buffers were too small
+    grown: int
+
+    @property
+    def statistics(self) -> Statistics:
+        """What density control reads."""
+        ...
+
+    def rebind(self, params: Rows, m: Rows, v: Rows) -> None:
+        """Take new rows after a density step; statistics start from nothing."""
+        ...
+
+    def run(self, until: int, phase: Phase) -> None:
+        """Take steps of one phase until the counter stands at `until`."""
+        ...
+
+    def step_stats(self, first: int, last: int) -> list[StepStats]:
+        """Return the measurements of the steps from `first` to before `last`."""
+        ...
+
+
+# parameters, first and second moments, the views, the view of every step, settings, the step to begin at
+MakeFused = Callable[[Rows, Rows, Rows, Sequence[ViewTensors], Sequence[int], StepSettings, int], Fused]
+
+
+@dataclass
+class FusedStepper:
+    """Takes steps by `make`; see `Stepper`.
+
+    Args:
+        task: what is trained; its strategy is one that `unsupported` has nothing against.
+        name: of the engine.
+        longest: most steps at a time.
+        make: makes what takes them.
+    """
+
+    task: Task
+    name: str
+    longest: int
+    make: MakeFused
+    fused: Fused | None = None
+
+    def __post_init__(self) -> None:
+        self.step = self.task.step
+        self._optimizers: Mapping[str, Adam] = {}
+        self._params: dict[str, Parameter] = {}
+        self._state: State = {}
+
+    def rebind(self, params: dict[str, Parameter], optimizers: Mapping[str, Adam], state: State) -> None:
+        """See `Stepper.rebind`."""
+        self._params, self._optimizers, self._state = params, optimizers, state
+        rows = {key: params[key].detach() for key in KEYS}
+        moments = {key: optimizers[key].state[params[key]] for key in KEYS}
+        m, v = ({key: moments[key][name] for key in KEYS} for name in ("exp_avg", "exp_avg_sq"))
+        if self.fused is None:
+            task = self.task
+            settings = step_settings(task.config, task.scene_scale)
+            self.fused = self.make(rows, m, v, task.views, task.order, settings, self.step)
+        else:
+            self.fused.rebind(rows, m, v)
+        self._give_statistics(self.fused.statistics)
+
+    def steps(self, first: int, last: int, phase: Phase) -> list[StepStats]:
+        """See `Stepper.steps`."""
+        assert self.fused is not None
+        try:
+            self.fused.run(last, phase)
+        finally:
+            self.step = self.fused.step
+        self._take_statistics(self.fused.statistics, first, last, phase)
+        for key, param in self._params.items():
+            self._optimizers[key].state[param]["step"].fill_(float(last))
+        return self.fused.step_stats(first, last)
+
+    def facts(self) -> dict[str, Any]:
+        """See `Stepper.facts`."""
+        return {"instance_buffers_grown": 0 if self.fused is None else self.fused.grown}
+
+    def _take_statistics(self, found: Statistics, first: int, last: int, phase: Phase) -> None:
+        """Copy what was collected into the strategy's state."""
+        state, pop = self._state, self.task.config.strategy
+        if phase.statistics:
+            state["grad2d"], state["count"] = found.grad_sum.clone(), found.n_visible.to(found.grad_sum.dtype)
+            state["views"] += last - first
+        summed = phase.blur and pop.blur_window == "sum"
+        if summed or phase.window:
+            state["dominant_sum"] = found.dominant_sum.long()
+        if not phase.blur:
+            return
+        if summed:
+            view = self.task.views[self.task.order[last - 1]]
+            bound = (view.width, view.height, pop.theta_blur, pop.blur_min_pixels)
+            state["blurred"] = blur_set(state["dominant_sum"], *bound)
+        else:
+            state["blurred"] = found.blurred.bool()
+
+    def _give_statistics(self, found: Statistics) -> None:
+        """Go on from the strategy's state: after a checkpoint, or a change that kept the window."""
+        given = {"grad2d": found.grad_sum, "count": found.n_visible, "dominant_sum": found.dominant_sum}
+        for key, target in {**given, "blurred": found.blurred}.items():
+            if self._state.get(key) is not None:
+                target.copy_(self._state[key])
+
+
+def unsupported(config: TrainConfig) -> str | None:
+    """Return one sentence on a setting that fused steps do not know and what to do, or None."""
+    plan, method = config.strategy, config.method
+    known: dict[str, tuple[Any, Any]] = {
+        "absgrad": (plan.absgrad, False),
+        "key_for_gradient": (plan.key_for_gradient, "means2d"),
+        "refine_scale2d_stop_iter": (plan.refine_scale2d_stop_iter, 0),
+    }
+    for name, (value, supported) in known.items():
+        if value != supported:
+            return (
+                f"backend 'cuda' trains with {method}.{name} = {supported!r} only, not {value!r}; "
+                f"use --backend fast, or leave {method}.{name} as it is"
+            )
+    return None
+
+
+def step_settings(config: TrainConfig, scene_scale: float) -> StepSettings:
+    """Return what stays the same over a run.
+
+    Args:
+        config: step numbers as they are run.
+        scene_scale: the unit of the means' learning rate.
+    """
+    pop = config.strategy
+    return StepSettings(
+        learning_rates(config.lr, scene_scale),
+        config.max_steps,
+        means_decay=config.lr.means_decay,
+        padding=config.ssim_padding,
+        d_ssim_halved=config.d_ssim_halved,
+        pixelwise_scale=1.0 / config.photometric_divisor,
+        lambda_pop=pop.lambda_pop,
+        pop_views=pop.pop_views,
+        pop_over=pop.pop_over,
+        blur_window=pop.blur_window,
+        theta_blur=pop.theta_blur,
+        blur_min_pixels=pop.blur_min_pixels,
+        background=config.background,
+        profile=PROFILES[config.profile],
+        antialiased=config.antialiased,
+    )

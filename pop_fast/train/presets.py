@@ -1,0 +1,182 @@
+"""Methods and presets: the defaults of a run, and how what the user says is laid over them.
+
+A default is the method's recipe (`pop_ref.recipes`), with the schedule multiplied by a scaler:
+
+    what                                            scaled
+    max_steps                                       yes; the means' learning rate decays over it, so that scales too
+    refine start and stop, blur, POP                yes
+    refine_every, reset_every                       up only: a shorter schedule has fewer changes and fewer resets, as
+                                                    far apart as ever (see `DensityControl.scaled`)
+    sh_interval, eval_steps, save_steps             yes
+    lambda_pop                                      no, unless `scale_lambda_pop` asks for it
+    learning rates, other weights, thresholds       no: Adam's step does not depend on the length of a run
+    checkpoint_every, log_every                     no: they are about time, not about the schedule
+
+What is said is taken as it is said: neither a preset nor the scaler changes it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, is_dataclass, replace
+from typing import Any, Final, Literal, NamedTuple, Self
+
+from pop_fast.errors import PopError
+from pop_fast.strategies import DensityControl, GsplatStrategy, InriaStrategy, POPStrategy
+from pop_fast.train.jsonable import from_plain, to_plain
+from pop_ref.recipes import RECIPES, Recipe
+
+
+class Method(NamedTuple):
+    """A method that can be trained: its strategy, and the recipe that the rest of its defaults are from."""
+
+    strategy: type[DensityControl]
+    recipe: Recipe
+
+
+METHODS: Final = {
+    "pop": Method(POPStrategy, RECIPES["POP"]),
+    "gsplat": Method(GsplatStrategy, RECIPES["gsplat"]),
+    "3dgs": Method(InriaStrategy, RECIPES["3DGS"]),
+}
+# what the control was called when there was one
+ALIASES: Final = {"adc": "gsplat"}
+QUICK_SCALER: Final = 0.1
+PRESETS: Final = {"paper": 1.0, "quick": QUICK_SCALER}
+# about what theta_blur comes to in the smallest images of the paper (10.7 in 980 x 545), so that 11 pixels are blur;
+# "quick" is for images smaller than those
+QUICK_BLUR_MIN_PIXELS: Final = 10.0
+# of the full schedule: gsplat's trainer measures and saves then
+MILESTONES: Final = (7_000, Recipe.max_steps)
+# step numbers times this are still far from where a float ends
+_LARGEST_SCALER: Final = 1e6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Given:
+    """What a run was asked for: what gives its defaults, and what was said besides.
+
+    Attributes:
+        method: "pop", "gsplat" for gsplat's default strategy, or "3dgs" for Inria's constants, learning rates, SSIM and
+            rasterizer.
+        preset: "paper" is the whole schedule; "quick" a tenth of it, for a CPU, in which a Gaussian must dominate more
+            than 10 pixels to count as blur, and none is pruned for its size. It gives defaults: what is said besides
+            wins.
+        steps_scaler: multiplies the default of every step number; None takes the preset's.
+        scale_lambda_pop: divide the default of lambda_pop by the scaler, so that the push of the prior adds up to the
+            same over a short schedule; it then weighs more against the photographs than in the paper.
+        settings: what was said, as plain values by dotted name.
+    """
+
+    method: Literal["pop", "gsplat", "3dgs"] = "pop"
+    preset: Literal["paper", "quick"] = "paper"
+    steps_scaler: float | None = None
+    scale_lambda_pop: bool = False
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        scaler = self.steps_scaler
+        if scaler is not None and not 0.0 < scaler < math.inf:
+            raise PopError(f"steps_scaler is {scaler}; it must be > 0 and finite")
+        if scaler is not None and scaler > _LARGEST_SCALER:
+            raise PopError(f"steps_scaler is {scaler}; it must be at most {_LARGEST_SCALER:.0f}")
+
+    @classmethod
+    def of(cls, said: Mapping[str, Any], **plan: Any) -> Self:
+        """Check method, preset and scaler, and flatten what was said.
+
+        Args:
+            said: settings by name; those of a group with a dot, or the group as a dict or whole.
+            plan: method, preset, steps_scaler, scale_lambda_pop; None leaves the default.
+
+        Raises:
+            PopError: method, preset or scaler cannot be; names it.
+        """
+        plan = {name: value for name, value in plan.items() if value is not None}
+        if "method" in plan:
+            plan["method"] = ALIASES.get(plan["method"], plan["method"])
+        given = from_plain(cls, plan, "config", skipped=("settings",))
+        settings: dict[str, Any] = {}
+        for name, value in said.items():
+            group, dot, rest = name.partition(".")
+            known = group == "strategy" or ALIASES.get(group, group) == given.method
+            path = f"{given.method}{dot}{rest}" if known else name
+            plain = to_plain(value)
+            whole = isinstance(plain, dict) or is_dataclass(value)
+            settings |= {f"{path}.{key}": item for key, item in plain.items()} if whole else {path: plain}
+        return replace(given, settings=settings)
+
+    @classmethod
+    def from_plain(cls, plain: Any, where: str) -> Self:
+        """Read what `to_plain` makes of this.
+
+        Raises:
+            PopError: a field is unknown or of the wrong type; names it.
+        """
+        settings = plain.get("settings") if isinstance(plain, dict) else None
+        if not isinstance(settings, dict):
+            raise PopError(f"{where}.settings is {settings}; it must be an object of settings")
+        rest = {name: value for name, value in plain.items() if name != "settings"}
+        return replace(from_plain(cls, rest, where, skipped=("settings",)), settings=settings)
+
+    def to_plain(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        names = ("method", "preset", "steps_scaler", "scale_lambda_pop")
+        return {**{name: getattr(self, name) for name in names}, "settings": dict(self.settings)}
+
+    @property
+    def scaler(self) -> float:
+        """What the defaults of step numbers are multiplied by."""
+        return PRESETS[self.preset] if self.steps_scaler is None else self.steps_scaler
+
+
+def method_of(strategy: DensityControl) -> str:
+    """Return the name of the method that a strategy belongs to; that of its class where it is somebody else's."""
+    names = (name for name, method in METHODS.items() if type(strategy) is method.strategy)
+    return next(names, type(strategy).__name__)
+
+
+def defaults(given: Given) -> dict[str, Any]:
+    """Return every setting that method, preset and scaler decide, nothing said, by its name in `TrainConfig`."""
+    kind, recipe = METHODS[given.method]
+    by = given.scaler
+    strategy = kind().scaled(by)
+    if given.scale_lambda_pop:
+        strategy = replace(strategy, lambda_pop=strategy.lambda_pop / by)
+    if given.preset == "quick":
+        # what a big Gaussian covered, a sky above all, does not grow back in so few steps: see benchmarks/NOTES.md
+        strategy = replace(strategy, prune_too_big=False, blur_min_pixels=QUICK_BLUR_MIN_PIXELS)
+
+    def scaled(step: int) -> int:
+        return max(round(step * by), 1)
+
+    milestones = tuple(scaled(step) for step in MILESTONES)
+    return {
+        "max_steps": scaled(recipe.max_steps),
+        "sh_interval": scaled(recipe.sh_interval),
+        "eval_steps": milestones,
+        "save_steps": milestones,
+        "photometric": recipe.pixelwise,
+        "photometric_divisor": 1.0 / recipe.pixel_scale,
+        "lambda_ssim": recipe.lambda_ssim,
+        "l2_stop_iter": None if recipe.l2_stop_iter is None else scaled(recipe.l2_stop_iter),
+        "ssim_padding": recipe.padding,
+        "d_ssim_halved": recipe.d_ssim_halved,
+        "profile": recipe.profile.name,
+        "lr": recipe.lr,
+        "strategy": strategy,
+    }
+
+
+def laid_over(plain: dict[str, Any], given: Given) -> dict[str, Any]:
+    """Lay what was said over the plain values of a run, whose groups are dicts; names that are not there are added."""
+    merged = {name: dict(value) if isinstance(value, dict) else value for name, value in plain.items()}
+    for path, value in given.settings.items():
+        group, dot, name = path.partition(".")
+        target = "strategy" if group == given.method else group
+        if dot and isinstance(merged.get(target), dict):
+            merged[target][name] = value
+        else:
+            merged[path] = value
+    return merged

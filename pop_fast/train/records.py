@@ -1,0 +1,79 @@
+"""The records of metrics.jsonl: what of a step's measurements is written, and under which names."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from cuda_ext.train_settings import Phase, StepStats
+from pop_fast.strategies.base import StepEvent
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.schedule import means_lr
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Steps of one phase, taken one after the other, and the densification step after the last of them.
+
+    Attributes:
+        first: number of the first step, from 0.
+        phase: what they did.
+        views: name of the photograph of each step.
+        stats: of each step.
+        event: what density control did after the last, None where nothing was due.
+        before: Gaussians that were trained.
+        after: Gaussians after the event.
+        seconds: that all of it took.
+    """
+
+    first: int
+    phase: Phase
+    views: list[str]
+    stats: list[StepStats]
+    event: StepEvent | None
+    before: int
+    after: int
+    seconds: float
+
+
+def record_of(
+    stretch: Stretch, step: int, config: TrainConfig, scene_scale: float, seconds_before: float
+) -> dict[str, Any] | None:
+    """Make the record of a step, or None where none is due: every `log_every` steps there is one, and at every event.
+
+    What the engine has not measured is left out.
+
+    Args:
+        stretch: that the step belongs to.
+        step: its number.
+        config: step numbers as they are run.
+        scene_scale: unit of the means' learning rate, world units.
+        seconds_before: of training, before the stretch.
+    """
+    place = step - stretch.first
+    stats, last = stretch.stats[place], place + 1 == len(stretch.stats)
+    event = stretch.event if last else None
+    if step % config.log_every != 0 and event is None:
+        return None
+    halved = 0.5 if config.d_ssim_halved else 1.0
+    measured = {
+        "l1" if stretch.phase.l1 else "l2": stats.pixelwise,
+        "d_ssim": halved * (1.0 - stats.ssim),
+        "psnr": -10.0 * math.log10(stats.square) if stats.square != 0.0 else math.inf,
+        "n_blended": stats.n_blended,
+        "n_traversed": stats.n_traversed,
+    }
+    return {
+        "step": step,
+        "view": stretch.views[place],
+        "loss": stats.objective + stats.pop,
+        **{name: value for name, value in measured.items() if not math.isnan(value)},
+        **({"pop": stats.pop} if stretch.phase.pop or stats.pop != 0.0 else {}),
+        "num_gaussians": stretch.before if event is None else stretch.after,
+        "sh_degree": stretch.phase.sh_degree,
+        "lr_means": means_lr(step, config.max_steps, config.lr.means * scene_scale, config.lr.means_decay),
+        "it_per_s": len(stretch.stats) / stretch.seconds,
+        "seconds": seconds_before + stretch.seconds * (place + 1) / len(stretch.stats),
+        **({} if event is None else event.record()),
+    }

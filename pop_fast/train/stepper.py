@@ -1,0 +1,92 @@
+"""What takes the steps of a training run, whatever it is made of; `TrainingRun` does all the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import torch
+from torch.nn import Parameter
+from torch.optim import Adam
+
+from cuda_ext.train_settings import Phase, StepStats
+from pop_fast.backends import Backend
+from pop_fast.strategies.base import State
+from pop_fast.strategies.control import DensityControl
+from pop_fast.strategies.foreign import ForeignStrategy
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.views import ViewTensors
+
+
+class Stepper(Protocol):
+    """Takes training steps: render, objective, backward pass, Adam, the statistics of density control.
+
+    It works on what it is bound to and owns nothing that a checkpoint needs: after `steps` the parameters, the
+    optimizers' state and the strategy's statistics in `state` are those of the last step.
+
+    Attributes:
+        name: of the engine, for the statistics of a run.
+        longest: steps that `steps` is asked for at most, so that a run can be stopped and its progress seen.
+        step: steps taken.
+    """
+
+    name: str
+    longest: int
+    step: int
+
+    def rebind(self, params: dict[str, Parameter], optimizers: Mapping[str, Adam], state: State) -> None:
+        """Go on with these rows, moments and statistics: at the beginning, and after the population has changed."""
+        ...
+
+    def steps(self, first: int, last: int, phase: Phase) -> list[StepStats]:
+        """Take the steps from `first` to before `last`, all of one phase, and return each one's measurements.
+
+        Raises:
+            ValueError: a number is no longer finite; `step` tells at which step, which has not changed the parameters.
+        """
+        ...
+
+    def facts(self) -> dict[str, Any]:
+        """Return what goes into the statistics of a run."""
+        ...
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a stepper is to train.
+
+    Attributes:
+        config: step numbers as they are run.
+        strategy: the population's.
+        views: to train on.
+        order: the view of every step, `config.max_steps` of them.
+        scene_scale: unit of the means' learning rate, world units.
+        step: steps taken.
+    """
+
+    config: TrainConfig
+    strategy: DensityControl | ForeignStrategy
+    views: Sequence[ViewTensors]
+    order: Sequence[int]
+    scene_scale: float
+    step: int
+
+
+@dataclass(frozen=True)
+class Engine:
+    """Where and by what a run is done.
+
+    Attributes:
+        name: that settings give it, under which a run is resumed.
+        device: holds parameters, moments and statistics.
+        backend: renders there for measurements, from and to the CPU.
+        make_stepper: makes what takes the steps.
+        facts: goes into the statistics of a run.
+    """
+
+    name: Literal["fast", "compiled", "cuda", "ref"]
+    device: torch.device
+    backend: Backend
+    make_stepper: Callable[[Task], Stepper]
+    facts: Callable[[], dict[str, Any]] = dict

@@ -1,0 +1,98 @@
+"""Training steps by autograd over a backend's stages: every setting, and strategies of other people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Adam
+
+from cuda_ext.train_settings import Phase, StepStats
+from pop_fast.backends import Backend
+from pop_fast.strategies.base import State
+from pop_fast.train.evaluate import gaussians_per_pixel
+from pop_fast.train.model import adam_step
+from pop_fast.train.objective import Objective
+from pop_fast.train.stepper import Task
+from pop_fast.train.views import Rendered, render_view
+
+
+class TorchStepper:
+    """Takes steps on the CPU in the parameters' precision; see `Stepper`.
+
+    The same parameters, statistics and number of threads give the same bits.
+
+    Args:
+        task: what is trained.
+        backend: its stages.
+    """
+
+    name = "torch"
+    longest = 1
+
+    def __init__(self, task: Task, backend: Backend) -> None:
+        self.step = task.step
+        self._task, self._backend = task, backend
+        self._objective = Objective(task.config, task.views, backend.name)
+        self._params: dict[str, Parameter] = {}
+        self._optimizers: Mapping[str, Adam] = {}
+        self._state: State = {}
+
+    def rebind(self, params: dict[str, Parameter], optimizers: Mapping[str, Adam], state: State) -> None:
+        """See `Stepper.rebind`."""
+        self._params, self._optimizers, self._state = params, optimizers, state
+
+    def steps(self, first: int, last: int, phase: Phase) -> list[StepStats]:
+        """See `Stepper.steps`."""
+        return [self._take(step, phase) for step in range(first, last)]
+
+    def facts(self) -> dict[str, Any]:
+        """See `Stepper.facts`."""
+        return {}
+
+    def _take(self, step: int, phase: Phase) -> StepStats:
+        strategy, params, optimizers, state = self._task.strategy, self._params, self._optimizers, self._state
+        index = self._task.order[step]
+        rendered = self._render(index, step, phase)
+        objective = self._objective(rendered.image, index, phase)
+        term = strategy.regularizer(rendered.opacities, state, step, rendered.info)
+        strategy.step_pre_backward(params, optimizers, state, step, rendered.info)
+        loss = objective if term is None else objective + term
+        loss.backward()
+        self._require_finite(loss, index, step)
+        stats = self._measured(rendered, index, step, phase, objective, term)
+        config, scale = self._task.config, self._task.scene_scale
+        adam_step(params, optimizers, config.lr, scale, step, config.max_steps, phase.sh_degree)
+        strategy.collect(params, state, step, rendered.info)
+        self.step = step + 1
+        return stats
+
+    def _render(self, index: int, step: int, phase: Phase) -> Rendered:
+        config, strategy = self._task.config, self._task.strategy
+        return render_view(
+            self._backend,
+            self._params,
+            self._task.views[index],
+            config,
+            phase.sh_degree,
+            dominance=strategy.needs_dominance(step),
+            counts=step % config.log_every == 0,
+            absgrad=strategy.absgrad,
+        )
+
+    def _require_finite(self, loss: Tensor, index: int, step: int) -> None:
+        if not math.isfinite(loss.item()):
+            raise ValueError(f"the loss of view {self._task.views[index].name} is {loss.item()} at step {step}")
+
+    def _measured(
+        self, rendered: Rendered, index: int, step: int, phase: Phase, objective: Tensor, term: Tensor | None
+    ) -> StepStats:
+        """Return the loss's parts, and where a record is due everything else too."""
+        photometric, pop = objective.item(), 0.0 if term is None else term.item()
+        if step % self._task.config.log_every != 0 and not self._task.strategy.changes_after(step):
+            return StepStats(math.nan, math.nan, photometric, math.nan, pop)
+        pixelwise, structural, square = self._objective.measure(rendered.image.detach(), index, phase.l1)
+        return StepStats(pixelwise, structural, photometric, square, pop, *gaussians_per_pixel(rendered.info))
