@@ -120,10 +120,16 @@ def test_a_new_population_has_zero_moments(backend, n):
         assert_same_bits(f"v[{name}]", rows.v[name], np.zeros_like(array))
 
 
-@law("density", "blur_set", counts=counts, theta=st.sampled_from([1 / 64, 1 / 128, 1 / 32, 0.0]))
-def test_the_blur_set_dominates_strictly_more_than_its_share_of_pixels(backend, counts, theta):
-    blurred = backend.stage("blur_set")(np.array(counts, dtype=np.int64), W, H, theta)
-    assert_same_bits("blurred", blurred, [c > theta * W * H for c in counts])
+@law(
+    "density",
+    "blur_set",
+    counts=counts,
+    theta=st.sampled_from([1 / 64, 1 / 128, 1 / 32, 0.0]),
+    min_pixels=st.sampled_from([0.0, 1.0, 2.5, 3.0, 8.0]),
+)
+def test_the_blur_set_dominates_strictly_more_than_its_share_of_pixels(backend, counts, theta, min_pixels):
+    blurred = backend.stage("blur_set")(np.array(counts, dtype=np.int64), W, H, theta, min_pixels)
+    assert_same_bits("blurred", blurred, [c > theta * W * H and c > min_pixels for c in counts])
 
 
 views = st.lists(
@@ -199,18 +205,17 @@ def test_the_faint_are_pruned_and_later_the_far_too_large(backend, opacity, scen
         assert_same_bits(f"pruned at step {step}", pruned[clear], expected[clear])
 
 
-@law("density", "densifies_at", "resets_at", step=st.integers(0, 170).map(lambda k: 100 * k), beside=st.integers(-1, 1))
+@law("density", "densifies_at", "resets_at", step=st.integers(0, 170).map(lambda k: 100 * k), later=st.integers(-1, 1))
 def test_the_population_changes_every_hundred_steps_and_opacities_are_reset_where_that_is_asked_for(
-    backend, step, beside
+    backend, step, later
 ):
-    at = max(step + beside, 0)
+    at = max(step + later, 0)
     due = at % 100 == 0 and 500 < at < 15_000
-    for reset_every in (0, 3000):
-        for at_zero in (False, True):
-            config = DensityConfig(reset_every=reset_every, reset_at_zero=at_zero)
-            resets = reset_every > 0 and at % 3000 == 0 and at < 15_000 and (at > 0 or at_zero)
-            assert backend.stage("densifies_at")(at, config) == due
-            assert backend.stage("resets_at")(at, config) == resets
+    for reset_every, at_zero, pause in ((0, False, 0), (0, True, 0), (3000, False, 0), (3000, True, 300)):
+        config = DensityConfig(reset_every=reset_every, reset_at_zero=at_zero, pause_refine_after_reset=pause)
+        resets = reset_every > 0 and at % 3000 == 0 and at < 15_000 and (at > 0 or at_zero)
+        assert backend.stage("densifies_at")(at, config) == (due and at % 3000 >= pause)
+        assert backend.stage("resets_at")(at, config) == resets
 
 
 @law("density", "densify_and_prune", choices=choices, scene_scale=scene_scales)

@@ -115,6 +115,8 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 @contextmanager
 def living(mutant: Mutant) -> Iterator[Any]:
     """Bring a mutant to life as a backend for the duration of a with statement; one lives at a time."""
+    # a change that cannot be made must not pass for one that breaks a law
+    mutant.broken_source()
     finder = _Finder(mutant)
     _forget(mutant.copy)
     sys.meta_path.insert(0, finder)

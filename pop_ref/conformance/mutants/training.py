@@ -122,7 +122,7 @@ TRAINING: Final = (
     Mutant(
         "eps_of_the_usual_size",
         "eps is 1e-8, Adam's usual one: gradients under it take small steps",
-        "optimizer.py",
+        "settings.py",
         "EPS: Final = 1e-15",
         "EPS: Final = 1e-8",
         "test_optimizer:gradients_of_any_smallness_take_whole_steps",
@@ -147,8 +147,8 @@ TRAINING: Final = (
         "rate_of_a_unit_scene",
         "the positions' learning rate is not scaled by the scene",
         "optimizer.py",
-        'LEARNING_RATES["means"] * scene_scale * MEANS_DECAY',
-        'LEARNING_RATES["means"] * MEANS_DECAY',
+        "rates.means * scene_scale * rates.means_decay**share",
+        "rates.means * rates.means_decay**share",
         "test_optimizer:the_position_rate_falls_log_linearly_to_a_hundredth",
     ),
     Mutant(
@@ -198,5 +198,13 @@ TRAINING: Final = (
         'log_left = -0.5 * np.logaddexp(0.0, children["opacities"])',
         'log_left = np.log1p(-0.5 / (1.0 + np.exp(-children["opacities"])))',
         "test_density:a_split_replaces_each_parent_by_two_smaller_children_drawn_from_it",
+    ),
+    Mutant(
+        "least_pixels_forgotten",
+        "the least number of pixels of a blurred Gaussian is not read: in small images nearly everything is blurred",
+        "density.py",
+        "max(theta_blur * (height * width), min_pixels)",
+        "theta_blur * (height * width)",
+        "test_density:the_blur_set_dominates_strictly_more_than_its_share_of_pixels",
     ),
 )
