@@ -64,7 +64,6 @@ void bind_training(nb::module_& m) {
     VALUE(update, UpdateArrays, n);
     VALUE(update, UpdateArrays, n_rest);
     VALUE(update, UpdateArrays, lambda_pop);
-    VALUE(update, UpdateArrays, blur_pixels);
     VALUE(update, UpdateArrays, blur_own_view);
     POINTER(update, UpdateArrays, constants);
     POINTER(update, UpdateArrays, sums);
@@ -73,6 +72,7 @@ void bind_training(nb::module_& m) {
     POINTER(update, UpdateArrays, grad_sum);
     POINTER(update, UpdateArrays, n_visible);
     POINTER(update, UpdateArrays, dominant_sum);
+    POINTER(update, UpdateArrays, blur_pixels);
     POINTER(update, UpdateArrays, blurred);
     update.def("set_group", [](UpdateArrays& s, int group, uintptr_t param, uintptr_t m, uintptr_t v) {
         s.groups[group] = {reinterpret_cast<float*>(param), reinterpret_cast<float*>(m), reinterpret_cast<float*>(v)};

@@ -47,6 +47,7 @@ class ResidentViews:
         for k, (image, mask) in enumerate(zip(images, kept, strict=True)):
             self._check(k, image, mask)
         self.sizes = [(image.shape[1], image.shape[0]) for image in images]
+        self.kept_pixels = [_kept(size, mask) for size, mask in zip(self.sizes, kept, strict=True)]
         self.viewmats = viewmats.to(device, torch.float32).contiguous()
         self.Ks = Ks.to(device, torch.float32).contiguous()
         self._images = [self._uploaded("the photographs", image) for image in images]
@@ -88,10 +89,8 @@ class ResidentViews:
 
     def _share(self, size: tuple[int, int], mask: Tensor | None) -> tuple[float, float]:
         m, (width, height) = self._margin, size
-        if mask is None:
-            pixels, inner = width * height, (width - 2 * m) * (height - 2 * m)
-        else:
-            pixels, inner = int(mask.count_nonzero()), int(mask[m : height - m, m : width - m].count_nonzero())
+        pixels = _kept(size, mask)
+        inner = _kept((width - 2 * m, height - 2 * m), None if mask is None else mask[m : height - m, m : width - m])
         return 1.0 / max(3 * pixels, 1), 1.0 / (3 * inner) if inner else 0.0
 
     def _table(self, tensors: Sequence[Tensor]) -> Tensor:
@@ -111,3 +110,7 @@ class ResidentViews:
             blank = torch.zeros((height, width, 3), device=self.device)
             loss = fill(kernels.LossArrays(), image=blank, width=width, height=height)
             kernels.target_moments(self.photographs(), loss, settings, state.data_ptr(), stream_of(self.device))
+
+
+def _kept(size: tuple[int, int], mask: Tensor | None) -> int:
+    return size[0] * size[1] if mask is None else int(mask.count_nonzero())

@@ -28,6 +28,7 @@ class Shared:
         device: where everything is.
         state: the device's flags and counters.
         order: the view of every step.
+        blur_pixels: of every view, the pixels that a blurred Gaussian dominates more than.
         background: colour behind everything, or None for black.
         viewmat, K: this step's camera.
         constants: this step's learning rates.
@@ -40,6 +41,7 @@ class Shared:
     device: torch.device
     state: Tensor
     order: Tensor
+    blur_pixels: Tensor
     background: Tensor | None
     viewmat: Tensor
     K: Tensor
@@ -60,6 +62,7 @@ class Shared:
             device,
             state,
             torch.tensor(order, dtype=torch.int32, device=device),
+            torch.tensor([settings.blur_pixels(kept) for kept in views.kept_pixels], device=device),
             torch.tensor(settings.background, device=device) if any(settings.background) else None,
             torch.zeros(16, device=device),
             torch.zeros(9, device=device),

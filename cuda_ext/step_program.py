@@ -123,11 +123,11 @@ def _update(shared: Shared, rows: Population, frame: Frame, phase: Phase) -> Any
     counts = frame.told["dominant_counts"] if phase.dominance else None
     fill(made, constants=shared.constants, dominant_counts=counts, pop_sides=rows.pop_sides)
     made.lambda_pop = s.lambda_pop if phase.pop else 0.0
-    made.blur_pixels, made.blur_own_view = s.blur_pixels(*frame.size), s.blur_window == "own_view"
+    made.blur_own_view = s.blur_window == "own_view"
     if phase.statistics:
         fill(made, grad_sum=found.grad_sum, n_visible=found.n_visible)
     if phase.blur:
-        fill(made, blurred=found.blurred)
+        fill(made, blurred=found.blurred, blur_pixels=shared.blur_pixels)
     if phase.blur or phase.window:
         fill(made, dominant_sum=found.dominant_sum)
     for k, name in enumerate(GROUPS):

@@ -64,10 +64,10 @@ class StepSettings:
     replay: bool = True
     counts: bool = False
 
-    def blur_pixels(self, width: int, height: int) -> float:
-        """Return the whole number of pixels that a blurred Gaussian dominates more than."""
+    def blur_pixels(self, kept_pixels: int) -> float:
+        """Return the whole number of pixels that a blurred Gaussian dominates more than, of a view's that count."""
         # counts are whole, so that rounding down changes no comparison and a float holds the bound exactly
-        return float(math.floor(max(self.theta_blur * (height * width), self.blur_min_pixels)))
+        return float(math.floor(max(self.theta_blur * kept_pixels, self.blur_min_pixels)))
 
 
 class Phase(NamedTuple):

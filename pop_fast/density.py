@@ -33,9 +33,17 @@ class Statistics:
     blurred: Tensor
 
 
-def blur_set(dominant_counts: Tensor, width: int, height: int, theta_blur: float, min_pixels: float = 0.0) -> Tensor:
+def blur_set(
+    dominant_counts: Tensor,
+    width: int,
+    height: int,
+    theta_blur: float,
+    min_pixels: float = 0.0,
+    kept_pixels: int | None = None,
+) -> Tensor:
     """See `pop_ref.density.blur_set`. Works for [N] and, view by view, for [C, N]."""
-    return dominant_counts > max(theta_blur * (height * width), min_pixels)
+    n_pixels = height * width if kept_pixels is None else kept_pixels
+    return dominant_counts > max(theta_blur * n_pixels, min_pixels)
 
 
 def average_grads(statistics: Statistics, config: Any) -> Tensor:

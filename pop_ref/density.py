@@ -72,12 +72,18 @@ def zero_statistics(n: int) -> Statistics:
 
 
 def blur_set(
-    dominant_counts: Int64[np.ndarray, " N"], width: int, height: int, theta_blur: float, min_pixels: float = 0.0
+    dominant_counts: Int64[np.ndarray, " N"],
+    width: int,
+    height: int,
+    theta_blur: float,
+    min_pixels: float = 0.0,
+    kept_pixels: int | None = None,
 ) -> Bool[np.ndarray, " N"]:
     """Select the Gaussians that dominate more of an image than a point should: `D > max(theta H W, min)`, strictly.
 
     Source: POP paper eq. 6; theta 2e-5, one tenth of Mini-Splatting's.
-    Departs: the paper has no least number of pixels (`DensityConfig.blur_min_pixels`); it is 0 unless asked for.
+    Departs: the paper has no least number of pixels (`DensityConfig.blur_min_pixels`), which is 0 unless asked for, and
+        no masks.
 
     Args:
         dominant_counts: pixels that each Gaussian dominates.
@@ -85,6 +91,8 @@ def blur_set(
         height: of the view, px.
         theta_blur: share of the pixels.
         min_pixels: and at least so many of them.
+        kept_pixels: how many of the view's pixels count, where a mask leaves some out; None for all. Dominant counts
+            are then those of the kept ones, and so is the share.
 
     Returns:
         True where a Gaussian is blurred.
@@ -93,7 +101,8 @@ def blur_set(
         >>> blur_set(np.array([2, 3]), width=16, height=8, theta_blur=1 / 64).tolist()
         [False, True]
     """
-    return dominant_counts > max(theta_blur * (height * width), min_pixels)
+    n_pixels = height * width if kept_pixels is None else kept_pixels
+    return dominant_counts > max(theta_blur * n_pixels, min_pixels)
 
 
 def accumulate(
@@ -104,6 +113,7 @@ def accumulate(
     width: int,
     height: int,
     config: DensityConfig = POP,
+    kept_pixels: int | None = None,
 ) -> Statistics:
     """Add one view to the window.
 
@@ -117,10 +127,11 @@ def accumulate(
         statistics: the window so far.
         v_means2d: gradient of the loss by the screen centres, per px.
         visible: True where the view shows the Gaussian (extents > 0).
-        dominant_counts: pixels that each Gaussian dominates in this view.
+        dominant_counts: pixels that each Gaussian dominates in this view, of those that count.
         width: of the view, px.
         height: of the view, px.
         config: says how the blur flags of several views combine (A2).
+        kept_pixels: how many of the view's pixels count, where a mask leaves some out; None for all.
 
     Returns:
         The window with this view.
@@ -133,7 +144,7 @@ def accumulate(
     grads = np.sqrt((0.5 * width * v_means2d[:, 0]) ** 2 + (0.5 * height * v_means2d[:, 1]) ** 2)
     dominant_sum = statistics.dominant_sum + dominant_counts
     tested = dominant_sum if config.blur_window == "sum" else dominant_counts
-    blurred = blur_set(tested, width, height, config.theta_blur, config.blur_min_pixels)
+    blurred = blur_set(tested, width, height, config.theta_blur, config.blur_min_pixels, kept_pixels)
     if config.blur_window == "any_view":
         blurred = blurred | statistics.blurred
     return Statistics(

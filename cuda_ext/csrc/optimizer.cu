@@ -190,22 +190,22 @@ __device__ __forceinline__ Given load_given(const UpdateArrays& a, const SplatAr
 }
 
 __device__ __forceinline__ void note_statistics(const UpdateArrays& a, int i, const Given& given, Vec2<float> v_mean2d,
-                                                const ViewArrays& view) {
+                                                const ViewArrays& view, float blur_pixels) {
     if (a.grad_sum != nullptr && given.seen) {
         a.grad_sum[i] = given.grad_sum + densification_gradient(v_mean2d, view.width, view.height);
         a.n_visible[i] = given.n_visible + 1;
     }
     if (a.dominant_counts == nullptr) return;
     if (a.dominant_sum != nullptr) a.dominant_sum[i] = given.dominant_sum + given.dominant_count;
-    const bool blurred = float(given.dominant_count) > a.blur_pixels;
+    const bool blurred = float(given.dominant_count) > blur_pixels;
     if (a.blurred != nullptr && (blurred || a.blur_own_view)) a.blurred[i] = blurred;
 }
 
 template <int DEGREE>
 __device__ __forceinline__ void make_gradients(const UpdateArrays& a, const ViewArrays& view,
                                                const ProjectSettings& settings, const Camera<float>& camera,
-                                               int n_important, int n_others, int i, const Given& given,
-                                               Staged<DEGREE>& staged) {
+                                               int n_important, int n_others, float blur_pixels, int i,
+                                               const Given& given, Staged<DEGREE>& staged) {
     const int lane = threadIdx.x & (WARP - 1);
     GaussianVjp<float> v = {};
     Vec3<float> v_first = {0.0f, 0.0f, 0.0f};
@@ -227,7 +227,7 @@ __device__ __forceinline__ void make_gradients(const UpdateArrays& a, const View
     }
     if (a.lambda_pop != 0.0f)
         v.v_opacity += pop_loss_vjp_one(given.side, n_important, n_others, a.lambda_pop);
-    note_statistics(a, i, given, v_mean2d, view);
+    note_statistics(a, i, given, v_mean2d, view, blur_pixels);
     store3(staged.rows(G_MEANS), lane, v.v_mean);
     store3(staged.rows(G_SCALES), lane, scale_from_log_scale_vjp(given.raw.scale, v.v_scale));
     reinterpret_cast<float4*>(staged.rows(G_QUATS))[lane] = {v.v_quat.w, v.v_quat.x, v.v_quat.y, v.v_quat.z};
@@ -319,13 +319,15 @@ __global__ void __launch_bounds__(BLOCK, 4)
     Staged<DEGREE>& staged = of_warps[warp];
     const Camera<float> camera = camera_of(view, settings);
     const int n_important = state->n_important, n_others = state->n_others;
+    const float blur_pixels = a.blurred != nullptr ? a.blur_pixels[state->view] : 0.0f;
     Given given = {};
     if (lane < rows) given = load_given(a, splats, first + lane);
     if constexpr (DEGREE > 0)
         read_rows<12>(a.groups[G_SHN].param + size_t(first) * stride.floats, stride, rows, FULL_WARP, staged.rest);
     __syncwarp();
     if (lane < rows) 
-        make_gradients<DEGREE>(a, view, settings, camera, n_important, n_others, first + lane, given, staged);
+        make_gradients<DEGREE>(a, view, settings, camera, n_important, n_others, blur_pixels, first + lane, given,
+                               staged);
     __syncwarp();
     update_short_rows<DEGREE>(a, first, rows, staged);
     if constexpr (DEGREE > 0) update_long_rows<DEGREE>(a, stride, first, rows, staged);

@@ -71,7 +71,7 @@ struct UpdateArrays {
     int* n_visible;
     int* dominant_sum;
     uint8_t* blurred;
-    float blur_pixels;           // a view's count above it blurs
+    const float* blur_pixels;    // [views]: of state->view, a count above it blurs; read where blurred is asked for
     bool blur_own_view;          // the flag is this view's alone; else it stays up until the next event (A2)
 };
 

@@ -236,7 +236,9 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules):
             _collect_extents(state, info, packed)
 
     def _collect_blur(self, state: State, info: Info) -> None:
-        bound = (int(info["width"]), int(info["height"]), self.theta_blur, self.blur_min_pixels)
+        # where a mask leaves pixels out, counts and share are of those that it keeps
+        kept = info.get("kept_pixels")
+        bound = (int(info["width"]), int(info["height"]), self.theta_blur, self.blur_min_pixels, kept)
         if self.blur_window == "sum":
             state["blurred"] = blur_set(state["dominant_sum"], *bound)
             return

@@ -121,7 +121,7 @@ class FusedStepper:
             return
         if summed:
             view = self.task.views[self.task.order[last - 1]]
-            bound = (view.width, view.height, pop.theta_blur, pop.blur_min_pixels)
+            bound = (view.width, view.height, pop.theta_blur, pop.blur_min_pixels, view.kept_pixels)
             state["blurred"] = blur_set(state["dominant_sum"], *bound)
         else:
             state["blurred"] = found.blurred.bool()

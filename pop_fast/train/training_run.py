@@ -7,6 +7,7 @@ capture, engine, machine and number of threads give the same bits, whether a run
 from __future__ import annotations
 
 import math
+import sys
 import threading
 import time
 from collections.abc import Mapping
@@ -32,6 +33,7 @@ from pop_fast.strategies.foreign import ForeignStrategy
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.effects import doubts, facts
 from pop_fast.train.engines import engine_of
 from pop_fast.train.environment import reproducible, run_facts, versions
 from pop_fast.train.evaluate import evaluate
@@ -139,6 +141,8 @@ class TrainingRun:
             PopError: the folder is in use, a checkpoint does not fit, or a number is no longer finite.
             KeyboardInterrupt: after Ctrl-C or SIGTERM, when a checkpoint has been written; or at once after the second.
         """
+        for doubt in doubts(self.config, self._train):
+            print(f"warning: {doubt}", file=sys.stderr, flush=True)
         self._started = time.perf_counter()
         with reproducible(self.config.threads), stop_requests() as stop:
             try:
@@ -193,10 +197,10 @@ class TrainingRun:
             PopError: a number is no longer finite; names it.
         """
         start, first, before = time.perf_counter(), self.step, len(self.params["means"])
-        phase = phase_at(self.config, self.strategy, first)
+        phase, stepper = phase_at(self.config, self.strategy, first), self.stepper
         views = [self._train[self._order.next()].name for _ in range(first, last)]
         with words_for_memory():
-            stats = self._measured(self.stepper, first, last, phase)
+            stats = self._measured(stepper, first, last, phase)
             event = self._change(last - 1)
         after, seconds = len(self.params["means"]), time.perf_counter() - start
         return Stretch(first, phase, views, stats, event, before, after, seconds)
@@ -290,7 +294,7 @@ class TrainingRun:
         config = self.config
         stats = {
             "step": step,
-            "method": config.method,
+            **facts(config, self._train),
             "capture": self._capture.name,
             **population(self._opacities()),
             **self._facts(),

@@ -53,6 +53,11 @@ class ViewTensors:
         """Width, px."""
         return self.photo.shape[1]
 
+    @property
+    def kept_pixels(self) -> int:
+        """How many pixels count: those that the mask keeps."""
+        return self.height * self.width if self.mask is None else int(self.mask.count_nonzero())
+
     def target(self) -> Tensor:
         """Return the photograph as floats in [0, 1]. [H, W, 3]"""
         return self.photo.to(self.viewmat.dtype).div_(255.0)
@@ -116,6 +121,7 @@ def render_view(
     )
     if dominance and view.mask is not None:
         info["dominant_counts"] = _counts_inside(info["dominant_ids"], view.mask, len(opacities))
+        info["kept_pixels"] = view.kept_pixels
     return Rendered(colors[0], opacities, info)
 
 

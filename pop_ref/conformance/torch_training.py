@@ -108,6 +108,7 @@ class Trainer:
         width: int,
         height: int,
         config: DensityConfig,
+        kept_pixels: int | None = None,
     ) -> Statistics:
         """See `pop_ref.density.accumulate`."""
         strategy = self._strategy(config)
@@ -123,6 +124,7 @@ class Trainer:
             "n_cameras": 1,
             "width": width,
             "height": height,
+            **({} if kept_pixels is None else {"kept_pixels": kept_pixels}),
         }
         params = {"means": self._torch.zeros_like(v_means2d)}
         strategy.step_post_backward(params, {}, state, QUIET_STEP, info)

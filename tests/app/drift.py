@@ -75,7 +75,7 @@ class Drift:
         if phase.blur or phase.window:
             found.dominant_sum.add_(counts)
         if phase.blur:
-            blurred = counts > self.settings.blur_pixels(self.views[view].width, self.views[view].height)
+            blurred = counts > self.settings.blur_pixels(self.views[view].kept_pixels)
             found.blurred.copy_(blurred if self.settings.blur_window == "own_view" else found.blurred.bool() | blurred)
         loss = float(shift.square().mean())
         return StepStats(loss, 0.5, loss, loss, 0.25 if phase.pop else 0.0)

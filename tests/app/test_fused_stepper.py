@@ -191,5 +191,5 @@ def test_the_fused_step_gets_the_learning_rates_in_its_own_words():
     assert settings.lr["means"] == 2.0 * config.lr.means
     assert settings.lr["shN"] == config.lr.sh_rest
     assert set(settings.lr) == {"means", "scales", "quats", "opacities", "sh0", "shN"}
-    assert settings.blur_pixels(WIDTH, HEIGHT) == int(0.02 * WIDTH * HEIGHT)
-    assert replace(settings, blur_min_pixels=40.0).blur_pixels(WIDTH, HEIGHT) == 40.0
+    assert settings.blur_pixels(WIDTH * HEIGHT) == int(0.02 * WIDTH * HEIGHT)
+    assert replace(settings, blur_min_pixels=40.0).blur_pixels(WIDTH * HEIGHT) == 40.0

@@ -42,6 +42,16 @@ def test_what_the_dominant_count_is_taken_over_is_a_switch(window, n):
     assert n == len(params["means"]) - 1
 
 
+@pytest.mark.parametrize("window", ["any_view", "sum", "own_view"])
+def test_the_share_of_a_masked_view_is_of_the_pixels_that_it_keeps(window):
+    kept = WIDTH * HEIGHT // 4
+    for pixels, n in ((kept // 2, 3), (kept // 2 + 1, 4)):
+        params, optimizers = make(3)
+        info = {**make_info(3, counts=[pixels, 0, 0]), "kept_pixels": kept}
+        run_event(POPStrategy(theta_blur=0.5, blur_window=window), params, optimizers, info, 3000)
+        assert len(params["means"]) == n
+
+
 def test_blur_flags_are_forgotten_after_an_event():
     params, optimizers = make(1)
     strategy = POPStrategy()

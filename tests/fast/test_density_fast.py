@@ -30,6 +30,7 @@ CONFIGS = st.builds(
     prune_scale3d=st.just(0.5),
     prune_opa=st.just(0.125),
     theta_blur=st.sampled_from([0.25, 0.5]),
+    blur_min_pixels=st.sampled_from([0.0, 5.0]),
     blur_window=st.sampled_from(["any_view", "sum", "own_view"]),
     blur_rule=st.sampled_from(["by_scale", "split"]),
 )
@@ -49,7 +50,8 @@ def test_statistics_and_masks_are_the_oracles_exactly_also_at_thresholds(
     ours = theirs = oracle.zero_statistics(n)
     for width, height in ((4, 4), (8, 4), (4, 2)):
         v_means2d = rng.choice([0.0, 0.125, 0.25], (n, 1)) * np.array([0.5, 0.0] if width == 8 else [0.0, 1.0])
-        view = (v_means2d, rng.random(n) < 0.75, rng.integers(0, 10, n), width, height, config)
+        kept = int(rng.integers(1, width * height)) if width == 8 else None
+        view = (v_means2d, rng.random(n) < 0.75, rng.integers(0, 10, n), width, height, config, kept)
         theirs = oracle.accumulate(theirs, *view)
         found = judged("accumulate")(ours, *view)
         ours = oracle.Statistics(**{f.name: getattr(found, f.name) for f in fields(theirs)})

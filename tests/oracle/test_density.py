@@ -97,6 +97,23 @@ def test_blur_threshold_is_two_hundred_thousandths_of_the_image(width: int, heig
     assert blur_set(np.array([least - 1, least]), width, height, POP.theta_blur).tolist() == [False, True]
 
 
+def test_a_least_number_of_pixels_is_exceeded_too_and_changes_nothing_where_the_share_is_more() -> None:
+    counts = np.array([10, 11, 20, 21])
+    assert blur_set(counts, 480, 270, 2e-5, min_pixels=10.0).tolist() == [False, True, True, True]
+    assert blur_set(counts, 1000, 1000, 2e-5, min_pixels=10.0).tolist() == [False, False, False, True]
+
+
+@pytest.mark.parametrize("reading", ["any_view", "sum", "own_view"])
+def test_where_a_mask_leaves_pixels_out_the_share_is_of_those_that_count(reading: str) -> None:
+    config = DensityConfig(theta_blur=0.25, blur_window=reading, blur_min_pixels=2.0)
+    nothing = (np.zeros((3, 2)), np.ones(3, bool), np.array([3, 5, 17]), 8, 8, config)
+    assert accumulate(zero_statistics(3), *nothing).blurred.tolist() == [False, False, True]
+    assert accumulate(zero_statistics(3), *nothing, kept_pixels=16).blurred.tolist() == [False, True, True]
+    # a mask that keeps next to nothing does not make every pixel blur
+    assert accumulate(zero_statistics(3), *nothing, kept_pixels=4).blurred.tolist() == [True, True, True]
+    assert blur_set(np.array([2, 3]), 8, 8, 0.25, 2.0, kept_pixels=4).tolist() == [False, True]
+
+
 def test_a_count_exactly_at_the_blur_threshold_is_not_blurred() -> None:
     for k in (1, 2, 3, 7, 20):
         assert blur_set(np.array([k, k + 1]), 250 * k, 200, 2e-5).tolist() == [False, True]

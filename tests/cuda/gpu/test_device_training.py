@@ -56,8 +56,8 @@ def records(folder):
 def test_steps_are_the_cpus_under_every_setting(engine, case, tmp_path):
     changes, edit = CASES[case]
     # a population that stays, and rates at which rounding does not grow
-    pop = POPStrategy(**{**STILL, "pop_stop_iter": 6, **changes.get("strategy", {})})
-    settings = {"max_steps": 8, "log_every": 1, "checkpoint_every": 0, **changes, "strategy": pop}
+    strategy = POPStrategy(**{**STILL, "pop_stop_iter": 6, **changes.get("strategy", {})})
+    settings = {"max_steps": 8, "log_every": 1, "checkpoint_every": 0, **changes, "strategy": strategy}
     capture = edit(tiny_capture())
     rates = replace(tiny_config("x").lr, quats=0.0)
     expected = TrainingRun(tiny_config(tmp_path / "cpu", lr=rates, **settings), capture).run()

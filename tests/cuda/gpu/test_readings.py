@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from .scene import STEPS, training_scene
-from .steps import THETA, apart, fused, on_the_cpu
+from .scene import HEIGHT, STEPS, WIDTH, training_scene
+from .steps import THETA, apart, fused, fused_trainer, on_the_cpu
 
 READINGS = (
     {"pop_over": "visible"},
@@ -41,3 +41,21 @@ def test_ten_fused_steps_under_another_reading_are_the_cpus(gpu, reading, family
         assert 0 < int(state["blurred"].sum()) < int(usual_state["blurred"].sum())
     else:
         assert apart(usual["opacities"], wanted["opacities"], "opacities") > 0.05
+
+
+def test_the_share_that_blurs_is_of_the_pixels_that_a_view_keeps(gpu):
+    from cuda_ext.train_settings import Phase
+
+    scene = training_scene()
+    masks = [None if k % 2 else torch.arange(WIDTH) < WIDTH // 4 for k in range(len(scene.photographs))]
+    masks = [None if mask is None else mask.expand(HEIGHT, WIDTH) for mask in masks]
+    _, trainer = fused_trainer(scene, gpu, masks, theta_blur=THETA, blur_window="own_view", replay=False)
+    differs = 0
+    for step in range(STEPS):
+        trainer.run(step + 1, Phase(3, True, True, True))
+        ((_, maps),) = trainer.told_maps().items()
+        counts, masked = maps["dominant_counts"].cpu(), masks[scene.order[step]] is not None
+        kept = WIDTH // 4 * HEIGHT if masked else WIDTH * HEIGHT
+        assert torch.equal(trainer.statistics.blurred.bool().cpu(), counts > THETA * kept), step
+        differs += int((counts > THETA * kept).sum() - (counts > THETA * WIDTH * HEIGHT).sum())
+    assert differs > 0
