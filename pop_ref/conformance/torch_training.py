@@ -90,14 +90,20 @@ class Trainer:
         return self._rows(params, optimizers)
 
     def blur_set(
-        self, dominant_counts: Any, width: int, height: int, theta_blur: float, min_pixels: float = 0.0
+        self,
+        dominant_counts: Any,
+        width: int,
+        height: int,
+        theta_blur: float,
+        min_pixels: float = 0.0,
+        kept_pixels: int | None = None,
     ) -> Any:
         """See `pop_ref.density.blur_set`."""
         n, nothing = len(dominant_counts), self._torch.zeros((len(dominant_counts), 2))
         config = DensityConfig(theta_blur=theta_blur, blur_min_pixels=min_pixels, blur_window="own_view")
         empty = Statistics(nothing[:, 0], nothing[:, 0], 0, dominant_counts, nothing[:, 0] > 0)
         unseen = self._torch.zeros(n, dtype=self._torch.bool)
-        return self.accumulate(empty, nothing, unseen, dominant_counts, width, height, config).blurred
+        return self.accumulate(empty, nothing, unseen, dominant_counts, width, height, config, kept_pixels).blurred
 
     def accumulate(
         self,
@@ -126,6 +132,8 @@ class Trainer:
             "height": height,
             **({} if kept_pixels is None else {"kept_pixels": kept_pixels}),
         }
+        if kept_pixels is not None:
+            info["kept_pixels"] = kept_pixels
         params = {"means": self._torch.zeros_like(v_means2d)}
         strategy.step_post_backward(params, {}, state, QUIET_STEP, info)
         return self._statistics(state, statistics.grad_sum)

@@ -41,7 +41,13 @@ RECIPE = Recipe(
 SHORT = replace(
     RECIPE,
     density=replace(
-        DENSITY, refine_start_iter=1, refine_stop_iter=9, refine_every=3, blur_start_iter=5, blur_stop_iter=7, reset_every=4
+        DENSITY,
+        refine_start_iter=1,
+        refine_stop_iter=9,
+        refine_every=3,
+        blur_start_iter=5,
+        blur_stop_iter=7,
+        reset_every=4,
     ),
     pop_start_iter=1,
     pop_stop_iter=8,

@@ -126,10 +126,13 @@ def test_a_new_population_has_zero_moments(backend, n):
     counts=counts,
     theta=st.sampled_from([1 / 64, 1 / 128, 1 / 32, 0.0]),
     min_pixels=st.sampled_from([0.0, 1.0, 2.5, 3.0, 8.0]),
+    kept=st.sampled_from([None, W * H, 64, 32, 0]),
 )
-def test_the_blur_set_dominates_strictly_more_than_its_share_of_pixels(backend, counts, theta, min_pixels):
-    blurred = backend.stage("blur_set")(np.array(counts, dtype=np.int64), W, H, theta, min_pixels)
-    assert_same_bits("blurred", blurred, [c > theta * W * H and c > min_pixels for c in counts])
+def test_the_blur_set_dominates_strictly_more_than_its_share_of_pixels(backend, counts, theta, min_pixels, kept):
+    # a share of the pixels that a mask keeps
+    blurred = backend.stage("blur_set")(np.array(counts, dtype=np.int64), W, H, theta, min_pixels, kept)
+    n_pixels = W * H if kept is None else kept
+    assert_same_bits("blurred", blurred, [c > theta * n_pixels and c > min_pixels for c in counts])
 
 
 views = st.lists(
@@ -137,11 +140,11 @@ views = st.lists(
 )
 
 
-def _window(backend, views, config=POP):
+def _window(backend, views, config=POP, kept=None):
     one = Statistics(np.zeros(1), np.zeros(1, dtype=np.int64), 0, np.zeros(1, dtype=np.int64), np.zeros(1, dtype=bool))
     for x, y, visible, count in views:
         v, shown, won = np.array([[x, y]]), np.array([visible]), np.array([count], dtype=np.int64)
-        found = backend.stage("accumulate")(one, v, shown, won, W, H, config)
+        found = backend.stage("accumulate")(one, v, shown, won, W, H, config, kept)
         one = Statistics(*(getattr(found, f.name) for f in dataclasses.fields(Statistics)))
     return one
 
@@ -168,6 +171,9 @@ def test_blur_flags_combine_over_views_as_the_reading_says(backend, won):
     for reading, blurred in expected.items():
         config = DensityConfig(theta_blur=3.0 / (W * H), blur_window=reading)
         assert_same_bits(reading, _window(backend, views, config).blurred, [blurred])
+        # of half the pixels, twice the share is as many
+        of_half = DensityConfig(theta_blur=6.0 / (W * H), blur_window=reading)
+        assert_same_bits(f"{reading}, masked", _window(backend, views, of_half, W * H // 2).blurred, [blurred])
 
 
 @law(

@@ -203,8 +203,8 @@ TRAINING: Final = (
         "least_pixels_forgotten",
         "the least number of pixels of a blurred Gaussian is not read: in small images nearly everything is blurred",
         "density.py",
-        "max(theta_blur * (height * width), min_pixels)",
-        "theta_blur * (height * width)",
+        "max(theta_blur * n_pixels, min_pixels)",
+        "theta_blur * n_pixels",
         "test_density:the_blur_set_dominates_strictly_more_than_its_share_of_pixels",
     ),
 )
