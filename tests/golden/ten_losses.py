@@ -64,12 +64,12 @@ def cameras() -> list[Camera]:
 
 
 def photographs() -> list[np.ndarray]:
-    """Return a disc on a ramp, moving sideways from view to view."""
+    """Return a disc on a ramp, moving sideways from view to view; multiples of 1/255, as bytes are."""
     x, y = np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5)
     photos = []
     for centre in (6.0, 8.0, 10.0):
         disc = ((x - centre) ** 2 + (y - 8.0) ** 2 < 20.0).astype(np.float64)
-        photos.append(np.stack([0.75 * disc, x / 32.0, 0.5 - 0.25 * disc], axis=2))
+        photos.append(np.round(255.0 * np.stack([0.75 * disc, x / 32.0, 0.5 - 0.25 * disc], axis=2)) / 255.0)
     return photos
 
 

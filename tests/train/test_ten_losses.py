@@ -1,0 +1,81 @@
+"""The ladder of ten losses, climbed by the run that trains, on every engine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pop_fast.data.capture import Capture, View
+from pop_fast.train import TrainingRun
+from pop_fast.train.engines import torch_engine
+from tests.golden import ten_losses
+from tests.golden.ten_losses import RECIPE, SCENE_SCALE, STEPS, Rung
+from tests.train.oracle_steps import config_of
+
+# float64 as the oracle itself (measured: 3e-16); float32 some ten times the worst rung's error
+RELATIVE = {torch.float64: 1e-9, torch.float32: 1.2e-6}
+
+
+class ScaledCapture(Capture):
+    """Three views of a scene whose scale is the ladder's."""
+
+    def scene_scale(self) -> float:
+        return SCENE_SCALE
+
+
+class InTurn:
+    """In the place of a random order: the views one after the other."""
+
+    def __init__(self) -> None:
+        self.taken = 0
+
+    def next(self) -> int:
+        self.taken += 1
+        return (self.taken - 1) % 3
+
+    def state_dict(self) -> dict[str, Any]:
+        order = torch.Generator().manual_seed(0)
+        # read by the order of the steps to come: an epoch that never ends
+        return {"generator": order.get_state(), "order": [step % 3 for step in range(STEPS)], "position": self.taken}
+
+
+def climb(engine: Any, folder: Path, dtype: torch.dtype = torch.float32) -> list[Rung]:
+    views = [
+        View(f"{i}.png", np.round(255.0 * photo).astype(np.uint8), camera.viewmat, camera.K)
+        for i, (photo, camera) in enumerate(zip(ten_losses.photographs(), ten_losses.cameras(), strict=True))
+    ]
+    capture = ScaledCapture("ladder", tuple(views), np.zeros((1, 3)), np.zeros((1, 3), np.uint8), source="formulas")
+    initial = {name: torch.tensor(array, dtype=dtype) for name, array in ten_losses.first_params().items()}
+    config = config_of(RECIPE, folder / "run", sh_degree=1)
+    run = TrainingRun(config, capture, engine=engine, initial=initial)
+    run._order = InTurn()  # type: ignore[assignment]
+    run.normals = lambda n: torch.tensor(ten_losses.draws(n))  # type: ignore[method-assign]
+    rungs = []
+    for step in range(STEPS):
+        stretch = run.take_steps(step + 1)
+        assert stretch.views == [f"{step % 3}.png"]
+        rungs.append(Rung(stretch.stats[0].objective + stretch.stats[0].pop, len(run.params["means"])))
+    return rungs
+
+
+def agree(rungs: list[Rung], dtype: torch.dtype) -> None:
+    written = ten_losses.written()
+    assert [rung.n for rung in rungs] == [rung.n for rung in written]
+    np.testing.assert_allclose([r.loss for r in rungs], [r.loss for r in written], rtol=RELATIVE[dtype])
+
+
+def test_ten_losses_are_the_oracles(engine: Any, tmp_path: Path) -> None:
+    agree(climb(engine, tmp_path), torch.float32)
+
+
+@pytest.mark.parametrize("backend", ["fast", "ref"])
+def test_ten_losses_in_double_precision_are_the_oracles(backend: Any, tmp_path: Path) -> None:
+    agree(climb(torch_engine(backend), tmp_path, torch.float64), torch.float64)
+
+
+def test_two_climbs_give_the_same_bits(engine: Any, tmp_path: Path) -> None:
+    assert climb(engine, tmp_path / "one") == climb(engine, tmp_path / "two")
