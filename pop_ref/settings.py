@@ -169,7 +169,7 @@ class LearningRates:
 
 
 POP: Final = DensityConfig()
-GSPLAT: Final = DensityConfig(blur_start_iter=0, blur_stop_iter=-1, reset_every=3000)
+GSPLAT: Final = DensityConfig(blur_stop_iter=-1, reset_every=3000)
 # whose opacities move half as fast since October 2024
 INRIA_RATES: Final = LearningRates(opacities=0.025)
 

@@ -47,6 +47,9 @@ class TrainConfig:
         profile: the rasterizer's constants: "paper", "gsplat_1_5", "gsplat_1_6" or "inria" (that of method "3dgs").
         antialiased: render with opacity compensation (Mip-Splatting) instead of classically.
         factor: photographs are shrunk by it.
+        resize: how, where the capture does not bring them shrunk: "area" averages, "bicubic" does as Pillow does, and
+            so gsplat's example trainer, which also takes the full photographs (--images images) instead of those that
+            Mip-NeRF 360 brings (A32).
         test_every: every n-th view by file name is held out; 0 holds nothing out.
         background: colour behind everything, and behind photographs with alpha. [0, 1]
         normalize: move the capture into gsplat's normalised world.
@@ -86,6 +89,7 @@ class TrainConfig:
     profile: Literal["paper", "gsplat_1_5", "gsplat_1_6", "inria"] = "paper"
     antialiased: bool = False
     factor: int = 1
+    resize: Literal["area", "bicubic"] = "area"
     test_every: int = 8
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     normalize: bool = True
