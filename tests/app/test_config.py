@@ -178,6 +178,11 @@ def test_a_label_cannot_be_carried_by_settings_that_do_not_follow_it():
     # where it runs and where it writes is not part of a preset
     assert replace(quick, result_dir="x", backend="fast").but(seed=1).result_dir == "x"
     assert TrainConfig().preset is None
+    # what was run is read back also where the preset has other values now
+    written = json.loads(quick.to_json())
+    written["resolved"]["max_steps"] = 2500
+    read = TrainConfig.from_json(json.dumps(written))
+    assert (read.max_steps, read.preset) == (2500, None)
 
 
 def test_the_means_rate_falls_log_linearly_to_a_hundredth():
