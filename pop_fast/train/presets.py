@@ -103,6 +103,11 @@ class Given:
             group, dot, rest = name.partition(".")
             known = group == "strategy" or ALIASES.get(group, group) == given.method
             path = f"{given.method}{dot}{rest}" if known else name
+            if isinstance(value, DensityControl) and method_of(value) != given.method:
+                raise PopError(
+                    f"{name} is a {type(value).__name__}, but the method is {given.method!r}; "
+                    f"give a {METHODS[given.method].strategy.__name__}, or method={method_of(value)!r}"
+                )
             plain = to_plain(value)
             whole = isinstance(plain, dict) or is_dataclass(value)
             settings |= {f"{path}.{key}": item for key, item in plain.items()} if whole else {path: plain}

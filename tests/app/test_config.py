@@ -256,6 +256,7 @@ def test_bad_settings_are_named(change, message):
         ({"method": "magic"}, r"config\.method is 'magic'; it must be one of 'pop', 'gsplat', '3dgs'"),
         ({"max_stepz": 3}, r"config\.max_stepz is not a setting"),
         ({"pop.lambda": 3}, r"config\.pop\.lambda is not a setting"),
+        ({"strategy": GsplatStrategy()}, "strategy is a GsplatStrategy, but the method is 'pop'"),
         ({"gsplat.reset_every": 3}, r"config\.gsplat\.reset_every is not a setting"),
     ],
 )
