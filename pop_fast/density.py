@@ -14,9 +14,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.covariance import rotmats_from_quats
-
-SPLIT_CHILDREN = 2
-SPLIT_SHRINK = 1.6
+from pop_ref.settings import POP, SPLIT_CHILDREN, SPLIT_SHRINK
 
 Params = dict[str, Tensor]
 
@@ -167,7 +165,7 @@ def prune_rows(rows: Rows, mask: Tensor) -> Rows:
     return _keep_and_append(rows, ~mask, {name: tensor[:0] for name, tensor in rows.params.items()})
 
 
-def reset_opacities(rows: Rows, ceiling: float = 0.01) -> Rows:
+def reset_opacities(rows: Rows, ceiling: float = POP.reset_opa) -> Rows:
     """See `pop_ref.density_rows.reset_opacities`."""
     opacities = rows.params["opacities"]
     logit = torch.logit(torch.tensor(ceiling, dtype=torch.float64)).item()
