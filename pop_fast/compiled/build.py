@@ -38,7 +38,16 @@ SHARED: Final = tuple(
     )
 )
 # roots and comparisons of many numbers at once neither set errno nor stop at a NaN
-FLAGS: Final = ("-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-fno-tree-slp-vectorize", "-fPIC", "-shared", "-pthread")
+FLAGS: Final = (
+    "-std=c++17",
+    "-O3",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fno-tree-slp-vectorize",
+    "-fPIC",
+    "-shared",
+    "-pthread",
+)
 UNITS: Final = ("blend.cpp", "step.cpp")
 # for this processor, as compilers of different kinds and ages spell it; the last resort is any processor of its kind
 TUNING: Final = (("-march=native",), ("-mcpu=native",), ())

@@ -106,7 +106,7 @@ def _aligned(n: int, each: int) -> Tensor:
 
 
 def _lights(lists: TileLists, like: Tensor) -> dict[str, Tensor]:
-    """Return space for T before every chunk of entries, which of them reach which strips, and where each tile's begin."""
+    """Return space for T before every chunk, for which entries reach which strips, and where each tile's begins."""
     library = this_library()
     chunks = (lists.lengths + (library.chunk - 1)) // library.chunk
     pixels = library.padded_pixels(lists.tile_size, like.dtype.itemsize)

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, StepStats
 from pop_fast.compiled.library import stepper_functions
-from pop_fast.ssim import TargetMoments, border_of, kept_windows, target_moments
+from pop_fast.ssim import Padding, TargetMoments, border_of, kept_windows, target_moments
 from pop_fast.transmittance import Stop, below
 
 # steps that are taken before Python is asked again: Ctrl-C, a progress bar
@@ -60,10 +60,25 @@ class StepGiven(ctypes.Structure):
 class TrainingView(Protocol):
     """A photograph with its camera, as `pop_fast.train.views.ViewTensors`."""
 
-    photo: Tensor
-    mask: Tensor | None
-    viewmat: Tensor
-    K: Tensor
+    @property
+    def photo(self) -> Tensor:
+        """Photograph. uint8 [H, W, 3]"""
+        ...
+
+    @property
+    def mask(self) -> Tensor | None:
+        """True for the pixels that count, or None. [H, W]"""
+        ...
+
+    @property
+    def viewmat(self) -> Tensor:
+        """World -> camera. [1, 4, 4]"""
+        ...
+
+    @property
+    def K(self) -> Tensor:
+        """Intrinsics, px. [1, 3, 3]"""
+        ...
 
 
 @dataclass(frozen=True)
@@ -79,9 +94,9 @@ class _Target:
     kept_windows: Tensor | None
 
     @classmethod
-    def of(cls, view: TrainingView, padding: Any) -> _Target:
+    def of(cls, view: TrainingView, padding: Padding) -> _Target:
         moments: TargetMoments = target_moments(view.photo.float().div_(255.0), padding)
-        height, width, channels = moments.target.shape
+        channels = moments.target.shape[2]
 
         def planes(maps: Tensor) -> Tensor:
             return maps.reshape(len(maps), -1, channels).permute(2, 0, 1).contiguous()
@@ -137,6 +152,7 @@ class NativeTrainer:
         cache_mb: float = 1024,
     ) -> None:
         self.settings, self.step = settings, step
+        self._padding: Padding = "same" if settings.padding == "same" else "valid"
         self._views, self._order = views, list(order)
         self._targets: dict[int, _Target] = {}
         self._cache_left = cache_mb * 2**20
@@ -215,7 +231,7 @@ class NativeTrainer:
         given.floor_below = below(profile.alpha_floor, torch.float32)
         given.stop = Stop.of(profile, torch.float32).at
         given.background = (_REAL * 3)(*settings.background)
-        given.border = border_of(settings.padding)
+        given.border = border_of(self._padding)
         given.pop_visible, given.pop_window = settings.pop_over == "visible", settings.pop_views == "window"
         given.blur_own_view = settings.blur_window == "own_view"
         (given.beta1, given.beta2), given.eps = settings.betas, settings.eps
@@ -271,7 +287,7 @@ class NativeTrainer:
     def _target(self, index: int) -> _Target:
         if index in self._targets:
             return self._targets[index]
-        made = _Target.of(self._views[index], self.settings.padding)
+        made = _Target.of(self._views[index], self._padding)
         if made.bytes <= self._cache_left:
             self._cache_left -= made.bytes
             self._targets[index] = made

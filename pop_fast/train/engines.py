@@ -73,7 +73,9 @@ def native_engine() -> Engine:
         PopError: it is not compiled.
     """
     engine = torch_engine("compiled")
-    return replace(engine, make_stepper=lambda task: FusedStepper(task, "native", LONGEST_ON_CPU, _native_trainer(task)))
+    return replace(
+        engine, make_stepper=lambda task: FusedStepper(task, "native", LONGEST_ON_CPU, _native_trainer(task))
+    )
 
 
 def _native_trainer(task: Task) -> MakeFused:

@@ -33,7 +33,7 @@ from pop_fast.strategies.foreign import ForeignStrategy
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.effects import doubts, facts
+from pop_fast.train.effects import facts, find_warnings
 from pop_fast.train.engines import engine_of
 from pop_fast.train.environment import reproducible, run_facts, versions
 from pop_fast.train.evaluate import evaluate
@@ -141,8 +141,8 @@ class TrainingRun:
             PopError: the folder is in use, a checkpoint does not fit, or a number is no longer finite.
             KeyboardInterrupt: after Ctrl-C or SIGTERM, when a checkpoint has been written; or at once after the second.
         """
-        for doubt in doubts(self.config, self._train):
-            print(f"warning: {doubt}", file=sys.stderr, flush=True)
+        for warning in find_warnings(self.config, self._train):
+            print(f"warning: {warning}", file=sys.stderr, flush=True)
         self._started = time.perf_counter()
         with reproducible(self.config.threads), stop_requests() as stop:
             try:

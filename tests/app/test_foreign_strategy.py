@@ -19,7 +19,7 @@ from tests.app.tiny import tiny_capture, tiny_config
 
 @dataclass
 class Jitter:
-    """Every fourth step the Gaussian that moved most on the screen gets a copy nearby, placed by torch's own numbers."""
+    """Every fourth step what moved most on the screen gets a copy nearby, placed by torch's own numbers."""
 
     every: int = 4
     tells: bool = False

@@ -10,11 +10,11 @@ import torch
 
 from cuda_ext.library_folder import library_folder
 from pop_fast.backends import get_backend
-from pop_fast.train.engines import torch_engine
+from pop_fast.train.engines import native_engine, torch_engine
 from tests.cuda.emulated import emulate
 
 # "cuda" is the kernels' own source under the emulator; tests/cuda/gpu says the same of a GPU
-ENGINES = ("fast", "compiled", "cuda")
+ENGINES = ("fast", "compiled", "native", "cuda")
 
 
 @pytest.fixture(params=ENGINES)
@@ -27,10 +27,10 @@ def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> A
         folder = Path(emulate.__file__).parent
         emulate.install(monkeypatch, emulate.build(library_folder(folder)))
         return emulate.engine()
-    reason = get_backend(request.param).why_not()
+    reason = get_backend("fast" if request.param == "fast" else "compiled").why_not()
     if reason is not None:
         pytest.skip(reason)
-    return torch_engine(request.param)
+    return native_engine() if request.param == "native" else torch_engine(request.param)
 
 
 @pytest.fixture(autouse=True)
