@@ -157,9 +157,10 @@ class NativeTrainer:
         self._targets: dict[int, _Target] = {}
         self._cache_left = cache_mb * 2**20
         self._functions = stepper_functions(ctypes.sizeof(StepGiven))
-        self._stepper = self._functions.open(torch.get_num_threads() if threads is None else threads)
-        if not self._stepper:
+        stepper = self._functions.open(torch.get_num_threads() if threads is None else threads)
+        if stepper is None:
             raise MemoryError("there is no memory for the native training step")
+        self._stepper = stepper
         weakref.finalize(self, self._functions.close, self._stepper)
         self._given = StepGiven()
         self._seconds = torch.zeros(len(PARTS), dtype=torch.float64)
