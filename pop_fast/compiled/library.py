@@ -113,6 +113,16 @@ class Ssim(ctypes.Structure):
     )
 
 
+class Moments(ctypes.Structure):
+    """`pop::Moments` of moments.h, where every field is explained, in its order."""
+
+    _fields_ = (
+        *_fields(_POINTER, "photograph"),
+        *_fields(_WHOLE, "height", "width", "border", "threads"),
+        *_fields(_POINTER, "target", "mu_y", "s_yy"),
+    )
+
+
 _NAMES: dict[type[ctypes.Structure], str] = {
     Covariances: "covariances",
     CovariancesBackward: "covariances_backward",
@@ -124,6 +134,7 @@ _NAMES: dict[type[ctypes.Structure], str] = {
     Blend: "forward",
     BlendBackward: "backward",
     Ssim: "ssim",
+    Moments: "moments",
 }
 
 
@@ -226,7 +237,7 @@ def open_library(path: str) -> Library:
         OSError: it is missing, does not load, or was not made from the same source as this module.
     """
     loaded = ctypes.CDLL(path)
-    layouts = (Covariances, Projection, Colors, Lists, Blend, Ssim)
+    layouts = (Covariances, Projection, Colors, Lists, Blend, Ssim, Moments)
     sizes = {f"pop_{layout.__name__.lower()}_bytes": layout for layout in layouts}
     numbers = ("chunk", "padded_pixels", "splat_bytes", "lanes", "window_rows", "padded_line", "rows_at_a_time")
     for name in (*sizes, *(f"pop_{number}" for number in numbers)):
