@@ -151,6 +151,7 @@ class Library:
         window_rows: rows of SSIM's windows whose total is one number.
         padded_line: numbers from one row of maps to the next, for rows of that many numbers of so many bytes.
         rows_at_a_time: Gaussians whose share of the camera's gradient is one sum.
+        adam: moves so many floats by one update of Adam.
         fork: starts the threads, or None.
     """
 
@@ -162,6 +163,7 @@ class Library:
     window_rows: int
     padded_line: Callable[[int, int], int]
     rows_at_a_time: int
+    adam: Callable[..., None]
     fork: Any
 
 
@@ -246,6 +248,8 @@ def open_library(path: str) -> Library:
     loaded.pop_padded_pixels.argtypes = loaded.pop_padded_line.argtypes = (_WHOLE, _WHOLE)
     if any(getattr(loaded, name)() != ctypes.sizeof(layout) for name, layout in sizes.items()):
         raise OSError(f"{path} expects arguments of another layout")
+    loaded.pop_adam.argtypes = (*(_POINTER,) * 4, *(_WHOLE,) * 2, *(_REAL,) * 4)
+    loaded.pop_adam.restype = None
     functions: dict[tuple[type[ctypes.Structure], torch.dtype], Callable[..., int]] = {}
     for layout, name in _NAMES.items():
         for dtype in (torch.float32, torch.float64):
@@ -261,6 +265,7 @@ def open_library(path: str) -> Library:
         loaded.pop_window_rows(),
         loaded.pop_padded_line,
         loaded.pop_rows_at_a_time(),
+        loaded.pop_adam,
         _fork(),
     )
 
