@@ -18,11 +18,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from stages import ROOT, STAGES, files, functions, laws
 
+from pop_fast.train.presets import options_for
 from pop_ref.conformance.abilities import STAGES as LAW_STAGES
 from pop_ref.conformance.mutants import MUTANTS
 from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER
 from pop_ref.notation import SYMBOLS
+from pop_ref.recipes import L1_DIVIDED, RECIPES
 
 README = ROOT / "README.md"
 MUTANT_LIST = ROOT / "docs" / "MUTANTS.md"
@@ -75,6 +77,24 @@ def profiles() -> str:
         ("gradient of the frustum clamp", lambda p: p.clamp_gradient),
     ]
     return _table(["", *(f"`{p.name}`" for p in named)], [[title, *map(show, named)] for title, show in lines])
+
+
+def recipes() -> str:
+    """Make the table of the paper's rows as options of `pop train`, from `pop_ref.recipes`."""
+    rows = [[name, f"`pop train scene {' '.join(options_for(recipe))}`".replace(" `", "`"), RECIPE_NOTES.get(name, "")]
+            for name, recipe in RECIPES.items()]  # fmt: skip
+    divided = " ".join(options_for(L1_DIVIDED[10]))
+    rows.append(["L1 div = 10", f"`pop train scene {divided}`", "and likewise 1, 2, 5, 20, 50, 100"])
+    return _table(["row of the paper", "command", ""], rows)
+
+
+RECIPE_NOTES = {
+    "POP": "the whole method",
+    "L2": "the module ablation's first row: no blur rule, no POP term, no reset",
+    "Reset": "opacity reset in place of the POP term",
+    "3DGS": "Inria's code, with its rasterizer's constants",
+    "gsplat": "gsplat's default strategy",
+}
 
 
 def results() -> str:
@@ -178,6 +198,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "profiles": profiles,
     "speed": speed,
     "results": results,
+    "recipes": recipes,
     "kit": kit,
     "scorecards": scorecards,
     "broken": broken_laws,

@@ -15,9 +15,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.covariance import rotmats_from_quats
-
-SPLIT_CHILDREN = 2
-SPLIT_SHRINK = 1.6
+from pop_ref.settings import SPLIT_CHILDREN, SPLIT_SHRINK
 
 Params = dict[str, Tensor]
 

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.ssim import Padding, TargetMoments, check_size, mean_dissimilarity, ssim_map, target_moments
+from pop_ref.settings import LAMBDA_SSIM_3DGS, Recipe
 
 __all__ = ["Padding", "TargetMoments", "target_moments", "ssim_map", "l1", "l1_vjp", "l2", "l2_vjp"]
 __all__ += ["ssim", "ssim_vjp", "d_ssim", "d_ssim_vjp"]
@@ -115,7 +116,7 @@ def d_ssim_vjp(
 def photometric_3dgs(
     image: Tensor,
     target: Tensor,
-    lambda_ssim: float = 0.2,
+    lambda_ssim: float = LAMBDA_SSIM_3DGS,
     padding: Padding = "valid",
     mask: Tensor | None = None,
     halved: bool = False,
@@ -137,7 +138,7 @@ def photometric_3dgs_vjp(
     image: Tensor,
     target: Tensor,
     v_loss: Tensor | float,
-    lambda_ssim: float = 0.2,
+    lambda_ssim: float = LAMBDA_SSIM_3DGS,
     padding: Padding = "valid",
     mask: Tensor | None = None,
     halved: bool = False,
@@ -152,7 +153,7 @@ def photometric_3dgs_vjp(
 def photometric_pop(
     image: Tensor,
     target: Tensor,
-    lambda_ssim: float = 0.01,
+    lambda_ssim: float = Recipe.lambda_ssim,
     padding: Padding = "valid",
     mask: Tensor | None = None,
     halved: bool = False,
@@ -174,7 +175,7 @@ def photometric_pop_vjp(
     image: Tensor,
     target: Tensor,
     v_loss: Tensor | float,
-    lambda_ssim: float = 0.01,
+    lambda_ssim: float = Recipe.lambda_ssim,
     padding: Padding = "valid",
     mask: Tensor | None = None,
     halved: bool = False,

@@ -259,7 +259,7 @@ AMBIGUITIES: Final = (
         "Which images: those the data set brings shrunk, or shrunk anew?",
         "those it brings",
         "pop_fast.data.load:load_capture",
-        ("load_capture.images = images",),
+        ("load_capture.images = images", "load_capture.resize = bicubic"),
         mark="images_<factor>",
     ),
 )

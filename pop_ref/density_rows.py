@@ -17,16 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
 from pop_ref._shapes import Bool, Float64
 from pop_ref.activations import scales_from_log_scales
 from pop_ref.covariance import rotmats_from_quats
-
-SPLIT_CHILDREN: Final = 2
-SPLIT_SHRINK: Final = 1.6
+from pop_ref.settings import POP, SPLIT_CHILDREN, SPLIT_SHRINK
 
 
 @dataclass(frozen=True)
@@ -174,7 +171,7 @@ def prune_rows(rows: Rows, mask: Bool[np.ndarray, " N"]) -> Rows:
     return _keep_and_append(rows, ~mask, {name: array[:0] for name, array in rows.params.items()})
 
 
-def reset_opacities(rows: Rows, ceiling: float = 0.01) -> Rows:
+def reset_opacities(rows: Rows, ceiling: float = POP.reset_opa) -> Rows:
     """Lower every opacity to at most `ceiling` and forget the opacities' moments: `o <- min(o, ceiling)`.
 
     Source: POP paper section 3.1 (the reset that POP does without); the ceiling 0.01 is Inria's and gsplat's.

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from pop_ref._shapes import Bool, Float64
+from pop_ref.settings import LAMBDA_SSIM_3DGS, Recipe
 from pop_ref.ssim import Padding, d_ssim, d_ssim_vjp, replace_left_out, ssim, ssim_map, ssim_vjp
 
 __all__ = ["Padding", "l1", "l1_vjp", "l2", "l2_vjp", "ssim", "ssim_map", "ssim_vjp", "d_ssim", "d_ssim_vjp"]
@@ -143,7 +144,7 @@ def l2_vjp(
 def photometric_3dgs(
     image: Float64[np.ndarray, "H W D"],
     target: Float64[np.ndarray, "H W D"],
-    lambda_ssim: float = 0.2,
+    lambda_ssim: float = LAMBDA_SSIM_3DGS,
     padding: Padding = "valid",
     mask: Bool[np.ndarray, "H W"] | None = None,
     halved: bool = False,
@@ -181,7 +182,7 @@ def photometric_3dgs_vjp(
     image: Float64[np.ndarray, "H W D"],
     target: Float64[np.ndarray, "H W D"],
     v_loss: float,
-    lambda_ssim: float = 0.2,
+    lambda_ssim: float = LAMBDA_SSIM_3DGS,
     padding: Padding = "valid",
     mask: Bool[np.ndarray, "H W"] | None = None,
     halved: bool = False,
@@ -219,7 +220,7 @@ def photometric_3dgs_vjp(
 def photometric_pop(
     image: Float64[np.ndarray, "H W D"],
     target: Float64[np.ndarray, "H W D"],
-    lambda_ssim: float = 0.01,
+    lambda_ssim: float = Recipe.lambda_ssim,
     padding: Padding = "valid",
     mask: Bool[np.ndarray, "H W"] | None = None,
     halved: bool = False,
@@ -257,7 +258,7 @@ def photometric_pop_vjp(
     image: Float64[np.ndarray, "H W D"],
     target: Float64[np.ndarray, "H W D"],
     v_loss: float,
-    lambda_ssim: float = 0.01,
+    lambda_ssim: float = Recipe.lambda_ssim,
     padding: Padding = "valid",
     mask: Bool[np.ndarray, "H W"] | None = None,
     halved: bool = False,

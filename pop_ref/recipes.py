@@ -21,7 +21,7 @@ from pop_ref.settings import GSPLAT, INRIA_RATES, LAMBDA_SSIM_3DGS, POP, Recipe
 
 __all__ = ["L1_DIVIDED", "RECIPES", "Recipe"]
 
-_NO_BLUR: Final = replace(POP, blur_start_iter=GSPLAT.blur_start_iter, blur_stop_iter=GSPLAT.blur_stop_iter)
+_NO_BLUR: Final = replace(POP, blur_stop_iter=GSPLAT.blur_stop_iter)
 
 # "Reset" has blur but no POP, and no other row of the module ablation has resets (A22); "L2" has nothing else (A29).
 # only so do the tables' counts fit together

@@ -22,6 +22,9 @@ EPS: Final = 1e-15
 # the last degree of the harmonics, and the loss of 3DGS: 0.8 L1 + 0.2 D-SSIM (eq. 2)
 MAX_SH_DEGREE: Final = 3
 LAMBDA_SSIM_3DGS: Final = 0.2
+# a split replaces a Gaussian by so many, so many times smaller (Kerbl et al. 2023, section 5.2)
+SPLIT_CHILDREN: Final = 2
+SPLIT_SHRINK: Final = 1.6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,7 +172,7 @@ class LearningRates:
 
 
 POP: Final = DensityConfig()
-GSPLAT: Final = DensityConfig(blur_start_iter=0, blur_stop_iter=-1, reset_every=3000)
+GSPLAT: Final = DensityConfig(blur_stop_iter=-1, reset_every=3000)
 # whose opacities move half as fast since October 2024
 INRIA_RATES: Final = LearningRates(opacities=0.025)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
 from typing import Annotated, Final, Literal
@@ -72,7 +72,7 @@ def run(argv: Sequence[str]) -> int:
     view = chosen_view(capture, args.view)
     if at is not None:
         check_inside(view, *at)
-    config = with_objective(replace(config, profile=args.profile or config.profile), args.objective)
+    config = with_objective(config.but(profile=args.profile) if args.profile else config, args.objective)
     with reproducible(config.threads):
         scene = explain_view(splat.params, view, config, splat.sh_degree, splat.step)
         parting = None if args.diff is None or at is None else difference(scene, *args.diff, *at)

@@ -17,6 +17,7 @@ from pop_fast.io.atomic import folder_atomically
 from pop_fast.io.images import write_png
 from pop_fast.io.ply import save_ply
 from pop_fast.train.views import ViewTensors
+from pop_ref.settings import Recipe
 
 _BY: Final = "exported_by='pop export'"
 _FILES: Final = re.compile(
@@ -40,7 +41,7 @@ def write_inria_folder(splat: Splat, capture: Capture, out: Path, overwrite: boo
         PopError: `out` is there and may not be replaced, or cannot be written.
     """
     transform = capture.world_transform
-    steps = 30_000 if splat.step is None else splat.step + 1
+    steps = Recipe.max_steps if splat.step is None else splat.step + 1
     held_out = capture.test_views(splat.config.test_every)
     keeps = paths_read(splat, Path(splat.config.data), capture)
     with folder_atomically(out, overwrite, keeps=keeps, recognise=_exported_to(out)) as folder:
@@ -49,7 +50,7 @@ def write_inria_folder(splat: Splat, capture: Capture, out: Path, overwrite: boo
         cameras = [_camera(i, view, transform, capture.world_scale) for i, view in enumerate(capture.views)]
         (folder / "cameras.json").write_text(json.dumps(cameras), encoding="utf-8")
         (folder / "cfg_args").write_text(_cfg_args(splat, out), encoding="utf-8")
-        frames = rendered(splat, splat.config, [ViewTensors.of(view) for view in held_out])
+        frames = rendered(splat, splat.config, [ViewTensors.of(view) for view in held_out], as_measured=True)
         for i, (view, frame) in enumerate(zip(held_out, frames, strict=True)):
             write_png(folder / "test" / f"ours_{steps}" / "renders" / f"{i:05d}.png", frame)
             write_png(folder / "test" / f"ours_{steps}" / "gt" / f"{i:05d}.png", view.image)

@@ -71,7 +71,7 @@ def run(argv: Sequence[str]) -> int:
     views = planned_views(capture, config, args.path, args.frames)
     if video is not None:
         check_one_size(video, views)
-    frames = rendered(splat, config, views)
+    frames = rendered(splat, config, views, as_measured=args.path == "views")
     if args.out is None:
         written = write_video(frames, video)
     else:
@@ -181,14 +181,24 @@ def planned_views(capture: Capture, config: TrainConfig, path: str, frames: int)
 
 
 @torch.no_grad()
-def rendered(splat: Splat, config: TrainConfig, views: Sequence[ViewTensors]) -> Iterator[np.ndarray]:
-    """Render views one by one. uint8 [H, W, 3] each"""
+def rendered(
+    splat: Splat, config: TrainConfig, views: Sequence[ViewTensors], as_measured: bool = False
+) -> Iterator[np.ndarray]:
+    """Render views one by one. uint8 [H, W, 3] each
+
+    Args:
+        splat: what to render.
+        config: how.
+        views: the cameras.
+        as_measured: count Gaussians per pixel, as measurements do, which rounds sums otherwise: only then are the bytes
+            always those that training has left.
+    """
     backend, note = renderer(config.backend)
     if note:
         print(f"note: {note}", file=sys.stderr)
     with reproducible(config.threads):
         for view in tqdm(views, desc="rendering", unit="view", disable=None, leave=False):
-            image = render_view(backend, splat.params, view, config, splat.sh_degree).image
+            image = render_view(backend, splat.params, view, config, splat.sh_degree, counts=as_measured).image
             yield (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
 
 

@@ -166,6 +166,7 @@ def open_capture(splat: Splat, options: CaptureOptions) -> tuple[Capture, TrainC
             progress=progress,
             source=record.source if options.capture is None else "auto",
             images=options.images or record.images,
+            resize=config.resize,
             seed=config.seed,
         )
     return capture, config

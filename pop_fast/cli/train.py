@@ -260,6 +260,7 @@ def open_capture(config: TrainConfig, options: Any) -> Capture:
             progress=progress,
             source=options.source,
             images=options.images,
+            resize=config.resize,
             sfm=True,
             seed=config.seed,
         )

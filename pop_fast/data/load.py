@@ -36,6 +36,7 @@ def load_capture(
     *,
     source: Source = "auto",
     images: str | None = None,
+    resize: Literal["area", "bicubic"] = "area",
     sfm: bool = False,
     points: int = 30_000,
     seed: int = 0,
@@ -58,6 +59,8 @@ def load_capture(
         source: take this one, or fail.
         images: read photographs from this folder in place of the listed one, shrunk by `factor` unless its name ends in
             `_<factor>`.
+        resize: how they are shrunk: "area" averages, "bicubic" does as Pillow does, and so
+            gsplat's example trainer (A32).
         sfm: for a bare folder of photographs: find the cameras first, and write them to `<path>/sparse/0`.
         points: how many random points to make where the capture brings none.
         seed: of the random points.
@@ -73,7 +76,9 @@ def load_capture(
         raise CaptureError(f"factor is {factor}; it must be a whole number of at least 1")
     if missing not in ("error", "skip"):
         raise CaptureError(f"missing is {missing!r}; it must be 'error' or 'skip'")
-    options = PhotoOptions(int(factor), masks, missing, _background(background), images)
+    if resize not in ("area", "bicubic"):
+        raise CaptureError(f"resize is {resize!r}; it must be 'area' or 'bicubic'")
+    options = PhotoOptions(int(factor), masks, missing, _background(background), images, resize)
     listing, shots, cloud, made_from, notes = _read_listing(root, source, sfm, progress)
     if len(shots) < 2:
         raise CaptureError(f"{listing}: has {len(shots)} view(s) with a known camera; a scene needs two or more")

@@ -21,6 +21,7 @@ import numpy as np
 
 from pop_fast.data.capture import Progress, View
 from pop_fast.data.pinhole import make_camera
+from pop_fast.data.resample import shrink_bicubic
 from pop_fast.data.shots import Shot
 from pop_fast.data.undistort import Undistortion, undistortion
 from pop_fast.errors import CaptureError
@@ -39,6 +40,7 @@ class PhotoOptions:
     missing: Literal["error", "skip"] = "error"
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     images: str | None = None
+    resize: Literal["area", "bicubic"] = "area"
 
 
 @dataclass(frozen=True)
@@ -159,7 +161,7 @@ def _read(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
         mask = _read_mask(photo.mask, (width, height), rectification, size)
     K = rectification.K.copy()
     if size != (width, height):
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        image = _shrunk(image, size, options.resize)
         K[:2] *= np.array([size[0] / width, size[1] / height])[:, None]
     return View(photo.shot.name, image, photo.shot.viewmat, K, mask, photo.shot.split)
 
@@ -196,6 +198,12 @@ def _read_mask(path: Path, stored: tuple[int, int], rectification: Undistortion,
     if not mask.any():
         raise CaptureError(f"{path}: the mask hides the whole photograph; white means keep: invert it or remove it")
     return mask
+
+
+def _shrunk(image: np.ndarray, size: tuple[int, int], resize: Literal["area", "bicubic"]) -> np.ndarray:
+    if resize == "bicubic":
+        return shrink_bicubic(image, size)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 def _resize_mask(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:

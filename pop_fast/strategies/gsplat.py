@@ -20,7 +20,6 @@ class GsplatStrategy(DensityControl):
     """
 
     reset_every: int = _GSPLAT.density.reset_every
-    blur_start_iter: int = _GSPLAT.density.blur_start_iter
     blur_stop_iter: int = _GSPLAT.density.blur_stop_iter
     lambda_pop: float = _GSPLAT.lambda_pop
 

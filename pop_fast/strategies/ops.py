@@ -13,8 +13,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from pop_fast.density import SPLIT_CHILDREN, split_children
+from pop_fast.density import split_children
 from pop_fast.strategies.base import Optimizers, Params, State
+from pop_ref.settings import SPLIT_CHILDREN
 
 
 @torch.no_grad()

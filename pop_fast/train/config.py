@@ -47,6 +47,9 @@ class TrainConfig:
         profile: the rasterizer's constants: "paper", "gsplat_1_5", "gsplat_1_6" or "inria" (that of method "3dgs").
         antialiased: render with opacity compensation (Mip-Splatting) instead of classically.
         factor: photographs are shrunk by it.
+        resize: how, where the capture does not bring them shrunk: "area" averages, "bicubic" does as Pillow does, and
+            so gsplat's example trainer, which also takes the full photographs (--images images) instead of those that
+            Mip-NeRF 360 brings (A32).
         test_every: every n-th view by file name is held out; 0 holds nothing out.
         background: colour behind everything, and behind photographs with alpha. [0, 1]
         normalize: move the capture into gsplat's normalised world.
@@ -86,6 +89,7 @@ class TrainConfig:
     profile: Literal["paper", "gsplat_1_5", "gsplat_1_6", "inria"] = "paper"
     antialiased: bool = False
     factor: int = 1
+    resize: Literal["area", "bicubic"] = "area"
     test_every: int = 8
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     normalize: bool = True
@@ -119,12 +123,12 @@ class TrainConfig:
         if self.given is None:
             return
         promised = self._promised(self.given)
-        for name in defaults(self.given):
-            if getattr(self, name) != getattr(promised, name):
-                raise PopError(
-                    f"{name} is {getattr(self, name)}, but preset {self.given.preset!r} and what was said make it "
-                    f"{getattr(promised, name)}; say it with config.but({name}=...), or replace given=None too"
-                )
+        name = self._departs_from(promised, self.given)
+        if name is not None:
+            raise PopError(
+                f"{name} is {getattr(self, name)}, but preset {self.given.preset!r} and what was said make it "
+                f"{getattr(promised, name)}; say it with config.but({name}=...), or replace given=None too"
+            )
 
     @classmethod
     def of(cls, *, method: str = "pop", preset: str = "paper", **said: Any) -> Self:
@@ -159,6 +163,10 @@ class TrainConfig:
         plain = {name: to_plain(value) for name, value in {**_as_dict(cls()), **defaults(given)}.items()}
         return cls._from_values(laid_over(plain, given), given.method)
 
+    def _departs_from(self, promised: TrainConfig, given: Given) -> str | None:
+        differing = (name for name in defaults(given) if getattr(self, name) != getattr(promised, name))
+        return next(differing, None)
+
     @classmethod
     def _from_values(cls, values: dict[str, Any], method: str) -> Self:
         rest = {name: value for name, value in values.items() if name != "strategy"}
@@ -191,6 +199,9 @@ class TrainConfig:
     def from_json(cls, text: str) -> Self:
         """Read what `to_json` wrote; settings that are absent keep their default.
 
+        The values as they are run are what counts. Where presets had other values when that was written, there is no
+        label (`given` is None).
+
         Raises:
             PopError: not JSON, of an older layout, an unknown field, or a value of the wrong type; names the field.
         """
@@ -211,8 +222,11 @@ class TrainConfig:
         if method not in METHODS:
             raise PopError(f"config.method is {method!r}; it must be one of {', '.join(map(repr, METHODS))}")
         config = cls._from_values(values, method)
-        given = plain.get(_GIVEN)
-        return config if given is None else replace(config, given=Given.from_plain(given, "config.given"))
+        if plain[_GIVEN] is None:
+            return config
+        given = Given.from_plain(plain[_GIVEN], "config.given")
+        follows = config._departs_from(cls._promised(given), given) is None
+        return replace(config, given=given) if follows else config
 
     def binding(self) -> dict[str, Any]:
         """Return the settings that a resumed run must share, flat."""

@@ -1,4 +1,4 @@
-"""What the settings of a run come to on the photographs of a capture, and what is doubtful about that."""
+"""What the settings of a run come to on the photographs of a capture, and what will not do in that."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def facts(config: TrainConfig, views: Sequence[ViewTensors]) -> dict[str, Any]:
     }
 
 
-def doubts(config: TrainConfig, views: Sequence[ViewTensors]) -> Iterator[str]:
+def find_warnings(config: TrainConfig, views: Sequence[ViewTensors]) -> Iterator[str]:
     """Say, in one sentence each, what will not do as it is set, and which option mends it.
 
     Args:

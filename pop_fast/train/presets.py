@@ -19,13 +19,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, Final, Literal, NamedTuple, Self
 
 from pop_fast.errors import PopError
 from pop_fast.strategies import DensityControl, GsplatStrategy, InriaStrategy, POPStrategy
 from pop_fast.train.jsonable import from_plain, to_plain
 from pop_ref.recipes import RECIPES, Recipe
+from pop_ref.settings import DensityConfig, PopTerm
 
 
 class Method(NamedTuple):
@@ -102,6 +103,11 @@ class Given:
             group, dot, rest = name.partition(".")
             known = group == "strategy" or ALIASES.get(group, group) == given.method
             path = f"{given.method}{dot}{rest}" if known else name
+            if isinstance(value, DensityControl) and method_of(value) != given.method:
+                raise PopError(
+                    f"{name} is a {type(value).__name__}, but the method is {given.method!r}; "
+                    f"give a {METHODS[given.method].strategy.__name__}, or method={method_of(value)!r}"
+                )
             plain = to_plain(value)
             whole = isinstance(plain, dict) or is_dataclass(value)
             settings |= {f"{path}.{key}": item for key, item in plain.items()} if whole else {path: plain}
@@ -141,6 +147,7 @@ def defaults(given: Given) -> dict[str, Any]:
     """Return every setting that method, preset and scaler decide, nothing said, by its name in `TrainConfig`."""
     kind, recipe = METHODS[given.method]
     by = given.scaler
+    values = _values_of(recipe)
     strategy = kind().scaled(by)
     if given.scale_lambda_pop:
         strategy = replace(strategy, lambda_pop=strategy.lambda_pop / by)
@@ -151,22 +158,44 @@ def defaults(given: Given) -> dict[str, Any]:
     def scaled(step: int) -> int:
         return max(round(step * by), 1)
 
+    for name in ("max_steps", "sh_interval", "l2_stop_iter"):
+        values[name] = None if values[name] is None else scaled(values[name])
     milestones = tuple(scaled(step) for step in MILESTONES)
+    return {**values, "eval_steps": milestones, "save_steps": milestones, "strategy": strategy}
+
+
+def _values_of(recipe: Recipe) -> dict[str, Any]:
+    """Return what a recipe says besides density control and the POP term, in the names of `TrainConfig`."""
     return {
-        "max_steps": scaled(recipe.max_steps),
-        "sh_interval": scaled(recipe.sh_interval),
-        "eval_steps": milestones,
-        "save_steps": milestones,
+        "max_steps": recipe.max_steps,
+        "sh_interval": recipe.sh_interval,
         "photometric": recipe.pixelwise,
         "photometric_divisor": 1.0 / recipe.pixel_scale,
         "lambda_ssim": recipe.lambda_ssim,
-        "l2_stop_iter": None if recipe.l2_stop_iter is None else scaled(recipe.l2_stop_iter),
+        "l2_stop_iter": recipe.l2_stop_iter,
         "ssim_padding": recipe.padding,
         "d_ssim_halved": recipe.d_ssim_halved,
         "profile": recipe.profile.name,
         "lr": recipe.lr,
-        "strategy": strategy,
     }
+
+
+def options_for(recipe: Recipe) -> list[str]:
+    """Return the options of `pop train` that make it run a recipe: of the method that takes the fewest."""
+    return min((_options(recipe, name) for name in METHODS), key=len)
+
+
+def _options(recipe: Recipe, method: str) -> list[str]:
+    base = METHODS[method].recipe
+    pairs = [(name, _values_of(recipe)[name], value) for name, value in _values_of(base).items()]
+    for kind, ours, theirs in ((DensityConfig, recipe.density, base.density), (PopTerm, recipe, base)):
+        pairs += [(f"{method}.{f.name}", getattr(ours, f.name), getattr(theirs, f.name)) for f in fields(kind)]
+    rates = [(f"lr.{f.name}", getattr(recipe.lr, f.name), getattr(base.lr, f.name)) for f in fields(recipe.lr)]
+    chosen = [] if method == Given.method else ["--method", method]
+    for name, ours, theirs in [*(pair for pair in pairs if pair[0] != "lr"), *rates]:
+        if ours != theirs:
+            chosen += [f"--{name.replace('_', '-')}", f"{ours:g}" if isinstance(ours, float) else str(ours)]
+    return chosen
 
 
 def laid_over(plain: dict[str, Any], given: Given) -> dict[str, Any]:

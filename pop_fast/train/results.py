@@ -1,6 +1,6 @@
 """The folder that a run writes, laid out as gsplat's trainer does.
 
-    cfg.json                        the settings, before `steps_scaler`
+    cfg.json                        the settings as given, and as they are run
     capture.json                    how `pop train` read the capture, and its training frame
     metrics.jsonl                   one record every `log_every` steps and at every change of the population
     ckpts/ckpt_{step}_rank0.pt      checkpoints; `step` counts from 0 here and below, so 30,000 steps end at 29999

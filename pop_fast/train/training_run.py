@@ -33,7 +33,7 @@ from pop_fast.strategies.foreign import ForeignStrategy
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.effects import doubts, facts
+from pop_fast.train.effects import facts, find_warnings
 from pop_fast.train.engines import engine_of
 from pop_fast.train.environment import reproducible, run_facts, versions
 from pop_fast.train.evaluate import evaluate
@@ -141,8 +141,8 @@ class TrainingRun:
             PopError: the folder is in use, a checkpoint does not fit, or a number is no longer finite.
             KeyboardInterrupt: after Ctrl-C or SIGTERM, when a checkpoint has been written; or at once after the second.
         """
-        for doubt in doubts(self.config, self._train):
-            print(f"warning: {doubt}", file=sys.stderr, flush=True)
+        for warning in [] if isinstance(self.strategy, ForeignStrategy) else find_warnings(self.config, self._train):
+            print(f"warning: {warning}", file=sys.stderr, flush=True)
         self._started = time.perf_counter()
         with reproducible(self.config.threads), stop_requests() as stop:
             try:
@@ -294,7 +294,7 @@ class TrainingRun:
         config = self.config
         stats = {
             "step": step,
-            **facts(config, self._train),
+            **self._of_settings(),
             "capture": self._capture.name,
             **population(self._opacities()),
             **self._facts(),
@@ -306,6 +306,11 @@ class TrainingRun:
         stats["seconds_total"] = self._total_seconds
         self._results.write_stats("val", step, stats)
         return stats
+
+    def _of_settings(self) -> dict[str, Any]:
+        if isinstance(self.strategy, ForeignStrategy):
+            return {"method": self.strategy.name}
+        return facts(self.config, self._train)
 
     def _facts(self) -> dict[str, Any]:
         stepper, engine = self.stepper, self._engine

@@ -123,7 +123,7 @@ FORGED: dict[str, tuple[Callable[[Content], Any], tuple[str, ...]]] = {
     "no strategy's state": (to("strategy", {}), ("has no strategy.generator",)),
     "no random numbers": (without("strategy.generator"), ("has no strategy.generator",)),
     "no blur": (without("strategy.blurred"), ("strategy.blurred is missing",)),
-    "a state of other strategies": (to("strategy.score", None), ("strategy.score is unknown",)),
+    "a state of other strategies": (to("strategy.momentum", None), ("strategy.momentum is unknown",)),
     "sums of more rows": (to("strategy.grad2d", lambda g: torch.cat([g, g])), ("strategy.grad2d has shape",)),
     "sums of one row": (to("strategy.count", torch.ones(1)), ("strategy.count has shape [1]",)),
     "sums in double": (to("strategy.grad2d", lambda g: g.double()), ("strategy.grad2d is torch.float64",)),

@@ -178,6 +178,11 @@ def test_a_label_cannot_be_carried_by_settings_that_do_not_follow_it():
     # where it runs and where it writes is not part of a preset
     assert replace(quick, result_dir="x", backend="fast").but(seed=1).result_dir == "x"
     assert TrainConfig().preset is None
+    # what was run is read back also where the preset has other values now
+    written = json.loads(quick.to_json())
+    written["resolved"]["max_steps"] = 2500
+    read = TrainConfig.from_json(json.dumps(written))
+    assert (read.max_steps, read.preset) == (2500, None)
 
 
 def test_the_means_rate_falls_log_linearly_to_a_hundredth():
@@ -251,6 +256,7 @@ def test_bad_settings_are_named(change, message):
         ({"method": "magic"}, r"config\.method is 'magic'; it must be one of 'pop', 'gsplat', '3dgs'"),
         ({"max_stepz": 3}, r"config\.max_stepz is not a setting"),
         ({"pop.lambda": 3}, r"config\.pop\.lambda is not a setting"),
+        ({"strategy": GsplatStrategy()}, "strategy is a GsplatStrategy, but the method is 'pop'"),
         ({"gsplat.reset_every": 3}, r"config\.gsplat\.reset_every is not a setting"),
     ],
 )

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pop_fast.train import TrainConfig, TrainingRun
-from pop_fast.train.effects import doubts, facts
+from pop_fast.train.effects import facts, find_warnings
 from pop_fast.train.views import ViewTensors
 from tests.app.tiny import tiny_capture, tiny_config
 
@@ -19,7 +19,7 @@ def a_view(width: int, height: int, mask: torch.Tensor | None = None) -> ViewTen
 
 
 def said_of(width: int = 980, height: int = 545, **settings: object) -> list[str]:
-    return list(doubts(TrainConfig.of(**settings), [a_view(1600, 1200), a_view(width, height)]))
+    return list(find_warnings(TrainConfig.of(**settings), [a_view(1600, 1200), a_view(width, height)]))
 
 
 def test_the_papers_schedule_on_the_papers_images_raises_no_doubt():
@@ -27,9 +27,9 @@ def test_the_papers_schedule_on_the_papers_images_raises_no_doubt():
 
 
 def test_small_images_need_a_least_number_of_pixels():
-    (doubt,) = said_of(480, 270)
-    assert "theta_blur is 2.6 pixels of a.jpg (480 x 270)" in doubt
-    assert "--pop.blur-min-pixels 10" in doubt
+    (warning,) = said_of(480, 270)
+    assert "theta_blur is 2.6 pixels of a.jpg (480 x 270)" in warning
+    assert "--pop.blur-min-pixels 10" in warning
     # what it names mends it; quick has it; and where nothing grows by blur there is nothing to mend
     assert said_of(480, 270, **{"pop.blur_min_pixels": 10}) == []
     assert said_of(480, 270, preset="quick") == []
@@ -40,22 +40,22 @@ def test_small_images_need_a_least_number_of_pixels():
 def test_a_mask_makes_a_view_as_small_as_what_it_keeps():
     mask = torch.zeros((545, 980), dtype=torch.bool)
     mask[:100] = True
-    (doubt,) = doubts(TrainConfig.of(), [a_view(980, 545, mask)])
-    assert "theta_blur is 2.0 pixels" in doubt
+    (warning,) = find_warnings(TrainConfig.of(), [a_view(980, 545, mask)])
+    assert "theta_blur is 2.0 pixels" in warning
 
 
 @pytest.mark.parametrize("method", ["gsplat", "3dgs"])
 def test_a_short_schedule_has_no_resets_unless_they_are_asked_for(method):
     assert said_of(method=method, preset="quick") == []
-    (doubt,) = said_of(method=method, preset="quick", **{f"{method}.reset_every": 300})
-    assert "reset after step 300 and have 300 steps (3 densification steps) to recover" in doubt
-    assert f"--{method}.reset-every 0" in doubt
+    (warning,) = said_of(method=method, preset="quick", **{f"{method}.reset_every": 300})
+    assert "reset after step 300 and have 300 steps (3 densification steps) to recover" in warning
+    assert f"--{method}.reset-every 0" in warning
     assert said_of(method=method, preset="quick", **{f"{method}.reset_every": 0}) == []
 
 
-def test_a_run_that_ends_soon_after_a_reset_is_doubted():
-    (doubt,) = said_of(method="gsplat", max_steps=6500)
-    assert "reset after step 6,000 and have 500 steps" in doubt
+def test_a_run_that_ends_soon_after_a_reset_is_warned_of():
+    (warning,) = said_of(method="gsplat", max_steps=6500)
+    assert "reset after step 6,000 and have 500 steps" in warning
     assert said_of(method="gsplat", steps_scaler=2.0) == []
 
 

@@ -25,7 +25,7 @@ def records(folder):
     return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
 
-@pytest.fixture(scope="module", params=["pop", "gsplat"])
+@pytest.fixture(scope="module", params=["pop", "gsplat", "3dgs"])
 def finished(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / request.param
     config = tiny_config(folder, method=request.param)
@@ -48,7 +48,7 @@ def test_the_population_changes_when_the_schedule_says(finished):
     changes = [record["step"] for record in events if not record.get("reset") or record["step"] % 4 == 0]
     assert changes == [4, 8, 12, 16, 20]
     resets = [record["step"] for record in events if record.get("reset")]
-    assert resets == ([12] if trainer.config.method == "gsplat" else [])
+    assert resets == ([] if trainer.config.method == "pop" else [12])
     assert sum(record["cloned"] + record["split"] for record in events) > 0
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pop_fast.data.capture import Capture, View
-from pop_fast.strategies import GsplatStrategy, POPStrategy
+from pop_fast.strategies import GsplatStrategy, InriaStrategy, POPStrategy
 from pop_fast.train import LearningRates, TrainConfig, TrainingRun
 from pop_fast.train.records import Stretch
 
@@ -58,6 +58,7 @@ def tiny_config(folder: Path | str, method: str = "pop", **changes: Any) -> Trai
     strategies = {
         "pop": POPStrategy(**steps, **grow, blur_start_iter=8, blur_stop_iter=16, theta_blur=0.02, pop_stop_iter=24),
         "gsplat": GsplatStrategy(**steps, **grow, reset_every=12),
+        "3dgs": InriaStrategy(**steps, **grow, reset_every=12),
     }
     base = replace(
         TrainConfig.of(method=method),

@@ -114,6 +114,12 @@ def test_where_a_mask_leaves_pixels_out_the_share_is_of_those_that_count(reading
     assert blur_set(np.array([2, 3]), 8, 8, 0.25, 2.0, kept_pixels=4).tolist() == [False, True]
 
 
+def test_the_population_can_rest_after_a_reset() -> None:
+    resting = replace(GSPLAT, pause_refine_after_reset=250)
+    skipped = {step for step in STEPS if densifies_at(step, GSPLAT)} - {s for s in STEPS if densifies_at(s, resting)}
+    assert skipped == {reset + rest for reset in range(3000, 15_000, 3000) for rest in (0, 100, 200)}
+
+
 def test_a_count_exactly_at_the_blur_threshold_is_not_blurred() -> None:
     for k in (1, 2, 3, 7, 20):
         assert blur_set(np.array([k, k + 1]), 250 * k, 200, 2e-5).tolist() == [False, True]
