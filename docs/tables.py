@@ -20,7 +20,7 @@ from stages import ROOT, STAGES, files, functions, laws
 
 from pop_fast.train.presets import options_for
 from pop_ref.conformance.abilities import STAGES as LAW_STAGES
-from pop_ref.conformance.mutants import MUTANTS
+from pop_ref.conformance.mutants import MUTANTS, PROGRAM
 from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER
 from pop_ref.notation import SYMBOLS
@@ -160,9 +160,10 @@ def _speed_row(what: str, ms: dict[str, float]) -> list[str]:
 
 def kit() -> str:
     """Say how much the kit holds."""
+    where = f"[{MUTANT_LIST.name}]({MUTANT_LIST.relative_to(ROOT).as_posix()})"
     return (
-        f"{len(every_law())} laws in {len(LAW_STAGES)} stages; {len(MUTANTS)} mutants, every one of them killed by a "
-        f"named law within the `ci` profile: [{MUTANT_LIST.name}]({MUTANT_LIST.relative_to(ROOT).as_posix()})."
+        f"{len(every_law())} laws in {len(LAW_STAGES)} stages; {len(MUTANTS)} mutants of the oracle and {len(PROGRAM)} "
+        f"of the program that trains, every one of them killed by a named law within the `ci` profile: {where}."
     )
 
 
@@ -173,22 +174,24 @@ def mutants() -> str:
         [
             m.name.replace("_", " "),
             m.story.replace("|", "\\|"),
-            f"`{m.file}`",
+            f"`{m.package}/{m.file}`",
             laws[m.law].stage,
             m.law.partition(":")[2].replace("_", " "),
         ]
-        for m in MUTANTS
+        for m in (*MUTANTS, *PROGRAM)
     ]
-    return MUTANT_HEAD.format(n=len(MUTANTS)) + _table(["mutant", "what happened", "file", "stage", "killed by"], rows)
+    head = MUTANT_HEAD.format(n=len(MUTANTS), programs=len(PROGRAM))
+    return head + _table(["mutant", "what happened", "file", "stage", "killed by"], rows)
 
 
 MUTANT_HEAD = """# Mutants
 
 Made by `python docs/tables.py --write`; a test holds it to the code.
 
-{n} copies of the oracle, each with one line broken as somebody once broke it. A kit that lets one live is not worth
-its time, so for each a law is named that breaks on it within the `ci` profile; `tests/meta/test_mutants.py` tries them
-all. `python -m pop_ref.conformance.mutants` puts them on trial again, `--every` lists all laws that notice.
+{n} copies of the oracle and {programs} of the program that trains, each with one line broken as somebody once broke it.
+A kit that lets one live is not worth its time, so for each a law is named that breaks on it within the `ci` profile;
+`tests/meta/test_mutants.py` tries them all. `python -m pop_ref.conformance.mutants` puts them on trial again, `--every`
+lists all laws that notice.
 
 """
 

@@ -14,7 +14,7 @@ from pop_ref.conformance.plugin import parametrize_backends
 def judge_own_backends(metafunc: pytest.Metafunc) -> None:
     """Run a law over the oracle and `pop_fast`, in torch and, where a compiled stage is in it, in C++, too.
 
-    Every other stage is the same code there, so that its laws have nothing to judge.
+    What trains counts among those; every other stage is the same code there, so that its laws have nothing to judge.
     """
     stated = getattr(metafunc.function, "law", None)
     compiled: list[Any] = [shipped_or_absent(name) for name in ("compiled64", "compiled32")]

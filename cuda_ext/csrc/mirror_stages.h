@@ -33,6 +33,12 @@ Camera<Real> pose(const Arguments<Real>& a, const Real* viewmat) {
     return camera_of(a, viewmat, K);
 }
 
+// a number that the kernels hold in double whatever Real is: given as what Real keeps of it, and the rest
+template <class Real>
+double in_two(const Arguments<Real>& a, int k) {
+    return double(a.numbers[2 * k]) + double(a.numbers[2 * k + 1]);
+}
+
 // a row of a vectorised stage
 #define POP_ROWS(name, ...)                                               \
     {                                                                     \
@@ -144,8 +150,8 @@ const Entry<Real>* stage_table() {
         POP_ROWS("pop_loss_vjp",
                  a.out[0][i] = pop_loss_vjp_one(a.ids[0][i] != 0 ? PopSide::important : PopSide::other, a.integers[2],
                                                 a.integers[3] - a.integers[2], a.numbers[0])),
-        POP_ROWS("adam_step", const AdamStep<Real> step = adam_step_at<Real>(a.integers[2], a.numbers[0], a.numbers[1],
-                                                                             a.numbers[2], a.numbers[3]);
+        POP_ROWS("adam_step", const AdamStep<Real> step = adam_step_at<Real>(a.integers[2], in_two(a, 0), in_two(a, 1),
+                                                                             in_two(a, 2), in_two(a, 3));
                  a.out[0][i] = a.in[0][i]; a.out[1][i] = a.in[1][i]; a.out[2][i] = a.in[2][i];
                  adam_one(a.out[0][i], a.out[1][i], a.out[2][i], a.in[3][i], step)),
         POP_ROWS("split_rows", put(a.out[0], i, split_one(vec3(a.in[0], i), vec4(a.in[1], i), vec3(a.in[2], i),

@@ -33,6 +33,7 @@ GRADIENTS: Final = "gradients"
 DOMINANCE: Final = "dominance"
 ANTIALIASING: Final = "antialiased mode"
 DOUBLE: Final = "double precision"
+INSTRUMENTS: Final = "dominance and counts that can be asked for"
 ROWWISE: Final = "rows computed one by one"
 
 # these follow from the constants that are implemented

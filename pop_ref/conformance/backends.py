@@ -73,7 +73,7 @@ def shipped(name: str) -> Any:
     if name not in (*SHIPPED, *ELSEWHERE):
         raise ValueError(f"backend {name!r} is unknown; use one of {', '.join((*SHIPPED, *ELSEWHERE))}")
     try:
-        return program(name, "pop_fast", "fast") if name.startswith("fast") else _elsewhere(name)
+        return program(name, "pop_fast", "fast", _dtype(name)) if name.startswith("fast") else _elsewhere(name)
     except ModuleNotFoundError as error:
         raise Unavailable(f"{name} needs {error.name}, which is not installed") from error
 
@@ -84,7 +84,7 @@ def _elsewhere(name: str) -> Any:
         reason = importlib.import_module("pop_fast.compiled").why_not()
         if reason is not None:
             raise Unavailable(reason)
-        return program(name, "pop_fast", "compiled")
+        return program(name, "pop_fast", "compiled", _dtype(name))
     if name.startswith("mirror"):
         compiler = importlib.import_module("cuda_ext.compiler")
         if compiler.find_compiler() is None:
@@ -96,7 +96,7 @@ def _elsewhere(name: str) -> Any:
             raise Unavailable(reason)
         return adapter_for("cuda_ext.ops:rasterization", name, None, "float32", "cuda")
     if name.startswith("gsplat-torch"):
-        return importlib.import_module(f"{kit}.gsplat_adapter").gsplat_torch(name, f"float{name[-2:]}")
+        return importlib.import_module(f"{kit}.gsplat_adapter").gsplat_torch(name, _dtype(name))
     # the packages first: what is not installed cannot run anywhere
     importlib.import_module("gsplat" if name == "gsplat" else name.replace("-", "_"))
     if not importlib.import_module("torch").cuda.is_available():
@@ -107,20 +107,25 @@ def _elsewhere(name: str) -> Any:
     return importlib.import_module(f"{kit}.inria_adapter").inria(name)
 
 
-def program(name: str, package: str, backend: str) -> Any:
+def _dtype(name: str) -> str:
+    return f"float{name[-2:]}"
+
+
+def program(name: str, package: str, backend: str, dtype: str) -> Any:
     """Return the adapter of a CPU backend of this program, or of a copy of it: what renders, and what trains with it.
 
     Args:
-        name: how reports call it; it ends in 64 or 32.
+        name: how reports call it.
         package: "pop_fast", or a copy's name.
         backend: of its `rasterization`: "fast", or "compiled", whose own stages stand in the package of that name.
+        dtype: "float64" or "float32".
     """
     from pop_ref.conformance.torch_adapter import TorchAdapter
     from pop_ref.conformance.torch_training import training_stages
 
     rasterization = partial(function_named(f"{package}.rasterization:rasterization"), backend=backend)
     stages = package if backend == "fast" else f"{package}.{backend}"
-    return TorchAdapter(name, rasterization, stages, f"float{name[-2:]}", stages=training_stages(package))
+    return TorchAdapter(name, rasterization, stages, dtype, stages=training_stages(package))
 
 
 class Absent:

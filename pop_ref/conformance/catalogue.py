@@ -31,6 +31,13 @@ name. A failing law prints the first stage, Gaussian, pixel or gradient that dif
 nearest decision with its margin, and a scene to paste, which is also saved as npz (`--failures DIR`;
 `scene_files.load_scene` reads it). `--scorecard card.html`, or `.json`, sums up by stage.
 
+What is drawn where nothing but an image is asked for may be other code than what also counts. A rasterizer with the
+arguments `dominance` and `counts` is judged as training asks it, and a law holds every choice of the two together.
+
+Density control and Adam are judged as what trains: `torch_training.training_stages` makes stage functions of a
+trainer's strategy, row operations and optimizers, and `TorchAdapter(stages=...)` takes any such functions, on tensors
+under the oracle's names; those of another engine are one more entry of `backends.py`.
+
 An adapter defines what there is, under the oracle's names, on arrays. With `composite` alone the oracle projects and
 lists the splats of whole scenes; a stage function such as `project_means` is judged by its own laws.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -166,6 +167,30 @@ def pop_loss_vjp(m: Mirror, opacities: Any, mask: Any, v_loss: float) -> Any:
     return m.call("pop_loss_vjp", n, [], [(n,)], [], [mask], (0, 0, n_important, n), (v_loss,))[0]
 
 
+def adam_step(m: Mirror, params: Any, grads: Any, first: Any, second: Any, step: int, lr: Any) -> Any:
+    # betas and eps are those of the fused step
+    settings = importlib.import_module("cuda_ext.train_settings").StepSettings
+    moved: tuple[dict[str, Any], ...] = (dict(params), dict(first), dict(second))
+    for name, g in grads.items():
+        numbers = [lr[name], *settings.betas, settings.eps]
+        kept = [float(m.dtype(number)) for number in numbers]
+        halves = [half for number, near in zip(numbers, kept, strict=True) for half in (near, number - near)]
+        rows = [params[name], first[name], second[name], g]
+        found = m.call("adam_step", g.size, rows, [g.shape] * 3, integers=(0, 0, step), numbers=tuple(halves))
+        for part, value in zip(moved, found, strict=True):
+            part[name] = value
+    return moved
+
+
+def adam_steps(m: Mirror, params: Any, grads: Any, lr: Any) -> Any:
+    first, second = ({name: np.zeros_like(array) for name, array in params.items()} for _ in range(2))
+    for step, given in enumerate(grads, start=1):
+        # a row that nothing reaches takes a step all the same, by a gradient of zero
+        whole = {name: given.get(name, np.zeros_like(array)) for name, array in params.items()}
+        params, first, second = adam_step(m, params, whole, first, second, step, lr)
+    return params, first, second
+
+
 STAGES: dict[str, Callable[..., Any]] = {
     "scales_from_log_scales": _rowwise("scales_from_log_scales", [(3,)]),
     "scales_from_log_scales_vjp": _rowwise("scales_from_log_scales_vjp", [(3,)]),
@@ -215,5 +240,7 @@ STAGES |= {
         ssim,
         ssim_vjp,
         pop_loss_vjp,
+        adam_step,
+        adam_steps,
     )
 }

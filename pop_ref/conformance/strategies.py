@@ -212,6 +212,24 @@ def scenes(
     return Scene(pack(chosen, camera), camera, draw(backgrounds()), profile, tile_size)
 
 
+def wide_scene(seed: int) -> Scene:
+    """Return a scene of 24 long Gaussians over many tiles, of which most meet no more than a corner of each splat.
+
+    They are as long as conics can be that single precision resolves.
+    """
+    rng = np.random.default_rng(seed)
+    width, height = int(rng.integers(40, 97)), int(rng.integers(24, 65))
+    camera = Camera(np.eye(4), np.array([[32.0, 0, 0.5 * width], [0, 32.0, 0.5 * height], [0, 0, 1]]), width, height)
+
+    def long_one() -> Record:
+        size = (*rng.choice([2.0, 4.0, 6.0], 1), *rng.choice([0.75, 1.0, 1.5], 2))
+        at = {"x": rng.uniform(0.0, width), "y": rng.uniform(0.0, height), "depth": rng.uniform(1.0, 8.0)}
+        colour = tuple(rng.integers(-4, 9, 3) / 4.0)
+        return Record(**at, size=size, quat=tuple(rng.normal(size=4)), opacity=rng.uniform(0.1, 1.0), sh=(colour,))
+
+    return Scene(pack([long_one() for _ in range(24)], camera), camera, (0.25, 0.5, 0.75))
+
+
 @functools.cache
 def faint_opacities() -> st.SearchStrategy[float]:
     """Draw opacities so low that six Gaussians never reach the transmittance stop: 0.75^6 > 1e-4."""

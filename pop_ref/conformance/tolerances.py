@@ -129,6 +129,8 @@ TABLE: Final[dict[str, Tolerance]] = {
     "gradients.background": Tolerance(units=200, worst=22),
     "gradients.color": Tolerance(units=2, worst=0.22),
     "gradients.difference": Tolerance(units=0.08, worst=0.0078),
+    "gradients.instruments": Tolerance(units=50, worst=4.9),
+    "gradients.instruments.image": Tolerance(units=50, worst=4.9),
     "gradients.radial": Tolerance(units=0.0002, worst=2.4e-05),
     "gradients.rigid": Tolerance(units=0.003, worst=0.00027),
     "gradients.sum.background": Tolerance(units=0.4, worst=0.049),

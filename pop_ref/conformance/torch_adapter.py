@@ -5,6 +5,7 @@ torch is imported when an adapter is made, never when the kit is.
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import inspect
 import itertools
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 from hypothesis import reject
 
-from pop_ref.conformance.abilities import ANTIALIASING, DOMINANCE, GRADIENTS, RENDER, same_constants
+from pop_ref.conformance.abilities import ANTIALIASING, DOMINANCE, GRADIENTS, INSTRUMENTS, RENDER, same_constants
 from pop_ref.conformance.adapter import Adapter, View, stage_function
 from pop_ref.conformance.cases import BY_NAME, Case
 from pop_ref.conformance.scenes import Scene
@@ -26,6 +27,10 @@ from pop_ref.constants import PAPER, Profile
 
 class TorchAdapter(Adapter):
     """A torch rasterizer and, when a package is named, its stage functions.
+
+    What is not asked for may be drawn by other code. So a program that is asked for dominance and counts by arguments
+    of these names is asked as training asks: for dominance where an image is judged, for nothing where a gradient is.
+    `otherwise` has what the other choices give.
 
     Args:
         name: how reports call it.
@@ -63,13 +68,15 @@ class TorchAdapter(Adapter):
         takes_any = self._takes_profile or (rasterization is None and package is not None)
         self.profile = None if takes_any else profile
         self.able = (ANTIALIASING,) if "rasterize_mode" in parameters else ()
-        self._asked = {name: True for name in ("dominance", "counts") if name in parameters}
+        self._instruments = tuple(name for name in ("dominance", "counts") if name in parameters)
         self._tells_dominance: bool | None = None if rasterization else False
 
     def has(self, need: str) -> bool:
         """Tell what the program offers; asks the rasterizer for its meta once to learn about dominance."""
         if need in (RENDER, GRADIENTS):
             return self._rasterization is not None
+        if need == INSTRUMENTS:
+            return self._rasterization is not None and bool(self._instruments)
         if need == DOMINANCE:
             if self._tells_dominance is None:
                 self._tells_dominance = self._asked_for_dominance()
@@ -139,32 +146,56 @@ class TorchAdapter(Adapter):
         return self._package is not None or self.profile is None or same_constants(profile, self.profile)
 
     def render(self, scene: Scene) -> View:
-        """Draw a scene with one camera."""
+        """Draw a scene with one camera: as POP trains, and the tallies as where they are asked for."""
+        drawn = self._drawn(scene, dominance=True, counts=False)
+        if "counts" not in self._instruments:
+            return drawn
+        counted = self._drawn(scene, dominance=True, counts=True)
+        return dataclasses.replace(drawn, n_blended=counted.n_blended, n_traversed=counted.n_traversed)
+
+    def otherwise(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, tuple[View, dict[str, np.ndarray]]]:
+        """Return, by what is asked for, the render and the gradients of every choice; the first is to ask for nothing.
+
+        Args:
+            scene: to be drawn.
+            v_image, v_T_final: cotangents.
+        """
+        found = {}
+        for asked in ("nothing", "dominance", "dominance and counts"):
+            chosen = {"dominance": "dominance" in asked, "counts": "counts" in asked}
+            view = self._drawn(scene, **chosen)
+            found[asked] = (view, self._pulled(scene, v_image, v_T_final, **chosen))
+        return found
+
+    def _drawn(self, scene: Scene, dominance: bool, counts: bool) -> View:
         leaves = self._leaves(scene, grad=False)
-        image, alphas, meta = self._call(scene, leaves, **self._asked)
-        H, W = scene.camera.height, scene.camera.width
-        told = {}
-        for name in ("dominant_ids", "dominant_weights", "n_blended", "n_traversed"):
-            value = meta.get("n_contrib" if name == "n_blended" else name)
-            told[name] = None if value is None else self._array(value).reshape(H, W)
-        counts = meta.get("dominant_counts")
-        N = len(scene.gaussians)
+        image, alphas, meta = self._call(scene, leaves, dominance, counts)
+        H, W, N = scene.camera.height, scene.camera.width, len(scene.gaussians)
         T_final = meta.get("final_T")
+        told: dict[str, Any] = {}
+        # reading what was not asked for may draw anew
+        if dominance or "dominance" not in self._instruments:
+            told |= {name: (meta.get(name), (H, W)) for name in ("dominant_ids", "dominant_weights")}
+            told["dominant_counts"] = (meta.get("dominant_counts"), (N,))
+        if counts or "counts" not in self._instruments:
+            told |= {"n_blended": (meta.get("n_contrib"), (H, W)), "n_traversed": (meta.get("n_traversed"), (H, W))}
+        shapes = {"radii": (N, 2), "means2d": (N, 2), "depths": (N,), "conics": (N, 3)}
+        told |= {name: (meta.get(name), shape) for name, shape in shapes.items()}
         return View(
             image=self._array(image).reshape(H, W, -1),
             T_final=self._array(T_final if T_final is not None else 1.0 - alphas).reshape(H, W),
-            dominant_counts=None if counts is None else self._array(counts).reshape(N),
-            radii=self._array(meta["radii"]).reshape(N, 2) if "radii" in meta else None,
-            means2d=self._array(meta["means2d"]).reshape(N, 2) if "means2d" in meta else None,
-            depths=self._array(meta["depths"]).reshape(N) if "depths" in meta else None,
-            conics=self._array(meta["conics"]).reshape(N, 3) if "conics" in meta else None,
-            **told,
+            **{name: None if x is None else self._array(x).reshape(shape) for name, (x, shape) in told.items()},
         )
 
     def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
         """Return autograd's cotangents; those of the screen means when the meta keeps them."""
+        return self._pulled(scene, v_image, v_T_final, dominance=False, counts=False)
+
+    def _pulled(
+        self, scene: Scene, v_image: Any, v_T_final: Any, dominance: bool, counts: bool
+    ) -> dict[str, np.ndarray]:
         leaves = self._leaves(scene, grad=True)
-        image, alphas, meta = self._call(scene, leaves, absgrad=True)
+        image, alphas, meta = self._call(scene, leaves, dominance, counts, absgrad=True)
         means2d = meta.get("means2d")
         if means2d is not None and means2d.requires_grad:
             means2d.retain_grad()
@@ -195,11 +226,14 @@ class TorchAdapter(Adapter):
         }
         return {name: self._tensor(value).requires_grad_(grad) for name, value in named.items()}
 
-    def _call(self, scene: Scene, leaves: dict[str, Any], **more: Any) -> Any:
+    def _call(self, scene: Scene, leaves: dict[str, Any], dominance: bool, counts: bool, **more: Any) -> Any:
         if self._rasterization is None:
             raise LookupError(f"{self.name} has no rasterization function")
         n_bands = round(np.sqrt(scene.gaussians.sh.shape[1])) - 1
-        options: dict[str, Any] = {"profile": scene.profile, **more} if self._takes_profile else more
+        asked = {"dominance": dominance, "counts": counts}
+        options: dict[str, Any] = {**more, **{name: asked[name] for name in self._instruments}}
+        if self._takes_profile:
+            options["profile"] = scene.profile
         if scene.antialiased:
             options = {"rasterize_mode": "antialiased", **options}
         return self._rasterization(

@@ -89,13 +89,21 @@ class Trainer:
         self._ops.reset_opacities(params, optimizers, ceiling)
         return self._rows(params, optimizers)
 
-    def blur_set(self, dominant_counts: Any, width: int, height: int, theta_blur: float) -> Any:
+    def blur_set(
+        self,
+        dominant_counts: Any,
+        width: int,
+        height: int,
+        theta_blur: float,
+        min_pixels: float = 0.0,
+        kept_pixels: int | None = None,
+    ) -> Any:
         """See `pop_ref.density.blur_set`."""
         n, nothing = len(dominant_counts), self._torch.zeros((len(dominant_counts), 2))
-        config = DensityConfig(theta_blur=theta_blur, blur_window="own_view")
+        config = DensityConfig(theta_blur=theta_blur, blur_min_pixels=min_pixels, blur_window="own_view")
         empty = Statistics(nothing[:, 0], nothing[:, 0], 0, dominant_counts, nothing[:, 0] > 0)
         unseen = self._torch.zeros(n, dtype=self._torch.bool)
-        return self.accumulate(empty, nothing, unseen, dominant_counts, width, height, config).blurred
+        return self.accumulate(empty, nothing, unseen, dominant_counts, width, height, config, kept_pixels).blurred
 
     def accumulate(
         self,
@@ -124,6 +132,8 @@ class Trainer:
             "height": height,
             **({} if kept_pixels is None else {"kept_pixels": kept_pixels}),
         }
+        if kept_pixels is not None:
+            info["kept_pixels"] = kept_pixels
         params = {"means": self._torch.zeros_like(v_means2d)}
         strategy.step_post_backward(params, {}, state, QUIET_STEP, info)
         return self._statistics(state, statistics.grad_sum)
@@ -226,13 +236,10 @@ class Trainer:
         return leaves, optimizers
 
     def _rows(self, leaves: Mapping[str, Any], optimizers: Mapping[str, Any]) -> Rows:
-        """Return parameters and moments; an optimizer that has none yet will begin with zeros."""
+        """Return parameters and moments."""
 
         def moments(name: str) -> dict[str, Any]:
-            return {
-                key: optimizers[key].state.get(leaf, {}).get(name, self._torch.zeros_like(leaf)).detach()
-                for key, leaf in leaves.items()
-            }
+            return {key: optimizers[key].state[leaf][name].detach() for key, leaf in leaves.items()}
 
         params = {key: leaf.detach() for key, leaf in leaves.items()}
         return Rows(params, moments("exp_avg"), moments("exp_avg_sq"))

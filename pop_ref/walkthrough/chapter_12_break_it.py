@@ -170,14 +170,15 @@ assert broken.sum() < 0.25 * broken.size
 #
 # The table is made from the kit's own list, in which every mutant names its law; a test of the kit runs each pair.
 # `python -m pop_ref.conformance.mutants` does the same on your machine, and with `--every` it finds all laws that
-# notice a mutant, not only the one that is named. Where a mutant comes from is told by its `story`.
+# notice a mutant, not only the one that is named. Where a mutant comes from is told by its `story`. The kit has more
+# of them, copies of the program that trains: `pop_ref.conformance.mutants.PROGRAM`.
 
 # %%
 print(f"{len(MUTANTS)} mutants, {len(every_law())} laws; * was tried above\n")
 for mutant in MUTANTS:
     law = mutant.law.partition(":")[2].replace("_", " ")
     first = f"{'*' if mutant.name in tried else ' '} {mutant.name:35}"
-    print(textwrap.fill(law, 94, initial_indent=first, subsequent_indent=" " * 37))
+    print(first + textwrap.shorten(law, 58, placeholder=" ..."))
 assert {mutant.law for mutant in MUTANTS} <= set(every_law())
 
 # %% [markdown]

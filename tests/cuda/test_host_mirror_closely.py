@@ -173,12 +173,10 @@ def test_adam_moves_every_number_as_the_oracle_does(seed, step):
     rng = np.random.default_rng(seed)
     x, m, g = rng.normal(size=(3, 64))
     v = rng.uniform(0.0, 1.0, 64) ** 4
-    expected = adam_step({"x": x}, {"x": g}, {"x": m}, {"x": v}, step, {"x": 0.05})
-    found = Mirror(FOLDER, np.float64).call(
-        "adam_step", 64, [x, m, v, g], [(64,)] * 3, integers=(0, 0, step), numbers=(0.05, 0.9, 0.999, 1e-15)
-    )
+    given_rows = ({"x": x}, {"x": g}, {"x": m}, {"x": v}, step, {"x": 0.05})
+    found, expected = STAGES["adam_step"](Mirror(FOLDER, np.float64), *given_rows), adam_step(*given_rows)
     for a, e in zip(found, expected, strict=True):
-        np.testing.assert_allclose(a, e["x"], rtol=1e-13, atol=1e-15)
+        np.testing.assert_allclose(a["x"], e["x"], rtol=1e-13, atol=1e-15)
 
 
 @pytest.mark.parametrize("mask", [[True, False, True], [False] * 3, [True] * 3])

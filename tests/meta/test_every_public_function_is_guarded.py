@@ -91,6 +91,7 @@ LAWS = {
     "losses.photometric_pop": "agreement:photometric_pop_vjp_is_the_transpose",
     "losses.photometric_pop_vjp": "agreement:photometric_pop_vjp_is_the_transpose",
     "optimizer.adam_step": "optimizer:adam_follows_the_scalar_recurrence",
+    "optimizer.adam_steps": "optimizer:harmonics_that_wait_do_not_move_and_their_counter_goes_on",
     "optimizer.means_learning_rate": "optimizer:the_position_rate_falls_log_linearly_to_a_hundredth",
     "optimizer.learning_rates": "optimizer:every_other_rate_stays_as_it_is",
     "optimizer.sh_degree_at": "optimizer:a_band_is_added_every_thousand_steps_up_to_the_third",

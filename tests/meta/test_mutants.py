@@ -5,16 +5,24 @@ from __future__ import annotations
 import pytest
 
 from pop_ref.conformance.abilities import STAGES
+from pop_ref.conformance.backends import shipped
 from pop_ref.conformance.catalogue import FILE, catalogue
-from pop_ref.conformance.mutants import MUTANTS
+from pop_ref.conformance.mutants import MUTANTS, PROGRAM
 from pop_ref.conformance.mutants.__main__ import main
 from pop_ref.conformance.mutants.copies import Mutant
-from pop_ref.conformance.mutants.trial import every_law, killed_by, law_named
+from pop_ref.conformance.mutants.trial import every_law, killed_by, law_named, obeys
+
+EVERYONE = (*MUTANTS, *PROGRAM)
 
 
-@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.name)
+@pytest.mark.parametrize("mutant", EVERYONE, ids=lambda mutant: mutant.name)
 def test_the_named_law_kills_the_mutant(mutant: Mutant) -> None:
     assert killed_by(mutant) is not None, f"{mutant.name} survives {mutant.law}"
+
+
+@pytest.mark.parametrize("law", sorted({mutant.law for mutant in PROGRAM}))
+def test_the_program_itself_obeys_what_its_mutants_break(law: str) -> None:
+    assert obeys(law_named(law), shipped("fast32")) is None
 
 
 def test_a_trial_says_who_dies_by_what(capsys: pytest.CaptureFixture[str]) -> None:
@@ -30,12 +38,12 @@ def test_a_trial_says_who_dies_by_what(capsys: pytest.CaptureFixture[str]) -> No
 
 def test_there_are_at_least_twenty_mutants_and_no_two_alike() -> None:
     assert len(MUTANTS) >= 20
-    assert len({mutant.name for mutant in MUTANTS}) == len(MUTANTS)
-    assert len({(mutant.file, mutant.new) for mutant in MUTANTS}) == len(MUTANTS)
+    assert len({mutant.name for mutant in EVERYONE}) == len(EVERYONE)
+    assert len({(mutant.package, mutant.file, mutant.new) for mutant in EVERYONE}) == len(EVERYONE)
 
 
 def test_each_change_is_one_place_of_one_file() -> None:
-    for mutant in MUTANTS:
+    for mutant in EVERYONE:
         assert mutant.broken_source()
         assert law_named(mutant.law).name == mutant.law.partition(":")[2]
 

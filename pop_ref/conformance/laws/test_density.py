@@ -120,10 +120,19 @@ def test_a_new_population_has_zero_moments(backend, n):
         assert_same_bits(f"v[{name}]", rows.v[name], np.zeros_like(array))
 
 
-@law("density", "blur_set", counts=counts, theta=st.sampled_from([1 / 64, 1 / 128, 1 / 32, 0.0]))
-def test_the_blur_set_dominates_strictly_more_than_its_share_of_pixels(backend, counts, theta):
-    blurred = backend.stage("blur_set")(np.array(counts, dtype=np.int64), W, H, theta)
-    assert_same_bits("blurred", blurred, [c > theta * W * H for c in counts])
+@law(
+    "density",
+    "blur_set",
+    counts=counts,
+    theta=st.sampled_from([1 / 64, 1 / 128, 1 / 32, 0.0]),
+    min_pixels=st.sampled_from([0.0, 1.0, 2.5, 3.0, 8.0]),
+    kept=st.sampled_from([None, W * H, 64, 32, 0]),
+)
+def test_the_blur_set_dominates_strictly_more_than_its_share_of_pixels(backend, counts, theta, min_pixels, kept):
+    # a share of the pixels that a mask keeps
+    blurred = backend.stage("blur_set")(np.array(counts, dtype=np.int64), W, H, theta, min_pixels, kept)
+    n_pixels = W * H if kept is None else kept
+    assert_same_bits("blurred", blurred, [c > theta * n_pixels and c > min_pixels for c in counts])
 
 
 views = st.lists(
@@ -131,11 +140,11 @@ views = st.lists(
 )
 
 
-def _window(backend, views, config=POP):
+def _window(backend, views, config=POP, kept=None):
     one = Statistics(np.zeros(1), np.zeros(1, dtype=np.int64), 0, np.zeros(1, dtype=np.int64), np.zeros(1, dtype=bool))
     for x, y, visible, count in views:
         v, shown, won = np.array([[x, y]]), np.array([visible]), np.array([count], dtype=np.int64)
-        found = backend.stage("accumulate")(one, v, shown, won, W, H, config)
+        found = backend.stage("accumulate")(one, v, shown, won, W, H, config, kept)
         one = Statistics(*(getattr(found, f.name) for f in dataclasses.fields(Statistics)))
     return one
 
@@ -162,6 +171,9 @@ def test_blur_flags_combine_over_views_as_the_reading_says(backend, won):
     for reading, blurred in expected.items():
         config = DensityConfig(theta_blur=3.0 / (W * H), blur_window=reading)
         assert_same_bits(reading, _window(backend, views, config).blurred, [blurred])
+        # of half the pixels, twice the share is as many
+        of_half = DensityConfig(theta_blur=6.0 / (W * H), blur_window=reading)
+        assert_same_bits(f"{reading}, masked", _window(backend, views, of_half, W * H // 2).blurred, [blurred])
 
 
 @law(
@@ -199,18 +211,17 @@ def test_the_faint_are_pruned_and_later_the_far_too_large(backend, opacity, scen
         assert_same_bits(f"pruned at step {step}", pruned[clear], expected[clear])
 
 
-@law("density", "densifies_at", "resets_at", step=st.integers(0, 170).map(lambda k: 100 * k), beside=st.integers(-1, 1))
+@law("density", "densifies_at", "resets_at", step=st.integers(0, 170).map(lambda k: 100 * k), later=st.integers(-1, 1))
 def test_the_population_changes_every_hundred_steps_and_opacities_are_reset_where_that_is_asked_for(
-    backend, step, beside
+    backend, step, later
 ):
-    at = max(step + beside, 0)
+    at = max(step + later, 0)
     due = at % 100 == 0 and 500 < at < 15_000
-    for reset_every in (0, 3000):
-        for at_zero in (False, True):
-            config = DensityConfig(reset_every=reset_every, reset_at_zero=at_zero)
-            resets = reset_every > 0 and at % 3000 == 0 and at < 15_000 and (at > 0 or at_zero)
-            assert backend.stage("densifies_at")(at, config) == due
-            assert backend.stage("resets_at")(at, config) == resets
+    for reset_every, at_zero, pause in ((0, False, 0), (0, True, 0), (3000, False, 0), (3000, True, 300)):
+        config = DensityConfig(reset_every=reset_every, reset_at_zero=at_zero, pause_refine_after_reset=pause)
+        resets = reset_every > 0 and at % 3000 == 0 and at < 15_000 and (at > 0 or at_zero)
+        assert backend.stage("densifies_at")(at, config) == (due and at % 3000 >= pause)
+        assert backend.stage("resets_at")(at, config) == resets
 
 
 @law("density", "densify_and_prune", choices=choices, scene_scale=scene_scales)

@@ -57,12 +57,15 @@ def test_the_counts_of_a_render_are_those_of_its_map(backend, scene):
 
 @law("dominance", RENDER, DOMINANCE, scene=scenes())
 def test_a_pixel_without_blended_splats_belongs_to_nobody(backend, scene):
-    view = backend.render(backend.sees(scene))
+    seen, charges = charged(backend, scene)
+    view = backend.render(seen)
     nobody = view.dominant_ids < 0
     assert_same_bits("remaining light of empty pixels", view.T_final[nobody], np.ones(int(np.sum(nobody))))
     assert_same_bits("weights of empty pixels", view.dominant_weights[nobody], np.zeros(int(np.sum(nobody))))
     if view.n_blended is not None:
-        assert_same_bits("empty pixels", view.n_blended == 0, nobody)
+        # what counts may be drawn anew, and decide for itself where rounding does
+        sure = charges.certain
+        assert_same_bits("empty pixels", (view.n_blended == 0)[sure], nobody[sure])
 
 
 @law("dominance", RENDER, DOMINANCE, scene=plain)

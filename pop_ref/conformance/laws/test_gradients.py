@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume
 from hypothesis import strategies as st
 
-from pop_ref.conformance.abilities import DERIVATIVES, DOUBLE, GRADIENTS, RENDER
+from pop_ref.conformance.abilities import DERIVATIVES, DOUBLE, GRADIENTS, INSTRUMENTS, RENDER
 from pop_ref.conformance.charges import charge
 from pop_ref.conformance.compare import assert_close, assert_same_bits
 from pop_ref.conformance.gradient_charges import gradient_charges
@@ -15,8 +15,8 @@ from pop_ref.conformance.law import law
 from pop_ref.conformance.laws.test_compositing import colored
 from pop_ref.conformance.scenes import SH_C0, cotangents
 from pop_ref.conformance.screen_charges import screen_charges
-from pop_ref.conformance.strategies import arrays_of, plain_sizes, scenes
-from pop_ref.conformance.verdicts import charged, require
+from pop_ref.conformance.strategies import arrays_of, plain_sizes, scenes, wide_scene
+from pop_ref.conformance.verdicts import assert_same_image, assert_same_light, assert_seen, charged, require
 
 plain = scenes(anchored=True, size=plain_sizes(), max_gaussians=4)
 banded = scenes(anchored=True, size=plain_sizes(), max_gaussians=3, max_degree=3)
@@ -37,14 +37,18 @@ def _pulled_where_certain(backend, seen, charges):
 
     A gradient and a render may come from different code of the backend; where rounding decides, each decides by itself.
     """
-    v_image, v_T_final = cotangents(seen)
-    v_image, v_T_final = v_image * charges.certain[..., None], v_T_final * charges.certain
+    v_image, v_T_final = _at_certain_pixels(seen, charges)
     g = backend.gradients(seen, v_image, v_T_final)
     if np.all(charges.certain):
         _assert_signal(g)
     else:
         assume(all(np.any(g[name] != 0.0) for name in SIGNAL))
     return g, v_image, v_T_final
+
+
+def _at_certain_pixels(seen, charges):
+    v_image, v_T_final = cotangents(seen)
+    return v_image * charges.certain[..., None], v_T_final * charges.certain
 
 
 def _assert_signal(g):
@@ -227,3 +231,18 @@ def test_gradients_ignore_the_coefficients_of_other_bands(backend, scene, opacit
     assert_same_bits("v_sh of unused bands", one["sh"][:, 1:], np.zeros_like(one["sh"][:, 1:]))
     assert_same_bits("v_sh", one["sh"][:, :1], other["sh"])
     assert_same_bits("v_means", one["means"], other["means"])
+
+
+@law("gradients", RENDER, GRADIENTS, INSTRUMENTS, scene=st.one_of(banded, st.integers(0, 2**16).map(wide_scene)))
+def test_asking_for_dominance_and_counts_changes_neither_image_nor_gradient(backend, scene):
+    # what is asked for nothing, as in training, may choose tiles of its own and leave out what reaches no pixel
+    seen, charges = charged(backend, scene)
+    v_image, v_T_final = _at_certain_pixels(seen, charges)
+    bounds = gradient_charges(seen, charges, v_image, v_T_final)
+    (plain_view, plain_gradients), *others = backend.otherwise(seen, v_image, v_T_final).values()
+    assert_seen(plain_view)
+    for view, gradients in others:
+        assert_same_image("gradients.instruments.image", backend, view.image, plain_view.image, charges)
+        assert_same_light("gradients.instruments.image", backend, view.T_final, plain_view.T_final, charges)
+        for name, value in plain_gradients.items():
+            assert_close("gradients.instruments", gradients[name], value, bounds[name], backend.dtype)

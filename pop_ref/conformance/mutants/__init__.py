@@ -3,8 +3,10 @@
 from pop_ref.conformance.mutants.copies import Mutant, living
 from pop_ref.conformance.mutants.geometry import GEOMETRY
 from pop_ref.conformance.mutants.pixels import PIXELS
+from pop_ref.conformance.mutants.program import PROGRAM
 from pop_ref.conformance.mutants.training import TRAINING
 
+# of the oracle, and of the program that trains
 MUTANTS = (*GEOMETRY, *PIXELS, *TRAINING)
 
-__all__ = ["MUTANTS", "Mutant", "living"]
+__all__ = ["MUTANTS", "PROGRAM", "Mutant", "living"]

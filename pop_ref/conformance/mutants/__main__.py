@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Iterator, Sequence
 
 from pop_ref.conformance.examples import EXAMPLES
-from pop_ref.conformance.mutants import MUTANTS, Mutant
+from pop_ref.conformance.mutants import MUTANTS, PROGRAM, Mutant
 from pop_ref.conformance.mutants.trial import killed_by, killers
 
 
@@ -27,10 +27,11 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--every", action="store_true", help="try every law on every mutant and list those that break")
     parser.add_argument("--examples", type=int, default=EXAMPLES["ci"], help="of each law under --every")
     args = parser.parse_args(words)
-    unknown = set(args.names) - {mutant.name for mutant in MUTANTS}
+    everyone = (*MUTANTS, *PROGRAM)
+    unknown = set(args.names) - {mutant.name for mutant in everyone}
     if unknown:
         parser.error(f"there is no mutant {', '.join(sorted(unknown))}")
-    chosen = [mutant for mutant in MUTANTS if not args.names or mutant.name in args.names]
+    chosen = [mutant for mutant in everyone if not args.names or mutant.name in args.names]
     survived = False
     for line in report(chosen, args.every, args.examples):
         survived |= ": SURVIVES " in line

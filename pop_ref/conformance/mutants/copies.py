@@ -1,4 +1,4 @@
-"""A copy of the oracle with one line changed, importable beside the oracle itself."""
+"""A copy of the oracle, or of the program, with one line changed, importable beside what it is a copy of."""
 
 from __future__ import annotations
 
@@ -12,23 +12,25 @@ from dataclasses import dataclass
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import CodeType, ModuleType
+from typing import Any
 
 from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.backends import program
 
-ORACLE = Path(__file__).parents[2]
-PACKAGE = "pop_ref_mutant"
+ORACLE, PROGRAM = "pop_ref", "pop_fast"
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """One line of the oracle, broken as somebody once broke it.
+    """One line, broken as somebody once broke it.
 
     Attributes:
         name: how tables call it.
         story: what happened, and where.
-        file: the oracle's module.
+        file: the module, as a path in the package.
         old, new: the line before and after; `old` occurs once in the file.
         law: module and name of the law that kills it, as `test_alpha:a_negative_exponent_is_skipped`.
+        package: what is copied: the oracle, or the program, whose copy is judged in float32.
     """
 
     name: str
@@ -37,26 +39,41 @@ class Mutant:
     old: str
     new: str
     law: str
+    package: str = ORACLE
+
+    @property
+    def copy(self) -> str:
+        """Return the name that the copy is imported by."""
+        return f"{self.package}_mutant"
 
     def broken_source(self) -> str:
         """Return the module's text with the line changed."""
-        text = (ORACLE / self.file).read_text(encoding="utf-8")
+        text = (_folder(self.package) / self.file).read_text(encoding="utf-8")
         if text.count(self.old) != 1:
             raise ValueError(f"mutant {self.name}: {self.old!r} occurs {text.count(self.old)} times in {self.file}")
         return text.replace(self.old, self.new)
 
 
 @functools.cache
-def _sound_code(file: str) -> CodeType:
-    return _compiled((ORACLE / file).read_text(encoding="utf-8"), file)
+def _folder(package: str) -> Path:
+    # found without importing it
+    spec = importlib.util.find_spec(package)
+    if spec is None or spec.origin is None:
+        raise ModuleNotFoundError(f"No module named {package!r}", name=package)
+    return Path(spec.origin).parent
 
 
-def _compiled(text: str, file: str) -> CodeType:
-    return compile(text.replace("pop_ref", PACKAGE), f"<{PACKAGE}/{file}>", "exec")
+@functools.cache
+def _sound_code(package: str, file: str) -> CodeType:
+    return _compiled((_folder(package) / file).read_text(encoding="utf-8"), package, file)
+
+
+def _compiled(text: str, package: str, file: str) -> CodeType:
+    return compile(text.replace(package, f"{package}_mutant"), f"<{package}_mutant/{file}>", "exec")
 
 
 class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Imports the oracle's files under another package name, one of them from a mutant."""
+    """Imports a package's files under another package name, one of them from a mutant."""
 
     def __init__(self, mutant: Mutant) -> None:
         self.mutant = mutant
@@ -65,38 +82,54 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         """Answer for the copy's names only."""
-        if fullname == PACKAGE:
+        if fullname == self.mutant.copy:
             return importlib.util.spec_from_loader(fullname, self, is_package=True)
-        if fullname.startswith(f"{PACKAGE}.") and (ORACLE / self._file(fullname)).exists():
-            return importlib.util.spec_from_loader(fullname, self)
-        return None
+        if not fullname.startswith(f"{self.mutant.copy}."):
+            return None
+        source = _folder(self.mutant.package) / self._file(fullname)
+        if not source.exists():
+            return None
+        # what stands next to a module is found from where it was copied
+        spec = ModuleSpec(fullname, self, origin=str(source), is_package=source.name == "__init__.py")
+        spec.has_location = True
+        return spec
 
     def exec_module(self, module: ModuleType) -> None:
         """Run the file's text, the mutant's if it is the file that it breaks; the package itself is empty."""
-        if module.__name__ == PACKAGE:
+        mutant = self.mutant
+        if module.__name__ == mutant.copy:
             return
         file = self._file(module.__name__)
-        code = _compiled(self.mutant.broken_source(), file) if file == self.mutant.file else _sound_code(file)
+        if file == mutant.file:
+            code = _compiled(mutant.broken_source(), mutant.package, file)
+        else:
+            code = _sound_code(mutant.package, file)
         exec(code, module.__dict__)
 
-    @staticmethod
-    def _file(fullname: str) -> str:
-        return fullname.removeprefix(f"{PACKAGE}.").replace(".", "/") + ".py"
+    def _file(self, fullname: str) -> str:
+        stem = fullname.removeprefix(f"{self.mutant.copy}.").replace(".", "/")
+        package = f"{stem}/__init__.py"
+        return package if (_folder(self.mutant.package) / package).exists() else f"{stem}.py"
 
 
 @contextmanager
-def living(mutant: Mutant) -> Iterator[OracleAdapter]:
+def living(mutant: Mutant) -> Iterator[Any]:
     """Bring a mutant to life as a backend for the duration of a with statement; one lives at a time."""
+    # a change that cannot be made must not pass for one that breaks a law
+    mutant.broken_source()
     finder = _Finder(mutant)
-    _forget()
+    _forget(mutant.copy)
     sys.meta_path.insert(0, finder)
     try:
-        yield OracleAdapter(PACKAGE, mutant.name)
+        if mutant.package == ORACLE:
+            yield OracleAdapter(mutant.copy, mutant.name)
+        else:
+            yield program(mutant.name, mutant.copy, "fast", "float32")
     finally:
         sys.meta_path.remove(finder)
-        _forget()
+        _forget(mutant.copy)
 
 
-def _forget() -> None:
-    for name in [n for n in sys.modules if n == PACKAGE or n.startswith(f"{PACKAGE}.")]:
+def _forget(package: str) -> None:
+    for name in [n for n in sys.modules if n == package or n.startswith(f"{package}.")]:
         del sys.modules[name]

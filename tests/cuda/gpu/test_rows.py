@@ -5,6 +5,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import pytest
 import torch
 
@@ -32,8 +35,19 @@ def _moved(value: torch.Tensor, floats: int) -> torch.Tensor:
     return moved.copy_(value)
 
 
-def _moments(scene: TrainingScene, device, degree: int, floats: int = 0):
-    """Take a step on the device and return Adam's first moments, a tenth of the gradients, and the parameters."""
+def _moments(
+    scene: TrainingScene,
+    device,
+    degree: int,
+    floats: int = 0,
+    settings: Mapping[str, Any] | None = None,
+    waits: int = 0,
+    **phase: float,
+):
+    """Take a step on the device and return Adam's first moments, a tenth of the gradients, and the parameters.
+
+    Before it, `waits` steps are taken in which the harmonics beyond the first band take no part.
+    """
     from cuda_ext.resident import ResidentViews
     from cuda_ext.train_settings import Phase, StepSettings
     from cuda_ext.train_step import FusedTrainer
@@ -41,9 +55,41 @@ def _moments(scene: TrainingScene, device, degree: int, floats: int = 0):
     params = {name: _moved(value.to(device), floats) for name, value in scene.params.items()}
     m, v = ({name: _moved(torch.zeros_like(value), floats) for name, value in params.items()} for _ in range(2))
     views = ResidentViews(scene.photographs, scene.viewmats, scene.Ks, None, "valid", device)
-    trainer = FusedTrainer(params, m, v, views, scene.order, StepSettings(LR, 1, means_decay=1.0))
-    trainer.run(1, Phase(degree, False, False, False))
+    chosen = StepSettings(LR, 1 + waits, means_decay=1.0, **(settings or {}))
+    trainer = FusedTrainer(params, m, v, views, scene.order, chosen)
+    if waits:
+        trainer.run(waits, Phase(0, False, False, False, **phase))
+    trainer.run(1 + waits, Phase(degree, False, False, False, **phase))
     return {name: value.cpu() for name, value in m.items()}, {name: value.cpu() for name, value in params.items()}
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3, 1e-6])
+def test_a_first_step_has_the_length_of_the_learning_rate_however_small_the_gradient(gpu, scale):
+    # x - lr g / (|g| + eps): with an eps under the root, or of 1e-8, small gradients take small steps
+    found, after = _moments(_scene(15), gpu, 3, settings={"pixelwise_scale": scale}, lambda_ssim=0.0)
+    smallest = []
+    for name, m in found.items():
+        g, before = m.double() / 0.1, _scene(15).params[name].double()
+        told = g.abs() > 1e-13  # the square of a smaller one is no normal number
+        smallest.append(float(g[told].abs().min()))
+        expected = before - LR[name] * g / (g.abs() + 1e-15)
+        wrong = (after[name].double() - expected).abs() > 1e-6 * before.abs() + 1e-4 * LR[name]
+        assert not bool((wrong & told).any()), f"{name}: {g[wrong & told][:3].tolist()}"
+        # what has no gradient does not move
+        assert torch.equal(after[name][m == 0.0], _scene(15).params[name][m == 0.0])
+    assert min(smallest) < 1e-6 * scale, "no gradient was small"
+
+
+def test_harmonics_that_wait_do_not_move_and_their_counter_goes_on(gpu):
+    # degree 0 for two steps, then degree 3: the first step is corrected as the third update
+    scene = _scene(15)
+    found, after = _moments(scene, gpu, 3, waits=2)
+    g = found["shN"].double() / 0.1
+    told = g.abs() > 1e-13
+    length = (0.1 / (1.0 - 0.9**3)) / ((0.001 / (1.0 - 0.999**3)) ** 0.5)
+    expected = scene.params["shN"].double() - LR["shN"] * length * torch.sign(g)
+    assert bool(told.any())
+    torch.testing.assert_close(after["shN"].double()[told], expected[told], rtol=1e-6, atol=1e-4 * LR["shN"])
 
 
 def _draw(function, scene: TrainingScene, sh: torch.Tensor, device, degree: int):

@@ -1,0 +1,195 @@
+"""Mutants of the program that trains: its row operations, its strategy, its optimizers, and what it draws by when
+nothing but an image is asked for."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from pop_ref.conformance.mutants.copies import PROGRAM as PACKAGE
+from pop_ref.conformance.mutants.copies import Mutant
+
+SPLIT = "test_density:a_split_replaces_each_parent_by_two_smaller_children_drawn_from_it"
+PRUNING = "test_density:survivors_of_pruning_keep_their_order_bits_and_moments"
+CLONES = "test_density:clones_are_exact_copies_at_the_end_with_fresh_moments"
+RESET = "test_density:a_reset_lowers_opacities_to_the_ceiling_and_forgets_their_moments_only"
+AVERAGE = "test_density:the_density_statistic_averages_ndc_gradients_over_the_views_that_showed_the_gaussian"
+FLAGS = "test_density:blur_flags_combine_over_views_as_the_reading_says"
+STEP = "test_density:a_densification_step_is_the_oracles_under_every_reading"
+RESETS = "test_density:the_population_changes_every_hundred_steps_and_opacities_are_reset_where_that_is_asked_for"
+TINY = "test_optimizer:gradients_of_any_smallness_take_whole_steps"
+WAIT = "test_optimizer:harmonics_that_wait_do_not_move_and_their_counter_goes_on"
+RATE = "test_optimizer:the_position_rate_falls_log_linearly_to_a_hundredth"
+ASKED = "test_gradients:asking_for_dominance_and_counts_changes_neither_image_nor_gradient"
+
+_LINES: Final = (
+    (
+        "moments_of_the_next_row",
+        "an edit gathers the moments one row off: every survivor goes on with its neighbour's momentum",
+        "strategies/ops.py",
+        "moments[name] = edited(value, None",
+        "moments[name] = edited(value.roll(1, 0), None",
+        PRUNING,
+    ),
+    (
+        "copies_begin_with_momentum",
+        "appended rows start with moments of their own values instead of zero",
+        "strategies/ops.py",
+        "None if tail is None else torch.zeros_like(tail)",
+        "tail",
+        CLONES,
+    ),
+    (
+        "reset_keeps_moments",
+        "a reset lowers the opacities and keeps their moments, which carry them up again",
+        "strategies/ops.py",
+        "            value.zero_()\n",
+        "            pass\n",
+        RESET,
+    ),
+    (
+        "splits_keep_the_opacity",
+        "the step forgets that revised opacities were asked for: two children are denser than their parent (A26)",
+        "strategies/control.py",
+        "padded, normals(n_splits), self.revised_opacity)",
+        "padded, normals(n_splits))",
+        STEP,
+    ),
+    (
+        "square_pixels_of_ndc",
+        "the screen gradient is scaled by the width along both axes",
+        "strategies/control.py",
+        '0.5 * info["height"] * cameras',
+        '0.5 * info["width"] * cameras',
+        AVERAGE,
+    ),
+    (
+        "every_view_counted",
+        "views that do not show a Gaussian are counted in its average (A23)",
+        "strategies/control.py",
+        'state["count"].add_(visible.sum(0))',
+        'state["count"].add_(len(visible))',
+        AVERAGE,
+    ),
+    (
+        "window_without_end",
+        "the views that showed a Gaussian are counted from the first step on, its gradients from the last change",
+        "strategies/control.py",
+        '        state["count"].zero_()\n',
+        "",
+        STEP,
+    ),
+    (
+        "growth_in_world_units",
+        "the size that decides between clone and split is in world units: scene_scale is forgotten",
+        "strategies/control.py",
+        'grow_masks(statistics, torch.exp(params["scales"]), state["scene_scale"]',
+        'grow_masks(statistics, torch.exp(params["scales"]), 1.0',
+        STEP,
+    ),
+    (
+        "pruning_in_world_units",
+        "the size over which a Gaussian is pruned is in world units: scene_scale is forgotten",
+        "strategies/control.py",
+        'prune_mask(opacities, torch.exp(params["scales"]), state["scene_scale"]',
+        'prune_mask(opacities, torch.exp(params["scales"]), 1.0',
+        STEP,
+    ),
+    (
+        "clones_before_survivors",
+        "who is split is looked up as if the clones stood before the rest",
+        "strategies/control.py",
+        "padded = torch.cat([splits, splits.new_zeros(n_clones)])",
+        "padded = torch.cat([splits.new_zeros(n_clones), splits])",
+        STEP,
+    ),
+    (
+        "reset_at_the_first_step",
+        "opacities are reset at step 0, before anything has been learnt (A25)",
+        "strategies/control.py",
+        "(step > 0 or self.reset_at_zero)",
+        "(step >= 0 or self.reset_at_zero)",
+        RESETS,
+    ),
+    (
+        "blur_flag_of_one_view",
+        "the blur flag of earlier views is forgotten: only the last view counts (A2)",
+        "strategies/control.py",
+        '            blurred |= state["blurred"]\n',
+        "            blurred |= blurred\n",
+        FLAGS,
+    ),
+    (
+        "blur_bound_not_passed_on",
+        "the least number of pixels of a blurred Gaussian is a setting that nothing reads",
+        "strategies/control.py",
+        "self.theta_blur, self.blur_min_pixels, kept)",
+        "self.theta_blur, 0.0, kept)",
+        "test_density:the_blur_set_dominates_strictly_more_than_its_share_of_pixels",
+    ),
+    (
+        "share_of_masked_pixels",
+        "the share of a blurred Gaussian is of all pixels, also of those that a mask leaves out",
+        "strategies/control.py",
+        'kept = info.get("kept_pixels")',
+        "kept = None",
+        FLAGS,
+    ),
+    (
+        "parent_opacity_for_children",
+        "the children's opacity is revised twice",
+        "density.py",
+        "log_left = -0.5 *",
+        "log_left = -0.25 *",
+        SPLIT,
+    ),
+    (
+        "adams_usual_eps",
+        "eps is 1e-8, Adam's usual one: gradients under it take small steps",
+        "train/model.py",
+        "eps=EPS",
+        "eps=1e-8",
+        TINY,
+    ),
+    (
+        "betas_swapped",
+        "the two decays change places",
+        "train/model.py",
+        "betas=BETAS",
+        "betas=(0.999, 0.9)",
+        "test_optimizer:adam_follows_the_scalar_recurrence",
+    ),
+    (
+        "waiting_stops_the_counter",
+        "harmonics that wait do not count their steps, so that their first ones are corrected as if training began",
+        "train/model.py",
+        '.state[param]["step"] += 1',
+        '.state[param]["step"] += 0',
+        WAIT,
+    ),
+    (
+        "rate_in_world_units",
+        "the positions' learning rate is not scaled by the scene",
+        "train/model.py",
+        "means_lr(step, max_steps, lr.means * scene_scale, lr.means_decay)",
+        "means_lr(step, max_steps, lr.means, lr.means_decay)",
+        RATE,
+    ),
+    (
+        "ellipse_misses_its_tile",
+        "the test that leaves tiles out follows the wrong diagonal; counting draws without it",
+        "tiles.py",
+        "torch.maximum(-b * edge_x / c, top)",
+        "torch.maximum(b * edge_x / c, top)",
+        ASKED,
+    ),
+    (
+        "ellipse_of_a_fainter_splat",
+        "tiles are left out where alpha is under ten times the floor; counting draws without it",
+        "tiles.py",
+        "torch.log(shapes[5] / profile.alpha_floor)",
+        "torch.log(0.1 * shapes[5] / profile.alpha_floor)",
+        ASKED,
+    ),
+)
+
+PROGRAM: Final = tuple(Mutant(*line, package=PACKAGE) for line in _LINES)
