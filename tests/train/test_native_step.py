@@ -95,7 +95,7 @@ def test_six_steps_are_torchs(what: str, tmp_path: Path) -> None:
         for key, param in its.params.items():
             update = (param.detach() - start[key]).abs().max() if param.numel() else 0.0
             moved[key] = max(moved[key], float(update))
-            # where a gradient is rounding, Adam turns its sign into a whole step: what nearly all entries do is compared
+            # where a gradient is rounding, Adam makes its sign a whole step: what nearly all entries do is compared
             apart = (mine.params[key].detach() - param.detach()).abs() > 1e-3 * update + 1e-7
             assert not param.numel() or float(apart.float().mean()) < 0.01, key
     # by themselves the bands beyond the first would begin after these steps
