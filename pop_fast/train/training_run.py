@@ -28,7 +28,7 @@ from pop_fast.data.initialize import initialize_params
 from pop_fast.errors import PopError
 from pop_fast.io.ply import save_ply
 from pop_fast.strategies.base import StepEvent, Strategy
-from pop_fast.strategies.control import standard_normals
+from pop_fast.strategies.densify import standard_normals
 from pop_fast.strategies.foreign import ForeignStrategy
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.choose import choose_backend
