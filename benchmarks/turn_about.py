@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 HERE = Path(__file__).resolve().parent
-PACKAGES = ("pop_fast", "pop_ref", "cuda_ext", "cases", "run", "timing")
+PACKAGES = ("pop_fast", "pop_ref", "cuda_ext", *(path.stem for path in HERE.glob("*.py")))
 SAME = 1e-4  # the largest difference of two images, of colours around 1
 
 Times = tuple[float, ...]
@@ -156,7 +156,7 @@ def main() -> None:
                     pair = [checkout.blend(case.name, tile, given.backend) for checkout in (this, other)]
                     timed[f"blend {case.name}, {tile} px"] = compare(*pair, ("forward", "backward"), given.repeats)
         if given.only != "blend":
-            for case in this.run.ITERATION_CASES:
+            for case in this.run.RASTER_CASES:
                 folders = (f"{folder}/{case.name}", f"{folder}/{case.name}-")
                 both = zip((this, other), folders, strict=True)
                 pair = [checkout.step(case.name, where, given.backend) for checkout, where in both]

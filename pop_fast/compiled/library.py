@@ -174,12 +174,13 @@ class Library:
 
 @dataclass(frozen=True)
 class StepperFunctions:
-    """The functions of step.cpp: make a stepper for so many threads, let go of it, take steps, its memory in bytes."""
+    """The functions of a stepper: make one for so many threads, let go of it, take steps, its bytes, its counts."""
 
     open: Callable[[int], int | None]
     close: Callable[[int], None]
     steps: Callable[..., int]
     bytes: Callable[[int], int]
+    counts: Callable[..., None]
 
 
 def stepper_functions(given_bytes: int) -> StepperFunctions:
@@ -201,8 +202,13 @@ def stepper_functions(given_bytes: int) -> StepperFunctions:
     loaded.pop_stepper_close.argtypes, loaded.pop_stepper_close.restype = (_POINTER,), None
     loaded.pop_stepper_steps.argtypes, loaded.pop_stepper_steps.restype = (_POINTER, _POINTER, _WHOLE), _WHOLE
     loaded.pop_stepper_bytes.argtypes, loaded.pop_stepper_bytes.restype = (_POINTER,), _WHOLE
+    loaded.pop_stepper_counts.argtypes, loaded.pop_stepper_counts.restype = (_POINTER, _POINTER), None
     return StepperFunctions(
-        loaded.pop_stepper_open, loaded.pop_stepper_close, loaded.pop_stepper_steps, loaded.pop_stepper_bytes
+        loaded.pop_stepper_open,
+        loaded.pop_stepper_close,
+        loaded.pop_stepper_steps,
+        loaded.pop_stepper_bytes,
+        loaded.pop_stepper_counts,
     )
 
 
@@ -278,7 +284,7 @@ def load_library(path: str) -> ctypes.CDLL:
         OSError: it is missing, does not load, or was not made from the same source as this module.
     """
     loaded = ctypes.CDLL(path)
-    for layout in (Covariances, Projection, Colors, Lists, Blend, Ssim):
+    for layout in (Covariances, Projection, Colors, Lists, Blend, Ssim, Moments):
         size = getattr(loaded, f"pop_{layout.__name__.lower()}_bytes")
         size.restype = _WHOLE
         if size() != ctypes.sizeof(layout):

@@ -26,6 +26,8 @@ LONGEST: Final = 10
 # what the step measures, the first of `StepStats`
 N_VALUES: Final = 5
 PARTS: Final = ("see", "list", "blend", "compare", "gather", "transpose", "update")
+# what a step had to do: `pop::StepCounts` of step.h, where each is explained, in its order
+COUNTS: Final = ("visible", "entries", "walked", "chunks", "pairs", "marked", "reached")
 _POINTER, _WHOLE, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 
 
@@ -206,6 +208,12 @@ class NativeTrainer:
     def bytes(self) -> int:
         """Memory that a step works in, the parameters and photographs not counted."""
         return self._functions.bytes(self._stepper)
+
+    def counts(self) -> dict[str, int]:
+        """Count what the last step had to do, by the names of `COUNTS`; all are 0 before the first."""
+        found = (_WHOLE * len(COUNTS))()
+        self._functions.counts(self._stepper, found)
+        return dict(zip(COUNTS, found, strict=True))
 
     def run(self, until: int, phase: Phase) -> None:
         """Take steps until the counter stands at `until`, all of one phase.

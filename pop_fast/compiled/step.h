@@ -106,6 +106,17 @@ private:
   int64_t size = 0;
 };
 
+// What a step had to do, in the order of `native_step.py`.
+struct StepCounts {
+  int64_t visible;  // Gaussians with an entry
+  int64_t entries;  // of all lists
+  int64_t walked;   // of these, those before the last pixel of the tile had stopped
+  int64_t chunks;   // that these make
+  int64_t pairs;    // of a walked entry and a pixel of a strip in which some pixel had not stopped
+  int64_t marked;   // of a walked entry and such a strip which it may reach by its parabola: blended
+  int64_t reached;  // of these, those where it changed a pixel: transposed
+};
+
 class Stepper : public Plan {
 public:
   explicit Stepper(int64_t threads) : pool(threads), pixels(STEP_TILE) {}
@@ -113,6 +124,8 @@ public:
   int64_t steps(const StepGiven *first, int64_t n);
   bool next(Work &work) override;
   int64_t bytes() const;
+  // of the last step that was taken to its end; none before there is one
+  StepCounts counted() const;
 
 private:
   Pool pool;

@@ -1,0 +1,186 @@
+"""Training steps of POP by every engine, in turns, and where those of the native step go.
+
+All are taken as a user's run takes them, by a `TrainingRun` that asks its stepper for stretches; the POP term,
+dominance and the statistics of density control are on, and the population stays as it is.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from typing import Any
+
+import torch
+from cases import Case, capture_of, gaussians_of
+from timing import median_ratio, turns
+
+import pop_fast.train
+from pop_fast.backends import get_backend
+from pop_fast.data import Capture, load_capture
+from pop_fast.train import TrainConfig
+from pop_fast.train.environment import reproducible
+from pop_fast.train.views import Rendered, ViewTensors, render_view
+
+# makes the run of an engine in a folder
+Maker = Callable[[str, str], Any]
+DEGREE = 3  # of synthetic cases: all bands, as in most of a run
+STEPS, FEW_STEPS = 5, 1  # of a turn; few where a step takes long
+LONG = 100_000  # Gaussians from which on it does
+# ms on two cores, that the native step was built for
+TARGETS = {
+    "270x480-12k": 12.0,
+    "270x480-40k": 20.0,
+    "640x480-100k": 45.0,
+    "1600x1000-300k": 250.0,
+    "fox": 11.0,
+}
+LONE = "native, 1 thread"
+
+
+def engines() -> tuple[str, ...]:
+    """Return what takes steps on a CPU here, slowest first: torch, autograd over compiled stages, the native step."""
+    return ("fast", "compiled", "native") if get_backend("compiled").available() else ("fast",)
+
+
+def run_of_case(case: Case, folder: str, engine: str) -> Any:
+    """Return a training run by an engine whose Gaussians are a case's."""
+    return _with_gaussians(case, _run(capture_of(case), folder, DEGREE, engine=_engine(engine)))
+
+
+def run_of(case: Case, folder: str, backend: str = "fast") -> Any:
+    """Return a training run whose Gaussians are a case's, by what a checkout trains with for a backend's name."""
+    return _with_gaussians(case, _run(capture_of(case), folder, DEGREE, backend=backend))
+
+
+def stepping(training: Any) -> Callable[[], Any]:
+    """Return what takes one step of a run."""
+    # `turn_about` calls this of checkouts too in which a run was called a trainer
+    return getattr(training, "train_step", None) or (lambda: training.take_steps(training.step + 1))
+
+
+def first_view(training: Any, capture: Capture) -> Rendered:
+    """Return the first view of a capture as a run's Gaussians are now."""
+    view = ViewTensors.of(capture.views[0])
+    with torch.no_grad():
+        return render_view(get_backend(training.config.backend), training.params, view, training.config, 0)
+
+
+def take_turn(training: Any, steps: int, threads: int) -> None:
+    """Take steps of a run as its own loop does, with so many threads; 0 leaves their number as it is."""
+    from pop_fast.train.phases import stretch_end
+
+    if threads > 0:
+        torch.set_num_threads(threads)
+    last = training.step + steps
+    while training.step < last:
+        longest = min(training.stepper.longest, last - training.step)
+        training.take_steps(stretch_end(training.config, training.strategy, training.step, longest))
+
+
+def _engine(name: str) -> Any:
+    from pop_fast.train.engines import native_engine, torch_engine
+
+    if name == "native":
+        return native_engine()
+    return torch_engine("compiled" if name == "compiled" else "fast")
+
+
+def _run(capture: Capture, folder: str, degree: int, **by: Any) -> Any:
+    # bands are activated one a step, or never
+    interval = 1 if degree > 0 else 10**9
+    backend = {"backend": by.pop("backend")} if "backend" in by else {}
+    config = TrainConfig(result_dir=folder, sh_interval=interval, log_every=10**9, progress=False, **backend)
+    frozen = replace(config.strategy, refine_start_iter=config.strategy.refine_stop_iter)
+    kind: Any = getattr(pop_fast.train, "TrainingRun", None) or vars(pop_fast.train)["Trainer"]
+    return kind(replace(config, strategy=frozen), capture, **by)
+
+
+def _with_gaussians(case: Case, training: Any) -> Any:
+    """Give a run a case's Gaussians, of which some are opaque and their sizes differ."""
+    scene = gaussians_of(case)
+    with torch.no_grad():
+        training.params["scales"].copy_(scene["scales"].log())
+        training.params["opacities"].copy_(torch.logit(scene["opacities"].clamp(1e-4, 1.0 - 1e-4)))
+    return training
+
+
+def time_case(case: Case, repeats: int) -> dict[str, Any]:
+    """Time steps on a synthetic capture with `case.n` Gaussians."""
+    steps = FEW_STEPS if case.n > LONG else STEPS
+    views = len(capture_of(case).views)
+    found = _time_steps(lambda folder, engine: run_of_case(case, folder, engine), views, steps, repeats)
+    return {**asdict(case), "degree": DEGREE, "target_ms": TARGETS.get(case.name), **found}
+
+
+def capture_runs(path: str, factor: int, degree: int) -> tuple[Capture, Maker]:
+    """Return a real capture, and what makes runs of an engine that start from its sparse points."""
+    capture = load_capture(path, factor=factor)
+    return capture, lambda folder, engine: _run(capture, folder, degree, engine=_engine(engine))
+
+
+def time_capture(path: str, factor: int, degree: int, repeats: int) -> dict[str, Any]:
+    """Time the first steps on a real capture: with colours of degree 0, as a run begins, or with all bands."""
+    capture, make = capture_runs(path, factor, degree)
+    view = capture.views[0]
+    found = _time_steps(make, len(capture.views), STEPS, repeats)
+    size = {"n": found["num_gaussians"], "width": view.width, "height": view.height}
+    return {"name": capture.name, **size, "degree": degree, "target_ms": TARGETS.get(capture.name), **found}
+
+
+def _time_steps(make: Maker, views: int, steps: int, repeats: int) -> dict[str, Any]:
+    """Time turns of some steps by every engine; those of the native step also with one thread."""
+    threads = torch.get_num_threads()
+    with tempfile.TemporaryDirectory() as folder, reproducible(threads):
+        runs = {name: make(f"{folder}/{name}", name) for name in engines()}
+        used = dict.fromkeys(runs, threads)
+        if "native" in runs and threads > 1:
+            runs[LONE], used[LONE] = make(f"{folder}/lone", "native"), 1
+        takes = {name: lambda name=name: take_turn(runs[name], steps, used[name]) for name in runs}
+        # what SSIM needs of a photograph is made at its first visit, so every photograph is visited once before
+        turns(takes, 0, warm_up=math.ceil(views / steps) + 1)
+        taken, parts = _timed_by_part(runs, takes, repeats)
+        torch.set_num_threads(threads)
+        found = {"num_gaussians": len(runs["fast"].params["means"]), "steps_a_turn": steps, "threads": threads}
+        return {**found, **_times(taken, steps, threads), **_native_facts(runs, parts, steps)}
+
+
+def _timed_by_part(
+    runs: dict[str, Any], takes: dict[str, Callable[[], None]], repeats: int
+) -> tuple[dict[str, list[float]], list[dict[str, float]]]:
+    """Time turns, and by part those of the native step, seconds."""
+    parts: list[dict[str, float]] = []
+
+    def by_part(take: Callable[[], None]) -> None:
+        trainer = runs["native"].stepper.fused
+        before = trainer.seconds
+        take()
+        parts.append({part: after - before[part] for part, after in trainer.seconds.items()})
+
+    if "native" in takes:
+        native = takes["native"]
+        takes = {**takes, "native": lambda: by_part(native)}
+    return turns(takes, repeats, warm_up=0), parts
+
+
+def _times(taken: dict[str, list[float]], steps: int, threads: int) -> dict[str, Any]:
+    ms = {
+        name: {"median": 1e3 * statistics.median(times) / steps, "minimum": 1e3 * min(times) / steps}
+        for name, times in taken.items()
+    }
+    pairs = [("compiled", "fast"), ("native", "compiled"), ("native", "fast")]
+    ratios = {f"{a} / {b}": median_ratio(taken[a], taken[b]) for a, b in pairs if a in taken}
+    if LONE in taken:
+        ratios["efficiency"] = median_ratio(taken[LONE], taken["native"]) / threads
+    return {"ms": ms, "ratios": ratios}
+
+
+def _native_facts(runs: dict[str, Any], parts: list[dict[str, float]], steps: int) -> dict[str, Any]:
+    """Return what the native step's parts took, what it had to do in its last step, and what it works in."""
+    if not parts:
+        return {}
+    trainer = runs["native"].stepper.fused
+    ms = {part: 1e3 * statistics.median(turn[part] for turn in parts) / steps for part in parts[0]}
+    return {"parts_ms": ms, "counts": trainer.counts(), "working_mib": trainer.bytes / 2**20}
