@@ -360,7 +360,7 @@ Work Stepper::place_entries() {
 // ---- blend: the picture, and its difference from the photograph
 
 Work Stepper::blend_tiles() {
-  const auto one_tile = blend_tile_function<float>(blend, pixels);
+  const auto one_tile = blend.dominance() ? blend_tile<float, 3, true, true> : blend_tile<float, 3, true, false>;
   return {blend.tiles(), 2, [=](int thread, int64_t first, int64_t last) {
             for (int64_t tile = first; tile < last; tile++) {
               one_tile(blend, pixels, tile, workers[size_t(thread)]->canvas);
@@ -465,7 +465,7 @@ void Stepper::gather_rows(Worker &own, int64_t first, int64_t last) {
 // ---- transpose: back to the entries
 
 Work Stepper::transpose_tiles() {
-  const auto one_tile = transpose_tile_function<float>(blend, pixels);
+  const auto one_tile = transpose_tile<float, 3, true>;
   return {blend.tiles(), 2, [=](int thread, int64_t first, int64_t last) {
             for (int64_t tile = first; tile < last; tile++) {
               one_tile(blend, pixels, tile, workers[size_t(thread)]->transpose);
