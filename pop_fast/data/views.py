@@ -141,9 +141,7 @@ def _rectifier() -> Any:
 
     def rectify(camera: Any, width: int, height: int) -> Undistortion:
         with one_at_a_time:
-            return remembered(
-                camera.model_name, tuple(camera.params), (camera.width, camera.height), (width, height)
-            )
+            return remembered(camera.model_name, tuple(camera.params), (camera.width, camera.height), (width, height))
 
     return rectify
 
