@@ -13,6 +13,8 @@ from typing import Any
 
 import torch
 
+from pop_fast.machine import machine_name
+
 _OMP_PAUSE_SOFT = 1
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of glibc's mallopt
 _LARGEST_INT = 2**31 - 1
@@ -99,16 +101,6 @@ def peak_memory_bytes() -> int:
         return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak
-
-
-def machine_name() -> str:
-    """Return the processor's name."""
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
 
 
 def run_facts(backend: str, train_seconds: float, total_seconds: float) -> dict[str, Any]:
