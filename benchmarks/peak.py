@@ -18,7 +18,7 @@ from cuda_ext.compiler import find_compiler, no_compiler
 LANES = 16  # floats of a vector
 SOURCE = Path(__file__).resolve().with_suffix(".cpp")
 ROUNDS, REPEATS = 2_000_000, 9
-# bytes of the arrays that a bandwidth is measured on, and how many are moved at least, so that starting threads is little
+# bytes of the arrays that a bandwidth is measured on, and how many are moved at least: starting threads is little of it
 SMALLEST, LARGEST, MOVED = 1 << 17, 1 << 28, 1 << 28
 
 
@@ -43,8 +43,12 @@ def _bandwidth(bits: int, threads: int) -> float:
     library, size = _library(), (1 << bits) // 4 // threads
     rounds = max(1, MOVED // (8 * size * threads))
     shares = [np.zeros(size, np.float32) for _ in range(threads)]
-    return threads * 8 * size * rounds / _best(
-        [lambda share=share: library.passes(share.ctypes.data, size, rounds) for share in shares]
+    return (
+        threads
+        * 8
+        * size
+        * rounds
+        / _best([lambda share=share: library.passes(share.ctypes.data, size, rounds) for share in shares])
     )
 
 
