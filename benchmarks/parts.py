@@ -27,8 +27,8 @@ TILE: Final = 16
 EXPONENT, POWER, TAKE = 2, 9, 8
 # whether T went down, sum of weights, three colours; comparison, two selections and the entry's number of dominance
 BLENDED, DOMINANCE = 5, 4
-# q from v and what is behind (7), three colours, what is behind, dx, G, the ceiling, six moments and G dx
-ENTRY_SUMS = 20
+# q from v and what is behind (4), three colours, what is behind, dx, G, the ceiling, G dx, six moments
+ENTRY_SUMS = 18
 # of a chunk: its coefficients in double, two vectors each, and rounded; on each row, its parabolas (3) and their maxima
 GATHERED, PARABOLAS, MAXIMA = 42, 3 * TILE, 16 * TILE
 # nine sums of sixteen entries by a tree: 15 additions and 30 shuffles each

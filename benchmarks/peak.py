@@ -18,7 +18,7 @@ from cuda_ext.compiler import find_compiler, no_compiler
 LANES = 16  # floats of a vector
 SOURCE = Path(__file__).resolve().with_suffix(".cpp")
 ROUNDS, REPEATS = 2_000_000, 9
-# bytes of the arrays that a bandwidth is measured on, and of all that is moved: starting threads must be little of it
+# bytes of the arrays that a bandwidth is measured on, and how many are moved at least: starting threads is little of it
 SMALLEST, LARGEST, MOVED = 1 << 17, 1 << 28, 1 << 28
 
 

@@ -134,24 +134,31 @@ def broken_laws() -> str:
 
 
 def speed() -> str:
-    """Make the table of CPU times, each pair of them taken in turns in one process."""
+    """Make the tables of CPU times, those of a row taken in turns in one process: training steps, renders, blends."""
     timed = json.loads(CPU_TIMES.read_text(encoding="utf-8"))
+    machine, made = timed["machine"], []
+    if "steps" in timed:
+        make = runpy.run_path(str(ROOT / "benchmarks" / "step_tables.py"))["steps"]
+        made.append(str(make(timed)))
     rows = []
-    for case in timed["iteration"]:
-        size = f"{case['width']}x{case['height']}, {case['n']:,} Gaussians"
-        rows.append(_speed_row(f"training step of POP, {size}", case["iteration_ms"]))
+    # results of before the native step have training steps by backend
+    for case in timed.get("iteration", ()):
+        rows.append(_speed_row(f"training step of POP, {_size(case)}", case["iteration_ms"]))
     for case in timed["raster"]:
-        size = f"{case['width']}x{case['height']}, {case['n']:,} Gaussians"
-        rows.append(_speed_row(f"render, {size}", case["forward_ms"]))
-        rows.append(_speed_row(f"render and backward, {size}", case["forward_backward_ms"]))
+        rows.append(_speed_row(f"render, {_size(case)}", case["forward_ms"]))
+        rows.append(_speed_row(f"render and backward, {_size(case)}", case["forward_backward_ms"]))
         for blend in case["blend"]:
             ns = {name: f"{value:.1f} ns a pair" for name, value in blend["forward_backward_ns_per_pair"].items()}
             ratio = blend["forward_backward_ms"]["compiled / fast"]
-            what = f"blend and backward alone, {size}, {blend['tile']} px tiles"
+            what = f"blend and backward alone, {_size(case)}, {blend['tile']} px tiles"
             rows.append([what, ns["fast"], ns["compiled"], f"{ratio:.2f}"])
-    machine = timed["machine"]
-    table = _table(["", "`fast`", "`compiled`", "ratio of times"], rows)
-    return f"{table}\n\n{machine['cpu']}, {machine['threads']} threads, torch {machine['torch']}."
+    made.append(_table(["", "`fast`", "`compiled`", "ratio of times"], rows))
+    made.append(f"{machine['cpu']}, {machine['threads']} threads, torch {machine['torch']}.")
+    return "\n\n".join(made)
+
+
+def _size(case: dict[str, Any]) -> str:
+    return f"{case['width']}x{case['height']}, {case['n']:,} Gaussians"
 
 
 def _speed_row(what: str, ms: dict[str, float]) -> list[str]:

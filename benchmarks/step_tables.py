@@ -1,0 +1,189 @@
+"""The tables of a training step in NOTES.md, made from `results/cpu.json`.
+
+    python benchmarks/step_tables.py            print them
+    python benchmarks/step_tables.py --write    put them into NOTES.md, between their marks
+    python benchmarks/step_tables.py --check    exit with 1 when NOTES.md holds others
+
+`docs/tables.py` puts the first of them into README.md.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+NOTES = Path(__file__).resolve().parent / "NOTES.md"
+RESULTS = Path(__file__).resolve().parent / "results" / "cpu.json"
+NOT_YET = "Not measured yet: run `python benchmarks/run.py`."
+BOUNDS = {"operations": "o", "bytes": "b"}
+
+
+def title(case: Mapping[str, Any]) -> str:
+    """Say what is trained."""
+    real = "" if case["name"][0].isdigit() else f"{case['name']}, bands to {case['degree']}, "
+    return f"{real}{case['width']}x{case['height']}, {case['num_gaussians']:,} Gaussians"
+
+
+def steps(timed: Mapping[str, Any]) -> str:
+    """Make the table of times of a step by every engine."""
+    head = ["training step of POP", "`fast`", "`compiled`, autograd", "`compiled`, native", "native / autograd"]
+    rows = []
+    for case in timed["steps"]["cases"]:
+        ms, ratios = case["ms"], case["ratios"]
+        least = [f"{ms[name]['median']:.0f} ms" for name in ("fast", "compiled")]
+        native = f"{ms['native']['median']:.1f} ms ({ms['native']['minimum']:.1f})"
+        rows.append([title(case), *least, native, f"{ratios['native / compiled']:.2f}"])
+    return f"{_table(head, rows)}\n\nMedians of turns; of the native step the least turn in brackets."
+
+
+def native(timed: Mapping[str, Any]) -> str:
+    """Make the table of targets, threads and memory of the native step."""
+    head = ["case", "target", "native", "one thread", "efficiency of threads", "works in"]
+    rows = []
+    for case in timed["steps"]["cases"]:
+        ms, lone = case["ms"], case["ms"].get("native, 1 thread")
+        rows.append(
+            [
+                title(case),
+                "" if case["target_ms"] is None else f"{case['target_ms']:.0f} ms",
+                f"{ms['native']['median']:.1f} ms",
+                "" if lone is None else f"{lone['median']:.1f} ms",
+                "" if lone is None else f"{case['ratios']['efficiency']:.2f}",
+                f"{case['working_mib']:.0f} MiB",
+            ]
+        )
+    return _table(head, rows)
+
+
+def parts(timed: Mapping[str, Any]) -> str:
+    """Make the table of where the native step goes: of each part its time, its floor, what bounds that, their ratio."""
+    cases, peak = timed["steps"]["cases"], timed["steps"]["peak"]
+    rows = []
+    for part in cases[0]["parts"]:
+        found = [case["parts"][part] for case in cases]
+        rows.append([part, *(_cell(one["ms"], one["floor_ms"], BOUNDS[one["bound"]]) for one in found)])
+    sums = [[sum(one[key] for one in case["parts"].values()) for key in ("ms", "floor_ms")] for case in cases]
+    rows.append(["all", *(_cell(ms, floor, "") for ms, floor in sums)])
+    table = _table(["part", *map(title, cases)], rows)
+    rates = f"{peak['vector_ops_per_s'] / 1e9:.1f} G vector operations/s and {peak['bytes_per_s'] / 1e9:.0f} GB/s"
+    legend = "ms (floor ms by operations o or bytes b, ratio)"
+    return f"{table}\n\n{legend}; {peak['threads']} threads were seen to do {rates} from memory."
+
+
+def _cell(ms: float, floor: float, bound: str) -> str:
+    return f"{ms:.2f} ({floor:.2f}{bound}, {ms / floor:.1f})"
+
+
+def counts(timed: Mapping[str, Any]) -> str:
+    """Make the table of what a step had to do, and what a pair costs by that."""
+    cases = timed["steps"]["cases"]
+    lines: list[tuple[str, Callable[[Mapping[str, Any], Mapping[str, int]], str]]] = [
+        ("visible", lambda _, did: f"{did['visible']:,}"),
+        ("entries of lists, until pixels stop", lambda _, did: f"{did['entries']:,}, {did['walked']:,}"),
+        ("pairs a pixel", lambda case, did: f"{did['pairs'] / (case['width'] * case['height']):.1f}"),
+        ("of these in strips that are blended, that change", lambda _, did: _shares(did)),
+        ("blend, ns a pair", lambda case, did: f"{1e6 * case['parts_ms']['blend'] / did['pairs']:.2f}"),
+        ("transpose, ns a pair", lambda case, did: f"{1e6 * case['parts_ms']['transpose'] / did['pairs']:.2f}"),
+    ]
+    rows = [[what, *(show(case, case["counts"]) for case in cases)] for what, show in lines]
+    return _table(["", *map(title, cases)], rows)
+
+
+def _shares(did: Mapping[str, int]) -> str:
+    return ", ".join(f"{16 * did[name] / did['pairs']:.0%}" for name in ("marked", "reached"))
+
+
+def busy(timed: Mapping[str, Any]) -> str:
+    """Make the table of steps beside busy processes."""
+    rows = []
+    for case in timed["busy"]:
+        for engine, found in case["engines"].items():
+            times = [f"{found[name]:.1f} ms" for name in ("alone_ms", "beside_ms")]
+            rows.append([case["name"], NAMES[engine], *times, f"{found['of_fair_share']:.2f}"])
+    first = timed["busy"][0]
+    head = ["case", "engine", "alone", f"beside {first['processes']} busy processes", "times the fair share"]
+    share = f"({first['processes']} + {first['threads']}) / {first['cores']} = {first['fair_factor']:g}"
+    return f"{_table(head, rows)}\n\nThe fair share is {share} times the time alone; means over all steps."
+
+
+NAMES = {"fast": "`fast`", "compiled": "`compiled`, autograd", "native": "`compiled`, native"}
+
+
+def startup(timed: Mapping[str, Any]) -> str:
+    """Make the table of how long commands take until they do something."""
+    found = timed["first-step"]
+    rows = [[f"`{name}`", _s(one["wall_s"]), _s(one["cpu_s"])] for name, one in found["commands"].items()]
+    if "first_step" in found:
+        first = found["first_step"]
+        command = f"`pop train {first['capture']} --factor {first['factor']} --preset quick`, to its first step"
+        rows.append([command, _s(first["wall_s"]), ""])
+    table = _table(["command", "seconds", "processor seconds"], rows)
+    return f"{table}\n\nThe least of {found['repeats']}."
+
+
+def _s(seconds: float) -> str:
+    return f"{seconds:.2f}"
+
+
+def memory(timed: Mapping[str, Any]) -> str:
+    """Make the table of peaks of memory."""
+    head = ["what", "by", "before", "at the peak", "of it the step's own"]
+    what = {"render": "render and backward", "step": "two training steps"}
+    rows = []
+    for one in timed["memory"]:
+        own = f"{one['working_gib']:.2f} GiB" if "working_gib" in one else ""
+        size = f"{what[one['what']]}, {one['width']}x{one['height']}, {one['n']:,} Gaussians"
+        rows.append([size, NAMES[one["by"]], f"{one['before_gib']:.2f} GiB", f"{one['peak_gib']:.2f} GiB", own])
+    return _table(head, rows)
+
+
+# the part of the results that each table is made of, by its marks in NOTES.md
+TABLES: dict[str, tuple[str, Callable[[Mapping[str, Any]], str]]] = {
+    "steps": ("steps", steps),
+    "native step": ("steps", native),
+    "where a step goes": ("steps", parts),
+    "what a step has to do": ("steps", counts),
+    "busy machine": ("busy", busy),
+    "first step": ("first-step", startup),
+    "memory": ("memory", memory),
+}
+
+
+def measured(timed: Mapping[str, Any], part: str) -> bool:
+    """Whether results hold a part as it is measured now, and not as before, when memory was that of renders alone."""
+    return part in timed and not (part == "memory" and "what" not in timed[part][0])
+
+
+def with_tables(text: str, timed: Mapping[str, Any]) -> str:
+    """Put every table between its marks, `<!-- NAME -->` and `<!-- end of NAME -->`."""
+    for name, (part, make) in TABLES.items():
+        begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
+        head, rest = text.split(begin)
+        text = head + begin + (make(timed) if measured(timed, part) else NOT_YET) + "\n" + end + rest.split(end)[1]
+    return text
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows))
+
+
+def main(words: list[str]) -> int:
+    """Run the script."""
+    text, timed = NOTES.read_text(encoding="utf-8"), json.loads(RESULTS.read_text(encoding="utf-8"))
+    if words == ["--write"]:
+        NOTES.write_text(with_tables(text, timed), encoding="utf-8")
+    elif words == ["--check"]:
+        if with_tables(text, timed) != text:
+            print("NOTES.md: a table of the training step is not what was measured; run step_tables.py --write")
+            return 1
+    else:
+        made = (make(timed) if measured(timed, part) else NOT_YET for part, make in TABLES.values())
+        print("\n\n".join(f"{name}\n\n{table}" for name, table in zip(TABLES, made, strict=True)))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

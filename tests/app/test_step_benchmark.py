@@ -1,0 +1,196 @@
+"""`benchmarks/run.py`'s training steps: tables from results, floors from counts, busy processes that end."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+PARTS = ("see", "list", "blend", "compare", "gather", "transpose", "update")
+COUNTS = {"visible": 90, "entries": 640, "walked": 600, "chunks": 40, "pairs": 4096, "marked": 128, "reached": 64}
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Import a module of benchmarks/, and forget all of them afterwards: their names are plain words."""
+    before = set(sys.modules)
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    yield importlib.import_module
+    for name in {path.stem for path in BENCHMARKS.glob("*.py")} - before:
+        sys.modules.pop(name, None)
+
+
+def case(name: str, **changed: Any) -> dict[str, Any]:
+    ms = {"fast": 90.0, "compiled": 30.0, "native": 12.25, "native, 1 thread": 22.0}
+    return {
+        "name": name,
+        "width": 64,
+        "height": 32,
+        "degree": 3,
+        "num_gaussians": 100,
+        "threads": 2,
+        "target_ms": 12.0,
+        "ms": {engine: {"median": value, "minimum": value - 1.0} for engine, value in ms.items()},
+        "ratios": {"compiled / fast": 0.33, "native / compiled": 0.41, "efficiency": 0.9},
+        "parts_ms": dict.fromkeys(PARTS, 1.5),
+        "counts": dict(COUNTS),
+        "working_mib": 15.0,
+        "parts": {part: {"ms": 1.5, "floor_ms": 0.5, "bound": "bytes", "ratio": 3.0} for part in PARTS},
+        **changed,
+    }
+
+
+def results() -> dict[str, Any]:
+    beside = {"alone_ms": 10.0, "beside_ms": 60.0, "of_fair_share": 1.2}
+    memory = {"width": 64, "height": 32, "n": 100, "before_gib": 0.5, "peak_gib": 0.75}
+    return {
+        "steps": {
+            "peak": {"threads": 2, "vector_ops_per_s": 16e9, "bytes_per_s": 40e9},
+            "cases": [case("64x32-100"), case("fox", degree=0, target_ms=None)],
+        },
+        "busy": [
+            {
+                "name": "64x32-100",
+                "processes": 8,
+                "threads": 2,
+                "cores": 2,
+                "fair_factor": 5.0,
+                "engines": {"compiled": beside, "native": beside},
+            }
+        ],
+        "first-step": {
+            "repeats": 5,
+            "commands": {"pop --help": {"wall_s": 0.2, "cpu_s": 0.1}},
+            "first_step": {"capture": "fox", "factor": 4, "wall_s": 1.75, "step_s": 0.02},
+        },
+        "memory": [
+            {"what": "render", "by": "fast", **memory},
+            {"what": "step", "by": "native", "working_gib": 0.25, **memory},
+        ],
+    }
+
+
+def test_notes_hold_the_tables_of_the_results(script: Any) -> None:
+    assert script("step_tables").main(["--check"]) == 0, "run 'python benchmarks/step_tables.py --write'"
+
+
+def test_every_table_says_what_was_measured(script: Any) -> None:
+    tables, timed = script("step_tables"), results()
+    notes = tables.with_tables((BENCHMARKS / "NOTES.md").read_text(), timed)
+    assert tables.NOT_YET not in notes
+    for row in (
+        "| 64x32, 100 Gaussians | 90 ms | 30 ms | 12.2 ms (11.2) | 0.41 |",
+        "| fox, bands to 0, 64x32, 100 Gaussians |  | 12.2 ms | 22.0 ms | 0.90 | 15 MiB |",
+        "| update | 1.50 (0.50b, 3.0) | 1.50 (0.50b, 3.0) |",
+        "| all | 10.50 (3.50, 3.0) | 10.50 (3.50, 3.0) |",
+        "| of these in strips that are blended, that change | 50%, 25% | 50%, 25% |",
+        "| 64x32-100 | `compiled`, native | 10.0 ms | 60.0 ms | 1.20 |",
+        "| `pop train fox --factor 4 --preset quick`, to its first step | 1.75 |  |",
+        "| two training steps, 64x32, 100 Gaussians | `compiled`, native | 0.50 GiB | 0.75 GiB | 0.25 GiB |",
+    ):
+        assert row in notes, row
+
+
+def test_what_was_not_measured_is_said_so(script: Any) -> None:
+    tables = script("step_tables")
+    old = {"memory": [{"backend": "fast", "peak_gib": 0.9}], "iteration": []}
+    notes = tables.with_tables((BENCHMARKS / "NOTES.md").read_text(), old)
+    assert notes.count(tables.NOT_YET) == len(tables.TABLES)
+
+
+def test_the_readme_takes_results_with_and_without_the_native_step(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS.parent / "docs"))
+    tables, path = importlib.import_module("tables"), tmp_path / "cpu.json"
+    monkeypatch.setattr(tables, "CPU_TIMES", path)
+    timed = json.loads((BENCHMARKS / "results" / "cpu.json").read_text())
+    timed = {key: value for key, value in timed.items() if key not in ("steps", "iteration")}
+    path.write_text(json.dumps(timed | {"steps": results()["steps"]}))
+    assert "| 64x32, 100 Gaussians | 90 ms | 30 ms | 12.2 ms (11.2) | 0.41 |" in tables.speed()
+    older = {"width": 270, "height": 480, "n": 12000, "iteration_ms": {"fast": 104.0, "compiled": 32.0}}
+    older["iteration_ms"]["compiled / fast"] = 0.3
+    path.write_text(json.dumps(timed | {"iteration": [older]}))
+    assert "| training step of POP, 270x480, 12,000 Gaussians | 104 ms | 32 ms | 0.30 |" in tables.speed()
+
+
+def test_floors_follow_the_counts_and_the_machine(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = script("parts")
+    monkeypatch.setattr(parts, "vector_ops_per_s", lambda threads: 1e6 * threads)
+    monkeypatch.setattr(parts, "bytes_per_s", lambda moved, threads: 1e9)
+    row = case("64x32-100")
+    found = parts.floors(row)
+    assert set(found) == set(PARTS)
+    assert found["list"]["bound"] == "bytes"
+    # 128 strips of 28 operations, 40 chunks of 346 and 8 a number of the picture, by two threads
+    assert found["blend"]["bound"] == "operations"
+    assert found["blend"]["floor_ms"] == pytest.approx((128 * 28 + 40 * 346 + 8 * 3 * 64 * 32 / 16) / 2e3)
+    assert found["blend"]["ratio"] == pytest.approx(1.5 / found["blend"]["floor_ms"])
+    # eight more strips change a pixel, of 37 operations
+    more = parts.floors({**row, "counts": {**COUNTS, "reached": 72}})
+    assert more["transpose"]["floor_ms"] - found["transpose"]["floor_ms"] == pytest.approx(8 * 37 / 2e3)
+    # one band has fewer numbers than four
+    assert parts.works({**row, "degree": 0})["update"].bytes < parts.works(row)["update"].bytes
+
+
+def test_the_peaks_of_this_machine_are_measured(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    peak = script("peak")
+    if peak.find_compiler() is None:
+        pytest.skip(peak.no_compiler())
+    monkeypatch.setattr(peak, "ROUNDS", 1000)
+    monkeypatch.setattr(peak, "MOVED", 1 << 20)
+    assert 1e7 < peak.vector_ops_per_s(1) < 1e12
+    assert 1e7 < peak.bytes_per_s(1 << 20, 2) < 1e13
+
+
+def counting() -> int:
+    """Count the busy processes that this one has started, those that ended but were not asked about too."""
+    shown = subprocess.run(["ps", "-o", "args=", "--ppid", str(os.getpid())], capture_output=True, text=True)
+    return len(re.findall("getppid", shown.stdout))
+
+
+def test_busy_processes_end_with_their_block(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    busy = script("busy")
+    monkeypatch.setattr(busy.time, "sleep", lambda _: None)
+
+    def interrupted() -> None:
+        with busy.busy_processes(2):
+            assert counting() > 0
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert counting() == 0
+
+
+def test_busy_processes_end_with_who_started_them(script: Any) -> None:
+    loop = script("busy").LOOP
+    alone = subprocess.Popen([sys.executable, "-S", "-c", loop, "0"])
+    try:
+        assert alone.wait(timeout=60) == 0
+    finally:
+        alone.kill()
+
+
+def test_a_fair_share_is_that_of_all_who_want_a_core(script: Any) -> None:
+    busy = script("busy")
+    assert busy.fair_factor(2, 2) == 5.0
+    assert busy.fair_factor(1, 16) == 1.0
+
+
+def test_turns_change_order_and_keep_what_counts(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    timing, log = script("timing"), []
+    clock = iter(range(1000))
+    monkeypatch.setattr(time, "perf_counter", lambda: float(next(clock)))
+    found = timing.turns({"a": lambda: log.append("a"), "b": lambda: log.append("b")}, repeats=2, warm_up=1)
+    assert log == ["b", "a", "a", "b", "b", "a"]
+    assert found == {"a": [1.0, 1.0], "b": [1.0, 1.0]}
