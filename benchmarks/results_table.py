@@ -1,38 +1,98 @@
-"""The results table of README.md, from the statistics of training runs.
+"""The results tables of README.md, from the statistics of training runs.
 
-Copy stats/val_step*.json of a finished run to benchmarks/results/training/<capture>_<method>.json; then
+Copy stats/val_step*.json of a finished run to benchmarks/results/training/<capture>_<method>_<seed>.json; then
 
-    python benchmarks/results_table.py                      print the table
-    python benchmarks/results_table.py --check README.md    exit with 1 when that file holds another one
+    python benchmarks/results_table.py                      print the tables
+    python benchmarks/results_table.py --check README.md    exit with 1 when that file holds others
 
-`python docs/tables.py --write` puts it into README.md.
+`python docs/tables.py --write` puts them into README.md. Runs of one capture, method and weight of the POP term that
+differ in their seed share a row: means, and in brackets the smallest and largest PSNR and SSIM.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from pop_fast.report.compare import markdown, row
+from pop_fast.report.compare import COLUMNS, markdown, row
 
-RUNS = Path(__file__).resolve().parent / "results" / "training"
+RESULTS = Path(__file__).resolve().parent / "results"
+RUNS, PAPER = RESULTS / "training", RESULTS / "paper_main_table.json"
+
+Stats = dict[str, Any]
 
 
 def table(folder: Path = RUNS) -> str:
     """Make the table of all runs in a folder, by capture, POP before others."""
+    return markdown([_row(runs) for runs in _groups(folder)])
+
+
+def differences(folder: Path = RUNS, paper: Path = PAPER) -> str:
+    """Make the table of what POP is less gsplat's strategy: of these runs, and of the paper's main table."""
+    lines = ["| scene | schedule | PSNR | SSIM | Gaussians |", "| --- | --- | ---: | ---: | ---: |"]
+    means = {(stats["capture"], stats["method"]): stats for stats in map(_mean, _groups(folder))}
+    for capture in sorted({capture for capture, _ in means}):
+        pop, control = means.get((capture, "pop")), means.get((capture, "gsplat"))
+        if pop and control:
+            share = pop["num_GS"] / control["num_GS"]
+            steps = f"{pop['step'] + 1:,} steps, measured here"
+            lines.append(
+                _difference(capture, steps, pop["psnr"] - control["psnr"], pop["ssim"] - control["ssim"], share)
+            )
+    for dataset, rows in json.loads(paper.read_text(encoding="utf-8"))["datasets"].items():
+        pop, control = rows["POP"], rows["gsplat"]
+        share = pop["num_gaussians_k"] / control["num_gaussians_k"]
+        found = (pop["psnr"] - control["psnr"], pop["ssim"] - control["ssim"], share)
+        lines.append(_difference(dataset, "30,000 steps, the paper's", *found))
+    return "\n".join(lines)
+
+
+def _difference(scene: str, schedule: str, psnr: float, ssim: float, share: float) -> str:
+    return f"| {scene} | {schedule} | {psnr:+.2f} dB | {ssim:+.3f} | {share:.1%} |"
+
+
+def _groups(folder: Path) -> list[list[Stats]]:
     runs = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.json"))]
-    runs.sort(key=lambda stats: (stats["capture"], stats["method"] != "pop", stats["method"]))
-    return markdown([row(stats) for stats in runs])
+    groups: dict[tuple[Any, ...], list[Stats]] = {}
+    for stats in runs:
+        key = (stats["capture"], stats["method"] != "pop", stats["method"], stats.get("lambda_pop", 0.0))
+        groups.setdefault(key, []).append(stats)
+    return [groups[key] for key in sorted(groups)]
+
+
+def _mean(runs: Sequence[Stats]) -> Stats:
+    """Return the first run's statistics with the means of what is a number in all of them."""
+    merged = dict(runs[0])
+    for name, value in merged.items():
+        if isinstance(value, (int, float)) and name != "step":
+            mean = sum(stats[name] for stats in runs) / len(runs)
+            merged[name] = round(mean) if isinstance(value, int) else mean
+    return merged
+
+
+def _row(runs: Sequence[Stats]) -> list[str]:
+    cells = row(_mean(runs))
+    if len(runs) == 1:
+        return cells
+    cells[0] += f", {len(runs)} seeds"
+    for name, key, form in (("PSNR", "psnr", ".2f"), ("SSIM", "ssim", ".4f")):
+        values = [stats[key] for stats in runs]
+        cells[COLUMNS.index(name)] += f" ({min(values):{form}} to {max(values):{form}})"
+    return cells
 
 
 def main(words: list[str]) -> int:
     """Run the script."""
+    tables = (table(), differences())
     if words[:1] != ["--check"]:
-        print(table())
+        print("\n\n".join(tables))
         return 0
-    if f"\n{table()}\n" not in Path(words[1]).read_text(encoding="utf-8"):
-        print(f"{words[1]}: the results table is not what the runs say; run 'python docs/tables.py --write'")
+    text = Path(words[1]).read_text(encoding="utf-8")
+    if any(f"\n{made}\n" not in text for made in tables):
+        print(f"{words[1]}: a results table is not what the runs say; run 'python docs/tables.py --write'")
         return 1
     return 0
 

@@ -102,6 +102,11 @@ def results() -> str:
     return str(runpy.run_path(str(ROOT / "benchmarks" / "results_table.py"))["table"]())
 
 
+def differences() -> str:
+    """Make the table of POP less gsplat's strategy, as benchmarks/results_table.py does."""
+    return str(runpy.run_path(str(ROOT / "benchmarks" / "results_table.py"))["differences"]())
+
+
 def scorecards() -> str:
     """Make the table of what the kit found: rows are stages, cells say laws passed, failed and skipped."""
     columns = [card(file)["summary"][backend] for file, backend in JUDGED.values()]
@@ -208,6 +213,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "profiles": profiles,
     "speed": speed,
     "results": results,
+    "differences": differences,
     "recipes": recipes,
     "kit": kit,
     "scorecards": scorecards,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,9 +13,6 @@ from pop_fast.dominance import dominant_counts
 from pop_fast.raster_meta import RenderMeta, intersections
 from pop_fast.raster_stages import Stages
 from pop_fast.splatting import Splats, View
-
-SMALL_TILE, LARGE_TILE = 8, 16  # px
-SMALL_TILE_BELOW = 14.0  # px, root mean square extent of the visible splats; see benchmarks/NOTES.md
 
 
 @dataclass(frozen=True)
@@ -185,7 +181,7 @@ class Frame:
         # counting visited entries needs the asked-for tiles and their full lists; without it, entries that reach no
         # pixel are left out, and small splats are listed in small tiles
         exact = {} if counts else {"conics": rows.conics.detach(), "opacities": rows.opacities.detach()}
-        size = self.tile_size if counts or profile.extent == "square" else _blend_tile(rows.radii)
+        size = self.tile_size if counts or profile.extent == "square" else self.stages.blend_tile(rows.radii)
         lists = self.stages.tile_lists(
             rows.means2d.detach(), rows.radii, rows.depths.detach(), width, height, size, profile, **exact
         )
@@ -261,13 +257,6 @@ class Frame:
 def _items(tensor: Tensor) -> list[Tensor]:
     """Take the first axis apart; a single item stays a view, whose transpose costs nothing."""
     return [tensor.squeeze(0)] if len(tensor) == 1 else list(tensor.unbind(0))
-
-
-def _blend_tile(radii: Tensor) -> int:
-    """Choose the tile that is cheapest to blend; the image does not depend on it."""
-    visible = (radii > 0).all(1)
-    area = (radii * visible[:, None]).to(torch.float64).prod(1).sum() / visible.sum().clamp_min(1)
-    return SMALL_TILE if math.sqrt(float(area)) < SMALL_TILE_BELOW else LARGE_TILE
 
 
 def _present(tensor: Tensor | None) -> Tensor:

@@ -2,15 +2,36 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from pop_fast.backends import require_backend
 from pop_fast.compositing import Composite, composite
 from pop_fast.splatting import Splats, colors_of_view, covariances, project
 from pop_fast.tiles import TileLists, tile_lists
+
+SMALL_TILE, LARGE_TILE = 8, 16  # px
+SMALL_TILE_BELOW = 14.0  # px, root mean square extent of the visible splats; see benchmarks/NOTES.md
+
+
+def torchs_tile(radii: Tensor) -> int:
+    """Choose the tile that torch blends the cheapest, px; the image does not depend on it.
+
+    Args:
+        radii: extents of the splats, px, 0 where culled. [N, 2]
+    """
+    visible = (radii > 0).all(1)
+    area = (radii * visible[:, None]).to(torch.float64).prod(1).sum() / visible.sum().clamp_min(1)
+    return SMALL_TILE if math.sqrt(float(area)) < SMALL_TILE_BELOW else LARGE_TILE
+
+
+def large_tile(radii: Tensor) -> int:
+    """Return the tile whose rows are one vector of the compiled blend, px; it passes over rows that a splat misses."""
+    return LARGE_TILE
 
 
 @dataclass(frozen=True)
@@ -23,6 +44,7 @@ class Stages:
         colors_of_view: as `pop_fast.splatting.colors_of_view`.
         tile_lists: as `pop_fast.tiles.tile_lists`.
         composite: as `pop_fast.compositing.composite`.
+        blend_tile: given the splats' extents, the tile to blend them in.
     """
 
     covariances: Callable[..., Tensor] = covariances
@@ -30,6 +52,7 @@ class Stages:
     colors_of_view: Callable[..., Tensor] = colors_of_view
     tile_lists: Callable[..., TileLists] = tile_lists
     composite: Callable[..., Composite] = composite
+    blend_tile: Callable[[Tensor], int] = torchs_tile
 
 
 def stages_of(backend: str) -> Stages:
@@ -45,4 +68,4 @@ def stages_of(backend: str) -> Stages:
     from pop_fast.compiled.splatting import colors_of_view, covariances, project
     from pop_fast.compiled.tiles import tile_lists
 
-    return Stages(covariances, project, colors_of_view, tile_lists, composite)
+    return Stages(covariances, project, colors_of_view, tile_lists, composite, large_tile)

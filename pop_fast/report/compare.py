@@ -8,6 +8,7 @@ from typing import Any, Final
 COLUMNS: Final = (
     "capture",
     "method",
+    "λ",
     "steps",
     "PSNR",
     "SSIM",
@@ -36,6 +37,7 @@ def row(stats: Mapping[str, Any]) -> list[str]:
     return [
         str(stats.get("capture", "–")),
         _METHODS.get(method, method),
+        "–" if not stats.get("lambda_pop") else f"{stats['lambda_pop']:g}",
         "–" if steps is None else f"{steps + 1:,}",
         cell("{:.2f}", "psnr"),
         cell("{:.4f}", "ssim"),

@@ -23,7 +23,7 @@ def facts(config: TrainConfig, views: Sequence[ViewTensors]) -> dict[str, Any]:
         views: the training views.
 
     Returns:
-        method, preset, lambda_pop, theta_blur_pixels (share of the smallest and of the largest view, px),
+        method, preset, seed, lambda_pop, theta_blur_pixels (share of the smallest and of the largest view, px),
         blur_min_pixels (px), blur_events (densification steps that look at blur).
     """
     plan = config.strategy
@@ -31,6 +31,7 @@ def facts(config: TrainConfig, views: Sequence[ViewTensors]) -> dict[str, Any]:
     return {
         "method": config.method,
         "preset": config.preset,
+        "seed": config.seed,
         "lambda_pop": plan.lambda_pop,
         "theta_blur_pixels": [plan.theta_blur * min(sizes), plan.theta_blur * max(sizes)],
         "blur_min_pixels": plan.blur_min_pixels,
