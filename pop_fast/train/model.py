@@ -46,7 +46,9 @@ def make_optimizers(params: Mapping[str, Parameter], lr: LearningRates, scene_sc
         scene_scale: the unit of the means' learning rate, world units.
     """
     rates = learning_rates(lr, scene_scale)
-    made = {key: _Moments([param], lr=rates[key], betas=BETAS, eps=EPS, fused=True) for key, param in params.items()}
+    made: dict[str, Adam] = {
+        key: _Moments([param], lr=rates[key], betas=BETAS, eps=EPS, fused=True) for key, param in params.items()
+    }
     for key, optimizer in made.items():
         moments = {name: torch.zeros_like(params[key].detach()) for name in ("exp_avg", "exp_avg_sq")}
         optimizer.state[params[key]] = {"step": torch.zeros((), dtype=torch.float32), **moments}
