@@ -241,6 +241,43 @@ def test_ctrl_c_anywhere_exits_with_130(pop: Pop, monkeypatch: pytest.MonkeyPatc
     assert outcome.err.strip() == "pop: interrupted"
 
 
+@pytest.mark.parametrize(
+    ("fault", "status", "words"),
+    [
+        (OSError(28, "No space left on device", "report.html"), 1, "report.html: the disk is full"),
+        (ZeroDivisionError("a bug"), 1, "ZeroDivisionError: a bug"),
+        (KeyboardInterrupt(), 130, "stopped while writing the report"),
+    ],
+)
+def test_results_are_complete_before_the_report_and_whatever_becomes_of_it(
+    pop: Pop,
+    shared_capture: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    fault: BaseException,
+    status: int,
+    words: str,
+) -> None:
+    folder, found = tmp_path / "r", []
+
+    def broken(result: Path) -> None:
+        found.extend(sorted(path.relative_to(result).as_posix() for path in Path(result).rglob("*") if path.is_file()))
+        raise fault
+
+    with monkeypatch.context() as patch:
+        patch.setattr("pop_fast.report.write.write_report", broken)
+        outcome = pop("train", shared_capture, "--out", folder, *TRAIN)
+    assert {"ckpts/ckpt_29_rank0.pt", "ply/point_cloud_29.ply", "stats/val_step0029.json", "cfg.json"} <= set(found)
+    assert outcome.status == status
+    assert "PSNR" in outcome.out
+    (line,) = [line for line in outcome.err.splitlines() if line.startswith("pop: ")]
+    assert words in line
+    assert f"the results in {folder} are complete, and pop report {folder} writes it" in line
+    assert not (folder / "report.html").exists()
+    assert pop("report", folder).status == 0
+    assert pop("eval", folder).status == 0
+
+
 def test_a_reader_that_stops_listening_is_no_error() -> None:
     command = f"{sys.executable} -c 'import pop_fast.cli as c, sys; sys.exit(c.main([\"--help\"]))' | true"
     done = subprocess.run(["bash", "-c", f"set -o pipefail; {command}"], capture_output=True, text=True, check=False)

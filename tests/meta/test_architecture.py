@@ -7,9 +7,12 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+
+from pop_fast.cli import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOMS = ("pop_ref", "pop_fast", "cuda_ext", "tests", "benchmarks", "paper_repro", "docs")
@@ -146,6 +149,66 @@ assert not happened, f"importing {package} does {{happened}}"
 def test_importing_is_light_and_starts_nothing(package: str, heavy: tuple[str, ...]) -> None:
     script = WATCHED.format(package=package, heavy=heavy)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+
+
+HEAVY = ("torch", "scipy", "cv2", "matplotlib", "pycolmap", "plyfile", "tqdm")
+CALLED = """
+import contextlib, io, sys
+from pop_fast.cli import main
+with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+    status = main({words!r})
+assert status == {status}, status
+loaded = sorted(m for m in {heavy!r} if m in sys.modules)
+assert not loaded, f"pop {{' '.join({words!r})}} loads {{loaded}}"
+"""
+
+
+def _call(words: list[str], status: int, heavy: tuple[str, ...]) -> None:
+    script = CALLED.format(words=words, status=status, heavy=heavy)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_help_of_a_subcommand_loads_nothing_heavy(command: str) -> None:
+    _call([*command.split(), "--help"], 0, HEAVY)
+
+
+@pytest.mark.parametrize("words", [["train", "x", "--max-stepz", "3"], ["eval", "x", "--fakter", "2"], ["trian"]])
+def test_a_typo_is_said_before_anything_heavy_is_loaded(words: list[str]) -> None:
+    _call(words, 2, HEAVY)
+
+
+def test_a_capture_that_is_not_there_is_said_before_torch_is_loaded() -> None:
+    _call(["train", "not_there", "--backend", "fast"], 2, ("torch", "scipy", "matplotlib", "pycolmap"))
+
+
+def test_doctor_tells_of_torch_without_loading_it() -> None:
+    if find_spec("cuda_ext._kernels") is not None:
+        pytest.skip("the CUDA extension is built, and whether it can run here only torch knows")
+    _call(["doctor"], 0, ("torch",))
+
+
+# reading settings and captures is what a first step begins with; torch's compiler takes as long to load as torch
+WITHOUT = [
+    ("from pop_fast.train import TrainConfig", ("torch", "cv2", "scipy")),
+    ("from pop_fast.data import load_capture", ("torch", "scipy", "matplotlib")),
+    (
+        "import torch; from torch.nn import Parameter\n"
+        "from pop_fast.train.environment import reproducible\n"
+        "from pop_fast.train.model import LearningRates, make_optimizers\n"
+        "with reproducible(): make_optimizers({'means': Parameter(torch.zeros(1, 3))}, LearningRates(), 1.0)",
+        ("torch._dynamo", "torch._inductor", "sympy"),
+    ),
+    ("import pop_fast.train.training_run", ("torch._dynamo", "matplotlib", "pycolmap", "pop_fast.report.page")),
+]
+
+
+@pytest.mark.parametrize(("script", "heavy"), WITHOUT, ids=range(len(WITHOUT)))
+def test_a_run_begins_without_what_it_does_not_need(script: str, heavy: tuple[str, ...]) -> None:
+    check = f"import sys; loaded = [m for m in {heavy!r} if m in sys.modules]; assert not loaded, loaded"
+    done = subprocess.run([sys.executable, "-c", f"{script}\n{check}"], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
 
 
