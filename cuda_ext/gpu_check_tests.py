@@ -17,7 +17,16 @@ from cuda_ext.gpu_check_tools import ROOT
 LAWS = tuple(f"test_gpu_{name}.py" for name in ("whole", "compositing", "dominance", "gradients", "agreement"))
 STEPS = tuple(
     f"test_{name}.py"
-    for name in ("ten_steps", "struct_fields", "instances", "readings", "rows", "photometric", "device_training")
+    for name in (
+        "ten_steps",
+        "struct_fields",
+        "instances",
+        "readings",
+        "rows",
+        "photometric",
+        "device_training",
+        "oracle_steps",
+    )
 )
 SMOKE = tuple(
     f"test_ten_steps.py::test_{name}"

@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, Protocol
-
-from torch import Tensor
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from pop_fast.errors import PopError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 class Backend(Protocol):

@@ -33,6 +33,7 @@ COMMANDS: Final = {
     "doctor": "say what is installed, what is missing and how to get it",
 }
 
+EXIT_INCOMPLETE: Final = 1
 EXIT_BAD_INPUT: Final = 2
 EXIT_INTERRUPTED: Final = 130
 
@@ -44,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: the words after `pop`; the process's own when None.
 
     Returns:
-        0, or 2 for bad input and bad usage, or 130 after Ctrl-C.
+        0, or 1 where something is missing, or 2 for bad input and bad usage, or 130 after Ctrl-C.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words or os.environ.get("POP_DEBUG", "") not in ("", "0")

@@ -11,9 +11,6 @@ import tyro
 
 from pop_fast.cli.arguments import parse
 from pop_fast.errors import PopError
-from pop_fast.report.compare import markdown, plain, row
-from pop_fast.report.source import read_last_stats
-from pop_fast.train.results import read_config
 
 _EXAMPLES: Final = """
     pop compare out/scene_pop out/scene_adc
@@ -35,12 +32,17 @@ def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "compare", examples=_EXAMPLES)
     if not args.results:
         raise PopError("nothing to compare; name one or more result folders")
+    from pop_fast.report.compare import markdown, plain, row
+
     rows = [row(_stats(folder)) for folder in args.results]
     print(markdown(rows) if args.markdown else plain(rows))
     return 0
 
 
 def _stats(folder: Path) -> dict[str, object]:
+    from pop_fast.report.source import read_last_stats
+    from pop_fast.train.results import read_config
+
     read_config(folder)
     stats = read_last_stats(folder)
     if not stats:

@@ -6,15 +6,14 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from pop_fast.cli import examine
 from pop_fast.cli.arguments import parse
-from pop_fast.cli.doctor import memory_bytes
-from pop_fast.cli.progress import bars
-from pop_fast.io.jpeg import jpeg_damage
+
+if TYPE_CHECKING:
+    from pop_fast.cli.examine import Finding
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +49,13 @@ def run(argv: Sequence[str]) -> int:
     return 1 if bad else 0
 
 
-def look_over(root: Path) -> list[examine.Finding]:
+def look_over(root: Path) -> list[Finding]:
     """Examine a capture; all findings in reading order."""
+    from pop_fast.cli import examine
+    from pop_fast.cli.doctor import memory_bytes
+    from pop_fast.cli.progress import bars
+    from pop_fast.io.jpeg import jpeg_damage
+
     made_from, shots, cloud = examine.read_listing(root)
     findings = [examine.Finding("ok" if len(shots) > 1 else "bad", "poses", f"{len(shots)} views from the {made_from}")]
     findings += examine.about_cameras(shots)

@@ -10,8 +10,6 @@ from typing import Annotated, Final
 import tyro
 
 from pop_fast.cli.arguments import parse
-from pop_fast.cli.progress import bars
-from pop_fast.data import make_demo
 
 _EXAMPLES: Final = """
     pop demo scene && pop train scene --preset quick
@@ -39,6 +37,9 @@ class Args:
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "demo", examples=_EXAMPLES)
+    from pop_fast.cli.progress import bars
+    from pop_fast.data import make_demo
+
     with bars() as progress:
         folder = make_demo(
             args.out, args.seed, args.views, args.width, args.height, progress=progress, overwrite=args.overwrite

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import platform
@@ -10,7 +11,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
+from pop_fast.backends import backend_names, get_backend
 from pop_fast.cli.arguments import parse
+from pop_fast.machine import machine_name
+from pop_fast.torch_install import cuda_version, why_torch_fails
 
 State = Literal["ok", "missing", "off"]
 
@@ -55,7 +59,10 @@ class Args:
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "doctor")
-    findings = [*packages(), *machine(), *backends(), cuda_build(), *lpips(args)]
+    findings = [*packages(), *machine()]
+    if not any(finding.name == "torch" and finding.state == "missing" for finding in findings):
+        findings += [*torch_build(), *backends()]
+    findings += [cuda_build(), *lpips(args)]
     width = max(len(finding.name) for finding in findings) + 2
     marks = {"ok": "ok", "missing": "MISSING", "off": "-"}
     print(f"pop-splatting {_installed('pop-splatting') or '(not installed)'}, Python {platform.python_version()}")
@@ -68,13 +75,12 @@ def run(argv: Sequence[str]) -> int:
 
 
 def packages() -> Iterator[Finding]:
-    """Import every package that pop uses and tell its version."""
+    """Import every package that pop uses, all but torch, whose library is loaded, and tell its version."""
     for distribution, module, purpose, needed in _PACKAGES:
         version = _installed(distribution)
-        try:
-            importlib.import_module(module)
-        except Exception as error:  # a broken install raises anything: OSError for a shared library, for one
-            reason = f"{purpose}; import fails: {type(error).__name__}: {error}" if version else purpose
+        fault = why_torch_fails() if module == "torch" else _why_not_imported(module)
+        if fault is not None:
+            reason = f"{purpose}; import fails: {fault}" if version else purpose
             fix = f"pip install --force-reinstall {distribution}" if version else f"pip install {distribution}"
             yield Finding(distribution, "missing" if needed else "off", reason, fix if needed else "")
             continue
@@ -82,28 +88,25 @@ def packages() -> Iterator[Finding]:
 
 
 def machine() -> Iterator[Finding]:
-    """Tell processor, threads, memory and the torch build."""
+    """Tell processor, cores and memory."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    yield Finding("processor", "ok", f"{processor_name()}, {cores} usable core{'s' if cores != 1 else ''}")
+    yield Finding("processor", "ok", f"{machine_name()}, {cores} usable core{'s' if cores != 1 else ''}")
     total, free = memory_bytes()
     if total:
         low = free < 2 * 2**30
         hint = "close other programs, or train with --factor 4" if low else ""
         yield Finding("memory", "ok", f"{total / 2**30:.1f} GiB, {free / 2**30:.1f} GiB free", hint)
-    try:
-        import torch
-    except Exception:
-        return
-    build = f"CUDA {torch.version.cuda}" if torch.version.cuda else "CPU"
-    yield Finding("torch build", "ok", f"{build}, {torch.get_num_threads()} threads")
+
+
+def torch_build() -> Iterator[Finding]:
+    """Tell whether torch was built for the CPU alone."""
+    with contextlib.suppress(ImportError):
+        cuda = cuda_version()
+        yield Finding("torch build", "ok", f"CUDA {cuda}" if cuda else "CPU")
 
 
 def backends() -> Iterator[Finding]:
-    """Ask every backend whether it can run here and, if not, why."""
-    try:
-        from pop_fast.backends import backend_names, get_backend
-    except ImportError:  # torch is missing, which has its own line
-        return
+    """Ask every backend whether it can run here and, if not, why; all of them need torch."""
     for name in backend_names():
         backend = get_backend(name)
         if backend.available():
@@ -139,15 +142,6 @@ def lpips(args: Args) -> Iterator[Finding]:
             yield Finding(f"LPIPS {net}", "ok", ", ".join(f"{k} {v[:12]}" for k, v in weights.sha256.items()))
 
 
-def processor_name() -> str:
-    """Give the processor's name as statistics files have it, or the system's own word for it where torch is missing."""
-    try:
-        from pop_fast.train.environment import machine_name
-    except ImportError:
-        return platform.processor() or platform.machine()
-    return machine_name()
-
-
 def memory_bytes() -> tuple[int, int]:
     """Give the machine's memory and what is free of it, bytes; (0, 0) where the system does not tell."""
     try:
@@ -160,6 +154,14 @@ def memory_bytes() -> tuple[int, int]:
         total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
         return total, total
     return 0, 0
+
+
+def _why_not_imported(module: str) -> str | None:
+    try:
+        importlib.import_module(module)
+    except Exception as error:  # a broken install raises anything: OSError for a shared library, for one
+        return f"{type(error).__name__}: {error}"
+    return None
 
 
 def _installed(distribution: str) -> str | None:

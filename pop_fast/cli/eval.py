@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import tyro
 
@@ -15,16 +15,11 @@ from pop_fast.cli.arguments import parse
 from pop_fast.cli.splat import CaptureOptions, Splat, load_splat, open_capture
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
-from pop_fast.report import write_report
-from pop_fast.report.source import read_stats
-from pop_fast.train.config import TrainConfig
-from pop_fast.train.environment import reproducible
-from pop_fast.train.evaluate import evaluate
-from pop_fast.train.lpips import LPIPS
-from pop_fast.train.metrics import population, too_small
-from pop_fast.train.on_device import renderer
-from pop_fast.train.results import ResultFolder
-from pop_fast.train.views import ViewTensors
+
+if TYPE_CHECKING:
+    from pop_fast.train.config import TrainConfig
+    from pop_fast.train.lpips import LPIPS
+    from pop_fast.train.views import ViewTensors
 
 _EXAMPLES: Final = """
     pop eval out/scene_pop                                   the last checkpoint, on the capture it was trained on
@@ -55,6 +50,9 @@ class Args(CaptureOptions):
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "eval", examples=_EXAMPLES)
+    from pop_fast.train.metrics import too_small
+    from pop_fast.train.views import ViewTensors
+
     splat = load_splat(args.splat)
     nets = _nets(args, splat.config)
     capture, config = open_capture(splat, args)
@@ -80,6 +78,11 @@ def run(argv: Sequence[str]) -> int:
 
 def measure_splat(splat: Splat, config: TrainConfig, views: list[ViewTensors], nets: Sequence[LPIPS]) -> dict[str, Any]:
     """Measure a splat on views; the numbers are those that training itself would write."""
+    from pop_fast.train.environment import reproducible
+    from pop_fast.train.evaluate import evaluate
+    from pop_fast.train.metrics import population
+    from pop_fast.train.on_device import renderer
+
     backend, note = renderer(config.backend)
     if note:
         print(f"note: {note}", file=sys.stderr)
@@ -89,11 +92,17 @@ def measure_splat(splat: Splat, config: TrainConfig, views: list[ViewTensors], n
 
 
 def _nets(args: Args, config: TrainConfig) -> list[LPIPS]:
+    from pop_fast.train.lpips import LPIPS
+
     chosen = {"vgg": args.lpips_vgg or config.lpips_vgg, "alex": args.lpips_alex or config.lpips_alex}
     return [LPIPS(net, files) for net, files in chosen.items() if files]  # type: ignore[arg-type]
 
 
 def _record(folder: Path, step: int, stats: dict[str, Any]) -> None:
+    from pop_fast.report import write_report
+    from pop_fast.report.source import read_stats
+    from pop_fast.train.results import ResultFolder
+
     results = ResultFolder(folder)
     path = results.stats_path("val", step)
     before = read_stats(path) if path.is_file() else {"step": step}

@@ -7,23 +7,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
-from typing import Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import tyro
 
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.splat import CaptureOptions, load_splat, open_capture
-from pop_fast.data import Capture, View
 from pop_fast.errors import PopError
-from pop_fast.explain import explain_pixel, explain_view
-from pop_fast.explain.diff import difference
-from pop_fast.explain.maps import view_maps, write_maps
-from pop_fast.explain.page import page
-from pop_fast.explain.pixel import check_inside
-from pop_fast.explain.scene import with_objective
-from pop_fast.explain.table import WIDTH, table
 from pop_fast.io.atomic import folder_atomically, write_atomically
-from pop_fast.train.environment import reproducible
+
+if TYPE_CHECKING:
+    from pop_fast.data import Capture, View
 
 _EXAMPLES: Final = """
     pop explain out/scene_pop --view 3 --pixel 120,80                     the table
@@ -67,6 +61,19 @@ def run(argv: Sequence[str]) -> int:
     at = None if args.pixel is None else parse_pixel(args.pixel)
     if at is None and (args.maps is None or args.html or args.json or args.diff):
         raise PopError("pixel is not given; say which with --pixel X,Y, or ask for maps alone with --maps DIR")
+    return _explain(args, at)
+
+
+def _explain(args: Args, at: tuple[int, int] | None) -> int:
+    from pop_fast.explain import explain_pixel, explain_view
+    from pop_fast.explain.diff import difference
+    from pop_fast.explain.maps import view_maps, write_maps
+    from pop_fast.explain.page import page
+    from pop_fast.explain.pixel import check_inside
+    from pop_fast.explain.scene import with_objective
+    from pop_fast.explain.table import WIDTH, table
+    from pop_fast.train.environment import reproducible
+
     splat = load_splat(args.splat)
     capture, config = open_capture(splat, args)
     view = chosen_view(capture, args.view)

@@ -11,12 +11,8 @@ import numpy as np
 import tyro
 
 from pop_fast.cli.arguments import parse
-from pop_fast.cli.inria import write_inria_folder
 from pop_fast.cli.splat import CaptureOptions, Splat, load_splat, open_capture, read_record
-from pop_fast.data import to_capture_frame
 from pop_fast.errors import PopError
-from pop_fast.io.ply import save_ply, save_splat
-from pop_fast.train.metrics import ALPHA_FLOOR
 
 _EXAMPLES: Final = """
     pop export out/scene_pop --out scene.ply                 for any viewer, in the capture's own world frame
@@ -51,6 +47,8 @@ def run(argv: Sequence[str]) -> int:
         check_file(args)
     splat = load_splat(args.splat)
     if args.layout == "inria":
+        from pop_fast.cli.inria import write_inria_folder
+
         capture, config = open_capture(splat, args)
         write_inria_folder(replace(splat, config=config), capture, args.out, args.overwrite)
         print(f"{len(splat.params['means']):,} Gaussians, {len(capture.views)} cameras -> {args.out}")
@@ -58,6 +56,8 @@ def run(argv: Sequence[str]) -> int:
     splat = in_frame(splat, args)
     if args.drop_invisible:
         splat = without_invisible(splat)
+    from pop_fast.io.ply import save_ply, save_splat
+
     n = len(splat.params["means"])
     if args.out.suffix.lower() == ".splat":
         save_splat(args.out, splat.params)
@@ -97,11 +97,15 @@ def in_frame(splat: Splat, args: Args) -> Splat:
         transform = np.array(record.world_transform)
     else:
         transform = open_capture(splat, args)[0].world_transform
+    from pop_fast.data import to_capture_frame
+
     return replace(splat, params=to_capture_frame(splat.params, transform))
 
 
 def without_invisible(splat: Splat) -> Splat:
     """Leave out Gaussians that no renderer shows, and say how many there were."""
+    from pop_fast.train.metrics import ALPHA_FLOOR
+
     kept = splat.params["opacities"].sigmoid() >= ALPHA_FLOOR
     before, after = len(kept), int(kept.sum())
     print(f"opacity >= 1/255: {after:,} of {before:,} Gaussians kept, {before - after:,} left out")

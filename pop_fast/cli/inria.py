@@ -10,7 +10,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from pop_fast.cli.render import paths_read, rendered
+from pop_fast.cli.frames import rendered
+from pop_fast.cli.render import paths_read
 from pop_fast.cli.splat import Splat
 from pop_fast.data import Capture, View, to_capture_frame
 from pop_fast.io.atomic import folder_atomically

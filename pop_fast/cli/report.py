@@ -10,7 +10,6 @@ from typing import Annotated
 import tyro
 
 from pop_fast.cli.arguments import parse
-from pop_fast.report import write_report
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,5 +23,7 @@ class Args:
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "report")
+    from pop_fast.report import write_report
+
     print(write_report(args.result))
     return 0

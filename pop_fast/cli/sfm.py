@@ -10,8 +10,6 @@ from typing import Annotated, Final
 import tyro
 
 from pop_fast.cli.arguments import parse
-from pop_fast.cli.progress import bars
-from pop_fast.data import run_sfm
 
 _EXAMPLES: Final = """
     pop sfm photos                 writes photos/sparse/0
@@ -40,6 +38,9 @@ class Args:
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "sfm", examples=_EXAMPLES)
+    from pop_fast.cli.progress import bars
+    from pop_fast.data import run_sfm
+
     with bars() as progress:
         found = run_sfm(
             args.photos,

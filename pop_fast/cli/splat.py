@@ -5,20 +5,18 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
-from torch import Tensor
 
-from pop_fast.cli.progress import bars
-from pop_fast.data import Capture, load_capture
 from pop_fast.errors import PopError
-from pop_fast.io.ply import is_antialiased, load_ply
-from pop_fast.train.checkpoint import list_checkpoints, load_splats
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.results import read_config
-from pop_fast.train.schedule import active_sh_degree
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from pop_fast.data import Capture
 
 RECORD = "capture.json"
 
@@ -47,6 +45,8 @@ class Splat:
         degree = {0: 0, 3: 1, 8: 2, 15: 3}[self.params["shN"].shape[1]]
         if self.step is None or self.folder is None:
             return degree
+        from pop_fast.train.schedule import active_sh_degree
+
         return active_sh_degree(self.step, self.config.sh_interval, degree)
 
 
@@ -106,6 +106,10 @@ def load_splat(path: Path) -> Splat:
     Raises:
         PopError: none of these, or damaged.
     """
+    from pop_fast.io.ply import is_antialiased, load_ply
+    from pop_fast.train.checkpoint import load_splats
+    from pop_fast.train.results import read_config
+
     if path.is_dir():
         return _from_folder(path)
     if not path.exists():
@@ -124,6 +128,10 @@ def load_splat(path: Path) -> Splat:
 
 
 def _from_folder(folder: Path) -> Splat:
+    from pop_fast.io.ply import load_ply
+    from pop_fast.train.checkpoint import list_checkpoints, load_splats
+    from pop_fast.train.results import read_config
+
     config = read_config(folder)
     checkpoints = list_checkpoints(folder)
     if checkpoints:
@@ -141,6 +149,9 @@ def open_capture(splat: Splat, options: CaptureOptions) -> tuple[Capture, TrainC
     Raises:
         PopError: no capture is known, or it cannot be read.
     """
+    from pop_fast.cli.progress import bars
+    from pop_fast.data import load_capture
+
     record = read_record(splat.folder) or CaptureRecord()
     data = str(options.capture or splat.config.data)
     if not data:

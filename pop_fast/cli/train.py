@@ -9,27 +9,21 @@ import typing
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import tyro
 
-from pop_fast.backends import get_backend
-from pop_fast.cli import EXIT_INTERRUPTED
+from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED
 from pop_fast.cli.arguments import parse
-from pop_fast.cli.progress import bars
+from pop_fast.cli.errors import describe
 from pop_fast.cli.said import PLAN, plan_of, said
-from pop_fast.cli.splat import RECORD, CaptureRecord, read_record, record_text
-from pop_fast.data import Capture, load_capture
 from pop_fast.errors import PopError
-from pop_fast.report import write_report
-from pop_fast.train.checkpoint import list_checkpoints
-from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.environment import keep_freed_memory
-from pop_fast.train.fused_stepper import unsupported
 from pop_fast.train.presets import Given
-from pop_fast.train.results import ResultFolder
-from pop_fast.train.training_run import TrainingRun
+
+if TYPE_CHECKING:
+    from pop_fast.cli.splat import CaptureRecord
+    from pop_fast.data import Capture
 
 _EXAMPLES: Final = """
     pop train scene                          POP, the paper's 30,000 steps, results in out/scene_pop
@@ -56,6 +50,8 @@ _ALIASES: Final = {
     **dict.fromkeys(("-m", "--model-path", "--result-dir", "-o"), "--out"),
     "--data-factor": "--factor",
 }
+# what trains, and takes longest to import
+_TRAINING: Final = ("pop_fast.train.training_run", "pop_fast.compiled.native_step")
 _IGNORED: Final = frozenset({"--eval"})  # Inria: hold out every 8th view; here the default (--test-every 0 holds none)
 
 
@@ -88,15 +84,26 @@ class _Run:
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     config, options = arguments(argv)
+    from pop_fast.train.choose import choose_backend
+
     folder = Path(config.result_dir)
     check_output(folder, options)
     options = as_begun(folder, options)
     config, chosen = choose_backend(config, options.resume)
     check_backend(config)
-    keep_freed_memory()
-    start = time.perf_counter()
+    return _train(config, options, chosen)
+
+
+def _train(config: TrainConfig, options: Any, chosen: str) -> int:
+    from pop_fast.cli.splat import RECORD, record_text
+
+    folder, start = Path(config.result_dir), time.perf_counter()
     capture = open_capture(config, options)
     loading = time.perf_counter() - start
+    from pop_fast.train.environment import keep_freed_memory
+    from pop_fast.train.training_run import TrainingRun
+
+    keep_freed_memory()
     for note in capture.notes:
         print(f"note: {note}")
     print(f"{capture.name}: {capture.source}; {_plan(config)}")
@@ -114,9 +121,29 @@ def run(argv: Sequence[str]) -> int:
         nothing = "stopped before the first step; nothing was written"
         print(f"pop: {stopped if training.step else nothing}", file=sys.stderr)
         return EXIT_INTERRUPTED
-    report = write_report(folder)
-    print(summary(stats))
-    print(f"report: {report}")
+    print(summary(stats), flush=True)
+    return report(folder)
+
+
+def report(folder: Path) -> int:
+    """Write the report of a run whose results are complete, which they stay whatever becomes of it.
+
+    Returns:
+        The exit status: 0, or 1 where it could not be written, or 130 after Ctrl-C.
+    """
+    left = f"the results in {folder} are complete, and pop report {folder} writes it"
+    try:
+        from pop_fast.report import write_report
+
+        print(f"report: {write_report(folder)}")
+    except KeyboardInterrupt:
+        print(f"pop: stopped while writing the report; {left}", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except Exception as error:
+        # a fault of the program too: 'pop report' shows where it is
+        reason = describe(error) or f"{type(error).__name__}: {error}"
+        print(f"pop: error: the report could not be written: {reason}; {left}", file=sys.stderr)
+        return EXIT_INCOMPLETE
     return 0
 
 
@@ -202,6 +229,8 @@ def check_output(folder: Path, options: Any) -> None:
     """
     if options.resume and options.overwrite:
         raise PopError("--resume and --overwrite exclude each other; choose one")
+    from pop_fast.train.results import ResultFolder
+
     if ResultFolder(folder).check(options.resume, options.overwrite):
         print(f"note: {folder}: an --overwrite was cut short; the results that it had set aside are back")
 
@@ -216,6 +245,8 @@ def as_begun(folder: Path, options: Any) -> Any:
     Raises:
         PopError: capture.json is damaged.
     """
+    from pop_fast.cli.splat import read_record
+
     record = read_record(folder) if options.resume else None
     if record is None:
         return options
@@ -229,6 +260,8 @@ def as_begun(folder: Path, options: Any) -> Any:
 
 
 def _resumption(folder: Path) -> str:
+    from pop_fast.train.checkpoint import list_checkpoints
+
     found = list_checkpoints(folder)
     return f"going on from step {found[-1][0] + 1:,}" if found else f"nothing to resume in {folder}: starting anew"
 
@@ -239,17 +272,31 @@ def check_backend(config: TrainConfig) -> None:
     Raises:
         PopError: says why and what to do.
     """
+    from pop_fast.backends import get_backend
+
     backend = get_backend(config.backend)
     if not backend.available():
         raise PopError(f"backend {config.backend!r} is not available: {backend.why_not()}")
-    reason = unsupported(config) if config.backend == "cuda" else None
-    if reason is not None:
-        raise PopError(reason)
+    if config.backend == "cuda":
+        from pop_fast.train.fused_stepper import unsupported
+
+        reason = unsupported(config)
+        if reason is not None:
+            raise PopError(reason)
 
 
 def open_capture(config: TrainConfig, options: Any) -> Capture:
-    """Load the capture that a config names, with progress; finds the cameras of bare photographs first."""
-    with bars(config.progress) as progress:
+    """Load the capture that a config names, with progress, while what trains is imported.
+
+    The cameras of bare photographs are found first.
+    """
+    from pop_fast.cli.meanwhile import importing
+    from pop_fast.cli.progress import bars
+    from pop_fast.data.load import load_capture
+
+    # a folder that is not there is said at once
+    modules = _TRAINING if Path(config.data).is_dir() else ()
+    with importing(*modules), bars(config.progress) as progress:
         return load_capture(
             config.data,
             factor=config.factor,
@@ -267,6 +314,8 @@ def open_capture(config: TrainConfig, options: Any) -> Capture:
 
 
 def _record(capture: Capture, options: Any) -> CaptureRecord:
+    from pop_fast.cli.splat import CaptureRecord
+
     return CaptureRecord(
         images=options.images,
         missing=options.missing,

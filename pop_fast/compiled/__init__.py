@@ -25,10 +25,10 @@ def why_not() -> str | None:
         return None
     if not path.exists():
         return "the CPU kernels are not compiled for this version and this processor; run `pop build-cpu`"
-    from pop_fast.compiled.library import open_library
+    from pop_fast.compiled.library import load_library
 
     try:
-        open_library(str(path))
+        load_library(str(path))
     except OSError as error:
         return f"the compiled CPU kernels do not load ({error}); compile them again: `pop build-cpu`"
     _loaded.add(str(path))

@@ -6,6 +6,7 @@
 #include "colors.h"
 #include "forward.h"
 #include "lists.h"
+#include "moments.h"
 #include "projection.h"
 #include "ssim.h"
 #include "threads.h"
@@ -75,6 +76,7 @@ POP_STAGE(lists, Lists, list_tiles)
 POP_STAGE(forward, Blend, forward)
 POP_STAGE(backward, Blend, backward)
 POP_STAGE(ssim, Ssim, dissimilarity)
+POP_STAGE(moments, Moments, moments)
 
 // what `library.py` compares and asks for
 int64_t pop_covariances_bytes() { return int64_t(sizeof(pop::Covariances<float>)); }
@@ -83,6 +85,7 @@ int64_t pop_rows_at_a_time() { return pop::ROWS_AT_A_TIME; }
 int64_t pop_colors_bytes() { return int64_t(sizeof(pop::Colors<float>)); }
 int64_t pop_lists_bytes() { return int64_t(sizeof(pop::Lists<float>)); }
 int64_t pop_blend_bytes() { return int64_t(sizeof(pop::Blend<float>)); }
+int64_t pop_moments_bytes() { return int64_t(sizeof(pop::Moments<float>)); }
 int64_t pop_ssim_bytes() { return int64_t(sizeof(pop::Ssim<float>)); }
 int64_t pop_window_rows() { return pop::WINDOW_ROWS; }
 int64_t pop_padded_line(int64_t length, int64_t bytes) {

@@ -25,7 +25,7 @@ from cuda_ext.compiler import find_compiler, no_compiler
 
 HERE: Final = Path(__file__).resolve().parent
 SOURCES: Final = (
-    *("projection.h", "colors.h", "lists.h", "tile.h", "forward.h", "backward.h", "ssim.h"),
+    *("projection.h", "colors.h", "lists.h", "tile.h", "forward.h", "backward.h", "ssim.h", "moments.h"),
     *("lanes.h", "threads.h", "pool.h", "step.h", "step.cpp", "counts.cpp", "blend.cpp"),
 )
 # one Gaussian's arithmetic is that of the CUDA kernels

@@ -1,4 +1,7 @@
-"""The compiled library through ctypes: the layouts of what its functions are given, and how they are called."""
+"""The compiled library through ctypes: the layouts of what its functions are given, and how they are called.
+
+Whether the library loads can be told without torch; calling it takes torch's tensors.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +12,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any, Final
 
 from pop_fast.compiled.build import library_path
 
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+_PRECISIONS: Final = ("float32", "float64")
 _POINTER, _WHOLE, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 
 
@@ -113,6 +118,16 @@ class Ssim(ctypes.Structure):
     )
 
 
+class Moments(ctypes.Structure):
+    """`pop::Moments` of moments.h, where every field is explained, in its order."""
+
+    _fields_ = (
+        *_fields(_POINTER, "photograph"),
+        *_fields(_WHOLE, "height", "width", "border", "threads"),
+        *_fields(_POINTER, "target", "mu_y", "s_yy"),
+    )
+
+
 _NAMES: dict[type[ctypes.Structure], str] = {
     Covariances: "covariances",
     CovariancesBackward: "covariances_backward",
@@ -124,6 +139,7 @@ _NAMES: dict[type[ctypes.Structure], str] = {
     Blend: "forward",
     BlendBackward: "backward",
     Ssim: "ssim",
+    Moments: "moments",
 }
 
 
@@ -132,7 +148,7 @@ class Library:
     """What is in the library.
 
     Attributes:
-        functions: by layout and type.
+        functions: by layout and precision.
         chunk: list entries after which the blend writes down the light.
         padded_pixels: pixels of a tile of that size, padded to whole vectors of floats of so many bytes.
         splat_bytes: size of what blending keeps of a splat, and its alignment.
@@ -140,10 +156,11 @@ class Library:
         window_rows: rows of SSIM's windows whose total is one number.
         padded_line: numbers from one row of maps to the next, for rows of that many numbers of so many bytes.
         rows_at_a_time: Gaussians whose share of the camera's gradient is one sum.
+        adam: moves so many floats by one update of Adam.
         fork: starts the threads, or None.
     """
 
-    functions: dict[tuple[type[ctypes.Structure], torch.dtype], Callable[..., int]]
+    functions: dict[tuple[type[ctypes.Structure], str], Callable[..., int]]
     chunk: int
     padded_pixels: Callable[[int, int], int]
     splat_bytes: int
@@ -151,6 +168,7 @@ class Library:
     window_rows: int
     padded_line: Callable[[int, int], int]
     rows_at_a_time: int
+    adam: Callable[..., None]
     fork: Any
 
 
@@ -215,7 +233,7 @@ def call_library(
     # the arguments only point: these are what they point into, and live until the function has returned
     held = {name: tensor.contiguous() for name, tensor in tensors.items() if tensor is not None}
     arguments = layout(**numbers, **{name: tensor.data_ptr() for name, tensor in held.items()})
-    if not library.functions[layout, dtype](ctypes.byref(arguments), library.fork):
+    if not library.functions[layout, str(dtype).removeprefix("torch.")](ctypes.byref(arguments), library.fork):
         raise MemoryError(f"the compiled CPU kernels ran out of memory in stage {_NAMES[layout]}")
 
 
@@ -226,27 +244,25 @@ def this_library() -> Library:
 
 @cache
 def open_library(path: str) -> Library:
-    """Load a library.
+    """Load a library to call it; torch is imported by then.
 
     Raises:
         OSError: it is missing, does not load, or was not made from the same source as this module.
     """
-    loaded = ctypes.CDLL(path)
-    layouts = (Covariances, Projection, Colors, Lists, Blend, Ssim)
-    sizes = {f"pop_{layout.__name__.lower()}_bytes": layout for layout in layouts}
+    loaded = load_library(path)
     numbers = ("chunk", "padded_pixels", "splat_bytes", "lanes", "window_rows", "padded_line", "rows_at_a_time")
-    for name in (*sizes, *(f"pop_{number}" for number in numbers)):
-        getattr(loaded, name).restype = _WHOLE
+    for number in numbers:
+        getattr(loaded, f"pop_{number}").restype = _WHOLE
     loaded.pop_lanes.argtypes = (_WHOLE,)
     loaded.pop_padded_pixels.argtypes = loaded.pop_padded_line.argtypes = (_WHOLE, _WHOLE)
-    if any(getattr(loaded, name)() != ctypes.sizeof(layout) for name, layout in sizes.items()):
-        raise OSError(f"{path} expects arguments of another layout")
-    functions: dict[tuple[type[ctypes.Structure], torch.dtype], Callable[..., int]] = {}
+    loaded.pop_adam.argtypes = (*(_POINTER,) * 4, *(_WHOLE,) * 2, *(_REAL,) * 4)
+    loaded.pop_adam.restype = None
+    functions: dict[tuple[type[ctypes.Structure], str], Callable[..., int]] = {}
     for layout, name in _NAMES.items():
-        for dtype in (torch.float32, torch.float64):
-            function = getattr(loaded, f"pop_{name}_{str(dtype).removeprefix('torch.')}")
+        for precision in _PRECISIONS:
+            function = getattr(loaded, f"pop_{name}_{precision}")
             function.argtypes, function.restype = (_POINTER, _POINTER), ctypes.c_int
-            functions[layout, dtype] = function
+            functions[layout, precision] = function
     return Library(
         functions,
         loaded.pop_chunk(),
@@ -256,8 +272,24 @@ def open_library(path: str) -> Library:
         loaded.pop_window_rows(),
         loaded.pop_padded_line,
         loaded.pop_rows_at_a_time(),
+        loaded.pop_adam,
         _fork(),
     )
+
+
+def load_library(path: str) -> ctypes.CDLL:
+    """Load a library and compare its layouts of arguments with those of this module.
+
+    Raises:
+        OSError: it is missing, does not load, or was not made from the same source as this module.
+    """
+    loaded = ctypes.CDLL(path)
+    for layout in (Covariances, Projection, Colors, Lists, Blend, Ssim, Moments):
+        size = getattr(loaded, f"pop_{layout.__name__.lower()}_bytes")
+        size.restype = _WHOLE
+        if size() != ctypes.sizeof(layout):
+            raise OSError(f"{path} expects arguments of another layout")
+    return loaded
 
 
 def _fork() -> Any:

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, StepStats
-from pop_fast.compiled.library import stepper_functions
-from pop_fast.ssim import Padding, TargetMoments, border_of, kept_windows, target_moments
+from pop_fast.compiled.library import Moments, call_library, stepper_functions
+from pop_fast.ssim import REACH, Padding, border_of, check_size, kept_windows
 from pop_fast.transmittance import Stop, below
 
 # steps that are taken before Python is asked again: Ctrl-C, a progress bar
@@ -97,19 +97,24 @@ class _Target:
 
     @classmethod
     def of(cls, view: TrainingView, padding: Padding) -> _Target:
-        moments: TargetMoments = target_moments(view.photo.float().div_(255.0), padding)
-        channels = moments.target.shape[2]
-
-        def planes(maps: Tensor) -> Tensor:
-            return maps.reshape(len(maps), -1, channels).permute(2, 0, 1).contiguous()
-
+        height, width = view.photo.shape[:2]
+        check_size(view.photo, padding)
+        border = border_of(padding)
+        target = torch.empty((3, height, width))
+        mu_y, s_yy = (torch.empty((3, height + 2 * border - REACH, width + 2 * border - REACH)) for _ in range(2))
+        call_library(
+            Moments,
+            torch.float32,
+            {"height": height, "width": width, "border": border, "threads": torch.get_num_threads()},
+            {"photograph": view.photo, "target": target, "mu_y": mu_y, "s_yy": s_yy},
+        )
         mask = view.mask
         return cls(
             view.viewmat.reshape(4, 4).float().contiguous(),
             view.K.reshape(3, 3).float().contiguous(),
-            planes(moments.target),
-            planes(moments.mu_y),
-            planes(moments.s_yy),
+            target,
+            mu_y,
+            s_yy,
             None if mask is None else mask.contiguous(),
             None if mask is None else kept_windows(mask, padding, 1, torch.float32).contiguous(),
         )

@@ -57,6 +57,11 @@ template <class Call> void with_degree(int64_t degree, Call call) {
   call(std::integral_constant<int, 3>());
 }
 
+void adam_on(float *__restrict param, float *__restrict m, float *__restrict v, const float *__restrict gradient, int64_t n,
+             const AdamStep<float> &step) {
+  for (int64_t k = 0; k < n; k++) adam_one(param[k], m[k], v[k], gradient[k], step);
+}
+
 // A bit pattern that is ordered as the floats are.
 uint32_t ordered_bits(float x) {
   const uint32_t bits = bits_of<uint32_t>(x);
@@ -355,7 +360,7 @@ Work Stepper::place_entries() {
 // ---- blend: the picture, and its difference from the photograph
 
 Work Stepper::blend_tiles() {
-  const auto one_tile = blend_tile_function<float>(blend, pixels);
+  const auto one_tile = blend.dominance() ? blend_tile<float, 3, true, true> : blend_tile<float, 3, true, false>;
   return {blend.tiles(), 2, [=](int thread, int64_t first, int64_t last) {
             for (int64_t tile = first; tile < last; tile++) {
               one_tile(blend, pixels, tile, workers[size_t(thread)]->canvas);
@@ -460,7 +465,7 @@ void Stepper::gather_rows(Worker &own, int64_t first, int64_t last) {
 // ---- transpose: back to the entries
 
 Work Stepper::transpose_tiles() {
-  const auto one_tile = transpose_tile_function<float>(blend, pixels);
+  const auto one_tile = transpose_tile<float, 3, true>;
   return {blend.tiles(), 2, [=](int thread, int64_t first, int64_t last) {
             for (int64_t tile = first; tile < last; tile++) {
               one_tile(blend, pixels, tile, workers[size_t(thread)]->transpose);
@@ -584,11 +589,7 @@ template <int DEGREE> [[gnu::flatten]] void Stepper::gradient_of_row(int64_t i, 
 }
 
 void Stepper::adam(StepGroup group, const float *gradient, int64_t first, int64_t n) {
-  float *__restrict param = given->params[group] + first, *__restrict m = given->m[group] + first;
-  float *__restrict v = given->v[group] + first;
-  const float *__restrict g = gradient;
-  const AdamStep<float> step = adam_steps[group];
-  for (int64_t k = 0; k < n; k++) adam_one(param[k], m[k], v[k], g[k], step);
+  adam_on(given->params[group] + first, given->m[group] + first, given->v[group] + first, gradient, n, adam_steps[group]);
 }
 
 // ---- what the step was like
@@ -636,6 +637,12 @@ int64_t pop_stepper_steps(void *stepper, const pop::StepGiven *first, int64_t n)
   } catch (...) {
     return -1;
   }
+}
+
+// the update by itself, for whoever judges it
+void pop_adam(float *param, float *m, float *v, const float *gradient, int64_t n, int64_t step, double lr, double beta1,
+              double beta2, double eps) {
+  pop::adam_on(param, m, v, gradient, n, pop::adam_step_at<float>(int(step), lr, beta1, beta2, eps));
 }
 
 int64_t pop_stepper_bytes(const void *stepper) { return static_cast<const pop::Stepper *>(stepper)->bytes(); }

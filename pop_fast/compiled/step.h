@@ -30,7 +30,7 @@ enum StepGroup { MEANS, SCALES, QUATS, OPACITIES, SH0, SHN, GROUPS };
 enum StepPart { SEE, LIST, BLEND, COMPARE, GATHER, TRANSPOSE, UPDATE, PARTS };
 enum StepValue { PIXELWISE, SSIM, OBJECTIVE, SQUARE, POP, VALUES };
 
-constexpr int STEP_TILE = 16;  // a row of a tile is one vector of floats
+constexpr int STEP_TILE = LANES<float>;  // a row of a tile is one vector
 
 // Everything of one step; eight bytes each, in the order of `native_step.py`.
 struct StepGiven {

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from pop_fast.data.capture import Capture, View
-from pop_fast.data.demo import make_demo
-from pop_fast.data.initialize import initialize_params
-from pop_fast.data.load import load_capture
-from pop_fast.data.photos import run_sfm
-from pop_fast.data.similarity import apply_similarity, to_capture_frame
+from typing import TYPE_CHECKING
+
 from pop_fast.errors import CaptureError
+from pop_fast.lazy import given_by
+
+if TYPE_CHECKING:
+    from pop_fast.data.capture import Capture, View
+    from pop_fast.data.demo import make_demo
+    from pop_fast.data.initialize import initialize_params
+    from pop_fast.data.load import load_capture
+    from pop_fast.data.photos import run_sfm
+    from pop_fast.data.similarity import apply_similarity, to_capture_frame
 
 __all__ = [
     "Capture",
@@ -21,3 +26,16 @@ __all__ = [
     "run_sfm",
     "to_capture_frame",
 ]
+
+# a capture is read without torch, and while that is imported
+__getattr__ = given_by(
+    __name__,
+    {
+        "capture": ("Capture", "View"),
+        "demo": ("make_demo",),
+        "initialize": ("initialize_params",),
+        "load": ("load_capture",),
+        "photos": ("run_sfm",),
+        "similarity": ("apply_similarity", "to_capture_frame"),
+    },
+)

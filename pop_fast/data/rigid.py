@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from pop_fast.io.points import FARTHEST
 
@@ -67,6 +68,21 @@ def rigid_from_quat(quat: np.ndarray, translation: np.ndarray) -> np.ndarray:
     unit = quat / np.abs(quat).max()
     unit = unit / np.linalg.norm(unit)
     rigid = np.eye(4)
-    rigid[:3, :3] = Rotation.from_quat(unit[[1, 2, 3, 0]]).as_matrix()
+    rigid[:3, :3] = _rotation(*unit.tolist())
     rigid[:3, 3] = translation
     return rigid
+
+
+def _rotation(w: float, x: float, y: float, z: float) -> list[list[float]]:
+    """Turn a quaternion into a matrix, to the bits of scipy's `Rotation`, which takes longer to import than to use.
+
+    What a capture's poses come to is part of its fingerprint in checkpoints.
+    """
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    w, x, y, z = w / norm, x / norm, y / norm, z / norm
+    x2, y2, z2, w2 = x * x, y * y, z * z, w * w
+    return [
+        [x2 - y2 - z2 + w2, 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+        [2.0 * (x * y + z * w), -x2 + y2 - z2 + w2, 2.0 * (y * z - x * w)],
+        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), -x2 - y2 + z2 + w2],
+    ]

@@ -95,13 +95,17 @@ def undistortion(camera: Any, width: int, height: int) -> Undistortion:
             f"({camera.model_name}) has distortion {camera.params.tolist()} that folds the {width}x{height} image over "
             "itself; calibrate it again, or undistort the photographs first"
         )
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    # opencv's remap puts pixel centres at integers
-    at = source(np.stack([x.ravel(), y.ravel()], axis=1), zoom) - 0.5
+    maps = np.empty((2, height, width), np.float32)
+    points = np.empty((width, 2))
+    points[:, 0] = np.arange(width) + 0.5
+    # row by row, which stays in the processor's cache
+    for row in range(height):
+        points[:, 1] = row + 0.5
+        # opencv's remap puts pixel centres at integers
+        maps[:, row] = (source(points, zoom) - 0.5).T
     K[0, 0] *= zoom
     K[1, 1] *= zoom
-    maps = at.astype(np.float32).reshape(height, width, 2)
-    return Undistortion(K, (np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1])))
+    return Undistortion(K, (maps[0], maps[1]))
 
 
 def _fan(width: int, height: int, center: np.ndarray, steps: int = 48, along: int = 24) -> np.ndarray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import os
+import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -135,8 +136,12 @@ def _rectifier() -> Any:
     ) -> Undistortion:
         return undistortion(make_camera(0, model, *size, list(params)), *stored)
 
+    # the threads that read photographs of one camera would all begin with the same plan
+    one_at_a_time = threading.Lock()
+
     def rectify(camera: Any, width: int, height: int) -> Undistortion:
-        return remembered(camera.model_name, tuple(camera.params), (camera.width, camera.height), (width, height))
+        with one_at_a_time:
+            return remembered(camera.model_name, tuple(camera.params), (camera.width, camera.height), (width, height))
 
     return rectify
 

@@ -18,7 +18,8 @@ from pop_fast.io.images import FIX
 __all__ = ["jpeg_damage", "sound_jpegs"]
 
 _LISTENER = Path(__file__).with_name("jpeg_listener.py")
-_A_LISTENER_FOR = 16
+# a process takes as long to start as to read so many
+_A_LISTENER_FOR = 64
 _LISTENERS = 4
 _DAMAGE = re.compile(
     rb"premature end of data segment|bad Huffman code|bad arithmetic code|found marker \w+ instead of RST\d"

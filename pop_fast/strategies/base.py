@@ -17,17 +17,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
 
-from torch import Tensor
-from torch.optim import Optimizer
+if TYPE_CHECKING:
+    from torch import Tensor
+    from torch.optim import Optimizer
 
 Params: TypeAlias = MutableMapping[str, Any]
-Optimizers: TypeAlias = Mapping[str, Optimizer]
+Optimizers: TypeAlias = "Mapping[str, Optimizer]"
 State: TypeAlias = dict[str, Any]
 Info: TypeAlias = Mapping[str, Any]
 # given n, standard normal draws for the children of n split parents, on the CPU. -> [2, n, 3]
-Normals: TypeAlias = Callable[[int], Tensor]
+Normals: TypeAlias = "Callable[[int], Tensor]"
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch
@@ -14,8 +15,8 @@ from pop_fast.strategies.base import Info, Normals, Optimizers, Params, State, S
 class ForeignStrategy:
     """A strategy that collects and changes in one call, `step_post_backward`, as gsplat's do.
 
-    Its random numbers come from a generator in `state` that is saved with it, whatever it draws them with, so that
-    a run that is resumed goes on to the same bits. When it changes the population is not known beforehand; a
+    Where it draws random numbers with torch's global generator, they come from one in `state` that is saved with it, so
+    that a run that is resumed goes on to the same bits. When it changes the population is not known beforehand; a
     `StepEvent` that it returns goes into the records.
 
     Args:
@@ -27,6 +28,7 @@ class ForeignStrategy:
         self.strategy = strategy
         self.absgrad = bool(getattr(strategy, "absgrad", False))
         self._info: Info | None = None
+        self._lends = True
 
     @property
     def name(self) -> str:
@@ -38,11 +40,10 @@ class ForeignStrategy:
         self.strategy.check_sanity(params, optimizers)
 
     def initialize_state(self, scene_scale: float = 1.0, seed: int = 0) -> State:
-        """Return the strategy's own state and the generator of its random numbers."""
-        return {
-            **self.strategy.initialize_state(scene_scale=scene_scale),
-            "generator": torch.Generator().manual_seed(seed),
-        }
+        """Return the strategy's own state and, unless it has one, a generator for its random numbers."""
+        own = self.strategy.initialize_state(scene_scale=scene_scale)
+        self._lends = "generator" not in own
+        return {**own, "generator": torch.Generator().manual_seed(seed)} if self._lends else own
 
     def needs_dominance(self, step: int) -> bool:
         """Tell whether `info["dominant_counts"]` is read at this step."""
@@ -73,8 +74,15 @@ class ForeignStrategy:
         info, self._info = self._info, None
         if info is None:
             raise ValueError("change needs the info of the step before it; call collect first")
-        with torch.random.fork_rng(devices=[]):
-            torch.set_rng_state(state["generator"].get_state())
+        with _drawing_from(state["generator"]) if self._lends else nullcontext():
             found: Any = self.strategy.step_post_backward(params, optimizers, state, step, info)
-            state["generator"].set_state(torch.get_rng_state())
         return found if isinstance(found, StepEvent) else None
+
+
+@contextmanager
+def _drawing_from(generator: torch.Generator) -> Iterator[None]:
+    """Let torch's global generator on the CPU be this one for a while."""
+    with torch.random.fork_rng(devices=[]):
+        torch.set_rng_state(generator.get_state())
+        yield
+        generator.set_state(torch.get_rng_state())

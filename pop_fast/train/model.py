@@ -8,13 +8,23 @@ from typing import Final
 import torch
 from torch import Tensor
 from torch.nn import Parameter
-from torch.optim import Adam
+from torch.optim import Adam, Optimizer
 
 from pop_fast.activations import scales_from_log_scales
 from pop_fast.train.schedule import means_lr
 from pop_ref.settings import BETAS, EPS, LearningRates
 
 KEYS: Final = ("means", "scales", "quats", "opacities", "sh0", "shN")
+
+
+class _Moments(Adam):
+    """Adam, made without importing torch's compiler.
+
+    torch keeps its compiler out of `add_param_group`, which every optimizer calls when it is made, and imports it for
+    that: 0.6 s before a first step that compiles nothing. An engine other than torch's never calls what else does so.
+    """
+
+    add_param_group = getattr(Optimizer.add_param_group, "__wrapped__", Optimizer.add_param_group)
 
 
 def learning_rates(lr: LearningRates, scene_scale: float) -> dict[str, float]:
@@ -36,7 +46,9 @@ def make_optimizers(params: Mapping[str, Parameter], lr: LearningRates, scene_sc
         scene_scale: the unit of the means' learning rate, world units.
     """
     rates = learning_rates(lr, scene_scale)
-    made = {key: Adam([param], lr=rates[key], betas=BETAS, eps=EPS, fused=True) for key, param in params.items()}
+    made: dict[str, Adam] = {
+        key: _Moments([param], lr=rates[key], betas=BETAS, eps=EPS, fused=True) for key, param in params.items()
+    }
     for key, optimizer in made.items():
         moments = {name: torch.zeros_like(params[key].detach()) for name in ("exp_avg", "exp_avg_sq")}
         optimizer.state[params[key]] = {"step": torch.zeros((), dtype=torch.float32), **moments}

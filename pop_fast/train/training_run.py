@@ -28,7 +28,7 @@ from pop_fast.data.initialize import initialize_params
 from pop_fast.errors import PopError
 from pop_fast.io.ply import save_ply
 from pop_fast.strategies.base import StepEvent, Strategy
-from pop_fast.strategies.control import standard_normals
+from pop_fast.strategies.densify import standard_normals
 from pop_fast.strategies.foreign import ForeignStrategy
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.choose import choose_backend
@@ -115,7 +115,7 @@ class TrainingRun:
         if initial is None:
             initial = initialize_params(capture, config.seed, config.init_opacity, config.init_scale)
         check_start(capture.name, initial)
-        self.params = {key: Parameter(initial[key]) for key in KEYS}
+        self.params = {key: Parameter(initial[key].contiguous()) for key in KEYS}
         dtype = self.params["means"].dtype
         self._train = [ViewTensors.of(view, dtype) for view in capture.train_views(config.test_every)]
         self._test = [ViewTensors.of(view, dtype) for view in capture.test_views(config.test_every)]
@@ -141,7 +141,7 @@ class TrainingRun:
             PopError: the folder is in use, a checkpoint does not fit, or a number is no longer finite.
             KeyboardInterrupt: after Ctrl-C or SIGTERM, when a checkpoint has been written; or at once after the second.
         """
-        for warning in find_warnings(self.config, self._train):
+        for warning in [] if isinstance(self.strategy, ForeignStrategy) else find_warnings(self.config, self._train):
             print(f"warning: {warning}", file=sys.stderr, flush=True)
         self._started = time.perf_counter()
         with reproducible(self.config.threads), stop_requests() as stop:
@@ -294,7 +294,7 @@ class TrainingRun:
         config = self.config
         stats = {
             "step": step,
-            **facts(config, self._train),
+            **self._of_settings(),
             "capture": self._capture.name,
             **population(self._opacities()),
             **self._facts(),
@@ -306,6 +306,11 @@ class TrainingRun:
         stats["seconds_total"] = self._total_seconds
         self._results.write_stats("val", step, stats)
         return stats
+
+    def _of_settings(self) -> dict[str, Any]:
+        if isinstance(self.strategy, ForeignStrategy):
+            return {"method": self.strategy.name}
+        return facts(self.config, self._train)
 
     def _facts(self) -> dict[str, Any]:
         stepper, engine = self.stepper, self._engine

@@ -124,8 +124,12 @@ def program(name: str, package: str, backend: str, dtype: str) -> Any:
     from pop_ref.conformance.torch_training import training_stages
 
     rasterization = partial(function_named(f"{package}.rasterization:rasterization"), backend=backend)
-    stages = package if backend == "fast" else f"{package}.{backend}"
-    return TorchAdapter(name, rasterization, stages, dtype, stages=training_stages(package))
+    stages, trains = package if backend == "fast" else f"{package}.{backend}", training_stages(package)
+    if backend == "compiled" and dtype == "float32":
+        # what trains in this precision is the native step, which has an Adam of its own
+        native = importlib.import_module(f"{package}.compiled.optimizer")
+        trains |= {name: getattr(native, name) for name in ("adam_step", "adam_steps")}
+    return TorchAdapter(name, rasterization, stages, dtype, stages=trains)
 
 
 class Absent:

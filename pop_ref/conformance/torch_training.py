@@ -130,7 +130,6 @@ class Trainer:
             "n_cameras": 1,
             "width": width,
             "height": height,
-            **({} if kept_pixels is None else {"kept_pixels": kept_pixels}),
         }
         if kept_pixels is not None:
             info["kept_pixels"] = kept_pixels

@@ -215,7 +215,7 @@ def test_a_library_of_another_layout_is_refused(monkeypatch: pytest.MonkeyPatch)
 def test_auto_takes_it_where_it_is_and_says_how_to_get_it_where_it_is_not(
     fresh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    chosen, line = choose_backend(tiny_config(tmp_path))
+    chosen, line = choose_backend(tiny_config(tmp_path, backend="auto"))
     assert chosen.backend == "fast"
     assert line.startswith("backend fast (CPU): the CPU kernels are not compiled")
     assert line.endswith(f"run `pop build-cpu`; {NO_GPU}")
@@ -223,7 +223,7 @@ def test_auto_takes_it_where_it_is_and_says_how_to_get_it_where_it_is_not(
     assert finding.state == "off"
     assert "`pop build-cpu`" in finding.found
     monkeypatch.setattr("pop_fast.compiled.why_not", lambda: None)
-    chosen, line = choose_backend(tiny_config(tmp_path))
+    chosen, line = choose_backend(tiny_config(tmp_path, backend="auto"))
     assert (chosen.backend, line) == ("compiled", f"backend compiled (CPU): {NO_GPU}")
 
 

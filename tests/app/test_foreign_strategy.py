@@ -12,14 +12,13 @@ import torch
 from pop_fast.errors import PopError
 from pop_fast.strategies import POPStrategy, StepEvent
 from pop_fast.train import TrainingRun
-from tests.app.drift import drift_engine
 from tests.app.test_resume import assert_same_run
 from tests.app.tiny import tiny_capture, tiny_config
 
 
 @dataclass
 class Jitter:
-    """Every fourth step what moved most on the screen gets a copy nearby, placed by torch's own numbers."""
+    """Every fourth step the Gaussian that moved most on the screen gets a copy nearby, placed by torch's numbers."""
 
     every: int = 4
     tells: bool = False
@@ -83,7 +82,7 @@ def test_it_decides_over_the_population_and_the_loss_falls(tmp_path):
     # steps 0, 4, ... 28
     assert len(training.params["means"]) == n + 8
     stats = json.loads((tmp_path / "stats" / "val_step0029.json").read_text())
-    assert (stats["num_GS"], stats["stepper"]) == (n + 8, "torch")
+    assert (stats["num_GS"], stats["stepper"], stats["method"]) == (n + 8, "torch", "Jitter")
     records = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert records[-1]["loss"] < records[0]["loss"]
     assert not any("cloned" in record or "pop" in record for record in records)
@@ -111,8 +110,9 @@ def test_our_own_strategies_follow_the_protocol_too(tmp_path):
     given = TrainingRun(tiny_config(tmp_path / "given"), tiny_capture(), strategy=own)
     given.run()
     named = TrainingRun(tiny_config(tmp_path / "named"), tiny_capture())
+    # by gsplat's protocol a strategy is not told a seed
+    named.state["generator"].manual_seed(0)
     named.run()
-    # the draws come from the same seed, so that the same happens through either door
     for key, value in named.params.items():
         assert torch.equal(given.params[key], value), key
 
@@ -120,5 +120,3 @@ def test_our_own_strategies_follow_the_protocol_too(tmp_path):
 def test_a_gpu_trains_with_the_strategies_of_this_package(tmp_path):
     with pytest.raises(PopError, match="strategies of this package only; use --backend fast"):
         TrainingRun(tiny_config(tmp_path, backend="cuda"), tiny_capture(), strategy=Jitter())
-    with pytest.raises(PopError, match="strategies of this package only"):
-        TrainingRun(tiny_config(tmp_path), tiny_capture(), strategy=Jitter(), engine=drift_engine())

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pop_fast.cli.render import write_pictures
+from pop_fast.cli.frames import write_pictures
 from pop_fast.errors import PopError
 from pop_fast.paths.video import frames_in
 from tests.app.captures import (

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from pop_fast.strategies import POPStrategy
-from pop_fast.strategies.control import standard_normals
+from pop_fast.strategies.densify import standard_normals
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_ref.activations import opacities_from_logits
 from pop_ref.conformance.charges import REACH, charge

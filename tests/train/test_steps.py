@@ -53,7 +53,8 @@ def test_three_hundred_steps_through_every_kind_of_event_are_the_oracles(engine:
     steps = judged(run_of(RECIPE, tmp_path, engine), RECIPE, STEPS)
     agree(steps)
     assert set().union(*(step.happened for step in steps)) == EVERYTHING
-    assert steps[-1].loss < steps[0].loss
+    # before the first reset, while the loss is the same
+    assert sum(step.loss for step in steps[64:68]) < 0.8 * sum(step.loss for step in steps[:4])
 
 
 WRONG = {

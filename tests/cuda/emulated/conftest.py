@@ -18,9 +18,8 @@ from cuda_ext.library_folder import library_folder
 pytest.register_assert_rewrite("pop_ref.conformance.laws")
 
 from pop_ref.conformance.plugin import parametrize_backends  # noqa: E402  asserts must be rewritten first
+from tests.cuda.emulated import emulate  # noqa: E402
 from tests.cuda.gpu.conftest import cuda_backends  # noqa: E402
-
-from . import emulate  # noqa: E402
 
 FOLDER = library_folder(Path(__file__).parent)
 LAWS = bool(os.environ.get("POP_EMULATED_LAWS"))

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from cuda_ext.train_settings import Phase
+from tests.cuda.emulated import emulate
 from tests.cuda.gpu.scene import HEIGHT, STEPS, WIDTH, training_scene
 from tests.cuda.gpu.steps import fused_trainer
 
-from . import emulate
 from .conftest import FOLDER
 
 POP = Phase(3, True, True, True)

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from . import emulate
+from tests.cuda.emulated import emulate
+from tests.cuda.emulated.emulate import FLAGS, HERE, translated
+
 from .conftest import FOLDER
-from .emulate import FLAGS, HERE, translated
 
 PROGRAM = r"""
 #include <cuda_runtime.h>

@@ -15,8 +15,7 @@ import torch
 import pop_fast.rasterization
 from pop_fast.cli import main
 from tests.app.captures import HEIGHT, WIDTH, colmap_capture
-
-from .rehearse import stand_in_card
+from tests.cuda.emulated.rehearse import stand_in_card
 
 BENCHMARKS = Path(__file__).resolve().parents[3] / "benchmarks"
 STAND_IN = 'from pop_fast.rasterization import rasterization\n\n__version__ = "stand-in"\n'

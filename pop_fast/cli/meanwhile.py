@@ -1,0 +1,40 @@
+"""Importing what comes next while something else is waited for."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import sys
+import threading
+from collections.abc import Iterator
+from typing import Final
+
+# s; a thread that decodes photographs asks for the interpreter for microseconds at a time, and would wait 5 ms for it
+_SWITCH_INTERVAL: Final = 2e-4
+
+
+@contextlib.contextmanager
+def importing(*modules: str) -> Iterator[None]:
+    """Import modules in a thread of their own while the block runs; they are there, or have failed, when it ends.
+
+    What fails is not said here: whoever imports such a module afterwards is told. The block must have imported all that
+    it needs, as two threads do not import one package at a time.
+
+    Args:
+        modules: their names.
+    """
+
+    def work() -> None:
+        with contextlib.suppress(Exception):
+            for name in modules:
+                importlib.import_module(name)
+
+    thread = threading.Thread(target=work, name="importing")
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_INTERVAL)
+    thread.start()
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+        thread.join()

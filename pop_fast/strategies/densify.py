@@ -1,0 +1,185 @@
+"""What density control collects of each view, and how it changes the population: `DensityControl` says when."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from pop_fast.density import SPLIT_CHILDREN, Statistics, blur_set, grow_masks, prune_mask
+from pop_fast.polarization import importance_mask, pop_loss
+from pop_fast.strategies import ops
+from pop_fast.strategies.base import Info, Normals, Optimizers, Params, State, StepEvent
+from pop_fast.strategies.control import DensityControl
+from pop_fast.strategies.info import dominant_counts, visible_from_radii, visible_in
+
+
+def initialize_state(scene_scale: float, seed: int) -> State:
+    """Return the state before the first step; see `DensityControl.initialize_state`."""
+    generator = torch.Generator().manual_seed(seed)
+    return {
+        "grad2d": None,
+        "count": None,
+        "views": 0,
+        "blurred": None,
+        "dominant_sum": None,
+        "radii": None,
+        "scene_scale": float(scene_scale),
+        "generator": generator,
+    }
+
+
+def regularizer(plan: DensityControl, opacities: Tensor, state: State, info: Info) -> Tensor:
+    """Return the weighted POP loss of a view; see `DensityControl.regularizer`."""
+    mask = importance_mask(dominant_counts(info).sum(0))
+    if plan.pop_views == "window" and state["dominant_sum"] is not None:
+        mask = mask | importance_mask(state["dominant_sum"])
+    visible = visible_in(info, len(mask)) if plan.pop_over == "visible" else None
+    return plan.lambda_pop * pop_loss(opacities.reshape(-1), mask, visible=visible)
+
+
+@torch.no_grad()
+def collect(plan: DensityControl, params: Params, state: State, step: int, info: Info, packed: bool) -> None:
+    """Add what a view has shown to the window's statistics; see `DensityControl.collect`."""
+    n = len(params["means"])
+    means2d = info[plan.key_for_gradient]
+    grads = means2d.absgrad if plan.absgrad else means2d.grad
+    if grads is None:
+        raise ValueError(f"{plan.key_for_gradient} has no gradient; call step_pre_backward before loss.backward()")
+    if state["grad2d"] is None:
+        state["grad2d"] = torch.zeros(n, dtype=grads.dtype, device=grads.device)
+        state["count"] = torch.zeros(n, dtype=grads.dtype, device=grads.device)
+    # pixels -> normalised device coordinates of [-1, 1]; times the cameras, whose mean the loss is
+    cameras = int(info["n_cameras"])
+    state["views"] += cameras
+    unit = grads.new_tensor([0.5 * info["width"] * cameras, 0.5 * info["height"] * cameras])
+    norms = torch.linalg.vector_norm(grads * unit, dim=-1)
+    if packed:
+        ids = info["gaussian_ids"].long()
+        state["grad2d"].index_add_(0, ids, norms)
+        state["count"].index_add_(0, ids, torch.ones_like(norms))
+    else:
+        visible = visible_from_radii(info["radii"])
+        state["grad2d"].add_(norms.masked_fill_(~visible, 0.0).sum(0))
+        state["count"].add_(visible.sum(0))
+    if (plan.blur_window == "sum" and plan.collects_blur(step)) or plan.collects_window(step):
+        counts = dominant_counts(info).sum(0)
+        state["dominant_sum"] = counts if state["dominant_sum"] is None else state["dominant_sum"] + counts
+    if plan.collects_blur(step):
+        _collect_blur(plan, state, info)
+    if plan.refine_scale2d_stop_iter > 0:
+        _collect_extents(state, info, packed)
+
+
+def _collect_blur(plan: DensityControl, state: State, info: Info) -> None:
+    # where a mask leaves pixels out, counts and share are of those that it keeps
+    kept = info.get("kept_pixels")
+    bound = (int(info["width"]), int(info["height"]), plan.theta_blur, plan.blur_min_pixels, kept)
+    if plan.blur_window == "sum":
+        state["blurred"] = blur_set(state["dominant_sum"], *bound)
+        return
+    blurred = blur_set(dominant_counts(info), *bound).any(0)
+    if plan.blur_window == "any_view" and state["blurred"] is not None:
+        blurred |= state["blurred"]
+    state["blurred"] = blurred
+
+
+@torch.no_grad()
+def change(
+    plan: DensityControl,
+    params: Params,
+    optimizers: Optimizers,
+    state: State,
+    step: int,
+    normals: Normals | None,
+) -> StepEvent:
+    """Do what is due after a step; see `DensityControl.change`."""
+    event = StepEvent()
+    if plan.is_refine_step(step):
+        draws = normals or (lambda n: standard_normals(state["generator"], n))
+        cloned, split = _grow(plan, params, optimizers, state, step, draws)
+        event = StepEvent(cloned, split, _prune(plan, params, optimizers, state, step))
+        _clear(state)
+        if plan.verbose:
+            print(f"step {step}: {event}, {len(params['means'])} Gaussians")
+    if plan.is_reset_step(step):
+        ops.reset_opacities(params, optimizers, ceiling=plan.reset_opa)
+        event = replace(event, reset=True)
+    return event
+
+
+def _grow(
+    plan: DensityControl, params: Params, optimizers: Optimizers, state: State, step: int, normals: Normals
+) -> tuple[int, int]:
+    clones, splits = _grow_masks(plan, params, state, step)
+    n_clones, n_splits = int(clones.sum()), int(splits.sum())
+    if n_clones:
+        ops.clone(params, optimizers, state, clones)
+    if n_splits:
+        # a clone of this event is never split in it
+        padded = torch.cat([splits, splits.new_zeros(n_clones)])
+        ops.split(params, optimizers, state, padded, normals(n_splits), plan.revised_opacity)
+    return n_clones, n_splits
+
+
+def _grow_masks(plan: DensityControl, params: Params, state: State, step: int) -> tuple[Tensor, Tensor]:
+    blurred = state.get("blurred")
+    none = torch.zeros_like(state["count"], dtype=torch.bool)
+    statistics = Statistics(
+        grad_sum=state["grad2d"],
+        n_visible=state["count"],
+        n_views=state["views"],
+        dominant_sum=none,
+        blurred=none if blurred is None else blurred,
+    )
+    clones, splits = grow_masks(statistics, torch.exp(params["scales"]), state["scene_scale"], step, plan)
+    return clones, splits | (state["radii"] > plan.grow_scale2d) if step < plan.refine_scale2d_stop_iter else splits
+
+
+def _prune_mask(plan: DensityControl, params: Params, state: State, step: int) -> Tensor:
+    opacities = torch.sigmoid(params["opacities"].flatten())
+    mask = prune_mask(opacities, torch.exp(params["scales"]), state["scene_scale"], step, plan)
+    if plan.prune_too_big_after < step < plan.refine_scale2d_stop_iter:
+        mask |= state["radii"] > plan.prune_scale2d
+    return mask
+
+
+def _prune(plan: DensityControl, params: Params, optimizers: Optimizers, state: State, step: int) -> int:
+    mask = _prune_mask(plan, params, state, step)
+    n_pruned = int(mask.sum())
+    if n_pruned:
+        ops.prune(params, optimizers, state, mask)
+    return n_pruned
+
+
+def _clear(state: State) -> None:
+    state["grad2d"].zero_()
+    state["count"].zero_()
+    state["views"] = 0
+    state["blurred"] = state["dominant_sum"] = None
+    if state["radii"] is not None:
+        state["radii"].zero_()
+
+
+def standard_normals(generator: torch.Generator, n: int) -> Tensor:
+    """Draw what places the children of n split parents: float32 on the CPU, whatever trains and in what precision.
+
+    Returns:
+        Standard normal draws. [2, n, 3]
+    """
+    return torch.randn((SPLIT_CHILDREN, n, 3), generator=generator, dtype=torch.float32)
+
+
+def _collect_extents(state: State, info: Info, packed: bool) -> None:
+    """Keep the largest extent of each Gaussian, as a share of the longer image side."""
+    extents = info["radii"].to(state["grad2d"].dtype) / max(int(info["width"]), int(info["height"]))
+    if state["radii"] is None:
+        state["radii"] = torch.zeros_like(state["grad2d"])
+    if packed:
+        largest = extents.amax(-1) if extents.dim() == 2 else extents
+        state["radii"].scatter_reduce_(0, info["gaussian_ids"].long(), largest, "amax")
+    else:
+        largest = extents.amax(-1) if extents.dim() == 3 else extents
+        seen = largest.masked_fill(~visible_from_radii(info["radii"]), 0.0)
+        torch.maximum(state["radii"], seen.amax(0), out=state["radii"])

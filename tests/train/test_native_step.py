@@ -1,0 +1,174 @@
+"""The native step under every setting that it knows is torch's, and its bits depend on nothing but its input."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pop_fast.backends import get_backend
+from pop_fast.data.initialize import initialize_params
+from pop_fast.errors import PopError
+from pop_fast.strategies import POPStrategy
+from pop_fast.train import TrainingRun
+from pop_fast.train.engines import engine_of, native_engine, torch_engine
+from pop_fast.train.model import KEYS
+from pop_fast.train.stepper import Engine
+from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config
+
+REASON = get_backend("compiled").why_not()
+pytestmark = pytest.mark.skipif(REASON is not None, reason=REASON or "")
+
+STEPS = 6
+# statistics and dominance are collected at every step, and nothing is changed
+WATCHED = {"refine_start_iter": 50, "blur_start_iter": 0, "blur_stop_iter": 60, "pop_stop_iter": 60}
+MASK = np.hypot(*np.mgrid[-1.0 : 1.0 : HEIGHT * 1j, -1.0 : 1.0 : WIDTH * 1j]) < 0.9
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    "POP": {},
+    "on grey": {"background": (0.5, 0.25, 0.125)},
+    "on grey, with a mask": {"background": (0.5, 0.25, 0.125), "mask": MASK},
+    "a mask": {"mask": MASK},
+    "a mask that keeps nothing": {"mask": np.zeros_like(MASK)},
+    "antialiased": {"antialiased": True},
+    "L1": {"photometric": "l1", "lambda_ssim": 0.2, "photometric_divisor": 3.0},
+    "windows to the border": {"ssim_padding": "same", "d_ssim_halved": True},
+    "without SSIM": {"lambda_ssim": 0.0},
+    "without the prior": {"lambda_pop": 0.0},
+    "the prior over what is seen": {"pop_over": "visible"},
+    "the prior over the window": {"pop_views": "window"},
+    "blur of its own view": {"blur_window": "own_view"},
+    "blur of summed counts": {"blur_window": "sum"},
+    "profile inria": {"profile": "inria"},
+    "profile gsplat_1_6": {"profile": "gsplat_1_6"},
+    "no harmonics": {"sh_degree": 0},
+    "few harmonics": {"sh_degree": 2, "sh_interval": 2},
+    "all harmonics": {"sh_interval": 1},
+}
+
+
+# what stays as it is
+STILL = {"a mask that keeps nothing": set(KEYS) - {"opacities"}, "no harmonics": {"shN"}}
+
+
+def run_of(folder: Path, engine: Engine, settings: dict[str, Any]) -> TrainingRun:
+    settings = dict(settings)
+    capture = tiny_capture(mask=settings.pop("mask", None))
+    pop = {name: settings.pop(name) for name in list(settings) if hasattr(POPStrategy, name)}
+    config = tiny_config(folder, **settings)
+    config = replace(config, strategy=replace(config.strategy, **{**WATCHED, **pop}))
+    # axes of one length would leave the rotations' gradients to rounding
+    initial = initialize_params(capture, config.seed, config.init_opacity, config.init_scale)
+    noise = torch.randn(initial["scales"].shape, generator=torch.Generator().manual_seed(5))
+    bands = (config.sh_degree + 1) ** 2 - 1
+    initial = {**initial, "scales": initial["scales"] + 0.5 * noise, "shN": initial["shN"][:, :bands]}
+    return TrainingRun(config, capture, engine=engine, initial=initial)
+
+
+def taken(run: TrainingRun, steps: int = STEPS) -> list[Any]:
+    return [run.take_steps(step + 1).stats[0] for step in range(steps)]
+
+
+def put_where(run: TrainingRun, other: TrainingRun) -> None:
+    """Give a run the parameters and moments of another one, so that rounding does not add up over steps."""
+    for key, param in run.params.items():
+        param.data.copy_(other.params[key].data)
+        for name, moment in run.optimizers[key].state[param].items():
+            moment.copy_(other.optimizers[key].state[other.params[key]][name])
+
+
+@pytest.mark.parametrize("what", SETTINGS)
+def test_six_steps_are_torchs(what: str, tmp_path: Path) -> None:
+    mine, its = (run_of(tmp_path, engine, SETTINGS[what]) for engine in (native_engine(), torch_engine("fast")))
+    moved = dict.fromkeys(KEYS, 0.0)
+    for step in range(STEPS):
+        put_where(mine, its)
+        start = {key: param.detach().clone() for key, param in its.params.items()}
+        found, wanted = (run.take_steps(step + 1).stats[0] for run in (mine, its))
+        for name in ("objective", "pop"):
+            assert getattr(found, name) == pytest.approx(getattr(wanted, name), rel=3e-6, abs=1e-8), name
+        for key, param in its.params.items():
+            update = (param.detach() - start[key]).abs().max() if param.numel() else 0.0
+            moved[key] = max(moved[key], float(update))
+            # where a gradient is rounding, Adam makes its sign a whole step: what nearly all entries do is compared
+            apart = (mine.params[key].detach() - param.detach()).abs() > 1e-3 * update + 1e-7
+            assert not param.numel() or float(apart.float().mean()) < 0.01, key
+    # by themselves the bands beyond the first would begin after these steps
+    usual = set[str]() if "sh_interval" in SETTINGS[what] else {"shN"}
+    assert {key for key in KEYS if moved[key] == 0.0} == STILL.get(what, usual)
+    torch.testing.assert_close(mine.state["grad2d"], its.state["grad2d"], rtol=1e-3, atol=1e-6)
+    for name in ("count", "blurred", "dominant_sum"):
+        found, wanted = (run.state[name] for run in (mine, its))
+        assert (found is None) == (wanted is None), name
+        assert found is None or torch.equal(found.to(wanted.dtype), wanted), name
+
+
+@pytest.mark.parametrize("what", ["on grey, with a mask", "antialiased"])
+def test_the_bits_depend_neither_on_threads_nor_on_how_many_steps_are_asked_for_at_once(
+    what: str, tmp_path: Path
+) -> None:
+    found = []
+    for threads, pace in ((1, 1), (2, STEPS), (3, 2), (7, STEPS)):
+        torch.set_num_threads(threads)
+        run = run_of(tmp_path, native_engine(), SETTINGS[what])
+        stats = [s[:5] for last in range(pace, STEPS + 1, pace) for s in run.take_steps(last).stats]
+        found.append((stats, {key: param.detach().clone() for key, param in run.params.items()}))
+    for stats, params in found[1:]:
+        assert stats == found[0][0]
+        assert all(torch.equal(params[key], found[0][1][key]) for key in params)
+
+
+def test_memory_for_photographs_changes_no_bit(tmp_path: Path) -> None:
+    runs = [run_of(tmp_path, native_engine(), {"target_cache_mb": room}) for room in (0, 1024)]
+    first, second = ([stats[:5] for stats in taken(run)] for run in runs)
+    assert first == second
+
+
+def test_photographs_of_several_sizes_are_trained_on(tmp_path: Path) -> None:
+    capture = tiny_capture()
+    views = tuple(
+        replace(view, image=np.ascontiguousarray(view.image[: HEIGHT - 3 * k, : WIDTH - 2 * k]))
+        for k, view in enumerate(capture.views)
+    )
+    config = tiny_config(tmp_path)
+    runs = [
+        TrainingRun(config, replace(capture, views=views), engine=e) for e in (native_engine(), torch_engine("fast"))
+    ]
+    for found, wanted in zip(*(taken(run, 3) for run in runs), strict=True):
+        assert found.objective == pytest.approx(wanted.objective, rel=2e-5)
+
+
+@pytest.mark.parametrize("key", ["means", "scales", "quats", "opacities", "sh0"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_a_row_that_is_not_finite_is_named_and_nothing_moves(key: str, value: float, tmp_path: Path) -> None:
+    run = run_of(tmp_path, native_engine(), {})
+    taken(run, 2)
+    with torch.no_grad():
+        run.params[key].view(len(run.params[key]), -1)[17, 0] = value
+    before = {name: param.detach().clone() for name, param in run.params.items()}
+    with pytest.raises(PopError, match=re.escape(f"{key}[17")):
+        run.take_steps(4)
+    assert run.step == 2
+    for name, param in run.params.items():
+        torch.testing.assert_close(param.detach(), before[name], rtol=0.0, atol=0.0, equal_nan=True)
+
+
+def test_a_run_trains_natively_where_it_can_and_says_so(tmp_path: Path) -> None:
+    config = replace(tiny_config(tmp_path), backend="compiled")
+    assert TrainingRun(config, tiny_capture()).stepper.name == "native"
+    by_absolute_gradients = replace(config, strategy=replace(config.strategy, absgrad=True))
+    assert TrainingRun(by_absolute_gradients, tiny_capture()).stepper.name == "torch"
+    assert engine_of(config, own_strategy=False).make_stepper is not None
+
+
+def test_a_stepper_takes_rows_on_the_cpu_in_single_precision_only(tmp_path: Path) -> None:
+    run = run_of(tmp_path, native_engine(), {})
+    fused: Any = run.stepper
+    rows = {key: param.detach() for key, param in run.params.items()}
+    with pytest.raises(ValueError, match="must be a contiguous float32 tensor on the CPU"):
+        fused.fused.rebind({**rows, "means": rows["means"].double()}, rows, rows)
