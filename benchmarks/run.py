@@ -24,22 +24,31 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from busy import time_beside
-from cases import RASTER_CASES, STEP_CASES
+from cases import RASTER_CASES, STEP_CASES, capture_of
 from gate import gate
 from memory import measure
 from parts import floors
 from peak import LARGEST, bytes_per_s, vector_ops_per_s
-from raster import backends, time_raster
-from record import machine, read_json, write_json
+from raster import backends, blend_of, time_raster
+from record import commit, machine, read_json, write_json
 from startup import time_startup
-from steps import capture_runs, engines, run_of_case, time_capture, time_case
+from steps import capture_runs, engines, first_view, run_of, run_of_case, stepping, time_capture, time_case
 
-from pop_fast.train.environment import keep_freed_memory
+from pop_fast.train.environment import keep_freed_memory, reproducible
 
 # `turn_about` finds here what it times of each checkout
 __all__ = [
-    *("RASTER_CASES", "blend_of", "capture_of", "commit", "first_view", "keep_freed_memory", "machine"),
-    *("reproducible", "run_of", "stepping", "write_json"),
+    "RASTER_CASES",
+    "blend_of",
+    "capture_of",
+    "commit",
+    "first_view",
+    "keep_freed_memory",
+    "machine",
+    "reproducible",
+    "run_of",
+    "stepping",
+    "write_json",
 ]
 
 RESULTS = Path(__file__).resolve().parent / "results" / "cpu.json"
