@@ -9,7 +9,8 @@ import threading
 from collections.abc import Iterator
 from typing import Final
 
-# s; a thread that decodes photographs asks for the interpreter for microseconds at a time, and would wait 5 ms for it
+# s; a thread that decodes photographs asks for the interpreter for microseconds at a time, and would wait 5 ms for it:
+# reading 50 photographs next to a thread that computes in Python took 4.0 to 4.9 s so, and 3.1 s with this
 _SWITCH_INTERVAL: Final = 2e-4
 
 
