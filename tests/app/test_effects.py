@@ -78,10 +78,19 @@ def test_statistics_name_what_decides_a_comparison(tmp_path):
     quick = facts(TrainConfig.of(preset="quick"), views)
     assert quick["theta_blur_pixels"] == pytest.approx([2.592, 10.368])
     del quick["theta_blur_pixels"]
-    named = {"method": "pop", "preset": "quick", "lambda_pop": 0.001, "blur_min_pixels": 10.0, "blur_events": 5}
+    named = {
+        "method": "pop",
+        "preset": "quick",
+        "seed": 42,
+        "lambda_pop": 0.001,
+        "blur_min_pixels": 10.0,
+        "blur_events": 5,
+    }
     assert quick == named
     assert facts(TrainConfig.of(), views)["blur_events"] == 41
     assert facts(TrainConfig.of(method="gsplat"), views)["blur_events"] == 0
     assert facts(TrainConfig.of(max_steps=3100), views)["blur_events"] == 1
     stats = TrainingRun(tiny_config(tmp_path, max_steps=1), tiny_capture()).run()
-    assert {"method", "preset", "lambda_pop", "theta_blur_pixels", "blur_min_pixels", "blur_events"} <= set(stats)
+    assert {"method", "preset", "seed", "lambda_pop", "theta_blur_pixels", "blur_min_pixels", "blur_events"} <= set(
+        stats
+    )
