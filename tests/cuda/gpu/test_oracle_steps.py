@@ -1,11 +1,14 @@
-"""Steps of a real run on the GPU, each judged by the oracle's step from the same state; see `tests.train`."""
+"""The golden ladder, and steps of a real run each judged by the oracle's from the same state; see `tests.train`."""
 
 from __future__ import annotations
 
 import pytest
+import torch
 
 from tests.train.scene import RECIPE, SHORT, STEPS
 from tests.train.test_steps import EVERYTHING, agree, judged, run_of
+from tests.train.test_ten_losses import agree as climbed
+from tests.train.test_ten_losses import climb
 
 
 @pytest.mark.parametrize(("recipe", "steps"), [(SHORT, 10), (RECIPE, STEPS)], ids=["ten", "three-hundred"])
@@ -14,3 +17,7 @@ def test_every_step_is_the_oracles(engine, recipe, steps, tmp_path):
     agree(found)
     happened = {kind for step in found for kind in step.happened}
     assert happened == EVERYTHING if recipe is RECIPE else happened
+
+
+def test_ten_losses_are_the_oracles(engine, tmp_path):
+    climbed(climb(engine, tmp_path), torch.float32)
