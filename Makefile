@@ -23,7 +23,7 @@ $(STAMP): pyproject.toml constraints.txt
 
 demo: setup  ## write the demo capture, train POP on it, leave report.html, PLY, renders and metrics in out/demo
 	$(BIN)/pop demo out/demo_capture --overwrite
-	$(BIN)/pop train out/demo_capture --out out/demo --preset quick --steps-scaler 0.05 --overwrite
+	$(BIN)/pop train out/demo_capture --out out/demo --preset quick --overwrite
 	@echo "open out/demo/report.html"
 
 walkthrough: setup  ## run the twelve chapters and write their pages with pictures to out/walkthrough

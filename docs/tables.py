@@ -146,9 +146,6 @@ def speed() -> str:
         make = runpy.run_path(str(ROOT / "benchmarks" / "step_tables.py"))["steps"]
         made.append(str(make(timed)))
     rows = []
-    # results of before the native step have training steps by backend
-    for case in timed.get("iteration", ()):
-        rows.append(_speed_row(f"training step of POP, {_size(case)}", case["iteration_ms"]))
     for case in timed["raster"]:
         rows.append(_speed_row(f"render, {_size(case)}", case["forward_ms"]))
         rows.append(_speed_row(f"render and backward, {_size(case)}", case["forward_backward_ms"]))
