@@ -152,17 +152,12 @@ TABLES: dict[str, tuple[str, Callable[[Mapping[str, Any]], str]]] = {
 }
 
 
-def measured(timed: Mapping[str, Any], part: str) -> bool:
-    """Whether results hold a part as it is measured now, and not as before, when memory was that of renders alone."""
-    return part in timed and not (part == "memory" and "what" not in timed[part][0])
-
-
 def with_tables(text: str, timed: Mapping[str, Any]) -> str:
     """Put every table between its marks, `<!-- NAME -->` and `<!-- end of NAME -->`."""
     for name, (part, make) in TABLES.items():
         begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
         head, rest = text.split(begin)
-        text = head + begin + (make(timed) if measured(timed, part) else NOT_YET) + "\n" + end + rest.split(end)[1]
+        text = head + begin + (make(timed) if part in timed else NOT_YET) + "\n" + end + rest.split(end)[1]
     return text
 
 

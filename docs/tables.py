@@ -141,11 +141,9 @@ def broken_laws() -> str:
 def speed() -> str:
     """Make the tables of CPU times, those of a row taken in turns in one process: training steps, renders, blends."""
     timed = json.loads(CPU_TIMES.read_text(encoding="utf-8"))
-    machine, made = timed["machine"], []
-    if "steps" in timed:
-        make = runpy.run_path(str(ROOT / "benchmarks" / "step_tables.py"))["steps"]
-        made.append(str(make(timed)))
-    rows = []
+    machine = timed["machine"]
+    make = runpy.run_path(str(ROOT / "benchmarks" / "step_tables.py"))["steps"]
+    made, rows = [str(make(timed))], []
     for case in timed["raster"]:
         rows.append(_speed_row(f"render, {_size(case)}", case["forward_ms"]))
         rows.append(_speed_row(f"render and backward, {_size(case)}", case["forward_backward_ms"]))

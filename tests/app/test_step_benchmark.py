@@ -102,25 +102,17 @@ def test_every_table_says_what_was_measured(script: Any) -> None:
 
 def test_what_was_not_measured_is_said_so(script: Any) -> None:
     tables = script("step_tables")
-    old = {"memory": [{"backend": "fast", "peak_gib": 0.9}], "iteration": []}
-    notes = tables.with_tables((BENCHMARKS / "NOTES.md").read_text(), old)
+    notes = tables.with_tables((BENCHMARKS / "NOTES.md").read_text(), {})
     assert notes.count(tables.NOT_YET) == len(tables.TABLES)
 
 
-def test_the_readme_takes_results_with_and_without_the_native_step(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_readme_takes_the_steps_with_the_renders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.syspath_prepend(str(BENCHMARKS.parent / "docs"))
     tables, path = importlib.import_module("tables"), tmp_path / "cpu.json"
     monkeypatch.setattr(tables, "CPU_TIMES", path)
     timed = json.loads((BENCHMARKS / "results" / "cpu.json").read_text())
-    timed = {key: value for key, value in timed.items() if key not in ("steps", "iteration")}
     path.write_text(json.dumps(timed | {"steps": results()["steps"]}))
     assert "| 64x32, 100 Gaussians | 90 ms | 30 ms | 12.2 ms (11.2) | 0.41 |" in tables.speed()
-    older = {"width": 270, "height": 480, "n": 12000, "iteration_ms": {"fast": 104.0, "compiled": 32.0}}
-    older["iteration_ms"]["compiled / fast"] = 0.3
-    path.write_text(json.dumps(timed | {"iteration": [older]}))
-    assert "| training step of POP, 270x480, 12,000 Gaussians | 104 ms | 32 ms | 0.30 |" in tables.speed()
 
 
 def test_floors_follow_the_counts_and_the_machine(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
