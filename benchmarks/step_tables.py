@@ -175,7 +175,7 @@ def main(words: list[str]) -> int:
             print("NOTES.md: a table of the training step is not what was measured; run step_tables.py --write")
             return 1
     else:
-        made = (make(timed) if measured(timed, part) else NOT_YET for part, make in TABLES.values())
+        made = (make(timed) if part in timed else NOT_YET for part, make in TABLES.values())
         print("\n\n".join(f"{name}\n\n{table}" for name, table in zip(TABLES, made, strict=True)))
     return 0
 
