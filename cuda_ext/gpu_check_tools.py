@@ -32,6 +32,8 @@ class Command:
         self._log, self._start = log, time.monotonic()
         with open(log, "ab") as file:
             file.write(f"\n$ {' '.join(words)}\n".encode())
+            # before the command writes: what is still in the buffer would come after its words
+            file.flush()
             self._from = file.tell()
             self._process = self._begin(words, file, {**os.environ, **(environment or {})})
 
