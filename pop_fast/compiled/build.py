@@ -24,9 +24,11 @@ import cuda_ext
 from cuda_ext.compiler import find_compiler, no_compiler
 
 HERE: Final = Path(__file__).resolve().parent
+UNITS: Final = ("blend.cpp", "step.cpp", "step_lists.cpp", "step_pixels.cpp", "step_update.cpp", "counts.cpp")
 SOURCES: Final = (
     *("projection.h", "colors.h", "lists.h", "tile.h", "forward.h", "backward.h", "ssim.h", "moments.h"),
-    *("lanes.h", "threads.h", "pool.h", "step.h", "step.cpp", "counts.cpp", "blend.cpp"),
+    *("lanes.h", "threads.h", "pool.h", "step.h", "step_rows.h"),
+    *UNITS,
 )
 # one Gaussian's arithmetic is that of the CUDA kernels
 CUDA: Final = Path(cuda_ext.__file__).resolve().parent
@@ -48,7 +50,6 @@ FLAGS: Final = (
     "-shared",
     "-pthread",
 )
-UNITS: Final = ("blend.cpp", "step.cpp", "counts.cpp")
 # for this processor, as compilers of different kinds and ages spell it; the last resort is any processor of its kind
 TUNING: Final = (("-march=native",), ("-mcpu=native",), ())
 

@@ -1,6 +1,6 @@
 """Adam as the native step runs it, float32. Meaning: `pop_ref.optimizer`.
 
-A training calls it inside the step (`step.cpp`, `update`); here it can be called by itself, so that laws judge it.
+A training calls it inside the step (`step_update.cpp`); here it can be called by itself, so that laws judge it.
 """
 
 from __future__ import annotations

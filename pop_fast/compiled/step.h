@@ -1,6 +1,6 @@
 // One step of training: what it is given, and what it keeps from one step to the next.
 //
-// The step in order, every line shared out to the threads (`step.cpp`), `list` in two goes:
+// The step in order, every line shared out to the threads (`step_*.cpp`), `list` in two goes:
 //     see         a Gaussian's splat, colour, and the tiles it reaches
 //     list        depth order; each tile's list, front to back
 //     blend       the picture tile by tile, who dominates it, its difference from the photograph
@@ -67,9 +67,12 @@ struct Seen {
   int32_t n, first;                            // entries, -1 where it is culled; the first one's slot in its part
 };
 
+constexpr int COLUMNS = 9;          // of an entry's row: six moments, colours
 constexpr int64_t ROWS = 256;       // Gaussians in a part
 constexpr int64_t ROW_BLOCK = 64;   // whose gradients are held at once
 constexpr int SHORT = 14;           // floats of a row besides the bands beyond the first
+
+inline int64_t parts_of(int64_t n, int64_t part) { return (n + part - 1) / part; }
 
 // What one thread works with.
 struct Worker {

@@ -1,0 +1,198 @@
+// From raw parameters to each tile's list: a Gaussian's splat and colour, the tiles it reaches, depth order.
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <utility>
+
+#include "lists.h"
+#include "step_rows.h"
+
+namespace pop {
+
+namespace {
+
+// NaN and infinity stay what they are under any sum, and a sum of finite numbers that overflows is one too
+bool finite_row(const StepGiven &given, int64_t i) {
+  float sum = given.params[OPACITIES][i];
+  for (const StepGroup group : {MEANS, SCALES, QUATS, SH0})
+    for (int k = 0; k < ROW_FLOATS[group]; k++) sum += given.params[group][ROW_FLOATS[group] * i + k];
+  return std::isfinite(sum);
+}
+
+// A bit pattern that is ordered as the floats are.
+uint32_t ordered_bits(float x) {
+  const uint32_t bits = bits_of<uint32_t>(x);
+  return bits & 0x80000000u ? ~bits : bits | 0x80000000u;
+}
+
+}  // namespace
+
+// ---- see: from raw parameters to splats and colours
+
+Work Stepper::see() {
+  const int64_t n_parts = parts_of(given->n, ROWS);
+  part_visible.assign(size_t(n_parts), 0);
+  part_slots.assign(size_t(n_parts), 0);
+  keys.get(given->n);
+  Work work = {given->n, ROWS, {}};
+  with_degree(given->degree, [&](auto degree) {
+    work.f = [this](int, int64_t first, int64_t last) { see_rows<decltype(degree)::value>(first, last); };
+  });
+  return work;
+}
+
+bool Stepper::all_finite() const {
+  for (const int64_t visible : part_visible)
+    if (visible < 0) {
+      *given->bad_row = -visible - 1;
+      return false;
+    }
+  return true;
+}
+
+// The visible ones' keys begin where the part's Gaussians do.
+template <int DEGREE> void Stepper::see_rows(int64_t first, int64_t last) {
+  Seen *const all = seen.get(given->n);
+  int32_t *const count = counts.get(given->n);
+  uint64_t *const key = keys.get(given->n) + first;
+  int64_t visible = 0, slot = 0, bad = -1;
+  for (int64_t i = first; i < last; i++) {
+    Seen &row = all[i];
+    row.n = -1;
+    count[i] = 0;
+    if (!finite_row(*given, i)) {
+      if (bad < 0) bad = i;
+      continue;
+    }
+    if (!see_row<DEGREE>(i, row)) continue;
+    row.first = int32_t(slot);
+    slot += row.n;
+    if (row.n > 0) key[visible++] = uint64_t(ordered_bits(row.depth)) << 32 | uint64_t(i);
+  }
+  part_visible[first / ROWS] = bad < 0 ? visible : -bad - 1;
+  part_slots[first / ROWS] = slot;
+}
+
+template <int DEGREE> [[gnu::flatten]] bool Stepper::see_row(int64_t i, Seen &to) {
+  const GaussianRow<float> g = gaussian_of(*given, i);
+  const SplatRow<float> splat = project_one(g, camera, profile, options);
+  if (splat.radii.x <= 0) return false;
+  const float mean2d[2] = {splat.mean2d.x, splat.mean2d.y}, conic[3] = {splat.conic.xx, splat.conic.xy, splat.conic.yy};
+  float color[3];
+  put(color, color_from_sh(harmonics_of(*given, i), view_dir(g.mean, camera), DEGREE));
+  blend.splats[i] = splat_of(mean2d, conic, splat.opacity, color, 3);
+  const TileGrid grid = grid_of(int(given->width), int(given->height), STEP_TILE, STEP_TILE);
+  const TileRect rect = tile_rect(splat.mean2d, splat.radii, grid, profile);
+  to = {mean2d[0], mean2d[1], conic[0], conic[1], conic[2], splat.opacity, 0.0f, splat.depth,
+        rect.x0,   rect.y0,   rect.x1,  rect.y1,  0,        0,             0};
+  reach_tiles(to);
+  return true;
+}
+
+// Calls f(tile) for those of the rectangle that the splat may reach, row by row.
+template <class F> void Stepper::each_tile(const Seen &of, F f) const {
+  const float extent = float(STEP_TILE - 1);
+  for (int32_t y = of.y0; y < of.y1; y++)
+    for (int32_t x = of.x0; x < of.x1; x++) {
+      const float left = float(x * STEP_TILE) + 0.5f - of.x, top = float(y * STEP_TILE) + 0.5f - of.y;
+      if (profile.square || touches(of.a, of.b, of.c, of.limit, left, top, extent)) f(int64_t(y) * blend.tiles_x + x);
+    }
+}
+
+void Stepper::reach_tiles(Seen &of) const {
+  of.limit = std::log(of.opacity / profile.alpha_floor);
+  const int64_t across = of.x1 - of.x0;
+  each_tile(of, [&](int64_t tile) {
+    const int64_t y = tile / blend.tiles_x, x = tile % blend.tiles_x, bit = (y - of.y0) * across + x - of.x0;
+    if (bit < 64) of.tiles |= uint64_t(1) << bit;
+    of.n++;
+  });
+}
+
+// ---- list: tile by tile, front to back (D3, D4)
+
+// By depth, then by row: digit by digit from the lowest of the depth's bits, each pass keeping the order before it.
+void Stepper::sort_by_depth() {
+  constexpr int DIGIT = 11, VALUES_OF_DIGIT = 1 << DIGIT, PASSES = 3;
+  std::vector<int32_t> places(PASSES * VALUES_OF_DIGIT);
+  uint64_t *from = keys.get(given->n), *to = sorted.get(given->n);
+  n_visible = 0;
+  for (size_t part = 0; part < part_visible.size(); part++) {
+    std::memmove(from + n_visible, from + int64_t(part) * ROWS, size_t(part_visible[part]) * sizeof(uint64_t));
+    n_visible += part_visible[part];
+  }
+  const auto digit = [](uint64_t key, int pass) { return int(key >> (32 + DIGIT * pass) & (VALUES_OF_DIGIT - 1)); };
+  for (int64_t k = 0; k < n_visible; k++)
+    for (int pass = 0; pass < PASSES; pass++) places[pass * VALUES_OF_DIGIT + digit(from[k], pass)]++;
+  for (int pass = 0; pass < PASSES; pass++) {
+    int32_t *place = &places[pass * VALUES_OF_DIGIT], before = 0;
+    for (int value = 0; value < VALUES_OF_DIGIT; value++) before += std::exchange(place[value], before);
+    for (int64_t k = 0; k < n_visible; k++) to[place[digit(from[k], pass)]++] = from[k];
+    std::swap(from, to);
+  }
+  // an odd number of passes ends in `sorted`
+  static_assert(PASSES % 2 == 1);
+}
+
+// Gaussians in depth order that are listed at a time; each part counts and places its own entries.
+int64_t Stepper::list_part() const { return std::max<int64_t>(1, parts_of(n_visible, 4 * pool.size())); }
+
+// Calls f(row, tile, slot) for the entries of some Gaussians, front to back.
+template <class F> void Stepper::each_entry(int64_t first, int64_t last, F f) const {
+  for (int64_t k = first; k < last; k++) {
+    // depth order jumps about in memory: what comes soon is asked for now
+    __builtin_prefetch(&seen[int64_t(uint32_t(sorted[std::min(k + 12, last - 1)]))]);
+    const int64_t i = int64_t(uint32_t(sorted[k]));
+    const Seen &of = seen[i];
+    const int64_t across = of.x1 - of.x0;
+    int64_t slot = part_slots[size_t(i / ROWS)] + of.first;
+    if (across * (of.y1 - of.y0) > 64) {
+      each_tile(of, [&](int64_t tile) { f(i, tile, slot++); });
+      continue;
+    }
+    for (uint64_t bits = of.tiles; bits; bits &= bits - 1) {
+      const int64_t bit = __builtin_ctzll(bits);
+      f(i, (of.y0 + bit / across) * blend.tiles_x + of.x0 + bit % across, slot++);
+    }
+  }
+}
+
+Work Stepper::count_entries() {
+  int64_t n_slots = 0;
+  for (auto &slot : part_slots) n_slots += std::exchange(slot, n_slots);
+  const int64_t part = list_part(), n_tiles = blend.tiles();
+  starts.assign(size_t(parts_of(n_visible, part) * n_tiles), 0);
+  return {n_visible, part, [=](int, int64_t first, int64_t last) {
+            int64_t *const count = &starts[size_t(first / part * n_tiles)];
+            each_entry(first, last, [&](int64_t, int64_t tile, int64_t) { count[tile]++; });
+          }};
+}
+
+Work Stepper::place_entries() {
+  const int64_t part = list_part(), n_parts = parts_of(n_visible, part), n_tiles = blend.tiles();
+  int64_t total = 0, n_chunks = 0;
+  for (int64_t tile = 0; tile < n_tiles; tile++) {
+    offsets[size_t(tile)] = total;
+    first_chunks[size_t(tile)] = n_chunks;
+    for (int64_t k = 0; k < n_parts; k++) total += std::exchange(starts[size_t(k * n_tiles + tile)], total);
+    n_chunks += parts_of(total - offsets[size_t(tile)], CHUNK);
+  }
+  offsets[size_t(n_tiles)] = total;
+  int64_t *const to_ids = ids.get(total);
+  int32_t *const to_slots = slots.get(total);
+  blend.ids = to_ids;
+  blend.slots = to_slots;
+  blend.lights = lights.get(n_chunks * pixels.padded());
+  blend.reached = reached.get(n_chunks * pixels.strips);
+  blend.rows = rows.get(total * COLUMNS);
+  return {n_visible, part, [=](int, int64_t first, int64_t last) {
+            int64_t *const next = &starts[size_t(first / part * n_tiles)];
+            each_entry(first, last, [&](int64_t i, int64_t tile, int64_t slot) {
+              to_ids[next[tile]] = i;
+              to_slots[next[tile]++] = int32_t(slot);
+            });
+          }};
+}
+
+}  // namespace pop

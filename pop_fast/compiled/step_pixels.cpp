@@ -1,0 +1,129 @@
+// The picture, its difference from the photograph, D-SSIM with its gradient, and the way back to the lists' entries.
+
+#include <algorithm>
+#include <cmath>
+
+#include "step_rows.h"
+
+namespace pop {
+
+// ---- blend: the picture, and its difference from the photograph
+
+Work Stepper::blend_tiles() {
+  const auto one_tile = blend.dominance() ? blend_tile<float, 3, true, true> : blend_tile<float, 3, true, false>;
+  return {blend.tiles(), 2, [=](int thread, int64_t first, int64_t last) {
+            for (int64_t tile = first; tile < last; tile++) {
+              one_tile(blend, pixels, tile, workers[size_t(thread)]->canvas);
+              differ(tile);
+            }
+          }};
+}
+
+// Turn a tile of the picture into its difference from the photograph, 0 where the mask leaves a pixel out, and sum up
+// |d|, d^2, and d^2 of the picture clamped to [0, 1].
+void Stepper::differ(int64_t tile) {
+  const StepGiven &g = *given;
+  const float *const alphas = blend.alphas;
+  const Place<float> place(blend, tile);
+  float absolute[STEP_TILE] = {}, squared[STEP_TILE] = {}, clamped_squared[STEP_TILE] = {};
+  for (int channel = 0; channel < 3; channel++) {
+    const float behind = float(g.background[channel]);
+    float *const plane = blend.image + channel * blend.channel_stride;
+    const float *const photograph = g.target + channel * blend.channel_stride;
+    place.each_row([&](int64_t, int64_t at) {
+      for (int64_t x = 0; x < place.columns(); x++) {
+        const float keep = !g.kept || g.kept[at + x] ? 1.0f : 0.0f, y = photograph[at + x];
+        const float color = plane[at + x] + (alphas ? (1.0f - alphas[at + x]) * behind : 0.0f);
+        const float d = keep * (color - y), clamped_d = keep * (clamped(color, 0.0f, 1.0f) - y);
+        plane[at + x] = d;
+        absolute[x] += std::fabs(d);
+        squared[x] += d * d;
+        clamped_squared[x] += clamped_d * clamped_d;
+      }
+    });
+  }
+  double *const sums = &tile_sums[3 * tile];
+  sums[0] = sums[1] = sums[2] = 0.0;
+  for (int x = 0; x < STEP_TILE; x++) {
+    sums[0] += absolute[x];
+    sums[1] += squared[x];
+    sums[2] += clamped_squared[x];
+  }
+}
+
+// ---- compare and gather: D-SSIM with its gradient, and that of L1 or L2
+
+Ssim<float> Stepper::ssim_of(int channel) {
+  const StepGiven &g = *given;
+  Ssim<float> of = {};
+  of.height = g.height;
+  of.width = g.width;
+  of.channels = 1;
+  of.border = g.border;
+  of.stride = worker_stride;
+  const int64_t n_pixels = g.width * g.height, n_maps = of.rows() * of.columns();
+  of.difference = blend.image + channel * n_pixels;
+  of.target = g.target + channel * n_pixels;
+  of.mu_y = g.mu_y + channel * n_maps;
+  of.s_yy = g.s_yy + channel * n_maps;
+  of.kept = g.kept_windows;
+  of.weight = g.n_windows > 0 ? g.ssim_weight / double(3 * g.n_windows) : 0.0;
+  const int64_t n_partials = 3 * (g.height + Ssim<float>::REACH) * of.stride;
+  of.partials = partials.get(3 * n_partials) + channel * n_partials;
+  of.gradient = v_image.get(3 * n_pixels) + channel * n_pixels;
+  return of;
+}
+
+Work Stepper::compare() {
+  const int64_t rows = ssim[0].rows(), margin = ssim[0].margin();
+  for (const auto &of : ssim)
+    for (int map = 0; map < 3; map++) {
+      std::fill(of.partial(map, 0), of.partial(map, margin), 0.0f);
+      std::fill(of.partial(map, margin + rows), of.partial(map + 1, 0), 0.0f);
+    }
+  window_sums.assign(size_t(3 * parts_of(rows, WINDOW_ROWS)), 0.0);
+  return {rows, WINDOW_ROWS, [this](int thread, int64_t first, int64_t last) {
+            for (int channel = 0; channel < 3; channel++)
+              window_sums[size_t(3 * (first / WINDOW_ROWS) + channel)] =
+                  compare_rows(ssim[channel], workers[size_t(thread)]->products, first, last);
+          }};
+}
+
+Work Stepper::gather() {
+  return {given->height, WINDOW_ROWS,
+          [this](int thread, int64_t first, int64_t last) { gather_rows(*workers[size_t(thread)], first, last); }};
+}
+
+void Stepper::gather_rows(Worker &own, int64_t first, int64_t last) {
+  const StepGiven &g = *given;
+  const int64_t n_pixels = g.width * g.height, begin = first * g.width, end = last * g.width;
+  const float unit = float(g.pixel_weight / double(3 * std::max<int64_t>(g.n_kept, 1))), twice = 2.0f * unit;
+  float *const v_alpha = blend.v_alphas ? v_alphas.get(n_pixels) : nullptr;
+  if (v_alpha) std::fill(v_alpha + begin, v_alpha + end, 0.0f);
+  for (int channel = 0; channel < 3; channel++) {
+    const Ssim<float> &of = ssim[channel];
+    pop::gather_rows(of, own.blur, first, last);
+    const float behind = float(g.background[channel]), *const d = of.difference;
+    for (int64_t at = begin; at < end; at++) {
+      const float slope = g.l1 ? (d[at] > 0.0f ? unit : d[at] < 0.0f ? -unit : 0.0f) : twice * d[at];
+      of.gradient[at] = !g.kept || g.kept[at] ? of.gradient[at] + slope : 0.0f;
+    }
+    for (int64_t at = begin; v_alpha && at < end; at++) v_alpha[at] -= behind * of.gradient[at];
+  }
+}
+
+// ---- transpose: back to the entries
+
+Work Stepper::transpose_tiles() {
+  const auto one_tile = transpose_tile<float, 3, true>;
+  return {blend.tiles(), 2, [=](int thread, int64_t first, int64_t last) {
+            for (int64_t tile = first; tile < last; tile++) {
+              one_tile(blend, pixels, tile, workers[size_t(thread)]->transpose);
+              // what lies behind the last pixel's stop passes nothing back
+              for (int64_t entry = offsets[size_t(tile)] + n_reached[size_t(tile)]; entry < offsets[size_t(tile) + 1]; entry++)
+                std::fill_n(blend.rows + COLUMNS * blend.slots[entry], COLUMNS, 0.0f);
+            }
+          }};
+}
+
+}  // namespace pop
