@@ -147,7 +147,7 @@ def defaults(given: Given) -> dict[str, Any]:
     """Return every setting that method, preset and scaler decide, nothing said, by its name in `TrainConfig`."""
     kind, recipe = METHODS[given.method]
     by = given.scaler
-    values = _values_of(recipe)
+    values = values_of(recipe)
     strategy = kind().scaled(by)
     if given.scale_lambda_pop:
         strategy = replace(strategy, lambda_pop=strategy.lambda_pop / by)
@@ -164,7 +164,7 @@ def defaults(given: Given) -> dict[str, Any]:
     return {**values, "eval_steps": milestones, "save_steps": milestones, "strategy": strategy}
 
 
-def _values_of(recipe: Recipe) -> dict[str, Any]:
+def values_of(recipe: Recipe) -> dict[str, Any]:
     """Return what a recipe says besides density control and the POP term, in the names of `TrainConfig`."""
     return {
         "max_steps": recipe.max_steps,
@@ -187,7 +187,7 @@ def options_for(recipe: Recipe) -> list[str]:
 
 def _options(recipe: Recipe, method: str) -> list[str]:
     base = METHODS[method].recipe
-    pairs = [(name, _values_of(recipe)[name], value) for name, value in _values_of(base).items()]
+    pairs = [(name, values_of(recipe)[name], value) for name, value in values_of(base).items()]
     for kind, ours, theirs in ((DensityConfig, recipe.density, base.density), (PopTerm, recipe, base)):
         pairs += [(f"{method}.{f.name}", getattr(ours, f.name), getattr(theirs, f.name)) for f in fields(kind)]
     rates = [(f"lr.{f.name}", getattr(recipe.lr, f.name), getattr(base.lr, f.name)) for f in fields(recipe.lr)]

@@ -67,7 +67,7 @@ def run(folder: Any, stop_after: int | None = None, resume: bool = False, **opti
             raise KeyboardInterrupt
         return take_steps(last)
 
-    training.take_steps = stepping  # type: ignore[method-assign]
+    training.take_steps = stepping
     if stop_after is None:
         training.run()
     else:

@@ -17,7 +17,7 @@ from pop_fast.train.engines import LONGEST_ON_GPU
 from pop_fast.train.fused_stepper import step_settings, unsupported
 from pop_fast.train.phases import phase_at, stretch_end
 from tests.app.drift import Drift, drift_engine
-from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config
+from tests.app.tiny import HEIGHT, WIDTH, last_checkpoint, tiny_capture, tiny_config
 
 CLOCKS = ("it_per_s", "seconds")
 
@@ -44,17 +44,7 @@ CASES = {
 
 def everything(folder):
     """All of a finished run's last checkpoint that does not depend on the backend or a clock, flat."""
-    content, flat = ckpt.load_checkpoint(ckpt.checkpoint_path(folder, 29)), {}
-
-    def walk(value, name):
-        if isinstance(value, dict):
-            for key, item in value.items():
-                walk(item, f"{name}.{key}")
-        else:
-            flat[name] = value
-
-    walk({k: v for k, v in content.items() if k not in ("seconds", "metrics_bytes", "config")}, "")
-    return flat
+    return last_checkpoint(folder, "seconds", "metrics_bytes", "config")
 
 
 def assert_same_state(ours, theirs):

@@ -17,7 +17,7 @@ import torch
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.signals import stop_requests
-from tests.app.tiny import tiny_capture, tiny_config
+from tests.app.tiny import last_checkpoint, tiny_capture, tiny_config
 
 ROOT = Path(__file__).parents[2]
 # what a clock says differs from run to run
@@ -44,18 +44,7 @@ def run_to(folder, stop_after=None, resume=False, method="pop"):
 
 def everything(folder):
     """All that a finished run leaves and that must not depend on interruptions, flat."""
-    content = ckpt.load_checkpoint(ckpt.checkpoint_path(folder, 29))
-    flat = {}
-
-    def walk(value, name):
-        if isinstance(value, dict):
-            for key, item in value.items():
-                walk(item, f"{name}.{key}")
-        else:
-            flat[name] = value
-
-    walk({k: v for k, v in content.items() if k not in ("seconds", "metrics_bytes")}, "")
-    return flat
+    return last_checkpoint(folder, "seconds", "metrics_bytes")
 
 
 def assert_same_run(folder, reference):

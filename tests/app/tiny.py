@@ -16,6 +16,7 @@ import numpy as np
 from pop_fast.data.capture import Capture, View
 from pop_fast.strategies import GsplatStrategy, InriaStrategy, POPStrategy
 from pop_fast.train import LearningRates, TrainConfig, TrainingRun
+from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.records import Stretch
 
 WIDTH, HEIGHT = 32, 24
@@ -49,6 +50,21 @@ def tiny_capture(seed: int = 0, n_views: int = 5, mask: np.ndarray | None = None
             image[(xs - u) ** 2 + (ys - v) ** 2 < (8.0 / cam[j, 2]) ** 2] = colors[j]
         views.append(View(f"{i:02d}.png", image, viewmat, K, mask))
     return Capture("tiny", tuple(views), points, colors, source="made up")
+
+
+def last_checkpoint(folder: Path, *without: str) -> dict[str, Any]:
+    """Return what a finished run of `tiny_config` keeps last, but for some of its parts, by dotted name."""
+    content, flat = ckpt.load_checkpoint(ckpt.checkpoint_path(folder, 29)), {}
+
+    def walk(value: Any, name: str) -> None:
+        if isinstance(value, dict):
+            for key, item in value.items():
+                walk(item, f"{name}.{key}")
+        else:
+            flat[name] = value
+
+    walk({key: value for key, value in content.items() if key not in without}, "")
+    return flat
 
 
 def tiny_config(folder: Path | str, method: str = "pop", **changes: Any) -> TrainConfig:

@@ -348,4 +348,4 @@ def test_an_unknown_backend_is_an_error_that_lists_the_known() -> None:
     with pytest.raises(PopError, match="fast"):
         get_backend("metal")
     with pytest.raises(PopError, match="backend 'metal' is unknown; use one of fast, compiled, cuda, ref"):
-        program(**scene(), **cameras(), backend="metal")  # type: ignore[arg-type]
+        program(**scene(), **cameras(), backend="metal")

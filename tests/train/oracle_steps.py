@@ -22,6 +22,7 @@ import torch
 from pop_fast.strategies import POPStrategy
 from pop_fast.strategies.densify import standard_normals
 from pop_fast.train import TrainConfig, TrainingRun
+from pop_fast.train.presets import values_of
 from pop_ref.activations import opacities_from_logits
 from pop_ref.conformance.charges import REACH, charge
 from pop_ref.conformance.gradient_charges import gradient_charges
@@ -66,16 +67,7 @@ def config_of(recipe: Recipe, folder: Any, **changes: Any) -> TrainConfig:
     term = {f.name: getattr(recipe, f.name) for f in fields(PopTerm)}
     settings: dict[str, Any] = {
         "result_dir": str(folder),
-        "max_steps": recipe.max_steps,
-        "profile": recipe.profile.name,
-        "sh_interval": recipe.sh_interval,
-        "photometric": recipe.pixelwise,
-        "photometric_divisor": 1.0 / recipe.pixel_scale,
-        "lambda_ssim": recipe.lambda_ssim,
-        "l2_stop_iter": recipe.l2_stop_iter,
-        "ssim_padding": recipe.padding,
-        "d_ssim_halved": recipe.d_ssim_halved,
-        "lr": recipe.lr,
+        **values_of(recipe),
         "strategy": POPStrategy(**density, **term),
         "test_every": 0,
         "threads": 1,

@@ -52,8 +52,8 @@ def climb(engine: Any, folder: Path, dtype: torch.dtype = torch.float32) -> list
     initial = {name: torch.tensor(array, dtype=dtype) for name, array in ten_losses.first_params().items()}
     config = config_of(RECIPE, folder / "run", sh_degree=1)
     run = TrainingRun(config, capture, engine=engine, initial=initial)
-    run._order = InTurn()  # type: ignore[assignment]
-    run.normals = lambda n: torch.tensor(ten_losses.draws(n))  # type: ignore[method-assign]
+    run._order = InTurn()
+    run.normals = lambda n: torch.tensor(ten_losses.draws(n))
     rungs = []
     for step in range(STEPS):
         stretch = run.take_steps(step + 1)

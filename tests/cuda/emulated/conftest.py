@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 
 from cuda_ext.library_folder import library_folder
+from tests.cuda.emulated import emulate
 
 pytest.register_assert_rewrite("pop_ref.conformance.laws")
 
 from pop_ref.conformance.plugin import parametrize_backends  # noqa: E402  asserts must be rewritten first
-from tests.cuda.emulated import emulate  # noqa: E402
 from tests.cuda.gpu.conftest import cuda_backends  # noqa: E402
 
 FOLDER = library_folder(Path(__file__).parent)
