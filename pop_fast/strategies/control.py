@@ -15,14 +15,15 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, Self
 
 from pop_fast.strategies.base import Info, Normals, Optimizers, Params, State, StepEvent, check_layout
-from pop_ref.settings import DensityConfig, PopTerm, ScreenSizeRules
+from pop_ref.settings import DensityConfig, PopTerm, ScreenSizeRules, UpdateRules
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 _NEEDED = ("means", "scales", "quats", "opacities")
 _STEPS = ("prune_too_big_after", "refine_start_iter", "refine_stop_iter", "blur_start_iter", "blur_stop_iter")
-_MORE_STEPS = ("pop_start_iter", "pop_stop_iter", "refine_scale2d_stop_iter")
+_MORE_STEPS = ("pop_start_iter", "pop_stop_iter", "refine_scale2d_stop_iter", "sh_start_iter", "opacities_stop_iter")
+_STILL_MORE_STEPS = ("means_rewind_iter", "means_rewind_to", "rounds_start_iter", "round_steps", "round_decay_every")
 # steps between a reset and what it has to be recovered from by; see `DensityControl.scaled`
 _RECOVERY = ("reset_every", "pause_refine_after_reset")
 # a shrunk schedule keeps at least so many steps between changes. They are not a share of the schedule: in them a window
@@ -33,7 +34,7 @@ SHORTEST_REFINE_EVERY = 100
 
 
 @dataclass(frozen=True, kw_only=True)
-class DensityControl(DensityConfig, PopTerm, ScreenSizeRules):
+class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
     """Density control with every rule that a method may have; a method is a set of defaults.
 
     The settings are those of `pop_ref.settings`, named as gsplat's default strategy names them where that has them.
@@ -72,10 +73,15 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules):
         whichever is less: a shorter schedule has fewer changes, not more hasty ones. Resets come no faster either: what
         one takes away has to be regrown in steps, and those do not get shorter with the schedule.
         """
-        changed = {name: _scaled(getattr(self, name), factor) for name in (*_STEPS, *_MORE_STEPS)}
+        changed = {name: _scaled(getattr(self, name), factor) for name in (*_STEPS, *_MORE_STEPS, *_STILL_MORE_STEPS)}
         changed |= {name: max(_scaled(getattr(self, name), factor), getattr(self, name)) for name in _RECOVERY}
         floor = min(SHORTEST_REFINE_EVERY, self.refine_every)
         return replace(self, **changed, refine_every=max(round(self.refine_every * factor), floor))
+
+    @property
+    def adam_restarts(self) -> tuple[int, ...]:
+        """Return the steps after which Adam begins anew."""
+        return ()
 
     def needs_dominance(self, step: int) -> bool:
         """Tell whether `info["dominant_counts"]` is read at this step: by the POP loss, the blur rule or a window."""

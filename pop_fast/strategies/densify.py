@@ -25,6 +25,7 @@ def initialize_state(scene_scale: float, seed: int) -> State:
         "blurred": None,
         "dominant_sum": None,
         "radii": None,
+        "sh_rest_sum": None,
         "scene_scale": float(scene_scale),
         "generator": generator,
     }
@@ -157,7 +158,8 @@ def _clear(state: State) -> None:
     state["grad2d"].zero_()
     state["count"].zero_()
     state["views"] = 0
-    state["blurred"] = state["dominant_sum"] = None
+    # rows that wait are not those of a population that has been edited
+    state["blurred"] = state["dominant_sum"] = state["sh_rest_sum"] = None
     if state["radii"] is not None:
         state["radii"].zero_()
 

@@ -29,3 +29,4 @@ class InriaStrategy(GsplatStrategy):
     """The same as Inria's code has it: a gradient at the threshold grows."""
 
     inclusive: bool = RECIPES["3DGS"].density.inclusive
+    edits_replace_update: bool = RECIPES["3DGS"].updates.edits_replace_update

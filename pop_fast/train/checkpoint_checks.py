@@ -106,8 +106,9 @@ def _moments(packed: Any, name: str, param: Tensor, taken: int) -> dict[str, Ten
     found = _mapping(packed, name, _MOMENTS)
     like = list(param.shape)
     checked = {"step": _own(_tensor(found["step"], f"{name}.step", torch.float32), [], f"{name}.step")}
-    if checked["step"].item() != taken:
-        raise ValueError(f"{name}.step is {checked['step'].item():g}; it must be {taken}, the steps taken")
+    if not (0 <= checked["step"].item() <= taken and checked["step"].item().is_integer()):
+        most = f"a whole number of updates, at most {taken}, the steps taken"
+        raise ValueError(f"{name}.step is {checked['step'].item():g}; it must be {most}")
     for key in _MOMENTS[1:]:
         checked[key] = _own(_tensor(found[key], f"{name}.{key}", torch.float32), like, f"{name}.{key}")
     bad = first_non_finite({"exp_avg": checked["exp_avg"]})
