@@ -23,7 +23,12 @@ STAGES = {p.stem for p in ORACLE}
 VALUES = {"pop_ref.constants", "pop_ref.settings", "pop_ref.recipes"}
 SHARED_WITH_FAST = VALUES | {"pop_ref.notation", "pop_ref.types"}
 # rooms of the program whose work is to show what the oracle does
-SHOW_THE_ORACLE = ("pop_fast/explain/", "pop_fast/oracle_backend.py", "pop_fast/cli/vectors.py")
+SHOW_THE_ORACLE = (
+    "pop_fast/explain/",
+    "pop_fast/oracle_backend.py",
+    "pop_fast/oracle_passes.py",
+    "pop_fast/cli/vectors.py",
+)
 
 
 def _name(path: Path) -> str:
