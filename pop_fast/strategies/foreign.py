@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pop_fast.strategies.base import Info, Normals, Optimizers, Params, State, StepEvent, Strategy
+from pop_fast.strategies.base import Draws, Info, Optimizers, Params, State, StepEvent, Strategy
+from pop_ref.settings import MAX_SH_DEGREE
 
 
 class ForeignStrategy:
@@ -54,6 +55,10 @@ class ForeignStrategy:
         """Tell whether the population may change after this step: always."""
         return True
 
+    def needs_passes(self, step: int) -> bool:
+        """Tell whether the change after this step looks at the training views: gsplat's protocol has none."""
+        return False
+
     def regularizer(self, opacities: Tensor, state: State, step: int, info: Info) -> Tensor | None:
         """Return the term that it adds to the loss, or None."""
         term: Callable[..., Tensor | None] | None = getattr(self.strategy, "regularizer", None)
@@ -68,7 +73,14 @@ class ForeignStrategy:
         self._info = info
 
     def change(
-        self, params: Params, optimizers: Optimizers, state: State, step: int, normals: Normals | None = None
+        self,
+        params: Params,
+        optimizers: Optimizers,
+        state: State,
+        step: int,
+        draws: Draws | None = None,
+        passes: Any = None,
+        sh_degree: int = MAX_SH_DEGREE,
     ) -> StepEvent | None:
         """Call `step_post_backward`."""
         info, self._info = self._info, None

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +28,9 @@ from pop_fast.data.capture import Capture
 from pop_fast.data.initialize import initialize_params
 from pop_fast.errors import PopError
 from pop_fast.io.ply import save_ply
-from pop_fast.strategies.base import StepEvent, Strategy
-from pop_fast.strategies.densify import standard_normals
+from pop_fast.strategies.base import Draws, StepEvent, Strategy
+from pop_fast.passes import Passes
+from pop_fast.strategies.densify import draws_of
 from pop_fast.strategies.foreign import ForeignStrategy
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.choose import choose_backend
@@ -235,13 +237,23 @@ class TrainingRun:
         """Let density control edit the population, if that is due."""
         if not self.strategy.changes_after(step):
             return None
-        event = self.strategy.change(self.params, self.optimizers, self.state, step, self.normals)
+        config = self.config
+        degree = active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter)
+        passes = self._passes if self.strategy.needs_passes(step) else None
+        given = (self.params, self.optimizers, self.state, step, self.draws)
+        event = self.strategy.change(*given, passes=passes, sh_degree=degree)
         self.stepper.rebind(self.params, self.optimizers, self.state)
         return event
 
-    def normals(self, n: int) -> Tensor:
-        """Draw what places the children of n split parents, the same numbers whatever takes the steps. [2, n, 3]"""
-        return standard_normals(self.state["generator"], n)
+    @cached_property
+    def draws(self) -> Draws:
+        """What changes of the population are decided by, the same numbers whatever takes the steps."""
+        return draws_of(self.state["generator"])
+
+    @cached_property
+    def _passes(self) -> Passes:
+        """What a change of the population sees of the training views."""
+        return Passes.of(self._engine.backend, self._train, self.config, self._engine.device)
 
     @property
     def stepper(self) -> Stepper:

@@ -64,6 +64,7 @@ class Trainer:
         self._model: Any = importlib.import_module(f"{package}.train.model")
         self._schedule: Any = importlib.import_module(f"{package}.train.schedule")
         self._config: Any = importlib.import_module(f"{package}.train.config")
+        self._Draws: Any = importlib.import_module(f"{package}.strategies.base").Draws
         self._Strategy: Any = importlib.import_module(f"{package}.strategies").POPStrategy
 
     def rows_from_params(self, params: Mapping[str, Any]) -> Rows:
@@ -157,7 +158,7 @@ class Trainer:
         strategy = self._strategy(config)
         params, optimizers = self._population(rows.params, rows)
         state = self._state(strategy, statistics, scene_scale)
-        strategy.change(params, optimizers, state, step, normals)
+        strategy.change(params, optimizers, state, step, self._Draws(normals, None))
         return self._rows(params, optimizers), self._statistics(state, statistics.grad_sum)
 
     def adam_step(
