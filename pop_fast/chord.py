@@ -115,9 +115,9 @@ def points_on_rays(ids: Tensor, gaussians: Gaussians, camera: Camera, profile: P
     found = ids >= 0
     chosen = ids[found]
     directions = torch.nn.functional.normalize(ray_directions(camera, profile)[found], dim=1) @ viewmat[:3, :3]
-    rows = (t.double()[chosen] for t in (gaussians.means, gaussians.quats, gaussians.scales))
+    means, quats, scales = (t.double()[chosen] for t in (gaussians.means, gaussians.quats, gaussians.scales))
     origin = camera_center(viewmat)
-    t = chord_midpoint(*rows, origin, directions)
+    t = chord_midpoint(means, quats, scales, origin, directions)
     points = torch.zeros((*ids.shape, 3), dtype=torch.float64)
     points[found] = origin + t[:, None] * directions
     return points

@@ -14,7 +14,7 @@ from pop_ref.contributions import contributions
 from pop_ref.fisher import fisher_blocks, screen_moments
 from pop_ref.render import render
 from pop_ref.sensitivity import sensitivities
-from pop_ref.types import Camera, Gaussians
+from pop_ref.types import Camera, Gaussians, Splats
 
 
 class OracleView:
@@ -67,7 +67,7 @@ class OracleView:
         found = dominant_points(made.splats, made.tile_lists, self._gaussians, self._camera, profile.tile_size, profile)
         return DominantPoints(self._floats(found.points), torch.as_tensor(found.ids), self._floats(found.T_final))
 
-    def _listed(self) -> tuple:
+    def _listed(self) -> tuple[Splats, list[list[int]], int, int, int]:
         made, camera = self._render, self._camera
         return made.splats, made.tile_lists, camera.width, camera.height, self._shot.profile.tile_size
 
