@@ -67,7 +67,7 @@ def adam_step(
         [0.75]
     """
     numbers = dict.fromkeys(grads, step) if isinstance(step, int) else step
-    if isinstance(step, int) and step < 1 or any(number < 1 for number in numbers.values()):
+    if (isinstance(step, int) and step < 1) or any(number < 1 for number in numbers.values()):
         raise ValueError(f"step is {step}; Adam's updates count from 1")
     beta1, beta2 = betas
     new_params, new_m, new_v = dict(params), dict(m), dict(v)
@@ -252,9 +252,7 @@ def update_numbers(names: Iterable[str], step: int, recipe: Recipe) -> dict[str,
     return {name: sum(is_updated(name, s, recipe) for s in range(first, step + 1)) for name in moved}
 
 
-def sh_degree_at(
-    step: int, interval: int = SH_DEGREE_INTERVAL, max_degree: int = MAX_SH_DEGREE, start: int = 0
-) -> int:
+def sh_degree_at(step: int, interval: int = SH_DEGREE_INTERVAL, max_degree: int = MAX_SH_DEGREE, start: int = 0) -> int:
     """Raise the degree of the harmonics by one each 1000 steps: `min(step // interval, max_degree)`.
 
     Source: Kerbl et al. 2023, appendix; gsplat's trainer; mini-splatting (which starts to count at step 15,000).

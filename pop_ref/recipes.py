@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from pop_ref.constants import INRIA
+from pop_ref.constants import INRIA, SPEEDY_SPLAT
 from pop_ref.settings import GSPLAT, INRIA_RATES, LAMBDA_SSIM_3DGS, POP, LearningRates, Recipe, UpdateRules
 
 __all__ = ["BASELINES", "L1_DIVIDED", "RECIPES", "Recipe"]
@@ -78,7 +78,7 @@ BASELINES: Final = {
         lr=LearningRates(opacities=INRIA_RATES.opacities, sh_rest=2.0 * LearningRates.sh_rest),
         updates=replace(_INRIA.updates, sh_rest_every=16, opacities_stop_iter=15_000),
     ),
-    "Speedy-Splat": _INRIA,
+    "Speedy-Splat": replace(_INRIA, profile=SPEEDY_SPLAT),
 }
 
 L1_DIVIDED: Final = {n: replace(RECIPES["L2"], pixelwise="l1", pixel_scale=1.0 / n) for n in (1, 2, 5, 10, 20, 50, 100)}

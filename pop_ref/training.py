@@ -40,7 +40,7 @@ from pop_ref.optimizer import adam_step, learning_rates, sh_degree_at, update_nu
 from pop_ref.polarization import importance_mask, pop_loss, pop_loss_vjp
 from pop_ref.recipes import RECIPES, Recipe
 from pop_ref.render import RenderGradients, render, render_vjp
-from pop_ref.settings import LAMBDA_SSIM_3DGS, UpdateRules
+from pop_ref.settings import LAMBDA_SSIM_3DGS
 from pop_ref.types import Camera, Gaussians, Render
 
 
@@ -152,6 +152,7 @@ def update(
         The population after the update; the gradients that wait from now on.
 
     Example:
+        >>> from pop_ref.settings import UpdateRules
         >>> rows, recipe = rows_from_params({"shN": np.zeros((1, 3, 3))}), Recipe(updates=UpdateRules(sh_rest_every=2))
         >>> same, waiting = update(rows, {"shN": np.ones((1, 3, 3))}, Training(rows, zero_statistics(1)), 1.0, recipe)
         >>> float(same.params["shN"].max()), float(waiting["shN"].max())

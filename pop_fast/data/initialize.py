@@ -11,9 +11,9 @@ from pop_fast.data.capture import Capture
 from pop_fast.errors import CaptureError
 from pop_fast.neighbours import mean_squared_distances
 
-__all__ = ["initialize_params"]
+__all__ = ["SH_C0", "initialize_params"]
 
-_SH_C0 = 0.28209479177387814
+SH_C0 = 0.28209479177387814
 
 
 def initialize_params(
@@ -49,7 +49,7 @@ def initialize_params(
     squared = np.maximum(mean_squared_distances(capture.points), 1e-7 * capture.scene_scale() ** 2)
     sizes = np.log(init_scale * np.sqrt(squared))
     generator = torch.Generator().manual_seed(seed)
-    sh0 = (capture.points_rgb.astype(np.float64) / 255.0 - 0.5) / _SH_C0
+    sh0 = (capture.points_rgb.astype(np.float64) / 255.0 - 0.5) / SH_C0
     return {
         "means": torch.tensor(capture.points, dtype=dtype),
         "scales": torch.tensor(sizes, dtype=dtype)[:, None].repeat(1, 3),

@@ -61,16 +61,17 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         if self.refine_every < 1 or self.reset_every < 0:
             raise ValueError(f"refine_every, reset_every are {self.refine_every}, {self.reset_every}; use >= 1, >= 0")
 
-    def initialize_state(self, scene_scale: float = 1.0, seed: int = 0) -> State:
+    def initialize_state(self, scene_scale: float = 1.0, seed: int = 0, count: int = 0) -> State:
         """Return the state; statistics are allocated at the first step, when the number of Gaussians is known.
 
         Args:
             scene_scale: the unit of `grow_scale3d` and `prune_scale3d`, world units.
-            seed: seeds the noise that places the children of a split.
+            seed: seeds the random numbers that changes of the population take.
+            count: of the first Gaussians, which some methods measure their budget by.
         """
         from pop_fast.strategies import densify
 
-        return densify.initialize_state(scene_scale, seed)
+        return densify.initialize_state(scene_scale, seed, count)
 
     def scaled(self, factor: float) -> Self:
         """Return the same settings on a schedule `factor` times as long.

@@ -15,7 +15,7 @@ from pop_fast.strategies.control import DensityControl
 from pop_fast.strategies.info import dominant_counts, visible_from_radii, visible_in
 
 
-def initialize_state(scene_scale: float, seed: int) -> State:
+def initialize_state(scene_scale: float, seed: int, count: int) -> State:
     """Return the state before the first step; see `DensityControl.initialize_state`."""
     generator = torch.Generator().manual_seed(seed)
     return {
@@ -27,6 +27,7 @@ def initialize_state(scene_scale: float, seed: int) -> State:
         "radii": None,
         "sh_rest_sum": None,
         "scene_scale": float(scene_scale),
+        "first_count": count,
         "generator": generator,
     }
 
@@ -172,6 +173,13 @@ def clear(state: State) -> None:
     state["blurred"] = state["dominant_sum"] = state["sh_rest_sum"] = None
     if state["radii"] is not None:
         state["radii"].zero_()
+
+
+def forget(state: State) -> None:
+    """Leave a window behind whose Gaussians are gone."""
+    state["grad2d"] = state["count"] = state["radii"] = None
+    state["blurred"] = state["dominant_sum"] = state["sh_rest_sum"] = None
+    state["views"] = 0
 
 
 def standard_normals(generator: torch.Generator, n: int) -> Tensor:

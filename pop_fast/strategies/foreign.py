@@ -40,7 +40,7 @@ class ForeignStrategy:
         """See `Strategy.check_sanity`."""
         self.strategy.check_sanity(params, optimizers)
 
-    def initialize_state(self, scene_scale: float = 1.0, seed: int = 0) -> State:
+    def initialize_state(self, scene_scale: float = 1.0, seed: int = 0, count: int = 0) -> State:
         """Return the strategy's own state and, unless it has one, a generator for its random numbers."""
         own = self.strategy.initialize_state(scene_scale=scene_scale)
         self._lends = "generator" not in own

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from pop_fast.harmonics import SH_C0
+from pop_fast.data.initialize import SH_C0
 from pop_fast.mini_splatting import nearest_log_scales, samples_per_view, view_importance
 from pop_fast.selection import least_mass, sample_without_replacement
 from pop_fast.strategies import densify, ops
 from pop_fast.strategies.base import Params, Population, StepEvent
-from pop_fast.activations import logits_from_opacities
 
 if TYPE_CHECKING:
     from pop_fast.strategies.mini_splatting import MiniSplattingStrategy
@@ -35,7 +34,9 @@ def _points_of_view(plan: MiniSplattingStrategy, of: Population, index: int) -> 
     views = of.views
     points, ids, T_final = views.dominant_points(of.params, index, of.sh_degree)
     height, width = ids.shape
-    weights = torch.where(ids >= 0, 1.0 - T_final, 0.0).flatten().to("cpu", torch.float64)
+    mask = views.view(index).mask
+    shown = ids >= 0 if mask is None else (ids >= 0) & mask.to(ids.device)
+    weights = torch.where(shown, 1.0 - T_final, 0.0).flatten().to("cpu", torch.float64)
     wanted = samples_per_view(views.n_views, width, height, plan.reinit_points)
     wanted = min(wanted, int((weights > 0.0).sum()))
     drawn = sample_without_replacement(weights, wanted, of.draws.uniforms(len(weights))).to(points.device)
@@ -86,7 +87,7 @@ def _rows(params: Params, points: Tensor, sh0: Tensor, opacity: float) -> Mappin
         "means": points,
         "scales": nearest_log_scales(points).to(points),
         "quats": upright,
-        "opacities": logits_from_opacities(points.new_full((n,), opacity)),
+        "opacities": torch.logit(points.new_full((n,), opacity)),
         "sh0": sh0.to(points),
         "shN": points.new_zeros((n, *params["shN"].shape[1:])),
     }

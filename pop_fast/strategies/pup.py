@@ -2,9 +2,9 @@
 
 Source: Hanson et al. 2025 and its code. The score of a Gaussian is the log-determinant of the Fisher block of its mean
 and log-scale, summed over pixels and channels of all training views at a quarter of their size (`pop_ref.fisher`). A
-round removes the lowest scores, starts Adam anew, and trains 5,000 steps without densification, with the positions' rate
-where the training has ended and all others falling by 5 % each 400 steps (`pop_ref.optimizer`). The rounds remove 80 %
-and then 50 %; the paper's PUP* removes 70 % and then 50 %. What comes before is 3DGS of 2023.
+round removes the lowest scores, starts Adam anew, and trains 5,000 steps without densification, with the positions'
+rate where the training has ended and all others falling by 5 % each 400 steps (`pop_ref.optimizer`). The rounds remove
+80 % and then 50 %; the paper's PUP* removes 70 % and then 50 %. What comes before is 3DGS of 2023.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 Source: Hanson et al. 2025 and its code. The renderer is profile "speedy_splat", whose tiles are those that the ellipse
 of alpha >= 1/255 meets (SnugBox, AccuTile). The score of a Gaussian is the square of what its value at a pixel means
 for the pixel's colour, over all pixels of all training views (`pop_ref.sensitivity`). At steps 6000, 9000 and 12000,
-after densification and before the opacity reset, the lowest 80 % go; from step 15000 on each 3000 steps the lowest 30 %,
-after the update. Everything else is 3DGS of 2023.
+after densification and before the opacity reset, the lowest 80 % go; from step 15000 on each 3000 steps the lowest
+30 %, after the update. Everything else is 3DGS of 2023.
 """
 
 from __future__ import annotations

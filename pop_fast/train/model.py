@@ -46,7 +46,7 @@ def make_optimizers(params: Mapping[str, Parameter]) -> dict[str, Adam]:
 def adam_step(
     params: Mapping[str, Parameter], optimizers: Mapping[str, Adam], updates: Updates, step: int, state: State
 ) -> None:
-    """Move every parameter whose turn it is along its gradient, and forget the gradients; see `pop_ref.training.update`.
+    """Move every parameter whose turn it is by its gradient, and forget the gradients; see `pop_ref.training.update`.
 
     A parameter without a gradient, as the bands beyond the first are while band 0 alone is drawn, waits: with zero
     moments Adam would not move it.

@@ -20,12 +20,22 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import Any, Final, Literal, NamedTuple, Self
+from typing import Any, Final, Literal, NamedTuple, Self, TypeAlias
 
 from pop_fast.errors import PopError
-from pop_fast.strategies import DensityControl, GsplatStrategy, InriaStrategy, POPStrategy
+from pop_fast.strategies import (
+    DensityControl,
+    GsplatStrategy,
+    Inria2023Strategy,
+    InriaStrategy,
+    MiniSplattingStrategy,
+    POPStrategy,
+    PupStrategy,
+    SpeedySplatStrategy,
+    TamingStrategy,
+)
 from pop_fast.train.jsonable import from_plain, to_plain
-from pop_ref.recipes import RECIPES, Recipe
+from pop_ref.recipes import BASELINES, RECIPES, Recipe
 from pop_ref.settings import DensityConfig, PopTerm
 
 
@@ -40,7 +50,13 @@ METHODS: Final = {
     "pop": Method(POPStrategy, RECIPES["POP"]),
     "gsplat": Method(GsplatStrategy, RECIPES["gsplat"]),
     "3dgs": Method(InriaStrategy, RECIPES["3DGS"]),
+    "3dgs-2023": Method(Inria2023Strategy, RECIPES["3DGS 2023"]),
+    "pup": Method(PupStrategy, BASELINES["PUP-3DGS"]),
+    "mini-splatting": Method(MiniSplattingStrategy, BASELINES["Mini-Splatting"]),
+    "taming": Method(TamingStrategy, BASELINES["Taming-3DGS"]),
+    "speedy-splat": Method(SpeedySplatStrategy, BASELINES["Speedy-Splat"]),
 }
+MethodName: TypeAlias = Literal["pop", "gsplat", "3dgs", "3dgs-2023", "pup", "mini-splatting", "taming", "speedy-splat"]
 # what the control was called when there was one
 ALIASES: Final = {"adc": "gsplat"}
 QUICK_SCALER: Final = 0.1
@@ -59,8 +75,9 @@ class Given:
     """What a run was asked for: what gives its defaults, and what was said besides.
 
     Attributes:
-        method: "pop", "gsplat" for gsplat's default strategy, or "3dgs" for Inria's constants, learning rates, SSIM and
-            rasterizer.
+        method: "pop", "gsplat" for gsplat's default strategy, "3dgs" for Inria's constants, learning rates, SSIM and
+            rasterizer, "3dgs-2023" for those before October 2024, and on top of these "pup", "mini-splatting",
+            "taming" and "speedy-splat".
         preset: "paper" is the whole schedule; "quick" a tenth of it, for a CPU, in which a Gaussian must dominate more
             than 10 pixels to count as blur, and none is pruned for its size. It gives defaults: what is said besides
             wins.
@@ -70,7 +87,7 @@ class Given:
         settings: what was said, as plain values by dotted name.
     """
 
-    method: Literal["pop", "gsplat", "3dgs"] = "pop"
+    method: MethodName = "pop"
     preset: Literal["paper", "quick"] = "paper"
     steps_scaler: float | None = None
     scale_lambda_pop: bool = False

@@ -1,4 +1,4 @@
-"""What depends on the step number alone: rates and numbers of Adam's updates, the active colour bands, the view order."""
+"""What depends on the step number alone: rates and numbers of Adam's updates, active colour bands, the view order."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def updates_of(
         restarts: steps after which Adam begins anew.
     """
     rules = rules or UpdateRules()
-    steps = torch.arange(max_steps)
+    steps = torch.arange(max_steps, dtype=torch.float64)
     base = {**lr.by_parameter(), "means": lr.means * scene_scale}
     rates = torch.tensor([base[name] for name in GROUPS], dtype=torch.float64).repeat(max_steps, 1)
     rates *= _round_factor(steps, rules)[:, None]
@@ -55,18 +55,19 @@ def _share(steps: Tensor, max_steps: int, rules: UpdateRules) -> Tensor:
     start = rules.rounds_start_iter
     if start > 0:
         in_rounds = start + (steps - start) % rules.round_steps + 1.0
-        return torch.where(steps < start, steps / start, in_rounds / (start + rules.round_steps)).double()
+        return torch.where(steps < start, steps / start, in_rounds / (start + rules.round_steps))
     at = steps
     if rules.means_rewind_iter > 0:
-        at = torch.where(steps < rules.means_rewind_iter, steps, steps - rules.means_rewind_iter + rules.means_rewind_to)
-    return (at.double() / max_steps).clamp_(0.0, 1.0)
+        back = rules.means_rewind_iter - rules.means_rewind_to
+        at = torch.where(steps < rules.means_rewind_iter, steps, steps - back)
+    return (at / max_steps).clamp_(0.0, 1.0)
 
 
 def _round_factor(steps: Tensor, rules: UpdateRules) -> Tensor:
     """Return what a round of pruning and refining has multiplied the rates by."""
     start = rules.rounds_start_iter
     taken = (steps - start) % rules.round_steps + 1
-    factor = rules.round_decay ** (taken // rules.round_decay_every).double()
+    factor = rules.round_decay ** (taken // rules.round_decay_every)
     return torch.where((steps >= start) & (start > 0), factor, 1.0)
 
 

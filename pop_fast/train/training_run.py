@@ -28,8 +28,8 @@ from pop_fast.data.capture import Capture
 from pop_fast.data.initialize import initialize_params
 from pop_fast.errors import PopError
 from pop_fast.io.ply import save_ply
-from pop_fast.strategies.base import Draws, StepEvent, Strategy
 from pop_fast.passes import Passes
+from pop_fast.strategies.base import Draws, StepEvent, Strategy
 from pop_fast.strategies.densify import draws_of
 from pop_fast.strategies.foreign import ForeignStrategy
 from pop_fast.train import checkpoint as ckpt
@@ -104,7 +104,9 @@ class TrainingRun:
         self.optimizers = make_optimizers(self.params)
         self.strategy = self.config.strategy if strategy is None else ForeignStrategy(strategy)
         self.strategy.check_sanity(self.params, self.optimizers)
-        self.state = self.strategy.initialize_state(self._scene_scale, seed=self.config.seed)
+        self.state = self.strategy.initialize_state(
+            self._scene_scale, seed=self.config.seed, count=len(self.params["means"])
+        )
         self.updates = self._updates()
         self.step = 0
         self._stepper: Stepper | None = None

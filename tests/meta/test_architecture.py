@@ -202,8 +202,8 @@ WITHOUT = [
     (
         "import torch; from torch.nn import Parameter\n"
         "from pop_fast.train.environment import reproducible\n"
-        "from pop_fast.train.model import LearningRates, make_optimizers\n"
-        "with reproducible(): make_optimizers({'means': Parameter(torch.zeros(1, 3))}, LearningRates(), 1.0)",
+        "from pop_fast.train.model import make_optimizers\n"
+        "with reproducible(): make_optimizers({'means': Parameter(torch.zeros(1, 3))})",
         ("torch._dynamo", "torch._inductor", "sympy"),
     ),
     ("import pop_fast.train.training_run", ("torch._dynamo", "matplotlib", "pycolmap", "pop_fast.report.page")),
