@@ -152,7 +152,7 @@ def tight_tile_lists(
 
 
 def _reach_in_slab(
-    mean2d: Float64[np.ndarray, "2"], conic: Float64[np.ndarray, "3"], t: float, top: float, bottom: float
+    mean2d: Float64[np.ndarray, "2"], conic: Float64[np.ndarray, "3"], t: float, top: int, bottom: int
 ) -> tuple[float, float] | None:
     """Give the ellipse's least and greatest x inside `top <= y <= bottom`; None where it does not get inside."""
     A, B, C = conic.tolist()
