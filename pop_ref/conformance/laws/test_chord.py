@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from hypothesis import strategies as st
 
@@ -9,8 +11,10 @@ from pop_ref.chord import dominant_points
 from pop_ref.compositing import composite
 from pop_ref.conformance.compare import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
+from pop_ref.conformance.scenes import Scene
 from pop_ref.conformance.score_charges import screened
 from pop_ref.conformance.strategies import arrays_of, plain_sizes, quats, scenes
+from pop_ref.types import Camera, Gaussians
 
 vectors = arrays_of((3,), -4.0, 4.0)
 rays = vectors.map(lambda d: d if np.any(d) else np.array([0.0, 0.0, 1.0]))
@@ -88,6 +92,29 @@ def test_points_lie_on_the_rays_through_their_pixels_and_ahead_of_the_camera(bac
         assert_close("chord.ray", off[some], np.zeros(int(np.sum(some))), size[some], backend.dtype)
     assert np.all(p[..., 2][some] >= -(2.0**6) * np.finfo(backend.dtype).eps * size[some])
     assert_same_bits("points of no Gaussian", found.points[~some], np.zeros((int(np.sum(~some)), 3)))
+
+
+@law(
+    "chord",
+    "dominant_points",
+    side=st.sampled_from([0.25, -0.25, 0.375]),
+    depth=st.sampled_from([0.125, 0.0625]),
+    opacity=st.sampled_from([0.5, 1.0, 0.75]),
+)
+def test_a_gaussian_that_is_densest_behind_the_camera_gives_no_point(backend, side, depth, opacity):
+    # a long one just ahead, slanted by 45 degrees towards the axis, which its line crosses at depth - |side| < 0
+    camera = Camera(np.eye(4), np.array([[4.0, 0, 2.5], [0, 4.0, 2.5], [0, 0, 1]]), 5, 5)
+    half = math.copysign(math.pi / 8.0, side)
+    slanted = ([side, 0.0, depth], [math.cos(half), 0.0, math.sin(half), 0.0], [0.0625, 0.0625, 4.0], opacity)
+    round_ = ([0.0, 0.0, 4.0], [1.0, 0.0, 0.0, 0.0], [1.0, 1.0, 1.0], 0.5)
+    columns = [np.array(column) for column in zip(slanted, round_, strict=True)]
+    given = screened(backend, Scene(Gaussians(*columns, np.zeros((2, 1, 3))), camera))
+    found, expected = _drawn(backend, given)
+    drawn = composite(*given.view, profile=given.scene.profile)
+    # blended first, and heaviest in the middle
+    assert drawn.dominant_ids[2, 2] == 0
+    assert expected.ids[2, 2] == found.ids[2, 2]
+    assert found.ids[2, 2] != 0
 
 
 @law("chord", "dominant_points", scene=scenes(anchored=True))
