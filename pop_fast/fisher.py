@@ -36,11 +36,10 @@ def screen_moments(
         ValueError: there are not three channels, or the lists are not of that grid.
     """
     check_grid(lists, width, height, tile_size)
-    if colors_of(splats).shape[1] != 3:
-        raise ValueError(f"the colours have {colors_of(splats).shape[1]} channels; they must have 3")
+    behind = background_or_black(background, three_channels(splats))
     walk = PairWalk(splats, lists, width, height, profile)
     rows = EntryRows(walk, N_MOMENTS)
-    for pairs, worth in walk.worths(background_or_black(background, colors_of(splats))):
+    for pairs, worth in walk.worths(behind):
         slopes = _slopes(walk, pairs, splats.conics)
         through = pairs.scratch.copy_(pairs.weight)
         walk.blender.pass_ceiling(pairs.coefficients, pairs.alpha, through)
@@ -51,6 +50,18 @@ def screen_moments(
         of_colors = [-mixed[..., i, c] for c in range(3) for i in range(5)]
         rows.put(pairs, [*upper, *of_colors, pairs.weight.square().sum(2)])
     return rows.totals()
+
+
+def three_channels(splats: Splats) -> Tensor:
+    """Return the colours of splats. [N, 3]
+
+    Raises:
+        ValueError: there are not three channels.
+    """
+    colors = colors_of(splats)
+    if colors.shape[1] != 3:
+        raise ValueError(f"the splats have {colors.shape[1]} colour channels; they must have 3")
+    return colors
 
 
 def _slopes(walk: PairWalk, pairs: Pairs, conics: Tensor) -> Tensor:
