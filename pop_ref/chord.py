@@ -7,7 +7,7 @@ the density cuts out of the ray, however many standard deviations wide.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,8 +21,15 @@ from pop_ref.tiles import listed_pixels
 from pop_ref.types import Camera, Gaussians, Splats
 
 
-class DominantPoints(NamedTuple):
-    """Of each pixel the point on its ray, the Gaussian that it belongs to (-1 none, and the point 0), and `T_final`."""
+@dataclass(frozen=True)
+class DominantPoints:
+    """What each pixel's ray meets first and foremost.
+
+    Attributes:
+        points: on the rays, world units; 0 where no Gaussian competes. [H, W, 3]
+        ids: the Gaussian that the point belongs to, -1 where none competes. [H, W]
+        T_final: transmittance after the last blended splat, competing or not. [H, W]
+    """
 
     points: Float64[np.ndarray, "H W 3"]
     ids: Int64[np.ndarray, "H W"]
@@ -78,15 +85,16 @@ def dominant_points(
     """Find each pixel's point: that of the blended Gaussian of the largest weight on the ray through its centre.
 
     `point = c + t* d` with c the camera's centre and d the unit direction. Gaussians that are densest behind the
-    camera, `t* < 0`, are blended and do not compete; ties go to the front (D8).
+    camera, `t* < 0`, or that have a scale of 0 and so no density, are blended and do not compete; ties go to the front
+    (D8).
 
     Source: Fang and Wang 2024 (Mini-Splatting), depth reinitialization, and its code.
-    Departs: nothing.
+    Departs: the code divides by a scale of 0.
 
     Args:
         splats: the projected Gaussians.
         lists: ids front to back, one list a tile, row-major.
-        gaussians: the same in the world, scales > 0.
+        gaussians: the same in the world.
         camera: the view.
         tile_size: px, the one the lists were made with.
         profile: floor, ceiling, stop, and which principal point is used.
@@ -95,7 +103,7 @@ def dominant_points(
         Points, ids and remaining light.
 
     Raises:
-        ValueError: the lists do not fit, or a blended Gaussian has a scale that is not over 0.
+        ValueError: the lists do not fit.
 
     Example:
         >>> from pop_ref.render import render
@@ -114,10 +122,7 @@ def dominant_points(
     for x, y, listed in listed_pixels(lists, width, height, tile_size):
         pixel = composite_pixel(listed, rows, x + 0.5, y + 0.5, black, profile)
         direction = _ray_direction(x + 0.5, y + 0.5, camera, profile)
-        depth_of = {
-            i: chord_midpoint(gaussians.means[i], gaussians.quats[i], gaussians.scales[i], origin, direction)
-            for i in pixel.ids
-        }
+        depth_of = {i: _depth_on_ray(gaussians, i, origin, direction) for i in pixel.ids}
         ahead = [(i, weight) for i, weight in zip(pixel.ids, pixel.weights, strict=True) if depth_of[i] >= 0.0]
         winner = dominant_id([i for i, _ in ahead], [weight for _, weight in ahead])
         if winner >= 0:
@@ -125,6 +130,15 @@ def dominant_points(
         ids[y, x] = winner
         T_final[y, x] = pixel.T_final
     return DominantPoints(points, ids, T_final)
+
+
+def _depth_on_ray(
+    gaussians: Gaussians, i: int, origin: Float64[np.ndarray, "3"], direction: Float64[np.ndarray, "3"]
+) -> float:
+    """Give t* of one Gaussian, -inf where a scale of 0 leaves it without density."""
+    if np.any(gaussians.scales[i] == 0.0):
+        return -np.inf
+    return chord_midpoint(gaussians.means[i], gaussians.quats[i], gaussians.scales[i], origin, direction)
 
 
 def _ray_direction(px: float, py: float, camera: Camera, profile: Profile) -> Float64[np.ndarray, "3"]:

@@ -7,7 +7,7 @@ Taming-3DGS reads all four. Only blended splats contribute, the same that a rend
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,11 +18,15 @@ from pop_ref.tiles import listed_pixels
 from pop_ref.types import Splats
 
 
-class Contributions(NamedTuple):
+@dataclass(frozen=True)
+class Contributions:
     """Sums over the pixels of one view at which a Gaussian is blended.
 
-    `weight_sum` adds T alpha, `n_pixels` adds 1, `map_sum` adds a given map, `distance_sum` adds the distance from the
-    pixel's centre to the screen centre, px.
+    Attributes:
+        weight_sum: of T alpha. [N]
+        n_pixels: how many there are. [N]
+        map_sum: of a given map, 0 without one. [N]
+        distance_sum: of the distances from the pixels' centres to the screen centre, px. [N]
     """
 
     weight_sum: Float64[np.ndarray, " N"]

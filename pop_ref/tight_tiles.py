@@ -3,7 +3,7 @@
 A pixel blends a splat where o exp(-sigma) >= alpha_floor (D5), that is inside the ellipse d^T Q d <= t with Q the conic
 and t = 2 ln(o / alpha_floor). With Sigma = Q^-1 its bounding box is |dx| <= sqrt(t Sigma_xx), |dy| <= sqrt(t Sigma_yy)
 (SnugBox). A row of tiles cuts a convex piece out of it, whose reach along x is an interval, so the row's tiles that
-meet the ellipse are consecutive (AccuTile). Inside a row the point furthest to the right is the ellipse's own where that
+meet the ellipse are consecutive (AccuTile). Inside a row the point furthest right is the ellipse's own where that
 lies in the row, at dy = Sigma_xy sqrt(t / Sigma_xx), and else lies on the row's edge nearest to it, where
     Q_xx dx^2 + 2 Q_xy dx dy + Q_yy dy^2 = t   gives   dx = (-Q_xy dy +- sqrt(Q_xx t - det Q dy^2)) / Q_xx.
 
@@ -152,7 +152,7 @@ def tight_tile_lists(
 
 
 def _reach_in_slab(
-    mean2d: Float64[np.ndarray, "2"], conic: Float64[np.ndarray, "3"], t: float, top: float, bottom: float
+    mean2d: Float64[np.ndarray, "2"], conic: Float64[np.ndarray, "3"], t: float, top: int, bottom: int
 ) -> tuple[float, float] | None:
     """Give the ellipse's least and greatest x inside `top <= y <= bottom`; None where it does not get inside."""
     A, B, C = conic.tolist()

@@ -7,7 +7,6 @@ the square cuts visible alpha off and the tile grid decides where, so its 16 px 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 
@@ -159,10 +158,8 @@ def tile_lists(
     return lists
 
 
-def listed_pixels(
-    lists: list[list[int]], width: int, height: int, tile_size: int
-) -> Iterator[tuple[int, int, list[int]]]:
-    """Walk an image row by row, each pixel with the list of its tile.
+def listed_pixels(lists: list[list[int]], width: int, height: int, tile_size: int) -> list[tuple[int, int, list[int]]]:
+    """Go through an image row by row, each pixel with the list of its tile.
 
     Source: Kerbl et al. 2023 (3DGS), algorithm 2.
     Departs: nothing.
@@ -173,14 +170,14 @@ def listed_pixels(
         height: px.
         tile_size: px, the one the lists were made with.
 
-    Yields:
-        Column, row, and ids front to back.
+    Returns:
+        Column, row, and ids front to back, for each pixel.
 
     Raises:
         ValueError: there are not as many lists as tiles.
 
     Example:
-        >>> list(listed_pixels([[0, 2], [1]], 3, 1, 2))
+        >>> listed_pixels([[0, 2], [1]], 3, 1, 2)
         [(0, 0, [0, 2]), (1, 0, [0, 2]), (2, 0, [1])]
     """
     tiles_x, tiles_y = grid_size(width, height, tile_size)
@@ -188,6 +185,4 @@ def listed_pixels(
         raise ValueError(
             f"lists has {len(lists)} tiles; {width} x {height} px in {tile_size} px tiles need {tiles_x * tiles_y}"
         )
-    for y in range(height):
-        for x in range(width):
-            yield x, y, lists[(y // tile_size) * tiles_x + x // tile_size]
+    return [(x, y, lists[(y // tile_size) * tiles_x + x // tile_size]) for y in range(height) for x in range(width)]
