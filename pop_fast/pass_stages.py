@@ -55,14 +55,17 @@ class StagesView:
 
     def fisher_blocks(self) -> Tensor:
         """As `pop_fast.fisher.fisher_blocks`, of its own screen moments."""
-        moments, stages, shot = self.stages.screen_moments(*self._blended()), self.stages, self.shot
+        stages, shot = self.stages, self.shot
         chain = {"project": stages.project, "colors_of_view": stages.colors_of_view, "covariances": stages.covariances}
-        return fisher_blocks(shot.gaussians, shot.camera, moments, shot.sh_degree, shot.profile, **chain)
+        return fisher_blocks(shot.gaussians, shot.camera, self._moments(), shot.sh_degree, shot.profile, **chain)
 
     def dominant_points(self) -> DominantPoints:
         """As `pop_fast.chord.dominant_points`."""
         shot, size = self.shot, self.lists.tile_size
         return self.stages.dominant_points(self.splats, self.lists, shot.gaussians, shot.camera, size, shot.profile)
+
+    def _moments(self) -> Tensor:
+        return self.stages.screen_moments(*self._blended())
 
     def _blended(self) -> tuple[object, ...]:
         shot, size = self.shot, self.lists.tile_size
