@@ -85,12 +85,13 @@ def dominant_points(
 
 
 def towards_camera(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """Return g in the camera's axes: t* of a ray d has the sign of -(g . d). [N, 3] float64"""
+    """Return g in the camera's axes: t* of a ray d has the sign of -(g . d), nan where a scale is 0. [N, 3] float64"""
     means, quats, scales = (t.double() for t in (gaussians.means, gaussians.quats, gaussians.scales))
     viewmat = camera.viewmat.double()
     a = _whitened(quats, scales, camera_center(viewmat) - means)
     g = (rotmats_from_quats(quats) * (a / scales)[:, None, :]).sum(2)
-    return g @ viewmat[:3, :3].T
+    flat = (scales == 0.0).any(1, keepdim=True)
+    return (g @ viewmat[:3, :3].T).masked_fill(flat, torch.nan)
 
 
 def ray_directions(camera: Camera, profile: Profile) -> Tensor:

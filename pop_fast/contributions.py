@@ -46,8 +46,8 @@ def contributions(
     check_grid(lists, width, height, tile_size)
     walk = PairWalk(splats, lists, width, height, profile)
     rows = EntryRows(walk, 4)
-    shown = splats.means2d.new_zeros((height, width)) if pixel_map is None else pixel_map.to(splats.means2d.dtype)
-    values = walk.tiles_of(shown[..., None])
+    given = checked_map(pixel_map, width, height, splats.means2d.dtype)
+    values = walk.tiles_of(splats.means2d.new_zeros((height, width, 1)) if given is None else given[..., None])
     for pairs in walk.front_to_back():
         dx, dy = walk.offsets(pairs)
         weight = pairs.weight.sum(2)
@@ -57,3 +57,14 @@ def contributions(
         rows.put(pairs, [weight, blended.sum(2), of_map, distance])
     weight_sum, n_pixels, map_sum, distance_sum = rows.totals().T
     return Contributions(weight_sum, n_pixels.to(torch.int64), map_sum, distance_sum)
+
+
+def checked_map(pixel_map: Tensor | None, width: int, height: int, dtype: torch.dtype) -> Tensor | None:
+    """Return a map in a precision.
+
+    Raises:
+        ValueError: it is not of the view's size.
+    """
+    if pixel_map is not None and pixel_map.shape != (height, width):
+        raise ValueError(f"pixel_map has shape {list(pixel_map.shape)}; it must be [{height}, {width}]")
+    return None if pixel_map is None else pixel_map.to(dtype)

@@ -36,11 +36,10 @@ def screen_moments(
         ValueError: there are not three channels, or the lists are not of that grid.
     """
     check_grid(lists, width, height, tile_size)
-    if colors_of(splats).shape[1] != 3:
-        raise ValueError(f"the colours have {colors_of(splats).shape[1]} channels; they must have 3")
+    behind = background_or_black(background, three_channels(splats))
     walk = PairWalk(splats, lists, width, height, profile)
     rows = EntryRows(walk, N_MOMENTS)
-    for pairs, worth in walk.worths(background_or_black(background, colors_of(splats))):
+    for pairs, worth in walk.worths(behind):
         slopes = _slopes(walk, pairs, splats.conics)
         through = pairs.scratch.copy_(pairs.weight)
         walk.blender.pass_ceiling(pairs.coefficients, pairs.alpha, through)
@@ -51,6 +50,18 @@ def screen_moments(
         of_colors = [-mixed[..., i, c] for c in range(3) for i in range(5)]
         rows.put(pairs, [*upper, *of_colors, pairs.weight.square().sum(2)])
     return rows.totals()
+
+
+def three_channels(splats: Splats) -> Tensor:
+    """Return the colours of splats. [N, 3]
+
+    Raises:
+        ValueError: there are not three channels.
+    """
+    colors = colors_of(splats)
+    if colors.shape[1] != 3:
+        raise ValueError(f"the splats have {colors.shape[1]} colour channels; they must have 3")
+    return colors
 
 
 def _slopes(walk: PairWalk, pairs: Pairs, conics: Tensor) -> Tensor:
@@ -77,10 +88,10 @@ def fisher_blocks(
     colors_of_view: Callable[..., Tensor] = colors_of_view,
     covariances: Callable[..., Tensor] = covariances,
 ) -> Tensor:
-    """See `pop_ref.fisher.fisher_blocks`. [N, 6, 6]
+    """See `pop_ref.fisher.fisher_blocks`. [N, 6, 6] float64, whatever the precision of what is given
 
-    Optimizations: the Jacobian of every Gaussian's (mean2d, conic, colour) is the stages' own transpose, called once a
-    row for all of them.
+    Optimizations: only Gaussians that have moments; the Jacobian of their (mean2d, conic, colour) is the stages' own
+    transpose, called once a row for all of them.
 
     Args:
         gaussians: activated.
@@ -92,18 +103,23 @@ def fisher_blocks(
         colors_of_view: as `pop_fast.splatting.colors_of_view`.
         covariances: as `pop_fast.splatting.covariances`.
     """
+    blocks = torch.zeros((len(moments), 6, 6), dtype=torch.float64)
+    rows = (moments != 0.0).any(1).nonzero().squeeze(1)
     degree = round(gaussians.sh.shape[1] ** 0.5) - 1 if sh_degree is None else sh_degree
-    means, scales = (t.detach().clone().requires_grad_() for t in (gaussians.means, gaussians.scales))
+    chosen = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    means, quats, scales, opacities, sh = (t.detach().index_select(0, rows).double() for t in chosen)
+    viewmat, K = camera.viewmat.double(), camera.K.double()
     with torch.enable_grad():
-        covars = covariances(gaussians.quats.detach(), scales)
-        view = View(camera.K, camera.width, camera.height, profile)
-        splats = project(means, covars, gaussians.opacities.detach(), camera.viewmat, view)
+        means.requires_grad_()
+        scales.requires_grad_()
+        view = View(K, camera.width, camera.height, profile)
+        splats = project(means, covariances(quats, scales), opacities, viewmat, view)
         visible = (splats.radii > 0).all(1).nonzero().squeeze(1)
-        colors = colors_of_view(gaussians.sh.detach(), means, camera.viewmat, degree, visible).unbind(1)
+        colors = colors_of_view(sh, means, viewmat, degree, visible).unbind(1)
         of_screen = (*splats.means2d.unbind(1), *splats.conics.unbind(1))
     to_screen = torch.stack([_row(value, means, scales) for value in of_screen], 1)
     to_colors = torch.stack([_row(value, means, None) for value in colors], 1)
-    return _sandwich(to_screen, to_colors, moments.to(means.dtype))
+    return blocks.index_copy_(0, rows, _sandwich(to_screen, to_colors, moments[rows].double()))
 
 
 def _row(values: Tensor, means: Tensor, scales: Tensor | None) -> Tensor:

@@ -48,7 +48,8 @@ class OracleView:
     def contributions(self, pixel_map: Tensor | None) -> Contributions:
         """See `pop_ref.contributions.contributions`."""
         given = None if pixel_map is None else _array(pixel_map)
-        found = contributions(*self._listed(), given, self._shot.profile)
+        made = contributions(*self._listed(), given, self._shot.profile)
+        found = (made.weight_sum, made.n_pixels, made.map_sum, made.distance_sum)
         return Contributions(*(torch.as_tensor(sums) for sums in found))
 
     def sensitivities(self) -> Tensor:

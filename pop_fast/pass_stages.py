@@ -13,7 +13,6 @@ from pop_fast.passes import Seen, Shot
 from pop_fast.raster_stages import Stages
 from pop_fast.splatting import Splats, View, colors_of
 from pop_fast.tiles import TileLists
-from pop_fast.types import Gaussians
 
 
 @dataclass(frozen=True)
@@ -55,18 +54,18 @@ class StagesView:
         return self.stages.sensitivities(*self._blended())
 
     def fisher_blocks(self) -> Tensor:
-        """As `pop_fast.fisher.fisher_blocks`, of its own screen moments, in float64."""
-        moments, stages = self.stages.screen_moments(*self._blended()), self.stages
-        g, c = self.shot.gaussians, self.shot.camera
-        gaussians = Gaussians(*(t.double() for t in (g.means, g.quats, g.scales, g.opacities, g.sh)))
-        camera = replace(c, viewmat=c.viewmat.double(), K=c.K.double())
+        """As `pop_fast.fisher.fisher_blocks`, of its own screen moments."""
+        stages, shot = self.stages, self.shot
         chain = {"project": stages.project, "colors_of_view": stages.colors_of_view, "covariances": stages.covariances}
-        return fisher_blocks(gaussians, camera, moments, self.shot.sh_degree, self.shot.profile, **chain)
+        return fisher_blocks(shot.gaussians, shot.camera, self._moments(), shot.sh_degree, shot.profile, **chain)
 
     def dominant_points(self) -> DominantPoints:
         """As `pop_fast.chord.dominant_points`."""
         shot, size = self.shot, self.lists.tile_size
         return self.stages.dominant_points(self.splats, self.lists, shot.gaussians, shot.camera, size, shot.profile)
+
+    def _moments(self) -> Tensor:
+        return self.stages.screen_moments(*self._blended())
 
     def _blended(self) -> tuple[object, ...]:
         shot, size = self.shot, self.lists.tile_size

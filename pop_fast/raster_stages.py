@@ -76,8 +76,13 @@ def stages_of(backend: str) -> Stages:
     if backend == "fast":
         return Stages()
     require_backend(backend)
+    from pop_fast.compiled.chord import dominant_points
     from pop_fast.compiled.compositing import composite
+    from pop_fast.compiled.contributions import contributions
+    from pop_fast.compiled.fisher import screen_moments
+    from pop_fast.compiled.sensitivity import sensitivities
     from pop_fast.compiled.splatting import colors_of_view, covariances, project
     from pop_fast.compiled.tiles import tile_lists
 
-    return Stages(covariances, project, colors_of_view, tile_lists, composite, large_tile)
+    passes = (contributions, sensitivities, screen_moments, dominant_points)
+    return Stages(covariances, project, colors_of_view, tile_lists, composite, large_tile, *passes)
