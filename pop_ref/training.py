@@ -59,7 +59,7 @@ class Training:
     rows: Rows
     statistics: Statistics
     step: int = 0
-    waiting: Mapping[str, np.ndarray] = field(default_factory=dict)
+    waiting: Mapping[str, np.ndarray] = field(default_factory=dict[str, np.ndarray])
 
 
 def start(params: Mapping[str, np.ndarray]) -> Training:

@@ -106,7 +106,8 @@ def _moments(packed: Any, name: str, param: Tensor, taken: int) -> dict[str, Ten
     found = _mapping(packed, name, _MOMENTS)
     like = list(param.shape)
     checked = {"step": _own(_tensor(found["step"], f"{name}.step", torch.float32), [], f"{name}.step")}
-    if not (0 <= checked["step"].item() <= taken and checked["step"].item().is_integer()):
+    counted = float(checked["step"])
+    if not (0 <= counted <= taken and counted.is_integer()):
         most = f"a whole number of updates, at most {taken}, the steps taken"
         raise ValueError(f"{name}.step is {checked['step'].item():g}; it must be {most}")
     for key in _MOMENTS[1:]:

@@ -124,6 +124,8 @@ LAWS = {
     "tiles.tile_lists": "tiles:lists_run_front_to_back_and_equal_depths_keep_index_order",
 }
 TESTS = {
+    "optimizer.is_updated": "test_updates.test_a_step_that_edits_the_population_moves_nothing_in_inrias_loop",
+    "optimizer.update_numbers": "test_updates.test_taming_moves_upper_bands_each_16_steps_and_opacities_until_15_000",
     "density_config.densifies_at": CALENDAR,
     "density_config.resets_at": CALENDAR,
     "density_config.blurs_at": "test_density.test_split_only_blur_splits_small_ones_and_may_clone_them_as_well",
@@ -142,6 +144,7 @@ TESTS = {
 LADDER = (
     "training.start",
     "training.train_step",
+    "training.update",
     "training.gaussians_from_params",
     "training.params_vjp",
     "training.objective",
