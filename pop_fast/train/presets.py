@@ -36,7 +36,7 @@ from pop_fast.strategies import (
 )
 from pop_fast.train.jsonable import from_plain, to_plain
 from pop_ref.recipes import BASELINES, RECIPES, Recipe
-from pop_ref.settings import DensityConfig, PopTerm
+from pop_ref.settings import DensityConfig, PopTerm, UpdateRules
 
 
 class Method(NamedTuple):
@@ -205,7 +205,8 @@ def options_for(recipe: Recipe) -> list[str]:
 def _options(recipe: Recipe, method: str) -> list[str]:
     base = METHODS[method].recipe
     pairs = [(name, values_of(recipe)[name], value) for name, value in values_of(base).items()]
-    for kind, ours, theirs in ((DensityConfig, recipe.density, base.density), (PopTerm, recipe, base)):
+    groups = ((DensityConfig, recipe.density, base.density), (PopTerm, recipe, base))
+    for kind, ours, theirs in (*groups, (UpdateRules, recipe.updates, base.updates)):
         pairs += [(f"{method}.{f.name}", getattr(ours, f.name), getattr(theirs, f.name)) for f in fields(kind)]
     rates = [(f"lr.{f.name}", getattr(recipe.lr, f.name), getattr(base.lr, f.name)) for f in fields(recipe.lr)]
     chosen = [] if method == Given.method else ["--method", method]

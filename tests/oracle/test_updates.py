@@ -49,13 +49,8 @@ def test_the_positions_rate_of_mini_splatting_goes_back_to_what_it_was() -> None
     rules, plain = BASELINES["Mini-Splatting"].updates, UpdateRules()
     for step, like in ((14_999, 14_999), (15_000, 5_000), (29_999, 19_999)):
         assert learning_rates(step, 1.0, rules=rules)["means"] == learning_rates(like, 1.0, rules=plain)["means"]
-    assert [sh_degree_at(s, start=rules.sh_start_iter) for s in (14_999, 15_999, 16_000, 17_000, 18_000)] == [
-        0,
-        0,
-        1,
-        2,
-        3,
-    ]
+    steps = (14_999, 15_999, 16_000, 17_000, 18_000)
+    assert [sh_degree_at(step, start=rules.sh_start_iter) for step in steps] == [0, 0, 1, 2, 3]
 
 
 def test_in_a_round_of_pup_rates_fall_from_where_the_training_ended() -> None:

@@ -86,7 +86,9 @@ def test_fisher_blocks_are_the_oracles(backend, scene):
         K = np.concatenate([J[:, :5], J[:, 5 + c : 6 + c]], axis=1)
         charge += np.swapaxes(K, 1, 2) @ seconds[:, c] @ K
     rows = ~given.charges.screen.kinked & given.splats.visible
-    assert_close("agreement.fisher_blocks", found[rows], expected[rows], charge[rows], backend.dtype, True)
+    assert_close(
+        "agreement.fisher_blocks", found[rows], expected[rows], charge[rows], backend.dtype, against_oracle=True
+    )
 
 
 @law("fisher", "screen_moments", "fisher_blocks", scene=shapely)
