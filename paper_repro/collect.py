@@ -132,7 +132,7 @@ def collect(job: Job, folder: Path) -> Result:
         opacity_below_01=stats["opacity_below_0.1"],
         opacity_above_09=stats["opacity_above_0.9"],
         opacity_histogram=_histogram(folder, last),
-        curve=(*_thinned(_records(folder), config.max_steps), _last_point(last, stats)),
+        curve=_curve(folder, config.max_steps),
         per_view={name: {key: view[key] for key in ("psnr", "ssim")} for name, view in stats["per_view"].items()},
     )
 
@@ -183,6 +183,16 @@ def _records(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in lines]
 
 
+def _curve(folder: Path, max_steps: int) -> tuple[dict[str, Any], ...]:
+    """Make the curve of the records of single training views, and of the measurements of all held-out views."""
+    points = {point["step"]: point for point in _thinned(_records(folder), max_steps)}
+    for path in sorted((folder / "stats").glob("val_step*.json")):
+        stats = read_json(path, "train the row again in an empty folder")
+        # a record of the same step has what its training view says; the held-out views say more
+        points[stats["step"]] = {**points.get(stats["step"], {}), **_measured(stats)}
+    return tuple(points[step] for step in sorted(points))
+
+
 def _thinned(records: Iterable[Mapping[str, Any]], max_steps: int) -> list[dict[str, Any]]:
     """Keep about `_POINTS` of the records, the first among them."""
     kept: list[dict[str, Any]] = []
@@ -198,9 +208,9 @@ def _point(record: Mapping[str, Any]) -> dict[str, Any]:
     return {name: _short(record.get(name)) for name in (*_ALWAYS, *more)}
 
 
-def _last_point(last: int, stats: Mapping[str, Any]) -> dict[str, Any]:
-    known = {"step": last, "num_gaussians": stats["num_GS"], "seconds": _short(stats["seconds"])}
-    return {name: known.get(name) for name in _ALWAYS}
+def _measured(stats: Mapping[str, Any]) -> dict[str, Any]:
+    found = {**stats, "num_gaussians": stats["num_GS"], "psnr": None, "psnr_test": stats["psnr"]}
+    return {name: _short(found.get(name)) for name in (*_ALWAYS, "psnr_test")}
 
 
 def _short(value: Any) -> Any:

@@ -24,6 +24,8 @@ __all__ = ["SEED", "WORK", "Job", "job_named", "jobs_of", "missing_method"]
 # git ignores it; everything in it can be made again
 WORK: Final = Path(__file__).resolve().parent / "work"
 SEED: Final = 42
+# the held-out views are measured so often, evenly over the schedule: the curves of Gaussians per pixel are made of these
+_MEASURED: Final = 15
 # step numbers that are settings of a run and not of its strategy
 _STEPS: Final = ("max_steps", "sh_interval", "l2_stop_iter")
 
@@ -82,8 +84,8 @@ class Job:
             steps_scaler=scaler,
             **{
                 **{"log_every": self.scale.log_every, "checkpoint_every": self.scale.checkpoint_every},
-                # measured and saved at the end, which always counts
-                **{"eval_steps": (), "save_steps": ()},
+                # the Gaussians are saved at the end alone, which always counts
+                **{"eval_steps": _measured_at(whole.max_steps, scaler), "save_steps": ()},
                 **self.scale.settings,
                 **({} if plain else {"strategy.reset_every": self.scale.reset_every}),
                 **_scaled(whole, scaler),
@@ -154,3 +156,8 @@ def _scaled(whole: TrainConfig, scaler: float) -> dict[str, Any]:
         elif name in _STEPS and value is not None:
             said[name] = max(round(value * scaler), 1)
     return said
+
+
+def _measured_at(max_steps: int, scaler: float) -> tuple[int, ...]:
+    last = max_steps * scaler
+    return tuple(sorted({max(round(last * i / _MEASURED), 1) for i in range(1, _MEASURED)}))

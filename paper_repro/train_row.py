@@ -178,12 +178,16 @@ def _train(job: Job, options: Options, config: TrainConfig) -> None:
     from paper_repro.collect import BESIDE, state_of_data
     from paper_repro.data_check import check_capture
     from pop_fast.cli.train import check_backend
+    from pop_fast.train.checkpoint import list_checkpoints
     from pop_fast.train.choose import choose_backend
 
     # asked before the hours of training, in which the clone may move on
     program = commit()
     config, chosen = choose_backend(config, True)
     check_backend(config)
+    if not list_checkpoints(Path(config.result_dir)):
+        # what a finished row has left, whose result was removed since
+        shutil.rmtree(config.result_dir, ignore_errors=True)
     capture, seconds = _load(job, config)
     check_capture(job, config, capture)
     from pop_fast.train.environment import keep_freed_memory
