@@ -1,0 +1,168 @@
+"""paper.toml says what the paper prints: the LaTeX source and its transcription, where they lie beside the clone."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from paper_repro.paper import PAPER, load, paper
+from pop_fast.errors import PopError
+from pop_ref.settings import POP, Recipe
+
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "paper"
+SOURCE = SHARED / "pop_paper.tex"
+needs_the_source = pytest.mark.skipif(not SOURCE.is_file(), reason="../shared/paper with the LaTeX source is absent")
+
+# names of the transcription that are not those of the printed tables
+TRANSCRIBED = {"Gsplat": "gsplat", "Ours": "POP (Ours)"} | {
+    f"3k--{end}k": f"POP blur 3k-{end}k" for end in (4, 7, 11, 15)
+}
+# stated numbers that the transcription writes as text
+AS_TEXT = {
+    "l2_over_l1_gradient_range": ("2/255 to 2", (2 / 255, 2.0)),
+    "pup_default_schedule": ("100->20%->10%", (1.0, 0.2, 0.1)),
+    "pup_star_schedule": ("100->30%->15%", (1.0, 0.3, 0.15)),
+    "speedup_vs_taming_TT": (">=30% less time", 0.3),
+    "gpu": ("RTX 4090", "RTX 4090"),
+    "pup_compression": ("1/10", 0.1),
+}
+FILES = {
+    "main_eval_360_and_deep.csv": {1},
+    "main_eval_tank.csv": {2},
+    "ablation_module.csv": {3},
+    "ablation_blur_dense_iter.csv": {4},
+    "ablation_opacity.csv": {5},
+    "all_tables.csv": {1, 2, 3, 4, 5},
+}
+CELLS = {
+    (table.label, dataset, TRANSCRIBED.get(line.name, line.name.replace(" + ", "+")), metric): value
+    for table in paper().tables
+    for line in table.rows
+    for dataset in table.datasets
+    for metric, value in line.values[dataset].items()
+}
+
+
+@needs_the_source
+@pytest.mark.parametrize("name", FILES)
+def test_every_cell_is_as_transcribed_and_none_is_missing(name: str) -> None:
+    with open(SHARED / name, encoding="utf-8", newline="") as file:
+        rows = [(r["table"], r["dataset"], r["method"], r["metric"], float(r["value"])) for r in csv.DictReader(file)]
+    labels = {paper().table(number).label for number in FILES[name]}
+    assert {row[:4]: row[4] for row in rows} == {cell: value for cell, value in CELLS.items() if cell[0] in labels}
+    assert len(rows) == len({row[:4] for row in rows})
+
+
+@needs_the_source
+def test_the_stated_numbers_are_as_transcribed() -> None:
+    with open(SHARED / "stated_numbers.csv", encoding="utf-8", newline="") as file:
+        rows = {row["item"]: row["value"] for row in csv.DictReader(file)}
+    assert set(rows) <= set(paper().stated)
+    for item, told in rows.items():
+        if item in AS_TEXT:
+            assert AS_TEXT[item][0] == told
+            assert paper().stated[item].value == AS_TEXT[item][1]
+        else:
+            assert paper().stated[item].value == float(told), item
+
+
+@needs_the_source
+@pytest.mark.parametrize("stated", paper().stated.values(), ids=lambda s: s.id)
+def test_every_stated_number_stands_in_the_source(stated) -> None:
+    assert SOURCE.read_text(encoding="utf-8").count(stated.quote) >= 1
+
+
+def printed_tables() -> Iterator[tuple[str, list[list[tuple[float, int]]]]]:
+    """Read label, and value and mark of every numeric cell line by line, of the five tables of the LaTeX source."""
+    source = SOURCE.read_text(encoding="utf-8")
+    for body in re.findall(r"\\begin\{table\*\}.*?\\end\{table\*\}|\\begin\{table\*\}.*\Z", source, re.DOTALL):
+        label = re.search(r"\\label\{(tab:[^}]*)\}", body)
+        lines = body.partition(r"\midrule")[2].partition(r"\bottomrule")[0].split(r"\\")
+        assert label
+        yield label[1], [[*map(printed, cells)] for line in lines if len(cells := numeric(line)) > 1]
+
+
+def numeric(line: str) -> list[str]:
+    """Give the cells of a line that hold a number."""
+    return [cell.strip() for cell in line.split("&") if re.fullmatch(r"[\d.,]+k?", bare(cell))]
+
+
+def bare(cell: str) -> str:
+    """Take colours and bold face off a cell."""
+    return re.sub(r"\\textbf\{([^}]*)\}", r"\1", re.sub(r"\\cellcolor\{\w+\}", "", cell)).strip()
+
+
+def printed(cell: str) -> tuple[float, int]:
+    """Read a cell's value, and its place among the best: by colour, or 1 for bold face."""
+    colours = {"bestred": 1, "secondorange": 2, "thirdyellow": 3}
+    colour = re.search(r"\\cellcolor\{(\w+)\}", cell)
+    mark = colours[colour[1]] if colour else int(r"\textbf" in cell)
+    return float(bare(cell).replace(",", "").removesuffix("k")), mark
+
+
+@needs_the_source
+def test_every_value_and_every_colour_is_that_of_the_source() -> None:
+    found = dict(printed_tables())
+    assert set(found) == {table.label for table in paper().tables}
+    for table in paper().tables:
+        told = [
+            [(line.values[d][m], line.marks[d][m]) for d in table.datasets for m in table.metrics]
+            for line in table.rows
+        ]
+        assert found[table.label] == told, table.label
+
+
+def test_there_are_five_tables_of_288_cells() -> None:
+    # 84 and 54 cells of the main tables, 60, 60 and 30 of the ablations
+    sizes = {t.number: sum(len(line.values[d]) for line in t.rows for d in t.datasets) for t in paper().tables}
+    assert sizes == {1: 84, 2: 54, 3: 60, 4: 60, 5: 30}
+    assert len(CELLS) == 288
+
+
+def test_scenes_rows_and_encodings_are_known_to_each_other() -> None:
+    told = paper()
+    assert [len(told.datasets[d]) for d in ("Mip-NeRF 360", "Tanks & Temples", "Deep Blending")] == [9, 2, 2]
+    assert len({scene for scenes in told.datasets.values() for scene in scenes}) == 13
+    sized = {line.row for number in (1, 2) for line in told.table(number).rows}
+    assert set(told.bytes_per_gaussian) == sized
+    assert set(told.bytes_per_gaussian.values()) == {236, 248}
+    for table in told.tables:
+        assert set(table.datasets) <= set(told.datasets)
+        for line in table.rows:
+            assert all((dataset, line.row) in told.lpips for dataset in table.datasets)
+
+
+def test_the_defaults_of_the_method_are_the_stated_numbers() -> None:
+    told = paper()
+    recipe = Recipe()
+    pairs = {
+        "lambda_ssim": recipe.lambda_ssim,
+        "lambda_pop": recipe.lambda_pop,
+        "theta_blur": POP.theta_blur,
+        "densify_interval": POP.refine_every,
+        "densify_start": POP.refine_start_iter,
+        "densify_stop": POP.refine_stop_iter,
+        "blur_start": POP.blur_start_iter,
+        "blur_stop": POP.blur_stop_iter,
+    }
+    assert {id: told.number(id) for id in pairs} == pairs
+
+
+def test_a_damaged_file_is_told_by_its_table_and_row(tmp_path: Path) -> None:
+    text = PAPER.read_text(encoding="utf-8")
+    path = tmp_path / "paper.toml"
+    path.write_text(text.replace("[2509, 1304, 595,", "[2509, 1304,"), encoding="utf-8")
+    with pytest.raises(PopError, match="table 1: row 3dgs, Mip-NeRF 360: there must be 6 values"):
+        load(path)
+    path.write_text(text.replace('id = "lambda_pop"', 'id = "lambda_ssim"'), encoding="utf-8")
+    with pytest.raises(PopError, match="stated has an id twice"):
+        load(path)
+    path.write_text("[", encoding="utf-8")
+    with pytest.raises(PopError, match=r"paper\.toml: is not TOML"):
+        load(path)
+    with pytest.raises(PopError, match="table is 6; it must be one of 1, 2, 3, 4, 5"):
+        paper().table(6)
