@@ -6,6 +6,8 @@ defaults of a method (`DensityControl.scaled`), so that "blur from 3,000 to 4,00
 
 from __future__ import annotations
 
+import contextlib
+import io
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +21,7 @@ from pop_fast.errors import PopError
 if TYPE_CHECKING:
     from pop_fast.train import TrainConfig
 
-__all__ = ["SEED", "WORK", "Job", "job_named", "jobs_of", "missing_method"]
+__all__ = ["SEED", "WORK", "Job", "NotInThisVersion", "job_named", "jobs_of", "missing_method"]
 
 # git ignores it; everything in it can be made again
 WORK: Final = Path(__file__).resolve().parent / "work"
@@ -28,6 +30,10 @@ SEED: Final = 42
 _MEASURED: Final = 15
 # step numbers that are settings of a run and not of its strategy
 _STEPS: Final = ("max_steps", "sh_interval", "l2_stop_iter")
+
+
+class NotInThisVersion(PopError):
+    """Say that the program cannot train a row: it lacks the method, or does not take an option."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +78,7 @@ class Job:
             more: settings of the run that do not belong to the row: data, result_dir, threads, backend, ...
 
         Raises:
-            PopError: the program has no such method or option yet; names row and option.
+            NotInThisVersion: the program has no such method or option; names row and words.
         """
         from pop_fast.train import TrainConfig
 
@@ -135,13 +141,17 @@ def _whole(job: Job) -> TrainConfig:
 
     missing = missing_method(job.row)
     if missing is not None:
-        raise PopError(missing)
+        raise NotInThisVersion(missing)
     words = job.words()
     try:
-        return arguments(["capture", "--out", "out", *words])[0]
-    except SystemExit as stop:
-        # the parser has said which word it does not know
-        raise PopError(f"row {job.row.name}: pop train does not take its options: {' '.join(words)}") from stop
+        # what the parser prints about a word that it does not know says no more than the words do
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            return arguments(["capture", "--out", "out", *words])[0]
+    except (SystemExit, PopError) as error:
+        reason = f": {error}" if isinstance(error, PopError) else ""
+        raise NotInThisVersion(
+            f"row {job.row.name}: this version of pop train does not take {' '.join(words)}{reason}"
+        ) from error
 
 
 def _scaled(whole: TrainConfig, scaler: float) -> dict[str, Any]:

@@ -41,7 +41,8 @@ class Row:
         title: what it is, in a few words.
         method: its name for `pop train --method`.
         options: the options of `pop train` in which it differs from that, on the whole schedule.
-        tables: the tables and figures that it stands in.
+        tables: the paper's tables that it stands in.
+        figures: the paper's figures that it stands in.
         paper: its name in the paper's tables, by table; empty beyond the paper.
         description: about ten lines: what the method does, from which sources, and what is left out.
         cost: time of a training over that of POP, for the order of a queue; from the paper's table where it has one.
@@ -53,7 +54,8 @@ class Row:
     title: str
     method: str
     options: tuple[str, ...]
-    tables: tuple[str, ...]
+    tables: tuple[int, ...]
+    figures: tuple[str, ...]
     paper: Mapping[str, str]
     description: str
     cost: float
@@ -118,9 +120,11 @@ def _checked(name: str, path: Path, found: Mapping[str, Any]) -> Row:
     for field in ("title", "method", "description"):
         if not isinstance(found[field], str) or not found[field].strip():
             raise fail(field, "a text")
-    for field in ("options", "tables"):
+    for field in ("options", "figures"):
         if not _is_texts(found[field]):
             raise fail(field, "a list of texts")
+    if not isinstance(found["tables"], list) or not all(type(number) is int for number in found["tables"]):
+        raise fail("tables", "a list of whole numbers")
     for field, inner in (("paper", lambda value: isinstance(value, str)), ("scenes", _is_texts)):
         if not isinstance(found[field], dict) or not all(map(inner, found[field].values())):
             raise fail(field, "a table of texts" if field == "paper" else "a table of lists of texts")
@@ -138,6 +142,7 @@ def _checked(name: str, path: Path, found: Mapping[str, Any]) -> Row:
         method=found["method"],
         options=tuple(found["options"]),
         tables=tuple(found["tables"]),
+        figures=tuple(found["figures"]),
         paper=dict(found["paper"]),
         description=found["description"].strip(),
         cost=float(cost),
