@@ -1,0 +1,84 @@
+"""A table of the reproduction as Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from paper_repro.paper import Metric
+from paper_repro.tables import Block, Line, Table
+
+__all__ = ["grid", "markdown"]
+
+# so many run ids fit into a line; more are listed below the block
+_IDS = 3
+
+
+def markdown(table: Table) -> str:
+    """Render a table: what has to be said, one grid a data set or capture, the ratios, what cannot be compared."""
+    parts = [f"## {_title(table)}", f"**{table.header[0]}**", " ".join(table.header[1:])]
+    if any(line.runs for block in table.blocks for line in block.lines):
+        parts.append("Best in **bold**, second and third as (2) and (3), ties alike.")
+    for block in table.blocks:
+        parts += _block(table, block)
+    if table.ratios is not None and table.ratios.relative is not None:
+        named = {line.row: line.name for block in table.blocks for line in block.lines}
+        rows = [[named[row], *texts] for row, texts in table.ratios.relative.items()]
+        parts += [f"### {table.ratios.title}", grid(["method", *table.ratios.columns], rows)]
+    if table.remarks:
+        said = "\n".join(f"- {label}: {why}." for label, why in table.remarks.items())
+        parts += [f"Of the paper's numbers (protocol.md, part 2):\n\n{said}"]
+    return "\n\n".join(parts) + "\n"
+
+
+def grid(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Make a Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |" for line in lines)
+
+
+def _block(table: Table, block: Block) -> list[str]:
+    arrows = {"least": "↓", "most": "↑"}
+    head = ["method", "of", *(f"{_named(m)} {arrows[m.best]}" for m in table.metrics), "runs"]
+    rows: list[list[str]] = []
+    beside = table.scale == "paper" and table.name != "beyond"
+    if not beside and not any(line.runs for line in block.lines):
+        return [f"### {block.title}", f"{_reason(block)}: {', '.join(line.name for line in block.lines)}."]
+    for line in block.lines:
+        cells = [line.cells[metric.id] for metric in table.metrics]
+        rows.append([line.name, "here", *(_marked(cell.ours, cell.place) for cell in cells), _runs(line)])
+        if beside:
+            rows.append([line.name, "paper", *(_marked(cell.paper, cell.paper_place) for cell in cells), "the paper"])
+            rows.append([line.name, "difference", *(cell.difference for cell in cells), "here less the paper"])
+    parts = [f"### {block.title}", grid(head, rows)]
+    many = [line for line in block.lines if len(line.runs) > _IDS]
+    if many:
+        parts.append("\n".join(f"- {line.name}: {'; '.join(line.runs)}" for line in many))
+    missing = [line for line in block.lines if line.missing and line.runs]
+    if missing:
+        parts.append("\n".join(f"- {line.name}: no run of {', '.join(line.missing)}" for line in missing))
+    return parts
+
+
+def _title(table: Table) -> str:
+    return table.title if table.name == "beyond" else f"{table.name.capitalize()}: {table.title}"
+
+
+def _reason(block: Block) -> str:
+    texts = dict.fromkeys(cell.ours for line in block.lines for cell in line.cells.values())
+    return " or ".join(texts).capitalize()
+
+
+def _named(metric: Metric) -> str:
+    return f"{metric.name} ({metric.unit})" if metric.unit else metric.name
+
+
+def _marked(text: str, place: int) -> str:
+    return f"**{text}**" if place == 1 else f"{text} ({place})" if place > 1 else text
+
+
+def _runs(line: Line) -> str:
+    if not line.runs:
+        return "none"
+    if len(line.runs) > _IDS:
+        return f"n = {line.seeds}, {len(line.runs)} runs, listed below"
+    return f"n = {line.seeds}: " + ", ".join(run.split()[-1] for run in line.runs)
