@@ -33,7 +33,13 @@ _STEPS: Final = ("max_steps", "sh_interval", "l2_stop_iter")
 
 
 class NotInThisVersion(PopError):
-    """Say that the program cannot train a row: it lacks the method, or does not take an option."""
+    """Say that the program cannot train a row: it lacks the method, or does not take an option.
+
+    Attributes:
+        status: the exit status of `pop-repro run`, by which a queue tells it from a failure.
+    """
+
+    status: Final = 69
 
 
 @dataclass(frozen=True)

@@ -17,15 +17,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Final
 
-from paper_repro.jobs import Job
+from paper_repro.jobs import Job, NotInThisVersion
+from paper_repro.train_row import Busy
 
-__all__ = ["BUSY", "NOT_IN_THIS_VERSION", "Outcome", "run_queue"]
-
-# exit statuses of `pop-repro run`: another process trains the row; the program cannot train it
-BUSY: Final = 75
-NOT_IN_THIS_VERSION: Final = 69
+__all__ = ["Outcome", "run_queue"]
 
 
 @dataclass
@@ -91,7 +87,7 @@ def run_queue(jobs: Sequence[Job], results: Path, words: Sequence[str], threads:
             print(f"[{number}/{len(missing)}] {job}", flush=True)
             start = time.monotonic()
             status = child.run([sys.executable, "-m", "paper_repro", "run", *_words_of(job), *words], threads)
-            kinds = {0: outcome.done, BUSY: outcome.busy, NOT_IN_THIS_VERSION: outcome.impossible}
+            kinds = {0: outcome.done, Busy.status: outcome.busy, NotInThisVersion.status: outcome.impossible}
             if child.stop and status != 0:
                 break
             kinds.get(status, outcome.failed).append(job)

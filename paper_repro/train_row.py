@@ -30,7 +30,13 @@ _CHECKPOINTS, _PLY = "ckpts", "ply"
 
 
 class Busy(PopError):
-    """Say that another process trains this row."""
+    """Say that another process trains this row.
+
+    Attributes:
+        status: the exit status of `pop-repro run`, by which a queue tells it from a failure.
+    """
+
+    status: Final = 75
 
 
 @dataclass(frozen=True, kw_only=True)
