@@ -33,7 +33,7 @@ class Found:
     Attributes:
         scene: the scene.
         status: "ok", "missing" (not there) or "refused" (there, and not as the protocol has it).
-        reason: what is wrong and how to mend it, or what to know of a scene that is ok; empty for nothing.
+        reason: what is wrong and how to mend it; empty for nothing.
         folder: where it is.
         n_images: photographs with a known camera.
         sizes: their widths and heights, px, the most frequent first.
@@ -71,8 +71,7 @@ def check_scene(scene: Scene, root: Path) -> Found:
         or _wrong_ratio(scene, cameras, sizes)
         or _wrong_size(scene, counted, 1)
     )
-    told = reason or _unverified(scene)
-    return Found(scene, "refused" if reason else "ok", told, folder, len(listed), counted)
+    return Found(scene, "refused" if reason else "ok", reason or "", folder, len(listed), counted)
 
 
 def check_capture(job: Job, config: TrainConfig, capture: Capture) -> None:
@@ -94,20 +93,43 @@ def check_capture(job: Job, config: TrainConfig, capture: Capture) -> None:
         raise PopError(f"{config.data}: {reason}")
 
 
-def table(found: Sequence[Found]) -> list[str]:
-    """Write what was found as lines for people, one a scene, those of a dataset together."""
+def table(found: Sequence[Found], root: Path) -> list[str]:
+    """Write what was found as lines for people: the scenes of a dataset together, then where the absent ones are from.
+
+    Args:
+        found: of `check_scene`.
+        root: the data root.
+    """
     lines: list[str] = []
     for key, dataset in DATASETS.items():
         of_it = [item for item in found if item.scene.dataset == key]
-        lines += [*([""] if lines else []), dataset.name] if of_it else []
+        if not of_it:
+            continue
+        lines += [*([""] if lines else []), dataset.name]
         for item in of_it:
-            size = "" if not item.sizes else f"{item.sizes[0][0]} x {item.sizes[0][1]}"
-            counts = f"{item.n_images} photographs, {item.n_test} held out, {size}" if item.n_images else ""
-            where = "" if item.folder is None else item.folder.as_posix()
-            lines.append(f"  {item.scene.name:<12} {item.status:<8} {counts}{'  ' if counts else ''}{where}".rstrip())
-            notes = [note for note in (item.reason, item.scene.note) if note]
-            lines += [f"    {note}" for note in notes]
+            lines.append(f"  {item.scene.name:<12} {item.status:<8} {_counts(item)}")
+            notes = [item.reason if item.status == "refused" else "", item.scene.note]
+            lines += [f"    {note}" for note in notes if note]
+        absent = [item.scene for item in of_it if item.status == "missing"]
+        for source in dict.fromkeys(map(source_of, absent)):
+            names = ", ".join(scene.name for scene in absent if source_of(scene) == source)
+            lines.append(f"  {names}: from {source}")
+        if absent:
+            places = ", ".join((root / parent / "NAME").as_posix() for parent in dataset.parents)
+            lines.append(f"  looked for in {places}")
+    if any(not item.scene.verified for item in found):
+        lines += ["", "~ as is recalled of the publication; nobody has compared it with the photographs for this table"]
     return lines
+
+
+def _counts(item: Found) -> str:
+    scene = item.scene
+    if item.status == "ok":
+        width, height = item.sizes[0]
+        return f"{item.n_images} photographs, {item.n_test} held out, {width} x {height}  {item.folder}"
+    doubt = "" if scene.verified else "~"
+    width, height = scene.size
+    return f"expected: {doubt}{scene.n_images} photographs, {-(-scene.n_images // HOLD_OUT)} held out, {width} x {height}"
 
 
 def _listing(folder: Path) -> tuple[list[str], bool, list[tuple[int, int]]]:
@@ -192,6 +214,3 @@ def _wrong_size(scene: Scene, sizes: Sequence[tuple[int, int]], factor: int) -> 
 def _doubt(scene: Scene) -> str:
     return "" if scene.verified else " (as is recalled; nobody compared it with the photographs here)"
 
-
-def _unverified(scene: Scene) -> str:
-    return "" if scene.verified else "count and size agree with what is recalled of the publication"

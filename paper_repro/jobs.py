@@ -21,7 +21,7 @@ from pop_fast.errors import PopError
 if TYPE_CHECKING:
     from pop_fast.train import TrainConfig
 
-__all__ = ["SEED", "WORK", "Job", "NotInThisVersion", "job_named", "jobs_of", "missing_method"]
+__all__ = ["SEED", "WORK", "Job", "NotInThisVersion", "job_named", "jobs_of", "missing_method", "trainable"]
 
 # git ignores it; everything in it can be made again
 WORK: Final = Path(__file__).resolve().parent / "work"
@@ -130,6 +130,15 @@ def jobs_of(
     chosen = list(scale_named(scale).factors if scenes is None else scenes)
     jobs = [job_named(row, scene, scale, seed) for seed in seeds for scene in chosen for row in rows]
     return sorted(jobs, key=lambda job: job.cost)
+
+
+def trainable(job: Job) -> bool:
+    """Tell whether the program has a job's method and takes its options."""
+    try:
+        _whole(job)
+    except NotInThisVersion:
+        return False
+    return True
 
 
 def missing_method(row: Row) -> str | None:

@@ -28,5 +28,5 @@ def data_check(words: Sequence[str]) -> int:
     # the demo is made where it is needed
     chosen = args.scenes or [name for name in SCENES if name != "demo"]
     found = [check_scene(scene_named(name), args.data) for name in chosen]
-    print("\n".join(table(found)))
+    print("\n".join(table(found, args.data)))
     return 0 if all(item.status == "ok" for item in found) else EXIT_INCOMPLETE
