@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Final
 
 from paper_repro.paper import Metric
+from paper_repro.table_notes import Notes
 from paper_repro.tables import Block, Cell, Line, Table
 
 __all__ = ["PREAMBLE", "latex"]
@@ -24,7 +25,8 @@ _ARROWS: Final = {"least": r"$\downarrow$", "most": r"$\uparrow$"}
 _ESCAPES: Final = str.maketrans(
     {
         **{sign: f"\\{sign}" for sign in "&%_#$"},
-        **{"±": r"$\pm$", "*": r"$^\ast$", "~": r"\textasciitilde{}"},
+        "±": r"$\pm$",
+        "*": r"$^\ast$",
     }
 )
 
@@ -53,14 +55,19 @@ def _tabular(table: Table, block: Block) -> str:
         " & ".join(head) + r" \\",
         r"\midrule",
     ]
+    notes = Notes()
     for line in block.lines:
         cells = [line.cells[metric.id] for metric in table.metrics]
         shade = r"\rowcolor[gray]{0.95} " if line.row == "pop" else ""
         lines.append(_row([shade + _plain(line.name), "here", *map(_ours, cells), _plain(_runs(line))]))
         if beside:
             lines.append(_row(["", "paper", *map(_paper, cells), "the paper"]))
-            lines.append(_row(["", "difference", *(_plain(cell.difference) for cell in cells), "here less the paper"]))
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}}"])
+            lines.append(
+                _row(["", "difference", *(_noted(cell.difference, notes) for cell in cells), "here less the paper"])
+            )
+    lines += [r"\bottomrule", r"\end{tabular}}"]
+    below = [rf"\par $^{{{i}}}$ {_plain(text)}" for i, text in enumerate(notes.texts, start=1)]
+    return "\n".join([*lines, *below])
 
 
 def _ratios(table: Table, block: Block) -> str:
@@ -78,6 +85,11 @@ def _ratios(table: Table, block: Block) -> str:
 
 def _row(cells: list[str]) -> str:
     return " & ".join(cells) + r" \\"
+
+
+def _noted(text: str, notes: Notes) -> str:
+    short, number = notes.short(text)
+    return _plain(short) + (f"$^{{{number}}}$" if number else "")
 
 
 def _ours(cell: Cell) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from paper_repro.paper import Metric
+from paper_repro.table_notes import Notes
 from paper_repro.tables import Block, Line, Table
 
 __all__ = ["grid", "markdown"]
@@ -40,6 +41,7 @@ def _block(table: Table, block: Block) -> list[str]:
     arrows = {"least": "↓", "most": "↑"}
     head = ["method", "of", *(f"{_named(m)} {arrows[m.best]}" for m in table.metrics), "runs"]
     rows: list[list[str]] = []
+    notes = Notes()
     beside = table.scale == "paper" and table.name != "beyond"
     if not beside and not any(line.runs for line in block.lines):
         return [f"### {block.title}", f"{_reason(block)}: {', '.join(line.name for line in block.lines)}."]
@@ -48,8 +50,12 @@ def _block(table: Table, block: Block) -> list[str]:
         rows.append([line.name, "here", *(_marked(cell.ours, cell.place) for cell in cells), _runs(line)])
         if beside:
             rows.append([line.name, "paper", *(_marked(cell.paper, cell.paper_place) for cell in cells), "the paper"])
-            rows.append([line.name, "difference", *(cell.difference for cell in cells), "here less the paper"])
+            rows.append(
+                [line.name, "difference", *(_noted(cell.difference, notes) for cell in cells), "here less the paper"]
+            )
     parts = [f"### {block.title}", grid(head, rows)]
+    if notes.texts:
+        parts.append("\n".join(f"{i}. not comparable: {text}" for i, text in enumerate(notes.texts, start=1)))
     many = [line for line in block.lines if len(line.runs) > _IDS]
     if many:
         parts.append("\n".join(f"- {line.name}: {'; '.join(line.runs)}" for line in many))
@@ -66,6 +72,11 @@ def _title(table: Table) -> str:
 def _reason(block: Block) -> str:
     texts = dict.fromkeys(cell.ours for line in block.lines for cell in line.cells.values())
     return " or ".join(texts).capitalize()
+
+
+def _noted(text: str, notes: Notes) -> str:
+    short, number = notes.short(text)
+    return f"{short} [{number}]" if number else short
 
 
 def _named(metric: Metric) -> str:
