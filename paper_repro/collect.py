@@ -188,8 +188,9 @@ def _curve(folder: Path, max_steps: int) -> tuple[dict[str, Any], ...]:
     points = {point["step"]: point for point in _thinned(_records(folder), max_steps)}
     for path in sorted((folder / "stats").glob("val_step*.json")):
         stats = read_json(path, "train the row again in an empty folder")
-        # a record of the same step has what its training view says; the held-out views say more
-        points[stats["step"]] = {**points.get(stats["step"], {}), **_measured(stats)}
+        # at a step that has a record too, what that says of its training view stays
+        record = points.get(stats["step"], {})
+        points[stats["step"]] = {**_measured(stats), **{name: v for name, v in record.items() if v is not None}}
     return tuple(points[step] for step in sorted(points))
 
 

@@ -193,8 +193,8 @@ def _wrong_ratio(scene: Scene, cameras: Sequence[tuple[int, int]], sizes: Sequen
         for whole, side in zip(camera, size, strict=True):
             if abs(side * scene.shrunk - whole) > _ROUNDING * scene.shrunk:
                 return (
-                    f"{scene.name}: a photograph is {size[0]} x {size[1]} and its camera {camera[0]} x {camera[1]}; the "
-                    f"protocol takes a {scene.shrunk}th of that: use the folder {scene.images or 'images'} as published"
+                    f"{scene.name}: a photograph is {size[0]} x {size[1]} and its camera {camera[0]} x {camera[1]}, and "
+                    f"the protocol takes 1/{scene.shrunk} of that: use {scene.images or 'the photographs'} as published"
                 )
     return None
 

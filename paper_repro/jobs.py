@@ -99,8 +99,8 @@ class Job:
                 # the Gaussians are saved at the end alone, which always counts
                 **{"eval_steps": _measured_at(whole.max_steps, scaler), "save_steps": ()},
                 **self.scale.settings,
-                **({} if plain else {"strategy.reset_every": self.scale.reset_every}),
                 **_scaled(whole, scaler),
+                **({} if plain else {"strategy.reset_every": self.scale.reset_every}),
                 **{"seed": self.seed, "factor": self.factor, "progress": False},
                 **more,
             },

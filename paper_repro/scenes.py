@@ -173,8 +173,10 @@ def find_folder(scene: Scene, root: Path) -> Path:
     """Find a scene's folder under a data root, in the first of the published layouts that has it.
 
     Raises:
-        PopError: it is in none of them; names the places and where the data comes from.
+        PopError: there is no such root, or it is in none of them; names the places and where the data comes from.
     """
+    if not root.is_dir():
+        raise PopError(f"{root}: no such folder; name the one that holds the scenes with --data, or in POP_DATA")
     places = [root / parent / scene.folder for parent in DATASETS[scene.dataset].parents]
     found = next((place for place in places if place.is_dir()), None)
     if found is None:

@@ -103,6 +103,8 @@ def train_row(job: Job, options: Options) -> Path:
     path, work = job.result(options.results), job.work(options.work)
     if is_finished(job, options.results):
         return path
+    # a row that cannot be trained is said before anything is made
+    job.config()
     config = _config(job, options, work)
     with only_one(work.with_suffix(".lock"), f"{job}: another process trains it"):
         # that process may have finished it meanwhile
