@@ -1,0 +1,84 @@
+"""`pop-repro run` and `pop-repro queue`."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence
+from typing import Final
+
+from paper_repro.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED, parser_of
+from paper_repro.cli.options import add_training, training_words
+
+__all__ = ["queue", "run"]
+
+_SEED: Final = 42
+_RUN: Final = """
+    pop-repro run pop demo --scale toy                    in seconds, on a capture that the program makes
+    pop-repro run pop fox --scale dev --data DATA         the same command goes on after a stop
+    pop-repro run l2_blur bonsai_800 --scale full --data DATA --threads 2
+"""
+_QUEUE: Final = """
+    pop-repro queue --scale toy                           every row in minutes
+    pop-repro queue --scale dev --data DATA --nice 10     days; Ctrl-C or SIGTERM stops it, the same command goes on
+    pop-repro queue --scale dev --data DATA --rows pop gsplat 3dgs --scenes fox bear_512 --seeds 3
+    pop-repro queue --scale dev --data DATA --list        what is missing, in order, without training
+"""
+
+
+def run(words: Sequence[str]) -> int:
+    """Train one row and print where its result is."""
+    parser = parser_of("run", _RUN)
+    parser.add_argument("row", metavar="ROW", help="a file of configs: pop, gsplat, 3dgs, l2_blur, ...")
+    parser.add_argument("scene", metavar="SCENE", help="one of the scale's: fox, bonsai_800, garden, ...")
+    parser.add_argument("--seed", type=int, default=_SEED, help="of every random number (default: %(default)s)")
+    add_training(parser)
+    args = parser.parse_args(words)
+    from paper_repro.jobs import job_named
+    from paper_repro.train_row import Options, train_row
+
+    job = job_named(args.row, args.scene, args.scale, args.seed)
+    print(train_row(job, Options(results=args.out, **_options(args))))
+    return 0
+
+
+def queue(words: Sequence[str]) -> int:
+    """Train the rows that are missing."""
+    parser = parser_of("queue", _QUEUE)
+    parser.add_argument("--rows", nargs="+", metavar="ROW", help="these rows alone (default: all)")
+    parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="these scenes alone (default: the scale's)")
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help=f"seeds of each: {_SEED}, {_SEED + 1}, ...")
+    parser.add_argument("--nice", type=int, default=0, metavar="N", help="give way to other programs, 0 to 19")
+    parser.add_argument("--commit", action="store_true", help="commit each result in git when it is there")
+    parser.add_argument("--list", action="store_true", help="list what is missing, in order, and train nothing")
+    add_training(parser)
+    args = parser.parse_args(words)
+    from paper_repro.jobs import jobs_of
+    from paper_repro.queue import run_queue
+    from paper_repro.rows import ROWS
+
+    seeds = range(_SEED, _SEED + args.seeds)
+    jobs = jobs_of(args.scale, args.rows or ROWS, args.scenes, seeds)
+    if args.list:
+        print("\n".join(str(job) for job in jobs if not job.result(args.out).is_file()))
+        return 0
+    if args.nice:
+        os.nice(args.nice)
+    outcome = run_queue(jobs, args.out, training_words(args), args.threads, args.commit)
+    left = {"failed": outcome.failed, "not in this version": outcome.impossible, "trained elsewhere": outcome.busy}
+    print(f"{len(outcome.done)} rows trained")
+    for what, some in left.items():
+        if some:
+            print(f"{what}: {', '.join(f'{job.row.name} {job.scene.name} {job.seed}' for job in some)}")
+    if outcome.stopped:
+        print("stopped; the same command goes on")
+        return EXIT_INTERRUPTED
+    return EXIT_INCOMPLETE if any(left.values()) else 0
+
+
+def _options(args: argparse.Namespace) -> dict[str, object]:
+    names = ("data", "work", "threads", "backend", "checkpoint_every", "log_every", "keep_ply", "keep_checkpoints")
+    return {
+        **{name: getattr(args, name) for name in names},
+        **{name: tuple(getattr(args, name)) for name in ("lpips_vgg", "lpips_alex")},
+    }

@@ -1,0 +1,221 @@
+"""What a finished training says, gathered from its result folder into one `Result`."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from paper_repro.jobs import Job
+from paper_repro.results import BINS, LPIPS_VARIANTS, Result
+from pop_fast.errors import PopError
+from pop_fast.io.read_back import read_json
+from pop_fast.train.results import ResultFolder, read_config
+
+if TYPE_CHECKING:
+    from pop_fast.data import Capture
+    from pop_fast.train import TrainConfig
+
+__all__ = ["BESIDE", "collect", "first_change", "settings_hash", "state_of_data"]
+
+# what `train_row` leaves in the result folder about the capture and the program, from before the first step
+BESIDE: Final = "row.json"
+# where things lie, who takes the steps and how often something is written: no part of what was trained
+_APART: Final = frozenset(
+    {
+        *("data", "result_dir", "eval_steps", "save_steps", "checkpoint_every", "keep_checkpoints", "max_renders"),
+        *("progress", "lpips_vgg", "lpips_alex", "target_cache_mb", "seed", "threads", "backend", "log_every"),
+    }
+)
+# as many points as a curve of the whole schedule has with one each 100 steps
+_POINTS: Final = 300
+# of a record: what every point of a curve has, and what it may have besides
+_ALWAYS: Final = ("step", "num_gaussians", "psnr", "seconds", "n_blended", "n_traversed")
+_SOMETIMES: Final = ("l1", "l2", "d_ssim", "pop", "cloned", "split", "pruned")
+_SSIM: Final = "11 x 11 Gaussian window, sigma 1.5, windows inside the image, floats clamped to [0, 1]"
+_LPIPS: Final = {
+    "vgg_01": "vgg_01: VGG16, images in [0, 1]",
+    "alex_norm": "alex_norm: AlexNet, images moved to [-1, 1]",
+    "alex_01": "alex_01: AlexNet, images in [0, 1]",
+}
+_TIMING: Final = (
+    "training steps and density control with its passes over the views; reading the capture, measuring held-out views "
+    "and writing files are apart"
+)
+
+
+def state_of_data(job: Job, config: TrainConfig, capture: Capture) -> dict[str, Any]:
+    """Describe the photographs that a training uses, as the protocol of its result says it.
+
+    Args:
+        job: the training.
+        config: its settings.
+        capture: as it was loaded.
+
+    Returns:
+        data_hash, and of the protocol: split, test_views, images, factor, width, height, resize.
+    """
+    from pop_fast.train.checkpoint import capture_fingerprint
+
+    prints = capture_fingerprint(capture, 0)
+    first, published = capture.views[0], job.scene.images
+    folder = "the photographs that the capture lists" if published is None else f"{published}, as published"
+    return {
+        "data_hash": hashlib.sha256(json.dumps(prints, sort_keys=True).encode()).hexdigest(),
+        "split": f"every {config.test_every}th by name is held out",
+        "test_views": len(capture.test_views(config.test_every)),
+        "images": folder,
+        "factor": job.factor,
+        "width": first.width,
+        "height": first.height,
+        "resize": config.resize if job.factor > 1 else "none",
+    }
+
+
+def collect(job: Job, folder: Path) -> Result:
+    """Gather a finished training.
+
+    Args:
+        job: what was trained.
+        folder: its result folder.
+
+    Raises:
+        PopError: something of a finished training is absent; names the file.
+    """
+    config = read_config(folder)
+    last = config.max_steps - 1
+    stats, before = _stats(folder, "val", last), _stats(folder, "train", last)
+    said = read_json(folder / BESIDE, "train the row again in an empty folder")
+    data_hash, commit = said.pop("data_hash"), said.pop("commit")
+    config_hash = settings_hash(config)
+    n, size = stats["num_GS"], job.row.bytes_per_gaussian
+    variants = stats["lpips_variants"]
+    return Result(
+        scale=job.scale.name,
+        row=job.row.name,
+        scene=job.scene.name,
+        seed=job.seed,
+        run=hashlib.sha256(f"{config_hash} {data_hash} {job.seed}".encode()).hexdigest()[:12],
+        commit=commit,
+        config_hash=config_hash,
+        data_hash=data_hash,
+        machine=", ".join(stats[name] for name in ("machine", "gpu") if name in stats),
+        engine=stats["stepper"],
+        threads=stats["threads"],
+        versions=stats["versions"],
+        protocol={
+            **said,
+            "ssim": _SSIM,
+            "lpips": "; ".join(_LPIPS[name] for name in variants) or "not measured",
+            "timing": _TIMING,
+            "checkpoint_bytes_per_gaussian": size,
+        },
+        schedule=_settings(config),
+        seconds={
+            "load": stats["seconds_loading"],
+            "train": stats["seconds"],
+            "evaluate": max(stats["seconds_total"] - before["seconds_total"], 0.0),
+        },
+        num_gaussians=n,
+        checkpoint_mib=n * size / 2**20,
+        psnr=stats["psnr"],
+        ssim=stats["ssim"],
+        lpips={name: variants.get(name) for name in LPIPS_VARIANTS},
+        lpips_reason=_lpips_reason(stats),
+        n_blended=stats.get("n_blended"),
+        n_traversed=stats.get("n_traversed"),
+        opacity_below_01=stats["opacity_below_0.1"],
+        opacity_above_09=stats["opacity_above_0.9"],
+        opacity_histogram=_histogram(folder, last),
+        curve=_curve(folder, config.max_steps),
+        per_view={name: {key: view[key] for key in ("psnr", "ssim")} for name, view in stats["per_view"].items()},
+    )
+
+
+def settings_hash(config: TrainConfig) -> str:
+    """Hash what was trained: all settings but the seed, the engine and where things lie."""
+    return hashlib.sha256(json.dumps(_settings(config), sort_keys=True).encode()).hexdigest()
+
+
+def first_change(result: Result, config: TrainConfig) -> str | None:
+    """Say which setting of a finished result the row has otherwise now, or None; settings that are new do not count."""
+    now = _settings(config)
+    for name, value in result.schedule.items():
+        if name in now and now[name] != value:
+            return f"{name} = {value}, and the row has {now[name]} now"
+    return None
+
+
+def _settings(config: TrainConfig) -> dict[str, Any]:
+    return {name: value for name, value in config.flat().items() if name not in _APART}
+
+
+def _stats(folder: Path, kind: str, step: int) -> dict[str, Any]:
+    results = ResultFolder(folder)
+    found = results.read_stats(kind, step)
+    if found is None:
+        raise PopError(f"{results.stats_path(kind, step)}: is absent, so the training is not finished; run the row again")
+    return found
+
+
+def _lpips_reason(stats: Mapping[str, Any]) -> str | None:
+    missing = [name for name in LPIPS_VARIANTS if name not in stats["lpips_variants"]]
+    if not missing:
+        return None
+    return stats["lpips_reason"] or f"no weights were given for {', '.join(missing)}"
+
+
+def _histogram(folder: Path, last: int) -> tuple[int, ...]:
+    path = folder / "report_data" / f"opacity_step{last}.npz"
+    if not path.is_file():
+        raise PopError(f"{path}: is absent; train the row again in an empty folder")
+    with np.load(path) as found:
+        return tuple(int(count) for count in found["counts"].reshape(BINS, -1).sum(axis=1))
+
+
+def _records(folder: Path) -> list[dict[str, Any]]:
+    lines = (folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+    return [json.loads(line) for line in lines]
+
+
+def _curve(folder: Path, max_steps: int) -> tuple[dict[str, Any], ...]:
+    """Make the curve of the records of single training views, and of the measurements of all held-out views."""
+    points = {point["step"]: point for point in _thinned(_records(folder), max_steps)}
+    for path in sorted((folder / "stats").glob("val_step*.json")):
+        stats = read_json(path, "train the row again in an empty folder")
+        # at a step that has a record too, what that says of its training view stays
+        record = points.get(stats["step"], {})
+        points[stats["step"]] = {**_measured(stats), **{name: v for name, v in record.items() if v is not None}}
+    return tuple(points[step] for step in sorted(points))
+
+
+def _thinned(records: Iterable[Mapping[str, Any]], max_steps: int) -> list[dict[str, Any]]:
+    """Keep about `_POINTS` of the records, the first among them."""
+    kept: list[dict[str, Any]] = []
+    spacing = max_steps // _POINTS
+    for record in records:
+        if not kept or record["step"] >= kept[-1]["step"] + spacing:
+            kept.append(_point(record))
+    return kept
+
+
+def _point(record: Mapping[str, Any]) -> dict[str, Any]:
+    more = [name for name in record if name in _SOMETIMES or name.startswith("grad_")]
+    return {name: _short(record.get(name)) for name in (*_ALWAYS, *more)}
+
+
+def _measured(stats: Mapping[str, Any]) -> dict[str, Any]:
+    found = {**stats, "num_gaussians": stats["num_GS"], "psnr": None, "psnr_test": stats["psnr"]}
+    return {name: _short(found.get(name)) for name in (*_ALWAYS, "psnr_test")}
+
+
+def _short(value: Any) -> Any:
+    """Round to what a figure shows; what JSON cannot hold is None."""
+    if not isinstance(value, float):
+        return value
+    return float(f"{value:.6g}") if math.isfinite(value) else None

@@ -1,0 +1,188 @@
+"""One training of the reproduction: a row, a scene, a scale and a seed, as the settings that `pop train` would run.
+
+A row's options count steps of the paper's whole schedule. At a shorter one they are scaled as the program scales the
+defaults of a method (`DensityControl.scaled`), so that "blur from 3,000 to 4,000" stays a fortieth of the schedule.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from paper_repro.rows import ROWS, Row, load_row
+from paper_repro.scales import Scale, scale_named
+from paper_repro.scenes import SCENES, Scene, scene_named
+from pop_fast.errors import PopError
+
+if TYPE_CHECKING:
+    from pop_fast.train import TrainConfig
+
+__all__ = ["SEED", "WORK", "Job", "NotInThisVersion", "job_named", "jobs_of", "missing_method", "trainable"]
+
+# git ignores it; everything in it can be made again
+WORK: Final = Path(__file__).resolve().parent / "work"
+SEED: Final = 42
+# the held-out views are measured so often, evenly over the schedule: the curves of Gaussians per pixel are made of these
+_MEASURED: Final = 15
+# step numbers that are settings of a run and not of its strategy
+_STEPS: Final = ("max_steps", "sh_interval", "l2_stop_iter")
+
+
+class NotInThisVersion(PopError):
+    """Say that the program cannot train a row: it lacks the method, or does not take an option.
+
+    Attributes:
+        status: the exit status of `pop-repro run`, by which a queue tells it from a failure.
+    """
+
+    status: Final = 69
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training and its result."""
+
+    row: Row
+    scene: Scene
+    scale: Scale
+    seed: int = SEED
+
+    def __str__(self) -> str:
+        return f"{self.row.name} {self.scene.name} --scale {self.scale.name} --seed {self.seed}"
+
+    @property
+    def factor(self) -> int:
+        """What the scene's photographs are shrunk by, beside what they were published as."""
+        return self.scale.factors[self.scene.name]
+
+    @property
+    def cost(self) -> float:
+        """About how long it takes, in no unit: pixels times steps times what the paper says of the method."""
+        width, height = self.scene.size
+        return self.row.cost * width * height / self.factor**2 * self.scale.steps_scaler
+
+    def result(self, folder: Path) -> Path:
+        """Return the place of its result in a folder of results."""
+        return folder / self.scale.name / self.row.name / f"{self.scene.name}_{self.seed}.json"
+
+    def work(self, folder: Path) -> Path:
+        """Return the place of its checkpoints in a work folder."""
+        return folder / self.scale.name / self.row.name / f"{self.scene.name}_{self.seed}"
+
+    def words(self) -> list[str]:
+        """Return the words after `pop train` that say its row, on the whole schedule."""
+        return ["--method", self.row.method, *self.row.options_for(self.scene)]
+
+    def config(self, **more: Any) -> TrainConfig:
+        """Make its settings.
+
+        Args:
+            more: settings of the run that do not belong to the row: data, result_dir, threads, backend, ...
+
+        Raises:
+            NotInThisVersion: the program has no such method or option; names row and words.
+        """
+        from pop_fast.train import TrainConfig
+
+        scaler = self.scale.steps_scaler
+        whole = _whole(self)
+        plain = self.scale.reset_every is None or whole.strategy.reset_every == 0
+        return TrainConfig.of(
+            method=whole.method,
+            steps_scaler=scaler,
+            **{
+                **{"log_every": self.scale.log_every, "checkpoint_every": self.scale.checkpoint_every},
+                # the Gaussians are saved at the end alone, which always counts
+                **{"eval_steps": _measured_at(whole.max_steps, scaler), "save_steps": ()},
+                **self.scale.settings,
+                **_scaled(whole, scaler),
+                **({} if plain else {"strategy.reset_every": self.scale.reset_every}),
+                **{"seed": self.seed, "factor": self.factor, "progress": False},
+                **more,
+            },
+        )
+
+
+def job_named(row: str, scene: str, scale: str, seed: int = SEED) -> Job:
+    """Make a job from names.
+
+    Raises:
+        PopError: a name is unknown, or the scale does not have the scene.
+    """
+    job = Job(load_row(row), scene_named(scene), scale_named(scale), seed)
+    if scene not in job.scale.factors:
+        raise PopError(f"scale '{scale}' has no {scene}; its scenes are {', '.join(job.scale.factors)}")
+    return job
+
+
+def jobs_of(
+    scale: str, rows: Iterable[str] = ROWS, scenes: Iterable[str] | None = None, seeds: Iterable[int] = (SEED,)
+) -> list[Job]:
+    """List the jobs of a scale, the cheapest first.
+
+    Raises:
+        PopError: a name is unknown, or the scale does not have a scene.
+    """
+    chosen = list(scale_named(scale).factors if scenes is None else scenes)
+    jobs = [job_named(row, scene, scale, seed) for seed in seeds for scene in chosen for row in rows]
+    return sorted(jobs, key=lambda job: job.cost)
+
+
+def trainable(job: Job) -> bool:
+    """Tell whether the program has a job's method and takes its options."""
+    try:
+        _whole(job)
+    except NotInThisVersion:
+        return False
+    return True
+
+
+def missing_method(row: Row) -> str | None:
+    """Say that the program does not know a row's method, or None where it does."""
+    from pop_fast.train.presets import METHODS
+
+    if row.method in METHODS:
+        return None
+    return f"row {row.name}: this version of pop has no method '{row.method}'; it has {', '.join(METHODS)}"
+
+
+def _whole(job: Job) -> TrainConfig:
+    """Read a row's options as `pop train` does, on the whole schedule."""
+    from pop_fast.cli.train import arguments
+
+    missing = missing_method(job.row)
+    if missing is not None:
+        raise NotInThisVersion(missing)
+    words = job.words()
+    try:
+        # what the parser prints about a word that it does not know says no more than the words do
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            return arguments(["capture", "--out", "out", *words])[0]
+    except (SystemExit, PopError) as error:
+        reason = f": {error}" if isinstance(error, PopError) else ""
+        raise NotInThisVersion(
+            f"row {job.row.name}: this version of pop train does not take {' '.join(words)}{reason}"
+        ) from error
+
+
+def _scaled(whole: TrainConfig, scaler: float) -> dict[str, Any]:
+    """Return what a row's options say, its step numbers as they are on a schedule `scaler` times as long."""
+    given = whole.given
+    said = {} if given is None else {n: v for n, v in given.settings.items() if n not in ("data", "result_dir")}
+    scaled = whole.strategy.scaled(scaler)
+    for name, value in said.items():
+        group, dot, field = name.partition(".")
+        if dot and group == whole.method:
+            said[name] = getattr(scaled, field)
+        elif name in _STEPS and value is not None:
+            said[name] = max(round(value * scaler), 1)
+    return said
+
+
+def _measured_at(max_steps: int, scaler: float) -> tuple[int, ...]:
+    last = max_steps * scaler
+    return tuple(sorted({max(round(last * i / _MEASURED), 1) for i in range(1, _MEASURED)}))

@@ -1,0 +1,125 @@
+"""Train the rows that are missing one after the other, each in a process of its own, and stop cleanly when asked to.
+
+The child is what `pop-repro run` is. It decides whether its row can be trained, so that a queue of days takes up what
+the clone has learnt meanwhile; a row that another process trains is left to it, so that several queues can share a
+folder of results.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+
+from paper_repro.jobs import Job, NotInThisVersion
+from paper_repro.train_row import Busy
+
+__all__ = ["Outcome", "run_queue"]
+
+
+@dataclass
+class Outcome:
+    """What became of a queue's jobs, and whether it was stopped."""
+
+    done: list[Job] = field(default_factory=list)
+    failed: list[Job] = field(default_factory=list)
+    busy: list[Job] = field(default_factory=list)
+    impossible: list[Job] = field(default_factory=list)
+    stopped: bool = False
+
+
+class _Child:
+    """The one process that trains now, and the wish to stop."""
+
+    def __init__(self) -> None:
+        self.stop = False
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def request(self, number: int, frame: FrameType | None) -> None:
+        """Pass the first Ctrl-C or SIGTERM on: the child finishes its step, writes a checkpoint and ends."""
+        if self._process is not None and not self.stop:
+            self._process.terminate()
+        self.stop = True
+
+    def run(self, command: Sequence[str], threads: int) -> int:
+        environment = dict(os.environ)
+        if threads > 0:
+            environment["OMP_NUM_THREADS"] = str(threads)
+        # a session of its own: a terminal's Ctrl-C would reach it beside what is passed on, and two mean "at once"
+        self._process = subprocess.Popen(command, env=environment, start_new_session=True)
+        if self.stop:
+            self._process.terminate()
+        status = self._process.wait()
+        self._process = None
+        return status
+
+
+def run_queue(jobs: Sequence[Job], results: Path, words: Sequence[str], threads: int, commit: bool = False) -> Outcome:
+    """Train the jobs that have no result yet, in the order given.
+
+    Args:
+        jobs: what to train.
+        results: the folder of results.
+        words: further words of `pop-repro run`: --data and the like.
+        threads: CPU threads of a training.
+        commit: commit each result in git when it is there.
+
+    Returns:
+        What became of them; a failed row does not keep the next ones from being trained.
+    """
+    outcome, missing = Outcome(), [job for job in jobs if not job.result(results).is_file()]
+    print(f"{len(jobs) - len(missing)} of {len(jobs)} rows are done; {len(missing)} to go", flush=True)
+    with _stoppable() as child:
+        for number, job in enumerate(missing, 1):
+            if child.stop:
+                break
+            if job.result(results).is_file():
+                # another queue was there first
+                outcome.done.append(job)
+                continue
+            print(f"[{number}/{len(missing)}] {job}", flush=True)
+            start = time.monotonic()
+            status = child.run([sys.executable, "-m", "paper_repro", "run", *_words_of(job), *words], threads)
+            kinds = {0: outcome.done, Busy.status: outcome.busy, NotInThisVersion.status: outcome.impossible}
+            if child.stop and status != 0:
+                break
+            kinds.get(status, outcome.failed).append(job)
+            if status == 0:
+                print(f"[{number}/{len(missing)}] done after {(time.monotonic() - start) / 60:.1f} min", flush=True)
+                if commit:
+                    _commit(job, results)
+        outcome.stopped = child.stop
+    return outcome
+
+
+@contextmanager
+def _stoppable() -> Iterator[_Child]:
+    child = _Child()
+    before = {number: signal.signal(number, child.request) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield child
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _words_of(job: Job) -> list[str]:
+    return [job.row.name, job.scene.name, "--scale", job.scale.name, "--seed", str(job.seed)]
+
+
+def _commit(job: Job, results: Path) -> None:
+    path = job.result(results)
+    git = ["git", "-C", str(path.parent)]
+    message = f"Result: {job.row.name} on {job.scene.name}, {job.scale.name} scale, seed {job.seed}"
+    for command in (["add", "--", path.name], ["commit", "--quiet", "-m", message, "--", path.name]):
+        done = subprocess.run([*git, *command], capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            print(f"pop-repro: git {command[0]} {path.name} failed: {done.stderr.strip()}", file=sys.stderr)
+            return

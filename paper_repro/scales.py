@@ -1,0 +1,89 @@
+"""The scales that a row can be run at: which scenes, how much of the schedule, what of the settings differs and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from paper_repro.scenes import SCENES
+from pop_fast.errors import PopError
+
+__all__ = ["SCALES", "Scale", "scale_named"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """How much of the published protocol a run follows.
+
+    Attributes:
+        name: its name in results and on the command line.
+        about: one sentence for people.
+        factors: its scenes, each with what its photographs are shrunk by after they were read.
+        steps_scaler: multiplies every step number of the method.
+        settings: what else differs from the method's own values, in the names of `pop_fast.train.TrainConfig`; those
+            of density control under "strategy.".
+        reset_every: steps between two resets, for the rows that have resets; None leaves them as the scaled schedule
+            has them, no closer than 3,000 steps.
+        log_every: steps between two points of the curves.
+        checkpoint_every: steps that a kill can cost.
+    """
+
+    name: str
+    about: str
+    factors: Mapping[str, int]
+    steps_scaler: float = 1.0
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    reset_every: int | None = None
+    log_every: int = 100
+    checkpoint_every: int = 500
+
+
+# theta_blur comes to 10.7 pixels in the paper's smallest images, and to less in images smaller than those
+_FLOOR: Final = {"strategy.blur_min_pixels": 10.0}
+
+_ALL: Final = (
+    Scale(
+        name="toy",
+        about="the demo capture in seconds: that everything runs, and nothing more",
+        factors={"demo": 1},
+        # 300 steps, in which density control acts 14 times and resets, where it does, at 30, 60, 90 and 120
+        steps_scaler=0.01,
+        settings={**_FLOOR, "strategy.refine_every": 10},
+        reset_every=30,
+        log_every=10,
+        checkpoint_every=100,
+    ),
+    Scale(
+        name="dev",
+        about="real photographs for a CPU: 10,000 steps, small images, theta_blur at least 10 pixels",
+        factors={"fox": 4, "bear_512": 2, "garden_512": 2, "bonsai_800": 2},
+        steps_scaler=0.333333,
+        settings=_FLOOR,
+    ),
+    Scale(
+        name="full",
+        about="bonsai_800 at its size and the whole schedule, theta_blur at least 10 pixels",
+        factors={"bonsai_800": 1},
+        settings=_FLOOR,
+        log_every=25,
+    ),
+    Scale(
+        name="paper",
+        about="the published protocol",
+        factors={scene.name: 1 for scene in SCENES.values() if scene.in_paper},
+        checkpoint_every=1_000,
+    ),
+)
+SCALES: Final = {scale.name: scale for scale in _ALL}
+
+
+def scale_named(name: str) -> Scale:
+    """Return a scale by its name.
+
+    Raises:
+        PopError: there is none of this name; names them all.
+    """
+    if name not in SCALES:
+        raise PopError(f"scale is '{name}'; it must be one of {', '.join(SCALES)}")
+    return SCALES[name]

@@ -1,0 +1,223 @@
+"""Train one row: through what `pop train` itself runs, resumable in the middle, and leave its result as one file."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from paper_repro import results
+from paper_repro.jobs import WORK, Job
+from paper_repro.scenes import Scene, find_folder
+from pop_fast.errors import PopError
+
+if TYPE_CHECKING:
+    from pop_fast.data import Capture
+    from pop_fast.train import TrainConfig
+
+__all__ = ["Busy", "Options", "capture_folder", "commit", "is_finished", "train_row"]
+
+_DEMO: Final = {"seed": 0}
+# of a result folder: what takes space and a finished row does not need
+_CHECKPOINTS, _PLY = "ckpts", "ply"
+
+
+class Busy(PopError):
+    """Say that another process trains this row.
+
+    Attributes:
+        status: the exit status of `pop-repro run`, by which a queue tells it from a failure.
+    """
+
+    status: Final = 75
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """How a row is trained, none of which changes what it is.
+
+    Attributes:
+        data: the folder that holds the scenes.
+        results: the folder of results.
+        work: the folder of checkpoints; what is in it for a row can be removed once the row is finished.
+        threads: CPU threads; 0 takes all cores.
+        backend: as `pop train --backend`.
+        checkpoint_every: steps that a kill can cost; None takes the scale's.
+        log_every: steps between two points of the curve; None takes the scale's.
+        lpips_vgg: weights of LPIPS on VGG16.
+        lpips_alex: weights of LPIPS on AlexNet.
+        keep_ply: keep the Gaussians in the work folder.
+        keep_checkpoints: keep the checkpoints too.
+        quiet: no progress bar.
+    """
+
+    data: Path
+    results: Path = results.RESULTS
+    work: Path = WORK
+    threads: int = 1
+    backend: str = "auto"
+    checkpoint_every: int | None = None
+    log_every: int | None = None
+    lpips_vgg: tuple[str, ...] = ()
+    lpips_alex: tuple[str, ...] = ()
+    keep_ply: bool = False
+    keep_checkpoints: bool = False
+    quiet: bool = False
+
+
+def is_finished(job: Job, folder: Path) -> bool:
+    """Tell whether a job has its result.
+
+    Raises:
+        PopError: it has one that is damaged, or that was trained with settings that are no longer the row's.
+    """
+    path = job.result(folder)
+    if not path.is_file():
+        return False
+    from paper_repro.collect import first_change
+
+    change = first_change(results.read(path), job.config())
+    if change is not None:
+        raise PopError(f"{path}: was trained with {change}; remove the file to train the row again")
+    return True
+
+
+def train_row(job: Job, options: Options) -> Path:
+    """Train a job, or go on with it, and write its result; where it has one, nothing is done.
+
+    Returns:
+        The result's file.
+
+    Raises:
+        PopError: the program lacks the method, the scene is absent or is not what it must be, or as `TrainingRun`.
+        Busy: another process trains it.
+        KeyboardInterrupt: after Ctrl-C or SIGTERM, when a checkpoint has been written.
+    """
+    path, work = job.result(options.results), job.work(options.work)
+    if is_finished(job, options.results):
+        return path
+    # a row that cannot be trained is said before anything is made
+    job.config()
+    config = _config(job, options, work)
+    with only_one(work.with_suffix(".lock"), f"{job}: another process trains it"):
+        # that process may have finished it meanwhile
+        if not path.is_file():
+            _train(job, options, config)
+            from paper_repro.collect import collect
+
+            path = results.write(collect(job, work), options.results)
+        _remove_bulk(work, options)
+    return path
+
+
+def capture_folder(scene: Scene, options: Options) -> Path:
+    """Find a scene's capture; the demo is made where it is absent.
+
+    Raises:
+        PopError: it is not there; says where it comes from.
+    """
+    if scene.name != "demo":
+        return find_folder(scene, options.data)
+    folder = options.work / "demo"
+    with only_one(options.work / "demo.lock", f"{folder}: another process makes it", wait=True):
+        if not folder.is_dir():
+            from pop_fast.data import make_demo
+
+            (width, height), views = scene.size, scene.n_images
+            make_demo(folder, views=views, width=width, height=height, **_DEMO)
+    return folder
+
+
+def commit() -> str | None:
+    """Return the commit of the clone that this runs from, "-dirty" where its files differ from it; None outside one."""
+    here = Path(__file__).resolve().parents[1]
+    git = ["git", "-C", str(here)]
+    try:
+        asked = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+        # results are added while rows are trained, and change nothing
+        changed = subprocess.run(
+            [*git, "status", "--porcelain", "--untracked-files=no", "--", ":!paper_repro/results"],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return asked.stdout.strip() + ("-dirty" if changed.stdout.strip() else "")
+
+
+@contextlib.contextmanager
+def only_one(path: Path, busy: str, wait: bool = False) -> Iterator[None]:
+    """Hold a lock file for the block; the lock ends with the process, however that ends.
+
+    Args:
+        path: the lock file.
+        busy: what to say where another process holds it.
+        wait: wait for it instead.
+
+    Raises:
+        Busy: another process holds it.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError as error:
+            raise Busy(busy) from error
+        yield
+
+
+def _config(job: Job, options: Options, work: Path) -> TrainConfig:
+    said: dict[str, Any] = {"threads": options.threads, "backend": options.backend}
+    every = {"checkpoint_every": options.checkpoint_every, "log_every": options.log_every}
+    said |= {name: value for name, value in every.items() if value is not None}
+    said |= {"lpips_vgg": options.lpips_vgg, "lpips_alex": options.lpips_alex, "progress": not options.quiet}
+    return job.config(data=str(capture_folder(job.scene, options).absolute()), result_dir=str(work), **said)
+
+
+def _train(job: Job, options: Options, config: TrainConfig) -> None:
+    from paper_repro.collect import BESIDE, state_of_data
+    from paper_repro.data_check import check_capture
+    from pop_fast.cli.train import check_backend
+    from pop_fast.train.checkpoint import list_checkpoints
+    from pop_fast.train.choose import choose_backend
+
+    # asked before the hours of training, in which the clone may move on
+    program = commit()
+    config, chosen = choose_backend(config, True)
+    check_backend(config)
+    if not list_checkpoints(Path(config.result_dir)):
+        # what a finished row has left, whose result was removed since
+        shutil.rmtree(config.result_dir, ignore_errors=True)
+    capture, seconds = _load(job, config)
+    check_capture(job, config, capture)
+    from pop_fast.train.environment import keep_freed_memory
+    from pop_fast.train.training_run import TrainingRun
+
+    keep_freed_memory()
+    print(f"{job}: {capture.source}; {config.max_steps:,} steps; {chosen}", flush=True)
+    beside = {BESIDE: json.dumps({"commit": program, **state_of_data(job, config, capture)}, indent=2) + "\n"}
+    run = TrainingRun(config, capture, resume=True, loading_seconds=seconds, beside=beside)
+    run.run()
+
+
+def _load(job: Job, config: TrainConfig) -> tuple[Capture, float]:
+    from pop_fast.cli.train import arguments, open_capture
+
+    images = [] if job.scene.images is None else ["--images", job.scene.images]
+    start = time.perf_counter()
+    capture = open_capture(config, arguments([config.data, *images])[1])
+    return capture, time.perf_counter() - start
+
+
+def _remove_bulk(work: Path, options: Options) -> None:
+    for name, kept in ((_CHECKPOINTS, options.keep_checkpoints), (_PLY, options.keep_ply)):
+        if not kept:
+            shutil.rmtree(work / name, ignore_errors=True)

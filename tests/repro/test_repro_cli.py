@@ -1,0 +1,177 @@
+"""`pop-repro`: help that is quick, errors that name the fix, a queue that stops cleanly and goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from paper_repro.cli import COMMANDS, main
+from paper_repro.results import read_all
+from paper_repro.rows import ROWS
+
+ROOT = Path(__file__).parents[2]
+HEAVY = ("torch", "scipy", "cv2", "matplotlib", "pycolmap", "tyro", "snakemake")
+
+
+def call(*words: object, status: int = 0, capsys: pytest.CaptureFixture[str]) -> str:
+    """Call it here and return what it printed, on both streams."""
+    assert main([str(word) for word in words]) == status
+    printed = capsys.readouterr()
+    return printed.out + printed.err
+
+
+def test_help_names_every_command_and_is_the_answer_to_nothing(capsys):
+    text = call("--help", capsys=capsys)
+    assert all(f"  {command} " in text for command in COMMANDS)
+    assert call(capsys=capsys) == text
+
+
+@pytest.mark.parametrize("command", [*COMMANDS, ""])
+def test_help_is_quick_and_loads_nothing_heavy(command):
+    script = (
+        "import sys; from paper_repro.cli import main; status = main(sys.argv[1:])\n"
+        f"loaded = [name for name in {HEAVY!r} if name in sys.modules]; assert not loaded, loaded; sys.exit(status)"
+    )
+    start = time.process_time_ns(), os.times().children_user
+    done = subprocess.run(
+        [sys.executable, "-c", script, *command.split(), "--help"], capture_output=True, text=True, cwd=ROOT, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    # of the processor, since the machine may be busy
+    assert os.times().children_user - start[1] < 0.5
+    assert "usage: pop-repro" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["rum"], "'rum' is not a subcommand; did you mean 'pop-repro run'?"),
+        (["xyz"], "'xyz' is not a subcommand; see 'pop-repro --help'"),
+        (["run", "pops", "fox"], "row is 'pops'; it must be one of 3dgs, 3dgs_2023"),
+        (["run", "pop", "garden", "--scale", "dev"], "scale 'dev' has no garden; its scenes are fox, "),
+        (["run", "pop", "fox", "--scale", "tiny"], "argument --scale: invalid choice: 'tiny'"),
+        (["run", "pop", "fox", "--data", "nowhere"], "nowhere: no such folder; name the one that holds the scenes with"),
+        (["run", "pop"], "the following arguments are required: SCENE"),
+        (["table", "6"], "argument N: invalid choice: '6'"),
+        (["queue", "--rows", "pops"], "row is 'pops'; it must be one of"),
+        (["data", "check", "--scenes", "moon"], "scene is 'moon'; it must be one of bicycle, "),
+    ],
+)
+def test_a_mistake_is_one_line_that_names_the_fix(words, says, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = call(*words, status=2, capsys=capsys)
+    assert says in text
+    assert "Traceback" not in text
+
+
+def test_a_row_that_this_version_lacks_has_its_own_status(capsys, tmp_path, monkeypatch):
+    from pop_fast.train import presets
+
+    monkeypatch.setattr(presets, "METHODS", {"pop": presets.METHODS["pop"]})
+    words = ["run", "gsplat", "demo", "--scale", "toy", "--work", tmp_path, "--out", tmp_path]
+    assert "has no method 'gsplat'; it has pop" in call(*words, status=69, capsys=capsys)
+
+
+def test_data_check_names_what_is_absent_and_its_source(capsys, tmp_path):
+    text = call("data", "check", "--data", tmp_path, status=1, capsys=capsys)
+    assert "  drjohnson, playroom: from https://repo-sam.inria.fr/" in text
+    assert text.count("missing") == 17
+
+
+def test_a_queue_lists_what_is_missing_cheapest_first(capsys, tmp_path):
+    words = ["queue", "--scale", "dev", "--out", tmp_path, "--list"]
+    lines = call(*words, "--seeds", "2", capsys=capsys).splitlines()
+    assert len(lines) == 2 * 4 * len(ROWS)
+    assert lines[0].split()[1] in ("bear_512", "garden_512")
+    chosen = call(*words, "--rows", "gsplat", "pop", "--scenes", "fox", capsys=capsys).splitlines()
+    assert chosen == ["pop fox --scale dev --seed 42", "gsplat fox --scale dev --seed 42"]
+
+
+@pytest.fixture(scope="module")
+def queued(tmp_path_factory):
+    """A queue of three toy rows that is stopped by SIGTERM in the first, then called again to the end."""
+    folder = tmp_path_factory.mktemp("queue")
+    words = ["--scale", "toy", "--rows", "l2_pop", "l1_div_100", "pop", "--out", "results", "--work", "work"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, "-m", "paper_repro", "queue", *words, "--checkpoint-every", "50"]
+    said = []
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=folder, env=environment
+    )
+    metrics = folder / "work" / "toy" / "l1_div_100" / "demo_42" / "metrics.jsonl"
+    end = time.monotonic() + 120.0
+    while not (metrics.is_file() and metrics.stat().st_size > 0) and time.monotonic() < end and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    said.append((process.communicate(timeout=120)[0], process.returncode))
+    left = sorted(path.parent.name for path in folder.rglob("ckpts/*.pt"))
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=folder, env=environment)
+    said.append((done.stdout, done.returncode))
+    return folder, said, left
+
+
+def test_a_queue_stops_at_sigterm_with_a_checkpoint(queued):
+    _, ((text, status), _), left = queued
+    assert status == 130
+    assert "0 of 3 rows are done; 3 to go" in text
+    assert text.splitlines()[-1] == "stopped; the same command goes on"
+    assert left
+
+
+def test_a_queue_that_is_called_again_goes_on_to_the_end(queued):
+    folder, (_, (text, status)), _ = queued
+    assert status == 0, text
+    assert [result.row for result in read_all("toy", folder / "results")] == ["l1_div_100", "l2_pop", "pop"]
+    assert "with which the run was begun" in text
+    assert text.splitlines()[-1] == "3 rows trained"
+
+
+def test_status_counts_what_is_done_and_begun(queued, capsys, tmp_path):
+    folder = queued[0]
+    where = ["--results", folder / "results", "--work", tmp_path]
+    text = call("status", "--scale", "toy", "--rows", "pop", "l2", "l2_pop", *where, capsys=capsys)
+    assert text.split("\n")[1:4] == ["pop     done", "l2      to do", "l2_pop  done"]
+    assert "2 of 3 done" in text
+    checkpoint = tmp_path / "toy" / "l2" / "demo_42" / "ckpts" / "ckpt_149_rank0.pt"
+    checkpoint.parent.mkdir(parents=True)
+    checkpoint.touch()
+    text = call("status", "--scale", "toy", "--rows", "pop", "l2", "--seeds", "2", *where, capsys=capsys)
+    assert "1 done, to do" in text
+    assert "step 150, to do" in text
+
+
+def test_a_table_is_printed_or_written_in_three_formats(queued, capsys, tmp_path):
+    where = ["--scale", "toy", "--results", queued[0] / "results"]
+    printed = call("table", "3", *where, capsys=capsys)
+    assert "L2 + POP" in printed
+    call("table", "3", *where, "--out", tmp_path, capsys=capsys)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["table_3.csv", "table_3.md", "table_3.tex"]
+    assert (tmp_path / "table_3.md").read_text().strip() == printed.strip()
+
+
+def test_claims_are_judged(queued, capsys):
+    assert "claim" in call("claims", "--scale", "toy", "--results", queued[0] / "results", capsys=capsys)
+
+
+def test_results_are_committed_where_that_is_asked_for(tmp_path):
+    for words in (["init", "-q"], ["config", "user.name", "a"], ["config", "user.email", "a@b"]):
+        subprocess.run(["git", *words], cwd=tmp_path, check=True)
+    (tmp_path / "other.txt").write_text("not to be committed")
+    subprocess.run(["git", "add", "other.txt"], cwd=tmp_path, check=True)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    words = ["--scale", "toy", "--rows", "l1_div_100", "--out", "results", "--work", "work", "--commit"]
+    command = [sys.executable, "-m", "paper_repro", "queue", *words]
+    subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True)
+    shown = subprocess.run(["git", "show", "--stat", "--format=%s"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert shown.stdout.startswith("Result: l1_div_100 on demo, toy scale, seed 42\n")
+    assert "demo_42.json" in shown.stdout
+    assert "other.txt" not in shown.stdout
+    result = json.loads((tmp_path / "results" / "toy" / "l1_div_100" / "demo_42.json").read_text())
+    assert result["psnr"] > 0.0

@@ -1,0 +1,235 @@
+"""Training a row: its result is whole, the same whether it was interrupted or not, and made once."""
+
+from __future__ import annotations
+
+import atexit
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import fields, replace
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from paper_repro import train_row as module
+from paper_repro.collect import collect, first_change
+from paper_repro.jobs import Job, NotInThisVersion, job_named
+from paper_repro.results import Result, path_of, read, write
+from paper_repro.scenes import SCENES
+from paper_repro.train_row import Busy, Options, capture_folder, commit, is_finished, only_one, train_row
+from pop_fast.errors import PopError
+from pop_fast.train import TrainingRun
+from tests.app.interruptions import interrupt
+
+ROOT = Path(__file__).parents[2]
+# measured in seconds, so not the same twice
+TIMES = {"seconds"}
+
+
+@cache
+def demo() -> Path:
+    """Make the demo capture once for this module."""
+    folder = Path(tempfile.mkdtemp())
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return capture_folder(SCENES["demo"], Options(data=folder, work=folder))
+
+
+def options(folder: Path, **more) -> Options:
+    how = Options(**{"data": folder, "results": folder / "results", "work": folder / "work", "quiet": True, **more})
+    shutil.copytree(demo(), how.work / "demo", dirs_exist_ok=True)
+    return how
+
+
+def toy(row: str, **scale) -> Job:
+    job = job_named(row, "demo", "toy")
+    return replace(job, scale=replace(job.scale, **scale))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The options and the result of POP at toy scale, trained without an interruption."""
+    folder = tmp_path_factory.mktemp("made")
+    return options(folder), train_row(toy("pop"), options(folder))
+
+
+def values(result: Result) -> dict:
+    """What must be the same in two trainings of one row: everything but times."""
+    found = {field.name: getattr(result, field.name) for field in fields(Result) if field.name not in TIMES}
+    found["curve"] = [{key: value for key, value in point.items() if key not in TIMES} for point in result.curve]
+    return found
+
+
+def test_a_result_lies_in_its_place_and_holds_what_was_asked_for(made):
+    how, path = made
+    assert path == how.results / "toy" / "pop" / "demo_42.json"
+    result = read(path)
+    assert path_of(result, how.results) == path
+    assert (result.scale, result.row, result.scene, result.seed) == ("toy", "pop", "demo", 42)
+    assert (result.threads, result.commit) == (1, commit())
+    assert result.protocol["test_views"] == len(result.per_view) == 3
+    assert (result.protocol["width"], result.protocol["height"], result.protocol["resize"]) == (96, 72, "none")
+    assert result.schedule["pop.blur_stop_iter"] == 70
+    assert not {"data", "result_dir", "seed", "backend"} & set(result.schedule)
+    assert all(result.seconds[phase] > 0.0 for phase in ("load", "train", "evaluate"))
+    assert result.checkpoint_mib == pytest.approx(result.num_gaussians * 236 / 2**20, rel=1e-12)
+    assert result.lpips == {"vgg_01": None, "alex_norm": None, "alex_01": None}
+    assert result.psnr == pytest.approx(sum(view["psnr"] for view in result.per_view.values()) / 3, rel=1e-12)
+    assert str(how.data) not in path.read_text()
+
+
+def test_a_curve_has_every_event_and_the_held_out_views_of_every_fifteenth(made):
+    curve = read(made[1]).curve
+    steps = [point["step"] for point in curve]
+    assert steps == sorted(set(steps))
+    assert set(range(0, 300, 10)) <= set(steps)
+    measured = [point for point in curve if point.get("psnr_test") is not None]
+    assert [point["step"] for point in measured] == [20 * i - 1 for i in range(1, 16)]
+    assert all(point["n_blended"] > 0.0 and point["n_traversed"] >= point["n_blended"] for point in measured)
+    # the counts add up: what an event cloned, split and pruned is the difference to the point before it
+    events = [(before, now) for before, now in zip(curve, curve[1:], strict=False) if "cloned" in now]
+    assert len(events) == 14
+    for before, now in events:
+        change = now["cloned"] + now["split"] - now["pruned"]
+        assert now["num_gaussians"] == before["num_gaussians"] + change
+    last, result = curve[-1], read(made[1])
+    assert (last["step"], last["num_gaussians"], last["psnr_test"]) == (
+        *(299, result.num_gaussians),
+        pytest.approx(result.psnr, rel=1e-5),
+    )
+
+
+def test_a_finished_row_is_not_trained_again_and_leaves_no_bulk(made, monkeypatch):
+    how, path = made
+    work = toy("pop").work(how.work)
+    assert not (work / "ckpts").exists()
+    assert not (work / "ply").exists()
+    assert (work / "metrics.jsonl").is_file()
+    text = path.read_bytes()
+    monkeypatch.setattr(TrainingRun, "__init__", lambda *_, **__: pytest.fail("trained again"))
+    assert train_row(toy("pop"), how) == path
+    assert path.read_bytes() == text
+
+
+def test_a_row_that_was_interrupted_ends_with_the_same_result(made, tmp_path, monkeypatch):
+    how = options(tmp_path, work=made[0].work.parent / "again")
+    with monkeypatch.context() as patch:
+        interrupt(patch, at=150)
+        with pytest.raises(KeyboardInterrupt):
+            train_row(toy("pop"), how)
+    assert not toy("pop").result(how.results).exists()
+    assert (toy("pop").work(how.work) / "ckpts" / "ckpt_99_rank0.pt").is_file()
+    again = read(train_row(toy("pop"), how))
+    assert values(again) == values(read(made[1]))
+
+
+def test_what_was_asked_to_be_kept_is_kept(made, tmp_path):
+    how = options(tmp_path, keep_ply=True, keep_checkpoints=True)
+    job = toy("l1_div_10", steps_scaler=0.002)
+    result = read(train_row(job, how))
+    assert [path.name for path in (job.work(how.work) / "ply").iterdir()] == ["point_cloud_59.ply"]
+    assert list((job.work(how.work) / "ckpts").iterdir())
+    # a divisor is no step number, and a run of 60 steps has not become one of 300
+    assert (result.schedule["max_steps"], result.schedule["photometric_divisor"]) == (60, 10.0)
+
+
+@pytest.mark.parametrize("row", ["3dgs", "gsplat", "reset", "l1_div_10"])
+def test_rows_of_other_methods_and_losses_are_trained(row, tmp_path, made):
+    job = toy(row, steps_scaler=0.003)
+    result = read(train_row(job, options(tmp_path)))
+    assert result.schedule["method"] == job.row.method
+    assert {point["step"] for point in result.curve} >= {0, 89}
+    assert result.run != read(made[1]).run
+    assert result.data_hash == read(made[1]).data_hash
+    loss = "l2" if row == "reset" else "l1"
+    assert result.curve[0][loss] > 0.0
+
+
+def test_a_run_is_known_by_settings_data_and_seed_and_not_by_how_it_ran(tmp_path):
+    job = toy("pop", steps_scaler=0.001)
+    one, other = (read(train_row(job, options(tmp_path / name))) for name in ("a", "b"))
+    assert (one.run, one.config_hash, one.data_hash) == (other.run, other.config_hash, other.data_hash)
+    threads = read(train_row(job, options(tmp_path / "c", threads=2, checkpoint_every=7, log_every=5)))
+    assert (threads.run, threads.threads) == (one.run, 2)
+    logged = [{point["step"] for point in result.curve if point["psnr"] is not None} for result in (one, threads)]
+    assert logged == [{0, 10, 20}, {0, 5, 10, 15, 20, 25}]
+    seed = read(train_row(replace(job, seed=43), options(tmp_path / "d")))
+    assert (seed.config_hash, seed.seed) == (one.config_hash, 43)
+    assert seed.run != one.run
+
+
+def test_a_result_whose_row_has_changed_is_refused_and_new_settings_are_not(made, tmp_path):
+    result, job = read(made[1]), toy("pop")
+    assert is_finished(job, made[0].results)
+    older = replace(result, schedule={name: v for name, v in result.schedule.items() if name != "pop.absgrad"})
+    assert first_change(older, job.config()) is None
+    other = replace(result, schedule={**result.schedule, "pop.theta_blur": 3e-5})
+    path = write(other, tmp_path / "results")
+    with pytest.raises(PopError, match=r"was trained with pop\.theta_blur = 3e-05, and the row has 2e-05 now; remove"):
+        train_row(job, options(tmp_path))
+    assert path.is_file()
+
+
+def test_a_row_that_another_process_trains_is_left_to_it(made, tmp_path):
+    job, how = toy("l2"), options(tmp_path)
+    with only_one(job.work(how.work).with_suffix(".lock"), "taken"), pytest.raises(Busy, match="another process trains"):
+        train_row(job, how)
+    assert not job.work(how.work).exists()
+
+
+def test_a_method_that_is_not_there_is_said_before_anything_is_read(tmp_path):
+    job = toy("pop")
+    strange = replace(job, row=replace(job.row, name="pop", method="telepathy"))
+    with pytest.raises(NotInThisVersion, match="no method 'telepathy'"):
+        train_row(strange, Options(data=tmp_path, results=tmp_path / "results", work=tmp_path / "work"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unfinished_folder_is_not_collected(tmp_path, monkeypatch):
+    how, job = options(tmp_path), toy("pop", steps_scaler=0.001)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_remove_bulk", lambda *_: None)
+        interrupt(patch, at=20)
+        with pytest.raises(KeyboardInterrupt):
+            train_row(job, how)
+    with pytest.raises(PopError, match=r"val_step0029\.json: is absent, so the training is not finished"):
+        collect(job, job.work(how.work))
+
+
+def test_what_an_earlier_training_left_does_not_reach_a_result(tmp_path):
+    how, job = options(tmp_path), toy("pop", steps_scaler=0.001)
+    path = train_row(job, how)
+    first = values(read(path))
+    # measurements at steps that this training does not measure at
+    stats = job.work(how.work) / "stats"
+    (stats / "val_step0010.json").write_text(json.dumps({**json.loads((stats / "val_step0029.json").read_text()), "step": 10}))
+    path.unlink()
+    assert values(read(train_row(job, how))) == first
+
+
+def _waiting_for(path: Path, process: subprocess.Popen, seconds: float = 120.0) -> None:
+    end = time.monotonic() + seconds
+    while not (path.is_file() and path.stat().st_size > 0):
+        assert process.poll() is None, "it ended before its first step"
+        assert time.monotonic() < end, f"{path} was not written"
+        time.sleep(0.05)
+
+
+def test_sigterm_leaves_a_checkpoint_and_the_same_command_goes_on(made, tmp_path):
+    how, job = options(tmp_path), toy("pop")
+    words = ["run", "pop", "demo", "--scale", "toy", "--out", str(how.results), "--work", str(how.work)]
+    command = [sys.executable, "-m", "paper_repro", *words]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=ROOT)
+    _waiting_for(job.work(how.work) / "metrics.jsonl", process)
+    process.send_signal(signal.SIGTERM)
+    _, said = process.communicate(timeout=120)
+    assert (process.returncode, said) == (130, "pop-repro: stopped; the same command goes on from the last checkpoint\n")
+    assert list((job.work(how.work) / "ckpts").iterdir())
+    assert not job.result(how.results).exists()
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout.splitlines()[-1] == str(job.result(how.results))
+    assert values(read(job.result(how.results))) == values(read(made[1]))
