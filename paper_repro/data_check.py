@@ -129,7 +129,9 @@ def _counts(item: Found) -> str:
         return f"{item.n_images} photographs, {item.n_test} held out, {width} x {height}  {item.folder}"
     doubt = "" if scene.verified else "~"
     width, height = scene.size
-    return f"expected: {doubt}{scene.n_images} photographs, {-(-scene.n_images // HOLD_OUT)} held out, {width} x {height}"
+    return (
+        f"expected: {doubt}{scene.n_images} photographs, {-(-scene.n_images // HOLD_OUT)} held out, {width} x {height}"
+    )
 
 
 def _listing(folder: Path) -> tuple[list[str], bool, list[tuple[int, int]]]:
@@ -213,4 +215,3 @@ def _wrong_size(scene: Scene, sizes: Sequence[tuple[int, int]], factor: int) -> 
 
 def _doubt(scene: Scene) -> str:
     return "" if scene.verified else " (as is recalled; nobody compared it with the photographs here)"
-

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from paper_repro.rows import ROWS, Row, load_row
 from paper_repro.scales import Scale, scale_named
-from paper_repro.scenes import SCENES, Scene, scene_named
+from paper_repro.scenes import Scene, scene_named
 from pop_fast.errors import PopError
 
 if TYPE_CHECKING:
@@ -95,13 +95,17 @@ class Job:
             method=whole.method,
             steps_scaler=scaler,
             **{
-                **{"log_every": self.scale.log_every, "checkpoint_every": self.scale.checkpoint_every},
+                "log_every": self.scale.log_every,
+                "checkpoint_every": self.scale.checkpoint_every,
                 # the Gaussians are saved at the end alone, which always counts
-                **{"eval_steps": _measured_at(whole.max_steps, scaler), "save_steps": ()},
+                "eval_steps": _measured_at(whole.max_steps, scaler),
+                "save_steps": (),
                 **self.scale.settings,
                 **_scaled(whole, scaler),
                 **({} if plain else {"strategy.reset_every": self.scale.reset_every}),
-                **{"seed": self.seed, "factor": self.factor, "progress": False},
+                "seed": self.seed,
+                "factor": self.factor,
+                "progress": False,
                 **more,
             },
         )

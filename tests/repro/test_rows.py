@@ -20,8 +20,13 @@ from pop_ref.settings import DensityConfig, PopTerm
 
 # rows that are a recipe of the oracle
 OF_RECIPES = {
-    **{"pop": "POP", "l2": "L2", "l2_blur": "L2+Blur", "l2_pop": "L2+POP", "reset": "Reset"},
-    **{"3dgs": "3DGS", "gsplat": "gsplat"},
+    "pop": "POP",
+    "l2": "L2",
+    "l2_blur": "L2+Blur",
+    "l2_pop": "L2+POP",
+    "reset": "Reset",
+    "3dgs": "3DGS",
+    "gsplat": "gsplat",
 }
 NAMED: dict[str, Recipe] = {
     **{row: RECIPES[name] for row, name in OF_RECIPES.items()},

@@ -176,7 +176,10 @@ def test_a_result_whose_row_has_changed_is_refused_and_new_settings_are_not(made
 
 def test_a_row_that_another_process_trains_is_left_to_it(made, tmp_path):
     job, how = toy("l2"), options(tmp_path)
-    with only_one(job.work(how.work).with_suffix(".lock"), "taken"), pytest.raises(Busy, match="another process trains"):
+    with (
+        only_one(job.work(how.work).with_suffix(".lock"), "taken"),
+        pytest.raises(Busy, match="another process trains"),
+    ):
         train_row(job, how)
     assert not job.work(how.work).exists()
 
@@ -206,7 +209,9 @@ def test_what_an_earlier_training_left_does_not_reach_a_result(tmp_path):
     first = values(read(path))
     # measurements at steps that this training does not measure at
     stats = job.work(how.work) / "stats"
-    (stats / "val_step0010.json").write_text(json.dumps({**json.loads((stats / "val_step0029.json").read_text()), "step": 10}))
+    (stats / "val_step0010.json").write_text(
+        json.dumps({**json.loads((stats / "val_step0029.json").read_text()), "step": 10})
+    )
     path.unlink()
     assert values(read(train_row(job, how))) == first
 
@@ -227,7 +232,10 @@ def test_sigterm_leaves_a_checkpoint_and_the_same_command_goes_on(made, tmp_path
     _waiting_for(job.work(how.work) / "metrics.jsonl", process)
     process.send_signal(signal.SIGTERM)
     _, said = process.communicate(timeout=120)
-    assert (process.returncode, said) == (130, "pop-repro: stopped; the same command goes on from the last checkpoint\n")
+    assert (process.returncode, said) == (
+        130,
+        "pop-repro: stopped; the same command goes on from the last checkpoint\n",
+    )
     assert list((job.work(how.work) / "ckpts").iterdir())
     assert not job.result(how.results).exists()
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True)
