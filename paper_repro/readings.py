@@ -1,0 +1,180 @@
+"""What the runs say of other readings of the paper (A2, A12, A16), and of two experiments (E2, E4).
+
+A reading is known by what it does to the number of Gaussians: how much of N is left, when density control ends, of what
+there was when the blur window closed. The paper's tables imply that share; the reading that comes nearest to it on the
+scenes where all were run speaks for itself. On photographs that are not the paper's this is evidence, not proof.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from math import exp, log
+from statistics import fmean
+from typing import Final
+
+from paper_repro.evidence import Group, decay, groups, implied_shares
+from paper_repro.paper import paper
+from paper_repro.results import SCALES, Result
+from paper_repro.table_markdown import grid
+from paper_repro.tables import setting
+
+__all__ = ["READINGS", "Answer", "Reading", "answers", "experiments", "markdown"]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """An open question of the paper with a row for each reading, the default first."""
+
+    id: str
+    asks: str
+    rows: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the runs say of one question.
+
+    Attributes:
+        id: of the question.
+        asks: the question.
+        says: the answer in a sentence.
+        head: of its table.
+        lines: by scene and row.
+    """
+
+    id: str
+    asks: str
+    says: str
+    head: tuple[str, ...]
+    lines: tuple[tuple[str, ...], ...]
+
+
+READINGS: Final = (
+    Reading("A2", "over what is a dominant count cumulative in the blur rule?", ("pop", "pop_own_view", "pop_sum")),
+    Reading("A12", "does the POP term sum over all Gaussians or over visible ones?", ("pop", "pop_visible")),
+    Reading("A16", "are oversized Gaussians pruned although there is no reset?", ("pop", "pop_no_size_prune")),
+)
+_HEAD: Final = ("scale", "scene", "row", "N as the window closes", "left", "N", "of L2+Blur's", "PSNR", "runs")
+# the rows of E4: pruning harder at the paper's weight, in place of a tenfold weight
+_PRUNED: Final = ("final_prune", "pop_prune_002")
+
+
+def answers(results: Iterable[Result]) -> tuple[Answer, ...]:
+    """Answer the questions about readings from the results of all scales, the paper's scale first where it decides."""
+    found = list(results)
+    return tuple(_answer(reading, found) for reading in READINGS)
+
+
+def experiments(results: Iterable[Result]) -> tuple[Answer, ...]:
+    """Answer E2 and E4 from the results of all scales."""
+    found = list(results)
+    return _longer_schedules(found), _pruned_harder(found)
+
+
+def markdown(told: Sequence[Answer]) -> str:
+    """Render answers: the question, what is said, the numbers."""
+    parts = []
+    for answer in told:
+        parts.append(f"### {answer.id}: {answer.asks}\n\n{answer.says}")
+        if answer.lines:
+            parts.append(grid(answer.head, answer.lines))
+    return "\n\n".join(parts)
+
+
+def _answer(reading: Reading, results: Sequence[Result]) -> Answer:
+    lines: list[tuple[str, ...]] = []
+    distances: dict[str, list[float]] = {row: [] for row in reading.rows}
+    scenes = []
+    goal = exp(fmean(log(share) for share in implied_shares(paper())))
+    for scale in _telling(results):
+        for scene, rows in groups(r for r in results if r.scale == scale).items():
+            present = [row for row in reading.rows if row in rows]
+            if len(present) < 2:
+                continue
+            lines += [_line(scale, scene, row, rows) for row in present]
+            shares = {row: _left(rows[row]) for row in reading.rows if row in rows}
+            known = {row: share for row, share in shares.items() if share is not None}
+            if set(known) == set(reading.rows):
+                scenes.append(f"{scene} ({scale})")
+                for row, share in known.items():
+                    distances[row].append(abs(log(share / goal)))
+    says = "Not decided: no scene has a run of every reading."
+    if scenes:
+        nearest = min(reading.rows, key=lambda row: fmean(distances[row]))
+        kind = "the default" if nearest == reading.rows[0] else "not the default"
+        says = (
+            f"Nearest to the paper's {goal:.0%} (the mean of what its tables imply to be left) is `{nearest}`, {kind}, "
+            f"on {', '.join(scenes)}."
+        )
+    return Answer(reading.id, reading.asks, says, _HEAD, tuple(lines))
+
+
+def _telling(results: Sequence[Result]) -> list[str]:
+    """List the scales that say something about a method, the paper's first: the toy does not."""
+    return [scale for scale in reversed(SCALES) if scale != "toy" and any(r.scale == scale for r in results)]
+
+
+def _left(group: Group) -> float | None:
+    shares = [share for run in group.runs if (share := decay(run)) is not None]
+    return fmean(kept for _, kept in shares) if shares else None
+
+
+def _line(scale: str, scene: str, row: str, rows: Mapping[str, Group]) -> tuple[str, ...]:
+    group = rows[row]
+    peaks = [share for run in group.runs if (share := decay(run)) is not None]
+    blur = rows.get("l2_blur")
+    return (
+        *(scale, scene, row),
+        f"{fmean(peak for peak, _ in peaks):,.0f}" if peaks else "no curve",
+        f"{fmean(kept for _, kept in peaks):.1%}" if peaks else "no curve",
+        f"{group.n:,.0f}",
+        f"{group.n / blur.n:.1%}" if blur is not None else "l2_blur not run",
+        f"{group.psnr:.2f}",
+        ", ".join(group.ids),
+    )
+
+
+def _longer_schedules(results: Sequence[Result]) -> Answer:
+    """E2: what POP does to N and PSNR on schedules of several lengths, by its weight."""
+    lines: list[tuple[str, ...]] = []
+    lengths: dict[float, set[float]] = {}
+    for scale in _telling(results):
+        for scene, rows in groups(r for r in results if r.scale == scale).items():
+            if "pop" not in rows or "l2_blur" not in rows:
+                continue
+            pop, blur = rows["pop"], rows["l2_blur"]
+            steps, weight = setting(pop.runs[0], "max_steps"), setting(pop.runs[0], "lambda_pop")
+            if steps is None or weight is None:
+                continue
+            lengths.setdefault(weight, set()).add(steps)
+            shown = f"{steps:,.0f}", f"{weight:g}", f"{pop.n / blur.n:.1%}", f"{pop.psnr - blur.psnr:+.2f} dB"
+            lines.append((scale, scene, *shown, ", ".join((*pop.ids, *blur.ids))))
+    head = ("scale", "scene", "steps", "weight", "N(pop) / N(l2_blur)", "PSNR", "runs")
+    several = [weight for weight, steps in lengths.items() if len(steps) > 1]
+    if not several:
+        says = "Not decided: one weight has to be run on two lengths of the schedule."
+    else:
+        says = "One weight on several lengths of the schedule, below." + (
+            "" if len(lengths) > 1 else " No row divides the weight by the scaler, so that rule is not judged here."
+        )
+    return Answer(
+        "E2", "does the weight of the POP term have to grow when the schedule shrinks?", says, head, tuple(lines)
+    )
+
+
+def _pruned_harder(results: Sequence[Result]) -> Answer:
+    """E4: what pruning harder at the paper's weight does."""
+    lines: list[tuple[str, ...]] = []
+    for scale in _telling(results):
+        for scene, rows in groups(r for r in results if r.scale == scale).items():
+            for row in (row for row in _PRUNED if row in rows and "pop" in rows):
+                pop, pruned, base = rows["pop"], rows[row], rows.get("gsplat")
+                shown = f"{pruned.n / pop.n:.1%}", f"{pruned.psnr - pop.psnr:+.2f} dB"
+                share = f"{pruned.n / base.n:.1%}" if base is not None else "gsplat not run"
+                lines.append((scale, scene, row, *shown, share, ", ".join((*pruned.ids, *pop.ids))))
+    head = ("scale", "scene", "row", "N of POP's", "PSNR less POP's", "N of gsplat's", "runs")
+    says = (
+        "Pruning harder at the paper's weight, below." if lines else "Not decided: no scene has POP and a harder prune."
+    )
+    return Answer("E4", "how compact is POP at the paper's weight if more is pruned?", says, head, tuple(lines))

@@ -1,0 +1,168 @@
+"""What is reproduced so far: the status table of README.md, claims.md, and the generated parts of protocol.md.
+
+python -m paper_repro.status            print the status table
+python -m paper_repro.status --write    write all of them, from the results that are there
+python -m paper_repro.status --check    exit with 1 when a file holds something else
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Final
+
+from paper_repro import readings
+from paper_repro.claims import claims
+from paper_repro.claims import markdown as claims_markdown
+from paper_repro.evidence import DATASETS, Claim
+from paper_repro.paper import paper
+from paper_repro.results import RESULTS, SCALES, Result, read_all
+from paper_repro.table_markdown import grid
+from paper_repro.tables import BEYOND, SCENES_OF
+from pop_fast.errors import PopError
+from pop_ref.ambiguities import AMBIGUITIES
+
+__all__ = ["HERE", "files", "status_table", "with_part"]
+
+HERE: Final = Path(__file__).resolve().parent
+_MADE: Final = "<!-- made by python -m paper_repro.status --write -->"
+_WRITE: Final = "run 'python -m paper_repro.status --write'"
+
+
+def status_table(results: Iterable[Result]) -> str:
+    """Make the status table: every claim by the best scale that decides it, every table by the cells that are run."""
+    found = list(results)
+    by_scale = {scale: claims(scale, found) for scale in _telling()}
+    rows = []
+    for i, claim in enumerate(by_scale["paper"]):
+        judged = [(scale, by_scale[scale][i]) for scale in _telling() if by_scale[scale][i].verdict != "not decided"]
+        scale, best = judged[0] if judged else ("", claim)
+        ours = (
+            f"{best.verdict} at scale {scale}, {best.where}"
+            if judged
+            else "not decided: the runs it needs are not there"
+        )
+        command = f"`pop-repro claims --scale {scale or 'dev'}`"
+        rows.append([claim.says, claim.paper, ours, command, _commits(_runs_of(best, found))])
+    for table in paper().tables:
+        lines = [line.row for line in table.rows]
+        what = f"table {table.number}: {table.title}"
+        cells = f"{len(lines)} rows, {', '.join(table.datasets)}"
+        used = [r for r in found if r.row in lines]
+        rows.append(
+            [
+                what,
+                cells,
+                _progress(lines, table.datasets, used),
+                f"`pop-repro table {table.number} --scale dev`",
+                _commits(used),
+            ]
+        )
+    used = [r for r in found if r.row in BEYOND and r.row != "pop"]
+    progress = _progress([row for row in BEYOND if row != "pop"], DATASETS, used)
+    rows.append(
+        ["beyond the paper", "not in the paper", progress, "`pop-repro table beyond --scale dev`", _commits(used)]
+    )
+    return grid(["claim or table", "paper", "ours", "command", "commits"], rows)
+
+
+def files(results: Iterable[Result], folder: Path = HERE) -> dict[Path, str]:
+    """Give the text that each generated file should have.
+
+    Raises:
+        PopError: a file has no marks for its part.
+    """
+    found = list(results)
+    protocol = _read(folder / "protocol.md")
+    protocol = with_part(protocol, "ambiguities", _ambiguities())
+    told = (*readings.answers(found), *readings.experiments(found))
+    protocol = with_part(protocol, "readings", readings.markdown(told))
+    return {
+        folder / "README.md": with_part(_read(folder / "README.md"), "status", status_table(found)),
+        folder / "protocol.md": protocol,
+        folder / "claims.md": _claims(found),
+    }
+
+
+def with_part(text: str, name: str, part: str) -> str:
+    """Put a part between its marks, `<!-- NAME:begin -->` and `<!-- NAME:end -->`.
+
+    Raises:
+        PopError: the text has no such marks.
+    """
+    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+    before, _, rest = text.partition(begin)
+    _, marked, after = rest.partition(end)
+    if not marked:
+        raise PopError(f"there are no marks {begin} ... {end}; put them where the part belongs")
+    return f"{before}{begin}\n{part}\n{end}{after}"
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise PopError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def _telling() -> list[str]:
+    """List the scales that say something of a method, the most telling first."""
+    return [scale for scale in reversed(SCALES) if scale != "toy"]
+
+
+def _runs_of(claim: Claim, found: Sequence[Result]) -> list[Result]:
+    used = {run for e in claim.evidence for run in e.runs}
+    return [r for r in found if r.run in used]
+
+
+def _commits(used: Iterable[Result]) -> str:
+    known = sorted({r.commit[:7] for r in used if r.commit is not None})
+    return ", ".join(known) or "none"
+
+
+def _progress(rows: Sequence[str], datasets: Sequence[str], used: Sequence[Result]) -> str:
+    """Say for each scale how many of its pairs of row and scene have a run; the data sets are the paper's scale's."""
+    told = []
+    for scale in _telling():
+        scenes = SCENES_OF.get(scale) or [s for d in datasets for s in paper().datasets[d]]
+        done = {(r.row, r.scene) for r in used if r.scale == scale and r.scene in scenes}
+        told.append(f"{scale}: {len(done)} of {len(rows) * len(scenes)}" if done else f"{scale}: not run")
+    return "; ".join(told)
+
+
+def _ambiguities() -> str:
+    rows = [
+        [a.id, a.impact, a.question, a.default, ", ".join(f"`{other}`" for other in a.alternatives) or "none"]
+        for a in AMBIGUITIES
+    ]
+    return grid(["label", "impact", "question", "default here", "can be chosen besides"], rows)
+
+
+def _claims(found: Sequence[Result]) -> str:
+    about = "How each is judged: [claims.py](claims.py). What is compared with what: [protocol.md](protocol.md)."
+    parts = ["# The paper's claims", _MADE, about]
+    scales = [scale for scale in _telling() if any(r.scale == scale for r in found)]
+    parts += [claims_markdown(claims(scale, found), scale).strip() for scale in scales]
+    if not scales:
+        parts.append("No run is finished, so no claim is decided.")
+    return "\n\n".join(parts) + "\n"
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the script."""
+    found = [r for scale in SCALES for r in read_all(scale, RESULTS)]
+    if "--write" not in words and "--check" not in words:
+        print(status_table(found))
+        return 0
+    stale = [(path, text) for path, text in files(found).items() if not path.is_file() or _read(path) != text]
+    for path, text in stale:
+        if "--write" in words:
+            path.write_text(text, encoding="utf-8")
+        else:
+            print(f"{path.name}: is not what the results say; {_WRITE}")
+    return 0 if "--write" in words or not stale else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
