@@ -16,7 +16,7 @@ from torch import Tensor
 
 from cuda_ext import step_program
 from cuda_ext.resident import ResidentViews
-from cuda_ext.train_settings import Phase, StepSettings
+from cuda_ext.train_settings import Phase, StepSettings, steady_updates
 from cuda_ext.train_step import FusedTrainer
 
 PLAIN, POP = Phase(3, False, False, False), Phase(3, True, True, True)
@@ -46,7 +46,7 @@ def make_trainer(scene: dict[str, Tensor], photograph: Tensor, max_steps: int, *
     m, v = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))
     device = scene["means"].device
     views = ResidentViews([photograph], scene["viewmats"], scene["Ks"], None, "valid", device)
-    chosen = StepSettings(dict.fromkeys(params, 1e-9), max_steps, **settings)
+    chosen = StepSettings(steady_updates(dict.fromkeys(params, 1e-9), max_steps), **settings)
     return FusedTrainer(params, m, v, views, [0] * max_steps, chosen)
 
 

@@ -34,12 +34,11 @@ void bind_training(nb::module_& m) {
     POINTER(schedule, Schedule, Ks);
     POINTER(schedule, Schedule, viewmat);
     POINTER(schedule, Schedule, K);
-    VALUE(schedule, Schedule, means_decay);
-    VALUE(schedule, Schedule, max_steps);
+    POINTER(schedule, Schedule, rates);
+    POINTER(schedule, Schedule, numbers);
     VALUE(schedule, Schedule, beta1);
     VALUE(schedule, Schedule, beta2);
     VALUE(schedule, Schedule, eps);
-    schedule.def("set_lr", [](Schedule& s, int group, double lr) { s.lr[group] = lr; });
 
     nb::class_<StepRecord> record(m, "StepRecord", nb::dynamic_attr());
     record.def(nb::init<>());
@@ -66,6 +65,7 @@ void bind_training(nb::module_& m) {
     VALUE(update, UpdateArrays, lambda_pop);
     VALUE(update, UpdateArrays, blur_own_view);
     POINTER(update, UpdateArrays, constants);
+    POINTER(update, UpdateArrays, sh_rest_sum);
     POINTER(update, UpdateArrays, sums);
     POINTER(update, UpdateArrays, dominant_counts);
     POINTER(update, UpdateArrays, pop_sides);

@@ -32,6 +32,7 @@ class Shared:
         background: colour behind everything, or None for black.
         viewmat, K: this step's camera.
         constants: this step's learning rates.
+        rates, numbers: of every step, `Updates`.
         values: what the last step told.
         history: what every step told.
     """
@@ -46,6 +47,8 @@ class Shared:
     viewmat: Tensor
     K: Tensor
     constants: Tensor
+    rates: Tensor
+    numbers: Tensor
     values: Tensor
     history: Tensor
 
@@ -67,8 +70,10 @@ class Shared:
             torch.zeros(16, device=device),
             torch.zeros(9, device=device),
             torch.zeros(kernels.STEP_CONSTANTS_FLOATS, device=device),
+            settings.updates.rates.to(device),
+            settings.updates.numbers.to(device),
             torch.zeros(kernels.N_VALUES, device=device),
-            torch.zeros((settings.max_steps, kernels.N_VALUES), device=device),
+            torch.zeros((len(settings.updates.rates), kernels.N_VALUES), device=device),
         )
 
     def render(self, size: Size, sh_degree: int) -> Settings:
@@ -102,8 +107,8 @@ class Population:
     pop_sums: Tensor
 
     @classmethod
-    def make(cls, params: Rows, m: Rows, v: Rows) -> Population:
-        """Allocate what belongs to the rows; statistics start from nothing."""
+    def make(cls, params: Rows, m: Rows, v: Rows, waits: bool) -> Population:
+        """Allocate what belongs to the rows; statistics start from nothing, and so do gradients where they wait."""
         kernels, n, device = load(), len(params["means"]), params["means"].device
         shapes = {"means2d": (n, 2), "depths": (n,), "conics": (n, 3), "opacities": (n,)}
         splats = {name: empty("the splats", LOWER, shape, device) for name, shape in shapes.items()}
@@ -113,7 +118,7 @@ class Population:
             dict(params),
             dict(m),
             dict(v),
-            Statistics.zeros(n, device),
+            Statistics.zeros(n, device, params["shN"].shape[1] if waits else None),
             splats,
             empty("packed splats", LOWER, (rows, kernels.RECORD), device),
             torch.zeros((rows, kernels.RECORD), device=device),

@@ -66,10 +66,8 @@ class StepProgram:
 def _schedule(shared: Shared) -> Any:
     s, views = shared.settings, shared.views
     made = fill(load().Schedule(), views=shared.order, viewmats=views.viewmats, Ks=views.Ks)
-    fill(made, viewmat=shared.viewmat, K=shared.K, means_decay=s.means_decay, max_steps=s.max_steps, eps=s.eps)
+    fill(made, viewmat=shared.viewmat, K=shared.K, rates=shared.rates, numbers=shared.numbers, eps=s.eps)
     made.beta1, made.beta2 = s.betas
-    for k, name in enumerate(GROUPS):
-        made.set_lr(k, s.lr[name])
     return made
 
 
@@ -122,6 +120,7 @@ def _update(shared: Shared, rows: Population, frame: Frame, phase: Phase) -> Any
     made = fill(load().UpdateArrays(), n=len(rows), n_rest=rows.params["shN"].shape[1], sums=rows.sums)
     counts = frame.told["dominant_counts"] if phase.dominance else None
     fill(made, constants=shared.constants, dominant_counts=counts, pop_sides=rows.pop_sides)
+    fill(made, sh_rest_sum=found.sh_rest_sum)
     made.lambda_pop = s.lambda_pop if phase.pop else 0.0
     made.blur_own_view = s.blur_window == "own_view"
     if phase.statistics:

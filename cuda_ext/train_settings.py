@@ -17,14 +17,43 @@ from pop_ref.settings import BETAS, EPS, DensityConfig, Recipe
 GROUPS = ("means", "scales", "quats", "opacities", "sh0", "shN")
 
 
+class Updates(NamedTuple):
+    """Whom Adam moves at every step of a schedule, and how far: meaning in `pop_ref.optimizer`.
+
+    Attributes:
+        rates: learning rates, that of the means in world units. [steps, groups] float64
+        numbers: the number of the update, from 1, that the bias corrections are of; 0 where a parameter is not moved.
+            [steps, groups] int32
+        sh_rest_every: gradients of the bands beyond the first are summed up from one update to the next if it is > 1;
+            else those of a step without an update are lost, as all other parameters' are.
+    """
+
+    rates: Tensor
+    numbers: Tensor
+    sh_rest_every: int = 1
+
+    def __len__(self) -> int:
+        return len(self.rates)
+
+
+def steady_updates(lr: Mapping[str, float], steps: int) -> Updates:
+    """Move every parameter at every step, at rates that stay the same.
+
+    Args:
+        lr: learning rate by parameter.
+        steps: length of the schedule.
+    """
+    rates = torch.tensor([[lr[name] for name in GROUPS]], dtype=torch.float64).repeat(steps, 1)
+    numbers = torch.arange(1, steps + 1, dtype=torch.int32)[:, None].repeat(1, len(GROUPS))
+    return Updates(rates, numbers)
+
+
 @dataclass(frozen=True)
 class StepSettings:
     """What the objective and the update depend on.
 
     Attributes:
-        lr: learning rate by parameter; that of the means already times the scene's scale.
-        max_steps: length of the schedule.
-        means_decay: what the means' rate falls to.
+        updates: whom Adam moves at which step.
         padding: SSIM's border, "valid" or "same".
         d_ssim_halved: (1 - SSIM) / 2 instead of 1 - SSIM.
         pixelwise_scale: multiplies the L1 or L2 term.
@@ -42,9 +71,7 @@ class StepSettings:
         counts: also tell how many splats every pixel blends and visits, which training does not read.
     """
 
-    lr: Mapping[str, float]
-    max_steps: int
-    means_decay: float = Recipe.lr.means_decay
+    updates: Updates
     padding: str = Recipe.padding
     d_ssim_halved: bool = Recipe.d_ssim_halved
     pixelwise_scale: float = Recipe.pixel_scale
@@ -123,16 +150,21 @@ class StepStats(NamedTuple):
 
 @dataclass
 class Statistics:
-    """What density control reads, one entry a Gaussian, added to by every step of a phase that collects it."""
+    """What density control reads, one entry a Gaussian, added to by every step of a phase that collects it.
+
+    `sh_rest_sum` is Adam's, of the same life: gradients that wait for their update; None where none do. [N, n_rest, 3]
+    """
 
     grad_sum: Tensor
     n_visible: Tensor
     dominant_sum: Tensor
     blurred: Tensor
+    sh_rest_sum: Tensor | None = None
 
     @classmethod
-    def zeros(cls, n: int, device: torch.device) -> Statistics:
-        """Start from nothing."""
+    def zeros(cls, n: int, device: torch.device, n_rest: int | None = None) -> Statistics:
+        """Start from nothing; `n_rest` bands' gradients wait, None for none."""
         visible, dominant = (torch.zeros(n, dtype=torch.int32, device=device) for _ in range(2))
         flags = torch.zeros(n, dtype=torch.uint8, device=device)
-        return cls(torch.zeros(n, device=device), visible, dominant, flags)
+        waiting = None if n_rest is None else torch.zeros((n, n_rest, 3), device=device)
+        return cls(torch.zeros(n, device=device), visible, dominant, flags, waiting)

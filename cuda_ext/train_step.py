@@ -41,7 +41,7 @@ class FusedTrainer:
         params: raw float32 CUDA tensors by gsplat's keys; updated in place.
         m, v: Adam's moments, likewise.
         views: the resident photographs and cameras.
-        order: the view of every step, at least `settings.max_steps` long.
+        order: the view of every step of the schedule.
         settings: objective and update.
         step: the step to begin at.
 
@@ -76,7 +76,7 @@ class FusedTrainer:
         self._rows = None
         self._capacity.settle(len(params["means"]))
         with torch.cuda.device_of(params["means"]):
-            self._rows = Population.make(params, m, v)
+            self._rows = Population.make(params, m, v, self.settings.updates.sh_rest_every > 1)
 
     def run(self, until: int, phase: Phase) -> None:
         """Take steps until the counter stands at `until`, all of one phase.

@@ -30,6 +30,7 @@ import torch
 from torch import Tensor
 
 from pop_fast import workspace
+from pop_fast.alpha import Entries, exponent_coefficients, pixel_basis
 from pop_fast.dominance import Dominance
 from pop_fast.lit import Lit
 from pop_fast.tile_groups import BLOCK, TileGroup
@@ -92,6 +93,18 @@ class Blender:
     basis: Tensor
     profile: Profile
     clamps: bool
+
+    @classmethod
+    def of(cls, entries: Entries, conics: Tensor, opacities: Tensor, colors: Tensor, profile: Profile) -> Blender:
+        """Make what blends entries of splats in the precision of their colours; padding has any colour."""
+        ids, n_colors = entries.lists.ids, colors.shape[1]
+        table = colors.new_empty((len(ids), 6 + n_colors + 1))
+        table[:, :6] = exponent_coefficients(entries, conics, opacities).T
+        table[:, 6:-1] = torch.cat((colors, colors.new_zeros((1, n_colors)))).index_select(0, ids)
+        table[:, -1] = 1.0
+        basis = pixel_basis(entries.lists.tile_size, colors.dtype)
+        clamps = bool((opacities > profile.alpha_ceiling).any())
+        return cls(table.view(-1, BLOCK, table.shape[1]), basis, profile, clamps)
 
     @property
     def stop(self) -> Stop:
@@ -185,10 +198,7 @@ class Blender:
                 lit.select(step.rows)
                 n = len(step.blocks)
                 v, behind = lit["v"][:n], lit["behind"][:n]
-                entries = self._entries(step.blocks)
-                alpha, lights, q = _shaped(slabs, entries, group.n_pixels)
-                self._alphas(entries, alpha)
-                weight = self._weights(alpha, lights, step.light)
+                entries, alpha, weight, q = self.again(group, step, slabs)
                 torch.bmm(entries[:, :, 6:], v, out=q)
                 for a, q_k in zip(reversed(alpha.unbind(1)), reversed(q.unbind(1)), strict=True):
                     q_k.sub_(behind)
@@ -197,6 +207,23 @@ class Blender:
                 torch.ops.aten.threshold_backward.grad_input(behind, step.light, 0.0, grad_input=behind)
                 workspace.give(step.light)
                 yield step.blocks.view(-1), self._rows(entries, alpha, weight, q, v, absolute)
+
+    def again(self, group: TileGroup, step: Step, slabs: list[Tensor]) -> list[Tensor]:
+        """Blend a step that was kept once more.
+
+        Args:
+            group: whose step it is.
+            step: of a `blend` that kept what the transpose needs; its light stays.
+            slabs: two of `group.slab` numbers, or three.
+
+        Returns:
+            The entries' rows of the table [n, K, 6 + D + 1], and in the slabs their alphas and weights, both 0 from
+            where a pixel stops [n, K, P], and of a third slab as much.
+        """
+        entries = self._entries(step.blocks)
+        alpha, lights, *rest = _shaped(slabs, entries, group.n_pixels)
+        self._alphas(entries, alpha)
+        return [entries, alpha, self._weights(alpha, lights, step.light), *rest]
 
     def _rows(self, entries: Tensor, alpha: Tensor, weight: Tensor, q: Tensor, v: Tensor, absolute: bool) -> Tensor:
         n_colors, n_rows = v.shape[1] - 1, q.shape[0] * q.shape[1]
@@ -207,16 +234,23 @@ class Blender:
         rows = rows.view(-1, rows.shape[2], BLOCK)
         g = q.mul_(weight)
         flat = entries.view(n_rows, entries.shape[2])[:, :6]
-        if self.clamps:
-            self._pass_ceiling(flat, alpha, g)
+        self.pass_ceiling(flat, alpha, g)
         pairs = g.view(n_rows, g.shape[2])
         rows[:, :6] = torch.mm(self.basis, pairs.T).view(6, -1, BLOCK).transpose(0, 1)
         if absolute:
             rows[:, 6 + n_colors :] = self._absolute(flat, pairs).view(2, -1, BLOCK).transpose(0, 1)
         return rows
 
-    def _pass_ceiling(self, coefficients: Tensor, alpha: Tensor, g: Tensor) -> None:
-        """Apply the profile's gradient rule to clamped alphas (B3), in place."""
+    def pass_ceiling(self, coefficients: Tensor, alpha: Tensor, g: Tensor) -> None:
+        """Apply the profile's gradient rule to clamped alphas (B3), in place.
+
+        Args:
+            coefficients: of the exponents. [n K, 6]
+            alpha: clamped. [n, K, P]
+            g: alpha dL/dalpha, in and out. [n, K, P]
+        """
+        if not self.clamps:
+            return
         ceiling = self.profile.alpha_ceiling
         if self.profile.ceiling_gradient == "zero":
             torch.ops.aten.hardtanh_backward.grad_input(g, alpha, -1.0, ceiling, grad_input=g)

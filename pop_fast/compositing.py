@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pop_fast.alpha import Entries, centred_moments, exponent_coefficients, pixel_basis, splat_gradients
+from pop_fast.alpha import Entries, centred_moments, splat_gradients
 from pop_fast.blender import Blender, GroupBlend
 from pop_fast.tile_groups import BLOCK, PackedLists, TileGroup, tile_groups
 from pop_fast.tiles import TileLists
@@ -110,16 +110,10 @@ class _Composite(torch.autograd.Function):
     def forward(
         ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, options: BlendOptions
     ) -> tuple[Tensor | None, ...]:
-        lists, profile, dtype = options.lists, options.profile, means2d.dtype
-        entries = Entries.of(means2d, PackedLists.of(lists, len(means2d)))
-        blender = Blender(
-            _table(exponent_coefficients(entries, conics, opacities), colors, entries.lists.ids),
-            pixel_basis(lists.tile_size, dtype),
-            profile,
-            bool((opacities > profile.alpha_ceiling).any()),
-        )
+        entries = Entries.of(means2d, PackedLists.of(options.lists, len(means2d)))
+        blender = Blender.of(entries, conics, opacities, colors, options.profile)
         groups = tile_groups(entries.lists)
-        canvas = _Canvas(options, entries.lists, colors.shape[1] + 1, dtype)
+        canvas = _Canvas(options, entries.lists, colors.shape[1] + 1, colors.dtype)
         blends: list[GroupBlend | None] = []
         pairs = 0
         for group in groups:
@@ -146,15 +140,6 @@ class _Composite(torch.autograd.Function):
             blend, saved.blends[i] = saved.blends[i] or saved.blender.blend(group), None
             gradients.add(group, blend, tiles.index_select(0, group.tiles))
         return (*gradients.of_splats(*ctx.saved_tensors), None)
-
-
-def _table(coefficients: Tensor, colors: Tensor, ids: Tensor) -> Tensor:
-    """Put what a pair needs of its entry into one row: coefficients, colours, a 1; padding has any colour."""
-    table = colors.new_empty((len(ids), 6 + colors.shape[1] + 1))
-    table[:, :6] = coefficients.T
-    table[:, 6:-1] = torch.cat((colors, colors.new_zeros((1, colors.shape[1])))).index_select(0, ids)
-    table[:, -1] = 1.0
-    return table.view(-1, BLOCK, table.shape[1])
 
 
 class _Canvas:

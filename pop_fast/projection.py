@@ -9,9 +9,17 @@ from pop_fast.layout import columns, from_columns
 from pop_ref.constants import PAPER, Profile
 
 
+def intrinsics(K: Tensor, width: int, height: int, profile: Profile) -> tuple[float, float, float, float]:
+    """Return fx, fy and the principal point that the profile uses, px."""
+    fx, fy = float(K[0, 0]), float(K[1, 1])
+    if profile.principal_point == "centred":
+        return fx, fy, 0.5 * width, 0.5 * height
+    return fx, fy, float(K[0, 2]), float(K[1, 2])
+
+
 def project_means(means_cam: Tensor, K: Tensor, width: int, height: int, profile: Profile = PAPER) -> Tensor:
     """See `pop_ref.projection.project_means`. Optimizations: component rows."""
-    fx, fy, cx, cy = _intrinsics(K, width, height, profile)
+    fx, fy, cx, cy = intrinsics(K, width, height, profile)
     x, y, z = columns(means_cam)
     return from_columns((fx * x / z + cx, fy * y / z + cy), (2,))
 
@@ -20,7 +28,7 @@ def project_means_vjp(
     means_cam: Tensor, K: Tensor, width: int, height: int, v_means2d: Tensor, profile: Profile = PAPER
 ) -> Tensor:
     """See `pop_ref.projection.project_means_vjp`. Optimizations: component rows."""
-    fx, fy, _, _ = _intrinsics(K, width, height, profile)
+    fx, fy, _, _ = intrinsics(K, width, height, profile)
     x, y, z = columns(means_cam)
     v_u, v_v = columns(v_means2d)
     v_x, v_y = fx * v_u / z, fy * v_v / z
@@ -29,7 +37,7 @@ def project_means_vjp(
 
 def projection_jacobians(means_cam: Tensor, K: Tensor, width: int, height: int, profile: Profile = PAPER) -> Tensor:
     """See `pop_ref.projection.projection_jacobians` (B1). Optimizations: component rows."""
-    fx, fy, _, _ = _intrinsics(K, width, height, profile)
+    fx, fy, _, _ = intrinsics(K, width, height, profile)
     x, y, z = columns(means_cam)
     (tx, _), (ty, _) = _clamped(x, y, z, K, width, height, profile)
     zero = torch.zeros_like(z)
@@ -40,7 +48,7 @@ def projection_jacobians_vjp(
     means_cam: Tensor, K: Tensor, width: int, height: int, v_jacobians: Tensor, profile: Profile = PAPER
 ) -> Tensor:
     """See `pop_ref.projection.projection_jacobians_vjp` (B1). Optimizations: component rows, no branches."""
-    fx, fy, _, _ = _intrinsics(K, width, height, profile)
+    fx, fy, _, _ = intrinsics(K, width, height, profile)
     x, y, z = columns(means_cam)
     (tx, inside_x), (ty, inside_y) = _clamped(x, y, z, K, width, height, profile)
     v00, _, v02, _, v11, v12 = columns(v_jacobians)
@@ -94,18 +102,11 @@ def project_covars_vjp(covars_cam: Tensor, jacobians: Tensor, v_covars2d: Tensor
     return from_columns((v_xx, v_xy, v_xz, v_xy, v_yy, v_yz, v_xz, v_yz, v_zz), (3, 3)), v_jacobians
 
 
-def _intrinsics(K: Tensor, width: int, height: int, profile: Profile) -> tuple[float, float, float, float]:
-    fx, fy = float(K[0, 0]), float(K[1, 1])
-    if profile.principal_point == "centred":
-        return fx, fy, 0.5 * width, 0.5 * height
-    return fx, fy, float(K[0, 2]), float(K[1, 2])
-
-
 def _clamped(
     x: Tensor, y: Tensor, z: Tensor, K: Tensor, width: int, height: int, profile: Profile
 ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
     """Return (t, inside) along x and y: t = z * clamp(x / z), inside = it was not clamped."""
-    fx, fy, cx, cy = _intrinsics(K, width, height, profile)
+    fx, fy, cx, cy = intrinsics(K, width, height, profile)
     return _clamp_one(x, z, fx, cx, width, profile), _clamp_one(y, z, fy, cy, height, profile)
 
 

@@ -10,7 +10,11 @@ import torch
 from torch import Tensor
 
 from pop_fast.backends import require_backend
+from pop_fast.chord import DominantPoints, dominant_points
 from pop_fast.compositing import Composite, composite
+from pop_fast.contributions import Contributions, contributions
+from pop_fast.fisher import screen_moments
+from pop_fast.sensitivity import sensitivities
 from pop_fast.splatting import Splats, colors_of_view, covariances, project
 from pop_fast.tiles import TileLists, tile_lists
 
@@ -45,6 +49,10 @@ class Stages:
         tile_lists: as `pop_fast.tiles.tile_lists`.
         composite: as `pop_fast.compositing.composite`.
         blend_tile: given the splats' extents, the tile to blend them in.
+        contributions: as `pop_fast.contributions.contributions`.
+        sensitivities: as `pop_fast.sensitivity.sensitivities`.
+        screen_moments: as `pop_fast.fisher.screen_moments`.
+        dominant_points: as `pop_fast.chord.dominant_points`.
     """
 
     covariances: Callable[..., Tensor] = covariances
@@ -53,6 +61,10 @@ class Stages:
     tile_lists: Callable[..., TileLists] = tile_lists
     composite: Callable[..., Composite] = composite
     blend_tile: Callable[[Tensor], int] = torchs_tile
+    contributions: Callable[..., Contributions] = contributions
+    sensitivities: Callable[..., Tensor] = sensitivities
+    screen_moments: Callable[..., Tensor] = screen_moments
+    dominant_points: Callable[..., DominantPoints] = dominant_points
 
 
 def stages_of(backend: str) -> Stages:
@@ -64,8 +76,13 @@ def stages_of(backend: str) -> Stages:
     if backend == "fast":
         return Stages()
     require_backend(backend)
+    from pop_fast.compiled.chord import dominant_points
     from pop_fast.compiled.compositing import composite
+    from pop_fast.compiled.contributions import contributions
+    from pop_fast.compiled.fisher import screen_moments
+    from pop_fast.compiled.sensitivity import sensitivities
     from pop_fast.compiled.splatting import colors_of_view, covariances, project
     from pop_fast.compiled.tiles import tile_lists
 
-    return Stages(covariances, project, colors_of_view, tile_lists, composite, large_tile)
+    passes = (contributions, sensitivities, screen_moments, dominant_points)
+    return Stages(covariances, project, colors_of_view, tile_lists, composite, large_tile, *passes)

@@ -56,6 +56,7 @@ class Splats:
         opacities: what blends, after the antialiasing factor if any. [N]
         radii: extents in px; both 0 where culled. [N, 2] int32
         compensations: the antialiasing factor, None in classic mode. [N]
+        colors: any number of channels, where what takes the splats reads them. [N, D]
     """
 
     means2d: Tensor
@@ -63,7 +64,19 @@ class Splats:
     conics: Tensor
     opacities: Tensor
     radii: Tensor
-    compensations: Tensor | None
+    compensations: Tensor | None = None
+    colors: Tensor | None = None
+
+
+def colors_of(splats: Splats) -> Tensor:
+    """Return the colours of splats that have some. [N, D]
+
+    Raises:
+        ValueError: they have none.
+    """
+    if splats.colors is None:
+        raise ValueError("the splats have no colours")
+    return splats.colors
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -30,6 +31,13 @@ class TileLists:
     tile_size: int
     tiles_x: int
     tiles_y: int
+
+    @classmethod
+    def of(cls, lists: Sequence[Sequence[int]], width: int, height: int, tile_size: int) -> TileLists:
+        """Take over the oracle's lists: ids front to back, one list a tile, row-major."""
+        lengths = torch.tensor([0, *map(len, lists)])
+        ids = torch.tensor([i for tile in lists for i in tile], dtype=torch.int64)
+        return cls(ids, lengths.cumsum(0), tile_size, *grid_size(width, height, tile_size))
 
     @property
     def lengths(self) -> Tensor:

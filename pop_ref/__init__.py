@@ -1,6 +1,17 @@
 """The oracle: rendering, gradients, dominance, losses and density control, exactly and slowly, in NumPy float64."""
 
-from pop_ref.constants import DECISIONS, GSPLAT_1_5, GSPLAT_1_6, INRIA, KINKS, PAPER, PROFILES, Profile, profile_named
+from pop_ref.constants import (
+    DECISIONS,
+    GSPLAT_1_5,
+    GSPLAT_1_6,
+    INRIA,
+    KINKS,
+    PAPER,
+    PROFILES,
+    SPEEDY_SPLAT,
+    Profile,
+    profile_named,
+)
 from pop_ref.margins import Doubt, Margins, margins
 from pop_ref.render import RenderGradients, render, render_vjp
 from pop_ref.splatting import project, project_vjp
@@ -17,6 +28,7 @@ __all__ = [
     "GSPLAT_1_5",
     "GSPLAT_1_6",
     "INRIA",
+    "SPEEDY_SPLAT",
     "PROFILES",
     "profile_named",
     "DECISIONS",

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from pop_ref._shapes import Float64
 from pop_ref.constants import PAPER, Profile
 from pop_ref.dominance import dominant_counts, dominant_id
 from pop_ref.pixel import BlendGradients, composite_pixel, composite_pixel_vjp, rows_from_splats, zero_gradients
-from pop_ref.tiles import grid_size
+from pop_ref.tiles import listed_pixels
 from pop_ref.types import Render, Splats
 
 __all__ = ["composite", "composite_vjp", "composite_pixel", "composite_pixel_vjp"]
@@ -53,11 +51,11 @@ def composite(
         (array([4.5]), 0)
     """
     rows = rows_from_splats(splats)
-    behind = _background(background, splats.colors.shape[1])
+    behind = background_or_black(background, splats.colors.shape[1])
     image = np.zeros((height, width, len(behind)))
     T_final, dominant_weights = np.zeros((height, width)), np.zeros((height, width))
     dominant_ids, n_blended, n_traversed = (np.zeros((height, width), dtype=np.int64) for _ in range(3))
-    for x, y, ids in _pixels(lists, width, height, tile_size):
+    for x, y, ids in listed_pixels(lists, width, height, tile_size):
         pixel = composite_pixel(ids, rows, x + 0.5, y + 0.5, behind, profile)
         image[y, x] = pixel.color
         T_final[y, x] = pixel.T_final
@@ -110,9 +108,9 @@ def composite_vjp(
     """
     rows = rows_from_splats(splats)
     n_channels = splats.colors.shape[1]
-    behind = _background(background, n_channels)
+    behind = background_or_black(background, n_channels)
     totals = zero_gradients(len(rows.opacities), n_channels)
-    for x, y, ids in _pixels(lists, width, height, tile_size):
+    for x, y, ids in listed_pixels(lists, width, height, tile_size):
         px, py = x + 0.5, y + 0.5
         pixel = composite_pixel(ids, rows, px, py, behind, profile)
         v_T = 0.0 if v_T_final is None else float(v_T_final[y, x])
@@ -120,20 +118,28 @@ def composite_vjp(
     return totals
 
 
-def _background(background: Float64[np.ndarray, " D"] | None, n_channels: int) -> list[float]:
+def background_or_black(background: Float64[np.ndarray, " D"] | None, n_channels: int) -> list[float]:
+    """Unpack a background, or make a black one.
+
+    Source: bookkeeping.
+    Departs: nothing.
+
+    Args:
+        background: colour behind everything, None for black.
+        n_channels: number of colour channels.
+
+    Returns:
+        One number a channel.
+
+    Raises:
+        ValueError: the background has another number of channels.
+
+    Example:
+        >>> background_or_black(None, 2), background_or_black(np.array([0.5]), 1)
+        ([0.0, 0.0], [0.5])
+    """
     if background is None:
         return [0.0] * n_channels
     if background.shape != (n_channels,):
         raise ValueError(f"background has shape {list(background.shape)}; it must be [{n_channels}], as the colours")
     return background.tolist()
-
-
-def _pixels(lists: list[list[int]], width: int, height: int, tile_size: int) -> Iterator[tuple[int, int, list[int]]]:
-    tiles_x, tiles_y = grid_size(width, height, tile_size)
-    if len(lists) != tiles_x * tiles_y:
-        raise ValueError(
-            f"lists has {len(lists)} tiles; {width} x {height} px in {tile_size} px tiles need {tiles_x * tiles_y}"
-        )
-    for y in range(height):
-        for x in range(width):
-            yield x, y, lists[(y // tile_size) * tiles_x + x // tile_size]

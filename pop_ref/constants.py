@@ -1,6 +1,6 @@
 """Named profiles: every constant and every strictness that decides what a render is.
 
-A render is defined by a `Profile`. Four names exist; `paper` is the default and equals `gsplat_1_5`, because POP was
+A render is defined by a `Profile`. Five names exist; `paper` is the default and equals `gsplat_1_5`, because POP was
 built on gsplat 1.5 (clamp 0.999, before 1.6). The profile is a value that is passed, never a global.
 
 Decisions, that is everything discontinuous, carry labels that can be searched for in code, docstrings, margins, CUDA
@@ -16,7 +16,8 @@ The ceiling of 0.99 is the number that float32 kernels hold, 0.9900000095367432.
 0.010000000000000009, over the stop, and the second would be blended.
 
 Sources: diff-gaussian-rasterization 59f5f77 (`inria`), gsplat v1.5.0-1.5.3 (`gsplat_1_5`), gsplat main from 2026-03
-(`gsplat_1_6`: clamp 0.99), the POP paper section 3.1 (transmittance stop `T <= 1e-4`).
+(`gsplat_1_6`: clamp 0.99), Hanson et al. 2025 (Speedy-Splat, `speedy_splat`), the POP paper section 3.1 (transmittance
+stop `T <= 1e-4`).
 """
 
 from __future__ import annotations
@@ -132,7 +133,10 @@ INRIA: Final = Profile(
     tile_size=16,
 )
 
-PROFILES: Final = {p.name: p for p in (PAPER, GSPLAT_1_5, GSPLAT_1_6, INRIA)}
+# Speedy-Splat draws with Inria's constants and lists whatever is bright enough to be seen (SnugBox)
+SPEEDY_SPLAT: Final = replace(INRIA, name="speedy_splat", extent="opacity_aware", extent_sigmas=3.33)
+
+PROFILES: Final = {p.name: p for p in (PAPER, GSPLAT_1_5, GSPLAT_1_6, INRIA, SPEEDY_SPLAT)}
 
 
 def profile_named(name: str) -> Profile:
@@ -142,7 +146,7 @@ def profile_named(name: str) -> Profile:
     Departs: nothing.
 
     Args:
-        name: one of "paper", "gsplat_1_5", "gsplat_1_6", "inria".
+        name: one of "paper", "gsplat_1_5", "gsplat_1_6", "inria", "speedy_splat".
 
     Returns:
         The profile.

@@ -1,4 +1,4 @@
-"""Adam on rows, and the two schedules that training needs: learning rates and the degree of the harmonics.
+"""Adam on rows, and what training needs to know of a step: learning rates, who is moved, the harmonics' degree.
 
 Adam, with t counting updates from 1:
 
@@ -14,12 +14,13 @@ Label decided here: A21 (no learning rate changes with the L2 loss).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
 
-from pop_ref.settings import BETAS, EPS, MAX_SH_DEGREE, LearningRates, Recipe
+from pop_ref.density_config import densifies_at
+from pop_ref.settings import BETAS, EPS, MAX_SH_DEGREE, LearningRates, Recipe, UpdateRules
 
 LEARNING_RATES: Final = LearningRates().by_parameter()
 MAX_STEPS: Final = Recipe.max_steps
@@ -31,7 +32,7 @@ def adam_step(
     grads: Mapping[str, np.ndarray],
     m: Mapping[str, np.ndarray],
     v: Mapping[str, np.ndarray],
-    step: int,
+    step: int | Mapping[str, int],
     lr: Mapping[str, float],
     betas: tuple[float, float] = BETAS,
     eps: float = EPS,
@@ -48,7 +49,7 @@ def adam_step(
         grads: gradient of the loss, shapes as `params`; a key of `params` that it lacks is passed through untouched.
         m: first moments.
         v: second moments.
-        step: number of this update, from 1.
+        step: number of this update, from 1; by name where parameters have had different numbers of updates.
         lr: learning rate of each name.
         betas: decay of the first and second moments.
         eps: keeps the quotient finite.
@@ -65,15 +66,17 @@ def adam_step(
         >>> x["x"].round(12).tolist()
         [0.75]
     """
-    if step < 1:
+    numbers = dict.fromkeys(grads, step) if isinstance(step, int) else step
+    if (isinstance(step, int) and step < 1) or any(number < 1 for number in numbers.values()):
         raise ValueError(f"step is {step}; Adam's updates count from 1")
     beta1, beta2 = betas
     new_params, new_m, new_v = dict(params), dict(m), dict(v)
     for name, g in grads.items():
         new_m[name] = m[name] + (1.0 - beta1) * (g - m[name])
         new_v[name] = beta2 * v[name] + (1.0 - beta2) * g * g
-        denominator = np.sqrt(new_v[name]) / np.sqrt(1.0 - beta2**step) + eps
-        new_params[name] = params[name] - lr[name] / (1.0 - beta1**step) * new_m[name] / denominator
+        t = numbers[name]
+        denominator = np.sqrt(new_v[name]) / np.sqrt(1.0 - beta2**t) + eps
+        new_params[name] = params[name] - lr[name] / (1.0 - beta1**t) * new_m[name] / denominator
     return new_params, new_m, new_v
 
 
@@ -115,11 +118,18 @@ def adam_steps(
 
 
 def means_learning_rate(
-    step: int, scene_scale: float, max_steps: int = MAX_STEPS, rates: LearningRates = Recipe.lr
+    step: int,
+    scene_scale: float,
+    max_steps: int = MAX_STEPS,
+    rates: LearningRates = Recipe.lr,
+    rules: UpdateRules = Recipe.updates,
 ) -> float:
     """Decay the positions' learning rate log-linearly: `1.6e-4 scene_scale 0.01^(step / max_steps)`.
 
-    Source: Kerbl et al. 2023, appendix C; gsplat's exponential decay.
+    Mini-Splatting goes back along this curve, from `means_rewind_iter` to `means_rewind_to`. PUP-3DGS decays until its
+    rounds start; in each round the step is t = `rounds_start_iter` + 1, ..., and the length of the curve the last t.
+
+    Source: Kerbl et al. 2023, appendix C; gsplat's exponential decay; mini-splatting and gaussian-splatting-pup.
     Departs: Inria counts from 1, one step further along the same curve; the delay in its schedule is inert.
 
     Args:
@@ -127,6 +137,7 @@ def means_learning_rate(
         scene_scale: world units.
         max_steps: length of the training.
         rates: at the start.
+        rules: where the curve is left.
 
     Returns:
         The learning rate, world units.
@@ -134,17 +145,33 @@ def means_learning_rate(
     Example:
         >>> means_learning_rate(0, 2.0), round(means_learning_rate(30_000, 2.0) * 1e6, 9)
         (0.00032, 3.2)
+        >>> rules = UpdateRules(means_rewind_iter=15_000, means_rewind_to=5_000)
+        >>> means_learning_rate(16_000, 1.0, rules=rules) == means_learning_rate(6_000, 1.0)
+        True
     """
-    share = min(max(step / max_steps, 0.0), 1.0)
+    start, last = rules.rounds_start_iter, max_steps
+    if start > 0:
+        last = start
+        if step >= start:
+            step, last = start + (step - start) % rules.round_steps + 1, start + rules.round_steps
+    elif 0 < rules.means_rewind_iter <= step:
+        step = step - rules.means_rewind_iter + rules.means_rewind_to
+    share = min(max(step / last, 0.0), 1.0)
     return rates.means * scene_scale * rates.means_decay**share
 
 
 def learning_rates(
-    step: int, scene_scale: float, max_steps: int = MAX_STEPS, rates: LearningRates = Recipe.lr
+    step: int,
+    scene_scale: float,
+    max_steps: int = MAX_STEPS,
+    rates: LearningRates = Recipe.lr,
+    rules: UpdateRules = Recipe.updates,
 ) -> dict[str, float]:
     """List every parameter's learning rate at a step; only the positions' changes, and none with the loss (A21).
 
-    Source: Kerbl et al. 2023; values of gsplat's trainer.
+    In a round of PUP-3DGS the others are multiplied by `round_decay` each `round_decay_every` steps.
+
+    Source: Kerbl et al. 2023; values of gsplat's trainer; gaussian-splatting-pup.
     Departs: Inria's code since October 2024 uses 0.025 for opacities (`settings.INRIA_RATES`).
 
     Args:
@@ -152,6 +179,7 @@ def learning_rates(
         scene_scale: world units.
         max_steps: length of the training.
         rates: at the start.
+        rules: where a rate leaves its curve.
 
     Returns:
         Learning rates by parameter name.
@@ -159,20 +187,82 @@ def learning_rates(
     Example:
         >>> learning_rates(0, 1.0)["opacities"]
         0.05
+        >>> rules = UpdateRules(rounds_start_iter=30_000)
+        >>> learning_rates(30_399, 1.0, rules=rules)["scales"] / learning_rates(0, 1.0)["scales"]
+        0.95
     """
-    return {**rates.by_parameter(), "means": means_learning_rate(step, scene_scale, max_steps, rates)}
+    factor = 1.0
+    if 0 < rules.rounds_start_iter <= step:
+        taken = (step - rules.rounds_start_iter) % rules.round_steps + 1
+        factor = rules.round_decay ** (taken // rules.round_decay_every)
+    found = {name: factor * rate for name, rate in rates.by_parameter().items()}
+    return {**found, "means": means_learning_rate(step, scene_scale, max_steps, rates, rules)}
 
 
-def sh_degree_at(step: int, interval: int = SH_DEGREE_INTERVAL, max_degree: int = MAX_SH_DEGREE) -> int:
+def is_updated(name: str, step: int, recipe: Recipe) -> bool:
+    """Tell whether Adam moves a parameter at a step.
+
+    Source: Inria's training loop (a step that edits the population moves nothing); taming-3dgs (bands beyond the first
+        move each 16 steps, opacities not after 15,000).
+    Departs: nothing.
+
+    Args:
+        name: of the parameter.
+        step: from 0.
+        recipe: its density control, `updates` and `adam_restarts` are read.
+
+    Returns:
+        Whether it is moved.
+
+    Example:
+        >>> [is_updated("shN", step, Recipe(updates=UpdateRules(sh_rest_every=2))) for step in range(4)]
+        [False, True, False, True]
+    """
+    rules = recipe.updates
+    if rules.edits_replace_update and (densifies_at(step, recipe.density) or step in recipe.adam_restarts):
+        return False
+    if name == "opacities" and 0 <= rules.opacities_stop_iter <= step:
+        return False
+    return name != "shN" or (step + 1) % rules.sh_rest_every == 0
+
+
+def update_numbers(names: Iterable[str], step: int, recipe: Recipe) -> dict[str, int]:
+    """Count the updates that each parameter has had when a step has been taken, for those that it moves.
+
+    This is the t of `adam_step`; it starts again where Adam does.
+
+    Source: Kingma and Ba 2015, algorithm 1.
+    Departs: nothing.
+
+    Args:
+        names: of parameters.
+        step: from 0.
+        recipe: as in `is_updated`.
+
+    Returns:
+        t from 1 by name; who is not moved is not in it.
+
+    Example:
+        >>> recipe = Recipe(updates=UpdateRules(sh_rest_every=2), adam_restarts=(1,))
+        >>> [update_numbers(["means", "shN"], step, recipe) for step in range(4)]
+        [{'means': 1}, {'means': 2, 'shN': 1}, {'means': 1}, {'means': 2, 'shN': 1}]
+    """
+    first = 1 + max((restart for restart in recipe.adam_restarts if restart < step), default=-1)
+    moved = [name for name in names if is_updated(name, step, recipe)]
+    return {name: sum(is_updated(name, s, recipe) for s in range(first, step + 1)) for name in moved}
+
+
+def sh_degree_at(step: int, interval: int = SH_DEGREE_INTERVAL, max_degree: int = MAX_SH_DEGREE, start: int = 0) -> int:
     """Raise the degree of the harmonics by one each 1000 steps: `min(step // interval, max_degree)`.
 
-    Source: Kerbl et al. 2023, appendix; gsplat's trainer.
+    Source: Kerbl et al. 2023, appendix; gsplat's trainer; mini-splatting (which starts to count at step 15,000).
     Departs: nothing.
 
     Args:
         step: from 0.
         interval: steps between two raises.
         max_degree: the last degree.
+        start: step from which steps are counted; before it the degree is 0.
 
     Returns:
         The degree that is rendered at this step.
@@ -180,5 +270,7 @@ def sh_degree_at(step: int, interval: int = SH_DEGREE_INTERVAL, max_degree: int 
     Example:
         >>> [sh_degree_at(step) for step in (0, 999, 1000, 2000, 29_999)]
         [0, 0, 1, 2, 3]
+        >>> sh_degree_at(15_999, start=15_000), sh_degree_at(16_000, start=15_000)
+        (0, 1)
     """
-    return min(step // interval, max_degree)
+    return min(max(step - start, 0) // interval, max_degree)

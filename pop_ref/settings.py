@@ -171,6 +171,37 @@ class LearningRates:
         return {**same, "shN": self.sh_rest}
 
 
+@dataclass(frozen=True, kw_only=True)
+class UpdateRules:
+    """When Adam moves which parameter, and how its rates depart from one log-linear decay; the defaults are gsplat's.
+
+    Attributes:
+        edits_replace_update: a step after which Gaussians are added or removed moves nothing, as in Inria's loop, where
+            the edit makes new tensors before Adam is asked; gsplat, since 1.5, moves first.
+        sh_start_iter: step from which the degree of the harmonics is counted; before it is 0 (Mini-Splatting).
+        sh_rest_every: the bands beyond the first move each so many steps, by the sum of their gradients (Taming-3DGS).
+        opacities_stop_iter: first step from which opacities stay as they are (Taming-3DGS); -1 never.
+        means_rewind_iter: step from which the positions' rate is that of an earlier one (Mini-Splatting); 0 never.
+        means_rewind_to: that earlier step.
+        rounds_start_iter: first step of the rounds of pruning and refining that follow a training (PUP-3DGS), whose
+            positions' rate starts each round where the training has ended; 0 none.
+        round_steps: length of a round.
+        round_decay: what all other rates are multiplied by within a round,
+        round_decay_every: each so many steps.
+    """
+
+    edits_replace_update: bool = False
+    sh_start_iter: int = 0
+    sh_rest_every: int = 1
+    opacities_stop_iter: int = -1
+    means_rewind_iter: int = 0
+    means_rewind_to: int = 0
+    rounds_start_iter: int = 0
+    round_steps: int = 5000
+    round_decay: float = 0.95
+    round_decay_every: int = 400
+
+
 POP: Final = DensityConfig()
 GSPLAT: Final = DensityConfig(blur_stop_iter=-1, reset_every=3000)
 # whose opacities move half as fast since October 2024
@@ -187,6 +218,8 @@ class Recipe(Photometric, PopTerm):
         max_steps: length of the training, over which the positions' learning rate decays.
         sh_interval: steps between two raises of the harmonics' degree.
         profile: of the renderer (A24).
+        updates: when Adam moves what.
+        adam_restarts: steps after which Adam begins anew, its moments zero: where all Gaussians are replaced.
     """
 
     density: DensityConfig = POP
@@ -194,3 +227,5 @@ class Recipe(Photometric, PopTerm):
     max_steps: int = 30_000
     sh_interval: int = 1000
     profile: Profile = PAPER
+    updates: UpdateRules = UpdateRules()
+    adam_restarts: tuple[int, ...] = ()

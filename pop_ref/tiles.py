@@ -156,3 +156,33 @@ def tile_lists(
             for x in range(x0, x1):
                 lists[y * tiles_x + x].append(i)
     return lists
+
+
+def listed_pixels(lists: list[list[int]], width: int, height: int, tile_size: int) -> list[tuple[int, int, list[int]]]:
+    """Go through an image row by row, each pixel with the list of its tile.
+
+    Source: Kerbl et al. 2023 (3DGS), algorithm 2.
+    Departs: nothing.
+
+    Args:
+        lists: ids front to back, one list a tile, tiles in row-major order.
+        width: px.
+        height: px.
+        tile_size: px, the one the lists were made with.
+
+    Returns:
+        Column, row, and ids front to back, for each pixel.
+
+    Raises:
+        ValueError: there are not as many lists as tiles.
+
+    Example:
+        >>> listed_pixels([[0, 2], [1]], 3, 1, 2)
+        [(0, 0, [0, 2]), (1, 0, [0, 2]), (2, 0, [1])]
+    """
+    tiles_x, tiles_y = grid_size(width, height, tile_size)
+    if len(lists) != tiles_x * tiles_y:
+        raise ValueError(
+            f"lists has {len(lists)} tiles; {width} x {height} px in {tile_size} px tiles need {tiles_x * tiles_y}"
+        )
+    return [(x, y, lists[(y // tile_size) * tiles_x + x // tile_size]) for y in range(height) for x in range(width)]

@@ -11,7 +11,7 @@ Label decided here: A27 (whose dominant counts).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import isqrt
 
 import numpy as np
@@ -36,7 +36,7 @@ from pop_ref.density import (
     rows_from_params,
     zero_statistics,
 )
-from pop_ref.optimizer import adam_step, learning_rates, sh_degree_at
+from pop_ref.optimizer import adam_step, learning_rates, sh_degree_at, update_numbers
 from pop_ref.polarization import importance_mask, pop_loss, pop_loss_vjp
 from pop_ref.recipes import RECIPES, Recipe
 from pop_ref.render import RenderGradients, render, render_vjp
@@ -53,11 +53,13 @@ class Training:
             is not trained, and goes with its row.
         statistics: of the current densification window.
         step: number of the next step, from 0.
+        waiting: gradients that wait for their parameter's next update (`UpdateRules.sh_rest_every`); absent ones are 0.
     """
 
     rows: Rows
     statistics: Statistics
     step: int = 0
+    waiting: Mapping[str, np.ndarray] = field(default_factory=dict[str, np.ndarray])
 
 
 def start(params: Mapping[str, np.ndarray]) -> Training:
@@ -91,7 +93,8 @@ def train_step(
     """Take one step with one view.
 
     Source: POP paper, section 3; Kerbl et al. 2023, algorithm 1.
-    Departs: Inria edits the population before Adam and so loses that step's update; gsplat, and this, edit it after.
+    Departs: Inria edits the population before Adam and so loses that step's update; gsplat edits it after. Here it is
+        edited after, and `UpdateRules.edits_replace_update` leaves the update out.
 
     Args:
         state: before the step.
@@ -115,18 +118,53 @@ def train_step(
     """
     rows, step = state.rows, state.step
     gaussians = gaussians_from_params(rows.params)
-    degree = sh_degree_at(step, recipe.sh_interval, isqrt(gaussians.sh.shape[1]) - 1)
+    degree = sh_degree_at(step, recipe.sh_interval, isqrt(gaussians.sh.shape[1]) - 1, recipe.updates.sh_start_iter)
     view = render(gaussians, camera, sh_degree=degree, profile=recipe.profile)
     # the dominant counts of this very forward pass say who is important (A27)
     loss, v_image, v_opacities = objective(view, gaussians, target, state, recipe)
     gradients = render_vjp(gaussians, camera, v_image, sh_degree=degree, profile=recipe.profile)
     grads = params_vjp(rows.params, gradients, v_opacities)
-    rates = learning_rates(step, scene_scale, recipe.max_steps, recipe.lr)
-    rows = Rows(*adam_step(rows.params, grads, rows.m, rows.v, step + 1, rates))
+    rows, waiting = update(rows, grads, state, scene_scale, recipe)
     seen = (gradients.means2d, view.splats.visible, view.dominant_counts, camera.width, camera.height)
     statistics = accumulate(state.statistics, *seen, recipe.density)
     rows, statistics = control(rows, statistics, scene_scale, step, normals, recipe.density)
-    return Training(rows, statistics, step + 1), loss
+    # rows that wait are not those of a population that has been edited
+    waiting = {} if densifies_at(step, recipe.density) else waiting
+    return Training(rows, statistics, step + 1, waiting), loss
+
+
+def update(
+    rows: Rows, grads: Mapping[str, np.ndarray], state: Training, scene_scale: float, recipe: Recipe
+) -> tuple[Rows, dict[str, np.ndarray]]:
+    """Let Adam move the parameters whose turn it is; gradients of the bands beyond the first wait for theirs.
+
+    Source: Kingma and Ba 2015, algorithm 1; taming-3dgs for the gradients that wait.
+    Departs: nothing.
+
+    Args:
+        rows: the population.
+        grads: gradients of this step's loss.
+        state: before the step: its number, and the gradients that wait.
+        scene_scale: world units.
+        recipe: rates and rules.
+
+    Returns:
+        The population after the update; the gradients that wait from now on.
+
+    Example:
+        >>> from pop_ref.settings import UpdateRules
+        >>> rows, recipe = rows_from_params({"shN": np.zeros((1, 3, 3))}), Recipe(updates=UpdateRules(sh_rest_every=2))
+        >>> same, waiting = update(rows, {"shN": np.ones((1, 3, 3))}, Training(rows, zero_statistics(1)), 1.0, recipe)
+        >>> float(same.params["shN"].max()), float(waiting["shN"].max())
+        (0.0, 1.0)
+    """
+    summed = {name: g + state.waiting.get(name, 0.0) for name, g in grads.items()}
+    numbers = update_numbers(summed, state.step, recipe)
+    rates = learning_rates(state.step, scene_scale, recipe.max_steps, recipe.lr, recipe.updates)
+    due = {name: summed[name] for name in numbers}
+    moved = Rows(*adam_step(rows.params, due, rows.m, rows.v, numbers, rates))
+    waits = recipe.updates.sh_rest_every > 1 and "shN" in summed and "shN" not in numbers
+    return moved, {"shN": summed["shN"]} if waits else {}
 
 
 def gaussians_from_params(params: Mapping[str, np.ndarray]) -> Gaussians:

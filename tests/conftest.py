@@ -14,6 +14,7 @@ SHAPES_CHECKED = tuple(
         *("activations", "covariance", "harmonics", "camera", "projection", "footprint", "tiles", "compositing"),
         *("dominance", "splatting", "render", "losses", "ssim", "polarization", "density", "density_rows"),
         *("loss_magnitudes", "optimizer", "training", "margins", "extent_margins"),
+        *("contributions", "sensitivity", "fisher", "chord", "selection", "taming", "mini_splatting", "tight_tiles"),
     )
 )
 CHECKERS = ("beartype", "jaxtyping")

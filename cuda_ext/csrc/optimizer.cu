@@ -39,10 +39,9 @@ __global__ void begin_step_kernel(Schedule schedule, StepConstants* constants, D
     if (k < 16) schedule.viewmat[k] = schedule.viewmats[16 * view + k];
     if (k < 9) schedule.K[k] = schedule.Ks[9 * view + k];
     if (k >= N_GROUPS) return;
-    const double share = fmin(double(step) / schedule.max_steps, 1.0);
-    const double decay = k == G_MEANS ? pow(schedule.means_decay, share) : 1.0;
+    const int at = N_GROUPS * step + k;
     constants->adam[k] =
-        adam_step_at<float>(step + 1, schedule.lr[k] * decay, schedule.beta1, schedule.beta2, schedule.eps);
+        adam_step_at<float>(schedule.numbers[at], schedule.rates[at], schedule.beta1, schedule.beta2, schedule.eps);
 }
 
 // two sums over a block in a fixed order; valid in thread 0
@@ -273,6 +272,20 @@ __device__ __forceinline__ void update_short_rows(const UpdateArrays& a, int fir
     }
 }
 
+// The gradient of an update together with those that wait for it. One that is not due leaves them waiting, and its own.
+__device__ __forceinline__ float with_waiting(float* sum, float g, bool due) {
+    if (sum == nullptr) return g;
+    g += *sum;
+    *sum = due ? 0.0f : g;
+    return g;
+}
+
+__device__ __forceinline__ float4 with_waiting(float* sum, float4 g, bool due) {
+    if (sum == nullptr) return g;
+    return {with_waiting(sum, g.x, due), with_waiting(sum + 1, g.y, due), with_waiting(sum + 2, g.z, due),
+            with_waiting(sum + 3, g.w, due)};
+}
+
 // Adam on the bands beyond the first. Bands above the active degree have had no gradient yet: their moments are zero
 // and Adam would not move them.
 template <int DEGREE>
@@ -282,13 +295,18 @@ __device__ __forceinline__ void update_long_rows(const UpdateArrays& a, const Ro
     static_assert(FLOATS > 0);
     const AdamGroup& group = a.groups[G_SHN];
     const AdamStep<float> step = adam_step_of(a, G_SHN);
+    const bool due = step.beta1_rest != 0.0f;
+    float* const waiting = a.sh_rest_sum;
     const int lane = threadIdx.x & (WARP - 1), total = rows * stride.floats;
     const size_t base = size_t(first) * stride.floats;
     if (rows < WARP || !group_in_pieces(group)) {
 #pragma unroll 1
         for (int at = lane; at < total; at += WARP)
-            if (staged_at<FLOATS>(at, stride) >= 0)
-                adam_float(group, base + at, staged_float<FLOATS>(staged.rest, at, stride), step);
+            if (staged_at<FLOATS>(at, stride) >= 0) {
+                const float g = staged_float<FLOATS>(staged.rest, at, stride);
+                float* const sum = waiting == nullptr ? nullptr : waiting + base + at;
+                adam_float(group, base + at, with_waiting(sum, g, due), step);
+            }
         return;
     }
     for (int begin = 4 * lane; begin < total; begin += 4 * WARP * AT_ONCE) {  // per 16 floats of a lane
@@ -303,7 +321,10 @@ __device__ __forceinline__ void update_long_rows(const UpdateArrays& a, const Ro
 #pragma unroll
         for (int k = 0; k < AT_ONCE; ++k) {
             const int at = begin + 4 * WARP * k;
-            if (counts[k]) adam_piece(group, base + at, held[k], staged_piece<FLOATS>(staged.rest, at, stride), step);
+            if (!counts[k]) continue;
+            const float4 g = staged_piece<FLOATS>(staged.rest, at, stride);
+            float* const sum = waiting == nullptr ? nullptr : waiting + base + at;
+            adam_piece(group, base + at, held[k], with_waiting(sum, g, due), step);
         }
     }
 }

@@ -15,9 +15,11 @@ struct AdamStep {
     Real eps;
 };
 
-// in double whatever Real is: 1 - beta2^t loses digits in float
+// in double whatever Real is: 1 - beta2^t loses digits in float. No update has the number 0: it is one that leaves
+// numbers and moments as they are
 template <class Real>
 POP_HD AdamStep<Real> adam_step_at(int step, double lr, double beta1, double beta2, double eps) {
+    if (step == 0) return {Real(0), Real(1), Real(0), Real(1), Real(0), Real(eps)};
     const double first = 1.0 - pow(beta1, double(step)), second = 1.0 - pow(beta2, double(step));
     return {Real(lr / first), Real(1.0 / sqrt(second)), Real(1.0 - beta1), Real(beta2), Real(1.0 - beta2), Real(eps)};
 }

@@ -47,10 +47,9 @@ struct StepConstants {
 };
 
 struct Schedule {
-    const int* views;        // [max_steps], the view of every step
-    double lr[N_GROUPS];
-    double means_decay;      // what the means' rate falls to over max_steps
-    int max_steps;
+    const int* views;        // [steps], the view of every step
+    const double* rates;     // [steps, N_GROUPS], learning rates
+    const int* numbers;      // [steps, N_GROUPS], of the updates, from 1; 0 where a group is not moved
     double beta1, beta2, eps;
     const float* viewmats;   // [views, 16]
     const float* Ks;         // [views, 9]
@@ -62,6 +61,7 @@ struct UpdateArrays {
     AdamGroup groups[N_GROUPS];
     int n, n_rest;               // Gaussians; rows of harmonics beyond the first
     const StepConstants* constants;
+    float* sh_rest_sum;          // [n, n_rest, 3], gradients that wait for an update; null where none do
     const float* sums;           // [n, RECORD]
     const int* dominant_counts;  // [n] or null
     const uint8_t* pop_sides;    // [n], a PopSide each; read where lambda_pop is not 0
@@ -89,7 +89,7 @@ struct PopTerm {
 // what end_step keeps of a step
 struct StepRecord {
     float* values;          // [N_VALUES]
-    float* history;         // [max_steps, N_VALUES]: row `step` is written
+    float* history;         // [steps, N_VALUES]: row `step` is written
     const float* pop_sums;  // [important_blocks(n), 2], or null where the POP term is off
     int n;
     float lambda_pop;

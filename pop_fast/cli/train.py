@@ -19,7 +19,7 @@ from pop_fast.cli.errors import describe
 from pop_fast.cli.said import PLAN, plan_of, said
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.presets import Given
+from pop_fast.train.presets import ALIASES, METHODS, Given
 
 if TYPE_CHECKING:
     from pop_fast.cli.splat import CaptureRecord
@@ -31,6 +31,7 @@ _EXAMPLES: Final = """
     pop train photos --factor 4              a bare folder of photographs: cameras are found first
     pop train scene --method gsplat          the control: gsplat's default strategy, with opacity reset
     pop train scene --method 3dgs            Inria's constants, learning rates, SSIM and rasterizer
+    pop train scene --method taming          or pup, mini-splatting, speedy-splat: the paper's other methods
     pop train scene --out out/a --resume     go on from the last checkpoint
     pop train scene --backend fast           on the CPU, also where a GPU is
     pop train scene --pop.lambda-pop 0.01    any setting, taken as it is; --help-all lists them all
@@ -196,7 +197,7 @@ def _arguments_type(base: TrainConfig, plan: dict[str, Any], short: bool) -> typ
         short: hide what `_SHOWN` does not name.
     """
     kinds = typing.get_type_hints(Given)
-    kinds["method"] = Literal["pop", "gsplat", "3dgs", "adc"]
+    kinds["method"] = Literal[(*METHODS, *ALIASES)]
     columns: list[Any] = [(name, kinds[name], plan.get(name, getattr(Given, name))) for name in PLAN]
     hints = typing.get_type_hints(TrainConfig)
     for field in dataclasses.fields(TrainConfig):

@@ -10,36 +10,19 @@
 
 namespace pop {
 
-// A tile's cotangents, the colour from behind, a chunk's alphas and weights, and what its entries sum up in each lane.
-template <class Real> struct Transpose {
+// A chunk of a tile's list that is blended again from the light before it.
+template <class Real> struct Again {
   const int padded, strips;
-  std::vector<Real> v, behind, alphas, weights, sums;
-  std::vector<uint64_t> marks;  // in which strips an entry blends. [entries of a chunk, words]
+  std::vector<Real> alphas, weights;  // [entries of a chunk, pixels]
+  std::vector<uint64_t> marks;        // in which strips an entry blends. [entries of a chunk, words]
   Entries<Real> entries;
   Rows<Real> rows;
 
-  Transpose(const Pixels<Real> &pixels, int64_t channels)
-      : padded(pixels.padded()), strips(pixels.strips), v((channels + 1) * padded), behind(padded),
-        alphas(CHUNK * padded), weights(CHUNK * padded), sums((channels + 8) * CHUNK * LANES<Real>),
+  explicit Again(const Pixels<Real> &pixels)
+      : padded(pixels.padded()), strips(pixels.strips), alphas(CHUNK * padded), weights(CHUNK * padded),
         marks(CHUNK * words()), rows(pixels.size) {}
 
   int words() const { return (strips + 63) / 64; }
-
-  void begin(const Blend<Real> &blend, const Place<Real> &place) {
-    const int64_t D = blend.channels, n = place.columns();
-    std::fill(v.begin(), v.end(), Real(0));
-    std::fill(behind.begin(), behind.end(), Real(0));
-    place.each_row([&](int64_t pixel, int64_t from) {
-      for (int64_t d = 0; blend.v_image && d < D; d++) {
-        const Real *line = blend.v_image + from * blend.pixel_stride + d * blend.channel_stride;
-        for (int64_t x = 0; x < n; x++) v[d * padded + pixel + x] = line[x * blend.pixel_stride];
-      }
-      if (blend.v_alphas) std::copy_n(blend.v_alphas + from, n, &v[D * padded + pixel]);
-    });
-  }
-
-  // of one column of a chunk's rows: the sums in every lane. [entries of a chunk, lanes]
-  Real *column(int64_t j) { return &sums[j * CHUNK * LANES<Real>]; }
 
   template <bool ROW>
   void blend_again(const Thresholds<Real> &thresholds, const Pixels<Real> &pixels, const Real *lights,
@@ -65,6 +48,37 @@ template <class Real> struct Transpose {
       if (marks[k * words() + word]) return true;
     return false;
   }
+
+  // calls f(strip) for those in which entry k blends
+  template <class F> void each_strip(int k, F f) const {
+    for (int word = 0; word < words(); word++)
+      for (uint64_t left = marks[k * words() + word]; left; left &= left - 1) f(64 * word + __builtin_ctzll(left));
+  }
+};
+
+// A tile's cotangents, the colour from behind, and what a chunk's entries sum up in each lane.
+template <class Real> struct Transpose : Again<Real> {
+  using Again<Real>::padded;
+  std::vector<Real> v, behind, sums;
+
+  Transpose(const Pixels<Real> &pixels, int64_t channels)
+      : Again<Real>(pixels), v((channels + 1) * padded), behind(padded), sums((channels + 8) * CHUNK * LANES<Real>) {}
+
+  void begin(const Blend<Real> &blend, const Place<Real> &place) {
+    const int64_t D = blend.channels, n = place.columns();
+    std::fill(v.begin(), v.end(), Real(0));
+    std::fill(behind.begin(), behind.end(), Real(0));
+    place.each_row([&](int64_t pixel, int64_t from) {
+      for (int64_t d = 0; blend.v_image && d < D; d++) {
+        const Real *line = blend.v_image + from * blend.pixel_stride + d * blend.channel_stride;
+        for (int64_t x = 0; x < n; x++) v[d * padded + pixel + x] = line[x * blend.pixel_stride];
+      }
+      if (blend.v_alphas) std::copy_n(blend.v_alphas + from, n, &v[D * padded + pixel]);
+    });
+  }
+
+  // of one column of a chunk's rows: the sums in every lane. [entries of a chunk, lanes]
+  Real *column(int64_t j) { return &sums[j * CHUNK * LANES<Real>]; }
 };
 
 // B3: what the ceiling lets through of G. G carries the clamped alpha; where the gradient passes as if nothing had been
@@ -130,10 +144,7 @@ void entry_sums(const Blend<Real> &blend, const Thresholds<Real> &thresholds, co
       along_y += by_y < Real(0) ? -by_y : by_y;
     }
   };
-  for (int word = 0; word < state.words(); word++) {
-    uint64_t strips = state.marks[k * state.words() + word];
-    for (; strips; strips &= strips - 1) of_strip(64 * word + __builtin_ctzll(strips));
-  }
+  state.each_strip(k, of_strip);
   const Vec<Real> *moments[6] = {&m, &mx, &my, &mxx, &mxy, &myy};
   for (int j = 0; j < 6; j++) store(state.column(j) + k * LANES<Real>, *moments[j]);
   for (int d = 0; d < D; d++) store(state.column(6 + d) + k * LANES<Real>, colors[d]);

@@ -4,6 +4,7 @@
 
 #include "backward.h"
 #include "colors.h"
+#include "door.h"
 #include "forward.h"
 #include "lists.h"
 #include "moments.h"
@@ -12,16 +13,6 @@
 #include "threads.h"
 
 namespace pop {
-
-template <class Real> void make_splats(const Blend<Real> &blend, Fork fork) {
-  share(fork, blend.threads, blend.n, 4096, [&](int64_t first, int64_t last) {
-    for (int64_t i = first; i < last; i++)
-      blend.splats[i] = splat_of(blend.means2d + 2 * i, blend.conics + 3 * i, blend.opacities[i],
-                                 blend.colors + blend.channels * i, blend.channels);
-  });
-}
-
-constexpr int64_t TILES_AT_A_TIME = 4;
 
 template <class Real> void forward(const Blend<Real> &blend, Fork fork) {
   make_splats(blend, fork);
@@ -46,24 +37,6 @@ template <class Real> void backward(const Blend<Real> &blend, Fork fork) {
 }
 
 }  // namespace pop
-
-// Whether it ran to its end: what throws here is out of memory, and an exception must not leave C.
-template <class F> int ran(F f) noexcept {
-  try {
-    f();
-    return 1;
-  } catch (...) {
-    return 0;
-  }
-}
-
-#define POP_STAGE(name, Layout, function)                                        \
-  int pop_##name##_float32(const pop::Layout<float> *given, pop::Fork fork) {    \
-    return ran([&] { pop::function(*given, fork); });                            \
-  }                                                                              \
-  int pop_##name##_float64(const pop::Layout<double> *given, pop::Fork fork) {   \
-    return ran([&] { pop::function(*given, fork); });                            \
-  }
 
 extern "C" {
 POP_STAGE(covariances, Covariances, covariances)

@@ -24,10 +24,18 @@ import cuda_ext
 from cuda_ext.compiler import find_compiler, no_compiler
 
 HERE: Final = Path(__file__).resolve().parent
-UNITS: Final = ("blend.cpp", "step.cpp", "step_lists.cpp", "step_pixels.cpp", "step_update.cpp", "counts.cpp")
+UNITS: Final = (
+    "blend.cpp",
+    "scores.cpp",
+    "step.cpp",
+    "step_lists.cpp",
+    "step_pixels.cpp",
+    "step_update.cpp",
+    "counts.cpp",
+)
 SOURCES: Final = (
     *("projection.h", "colors.h", "lists.h", "tile.h", "forward.h", "backward.h", "ssim.h", "moments.h"),
-    *("lanes.h", "threads.h", "pool.h", "step.h", "step_rows.h"),
+    *("scores.h", "door.h", "lanes.h", "threads.h", "pool.h", "step.h", "step_rows.h"),
     *UNITS,
 )
 # one Gaussian's arithmetic is that of the CUDA kernels

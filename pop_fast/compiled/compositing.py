@@ -39,10 +39,10 @@ class _Composite(torch.autograd.Function):
             "n_traversed": torch.empty(size, dtype=torch.int32) if options.counts else None,
         }
         n_pairs, n_reached = (torch.empty_like(lists.lengths) for _ in range(2))
-        splats = _aligned(len(means2d), this_library().splat_bytes)
+        splats = aligned_records(len(means2d), this_library().splat_bytes)
         kept = {"n_reached": n_reached, "splats": splats, **(_lights(lists, colors) if options.keep else {})}
         given = {**_arguments(inputs, options), **results, **kept, "n_pairs": n_pairs}
-        call_library(Blend, means2d.dtype, _numbers(inputs, options), given)
+        call_library(Blend, means2d.dtype, blend_numbers(inputs, options), given)
         # saved, not held: autograd lets go of them with the graph
         ctx.options, ctx.kept = options, tuple(kept)
         ctx.save_for_backward(*inputs, *kept.values())
@@ -62,7 +62,7 @@ class _Composite(torch.autograd.Function):
         rows = inputs[0].new_empty((len(options.lists.ids), columns))
         given = {"v_image": v_image, "v_alphas": v_alphas, "rows": rows, "absgrad": absolute}
         given = {**_arguments(inputs, options), **given, **found, **dict(zip(ctx.kept, kept, strict=True))}
-        call_library(BlendBackward, inputs[0].dtype, _numbers(inputs, options), given)
+        call_library(BlendBackward, inputs[0].dtype, blend_numbers(inputs, options), given)
         if sink is not None and absolute is not None:
             sink.add_(absolute.T)
         v_means2d, v_conics, v_opacities, v_colors = found.values()
@@ -78,7 +78,8 @@ def _arguments(inputs: tuple[Tensor, ...], options: BlendOptions) -> dict[str, T
     return {**splats, "ids": options.lists.ids, "offsets": options.lists.offsets}
 
 
-def _numbers(inputs: tuple[Tensor, ...], options: BlendOptions) -> dict[str, float]:
+def blend_numbers(inputs: tuple[Tensor, ...], options: BlendOptions) -> dict[str, float]:
+    """Return the fields of a blend that are numbers."""
     lists, profile, dtype = options.lists, options.profile, inputs[0].dtype
     return {
         "n": len(inputs[0]),
@@ -98,7 +99,7 @@ def _numbers(inputs: tuple[Tensor, ...], options: BlendOptions) -> dict[str, flo
     }
 
 
-def _aligned(n: int, each: int) -> Tensor:
+def aligned_records(n: int, each: int) -> Tensor:
     """Return bytes for n records that begin where lines of the cache do."""
     room = torch.empty((n + 1) * each, dtype=torch.uint8)
     skip = -room.data_ptr() % each

@@ -1,9 +1,20 @@
 // Blend a tile's list front to back. Meaning: `pop_ref.compositing.composite`, `pop_ref.dominance`.
 #pragma once
 
+#include "threads.h"
 #include "tile.h"
 
 namespace pop {
+
+constexpr int64_t TILES_AT_A_TIME = 4;
+
+template <class Real> void make_splats(const Blend<Real> &blend, Fork fork) {
+  share(fork, blend.threads, blend.n, 4096, [&](int64_t first, int64_t last) {
+    for (int64_t i = first; i < last; i++)
+      blend.splats[i] = splat_of(blend.means2d + 2 * i, blend.conics + 3 * i, blend.opacities[i],
+                                 blend.colors + blend.channels * i, blend.channels);
+  });
+}
 
 // A tile's pixels on the way through its list, every array in strips of lanes; and what is known of a chunk.
 template <class Real> struct Canvas {

@@ -107,6 +107,28 @@ class BlendBackward(Blend):
     """The same, for the transpose."""
 
 
+class Scores(Blend):
+    """`pop::Scores` of scores.h, where every field is explained, in its order: sums over pixels for `contributions`."""
+
+    _fields_ = (
+        *_fields(_POINTER, "background", "pixel_map", "facing"),
+        *_fields(_REAL, "fx", "fy", "cx", "cy"),
+        *_fields(_POINTER, "T_final", "totals"),
+    )
+
+
+class SensitivityScores(Scores):
+    """The same, for `sensitivities`."""
+
+
+class MomentScores(Scores):
+    """The same, for `screen_moments`."""
+
+
+class PointScores(Scores):
+    """The same, for `dominant_points`."""
+
+
 class Ssim(ctypes.Structure):
     """`pop::Ssim` of ssim.h, where every field is explained, in its order."""
 
@@ -138,6 +160,10 @@ _NAMES: dict[type[ctypes.Structure], str] = {
     Lists: "lists",
     Blend: "forward",
     BlendBackward: "backward",
+    Scores: "contributions",
+    SensitivityScores: "sensitivities",
+    MomentScores: "screen_moments",
+    PointScores: "dominant_points",
     Ssim: "ssim",
     Moments: "moments",
 }
@@ -284,7 +310,7 @@ def load_library(path: str) -> ctypes.CDLL:
         OSError: it is missing, does not load, or was not made from the same source as this module.
     """
     loaded = ctypes.CDLL(path)
-    for layout in (Covariances, Projection, Colors, Lists, Blend, Ssim, Moments):
+    for layout in (Covariances, Projection, Colors, Lists, Blend, Scores, Ssim, Moments):
         size = getattr(loaded, f"pop_{layout.__name__.lower()}_bytes")
         size.restype = _WHOLE
         if size() != ctypes.sizeof(layout):

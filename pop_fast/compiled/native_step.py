@@ -53,7 +53,8 @@ class StepGiven(ctypes.Structure):
         *_fields(_REAL, "blur_pixels"),
         *_fields(_REAL * len(GROUPS), "lr"),
         *_fields(_REAL, "beta1", "beta2", "eps"),
-        *_fields(_WHOLE, "adam_step"),
+        *_fields(_WHOLE * len(GROUPS), "updates"),
+        *_fields(_POINTER, "sh_rest_sum"),
         *_fields(_POINTER, "grad_sum", "n_visible", "dominant_sum", "blurred"),
         *_fields(_POINTER, "values", "seconds", "bad_row"),
     )
@@ -132,7 +133,7 @@ class NativeTrainer:
         params: raw float32 tensors by gsplat's keys, updated in place.
         m, v: Adam's moments, likewise.
         views: photographs and cameras.
-        order: the view of every step, at least `settings.max_steps` long.
+        order: the view of every step of the schedule.
         settings: objective and update.
         step: the step to begin at.
         threads: None takes torch's number.
@@ -192,7 +193,10 @@ class NativeTrainer:
         # the arguments only point
         self._rows = (dict(params), dict(m), dict(v))
         given.n, given.n_rest = n, params["shN"].shape[1]
-        self.statistics = Statistics.zeros(n, torch.device("cpu"))
+        waits = self.settings.updates.sh_rest_every > 1
+        self.statistics = Statistics.zeros(n, torch.device("cpu"), given.n_rest if waits else None)
+        found = self.statistics.sh_rest_sum
+        given.sh_rest_sum = None if found is None else found.data_ptr()
 
     @property
     def params(self) -> Mapping[str, Tensor]:
@@ -249,7 +253,6 @@ class NativeTrainer:
         given.pop_visible, given.pop_window = settings.pop_over == "visible", settings.pop_views == "window"
         given.blur_own_view = settings.blur_window == "own_view"
         (given.beta1, given.beta2), given.eps = settings.betas, settings.eps
-        given.lr = (_REAL * len(GROUPS))(*(settings.lr[key] for key in GROUPS))
         given.seconds = self._seconds.data_ptr()
         given.bad_row = self._bad_row.data_ptr()
 
@@ -295,8 +298,9 @@ class NativeTrainer:
         given.n_kept = given.width * given.height if view.kept is None else int(view.kept.sum())
         given.n_windows = view.mu_y[0].numel() if view.kept_windows is None else int(view.kept_windows.sum())
         given.blur_pixels = settings.blur_pixels(given.n_kept)
-        decay = settings.means_decay ** min(step / settings.max_steps, 1.0)
-        given.lr[0], given.adam_step = settings.lr["means"] * decay, step + 1
+        rates, numbers, _ = settings.updates
+        given.lr = (_REAL * len(GROUPS))(*rates[step].tolist())
+        given.updates = (_WHOLE * len(GROUPS))(*numbers[step].tolist())
 
     def _target(self, index: int) -> _Target:
         if index in self._targets:

@@ -79,7 +79,7 @@ void Stepper::begin() {
   profile.inria_clamp = g.inria_clamp != 0;
   profile.square = g.square != 0;
   options = {g.antialiased != 0, 0.0f};
-  for (int k = 0; k < GROUPS; k++) adam_steps[k] = adam_step_at<float>(int(g.adam_step), g.lr[k], g.beta1, g.beta2, g.eps);
+  for (int k = 0; k < GROUPS; k++) adam_steps[k] = adam_step_at<float>(int(g.updates[k]), g.lr[k], g.beta1, g.beta2, g.eps);
 
   blend = {};
   blend.n = g.n;

@@ -50,7 +50,8 @@ struct StepGiven {
   int64_t dominance, pop_window, pop_visible, blur_own_view;  // dominance: counts are made
   double blur_pixels;                             // a view's count above it blurs
   double lr[GROUPS], beta1, beta2, eps;
-  int64_t adam_step;                              // from 1
+  int64_t updates[GROUPS];                        // number of the update, from 1; 0 where a group is not moved
+  float *sh_rest_sum;                             // gradients that wait for an update, null where none do. [N, n_rest, 3]
   float *grad_sum;                                // statistics of density control, each null where not asked for. [N]
   int32_t *n_visible, *dominant_sum;
   uint8_t *blurred;
@@ -190,6 +191,7 @@ private:
   float *gradients_of(Worker &own, StepGroup group) const;
   template <int DEGREE> void update_block(Worker &own, int64_t first, int64_t last, double *pop_sum);
   template <int DEGREE> void gradient_of_row(int64_t i, int64_t row, Worker &own);
+  void add_up_rest(const float *gradient, int64_t first, int64_t n);
   void adam(StepGroup group, const float *gradient, int64_t first, int64_t n);
   void finish();
 };

@@ -81,6 +81,7 @@ template <int DEGREE> void Stepper::update_block(Worker &own, int64_t first, int
   for (const StepGroup group : {MEANS, SCALES, QUATS, OPACITIES, SH0})
     adam(group, gradients_of(own, group), ROW_FLOATS[group] * first, ROW_FLOATS[group] * (last - first));
   const int64_t row = 3 * g.n_rest, active = std::min<int64_t>(row, 3 * ((g.degree + 1) * (g.degree + 1) - 1));
+  if (g.sh_rest_sum) return add_up_rest(gradients_of(own, SHN), row * first, row * (last - first));
   if (active == row) return adam(SHN, gradients_of(own, SHN), row * first, row * (last - first));
   // bands that have never been active have neither gradient nor moments: Adam would leave them as they are
   for (int64_t i = first; i < last && active > 0; i++) adam(SHN, gradients_of(own, SHN) + row * (i - first), row * i, active);
@@ -127,7 +128,17 @@ template <int DEGREE> [[gnu::flatten]] void Stepper::gradient_of_row(int64_t i, 
     put(v_rest + 3 * k, {basis[k + 1] * v_sum.x, basis[k + 1] * v_sum.y, basis[k + 1] * v_sum.z});
 }
 
+// Gradients of the bands beyond the first join those that wait; with an update due all are spent.
+void Stepper::add_up_rest(const float *gradient, int64_t first, int64_t n) {
+  float *const sum = given->sh_rest_sum + first;
+  for (int64_t k = 0; k < n; k++) sum[k] += gradient[k];
+  if (given->updates[SHN] == 0) return;
+  adam(SHN, sum, first, n);
+  std::fill(sum, sum + n, 0.0f);
+}
+
 void Stepper::adam(StepGroup group, const float *gradient, int64_t first, int64_t n) {
+  if (given->updates[group] == 0) return;
   adam_on(given->params[group] + first, given->m[group] + first, given->v[group] + first, gradient, n, adam_steps[group]);
 }
 

@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
 
 from pop_fast.data.capture import Capture
 from pop_fast.errors import CaptureError
+from pop_fast.neighbours import mean_squared_distances
 
-__all__ = ["initialize_params"]
+__all__ = ["SH_C0", "initialize_params"]
 
-_SH_C0 = 0.28209479177387814
+SH_C0 = 0.28209479177387814
 
 
 def initialize_params(
@@ -46,14 +46,10 @@ def initialize_params(
         raise CaptureError(f"{capture.name}: has no points to start from; load it again, random points are made then")
     if not 0.0 < init_opacity < 1.0:
         raise CaptureError(f"init_opacity is {init_opacity}; it must be between 0 and 1")
-    nearest = np.zeros((n, 1))
-    if n > 1:
-        # a point is its own nearest neighbour
-        nearest = np.asarray(KDTree(capture.points).query(capture.points, k=min(4, n))[0])[:, 1:]
-    squared = np.maximum(np.mean(nearest**2, axis=1), 1e-7 * capture.scene_scale() ** 2)
+    squared = np.maximum(mean_squared_distances(capture.points), 1e-7 * capture.scene_scale() ** 2)
     sizes = np.log(init_scale * np.sqrt(squared))
     generator = torch.Generator().manual_seed(seed)
-    sh0 = (capture.points_rgb.astype(np.float64) / 255.0 - 0.5) / _SH_C0
+    sh0 = (capture.points_rgb.astype(np.float64) / 255.0 - 0.5) / SH_C0
     return {
         "means": torch.tensor(capture.points, dtype=dtype),
         "scales": torch.tensor(sizes, dtype=dtype)[:, None].repeat(1, 3),

@@ -19,16 +19,68 @@ from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
 
+from pop_ref.settings import MAX_SH_DEGREE
+
 if TYPE_CHECKING:
     from torch import Tensor
     from torch.optim import Optimizer
+
+    from pop_fast.passes import Passes
 
 Params: TypeAlias = MutableMapping[str, Any]
 Optimizers: TypeAlias = "Mapping[str, Optimizer]"
 State: TypeAlias = dict[str, Any]
 Info: TypeAlias = Mapping[str, Any]
-# given n, standard normal draws for the children of n split parents, on the CPU. -> [2, n, 3]
-Normals: TypeAlias = "Callable[[int], Tensor]"
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Where a change of the population takes its random numbers from.
+
+    Attributes:
+        normals: given n, standard normal draws for the children of n split parents, on the CPU. -> [2, n, 3]
+        uniforms: given n, draws from [0, 1), on the CPU. -> [n] float64
+    """
+
+    normals: Callable[[int], Tensor]
+    uniforms: Callable[[int], Tensor]
+
+
+@dataclass(frozen=True)
+class Population:
+    """The Gaussians at a step after which they may change, and what a change may ask for.
+
+    Attributes:
+        params: raw parameters, replaced under their keys.
+        optimizers: one per key.
+        state: the strategy's.
+        step: just taken, from 0.
+        draws: random numbers.
+        passes: over the training views; None in a trainer that has none.
+        sh_degree: colour bands that are drawn.
+    """
+
+    params: Params
+    optimizers: Optimizers
+    state: State
+    step: int
+    draws: Draws
+    passes: Passes | None = None
+    sh_degree: int = MAX_SH_DEGREE
+
+    def __len__(self) -> int:
+        return len(self.params["means"])
+
+    @property
+    def views(self) -> Passes:
+        """Return the passes over the training views.
+
+        Raises:
+            ValueError: the trainer has none.
+        """
+        if self.passes is None:
+            raise ValueError("this strategy looks at the training views when it changes the population; give it passes")
+        return self.passes
 
 
 @dataclass(frozen=True)
@@ -40,17 +92,20 @@ class StepEvent:
         split: Gaussians that two smaller ones replaced.
         pruned: Gaussians that were removed.
         reset: whether all opacities were lowered.
+        replaced: Gaussians that took the place of all there were.
     """
 
     cloned: int = 0
     split: int = 0
     pruned: int = 0
     reset: bool = False
+    replaced: int = 0
 
     def record(self) -> dict[str, Any]:
-        """Return what a record of metrics.jsonl says about it; a reset is mentioned only where there was one."""
+        """Return what a record of metrics.jsonl says about it; what is rare is mentioned only where it happened."""
         counts = {"cloned": self.cloned, "split": self.split, "pruned": self.pruned}
-        return {**counts, "reset": True} if self.reset else counts
+        rare = {"reset": self.reset, "replaced": self.replaced}
+        return {**counts, **{name: value for name, value in rare.items() if value}}
 
 
 @runtime_checkable

@@ -12,17 +12,17 @@ what works on tensors stands in `densify`, which is imported when there are some
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
-from pop_fast.strategies.base import Info, Normals, Optimizers, Params, State, StepEvent, check_layout
-from pop_ref.settings import DensityConfig, PopTerm, ScreenSizeRules
+from pop_fast.strategies.base import Draws, Info, Optimizers, Params, Population, State, StepEvent, check_layout
+from pop_ref.settings import MAX_SH_DEGREE, DensityConfig, PopTerm, ScreenSizeRules, UpdateRules
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from pop_fast.passes import Passes
+
 _NEEDED = ("means", "scales", "quats", "opacities")
-_STEPS = ("prune_too_big_after", "refine_start_iter", "refine_stop_iter", "blur_start_iter", "blur_stop_iter")
-_MORE_STEPS = ("pop_start_iter", "pop_stop_iter", "refine_scale2d_stop_iter")
 # steps between a reset and what it has to be recovered from by; see `DensityControl.scaled`
 _RECOVERY = ("reset_every", "pause_refine_after_reset")
 # a shrunk schedule keeps at least so many steps between changes. They are not a share of the schedule: in them a window
@@ -33,7 +33,7 @@ SHORTEST_REFINE_EVERY = 100
 
 
 @dataclass(frozen=True, kw_only=True)
-class DensityControl(DensityConfig, PopTerm, ScreenSizeRules):
+class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
     """Density control with every rule that a method may have; a method is a set of defaults.
 
     The settings are those of `pop_ref.settings`, named as gsplat's default strategy names them where that has them.
@@ -43,6 +43,13 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules):
         verbose: print a line at every change.
         key_for_gradient: the entry of `info` whose gradient is read.
     """
+
+    # settings that are step numbers, or several of them: what `scaled` multiplies
+    scaled_steps: ClassVar[tuple[str, ...]] = (
+        *("prune_too_big_after", "refine_start_iter", "refine_stop_iter", "blur_start_iter", "blur_stop_iter"),
+        *("pop_start_iter", "pop_stop_iter", "refine_scale2d_stop_iter", "sh_start_iter", "opacities_stop_iter"),
+        *("means_rewind_iter", "means_rewind_to", "rounds_start_iter", "round_steps", "round_decay_every"),
+    )
 
     absgrad: bool = False
     verbose: bool = False
@@ -54,16 +61,17 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules):
         if self.refine_every < 1 or self.reset_every < 0:
             raise ValueError(f"refine_every, reset_every are {self.refine_every}, {self.reset_every}; use >= 1, >= 0")
 
-    def initialize_state(self, scene_scale: float = 1.0, seed: int = 0) -> State:
+    def initialize_state(self, scene_scale: float = 1.0, seed: int = 0, count: int = 0) -> State:
         """Return the state; statistics are allocated at the first step, when the number of Gaussians is known.
 
         Args:
             scene_scale: the unit of `grow_scale3d` and `prune_scale3d`, world units.
-            seed: seeds the noise that places the children of a split.
+            seed: seeds the random numbers that changes of the population take.
+            count: of the first Gaussians, which some methods measure their budget by.
         """
         from pop_fast.strategies import densify
 
-        return densify.initialize_state(scene_scale, seed)
+        return densify.initialize_state(scene_scale, seed, count)
 
     def scaled(self, factor: float) -> Self:
         """Return the same settings on a schedule `factor` times as long.
@@ -72,14 +80,23 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules):
         whichever is less: a shorter schedule has fewer changes, not more hasty ones. Resets come no faster either: what
         one takes away has to be regrown in steps, and those do not get shorter with the schedule.
         """
-        changed = {name: _scaled(getattr(self, name), factor) for name in (*_STEPS, *_MORE_STEPS)}
+        changed: dict[str, Any] = {name: _scaled(getattr(self, name), factor) for name in self.scaled_steps}
         changed |= {name: max(_scaled(getattr(self, name), factor), getattr(self, name)) for name in _RECOVERY}
         floor = min(SHORTEST_REFINE_EVERY, self.refine_every)
         return replace(self, **changed, refine_every=max(round(self.refine_every * factor), floor))
 
+    @property
+    def adam_restarts(self) -> tuple[int, ...]:
+        """Return the steps after which Adam begins anew."""
+        return ()
+
     def needs_dominance(self, step: int) -> bool:
         """Tell whether `info["dominant_counts"]` is read at this step: by the POP loss, the blur rule or a window."""
         return self.regularizes(step) or self.collects_blur(step) or self.collects_window(step)
+
+    def needs_passes(self, step: int) -> bool:
+        """Tell whether the change after this step looks at the training views."""
+        return False
 
     def regularizes(self, step: int) -> bool:
         """Tell whether `regularizer` adds the POP loss at this step."""
@@ -166,7 +183,14 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules):
             densify.collect(self, params, state, step, info, packed)
 
     def change(
-        self, params: Params, optimizers: Optimizers, state: State, step: int, normals: Normals | None = None
+        self,
+        params: Params,
+        optimizers: Optimizers,
+        state: State,
+        step: int,
+        draws: Draws | None = None,
+        passes: Passes | None = None,
+        sh_degree: int = MAX_SH_DEGREE,
     ) -> StepEvent | None:
         """Do what is due after a step whose statistics are collected.
 
@@ -175,18 +199,49 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules):
             optimizers: one per key.
             state: the strategy's state.
             step: counts from 0.
-            normals: draws that place the children of a split; None takes them from the state's generator.
+            draws: random numbers; None takes them from the state's generator.
+            passes: over the training views, which some methods look at.
+            sh_degree: colour bands that those are drawn with.
 
         Returns:
             What happened, or None where nothing is due.
+
+        Raises:
+            ValueError: the method needs passes, and there are none.
         """
         if not self.changes_after(step):
             return None
+        import torch
+
         from pop_fast.strategies import densify
 
-        return densify.change(self, params, optimizers, state, step, normals)
+        draws = draws or densify.draws_of(state["generator"])
+        with torch.no_grad():
+            return self.edit(Population(params, optimizers, state, step, draws, passes, sh_degree))
+
+    def edit(self, of: Population) -> StepEvent:
+        """Do what is due after a step after which the population changes: refine, then reset."""
+        event = self.refine(of) if self.is_refine_step(of.step) else StepEvent()
+        return self.reset(of, event)
+
+    def refine(self, of: Population) -> StepEvent:
+        """Clone, split and prune by the window's statistics."""
+        from pop_fast.strategies import densify
+
+        return densify.refine(self, of, *densify.who_grows(self, of), lambda: densify.who_goes(self, of))
+
+    def reset(self, of: Population, event: StepEvent) -> StepEvent:
+        """Reset opacities if it is time, and say so in the event."""
+        if not self.is_reset_step(of.step):
+            return event
+        from pop_fast.strategies import densify
+
+        densify.reset(self, of)
+        return replace(event, reset=True)
 
 
-def _scaled(step: int, factor: float) -> int:
+def _scaled(step: Any, factor: float) -> Any:
+    if isinstance(step, tuple):
+        return tuple(_scaled(one, factor) for one in step)
     # -1 is no step but "never"
-    return round(step * factor) if step > 0 else step
+    return max(round(step * factor), 1) if step > 0 else step

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -10,12 +10,12 @@ from torch import Tensor
 from pop_fast.density import SPLIT_CHILDREN, Statistics, blur_set, grow_masks, prune_mask
 from pop_fast.polarization import importance_mask, pop_loss
 from pop_fast.strategies import ops
-from pop_fast.strategies.base import Info, Normals, Optimizers, Params, State, StepEvent
+from pop_fast.strategies.base import Draws, Info, Params, Population, State, StepEvent
 from pop_fast.strategies.control import DensityControl
 from pop_fast.strategies.info import dominant_counts, visible_from_radii, visible_in
 
 
-def initialize_state(scene_scale: float, seed: int) -> State:
+def initialize_state(scene_scale: float, seed: int, count: int) -> State:
     """Return the state before the first step; see `DensityControl.initialize_state`."""
     generator = torch.Generator().manual_seed(seed)
     return {
@@ -25,7 +25,9 @@ def initialize_state(scene_scale: float, seed: int) -> State:
         "blurred": None,
         "dominant_sum": None,
         "radii": None,
+        "sh_rest_sum": None,
         "scene_scale": float(scene_scale),
+        "first_count": count,
         "generator": generator,
     }
 
@@ -85,81 +87,99 @@ def _collect_blur(plan: DensityControl, state: State, info: Info) -> None:
     state["blurred"] = blurred
 
 
-@torch.no_grad()
-def change(
-    plan: DensityControl,
-    params: Params,
-    optimizers: Optimizers,
-    state: State,
-    step: int,
-    normals: Normals | None,
+def draws_of(generator: torch.Generator) -> Draws:
+    """Draw from a generator on the CPU."""
+    return Draws(
+        normals=lambda n: standard_normals(generator, n),
+        uniforms=lambda n: torch.rand(n, generator=generator, dtype=torch.float64),
+    )
+
+
+def refine(
+    plan: DensityControl, of: Population, clones: Tensor, splits: Tensor, prunes: Callable[[], Tensor]
 ) -> StepEvent:
-    """Do what is due after a step; see `DensityControl.change`."""
-    event = StepEvent()
-    if plan.is_refine_step(step):
-        draws = normals or (lambda n: standard_normals(state["generator"], n))
-        cloned, split = _grow(plan, params, optimizers, state, step, draws)
-        event = StepEvent(cloned, split, _prune(plan, params, optimizers, state, step))
-        _clear(state)
-        if plan.verbose:
-            print(f"step {step}: {event}, {len(params['means'])} Gaussians")
-    if plan.is_reset_step(step):
-        ops.reset_opacities(params, optimizers, ceiling=plan.reset_opa)
-        event = replace(event, reset=True)
-    return event
+    """Clone, split, prune, and start a new window.
 
-
-def _grow(
-    plan: DensityControl, params: Params, optimizers: Optimizers, state: State, step: int, normals: Normals
-) -> tuple[int, int]:
-    clones, splits = _grow_masks(plan, params, state, step)
+    Args:
+        plan: the strategy.
+        of: the population.
+        clones: who is cloned. [N] bool
+        splits: who is split. [N] bool
+        prunes: asked of the grown population who of it is pruned. -> bool
+    """
     n_clones, n_splits = int(clones.sum()), int(splits.sum())
     if n_clones:
-        ops.clone(params, optimizers, state, clones)
+        ops.clone(of.params, of.optimizers, of.state, clones)
     if n_splits:
         # a clone of this event is never split in it
         padded = torch.cat([splits, splits.new_zeros(n_clones)])
-        ops.split(params, optimizers, state, padded, normals(n_splits), plan.revised_opacity)
-    return n_clones, n_splits
+        ops.split(of.params, of.optimizers, of.state, padded, of.draws.normals(n_splits), plan.revised_opacity)
+    event = StepEvent(n_clones, n_splits, prune(of, prunes()))
+    clear(of.state)
+    if plan.verbose:
+        print(f"step {of.step}: {event}, {len(of)} Gaussians")
+    return event
 
 
-def _grow_masks(plan: DensityControl, params: Params, state: State, step: int) -> tuple[Tensor, Tensor]:
-    blurred = state.get("blurred")
-    none = torch.zeros_like(state["count"], dtype=torch.bool)
-    statistics = Statistics(
+def prune(of: Population, mask: Tensor) -> int:
+    """Remove the selected Gaussians and return how many they were."""
+    n_pruned = int(mask.sum())
+    if n_pruned:
+        ops.prune(of.params, of.optimizers, of.state, mask)
+    return n_pruned
+
+
+def who_grows(plan: DensityControl, of: Population) -> tuple[Tensor, Tensor]:
+    """Return who is cloned and who is split; see `pop_ref.density.grow_masks`. [N] bool each"""
+    state = of.state
+    masks = grow_masks(window(state), torch.exp(of.params["scales"]), state["scene_scale"], of.step, plan)
+    if of.step < plan.refine_scale2d_stop_iter:
+        return masks[0], masks[1] | (state["radii"] > plan.grow_scale2d)
+    return masks
+
+
+def window(state: State) -> Statistics:
+    """Return what the window has collected."""
+    blurred, none = state.get("blurred"), torch.zeros_like(state["count"], dtype=torch.bool)
+    return Statistics(
         grad_sum=state["grad2d"],
         n_visible=state["count"],
         n_views=state["views"],
         dominant_sum=none,
         blurred=none if blurred is None else blurred,
     )
-    clones, splits = grow_masks(statistics, torch.exp(params["scales"]), state["scene_scale"], step, plan)
-    return clones, splits | (state["radii"] > plan.grow_scale2d) if step < plan.refine_scale2d_stop_iter else splits
 
 
-def _prune_mask(plan: DensityControl, params: Params, state: State, step: int) -> Tensor:
-    opacities = torch.sigmoid(params["opacities"].flatten())
-    mask = prune_mask(opacities, torch.exp(params["scales"]), state["scene_scale"], step, plan)
-    if plan.prune_too_big_after < step < plan.refine_scale2d_stop_iter:
+def who_goes(plan: DensityControl, of: Population) -> Tensor:
+    """Return who is too faint or too big; see `pop_ref.density.prune_mask`. [N] bool"""
+    opacities, state = torch.sigmoid(of.params["opacities"].flatten()), of.state
+    mask = prune_mask(opacities, torch.exp(of.params["scales"]), state["scene_scale"], of.step, plan)
+    if plan.prune_too_big_after < of.step < plan.refine_scale2d_stop_iter:
         mask |= state["radii"] > plan.prune_scale2d
     return mask
 
 
-def _prune(plan: DensityControl, params: Params, optimizers: Optimizers, state: State, step: int) -> int:
-    mask = _prune_mask(plan, params, state, step)
-    n_pruned = int(mask.sum())
-    if n_pruned:
-        ops.prune(params, optimizers, state, mask)
-    return n_pruned
+def reset(plan: DensityControl, of: Population) -> None:
+    """Lower all opacities to the ceiling of a reset."""
+    ops.reset_opacities(of.params, of.optimizers, ceiling=plan.reset_opa)
 
 
-def _clear(state: State) -> None:
+def clear(state: State) -> None:
+    """Start a new window."""
     state["grad2d"].zero_()
     state["count"].zero_()
     state["views"] = 0
-    state["blurred"] = state["dominant_sum"] = None
+    # rows that wait are not those of a population that has been edited
+    state["blurred"] = state["dominant_sum"] = state["sh_rest_sum"] = None
     if state["radii"] is not None:
         state["radii"].zero_()
+
+
+def forget(state: State) -> None:
+    """Leave a window behind whose Gaussians are gone."""
+    state["grad2d"] = state["count"] = state["radii"] = None
+    state["blurred"] = state["dominant_sum"] = state["sh_rest_sum"] = None
+    state["views"] = 0
 
 
 def standard_normals(generator: torch.Generator, n: int) -> Tensor:

@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pop_fast.strategies.base import Info, Normals, Optimizers, Params, State, StepEvent, Strategy
+from pop_fast.strategies.base import Draws, Info, Optimizers, Params, State, StepEvent, Strategy
+from pop_ref.settings import MAX_SH_DEGREE
 
 
 class ForeignStrategy:
@@ -39,7 +40,7 @@ class ForeignStrategy:
         """See `Strategy.check_sanity`."""
         self.strategy.check_sanity(params, optimizers)
 
-    def initialize_state(self, scene_scale: float = 1.0, seed: int = 0) -> State:
+    def initialize_state(self, scene_scale: float = 1.0, seed: int = 0, count: int = 0) -> State:
         """Return the strategy's own state and, unless it has one, a generator for its random numbers."""
         own = self.strategy.initialize_state(scene_scale=scene_scale)
         self._lends = "generator" not in own
@@ -53,6 +54,10 @@ class ForeignStrategy:
     def changes_after(self, step: int) -> bool:
         """Tell whether the population may change after this step: always."""
         return True
+
+    def needs_passes(self, step: int) -> bool:
+        """Tell whether the change after this step looks at the training views: gsplat's protocol has none."""
+        return False
 
     def regularizer(self, opacities: Tensor, state: State, step: int, info: Info) -> Tensor | None:
         """Return the term that it adds to the loss, or None."""
@@ -68,7 +73,14 @@ class ForeignStrategy:
         self._info = info
 
     def change(
-        self, params: Params, optimizers: Optimizers, state: State, step: int, normals: Normals | None = None
+        self,
+        params: Params,
+        optimizers: Optimizers,
+        state: State,
+        step: int,
+        draws: Draws | None = None,
+        passes: Any = None,
+        sh_degree: int = MAX_SH_DEGREE,
     ) -> StepEvent | None:
         """Call `step_post_backward`."""
         info, self._info = self._info, None

@@ -1,4 +1,4 @@
-"""Density control with opacity reset: gsplat's default strategy, and Inria's 3DGS, which differs at the threshold."""
+"""Density control with opacity reset: gsplat's default strategy, and Inria's 3DGS, which other methods are built on."""
 
 from __future__ import annotations
 
@@ -26,6 +26,13 @@ class GsplatStrategy(DensityControl):
 
 @dataclass(frozen=True, kw_only=True)
 class InriaStrategy(GsplatStrategy):
-    """The same as Inria's code has it: a gradient at the threshold grows."""
+    """The same as Inria's code has it: a gradient at the threshold grows, and a step that edits the population moves
+    nothing."""
 
     inclusive: bool = RECIPES["3DGS"].density.inclusive
+    edits_replace_update: bool = RECIPES["3DGS"].updates.edits_replace_update
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inria2023Strategy(InriaStrategy):
+    """The same as before October 2024, with opacities that move twice as fast, which is up to a learning rate."""

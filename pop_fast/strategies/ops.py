@@ -112,3 +112,27 @@ def reset_opacities(params: Params, optimizers: Optimizers, ceiling: float) -> N
     for value in optimizers["opacities"].state.get(opacities, {}).values():
         if isinstance(value, Tensor) and value.shape == opacities.shape:
             value.zero_()
+
+
+@torch.no_grad()
+def replace_rows(params: Params, optimizers: Optimizers, state: State, rows: Mapping[str, Tensor]) -> None:
+    """Let new Gaussians take the place of all there are, with Adam anew; per-Gaussian statistics are left with no rows.
+
+    Args:
+        params: raw parameters.
+        optimizers: one per key.
+        state: the strategy's state.
+        rows: every parameter of the new Gaussians.
+    """
+    none = torch.zeros(len(params["means"]), dtype=torch.bool, device=params["means"].device)
+    edit_rows(params, optimizers, state, keep=none, appended=rows)
+    restart(params, optimizers)
+
+
+@torch.no_grad()
+def restart(params: Params, optimizers: Optimizers) -> None:
+    """Forget all moments, and that there have been updates."""
+    for key, optimizer in optimizers.items():
+        for value in optimizer.state.get(params[key], {}).values():
+            if isinstance(value, Tensor):
+                value.zero_()

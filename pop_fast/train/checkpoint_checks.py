@@ -93,7 +93,7 @@ def check_content(content: Mapping[str, Any]) -> dict[str, Any]:
         **content,
         "splats": splats,
         "optimizers": {key: _moments(packed[key], f"optimizers.{key}", splats[key], step + 1) for key in KEYS},
-        "strategy": _strategy(content["strategy"], len(splats["means"]), step + 1),
+        "strategy": _strategy(content["strategy"], list(splats["shN"].shape), step + 1),
         "view_order": _view_order(content["view_order"]),
         "seconds": {key: _number(value, f"seconds.{key}") for key, value in seconds.items()},
     }
@@ -106,8 +106,10 @@ def _moments(packed: Any, name: str, param: Tensor, taken: int) -> dict[str, Ten
     found = _mapping(packed, name, _MOMENTS)
     like = list(param.shape)
     checked = {"step": _own(_tensor(found["step"], f"{name}.step", torch.float32), [], f"{name}.step")}
-    if checked["step"].item() != taken:
-        raise ValueError(f"{name}.step is {checked['step'].item():g}; it must be {taken}, the steps taken")
+    counted = float(checked["step"])
+    if not (0 <= counted <= taken and counted.is_integer()):
+        most = f"a whole number of updates, at most {taken}, the steps taken"
+        raise ValueError(f"{name}.step is {checked['step'].item():g}; it must be {most}")
     for key in _MOMENTS[1:]:
         checked[key] = _own(_tensor(found[key], f"{name}.{key}", torch.float32), like, f"{name}.{key}")
     bad = first_non_finite({"exp_avg": checked["exp_avg"]})
@@ -117,7 +119,7 @@ def _moments(packed: Any, name: str, param: Tensor, taken: int) -> dict[str, Ten
     return checked
 
 
-def _strategy(packed: Any, n: int, taken: int) -> dict[str, Any]:
+def _strategy(packed: Any, sh_rest: list[int], taken: int) -> dict[str, Any]:
     found = _mapping(packed, "strategy", ("generator",), others=True)
     checked = {**found, "generator": _generator(found["generator"], "strategy.generator")}
     if "views" in found:
@@ -126,13 +128,16 @@ def _strategy(packed: Any, n: int, taken: int) -> dict[str, Any]:
         checked["scene_scale"] = _number(found["scene_scale"], "strategy.scene_scale")
     for key in _ROWS.keys() & found.keys():
         if found[key] is not None:
-            checked[key] = _own(_tensor(found[key], f"strategy.{key}", _ROWS[key]), [n], f"strategy.{key}")
+            checked[key] = _own(_tensor(found[key], f"strategy.{key}", _ROWS[key]), sh_rest[:1], f"strategy.{key}")
             if checked[key].dtype != torch.bool:
                 _check_not_negative(checked[key], f"strategy.{key}")
-    for key in found.keys() - _ROWS.keys() - {"generator", "views", "scene_scale"}:
+    for key in found.keys() - _ROWS.keys() - {"generator", "views", "scene_scale", "sh_rest_sum"}:
         # of a strategy of other people
         name = shown(key).strip("'")
         checked[key] = _plain(found[key], f"strategy.{name}")
+    if found.get("sh_rest_sum") is not None:
+        waiting = _tensor(found["sh_rest_sum"], "strategy.sh_rest_sum", torch.float32)
+        checked["sh_rest_sum"] = _own(waiting, sh_rest, "strategy.sh_rest_sum")
     if (found.get("grad2d") is None) != (found.get("count") is None):
         raise ValueError("strategy.grad2d and strategy.count must both be tensors or both be None")
     return checked

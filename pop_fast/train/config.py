@@ -44,7 +44,8 @@ class TrainConfig:
         backend: what renders and trains: "fast" (CPU), "compiled" (CPU, with kernels in C++), "cuda", "ref" (the
             oracle, slow), or "auto": "cuda" where a GPU and the build are there, else "compiled" where that was
             compiled, else "fast".
-        profile: the rasterizer's constants: "paper", "gsplat_1_5", "gsplat_1_6" or "inria" (that of method "3dgs").
+        profile: the rasterizer's constants: "paper", "gsplat_1_5", "gsplat_1_6", "inria" (that of method "3dgs" and of
+            those built on it) or "speedy_splat".
         antialiased: render with opacity compensation (Mip-Splatting) instead of classically.
         factor: photographs are shrunk by it.
         resize: how, where the capture does not bring them shrunk: "area" averages, "bicubic" does as Pillow does, and
@@ -86,7 +87,7 @@ class TrainConfig:
     max_steps: int = Recipe.max_steps
     seed: int = 42
     backend: Literal["auto", "fast", "compiled", "cuda", "ref"] = "auto"
-    profile: Literal["paper", "gsplat_1_5", "gsplat_1_6", "inria"] = "paper"
+    profile: Literal["paper", "gsplat_1_5", "gsplat_1_6", "inria", "speedy_splat"] = "paper"
     antialiased: bool = False
     factor: int = 1
     resize: Literal["area", "bicubic"] = "area"

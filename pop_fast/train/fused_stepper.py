@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from cuda_ext.train_settings import Phase, Statistics, StepSettings, StepStats
+from cuda_ext.train_settings import Phase, Statistics, StepSettings, StepStats, Updates
 from pop_fast.density import blur_set
 from pop_fast.strategies.base import State
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.model import KEYS, learning_rates
+from pop_fast.train.model import KEYS
 from pop_fast.train.stepper import Task
 from pop_fast.train.views import ViewTensors
 from pop_ref.constants import PROFILES
@@ -86,7 +86,7 @@ class FusedStepper:
         m, v = ({key: moments[key][name] for key in KEYS} for name in ("exp_avg", "exp_avg_sq"))
         if self.fused is None:
             task = self.task
-            settings = step_settings(task.config, task.scene_scale)
+            settings = step_settings(task.config, task.updates)
             self.fused = self.make(rows, m, v, task.views, task.order, settings, self.step)
         else:
             self.fused.rebind(rows, m, v)
@@ -100,8 +100,10 @@ class FusedStepper:
         finally:
             self.step = self.fused.step
         self._take_statistics(self.fused.statistics, first, last, phase)
-        for key, param in self._params.items():
-            self._optimizers[key].state[param]["step"].fill_(float(last))
+        numbers = self.task.updates.numbers[first:last].amax(0).tolist()
+        for key, number in zip(KEYS, numbers, strict=True):
+            if number > 0:
+                self._optimizers[key].state[self._params[key]]["step"].fill_(float(number))
         return self.fused.step_stats(first, last)
 
     def facts(self) -> dict[str, Any]:
@@ -114,6 +116,8 @@ class FusedStepper:
         if phase.statistics:
             state["grad2d"], state["count"] = found.grad_sum.clone(), found.n_visible.to(found.grad_sum.dtype)
             state["views"] += last - first
+        if found.sh_rest_sum is not None:
+            state["sh_rest_sum"] = found.sh_rest_sum.clone()
         summed = phase.blur and pop.blur_window == "sum"
         if summed or phase.window:
             state["dominant_sum"] = found.dominant_sum.long()
@@ -129,8 +133,8 @@ class FusedStepper:
     def _give_statistics(self, found: Statistics) -> None:
         """Go on from the strategy's state: after a checkpoint, or a change that kept the window."""
         given = {"grad2d": found.grad_sum, "count": found.n_visible, "dominant_sum": found.dominant_sum}
-        for key, target in {**given, "blurred": found.blurred}.items():
-            if self._state.get(key) is not None:
+        for key, target in {**given, "blurred": found.blurred, "sh_rest_sum": found.sh_rest_sum}.items():
+            if target is not None and self._state.get(key) is not None:
                 target.copy_(self._state[key])
 
 
@@ -151,18 +155,16 @@ def unsupported(config: TrainConfig) -> str | None:
     return None
 
 
-def step_settings(config: TrainConfig, scene_scale: float) -> StepSettings:
+def step_settings(config: TrainConfig, updates: Updates) -> StepSettings:
     """Return what stays the same over a run.
 
     Args:
         config: step numbers as they are run.
-        scene_scale: the unit of the means' learning rate.
+        updates: whom Adam moves at which step.
     """
     pop = config.strategy
     return StepSettings(
-        learning_rates(config.lr, scene_scale),
-        config.max_steps,
-        means_decay=config.lr.means_decay,
+        updates,
         padding=config.ssim_padding,
         d_ssim_halved=config.d_ssim_halved,
         pixelwise_scale=1.0 / config.photometric_divisor,

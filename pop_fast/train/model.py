@@ -10,11 +10,12 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
+from cuda_ext.train_settings import GROUPS, Updates
 from pop_fast.activations import scales_from_log_scales
-from pop_fast.train.schedule import means_lr
-from pop_ref.settings import BETAS, EPS, LearningRates
+from pop_fast.strategies.base import State
+from pop_ref.settings import BETAS, EPS
 
-KEYS: Final = ("means", "scales", "quats", "opacities", "sh0", "shN")
+KEYS: Final = GROUPS
 
 
 class _Moments(Adam):
@@ -27,27 +28,14 @@ class _Moments(Adam):
     add_param_group = getattr(Optimizer.add_param_group, "__wrapped__", Optimizer.add_param_group)
 
 
-def learning_rates(lr: LearningRates, scene_scale: float) -> dict[str, float]:
-    """Return the learning rate of each parameter, the means' at step 0 and in world units.
-
-    Args:
-        lr: the settings.
-        scene_scale: the unit of the means' rate, world units.
-    """
-    return {**lr.by_parameter(), "means": lr.means * scene_scale}
-
-
-def make_optimizers(params: Mapping[str, Parameter], lr: LearningRates, scene_scale: float) -> dict[str, Adam]:
-    """Make one dense Adam a parameter, its moments zero, the counter of steps on the CPU.
+def make_optimizers(params: Mapping[str, Parameter]) -> dict[str, Adam]:
+    """Make one dense Adam a parameter, its moments zero, the counter of updates on the CPU; `adam_step` sets its rate.
 
     Args:
         params: raw parameters by name.
-        lr: the settings.
-        scene_scale: the unit of the means' learning rate, world units.
     """
-    rates = learning_rates(lr, scene_scale)
     made: dict[str, Adam] = {
-        key: _Moments([param], lr=rates[key], betas=BETAS, eps=EPS, fused=True) for key, param in params.items()
+        key: _Moments([param], lr=0.0, betas=BETAS, eps=EPS, fused=True) for key, param in params.items()
     }
     for key, optimizer in made.items():
         moments = {name: torch.zeros_like(params[key].detach()) for name in ("exp_avg", "exp_avg_sq")}
@@ -56,41 +44,41 @@ def make_optimizers(params: Mapping[str, Parameter], lr: LearningRates, scene_sc
 
 
 def adam_step(
-    params: Mapping[str, Parameter],
-    optimizers: Mapping[str, Adam],
-    lr: LearningRates,
-    scene_scale: float,
-    step: int,
-    max_steps: int,
-    sh_degree: int,
+    params: Mapping[str, Parameter], optimizers: Mapping[str, Adam], updates: Updates, step: int, state: State
 ) -> None:
-    """Move every parameter along its gradient, and forget the gradients; see `pop_ref.optimizer.adam_steps`.
+    """Move every parameter whose turn it is by its gradient, and forget the gradients; see `pop_ref.training.update`.
+
+    A parameter without a gradient, as the bands beyond the first are while band 0 alone is drawn, waits: with zero
+    moments Adam would not move it.
 
     Args:
         params: raw parameters with gradients.
         optimizers: one per key.
-        lr: the rates; that of the means decays over `max_steps`.
-        scene_scale: the unit of the means' rate, world units.
+        updates: of all steps.
         step: counts from 0.
-        max_steps: length of the schedule.
-        sh_degree: highest colour band that was drawn; at 0 the harmonics beyond it wait, with their counter going on.
+        state: holds the gradients that wait for an update, under "sh_rest_sum".
     """
-    optimizers["means"].param_groups[0]["lr"] = means_lr(step, max_steps, lr.means * scene_scale, lr.means_decay)
-    for key, optimizer in optimizers.items():
-        if key == "shN" and sh_degree == 0:
-            advance_idle(optimizer, params[key])
-        else:
+    rates, numbers = updates.rates[step].tolist(), updates.numbers[step].tolist()
+    for key, rate, number in zip(GROUPS, rates, numbers, strict=True):
+        if key not in params:
+            continue
+        param, optimizer = params[key], optimizers[key]
+        if key == "shN" and updates.sh_rest_every > 1:
+            _wait(param, state, number > 0)
+        if number > 0:
+            counter = optimizer.state[param]["step"]
+            counter.fill_(float(number - 1))
+            optimizer.param_groups[0]["lr"] = rate
             optimizer.step()
+            counter.fill_(float(number))
         optimizer.zero_grad(set_to_none=True)
 
 
-def advance_idle(optimizer: Adam, param: Tensor) -> None:
-    """Advance Adam's step counter as a step with a zero gradient and zero moments would, which changes nothing else.
-
-    With g = m = v = 0 the update is `lr * 0 / (0 + eps) = 0` and m and v stay 0; the counter has to go on because the
-    bias corrections `1 - beta^step` read it.
-    """
-    optimizer.state[param]["step"] += 1
+def _wait(param: Parameter, state: State, due: bool) -> None:
+    """Let the gradient join those that wait or, with an update due, be their sum."""
+    waiting = state.get("sh_rest_sum")
+    found = waiting if param.grad is None else param.grad if waiting is None else waiting + param.grad
+    param.grad, state["sh_rest_sum"] = (found, None) if due else (None, found)
 
 
 def first_non_finite(tensors: Mapping[str, Tensor]) -> tuple[str, list[int], float] | None:

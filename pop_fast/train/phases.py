@@ -20,7 +20,7 @@ def phase_at(config: TrainConfig, strategy: DensityControl | ForeignStrategy, st
     kind, weight = config.photometric_at(step)
     own = isinstance(strategy, DensityControl)
     return Phase(
-        sh_degree=active_sh_degree(step, config.sh_interval, config.sh_degree),
+        sh_degree=active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter),
         pop=own and strategy.regularizes(step),
         statistics=own and strategy.collects(step),
         blur=own and strategy.collects_blur(step),

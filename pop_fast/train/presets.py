@@ -20,13 +20,23 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import Any, Final, Literal, NamedTuple, Self
+from typing import Any, Final, Literal, NamedTuple, Self, TypeAlias
 
 from pop_fast.errors import PopError
-from pop_fast.strategies import DensityControl, GsplatStrategy, InriaStrategy, POPStrategy
+from pop_fast.strategies import (
+    DensityControl,
+    GsplatStrategy,
+    Inria2023Strategy,
+    InriaStrategy,
+    MiniSplattingStrategy,
+    POPStrategy,
+    PupStrategy,
+    SpeedySplatStrategy,
+    TamingStrategy,
+)
 from pop_fast.train.jsonable import from_plain, to_plain
-from pop_ref.recipes import RECIPES, Recipe
-from pop_ref.settings import DensityConfig, PopTerm
+from pop_ref.recipes import BASELINES, RECIPES, Recipe
+from pop_ref.settings import DensityConfig, PopTerm, UpdateRules
 
 
 class Method(NamedTuple):
@@ -40,7 +50,13 @@ METHODS: Final = {
     "pop": Method(POPStrategy, RECIPES["POP"]),
     "gsplat": Method(GsplatStrategy, RECIPES["gsplat"]),
     "3dgs": Method(InriaStrategy, RECIPES["3DGS"]),
+    "3dgs-2023": Method(Inria2023Strategy, RECIPES["3DGS 2023"]),
+    "pup": Method(PupStrategy, BASELINES["PUP-3DGS"]),
+    "mini-splatting": Method(MiniSplattingStrategy, BASELINES["Mini-Splatting"]),
+    "taming": Method(TamingStrategy, BASELINES["Taming-3DGS"]),
+    "speedy-splat": Method(SpeedySplatStrategy, BASELINES["Speedy-Splat"]),
 }
+MethodName: TypeAlias = Literal["pop", "gsplat", "3dgs", "3dgs-2023", "pup", "mini-splatting", "taming", "speedy-splat"]
 # what the control was called when there was one
 ALIASES: Final = {"adc": "gsplat"}
 QUICK_SCALER: Final = 0.1
@@ -59,8 +75,9 @@ class Given:
     """What a run was asked for: what gives its defaults, and what was said besides.
 
     Attributes:
-        method: "pop", "gsplat" for gsplat's default strategy, or "3dgs" for Inria's constants, learning rates, SSIM and
-            rasterizer.
+        method: "pop", "gsplat" for gsplat's default strategy, "3dgs" for Inria's constants, learning rates, SSIM and
+            rasterizer, "3dgs-2023" for those before October 2024, and on top of these "pup", "mini-splatting",
+            "taming" and "speedy-splat".
         preset: "paper" is the whole schedule; "quick" a tenth of it, for a CPU, in which a Gaussian must dominate more
             than 10 pixels to count as blur, and none is pruned for its size. It gives defaults: what is said besides
             wins.
@@ -70,7 +87,7 @@ class Given:
         settings: what was said, as plain values by dotted name.
     """
 
-    method: Literal["pop", "gsplat", "3dgs"] = "pop"
+    method: MethodName = "pop"
     preset: Literal["paper", "quick"] = "paper"
     steps_scaler: float | None = None
     scale_lambda_pop: bool = False
@@ -188,7 +205,8 @@ def options_for(recipe: Recipe) -> list[str]:
 def _options(recipe: Recipe, method: str) -> list[str]:
     base = METHODS[method].recipe
     pairs = [(name, values_of(recipe)[name], value) for name, value in values_of(base).items()]
-    for kind, ours, theirs in ((DensityConfig, recipe.density, base.density), (PopTerm, recipe, base)):
+    groups = ((DensityConfig, recipe.density, base.density), (PopTerm, recipe, base))
+    for kind, ours, theirs in (*groups, (UpdateRules, recipe.updates, base.updates)):
         pairs += [(f"{method}.{f.name}", getattr(ours, f.name), getattr(theirs, f.name)) for f in fields(kind)]
     rates = [(f"lr.{f.name}", getattr(recipe.lr, f.name), getattr(base.lr, f.name)) for f in fields(recipe.lr)]
     chosen = [] if method == Given.method else ["--method", method]

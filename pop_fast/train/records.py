@@ -9,7 +9,6 @@ from typing import Any
 from cuda_ext.train_settings import Phase, StepStats
 from pop_fast.strategies.base import StepEvent
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.schedule import means_lr
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class Stretch:
 
 
 def record_of(
-    stretch: Stretch, step: int, config: TrainConfig, scene_scale: float, seconds_before: float
+    stretch: Stretch, step: int, config: TrainConfig, lr_means: float, seconds_before: float
 ) -> dict[str, Any] | None:
     """Make the record of a step, or None where none is due: every `log_every` steps there is one, and at every event.
 
@@ -48,7 +47,7 @@ def record_of(
         stretch: that the step belongs to.
         step: its number.
         config: step numbers as they are run.
-        scene_scale: unit of the means' learning rate, world units.
+        lr_means: learning rate of the means at that step, world units.
         seconds_before: of training, before the stretch.
     """
     place = step - stretch.first
@@ -72,7 +71,7 @@ def record_of(
         **({"pop": stats.pop} if stretch.phase.pop or stats.pop != 0.0 else {}),
         "num_gaussians": stretch.before if event is None else stretch.after,
         "sh_degree": stretch.phase.sh_degree,
-        "lr_means": means_lr(step, config.max_steps, config.lr.means * scene_scale, config.lr.means_decay),
+        "lr_means": lr_means,
         "it_per_s": len(stretch.stats) / stretch.seconds,
         "seconds": seconds_before + stretch.seconds * (place + 1) / len(stretch.stats),
         **({} if event is None else event.record()),

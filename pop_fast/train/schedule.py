@@ -1,20 +1,79 @@
-"""What depends on the step number alone: the learning rate of the means, the active colour bands, the view order."""
+"""What depends on the step number alone: rates and numbers of Adam's updates, active colour bands, the view order."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
+
+from cuda_ext.train_settings import GROUPS, Updates, steady_updates
+from pop_ref.settings import LearningRates, UpdateRules
+
+__all__ = ["Updates", "ViewOrder", "active_sh_degree", "steady_updates", "updates_of"]
 
 
-def means_lr(step: int, max_steps: int, initial: float, decay: float) -> float:
-    """Return the means' learning rate, log-linear from start to end: `initial * decay^(step / max_steps)`."""
-    return initial * decay ** min(step / max_steps, 1.0)
+def updates_of(
+    lr: LearningRates,
+    scene_scale: float,
+    max_steps: int,
+    rules: UpdateRules | None = None,
+    edits: Sequence[int] = (),
+    restarts: Sequence[int] = (),
+) -> Updates:
+    """List the rates and the numbers of all updates of a run; see `pop_ref.optimizer`.
+
+    Args:
+        lr: the rates to begin with.
+        scene_scale: the unit of the means' rate, world units.
+        max_steps: length of the run, over which the means' rate decays.
+        rules: whom Adam moves when; None moves all at every step.
+        edits: steps after which Gaussians are added or removed.
+        restarts: steps after which Adam begins anew.
+    """
+    rules = rules or UpdateRules()
+    steps = torch.arange(max_steps, dtype=torch.float64)
+    base = {**lr.by_parameter(), "means": lr.means * scene_scale}
+    rates = torch.tensor([base[name] for name in GROUPS], dtype=torch.float64).repeat(max_steps, 1)
+    rates *= _round_factor(steps, rules)[:, None]
+    rates[:, GROUPS.index("means")] = base["means"] * lr.means_decay ** _share(steps, max_steps, rules)
+    moved = torch.ones((max_steps, len(GROUPS)), dtype=torch.bool)
+    if rules.edits_replace_update:
+        moved[[step for step in (*edits, *restarts) if step < max_steps]] = False
+    if rules.opacities_stop_iter >= 0:
+        moved[rules.opacities_stop_iter :, GROUPS.index("opacities")] = False
+    moved[:, GROUPS.index("shN")] &= (steps + 1) % rules.sh_rest_every == 0
+    numbers = moved.cumsum(0)
+    for step in sorted(step for step in restarts if step < max_steps):
+        numbers[step + 1 :] -= numbers[step].clone()
+    return Updates(rates, (numbers * moved).to(torch.int32), rules.sh_rest_every)
 
 
-def active_sh_degree(step: int, interval: int, degree: int) -> int:
-    """Return the highest active colour band: one more every `interval` steps, from 0."""
-    return min(step // interval, degree)
+def _share(steps: Tensor, max_steps: int, rules: UpdateRules) -> Tensor:
+    """Return how much of the means' decay lies behind each step."""
+    start = rules.rounds_start_iter
+    if start > 0:
+        in_rounds = start + (steps - start) % rules.round_steps + 1.0
+        return torch.where(steps < start, steps / start, in_rounds / (start + rules.round_steps))
+    at = steps
+    if rules.means_rewind_iter > 0:
+        back = rules.means_rewind_iter - rules.means_rewind_to
+        at = torch.where(steps < rules.means_rewind_iter, steps, steps - back)
+    return (at / max_steps).clamp_(0.0, 1.0)
+
+
+def _round_factor(steps: Tensor, rules: UpdateRules) -> Tensor:
+    """Return what a round of pruning and refining has multiplied the rates by."""
+    start = rules.rounds_start_iter
+    taken = (steps - start) % rules.round_steps + 1
+    factor = rules.round_decay ** (taken // rules.round_decay_every)
+    return torch.where((steps >= start) & (start > 0), factor, 1.0)
+
+
+def active_sh_degree(step: int, interval: int, degree: int, start: int = 0) -> int:
+    """Return the highest active colour band: from step `start` on one more every `interval` steps, from 0."""
+    return min(max(step - start, 0) // interval, degree)
 
 
 class ViewOrder:

@@ -10,7 +10,7 @@ import torch
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from cuda_ext.train_settings import Phase, StepStats
+from cuda_ext.train_settings import Phase, StepStats, Updates
 from pop_fast.backends import Backend
 from pop_fast.strategies.base import State
 from pop_fast.strategies.control import DensityControl
@@ -61,7 +61,7 @@ class Task:
         strategy: the population's.
         views: to train on.
         order: the view of every step, `config.max_steps` of them.
-        scene_scale: unit of the means' learning rate, world units.
+        updates: whom Adam moves at which step.
         step: steps taken.
     """
 
@@ -69,7 +69,7 @@ class Task:
     strategy: DensityControl | ForeignStrategy
     views: Sequence[ViewTensors]
     order: Sequence[int]
-    scene_scale: float
+    updates: Updates
     step: int
 
 

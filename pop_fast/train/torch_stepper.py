@@ -64,8 +64,7 @@ class TorchStepper:
         loss.backward()
         self._require_finite(loss, index, step)
         stats = self._measured(rendered, index, step, phase, objective, term)
-        config, scale = self._task.config, self._task.scene_scale
-        adam_step(params, optimizers, config.lr, scale, step, config.max_steps, phase.sh_degree)
+        adam_step(params, optimizers, self._task.updates, step, state)
         strategy.collect(params, state, step, rendered.info)
         self.step = step + 1
         return stats

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +28,9 @@ from pop_fast.data.capture import Capture
 from pop_fast.data.initialize import initialize_params
 from pop_fast.errors import PopError
 from pop_fast.io.ply import save_ply
-from pop_fast.strategies.base import StepEvent, Strategy
-from pop_fast.strategies.densify import standard_normals
+from pop_fast.passes import Passes
+from pop_fast.strategies.base import Draws, StepEvent, Strategy
+from pop_fast.strategies.densify import draws_of
 from pop_fast.strategies.foreign import ForeignStrategy
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.choose import choose_backend
@@ -45,7 +47,7 @@ from pop_fast.train.phases import phase_at, stretch_end
 from pop_fast.train.preflight import check_start, check_views
 from pop_fast.train.records import Stretch, record_of
 from pop_fast.train.results import ResultFolder
-from pop_fast.train.schedule import ViewOrder, active_sh_degree
+from pop_fast.train.schedule import Updates, ViewOrder, active_sh_degree, updates_of
 from pop_fast.train.signals import stop_requests
 from pop_fast.train.stepper import Engine, Stepper, Task
 from pop_fast.train.views import ViewTensors
@@ -61,6 +63,7 @@ class TrainingRun:
         strategy: the population's.
         state: the strategy's state.
         step: steps taken.
+        updates: whom Adam moves at which step.
     """
 
     def __init__(
@@ -98,10 +101,13 @@ class TrainingRun:
         self.config = replace(config, backend=self._engine.name)
         self._resume, self._overwrite, self._beside = resume, overwrite, beside or {}
         self._prepare_capture(capture, initial)
-        self.optimizers = make_optimizers(self.params, self.config.lr, self._scene_scale)
+        self.optimizers = make_optimizers(self.params)
         self.strategy = self.config.strategy if strategy is None else ForeignStrategy(strategy)
         self.strategy.check_sanity(self.params, self.optimizers)
-        self.state = self.strategy.initialize_state(self._scene_scale, seed=self.config.seed)
+        self.state = self.strategy.initialize_state(
+            self._scene_scale, seed=self.config.seed, count=len(self.params["means"])
+        )
+        self.updates = self._updates()
         self.step = 0
         self._stepper: Stepper | None = None
         self._train_seconds = 0.0
@@ -109,6 +115,13 @@ class TrainingRun:
         self._started = 0.0
         # the first Gaussians' opacities while the folder is still as it was found
         self._unwritten: np.ndarray | None = None
+
+    def _updates(self) -> Updates:
+        config, plan = self.config, self.strategy
+        if isinstance(plan, ForeignStrategy):
+            return updates_of(config.lr, self._scene_scale, config.max_steps)
+        edits = [step for step in range(config.max_steps) if plan.is_refine_step(step)]
+        return updates_of(config.lr, self._scene_scale, config.max_steps, plan, edits, plan.adam_restarts)
 
     def _prepare_capture(self, capture: Capture, initial: Mapping[str, Tensor] | None) -> None:
         config = self.config
@@ -226,13 +239,23 @@ class TrainingRun:
         """Let density control edit the population, if that is due."""
         if not self.strategy.changes_after(step):
             return None
-        event = self.strategy.change(self.params, self.optimizers, self.state, step, self.normals)
+        config = self.config
+        degree = active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter)
+        passes = self._passes if self.strategy.needs_passes(step) else None
+        given = (self.params, self.optimizers, self.state, step, self.draws)
+        event = self.strategy.change(*given, passes=passes, sh_degree=degree)
         self.stepper.rebind(self.params, self.optimizers, self.state)
         return event
 
-    def normals(self, n: int) -> Tensor:
-        """Draw what places the children of n split parents, the same numbers whatever takes the steps. [2, n, 3]"""
-        return standard_normals(self.state["generator"], n)
+    @cached_property
+    def draws(self) -> Draws:
+        """What changes of the population are decided by, the same numbers whatever takes the steps."""
+        return draws_of(self.state["generator"])
+
+    @cached_property
+    def _passes(self) -> Passes:
+        """What a change of the population sees of the training views."""
+        return Passes.of(self._engine.backend, self._train, self.config, self._engine.device)
 
     @property
     def stepper(self) -> Stepper:
@@ -243,7 +266,7 @@ class TrainingRun:
             ahead = ViewOrder(len(self._train), self.config.seed)
             ahead.load_state_dict(self._order.state_dict())
             order = [0] * self.step + [ahead.next() for _ in range(self.step, self.config.max_steps)]
-            task = Task(self.config, self.strategy, self._train, order, self._scene_scale, self.step)
+            task = Task(self.config, self.strategy, self._train, order, self.updates, self.step)
             self._stepper = self._engine.make_stepper(task)
             with words_for_memory():
                 self._stepper.rebind(self.params, self.optimizers, self.state)
@@ -257,7 +280,7 @@ class TrainingRun:
         moments = ckpt.pack_optimizers(self.optimizers)
         with words_for_memory():
             self.params = {key: Parameter(self.params[key].detach().to(device)) for key in KEYS}
-            self.optimizers = make_optimizers(self.params, self.config.lr, self._scene_scale)
+            self.optimizers = make_optimizers(self.params)
             for key, found in moments.items():
                 there = {name: value if name == "step" else value.to(device) for name, value in found.items()}
                 self.optimizers[key].state[self.params[key]] = there
@@ -267,7 +290,8 @@ class TrainingRun:
     def _log(self, stretch: Stretch, bar: tqdm) -> None:
         """Write the records of a stretch."""
         for step in range(stretch.first, self.step):
-            record = record_of(stretch, step, self.config, self._scene_scale, self._train_seconds)
+            lr_means = float(self.updates.rates[step, KEYS.index("means")])
+            record = record_of(stretch, step, self.config, lr_means, self._train_seconds)
             if record is not None:
                 self._results.log(record)
                 bar.set_postfix_str(f"PSNR {record['psnr']:.2f}, N {record['num_gaussians']:,}", refresh=False)
@@ -300,7 +324,7 @@ class TrainingRun:
             **self._facts(),
         }
         self._results.write_stats("train", step, {**stats, "ellipse_time": self._train_seconds})
-        degree = active_sh_degree(step, config.sh_interval, config.sh_degree)
+        degree = active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter)
         folder = self._results if step + 1 == config.max_steps else None
         stats |= evaluate(self._engine.backend, self.params, self._test, config, degree, self._nets, folder, step)
         stats["seconds_total"] = self._total_seconds
@@ -346,7 +370,7 @@ class TrainingRun:
         threads, n_views = torch.get_num_threads(), len(self._train)
         ckpt.check_fits(path, content, self.config, self._fingerprint(), threads, n_views, self.state.keys())
         self.params = {key: Parameter(content["splats"][key]) for key in KEYS}
-        self.optimizers = make_optimizers(self.params, self.config.lr, self._scene_scale)
+        self.optimizers = make_optimizers(self.params)
         ckpt.unpack_optimizers(self.optimizers, content["optimizers"])
         ckpt.unpack_strategy(self.state, content["strategy"])
         self._order.load_state_dict(content["view_order"])

@@ -17,7 +17,6 @@ from pop_ref.density_config import DensityConfig
 # of the Adam counter that rows are given, and of steps at which nothing but statistics happens
 COUNTER, QUIET_STEP = 7.0, 1
 # long enough that the means' rate has not begun to fall
-NO_DECAY = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -65,6 +64,7 @@ class Trainer:
         self._model: Any = importlib.import_module(f"{package}.train.model")
         self._schedule: Any = importlib.import_module(f"{package}.train.schedule")
         self._config: Any = importlib.import_module(f"{package}.train.config")
+        self._Draws: Any = importlib.import_module(f"{package}.strategies.base").Draws
         self._Strategy: Any = importlib.import_module(f"{package}.strategies").POPStrategy
 
     def rows_from_params(self, params: Mapping[str, Any]) -> Rows:
@@ -158,7 +158,7 @@ class Trainer:
         strategy = self._strategy(config)
         params, optimizers = self._population(rows.params, rows)
         state = self._state(strategy, statistics, scene_scale)
-        strategy.change(params, optimizers, state, step, normals)
+        strategy.change(params, optimizers, state, step, self._Draws(normals, None))
         return self._rows(params, optimizers), self._statistics(state, statistics.grad_sum)
 
     def adam_step(
@@ -171,8 +171,8 @@ class Trainer:
         lr: Mapping[str, float],
     ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
         """See `pop_ref.optimizer.adam_step`; the trainer chooses betas and eps."""
-        leaves, optimizers = self._population(params, Rows(params, m, v), float(step - 1), lr)
-        self._move(leaves, optimizers, grads, lr)
+        leaves, optimizers = self._population(params, Rows(params, m, v))
+        self._move(leaves, optimizers, grads, lr, step)
         moved = self._rows(leaves, optimizers)
         return dict(moved.params), dict(moved.m), dict(moved.v)
 
@@ -180,18 +180,17 @@ class Trainer:
         self, params: Mapping[str, Any], grads: Sequence[Mapping[str, Any]], lr: Mapping[str, float]
     ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
         """See `pop_ref.optimizer.adam_steps`; only the harmonics beyond the first band can wait."""
-        leaves, optimizers = self._population(params, lr=lr)
-        for given in grads:
-            self._move(leaves, optimizers, given, lr)
+        leaves, optimizers = self._population(params)
+        for step, given in enumerate(grads, start=1):
+            self._move(leaves, optimizers, given, lr, step)
         moved = self._rows(leaves, optimizers)
         return dict(moved.params), dict(moved.m), dict(moved.v)
 
     def learning_rates(self, step: int, scene_scale: float) -> dict[str, float]:
         """See `pop_ref.optimizer.learning_rates`."""
-        lr, leaves = self._config.LearningRates(), {key: self._leaf(self._torch.zeros(1)) for key in self._model.KEYS}
-        optimizers = self._model.make_optimizers(leaves, lr, scene_scale)
-        self._model.adam_step(leaves, optimizers, lr, scene_scale, step, self._config.TrainConfig().max_steps, 0)
-        return {key: optimizer.param_groups[0]["lr"] for key, optimizer in optimizers.items()}
+        config = self._config.TrainConfig()
+        rates = self._schedule.updates_of(config.lr, scene_scale, config.max_steps).rates[step].tolist()
+        return dict(zip(self._model.KEYS, rates, strict=True))
 
     def means_learning_rate(self, step: int, scene_scale: float) -> float:
         """See `pop_ref.optimizer.means_learning_rate`."""
@@ -202,15 +201,11 @@ class Trainer:
         config = self._config.TrainConfig()
         return int(self._schedule.active_sh_degree(step, config.sh_interval, config.sh_degree))
 
-    def _move(self, leaves: Any, optimizers: Any, grads: Mapping[str, Any], lr: Mapping[str, float]) -> None:
+    def _move(self, leaves: Any, optimizers: Any, grads: Mapping[str, Any], lr: Mapping[str, float], step: int) -> None:
         for key, grad in grads.items():
             leaves[key].grad = grad.clone()
-        degree = 0 if "shN" in leaves and "shN" not in grads else 1
-        self._model.adam_step(leaves, optimizers, self._rates(lr), 1.0, 0, NO_DECAY, degree)
-
-    def _rates(self, lr: Mapping[str, float]) -> Any:
-        own = {"sh_rest" if key == "shN" else key: rate for key, rate in lr.items()}
-        return self._config.LearningRates(**own)
+        rates = {key: lr.get(key, 0.0) for key in self._model.KEYS}
+        self._model.adam_step(leaves, optimizers, self._schedule.steady_updates(rates, step), step - 1, {})
 
     def _leaf(self, tensor: Any) -> Any:
         return self._torch.nn.Parameter(tensor.clone())
@@ -220,11 +215,10 @@ class Trainer:
         params: Mapping[str, Any],
         moments: Rows | None = None,
         counter: float = COUNTER,
-        lr: Mapping[str, float] | None = None,
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return leaves and the trainer's optimizers of them, with these moments or as they are made."""
         leaves = {key: self._leaf(value) for key, value in params.items()}
-        optimizers = self._model.make_optimizers(leaves, self._rates(lr or {}), 1.0)
+        optimizers = self._model.make_optimizers(leaves)
         if moments is not None:
             for key, leaf in leaves.items():
                 optimizers[key].state[leaf] = {

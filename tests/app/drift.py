@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from cuda_ext.train_settings import Phase, Statistics, StepSettings, StepStats
+from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, StepStats
 from pop_fast.backends import get_backend
 from pop_fast.train.engines import LONGEST_ON_GPU
 from pop_fast.train.fused_stepper import FusedStepper
@@ -34,7 +34,7 @@ class Drift:
         settings: StepSettings,
         step: int,
     ) -> None:
-        assert len(order) == settings.max_steps
+        assert len(order) == len(settings.updates.rates)
         self.views, self.order, self.settings, self.step = views, order, settings, step
         self.grown = 0
         self.runs: list[tuple[int, int, Phase]] = []
@@ -62,12 +62,13 @@ class Drift:
         """Nothing; for tests."""
 
     def _one(self, view: int, phase: Phase) -> StepStats:
+        rates = dict(zip(GROUPS, self.settings.updates.rates[self.step].tolist(), strict=True))
         found, shift = self.statistics, torch.cos(self.params["means"].sum(1) + view)
         for name, rows in self.params.items():
             step = shift.reshape(-1, *[1] * (rows.dim() - 1))
             self.m[name].mul_(0.9).add_(0.1 * step)
             self.v[name].mul_(0.9).add_(0.1 * step * step)
-            rows.add_(self.settings.lr[name] * self.m[name] / (self.v[name].sqrt() + 1.0))
+            rows.add_(rates[name] * self.m[name] / (self.v[name].sqrt() + 1.0))
         if phase.statistics:
             found.grad_sum.add_(0.02 * shift.abs())
             found.n_visible.add_((shift > -0.5).int())

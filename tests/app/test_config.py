@@ -11,6 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cuda_ext.train_settings import GROUPS
 from pop_fast.cli.train import arguments
 from pop_fast.density import blur_set
 from pop_fast.errors import PopError
@@ -20,7 +21,10 @@ from pop_fast.train.config import first_difference
 from pop_fast.train.jsonable import to_plain
 from pop_fast.train.presets import METHODS, Given
 from pop_fast.train.results import read_config
-from pop_fast.train.schedule import ViewOrder, active_sh_degree, means_lr
+from pop_fast.train.schedule import ViewOrder, active_sh_degree, updates_of
+from pop_ref.density import densifies_at
+from pop_ref.optimizer import learning_rates, update_numbers
+from pop_ref.recipes import BASELINES, RECIPES
 
 
 def test_the_defaults_are_the_papers_schedule():
@@ -185,15 +189,39 @@ def test_a_label_cannot_be_carried_by_settings_that_do_not_follow_it():
     assert (read.max_steps, read.preset) == (2500, None)
 
 
-def test_the_means_rate_falls_log_linearly_to_a_hundredth():
-    assert means_lr(0, 100, 2.0, 0.01) == 2.0
-    assert means_lr(50, 100, 2.0, 0.01) == pytest.approx(0.2)
-    assert means_lr(100, 100, 2.0, 0.01) == means_lr(200, 100, 2.0, 0.01) == pytest.approx(0.02)
+@pytest.mark.parametrize("recipe", [*RECIPES.values(), *BASELINES.values()], ids=[*RECIPES, *BASELINES])
+def test_a_run_moves_whom_the_oracle_moves_when_and_as_far(recipe):
+    rules = replace(
+        recipe.updates,
+        sh_start_iter=recipe.updates.sh_start_iter // 100,
+        opacities_stop_iter=recipe.updates.opacities_stop_iter // 100,
+        means_rewind_iter=recipe.updates.means_rewind_iter // 100,
+        means_rewind_to=recipe.updates.means_rewind_to // 100,
+        rounds_start_iter=recipe.updates.rounds_start_iter // 100,
+        round_steps=50,
+        round_decay_every=4,
+    )
+    density = replace(recipe.density, refine_start_iter=5, refine_stop_iter=150, refine_every=7)
+    short = replace(
+        recipe,
+        density=density,
+        updates=rules,
+        max_steps=recipe.max_steps // 100,
+        adam_restarts=tuple(step // 100 for step in recipe.adam_restarts),
+    )
+    edits = [step for step in range(short.max_steps) if densifies_at(step, density)]
+    found = updates_of(short.lr, 2.5, short.max_steps, rules, edits, short.adam_restarts)
+    for step in range(short.max_steps):
+        wanted = learning_rates(step, 2.5, short.max_steps, short.lr, rules)
+        assert found.rates[step].tolist() == pytest.approx([wanted[name] for name in GROUPS], rel=1e-14)
+        numbers = update_numbers(GROUPS, step, short)
+        assert found.numbers[step].tolist() == [numbers.get(name, 0) for name in GROUPS]
 
 
 def test_colour_bands_open_one_every_interval():
     assert [active_sh_degree(s, 1000, 3) for s in (0, 999, 1000, 2999, 3000, 29_999)] == [0, 0, 1, 2, 3, 3]
     assert active_sh_degree(5000, 1000, 1) == 1
+    assert [active_sh_degree(s, 1000, 3, 15_000) for s in (0, 15_999, 16_000, 18_000)] == [0, 0, 1, 3]
 
 
 def test_every_epoch_shows_every_view_once():

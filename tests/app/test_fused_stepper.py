@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from cuda_ext.arrays import CudaMemoryError
+from cuda_ext.train_settings import GROUPS
 from pop_fast.errors import PopError
 from pop_fast.strategies import POPStrategy
 from pop_fast.train import TrainingRun
@@ -16,6 +17,7 @@ from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.engines import LONGEST_ON_GPU
 from pop_fast.train.fused_stepper import step_settings, unsupported
 from pop_fast.train.phases import phase_at, stretch_end
+from pop_fast.train.schedule import updates_of
 from tests.app.drift import Drift, drift_engine
 from tests.app.tiny import HEIGHT, WIDTH, last_checkpoint, tiny_capture, tiny_config
 
@@ -177,9 +179,8 @@ def test_settings_that_the_device_does_not_know_are_refused_before_anything_star
 
 def test_the_fused_step_gets_the_learning_rates_in_its_own_words():
     config = tiny_config("x")
-    settings = step_settings(config, 2.0)
-    assert settings.lr["means"] == 2.0 * config.lr.means
-    assert settings.lr["shN"] == config.lr.sh_rest
-    assert set(settings.lr) == {"means", "scales", "quats", "opacities", "sh0", "shN"}
+    settings = step_settings(config, updates_of(config.lr, 2.0, config.max_steps))
+    first = dict(zip(GROUPS, settings.updates.rates[0].tolist(), strict=True))
+    assert first == {**config.lr.by_parameter(), "means": 2.0 * config.lr.means}
     assert settings.blur_pixels(WIDTH * HEIGHT) == int(0.02 * WIDTH * HEIGHT)
     assert replace(settings, blur_min_pixels=40.0).blur_pixels(WIDTH * HEIGHT) == 40.0

@@ -23,7 +23,12 @@ STAGES = {p.stem for p in ORACLE}
 VALUES = {"pop_ref.constants", "pop_ref.settings", "pop_ref.recipes"}
 SHARED_WITH_FAST = VALUES | {"pop_ref.notation", "pop_ref.types"}
 # rooms of the program whose work is to show what the oracle does
-SHOW_THE_ORACLE = ("pop_fast/explain/", "pop_fast/oracle_backend.py", "pop_fast/cli/vectors.py")
+SHOW_THE_ORACLE = (
+    "pop_fast/explain/",
+    "pop_fast/oracle_backend.py",
+    "pop_fast/oracle_passes.py",
+    "pop_fast/cli/vectors.py",
+)
 
 
 def _name(path: Path) -> str:
@@ -197,8 +202,8 @@ WITHOUT = [
     (
         "import torch; from torch.nn import Parameter\n"
         "from pop_fast.train.environment import reproducible\n"
-        "from pop_fast.train.model import LearningRates, make_optimizers\n"
-        "with reproducible(): make_optimizers({'means': Parameter(torch.zeros(1, 3))}, LearningRates(), 1.0)",
+        "from pop_fast.train.model import make_optimizers\n"
+        "with reproducible(): make_optimizers({'means': Parameter(torch.zeros(1, 3))})",
         ("torch._dynamo", "torch._inductor", "sympy"),
     ),
     ("import pop_fast.train.training_run", ("torch._dynamo", "matplotlib", "pycolmap", "pop_fast.report.page")),

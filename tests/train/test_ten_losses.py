@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ def climb(engine: Any, folder: Path, dtype: torch.dtype = torch.float32) -> list
     config = config_of(RECIPE, folder / "run", sh_degree=1)
     run = TrainingRun(config, capture, engine=engine, initial=initial)
     run._order = InTurn()
-    run.normals = lambda n: torch.tensor(ten_losses.draws(n))
+    run.draws = replace(run.draws, normals=lambda n: torch.tensor(ten_losses.draws(n)))
     rungs = []
     for step in range(STEPS):
         stretch = run.take_steps(step + 1)

@@ -6,7 +6,7 @@ import torch
 from cuda_ext.arrays import Settings
 from cuda_ext.lists import WARP_TILE, make_lists, splat_struct
 from cuda_ext.resident import ResidentViews
-from cuda_ext.train_settings import Phase, StepSettings
+from cuda_ext.train_settings import Phase, StepSettings, steady_updates
 from cuda_ext.train_step import FusedTrainer
 from pop_ref.constants import PAPER
 
@@ -53,7 +53,7 @@ def told(gpu, counts: bool):
     K = torch.tensor([[[60.0, 0.0, 20.0], [0.0, 60.0, 12.0], [0.0, 0.0, 1.0]]])
     photograph = torch.zeros((24, 40, 3), dtype=torch.uint8)
     views = ResidentViews([photograph], torch.eye(4)[None], K, None, "valid", gpu)
-    settings = StepSettings(dict.fromkeys(params, 1e-3), 2, replay=False, counts=counts)
+    settings = StepSettings(steady_updates(dict.fromkeys(params, 1e-3), 2), replay=False, counts=counts)
     trainer = FusedTrainer(params, m, v, views, [0, 0], settings)
     trainer.run(2, Phase(0, True, True, True))
     ((_, maps),) = trainer.told_maps().items()

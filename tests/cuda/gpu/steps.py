@@ -13,13 +13,13 @@ THETA = 0.02
 def fused_trainer(scene: TrainingScene, device, masks=None, **options):
     """Return rows (parameters and moments) and the trainer of them."""
     from cuda_ext.resident import ResidentViews
-    from cuda_ext.train_settings import StepSettings
+    from cuda_ext.train_settings import StepSettings, steady_updates
     from cuda_ext.train_step import FusedTrainer
 
     params = {name: value.to(device).clone() for name, value in scene.params.items()}
     m, v = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))
     views = ResidentViews(scene.photographs, scene.viewmats, scene.Ks, masks, "valid", device)
-    settings = StepSettings(LR, STEPS, means_decay=1.0, **options)
+    settings = StepSettings(steady_updates(LR, STEPS), **options)
     return (params, m, v), FusedTrainer(params, m, v, views, scene.order, settings)
 
 

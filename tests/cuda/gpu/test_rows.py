@@ -49,13 +49,13 @@ def _moments(
     Before it, `waits` steps are taken in which the harmonics beyond the first band take no part.
     """
     from cuda_ext.resident import ResidentViews
-    from cuda_ext.train_settings import Phase, StepSettings
+    from cuda_ext.train_settings import Phase, StepSettings, steady_updates
     from cuda_ext.train_step import FusedTrainer
 
     params = {name: _moved(value.to(device), floats) for name, value in scene.params.items()}
     m, v = ({name: _moved(torch.zeros_like(value), floats) for name, value in params.items()} for _ in range(2))
     views = ResidentViews(scene.photographs, scene.viewmats, scene.Ks, None, "valid", device)
-    chosen = StepSettings(LR, 1 + waits, means_decay=1.0, **(settings or {}))
+    chosen = StepSettings(steady_updates(LR, 1 + waits), **(settings or {}))
     trainer = FusedTrainer(params, m, v, views, scene.order, chosen)
     if waits:
         trainer.run(waits, Phase(0, False, False, False, **phase))

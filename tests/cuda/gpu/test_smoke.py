@@ -34,7 +34,7 @@ def test_a_render_is_the_oracles(gpu, family):
 
 def test_fused_steps_launched_one_by_one_give_the_same_bits_twice_and_learn(gpu):
     from cuda_ext.resident import ResidentViews
-    from cuda_ext.train_settings import Phase, StepSettings
+    from cuda_ext.train_settings import Phase, StepSettings, steady_updates
     from cuda_ext.train_step import FusedTrainer
 
     found = []
@@ -43,7 +43,7 @@ def test_fused_steps_launched_one_by_one_give_the_same_bits_twice_and_learn(gpu)
         params = {name: value.to(gpu).clone() for name, value in scene.params.items()}
         m, v = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))
         views = ResidentViews(scene.photographs, scene.viewmats, scene.Ks, None, "valid", gpu)
-        trainer = FusedTrainer(params, m, v, views, [0] * 4, StepSettings(LR, 4, means_decay=1.0, replay=False))
+        trainer = FusedTrainer(params, m, v, views, [0] * 4, StepSettings(steady_updates(LR, 4), replay=False))
         trainer.run(4, Phase(3, True, True, True))
         losses = [values.objective for values in trainer.step_stats(0, 4)]
         assert losses[-1] < losses[0]
