@@ -192,12 +192,12 @@ def _wrong_split(scene: Scene, own_split: bool, n_images: int) -> str | None:
 
 def _wrong_ratio(scene: Scene, cameras: Sequence[tuple[int, int]], sizes: Sequence[tuple[int, int]]) -> str | None:
     for camera, size in zip(cameras, sizes, strict=False):
-        for whole, side in zip(camera, size, strict=True):
-            if abs(side * scene.shrunk - whole) > _ROUNDING * scene.shrunk:
-                return (
-                    f"{scene.name}: a photograph is {size[0]} x {size[1]} and its camera {camera[0]} x {camera[1]}, and "
-                    f"the protocol takes 1/{scene.shrunk} of that: use {scene.images or 'the photographs'} as published"
-                )
+        if any(abs(n * scene.shrunk - m) > _ROUNDING * scene.shrunk for n, m in zip(size, camera, strict=True)):
+            what = f"a photograph is {size[0]} x {size[1]} and its camera {camera[0]} x {camera[1]}"
+            return (
+                f"{scene.name}: {what}, and the protocol takes 1/{scene.shrunk} of that: "
+                f"use {scene.images or 'the photographs'} as published"
+            )
     return None
 
 

@@ -53,9 +53,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     for net, name in (("vgg", "VGG16"), ("alex", "AlexNet")):
         note = f"weights of LPIPS on {name}: one merged file, or backbone and linear layers"
         parser.add_argument(f"--lpips-{net}", nargs="+", default=[], metavar="FILE", help=note)
-    parser.add_argument(
-        "--keep-ply", action="store_true", help="keep the Gaussians of finished rows in the work folder"
-    )
+    parser.add_argument("--keep-ply", action="store_true", help="keep the Gaussians of finished rows in --work")
     parser.add_argument("--keep-checkpoints", action="store_true", help="keep their checkpoints too")
 
 

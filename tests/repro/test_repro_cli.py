@@ -39,7 +39,7 @@ def test_help_is_quick_and_loads_nothing_heavy(command):
         "import sys; from paper_repro.cli import main; status = main(sys.argv[1:])\n"
         f"loaded = [name for name in {HEAVY!r} if name in sys.modules]; assert not loaded, loaded; sys.exit(status)"
     )
-    start = time.process_time_ns(), os.times().children_user
+    start = os.times().children_user
     done = subprocess.run(
         [sys.executable, "-c", script, *command.split(), "--help"],
         capture_output=True,
@@ -49,7 +49,7 @@ def test_help_is_quick_and_loads_nothing_heavy(command):
     )
     assert done.returncode == 0, done.stderr
     # of the processor, since the machine may be busy
-    assert os.times().children_user - start[1] < 0.5
+    assert os.times().children_user - start < 0.5
     assert "usage: pop-repro" in done.stdout
 
 
