@@ -39,6 +39,13 @@ STAGES = (
     Stage("density control", "eqs. 3, 6", ("density", "density_config", "density_rows")),
     Stage("Adam and its schedules", "4.1", ("optimizer",), ("train/model.py", "train/schedule.py")),
     Stage("one training step", "eq. 9", ("training", "recipes"), ("train/torch_stepper.py",)),
+    Stage("sums of weights, pixels and distances over a view", "4.2", ("contributions",)),
+    Stage("Speedy-Splat's score", "4.2", ("sensitivity",)),
+    Stage("PUP 3D-GS's score", "4.2", ("fisher",)),
+    Stage("Mini-Splatting's points and importance", "4.2", ("chord", "mini_splatting")),
+    Stage("Taming-3DGS's budget and score", "4.2", ("taming",)),
+    Stage("selection by score, by mass, by draw", "4.2", ("selection",)),
+    Stage("exact tile lists (SnugBox, AccuTile)", "4.2", ("tight_tiles",)),
     Stage(
         "distance of every decision from flipping", "–", ("margins", "extent_margins", "pixel_margins", "magnitudes")
     ),

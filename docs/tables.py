@@ -22,7 +22,7 @@ from pop_fast.train.presets import options_for
 from pop_ref.conformance.abilities import STAGES as LAW_STAGES
 from pop_ref.conformance.mutants import MUTANTS, PROGRAM
 from pop_ref.conformance.mutants.trial import every_law
-from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER
+from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER, SPEEDY_SPLAT
 from pop_ref.notation import SYMBOLS
 from pop_ref.recipes import L1_DIVIDED, RECIPES
 
@@ -62,7 +62,7 @@ def conventions() -> str:
 
 def profiles() -> str:
     """Make the table of constants by profile from `pop_ref.constants`."""
-    named = (PAPER, GSPLAT_1_5, GSPLAT_1_6, INRIA)
+    named = (PAPER, GSPLAT_1_5, GSPLAT_1_6, INRIA, SPEEDY_SPLAT)
 
     def stop(inclusive: bool, value: float) -> str:
         return f"T {'≤' if inclusive else '<'} {value:g}"

@@ -63,7 +63,7 @@ def edge_map(photo: np.ndarray) -> Float64[np.ndarray, "H W"]:
     Grey is `(19595 R + 38470 G + 7471 B + 2^15) >> 16`. The result is cut to 0 to 255.
 
     Source: Mallick et al. 2024 (Taming-3DGS), and its code: Pillow's `convert("L")` and `FIND_EDGES`.
-    Departs: nothing; as in Pillow the outermost pixels keep their grey values, for their neighbourhood is not whole, and
+    Departs: nothing; as in Pillow the outermost pixels keep their grey values, whose neighbourhood is not whole, and
         so count as edges where they are bright.
 
     Args:

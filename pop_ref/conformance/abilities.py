@@ -26,6 +26,14 @@ STAGES: Final = (
     "polarization",
     "density",
     "optimizer",
+    "contributions",
+    "sensitivity",
+    "fisher",
+    "chord",
+    "selection",
+    "taming",
+    "mini_splatting",
+    "tight_tiles",
 )
 
 RENDER: Final = "render"

@@ -51,6 +51,14 @@ STAGE_MODULES = (
     "density",
     "optimizer",
     "training",
+    "contributions",
+    "sensitivity",
+    "fisher",
+    "chord",
+    "selection",
+    "taming",
+    "mini_splatting",
+    "tight_tiles",
 )
 
 
@@ -132,7 +140,7 @@ class Adapter:
     def render(self, scene: Scene) -> View:
         """Draw a scene; by default the oracle projects and lists, and `composite` blends."""
         camera, size = scene.camera, scene.profile.tile_size if scene.tile_size is None else scene.tile_size
-        splats, lists = _projected(scene)
+        splats, lists = projected(scene)
         drawn = self.stage("composite")(
             splats, lists, camera.width, camera.height, size, scene.background, scene.profile
         )
@@ -143,7 +151,7 @@ class Adapter:
         """Return cotangents by name: means, quats, scales, opacities, sh, and those of viewmat, background, means2d,
         means2d_abs that the implementation offers; by default those of `composite_vjp`, projected by the oracle."""
         camera, size = scene.camera, scene.profile.tile_size if scene.tile_size is None else scene.tile_size
-        splats, lists = _projected(scene)
+        splats, lists = projected(scene)
         v = self.stage("composite_vjp")(
             splats, lists, camera.width, camera.height, size, v_image, v_T_final, scene.background, scene.profile
         )
@@ -189,7 +197,8 @@ def _shown(splats: Any) -> dict[str, Any]:
     return {name: getattr(splats, name) for name in ("radii", "means2d", "depths", "conics")}
 
 
-def _projected(scene: Scene) -> tuple[Splats, list[list[int]]]:
+def projected(scene: Scene) -> tuple[Splats, list[list[int]]]:
+    """Project a scene and list its splats, by the oracle: what stage functions of whole views take."""
     camera = scene.camera
     size = scene.profile.tile_size if scene.tile_size is None else scene.tile_size
     # the square extent's cull reads the grid from the profile
@@ -285,4 +294,4 @@ def oracle_view(scene: Scene) -> View:
     return OracleAdapter().render(scene)
 
 
-__all__ = ["Adapter", "OracleAdapter", "View", "oracle_view", "rounded_to", "stage_function"]
+__all__ = ["Adapter", "OracleAdapter", "View", "oracle_view", "projected", "rounded_to", "stage_function"]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pop_ref.camera import camera_center
-from pop_ref.conformance.charges import PixelCharges
+from pop_ref.conformance.charges import Layer, PixelCharges
 from pop_ref.conformance.scenes import Scene
 from pop_ref.conformance.screen_charges import TINY, ScreenCharges
 from pop_ref.covariance import covars_from_quats_scales, rotmats_from_quats
@@ -94,16 +94,38 @@ def _pixel_bounds(
         falloff = raw / max(float(s.opacities[i]), TINY)
         out["opacities"][i] = v_alpha.times(falloff, falloff * layer.e_sigma).summed((0, 1))
         v_sigma = v_alpha.times(raw, raw * layer.e_sigma + raw)
-        dx, dy = np.abs(layer.dx) + half_tile, np.abs(layer.dy) + half_tile
-        e_dx, e_dy = layer.e_dx + half_tile, layer.e_dy + half_tile
-        A, B, C = np.abs(s.conics[i])
-        e_A, e_B, e_C = s.e_conics[i]
-        slope_x = v_sigma.times(A * dx + B * dy, e_A * dx + A * e_dx + e_B * dy + B * e_dy)
-        slope_y = v_sigma.times(B * dx + C * dy, e_B * dx + B * e_dx + e_C * dy + C * e_dy)
-        out["means2d"][i] = _stack(slope_x.summed((0, 1)), slope_y.summed((0, 1)))
-        products = ((0.5 * dx * dx, dx * e_dx), (dx * dy, dx * e_dy + dy * e_dx), (0.5 * dy * dy, dy * e_dy))
-        out["conics"][i] = _stack(*(v_sigma.times(a, e_a).summed((0, 1)) for a, e_a in products))
+        slopes = [slope.summed((0, 1)) for slope in exponent_slopes(layer, s, v_sigma, half_tile)]
+        out["means2d"][i], out["conics"][i] = _stack(*slopes[:2]), _stack(*slopes[2:])
     return out
+
+
+def exponent_slopes(layer: Layer, s: ScreenCharges, v_sigma: Bound, half_tile: float) -> list[Bound]:
+    """Bound what a cotangent of the exponent is worth to (mean2d x, y, conic xx, xy, yy) at each pixel. [H, W] each"""
+    dx, dy = np.abs(layer.dx) + half_tile, np.abs(layer.dy) + half_tile
+    e_dx, e_dy = layer.e_dx + half_tile, layer.e_dy + half_tile
+    A, B, C = np.abs(s.conics[layer.id])
+    e_A, e_B, e_C = s.e_conics[layer.id]
+    factors = (
+        (A * dx + B * dy, e_A * dx + A * e_dx + e_B * dy + B * e_dy),
+        (B * dx + C * dy, e_B * dx + B * e_dx + e_C * dy + C * e_dy),
+        (0.5 * dx * dx, dx * e_dx),
+        (dx * dy, dx * e_dy + dy * e_dx),
+        (0.5 * dy * dy, dy * e_dy),
+    )
+    return [v_sigma.times(a, e_a) for a, e_a in factors]
+
+
+def parameter_charges(scene: Scene, s: ScreenCharges) -> np.ndarray:
+    """Charge the derivatives of (mean2d, conic, colour) by (mean, log scale). [N, 8, 6]"""
+    n = len(scene.gaussians)
+    charges = np.zeros((n, 8, 6))
+    for row in range(8 * (n > 0)):
+        v = np.zeros((n, 8))
+        v[:, row] = 1.0
+        parts = {"means2d": v[:, :2], "conics": v[:, 2:5], "opacities": np.zeros(n), "colors": v[:, 5:]}
+        found = _world_bounds(scene, s, {name: Bound(part, np.zeros_like(part)) for name, part in parts.items()})
+        charges[:, row] = np.concatenate([found["means"], found["scales"] * scene.gaussians.scales], axis=1)
+    return charges
 
 
 def _stack(*bounds: Bound) -> Bound:

@@ -137,6 +137,7 @@ class TorchAdapter(Adapter):
         def with_arrays(*args: Any, **kwargs: Any) -> Any:
             if any(isinstance(a, Profile) and not self._implements(a) for a in (*args, *kwargs.values())):
                 reject()
+            args, kwargs = _with_own_lists(function, args, kwargs)
             tensors = {key: self._tensor(value, own) for key, value in kwargs.items()}
             return self._array(function(*[self._tensor(a, own) for a in args], **tensors))
 
@@ -262,8 +263,8 @@ class TorchAdapter(Adapter):
             return self._torch.as_tensor(value.copy(), dtype=dtype, device=self._device)
         if isinstance(value, dict):
             return {key: self._tensor(each, own) for key, each in value.items()}
-        if isinstance(value, list):
-            return [self._tensor(each, own) for each in value]
+        if isinstance(value, list | tuple):
+            return type(value)(self._tensor(each, own) for each in value)
         if own is not None and is_dataclass(value) and hasattr(own, type(value).__name__):
             values = {f.name: self._tensor(getattr(value, f.name), own) for f in fields(value)}
             return getattr(own, type(value).__name__)(**values)
@@ -288,3 +289,19 @@ class TorchAdapter(Adapter):
             return value
         array = value.detach().cpu().numpy()
         return array.astype({"f": np.float64, "i": np.int64}.get(array.dtype.kind, array.dtype))
+
+
+def _with_own_lists(
+    function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """Return a stage function's arguments with tile lists as the `TileLists` that its module knows, if it knows any."""
+    own = getattr(sys.modules.get(function.__module__), "TileLists", None)
+    signature = inspect.signature(function)
+    if own is None or "lists" not in signature.parameters:
+        return args, kwargs
+    given = signature.bind(*args, **kwargs)
+    named = given.arguments
+    camera = named.get("camera")
+    size = (named["width"], named["height"]) if camera is None else (camera.width, camera.height)
+    named["lists"] = own.of(named["lists"], *size, named["tile_size"])
+    return given.args, given.kwargs
