@@ -1,4 +1,4 @@
-"""What methods change of an update and of an event, step by step: against the oracle in float64, to the bit on engines."""
+"""What methods change of an update and of an event: against the oracle in float64, and to the bit on every engine."""
 
 from __future__ import annotations
 
