@@ -1,4 +1,4 @@
-"""Everything that only a GPU can tell, in three jobs of limited length, for a bare GPU node: no network, no pip, no git.
+"""Everything that only a GPU can tell, in three jobs of limited length, on a bare GPU node: no network, pip or git.
 
     python3 -m cuda_ext.gpu_check            job 1: build, a smoke of half a minute, the benchmark, gsplat beside it
     python3 -m cuda_ext.gpu_check --job 2    job 2: laws, steps, sanitizer, training

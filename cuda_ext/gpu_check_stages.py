@@ -84,7 +84,7 @@ def train_stage(check: Check) -> dict[str, Any]:
 def reproduce_stage(check: Check) -> dict[str, Any]:
     """Train the rows of the paper's tables that are missing, the cheapest first, as `pop-repro queue` does.
 
-    Of the scenes that were brought along, at the scale whose rows nobody has the hours for on a CPU. A row that the time
+    Of the scenes that were brought along, at the scale whose rows take days on a CPU. A row that the time
     ends in is begun anew by the next call, unless the folder survives.
     """
     folder = check.packed / "captures" if check.packed else check.captures[0].parent if check.captures else None
