@@ -29,8 +29,6 @@ WORK: Final = Path(__file__).resolve().parent / "work"
 SEED: Final = 42
 # how often the held-out views are measured, evenly over the schedule: curves of Gaussians per pixel are made of these
 _MEASURED: Final = 15
-# of Mini-Splatting's 3.5 million points, pixels of garden's training photographs a point (161 of 1297 x 840)
-_PIXELS_A_POINT: Final = 50
 # step numbers that are settings of a run and not of its strategy
 _STEPS: Final = ("max_steps", "sh_interval", "l2_stop_iter")
 
@@ -80,16 +78,6 @@ class Job:
         """Return the words after `pop train` that say its row, on the whole schedule."""
         return ["--method", self.row.method, *self.row.options_for(self.scene)]
 
-    def _points(self, whole: TrainConfig) -> dict[str, int]:
-        """Return how many points a depth re-initialization sets: the paper's number, or as dense in small photographs."""
-        most: int | None = getattr(whole.strategy, "reinit_points", None)
-        if most is None or self.scale.name == "paper":
-            return {}
-        width, height = self.scene.size
-        train = self.scene.n_images - -(-self.scene.n_images // whole.test_every)
-        pixels = train * (width // self.factor) * (height // self.factor)
-        return {"strategy.reinit_points": min(most, pixels // _PIXELS_A_POINT)}
-
     def config(self, **more: Any) -> TrainConfig:
         """Make its settings.
 
@@ -111,9 +99,9 @@ class Job:
             # the Gaussians are saved at the end alone, which always counts
             "save_steps": (),
             **self.scale.settings,
+            **self.scale.of_methods.get(whole.method, {}),
             **_scaled(whole, scaler),
             **({} if plain else {"strategy.reset_every": self.scale.reset_every}),
-            **self._points(whole),
             "seed": self.seed,
             "factor": self.factor,
             "progress": False,

@@ -122,8 +122,8 @@ def opacity_entropy(logits: Float64[np.ndarray, " N"]) -> float:
         >>> round(opacity_entropy(np.array([0.0])), 12), opacity_entropy(np.array([800.0]))
         (0.69314718056, 0.0)
     """
-    o = opacities_from_logits(logits)
-    entropies = o * np.logaddexp(0.0, -logits) + (1.0 - o) * np.logaddexp(0.0, logits)
+    o, rest = opacities_from_logits(logits), opacities_from_logits(-logits)
+    entropies = o * np.logaddexp(0.0, -logits) + rest * np.logaddexp(0.0, logits)
     return float(np.sum(entropies) / max(len(logits), 1))
 
 
@@ -146,8 +146,8 @@ def opacity_entropy_vjp(logits: Float64[np.ndarray, " N"], v_loss: float) -> Flo
         >>> opacity_entropy_vjp(np.array([0.0, 800.0]), 1.0).tolist()
         [-0.0, -0.0]
     """
-    o = opacities_from_logits(logits)
-    return -v_loss * logits * o * (1.0 - o) / max(len(logits), 1)
+    o, rest = opacities_from_logits(logits), opacities_from_logits(-logits)
+    return -v_loss * logits * o * rest / max(len(logits), 1)
 
 
 def _sides(mask: np.ndarray, visible: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:

@@ -105,7 +105,7 @@ def test_gradients_that_wait_are_summed_alike_by_every_engine(engine: Any, tmp_p
     for step in range(10):
         for run in runs:
             run.take_steps(step + 1)
-    bands = [run.optimizers["shN"].state[run.params["shN"]]["exp_avg"] for run in runs]
+    bands = [run.optimizers["shN"].state[run.params["shN"]]["exp_avg"].cpu() for run in runs]
     largest = float(bands[1].abs().max())
     assert largest > 0.0
     # a moment is linear in the sums; gradients themselves differ by rounding
