@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 TORCH := $(shell sed -n 's/^\(torch==.*\)/\1/p' constraints.txt)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo walkthrough test explore lint bench cuda sass emulate gpu-check docs-check clean
+.PHONY: help setup demo walkthrough repro test explore lint bench cuda sass emulate gpu-check docs-check clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
@@ -28,6 +28,13 @@ demo: setup  ## write the demo capture, train POP on it, leave report.html, PLY,
 
 walkthrough: setup  ## run the twelve chapters and write their pages with pictures to out/walkthrough
 	$(BIN)/python -m pop_ref.walkthrough out/walkthrough
+
+repro: setup  ## train every row of the paper at toy scale (minutes), leave its tables and figures in out/repro
+	$(BIN)/pop-repro queue --scale toy --out out/repro/results --work out/repro/work
+	for table in 1 2 3 4 5 beyond; do \
+		$(BIN)/pop-repro table $$table --scale toy --results out/repro/results --out out/repro || exit 1; done
+	for figure in 1 2 3 4a 4b 5 6a 6b 7; do $(BIN)/pop-repro figure $$figure --scale toy --results out/repro/results \
+		--work out/repro/work --out out/repro || exit 1; done
 
 test: setup  ## run every test
 	$(BIN)/python -m pytest

@@ -159,7 +159,9 @@ def _stats(folder: Path, kind: str, step: int) -> dict[str, Any]:
     results = ResultFolder(folder)
     found = results.read_stats(kind, step)
     if found is None:
-        raise PopError(f"{results.stats_path(kind, step)}: is absent, so the training is not finished; run the row again")
+        raise PopError(
+            f"{results.stats_path(kind, step)}: is absent, so the training is not finished; run the row again"
+        )
     return found
 
 

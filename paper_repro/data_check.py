@@ -129,7 +129,9 @@ def _counts(item: Found) -> str:
         return f"{item.n_images} photographs, {item.n_test} held out, {width} x {height}  {item.folder}"
     doubt = "" if scene.verified else "~"
     width, height = scene.size
-    return f"expected: {doubt}{scene.n_images} photographs, {-(-scene.n_images // HOLD_OUT)} held out, {width} x {height}"
+    return (
+        f"expected: {doubt}{scene.n_images} photographs, {-(-scene.n_images // HOLD_OUT)} held out, {width} x {height}"
+    )
 
 
 def _listing(folder: Path) -> tuple[list[str], bool, list[tuple[int, int]]]:
@@ -190,12 +192,12 @@ def _wrong_split(scene: Scene, own_split: bool, n_images: int) -> str | None:
 
 def _wrong_ratio(scene: Scene, cameras: Sequence[tuple[int, int]], sizes: Sequence[tuple[int, int]]) -> str | None:
     for camera, size in zip(cameras, sizes, strict=False):
-        for whole, side in zip(camera, size, strict=True):
-            if abs(side * scene.shrunk - whole) > _ROUNDING * scene.shrunk:
-                return (
-                    f"{scene.name}: a photograph is {size[0]} x {size[1]} and its camera {camera[0]} x {camera[1]}, and "
-                    f"the protocol takes 1/{scene.shrunk} of that: use {scene.images or 'the photographs'} as published"
-                )
+        if any(abs(n * scene.shrunk - m) > _ROUNDING * scene.shrunk for n, m in zip(size, camera, strict=True)):
+            what = f"a photograph is {size[0]} x {size[1]} and its camera {camera[0]} x {camera[1]}"
+            return (
+                f"{scene.name}: {what}, and the protocol takes 1/{scene.shrunk} of that: "
+                f"use {scene.images or 'the photographs'} as published"
+            )
     return None
 
 
@@ -213,4 +215,3 @@ def _wrong_size(scene: Scene, sizes: Sequence[tuple[int, int]], factor: int) -> 
 
 def _doubt(scene: Scene) -> str:
     return "" if scene.verified else " (as is recalled; nobody compared it with the photographs here)"
-

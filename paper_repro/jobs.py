@@ -10,29 +10,30 @@ import contextlib
 import io
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from paper_repro.rows import ROWS, Row, load_row
 from paper_repro.scales import Scale, scale_named
-from paper_repro.scenes import SCENES, Scene, scene_named
+from paper_repro.scenes import Scene, scene_named
 from pop_fast.errors import PopError
 
 if TYPE_CHECKING:
     from pop_fast.train import TrainConfig
 
-__all__ = ["SEED", "WORK", "Job", "NotInThisVersion", "job_named", "jobs_of", "missing_method", "trainable"]
+__all__ = ["SEED", "WORK", "Job", "NotTrainableError", "job_named", "jobs_of", "missing_method", "trainable"]
 
 # git ignores it; everything in it can be made again
 WORK: Final = Path(__file__).resolve().parent / "work"
 SEED: Final = 42
-# the held-out views are measured so often, evenly over the schedule: the curves of Gaussians per pixel are made of these
+# how often the held-out views are measured, evenly over the schedule: curves of Gaussians per pixel are made of these
 _MEASURED: Final = 15
 # step numbers that are settings of a run and not of its strategy
 _STEPS: Final = ("max_steps", "sh_interval", "l2_stop_iter")
 
 
-class NotInThisVersion(PopError):
+class NotTrainableError(PopError):
     """Say that the program cannot train a row: it lacks the method, or does not take an option.
 
     Attributes:
@@ -84,27 +85,27 @@ class Job:
             more: settings of the run that do not belong to the row: data, result_dir, threads, backend, ...
 
         Raises:
-            NotInThisVersion: the program has no such method or option; names row and words.
+            NotTrainableError: the program has no such method or option; names row and words.
         """
         from pop_fast.train import TrainConfig
 
         scaler = self.scale.steps_scaler
         whole = _whole(self)
         plain = self.scale.reset_every is None or whole.strategy.reset_every == 0
-        return TrainConfig.of(
-            method=whole.method,
-            steps_scaler=scaler,
-            **{
-                **{"log_every": self.scale.log_every, "checkpoint_every": self.scale.checkpoint_every},
-                # the Gaussians are saved at the end alone, which always counts
-                **{"eval_steps": _measured_at(whole.max_steps, scaler), "save_steps": ()},
-                **self.scale.settings,
-                **_scaled(whole, scaler),
-                **({} if plain else {"strategy.reset_every": self.scale.reset_every}),
-                **{"seed": self.seed, "factor": self.factor, "progress": False},
-                **more,
-            },
-        )
+        said = {
+            "log_every": self.scale.log_every,
+            "checkpoint_every": self.scale.checkpoint_every,
+            "eval_steps": _measured_at(whole.max_steps, scaler),
+            # the Gaussians are saved at the end alone, which always counts
+            "save_steps": (),
+            **self.scale.settings,
+            **_scaled(whole, scaler),
+            **({} if plain else {"strategy.reset_every": self.scale.reset_every}),
+            "seed": self.seed,
+            "factor": self.factor,
+            "progress": False,
+        }
+        return TrainConfig.of(method=whole.method, steps_scaler=scaler, **{**said, **more})
 
 
 def job_named(row: str, scene: str, scale: str, seed: int = SEED) -> Job:
@@ -136,7 +137,7 @@ def trainable(job: Job) -> bool:
     """Tell whether the program has a job's method and takes its options."""
     try:
         _whole(job)
-    except NotInThisVersion:
+    except NotTrainableError:
         return False
     return True
 
@@ -152,21 +153,26 @@ def missing_method(row: Row) -> str | None:
 
 def _whole(job: Job) -> TrainConfig:
     """Read a row's options as `pop train` does, on the whole schedule."""
-    from pop_fast.cli.train import arguments
-
     missing = missing_method(job.row)
     if missing is not None:
-        raise NotInThisVersion(missing)
-    words = job.words()
+        raise NotTrainableError(missing)
     try:
-        # what the parser prints about a word that it does not know says no more than the words do
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-            return arguments(["capture", "--out", "out", *words])[0]
+        return _parsed(tuple(job.words()))
     except (SystemExit, PopError) as error:
         reason = f": {error}" if isinstance(error, PopError) else ""
-        raise NotInThisVersion(
-            f"row {job.row.name}: this version of pop train does not take {' '.join(words)}{reason}"
+        words = " ".join(job.words())
+        raise NotTrainableError(
+            f"row {job.row.name}: this version of pop train does not take {words}{reason}"
         ) from error
+
+
+@lru_cache
+def _parsed(words: tuple[str, ...]) -> TrainConfig:
+    from pop_fast.cli.train import arguments
+
+    # what the parser prints about a word that it does not know says no more than the words do
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        return arguments(["capture", "--out", "out", *words])[0]
 
 
 def _scaled(whole: TrainConfig, scaler: float) -> dict[str, Any]:

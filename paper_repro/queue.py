@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 
-from paper_repro.jobs import Job, NotInThisVersion
-from paper_repro.train_row import Busy
+from paper_repro.jobs import Job, NotTrainableError
+from paper_repro.train_row import BusyError
 
 __all__ = ["Outcome", "run_queue"]
 
@@ -87,7 +87,7 @@ def run_queue(jobs: Sequence[Job], results: Path, words: Sequence[str], threads:
             print(f"[{number}/{len(missing)}] {job}", flush=True)
             start = time.monotonic()
             status = child.run([sys.executable, "-m", "paper_repro", "run", *_words_of(job), *words], threads)
-            kinds = {0: outcome.done, Busy.status: outcome.busy, NotInThisVersion.status: outcome.impossible}
+            kinds = {0: outcome.done, BusyError.status: outcome.busy, NotTrainableError.status: outcome.impossible}
             if child.stop and status != 0:
                 break
             kinds.get(status, outcome.failed).append(job)

@@ -85,7 +85,9 @@ DATASETS: Final = {
     ),
     "further": Dataset(name="further scenes", parents=("",), source=""),
 }
-_EXTRA: Final = "http://storage.googleapis.com/gresearch/refraw360/360_extra_scenes.zip (https://jonbarron.info/mipnerf360)"
+_EXTRA: Final = (
+    "http://storage.googleapis.com/gresearch/refraw360/360_extra_scenes.zip (https://jonbarron.info/mipnerf360)"
+)
 _GAUSSCTRL: Final = "https://github.com/ActiveVisionLab/gaussctrl"
 
 

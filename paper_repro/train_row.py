@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
 
-__all__ = ["Busy", "Options", "capture_folder", "commit", "is_finished", "train_row"]
+__all__ = ["BusyError", "Options", "capture_folder", "commit", "is_finished", "train_row"]
 
-_DEMO: Final = {"seed": 0}
+_DEMO_SEED: Final = 0
 # of a result folder: what takes space and a finished row does not need
 _CHECKPOINTS, _PLY = "ckpts", "ply"
 
 
-class Busy(PopError):
+class BusyError(PopError):
     """Say that another process trains this row.
 
     Attributes:
@@ -97,7 +97,7 @@ def train_row(job: Job, options: Options) -> Path:
 
     Raises:
         PopError: the program lacks the method, the scene is absent or is not what it must be, or as `TrainingRun`.
-        Busy: another process trains it.
+        BusyError: another process trains it.
         KeyboardInterrupt: after Ctrl-C or SIGTERM, when a checkpoint has been written.
     """
     path, work = job.result(options.results), job.work(options.work)
@@ -131,7 +131,7 @@ def capture_folder(scene: Scene, options: Options) -> Path:
             from pop_fast.data import make_demo
 
             (width, height), views = scene.size, scene.n_images
-            make_demo(folder, views=views, width=width, height=height, **_DEMO)
+            make_demo(folder, seed=_DEMO_SEED, views=views, width=width, height=height)
     return folder
 
 
@@ -163,14 +163,14 @@ def only_one(path: Path, busy: str, wait: bool = False) -> Iterator[None]:
         wait: wait for it instead.
 
     Raises:
-        Busy: another process holds it.
+        BusyError: another process holds it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError as error:
-            raise Busy(busy) from error
+            raise BusyError(busy) from error
         yield
 
 

@@ -23,7 +23,9 @@ def add_scale(parser: argparse.ArgumentParser) -> None:
 
 def add_results(parser: argparse.ArgumentParser) -> None:
     """Add --results."""
-    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="the results (default: %(default)s)")
+    parser.add_argument(
+        "--results", type=Path, default=RESULTS, metavar="DIR", help="the results (default: %(default)s)"
+    )
 
 
 def add_data(parser: argparse.ArgumentParser) -> None:
@@ -51,13 +53,20 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     for net, name in (("vgg", "VGG16"), ("alex", "AlexNet")):
         note = f"weights of LPIPS on {name}: one merged file, or backbone and linear layers"
         parser.add_argument(f"--lpips-{net}", nargs="+", default=[], metavar="FILE", help=note)
-    parser.add_argument("--keep-ply", action="store_true", help="keep the Gaussians of finished rows in the work folder")
+    parser.add_argument("--keep-ply", action="store_true", help="keep the Gaussians of finished rows in --work")
     parser.add_argument("--keep-checkpoints", action="store_true", help="keep their checkpoints too")
 
 
 def training_words(args: argparse.Namespace) -> list[str]:
     """Say what `add_training` read as words again, but for the scale; paths absolute."""
-    words = ["--data", str(args.data.absolute()), "--out", str(args.out.absolute()), "--work", str(args.work.absolute())]
+    words = [
+        "--data",
+        str(args.data.absolute()),
+        "--out",
+        str(args.out.absolute()),
+        "--work",
+        str(args.work.absolute()),
+    ]
     words += ["--threads", str(args.threads), "--backend", args.backend]
     for name in ("checkpoint_every", "log_every"):
         value = getattr(args, name)

@@ -87,7 +87,9 @@ def figure(words: Sequence[str]) -> int:
     add_scale(parser)
     add_results(parser)
     add_data(parser)
-    parser.add_argument("--work", type=Path, default=WORK, metavar="DIR", help="pictures of finished rows (%(default)s)")
+    parser.add_argument(
+        "--work", type=Path, default=WORK, metavar="DIR", help="pictures of finished rows (%(default)s)"
+    )
     parser.add_argument("--out", type=Path, default=Path("out"), metavar="DIR", help="where to write (default: out)")
     args = parser.parse_args(words)
     try:

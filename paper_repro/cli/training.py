@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 from paper_repro.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED, parser_of
 from paper_repro.cli.options import add_training, training_words
@@ -76,7 +76,7 @@ def queue(words: Sequence[str]) -> int:
     return EXIT_INCOMPLETE if any(left.values()) else 0
 
 
-def _options(args: argparse.Namespace) -> dict[str, object]:
+def _options(args: argparse.Namespace) -> dict[str, Any]:
     names = ("data", "work", "threads", "backend", "checkpoint_every", "log_every", "keep_ply", "keep_checkpoints")
     return {
         **{name: getattr(args, name) for name in names},

@@ -101,7 +101,10 @@ def test_a_missing_photograph_is_refused_as_it_moves_the_split(root: Path):
     (root / "360_v2" / "bonsai" / "images_2" / "view_003.png").unlink()
     found = check_scene(bonsai(), root)
     assert found.status == "refused"
-    assert "1 of 10 photographs are absent, images_2/view_003.png the first, which moves the every-8th split" in found.reason
+    assert (
+        "1 of 10 photographs are absent, images_2/view_003.png the first, which moves the every-8th split"
+        in found.reason
+    )
 
 
 def test_another_number_of_photographs_is_refused(root: Path, monkeypatch):
@@ -114,7 +117,9 @@ def test_another_number_of_photographs_is_refused(root: Path, monkeypatch):
 def test_photographs_that_are_not_shrunk_as_published_are_refused(root: Path):
     folder = root / "360_v2" / "bonsai"
     shutil.rmtree(folder / "images_2")
-    assert "images_2: is absent; the protocol takes the photographs of this folder" in check_scene(bonsai(), root).reason
+    assert (
+        "images_2: is absent; the protocol takes the photographs of this folder" in check_scene(bonsai(), root).reason
+    )
     shutil.copytree(folder / "images", folder / "images_2")
     found = check_scene(bonsai(), root)
     assert found.status == "refused"

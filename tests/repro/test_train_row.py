@@ -12,16 +12,17 @@ import tempfile
 import time
 from dataclasses import fields, replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 from paper_repro import train_row as module
 from paper_repro.collect import collect, first_change
-from paper_repro.jobs import Job, NotInThisVersion, job_named
+from paper_repro.jobs import Job, NotTrainableError, job_named
 from paper_repro.results import Result, path_of, read, write
 from paper_repro.scenes import SCENES
-from paper_repro.train_row import Busy, Options, capture_folder, commit, is_finished, only_one, train_row
+from paper_repro.train_row import BusyError, Options, capture_folder, commit, is_finished, only_one, train_row
 from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
 from tests.app.interruptions import interrupt
@@ -91,7 +92,7 @@ def test_a_curve_has_every_event_and_the_held_out_views_of_every_fifteenth(made)
     assert [point["step"] for point in measured] == [20 * i - 1 for i in range(1, 16)]
     assert all(point["n_blended"] > 0.0 and point["n_traversed"] >= point["n_blended"] for point in measured)
     # the counts add up: what an event cloned, split and pruned is the difference to the point before it
-    events = [(before, now) for before, now in zip(curve, curve[1:], strict=False) if "cloned" in now]
+    events = [(before, now) for before, now in pairwise(curve) if "cloned" in now]
     assert len(events) == 14
     for before, now in events:
         change = now["cloned"] + now["split"] - now["pruned"]
@@ -176,7 +177,10 @@ def test_a_result_whose_row_has_changed_is_refused_and_new_settings_are_not(made
 
 def test_a_row_that_another_process_trains_is_left_to_it(made, tmp_path):
     job, how = toy("l2"), options(tmp_path)
-    with only_one(job.work(how.work).with_suffix(".lock"), "taken"), pytest.raises(Busy, match="another process trains"):
+    with (
+        only_one(job.work(how.work).with_suffix(".lock"), "taken"),
+        pytest.raises(BusyError, match="another process trains"),
+    ):
         train_row(job, how)
     assert not job.work(how.work).exists()
 
@@ -184,7 +188,7 @@ def test_a_row_that_another_process_trains_is_left_to_it(made, tmp_path):
 def test_a_method_that_is_not_there_is_said_before_anything_is_read(tmp_path):
     job = toy("pop")
     strange = replace(job, row=replace(job.row, name="pop", method="telepathy"))
-    with pytest.raises(NotInThisVersion, match="no method 'telepathy'"):
+    with pytest.raises(NotTrainableError, match="no method 'telepathy'"):
         train_row(strange, Options(data=tmp_path, results=tmp_path / "results", work=tmp_path / "work"))
     assert not list(tmp_path.iterdir())
 
@@ -206,7 +210,9 @@ def test_what_an_earlier_training_left_does_not_reach_a_result(tmp_path):
     first = values(read(path))
     # measurements at steps that this training does not measure at
     stats = job.work(how.work) / "stats"
-    (stats / "val_step0010.json").write_text(json.dumps({**json.loads((stats / "val_step0029.json").read_text()), "step": 10}))
+    (stats / "val_step0010.json").write_text(
+        json.dumps({**json.loads((stats / "val_step0029.json").read_text()), "step": 10})
+    )
     path.unlink()
     assert values(read(train_row(job, how))) == first
 
@@ -227,7 +233,10 @@ def test_sigterm_leaves_a_checkpoint_and_the_same_command_goes_on(made, tmp_path
     _waiting_for(job.work(how.work) / "metrics.jsonl", process)
     process.send_signal(signal.SIGTERM)
     _, said = process.communicate(timeout=120)
-    assert (process.returncode, said) == (130, "pop-repro: stopped; the same command goes on from the last checkpoint\n")
+    assert (process.returncode, said) == (
+        130,
+        "pop-repro: stopped; the same command goes on from the last checkpoint\n",
+    )
     assert list((job.work(how.work) / "ckpts").iterdir())
     assert not job.result(how.results).exists()
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True)

@@ -56,7 +56,9 @@ def test_there_is_one_rule_for_each_row_scene_and_seed_and_one_for_each_table_an
 
 def test_the_cheapest_row_has_the_highest_priority_and_a_gpu_is_asked_for_at_the_papers_scale(tmp_path):
     printed = workflow(tmp_path, "-n", "rows", scale="paper")
-    priority = {name: int(found) for name, found in re.findall(r"rule (train_\w+):.*?priority: (\d+)", printed, re.DOTALL)}
+    priority = {
+        name: int(found) for name, found in re.findall(r"rule (train_\w+):.*?priority: (\d+)", printed, re.DOTALL)
+    }
     jobs = [job for job in jobs_of("paper") if trainable(job)]
     assert len(priority) == len(jobs)
     ranked = sorted(priority, key=lambda name: -priority[name])
@@ -79,7 +81,9 @@ def test_rows_are_trained_and_finished_ones_are_left_alone(tmp_path):
     assert "Nothing to be done" in workflow(tmp_path, "-j", "1", "rows", scale="toy", rows="l1_div_100,l2_pop")
     # another machine has no memory of this one's runs, and its settings are other words
     (tmp_path / ".snakemake").rename(tmp_path / "forgotten")
-    assert "Nothing to be done" in workflow(tmp_path, "-j", "1", "rows", scale="toy", rows="l1_div_100,l2_pop", threads=2)
+    assert "Nothing to be done" in workflow(
+        tmp_path, "-j", "1", "rows", scale="toy", rows="l1_div_100,l2_pop", threads=2
+    )
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "results").rglob("*.json")} == before
 
 
