@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
 
-__all__ = ["BusyError", "Options", "capture_folder", "commit", "is_finished", "train_row"]
+__all__ = ["BusyError", "Options", "capture_folder", "commit", "is_finished", "load_capture_of", "train_row"]
 
 _DEMO_SEED: Final = 0
 # of a result folder: what takes space and a finished row does not need
@@ -196,7 +196,7 @@ def _train(job: Job, options: Options, config: TrainConfig) -> None:
     if not list_checkpoints(Path(config.result_dir)):
         # what a finished row has left, whose result was removed since
         shutil.rmtree(config.result_dir, ignore_errors=True)
-    capture, seconds = _load(job, config)
+    capture, seconds = load_capture_of(job, config)
     check_capture(job, config, capture)
     from paper_repro.probe import ProbedRun
     from pop_fast.train.environment import keep_freed_memory
@@ -208,7 +208,8 @@ def _train(job: Job, options: Options, config: TrainConfig) -> None:
     ProbedRun(config, capture, every=max(config.log_every, spacing(config.max_steps)), **more).run()
 
 
-def _load(job: Job, config: TrainConfig) -> tuple[Capture, float]:
+def load_capture_of(job: Job, config: TrainConfig) -> tuple[Capture, float]:
+    """Read the photographs and cameras of a job, and say how many seconds that took."""
     from pop_fast.cli.train import arguments, open_capture
 
     images = [] if job.scene.images is None else ["--images", job.scene.images]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -92,11 +91,9 @@ def figure(words: Sequence[str]) -> int:
     )
     parser.add_argument("--out", type=Path, default=Path("out"), metavar="DIR", help="where to write (default: out)")
     args = parser.parse_args(words)
-    try:
-        figures = importlib.import_module("paper_repro.figures")
-    except ModuleNotFoundError as error:
-        raise PopError("this version of pop-repro draws no figures") from error
-    for path in figures.draw(args.id, args.scale, args.results, args.out, work=args.work, data=args.data):
+    from paper_repro.figures import draw
+
+    for path in draw(args.id, args.scale, args.results, args.out, args.work, args.data):
         print(path)
     return 0
 
