@@ -127,7 +127,7 @@ class Instruments:
     dominant_counts: Tensor
 
 
-class _Blended:
+class Blended:
     """One forward blend and what its transpose needs."""
 
     def __init__(
@@ -215,7 +215,7 @@ class Blend(torch.autograd.Function):
         means2d, conics, opacities, colors, background, buffers, settings, state, told, sink = inputs
         rows = tuple(t.detach().contiguous() for t in (means2d, conics, opacities, colors))
         behind = None if background is None else background.detach().contiguous()
-        blended = _Blended(rows, behind, buffers, settings)
+        blended = Blended(rows, behind, buffers, settings)
         blended.run(told)
         ctx.blended, ctx.state, ctx.sink = blended, state, sink
         # aliases: an output that its own graph node holds would never be freed

@@ -153,6 +153,21 @@ void bind_blend(nb::module_& m) {
     POINTER(backward, BlendBackward, v_T_final);
     POINTER(backward, BlendBackward, rows);
     POINTER(backward, BlendBackward, sums);
+
+    nb::class_<ScoreArrays> scores(m, "Scores", nb::dynamic_attr());
+    scores.def(nb::init<>());
+    POINTER(scores, ScoreArrays, records);
+    POINTER(scores, ScoreArrays, background);
+    POINTER(scores, ScoreArrays, T_final);
+    POINTER(scores, ScoreArrays, last);
+    POINTER(scores, ScoreArrays, pixel_map);
+    VALUE(scores, ScoreArrays, fx);
+    VALUE(scores, ScoreArrays, fy);
+    VALUE(scores, ScoreArrays, cx);
+    VALUE(scores, ScoreArrays, cy);
+    POINTER(scores, ScoreArrays, rows);
+    POINTER(scores, ScoreArrays, totals);
+    POINTER(scores, ScoreArrays, ids);
 }
 
 void bind_functions(nb::module_& m) {
@@ -175,6 +190,11 @@ void bind_functions(nb::module_& m) {
     });
     m.def("blend_backward", [](const TileLists& l, const BlendBackward& b, const Profile<float>& p, P state, P stream) {
         blend_backward(l, b, p, as_state(state), as_stream(stream));
+    });
+    m.def("score_columns", [](int score) { return score_columns(Score(score)); });
+    m.def("score_pitch", [](int score) { return score_pitch(Score(score)); });
+    m.def("score_view", [](const TileLists& l, const ScoreArrays& s, int score, const Profile<float>& p, P stream) {
+        score_view(l, s, Score(score), p, as_stream(stream));
     });
     m.def("splat_gradients", [](int n, int channels, const SplatArrays& s, P sums, const SplatGradients& g, P stream) {
         splat_gradients(n, channels, s, reinterpret_cast<const float*>(sums), g, as_stream(stream));

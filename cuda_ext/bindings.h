@@ -23,10 +23,12 @@ constexpr const char* dtype_of() {
     constexpr bool ints = std::is_same_v<Value, int> || std::is_same_v<Value, unsigned> ||
                           std::is_same_v<Value, DeviceState>;
     constexpr bool floats = std::is_same_v<Value, float> || std::is_same_v<Value, StepConstants>;
+    constexpr bool doubles = std::is_same_v<Value, double>;
     constexpr bool bytes = std::is_same_v<Value, uint8_t>;
     // a pointer to pointers is a table of addresses; void is for tile keys, of which there are two kinds
     constexpr bool addresses = std::is_pointer_v<Value>, keys = std::is_void_v<Value>;
-    static_assert(ints || floats || bytes || addresses || keys, "give this field's type its torch dtype");
+    static_assert(ints || floats || doubles || bytes || addresses || keys, "give this field's type its torch dtype");
+    if (doubles) return "float64";
     return ints ? "int32" : floats ? "float32" : bytes ? "uint8" : addresses ? "int64" : "int16 int32";
 }
 

@@ -33,11 +33,13 @@ NO_NVDISASM = (
 )
 # what one warp does in one pass of a kernel's body, and threads a block
 KERNELS = {
+    "add_rows_kernel": ("Gaussian", 256),
     "begin_step_kernel": ("step", 32),
     "blend_forward_kernel": ("tile", 128),
     "buckets_kernel": ("32 tiles", 256),
     "bucket_counts_kernel": ("32 tiles", 256),
     "columns_kernel": ("tile", 128),
+    "contributions_kernel": ("tile", 128),
     "count_important_kernel": ("32 Gaussians", 256),
     "count_kernel": ("32 Gaussians", 256),
     "depth_keys_kernel": ("32 Gaussians", 256),
@@ -47,10 +49,12 @@ KERNELS = {
     "gather_rows_kernel": ("32 floats", 256),
     "pack_kernel": ("32 Gaussians", 256),
     "pixels_kernel": ("128 pixels", 256),
+    "points_kernel": ("tile", 128),
     "project_backward_kernel": ("32 Gaussians", 128),
     "project_kernel": ("32 Gaussians", 128),
     "ranges_kernel": ("32 instances", 256),
     "reset_opacities_kernel": ("32 Gaussians", 256),
+    "slopes_kernel": ("tile", 128),
     "splat_gradients_kernel": ("32 Gaussians", 256),
     "splats_kernel": ("bucket", 128),
     "split_rows_kernel": ("32 Gaussians", 256),

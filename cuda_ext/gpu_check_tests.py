@@ -26,6 +26,7 @@ STEPS = tuple(
         "photometric",
         "device_training",
         "oracle_steps",
+        "passes",
     )
 )
 SMOKE = tuple(

@@ -18,7 +18,10 @@ class Stage:
     paper: str
     modules: tuple[str, ...]
     also_fast: tuple[str, ...] = ()  # files of pop_fast under other names, where torch or gsplat's interface sets them
+    also_cuda: tuple[str, ...] = ()  # files of cuda_ext/csrc that hold several stages
 
+
+_SCORES = ("scores.cuh", "scores.cu")
 
 STAGES = (
     Stage("raw parameters to scales, opacities, unit quaternions", "3.1", ("activations",)),
@@ -39,10 +42,18 @@ STAGES = (
     Stage("density control", "eqs. 3, 6", ("density", "density_config", "density_rows")),
     Stage("Adam and its schedules", "4.1", ("optimizer",), ("train/model.py", "train/schedule.py")),
     Stage("one training step", "eq. 9", ("training", "recipes"), ("train/torch_stepper.py",)),
-    Stage("sums of weights, pixels and distances over a view", "4.2", ("contributions",)),
-    Stage("Speedy-Splat's score", "4.2", ("sensitivity",)),
-    Stage("PUP 3D-GS's score", "4.2", ("fisher",)),
-    Stage("Mini-Splatting's points and importance", "4.2", ("chord", "mini_splatting")),
+    Stage(
+        "sums of weights, pixels and distances over a view",
+        "4.2",
+        ("contributions",),
+        ("compiled/contributions.py",),
+        _SCORES,
+    ),
+    Stage("Speedy-Splat's score", "4.2", ("sensitivity",), ("compiled/sensitivity.py",), _SCORES),
+    Stage("PUP 3D-GS's score", "4.2", ("fisher",), ("compiled/fisher.py",), _SCORES),
+    Stage(
+        "Mini-Splatting's points and importance", "4.2", ("chord", "mini_splatting"), ("compiled/chord.py",), _SCORES
+    ),
     Stage("Taming-3DGS's budget and score", "4.2", ("taming",)),
     Stage("selection by score, by mass, by draw", "4.2", ("selection",)),
     Stage("exact tile lists (SnugBox, AccuTile)", "4.2", ("tight_tiles",)),
@@ -79,6 +90,8 @@ def files(room: str, stage: Stage) -> Iterator[Path]:
                 yield path
     if room == "pop_fast":
         yield from (ROOT / room / name for name in stage.also_fast)
+    if room == "cuda_ext/csrc":
+        yield from (ROOT / room / name for name in stage.also_cuda)
 
 
 def laws(stage: Stage) -> Iterator[Path]:

@@ -24,7 +24,7 @@ from pop_ref.conformance.mutants import MUTANTS, PROGRAM
 from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER, SPEEDY_SPLAT
 from pop_ref.notation import SYMBOLS
-from pop_ref.recipes import L1_DIVIDED, RECIPES
+from pop_ref.recipes import BASELINES, L1_DIVIDED, RECIPES
 
 README = ROOT / "README.md"
 MUTANT_LIST = ROOT / "docs" / "MUTANTS.md"
@@ -82,7 +82,7 @@ def profiles() -> str:
 def recipes() -> str:
     """Make the table of the paper's rows as options of `pop train`, from `pop_ref.recipes`."""
     rows = [[name, f"`pop train scene {' '.join(options_for(recipe))}`".replace(" `", "`"), RECIPE_NOTES.get(name, "")]
-            for name, recipe in RECIPES.items()]  # fmt: skip
+            for name, recipe in (*RECIPES.items(), *BASELINES.items())]  # fmt: skip
     divided = " ".join(options_for(L1_DIVIDED[10]))
     rows.append(["L1 div = 10", f"`pop train scene {divided}`", "and likewise 1, 2, 5, 20, 50, 100"])
     return _table(["row of the paper", "command", ""], rows)
@@ -93,7 +93,12 @@ RECIPE_NOTES = {
     "L2": "the module ablation's first row: no blur rule, no POP term, no reset",
     "Reset": "opacity reset in place of the POP term",
     "3DGS": "Inria's code, with its rasterizer's constants",
+    "3DGS 2023": "the same before its opacities moved half as fast; the next four are built on it or on 3DGS",
     "gsplat": "gsplat's default strategy",
+    "PUP-3DGS": "two rounds of pruning by Fisher blocks and refining, after a whole training",
+    "Mini-Splatting": "blur split, depth re-initialization, sampling and pruning by importance",
+    "Taming-3DGS": "growth to a budget, by sampling from a score",
+    "Speedy-Splat": "exact tile lists, soft and hard pruning by sensitivity",
 }
 
 

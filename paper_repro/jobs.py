@@ -99,6 +99,7 @@ class Job:
             # the Gaussians are saved at the end alone, which always counts
             "save_steps": (),
             **self.scale.settings,
+            **self.scale.of_methods.get(whole.method, {}),
             **_scaled(whole, scaler),
             **({} if plain else {"strategy.reset_every": self.scale.reset_every}),
             "seed": self.seed,

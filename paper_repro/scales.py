@@ -23,6 +23,7 @@ class Scale:
         steps_scaler: multiplies every step number of the method.
         settings: what else differs from the method's own values, in the names of `pop_fast.train.TrainConfig`; those
             of density control under "strategy.".
+        of_methods: what else differs for one method alone, likewise.
         reset_every: steps between two resets, for the rows that have resets; None leaves them as the scaled schedule
             has them, no closer than 3,000 steps.
         log_every: steps between two points of the curves.
@@ -34,6 +35,7 @@ class Scale:
     factors: Mapping[str, int]
     steps_scaler: float = 1.0
     settings: Mapping[str, Any] = field(default_factory=dict)
+    of_methods: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     reset_every: int | None = None
     log_every: int = 100
     checkpoint_every: int = 500
@@ -41,6 +43,12 @@ class Scale:
 
 # theta_blur comes to 10.7 pixels in the paper's smallest images, and to less in images smaller than those
 _FLOOR: Final = {"strategy.blur_min_pixels": 10.0}
+
+# Mini-Splatting's 3.5 million points are one to three of a hundred pixels of the paper's views; so many are these
+_POINTS: Final = {
+    scale: {"mini-splatting": {"strategy.reinit_points": count}}
+    for scale, count in (("toy", 3_000), ("dev", 200_000), ("full", 1_000_000))
+}
 
 _ALL: Final = (
     Scale(
@@ -50,6 +58,7 @@ _ALL: Final = (
         # 300 steps, in which density control acts 14 times and resets, where it does, at 30, 60, 90 and 120
         steps_scaler=0.01,
         settings={**_FLOOR, "strategy.refine_every": 10},
+        of_methods=_POINTS["toy"],
         reset_every=30,
         log_every=10,
         checkpoint_every=100,
@@ -60,12 +69,14 @@ _ALL: Final = (
         factors={"fox": 4, "bear_512": 2, "garden_512": 2, "bonsai_800": 2},
         steps_scaler=0.333333,
         settings=_FLOOR,
+        of_methods=_POINTS["dev"],
     ),
     Scale(
         name="full",
         about="bonsai_800 at its size and the whole schedule, theta_blur at least 10 pixels",
         factors={"bonsai_800": 1},
         settings=_FLOOR,
+        of_methods=_POINTS["full"],
         log_every=25,
     ),
     Scale(

@@ -97,8 +97,9 @@ def towards_camera(gaussians: Gaussians, camera: Camera) -> Tensor:
 def ray_directions(camera: Camera, profile: Profile) -> Tensor:
     """Return where the rays through the pixels' centres point, in the camera's axes, z being 1. [H, W, 3] float64"""
     fx, fy, cx, cy = intrinsics(camera.K, camera.width, camera.height, profile)
-    x = (torch.arange(camera.width, dtype=torch.float64) + (0.5 - cx)) / fx
-    y = (torch.arange(camera.height, dtype=torch.float64) + (0.5 - cy)) / fy
+    like = {"dtype": torch.float64, "device": camera.K.device}
+    x = (torch.arange(camera.width, **like) + (0.5 - cx)) / fx
+    y = (torch.arange(camera.height, **like) + (0.5 - cy)) / fy
     across, down = torch.meshgrid(x, y, indexing="xy")
     return torch.stack((across, down, torch.ones_like(down)), 2)
 
@@ -119,6 +120,6 @@ def points_on_rays(ids: Tensor, gaussians: Gaussians, camera: Camera, profile: P
     means, quats, scales = (t.double()[chosen] for t in (gaussians.means, gaussians.quats, gaussians.scales))
     origin = camera_center(viewmat)
     t = chord_midpoint(means, quats, scales, origin, directions)
-    points = torch.zeros((*ids.shape, 3), dtype=torch.float64)
+    points = viewmat.new_zeros((*ids.shape, 3))
     points[found] = origin + t[:, None] * directions
     return points

@@ -120,7 +120,7 @@ class Passes:
         profile: the rasterizer's constants.
         background: colour behind everything.
         antialiased: render with opacity compensation.
-        device: where the parameters lie.
+        device: where the parameters lie; the CPU by default.
 
     Raises:
         PopError: the backend cannot run here.
@@ -232,18 +232,18 @@ class Passes:
         sh = torch.cat((raw["sh0"], raw["shN"][:, : bands - 1]), 1)
         scales, opacities = scales_from_log_scales(raw["scales"]), opacities_from_logits(raw["opacities"])
         gaussians = Gaussians(raw["means"], raw["quats"], scales, opacities, sh)
-        camera = _smaller(self._views[index], divisor)
+        camera = _smaller(self._views[index], divisor, self._device)
         background = self._background.to(raw["means"])
         return Shot(gaussians, camera, sh_degree, background, self._profile, self._antialiased)
 
 
-def _smaller(view: ViewTensors, divisor: int) -> Camera:
+def _smaller(view: ViewTensors, divisor: int, device: torch.device) -> Camera:
     """Return a view's camera with its width and height divided, rounded up, and the same field of view."""
     width, height = -(-view.width // divisor), -(-view.height // divisor)
     K = view.K[0].clone()
     K[0] *= width / view.width
     K[1] *= height / view.height
-    return Camera(view.viewmat[0], K, width, height)
+    return Camera(view.viewmat[0].to(device), K.to(device), width, height)
 
 
 def _opener(name: str) -> Callable[[Shot], View]:
@@ -254,7 +254,9 @@ def _opener(name: str) -> Callable[[Shot], View]:
 
         return OracleView
     if name == "cuda":
-        raise PopError("backend 'cuda' has no passes over views; use backend 'compiled' or 'fast'")
+        from pop_fast.pass_cuda import CudaView
+
+        return CudaView
     from pop_fast.pass_stages import view_of
     from pop_fast.raster_stages import stages_of
 

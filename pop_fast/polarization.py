@@ -33,6 +33,37 @@ def pop_loss_vjp(opacities: Tensor, mask: Tensor, v_loss: Tensor | float, visibl
     return v_loss * _value_and_grad(opacities, mask, visible)[1]
 
 
+def opacity_entropy(logits: Tensor) -> Tensor:
+    """See `pop_ref.polarization.opacity_entropy`; differentiable in `logits`.
+
+    Optimizations: none.
+    """
+    return _Entropy.apply(logits)
+
+
+def opacity_entropy_vjp(logits: Tensor, v_loss: Tensor | float) -> Tensor:
+    """See `pop_ref.polarization.opacity_entropy_vjp`.
+
+    Optimizations: none.
+    """
+    o = torch.sigmoid(logits)
+    return -v_loss * logits * o * torch.sigmoid(-logits) / max(len(logits), 1)
+
+
+class _Entropy(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, logits: Tensor) -> Tensor:  # type: ignore[override]
+        ctx.save_for_backward(logits)
+        softplus = torch.nn.functional.softplus
+        entropies = torch.sigmoid(logits) * softplus(-logits) + torch.sigmoid(-logits) * softplus(logits)
+        return entropies.sum() / max(len(logits), 1)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, v_loss: Tensor) -> Tensor:  # type: ignore[override]
+        return opacity_entropy_vjp(ctx.saved_tensors[0], v_loss)
+
+
 def _value_and_grad(opacities: Tensor, mask: Tensor, visible: Tensor | None) -> tuple[Tensor, Tensor]:
     other = ~mask
     if visible is not None:

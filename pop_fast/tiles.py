@@ -107,8 +107,19 @@ def tile_lists(
         shapes = [t.index_select(0, rows) for t in (*columns(means2d), *columns(conics), opacities)]
         touched = _touches(shapes, splat, tile_x, tile_y, tile_size, profile).nonzero().squeeze(1)
         splat, tile_x, tile_y = (t.index_select(0, touched) for t in (splat, tile_x, tile_y))
-    ids = rows.index_select(0, splat)
-    tile = tile_y * tiles_x + tile_x
+    return sorted_by_tile(rows.index_select(0, splat), tile_y * tiles_x + tile_x, tile_size, tiles_x, tiles_y)
+
+
+def sorted_by_tile(ids: Tensor, tile: Tensor, tile_size: int, tiles_x: int, tiles_y: int) -> TileLists:
+    """Make lists of entries that come front to back.
+
+    Args:
+        ids: splat of every entry. [I]
+        tile: of every entry. [I] int32
+        tile_size: px.
+        tiles_x: tiles in a row.
+        tiles_y: rows of tiles.
+    """
     n_tiles = tiles_x * tiles_y
     order = _stable_order(tile.to(torch.int16 if n_tiles < 2**15 else torch.int32))
     offsets = torch.zeros(n_tiles + 1, dtype=torch.int64)

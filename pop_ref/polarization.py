@@ -7,6 +7,8 @@ With M the importance mask and N_imp = Σ M,
 so an important opacity feels -1 / N_imp and any other +1 / (N - N_imp): no gradient runs through the mask, and none
 depends on o itself. Through the sigmoid the pull on a logit is that times o (1 - o).
 
+A rival of the prior is `opacity_entropy`, which pulls every opacity to the pole that it is nearer to.
+
 Labels decided here: A1 (whose dominant counts), A7 (an empty term is 0), A12 (over which Gaussians the sums run).
 """
 
@@ -15,6 +17,7 @@ from __future__ import annotations
 import numpy as np
 
 from pop_ref._shapes import Bool, Float64, Int64
+from pop_ref.activations import opacities_from_logits
 
 
 def importance_mask(dominant_counts: Int64[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
@@ -99,6 +102,52 @@ def pop_loss_vjp(
     v_opacities[important] = -v_loss / max(int(np.sum(important)), 1)
     v_opacities[other] = v_loss / max(int(np.sum(other)), 1)
     return v_opacities
+
+
+def opacity_entropy(logits: Float64[np.ndarray, " N"]) -> float:
+    """Average the binary entropy of opacities: `mean_i(-o ln o - (1 - o) ln(1 - o))`, which is 0 at both poles.
+
+    Source: the opacity regularizer of volume and splat models that polarises without a mask, as in Guedon and Lepetit
+        2024 (SuGaR); the POP paper, section 2, sets itself apart from it.
+    Departs: written by the logit x, of which the two logarithms are -softplus(-x) and -softplus(x), so that no opacity
+        is too near a pole.
+
+    Args:
+        logits: of the opacities.
+
+    Returns:
+        The mean, in nats; 0 for no Gaussians.
+
+    Example:
+        >>> round(opacity_entropy(np.array([0.0])), 12), opacity_entropy(np.array([800.0]))
+        (0.69314718056, 0.0)
+    """
+    o, rest = opacities_from_logits(logits), opacities_from_logits(-logits)
+    entropies = o * np.logaddexp(0.0, -logits) + rest * np.logaddexp(0.0, logits)
+    return float(np.sum(entropies) / max(len(logits), 1))
+
+
+def opacity_entropy_vjp(logits: Float64[np.ndarray, " N"], v_loss: float) -> Float64[np.ndarray, " N"]:
+    """Pull a cotangent of `opacity_entropy` back to the logits: `-v x o (1 - o) / N`.
+
+    An opacity over one half rises, another falls, wherever the Gaussian is.
+
+    Source: derivative of `opacity_entropy`.
+    Departs: nothing.
+
+    Args:
+        logits: of the opacities.
+        v_loss: cotangent of the mean.
+
+    Returns:
+        Cotangent of `logits`.
+
+    Example:
+        >>> opacity_entropy_vjp(np.array([0.0, 800.0]), 1.0).tolist()
+        [-0.0, -0.0]
+    """
+    o, rest = opacities_from_logits(logits), opacities_from_logits(-logits)
+    return -v_loss * logits * o * rest / max(len(logits), 1)
 
 
 def _sides(mask: np.ndarray, visible: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:

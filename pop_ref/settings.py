@@ -51,6 +51,10 @@ class DensityConfig:
             every Gaussian that can be seen would grow until it cannot.
         blur_start_iter: first step of the blur window, inclusive.
         blur_stop_iter: last step of the blur window, inclusive (A19); under `blur_start_iter` there is none.
+        blur_stop_gain: the blur window also ends where growth no longer pays: where twice as many Gaussians have not
+            divided the loss by two to the power of this (`density.blur_is_over`); 0 leaves that out. The paper calls
+            its fixed window its first limitation.
+        blur_stop_span: events whose windows are averaged for that, before and after.
         blur_window: "any_view" tests each view by itself and keeps the flag until the event, "sum" adds the
             counts of the window up and tests the sum, "own_view" tests the event's own view only (A2).
         blur_rule: "by_scale" clones small blurred Gaussians and splits large ones, "split" splits all (A14).
@@ -59,6 +63,8 @@ class DensityConfig:
         reset_at_zero: reset at step 0 as well, as gsplat up to 1.5.2 does (A25).
         reset_opa: the ceiling of a reset; gsplat couples it to `prune_opa`, as twice that.
         pause_refine_after_reset: steps after a reset in which no event happens (gsplat's name; 0, as in its default).
+        final_prune_iter: step after which opacities under `final_prune_opa` are pruned once more; -1 never.
+        final_prune_opa: the opacity that survives that.
     """
 
     prune_opa: float = 0.005
@@ -78,6 +84,8 @@ class DensityConfig:
     blur_min_pixels: float = 0.0
     blur_start_iter: int = 3000
     blur_stop_iter: int = 7000
+    blur_stop_gain: float = 0.0
+    blur_stop_span: int = 5
     blur_window: Literal["any_view", "sum", "own_view"] = "any_view"
     blur_rule: Literal["by_scale", "split"] = "by_scale"
     revised_opacity: bool = False
@@ -85,6 +93,8 @@ class DensityConfig:
     reset_at_zero: bool = False
     reset_opa: float = 0.01
     pause_refine_after_reset: int = 0
+    final_prune_iter: int = -1
+    final_prune_opa: float = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,6 +122,8 @@ class PopTerm:
         pop_stop_iter: first step without it.
         pop_views: "current" takes importance from the current view, "window" from all views since the last event (A1).
         pop_over: "all" averages over all Gaussians, "visible" over those the view shows (A12).
+        lambda_entropy: weight of the mean binary entropy of all opacities, a rival of the POP term that does not ask
+            who is important; on at the same steps.
     """
 
     lambda_pop: float = 1e-3
@@ -119,6 +131,7 @@ class PopTerm:
     pop_stop_iter: int = 15_000
     pop_views: Literal["current", "window"] = "current"
     pop_over: Literal["all", "visible"] = "all"
+    lambda_entropy: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,15 +29,18 @@ from pop_ref.density import (
     Rows,
     Statistics,
     accumulate,
+    blurs_at,
     densifies_at,
     densify_and_prune,
+    prune_rows,
     reset_opacities,
     resets_at,
     rows_from_params,
+    without_blur_that_does_not_pay,
     zero_statistics,
 )
 from pop_ref.optimizer import adam_step, learning_rates, sh_degree_at, update_numbers
-from pop_ref.polarization import importance_mask, pop_loss, pop_loss_vjp
+from pop_ref.polarization import importance_mask, opacity_entropy, opacity_entropy_vjp, pop_loss, pop_loss_vjp
 from pop_ref.recipes import RECIPES, Recipe
 from pop_ref.render import RenderGradients, render, render_vjp
 from pop_ref.settings import LAMBDA_SSIM_3DGS
@@ -53,6 +56,8 @@ class Training:
             is not trained, and goes with its row.
         statistics: of the current densification window.
         step: number of the next step, from 0.
+        loss_sum: of the window's losses.
+        windows: of each window that ended in the blur window, the Gaussians that it had and its mean loss.
         waiting: gradients that wait for their parameter's next update (`UpdateRules.sh_rest_every`); absent ones are 0.
     """
 
@@ -60,6 +65,8 @@ class Training:
     statistics: Statistics
     step: int = 0
     waiting: Mapping[str, np.ndarray] = field(default_factory=dict[str, np.ndarray])
+    loss_sum: float = 0.0
+    windows: tuple[tuple[int, float], ...] = ()
 
 
 def start(params: Mapping[str, np.ndarray]) -> Training:
@@ -124,13 +131,22 @@ def train_step(
     loss, v_image, v_opacities = objective(view, gaussians, target, state, recipe)
     gradients = render_vjp(gaussians, camera, v_image, sh_degree=degree, profile=recipe.profile)
     grads = params_vjp(rows.params, gradients, v_opacities)
+    if recipe.lambda_entropy != 0.0 and recipe.pop_start_iter <= step < recipe.pop_stop_iter:
+        loss += recipe.lambda_entropy * opacity_entropy(rows.params["opacities"])
+        grads["opacities"] += opacity_entropy_vjp(rows.params["opacities"], recipe.lambda_entropy)
     rows, waiting = update(rows, grads, state, scene_scale, recipe)
     seen = (gradients.means2d, view.splats.visible, view.dominant_counts, camera.width, camera.height)
     statistics = accumulate(state.statistics, *seen, recipe.density)
-    rows, statistics = control(rows, statistics, scene_scale, step, normals, recipe.density)
+    windows, density = state.windows, recipe.density
+    loss_sum = state.loss_sum + loss
+    if densifies_at(step, density):
+        if blurs_at(step, density):
+            windows = (*windows, (len(rows), loss_sum / statistics.n_views))
+        density, loss_sum = without_blur_that_does_not_pay(density, windows), 0.0
+    rows, statistics = control(rows, statistics, scene_scale, step, normals, density)
     # rows that wait are not those of a population that has been edited
     waiting = {} if densifies_at(step, recipe.density) else waiting
-    return Training(rows, statistics, step + 1, waiting), loss
+    return Training(rows, statistics, step + 1, waiting, loss_sum, windows), loss
 
 
 def update(
@@ -309,4 +325,7 @@ def control(
         rows, statistics = densify_and_prune(rows, statistics, scene_scale, step, normals, config)
     if resets_at(step, config):
         rows = reset_opacities(rows, config.reset_opa)
+    if step == config.final_prune_iter:
+        faint = opacities_from_logits(rows.params["opacities"]) < config.final_prune_opa
+        rows, statistics = prune_rows(rows, faint), zero_statistics(len(rows) - int(np.sum(faint)))
     return rows, statistics

@@ -127,6 +127,23 @@ struct BlendBackward {
     float* sums;              // [n, RECORD]; zeroed by the caller for atomics
 };
 
+// sums over the pixels of every splat, or what every pixel belongs to
+enum class Score : int { contributions = 0, sensitivities = 1, moments = 2, points = 3 };
+
+// A pass over a view that blend_forward has drawn. Records carry what the score reads of a splat in the place of its
+// colour: nothing, the sum of its channels, its colour, or g, by which t* >= 0 is told.
+struct ScoreArrays {
+    const float* records;     // [n, RECORD]
+    const float* background;  // [channels], for sensitivities the sum of them; read by sensitivities and moments
+    const float* T_final;     // [H, W]
+    const int* last;          // [H, W]
+    const float* pixel_map;   // [H, W] or null, read by contributions
+    float fx, fy, cx, cy;     // px, of the rays; read by points
+    float* rows;              // [capacity * tiles of a list tile, score_pitch], zeros
+    double* totals;           // [n, score_columns]
+    int* ids;                 // [H, W], written by points
+};
+
 struct SplatGradients {
     float* v_means2d;
     float* v_means2d_abs;     // or null
@@ -167,6 +184,10 @@ void blend_backward(const TileLists& lists, const BlendBackward& blend, const Pr
                     const DeviceState* state, cudaStream_t stream);
 void splat_gradients(int n, int channels, const SplatArrays& splats, const float* sums,
                      const SplatGradients& gradients, cudaStream_t stream);
+int score_columns(Score score);
+int score_pitch(Score score);
+void score_view(const TileLists& lists, const ScoreArrays& scores, Score score, const Profile<float>& profile,
+                cudaStream_t stream);
 void project_backward(const GaussianArrays& gaussians, const ViewArrays& view, const ProjectSettings& settings,
                       const SplatArrays& splats, const SplatGradients& of, const float* v_depths,
                       const GaussianGradients& gradients, cudaStream_t stream);

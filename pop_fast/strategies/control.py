@@ -49,6 +49,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         *("prune_too_big_after", "refine_start_iter", "refine_stop_iter", "blur_start_iter", "blur_stop_iter"),
         *("pop_start_iter", "pop_stop_iter", "refine_scale2d_stop_iter", "sh_start_iter", "opacities_stop_iter"),
         *("means_rewind_iter", "means_rewind_to", "rounds_start_iter", "round_steps", "round_decay_every"),
+        "final_prune_iter",
     )
 
     absgrad: bool = False
@@ -92,15 +93,17 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
 
     def needs_dominance(self, step: int) -> bool:
         """Tell whether `info["dominant_counts"]` is read at this step: by the POP loss, the blur rule or a window."""
-        return self.regularizes(step) or self.collects_blur(step) or self.collects_window(step)
+        prior = self.lambda_pop != 0.0 and self.regularizes(step)
+        return prior or self.collects_blur(step) or self.collects_window(step)
 
     def needs_passes(self, step: int) -> bool:
         """Tell whether the change after this step looks at the training views."""
         return False
 
     def regularizes(self, step: int) -> bool:
-        """Tell whether `regularizer` adds the POP loss at this step."""
-        return self.lambda_pop != 0.0 and self.pop_start_iter <= step < self.pop_stop_iter
+        """Tell whether `regularizer` adds a prior on opacities at this step."""
+        weighs = self.lambda_pop != 0.0 or self.lambda_entropy != 0.0
+        return weighs and self.pop_start_iter <= step < self.pop_stop_iter
 
     def collects(self, step: int) -> bool:
         """Tell whether screen gradients are collected at this step."""
@@ -116,10 +119,10 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
 
     def changes_after(self, step: int) -> bool:
         """Tell whether the population is edited after this step."""
-        return self.is_refine_step(step) or self.is_reset_step(step)
+        return self.is_refine_step(step) or self.is_reset_step(step) or step == self.final_prune_iter
 
     def regularizer(self, opacities: Tensor, state: State, step: int, info: Info) -> Tensor | None:
-        """Return `lambda_pop * L_pop` of this view, or None when the term is off.
+        """Return `lambda_pop L_pop` of this view, with `lambda_entropy` times the entropy, or None when both are off.
 
         Args:
             opacities: activated opacities, in the graph. [N]
@@ -220,15 +223,26 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
             return self.edit(Population(params, optimizers, state, step, draws, passes, sh_degree))
 
     def edit(self, of: Population) -> StepEvent:
-        """Do what is due after a step after which the population changes: refine, then reset."""
+        """Do what is due after a step after which the population changes: refine, reset, prune for the last time."""
         event = self.refine(of) if self.is_refine_step(of.step) else StepEvent()
-        return self.reset(of, event)
+        return self.prune_finally(of, self.reset(of, event))
 
     def refine(self, of: Population) -> StepEvent:
         """Clone, split and prune by the window's statistics."""
         from pop_fast.strategies import densify
 
         return densify.refine(self, of, *densify.who_grows(self, of), lambda: densify.who_goes(self, of))
+
+    def prune_finally(self, of: Population, event: StepEvent) -> StepEvent:
+        """Prune faint Gaussians once more if it is time, and say so in the event."""
+        if of.step != self.final_prune_iter:
+            return event
+        import torch
+
+        from pop_fast.strategies import densify
+
+        faint = torch.sigmoid(of.params["opacities"].flatten()) < self.final_prune_opa
+        return replace(event, pruned=event.pruned + densify.prune(of, faint))
 
     def reset(self, of: Population, event: StepEvent) -> StepEvent:
         """Reset opacities if it is time, and say so in the event."""

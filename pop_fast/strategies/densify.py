@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from pop_fast.density import SPLIT_CHILDREN, Statistics, blur_set, grow_masks, prune_mask
-from pop_fast.polarization import importance_mask, pop_loss
+from pop_fast.density import SPLIT_CHILDREN, Statistics, blur_is_over, blur_set, grow_masks, prune_mask
+from pop_fast.polarization import importance_mask, opacity_entropy, pop_loss
 from pop_fast.strategies import ops
 from pop_fast.strategies.base import Draws, Info, Params, Population, State, StepEvent
 from pop_fast.strategies.control import DensityControl
@@ -28,17 +29,31 @@ def initialize_state(scene_scale: float, seed: int, count: int) -> State:
         "sh_rest_sum": None,
         "scene_scale": float(scene_scale),
         "first_count": count,
+        "loss_sum": 0.0,
+        "blur_windows": None,
         "generator": generator,
     }
 
 
 def regularizer(plan: DensityControl, opacities: Tensor, state: State, info: Info) -> Tensor:
-    """Return the weighted POP loss of a view; see `DensityControl.regularizer`."""
+    """Return the weighted priors on opacities of a view; see `DensityControl.regularizer`."""
+    terms = [] if plan.lambda_entropy == 0.0 else [plan.lambda_entropy * opacity_entropy(_logits(opacities))]
+    if plan.lambda_pop != 0.0:
+        terms.append(plan.lambda_pop * _prior(plan, opacities, state, info))
+    return sum(terms[1:], terms[0])
+
+
+def _logits(opacities: Tensor) -> Tensor:
+    # of sigmoid's own output, whose inverse is exact but next to the poles, where entropy does not pull
+    return torch.logit(opacities.reshape(-1), eps=torch.finfo(opacities.dtype).eps)
+
+
+def _prior(plan: DensityControl, opacities: Tensor, state: State, info: Info) -> Tensor:
     mask = importance_mask(dominant_counts(info).sum(0))
     if plan.pop_views == "window" and state["dominant_sum"] is not None:
         mask = mask | importance_mask(state["dominant_sum"])
     visible = visible_in(info, len(mask)) if plan.pop_over == "visible" else None
-    return plan.lambda_pop * pop_loss(opacities.reshape(-1), mask, visible=visible)
+    return pop_loss(opacities.reshape(-1), mask, visible=visible)
 
 
 @torch.no_grad()
@@ -132,10 +147,24 @@ def prune(of: Population, mask: Tensor) -> int:
 def who_grows(plan: DensityControl, of: Population) -> tuple[Tensor, Tensor]:
     """Return who is cloned and who is split; see `pop_ref.density.grow_masks`. [N] bool each"""
     state = of.state
+    if plan.blur_stop_gain > 0.0 and plan.is_blur_step(of.step):
+        plan = _without_blur_that_does_not_pay(plan, of)
     masks = grow_masks(window(state), torch.exp(of.params["scales"]), state["scene_scale"], of.step, plan)
     if of.step < plan.refine_scale2d_stop_iter:
         return masks[0], masks[1] | (state["radii"] > plan.grow_scale2d)
     return masks
+
+
+def _without_blur_that_does_not_pay(plan: DensityControl, of: Population) -> DensityControl:
+    """Note the window that ends; see `pop_ref.density.without_blur_that_does_not_pay`."""
+    state = of.state
+    if not state["loss_sum"] > 0.0:
+        raise ValueError("blur_stop_gain compares losses; add every step's to state['loss_sum'], or set it to 0")
+    noted = torch.tensor([[float(len(of))], [state["loss_sum"] / state["views"]]], dtype=torch.float64)
+    known = state["blur_windows"]
+    state["blur_windows"] = noted if known is None else torch.cat([known, noted], 1)
+    windows = [(n, loss) for n, loss in state["blur_windows"].T.tolist()]
+    return replace(plan, blur_stop_iter=-1) if blur_is_over(windows, plan.blur_stop_span, plan.blur_stop_gain) else plan
 
 
 def window(state: State) -> Statistics:
@@ -168,7 +197,7 @@ def clear(state: State) -> None:
     """Start a new window."""
     state["grad2d"].zero_()
     state["count"].zero_()
-    state["views"] = 0
+    state["views"], state["loss_sum"] = 0, 0.0
     # rows that wait are not those of a population that has been edited
     state["blurred"] = state["dominant_sum"] = state["sh_rest_sum"] = None
     if state["radii"] is not None:
@@ -179,7 +208,7 @@ def forget(state: State) -> None:
     """Leave a window behind whose Gaussians are gone."""
     state["grad2d"] = state["count"] = state["radii"] = None
     state["blurred"] = state["dominant_sum"] = state["sh_rest_sum"] = None
-    state["views"] = 0
+    state["views"], state["loss_sum"] = 0, 0.0
 
 
 def standard_normals(generator: torch.Generator, n: int) -> Tensor:

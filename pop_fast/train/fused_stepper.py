@@ -145,6 +145,7 @@ def unsupported(config: TrainConfig) -> str | None:
         "absgrad": (plan.absgrad, False),
         "key_for_gradient": (plan.key_for_gradient, "means2d"),
         "refine_scale2d_stop_iter": (plan.refine_scale2d_stop_iter, 0),
+        "lambda_entropy": (plan.lambda_entropy, 0.0),
     }
     for name, (value, supported) in known.items():
         if value != supported:

@@ -21,7 +21,7 @@ def phase_at(config: TrainConfig, strategy: DensityControl | ForeignStrategy, st
     own = isinstance(strategy, DensityControl)
     return Phase(
         sh_degree=active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter),
-        pop=own and strategy.regularizes(step),
+        pop=own and strategy.lambda_pop != 0.0 and strategy.regularizes(step),
         statistics=own and strategy.collects(step),
         blur=own and strategy.collects_blur(step),
         l1=kind == "l1",

@@ -199,6 +199,14 @@ def test_a_training_without_the_package_of_the_command_line_is_skipped(tmp_path,
     assert (found["status"], "needs tyro" in found["skipped"]) == (0, True)
 
 
+def test_rows_of_the_paper_are_trained_and_brought_back(tmp_path, monkeypatch):
+    assert "no captures" in gpu_check_stages.reproduce_stage(check(tmp_path))["skipped"]
+    monkeypatch.setattr(gpu_check_stages, "REPRODUCED", ("l1_div_100",))
+    found = gpu_check_stages.reproduce_stage(check(tmp_path, captures=(tmp_path / "demo",), rehearsal=True))
+    assert found["status"] == 0, found["output"]
+    assert found["rows"] == ["toy/l1_div_100/demo_42.json"]
+
+
 def test_gsplat_that_was_not_compiled_is_told_and_is_no_failure(tmp_path):
     assert "not among the wheels" in gpu_check_stages.gsplat_stage(check(tmp_path))["skipped"]
     command = [sys.executable, "-c", "raise SystemExit('nvcc does not know this')"]

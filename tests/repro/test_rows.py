@@ -15,7 +15,7 @@ from paper_repro.scales import SCALES
 from paper_repro.scenes import SCENES
 from pop_fast.errors import PopError
 from pop_ref.constants import PROFILES
-from pop_ref.recipes import L1_DIVIDED, RECIPES, Recipe
+from pop_ref.recipes import BASELINES, L1_DIVIDED, RECIPES, Recipe
 from pop_ref.settings import DensityConfig, PopTerm
 
 # rows that are a recipe of the oracle
@@ -30,16 +30,25 @@ OF_RECIPES = {
 }
 NAMED: dict[str, Recipe] = {
     **{row: RECIPES[name] for row, name in OF_RECIPES.items()},
+    "3dgs_2023": RECIPES["3DGS 2023"],
     **{f"l1_div_{n}": recipe for n, recipe in L1_DIVIDED.items()},
     **{
         f"blur_3k_{end}k": replace(RECIPES["POP"], density=replace(RECIPES["POP"].density, blur_stop_iter=1000 * end))
         for end in (4, 11, 15)
     },
 }
+# rows of other methods, whose own events are their strategies'
+OTHERS: dict[str, Recipe] = {
+    "pup": BASELINES["PUP-3DGS"],
+    "mini_splatting": BASELINES["Mini-Splatting"],
+    "taming": BASELINES["Taming-3DGS"],
+    "speedy_splat": BASELINES["Speedy-Splat"],
+}
 # rows that read an open question otherwise, with the one value in which they differ from POP
 READINGS = {
     "pop_visible": ("pop_over", "visible"),
     "pop_own_view": ("blur_window", "own_view"),
+    "pop_prune_002": ("prune_opa", 0.02),
     "pop_sum": ("blur_window", "sum"),
     "pop_no_size_prune": ("prune_too_big", False),
 }
@@ -71,9 +80,9 @@ def test_rows_have_the_names_and_bytes_that_the_paper_has_for_them():
         assert row.bytes_per_gaussian == paper().bytes_per_gaussian.get(row.name, row.bytes_per_gaussian), row.name
 
 
-@pytest.mark.parametrize("name", NAMED)
+@pytest.mark.parametrize("name", [*NAMED, *OTHERS])
 def test_a_row_trains_what_the_recipe_of_its_name_says(name):
-    recipe, config = NAMED[name], job_named(name, "garden", "paper").config()
+    recipe, config = {**NAMED, **OTHERS}[name], job_named(name, "garden", "paper").config()
     for kind, said in ((DensityConfig, recipe.density), (PopTerm, recipe)):
         for field in fields(kind):
             assert getattr(config.strategy, field.name) == getattr(said, field.name), field.name
@@ -112,6 +121,15 @@ def test_a_small_scale_keeps_theta_blur_at_ten_pixels_and_the_papers_does_not():
     for scale, floor in (("toy", 10.0), ("dev", 10.0), ("full", 10.0), ("paper", 0.0)):
         scene = next(iter(SCALES[scale].factors))
         assert job_named("pop", scene, scale).config().strategy.blur_min_pixels == floor
+
+
+@pytest.mark.parametrize("scale", ["toy", "dev", "full"])
+def test_a_small_scale_sets_fewer_points_anew_than_its_views_have_pixels(scale):
+    for scene, factor in SCALES[scale].factors.items():
+        (width, height), views = SCENES[scene].size, SCENES[scene].n_images
+        points = job_named("mini_splatting", scene, scale).config().strategy.reinit_points
+        assert 0.005 < points / (width * height // factor**2 * views) < 0.05
+    assert job_named("mini_splatting", "garden", "paper").config().strategy.reinit_points == 3_500_000
 
 
 def test_rows_of_a_method_that_is_not_there_say_so(monkeypatch):

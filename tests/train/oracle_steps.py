@@ -39,7 +39,7 @@ from pop_ref.density import (
 from pop_ref.margins import margins
 from pop_ref.optimizer import learning_rates, sh_degree_at
 from pop_ref.render import render, render_vjp
-from pop_ref.settings import BETAS, EPS, DensityConfig, PopTerm, Recipe
+from pop_ref.settings import BETAS, EPS, DensityConfig, PopTerm, Recipe, UpdateRules
 from pop_ref.training import Training, control, gaussians_from_params, objective, params_vjp, train_step
 from pop_ref.types import Camera
 
@@ -65,10 +65,11 @@ def config_of(recipe: Recipe, folder: Any, **changes: Any) -> TrainConfig:
     """Return the settings of a run that does what a recipe says, over views that are all trained on."""
     density = {f.name: getattr(recipe.density, f.name) for f in fields(DensityConfig)}
     term = {f.name: getattr(recipe, f.name) for f in fields(PopTerm)}
+    rules = {f.name: getattr(recipe.updates, f.name) for f in fields(UpdateRules)}
     settings: dict[str, Any] = {
         "result_dir": str(folder),
         **values_of(recipe),
-        "strategy": POPStrategy(**density, **term),
+        "strategy": POPStrategy(**density, **term, **rules),
         "test_every": 0,
         "threads": 1,
         "progress": False,

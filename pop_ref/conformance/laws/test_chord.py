@@ -105,7 +105,7 @@ def test_a_gaussian_that_is_densest_behind_the_camera_gives_no_point(backend, si
     # a long one just ahead, slanted by 45 degrees towards the axis, which its line crosses at depth - |side| < 0
     camera = Camera(np.eye(4), np.array([[4.0, 0, 2.5], [0, 4.0, 2.5], [0, 0, 1]]), 5, 5)
     half = math.copysign(math.pi / 8.0, side)
-    slanted = ([side, 0.0, depth], [math.cos(half), 0.0, math.sin(half), 0.0], [0.0625, 0.0625, 4.0], opacity)
+    slanted = ([side, 0.0, depth], [math.cos(half), 0.0, math.sin(half), 0.0], [0.5, 0.5, 2.0], opacity)
     round_ = ([0.0, 0.0, 4.0], [1.0, 0.0, 0.0, 0.0], [1.0, 1.0, 1.0], 0.5)
     columns = [np.array(column) for column in zip(slanted, round_, strict=True)]
     given = screened(backend, Scene(Gaussians(*columns, np.zeros((2, 1, 3))), camera))

@@ -81,3 +81,28 @@ def test_restricting_the_prior_to_the_visible_is_the_prior_of_the_visible(backen
     pulled = pull(o, mask, 1.0, visible)
     assert_same_bits("gradient of the hidden", pulled[~visible], np.zeros(int(np.sum(~visible))))
     assert_close("polarization.gradient", pulled[visible], pull(o[visible], mask[visible], 1.0), 1.0, backend.dtype)
+
+
+logits = st.lists(st.integers(-40, 40).map(lambda k: k / 4.0), max_size=8).map(lambda x: np.array(x, dtype=np.float64))
+
+
+@law("polarization", "opacity_entropy", logits=logits)
+def test_the_entropy_of_opacities_is_the_mean_of_what_each_leaves_open(backend, logits):
+    o, rest = 1.0 / (1.0 + np.exp(-logits)), 1.0 / (1.0 + np.exp(logits))
+    expected = float(np.sum(-o * np.log(o) - rest * np.log(rest))) / max(len(o), 1)
+    assert_close("polarization.loss", backend.stage("opacity_entropy")(logits), expected, 2.0, backend.dtype)
+
+
+@law("polarization", "opacity_entropy_vjp", logits=logits, v=st.sampled_from([1.0, 0.5, -2.0, 0.0]))
+def test_the_entropy_pulls_every_opacity_to_the_pole_that_it_is_nearer_to(backend, logits, v):
+    o, rest = 1.0 / (1.0 + np.exp(-logits)), 1.0 / (1.0 + np.exp(logits))
+    expected = -v * logits * o * rest / max(len(o), 1)
+    pulled = backend.stage("opacity_entropy_vjp")(logits, v)
+    assert_close("polarization.gradient", pulled, expected, 4.0 * np.abs(expected), backend.dtype)
+
+
+@law("polarization", "opacity_entropy", "opacity_entropy_vjp")
+def test_the_entropy_at_the_poles_is_zero_and_pulls_nowhere(backend):
+    poles = np.array([-800.0, 800.0])
+    assert_same_bits("entropy", backend.stage("opacity_entropy")(poles), 0.0)
+    assert_same_bits("gradient", np.abs(backend.stage("opacity_entropy_vjp")(poles, 1.0)), np.zeros(2))

@@ -35,7 +35,9 @@ FLAGS += tuple(os.environ.get("POP_EMULATED_FLAGS", "").split())
 FLAGS += ("-fvisibility=hidden", "-Wno-attributes", '-DPOP_CUDA_ARCHS="emulated"', "-DNB_DOMAIN=emulated")
 _LAUNCH = re.compile(r"([A-Za-z_]\w*(?:<[\w\s,:]*>)?)\s*<<<")
 # what the host asks and gets answered at once, also while a graph is captured
-QUERIES = frozenset({"tile_workspace", "loss_blocks", "important_blocks", "driver_version"})
+QUERIES = frozenset(
+    {"tile_workspace", "loss_blocks", "important_blocks", "driver_version", "score_columns", "score_pitch"}
+)
 
 
 def why_not() -> str | None:

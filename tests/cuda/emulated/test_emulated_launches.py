@@ -10,9 +10,11 @@ import pytest
 import torch
 
 from cuda_ext.train_settings import Phase
+from pop_fast.passes import Passes
 from tests.cuda.emulated import emulate
 from tests.cuda.gpu.scene import HEIGHT, STEPS, WIDTH, training_scene
 from tests.cuda.gpu.steps import fused_trainer
+from tests.fast.pass_scenes import raw_params, views
 
 from .conftest import FOLDER
 
@@ -122,3 +124,12 @@ def test_a_render_and_its_gradients_are_launched_on_the_tensors_device(guarded):
     assert bool(p["means"].grad.any())
     for key in ("isect_offsets", "n_traversed", "dominant_counts"):
         assert meta[key] is not None
+
+
+def test_passes_are_launched_on_the_tensors_device(guarded):
+    made = Passes("cuda", views(torch.float32), device=guarded)
+    params = raw_params(dtype=torch.float32)
+    assert bool(made.contributions(params, 0, 3, torch.ones(made.photo(0).shape[:2])).map_sum.any())
+    assert bool(made.sensitivities(params, 0, 3).any())
+    assert bool(made.fisher(params, 0, 3).any())
+    assert bool((made.dominant_points(params, 0, 3)[1] >= 0).any())
