@@ -27,6 +27,8 @@ _DIVISORS: Final = (1, 2, 5, 10, 20, 50, 100)
 _STAR: Final = "l2"
 # area of the largest marker, square points
 _LARGEST: Final = 330.0
+# and of the smallest in which its middle is marked
+_WITH_MIDDLE: Final = 16.0
 # where a name may stand: directions from the marker, the best first
 _SIDES: Final = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1))
 _GAP, _FAR = 2.0, 9.0
@@ -67,7 +69,8 @@ def psnr_against_time(asked: Asked) -> Drawn:
             {"facecolor": "none", "edgecolor": color, "linewidth": 1.0} if hollow else {"color": color, "linewidth": 0}
         )
         axes.scatter(point.x, point.y, s=point.area, alpha=0.85, **look)
-        axes.scatter(point.x, point.y, s=2.0, color=color if hollow else "white", linewidth=0)
+        if point.area > _WITH_MIDDLE:
+            axes.scatter(point.x, point.y, s=2.0, color=color if hollow else "white", linewidth=0)
     _name(axes, points)
     return Drawn(sheet.figure, *_table(chosen))
 
