@@ -21,10 +21,12 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
 
-__all__ = ["BESIDE", "collect", "first_change", "settings_hash", "state_of_data"]
+__all__ = ["BESIDE", "PROBE", "collect", "first_change", "settings_hash", "spacing", "state_of_data"]
 
 # what `train_row` leaves in the result folder about the capture and the program, from before the first step
 BESIDE: Final = "row.json"
+# what `ProbedRun` leaves there
+PROBE: Final = "probe.json"
 # where things lie, who takes the steps and how often something is written: no part of what was trained
 _APART: Final = frozenset(
     {
@@ -186,22 +188,36 @@ def _records(folder: Path) -> list[dict[str, Any]]:
 
 
 def _curve(folder: Path, max_steps: int) -> tuple[dict[str, Any], ...]:
-    """Make the curve of the records of single training views, and of the measurements of all held-out views."""
+    """Make the curve of the records of single training views, of the measurements of all held-out views, and of what a
+    few training views say all along."""
     points = {point["step"]: point for point in _thinned(_records(folder), max_steps)}
     for path in sorted((folder / "stats").glob("val_step*.json")):
         stats = read_json(path, "train the row again in an empty folder")
         # at a step that has a record too, what that says of its training view stays
         record = points.get(stats["step"], {})
         points[stats["step"]] = {**_measured(stats), **{name: v for name, v in record.items() if v is not None}}
+    for step, probed in _probed(folder).items():
+        point = {**dict.fromkeys(_ALWAYS), "step": step, **probed, **points.get(step, {})}
+        points[step] = {name: _short(value) for name, value in point.items()}
     return tuple(points[step] for step in sorted(points))
+
+
+def _probed(folder: Path) -> dict[int, dict[str, Any]]:
+    path = folder / PROBE
+    found = read_json(path, "train the row again in an empty folder") if path.is_file() else {}
+    return {int(step): point for step, point in found.items()}
+
+
+def spacing(max_steps: int) -> int:
+    """Return how many steps at least lie between two points of a curve."""
+    return max(max_steps // _POINTS, 1)
 
 
 def _thinned(records: Iterable[Mapping[str, Any]], max_steps: int) -> list[dict[str, Any]]:
     """Keep about `_POINTS` of the records, the first among them."""
     kept: list[dict[str, Any]] = []
-    spacing = max_steps // _POINTS
     for record in records:
-        if not kept or record["step"] >= kept[-1]["step"] + spacing:
+        if not kept or record["step"] >= kept[-1]["step"] + spacing(max_steps):
             kept.append(_point(record))
     return kept
 

@@ -13,7 +13,7 @@ from math import exp, log
 from statistics import fmean
 from typing import Final
 
-from paper_repro.evidence import Group, decay, groups, implied_shares
+from paper_repro.evidence import Group, decay, groups, implied_shares, paper_ratios
 from paper_repro.paper import paper
 from paper_repro.results import SCALES, Result
 from paper_repro.table_markdown import grid
@@ -56,6 +56,8 @@ READINGS: Final = (
     Reading("A16", "are oversized Gaussians pruned although there is no reset?", ("pop", "pop_no_size_prune")),
 )
 _HEAD: Final = ("scale", "scene", "row", "N as the window closes", "left", "N", "of L2+Blur's", "PSNR", "runs")
+# L2+Blur under two readings of A2, the default first
+_GROWN: Final = ("l2_blur", "l2_blur_own_view")
 # the rows of E4: pruning harder at the paper's weight, in place of a tenfold weight
 _PRUNED: Final = ("final_prune", "pop_prune_002")
 
@@ -67,9 +69,9 @@ def answers(results: Iterable[Result]) -> tuple[Answer, ...]:
 
 
 def experiments(results: Iterable[Result]) -> tuple[Answer, ...]:
-    """Answer E2 and E4 from the results of all scales."""
+    """Answer E2, E4, and A2 without the prior, from the results of all scales."""
     found = list(results)
-    return _longer_schedules(found), _pruned_harder(found)
+    return _longer_schedules(found), _pruned_harder(found), _growth(found)
 
 
 def markdown(told: Sequence[Answer]) -> str:
@@ -108,6 +110,33 @@ def _answer(reading: Reading, results: Sequence[Result]) -> Answer:
             f"on {', '.join(scenes)}."
         )
     return Answer(reading.id, reading.asks, says, _HEAD, tuple(lines))
+
+
+def _growth(results: Sequence[Result]) -> Answer:
+    """A2 without the prior: by what the blur rule multiplies the Gaussians under either reading."""
+    lines: list[tuple[str, ...]] = []
+    factors: dict[str, list[float]] = {row: [] for row in _GROWN}
+    goal = paper_ratios(paper(), "l2_blur", "l2")
+    for scale in _telling(results):
+        for scene, rows in groups(r for r in results if r.scale == scale).items():
+            if "l2" not in rows:
+                continue
+            found = {row: rows[row].n / rows["l2"].n for row in _GROWN if row in rows}
+            for row, factor in found.items():
+                runs = (*rows[row].ids, *rows["l2"].ids)
+                lines.append((scale, scene, row, f"{rows[row].n:,.0f}", f"x {factor:.2f}", ", ".join(runs)))
+            if len(found) == len(_GROWN):
+                for row, factor in found.items():
+                    factors[row].append(abs(log(factor) - fmean(map(log, goal))))
+    printed = ", ".join(f"x {factor:.2f}" for factor in goal)
+    says = "Not decided: no scene has L2 and both readings of L2+Blur."
+    if factors[_GROWN[0]]:
+        nearest = min(_GROWN, key=lambda row: fmean(factors[row]))
+        says = f"Nearest to the paper's factors ({printed}) is `{nearest}`."
+    head = ("scale", "scene", "row", "N", "of L2's", "runs")
+    return Answer(
+        "A2, without the prior", "by what does the blur rule multiply the Gaussians?", says, head, tuple(lines)
+    )
 
 
 def _telling(results: Sequence[Result]) -> list[str]:

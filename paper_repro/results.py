@@ -76,7 +76,8 @@ class Result:
         opacity_below_01: share of Gaussians with opacity under 0.1 ("opacity_below_0.1" in the file).
         opacity_above_09: share of Gaussians with opacity over 0.9 ("opacity_above_0.9" in the file).
         opacity_histogram: counts in 50 equal bins over [0, 1].
-        curve: what was logged during training, by rising "step"; absent values are None.
+        curve: what was logged during training, by rising "step"; absent values are None. What begins with "grad_" and
+            "probe_" is of a few training views that are rendered all along, "psnr_test" of the held-out views.
         per_view: "psnr" and "ssim" of every held-out view, by its name.
     """
 

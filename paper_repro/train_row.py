@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
 
-__all__ = ["BusyError", "Options", "capture_folder", "commit", "is_finished", "train_row"]
+__all__ = ["BusyError", "Options", "capture_folder", "commit", "is_finished", "load_capture_of", "train_row"]
 
 _DEMO_SEED: Final = 0
 # of a result folder: what takes space and a finished row does not need
@@ -183,7 +183,7 @@ def _config(job: Job, options: Options, work: Path) -> TrainConfig:
 
 
 def _train(job: Job, options: Options, config: TrainConfig) -> None:
-    from paper_repro.collect import BESIDE, state_of_data
+    from paper_repro.collect import BESIDE, spacing, state_of_data
     from paper_repro.data_check import check_capture
     from pop_fast.cli.train import check_backend
     from pop_fast.train.checkpoint import list_checkpoints
@@ -196,19 +196,20 @@ def _train(job: Job, options: Options, config: TrainConfig) -> None:
     if not list_checkpoints(Path(config.result_dir)):
         # what a finished row has left, whose result was removed since
         shutil.rmtree(config.result_dir, ignore_errors=True)
-    capture, seconds = _load(job, config)
+    capture, seconds = load_capture_of(job, config)
     check_capture(job, config, capture)
+    from paper_repro.probe import ProbedRun
     from pop_fast.train.environment import keep_freed_memory
-    from pop_fast.train.training_run import TrainingRun
 
     keep_freed_memory()
     print(f"{job}: {capture.source}; {config.max_steps:,} steps; {chosen}", flush=True)
     beside = {BESIDE: json.dumps({"commit": program, **state_of_data(job, config, capture)}, indent=2) + "\n"}
-    run = TrainingRun(config, capture, resume=True, loading_seconds=seconds, beside=beside)
-    run.run()
+    more = {"resume": True, "loading_seconds": seconds, "beside": beside}
+    ProbedRun(config, capture, every=max(config.log_every, spacing(config.max_steps)), **more).run()
 
 
-def _load(job: Job, config: TrainConfig) -> tuple[Capture, float]:
+def load_capture_of(job: Job, config: TrainConfig) -> tuple[Capture, float]:
+    """Read the photographs and cameras of a job, and say how many seconds that took."""
     from pop_fast.cli.train import arguments, open_capture
 
     images = [] if job.scene.images is None else ["--images", job.scene.images]

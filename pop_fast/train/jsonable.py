@@ -14,9 +14,11 @@ _LARGEST = 2**53
 
 
 def to_plain(value: Any) -> Any:
-    """Turn nested dataclasses and tuples into dicts and lists."""
+    """Turn nested dataclasses, dicts and tuples into dicts and lists."""
     if is_dataclass(value) and not isinstance(value, type):
         return {field.name: to_plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, dict):
+        return {name: to_plain(item) for name, item in value.items()}
     if isinstance(value, (tuple, list)):
         return [to_plain(item) for item in value]
     return value

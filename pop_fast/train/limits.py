@@ -26,8 +26,17 @@ _AT_LEAST: Final = {
 # numbers that are divided by, or of which a logarithm is taken
 _OVER_ZERO: Final = ("init_scale", "photometric_divisor", "lr.means_decay")
 # of the strategy, whose settings errors call by the method's name as the command line does
-_AT_LEAST_OF_STRATEGY: Final = {"refine_every": 1, "reset_every": 0, "pause_refine_after_reset": 0}
-_SHARES_OF_STRATEGY: Final = ("prune_opa", "theta_blur", "reset_opa")
+_AT_LEAST_OF_STRATEGY: Final = {
+    **dict.fromkeys(("refine_every", "sh_rest_every", "round_steps", "round_decay_every", "blur_stop_span"), 1),
+    **dict.fromkeys(("score_views", "score_divisor", "reinit_points", "max_gaussians"), 1),
+    **dict.fromkeys(("reset_every", "pause_refine_after_reset", "final_count", "sampled_prunes"), 0),
+}
+_SHARES_OF_STRATEGY: Final = (
+    *("prune_opa", "theta_blur", "reset_opa", "final_prune_opa", "soft_prune_share", "hard_prune_share"),
+    *("prune_shares", "sampling_factor", "prune_mass"),
+)
+# of which a logarithm is taken from both sides
+_BETWEEN_OF_STRATEGY: Final = ("reinit_opacity",)
 
 
 def check_values(config: Any) -> None:
@@ -40,8 +49,10 @@ def check_values(config: Any) -> None:
         PopError: a setting is out of range or, being a number, not finite.
     """
     values, method = dict(_flat(config)), config.method
-    shares = ("lambda_ssim", *(f"{method}.{name}" for name in _SHARES_OF_STRATEGY))
-    at_least = {**_AT_LEAST, **{f"{method}.{name}": least for name, least in _AT_LEAST_OF_STRATEGY.items()}}
+    own = {name: value for name, value in values.items() if name.startswith(f"{method}.")}
+    shares = ("lambda_ssim", *(name for name in own if name.removeprefix(f"{method}.") in _SHARES_OF_STRATEGY))
+    known = {f"{method}.{name}": least for name, least in _AT_LEAST_OF_STRATEGY.items()}
+    at_least = {**_AT_LEAST, **{name: least for name, least in known.items() if name in own}}
     for name, smallest in at_least.items():
         if values[name] is not None and values[name] < smallest:
             raise PopError(f"{name} is {values[name]}; it must be at least {smallest}")
@@ -49,10 +60,14 @@ def check_values(config: Any) -> None:
         raise PopError(f"sh_degree is {values['sh_degree']}; it must be 0, 1, 2 or 3")
     if not 0.0 < values["init_opacity"] < 1.0:
         raise PopError(f"init_opacity is {values['init_opacity']}; it must lie between 0 and 1")
+    for name in (f"{method}.{name}" for name in _BETWEEN_OF_STRATEGY):
+        if name in own and not 0.0 < own[name] < 1.0:
+            raise PopError(f"{name} is {own[name]}; it must lie between 0 and 1")
     if any(not 0.0 <= value <= 1.0 for value in values["background"]):
         raise PopError(f"background is {list(values['background'])}; every channel must lie in [0, 1]")
     for name in (*_OVER_ZERO, *shares, *(name for name, value in values.items() if isinstance(value, float))):
-        _check_number(name, values[name], name in shares)
+        for value in values[name] if isinstance(values[name], tuple) else (values[name],):
+            _check_number(name, value, name in shares)
 
 
 def _check_number(name: str, value: float, is_share: bool) -> None:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.backends import get_backend
+from pop_fast.errors import PopError
 from pop_fast.strategies import DensityControl
 from pop_fast.strategies.base import Draws
 from pop_fast.train import TrainConfig, TrainingRun
@@ -326,3 +327,34 @@ def test_taming_grows_and_prunes_who_the_oracle_draws(misaligned: bool, tmp_path
     gone = faint & np.isin(np.arange(len(grown)), drawn)
     assert event.pruned == gone.sum() > 0
     np.testing.assert_array_equal(after["opacities"], grown[~gone])
+
+
+@pytest.mark.parametrize(
+    ("method", "setting", "words"),
+    [
+        ("speedy-splat", {"hard_prune_share": 1.5}, "speedy-splat.hard_prune_share is 1.5; it must lie in [0, 1]"),
+        ("pup", {"prune_shares": (0.5, -0.1)}, "pup.prune_shares is -0.1; it must lie in [0, 1]"),
+        ("pup", {"score_divisor": 0}, "pup.score_divisor is 0; it must be at least 1"),
+        (
+            "mini-splatting",
+            {"reinit_opacity": 1.0},
+            "mini-splatting.reinit_opacity is 1.0; it must lie between 0 and 1",
+        ),
+        ("taming", {"sh_rest_every": 0}, "taming.sh_rest_every is 0; it must be at least 1"),
+        ("taming", {"budget_multiplier": -2.0}, "taming.budget_multiplier is -2.0; it must be >= 0 and finite"),
+        ("pop", {"blur_stop_span": 0}, "pop.blur_stop_span is 0; it must be at least 1"),
+    ],
+)
+def test_a_setting_that_cannot_be_is_named_as_the_command_line_names_it(
+    method: str, setting: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(PopError) as error:
+        TrainConfig.of(method=method, **{method: setting})
+    assert str(error.value) == words
+
+
+def test_a_method_that_looks_at_the_views_says_so_to_a_trainer_that_has_none(tmp_path: Any) -> None:
+    run, _ = in_double(tmp_path, "speedy-splat")
+    stopped_before(run, 25)
+    with pytest.raises(ValueError, match="this strategy looks at the training views"):
+        run.strategy.change(run.params, run.optimizers, run.state, 25)

@@ -221,3 +221,14 @@ def test_pruning_harder_is_told_beside_pop_and_gsplat() -> None:
     told = experiments([pop, pruned, result("gsplat", n=200)])[1]
     assert told.lines[0][:6] == ("dev", "fox", "final_prune", "70.0%", "-0.10 dB", "35.0%")
     assert experiments([pruned])[1].says.startswith("Not decided")
+
+
+def test_the_reading_whose_growth_is_the_papers_speaks_for_itself() -> None:
+    runs = [result("l2", n=100), result("l2_blur", n=900), result("l2_blur_own_view", n=230)]
+    told = experiments(runs)[2]
+    assert told.says == "Nearest to the paper's factors (x 2.78, x 2.52, x 1.54) is `l2_blur_own_view`."
+    assert [line[4] for line in told.lines] == ["x 9.00", "x 2.30"]
+    assert experiments([replace(runs[1], num_gaussians=240), replace(runs[2], num_gaussians=90), runs[0]])[
+        2
+    ].says.endswith("is `l2_blur`.")
+    assert experiments(runs[:2])[2].says.startswith("Not decided")

@@ -48,6 +48,7 @@ OTHERS: dict[str, Recipe] = {
 READINGS = {
     "pop_visible": ("pop_over", "visible"),
     "pop_own_view": ("blur_window", "own_view"),
+    "pop_prune_002": ("prune_opa", 0.02),
     "pop_sum": ("blur_window", "sum"),
     "pop_no_size_prune": ("prune_too_big", False),
 }

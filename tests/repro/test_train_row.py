@@ -104,6 +104,20 @@ def test_a_curve_has_every_event_and_the_held_out_views_of_every_fifteenth(made)
     )
 
 
+def test_a_curve_has_what_a_few_training_views_say_all_along(made):
+    points = {point["step"]: point for point in read(made[1]).curve}
+    probed = [step for step, point in points.items() if point.get("grad_l2") is not None]
+    assert probed == list(range(0, 300, 10))
+    for step in probed:
+        point = points[step]
+        # no pixel of a float render equals its photograph's, and L2's slope is twice the error
+        assert point["grad_l1"] == pytest.approx(1.0, rel=1e-3)
+        assert 0.0 < point["grad_l2"] < 2.0
+        assert point["grad_ssim"] > 0.0
+        assert point["probe_traversed"] >= point["probe_blended"] > 1.0
+    assert points[290]["grad_l2"] < 0.5 * points[0]["grad_l2"]
+
+
 def test_a_finished_row_is_not_trained_again_and_leaves_no_bulk(made, monkeypatch):
     how, path = made
     work = toy("pop").work(how.work)

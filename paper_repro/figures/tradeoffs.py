@@ -1,0 +1,218 @@
+"""Figures 1 and 6b: PSNR against training time, and against the number of Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Final
+
+from paper_repro.figures.data import Asked, Chosen, choose, mean_of
+from paper_repro.figures.foot import foot
+from paper_repro.figures.sheet import Drawn, Margins, Sheet
+from paper_repro.figures.style import color_of, count, darker, log_ticks, name_of
+from paper_repro.paper import paper
+from paper_repro.results import Result
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["psnr_against_count", "psnr_against_time"]
+
+_METHODS: Final = (
+    *("3dgs", "gsplat", "pup", "pup_star", "mini_splatting", "mini_splatting_star"),
+    *("taming", "speedy_splat", "pop"),
+)
+_DIVISORS: Final = (1, 2, 5, 10, 20, 50, 100)
+_STAR: Final = "l2"
+# area of the largest marker, square points
+_LARGEST: Final = 330.0
+# and of the smallest in which its middle is marked
+_WITH_MIDDLE: Final = 16.0
+# where a name may stand: directions from the marker, the best first
+_SIDES: Final = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1))
+_GAP, _FAR = 2.0, 9.0
+
+
+@dataclass(frozen=True)
+class _Point:
+    """A row in the plane of a figure; `area` in square points."""
+
+    row: str
+    x: float
+    y: float
+    n: float
+    area: float
+    text: str
+
+
+def psnr_against_time(asked: Asked) -> Drawn:
+    """Figure 1: PSNR against training time; the area of a marker is the number of Gaussians."""
+    chosen = choose(asked, _METHODS, asked.scenes(paper().datasets["Tanks & Temples"]))
+    means = {row: _means(chosen, row) for row in chosen.runs}
+    largest = max(n for _, _, n in means.values())
+    points = [
+        _Point(row, seconds, psnr, n, _LARGEST * n / largest, f"{name_of(row)}\n{count(n)}")
+        for row, (seconds, psnr, n) in means.items()
+    ]
+    machines = sorted({f"{r.machine}, {r.engine}, {_threads(r)}" for r in chosen.all})
+    where = machines[0] if len(machines) == 1 else f"{len(machines)} machines, so that times do not compare"
+    note = foot(asked, chosen, f"Area of a marker: number of Gaussians, written at it. Time on {where}.")
+    sheet = Sheet(note, 2.3)
+    axes = sheet.panel(Margins(right=0.1))
+    _plane(axes, points, "training time (s)", 0.16)
+    # small markers lie on large ones
+    for point in sorted(points, key=lambda point: -point.area):
+        hollow = point.row.endswith("_star")
+        color = color_of(point.row)
+        look = (
+            {"facecolor": "none", "edgecolor": color, "linewidth": 1.0} if hollow else {"color": color, "linewidth": 0}
+        )
+        axes.scatter(point.x, point.y, s=point.area, alpha=0.85, **look)
+        if point.area > _WITH_MIDDLE:
+            axes.scatter(point.x, point.y, s=2.0, color=color if hollow else "white", linewidth=0)
+    _name(axes, points)
+    return Drawn(sheet.figure, *_table(chosen))
+
+
+def psnr_against_count(asked: Asked) -> Drawn:
+    """Figure 6b: PSNR against the number of Gaussians, for L1 / n and for L2."""
+    rows = [f"l1_div_{n}" for n in _DIVISORS]
+    chosen = choose(asked, [*rows, _STAR], asked.scenes(paper().datasets["Mip-NeRF 360"]))
+    points = []
+    for row in chosen.runs:
+        _, psnr, n = _means(chosen, row)
+        text = "L2" if row == _STAR else "L1" if row == "l1_div_1" else name_of(row).replace(" ", "")
+        points.append(_Point(row, n, psnr, n, 90.0 if row == _STAR else 18.0, text))
+    note = foot(
+        *(asked, chosen),
+        "Circles: L1 / n; star: L2. Each with 1 - SSIM at weight 0.01; growth by gradient alone.",
+    )
+    sheet = Sheet(note, 1.9)
+    axes = sheet.panel(Margins(right=0.1))
+    _plane(axes, points, "Gaussians", 0.12)
+    circles = [point for point in points if point.row != _STAR]
+    color = color_of("l1_div_1")
+    axes.plot([p.x for p in circles], [p.y for p in circles], color=color, linewidth=0.7, alpha=0.5)
+    axes.scatter([p.x for p in circles], [p.y for p in circles], s=18.0, color=color, linewidth=0, zorder=3)
+    for point in (p for p in points if p.row == _STAR):
+        axes.scatter(point.x, point.y, s=point.area, marker="*", color=color_of(_STAR), linewidth=0, zorder=4)
+    _name(axes, points, [point.row for point in circles])
+    return Drawn(sheet.figure, *_table(chosen))
+
+
+def _means(chosen: Chosen, row: str) -> tuple[float, float, float]:
+    """Average seconds of training, PSNR and Gaussians."""
+    get: tuple[Callable[[Result], float], ...] = (
+        lambda r: r.seconds["train"],
+        lambda r: r.psnr,
+        lambda r: float(r.num_gaussians),
+    )
+    seconds, psnr, n = (mean_of(chosen.runs[row], chosen.scenes, one) for one in get)
+    return seconds, psnr, n
+
+
+def _threads(result: Result) -> str:
+    return "1 thread" if result.threads == 1 else f"{result.threads} threads"
+
+
+def _plane(axes: Axes, points: Sequence[_Point], label: str, room: float) -> None:
+    """Settle the axes around points, with some room for their names."""
+    xs, ys = [p.x for p in points], [p.y for p in points]
+    stretch = max((max(xs) / min(xs)) ** room, 1.08)
+    # names stand to the right where they can
+    low, high = min(xs) / stretch, max(xs) * stretch**2.0
+    axes.set_xscale("log")
+    axes.set_xlim(low, high)
+    log_ticks(axes.xaxis, low, high)
+    margin = max(room * (max(ys) - min(ys)), 0.05)
+    axes.set_ylim(min(ys) - margin, max(ys) + margin)
+    axes.locator_params(axis="y", nbins=6)
+    axes.set_xlabel(label)
+    axes.set_ylabel("PSNR (dB)")
+
+
+Box = tuple[float, float, float, float]
+
+
+def _name(axes: Axes, points: Sequence[_Point], joined: Sequence[str] = ()) -> None:
+    """Write each point's name where it covers least of markers, of other names and of what is outside the axes.
+
+    Args:
+        axes: whose limits and place are settled.
+        points: with their names.
+        joined: rows that a line joins, in its order.
+    """
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextToPath
+
+    to_points = 72.0 / axes.figure.dpi
+    size = 6.4
+    measure, font = TextToPath(), FontProperties(size=size)
+    x0, y0 = axes.transAxes.transform((0.0, 0.0)) * to_points
+    x1, y1 = axes.transAxes.transform((1.0, 1.0)) * to_points
+    frame: Box = (float(x0) + 1.0, float(y0) + 1.0, float(x1), float(y1))
+    at = {p.row: [float(v) * to_points for v in axes.transData.transform((p.x, p.y))] for p in points}
+    radius = {p.row: (p.area / 3.1416) ** 0.5 for p in points}
+    boxes = {p.row: _around(at[p.row], radius[p.row] + _GAP) for p in points}
+    taken = _along([at[row] for row in joined])
+    for point in sorted(points, key=lambda p: p.y):
+        lines = point.text.split("\n")
+        width = max(measure.get_text_width_height_descent(line, font, ismath=False)[0] for line in lines)
+        height = len(lines) * size * 1.15
+        x, y = at[point.row]
+        best: tuple[float, Box] | None = None
+        for step, gap in enumerate((_GAP, _FAR)):
+            for rank, (right, up) in enumerate(_SIDES):
+                off = radius[point.row] * (0.75 if right and up else 1.0) + gap
+                cx, cy = x + right * (off + width / 2.0), y + up * (off + height / 2.0)
+                box = (cx - width / 2.0, cy - height / 2.0, cx + width / 2.0, cy + height / 2.0)
+                others = [other for row, other in boxes.items() if row != point.row]
+                covered = sum(_overlap(box, other) for other in (*others, *taken))
+                outside = width * height - _overlap(box, frame)
+                cost = covered + 2.0 * outside + rank + 12.0 * step
+                if best is None or cost < best[0]:
+                    best = (cost, box)
+        assert best is not None
+        box = best[1]
+        taken.append(box)
+        axes.annotate(
+            point.text,
+            ((box[0] + box[2]) / 2.0, (box[1] + box[3]) / 2.0),
+            xycoords="figure points",
+            ha="center",
+            va="center",
+            size=size,
+            linespacing=1.05,
+            color=darker(color_of(point.row)),
+            zorder=5,
+        )
+
+
+def _around(at: Sequence[float], half: float) -> Box:
+    return (at[0] - half, at[1] - half, at[0] + half, at[1] + half)
+
+
+def _along(line: Sequence[Sequence[float]]) -> list[Box]:
+    """Cover a line with small boxes."""
+    boxes = []
+    for (x0, y0), (x1, y1) in pairwise(line):
+        n = int(max(abs(x1 - x0), abs(y1 - y0)) / 2.0) + 1
+        boxes += [_around((x0 + (x1 - x0) * i / n, y0 + (y1 - y0) * i / n), 1.0) for i in range(n + 1)]
+    return boxes
+
+
+def _overlap(a: Box, b: Box) -> float:
+    return max(min(a[2], b[2]) - max(a[0], b[0]), 0.0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0.0)
+
+
+def _table(chosen: Chosen) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
+    rows: list[Sequence[Any]] = []
+    found: Mapping[str, Mapping[str, tuple[Result, ...]]] = chosen.runs
+    for row, by_scene in found.items():
+        for scene in chosen.scenes:
+            for r in by_scene[scene]:
+                rows.append((row, scene, r.seed, r.run, r.seconds["train"], r.psnr, r.num_gaussians, r.machine))
+        seconds, psnr, n = _means(chosen, row)
+        rows.append((row, "mean", "", "", seconds, psnr, n, ""))
+    return ("row", "scene", "seed", "run", "seconds", "psnr", "num_gaussians", "machine"), rows

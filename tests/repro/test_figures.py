@@ -1,0 +1,339 @@
+"""The figures: their numbers are the results', what was not run is said, and the files are what they claim to be."""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from paper_repro import figures
+from paper_repro.cli import main
+from paper_repro.figures import FIGURES, opacities, style
+from paper_repro.figures.data import NoDataError, choose, curve_of
+from paper_repro.figures.foot import foot
+from paper_repro.figures.sheet import save
+from paper_repro.paper import paper
+from paper_repro.results import BINS, Result, write
+from paper_repro.rows import load_rows
+from pop_fast.errors import PopError
+from tests.repro.drawing import asked, drawn, lines, texts
+from tests.repro.made import curve, result
+
+METHODS = ("3dgs", "gsplat", "pup", "mini_splatting", "taming", "speedy_splat", "pop")
+OF_RESULTS = ("1", "2", "4a", "4b", "6a", "6b", "7")
+STEPS = {"max_steps": 10_000}
+
+
+def histogram(**counts: int) -> tuple[int, ...]:
+    """Make a histogram with counts in a few bins, named as b0 to b49."""
+    return tuple(counts.get(f"b{i}", 0) for i in range(BINS))
+
+
+def logged(n: int, steps: int = 10_000, **more: float) -> tuple:
+    """Make a curve of three points: `n` Gaussians at the start, twice and three times as many later."""
+    points = {0: n, steps // 2: 2 * n, steps - 1: 3 * n}
+    columns = {name: [value, value / 2, value / 4] for name, value in more.items()}
+    return curve(points, **columns)
+
+
+def full() -> list[Result]:
+    """Make results of every row on two scenes, each with its own numbers."""
+    found = []
+    for i, row in enumerate(load_rows()):
+        for j, scene in enumerate(("fox", "bear_512")):
+            n = 1000 * (i + 1) + 100 * j
+            points = logged(
+                *(n // 3, 13_333 if row.name == "pup" else 10_000),
+                grad_l1=1.0,
+                grad_l2=0.25,
+                grad_ssim=0.125,
+                probe_blended=8.0 + i,
+                probe_traversed=64.0 + i + j,
+            )
+            told = {
+                "curve": points,
+                "psnr": 20.0 + i / 4 + j,
+                "seconds": {"load": 1.0, "train": 10.0 + i, "evaluate": 1.0},
+            }
+            length = {"max_steps": 13_333 if row.name == "pup" else 10_000}
+            found.append(result(row.name, scene, n=n, schedule=length, **told))
+    return found
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """The figures that need results alone, drawn by the command from files."""
+    folder = tmp_path_factory.mktemp("figures")
+    for one in full():
+        write(one, folder / "results")
+    for figure in OF_RESULTS:
+        words = ["figure", figure, "--scale", "dev", "--results", folder / "results", "--out", folder / "out"]
+        assert main([str(word) for word in words]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("figure", OF_RESULTS)
+def test_a_figure_is_an_svg_a_png_and_a_table(written, figure):
+    stem = written / "out" / f"figure_{figure}"
+    root = ET.parse(stem.with_suffix(".svg")).getroot()
+    assert root.tag == "{http://www.w3.org/2000/svg}svg"
+    assert root.attrib["width"] == f"{72 * style.COLUMN:g}pt"
+    assert len(root.findall(".//{http://www.w3.org/2000/svg}path")) > 20
+    png = stem.with_suffix(".png").read_bytes()
+    assert png.startswith(b"\x89PNG\r\n\x1a\n")
+    # a pixel is a 300th of an inch in print
+    assert int.from_bytes(png[16:20], "big") == round(300 * style.COLUMN)
+    with stem.with_suffix(".csv").open(encoding="utf-8") as file:
+        found = list(csv.reader(file))
+    assert len(found) > 1
+    assert {len(row) for row in found} == {len(found[0])}
+
+
+def test_the_same_results_are_the_same_bytes(tmp_path):
+    for name in ("a", "b"):
+        save_as = tmp_path / name / "figure_7"
+        save_as.parent.mkdir()
+        with style.look():
+            save(drawn("7", full()), save_as)
+    for suffix in ("svg", "png", "csv"):
+        assert (tmp_path / "a" / f"figure_7.{suffix}").read_bytes() == (
+            tmp_path / "b" / f"figure_7.{suffix}"
+        ).read_bytes()
+
+
+def test_curves_in_the_table_are_the_means_of_the_results(written):
+    with (written / "out" / "figure_7.csv").open(encoding="utf-8") as file:
+        found = {(line["row"], int(line["step"])): line for line in csv.DictReader(file)}
+    results = {(r.row, r.scene): r for r in full()}
+    assert {row for row, _ in found} == set(METHODS)
+    for (row, step), line in found.items():
+        of_row = [results[row, scene] for scene in ("fox", "bear_512")]
+        counts = [next(p["num_gaussians"] for p in r.curve if p["step"] == step) for r in of_row]
+        assert float(line["value"]) == sum(counts) / 2
+        assert line["runs"].split() == [r.run for r in of_row]
+        assert line["scenes"] == "fox bear_512"
+    # PUP-3DGS goes on when the others have ended
+    assert max(step for row, step in found if row == "pup") == 13_332
+    assert max(step for row, step in found if row == "gsplat") == 9_999
+
+
+def test_gradients_are_those_of_pop_on_one_scene():
+    made = lines(drawn("4a", full()))
+    assert {(line["row"], line["scenes"]) for line in made} == {("pop", "fox")}
+    assert [line["value"] for line in made if line["quantity"] == "grad_l2"] == [0.25, 0.125, 0.0625]
+    assert [line["step"] for line in made if line["quantity"] == "grad_ssim"] == [0, 5_000, 9_999]
+
+
+def test_gaussians_per_pixel_are_of_the_probed_views_and_else_of_the_held_out_ones():
+    made = drawn("4b", full())
+    of_pop = [r for r in full() if r.row == "pop"]
+    means = [sum(r.curve[i]["probe_traversed"] for r in of_pop) / 2 for i in range(3)]
+    assert [x["value"] for x in lines(made) if (x["row"], x["quantity"]) == ("pop", "probe_traversed")] == means
+    assert "three training views" in texts(made).replace("\n", " ")
+    older = [
+        result(row, curve=logged(100, n_blended=8.0, n_traversed=32.0, psnr_test=20.0), schedule=STEPS)
+        for row in ("3dgs", "pop")
+    ]
+    # what a record of one training view says does not count
+    alone = {"step": 3, "num_gaussians": 100, "n_blended": 99.0, "n_traversed": 99.0, "psnr_test": None}
+    older = [replace(r, curve=(r.curve[0], alone, *r.curve[1:])) for r in older]
+    made = drawn("4b", older)
+    assert "the held-out views" in texts(made).replace("\n", " ")
+    assert [x["value"] for x in lines(made) if (x["row"], x["quantity"]) == ("pop", "n_blended")] == [8.0, 4.0, 2.0]
+
+
+def test_a_figure_of_psnr_has_every_run_and_the_means(written):
+    for figure, shown in (("1", 9), ("6b", 8)):
+        made = lines(drawn(figure, full()))
+        means = {line["row"]: line for line in made if line["scene"] == "mean"}
+        runs = {(line["row"], line["scene"]): line for line in made if line["scene"] != "mean"}
+        assert (len(means), len(runs)) == (shown, 2 * shown)
+        for one in full():
+            if one.row in means:
+                line = runs[one.row, one.scene]
+                told = (line["run"], line["seconds"], line["psnr"], line["num_gaussians"])
+                assert told == (one.run, one.seconds["train"], one.psnr, one.num_gaussians)
+        for row, line in means.items():
+            assert line["psnr"] == sum(runs[row, scene]["psnr"] for scene in ("fox", "bear_512")) / 2
+            assert line["num_gaussians"] == sum(runs[row, s]["num_gaussians"] for s in ("fox", "bear_512")) / 2
+
+
+def test_areas_of_markers_are_as_the_numbers_of_gaussians():
+    made = drawn("1", full())
+    means = {line["row"]: line["num_gaussians"] for line in lines(made) if line["scene"] == "mean"}
+    sizes = sorted(s for s in (float(c.get_sizes()[0]) for c in made.figure.axes[0].collections) if s > 2.0)
+    largest = max(means.values())
+    assert sizes == pytest.approx(sorted(max(sizes) * n / largest for n in means.values()), rel=1e-12)
+
+
+def test_the_marked_shares_are_those_of_the_histogram():
+    # edges belong to the bin above them: 0.1 opens b5, 0.9 opens b45
+    counts = histogram(b0=30, b4=70, b5=500, b44=150, b45=200, b49=50)
+    made = drawn("2", [result("3dgs", n=1000, opacity_histogram=counts, schedule=STEPS)])
+    shares = {line["what"]: line["share"] for line in lines(made) if line["what"] != "bin"}
+    assert shares["ours under 0.1"] == pytest.approx(0.1, rel=1e-12)
+    assert shares["ours over 0.9"] == pytest.approx(0.25, rel=1e-12)
+    assert (shares["paper under 0.1"], shares["paper over 0.9"]) == (0.337, 0.199)
+    bins = [line["share"] for line in lines(made) if line["what"] == "bin"]
+    assert bins == pytest.approx([count / 1000 for count in counts], rel=1e-12)
+    said = texts(made)
+    for text in ("10.0 % under 0.1", "25.0 % over 0.9", "paper: 33.7 %", "paper: 19.9 %"):
+        assert text in said
+    with pytest.raises(ValueError, match=r"edge is 0\.15; it must lie between two of 50 bins"):
+        opacities.share_below(np.ones(BINS), 0.15)
+
+
+def test_seeds_count_the_same_in_the_histogram():
+    runs = [
+        result("3dgs", seed=1, n=10, opacity_histogram=histogram(b0=10), schedule=STEPS),
+        result("3dgs", seed=2, n=1000, opacity_histogram=histogram(b49=1000), schedule=STEPS),
+    ]
+    shares = {line["what"]: line["share"] for line in lines(drawn("2", runs))}
+    assert (shares["ours under 0.1"], shares["ours over 0.9"]) == (0.5, 0.5)
+
+
+@pytest.mark.parametrize("figure", OF_RESULTS)
+def test_a_figure_without_results_says_what_was_not_run(figure, tmp_path, capsys):
+    words = ["figure", figure, "--scale", "dev", "--results", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert main(words) == 1
+    said = capsys.readouterr().err
+    assert f"figure {figure} at scale dev is not drawn: not run are " in said
+    assert "pop-repro queue --scale dev --data DATA --rows " in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_results_without_the_curve_that_is_shown_are_named():
+    with pytest.raises(NoDataError, match="the results of pop have no curve of what it shows; remove them and train"):
+        drawn("4a", [result("pop", schedule=STEPS)])
+
+
+def test_rows_that_were_not_run_are_named_below_the_figure():
+    some = [r for r in full() if r.row in ("pop", "gsplat")]
+    made = drawn("7", some)
+    said = texts(made).replace("\n", " ")
+    assert "Not run: 3DGS, PUP-3DGS, Mini-Splatting, Taming-3DGS and Speedy-Splat." in said
+    assert {line["row"] for line in lines(made)} == {"gsplat", "pop"}
+
+
+def test_the_note_says_captures_steps_seeds_and_whether_it_is_the_protocol():
+    runs = [result("pop", seed=seed, schedule=STEPS) for seed in (42, 43)]
+    chosen = choose(asked("7", runs), ["pop"], ["fox"])
+    said = foot(asked("7", runs), chosen)
+    assert said.replace("\N{NO-BREAK SPACE}", " ") == (
+        "Capture fox (270 × 480); 10,000 steps; mean over seeds 42 and 43. Scale dev, not the paper's protocol: real "
+        "photographs for a CPU: 10,000 steps, small images, theta_blur at least 10 pixels."
+    )
+    ours = [result("pop", "bicycle", scale="paper", schedule=STEPS)]
+    said = foot(asked("7", ours, scale="paper"), choose(asked("7", ours, scale="paper"), ["pop"], ["bicycle", "room"]))
+    assert said.endswith("Scale paper: the published protocol. Not every row was run on room.")
+
+
+def test_times_of_different_machines_are_said_not_to_compare():
+    runs = [result("pop"), result("gsplat", machine="another")]
+    assert "2 machines, so that times do not compare" in texts(drawn("1", runs)).replace("\n", " ")
+    assert "Time on a machine, native, 1 thread." in texts(drawn("1", runs[:1])).replace("\n", " ")
+
+
+def test_at_the_papers_scale_a_figure_is_of_the_papers_scenes():
+    runs = [result(row, scene, scale="paper") for row in ("pop", "gsplat") for scene in ("train", "truck", "bonsai")]
+    made = drawn("1", runs, scale="paper")
+    assert {line["scene"] for line in lines(made)} == {"train", "truck", "mean"}
+    with pytest.raises(NoDataError, match="not run are 3dgs on kitchen"):
+        drawn("2", runs, scale="paper")
+
+
+def test_rows_are_compared_on_the_scenes_that_most_of_them_have():
+    def chosen(*runs: tuple[str, str]):
+        some = [result(row, scene) for row, scene in runs]
+        return choose(asked("7", some), ["pop", "gsplat", "3dgs"], ["fox", "bear_512", "garden_512"])
+
+    common = chosen(
+        ("pop", "fox"), ("pop", "bear_512"), ("gsplat", "fox"), ("gsplat", "bear_512"), ("3dgs", "bear_512")
+    )
+    assert (common.scenes, common.missing, common.left_out) == (("bear_512",), (), ("fox", "garden_512"))
+    # none that all have: as many rows as can be, and then as many scenes
+    apart = chosen(
+        ("pop", "fox"), ("pop", "bear_512"), ("gsplat", "fox"), ("gsplat", "bear_512"), ("3dgs", "garden_512")
+    )
+    assert (apart.scenes, apart.missing) == (("fox", "bear_512"), ("3dgs",))
+    assert list(apart.runs) == ["pop", "gsplat"]
+
+
+def test_a_mean_curve_is_over_seeds_first_and_only_where_every_run_has_points():
+    a = result(seed=1, curve=curve({0: 10, 10: 30}))
+    b = result(seed=2, curve=curve({0: 20, 5: 40, 10: 60}))
+    c = result(scene="bear_512", curve=curve({2: 100, 8: 400}))
+    steps, values = curve_of({"fox": (a, b), "bear_512": (c,)}, ("fox", "bear_512"), "num_gaussians")
+    assert steps.tolist() == [2, 5, 8]
+    fox = [((10 + 2 * s) + (20 + 4 * s)) / 2 for s in (2, 5, 8)]
+    bear = [100 + 50 * (s - 2) for s in (2, 5, 8)]
+    assert values.tolist() == pytest.approx([(x + y) / 2 for x, y in zip(fox, bear, strict=True)], rel=1e-12)
+
+
+def test_every_method_has_a_name_and_a_colour_of_its_own():
+    shown = {line.row: line.name for table in paper().tables[:2] for line in table.rows}
+    for row, printed in shown.items():
+        assert style.name_of(row).lower() == printed.replace("Ours", "POP").lower()
+    plain = [row for row in shown if not row.endswith("_star")]
+    assert len({style.color_of(row) for row in plain}) == len(plain)
+    assert {style.name_of("pup_star"), style.color_of("pup_star")} == {"PUP-3DGS*", style.color_of("pup")}
+
+
+def test_names_are_moved_apart_and_no_more_than_that():
+    assert style.spread([1.0, 20.0, 40.0], 8.0, 100.0) == [1.0, 20.0, 40.0]
+    assert style.spread([10.0, 10.0], 8.0, 100.0) == [6.0, 14.0]
+    assert style.spread([0.0, 9.0, 10.0], 8.0, 100.0) == pytest.approx([-5 / 3, 19 / 3, 43 / 3])
+    assert style.spread([98.0, 99.0], 8.0, 100.0) == [92.0, 100.0]
+    generator = np.random.default_rng(0)
+    for _ in range(50):
+        wanted = sorted(generator.uniform(0.0, 60.0, 8))
+        placed = style.spread(wanted, 7.0, 60.0)
+        assert np.diff(placed).min() > 7.0 - 1e-9
+        assert max(placed) < 60.0 + 1e-9
+
+
+@pytest.mark.parametrize(("n", "text"), [(850, "850"), (1500, "1.5k"), (67038, "67k"), (2_500_000, "2.5M"), (0, "0")])
+def test_numbers_are_written_short(n, text):
+    assert style.count(n) == text
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(3.0, 40.0), (190.0, 240.0), (0.05, 1.5), (2e3, 5e6), (1.0, 1.05), (67000.0, 67200.0)]
+)
+def test_a_logarithmic_axis_has_a_few_marks(low, high):
+    from matplotlib.figure import Figure
+
+    axes = Figure().add_subplot()
+    axes.set_xscale("log")
+    axes.set_xlim(low, high)
+    style.log_ticks(axes.xaxis, low, high)
+    marks = [x for x in axes.get_xticks() if low <= x <= high]
+    assert 2 <= len(marks) <= 6
+    labels = [label.get_text() for label in axes.get_xticklabels()]
+    assert len(set(labels)) == len(labels)
+
+
+def test_an_unknown_figure_is_refused_before_anything_is_read(tmp_path):
+    with pytest.raises(PopError, match="figure is '8'; it must be one of 1, 2, 3, 4a, 4b, 5, 6a, 6b, 7"):
+        figures.draw("8", "dev", tmp_path, tmp_path)
+
+
+def test_rows_name_the_figures_that_show_them():
+    by_figure = {figure: {row.name for row in load_rows() if figure in row.figures} for figure in FIGURES}
+    assert by_figure["1"] == {*METHODS, "pup_star", "mini_splatting_star"}
+    assert by_figure["7"] == set(METHODS)
+    assert (by_figure["2"], by_figure["4a"]) == ({"3dgs"}, {"pop"})
+    assert by_figure["4b"] == by_figure["5"] == {"3dgs", "pop"}
+    assert by_figure["6a"] == {"l1_div_1", "l2_without_ssim", "l2"}
+    assert by_figure["6b"] == {"l2", *(f"l1_div_{n}" for n in (1, 2, 5, 10, 20, 50, 100))}
+
+
+def test_the_list_of_figures_is_read_without_drawing():
+    code = "import sys, paper_repro.figures; assert not {'matplotlib', 'numpy', 'torch'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])
