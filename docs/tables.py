@@ -18,6 +18,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from stages import ROOT, STAGES, files, functions, laws
 
+from paper_repro.results import SCALES, read_all
+from paper_repro.status import status_table
 from pop_fast.train.presets import options_for
 from pop_ref.conformance.abilities import STAGES as LAW_STAGES
 from pop_ref.conformance.mutants import MUTANTS, PROGRAM
@@ -100,6 +102,11 @@ RECIPE_NOTES = {
     "Taming-3DGS": "growth to a budget, by sampling from a score",
     "Speedy-Splat": "exact tile lists, soft and hard pruning by sensitivity",
 }
+
+
+def reproduction() -> str:
+    """Make the table of the paper's claims and tables, as `paper_repro.status` does."""
+    return status_table([result for scale in SCALES for result in read_all(scale)])
 
 
 def results() -> str:
@@ -215,6 +222,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "results": results,
     "differences": differences,
     "recipes": recipes,
+    "reproduction": reproduction,
     "kit": kit,
     "scorecards": scorecards,
     "broken": broken_laws,
