@@ -93,9 +93,18 @@ FORGED: dict[str, tuple[Callable[[Content], Any], tuple[str, ...]]] = {
     "step of moments a row": (to(STEP, torch.full((1,), 10.0)), (f"{STEP} has shape [1]; it must be []",)),
     "step of moments whole": (to(STEP, torch.tensor(10)), (f"{STEP} is torch.int64",)),
     "step of moments no tensor": (to(STEP, 10), (f"{STEP} is 10; it must be a tensor",)),
-    "step of moments negative": (to(STEP, torch.tensor(-10.0)), (f"{STEP} is -10; it must be 10",)),
-    "step of moments NaN": (to(STEP, torch.tensor(NAN)), (f"{STEP} is nan; it must be 10",)),
-    "step of moments of another run": (to(STEP, torch.tensor(11.0)), (f"{STEP} is 11; it must be 10",)),
+    "step of moments negative": (
+        to(STEP, torch.tensor(-10.0)),
+        (f"{STEP} is -10; it must be a whole number of updates, at most 10",),
+    ),
+    "step of moments NaN": (
+        to(STEP, torch.tensor(NAN)),
+        (f"{STEP} is nan; it must be a whole number of updates, at most 10",),
+    ),
+    "step of moments of another run": (
+        to(STEP, torch.tensor(11.0)),
+        (f"{STEP} is 11; it must be a whole number of updates, at most 10",),
+    ),
     "no moments of means": (without(MEANS), ("has no optimizers.means",)),
     "no m": (without(f"{MEANS}.exp_avg"), (f"has no {MEANS}.exp_avg",)),
     "a moment too many": (to(f"{MEANS}.max_exp_avg_sq", 0), (f"{MEANS}.'max_exp_avg_sq' is unknown",)),
