@@ -269,7 +269,7 @@ class OracleAdapter(Adapter):
         """Return the cotangents of `render.render_vjp`."""
         module = importlib.import_module(f"{self.package}.render")
         g = module.render_vjp(*self._own(scene), v_image=v_image, v_T_final=v_T_final, **self._options(scene))
-        return {f.name: np.asarray(getattr(g, f.name)) for f in fields(g)}
+        return {f.name: np.asarray(getattr(g, f.name)) for f in fields(g) if getattr(g, f.name) is not None}
 
     def _own(self, scene: Scene) -> tuple[Any, Any]:
         # a copy of the oracle has value types of its own
