@@ -12,16 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from pop_ref.camera import means_cam_from_means
 from pop_ref.conformance.scenes import Scene
 from pop_ref.constants import Profile
 from pop_ref.covariance import covars_from_quats_scales
 from pop_ref.depth import RenderMode
-from pop_ref.footprint import low_pass, radii_from_covars2d
-from pop_ref.projection import project_covars, projection_jacobians
 from pop_ref.render import RenderGradients, render, render_vjp
-from pop_ref.splatting import geometry
-from pop_ref.types import Camera, Gaussians, Render
+from pop_ref.splatting import project
+from pop_ref.types import Render
 
 
 @dataclass(frozen=True)
@@ -139,14 +136,9 @@ def drawn_scene(call: Call, frame: Frame) -> Scene:
     scene = frame.scene.but(profile=call.profile)
     if call.radius_clip <= 0.0:
         return scene
-    radii = frame_radii(scene)
+    radii = project(scene.gaussians, scene.camera, scene.sh_degree, scene.profile, scene.antialiased).radii
     small = np.all(radii <= call.radius_clip, axis=1)
     return scene.but(opacities=np.where(small, 0.0, scene.gaussians.opacities))
-
-
-def frame_radii(scene: Scene) -> np.ndarray:
-    """Return the extents of a scene's Gaussians, 0 where they are culled. [N, 2]"""
-    return oracle_frame(scene, None, "RGB").splats.radii
 
 
 def oracle_frame(scene: Scene, colors: np.ndarray | None, render_mode: RenderMode) -> Render:
@@ -173,3 +165,26 @@ def _options(scene: Scene, colors: np.ndarray | None, render_mode: RenderMode) -
         "colors": colors,
         "render_mode": render_mode,
     }
+
+
+def unpacked(call: Call, rows: np.ndarray, meta: Any) -> np.ndarray:
+    """Return rows of meta as one for each Gaussian of every frame, 0 where packed rows have none. [B, C, N, ...]
+
+    Args:
+        call: whose rows they are.
+        rows: of meta, packed or not.
+        meta: with the indices of packed rows.
+    """
+    shape = (len(call.frames), len(call.frames[0]), len(call.frames[0][0].scene.gaussians))
+    if not call.packed:
+        return rows.reshape(*shape, *rows.shape[2 + call.batched :])
+    found = np.zeros((*shape, *rows.shape[1:]), dtype=rows.dtype)
+    found[packed_index(meta)] = rows
+    return found
+
+
+def packed_index(meta: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the batch entry, camera and Gaussian of every packed row."""
+    cameras, gaussians = np.asarray(meta["camera_ids"]), np.asarray(meta["gaussian_ids"])
+    batch = np.zeros_like(cameras) if meta.get("batch_ids") is None else np.asarray(meta["batch_ids"])
+    return batch, cameras, gaussians

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis.errors import HypothesisException
 
 from pop_ref.conformance.abilities import STAGES
+from pop_ref.conformance.calls import Call
 from pop_ref.conformance.scenes import Scene
 
 
@@ -116,6 +117,10 @@ class _Watched:
     def gradients(self, scene: Scene, *cotangents: Any) -> Any:
         self._made.append(scene)
         return self.adapter.gradients(scene, *cotangents)
+
+    def call(self, call: Call, *cotangents: Any) -> Any:
+        self._made += [frame.scene for _, _, frame in call.each]
+        return self.adapter.call(call, *cotangents)
 
     @property
     def scenes(self) -> dict[str, Scene]:
