@@ -50,7 +50,9 @@ def with_depth_channel(splats: Splats, render_mode: RenderMode = "RGB") -> Splat
     return replace(splats, colors=np.concatenate((splats.colors, depths), axis=1) if colored else depths)
 
 
-def expected_depth(depth: Float64[np.ndarray, "H W"], T_final: Float64[np.ndarray, "H W"]) -> Float64[np.ndarray, "H W"]:
+def expected_depth(
+    depth: Float64[np.ndarray, "H W"], T_final: Float64[np.ndarray, "H W"]
+) -> Float64[np.ndarray, "H W"]:
     """Divide the accumulated depth by the opacity of the pixel: `E = D / max(1 - T_final, 1e-10)`.
 
     Source: gsplat v1.5.3, `rasterization`: modes ED and RGB+ED.

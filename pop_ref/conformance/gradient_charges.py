@@ -80,11 +80,17 @@ def gradient_charges(
         rows["colors"] = Bound(nothing, nothing)
     elif with_depth:
         rows["colors"] = Bound(given.m[:, :-1], given.e[:, :-1])
-    found = _world_bounds(scene, charges.screen, rows) if N else {}
+    found = _world_bounds(scene, charges.screen, rows) if N else _no_bounds(scene)
     found["colors"] = given.charge[:, :plain]
     found["background"] = background
     found["means2d"] = found["means2d_abs"] = rows["means2d"].charge
     return found
+
+
+def _no_bounds(scene: Scene) -> dict[str, np.ndarray]:
+    g = scene.gaussians
+    arrays = {"means": g.means, "quats": g.quats, "scales": g.scales, "opacities": g.opacities, "sh": g.sh}
+    return {name: np.zeros_like(value) for name, value in arrays.items()} | {"viewmat": np.zeros((4, 4))}
 
 
 def _gather(values: dict[int, Bound], n: int) -> Bound:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -84,7 +85,7 @@ def assert_tiles(backend: Any, call: Call, called: Called, wanted: Wanted) -> No
     assert len(starts) == len(every) * tiles[0] * tiles[1] + 1, "meta['isect_offsets'] has another number of tiles"
     owner = np.ravel_multi_index(_index(call, meta, flat), (len(call.frames), len(call.frames[0]), n))
     clear = [clear_of_extents(e, backend.dtype) for e in every]
-    lists = [owner[a:z] for a, z in zip(starts[:-1], starts[1:], strict=True)]
+    lists = [owner[a:z] for a, z in itertools.pairwise(starts)]
     for number, listed in enumerate(lists):
         image, tile = divmod(number, tiles[0] * tiles[1])
         assert np.all(listed // n == image), f"a list of image {image} holds Gaussians of another"

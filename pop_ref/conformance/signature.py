@@ -148,8 +148,12 @@ def _assert_gradients(backend: Any, call: Call, called: Called, wanted: list[lis
                     bound = bounds["means2d" if name.startswith("means2d") else name]
                     _assert_gradient(backend, call, name, value[b, c], expected[name], bound, rows)
             else:
-                total = [sum(side[name] for side in sides) for sides in zip(*pulled, strict=True)]
-                _assert_gradient(backend, call, name, value[b], *total, ~kinked)
+                _assert_gradient(backend, call, name, value[b], *_summed(pulled, name), ~kinked)
+
+
+def _summed(pulled: list[Any], name: str) -> tuple[Any, Any]:
+    """Return an argument's gradient and its charge, summed over the cameras that share it."""
+    return sum(expected[name] for expected, _ in pulled), sum(bounds[name] for _, bounds in pulled)
 
 
 def _assert_gradient(
@@ -168,5 +172,4 @@ def _assert_covariance_gradients(
     g = call.frames[b][0].scene.gaussians
     v = covars_from_quats_scales_vjp(g.quats, g.scales, 0.5 * (v_covars + np.swapaxes(v_covars, 1, 2)))
     for name, value in zip(("quats", "scales"), v, strict=True):
-        total = [sum(side[name] for side in sides) for sides in zip(*pulled, strict=True)]
-        _assert_gradient(backend, call, name, value, *total, rows)
+        _assert_gradient(backend, call, name, value, *_summed(pulled, name), rows)

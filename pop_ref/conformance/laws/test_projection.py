@@ -74,7 +74,14 @@ def test_shifting_the_principal_point_translates_the_screen(backend, point, dx, 
     assert_close("projection.shift", project(point, shifted, W, H), before + np.array([dx, dy]), size, backend.dtype)
 
 
-@law("projection", "project_means", "projection_jacobians", point=points, step=arrays_of((1, 3), -1.0, 1.0))
+@law(
+    "projection",
+    "project_means",
+    "projection_jacobians",
+    PROFILES_NEEDED,
+    point=points,
+    step=arrays_of((1, 3), -1.0, 1.0),
+)
 def test_the_jacobian_is_the_derivative_of_the_projection(backend, point, step):
     # the central difference of a pinhole along a direction is exact but for the square of h / z
     project = backend.stage("project_means")

@@ -33,6 +33,12 @@ class BlackBox:
     breaks: Callable[[Rasterization, dict[str, Any]], Any]
     law: str
 
+    def adapter(self) -> Any:
+        """Return it as the kit is handed any rasterizer, in float32."""
+        from pop_ref.conformance.torch_adapter import TorchAdapter
+
+        return TorchAdapter(self.name, self.rasterization(), dtype="float32")
+
     def rasterization(self) -> Rasterization:
         """Return the broken function, with the arguments that gsplat has."""
         sound = partial(function_named("pop_fast.rasterization:rasterization"), backend="fast")
