@@ -14,7 +14,6 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from hypothesis import reject
 
 from pop_ref.conformance.abilities import (
     ANTIALIASING,
@@ -175,6 +174,8 @@ class Adapter:
             own = self.profile
             given = [a for a in (*args, *kwargs.values()) if isinstance(a, Profile)]
             if own is not None and not all(same_constants(each, own) for each in given):
+                from hypothesis import reject
+
                 reject()
             return function(*args, **kwargs)
 

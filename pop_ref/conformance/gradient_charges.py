@@ -70,7 +70,8 @@ def gradient_charges(
     N = len(scene.gaussians)
     size = scene.tile_size or scene.profile.tile_size
     pixels = _pixel_bounds(scene, charges, np.abs(v_image), np.abs(v_T_final), 0.5 * size)
-    rows = {name: _gather(values, N) for name, values in pixels.items()}
+    shapes = {"means2d": (2,), "conics": (3,), "opacities": (), "colors": v_image.shape[2:]}
+    rows = {name: _gather(values, (N, *shapes[name])) for name, values in pixels.items()}
     T = charges.layers[-1].T_after if charges.layers else np.ones(v_T_final.shape)
     background = np.einsum("hw,hwc->c", 2.0 * T + charges.T_final, np.abs(v_image))
     given, nothing = rows["colors"], np.zeros((N, 3))
@@ -93,9 +94,8 @@ def _no_bounds(scene: Scene) -> dict[str, np.ndarray]:
     return {name: np.zeros_like(value) for name, value in arrays.items()} | {"viewmat": np.zeros((4, 4))}
 
 
-def _gather(values: dict[int, Bound], n: int) -> Bound:
-    shape = next(iter(values.values())).m.shape if values else (3,)
-    total = Bound(np.zeros((n, *shape)), np.zeros((n, *shape)))
+def _gather(values: dict[int, Bound], shape: tuple[int, ...]) -> Bound:
+    total = Bound(np.zeros(shape), np.zeros(shape))
     for i, value in values.items():
         total.m[i], total.e[i] = value.m, value.e
     return total

@@ -9,8 +9,7 @@ import numpy as np
 
 from pop_ref.conformance import abilities
 from pop_ref.conformance.calls import Call, Frame
-from pop_ref.conformance.scenes import Record, Scene, pack
-from pop_ref.conformance.strategies import rigid
+from pop_ref.conformance.scenes import Record, Scene, pack, rigid
 from pop_ref.types import Camera, Gaussians
 
 WIDTH, HEIGHT = 17, 11
