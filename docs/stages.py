@@ -34,7 +34,7 @@ STAGES = (
     Stage("falloff and alpha of one splat at one pixel", "eqs. 1, 11", ("alpha",)),
     Stage("blending with early ray termination", "eq. 1", ("compositing", "pixel"), ("compiled/compositing.py",)),
     Stage("dominant Gaussians", "eq. 5", ("dominance",)),
-    Stage("a whole view", "eq. 1", ("render", "splatting"), ("rasterization.py", "compiled/splatting.py")),
+    Stage("a whole view", "eq. 1", ("render", "splatting", "depth"), ("rasterization.py", "compiled/splatting.py")),
     Stage(
         "L1, L2, SSIM and both objectives", "eqs. 2, 4, 9", ("losses", "ssim", "loss_magnitudes"), ("compiled/ssim.py",)
     ),
@@ -67,6 +67,7 @@ NOT_STAGES = frozenset({"__init__", "_shapes", "ambiguities", "constants", "nota
 # stages whose laws stand in a file of another name: whole views, and what has a file of its own outside tests/laws
 LAWS_ELSEWHERE = {
     "render": "tests/laws/test_whole.py",
+    "depth": "tests/laws/test_signature_depth.py",
     "training": "tests/golden",
     "margins": "tests/thresholds",
 }

@@ -22,7 +22,7 @@ from paper_repro.results import SCALES, read_all
 from paper_repro.status import status_table
 from pop_fast.train.presets import options_for
 from pop_ref.conformance.abilities import STAGES as LAW_STAGES
-from pop_ref.conformance.mutants import MUTANTS, PROGRAM
+from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM
 from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER, SPEEDY_SPLAT
 from pop_ref.notation import SYMBOLS
@@ -182,7 +182,8 @@ def kit() -> str:
     where = f"[{MUTANT_LIST.name}]({MUTANT_LIST.relative_to(ROOT).as_posix()})"
     return (
         f"{len(every_law())} laws in {len(LAW_STAGES)} stages; {len(MUTANTS)} mutants of the oracle and {len(PROGRAM)} "
-        f"of the program that trains, every one of them killed by a named law within the `ci` profile: {where}."
+        f"of the program that trains, and {len(BLACK_BOXES)} rasterizers with one argument broken, every one of them "
+        f"killed by a named law within the `ci` profile: {where}."
     )
 
 
@@ -200,7 +201,15 @@ def mutants() -> str:
         for m in (*MUTANTS, *PROGRAM)
     ]
     head = MUTANT_HEAD.format(n=len(MUTANTS), programs=len(PROGRAM))
-    return head + _table(["mutant", "what happened", "file", "stage", "killed by"], rows)
+    boxes = [[b.name.replace("_", " "), b.story, b.law.partition(":")[2].replace("_", " ")] for b in BLACK_BOXES]
+    return "".join(
+        (
+            head,
+            _table(["mutant", "what happened", "file", "stage", "killed by"], rows),
+            BOX_HEAD.format(n=len(BLACK_BOXES)),
+            _table(["black box", "what it does", "killed by"], boxes),
+        )
+    )
 
 
 MUTANT_HEAD = """# Mutants
@@ -211,6 +220,15 @@ Made by `python docs/tables.py --write`; a test holds it to the code.
 A kit that lets one live is not worth its time, so for each a law is named that breaks on it within the `ci` profile;
 `tests/meta/test_mutants.py` tries them all. `python -m pop_ref.conformance.mutants` puts them on trial again, `--every`
 lists all laws that notice.
+
+"""
+
+BOX_HEAD = """
+
+## Behind gsplat's signature
+
+{n} rasterizers that draw one small view rightly and break one argument around it, judged as any `--rasterizer` is: by
+what they return alone. {n} of {n} are killed.
 
 """
 

@@ -79,7 +79,8 @@ def _check(args: Check) -> int:
         failed = [verdict for verdict in verdicts if not verdict.passed]
         print(f"{array:<{width}}{len(verdicts) - len(failed)} of {len(verdicts)} vectors pass")
         for verdict in failed:
-            print(f"  {verdict.vector}: off by {verdict.worst:.3g}, allowed {verdict.allowed:.3g}; {verdict.told}")
+            off = f"off by {verdict.worst:.3g} {verdict.unit}, allowed {verdict.allowed:.3g}"
+            print(f"  {verdict.vector}: {off}; {verdict.told}")
     for title, names in (("not there", found.absent), ("no result for", found.missing), ("unknown", found.strange)):
         if names:
             more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""

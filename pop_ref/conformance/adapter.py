@@ -17,14 +17,21 @@ import numpy as np
 
 from pop_ref.conformance.abilities import (
     ANTIALIASING,
+    DETERMINISTIC,
     DOMINANCE,
+    DOMINANT_COUNTS,
+    DOMINANT_WEIGHTS,
     DOUBLE,
     GRADIENTS,
     RENDER,
     ROWWISE,
+    SIGNATURE,
     abilities_of,
+    same_constants,
 )
+from pop_ref.conformance.calls import Call, Called, drawn_scene
 from pop_ref.conformance.scenes import Scene, rounded_to
+from pop_ref.conformance.views import ASKED, offers
 from pop_ref.constants import PAPER, Profile
 from pop_ref.splatting import project, project_vjp
 from pop_ref.tiles import tile_lists
@@ -60,6 +67,12 @@ STAGE_MODULES = (
     "mini_splatting",
     "tight_tiles",
 )
+# what a view may tell of dominance, by ability
+TOLD_OF_DOMINANCE = {
+    DOMINANCE: "dominant_ids",
+    DOMINANT_WEIGHTS: "dominant_weights",
+    DOMINANT_COUNTS: "dominant_counts",
+}
 
 
 @dataclass(frozen=True)
@@ -99,7 +112,7 @@ class Adapter:
         name: how reports call it.
         dtype: the NumPy type of the precision it computes in; its rounding is charged in units of that type's eps.
         profile: the constants that it implements; None when it takes any, which scenes then carry.
-        able: what nothing else tells: ANTIALIASING, DOMINANCE, ROWWISE of `abilities`.
+        able: what nothing else tells: ANTIALIASING, DETERMINISTIC, DOMINANCE, ROWWISE of `abilities`.
 
     Example:
         >>> class Mine(Adapter):
@@ -124,14 +137,49 @@ class Adapter:
             return type(self).gradients is not Adapter.gradients or self.has("composite_vjp")
         if need == DOUBLE:
             return bool(self.dtype == np.float64)
+        if need in (DOMINANT_WEIGHTS, DOMINANT_COUNTS):
+            return self.has(DOMINANCE) and self._tells(need)
+        if need == SIGNATURE:
+            return callable(getattr(self, "call", None))
+        if need in ASKED:
+            return self.has(SIGNATURE) and self._offers(need)
         return need in self.able or need in abilities_of(self.profile) or callable(getattr(self, need, None))
 
+    def _offers(self, need: str) -> bool:
+        known: dict[str, bool] = self.__dict__.setdefault("_known_offers", {})
+        if need not in known:
+            known[need] = offers(self, need)
+        return known[need]
+
+    def _tells(self, need: str) -> bool:
+        """Tell whether a render shows something of dominance; one is drawn to learn it."""
+        from pop_ref.conformance.golden import golden_scene
+
+        known: dict[str, bool] = self.__dict__.setdefault("_known_tellings", {})
+        if not known:
+            view = self.render(self.sees(golden_scene()))
+            known |= {each: getattr(view, name) is not None for each, name in TOLD_OF_DOMINANCE.items()}
+        return known[need]
+
     def stage(self, name: str) -> Callable[..., Any]:
-        """Return a stage function that takes and returns NumPy arrays."""
+        """Return a stage function that takes and returns NumPy arrays.
+
+        Constants that the implementation does not offer set the example aside.
+        """
         function = getattr(self, name, None)
         if not callable(function):
             raise LookupError(f"{self.name} has no stage function {name}")
-        return function
+
+        def within_its_constants(*args: Any, **kwargs: Any) -> Any:
+            own = self.profile
+            given = [a for a in (*args, *kwargs.values()) if isinstance(a, Profile)]
+            if own is not None and not all(same_constants(each, own) for each in given):
+                from hypothesis import reject
+
+                reject()
+            return function(*args, **kwargs)
+
+        return within_its_constants
 
     def sees(self, scene: Scene) -> Scene:
         """Return the scene as the implementation reads it: rounded to its dtype, under the constants that it has."""
@@ -233,7 +281,7 @@ class OracleAdapter(Adapter):
 
     dtype = np.float64
     profile = None
-    able = (ANTIALIASING, DOMINANCE, ROWWISE)
+    able = (ANTIALIASING, DETERMINISTIC, DOMINANCE, ROWWISE)
 
     def __init__(self, package: str = "pop_ref", name: str = "oracle") -> None:
         self.name = name
@@ -269,7 +317,30 @@ class OracleAdapter(Adapter):
         """Return the cotangents of `render.render_vjp`."""
         module = importlib.import_module(f"{self.package}.render")
         g = module.render_vjp(*self._own(scene), v_image=v_image, v_T_final=v_T_final, **self._options(scene))
-        return {f.name: np.asarray(getattr(g, f.name)) for f in fields(g)}
+        return {f.name: np.asarray(getattr(g, f.name)) for f in fields(g) if getattr(g, f.name) is not None}
+
+    def call(self, call: Call, v_images: Any = None, v_alphas: Any = None) -> Called:
+        """Draw every frame of a call by itself.
+
+        Raises:
+            NotImplementedError: the call asks for another form of arguments or of meta.
+        """
+        if call.packed or call.covars or call.sparse_grad:
+            raise NotImplementedError("the oracle takes quaternions and scales, and has neither packed nor sparse rows")
+        module = importlib.import_module(f"{self.package}.render")
+        images, alphas, pulled = [], [], []
+        for b, c, frame in call.each:
+            scene = drawn_scene(call, frame)
+            options = {**self._options(scene), "colors": frame.colors, "render_mode": call.render_mode}
+            drawn = module.render(*self._own(scene), **options)
+            images.append(drawn.image)
+            alphas.append(1.0 - drawn.T_final)
+            if v_images is not None:
+                v = (v_images[b, c], -v_alphas[b, c])
+                pulled.append(module.render_vjp(*self._own(scene), v_image=v[0], v_T_final=v[1], **options))
+        shape = (len(call.frames), len(call.frames[0]))
+        gradients = _gathered(call, pulled, shape) if pulled else {}
+        return Called(_folded(images, shape), _folded(alphas, shape), {}, gradients)
 
     def _own(self, scene: Scene) -> tuple[Any, Any]:
         # a copy of the oracle has value types of its own
@@ -287,6 +358,24 @@ class OracleAdapter(Adapter):
             "tile_size": scene.tile_size,
             "antialiased": scene.antialiased,
         }
+
+
+def _folded(rows: list[np.ndarray], shape: tuple[int, int]) -> np.ndarray:
+    return np.array(rows).reshape(*shape, *rows[0].shape)
+
+
+def _gathered(call: Call, pulled: list[Any], shape: tuple[int, int]) -> dict[str, np.ndarray]:
+    """Return the gradients of a call's arguments in their shapes: summed over the cameras that share one."""
+    names = {"viewmats": "viewmat", "backgrounds": "background"}
+    plain = call.sh_degree is None
+    found = {}
+    for name in call.tensors():
+        rows = [getattr(g, "sh" if name == "colors" and not plain else names.get(name, name)) for g in pulled]
+        value = _folded(rows, shape)
+        own = name in names or (name == "colors" and call.camera_colors)
+        value = value if own else np.sum(value, axis=1)
+        found[name] = value if call.batched else value[0]
+    return found | {name: _folded([getattr(g, name) for g in pulled], shape) for name in ("means2d", "means2d_abs")}
 
 
 def oracle_view(scene: Scene) -> View:

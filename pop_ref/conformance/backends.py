@@ -159,12 +159,14 @@ def adapter_for(
     dtype: str = "float32",
     device: str = "cpu",
     profile: Profile = PAPER,
+    deterministic: bool = True,
 ) -> Any:
     """Return an adapter for a torch function with gsplat's signature, given as `module:function`, and for a package of
-    stage functions."""
+    stage functions; `deterministic` says whether its sums are taken in the same order on every run."""
     try:
         from pop_ref.conformance.torch_adapter import TorchAdapter
 
-        return TorchAdapter(name, function_named(path) if path else None, package, dtype, device, profile)
+        function = function_named(path) if path else None
+        return TorchAdapter(name, function, package, dtype, device, profile, deterministic=deterministic)
     except ModuleNotFoundError as error:
         raise Unavailable(f"{name} needs {error.name}, which is not installed") from error

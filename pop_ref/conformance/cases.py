@@ -189,5 +189,5 @@ def sensitivity(function: Callable[..., Any], inputs: tuple[Any, ...]) -> tuple[
 def _row_size(value: np.ndarray) -> np.ndarray:
     if value.ndim < 2:
         return np.abs(value)
-    largest = np.max(np.abs(value).reshape(len(value), -1), axis=1, initial=0.0)
+    largest = np.max(np.abs(value), axis=tuple(range(1, value.ndim)), initial=0.0)
     return np.broadcast_to(largest.reshape(-1, *[1] * (value.ndim - 1)), value.shape)

@@ -25,11 +25,17 @@ names, `--adapter` a class derived from `pop_ref.conformance.Adapter`, for singl
 BACKENDS
 
 `--profile` says which constants a rasterizer has; `--dtype float64` charges double precision; `--stage compositing`
-keeps the laws of one stage. `HYPOTHESIS_PROFILE` is `dev`, `ci` or `thorough`, which draw the same examples on every
-machine, or `explore`, which draws anew (`--hypothesis-seed N`). What an implementation does not offer is skipped by
-name. A failing law prints the first stage, Gaussian, pixel or gradient that differs, the values on both sides, the
-nearest decision with its margin, and a scene to paste, which is also saved as npz (`--failures DIR`;
+keeps the laws of one stage; `--unordered-sums` is for a rasterizer that adds in another order on every run, as atomics
+do, and skips the laws that compare bits. `HYPOTHESIS_PROFILE` is `dev`, `ci` or `thorough`, which draw the same
+examples on every machine, or `explore`, which draws anew (`--hypothesis-seed N`). What an implementation does not offer
+is skipped by name. A failing law prints the first stage, Gaussian, pixel or gradient that differs, the values on both
+sides, the nearest decision with its margin, and a scene to paste, which is also saved as npz (`--failures DIR`;
 `scene_files.load_scene` reads it). `--scorecard card.html`, or `.json`, sums up by stage.
+
+A rasterizer is asked once for every argument of gsplat's signature: several cameras, batches, packed rows, depth modes,
+plain colours of any number of channels, colours of each camera, covariances, radius_clip, planes, no background,
+sparse_grad. What it refuses with NotImplementedError, TypeError or ValueError is skipped by name; what it accepts is
+compared with what the oracle draws of every frame alone. One that only draws has no gradients to judge.
 
 What is drawn where nothing but an image is asked for may be other code than what also counts. A rasterizer with the
 arguments `dominance` and `counts` is judged as training asks it, and a law holds every choice of the two together.

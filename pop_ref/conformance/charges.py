@@ -8,6 +8,7 @@ same distances one by one and in its own way; a test holds the two against each 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -70,9 +71,9 @@ class PixelCharges:
         screen: the charges of projection.
         layers: splats front to back.
         reach: eps of the dtype times REACH.
-        image, T_final: charges. [H, W, 3], [H, W]
+        image, T_final: charges. [H, W, D], [H, W]
         dominant_weight: charge of the dominant weight, exponents expanded about tile centres. [H, W]
-        absolute: sum of weights times absolute colours, background included. [H, W, 3]
+        absolute: sum of weights times absolute colours, background included. [H, W, D]
         doubts: decision label -> where it is within reach of rounding: D1, D4, D5, D6, D7, D8. [H, W]
     """
 
@@ -133,20 +134,27 @@ class _State:
     e_best_expanded: np.ndarray
 
 
-def charge(scene: Scene, dtype: Any, tile_lists: list[list[int]] | None = None) -> PixelCharges:
+def charge(
+    scene: Scene,
+    dtype: Any,
+    tile_lists: list[list[int]] | None = None,
+    channels: Callable[[ScreenCharges], ScreenCharges] | None = None,
+) -> PixelCharges:
     """Charge a scene in the precision of a dtype.
 
     Args:
         scene: what is drawn.
         dtype: float32 or float64; decides which decisions are doubtful.
         tile_lists: for profiles whose tile lists are part of the meaning, the oracle's.
+        channels: puts other channels in the place of colours: plain colours, depths.
     """
     reach = REACH * float(np.finfo(dtype).eps)
     screen = screen_charges(scene, reach)
+    screen = screen if channels is None else channels(screen)
     H, W = scene.camera.height, scene.camera.width
     doubts = {label: np.zeros((H, W), dtype=bool) for label in ("D1", "D4", "D5", "D6", "D7", "D8")}
-    none = np.zeros((H, W))
-    state = _State(np.ones((H, W)), none, none, np.zeros((H, W, 3)), np.zeros((H, W, 3)),
+    none, D = np.zeros((H, W)), screen.colors.shape[1]
+    state = _State(np.ones((H, W)), none, none, np.zeros((H, W, D)), np.zeros((H, W, D)),
                    np.ones((H, W), dtype=bool), none, none, none)  # fmt: skip
     layers = []
     for i in np.lexsort((np.arange(len(screen.depths)), screen.depths)).tolist():

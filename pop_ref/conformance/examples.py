@@ -26,7 +26,8 @@ def load_profile(name: str) -> None:
     if name not in EXAMPLES:
         raise ValueError(f"HYPOTHESIS_PROFILE is {name!r}; use one of {', '.join(EXAMPLES)}")
     _leave_out_mined_constants()
-    checks = [HealthCheck.too_slow, HealthCheck.data_too_large]
+    # an implementation of one profile sets the examples of the others aside
+    checks = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much]
     for each, count in EXAMPLES.items():
         settings.register_profile(
             each,

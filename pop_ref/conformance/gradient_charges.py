@@ -50,24 +50,52 @@ class Bound:
 
 
 def gradient_charges(
-    scene: Scene, charges: PixelCharges, v_image: np.ndarray, v_T_final: np.ndarray
+    scene: Scene,
+    charges: PixelCharges,
+    v_image: np.ndarray,
+    v_T_final: np.ndarray,
+    plain: int = 0,
+    with_depth: bool = False,
 ) -> dict[str, np.ndarray]:
-    """Return the charge of every gradient by name, in units of eps."""
+    """Return the charge of every gradient by name, in units of eps.
+
+    Args:
+        scene: what is drawn.
+        charges: of the scene, with the same channels as the cotangent.
+        v_image: cotangent of the image. [H, W, D]
+        v_T_final: cotangent of the remaining transmittance. [H, W]
+        plain: how many of the first channels are plain colours; with none, they are of harmonics.
+        with_depth: whether the last channel is depth.
+    """
     N = len(scene.gaussians)
     size = scene.tile_size or scene.profile.tile_size
     pixels = _pixel_bounds(scene, charges, np.abs(v_image), np.abs(v_T_final), 0.5 * size)
-    rows = {name: _gather(values, N) for name, values in pixels.items()}
+    shapes = {"means2d": (2,), "conics": (3,), "opacities": (), "colors": v_image.shape[2:]}
+    rows = {name: _gather(values, (N, *shapes[name])) for name, values in pixels.items()}
     T = charges.layers[-1].T_after if charges.layers else np.ones(v_T_final.shape)
     background = np.einsum("hw,hwc->c", 2.0 * T + charges.T_final, np.abs(v_image))
-    found = _world_bounds(scene, charges.screen, rows) if N else {}
+    given, nothing = rows["colors"], np.zeros((N, 3))
+    if with_depth:
+        rows["depths"] = Bound(given.m[:, -1], given.e[:, -1])
+    if plain or given.m.shape[1] - with_depth == 0:
+        rows["colors"] = Bound(nothing, nothing)
+    elif with_depth:
+        rows["colors"] = Bound(given.m[:, :-1], given.e[:, :-1])
+    found = _world_bounds(scene, charges.screen, rows) if N else _no_bounds(scene)
+    found["colors"] = given.charge[:, :plain]
     found["background"] = background
     found["means2d"] = found["means2d_abs"] = rows["means2d"].charge
     return found
 
 
-def _gather(values: dict[int, Bound], n: int) -> Bound:
-    shape = next(iter(values.values())).m.shape if values else (3,)
-    total = Bound(np.zeros((n, *shape)), np.zeros((n, *shape)))
+def _no_bounds(scene: Scene) -> dict[str, np.ndarray]:
+    g = scene.gaussians
+    arrays = {"means": g.means, "quats": g.quats, "scales": g.scales, "opacities": g.opacities, "sh": g.sh}
+    return {name: np.zeros_like(value) for name, value in arrays.items()} | {"viewmat": np.zeros((4, 4))}
+
+
+def _gather(values: dict[int, Bound], shape: tuple[int, ...]) -> Bound:
+    total = Bound(np.zeros(shape), np.zeros(shape))
     for i, value in values.items():
         total.m[i], total.e[i] = value.m, value.e
     return total
@@ -78,7 +106,9 @@ def _pixel_bounds(
 ) -> dict[str, dict[int, Bound]]:
     s = charges.screen
     out: dict[str, dict[int, Bound]] = {"means2d": {}, "conics": {}, "opacities": {}, "colors": {}}
-    behind = Bound(v_T + v @ np.abs(scene.background), 2.0 * (v_T + v @ np.abs(scene.background)))
+    # of the channels that are drawn: depth has a background of 0
+    worth_behind = v_T + v @ np.abs(charges.scene.background)
+    behind = Bound(worth_behind, 2.0 * worth_behind)
     for layer in reversed(charges.layers):
         i, shown = layer.id, layer.blended.astype(np.float64)
         T, T_error, alpha, e_alpha = (layer.T, layer.T_error, layer.alpha, layer.e_alpha)
@@ -156,6 +186,9 @@ def _world_bounds(scene: Scene, s: ScreenCharges, rows: dict[str, Bound]) -> dic
     AS, e_AS = A @ S, e_A @ S + A @ e_S
     v_J = Bound(2.0 * V.m @ AS, 2.0 * (V.e @ AS + V.m @ e_AS + 4.0 * V.m @ AS))
     v_p = _point_bound(s, camera.K, rows["means2d"], v_J)
+    if "depths" in rows:
+        v_p.m[:, 2] += rows["depths"].m
+        v_p.e[:, 2] += rows["depths"].e
     v_dirs, sh = _color_bounds(scene, rows["colors"])
     v_means = Bound(v_p.m @ R + v_dirs.m, v_p.e @ R + 4.0 * v_p.m @ R + v_dirs.e)
     v_covars = v_S.between(_t(R)[None], R[None], np.zeros((1, 3, 3)), np.zeros((1, 3, 3)))

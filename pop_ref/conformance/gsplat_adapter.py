@@ -99,4 +99,6 @@ def gsplat_cuda(name: str) -> TorchAdapter:
     gsplat: Any = importlib.import_module("gsplat")
     version = tuple(int(part) for part in gsplat.__version__.split(".")[:2])
     profile = GSPLAT_1_6 if version >= (1, 6) else GSPLAT_1_5
-    return TorchAdapter(name, gsplat.rasterization, dtype="float32", device="cuda", profile=profile)
+    return TorchAdapter(
+        name, gsplat.rasterization, dtype="float32", device="cuda", profile=profile, deterministic=False
+    )

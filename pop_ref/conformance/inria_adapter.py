@@ -105,7 +105,14 @@ def inria(name: str, module: Any = None, dtype: str = "float32", device: str = "
     module = importlib.import_module(MODULE) if module is None else module
     without = ("background", "viewmat")
     adapter = TorchAdapter(
-        name, gsplat_like(module), dtype=dtype, device=device, profile=INRIA, without_gradients=without
+        name,
+        gsplat_like(module),
+        dtype=dtype,
+        device=device,
+        profile=INRIA,
+        without_gradients=without,
+        deterministic=False,
+        whole_signature=False,
     )
     adapter.able = (ANTIALIASING,) if "antialiasing" in module.GaussianRasterizationSettings._fields else ()
     return adapter

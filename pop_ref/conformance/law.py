@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis.errors import HypothesisException
 
 from pop_ref.conformance.abilities import STAGES
+from pop_ref.conformance.calls import Call
 from pop_ref.conformance.scenes import Scene
 
 
@@ -90,7 +91,7 @@ def _telling(sentence: Callable[..., None], quantified: Callable[..., Any]) -> C
         except Exception as error:
             for seen in broken:
                 for tell in TELL:
-                    error.add_note(_safely(tell, sentence.__name__, seen.adapter, seen.scenes))
+                    error.add_note(_safely(tell, sentence.__name__, seen, seen.scenes))
             raise
         finally:
             broken.clear()
@@ -105,6 +106,7 @@ class _Watched:
         self.adapter = adapter
         self._given = {name: value for name, value in drawn.items() if isinstance(value, Scene)}
         self._made: list[Scene] = []
+        self.asked_for_gradients = False
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.adapter, name)
@@ -115,7 +117,13 @@ class _Watched:
 
     def gradients(self, scene: Scene, *cotangents: Any) -> Any:
         self._made.append(scene)
+        self.asked_for_gradients = True
         return self.adapter.gradients(scene, *cotangents)
+
+    def call(self, call: Call, *cotangents: Any) -> Any:
+        self._made += [frame.scene for _, _, frame in call.each]
+        self.asked_for_gradients |= bool(cotangents)
+        return self.adapter.call(call, *cotangents)
 
     @property
     def scenes(self) -> dict[str, Scene]:

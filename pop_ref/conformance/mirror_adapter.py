@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pop_ref.conformance.abilities import ANTIALIASING, DOMINANCE, ROWWISE
+from pop_ref.conformance.abilities import ANTIALIASING, DETERMINISTIC, DOMINANCE, ROWWISE
 from pop_ref.conformance.adapter import Adapter, View
 from pop_ref.conformance.mirror_library import Mirror
 from pop_ref.conformance.mirror_stages import STAGES
@@ -39,7 +39,7 @@ class MirrorAdapter(Adapter):
     """
 
     profile = None
-    able = (ANTIALIASING, DOMINANCE, ROWWISE)
+    able = (ANTIALIASING, DETERMINISTIC, DOMINANCE, ROWWISE)
 
     def __init__(self, folder: Path, dtype: Any, per_splat: bool = False, kernel_tiles: bool = False) -> None:
         family = "splats" if per_splat else "columns"

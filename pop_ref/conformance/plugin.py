@@ -39,6 +39,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--stages", metavar="PACKAGE", help="a package whose stage modules carry the oracle's names")
     group.addoption("--dtype", default="float32", choices=["float32", "float64"], help="precision of --rasterizer")
     group.addoption("--device", default="cpu", help="torch device of --rasterizer")
+    group.addoption(
+        "--unordered-sums",
+        action="store_true",
+        help="--rasterizer adds in another order on every run, as atomics do: laws of equal bits are skipped",
+    )
     group.addoption("--profile", default="paper", help="constants that --rasterizer implements, default paper")
     group.addoption("--backend", action="append", default=[], help="judge an adapter that comes with the kit, by name")
     group.addoption(
@@ -122,7 +127,8 @@ def _make_backends(config: pytest.Config) -> list[Any]:
         if path or package:
             profile = profile_named(option("--profile"))
             name = path or package
-            chosen.append(adapter_for(path, name, package, option("--dtype"), option("--device"), profile))
+            ordered = not option("--unordered-sums")
+            chosen.append(adapter_for(path, name, package, option("--dtype"), option("--device"), profile, ordered))
     except (Unavailable, ValueError) as error:
         raise pytest.UsageError(str(error)) from error
     return chosen or [shipped("oracle")]

@@ -136,6 +136,20 @@ def pack(records: list[Record], camera: Camera) -> Gaussians:
     return Gaussians(np.array(means), quats, np.array(scales), opacities, sh)
 
 
+def rigid(quat: tuple[float, ...], shift: tuple[float, ...]) -> np.ndarray:
+    """Return the world -> camera matrix of a turn and a shift."""
+    # written out here: the kit must not draw its inputs through the functions that it judges
+    w, x, y, z = np.array(quat) / np.sqrt(sum(c * c for c in quat))
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    viewmat[:3, 3] = shift
+    return viewmat
+
+
 def rounded_to(scene: Scene, dtype: Any) -> Scene:
     """Return the scene with every array rounded to a dtype, so that oracle and accused read the same numbers."""
     g, c = scene.gaussians, scene.camera

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from pop_ref.conformance.scenes import Record, Scene, pack
+from pop_ref.conformance.scenes import Record, Scene, pack, rigid
 from pop_ref.constants import PAPER, Profile
 from pop_ref.types import Camera
 
@@ -115,20 +115,6 @@ def viewmats(turned: bool = True) -> st.SearchStrategy[np.ndarray]:
     shift = st.tuples(*[dyadic(-4.0, 4.0)] * 3)
     turn = quats() if turned else st.just((1.0, 0.0, 0.0, 0.0))
     return st.one_of(st.just(np.eye(4)), st.builds(rigid, turn, shift))
-
-
-def rigid(quat: tuple[float, ...], shift: tuple[float, ...]) -> np.ndarray:
-    """Return the world -> camera matrix of a turn and a shift."""
-    # written out here: the kit must not draw its inputs through the functions that it judges
-    w, x, y, z = np.array(quat) / math.sqrt(sum(c * c for c in quat))
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    viewmat[:3, 3] = shift
-    return viewmat
 
 
 COINS = st.booleans()

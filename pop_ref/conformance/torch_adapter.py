@@ -18,8 +18,17 @@ from typing import Any
 import numpy as np
 from hypothesis import reject
 
-from pop_ref.conformance.abilities import ANTIALIASING, DOMINANCE, GRADIENTS, INSTRUMENTS, RENDER, same_constants
-from pop_ref.conformance.adapter import Adapter, View, stage_function
+from pop_ref.conformance.abilities import (
+    ANTIALIASING,
+    DETERMINISTIC,
+    GRADIENTS,
+    INSTRUMENTS,
+    RENDER,
+    SIGNATURE,
+    same_constants,
+)
+from pop_ref.conformance.adapter import TOLD_OF_DOMINANCE, Adapter, View, stage_function
+from pop_ref.conformance.calls import Call, Called, unpacked
 from pop_ref.conformance.cases import BY_NAME, Case
 from pop_ref.conformance.scenes import Scene
 from pop_ref.constants import PAPER, Profile
@@ -41,6 +50,9 @@ class TorchAdapter(Adapter):
         dtype: "float64" or "float32".
         device: a torch device.
         profile: the profile that a function without a `profile` argument implements.
+        deterministic: whether sums are taken in the same order on every run, as with atomics they are not.
+        whole_signature: whether the laws of gsplat's other arguments are asked; False for a function that takes them
+            for show.
     """
 
     def __init__(
@@ -53,6 +65,8 @@ class TorchAdapter(Adapter):
         profile: Profile = PAPER,
         stages: Mapping[str, Callable[..., Any]] | None = None,
         without_gradients: tuple[str, ...] = (),
+        deterministic: bool = True,
+        whole_signature: bool = True,
     ) -> None:
         self.name = name
         self._stages, self._without = dict(stages or {}), without_gradients
@@ -67,26 +81,41 @@ class TorchAdapter(Adapter):
         # stage functions of a package take the profile that they are given
         takes_any = self._takes_profile or (rasterization is None and package is not None)
         self.profile = None if takes_any else profile
-        self.able = (ANTIALIASING,) if "rasterize_mode" in parameters else ()
+        self.able = (*(ANTIALIASING,) * ("rasterize_mode" in parameters), *(DETERMINISTIC,) * deterministic)
+        self._whole_signature = whole_signature
+        self._takes_absgrad = "absgrad" in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values())
         self._instruments = tuple(name for name in ("dominance", "counts") if name in parameters)
-        self._tells_dominance: bool | None = None if rasterization else False
+        self._has_gradients: bool | None = None if rasterization else False
 
     def has(self, need: str) -> bool:
-        """Tell what the program offers; asks the rasterizer for its meta once to learn about dominance."""
-        if need in (RENDER, GRADIENTS):
-            return self._rasterization is not None
+        """Tell what the program offers; the rasterizer is asked once for its gradients, and for its meta."""
+        if need == RENDER or need in TOLD_OF_DOMINANCE:
+            return self._rasterization is not None and (need == RENDER or self._tells(need))
+        if need == GRADIENTS:
+            if self._has_gradients is None:
+                self._has_gradients = self._asked_for_gradients()
+            return self._has_gradients
         if need == INSTRUMENTS:
             return self._rasterization is not None and bool(self._instruments)
-        if need == DOMINANCE:
-            if self._tells_dominance is None:
-                self._tells_dominance = self._asked_for_dominance()
-            return self._tells_dominance
+        if need == SIGNATURE:
+            return self._rasterization is not None and self._whole_signature
         return super().has(need) or self._stage(need) is not None
 
-    def _asked_for_dominance(self) -> bool:
+    def _asked_for_gradients(self) -> bool:
+        """Tell whether an image follows its Gaussians in autograd; a renderer that only draws does not."""
         from pop_ref.conformance.golden import golden_scene
 
-        return self.render(golden_scene()).dominant_ids is not None
+        scene = self.sees(golden_scene())
+        try:
+            image, _, _ = self._call(scene, self._leaves(scene, grad=True), dominance=False, counts=False)
+        except NotImplementedError:
+            return False
+        except RuntimeError as error:
+            # what leaves torch on its way, to NumPy or to a foreign kernel, says that a tensor requires grad
+            if "requires grad" not in str(error):
+                raise
+            return False
+        return bool(image.requires_grad)
 
     def _stage(self, name: str) -> Callable[..., Any] | None:
         found = self._stages.get(name)
@@ -196,7 +225,7 @@ class TorchAdapter(Adapter):
         self, scene: Scene, v_image: Any, v_T_final: Any, dominance: bool, counts: bool
     ) -> dict[str, np.ndarray]:
         leaves = self._leaves(scene, grad=True)
-        image, alphas, meta = self._call(scene, leaves, dominance, counts, absgrad=True)
+        image, alphas, meta = self._call(scene, leaves, dominance, counts, **self._absgrad)
         means2d = meta.get("means2d")
         if means2d is not None and means2d.requires_grad:
             means2d.retain_grad()
@@ -213,6 +242,58 @@ class TorchAdapter(Adapter):
             if getattr(means2d, "absgrad", None) is not None:
                 found["means2d_abs"] = self._array(means2d.absgrad).reshape(N, 2)
         return {key: value for key, value in found.items() if key not in self._without}
+
+    @property
+    def _absgrad(self) -> dict[str, bool]:
+        return {"absgrad": True} if self._takes_absgrad else {}
+
+    def call(self, call: Call, v_images: Any = None, v_alphas: Any = None) -> Called:
+        """Make a whole call as it is written, and pull cotangents of its images and alphas back.
+
+        Args:
+            call: what is asked.
+            v_images, v_alphas: cotangents [B, C, H, W, X] and [B, C, H, W], or None for the images alone.
+        """
+        if self._rasterization is None:
+            raise LookupError(f"{self.name} has no rasterization function")
+        scene, pulls = call.frames[0][0].scene, v_images is not None
+        leaves = {name: self._tensor(value).requires_grad_(pulls) for name, value in call.tensors().items()}
+        images, alphas, meta = self._rasterization(
+            **{"quats": None, "scales": None} | leaves,
+            Ks=self._tensor(call.intrinsics()),
+            width=scene.camera.width,
+            height=scene.camera.height,
+            sh_degree=call.sh_degree,
+            packed=call.packed,
+            tile_size=scene.profile.tile_size if scene.tile_size is None else scene.tile_size,
+            **self._asked_by(call),
+            **(self._absgrad if pulls else {}),
+        )
+        B, C, H, W = len(call.frames), len(call.frames[0]), scene.camera.height, scene.camera.width
+        images, alphas = images.reshape(B, C, H, W, -1), alphas.reshape(B, C, H, W)
+        gradients: dict[str, np.ndarray] = {}
+        if pulls:
+            means2d = meta.get("means2d")
+            if means2d is not None and means2d.requires_grad:
+                means2d.retain_grad()
+            ((images * self._tensor(v_images)).sum() + (alphas * self._tensor(v_alphas)).sum()).backward()
+            gradients = {name: self._grad_of(leaf) for name, leaf in leaves.items() if name not in self._without}
+            if means2d is not None and means2d.requires_grad:
+                absolute = getattr(means2d, "absgrad", None)
+                of_screen = {"means2d": self._grad_of(means2d)}
+                of_screen |= {} if absolute is None else {"means2d_abs": self._array(absolute)}
+                gradients |= {name: unpacked(call, value, meta) for name, value in of_screen.items()}
+        told = {name: self._array(meta[name]) for name in meta if meta[name] is not None}
+        return Called(self._array(images), self._array(alphas), told, gradients)
+
+    def _asked_by(self, call: Call) -> dict[str, Any]:
+        """Return the arguments of a call that are not at gsplat's defaults, and the profile for who takes one."""
+        scene = call.frames[0][0].scene
+        asked: dict[str, Any] = {"near_plane": scene.profile.near_plane, "eps2d": scene.profile.eps2d} | call.planes
+        asked |= {"render_mode": call.render_mode} if call.render_mode != "RGB" else {}
+        asked |= {"radius_clip": call.radius_clip} if call.radius_clip else {}
+        asked |= {"sparse_grad": True} if call.sparse_grad else {}
+        return asked | ({"profile": scene.profile} if self._takes_profile else {})
 
     def _leaves(self, scene: Scene, grad: bool) -> dict[str, Any]:
         g, c = scene.gaussians, scene.camera
@@ -273,7 +354,8 @@ class TorchAdapter(Adapter):
         return value
 
     def _grad_of(self, tensor: Any) -> np.ndarray:
-        return self._array(self._torch.zeros_like(tensor) if tensor.grad is None else tensor.grad)
+        grad = self._torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
+        return self._array(grad.to_dense() if grad.is_sparse else grad)
 
     def _array(self, value: Any) -> Any:
         if isinstance(value, tuple | list):

@@ -25,6 +25,7 @@ class Verdict:
         worst: the largest difference over its charge; for integers the number of wrong entries.
         allowed: the largest that passes.
         told: where the worst entry is, with both values.
+        unit: what `worst` and `allowed` count.
     """
 
     vector: str
@@ -32,6 +33,7 @@ class Verdict:
     worst: float
     allowed: float
     told: str = ""
+    unit: str = "of its charge"
 
     @property
     def passed(self) -> bool:
@@ -177,7 +179,9 @@ def _judge(
     mask = np.True_ if compare["where"] is None else wanted[compare["where"]]
     # a mask covers the leading axes
     where = np.broadcast_to(np.reshape(mask, mask.shape + (1,) * (expected.ndim - mask.ndim)), expected.shape)
+    unit = "of its charge"
     if compare["rule"] == "equal":
+        unit = "wrong entries"
         wrong = np.asarray((result != expected) & where, dtype=np.float64)
         worst, allowed = float(np.sum(wrong)), 0.0
     else:
@@ -188,6 +192,7 @@ def _judge(
         wrong = np.where(where, np.where(np.isfinite(off), off, np.inf), 0.0)
         worst = float(np.max(wrong, initial=0.0))
     if worst <= allowed:
-        return Verdict(vector, array, worst, allowed)
+        return Verdict(vector, array, worst, allowed, unit=unit)
     at = tuple(int(i) for i in np.unravel_index(np.argmax(wrong), wrong.shape))
-    return Verdict(vector, array, worst, allowed, f"at {list(at)}: got {result[at]}, expected {expected[at]}")
+    told = f"at {list(at)}: got {result[at]}, expected {expected[at]}"
+    return Verdict(vector, array, worst, allowed, told, unit)

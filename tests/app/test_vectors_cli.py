@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -93,7 +94,8 @@ def test_one_wrong_entry_is_found_and_named(pop: Pop, shared_vectors: Path, port
     np.savez(results / "golden.npz", **arrays)
     outcome = pop("vectors", "check", shared_vectors, results)
     assert outcome.status == 1
-    assert "golden: off by" in outcome.out
+    (line,) = (line for line in outcome.out.splitlines() if "golden: off by" in line)
+    assert re.search(r"off by \S+ of its charge, allowed \S+; ", line), line
     assert "at [3, 5, 1]: got " in outcome.out
 
 

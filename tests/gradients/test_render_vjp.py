@@ -46,6 +46,39 @@ def test_transpose_matches_differences_in_every_parameter(profile: Profile, anti
     assert_vjp_matches(f, vjp, args, step=2e-6)
 
 
+@pytest.mark.parametrize("n_channels", [0, 1, 4], ids=["harmonics", "one channel", "four channels"])
+@pytest.mark.parametrize("render_mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
+def test_transpose_matches_differences_in_every_mode_and_number_of_channels(render_mode: str, n_channels: int) -> None:
+    gaussians, rng = safe_gaussians(VIEW), np.random.default_rng(5)
+    given = rng.uniform(0.25, 1.0, (len(gaussians), n_channels))
+    behind = rng.uniform(0.25, 1.0, n_channels) if n_channels else BACKGROUND
+
+    def scene(means, quats, scales, opacities, sh, viewmat):
+        moved = replace(gaussians, means=means, quats=quats, scales=scales, opacities=opacities, sh=sh)
+        return moved, loose_camera(VIEW, viewmat)
+
+    def options(colors):
+        return {"render_mode": render_mode, "colors": colors if n_channels else None}
+
+    def f(*args):
+        out = render(*scene(*args[:6]), args[6], **options(args[7]))
+        return out.image, out.T_final
+
+    def vjp(*args):
+        *parameters, background, colors, v_image, v_T_final = args
+        v = render_vjp(*scene(*parameters), v_image, v_T_final, background, **options(colors))
+        v_colors = np.zeros_like(given) if v.colors is None else v.colors
+        return v.means, v.quats, v.scales, v.opacities, v.sh, v.viewmat, v.background, v_colors
+
+    g = gaussians
+    args = [g.means, g.quats, g.scales, g.opacities, g.sh, VIEW.viewmat, behind, given]
+    colored = render_mode.startswith("RGB")
+    assert f(*args)[0].shape[2] == colored * (n_channels or 3) + (render_mode != "RGB")
+    # harmonics, background and colours are read by the modes that show colours, and harmonics only without colours
+    unread = {4: not colored or n_channels > 0, 6: not colored, 7: not colored or n_channels == 0}
+    assert_vjp_matches(f, vjp, args, step=2e-6, zero_gradient_allowed=[k for k, idle in unread.items() if idle])
+
+
 def test_every_gaussian_has_signal_in_the_scene_the_differences_are_taken_of() -> None:
     v = render_vjp(safe_gaussians(VIEW), VIEW, np.random.default_rng(0).normal(size=(5, 6, 3)))
     for name in ("means", "quats", "scales", "opacities", "sh", "means2d"):
@@ -81,8 +114,9 @@ def test_screen_gradients_are_those_of_the_centres_in_px() -> None:
 
 def test_a_zero_cotangent_gives_exact_zeros() -> None:
     v = render_vjp(safe_gaussians(VIEW), VIEW, np.zeros((5, 6, 3)), np.zeros((5, 6)), BACKGROUND)
+    assert v.colors is None
     for name, value in v.__dict__.items():
-        assert np.all(value == 0.0), name
+        assert name == "colors" or np.all(value == 0.0), name
 
 
 def test_moving_scene_and_camera_together_has_no_gradient() -> None:
@@ -110,7 +144,7 @@ def test_gradients_of_extreme_opacities_are_finite_and_follow_the_profile() -> N
     view = camera()
     gaussians = replace(safe_gaussians(view), opacities=np.array([0.0, 1.0 / 512.0, 1.0, 1.0, 0.5]))
     v = render_vjp(gaussians, view, np.ones((5, 6, 3)), background=BACKGROUND)
-    assert all(np.all(np.isfinite(value)) for value in v.__dict__.values())
+    assert all(np.all(np.isfinite(value)) for name, value in v.__dict__.items() if name != "colors")
     assert np.all(v.opacities[:2] == 0.0)
     assert np.all(v.means[:2] == 0.0)
     assert v.opacities[4] != 0.0

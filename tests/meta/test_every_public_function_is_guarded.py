@@ -182,6 +182,9 @@ LADDER = (
     "training.control",
 )
 DOCTESTS = (
+    "depth.expected_depth",
+    "depth.expected_depth_vjp",
+    "depth.with_depth_channel",
     "density.without_blur_that_does_not_pay",
     *("constants.profile_named", "notation.symbol_named", "magnitudes.distance", "magnitudes.colors_magnitudes"),
     *("loss_magnitudes.d_ssim_magnitudes", "loss_magnitudes.pixelwise_magnitudes"),

@@ -318,5 +318,5 @@ def test_a_weight_is_charged_for_an_exponent_that_is_expanded_about_a_tile_far_f
     )
     K = [[4.875, 0.0, 0.125], [0.0, 4.875, 2.0], [0.0, 0.0, 1.0]]
     scene = Scene(gaussians, Camera(np.eye(4), np.array(K), 4, 4), tile_size=16)
-    sentence = law_named("test_agreement:dominant_ids_and_weights_are_the_oracles").sentence
+    sentence = law_named("test_agreement:dominant_weights_are_the_oracles").sentence
     settings(max_examples=1, database=None)(given(scene=st.just(scene))(lambda scene: sentence(backend, scene=scene)))()

@@ -7,7 +7,7 @@ import pytest
 from pop_ref.conformance.abilities import STAGES
 from pop_ref.conformance.backends import shipped
 from pop_ref.conformance.catalogue import FILE, catalogue
-from pop_ref.conformance.mutants import MUTANTS, PROGRAM
+from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM, BlackBox
 from pop_ref.conformance.mutants.__main__ import main
 from pop_ref.conformance.mutants.copies import Mutant
 from pop_ref.conformance.mutants.trial import every_law, killed_by, law_named, obeys
@@ -15,12 +15,12 @@ from pop_ref.conformance.mutants.trial import every_law, killed_by, law_named, o
 EVERYONE = (*MUTANTS, *PROGRAM)
 
 
-@pytest.mark.parametrize("mutant", EVERYONE, ids=lambda mutant: mutant.name)
-def test_the_named_law_kills_the_mutant(mutant: Mutant) -> None:
+@pytest.mark.parametrize("mutant", [*EVERYONE, *BLACK_BOXES], ids=lambda mutant: mutant.name)
+def test_the_named_law_kills_the_mutant(mutant: Mutant | BlackBox) -> None:
     assert killed_by(mutant) is not None, f"{mutant.name} survives {mutant.law}"
 
 
-@pytest.mark.parametrize("law", sorted({mutant.law for mutant in PROGRAM}))
+@pytest.mark.parametrize("law", sorted({mutant.law for mutant in (*PROGRAM, *BLACK_BOXES)}))
 def test_the_program_itself_obeys_what_its_mutants_break(law: str) -> None:
     assert obeys(law_named(law), shipped("fast32")) is None
 
@@ -31,6 +31,8 @@ def test_a_trial_says_who_dies_by_what(capsys: pytest.CaptureFixture[str]) -> No
         "no_half_in_the_exponent: killed by "
         "test_alpha:the_exponent_is_half_the_squared_distance_in_the_conics_metric (AssertionError: alpha.sigma"
     )
+    assert main(["near_plane_ignored"]) == 0
+    assert "behind gsplat's signature: 1 of 1 killed" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         main(["nobody"])
     assert "there is no mutant nobody" in capsys.readouterr().err
@@ -38,7 +40,9 @@ def test_a_trial_says_who_dies_by_what(capsys: pytest.CaptureFixture[str]) -> No
 
 def test_there_are_at_least_twenty_mutants_and_no_two_alike() -> None:
     assert len(MUTANTS) >= 20
-    assert len({mutant.name for mutant in EVERYONE}) == len(EVERYONE)
+    everyone = (*EVERYONE, *BLACK_BOXES)
+    assert len({mutant.name for mutant in everyone}) == len(everyone)
+    assert len({mutant.law for mutant in BLACK_BOXES}) >= 8
     assert len({(mutant.package, mutant.file, mutant.new) for mutant in EVERYONE}) == len(EVERYONE)
 
 

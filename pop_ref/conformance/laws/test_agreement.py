@@ -8,7 +8,16 @@ import numpy as np
 from hypothesis import assume
 from hypothesis import strategies as st
 
-from pop_ref.conformance.abilities import ANTIALIASING, DOMINANCE, DOUBLE, GRADIENTS, INRIAS, LOWER_CEILING, RENDER
+from pop_ref.conformance.abilities import (
+    ANTIALIASING,
+    DOMINANCE,
+    DOMINANT_WEIGHTS,
+    DOUBLE,
+    GRADIENTS,
+    INRIAS,
+    LOWER_CEILING,
+    RENDER,
+)
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.cases import CASES, charges_of, cotangent_like, rounded, tangential, transposed
 from pop_ref.conformance.compare import assert_close, assert_same_bits
@@ -146,11 +155,17 @@ def test_the_antialiased_image_is_one_of_the_oracles_outcomes(backend, scene):
 
 
 @law("dominance", RENDER, DOMINANCE, scene=scenes(anchored=True))
-def test_dominant_ids_and_weights_are_the_oracles(backend, scene):
+def test_dominant_ids_are_the_oracles(backend, scene):
     seen, charges = charged(backend, scene)
     expected, view = ORACLE.render(seen), backend.render(seen)
     sure = charges.decided
     assert_same_bits("winner", view.dominant_ids[sure], expected.dominant_ids[sure])
+
+
+@law("dominance", RENDER, DOMINANCE, DOMINANT_WEIGHTS, scene=scenes(anchored=True))
+def test_dominant_weights_are_the_oracles(backend, scene):
+    seen, charges = charged(backend, scene)
+    expected, view = ORACLE.render(seen), backend.render(seen)
     magnitude = charges.dominant_weight + 1.0
     at = charges.certain
     weights = (view.dominant_weights[at], expected.dominant_weights[at])

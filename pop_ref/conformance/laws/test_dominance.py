@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from hypothesis import strategies as st
 
-from pop_ref.conformance.abilities import DOMINANCE, PROFILES, RENDER
+from pop_ref.conformance.abilities import DOMINANCE, DOMINANT_COUNTS, DOMINANT_WEIGHTS, PROFILES, RENDER
 from pop_ref.conformance.compare import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
 from pop_ref.conformance.laws.test_compositing import colored
@@ -46,7 +46,7 @@ def test_counts_add_over_crops(backend, ids, cut):
     assert_same_bits("counts", count(left, 4) + count(right, 4), count(ids, 4))
 
 
-@law("dominance", RENDER, DOMINANCE, scene=scenes())
+@law("dominance", RENDER, DOMINANCE, DOMINANT_COUNTS, scene=scenes())
 def test_the_counts_of_a_render_are_those_of_its_map(backend, scene):
     n = len(scene.gaussians)
     view = backend.render(backend.sees(scene))
@@ -61,7 +61,8 @@ def test_a_pixel_without_blended_splats_belongs_to_nobody(backend, scene):
     view = backend.render(seen)
     nobody = view.dominant_ids < 0
     assert_same_bits("remaining light of empty pixels", view.T_final[nobody], np.ones(int(np.sum(nobody))))
-    assert_same_bits("weights of empty pixels", view.dominant_weights[nobody], np.zeros(int(np.sum(nobody))))
+    if view.dominant_weights is not None:
+        assert_same_bits("weights of empty pixels", view.dominant_weights[nobody], np.zeros(int(np.sum(nobody))))
     if view.n_blended is not None:
         # what counts may be drawn anew, and decide for itself where rounding does
         sure = charges.certain
@@ -81,7 +82,8 @@ def test_the_winner_is_the_splat_whose_weight_shows_most_in_the_image(backend, s
     largest = np.max(weights, axis=0)
     sure = charges.decided & (largest > 0.0)
     magnitude = 2.0 * charges.T_final + 1.0
-    assert_close("dominance.weight", view.dominant_weights[sure], largest[sure], magnitude[sure], backend.dtype)
+    if view.dominant_weights is not None:
+        assert_close("dominance.weight", view.dominant_weights[sure], largest[sure], magnitude[sure], backend.dtype)
     assert_same_bits("winner", view.dominant_ids[sure], np.argmax(weights, axis=0)[sure])
 
 
@@ -98,7 +100,8 @@ def test_colours_and_background_do_not_matter(backend, scene, colors, background
     painted = backend.sees(colored(scene, colors[: len(scene.gaussians)]).but(background=background))
     one, other = backend.render(seen), backend.render(painted)
     assert_same_bits("winner", one.dominant_ids, other.dominant_ids)
-    assert_same_bits("weight", one.dominant_weights, other.dominant_weights)
+    if one.dominant_weights is not None:
+        assert_same_bits("weight", one.dominant_weights, other.dominant_weights)
 
 
 @law("dominance", RENDER, DOMINANCE, opacity=st.sampled_from([0.5, 0.25, 0.75]), copies=st.integers(2, 4))
@@ -106,11 +109,11 @@ def test_of_coincident_copies_only_the_first_in_memory_dominates(backend, opacit
     camera = Camera(np.eye(4), np.array([[8.0, 0, 2.5], [0, 8.0, 2.5], [0, 0, 1]]), 5, 5)
     records = [Record(2.5, 2.5, 1.0, (2.0, 2.0, 2.0), opacity=opacity)] * copies
     view = backend.render(backend.sees(Scene(pack(records, camera), camera)))
-    assert_same_bits("counts behind the first", view.dominant_counts[1:], np.zeros(copies - 1))
-    assert view.dominant_counts[0] > 0
+    won = np.unique(view.dominant_ids)
+    assert_same_bits("winners", won[won >= 0], [0])
 
 
-@law("dominance", RENDER, DOMINANCE, PROFILES, more=st.integers(0, 2))
+@law("dominance", RENDER, DOMINANCE, DOMINANT_WEIGHTS, PROFILES, more=st.integers(0, 2))
 def test_an_exact_tie_goes_to_the_front(backend, more):
     # half the light, then all of the other half: both weigh exactly one half once ceiling and stop are out of the way
     profile = dataclasses.replace(PAPER, name="open", alpha_ceiling=1.0, transmittance_stop=-1.0)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume
 from hypothesis import strategies as st
 
-from pop_ref.conformance.abilities import DERIVATIVES, DOUBLE, GRADIENTS, INSTRUMENTS, RENDER
+from pop_ref.conformance.abilities import DERIVATIVES, DETERMINISTIC, DOUBLE, GRADIENTS, INSTRUMENTS, RENDER
 from pop_ref.conformance.charges import charge
 from pop_ref.conformance.compare import assert_close, assert_same_bits
 from pop_ref.conformance.gradient_charges import gradient_charges
@@ -64,7 +64,7 @@ def test_zero_cotangents_give_exact_zeros(backend, scene):
         assert_same_bits(f"v_{name}", value, np.zeros_like(value))
 
 
-@law("gradients", GRADIENTS, scene=banded)
+@law("gradients", GRADIENTS, DETERMINISTIC, scene=banded)
 def test_twice_the_cotangent_is_exactly_twice_the_gradient(backend, scene):
     seen = backend.sees(scene)
     one, v_image, v_T_final = _pulled(backend, seen)
@@ -220,7 +220,7 @@ def _no_kink_near(seen, h):
     assume(not np.any(screen_charges(seen, 64.0 * h).kinked))
 
 
-@law("gradients", GRADIENTS, scene=plain, opacity=arrays_of((7,), 0.125, 0.875))
+@law("gradients", GRADIENTS, DETERMINISTIC, scene=plain, opacity=arrays_of((7,), 0.125, 0.875))
 def test_gradients_ignore_the_coefficients_of_other_bands(backend, scene, opacity):
     g = scene.gaussians
     sh = np.concatenate([g.sh[:, :1], np.ones((len(g), 3, 3))], axis=1)

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from hypothesis import strategies as st
 
+from pop_ref.conformance.abilities import HOMOGENEOUS
 from pop_ref.conformance.abilities import PROFILES as PROFILES_NEEDED
 from pop_ref.conformance.compare import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
@@ -48,7 +49,7 @@ def test_where_the_profile_says_so_the_principal_point_is_the_images_centre(back
     assert_close("projection.axis", backend.stage("project_means")(axis, K, W, H, INRIA), centre, 8.0, backend.dtype)
 
 
-@law("projection", "project_means", "projection_jacobians", point=points, power=st.integers(-4, 4))
+@law("projection", "project_means", "projection_jacobians", HOMOGENEOUS, point=points, power=st.integers(-4, 4))
 def test_scaling_the_world_by_a_power_of_two_keeps_the_screen_and_divides_the_jacobian_exactly(backend, point, power):
     project, jacobians = backend.stage("project_means"), backend.stage("projection_jacobians")
     scale = 2.0**power
@@ -73,7 +74,14 @@ def test_shifting_the_principal_point_translates_the_screen(backend, point, dx, 
     assert_close("projection.shift", project(point, shifted, W, H), before + np.array([dx, dy]), size, backend.dtype)
 
 
-@law("projection", "project_means", "projection_jacobians", point=points, step=arrays_of((1, 3), -1.0, 1.0))
+@law(
+    "projection",
+    "project_means",
+    "projection_jacobians",
+    PROFILES_NEEDED,
+    point=points,
+    step=arrays_of((1, 3), -1.0, 1.0),
+)
 def test_the_jacobian_is_the_derivative_of_the_projection(backend, point, step):
     # the central difference of a pinhole along a direction is exact but for the square of h / z
     project = backend.stage("project_means")
@@ -103,7 +111,7 @@ def test_outside_the_frustum_the_jacobian_is_that_of_the_clamped_point(backend, 
     assert_close("projection.clamp", J, written, np.abs(written) + fx / z, backend.dtype)
 
 
-@law("projection", "projection_jacobians_vjp", point=points, v=arrays_of((1, 2, 3), -1.0, 1.0))
+@law("projection", "projection_jacobians_vjp", PROFILES_NEEDED, point=points, v=arrays_of((1, 2, 3), -1.0, 1.0))
 def test_a_clamped_point_passes_no_gradient_sideways_and_profiles_differ_in_depth_only(backend, point, v):
     # B1: outside on both axes
     x, y, z = np.where(point[0] < 0.0, -40.0, 40.0) * np.array([1.0, 1.0, 0.0]) + [0.0, 0.0, point[0, 2]]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
+from pop_ref.conformance.abilities import INRIAS
 from pop_ref.conformance.compare import assert_same_bits
 from pop_ref.conformance.law import law
 from pop_ref.conformance.strategies import dyadic
@@ -57,7 +58,7 @@ def test_a_tile_is_listed_exactly_if_it_overlaps_the_open_extent(backend, placed
         assert inside == overlapped
 
 
-@law("tiles", "tile_rects", placed=placed, tile_size=tile_sizes)
+@law("tiles", "tile_rects", INRIAS, placed=placed, tile_size=tile_sizes)
 def test_the_square_extents_rectangle_truncates_towards_zero_as_inria_does(backend, placed, tile_size):
     means2d, radii, _ = _columns(placed)
     rects = backend.stage("tile_rects")(means2d, radii, W, H, tile_size, INRIA)

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from hypothesis import strategies as st
 
-from pop_ref.conformance.abilities import EXTENTS, PRINCIPAL_POINT, RENDER, ROWWISE
+from pop_ref.conformance.abilities import DETERMINISTIC, EXTENTS, HOMOGENEOUS, PRINCIPAL_POINT, RENDER, ROWWISE
 from pop_ref.conformance.compare import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
 from pop_ref.conformance.scenes import Record, Scene, pack
@@ -34,7 +34,7 @@ def _same_render(key, backend, one, other, charges):
         assert_same_bits(name, a[sure], b[sure])
 
 
-@law("whole", RENDER, scene=scenes(max_degree=3))
+@law("whole", RENDER, DETERMINISTIC, scene=scenes(max_degree=3))
 def test_two_runs_give_the_same_bits(backend, scene):
     seen = backend.sees(scene)
     one, other = backend.render(seen), backend.render(seen)
@@ -107,7 +107,7 @@ def test_an_invisible_gaussian_changes_nothing(backend, scene, hidden, at):
     _same_image_and_light("whole.invisible", backend, more, backend.render(seen), charges)
 
 
-@law("whole", RENDER, ROWWISE, scene=scenes(max_gaussians=4), hidden=invisible, at=st.integers(0, 4))
+@law("whole", RENDER, DETERMINISTIC, ROWWISE, scene=scenes(max_gaussians=4), hidden=invisible, at=st.integers(0, 4))
 def test_an_invisible_gaussian_changes_no_bit(backend, scene, hidden, at):
     one = backend.render(backend.sees(scene))
     other = backend.render(backend.sees(_joined(scene, hidden, at)))
@@ -115,7 +115,7 @@ def test_an_invisible_gaussian_changes_no_bit(backend, scene, hidden, at):
     assert_same_bits("remaining light", other.T_final, one.T_final)
 
 
-@law("whole", RENDER, scene=plain, power=st.integers(-3, 3))
+@law("whole", RENDER, DETERMINISTIC, HOMOGENEOUS, scene=plain, power=st.integers(-3, 3))
 def test_scaling_the_world_by_a_power_of_two_changes_no_bit(backend, scene, power):
     scale = 2.0**power
     seen = backend.sees(scene)

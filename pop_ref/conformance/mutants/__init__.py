@@ -1,6 +1,7 @@
 """Broken rasterizers, one line each, built from bugs that really happened; every one is killed by a named law."""
 
 from pop_ref.conformance.mutants.baselines import BASELINES
+from pop_ref.conformance.mutants.black_box import BLACK_BOXES, BlackBox
 from pop_ref.conformance.mutants.copies import Mutant, living
 from pop_ref.conformance.mutants.geometry import GEOMETRY
 from pop_ref.conformance.mutants.pixels import PIXELS
@@ -10,4 +11,4 @@ from pop_ref.conformance.mutants.training import TRAINING
 # of the oracle, and of the program that trains
 MUTANTS = (*GEOMETRY, *PIXELS, *TRAINING, *BASELINES)
 
-__all__ = ["MUTANTS", "PROGRAM", "Mutant", "living"]
+__all__ = ["BLACK_BOXES", "MUTANTS", "PROGRAM", "BlackBox", "Mutant", "living"]

@@ -1,0 +1,94 @@
+"""Laws of gsplat's signature: colours, backgrounds, covariances, planes and radius_clip away from their defaults."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from pop_ref.conformance.abilities import (
+    CAMERAS,
+    CHANNELS,
+    COLORS,
+    COVARS,
+    EXTENTS,
+    NO_BACKGROUND,
+    PACKED,
+    PLANES,
+    PRINCIPAL_POINT,
+    RADIUS_CLIP,
+    SIGNATURE,
+    SPARSE_GRAD,
+)
+from pop_ref.conformance.calls import Call
+from pop_ref.conformance.law import law
+from pop_ref.conformance.meta import clear_of_extents
+from pop_ref.conformance.signature import assert_call_is_the_oracles, expectations
+from pop_ref.conformance.views import frames
+
+JUDGED = (SIGNATURE, EXTENTS, PRINCIPAL_POINT)
+
+
+def _assert_it_matters(backend, call, **default):
+    """Assert that the oracle draws something else without the argument: a call that cannot tell says nothing."""
+    one, other = expectations(backend, call), expectations(backend, dataclasses.replace(call, **default))
+    moved = [np.max(np.abs(a.render.image - b.render.image)) for a, b in zip(one[0], other[0], strict=True)]
+    assert max(moved) > 2.0**-8, "the argument changes nothing in this scene"
+
+
+@law("signature", *JUDGED, COLORS)
+def test_plain_colours_are_drawn_as_they_are(backend):
+    for seed in (0, 1):
+        assert_call_is_the_oracles(backend, Call((frames(backend, seed, channels=3),)))
+
+
+@law("signature", *JUDGED, CHANNELS)
+def test_colours_of_any_number_of_channels_are_drawn_alike(backend):
+    for channels in (1, 2, 4, 8):
+        assert_call_is_the_oracles(backend, Call((frames(backend, channels, channels=channels),)))
+
+
+@law("signature", *JUDGED, NO_BACKGROUND, COLORS, CAMERAS)
+def test_without_a_background_it_is_black(backend):
+    for channels in (0, 3):
+        row = frames(backend, 2, 2, channels=channels, black=True)
+        assert_call_is_the_oracles(backend, Call((row,), no_background=True))
+
+
+@law("signature", *JUDGED, COVARS)
+def test_covariances_draw_what_their_quaternions_and_scales_draw(backend):
+    for seed in (3, 4):
+        assert_call_is_the_oracles(backend, Call((frames(backend, seed),), covars=True))
+
+
+@law("signature", *JUDGED, PLANES)
+def test_the_near_and_the_far_plane_are_where_the_call_says(backend):
+    for planes in ({"near_plane": 2.0}, {"far_plane": 4.0}, {"near_plane": 1.5, "far_plane": 4.5}):
+        call = Call((frames(backend, 5),), planes=planes)
+        _assert_it_matters(backend, call, planes={})
+        depths = expectations(backend, call)[0][0].render.splats.depths
+        assert all(np.min(np.abs(depths - plane)) > 2.0**-8 for plane in planes.values()), "a depth is at a plane"
+        assert_call_is_the_oracles(backend, call)
+
+
+@law("signature", *JUDGED, PLANES)
+def test_the_low_pass_is_as_wide_as_the_call_says(backend):
+    for eps2d in (0.0625, 2.0):
+        call = Call((frames(backend, 6),), planes={"eps2d": eps2d})
+        _assert_it_matters(backend, call, planes={})
+        assert_call_is_the_oracles(backend, call)
+
+
+@law("signature", *JUDGED, RADIUS_CLIP)
+def test_what_is_no_larger_than_radius_clip_is_culled(backend):
+    for seed, clip in ((7, 6.0), (8, 5.5)):
+        call = Call((frames(backend, seed),), radius_clip=clip)
+        _assert_it_matters(backend, call, radius_clip=0.0)
+        (unclipped,) = expectations(backend, dataclasses.replace(call, radius_clip=0.0))[0]
+        assert np.all(clear_of_extents(unclipped, backend.dtype)), "rounding decides an extent of this scene"
+        assert_call_is_the_oracles(backend, call)
+
+
+@law("signature", *JUDGED, PACKED, SPARSE_GRAD)
+def test_sparse_gradients_are_the_dense_ones(backend):
+    assert_call_is_the_oracles(backend, Call((frames(backend, 9, 1),), packed=True, sparse_grad=True))

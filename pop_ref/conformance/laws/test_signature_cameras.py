@@ -1,0 +1,50 @@
+"""Laws of gsplat's signature: cameras, batches and packed rows; every frame is what the oracle draws of it alone."""
+
+from __future__ import annotations
+
+from pop_ref.conformance.abilities import BATCHES, CAMERA_COLORS, CAMERAS, EXTENTS, PACKED, PRINCIPAL_POINT, SIGNATURE
+from pop_ref.conformance.calls import Call
+from pop_ref.conformance.law import law
+from pop_ref.conformance.meta import assert_rows
+from pop_ref.conformance.signature import assert_call_is_the_oracles
+from pop_ref.conformance.views import frames
+
+JUDGED = (SIGNATURE, EXTENTS, PRINCIPAL_POINT)
+
+
+@law("signature", *JUDGED, CAMERAS)
+def test_several_cameras_in_one_call_see_what_each_sees_alone(backend):
+    for seed, degree in ((0, 1), (1, 3), (2, 0)):
+        assert_call_is_the_oracles(backend, Call((frames(backend, seed, 3, degree),)))
+
+
+@law("signature", *JUDGED, CAMERAS, CAMERA_COLORS)
+def test_every_camera_has_the_colours_and_harmonics_that_were_given_for_it(backend):
+    for channels in (0, 3):
+        row = frames(backend, 3, 3, channels=channels, camera_colors=True)
+        assert_call_is_the_oracles(backend, Call((row,), camera_colors=True))
+
+
+@law("signature", *JUDGED, CAMERAS, BATCHES)
+def test_batch_entries_do_not_know_of_each_other(backend):
+    rows = tuple(frames(backend, seed, 2, channels=channels) for seed, channels in ((4, 0), (5, 0)))
+    assert_call_is_the_oracles(backend, Call(rows, batched=True))
+    plain = tuple(frames(backend, seed, 2, channels=3, camera_colors=True) for seed in (4, 5))
+    assert_call_is_the_oracles(backend, Call(plain, batched=True, camera_colors=True))
+
+
+@law("signature", *JUDGED, PACKED, CAMERAS)
+def test_packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same(backend):
+    for seed in (0, 6):
+        call = Call((frames(backend, seed, 3),), packed=True)
+        called, wanted = assert_call_is_the_oracles(backend, call)
+        assert any(not all(e.render.splats.visible) for row in wanted for e in row), "no Gaussian is culled"
+        assert_rows(backend, call, called, wanted)
+
+
+@law("signature", *JUDGED, PACKED, CAMERAS, BATCHES)
+def test_packed_rows_of_batch_entries_draw_the_same(backend):
+    rows = tuple(frames(backend, seed, 2) for seed in (7, 8))
+    call = Call(rows, batched=True, packed=True)
+    called, wanted = assert_call_is_the_oracles(backend, call)
+    assert_rows(backend, call, called, wanted)

@@ -1,0 +1,49 @@
+"""Laws of gsplat's signature: what every key of meta says is what the oracle knows."""
+
+from __future__ import annotations
+
+import pytest
+
+from pop_ref.conformance.abilities import CAMERAS, EXTENTS, PACKED, PRINCIPAL_POINT, SIGNATURE
+from pop_ref.conformance.calls import Call
+from pop_ref.conformance.law import law
+from pop_ref.conformance.meta import ROWS, TILES, assert_rows, assert_sizes, assert_tiles
+from pop_ref.conformance.signature import expectations
+from pop_ref.conformance.views import frames
+
+JUDGED = (SIGNATURE, EXTENTS, PRINCIPAL_POINT)
+SIZES = ("width", "height", "tile_size", "tile_width", "tile_height", "n_cameras", "n_batches")
+
+
+def _made(backend, names, needs_all=False, **options):
+    """Return a call of two cameras, what came of it and what the oracle says; skip who tells none of the keys."""
+    call = Call((frames(backend, 1, 2),), **options)
+    called = backend.call(call)
+    lacks = [name for name in names if name not in called.meta]
+    if len(lacks) == len(names) or (needs_all and lacks):
+        pytest.skip(f"{backend.name} has no meta {', '.join(lacks)}")
+    return call, called, expectations(backend, call)
+
+
+@law("signature", *JUDGED, CAMERAS)
+def test_meta_says_what_was_asked(backend):
+    call, called, _ = _made(backend, SIZES)
+    assert_sizes(call, called.meta)
+
+
+@law("signature", *JUDGED, CAMERAS)
+def test_the_splats_that_meta_shows_are_the_oracles(backend):
+    call, called, wanted = _made(backend, (*ROWS, "radii"))
+    assert_rows(backend, call, called, wanted)
+
+
+@law("signature", *JUDGED, CAMERAS)
+def test_the_tile_lists_that_meta_shows_run_front_to_back_and_hold_who_is_blended(backend):
+    call, called, wanted = _made(backend, TILES[1:3], needs_all=True)
+    assert_tiles(backend, call, called, wanted)
+
+
+@law("signature", *JUDGED, CAMERAS, PACKED)
+def test_the_tile_lists_of_packed_rows_run_front_to_back_and_hold_who_is_blended(backend):
+    call, called, wanted = _made(backend, TILES[1:3], needs_all=True, packed=True)
+    assert_tiles(backend, call, called, wanted)

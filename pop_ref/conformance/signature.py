@@ -1,0 +1,175 @@
+"""Verdicts on whole calls of a rasterizer: images, alphas and gradients of every frame are the oracle's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from pop_ref.conformance.abilities import GRADIENTS
+from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.calls import Call, Called, Frame, drawn_scene, oracle_frame, oracle_frame_vjp
+from pop_ref.conformance.charges import PixelCharges, charge
+from pop_ref.conformance.compare import assert_close
+from pop_ref.conformance.gradient_charges import gradient_charges
+from pop_ref.conformance.scenes import Scene
+from pop_ref.conformance.screen_charges import ScreenCharges
+from pop_ref.covariance import covars_from_quats_scales_vjp
+from pop_ref.depth import SMALLEST_OPACITY
+from pop_ref.types import Render
+
+OF_CAMERA = ("viewmats", "backgrounds")
+
+
+class Expected:
+    """What the oracle says of one frame of a call.
+
+    Attributes:
+        scene: what it draws.
+        charges: of the frame's channels, depth accumulated.
+        render: the oracle's.
+        v_image, v_T_final: cotangents, zero where a decision is in doubt.
+    """
+
+    def __init__(self, call: Call, frame: Frame, dtype: Any, number: int) -> None:
+        self.call, self.frame = call, frame
+        self.scene = drawn_scene(call, frame)
+        self.charges = _frame_charges(call, frame, self.scene, dtype)
+        self.render: Render = oracle_frame(self.scene, frame.colors, call.render_mode)
+        H, W, X = self.render.image.shape
+        k = np.arange(H * W * X, dtype=np.float64).reshape(H, W, X)
+        sure = self.charges.smooth
+        # dyadic, of either sign, nowhere zero, and others for every frame
+        self.v_image = (np.mod(k * 5.0 + 3.0 + 7.0 * number, 16.0) - 7.5) / 8.0 * sure[..., None]
+        self.v_T_final = (np.mod(np.arange(H * W).reshape(H, W) * 3.0 + number, 8.0) - 3.5) / 8.0 * sure
+
+    @property
+    def image_charges(self) -> np.ndarray:
+        """Return what one unit of the image is charged on; an expected depth pays for its quotient. [H, W, X]"""
+        found = self.charges.image + self.charges.absolute
+        if self.call.render_mode.endswith("ED"):
+            opacity, depth = self._opacity, np.abs(self.render.image[..., -1])
+            found = found.copy()
+            found[..., -1] = (found[..., -1] + depth * (self.charges.T_final + 1.0)) / opacity + depth
+        return found
+
+    @property
+    def _opacity(self) -> np.ndarray:
+        return np.maximum(1.0 - self.render.T_final, SMALLEST_OPACITY)
+
+    def gradients(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Return the oracle's gradients by the rasterizer's argument, and their charges."""
+        colors, mode = self.frame.colors, self.call.render_mode
+        g = oracle_frame_vjp(self.scene, colors, mode, self.v_image, self.v_T_final)
+        found = {name: getattr(g, name) for name in ("means", "quats", "scales", "opacities", "means2d", "means2d_abs")}
+        found |= {"viewmats": g.viewmat, "backgrounds": g.background}
+        found["colors"] = g.sh if g.colors is None else g.colors
+        v_image, v_T = np.abs(self.v_image), np.abs(self.v_T_final)
+        if mode.endswith("ED"):
+            # the cotangents of the quotient's two parts, with what rounding of the opacity does to them
+            share = 1.0 + (self.charges.T_final + 1.0) / self._opacity
+            v_depth = v_image[..., -1] / self._opacity * share
+            v_T = v_T + v_depth * np.abs(self.render.image[..., -1]) * share
+            v_image = np.concatenate((v_image[..., :-1], v_depth[..., None]), axis=2)
+        plain = 0 if colors is None or not mode.startswith("RGB") else colors.shape[1]
+        bounds = gradient_charges(self.scene, self.charges, v_image, v_T, plain, mode != "RGB")
+        bounds |= {"viewmats": bounds["viewmat"], "backgrounds": bounds["background"][: len(g.background)]}
+        bounds["colors"] = bounds["sh"] if colors is None else bounds["colors"]
+        for name in ("backgrounds", "colors"):
+            # what the mode does not show has no gradient, and no charge
+            if bounds[name].size == 0 or not mode.startswith("RGB"):
+                bounds[name] = np.zeros(found[name].shape)
+        return found, bounds
+
+
+def _frame_charges(call: Call, frame: Frame, scene: Scene, dtype: Any) -> PixelCharges:
+    with_depth, colored = call.render_mode != "RGB", call.render_mode.startswith("RGB")
+
+    def channels(s: ScreenCharges) -> ScreenCharges:
+        plain = frame.colors
+        colors, e_colors = (s.colors, s.e_colors) if plain is None else (plain, np.zeros_like(plain))
+        values, errors = ([colors], [e_colors]) if colored else ([], [])
+        if with_depth:
+            values.append(s.depths[:, None])
+            errors.append((s.e_depths + np.abs(s.depths))[:, None])
+        return replace(s, colors=np.concatenate(values, axis=1), e_colors=np.concatenate(errors, axis=1))
+
+    behind = np.append(scene.background if colored else [], [0.0] * with_depth)
+    lists = OracleAdapter().full_render(scene).tile_lists if scene.profile.extent == "square" else None
+    return charge(scene.but(background=behind), dtype, lists, channels)
+
+
+def expectations(backend: Any, call: Call) -> list[list[Expected]]:
+    """Return what the oracle says of every frame, in the precision of the backend."""
+    number = iter(range(10_000))
+    return [[Expected(call, frame, backend.dtype, next(number)) for frame in row] for row in call.frames]
+
+
+def assert_call_is_the_oracles(backend: Any, call: Call) -> tuple[Called, list[list[Expected]]]:
+    """Assert that what a rasterizer makes of a call is the oracle's, gradients too where it has them."""
+    wanted = expectations(backend, call)
+    assert all(np.min(e.render.T_final) < 1.0 for row in wanted for e in row), "nothing is blended in a frame"
+    cotangents: tuple[Any, ...] = ()
+    if backend.has(GRADIENTS):
+        v_images = np.array([[e.v_image for e in row] for row in wanted])
+        cotangents = (v_images, np.array([[-e.v_T_final for e in row] for row in wanted]))
+    called = backend.call(call, *cotangents)
+    for b, row in enumerate(wanted):
+        for c, e in enumerate(row):
+            sure, key = e.charges.certain, "agreement.image"
+            size, image, alpha = e.image_charges, called.images[b, c], called.alphas[b, c]
+            assert image.shape == e.render.image.shape, f"images have shape {image.shape}, not {e.render.image.shape}"
+            assert_close(key, image[sure], e.render.image[sure], size[sure], backend.dtype, True)
+            light = (e.charges.T_final + 1.0)[sure]
+            assert_close("agreement.T_final", 1.0 - alpha[sure], e.render.T_final[sure], light, backend.dtype, True)
+    if cotangents:
+        _assert_gradients(backend, call, called, wanted)
+    return called, wanted
+
+
+def _assert_gradients(backend: Any, call: Call, called: Called, wanted: list[list[Expected]]) -> None:
+    found = {
+        name: value if call.batched or name.startswith("means2d") else value[None]
+        for name, value in called.gradients.items()
+    }
+    for b, row in enumerate(wanted):
+        pulled = [e.gradients() for e in row]
+        kinked = np.any([e.charges.screen.kinked for e in row], axis=0)
+        for name, value in found.items():
+            own = name in OF_CAMERA or name.startswith("means2d") or (name == "colors" and call.camera_colors)
+            if name == "covars":
+                _assert_covariance_gradients(backend, call, value[b], b, pulled, ~kinked)
+            elif name == "viewmats" and np.any(kinked):
+                continue
+            elif own:
+                rows = slice(None) if name in OF_CAMERA else ~kinked
+                for c, (expected, bounds) in enumerate(pulled):
+                    bound = bounds["means2d" if name.startswith("means2d") else name]
+                    _assert_gradient(backend, call, name, value[b, c], expected[name], bound, rows)
+            else:
+                _assert_gradient(backend, call, name, value[b], *_summed(pulled, name), ~kinked)
+
+
+def _summed(pulled: list[Any], name: str) -> tuple[Any, Any]:
+    """Return an argument's gradient and its charge, summed over the cameras that share it."""
+    return sum(expected[name] for expected, _ in pulled), sum(bounds[name] for _, bounds in pulled)
+
+
+def _assert_gradient(
+    backend: Any, call: Call, name: str, value: np.ndarray, expected: Any, bound: Any, rows: Any
+) -> None:
+    assert value.shape == expected.shape, f"v_{name} has shape {value.shape}, not {expected.shape}"
+    key = {"viewmats": "viewmat", "backgrounds": "background"}.get(name, name)
+    key = "sh" if name == "colors" and call.sh_degree is not None else key
+    assert_close(f"agreement.v_{key}", value[rows], expected[rows], bound[rows], backend.dtype, True)
+
+
+def _assert_covariance_gradients(
+    backend: Any, call: Call, v_covars: np.ndarray, b: int, pulled: list[Any], rows: np.ndarray
+) -> None:
+    # through the oracle's covariances, so that it does not matter how a gradient is shared by the two triangles
+    g = call.frames[b][0].scene.gaussians
+    v = covars_from_quats_scales_vjp(g.quats, g.scales, 0.5 * (v_covars + np.swapaxes(v_covars, 1, 2)))
+    for name, value in zip(("quats", "scales"), v, strict=True):
+        _assert_gradient(backend, call, name, value, *_summed(pulled, name), rows)

@@ -1,0 +1,117 @@
+"""Fixed scenes seen by several cameras, and the smallest call that tells whether a rasterizer offers an argument."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+
+from pop_ref.conformance import abilities
+from pop_ref.conformance.calls import Call, Frame
+from pop_ref.conformance.scenes import Record, Scene, pack, rigid
+from pop_ref.types import Camera, Gaussians
+
+WIDTH, HEIGHT = 17, 11
+NEAREST, FARTHEST = 1.0, 6.0
+
+
+def cameras(count: int) -> list[Camera]:
+    """Return cameras side by side, each turned and shifted a little and with intrinsics of its own."""
+    found, base = [], rigid((0.9, 0.2, -0.3, 0.15), (0.25, -0.5, 0.75))
+    for c in range(count):
+        moved = rigid((1.0, 0.03 * c, -0.05 * c, 0.02 * c), (0.125 * c, -0.0625 * c, 0.1875 * c)) @ base
+        K = np.array([[18.0 + 3.0 * c, 0.0, 8.25 + c], [0.0, 16.0 + 2.0 * c, 5.75 - 0.5 * c], [0.0, 0.0, 1.0]])
+        found.append(Camera(moved, K, WIDTH, HEIGHT))
+    return found
+
+
+def gaussians(seed: int, degree: int = 1, count: int = 14) -> Gaussians:
+    """Return Gaussians before the first camera, one of them behind it and one far outside the picture.
+
+    Quaternions have norms other than 1, sizes along the axes differ, and coefficients of every band are there.
+    """
+    rng = np.random.default_rng(seed)
+
+    def one(k: int) -> Record:
+        return Record(
+            x=-300.0 if k == 1 else rng.uniform(0.0, WIDTH),
+            y=rng.uniform(0.0, HEIGHT),
+            depth=-2.0 if k == 0 else rng.uniform(NEAREST, FARTHEST),
+            size=tuple(rng.uniform(0.6, 3.0, 3)),
+            quat=tuple(rng.normal(size=4) * rng.uniform(0.5, 2.0)),
+            opacity=rng.uniform(0.1, 0.95),
+            sh=tuple(map(tuple, rng.normal(0.0, 0.15, ((degree + 1) ** 2, 3)) + 0.25)),
+        )
+
+    return pack([one(k) for k in range(count)], cameras(1)[0])
+
+
+def frames(
+    backend: Any,
+    seed: int = 0,
+    count: int = 1,
+    degree: int = 1,
+    channels: int = 0,
+    camera_colors: bool = False,
+    black: bool = False,
+) -> tuple[Frame, ...]:
+    """Return the frames of one batch entry, as a backend reads them.
+
+    Args:
+        backend: whose precision and constants they take.
+        seed: of the Gaussians.
+        count: of cameras.
+        degree: of the harmonics.
+        channels: of plain colours; 0 takes harmonics.
+        camera_colors: whether every camera has colours, or harmonics, of its own.
+        black: without a background.
+    """
+    g, rng = gaussians(seed, degree), np.random.default_rng(1000 + seed)
+    shared = rng.uniform(0.125, 1.0, (len(g), channels))
+    found = []
+    for c, camera in enumerate(cameras(count)):
+        mixed = camera_colors * 0.125 * c
+        own = Gaussians(g.means, g.quats, g.scales, g.opacities, g.sh * (1.0 - mixed))
+        behind = np.zeros(channels or 3) if black else np.round(16.0 * rng.uniform(0.1, 1.0, channels or 3)) / 16.0
+        scene = backend.sees(Scene(own, camera, behind, tile_size=4))
+        colors = (shared * (1.0 - mixed)).astype(backend.dtype).astype(np.float64) if channels else None
+        found.append(Frame(scene, colors))
+    return tuple(found)
+
+
+def _call(backend: Any, entries: int = 1, count: int = 1, **options: Any) -> Call:
+    of_frames = {k: options.pop(k) for k in ("degree", "channels", "camera_colors", "black") if k in options}
+    rows = tuple(frames(backend, seed, count, **of_frames) for seed in range(entries))
+    return Call(rows, camera_colors=of_frames.get("camera_colors", False), **options)
+
+
+# by ability, a call that needs it and nothing else
+ASKED: Final[dict[str, Callable[[Any], Call]]] = {
+    abilities.CAMERAS: lambda backend: _call(backend, count=2),
+    abilities.BATCHES: lambda backend: _call(backend, 2, batched=True),
+    abilities.PACKED: lambda backend: _call(backend, packed=True),
+    abilities.DEPTH: lambda backend: _call(backend, render_mode="RGB+ED"),
+    abilities.COLORS: lambda backend: _call(backend, channels=3),
+    abilities.CHANNELS: lambda backend: _call(backend, channels=4),
+    abilities.CAMERA_COLORS: lambda backend: _call(backend, count=2, channels=3, camera_colors=True),
+    abilities.COVARS: lambda backend: _call(backend, covars=True),
+    abilities.RADIUS_CLIP: lambda backend: _call(backend, radius_clip=2.5),
+    abilities.PLANES: lambda backend: _call(backend, planes={"near_plane": 2.0, "far_plane": 4.0, "eps2d": 0.5}),
+    abilities.NO_BACKGROUND: lambda backend: _call(backend, black=True, no_background=True),
+    abilities.SPARSE_GRAD: lambda backend: _call(backend, packed=True, sparse_grad=True),
+}
+
+
+def offers(backend: Any, ability: str) -> bool:
+    """Ask a backend once for a call that needs an ability; what it refuses, it does not offer.
+
+    Args:
+        backend: has a method `call`.
+        ability: one of ASKED.
+    """
+    try:
+        backend.call(ASKED[ability](backend))
+    except (NotImplementedError, TypeError, ValueError):
+        return False
+    return True
