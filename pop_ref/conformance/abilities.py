@@ -41,8 +41,9 @@ GRADIENTS: Final = "gradients"
 DOMINANCE: Final = "dominance"
 ANTIALIASING: Final = "antialiased mode"
 DOUBLE: Final = "double precision"
-INSTRUMENTS: Final = "dominance and counts that can be asked for"
+INSTRUMENTS: Final = "choices of what is asked for beside an image"
 ROWWISE: Final = "rows computed one by one"
+SCALE: Final = "thousands of Gaussians in seconds"
 
 # these follow from the constants that are implemented
 PROFILES: Final = "any profile"

@@ -20,6 +20,9 @@ def _tell(name: str, backend: Any, scenes: dict[str, Scene]) -> str:
     return tell(name, backend, scenes)
 
 
+# Gaussians of a scene that is told about
+MOST_TOLD = 64
+
 # what a failing law is told by: functions of its name, the backend and the scenes that were drawn
 TELL: list[Callable[[str, Any, dict[str, Scene]], str]] = [_tell]
 
@@ -110,12 +113,21 @@ class _Watched:
         return getattr(self.adapter, name)
 
     def render(self, scene: Scene) -> Any:
-        self._made.append(scene)
+        self._remember(scene)
         return self.adapter.render(scene)
 
+    def plainly(self, scene: Scene) -> Any:
+        self._remember(scene)
+        return self.adapter.plainly(scene)
+
     def gradients(self, scene: Scene, *cotangents: Any) -> Any:
-        self._made.append(scene)
+        self._remember(scene)
         return self.adapter.gradients(scene, *cotangents)
+
+    def _remember(self, scene: Scene) -> None:
+        # a scene of thousands is known by its name; to tell about it would take the oracle minutes
+        if len(scene.gaussians) <= MOST_TOLD:
+            self._made.append(scene)
 
     @property
     def scenes(self) -> dict[str, Scene]:

@@ -16,7 +16,7 @@ from pop_ref.conformance.gradient_charges import gradient_charges
 from pop_ref.conformance.law import law
 from pop_ref.conformance.outcomes import assert_one_of_the_oracles_outcomes
 from pop_ref.conformance.scenes import cotangents
-from pop_ref.conformance.strategies import plain_sizes, scenes
+from pop_ref.conformance.strategies import plain_sizes, scenes, wide_scene
 from pop_ref.conformance.verdicts import assert_same_image, assert_same_light, charged
 from pop_ref.constants import GSPLAT_1_6, INRIA, Profile
 
@@ -118,6 +118,12 @@ del _case, _make, _test
 def test_the_image_is_one_of_the_oracles_outcomes(backend, scene):
     seen, charges = charged(backend, scene)
     assert_one_of_the_oracles_outcomes(backend, seen, charges)
+
+
+@law("compositing", RENDER, scene=st.one_of(scenes(max_degree=3), st.integers(0, 2**16).map(wide_scene)))
+def test_the_image_that_training_draws_is_one_of_the_oracles_outcomes(backend, scene):
+    seen, charges = charged(backend, scene)
+    assert_one_of_the_oracles_outcomes(backend, seen, charges, backend.plainly(seen))
 
 
 @law("compositing", RENDER, LOWER_CEILING, scene=scenes(profile=GSPLAT_1_6))
