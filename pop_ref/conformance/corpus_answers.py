@@ -137,9 +137,7 @@ def _short(charges: np.ndarray) -> np.ndarray:
     return charges.astype(np.float32)
 
 
-def _gradient_charges(
-    scene: Scene, windows: list[tuple[tuple[slice, slice], PixelCharges]]
-) -> dict[str, np.ndarray]:
+def _gradient_charges(scene: Scene, windows: list[tuple[tuple[slice, slice], PixelCharges]]) -> dict[str, np.ndarray]:
     total: dict[str, Bound] = {}
     background = np.zeros(3)
     masks = masks_of(windows, (scene.camera.height, scene.camera.width))

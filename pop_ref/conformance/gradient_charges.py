@@ -17,7 +17,6 @@ from pop_ref.conformance.scenes import Scene
 from pop_ref.conformance.screen_charges import TINY, ScreenCharges
 from pop_ref.covariance import covars_from_quats_scales, rotmats_from_quats
 
-
 # of what a splat has of each
 _WIDTHS = {"means2d": (2,), "conics": (3,), "opacities": (), "colors": (3,)}
 

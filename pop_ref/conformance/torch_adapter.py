@@ -30,7 +30,7 @@ class TorchAdapter(Adapter):
 
     What is not asked for may be drawn by other code. So a program that is asked for dominance and counts by arguments
     of these names is asked as POP's training asks for dominance where an image is judged, and for nothing, as any
-    other training, where a gradient is, and where an image is judged `plainly`. `otherwise` has what every choice gives.
+    other training, where a gradient is and where an image is judged `plainly`. `otherwise` has every choice's.
 
     Args:
         name: how reports call it.

@@ -30,7 +30,7 @@ def _image(name, *needs):
         pixels = (seen[at][picked], expected["pixels"][picked], expected["e_pixels"][picked])
         blocks = (weighted_blocks(seen, sure), expected["blocks"], expected["e_blocks"])
         for key, part in (("image", np.s_[..., :3]), ("T_final", np.s_[..., 3])):
-            for kind, values in (("agreement", pixels), ("scale", blocks)):
+            for kind, values in (("scale.pixels", pixels), ("scale", blocks)):
                 assert_close(f"{kind}.{key}", *(v[part] for v in values), backend.dtype, against_oracle=True)
 
     sentence.__name__ = f"test_the_image_of_{name}_is_the_oracles"

@@ -192,6 +192,14 @@ _LINES: Final = (
         ASKED,
     ),
     (
+        "windows_of_the_corner",
+        "whether a window of SSIM counts is read from its corner, not from its centre",
+        "ssim.py",
+        "mask[margin:-margin, margin:-margin]",
+        "mask[: -2 * margin, : -2 * margin]",
+        "test_masked_losses:the_dissimilarity_of_what_a_mask_keeps_is_the_oracles",
+    ),
+    (
         "tiles_end_where_they_are_wide",
         "the lower edge of a tile is reckoned from its left one; counting draws without the test",
         "tiles.py",
@@ -267,8 +275,8 @@ _LINES: Final = (
         "gradients_of_256",
         "the backward pass ends after 256 entries of a list",
         "compositing.py",
-        "blend, saved.blends[i] = saved.blends[i] or saved.blender.blend(group), None",
-        "blend, saved.blends[i] = saved.blends[i] or saved.blender.blend(group), None\n            del blend.steps[32:]",
+        "gradients.add(group, blend, tiles.index_select(0, group.tiles))",
+        "del blend.steps[32:]; gradients.add(group, blend, tiles.index_select(0, group.tiles))",
         "test_scale:the_gradients_of_a_thousand_in_a_tile_are_the_oracles",
     ),
 )
