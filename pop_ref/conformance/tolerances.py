@@ -2,8 +2,9 @@
 
 A tolerance is a number of units; one unit is eps of the backend's dtype times a magnitude that the law or the oracle
 computes from absolute values. So a float32 backend is charged its rounding and nothing else, and no tolerance depends
-on where it runs. Against the oracle a float64 backend has to agree to 1e-10 of that same magnitude: its rounding alone
-is far smaller, so anything that is left is a wrong formula.
+on where it runs. Against the oracle a float64 backend has to agree to 1e-12 of that same magnitude, or to 64 times the
+units that single precision is allowed where that is less: its rounding alone is far smaller, so anything that is left
+is a wrong formula.
 
 `worst` is the largest number of units seen over all backends of this project under HYPOTHESIS_PROFILE=thorough
 (`pytest tests/laws --record-worst`); `tests/meta` asserts that no tolerance is far above its worst case.
@@ -16,7 +17,9 @@ from typing import Any, Final
 
 import numpy as np
 
-AGREEMENT_FLOAT64: Final = 1e-10
+# at float64 a formula that is wrong is wrong by more than this many times what single precision is charged
+ROOM_FLOAT64: Final = 64.0
+AGREEMENT_FLOAT64: Final = 1e-12
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,7 @@ TABLE: Final[dict[str, Tolerance]] = {
     "agreement.v_means2d": Tolerance(units=0.4, worst=0.047),
     "agreement.v_means2d_abs": Tolerance(units=0.4, worst=0.045),
     "agreement.v_opacities": Tolerance(units=3, worst=0.26),
-    "agreement.v_quats": Tolerance(units=0.01, worst=0.0011),
+    "agreement.v_quats": Tolerance(units=0.03, worst=0.0029),
     "agreement.v_scales": Tolerance(units=0.5, worst=0.061),
     "agreement.v_sh": Tolerance(units=20, worst=2),
     "agreement.v_viewmat": Tolerance(units=0.15, worst=0.015),
@@ -149,14 +152,14 @@ TABLE: Final[dict[str, Tolerance]] = {
     "gradients.difference": Tolerance(units=0.08, worst=0.0078),
     "gradients.instruments": Tolerance(units=50, worst=4.9),
     "gradients.instruments.image": Tolerance(units=50, worst=4.9),
-    "gradients.radial": Tolerance(units=0.0002, worst=2.4e-05),
+    "gradients.radial": Tolerance(units=0.004, worst=0.00043),
     "gradients.rigid": Tolerance(units=0.003, worst=0.00027),
     "gradients.sum.background": Tolerance(units=0.4, worst=0.049),
     "gradients.sum.means": Tolerance(units=0.04, worst=0.004),
     "gradients.sum.means2d": Tolerance(units=0.04, worst=0.0041),
     "gradients.sum.means2d_abs": Tolerance(units=0.015, worst=0.0016),
     "gradients.sum.opacities": Tolerance(units=0.08, worst=0.01),
-    "gradients.sum.quats": Tolerance(units=0.004, worst=0.00039),
+    "gradients.sum.quats": Tolerance(units=0.02, worst=0.0023),
     "gradients.sum.scales": Tolerance(units=0.2, worst=0.025),
     "gradients.sum.sh": Tolerance(units=0.4, worst=0.05),
     "gradients.sum.viewmat": Tolerance(units=0.04, worst=0.0049),
@@ -221,8 +224,11 @@ def allowed(key: str, dtype: Any) -> float:
 
 
 def agreement(key: str, dtype: Any) -> float:
-    """Return the allowed difference per magnitude from the oracle: 1e-10 at float64, rounding only at float32."""
-    return AGREEMENT_FLOAT64 if dtype == np.float64 else allowed(key, dtype)
+    """Return the allowed difference per magnitude from the oracle: rounding only, at float64 with room, up to 1e-12.
+
+    A float64 backend is judged on worse conditioned scenes, which single precision cannot resolve.
+    """
+    return min(AGREEMENT_FLOAT64, ROOM_FLOAT64 * allowed(key, dtype)) if dtype == np.float64 else allowed(key, dtype)
 
 
 def record(key: str, dtype: Any, units: float) -> None:

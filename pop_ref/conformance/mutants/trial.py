@@ -7,7 +7,7 @@ import pkgutil
 from collections.abc import Callable
 from typing import Any
 
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, Phase, settings
 from hypothesis.errors import HypothesisException
 
 from pop_ref.conformance import laws
@@ -56,13 +56,13 @@ def _tried(stated: Law, examples: int) -> Callable[[Any], None]:
         derandomize=True,
         database=None,
         deadline=None,
-        phases=(Phase.generate,),
+        phases=(Phase.explicit, Phase.generate),
         report_multiple_bugs=False,
         suppress_health_check=[HealthCheck(check) for check in HealthCheck],
     )
 
     def run(backend: Any) -> None:
-        chosen(given(**stated.strategies)(_bound(stated, backend)))()
+        chosen(stated.quantified(_bound(stated, backend)))()
 
     return run
 
