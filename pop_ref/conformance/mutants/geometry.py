@@ -24,14 +24,6 @@ GEOMETRY: Final = (
         "test_agreement:gradients_are_the_oracles",
     ),
     Mutant(
-        "centre_of_an_unturned_camera",
-        "the camera's centre is minus its translation, which is right where it is not turned: colours of bands",
-        "camera.py",
-        "return -viewmat[:3, :3].T @ viewmat[:3, 3]",
-        "return -viewmat[:3, 3]",
-        "test_agreement:the_image_that_training_draws_is_one_of_the_oracles_outcomes",
-    ),
-    Mutant(
         "xyzw",
         "quaternions are read with w last: the commonest mix-up between exporters",
         "covariance.py",
