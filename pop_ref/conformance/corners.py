@@ -2,7 +2,7 @@
 
 Each holds what random scenes seldom hold at once: harmonics of the third degree under a turned camera, quaternions of
 any norm, an order in depth that is not the order of distances, tiles cut by the border, slanted needles over corners of
-tiles, pixels that end, oblong pixels with the principal point aside, splats beyond the frustum's clamp, exact ties.
+tiles, pixels that end, oblong pixels with the principal point aside, splats beyond the frustum's clamp, exact ties; and a splat alone.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ def _records(width: int, height: int, degree: int) -> dict[str, list[Record]]:
     sh = [_bands(seed, degree) for seed in range(4)]
     x, y = 0.5 * width + 0.25, 0.5 * height + 0.25
     return {
+        # where nothing cancels, the least error shows
+        "alone": [Record(x, y, 2.0, (1.0, 1.5, 1.0), _SHORT, 0.5, sh[0])],
         "norms": [
             Record(x, y, 2.5, (1.5, 1.0, 2.0), _SHORT, 0.5, sh[0]),
             Record(x - 1.0, y + 0.5, 1.5, (0.75, 2.0, 1.25), _LONG, 0.625, sh[1]),
@@ -72,6 +74,7 @@ def _records(width: int, height: int, degree: int) -> dict[str, list[Record]]:
 
 # width, height, fx, fy, principal point off the centre, tile
 _VIEWS = {
+    "alone": (3, 2, 8.0, 8.0, (0.0, 0.0), 16),
     "norms": (7, 5, 8.0, 8.0, (0.0, 0.0), 16),
     "depth_is_not_distance": (8, 8, 4.0, 4.0, (0.0, 0.0), 4),
     "borders": (7, 6, 6.0, 9.0, (1.5, -0.75), 4),

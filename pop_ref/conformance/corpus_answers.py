@@ -71,7 +71,7 @@ def charged_windows(scene: Scene, at: Any = None) -> list[tuple[tuple[slice, sli
     for top, left in [(y, x) for y in range(0, H, WINDOW) for x in range(0, W, WINDOW)][at or slice(None)]:
         low, high = np.array([left, top]), np.array([min(left + WINDOW, W), min(top + WINDOW, H)])
         rows = np.all((screen.means2d + reach > low) & (screen.means2d - reach < high), axis=1)
-        window = Window(left, top, *high.tolist(), screen, rows)
+        window = Window(left, top, int(high[0]), int(high[1]), screen, rows)
         place = (slice(top, window.bottom), slice(left, window.right))
         found.append((place, charge(scene, np.float32, window=window)))
     return found

@@ -38,7 +38,7 @@ def test_laws_of_rendering_and_gradients_are_tried_on_them_first() -> None:
 def test_the_scenes_hold_what_they_are_for() -> None:
     scenes = [values["scene"] for values in corners(3)]
     views = [OracleAdapter().render(scene) for scene in scenes]
-    assert all(view.n_blended.max() >= 2 for view in views)
+    assert all(view.n_blended.max() >= 2 for view in views[1:])
     norms = np.concatenate([np.linalg.norm(scene.gaussians.quats, axis=1) for scene in scenes])
     assert norms.min() < 0.6
     assert norms.max() > 2.0
@@ -48,7 +48,7 @@ def test_the_scenes_hold_what_they_are_for() -> None:
     assert any(np.any(view.T_final < 1e-3) for view in views)
 
 
-def test_depth_is_not_distance_in_the_second_of_them() -> None:
-    scene = corners()[1]["scene"]
+def test_depth_is_not_distance_in_the_third_of_them() -> None:
+    scene = corners()[2]["scene"]
     p = scene.gaussians.means @ scene.camera.viewmat[:3, :3].T + scene.camera.viewmat[:3, 3]
     assert np.argsort(p[:, 2]).tolist() != np.argsort(np.linalg.norm(p, axis=1)).tolist()
