@@ -24,6 +24,7 @@ from pop_fast.train.presets import options_for
 from pop_ref.conformance.abilities import STAGES as LAW_STAGES
 from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM
 from pop_ref.conformance.mutants.trial import every_law
+from pop_ref.conformance.teeth import UNITS
 from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER, SPEEDY_SPLAT
 from pop_ref.notation import SYMBOLS
 from pop_ref.recipes import BASELINES, L1_DIVIDED, RECIPES
@@ -31,6 +32,7 @@ from pop_ref.recipes import BASELINES, L1_DIVIDED, RECIPES
 README = ROOT / "README.md"
 MUTANT_LIST = ROOT / "docs" / "MUTANTS.md"
 CARDS = ROOT / "benchmarks" / "results" / "scorecards"
+TEETH = ROOT / "benchmarks" / "results" / "teeth.json"
 CPU_TIMES = ROOT / "benchmarks" / "results" / "cpu.json"
 # the judged, in the order of their columns, and the card that each stands on
 JUDGED = {
@@ -187,6 +189,27 @@ def kit() -> str:
     )
 
 
+def teeth() -> str:
+    """Make the table of the smallest errors that the kit notices, and of what sound backends need of its tolerances."""
+    kept = json.loads(TEETH.read_text(encoding="utf-8"))
+    single, double = kept["float32"], kept["float64"]
+
+    def needed(of: dict[str, dict[str, float]], name: str) -> str:
+        share = of["sound"].get(name, of["sound"]["image"])
+        return f"{100.0 * share:.2g} %"
+
+    rows = [
+        [
+            f"`{name}`" if name.startswith("v_") else f"{name}, {UNITS.get(name, 'share of itself')}",
+            *(f"{of['teeth'][name]:.1e}" for of in (single, double)),
+            *(needed(of, name) for of in (single, double)),
+        ]
+        for name in single["teeth"]
+    ]
+    head = ["error in", "float32 notices", "float64 notices", "sound float32 needs", "sound float64 needs"]
+    return _table(head, rows)
+
+
 def mutants() -> str:
     """Make the list of mutants: what happened to whom, and the law that notices."""
     laws = every_law()
@@ -242,6 +265,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "recipes": recipes,
     "reproduction": reproduction,
     "kit": kit,
+    "teeth": teeth,
     "scorecards": scorecards,
     "broken": broken_laws,
 }

@@ -44,7 +44,7 @@ DOMINANT_WEIGHTS: Final = "dominant weights"
 DOMINANT_COUNTS: Final = "dominant counts"
 ANTIALIASING: Final = "antialiased mode"
 DOUBLE: Final = "double precision"
-INSTRUMENTS: Final = "dominance and counts that can be asked for"
+INSTRUMENTS: Final = "choices of what is asked for beside an image"
 ROWWISE: Final = "rows computed one by one"
 DETERMINISTIC: Final = "the same bits on every run"
 
@@ -62,6 +62,7 @@ RADIUS_CLIP: Final = "radius_clip"
 PLANES: Final = "planes and low-pass other than its defaults"
 NO_BACKGROUND: Final = "a call without backgrounds"
 SPARSE_GRAD: Final = "sparse_grad"
+SCALE: Final = "thousands of Gaussians in seconds"
 
 # these follow from the constants that are implemented
 PROFILES: Final = "any profile"

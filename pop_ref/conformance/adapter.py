@@ -25,6 +25,7 @@ from pop_ref.conformance.abilities import (
     GRADIENTS,
     RENDER,
     ROWWISE,
+    SCALE,
     SIGNATURE,
     abilities_of,
     same_constants,
@@ -143,6 +144,8 @@ class Adapter:
             return callable(getattr(self, "call", None))
         if need in ASKED:
             return self.has(SIGNATURE) and self._offers(need)
+        if need == SCALE:
+            return self.has(RENDER)
         return need in self.able or need in abilities_of(self.profile) or callable(getattr(self, need, None))
 
     def _offers(self, need: str) -> bool:
@@ -194,6 +197,10 @@ class Adapter:
         )
         told = {f.name: getattr(drawn, f.name, None) for f in fields(View)}
         return View(**{**told, **_shown(splats)})
+
+    def plainly(self, scene: Scene) -> View:
+        """Draw a scene as training does that wants nothing but an image; what is not asked for is None."""
+        return self.render(scene)
 
     def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
         """Return cotangents by name: means, quats, scales, opacities, sh, and those of viewmat, background, means2d,
@@ -288,8 +295,8 @@ class OracleAdapter(Adapter):
         self.package = package
 
     def has(self, need: str) -> bool:
-        """Tell that the oracle can do everything its modules define."""
-        return super().has(need) or stage_function(self.package, need) is not None
+        """Tell that the oracle can do everything its modules define, slowly."""
+        return need != SCALE and (super().has(need) or stage_function(self.package, need) is not None)
 
     def stage(self, name: str) -> Callable[..., Any]:
         """Return the oracle's function itself."""

@@ -110,12 +110,12 @@ CASES = (
     Case("low_pass", "footprint", st.tuples(_symmetric(2), dyadic(0.125, 1.0)), (0,)),
     Case("compensations", "footprint", st.tuples(_symmetric(2), dyadic(0.125, 1.0)), (0,)),
     Case("conics_from_covars2d", "footprint", st.tuples(_symmetric(2)), (0,)),
-    Case("l1", "losses", pair, (0,), magnitude=_picture_magnitude),
-    Case("l2", "losses", pair, (0,), magnitude=_picture_magnitude),
-    Case("ssim", "losses", pair, (0,), magnitude=_ssim_magnitude),
-    Case("d_ssim", "losses", pair, (0,), magnitude=_ssim_magnitude),
-    Case("photometric_3dgs", "losses", pair, (0,), magnitude=_ssim_magnitude),
-    Case("photometric_pop", "losses", pair, (0,), magnitude=_ssim_magnitude),
+    Case("l1", "losses", pair, (0,), 2, magnitude=_picture_magnitude),
+    Case("l2", "losses", pair, (0,), 2, magnitude=_picture_magnitude),
+    Case("ssim", "losses", pair, (0,), 2, magnitude=_ssim_magnitude),
+    Case("d_ssim", "losses", pair, (0,), 2, magnitude=_ssim_magnitude),
+    Case("photometric_3dgs", "losses", pair, (0,), 2, magnitude=_ssim_magnitude),
+    Case("photometric_pop", "losses", pair, (0,), 2, magnitude=_ssim_magnitude),
     Case("pop_loss", "polarization", st.tuples(_stacked(st.tuples(opacities())).map(np.ravel), masks), (0,)),
 )
 

@@ -134,11 +134,30 @@ class _State:
     e_best_expanded: np.ndarray
 
 
+@dataclass(frozen=True)
+class Window:
+    """A part of an image, for what is too large to be charged at once.
+
+    Attributes:
+        left, top, right, bottom: px, the last two beyond it.
+        screen: charges of projection of the whole scene.
+        rows: the splats that may be seen in it. [N]
+    """
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+    screen: ScreenCharges
+    rows: np.ndarray
+
+
 def charge(
     scene: Scene,
     dtype: Any,
     tile_lists: list[list[int]] | None = None,
     channels: Callable[[ScreenCharges], ScreenCharges] | None = None,
+    window: Window | None = None,
 ) -> PixelCharges:
     """Charge a scene in the precision of a dtype.
 
@@ -147,19 +166,24 @@ def charge(
         dtype: float32 or float64; decides which decisions are doubtful.
         tile_lists: for profiles whose tile lists are part of the meaning, the oracle's.
         channels: puts other channels in the place of colours: plain colours, depths.
+        window: the part of the image that is charged, None for all of it; every [H, W] is then the window's.
     """
     reach = REACH * float(np.finfo(dtype).eps)
-    screen = screen_charges(scene, reach)
-    screen = screen if channels is None else channels(screen)
-    H, W = scene.camera.height, scene.camera.width
+    if window is None:
+        screen = screen_charges(scene, reach)
+        screen = screen if channels is None else channels(screen)
+        everyone = np.ones(len(screen.depths), dtype=bool)
+        window = Window(0, 0, scene.camera.width, scene.camera.height, screen, everyone)
+    screen = window.screen
+    H, W = window.bottom - window.top, window.right - window.left
     doubts = {label: np.zeros((H, W), dtype=bool) for label in ("D1", "D4", "D5", "D6", "D7", "D8")}
     none, D = np.zeros((H, W)), screen.colors.shape[1]
     state = _State(np.ones((H, W)), none, none, np.zeros((H, W, D)), np.zeros((H, W, D)),
                    np.ones((H, W), dtype=bool), none, none, none)  # fmt: skip
     layers = []
     for i in np.lexsort((np.arange(len(screen.depths)), screen.depths)).tolist():
-        if screen.kept[i] or screen.near[i]:
-            layer = _layer(i, scene, screen, reach, _listed(i, scene, tile_lists))
+        if window.rows[i] and (screen.kept[i] or screen.near[i]):
+            layer = _layer(i, scene, window, reach, _listed(i, scene, tile_lists))
             layer.seen = state.alive
             _blend(layer, scene, screen, state, doubts, reach)
             layers.append(layer)
@@ -181,10 +205,12 @@ def _listed(i: int, scene: Scene, tile_lists: list[list[int]] | None) -> np.ndar
     return np.array([i in ids for ids in tile_lists])[tile]
 
 
-def _layer(i: int, scene: Scene, s: ScreenCharges, reach: float, listed: np.ndarray) -> Layer:
-    profile, (H, W) = scene.profile, (scene.camera.height, scene.camera.width)
-    dx = s.means2d[i, 0] - (np.arange(W)[None, :] + 0.5) + np.zeros((H, 1))
-    dy = s.means2d[i, 1] - (np.arange(H)[:, None] + 0.5) + np.zeros((1, W))
+def _layer(i: int, scene: Scene, window: Window, reach: float, listed: np.ndarray) -> Layer:
+    profile, s = scene.profile, window.screen
+    xs, ys = np.arange(window.left, window.right) + 0.5, np.arange(window.top, window.bottom) + 0.5
+    listed = listed[window.top : window.bottom, window.left : window.right]
+    dx = s.means2d[i, 0] - xs[None, :] + np.zeros((len(ys), 1))
+    dy = s.means2d[i, 1] - ys[:, None] + np.zeros((1, len(xs)))
     e_dx, e_dy = s.e_means2d[i, 0] + np.abs(dx), s.e_means2d[i, 1] + np.abs(dy)
     A, B, C = s.conics[i]
     e_A, e_B, e_C = s.e_conics[i]
@@ -245,8 +271,12 @@ def _blend(
 
 
 def _doubt_depths(charges: PixelCharges) -> None:
-    floor = charges.scene.profile.alpha_floor * (1.0 - 1e-3)
+    floor, s = charges.scene.profile.alpha_floor * (1.0 - 1e-3), charges.screen
+    largest = float(np.max(s.e_depths, initial=0.0))
     for a, front in enumerate(charges.layers):
+        farthest = s.depths[front.id] + charges.reach * (s.e_depths[front.id] + largest)
         for back in charges.layers[a + 1 :]:
+            if s.depths[back.id] > farthest:
+                break
             if charges.swappable(front.id, back.id):
                 charges.doubts["D4"] |= front.seen & (front.raw >= floor) & (back.raw >= floor)

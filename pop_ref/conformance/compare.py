@@ -24,7 +24,7 @@ def assert_close(
         actual, expected: arrays of one shape.
         magnitude: what one unit is a multiple of eps of; broadcasts.
         dtype: the precision charged.
-        against_oracle: True asks a float64 backend for 1e-10 of the magnitude.
+        against_oracle: True gives a float64 backend the room of `tolerances.agreement`.
     """
     actual, expected = np.asarray(actual, dtype=np.float64), np.asarray(expected, dtype=np.float64)
     assert actual.shape == expected.shape, f"{key}: shape {actual.shape}, expected {expected.shape}"

@@ -17,6 +17,9 @@ from pop_ref.conformance.scenes import Scene
 from pop_ref.conformance.screen_charges import TINY, ScreenCharges
 from pop_ref.covariance import covars_from_quats_scales, rotmats_from_quats
 
+# of what a splat has of each
+_WIDTHS = {"means2d": (2,), "conics": (3,), "opacities": (), "colors": (3,)}
+
 
 @dataclass
 class Bound:
@@ -67,13 +70,33 @@ def gradient_charges(
         plain: how many of the first channels are plain colours; with none, they are of harmonics.
         with_depth: whether the last channel is depth.
     """
+    found = sums_over_pixels(scene, charges, v_image, v_T_final)
+    return charges_of_sums(scene, charges.screen, *found, plain, with_depth)
+
+
+def sums_over_pixels(
+    scene: Scene, charges: PixelCharges, v_image: np.ndarray, v_T_final: np.ndarray
+) -> tuple[dict[str, Bound], np.ndarray]:
+    """Bound the cotangents of splats, by name, and charge that of the background; windows of one image add up."""
     N = len(scene.gaussians)
     size = scene.tile_size or scene.profile.tile_size
     pixels = _pixel_bounds(scene, charges, np.abs(v_image), np.abs(v_T_final), 0.5 * size)
-    shapes = {"means2d": (2,), "conics": (3,), "opacities": (), "colors": v_image.shape[2:]}
-    rows = {name: _gather(values, (N, *shapes[name])) for name, values in pixels.items()}
     T = charges.layers[-1].T_after if charges.layers else np.ones(v_T_final.shape)
     background = np.einsum("hw,hwc->c", 2.0 * T + charges.T_final, np.abs(v_image))
+    shapes = {"means2d": (2,), "conics": (3,), "opacities": (), "colors": v_image.shape[2:]}
+    return {name: _gather(values, (N, *shapes[name])) for name, values in pixels.items()}, background
+
+
+def charges_of_sums(
+    scene: Scene,
+    screen: ScreenCharges,
+    rows: dict[str, Bound],
+    background: np.ndarray,
+    plain: int = 0,
+    with_depth: bool = False,
+) -> dict[str, np.ndarray]:
+    """Return the charge of every gradient by name from what `sums_over_pixels` found."""
+    N, rows = len(scene.gaussians), dict(rows)
     given, nothing = rows["colors"], np.zeros((N, 3))
     if with_depth:
         rows["depths"] = Bound(given.m[:, -1], given.e[:, -1])
@@ -81,7 +104,7 @@ def gradient_charges(
         rows["colors"] = Bound(nothing, nothing)
     elif with_depth:
         rows["colors"] = Bound(given.m[:, :-1], given.e[:, :-1])
-    found = _world_bounds(scene, charges.screen, rows) if N else _no_bounds(scene)
+    found = _world_bounds(scene, screen, rows) if N else _no_bounds(scene)
     found["colors"] = given.charge[:, :plain]
     found["background"] = background
     found["means2d"] = found["means2d_abs"] = rows["means2d"].charge
@@ -263,9 +286,26 @@ def _shape_bounds(scene: Scene, v_covars: Bound) -> tuple[np.ndarray, np.ndarray
     v_M = Bound(2.0 * v_covars.m @ M, 2.0 * (v_covars.e @ M + v_covars.m @ e_M + 2.0 * v_covars.m @ M))
     v_scales = v_M.times(A, 2.0 * (A + 1.0)).summed(1)
     v_R = v_M.times(g.scales[:, None, :])
-    # each entry of dR/du is at most 2 in a unit quaternion; the radial part is projected out
-    v_quats = 8.0 * np.sum(v_R.charge, axis=(1, 2)) / np.linalg.norm(g.quats, axis=1)
-    return np.repeat(v_quats[:, None], 4, 1), v_scales.charge
+    length = np.linalg.norm(g.quats, axis=1, keepdims=True)
+    units = np.abs(g.quats) / length
+    slopes = _rotation_slopes(units)
+    m, e = (np.einsum("nkij,nij->nk", slopes, v) for v in (v_R.m, v_R.e))
+    # the slopes' own rounding, and that of the radial part, which is projected out
+    e = e + 4.0 * m
+    radial = np.sum(units * (e + 4.0 * m), axis=1, keepdims=True)
+    return (e + units * radial) / length, v_scales.charge
+
+
+def _rotation_slopes(units: np.ndarray) -> np.ndarray:
+    """Bound dR/du by the entries of absolute unit quaternions, however the diagonal is written. [N, 4, 3, 3]"""
+    w, x, y, z = units.T
+    rows = (
+        ((w, z, y), (z, w, x), (y, x, w)),
+        ((x, y, z), (y, 2 * x, w), (z, w, 2 * x)),
+        ((2 * y, x, w), (x, y, z), (w, z, 2 * y)),
+        ((2 * z, w, x), (w, 2 * z, y), (x, y, z)),
+    )
+    return 2.0 * np.moveaxis(np.array(rows), 3, 0)
 
 
 def _viewmat_bound(scene: Scene, v_p: Bound, v_S: Bound, v_dirs: Bound) -> np.ndarray:

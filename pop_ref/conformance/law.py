@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis.errors import HypothesisException
 
 from pop_ref.conformance.abilities import STAGES
@@ -20,6 +20,9 @@ def _tell(name: str, backend: Any, scenes: dict[str, Scene]) -> str:
 
     return tell(name, backend, scenes)
 
+
+# Gaussians of a scene that is told about
+MOST_TOLD = 64
 
 # what a failing law is told by: functions of its name, the backend and the scenes that were drawn
 TELL: list[Callable[[str, Any, dict[str, Scene]], str]] = [_tell]
@@ -34,27 +37,42 @@ class Law:
         needs: names of stage functions, or abilities (`abilities`); a backend without them is not judged.
         sentence: the function, whose name reads as the law; it takes `backend` and the drawn values.
         strategies: what it quantifies over, by argument name.
+        first: values that it is tried on before any is drawn, each by argument name.
     """
 
     stage: str
     needs: tuple[str, ...]
     sentence: Callable[..., None]
     strategies: dict[str, Any]
+    first: Sequence[dict[str, Any]] = ()
 
     @property
     def name(self) -> str:
         """Return the law's name without the test prefix."""
         return self.sentence.__name__.removeprefix("test_")
 
+    def quantified(self, sentence: Callable[..., None]) -> Callable[..., Any]:
+        """Return the sentence, or what wraps it, as a test of what is tried first and of what is drawn."""
+        if not self.strategies:
+            return sentence
+        test = given(**self.strategies)(sentence)
+        # the decorator that is applied last is tried first
+        for values in reversed(self.first):
+            test = example(**values)(test)
+        return test
 
-def law(stage: str, *needs: str, **strategies: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
+
+def law(
+    stage: str, *needs: str, first: Sequence[dict[str, Any]] = (), **strategies: Any
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Make a test of a sentence, to be run over every backend that has what the law needs."""
     if stage not in STAGES:
         raise ValueError(f"stage {stage!r} is unknown; use one of {', '.join(STAGES)}")
 
     def decorate(sentence: Callable[..., None]) -> Callable[..., None]:
-        test = _telling(sentence, given(**strategies) if strategies else lambda watched: watched)
-        test.law = Law(stage, needs, sentence, strategies)  # type: ignore[attr-defined]
+        stated = Law(stage, needs, sentence, strategies, first)
+        test = _telling(sentence, stated.quantified)
+        test.law = stated  # type: ignore[attr-defined]
         return test
 
     return decorate
@@ -112,18 +130,28 @@ class _Watched:
         return getattr(self.adapter, name)
 
     def render(self, scene: Scene) -> Any:
-        self._made.append(scene)
+        self._remember(scene)
         return self.adapter.render(scene)
 
+    def plainly(self, scene: Scene) -> Any:
+        self._remember(scene)
+        return self.adapter.plainly(scene)
+
     def gradients(self, scene: Scene, *cotangents: Any) -> Any:
-        self._made.append(scene)
+        self._remember(scene)
         self.asked_for_gradients = True
         return self.adapter.gradients(scene, *cotangents)
 
     def call(self, call: Call, *cotangents: Any) -> Any:
-        self._made += [frame.scene for _, _, frame in call.each]
+        for _, _, frame in call.each:
+            self._remember(frame.scene)
         self.asked_for_gradients |= bool(cotangents)
         return self.adapter.call(call, *cotangents)
+
+    def _remember(self, scene: Scene) -> None:
+        # a scene of thousands is known by its name; to tell about it would take the oracle minutes
+        if len(scene.gaussians) <= MOST_TOLD:
+            self._made.append(scene)
 
     @property
     def scenes(self) -> dict[str, Scene]:

@@ -2,8 +2,9 @@
 
 A tolerance is a number of units; one unit is eps of the backend's dtype times a magnitude that the law or the oracle
 computes from absolute values. So a float32 backend is charged its rounding and nothing else, and no tolerance depends
-on where it runs. Against the oracle a float64 backend has to agree to 1e-10 of that same magnitude: its rounding alone
-is far smaller, so anything that is left is a wrong formula.
+on where it runs. Against the oracle a float64 backend has to agree to 1e-12 of that same magnitude, or to 64 times the
+units that single precision is allowed where that is less: its rounding alone is far smaller, so anything that is left
+is a wrong formula.
 
 `worst` is the largest number of units seen over all backends of this project under HYPOTHESIS_PROFILE=thorough
 (`pytest tests/laws --record-worst`); `tests/meta` asserts that no tolerance is far above its worst case.
@@ -16,7 +17,9 @@ from typing import Any, Final
 
 import numpy as np
 
-AGREEMENT_FLOAT64: Final = 1e-10
+# at float64 a formula that is wrong is wrong by more than this many times what single precision is charged
+ROOM_FLOAT64: Final = 64.0
+AGREEMENT_FLOAT64: Final = 1e-12
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,8 @@ TABLE: Final[dict[str, Tolerance]] = {
     "agreement.l1_vjp": Tolerance(units=0.6, worst=0.063),
     "agreement.l2": Tolerance(units=0.4, worst=0.043),
     "agreement.l2_vjp": Tolerance(units=2, worst=0.19),
+    "agreement.losses": Tolerance(units=8, worst=0.99),
+    "agreement.losses_vjp": Tolerance(units=5, worst=0.57),
     "agreement.low_pass": Tolerance(units=1, worst=0),
     "agreement.low_pass_vjp": Tolerance(units=1, worst=0),
     "agreement.map_sum": Tolerance(units=1, worst=0),
@@ -98,7 +103,7 @@ TABLE: Final[dict[str, Tolerance]] = {
     "agreement.v_means2d": Tolerance(units=0.4, worst=0.047),
     "agreement.v_means2d_abs": Tolerance(units=0.4, worst=0.045),
     "agreement.v_opacities": Tolerance(units=3, worst=0.26),
-    "agreement.v_quats": Tolerance(units=0.01, worst=0.0011),
+    "agreement.v_quats": Tolerance(units=0.03, worst=0.0029),
     "agreement.v_scales": Tolerance(units=0.5, worst=0.061),
     "agreement.v_sh": Tolerance(units=20, worst=2),
     "agreement.v_viewmat": Tolerance(units=0.15, worst=0.015),
@@ -148,14 +153,14 @@ TABLE: Final[dict[str, Tolerance]] = {
     "gradients.difference": Tolerance(units=0.08, worst=0.0078),
     "gradients.instruments": Tolerance(units=50, worst=4.9),
     "gradients.instruments.image": Tolerance(units=50, worst=4.9),
-    "gradients.radial": Tolerance(units=0.0002, worst=2.4e-05),
+    "gradients.radial": Tolerance(units=0.004, worst=0.00043),
     "gradients.rigid": Tolerance(units=0.003, worst=0.00027),
     "gradients.sum.background": Tolerance(units=0.4, worst=0.049),
     "gradients.sum.means": Tolerance(units=0.04, worst=0.004),
     "gradients.sum.means2d": Tolerance(units=0.04, worst=0.0041),
     "gradients.sum.means2d_abs": Tolerance(units=0.015, worst=0.0016),
     "gradients.sum.opacities": Tolerance(units=0.08, worst=0.01),
-    "gradients.sum.quats": Tolerance(units=0.004, worst=0.00039),
+    "gradients.sum.quats": Tolerance(units=0.02, worst=0.0023),
     "gradients.sum.scales": Tolerance(units=0.2, worst=0.025),
     "gradients.sum.sh": Tolerance(units=0.4, worst=0.05),
     "gradients.sum.viewmat": Tolerance(units=0.04, worst=0.0049),
@@ -183,6 +188,19 @@ TABLE: Final[dict[str, Tolerance]] = {
     "projection.covariance": Tolerance(units=1, worst=0),
     "projection.jacobian": Tolerance(units=1.5, worst=0.15),
     "projection.shift": Tolerance(units=3, worst=0.35),
+    "scale.T_final": Tolerance(units=20, worst=2.1),
+    "scale.image": Tolerance(units=0.15, worst=0.017),
+    "scale.pixels.T_final": Tolerance(units=80, worst=7.9),
+    "scale.pixels.image": Tolerance(units=0.15, worst=0.018),
+    "scale.v_background": Tolerance(units=6, worst=0.61),
+    "scale.v_means": Tolerance(units=0.002, worst=0.00021),
+    "scale.v_means2d": Tolerance(units=0.004, worst=0.00043),
+    "scale.v_means2d_abs": Tolerance(units=0.008, worst=0.00076),
+    "scale.v_opacities": Tolerance(units=0.02, worst=0.002),
+    "scale.v_quats": Tolerance(units=4e-05, worst=4.2e-06),
+    "scale.v_scales": Tolerance(units=0.0004, worst=4.4e-05),
+    "scale.v_sh": Tolerance(units=0.3, worst=0.025),
+    "scale.v_viewmat": Tolerance(units=6e-05, worst=5.7e-06),
     "sensitivity.light": Tolerance(units=0.8, worst=0.088),
     "sensitivity.one": Tolerance(units=1, worst=0),
     "sensitivity.rows": Tolerance(units=1, worst=0),
@@ -208,8 +226,11 @@ def allowed(key: str, dtype: Any) -> float:
 
 
 def agreement(key: str, dtype: Any) -> float:
-    """Return the allowed difference per magnitude from the oracle: 1e-10 at float64, rounding only at float32."""
-    return AGREEMENT_FLOAT64 if dtype == np.float64 else allowed(key, dtype)
+    """Return the allowed difference per magnitude from the oracle: rounding only, at float64 with room, up to 1e-12.
+
+    A float64 backend is judged on worse conditioned scenes, which single precision cannot resolve.
+    """
+    return min(AGREEMENT_FLOAT64, ROOM_FLOAT64 * allowed(key, dtype)) if dtype == np.float64 else allowed(key, dtype)
 
 
 def record(key: str, dtype: Any, units: float) -> None:

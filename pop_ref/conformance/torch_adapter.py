@@ -38,8 +38,8 @@ class TorchAdapter(Adapter):
     """A torch rasterizer and, when a package is named, its stage functions.
 
     What is not asked for may be drawn by other code. So a program that is asked for dominance and counts by arguments
-    of these names is asked as training asks: for dominance where an image is judged, for nothing where a gradient is.
-    `otherwise` has what the other choices give.
+    of these names is asked as POP's training asks for dominance where an image is judged, and for nothing, as any
+    other training, where a gradient is and where an image is judged `plainly`. `otherwise` has every choice's.
 
     Args:
         name: how reports call it.
@@ -86,6 +86,7 @@ class TorchAdapter(Adapter):
         self._takes_absgrad = "absgrad" in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values())
         self._instruments = tuple(name for name in ("dominance", "counts") if name in parameters)
         self._has_gradients: bool | None = None if rasterization else False
+        self._chosen = tuple(name for name in ("absgrad", *self._instruments) if name in parameters)
 
     def has(self, need: str) -> bool:
         """Tell what the program offers; the rasterizer is asked once for its gradients, and for its meta."""
@@ -96,7 +97,7 @@ class TorchAdapter(Adapter):
                 self._has_gradients = self._asked_for_gradients()
             return self._has_gradients
         if need == INSTRUMENTS:
-            return self._rasterization is not None and bool(self._instruments)
+            return self._rasterization is not None and bool(self._chosen)
         if need == SIGNATURE:
             return self._rasterization is not None and self._whole_signature
         return super().has(need) or self._stage(need) is not None
@@ -184,22 +185,35 @@ class TorchAdapter(Adapter):
         return dataclasses.replace(drawn, n_blended=counted.n_blended, n_traversed=counted.n_traversed)
 
     def otherwise(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, tuple[View, dict[str, np.ndarray]]]:
-        """Return, by what is asked for, the render and the gradients of every choice; the first is to ask for nothing.
+        """Return, by what is asked for, the render and the gradients of every choice; the first is to ask for nothing
+        but the absolute gradients of the screen means.
 
         Args:
             scene: to be drawn.
             v_image, v_T_final: cotangents.
         """
-        found = {}
-        for asked in ("nothing", "dominance", "dominance and counts"):
-            chosen = {"dominance": "dominance" in asked, "counts": "counts" in asked}
-            view = self._drawn(scene, **chosen)
-            found[asked] = (view, self._pulled(scene, v_image, v_T_final, **chosen))
+        nothing = {"dominance": False, "counts": False}
+        found = {
+            "absolute gradients": self._pulled(scene, v_image, v_T_final, **nothing),
+            "nothing": self._pulled(scene, v_image, v_T_final, **nothing, absgrad=False),
+        }
+        found["an image"] = (self._drawn(scene, **nothing), found["nothing"][1])
+        for asked in ("dominance", "dominance and counts") if self._instruments else ():
+            chosen = {"dominance": True, "counts": "counts" in asked}
+            found[asked] = self._pulled(scene, v_image, v_T_final, **chosen)
+            found[f"{asked} of an image"] = (self._drawn(scene, **chosen), found[asked][1])
         return found
 
-    def _drawn(self, scene: Scene, dominance: bool, counts: bool) -> View:
-        leaves = self._leaves(scene, grad=False)
-        image, alphas, meta = self._call(scene, leaves, dominance, counts)
+    def plainly(self, scene: Scene) -> View:
+        """Draw a scene that gradients may follow from, and ask for nothing else."""
+        return self._drawn(scene, dominance=False, counts=False, grad=True)
+
+    def _drawn(self, scene: Scene, dominance: bool, counts: bool, grad: bool = False) -> View:
+        leaves = self._leaves(scene, grad)
+        return self._view(scene, self._call(scene, leaves, dominance, counts), dominance, counts)
+
+    def _view(self, scene: Scene, drawn: Any, dominance: bool, counts: bool) -> View:
+        image, alphas, meta = drawn
         H, W, N = scene.camera.height, scene.camera.width, len(scene.gaussians)
         T_final = meta.get("final_T")
         told: dict[str, Any] = {}
@@ -219,13 +233,15 @@ class TorchAdapter(Adapter):
 
     def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
         """Return autograd's cotangents; those of the screen means when the meta keeps them."""
-        return self._pulled(scene, v_image, v_T_final, dominance=False, counts=False)
+        return self._pulled(scene, v_image, v_T_final, dominance=False, counts=False)[1]
 
     def _pulled(
-        self, scene: Scene, v_image: Any, v_T_final: Any, dominance: bool, counts: bool
-    ) -> dict[str, np.ndarray]:
+        self, scene: Scene, v_image: Any, v_T_final: Any, dominance: bool, counts: bool, absgrad: bool = True
+    ) -> tuple[View, dict[str, np.ndarray]]:
         leaves = self._leaves(scene, grad=True)
-        image, alphas, meta = self._call(scene, leaves, dominance, counts, **self._absgrad)
+        asked = self._absgrad if absgrad else {}
+        image, alphas, meta = drawn = self._call(scene, leaves, dominance, counts, **asked)
+        view = self._view(scene, drawn, dominance, counts)
         means2d = meta.get("means2d")
         if means2d is not None and means2d.requires_grad:
             means2d.retain_grad()
@@ -241,7 +257,7 @@ class TorchAdapter(Adapter):
             found["means2d"] = self._grad_of(means2d).reshape(N, 2)
             if getattr(means2d, "absgrad", None) is not None:
                 found["means2d_abs"] = self._array(means2d.absgrad).reshape(N, 2)
-        return {key: value for key, value in found.items() if key not in self._without}
+        return view, {key: value for key, value in found.items() if key not in self._without}
 
     @property
     def _absgrad(self) -> dict[str, bool]:

@@ -21,11 +21,12 @@ from pop_ref.conformance.abilities import (
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.cases import CASES, charges_of, cotangent_like, rounded, tangential, transposed
 from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.corners import corners
 from pop_ref.conformance.gradient_charges import gradient_charges
 from pop_ref.conformance.law import law
 from pop_ref.conformance.outcomes import assert_one_of_the_oracles_outcomes
 from pop_ref.conformance.scenes import cotangents
-from pop_ref.conformance.strategies import plain_sizes, scenes
+from pop_ref.conformance.strategies import plain_sizes, scenes, wide_scene
 from pop_ref.conformance.verdicts import assert_same_image, assert_same_light, charged
 from pop_ref.constants import GSPLAT_1_6, INRIA, Profile
 
@@ -123,13 +124,24 @@ for _case in CASES:
 del _case, _make, _test
 
 
-@law("compositing", RENDER, scene=scenes(max_degree=3))
+@law("compositing", RENDER, first=corners(3), scene=scenes(max_degree=3))
 def test_the_image_is_one_of_the_oracles_outcomes(backend, scene):
     seen, charges = charged(backend, scene)
     assert_one_of_the_oracles_outcomes(backend, seen, charges)
 
 
-@law("compositing", RENDER, LOWER_CEILING, scene=scenes(profile=GSPLAT_1_6))
+@law(
+    "compositing",
+    RENDER,
+    first=corners(3),
+    scene=st.one_of(scenes(max_degree=3), st.integers(0, 2**16).map(wide_scene)),
+)
+def test_the_image_that_training_draws_is_one_of_the_oracles_outcomes(backend, scene):
+    seen, charges = charged(backend, scene)
+    assert_one_of_the_oracles_outcomes(backend, seen, charges, backend.plainly(seen))
+
+
+@law("compositing", RENDER, LOWER_CEILING, first=corners(3, profile=GSPLAT_1_6), scene=scenes(profile=GSPLAT_1_6))
 def test_the_image_under_the_lower_ceiling_is_one_of_the_oracles_outcomes(backend, scene):
     seen, charges = charged(backend, scene)
     assert_one_of_the_oracles_outcomes(backend, seen, charges)
@@ -147,6 +159,7 @@ def test_the_image_of_inrias_profile_is_the_oracles(backend, scene):
     "footprint",
     RENDER,
     ANTIALIASING,
+    first=corners(1, antialiased=True),
     scene=scenes(max_gaussians=4, anchored=True, size=plain_sizes()).map(lambda s: s.but(antialiased=True)),
 )
 def test_the_antialiased_image_is_one_of_the_oracles_outcomes(backend, scene):
@@ -154,7 +167,7 @@ def test_the_antialiased_image_is_one_of_the_oracles_outcomes(backend, scene):
     assert_one_of_the_oracles_outcomes(backend, seen, charges)
 
 
-@law("dominance", RENDER, DOMINANCE, scene=scenes(anchored=True))
+@law("dominance", RENDER, DOMINANCE, first=corners(), scene=scenes(anchored=True))
 def test_dominant_ids_are_the_oracles(backend, scene):
     seen, charges = charged(backend, scene)
     expected, view = ORACLE.render(seen), backend.render(seen)
@@ -172,12 +185,18 @@ def test_dominant_weights_are_the_oracles(backend, scene):
     assert_close("agreement.weight", *weights, magnitude[at], backend.dtype, against_oracle=True)
 
 
-@law("gradients", GRADIENTS, scene=scenes(anchored=True, max_gaussians=5, max_degree=3))
+@law("gradients", GRADIENTS, first=corners(3), scene=scenes(anchored=True, max_gaussians=5, max_degree=3))
 def test_gradients_are_the_oracles(backend, scene):
     _gradients_agree(backend, scene)
 
 
-@law("gradients", GRADIENTS, LOWER_CEILING, scene=scenes(anchored=True, max_gaussians=4, profile=GSPLAT_1_6))
+@law(
+    "gradients",
+    GRADIENTS,
+    LOWER_CEILING,
+    first=corners(2, profile=GSPLAT_1_6),
+    scene=scenes(anchored=True, max_gaussians=4, profile=GSPLAT_1_6),
+)
 def test_gradients_under_the_lower_ceiling_are_the_oracles(backend, scene):
     _gradients_agree(backend, scene)
 
@@ -186,6 +205,7 @@ def test_gradients_under_the_lower_ceiling_are_the_oracles(backend, scene):
     "gradients",
     GRADIENTS,
     ANTIALIASING,
+    first=corners(1, antialiased=True),
     scene=scenes(anchored=True, max_gaussians=3, size=plain_sizes()).map(lambda s: s.but(antialiased=True)),
 )
 def test_antialiased_gradients_are_the_oracles(backend, scene):

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from pop_ref.conformance.abilities import PRINCIPAL_POINT, RENDER
 from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.corners import corners
 from pop_ref.conformance.law import law
 from pop_ref.conformance.scenes import SH_C0, Record, Scene, pack
 from pop_ref.conformance.strategies import (
@@ -26,6 +27,7 @@ from pop_ref.constants import PROFILES as ALL_PROFILES
 from pop_ref.types import Camera
 
 plain = scenes(anchored=True, size=plain_sizes())
+COLOURS = {name: np.arange(21.0).reshape(7, 3)[::step] / 16.0 for name, step in (("one", 1), ("other", -1))}
 faint = scenes(anchored=True, opacity=faint_opacities(), size=plain_sizes())
 
 
@@ -39,7 +41,7 @@ def camera_depths(scene):
     return scene.gaussians.means @ V[2, :3] + V[2, 3]
 
 
-@law("compositing", RENDER, scene=plain)
+@law("compositing", RENDER, first=corners(), scene=plain)
 def test_weights_and_remaining_light_sum_to_one(backend, scene):
     white = colored(scene, np.ones((len(scene.gaussians), 3))).but(background=np.zeros(3))
     seen, charges = charged(backend, white)
@@ -51,7 +53,7 @@ def test_weights_and_remaining_light_sum_to_one(backend, scene):
     assert_close("compositing.sum", total, np.ones_like(total), magnitude, backend.dtype)
 
 
-@law("compositing", RENDER, scene=scenes())
+@law("compositing", RENDER, first=corners(), scene=scenes())
 def test_remaining_light_lies_between_the_stop_and_one(backend, scene):
     seen = backend.sees(scene)
     view = backend.render(seen)
@@ -59,7 +61,7 @@ def test_remaining_light_lies_between_the_stop_and_one(backend, scene):
     assert np.all(view.T_final >= seen.profile.transmittance_stop * (1.0 - 1e-3))
 
 
-@law("compositing", RENDER, scene=plain)
+@law("compositing", RENDER, first=corners(), scene=plain)
 def test_light_never_rises_when_a_splat_is_added_behind(backend, scene):
     seen, charges = charged(backend, scene)
     rearmost = int(np.lexsort((np.arange(len(scene.gaussians)), camera_depths(seen)))[-1])
@@ -82,7 +84,14 @@ def test_a_list_composites_as_its_front_over_its_back(backend, scene, cut):
     assert_same_light("compositing.split", backend, whole.T_final, over.T_final * under.T_final, charges)
 
 
-@law("compositing", RENDER, scene=plain, one=arrays_of((7, 3), 0.0, 2.0), other=arrays_of((7, 3), 0.0, 2.0))
+@law(
+    "compositing",
+    RENDER,
+    first=corners(with_=COLOURS),
+    scene=plain,
+    one=arrays_of((7, 3), 0.0, 2.0),
+    other=arrays_of((7, 3), 0.0, 2.0),
+)
 def test_the_image_is_linear_in_the_colours(backend, scene, one, other):
     n = len(scene.gaussians)
     dark = scene.but(background=np.zeros(3))
@@ -92,7 +101,13 @@ def test_the_image_is_linear_in_the_colours(backend, scene, one, other):
     assert_same_image("compositing.linear", backend, backend.render(both).image, parts[0] + parts[1], charges)
 
 
-@law("compositing", RENDER, scene=plain, background=arrays_of((3,), 0.0, 2.0))
+@law(
+    "compositing",
+    RENDER,
+    first=corners(with_={"background": np.array([0.5, 2.0, 1.0])}),
+    scene=plain,
+    background=arrays_of((3,), 0.0, 2.0),
+)
 def test_the_background_enters_with_the_remaining_light(backend, scene, background):
     seen, charges = charged(backend, scene.but(background=background))
     over_black = backend.render(seen.but(background=np.zeros(3)))

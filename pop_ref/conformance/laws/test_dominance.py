@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from pop_ref.conformance.abilities import DOMINANCE, DOMINANT_COUNTS, DOMINANT_WEIGHTS, PROFILES, RENDER
 from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.corners import corners
 from pop_ref.conformance.law import law
 from pop_ref.conformance.laws.test_compositing import colored
 from pop_ref.conformance.scenes import Record, Scene, pack
@@ -46,7 +47,7 @@ def test_counts_add_over_crops(backend, ids, cut):
     assert_same_bits("counts", count(left, 4) + count(right, 4), count(ids, 4))
 
 
-@law("dominance", RENDER, DOMINANCE, DOMINANT_COUNTS, scene=scenes())
+@law("dominance", RENDER, DOMINANCE, DOMINANT_COUNTS, first=corners(), scene=scenes())
 def test_the_counts_of_a_render_are_those_of_its_map(backend, scene):
     n = len(scene.gaussians)
     view = backend.render(backend.sees(scene))
@@ -55,7 +56,7 @@ def test_the_counts_of_a_render_are_those_of_its_map(backend, scene):
     assert int(np.sum(view.dominant_counts)) + int(np.sum(view.dominant_ids < 0)) == view.dominant_ids.size
 
 
-@law("dominance", RENDER, DOMINANCE, scene=scenes())
+@law("dominance", RENDER, DOMINANCE, first=corners(), scene=scenes())
 def test_a_pixel_without_blended_splats_belongs_to_nobody(backend, scene):
     seen, charges = charged(backend, scene)
     view = backend.render(seen)
@@ -69,7 +70,7 @@ def test_a_pixel_without_blended_splats_belongs_to_nobody(backend, scene):
         assert_same_bits("empty pixels", (view.n_blended == 0)[sure], nobody[sure])
 
 
-@law("dominance", RENDER, DOMINANCE, scene=plain)
+@law("dominance", RENDER, DOMINANCE, first=corners(), scene=plain)
 def test_the_winner_is_the_splat_whose_weight_shows_most_in_the_image(backend, scene):
     # a Gaussian that is white among black ones paints its own weight
     seen, charges = charged(backend, scene.but(background=np.zeros(3)))

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from pop_ref.conformance.abilities import DETERMINISTIC, EXTENTS, HOMOGENEOUS, PRINCIPAL_POINT, RENDER, ROWWISE
 from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.corners import corners
 from pop_ref.conformance.law import law
 from pop_ref.conformance.scenes import Record, Scene, pack
 from pop_ref.conformance.strategies import backgrounds, cameras, plain_sizes, quats, records, rigid, scenes
@@ -34,7 +35,7 @@ def _same_render(key, backend, one, other, charges):
         assert_same_bits(name, a[sure], b[sure])
 
 
-@law("whole", RENDER, DETERMINISTIC, scene=scenes(max_degree=3))
+@law("whole", RENDER, DETERMINISTIC, first=corners(3), scene=scenes(max_degree=3))
 def test_two_runs_give_the_same_bits(backend, scene):
     seen = backend.sees(scene)
     one, other = backend.render(seen), backend.render(seen)
@@ -52,7 +53,7 @@ def test_an_empty_scene_is_the_background(backend, camera, background):
     assert_same_bits("remaining light", view.T_final, np.ones((H, W)))
 
 
-@law("whole", RENDER, EXTENTS, scene=plain, size=st.sampled_from([1, 2, 3, 5, 16]))
+@law("whole", RENDER, EXTENTS, first=corners(with_={"size": 5}), scene=plain, size=st.sampled_from([1, 2, 3, 5, 16]))
 def test_any_tile_size_gives_the_same_image(backend, scene, size):
     # D3: where extents hold all visible alpha, tiling is only an optimisation
     seen, charges = charged(backend, scene)
@@ -115,7 +116,15 @@ def test_an_invisible_gaussian_changes_no_bit(backend, scene, hidden, at):
     assert_same_bits("remaining light", other.T_final, one.T_final)
 
 
-@law("whole", RENDER, DETERMINISTIC, HOMOGENEOUS, scene=plain, power=st.integers(-3, 3))
+@law(
+    "whole",
+    RENDER,
+    DETERMINISTIC,
+    HOMOGENEOUS,
+    first=corners(with_={"power": 2}),
+    scene=plain,
+    power=st.integers(-3, 3),
+)
 def test_scaling_the_world_by_a_power_of_two_changes_no_bit(backend, scene, power):
     scale = 2.0**power
     seen = backend.sees(scene)
@@ -132,7 +141,14 @@ def test_scaling_the_world_by_a_power_of_two_changes_no_bit(backend, scene, powe
     assert_same_bits("remaining light", other.T_final, one.T_final)
 
 
-@law("whole", RENDER, scene=plain, turn=quats(), shift=st.tuples(*[st.integers(-4, 4).map(float)] * 3))
+@law(
+    "whole",
+    RENDER,
+    first=corners(with_={"turn": (2.0, -1.0, 0.5, 1.0), "shift": (1.0, -2.0, 3.0)}),
+    scene=plain,
+    turn=quats(),
+    shift=st.tuples(*[st.integers(-4, 4).map(float)] * 3),
+)
 def test_moving_world_and_camera_together_changes_nothing(backend, scene, turn, shift):
     # degree 0: colours of higher bands are fixed to the world's axes
     motion = rigid(turn, shift)
@@ -181,7 +197,9 @@ def test_cropping_commutes_with_rendering(backend, scene, left, top):
     assert_close("whole.crop", part.image[sure], whole.image[window][sure], size[sure], backend.dtype)
 
 
-@law("whole", RENDER, EXTENTS, scene=scenes(anchored=True, size=plain_sizes(), turned=False))
+@law(
+    "whole", RENDER, EXTENTS, first=corners(turned=False), scene=scenes(anchored=True, size=plain_sizes(), turned=False)
+)
 def test_a_mirrored_world_makes_a_mirrored_image(backend, scene):
     # x -> -x: the principal point mirrors about the image's middle, a rotation keeps w and x and flips y and z
     mirror = np.array([-1.0, 1.0, 1.0])
@@ -214,7 +232,7 @@ def test_denormal_sizes_and_opacities_give_finite_images(backend, small, record)
     assert np.all(np.isfinite(view.T_final))
 
 
-@law("whole", RENDER, scene=scenes(max_gaussians=3))
+@law("whole", RENDER, first=corners(), scene=scenes(max_gaussians=3))
 def test_a_huge_world_far_away_is_finite(backend, scene):
     scale = 2.0**40
     g = scene.gaussians

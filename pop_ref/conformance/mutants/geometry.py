@@ -8,6 +8,22 @@ from pop_ref.conformance.mutants.copies import Mutant
 
 GEOMETRY: Final = (
     Mutant(
+        "sorted_by_distance",
+        "splats are sorted by their distance from the camera's centre, not by depth: nobody sees it near the axis",
+        "splatting.py",
+        "        depths=depths,\n",
+        "        depths=np.sqrt(np.sum(means_cam_from_means(gaussians.means, camera.viewmat) ** 2, axis=1)),\n",
+        "test_agreement:the_image_is_one_of_the_oracles_outcomes",
+    ),
+    Mutant(
+        "gradient_of_unit_quaternions",
+        "the gradient of a quaternion forgets that it was divided by its norm",
+        "covariance.py",
+        "return unit_quats_from_quats_vjp(quats, v_units)",
+        "return unit_quats_from_quats_vjp(unit_quats_from_quats(quats), v_units)",
+        "test_agreement:gradients_are_the_oracles",
+    ),
+    Mutant(
         "xyzw",
         "quaternions are read with w last: the commonest mix-up between exporters",
         "covariance.py",

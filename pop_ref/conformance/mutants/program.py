@@ -19,6 +19,7 @@ RESETS = "test_density:the_population_changes_every_hundred_steps_and_opacities_
 TINY = "test_optimizer:gradients_of_any_smallness_take_whole_steps"
 WAIT = "test_optimizer:harmonics_that_wait_do_not_move_and_their_counter_goes_on"
 RATE = "test_optimizer:the_position_rate_falls_log_linearly_to_a_hundredth"
+PLAIN = "test_agreement:the_image_that_training_draws_is_one_of_the_oracles_outcomes"
 ASKED = "test_gradients:asking_for_dominance_and_counts_changes_neither_image_nor_gradient"
 
 _LINES: Final = (
@@ -189,6 +190,94 @@ _LINES: Final = (
         "torch.log(shapes[5] / profile.alpha_floor)",
         "torch.log(0.1 * shapes[5] / profile.alpha_floor)",
         ASKED,
+    ),
+    (
+        "windows_of_the_corner",
+        "whether a window of SSIM counts is read from its corner, not from its centre",
+        "ssim.py",
+        "mask[margin:-margin, margin:-margin]",
+        "mask[: -2 * margin, : -2 * margin]",
+        "test_masked_losses:the_dissimilarity_of_what_a_mask_keeps_is_the_oracles",
+    ),
+    (
+        "tiles_end_where_they_are_wide",
+        "the lower edge of a tile is reckoned from its left one; counting draws without the test",
+        "tiles.py",
+        "right, bottom = left + (tile_size - 1), top + (tile_size - 1)",
+        "right, bottom = left + (tile_size - 1), left + (tile_size - 1)",
+        PLAIN,
+    ),
+    (
+        "sums_without_absolute_ones",
+        "where no absolute gradients are asked for, as 3DGS trains, the exponent's moments change places",
+        "blender.py",
+        "rows[:, :6] = torch.mm(self.basis, pairs.T)",
+        "rows[:, :6] = torch.mm(self.basis if absolute else self.basis[[0, 2, 1, 3, 4, 5]], pairs.T)",
+        ASKED,
+    ),
+    (
+        "lists_of_thirty_two",
+        "a tile blends the first 32 entries of its list",
+        "tile_groups.py",
+        "torch.arange(int(n_blocks[0]))",
+        "torch.arange(min(int(n_blocks[0]), 4))",
+        "test_scale:the_image_of_fifty_is_the_oracles",
+    ),
+    (
+        "lists_of_256",
+        "a tile blends the first 256 entries of its list: nobody sees it in small scenes",
+        "tile_groups.py",
+        "torch.arange(int(n_blocks[0]))",
+        "torch.arange(min(int(n_blocks[0]), 32))",
+        "test_scale:the_image_of_hundreds_in_a_tile_is_the_oracles",
+    ),
+    (
+        "lists_of_1024",
+        "a tile blends the first 1,024 entries of its list",
+        "tile_groups.py",
+        "torch.arange(int(n_blocks[0]))",
+        "torch.arange(min(int(n_blocks[0]), 128))",
+        "test_scale:the_image_of_a_thousand_in_a_tile_is_the_oracles",
+    ),
+    (
+        "tiles_in_eight_bits",
+        "entries are sorted by tile numbers of eight bits",
+        "tiles.py",
+        "tile.to(torch.int16 if n_tiles < 2**15 else torch.int32)",
+        "tile.to(torch.int8)",
+        "test_scale:the_image_of_five_thousand_is_the_oracles",
+    ),
+    (
+        "entries_in_sixteen_bits",
+        "where a tile's list begins is counted in sixteen bits",
+        "tiles.py",
+        "return TileLists(ids.index_select(0, order), offsets,",
+        "return TileLists(ids.index_select(0, order), offsets % 2**16,",
+        "test_scale:dominant_ids_and_counts_of_five_thousand_are_the_oracles",
+    ),
+    (
+        "winners_in_eight_bits",
+        "dominant ids are kept in eight bits",
+        "compositing.py",
+        "ids.masked_fill_(places < 0, -1))",
+        "(ids % 256).masked_fill_(places < 0, -1))",
+        "test_scale:dominant_ids_and_counts_of_hundreds_in_a_tile_are_the_oracles",
+    ),
+    (
+        "counts_in_eight_bits",
+        "blended splats are counted in eight bits",
+        "compositing.py",
+        "blend.n_blended.to(torch.int32)",
+        "(blend.n_blended % 256).to(torch.int32)",
+        "test_scale:dominant_ids_and_counts_of_a_thousand_in_a_tile_are_the_oracles",
+    ),
+    (
+        "gradients_of_256",
+        "the backward pass ends after 256 entries of a list",
+        "compositing.py",
+        "gradients.add(group, blend, tiles.index_select(0, group.tiles))",
+        "del blend.steps[32:]; gradients.add(group, blend, tiles.index_select(0, group.tiles))",
+        "test_scale:the_gradients_of_a_thousand_in_a_tile_are_the_oracles",
     ),
 )
 

@@ -1,0 +1,129 @@
+"""Scenes at scale, the same on every machine: up to 5,000 Gaussians, long lists, many tiles, tiles cut by the border.
+
+They are made by formula, of integers and of elementwise arithmetic alone, and every number is one of float32, so that
+all precisions read the same scene. What the oracle says of them is kept beside (`corpus_answers`), because the oracle
+would take minutes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from pop_ref.conformance.scenes import Scene
+from pop_ref.types import Camera, Gaussians
+
+# odd multipliers: i -> i M mod 2^16 visits every residue, each column of numbers in an order of its own
+_MULTIPLIERS: Final = (40503, 24571, 52711, 14009, 61001, 33391, 9973, 46337, 27737, 57193, 19249, 38839)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a scene of the corpus is for, in numbers.
+
+    Attributes:
+        n: Gaussians.
+        width, height: px.
+        tile_size: px.
+        sizes: least and largest standard deviation, px at their depth.
+        opacities: least and largest.
+        degree: of harmonics.
+        turn: wxyz of the camera, of any norm.
+        oblong: fy over fx.
+        small: the oracle itself draws it in a second.
+    """
+
+    n: int
+    width: int
+    height: int
+    tile_size: int
+    sizes: tuple[float, float]
+    opacities: tuple[float, float]
+    degree: int = 0
+    turn: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    oblong: float = 1.0
+    small: bool = False
+
+
+PLANS: Final[dict[str, Plan]] = {
+    "fifty": Plan(50, 33, 17, 16, (2.0, 9.0), (0.05, 0.8), 3, (3.0, 1.0, -2.0, 0.5), 1.25, small=True),
+    "slanted": Plan(80, 96, 64, 16, (0.5, 9.0), (0.1, 0.95), 1, (0.5, -0.25, 0.125, 0.75), 1.125),
+    "hundreds_in_a_tile": Plan(700, 33, 49, 16, (4.0, 12.0), (0.006, 0.03), 0, (2.0, 0.0, 1.0, 1.0)),
+    "a_thousand_in_a_tile": Plan(1500, 33, 17, 16, (24.0, 72.0), (0.0045, 0.0075), 0, (1.0, 0.5, 0.0, 0.0)),
+    "many_tiles": Plan(2000, 121, 90, 4, (0.75, 3.5), (0.05, 1.0), 2, (1.0, 2.0, 3.0, 4.0), 0.875),
+    "five_thousand": Plan(5000, 200, 120, 4, (0.75, 4.0), (0.02, 0.95), 0, (5.0, -1.0, 0.5, 1.0), 1.0),
+}
+
+
+def _column(n: int, k: int) -> np.ndarray:
+    """Return n numbers in (0, 1), evenly spread and in an order that no other column has."""
+    return (np.mod((np.arange(n, dtype=np.int64) + 1) * _MULTIPLIERS[k], 2**16) + 0.5) / 2**16
+
+
+def _between(low: float, high: float, share: np.ndarray) -> np.ndarray:
+    return low + (high - low) * share
+
+
+def _float32(values: np.ndarray) -> np.ndarray:
+    return values.astype(np.float32).astype(np.float64)
+
+
+def corpus_scene(name: str) -> Scene:
+    """Return the scene of that name in `PLANS`."""
+    plan = PLANS[name]
+    n, fx = plan.n, 64.0
+    fy = fx * plan.oblong
+    cx, cy = 0.5 * plan.width + 1.25, 0.5 * plan.height - 0.75
+    # no two depths are alike, and none is so close to another that rounding could exchange them
+    depths = 1.5 + 4.5 * (np.mod(np.arange(n) * _stride(n), n) + 0.5) / n
+    # a few pixels beyond the image on all sides
+    x = (_between(-3.5, plan.width + 3.5, _column(n, 0)) - cx) / fx * depths
+    y = (_between(-3.5, plan.height + 3.5, _column(n, 1)) - cy) / fy * depths
+    R, t = _float32(_rotation(plan.turn)), np.array([0.5, -0.25, 0.75])
+    moved = np.stack([x - t[0], y - t[1], depths - t[2]])
+    means = _float32(np.stack([R[0, k] * moved[0] + R[1, k] * moved[1] + R[2, k] * moved[2] for k in range(3)], 1))
+    px = np.stack([_between(*plan.sizes, _column(n, k) ** 2) for k in (2, 3, 4)], 1)
+    scales = _float32(px * depths[:, None] / fx)
+    # of norms from a quarter to some three
+    quats = np.stack([_column(n, k) - 0.5 for k in (5, 6, 7, 8)], 1)
+    length = np.sqrt(np.sum(quats * quats, axis=1, keepdims=True))
+    quats = _float32(quats / length * _between(0.25, 3.0, _column(n, 9))[:, None])
+    opacities = _float32(_between(*plan.opacities, _column(n, 10)))
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = R, t
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    camera = Camera(viewmat, K, plan.width, plan.height)
+    g = Gaussians(means, quats, scales, opacities, _harmonics(n, plan.degree))
+    return Scene(g, camera, (0.25, 0.5, 0.75), tile_size=plan.tile_size)
+
+
+def _stride(n: int) -> int:
+    # near n over the golden section, and without a common factor
+    return next(k for k in range(int(0.618 * n), n) if np.gcd(k, n) == 1)
+
+
+def _rotation(quat: tuple[float, float, float, float]) -> np.ndarray:
+    w, x, y, z = quat
+    s = w * w + x * x + y * y + z * z
+    return (
+        np.array(
+            [
+                [s - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), s - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), s - 2 * (x * x + y * y)],
+            ]
+        )
+        / s
+    )
+
+
+def _harmonics(n: int, degree: int) -> np.ndarray:
+    """Return coefficients in eighths; one Gaussian in sixteen is darker than black in one channel."""
+    k = np.arange(n * (degree + 1) ** 2 * 3, dtype=np.int64)
+    sh = (np.mod(k * 2654435761, 2**20) // 2**17 - 3.5).reshape(n, -1, 3) / 8.0
+    sh[:, 0] = 3.0 * sh[:, 0] + 1.0
+    rows = np.arange(0, n, 16)
+    sh[rows, 0, rows % 3] = -3.0
+    return sh

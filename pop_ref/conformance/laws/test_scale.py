@@ -1,0 +1,71 @@
+"""Laws of scale: long lists, many tiles and thousands of Gaussians, drawn as training draws them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pop_ref.conformance.abilities import DERIVATIVES, DOMINANCE, EXTENTS, GRADIENTS, PRINCIPAL_POINT, RENDER, SCALE
+from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.corpus import PLANS, corpus_scene
+from pop_ref.conformance.corpus_answers import (
+    GRADIENTS as ROWS,
+)
+from pop_ref.conformance.corpus_answers import (
+    answers,
+    certain_cotangents,
+    picked_pixels,
+    weighted_blocks,
+    weighted_runs,
+)
+from pop_ref.conformance.law import law
+
+
+def _image(name, *needs):
+    def sentence(backend):
+        scene, expected = corpus_scene(name), answers(name)
+        view = backend.plainly(scene)
+        sure, at = expected["certain"], picked_pixels(scene)
+        seen = np.concatenate([view.image, view.T_final[..., None]], axis=2)
+        picked = sure[at]
+        pixels = (seen[at][picked], expected["pixels"][picked], expected["e_pixels"][picked])
+        blocks = (weighted_blocks(seen, sure), expected["blocks"], expected["e_blocks"])
+        for key, part in (("image", np.s_[..., :3]), ("T_final", np.s_[..., 3])):
+            for kind, values in (("scale.pixels", pixels), ("scale", blocks)):
+                assert_close(f"{kind}.{key}", *(v[part] for v in values), backend.dtype, against_oracle=True)
+
+    sentence.__name__ = f"test_the_image_of_{name}_is_the_oracles"
+    return law("whole", RENDER, EXTENTS, PRINCIPAL_POINT, *needs)(sentence)
+
+
+def _integers(name, *needs):
+    def sentence(backend):
+        scene, expected = corpus_scene(name), answers(name)
+        view = backend.render(scene)
+        winners = weighted_blocks(view.dominant_ids, expected["decided"])
+        assert_same_bits("weighted sums of dominant ids over blocks", winners, expected["winners"])
+        if view.n_blended is not None:
+            blended = weighted_blocks(view.n_blended, expected["certain"])
+            assert_same_bits("weighted sums of blended counts over blocks", blended, expected["blended"])
+
+    sentence.__name__ = f"test_dominant_ids_and_counts_of_{name}_are_the_oracles"
+    return law("dominance", RENDER, DOMINANCE, EXTENTS, PRINCIPAL_POINT, *needs)(sentence)
+
+
+def _gradients(name, *needs):
+    def sentence(backend):
+        scene, expected = corpus_scene(name), answers(name)
+        found = backend.gradients(scene, *certain_cotangents(scene, expected["smooth"]))
+        for key, value in found.items():
+            sums = weighted_runs(value) if key in ROWS else value
+            charge = expected[f"e_{key}"]
+            assert_close(f"scale.v_{key}", sums, expected[f"v_{key}"], charge, backend.dtype, against_oracle=True)
+
+    sentence.__name__ = f"test_the_gradients_of_{name}_are_the_oracles"
+    return law("gradients", GRADIENTS, EXTENTS, PRINCIPAL_POINT, DERIVATIVES, *needs)(sentence)
+
+
+for _name, _plan in PLANS.items():
+    for _make in (_image, _integers, _gradients):
+        _test = _make(_name, *(() if _plan.small else (SCALE,)))
+        globals()[_test.law.sentence.__name__] = _test
+del _name, _plan, _make, _test

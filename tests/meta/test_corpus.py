@@ -1,0 +1,96 @@
+"""What is kept of the corpus is what the oracle says today, and the corpus reaches what it is for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.corpus import PLANS, corpus_scene
+from pop_ref.conformance.corpus_answers import (
+    MAPS,
+    answer,
+    answers,
+    charged_windows,
+    picked_pixels,
+    weighted_blocks,
+    weighted_runs,
+)
+
+# in seconds; of the others a part is computed again
+QUICK = ("fifty", "slanted", "hundreds_in_a_tile", "many_tiles")
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_the_answers_are_the_oracles(name: str) -> None:
+    kept, again = answers(name), answer(name)
+    assert set(kept) == set(again)
+    for key, value in again.items():
+        if key in MAPS:
+            assert np.array_equal(np.packbits(kept[key]), value)
+        elif key.startswith("e_"):
+            np.testing.assert_allclose(kept[key], value, rtol=1e-5)
+        else:
+            close = 1e-11 * np.abs(again.get(f"e_{key.removeprefix('v_')}", 0.0))
+            assert np.all(np.abs(kept[key] - value) <= close), key
+
+
+@pytest.mark.parametrize("name", sorted(set(PLANS) - set(QUICK)))
+def test_the_images_and_two_windows_of_the_answers_are_the_oracles(name: str) -> None:
+    kept, scene = answers(name), corpus_scene(name)
+    drawn = OracleAdapter().full_render(scene)
+    seen = np.concatenate([drawn.image, drawn.T_final[..., None]], axis=2)
+    np.testing.assert_allclose(seen[picked_pixels(scene)], kept["pixels"], rtol=1e-10)
+    np.testing.assert_allclose(weighted_blocks(seen, kept["certain"]), kept["blocks"], rtol=1e-10)
+    assert np.array_equal(weighted_blocks(drawn.n_blended, kept["certain"]), kept["blended"])
+    assert np.array_equal(weighted_blocks(drawn.dominant_ids, kept["decided"]), kept["winners"])
+    for place, charges in charged_windows(scene, slice(1, 3)):
+        for key in MAPS:
+            assert np.array_equal(getattr(charges, key), kept[key][place])
+
+
+def test_the_corpus_has_long_lists_many_tiles_many_entries_and_cut_tiles() -> None:
+    longest, tiles, entries, blended = [], [], [], []
+    for name, plan in PLANS.items():
+        drawn = OracleAdapter().full_render(corpus_scene(name))
+        lengths = [len(ids) for ids in drawn.tile_lists]
+        longest.append(max(lengths))
+        blended.append(int(drawn.n_blended.max()))
+        tiles.append(len(lengths))
+        entries.append(sum(lengths))
+        assert answers(name)["certain"].mean() > 0.5
+        assert 50 <= plan.n <= 5000
+    for length in (8, 32, 256, 1024):
+        assert max(longest) > length
+        assert any(length < each <= 8 * length for each in longest)
+    assert max(blended) > 1024
+    assert max(tiles) > 256
+    assert max(entries) > 2**16
+    assert any(plan.width % plan.tile_size and plan.height % plan.tile_size for plan in PLANS.values())
+    assert {(33, 17), (200, 120)} <= {(plan.width, plan.height) for plan in PLANS.values()}
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_a_scene_is_the_same_in_single_precision_and_has_signal(name: str) -> None:
+    scene = corpus_scene(name)
+    for array in (*vars(scene.gaussians).values(), scene.camera.viewmat, scene.camera.K, scene.background):
+        assert np.array_equal(array, array.astype(np.float32))
+    norms = np.linalg.norm(scene.gaussians.quats, axis=1)
+    assert norms.min() < 0.5
+    assert norms.max() > 2.0
+    kept = answers(name)
+    for key in ("means", "quats", "scales", "opacities", "sh", "means2d"):
+        assert np.mean(kept[f"v_{key}"] != 0.0) > 0.5, f"the gradient of {key} says little"
+
+
+def test_weighted_sums_see_two_pixels_or_rows_change_places() -> None:
+    image = np.arange(24.0 * 20.0).reshape(24, 20)
+    everywhere = np.ones(image.shape, dtype=bool)
+    for a, b in (((0, 0), (0, 1)), ((0, 0), (1, 0)), ((9, 3), (15, 6))):
+        swapped = image.copy()
+        swapped[a], swapped[b] = image[b], image[a]
+        assert not np.array_equal(weighted_blocks(swapped, everywhere), weighted_blocks(image, everywhere))
+    rows = np.arange(600.0).reshape(300, 2)
+    swapped = rows.copy()
+    swapped[[1, 2]] = rows[[2, 1]]
+    assert not np.array_equal(weighted_runs(swapped), weighted_runs(rows))
