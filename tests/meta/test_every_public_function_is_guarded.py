@@ -16,7 +16,7 @@ from collections.abc import Callable
 import pytest
 
 from pop_ref.conformance.adapter import OracleAdapter
-from pop_ref.conformance.mutants.trial import law_named, obeys
+from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
 from tests.golden import ten_losses
 from tests.meta.breakage import broken, public_functions
 
@@ -205,6 +205,7 @@ def _law(path: str) -> None:
 
 
 # imported while everything is sound: a module that is imported under breakage would keep the broken function
+every_law()
 MODULES = {
     name: importlib.import_module(f"tests.oracle.{name}") for name in {t.partition(".")[0] for t in TESTS.values()}
 }
