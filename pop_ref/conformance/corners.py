@@ -2,8 +2,8 @@
 
 Each holds what random scenes seldom hold at once: harmonics of the third degree under a turned camera, quaternions of
 any norm, an order in depth that is not the order of distances, tiles cut by the border, slanted needles over corners of
-tiles, pixels that end, oblong pixels with the principal point aside, splats beyond the frustum's clamp, exact ties; and
-a splat alone.
+tiles, pixels that end, oblong pixels with the principal point aside, splats beyond the frustum's clamp, exact ties;
+and a splat alone.
 """
 
 from __future__ import annotations
