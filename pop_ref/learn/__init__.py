@@ -1,0 +1,1 @@
+"""Build your own Gaussian splatting, stage by stage, judged by the conformance kit."""
