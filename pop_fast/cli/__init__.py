@@ -29,6 +29,7 @@ COMMANDS: Final = {
     "data check": "look a capture over before training: sizes, pairing, masks, memory",
     "build-cpu": "compile the CPU kernels: about three times the speed (needs a C++ compiler)",
     "build-cuda": "compile the CUDA extension (needs nvcc)",
+    "learn": "build your own splatting in NumPy, judged stage by stage",
     "vectors": "write the conformance vectors for ports in other languages, and check a port's results",
     "doctor": "say what is installed, what is missing and how to get it",
 }

@@ -28,6 +28,7 @@ SHOW_THE_ORACLE = (
     "pop_fast/oracle_backend.py",
     "pop_fast/oracle_passes.py",
     "pop_fast/cli/vectors.py",
+    "pop_fast/cli/learn.py",
 )
 
 
@@ -90,6 +91,17 @@ def test_nothing_else_imports_the_walk_through() -> None:
     for path in outside:
         taken = [m for m in _imports(path) if m.startswith("pop_ref.walkthrough")]
         assert not taken, f"{_name(path)} imports {taken}"
+
+
+def test_the_course_adds_the_kit_and_what_the_kit_needs_and_is_used_by_its_command_only() -> None:
+    course = sorted((ROOT / "pop_ref" / "learn").glob("*.py"))
+    assert course
+    for path in course:
+        assert not _foreign(path, {"numpy", "pop_ref", "hypothesis"}), _name(path)
+    for path in FILES:
+        if path not in course and "tests" not in path.parts and _name(path) != "pop_fast/cli/learn.py":
+            taken = [m for m in _imports(path) if m.startswith("pop_ref.learn")]
+            assert not taken, f"{_name(path)} imports {taken}"
 
 
 def test_the_program_takes_no_formula_from_the_oracle() -> None:

@@ -1,0 +1,159 @@
+"""The course: twelve stages in the order of the pipeline, what each is made of, and which laws judge it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One module that a student writes.
+
+    Attributes:
+        name: of the stage and its file.
+        does: what it does, in a few words.
+        chapter: the walk-through's chapter that explains it.
+        functions: the oracle's functions, by the oracle's module that has them.
+        laws: the kit's stages whose laws judge it.
+        more_laws: names of single laws of other stages.
+    """
+
+    name: str
+    does: str
+    chapter: int
+    functions: dict[str, tuple[str, ...]]
+    laws: tuple[str, ...] = ()
+    more_laws: tuple[str, ...] = field(default=())
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the functions, in the order in which a file has them."""
+        return tuple(name for names in self.functions.values() for name in names)
+
+    @property
+    def file(self) -> str:
+        """Return the name of the student's file."""
+        return f"{self.name}.py"
+
+
+def _with_transposes(*names: str) -> tuple[str, ...]:
+    return tuple(each for name in names for each in (name, f"{name}_vjp"))
+
+
+COURSE: Final = (
+    Stage(
+        "activations",
+        "raw parameters to scales, opacities, unit quaternions",
+        1,
+        {"activations": _with_transposes("scales_from_log_scales", "opacities_from_logits", "unit_quats_from_quats")},
+        ("activations",),
+    ),
+    Stage(
+        "covariance",
+        "quaternions and scales to ellipsoids",
+        1,
+        {"covariance": _with_transposes("rotmats_from_quats", "covars_from_quats_scales")},
+        ("covariance",),
+    ),
+    Stage(
+        "harmonics",
+        "coefficients and directions to colours",
+        3,
+        {"harmonics": _with_transposes("sh_basis", "colors_from_sh")},
+        ("harmonics",),
+    ),
+    Stage(
+        "camera",
+        "from the world into the camera's frame",
+        2,
+        {
+            "camera": (
+                *_with_transposes("camera_center", "view_dirs", "means_cam_from_means", "covars_cam_from_covars"),
+                "in_front",
+            )
+        },
+        ("camera",),
+    ),
+    Stage(
+        "projection",
+        "from the camera's frame to the screen: ellipsoids to ellipses",
+        2,
+        {"projection": _with_transposes("project_means", "projection_jacobians", "project_covars")},
+        ("projection",),
+    ),
+    Stage(
+        "footprint",
+        "a little blur, the inverse covariance, and how far a splat reaches",
+        2,
+        {"footprint": (*_with_transposes("low_pass", "conics_from_covars2d"), "radii_from_covars2d", "on_screen")},
+        ("footprint",),
+    ),
+    Stage(
+        "tiles",
+        "which splats a tile must look at, front to back",
+        11,
+        {"tiles": ("grid_size", "tile_span", "tile_rects", "tile_lists")},
+        ("tiles",),
+    ),
+    Stage(
+        "alpha",
+        "one splat at one pixel",
+        4,
+        {"alpha": _with_transposes("sigma_at_pixel", "falloff", "alpha_from_sigma")},
+        ("alpha",),
+    ),
+    Stage(
+        "compositing",
+        "one pixel from front to back, its gradient from back to front, and who dominates it",
+        4,
+        {
+            "pixel": ("stops", *_with_transposes("composite_pixel")),
+            "dominance": ("dominant_id", "dominant_counts"),
+        },
+        ("compositing", "dominance"),
+        (
+            "zero_cotangents_give_exact_zeros",
+            "gradients_are_the_oracles",
+            "a_step_along_any_direction_changes_the_image_as_the_gradient_says",
+        ),
+    ),
+    Stage(
+        "losses",
+        "how far a picture is from its photograph, and opacities from their poles",
+        6,
+        {"losses": _with_transposes("l1", "l2"), "polarization": ("importance_mask", *_with_transposes("pop_loss"))},
+        ("losses", "polarization"),
+    ),
+    Stage(
+        "optimizer",
+        "Adam, which moves every parameter",
+        6,
+        {"optimizer": ("adam_step",)},
+        ("optimizer",),
+    ),
+    Stage(
+        "density",
+        "clone, split and prune: more Gaussians where they are needed, fewer where not",
+        9,
+        {"density_rows": ("clone_rows", "split_rows", "prune_rows"), "density": ("grow_masks", "prune_mask")},
+        ("density",),
+    ),
+)
+
+BY_NAME: Final = {stage.name: stage for stage in COURSE}
+
+
+def stage_named(name: str) -> Stage:
+    """Find a stage.
+
+    Raises:
+        ValueError: there is none of that name.
+
+    Example:
+        >>> stage_named("alpha").file
+        'alpha.py'
+    """
+    if name not in BY_NAME:
+        raise ValueError(f"'{name}' is not a stage of the course; there are {', '.join(BY_NAME)}")
+    return BY_NAME[name]

@@ -1,0 +1,142 @@
+"""The files that a course begins with: the oracle's functions without their bodies and without their formulas."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import re
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import pop_ref
+from pop_ref.learn.course import COURSE, Stage
+
+_ORACLE: Final = Path(pop_ref.__file__).parent
+_QUOTED: Final = re.compile(r"`([^`]*)`")
+_HEAD: Final = '''"""Stage {number} of {count}, {name}: {does}.
+
+Chapter {chapter} of the walk-through explains it, and every docstring has an example to try. What you call from another
+stage is your own function where you have written it, and the oracle's where you have not. The course has one profile,
+`paper`: readings of other profiles that a docstring speaks of may be left out.
+
+    pop learn check {name}
+"""
+'''
+
+
+def start(folder: Path) -> list[Path]:
+    """Write the stubs that are not there yet; a file that is there is left alone.
+
+    Returns:
+        The files written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for stage in COURSE:
+        path = folder / stage.file
+        if not path.exists():
+            path.write_text(stub(stage), encoding="utf-8")
+            written.append(path)
+    return written
+
+
+def stub(stage: Stage) -> str:
+    """Write a stage's stub.
+
+    Example:
+        >>> from pop_ref.learn.course import stage_named
+        >>> print(stub(stage_named("alpha")).splitlines()[0])
+        \"\"\"Stage 8 of 12, alpha: one splat at one pixel.
+    """
+    number = COURSE.index(stage) + 1
+    head = _HEAD.format(number=number, count=len(COURSE), name=stage.name, does=stage.does, chapter=stage.chapter)
+    functions = [_without_body(module, name) for module, names in stage.functions.items() for name in names]
+    return "\n\n".join(["\n".join([head, *_imports(stage)]), *functions])
+
+
+def answer(stage: Stage) -> str:
+    """Return the oracle's functions of a stage, without their docstrings."""
+    parts = []
+    for module, names in stage.functions.items():
+        lines = _source(module).splitlines()
+        for name in names:
+            node = _functions(module)[name]
+            text = [
+                *lines[node.lineno - 1 : node.body[0].lineno - 1],
+                *lines[node.body[1].lineno - 1 : node.end_lineno],
+            ]
+            parts.append("\n".join(text))
+    return "\n\n".join(parts)
+
+
+def formulas(module: str, name: str) -> list[str]:
+    """Return the formulas that a function's docstring states.
+
+    Example:
+        >>> formulas("alpha", "falloff")
+        ['G = exp(-sigma)']
+    """
+    text = (ast.get_docstring(_functions(module)[name]) or "").partition("\nSource:")[0]
+    return _formulas_in(text)
+
+
+@functools.cache
+def _source(module: str) -> str:
+    return (_ORACLE / f"{module}.py").read_text(encoding="utf-8")
+
+
+@functools.cache
+def _functions(module: str) -> dict[str, ast.FunctionDef]:
+    return {node.name: node for node in ast.parse(_source(module)).body if isinstance(node, ast.FunctionDef)}
+
+
+def _without_body(module: str, name: str) -> str:
+    node = _functions(module)[name]
+    signature = "\n".join(_source(module).splitlines()[node.lineno - 1 : node.body[0].lineno - 1])
+    docstring = textwrap.indent(f'"""{_without_formulas(ast.get_docstring(node) or "")}\n"""', "    ")
+    # blank lines carry no indentation
+    docstring = re.sub(r"^ +$", "", docstring, flags=re.MULTILINE)
+    return f'\n{signature}\n{docstring}\n    raise NotImplementedError("{name} is yours to write")'
+
+
+def _without_formulas(docstring: str) -> str:
+    about, source, rest = docstring.partition("Source:")
+    first, *others = about.strip().split("\n\n")
+    first = first.partition("`")[0].rstrip(" :,") if _formulas_in(first) else first
+    kept = [first if first.endswith(".") else f"{first}.", *(p for p in others if not _formulas_in(p))]
+    return "\n\n".join([*kept, f"{source}{rest}"])
+
+
+def _formulas_in(text: str) -> list[str]:
+    return [" ".join(quoted.split()) for quoted in _QUOTED.findall(text) if re.search("[=<>]", quoted)]
+
+
+def _imports(stage: Stage) -> Iterator[str]:
+    """Import what the oracle's module imports, and what else it defines that the stage does not ask for."""
+    yield "from __future__ import annotations\n"
+    own, seen = set(stage.names), set()
+    plain: list[str] = []
+    ours: dict[str, list[str]] = {}
+    for module in stage.functions:
+        body = ast.parse(_source(module)).body
+        for node in body:
+            if isinstance(node, ast.Import) or (isinstance(node, ast.ImportFrom) and node.module in ("math", "typing")):
+                plain.append(ast.unparse(node))
+            elif isinstance(node, ast.ImportFrom) and node.module != "__future__":
+                names = [alias.name for alias in node.names]
+                if str(node.module).startswith("pop_ref"):
+                    ours.setdefault(str(node.module), []).extend(names)
+                else:
+                    plain.append(ast.unparse(node))
+            elif isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_"):
+                ours.setdefault(f"pop_ref.{module}", []).append(node.name)
+    yield from sorted(set(plain))
+    yield ""
+    for origin, names in sorted(ours.items()):
+        fresh = [name for name in dict.fromkeys(names) if name not in own | seen]
+        seen.update(fresh)
+        if fresh:
+            line = f"from {origin} import {', '.join(fresh)}"
+            yield line if len(line) <= 120 else f"from {origin} import (\n    " + ",\n    ".join(fresh) + ",\n)"

@@ -1,0 +1,236 @@
+"""A student's folder, and the oracle with the student's functions put in.
+
+The oracle is copied under another package name, as mutants are, and in the copy each function that the student has
+written takes the place of the oracle's. A student's `from pop_ref.alpha import falloff` means the copy's, so that it
+finds the student's own function where there is one.
+"""
+
+from __future__ import annotations
+
+import ast
+import copy
+import importlib
+import importlib.abc
+import importlib.util
+import inspect
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final
+
+import pop_ref
+from pop_ref.learn.course import COURSE, Stage
+
+PACKAGE: Final = "pop_yours"
+_ORACLE: Final = Path(pop_ref.__file__).parent
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a student has written.
+
+    Attributes:
+        folder: of the stubs.
+        written: names of the functions that have a body, by stage.
+    """
+
+    folder: Path
+    written: dict[str, tuple[str, ...]]
+
+    def is_whole(self, stage: Stage) -> bool:
+        """Tell whether every function of a stage is written."""
+        return set(self.written[stage.name]) == set(stage.names)
+
+
+@dataclass
+class Call:
+    """One call of a student's function: what went in, what came out, what the oracle says to the same input."""
+
+    function: str
+    parameters: tuple[str, ...]
+    given: tuple[Any, ...]
+    named: dict[str, Any]
+    found: Any
+    expected: Any
+
+
+@dataclass
+class Borrowed:
+    """The copy of the oracle that is in use.
+
+    Attributes:
+        oracle: the copy's own functions, which the student's have replaced.
+        installed: the student's functions that have replaced them, as the copy calls them.
+        calls: of the student's functions, while `watching`.
+    """
+
+    oracle: dict[str, Callable[..., Any]] = field(default_factory=dict)
+    installed: dict[str, Callable[..., Any]] = field(default_factory=dict)
+    calls: list[Call] = field(default_factory=list)
+    watching: bool = False
+
+    def module(self, name: str) -> Any:
+        """Return a module of the copy."""
+        return importlib.import_module(f"{PACKAGE}.{name}")
+
+
+def read_work(folder: Path) -> Work:
+    """Read a student's folder without running it.
+
+    Raises:
+        ValueError: the folder has no stubs, or a file is not Python; the message names file and line.
+    """
+    if not any((folder / stage.file).exists() for stage in COURSE):
+        raise ValueError(f"{folder} has no stubs; 'pop learn start {folder}' writes them")
+    written = {}
+    for stage in COURSE:
+        path = folder / stage.file
+        written[stage.name] = _written(stage, path) if path.exists() else ()
+    return Work(folder, written)
+
+
+def _written(stage: Stage, path: Path) -> tuple[str, ...]:
+    functions = {node.name: node for node in _parsed(path).body if isinstance(node, ast.FunctionDef)}
+    return tuple(name for name in stage.names if name in functions and not _is_stub(functions[name]))
+
+
+def _is_stub(node: ast.FunctionDef) -> bool:
+    body = node.body[1:] if ast.get_docstring(node) is not None else node.body
+    return not body or (
+        len(body) == 1 and isinstance(body[0], ast.Raise) and "NotImplementedError" in ast.dump(body[0])
+    )
+
+
+def _parsed(path: Path) -> ast.Module:
+    try:
+        return ast.parse(path.read_text(encoding="utf-8"), str(path))
+    except SyntaxError as error:
+        raise ValueError(f"{path}, line {error.lineno}: this is not Python yet: {error.msg}") from None
+    except UnicodeDecodeError:
+        raise ValueError(f"{path} is not UTF-8 text; save it as UTF-8") from None
+
+
+@contextmanager
+def borrowing(work: Work, stages: Sequence[Stage] = COURSE) -> Iterator[Borrowed]:
+    """Bring the oracle to life with the student's functions of some stages in place of its own.
+
+    Raises:
+        ValueError: a file of the student cannot be run; the message names file and line.
+    """
+    finder = _Copies()
+    _forget()
+    sys.meta_path.insert(0, finder)
+    borrowed = Borrowed()
+    try:
+        modules = [borrowed.module(path.stem) for path in sorted(_ORACLE.glob("[a-z]*.py"))]
+        theirs = {stage.name: _run(work.folder / stage.file) for stage in stages if work.written[stage.name]}
+        modules += theirs.values()
+        for stage in COURSE:
+            for home, names in stage.functions.items():
+                borrowed.oracle |= {name: getattr(borrowed.module(home), name) for name in names}
+        for stage in stages:
+            for name in stage.names if stage.name in theirs else ():
+                if name in work.written[stage.name]:
+                    _replace(modules, borrowed, name, getattr(theirs[stage.name], name))
+                else:
+                    # a stub that the student's own functions call
+                    setattr(theirs[stage.name], name, borrowed.oracle[name])
+        yield borrowed
+    finally:
+        sys.meta_path.remove(finder)
+        _forget()
+
+
+def _replace(modules: list[ModuleType], borrowed: Borrowed, name: str, function: Callable[..., Any]) -> None:
+    """Put a student's function wherever the copy has the oracle's, and in the student's own modules."""
+    before = borrowed.oracle[name]
+    parameters = tuple(inspect.signature(before).parameters)
+
+    def watched(*given: Any, **named: Any) -> Any:
+        if not borrowed.watching:
+            return function(*given, **named)
+        kept = copy.deepcopy((given, named))
+        theirs = copy.deepcopy(kept)
+        found = function(*given, **named)
+        # what is added to in place is part of what came out
+        expected = before(*theirs[0], **theirs[1])
+        results = (found, _written_to(kept, given)), (expected, _written_to(kept, theirs[0]))
+        borrowed.calls.append(Call(name, parameters, *kept, *results))
+        return found
+
+    borrowed.installed[name] = watched
+    for module in modules:
+        for attribute, value in list(vars(module).items()):
+            if value is before or value is function:
+                setattr(module, attribute, watched)
+
+
+def _written_to(kept: tuple[Any, ...], after: tuple[Any, ...]) -> tuple[Any, ...]:
+    # what is added to once more later must not change what is kept here
+    return tuple(copy.deepcopy(a) for b, a in zip(kept[0], after, strict=True) if repr(b) != repr(a))
+
+
+def _run(path: Path) -> ModuleType:
+    """Run a student's file, its imports of the oracle turned to the copy."""
+    tree = _parsed(path)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "pop_ref":
+            node.module = node.module.replace("pop_ref", PACKAGE, 1)
+    module = ModuleType(f"{PACKAGE}.written.{path.stem}")
+    module.__file__ = str(path)
+    # a dataclass looks its module up
+    sys.modules[module.__name__] = module
+    try:
+        exec(compile(tree, str(path), "exec"), module.__dict__)
+    except Exception as error:
+        raise ValueError(f"{where(error, path.parent)}: the file cannot be run: {said(error)}") from None
+    return module
+
+
+def where(error: BaseException, folder: Path) -> str:
+    """Return the innermost line of the student's files that an exception passed through, as "file, line n"."""
+    found, trace = str(folder), error.__traceback__
+    while trace is not None:
+        file = trace.tb_frame.f_code.co_filename
+        if Path(file).parent == folder:
+            found = f"{file}, line {trace.tb_lineno}"
+        trace = trace.tb_next
+    return found
+
+
+def said(error: BaseException) -> str:
+    """Say an exception in one line."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+class _Copies(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Imports the oracle's files under the copy's name."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Answer for the copy's names only."""
+        if fullname == PACKAGE:
+            return importlib.util.spec_from_loader(fullname, self, is_package=True)
+        known = fullname.startswith(f"{PACKAGE}.") and _file(fullname).exists()
+        return importlib.util.spec_from_loader(fullname, self) if known else None
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Run the oracle's text; the package itself is empty."""
+        if module.__name__ != PACKAGE:
+            text = _file(module.__name__).read_text(encoding="utf-8").replace("pop_ref", PACKAGE)
+            exec(compile(text, f"<{module.__name__}>", "exec"), module.__dict__)
+
+
+def _file(fullname: str) -> Path:
+    return _ORACLE / f"{fullname.removeprefix(f'{PACKAGE}.')}.py"
+
+
+def _forget() -> None:
+    for name in [n for n in sys.modules if n == PACKAGE or n.startswith(f"{PACKAGE}.")]:
+        del sys.modules[name]
