@@ -62,7 +62,7 @@ def test_help_is_quick_and_loads_nothing_heavy(command):
         (["run", "pop", "garden", "--scale", "dev"], "scale 'dev' has no garden; its scenes are fox, "),
         (["run", "pop", "fox", "--scale", "tiny"], "argument --scale: invalid choice: 'tiny'"),
         (
-            ["run", "pop", "fox", "--data", "nowhere"],
+            ["run", "pop", "fox", "--data", "nowhere", "--out", "results"],
             "nowhere: no such folder; name the one that holds the scenes with",
         ),
         (["run", "pop"], "the following arguments are required: SCENE"),
