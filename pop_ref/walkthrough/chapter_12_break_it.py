@@ -168,14 +168,16 @@ assert broken.sum() < 0.25 * broken.size
 # %% [markdown]
 # ## All of them
 #
-# The table is made from the kit's own list, in which every mutant names its law; a test of the kit runs each pair.
-# `python -m pop_ref.conformance.mutants` does the same on your machine, and with `--every` it finds all laws that
-# notice a mutant, not only the one that is named. Where a mutant comes from is told by its `story`. The kit has more
-# of them, copies of the program that trains: `pop_ref.conformance.mutants.PROGRAM`.
+# The table is made from the kit's own list, in which every mutant names its law; a test of the kit runs each pair. It
+# shows two of each of the oracle's files. `python -m pop_ref.conformance.mutants` does the same on your machine, and
+# with `--every` it finds all laws that notice a mutant, not only the one that is named. Where a mutant comes from is
+# told by its `story`. The kit has more of them, copies of the program that trains:
+# `pop_ref.conformance.mutants.PROGRAM`.
 
 # %%
 print(f"{len(MUTANTS)} mutants, {len(every_law())} laws; * was tried above\n")
-for mutant in MUTANTS:
+of_files = {mutant.file: [other for other in MUTANTS if other.file == mutant.file] for mutant in MUTANTS}
+for mutant in (mutant for same in of_files.values() for mutant in same[:2]):
     law = mutant.law.partition(":")[2].replace("_", " ")
     first = f"{'*' if mutant.name in tried else ' '} {mutant.name:35}"
     print(first + textwrap.shorten(law, 58, placeholder=" ..."))
