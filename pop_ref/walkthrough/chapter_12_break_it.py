@@ -176,7 +176,10 @@ assert broken.sum() < 0.25 * broken.size
 
 # %%
 print(f"{len(MUTANTS)} mutants, {len(every_law())} laws; * was tried above\n")
-of_files = {mutant.file: [other for other in MUTANTS if other.file == mutant.file] for mutant in MUTANTS}
+of_files = {
+    mutant.file: [other for other in MUTANTS if other.file == mutant.file]
+    for mutant in MUTANTS
+}
 for mutant in (mutant for same in of_files.values() for mutant in same[:2]):
     law = mutant.law.partition(":")[2].replace("_", " ")
     first = f"{'*' if mutant.name in tried else ' '} {mutant.name:35}"
