@@ -170,9 +170,10 @@ def test_recipes_are_the_rows_of_the_ablation_tables() -> None:
         "L2+POP": (False, True, False),
         "Reset": (True, False, True),
         "3DGS": (False, False, True),
+        "3DGS 2023": (False, False, True),
         "gsplat": (False, False, True),
     }
-    assert [name for name, recipe in RECIPES.items() if recipe.pixelwise == "l1"] == ["3DGS", "gsplat"]
+    assert [name for name, recipe in RECIPES.items() if recipe.pixelwise == "l1"] == ["3DGS", "3DGS 2023", "gsplat"]
 
 
 def test_an_event_and_a_reset_of_one_step_happen_in_that_order() -> None:
