@@ -133,7 +133,9 @@ def another(value, hint):
         return (0.25, 0.5, 0.75) if value and isinstance(value[0], float) else (*value, *((3,) if value else ("x",)))
     if isinstance(value, str):
         return value + "x"
-    return 0.625 if isinstance(value, float) else 2
+    if isinstance(value, float):
+        return 0.625 if value != 0.625 else 0.375
+    return 2 if value != 2 else 3
 
 
 @given(plan=SCHEDULES, name=st.sampled_from(NAMES))
