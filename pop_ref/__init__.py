@@ -13,9 +13,9 @@ from pop_ref.constants import (
     profile_named,
 )
 from pop_ref.margins import Doubt, Margins, margins
+from pop_ref.records import Camera, Gaussians, Render, Splats
 from pop_ref.render import RenderGradients, render, render_vjp
 from pop_ref.splatting import project, project_vjp
-from pop_ref.types import Camera, Gaussians, Render, Splats
 
 __all__ = [
     "Camera",

@@ -34,8 +34,8 @@ from pop_ref.magnitudes import (
     splat_magnitudes,
 )
 from pop_ref.pixel_margins import PixelDoubts, pixel_doubts
+from pop_ref.records import Camera, Gaussians, Render
 from pop_ref.render import render
-from pop_ref.types import Camera, Gaussians, Render
 
 _HORIZON = 1e-2
 

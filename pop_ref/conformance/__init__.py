@@ -6,7 +6,7 @@ A law is a sentence that every correct rasterizer obeys; it is written once, in 
 over every backend and over the oracle itself. Needs numpy, hypothesis and pytest; an adapter imports what it adapts.
 
 In reading order: `scenes` (what is drawn), `strategies` and `near` (how it is drawn), `adapter` (who is judged),
-`tolerances` and `charges` (how much rounding costs), `outcomes` (what rounding may decide), `compare` (the verdict).
+`tolerances` and `error_bounds` (how much rounding costs), `outcomes` (what rounding may decide), `compare` (the verdict).
 """
 
 from pop_ref.conformance.adapter import Adapter, View

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from pop_ref.conformance.abilities import (
+from pop_ref.conformance.calls import Call, Called, drawn_scene
+from pop_ref.conformance.capabilities import (
     ANTIALIASING,
     DETERMINISTIC,
     DOMINANCE,
@@ -27,16 +28,15 @@ from pop_ref.conformance.abilities import (
     ROWWISE,
     SCALE,
     SIGNATURE,
-    abilities_of,
+    capabilities_of,
     same_constants,
 )
-from pop_ref.conformance.calls import Call, Called, drawn_scene
 from pop_ref.conformance.scenes import Scene, rounded_to
 from pop_ref.conformance.views import ASKED, offers
 from pop_ref.constants import PAPER, Profile
+from pop_ref.records import Splats
 from pop_ref.splatting import project, project_vjp
 from pop_ref.tiles import tile_lists
-from pop_ref.types import Splats
 
 STAGE_MODULES = (
     "activations",
@@ -68,7 +68,7 @@ STAGE_MODULES = (
     "mini_splatting",
     "tight_tiles",
 )
-# what a view may tell of dominance, by ability
+# what a view may tell of dominance, by capability
 TOLD_OF_DOMINANCE = {
     DOMINANCE: "dominant_ids",
     DOMINANT_WEIGHTS: "dominant_weights",
@@ -113,7 +113,7 @@ class Adapter:
         name: how reports call it.
         dtype: the NumPy type of the precision it computes in; its rounding is charged in units of that type's eps.
         profile: the constants that it implements; None when it takes any, which scenes then carry.
-        able: what nothing else tells: ANTIALIASING, DETERMINISTIC, DOMINANCE, ROWWISE of `abilities`.
+        able: what nothing else tells: ANTIALIASING, DETERMINISTIC, DOMINANCE, ROWWISE of `capabilities`.
 
     Example:
         >>> class Mine(Adapter):
@@ -131,7 +131,7 @@ class Adapter:
     able: tuple[str, ...] = ()
 
     def has(self, need: str) -> bool:
-        """Tell whether the implementation offers a stage function, or one of the abilities of `abilities`."""
+        """Tell whether the implementation offers a stage function, or one of the capabilities of `capabilities`."""
         if need == RENDER:
             return type(self).render is not Adapter.render or self.has("composite")
         if need == GRADIENTS:
@@ -146,7 +146,7 @@ class Adapter:
             return self.has(SIGNATURE) and self._offers(need)
         if need == SCALE:
             return self.has(RENDER)
-        return need in self.able or need in abilities_of(self.profile) or callable(getattr(self, need, None))
+        return need in self.able or need in capabilities_of(self.profile) or callable(getattr(self, need, None))
 
     def _offers(self, need: str) -> bool:
         known: dict[str, bool] = self.__dict__.setdefault("_known_offers", {})

@@ -152,7 +152,7 @@ def rounded(inputs: tuple[Any, ...], dtype: Any) -> tuple[Any, ...]:
     )
 
 
-def charges_of(case: Case, function: Callable[..., Any], inputs: tuple[Any, ...]) -> tuple[np.ndarray, ...]:
+def error_bounds_of(case: Case, function: Callable[..., Any], inputs: tuple[Any, ...]) -> tuple[np.ndarray, ...]:
     """Charge each output of a function, or of its transpose with the cotangent bound."""
     if case.magnitude is None:
         return sensitivity(function, inputs)
@@ -173,7 +173,7 @@ def sensitivity(function: Callable[..., Any], inputs: tuple[Any, ...]) -> tuple[
 
     step = 2.0**-20
     here = _outputs(function(*inputs))
-    charges = [np.abs(h) + _row_size(h) for h in here]
+    error_bounds = [np.abs(h) + _row_size(h) for h in here]
     for k, argument in enumerate(inputs):
         if not (isinstance(argument, np.ndarray) and argument.dtype.kind == "f"):
             continue
@@ -181,9 +181,9 @@ def sensitivity(function: Callable[..., Any], inputs: tuple[Any, ...]) -> tuple[
             moved = argument.copy()
             moved[index] *= 1.0 + step
             there = _outputs(function(*inputs[:k], moved, *inputs[k + 1 :]))
-            for charge, a, b in zip(charges, here, there, strict=True):
-                charge += np.abs(b - a) / step
-    return tuple(charges)
+            for error_bound, a, b in zip(error_bounds, here, there, strict=True):
+                error_bound += np.abs(b - a) / step
+    return tuple(error_bounds)
 
 
 def _row_size(value: np.ndarray) -> np.ndarray:

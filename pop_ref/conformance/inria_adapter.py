@@ -11,7 +11,7 @@ import importlib
 from collections.abc import Callable
 from typing import Any
 
-from pop_ref.conformance.abilities import ANTIALIASING
+from pop_ref.conformance.capabilities import ANTIALIASING
 from pop_ref.conformance.torch_adapter import TorchAdapter
 from pop_ref.constants import INRIA
 
@@ -75,9 +75,9 @@ def gsplat_like(module: Any) -> Callable[..., Any]:
             return image.permute(1, 2, 0), radii
 
         image, radii = drawn(backgrounds[0].detach(), shs=colors)
-        light, _ = drawn(torch.ones_like(backgrounds[0]), colors_precomp=torch.zeros_like(means))
+        transmittance, _ = drawn(torch.ones_like(backgrounds[0]), colors_precomp=torch.zeros_like(means))
         meta = {"radii": radii[:, None].repeat(1, 2), **({"means2d": points} if points.requires_grad else {})}
-        return image[None], 1.0 - light[None, :, :, :1], meta
+        return image[None], 1.0 - transmittance[None, :, :, :1], meta
 
     return rasterization
 

@@ -10,13 +10,13 @@ from typing import Any
 from hypothesis import example, given
 from hypothesis.errors import HypothesisException
 
-from pop_ref.conformance.abilities import STAGES
 from pop_ref.conformance.calls import Call
+from pop_ref.conformance.capabilities import STAGES
 from pop_ref.conformance.scenes import Scene
 
 
 def _tell(name: str, backend: Any, scenes: dict[str, Scene]) -> str:
-    from pop_ref.conformance.telling import tell
+    from pop_ref.conformance.failure_report import tell
 
     return tell(name, backend, scenes)
 
@@ -34,7 +34,7 @@ class Law:
 
     Attributes:
         stage: one of STAGES.
-        needs: names of stage functions, or abilities (`abilities`); a backend without them is not judged.
+        needs: names of stage functions, or capabilities (`capabilities`); a backend without them is not judged.
         sentence: the function, whose name reads as the law; it takes `backend` and the drawn values.
         strategies: what it quantifies over, by argument name.
         first: values that it is tried on before any is drawn, each by argument name.

@@ -14,16 +14,16 @@ import pytest
 
 from pop_ref.compositing import composite, composite_vjp
 from pop_ref.conformance import Adapter, Scene
-from pop_ref.conformance.abilities import DERIVATIVES, EXTENTS, GRADIENTS, INRIAS, LOWER_CEILING, PROFILES, RENDER
 from pop_ref.conformance.adapter import under
 from pop_ref.conformance.backends import ELSEWHERE, Absent, Unavailable, made_by, shipped, shipped_or_absent
+from pop_ref.conformance.capabilities import DERIVATIVES, EXTENTS, GRADIENTS, INRIAS, LOWER_CEILING, PROFILES, RENDER
+from pop_ref.conformance.failure_report import tell
 from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.inria_adapter import inria
 from pop_ref.conformance.law import missing
 from pop_ref.conformance.mutants import MUTANTS, living
 from pop_ref.conformance.mutants.trial import every_law, obeys
 from pop_ref.conformance.scenes import scene_as_code
-from pop_ref.conformance.telling import tell
 from pop_ref.conformance.torch_adapter import TorchAdapter
 from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER
 from pop_ref.constants import PROFILES as ALL_PROFILES

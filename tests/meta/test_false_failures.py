@@ -11,14 +11,14 @@ import pytest
 import torch
 
 from pop_fast.rasterization import rasterization as fast
-from pop_ref.conformance.abilities import DETERMINISTIC, DOMINANCE, DOMINANT_WEIGHTS, GRADIENTS, HOMOGENEOUS, RENDER
 from pop_ref.conformance.adapter import Adapter, OracleAdapter, View, stage_function
+from pop_ref.conformance.capabilities import DETERMINISTIC, DOMINANCE, DOMINANT_WEIGHTS, GRADIENTS, HOMOGENEOUS, RENDER
+from pop_ref.conformance.failure_report import tell
 from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.law import missing
 from pop_ref.conformance.laws.test_whole import test_an_empty_scene_is_the_background as empty_scene_law
 from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
 from pop_ref.conformance.scenes import Scene
-from pop_ref.conformance.telling import tell
 from pop_ref.conformance.torch_adapter import TorchAdapter
 from pop_ref.conformance.views import ASKED
 from pop_ref.constants import GSPLAT_1_5, INRIA, Profile
