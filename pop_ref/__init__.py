@@ -12,7 +12,7 @@ from pop_ref.constants import (
     Profile,
     profile_named,
 )
-from pop_ref.margins import Doubt, Margins, margins
+from pop_ref.margins import CloseDecision, Margins, margins
 from pop_ref.records import Camera, Gaussians, Render, Splats
 from pop_ref.render import RenderGradients, render, render_vjp
 from pop_ref.splatting import project, project_vjp
@@ -39,5 +39,5 @@ __all__ = [
     "render_vjp",
     "margins",
     "Margins",
-    "Doubt",
+    "CloseDecision",
 ]

@@ -78,7 +78,7 @@ TOLD_OF_DOMINANCE = {
 
 @dataclass(frozen=True)
 class View:
-    """What a rasterizer shows of one render; None where it does not tell.
+    """What a rasterizer shows of one render; None where it shows nothing.
 
     Attributes:
         image: [H, W, 3]
@@ -86,7 +86,7 @@ class View:
         dominant_ids, dominant_weights, n_blended, n_traversed: [H, W]
         dominant_counts: [N]
         radii: [N, 2]
-        means2d, depths, conics: [N, 2], [N], [N, 3]; read only where a failure is told
+        means2d, depths, conics: [N, 2], [N], [N, 3]; read only for the report of a failure
     """
 
     image: Any
@@ -111,9 +111,9 @@ class Adapter:
 
     Attributes:
         name: how reports call it.
-        dtype: the NumPy type of the precision it computes in; its rounding is charged in units of that type's eps.
+        dtype: the NumPy type of the precision it computes in; its rounding is bounded in units of that type's eps.
         profile: the constants that it implements; None when it takes any, which scenes then carry.
-        able: what nothing else tells: ANTIALIASING, DETERMINISTIC, DOMINANCE, ROWWISE of `capabilities`.
+        able: what cannot be seen otherwise: ANTIALIASING, DETERMINISTIC, DOMINANCE, ROWWISE of `capabilities`.
 
     Example:
         >>> class Mine(Adapter):
@@ -195,8 +195,8 @@ class Adapter:
         drawn = self.stage("composite")(
             splats, lists, camera.width, camera.height, size, scene.background, scene.profile
         )
-        told = {f.name: getattr(drawn, f.name, None) for f in fields(View)}
-        return View(**{**told, **_shown(splats)})
+        found = {f.name: getattr(drawn, f.name, None) for f in fields(View)}
+        return View(**{**found, **_shown(splats)})
 
     def plainly(self, scene: Scene) -> View:
         """Draw a scene as training does that wants nothing but an image; what is not asked for is None."""

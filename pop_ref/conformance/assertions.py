@@ -32,7 +32,7 @@ def assert_close(
         key: the tolerance, and the name in the message.
         actual, expected: arrays of one shape.
         magnitude: what one unit is a multiple of eps of; broadcasts.
-        dtype: the precision charged.
+        dtype: the precision whose eps is meant.
         against_oracle: True gives a float64 backend the room of `tolerances.agreement`.
     """
     actual, expected = np.asarray(actual, dtype=np.float64), np.asarray(expected, dtype=np.float64)
@@ -70,7 +70,7 @@ def _first(wrong: Any, actual: Any, expected: Any) -> str:
 
 
 def with_error_bounds(backend: Any, scene: Scene) -> tuple[Scene, PixelErrorBounds]:
-    """Return the scene as the backend reads it and its error_bounds; set scenes aside that its precision cannot resolve."""
+    """Return the scene as the backend reads it, and its error bounds; set aside what its precision cannot resolve."""
     seen, lists = backend.sees(scene), None
     if seen.profile.extent == "square":
         # here extents and tile lists are part of the meaning; where rounding decides them, nothing is said
@@ -96,7 +96,7 @@ def assert_same_image(
     against_oracle: bool = False,
     at: Any = None,
 ) -> None:
-    """Assert that two images agree where no decision is near its threshold, within their error_bounds."""
+    """Assert that two images agree where no decision is near its threshold, within their error bounds."""
     where = error_bounds.unambiguous if at is None else error_bounds.unambiguous & at
     magnitude = error_bounds.image + error_bounds.absolute
     assert_close(key, actual[where], expected[where], magnitude[where], backend.dtype, against_oracle)

@@ -22,7 +22,7 @@ from pop_ref.conformance.screen_error_bounds import screen_error_bounds
 
 FILE: Final = Path(__file__).with_name("corpus_answers.npz")
 BLOCK: Final = 8
-# side of what is charged at once, px
+# side of what is bounded at once, px
 WINDOW: Final = 16
 # this many runs of rows, or a little more
 RUNS: Final = 100
@@ -57,7 +57,7 @@ def picked_pixels(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bounded_windows(scene: Scene, at: Any = None) -> list[tuple[tuple[slice, slice], PixelErrorBounds]]:
-    """Charge a scene in float32, a window at a time.
+    """Bound the rounding of a scene in float32, a window at a time.
 
     Args:
         scene: what is drawn.
@@ -80,7 +80,7 @@ def bounded_windows(scene: Scene, at: Any = None) -> list[tuple[tuple[slice, sli
 def masks_of(
     windows: list[tuple[tuple[slice, slice], PixelErrorBounds]], shape: tuple[int, int]
 ) -> dict[str, np.ndarray]:
-    """Return where no decision of an image, of its gradient, and of its dominant splats is near its threshold. [H, W] each"""
+    """Return where no decision of an image, its gradient, its dominant splats is near its threshold. [H, W] each"""
     found = {name: np.zeros(shape, dtype=bool) for name in MAPS}
     for place, error_bounds in windows:
         for name, mask in found.items():
@@ -119,10 +119,10 @@ def answer(name: str) -> dict[str, np.ndarray]:
     masks, (e_image, e_transmittance) = masks_of(windows, shape), image_error_bounds(windows, shape)
     at, sure = picked_pixels(scene), masks["unambiguous"]
     seen = np.concatenate([drawn.image, drawn.T_final[..., None]], axis=2)
-    charged = np.concatenate([e_image, e_transmittance[..., None]], axis=2)
+    bounds = np.concatenate([e_image, e_transmittance[..., None]], axis=2)
     found = {key: np.packbits(mask) for key, mask in masks.items()}
-    found |= {"pixels": seen[at], "e_pixels": _short(charged[at])}
-    found |= {"blocks": weighted_blocks(seen, sure), "e_blocks": _short(weighted_blocks(charged, sure))}
+    found |= {"pixels": seen[at], "e_pixels": _short(bounds[at])}
+    found |= {"blocks": weighted_blocks(seen, sure), "e_blocks": _short(weighted_blocks(bounds, sure))}
     found["blended"] = weighted_blocks(drawn.n_blended, sure)
     found["winners"] = weighted_blocks(drawn.dominant_ids, masks["decided"])
     v_image, v_T_final = unambiguous_cotangents(scene, masks["smooth"])
@@ -135,7 +135,7 @@ def answer(name: str) -> dict[str, np.ndarray]:
 
 
 def _short(error_bounds: np.ndarray) -> np.ndarray:
-    # three digits of a error_bound are enough
+    # three digits of an error bound are enough
     return error_bounds.astype(np.float32)
 
 

@@ -1,9 +1,9 @@
 """What rounding costs at the pixels, and which decisions it could turn.
 
-Splats are composited over the whole image at once, front to back, carrying the error_bounds of `screen_error_bounds` into alpha,
-transmittance, weight and colour. On the way every decision whose distance from its threshold is within reach of
-rounding is noted as a doubt: away from doubts integers must match the oracle exactly. `pop_ref.margins` measures the
-same distances one by one and in its own way; a test holds the two against each other.
+Splats are composited over the whole image at once, front to back, carrying the error bounds of `screen_error_bounds`
+into alpha, transmittance, weight and colour. On the way every decision whose distance from its threshold is within
+reach of rounding is noted as near its threshold: elsewhere integers must match the oracle exactly. `pop_ref.margins`
+measures the same distances one by one and in its own way; a test holds the two against each other.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from pop_ref.conformance.scenes import Scene
 from pop_ref.conformance.screen_error_bounds import TINY, ScreenErrorBounds, screen_error_bounds
 
-# a decision is doubtful when its margin is under this many error_bounds: the error_bounds' constant, with room
+# a decision is near its threshold when its margin is under this many error bounds: the bounds' constant, with room
 REACH = 64.0
 
 
@@ -27,13 +27,13 @@ class Layer:
 
     Attributes:
         id: the splat. scalar
-        dx, dy, e_dx, e_dy: offsets mean - pixel with error_bounds, px.
+        dx, dy, e_dx, e_dy: offsets mean - pixel with error bounds, px.
         sigma, e_sigma: the exponent.
         raw, e_raw: opacity times falloff before the ceiling.
         alpha, e_alpha: after it.
-        e_expanded: error_bound of alpha where the exponent is expanded about a tile's centre: its terms are those of an
+        e_expanded: error bound of alpha where the exponent is expanded about a tile's centre: its terms are those of an
             offset half a tile longer, and cancel.
-        taken: at or over the floor, so blended if the light reaches it.
+        taken: at or over the floor, so blended unless the pixel has ended.
         near_threshold: whether it is taken is within reach of rounding (D1, D2, D5).
         seen: the pixel had not ended.
         blended: taken, seen, and not the end.
@@ -64,15 +64,15 @@ class Layer:
 
 @dataclass
 class PixelErrorBounds:
-    """Charges and doubts of one render.
+    """Error bounds of one render, and where its decisions are near their thresholds.
 
     Attributes:
-        scene: what was charged.
-        screen: the error_bounds of projection.
+        scene: what was bounded.
+        screen: the error bounds of projection.
         layers: splats front to back.
         reach: eps of the dtype times REACH.
-        image, T_final: error_bounds. [H, W, D], [H, W]
-        dominant_weight: error_bound of the dominant weight, exponents expanded about tile centres. [H, W]
+        image, T_final: error bounds. [H, W, D], [H, W]
+        dominant_weight: error bound of the dominant weight, exponents expanded about tile centres. [H, W]
         absolute: sum of weights times absolute colours, background included. [H, W, D]
         near_threshold: decision label -> where it is within reach of rounding: D1, D4, D5, D6, D7, D8. [H, W]
     """
@@ -116,7 +116,7 @@ class PixelErrorBounds:
         return not same and band > 0.0 and abs(s.depths[i] - s.depths[j]) <= band
 
     def worst_condition(self) -> float:
-        """Return the largest relative error_bound of a conic; infinite where a determinant's sign is near its threshold."""
+        """Return the largest relative error bound of a conic; infinite where a determinant may round to either sign."""
         s = self.screen
         listed = s.kept | s.near
         flat = np.abs(s.det) <= self.reach * s.e_det
@@ -141,11 +141,11 @@ class _State:
 
 @dataclass(frozen=True)
 class Window:
-    """A part of an image, for what is too large to be charged at once.
+    """A part of an image, for what is too large to be bounded at once.
 
     Attributes:
         left, top, right, bottom: px, the last two beyond it.
-        screen: error_bounds of projection of the whole scene.
+        screen: error bounds of projection of the whole scene.
         rows: the splats that may be seen in it. [N]
     """
 
@@ -164,14 +164,14 @@ def pixel_error_bounds(
     channels: Callable[[ScreenErrorBounds], ScreenErrorBounds] | None = None,
     window: Window | None = None,
 ) -> PixelErrorBounds:
-    """Charge a scene in the precision of a dtype.
+    """Bound the rounding of a render in the precision of a dtype.
 
     Args:
         scene: what is drawn.
-        dtype: float32 or float64; decides which decisions are near_threshold.
+        dtype: float32 or float64; decides which decisions are near their thresholds.
         tile_lists: for profiles whose tile lists are part of the meaning, the oracle's.
         channels: puts other channels in the place of colours: plain colours, depths.
-        window: the part of the image that is charged, None for all of it; every [H, W] is then the window's.
+        window: the part of the image that is bounded, None for all of it; every [H, W] is then the window's.
     """
     reach = REACH * float(np.finfo(dtype).eps)
     if window is None:
@@ -249,7 +249,7 @@ def _blend(
     layer: Layer, scene: Scene, s: ScreenErrorBounds, state: _State, near_threshold: dict[str, np.ndarray], reach: float
 ) -> None:
     profile, seen, alpha, e_alpha = scene.profile, layer.seen, layer.alpha, layer.e_alpha
-    near_threshold["D1" if s.near[layer.id] else "D5"] |= seen & layer.doubtful
+    near_threshold["D1" if s.near[layer.id] else "D5"] |= seen & layer.near_threshold
     near_threshold["D6"] |= seen & (np.abs(layer.raw - profile.alpha_ceiling) <= reach * layer.e_raw)
     taken = seen & layer.taken
     next_T = state.T * (1.0 - alpha)

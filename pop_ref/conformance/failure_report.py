@@ -98,8 +98,8 @@ def first_shown(backend: Any, scene: Scene) -> Difference | list[str]:
         for i in np.flatnonzero(drawn).tolist():
             limit = error_bounds.reach * (units[i] + np.abs(wanted[i]))
             if np.any(~(np.abs(value[i] - wanted[i]) <= limit)):
-                told = f"{name} as its meta shows them ({stage})"
-                return Difference(told, f"Gaussian {i}", np.asarray(wanted[i]).tolist(), np.asarray(value[i]).tolist())
+                what = f"{name} as its meta shows them ({stage})"
+                return Difference(what, f"Gaussian {i}", np.asarray(wanted[i]).tolist(), np.asarray(value[i]).tolist())
         alike.append(name)
     return alike
 
@@ -110,7 +110,7 @@ def _error_bounds(backend: Any, scene: Scene) -> PixelErrorBounds:
 
 
 def first_pixel(backend: Any, scene: Scene) -> tuple[Difference, tuple[int, int]] | None:
-    """Find the first pixel that differs by more than rounding, doubtful or not."""
+    """Find the first pixel that differs by more than rounding, near a threshold or not."""
     expected, found = ORACLE.render(scene), backend.render(scene)
     error_bounds = _error_bounds(backend, scene)
     limit = error_bounds.reach * (error_bounds.T_final + 1.0)
@@ -179,17 +179,17 @@ def nearest_decision(scene: Scene, pixel: tuple[int, int] | None) -> str:
         return f"nearest decision at that pixel: {label}, margin {margin:.3g} (float32 decides alike over 1e-6)"
     if found.nearest is None:
         return "no decision is near its threshold"
-    doubt = found.nearest
-    return f"nearest decision: {doubt.decision} of {doubt.where}, margin {doubt.margin:.3g}"
+    close = found.nearest
+    return f"nearest decision: {close.decision} of {close.where}, margin {close.margin:.3g}"
 
 
-def tell(name: str, backend: Any, scenes: dict[str, Scene]) -> str:
+def failure_report(name: str, backend: Any, scenes: dict[str, Scene]) -> str:
     """Write a failing law's report: what differs first, the nearest decision, and the scene as code to paste.
 
     Args:
         name: the law.
         backend: who broke it; as a law watched it, it says whether gradients were asked for.
-        scenes: what was drawn, by name; the first that the backend draws otherwise than the oracle is told.
+        scenes: what was drawn, by name; the first that the backend draws otherwise than the oracle is reported.
     """
     title = f"law {name.removeprefix('test_')} fails on {backend.name}"
     reports = [(scene, *_findings(backend, scene)) for scene in scenes.values()]

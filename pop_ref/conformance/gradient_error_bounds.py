@@ -1,8 +1,8 @@
 """What rounding costs in gradients: the backward pass on absolute values.
 
-Every cotangent carries a pair: an upper bound m of its terms' absolute sum, and a error_bound e in units of eps. The rule is
-that of `screen_error_bounds`: a product a v costs `|a| e(v) + e(a) m(v) + |a| m(v)`. Sums over pixels may be taken about a
-tile's centre, so an offset counts as itself plus half a tile.
+Every cotangent carries a pair: an upper bound m of its terms' absolute sum, and an error bound e in units of eps. The
+rule is that of `screen_error_bounds`: a product a v costs `|a| e(v) + e(a) m(v) + |a| m(v)`. Sums over pixels may be
+taken about a tile's centre, so an offset counts as itself plus half a tile.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _WIDTHS = {"means2d": (2,), "conics": (3,), "opacities": (), "colors": (3,)}
 
 @dataclass
 class Bound:
-    """A bound of absolute values and its error_bound in units of eps; arithmetic follows the module's rule."""
+    """A bound of absolute values and its error bound in units of eps; arithmetic follows the module's rule."""
 
     m: np.ndarray
     e: np.ndarray
@@ -32,7 +32,7 @@ class Bound:
         return Bound(self.m + other.m, self.e + other.e)
 
     def times(self, a: np.ndarray | float, e_a: np.ndarray | float | None = None) -> Bound:
-        """Return the product with a known factor, whose own error_bound defaults to its rounding."""
+        """Return the product with a known factor, whose own error bound defaults to its rounding."""
         size = np.abs(a)
         return Bound(size * self.m, size * self.e + (size if e_a is None else e_a + size) * self.m)
 
@@ -47,8 +47,8 @@ class Bound:
         return Bound(m, left @ self.e @ right + e_left @ self.m @ right + left @ self.m @ e_right + 4.0 * m)
 
     @property
-    def pixel_error_bounds(self) -> np.ndarray:
-        """Return what a comparison is charged: the error's units and one of the bound itself."""
+    def error_bound(self) -> np.ndarray:
+        """Return what a comparison allows: the error's units and one of the bound itself."""
         return self.e + self.m
 
 
@@ -60,7 +60,7 @@ def gradient_error_bounds(
     plain: int = 0,
     with_depth: bool = False,
 ) -> dict[str, np.ndarray]:
-    """Return the error_bound of every gradient by name, in units of eps.
+    """Return the error bound of every gradient by name, in units of eps.
 
     Args:
         scene: what is drawn.
@@ -77,7 +77,7 @@ def gradient_error_bounds(
 def sums_over_pixels(
     scene: Scene, error_bounds: PixelErrorBounds, v_image: np.ndarray, v_T_final: np.ndarray
 ) -> tuple[dict[str, Bound], np.ndarray]:
-    """Bound the cotangents of splats, by name, and error_bound that of the background; windows of one image add up."""
+    """Bound the cotangents of splats, by name, and the error bound of the background's; windows of one image add up."""
     N = len(scene.gaussians)
     size = scene.tile_size or scene.profile.tile_size
     pixels = _pixel_bounds(scene, error_bounds, np.abs(v_image), np.abs(v_T_final), 0.5 * size)
@@ -95,7 +95,7 @@ def error_bounds_of_sums(
     plain: int = 0,
     with_depth: bool = False,
 ) -> dict[str, np.ndarray]:
-    """Return the error_bound of every gradient by name from what `sums_over_pixels` found."""
+    """Return the error bound of every gradient by name from what `sums_over_pixels` found."""
     N, rows = len(scene.gaussians), dict(rows)
     given, nothing = rows["colors"], np.zeros((N, 3))
     if with_depth:
@@ -169,7 +169,7 @@ def exponent_slopes(layer: Layer, s: ScreenErrorBounds, v_sigma: Bound, half_til
 
 
 def parameter_error_bounds(scene: Scene, s: ScreenErrorBounds) -> np.ndarray:
-    """Charge the derivatives of (mean2d, conic, colour) by (mean, log scale). [N, 8, 6]"""
+    """Bound the rounding of the derivatives of (mean2d, conic, colour) by (mean, log scale). [N, 8, 6]"""
     n = len(scene.gaussians)
     error_bounds = np.zeros((n, 8, 6))
     for row in range(8 * (n > 0)):

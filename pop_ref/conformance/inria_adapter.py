@@ -1,8 +1,8 @@
 """An adapter for diff-gaussian-rasterization, Inria's CUDA rasterizer: its interface under gsplat's signature.
 
 Inria's takes transposed matrices, tangents of half the field of view and unit quaternions, returns the image channels
-first, and tells neither alpha nor screen centres; the remaining light is what a second render of black splats shows of
-a white background. Background and view matrix have no gradients there. Nothing of it is imported unasked.
+first, and shows neither alpha nor screen centres; the remaining transmittance is what a second render of black splats
+shows of a white background. Background and view matrix have no gradients there. Nothing of it is imported unasked.
 """
 
 from __future__ import annotations

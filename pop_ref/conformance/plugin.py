@@ -19,7 +19,7 @@ from pop_ref.conformance.capabilities import STAGES
 
 LAWS = "pop_ref.conformance.laws"
 FAILURES = "conformance_failures"
-# the lines of a failure's report that say what differs first (`telling`)
+# the lines of a failure's report that say what differs first (`failure_report`)
 TOLD = re.compile(
     r"^E +((?:first|nearest|no) (?:stage|pixel|Gaussian|gradient|decision)\b.*|saved as .*)$", re.MULTILINE
 )
@@ -154,9 +154,9 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     folder = session.config.getoption("--failures")
     if folder and _chosen(session.config):
         from pop_ref.conformance.failure_report import failure_saver
-        from pop_ref.conformance.law import TELL
+        from pop_ref.conformance.law import FAILURE_REPORTS
 
-        TELL.append(failure_saver(Path(folder)))
+        FAILURE_REPORTS.append(failure_saver(Path(folder)))
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

@@ -1,7 +1,8 @@
-"""What rounding costs in the scores of pruning and budgeting methods: sums over pixels of products of charged terms.
+"""What rounding costs in the scores of pruning and budgeting methods: sums over pixels of products of bounded terms.
 
 The functions that are judged take splats and tile lists; these are the oracle's, rounded to the backend's precision, so
-the error_bounds of a whole render bound theirs. A Gaussian is compared where every pixel that it may reach is unambiguous.
+the error bounds of a whole render bound theirs. A Gaussian is compared where every pixel that it may reach is
+unambiguous.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ def _clear_rows(error_bounds: PixelErrorBounds, unambiguous: np.ndarray) -> np.n
 
 
 def weight_error_bounds(error_bounds: PixelErrorBounds) -> tuple[np.ndarray, np.ndarray]:
-    """Charge sums of weights, and of distances, over the pixels of each Gaussian. [N], [N]"""
+    """Bound the rounding of sums of weights, and of distances, over the pixels of each Gaussian. [N], [N]"""
     n = len(error_bounds.scene.gaussians)
     weights, distances = np.zeros(n), np.zeros(n)
     for layer in error_bounds.layers:
@@ -81,7 +82,7 @@ def weight_error_bounds(error_bounds: PixelErrorBounds) -> tuple[np.ndarray, np.
 
 
 def sensitivity_error_bounds(error_bounds: PixelErrorBounds) -> np.ndarray:
-    """Charge Speedy-Splat's score: twice a term times its error_bound, over pixels. [N]"""
+    """Bound the rounding of Speedy-Splat's score: twice a term times its error bound, over pixels. [N]"""
     s = error_bounds.screen
     found = np.zeros(len(error_bounds.scene.gaussians))
     for layer, channels in _alpha_bounds(error_bounds):
@@ -92,7 +93,7 @@ def sensitivity_error_bounds(error_bounds: PixelErrorBounds) -> np.ndarray:
 
 
 def moment_error_bounds(error_bounds: PixelErrorBounds, half_tile: float) -> np.ndarray:
-    """Charge the screen moments of Fisher blocks. [N, 31]"""
+    """Bound the rounding of the screen moments of Fisher blocks. [N, 31]"""
     s = error_bounds.screen
     found = np.zeros((len(error_bounds.scene.gaussians), 31))
     passes = error_bounds.scene.profile.ceiling_gradient == "pass"

@@ -1,8 +1,8 @@
 """What rounding costs up to the screen: a running error analysis of projection, one row a Gaussian.
 
-Every quantity x carries a error_bound e(x), so that a computation in precision eps may be wrong by about eps * e(x). Charges
-follow the textbook rule on absolute values, `e(f(x)) = |df/dx| e(x) + |terms of f|`, so they grow where terms cancel
-(needles, splats seen edge-on) and nowhere else. Charges are of first order and hold for any order of evaluation.
+Every quantity x carries an error bound e(x), so that a computation in precision eps may be wrong by about eps * e(x).
+Bounds follow the textbook rule on absolute values, `e(f(x)) = |df/dx| e(x) + |terms of f|`, so they grow where terms
+cancel (needles, splats seen edge-on) and nowhere else. Bounds are of first order and hold for any order of evaluation.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ TINY = np.finfo(np.float64).tiny
 
 @dataclass(frozen=True)
 class ScreenErrorBounds:
-    """Screen quantities in float64 with their error_bounds; rows behind the near plane are left at zero.
+    """Screen quantities in float64 with their error bounds; rows behind the near plane are left at zero.
 
     Attributes:
         kept: in front of the near plane with a positive determinant. [N]
@@ -110,7 +110,7 @@ def _conic_error_bounds(covars2d: np.ndarray, e_covars2d: np.ndarray) -> tuple[n
 
 
 def _color_error_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return colours, their error_bounds, and the sums before the clamp at 0."""
+    """Return colours, their error bounds, and the sums before the clamp at 0."""
     g = scene.gaussians
     degree = round(np.sqrt(g.sh.shape[1])) - 1 if scene.sh_degree is None else scene.sh_degree
     n_sh = (degree + 1) ** 2
@@ -142,7 +142,7 @@ def _clamp_in_reach(scene: Scene, p: np.ndarray, e_p: np.ndarray, reach: float) 
 
 
 def screen_error_bounds(scene: Scene, reach: float) -> ScreenErrorBounds:
-    """Carry error_bounds from the scene to the screen; decisions within reach times their error_bound are near_threshold."""
+    """Carry error bounds from the scene to the screen; note decisions within reach of them."""
     g, camera, profile = scene.gaussians, scene.camera, scene.profile
     N = len(g)
     e_p, e_S = _camera_error_bounds(scene)

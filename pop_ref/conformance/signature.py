@@ -46,7 +46,7 @@ class Expected:
 
     @property
     def image_error_bounds(self) -> np.ndarray:
-        """Return what one unit of the image is charged on; an expected depth pays for its quotient. [H, W, X]"""
+        """Return what one unit of the image is eps times of; an expected depth pays for its quotient. [H, W, X]"""
         found = self.error_bounds.image + self.error_bounds.absolute
         if self.call.render_mode.endswith("ED"):
             opacity, depth = self._opacity, np.abs(self.render.image[..., -1])
@@ -59,7 +59,7 @@ class Expected:
         return np.maximum(1.0 - self.render.T_final, SMALLEST_OPACITY)
 
     def gradients(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Return the oracle's gradients by the rasterizer's argument, and their error_bounds."""
+        """Return the oracle's gradients by the rasterizer's argument, and their error bounds."""
         colors, mode = self.frame.colors, self.call.render_mode
         g = oracle_frame_vjp(self.scene, colors, mode, self.v_image, self.v_T_final)
         found = {name: getattr(g, name) for name in ("means", "quats", "scales", "opacities", "means2d", "means2d_abs")}
@@ -77,7 +77,7 @@ class Expected:
         bounds |= {"viewmats": bounds["viewmat"], "backgrounds": bounds["background"][: len(g.background)]}
         bounds["colors"] = bounds["sh"] if colors is None else bounds["colors"]
         for name in ("backgrounds", "colors"):
-            # what the mode does not show has no gradient, and no error_bound
+            # what the mode does not show has no gradient, and no error bound
             if bounds[name].size == 0 or not mode.startswith("RGB"):
                 bounds[name] = np.zeros(found[name].shape)
         return found, bounds
@@ -154,7 +154,7 @@ def _assert_gradients(backend: Any, call: Call, called: Called, wanted: list[lis
 
 
 def _summed(pulled: list[Any], name: str) -> tuple[Any, Any]:
-    """Return an argument's gradient and its error_bound, summed over the cameras that share it."""
+    """Return an argument's gradient and its error bound, summed over the cameras that share it."""
     return sum(expected[name] for expected, _ in pulled), sum(bounds[name] for _, bounds in pulled)
 
 

@@ -91,7 +91,7 @@ def gradient_teeth(dtype: Any) -> dict[str, float]:
 
 
 def _pulled(dtype: Any) -> Iterator[tuple[Scene, PixelErrorBounds, dict[str, Any], dict[str, Any], tuple[Any, Any]]]:
-    """Yield scenes with their error_bounds, the oracle's gradients, what is allowed of each, and the cotangents."""
+    """Yield scenes with their error bounds, the oracle's gradients, what is allowed of each, and the cotangents."""
     for scene, error_bounds in _scenes(dtype):
         v_image, v_T_final = cotangents(scene)
         v = v_image * error_bounds.smooth[..., None], v_T_final * error_bounds.smooth

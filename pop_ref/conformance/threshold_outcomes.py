@@ -1,7 +1,7 @@
-"""Near a threshold: the outcomes that the oracle has when each doubtful decision is taken either way.
+"""Near a threshold: the outcomes that the oracle has when each decision near its threshold is taken either way.
 
-At a pixel whose decisions are all clear of rounding there is one outcome. Elsewhere every doubtful splat is blended or
-skipped (D1, D2, D5), the pixel ends before a doubtful splat or goes on (D7), and doubtful neighbours in depth swap
+At a pixel whose decisions are all clear of rounding there is one outcome. Elsewhere every such splat is blended or
+skipped (D1, D2, D5), the pixel ends before such a splat or goes on (D7), and neighbours in depth swap
 (D4); each combination is a list of splats, and the oracle's own blending of that list is an outcome. A backend must
 equal one of them.
 """
@@ -52,7 +52,7 @@ def _orders(met: list[Layer], error_bounds: PixelErrorBounds) -> Iterator[list[L
 
 
 def _lists(met: list[Layer], error_bounds: PixelErrorBounds, x: int, y: int) -> Iterator[list[int]]:
-    """Yield the lists of blended splats that the doubtful decisions allow."""
+    """Yield the lists of blended splats that the decisions near their thresholds allow."""
     profile, stop = error_bounds.scene.profile, error_bounds.scene.profile.transmittance_stop
 
     def walk(k: int, T: float, T_error: float, blended: list[int]) -> Iterator[list[int]]:
@@ -115,7 +115,7 @@ def _assert_an_outcome(backend: Any, view: Any, error_bounds: PixelErrorBounds, 
 
 
 def _room(error_bounds: PixelErrorBounds, x: int, y: int) -> np.ndarray:
-    # the error_bounds of the likeliest outcome, and as much again for what another one blends
+    # the error bounds of the likeliest outcome, and as much again for what another one blends
     brightest = max([1.0, float(np.max(np.abs(error_bounds.screen.colors), initial=0.0))])
     gain = brightest * (1.0 + sum(float(layer.e_raw[y, x]) for layer in error_bounds.layers))
     image = error_bounds.image[y, x] + error_bounds.absolute[y, x] + gain

@@ -22,7 +22,7 @@ class Verdict:
 
     Attributes:
         vector, array: names.
-        worst: the largest difference over its error_bound; for integers the number of wrong entries.
+        worst: the largest difference over its error bound; for integers the number of wrong entries.
         allowed: the largest that passes.
         told: where the worst entry is, with both values.
         unit: what `worst` and `allowed` count.
@@ -186,7 +186,7 @@ def _judge(
         worst, allowed = float(np.sum(wrong)), 0.0
     else:
         allowed = compare["limit"][precision]
-        # a error_bound of zero leaves `tiny`
+        # an error bound of zero leaves `tiny`
         error_bound = wanted[compare["error_bound"]] + index["tiny"][precision] / allowed
         off = np.abs(result.astype(np.float64) - expected) / error_bound
         wrong = np.where(where, np.where(np.isfinite(off), off, np.inf), 0.0)

@@ -22,8 +22,8 @@ ABOUT: Final = (
     "Read the arrays whose role is 'input' and the vector's 'options', and write a result of the same name into a "
     "folder of your own: NAME.npz, or NAME.json holding nested lists by array name. Write as many of the arrays whose "
     "role is 'output' as you have, in the stated shape and any number type.",
-    "A result is judged by its array's 'compare'. 'close': |result - expected| <= limit * error_bound + tiny, with limit "
-    "and tiny of the precision that you compute in, and the array named 'error_bound', which says what rounding may cost. "
+    "A result is judged by its array's 'compare'. 'close': |result - expected| <= limit * error bound + tiny, with "
+    "limit and tiny of the precision that you compute in, and the array named by 'error_bound': what rounding may cost. "
     "'equal': result = expected.",
     "Only entries whose mask 'where' is true are compared: elsewhere rounding may decide either way. A mask covers the "
     "leading axes of its array: unambiguous [H, W] covers image [H, W, 3], a mask of shape [] all or nothing.",
@@ -81,8 +81,14 @@ _INPUTS = {
     "viewmat": ("[4, 4]", "world -> camera: x right, y down, z forward"),
     "K": ("[3, 3]", "intrinsics fx, fy, cx, cy, px"),
     "background": ("[3]", "colour behind everything"),
-    "v_image": ("[H, W, 3]", "cotangent of image that the gradients belong to; zero where a decision is doubtful"),
-    "v_T_final": ("[H, W]", "cotangent of T_final that the gradients belong to; zero where a decision is doubtful"),
+    "v_image": (
+        "[H, W, 3]",
+        "cotangent of image that the gradients belong to; zero near thresholds",
+    ),
+    "v_T_final": (
+        "[H, W]",
+        "cotangent of T_final that the gradients belong to; zero near thresholds",
+    ),
 }
 _OUTPUTS = {
     "image": ("[H, W, 3]", "colours over the background, not clamped"),

@@ -23,7 +23,7 @@ from pop_ref.margins import margins
 
 
 def expected_arrays(scene: Scene) -> dict[str, np.ndarray]:
-    """Return a vector's arrays: inputs, outputs, error_bounds, masks and margins.
+    """Return a vector's arrays: inputs, outputs, error bounds, masks and margins.
 
     Args:
         scene: every array exact in float32.

@@ -26,7 +26,7 @@ def test_the_oracle_draws_what_is_written() -> None:
 def test_a_backend_draws_what_is_written(name: str) -> None:
     backend, golden = shipped(name), written()
     scene = backend.sees(golden_scene())
-    # the file holds the scene in float64; a float32 backend is told its rounding, which these error_bounds pay for
+    # the file holds the scene in float64; a float32 backend is told its rounding, which these error bounds pay for
     error_bounds = pixel_error_bounds(golden_scene(), backend.dtype)
     view = backend.render(scene)
     assert_same_image("agreement.image", backend, view.image, golden.image, error_bounds, against_oracle=True)

@@ -1,4 +1,4 @@
-"""The strategies that aim at thresholds hit them, and the two measures of doubt agree."""
+"""The strategies that aim at thresholds hit them, and the two measures of nearness agree."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ def test_an_aimed_scene_has_the_doubt_that_it_aims_at(label: str) -> None:
     @TRIED
     @given(scene=threshold_strategies.AIMS[label]())
     def count(scene: Scene) -> None:
-        near_threshold = _margins(rounded_to(scene, np.float32)).doubts(1e-4)
-        hits.append(any(doubt.decision in COUNTED.get(label, (label,)) for doubt in near_threshold))
+        near_threshold = _margins(rounded_to(scene, np.float32)).near_threshold(1e-4)
+        hits.append(any(close.decision in COUNTED.get(label, (label,)) for close in near_threshold))
 
     count()
     assert np.mean(hits) > 0.3, f"only {np.mean(hits):.0%} of the scenes have a {label} decision within rounding"
 
 
 def _close(found: Margins, label: str, tolerance: float) -> np.ndarray:
-    # margins call an opacity under the floor a cull (D2), error_bounds a skip (D5)
+    # margins call an opacity under the floor a cull (D2), error bounds a skip (D5)
     return np.logical_or.reduce([found.pixels[d] <= tolerance for d in ((label, "D2") if label == "D5" else (label,))])
 
 
@@ -56,8 +56,8 @@ def test_charges_and_margins_doubt_the_same_pixels_of_plain_scenes(scene: Scene)
         )
         assert not np.any(unseen), f"{label}: within rounding by margins, unseen by error_bounds"
     for label in ("D4", "D5", "D6", "D7"):
-        doubted = error_bounds.near_threshold[label]
-        assert np.all(_close(found, label, 8.0 * TOLERANCE)[doubted]), f"{label}: far from rounding by margins"
+        near = error_bounds.near_threshold[label]
+        assert np.all(_close(found, label, 8.0 * TOLERANCE)[near]), f"{label}: far from rounding by margins"
 
 
 @pytest.mark.parametrize("label", ["D5", "D6", "D7", "D8"])
@@ -67,7 +67,7 @@ def test_charges_doubt_all_that_margins_call_close_in_aimed_scenes(label: str) -
     def agree(scene: Scene) -> None:
         error_bounds = pixel_error_bounds(scene, np.float32)
         close = _margins(scene).pixels[label] <= TOLERANCE / 8.0
-        # an earlier doubt may end a pixel in one of the two walks and not in the other
+        # an earlier decision may end a pixel in one of the two walks and not in the other
         unseen = close & ~error_bounds.near_threshold[label] & error_bounds.unambiguous
         assert not np.any(unseen), (
             f"{label}: within rounding by margins, unseen by error_bounds, at {np.argwhere(unseen)}"

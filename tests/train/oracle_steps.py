@@ -87,7 +87,7 @@ class Judged:
         event: what density control did, or None.
         loss: the run's.
         differences: what is not the oracle's within rounding; empty where all is.
-        near_threshold: whether a decision of this step was so close that rounding could turn it.
+        doubtful: whether a decision of this step was so close that rounding could turn it.
         happened: what was done and why, of "gradient clone", "gradient split", "blur clone", "blur split", "faint",
             "too big" and "reset".
     """
@@ -96,7 +96,7 @@ class Judged:
     event: Any
     loss: float
     differences: list[str]
-    near_threshold: bool
+    doubtful: bool
     happened: set[str]
 
 
@@ -149,12 +149,10 @@ def judged_step(run: TrainingRun, recipe: Recipe, scene_scale: float) -> Judged:
     differences += compared_rows(after.rows, rows, max((float(np.abs(d).max(initial=0.0)) for d in drawn), default=0.0))
     if run.strategy.collects(before.step):
         differences += compared_statistics(after.statistics, statistics, work.gradients2d, recipe, before.step)
-    near_threshold = bool(differences) and (
+    doubtful = bool(differences) and (
         work.doubtful() or near_threshold(moved, work, before.step, scene_scale, normals, recipe.density)
     )
-    return Judged(
-        before.step, stretch.event, found, differences, near_threshold, reasons(moved, scene_scale, recipe.density)
-    )
+    return Judged(before.step, stretch.event, found, differences, doubtful, reasons(moved, scene_scale, recipe.density))
 
 
 @dataclass
@@ -186,8 +184,8 @@ class Bounds:
         found = render_vjp(gaussians, camera, v_image, sh_degree=degree, profile=recipe.profile)
         grads = params_vjp(params, found, v_opacities)
         scene = Scene(gaussians, camera, profile=recipe.profile, sh_degree=degree)
-        error_bounds = pixel_error_bounds(scene, np.float32 if eps > 1e-10 else np.float64)
-        units = gradient_error_bounds(scene, error_bounds, np.abs(v_image), np.zeros(v_image.shape[:2]))
+        bounds = pixel_error_bounds(scene, np.float32 if eps > 1e-10 else np.float64)
+        units = gradient_error_bounds(scene, bounds, np.abs(v_image), np.zeros(v_image.shape[:2]))
         o = gaussians.opacities
         # 1 - o loses digits where o is near 1
         logit = (1.0 - o) * (units["opacities"] + np.abs(v_opacities)) + np.abs(found.opacities + v_opacities)
@@ -229,7 +227,7 @@ class Bounds:
     def doubtful(self) -> bool:
         """Tell whether a decision of the render, or a kink of its gradient, was within reach of rounding."""
         seen = margins(self.scene.gaussians, self.scene.camera, self.scene.sh_degree, self.scene.profile)
-        return bool(seen.doubts(CLOSE * self.eps))
+        return bool(seen.near_threshold(CLOSE * self.eps))
 
 
 def reasons(moved: Training, scene_scale: float, density: DensityConfig) -> set[str]:

@@ -220,7 +220,7 @@ def test_antialiased_gradients_are_the_oracles(backend, scene):
 
 
 def _gradients_agree(backend, scene):
-    """Compare every gradient where decisions are unambiguous: doubtful pixels get no cotangent."""
+    """Compare every gradient where decisions are unambiguous: other pixels get no cotangent."""
     seen, error_bounds = with_error_bounds(backend, scene)
     sure = error_bounds.smooth
     v_image, v_T_final = cotangents(seen)

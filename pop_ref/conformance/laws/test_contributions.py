@@ -65,7 +65,7 @@ def _agree(backend, given):
 @law("contributions", "contributions", scene=plain)
 def test_weights_and_the_light_that_is_left_cover_the_image(backend, scene):
     given = screened(backend, scene)
-    # where a decision is near its threshold the oracle's remaining light may be another pixel's story
+    # where a decision is near its threshold the oracle's transmittance may be quite another
     assume(bool(np.all(given.error_bounds.unambiguous)))
     drawn = composite(*given.view, profile=given.scene.profile)
     found = backend.stage("contributions")(*given.view, None, given.scene.profile)

@@ -78,7 +78,7 @@ def test_fisher_blocks_are_the_oracles(backend, scene):
     args = (seen.gaussians, seen.camera, moments, seen.sh_degree, seen.profile)
     expected, found = fisher_blocks(*args), backend.stage("fisher_blocks")(*args)
     assert np.any(expected != 0.0), "no block has anything in it"
-    # twice the Jacobian times its error_bound, about the absolute values of the moments
+    # twice the Jacobian times its error bound, about the absolute values of the moments
     J = parameter_error_bounds(seen, given.error_bounds.screen)
     seconds = np.abs(_second_moments(moments))
     error_bound = np.zeros((len(moments), 6, 6))

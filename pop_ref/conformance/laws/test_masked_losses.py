@@ -31,7 +31,7 @@ masks = st.integers(0, 63).map(_mask)
 
 
 def _similarity_error_bounds(image, target, padding, mask):
-    """Charge D-SSIM and its gradient for whoever writes it as the textbook does, or as a difference."""
+    """Bound the rounding of D-SSIM and its gradient for whoever writes it as the textbook does, or as a difference."""
     forms = [d_ssim_magnitudes(image, target, padding, mask, form) for form in ("textbook", "difference")]
     return max(form.value for form in forms) + 1.0, np.maximum(*[form.gradient for form in forms])
 
@@ -44,7 +44,7 @@ def _agrees(backend, name, image, target, error_bounds, arguments):
     assert_close("agreement.losses", found, expected, of_value, backend.dtype, against_oracle=True)
     pulled = ORACLE.stage(f"{name}_vjp")(image, target, 0.75, *arguments)
     found = backend.stage(f"{name}_vjp")(image, target, 0.75, *arguments)
-    # one unit of a pixel's share beside its own error_bound: a gradient may vanish where its terms cancel
+    # one unit of a pixel's share beside its own error bound: a gradient may vanish where its terms cancel
     size = of_gradient + 1.0 / image.size
     assert_close("agreement.losses_vjp", found, pulled, size, backend.dtype, against_oracle=True)
 

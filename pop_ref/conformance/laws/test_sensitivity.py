@@ -79,7 +79,7 @@ def test_the_same_light_added_to_everything_changes_no_sensitivity(backend, scen
     lit = dataclasses.replace(given, splats=dataclasses.replace(given.splats, colors=given.splats.colors + more))
     under = given.scene.but(background=given.scene.background + more)
     bright = _scored(backend, lit, under.background)
-    # a error_bound is of absolute values, so take it of the brighter scene
+    # an error bound is of absolute values, so take it of the brighter scene
     error_bounds = dataclasses.replace(given.error_bounds, scene=under)
     error_bounds.screen = dataclasses.replace(given.error_bounds.screen, colors=given.error_bounds.screen.colors + more)
     error_bound = sensitivity_error_bounds(error_bounds)

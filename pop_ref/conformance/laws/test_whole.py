@@ -169,8 +169,8 @@ def test_moving_world_and_camera_together_changes_nothing(backend, scene, turn, 
     seen_moved, moved_bounds = with_error_bounds(backend, moved)
     error_bounds.image += moved_bounds.image
     error_bounds.T_final += moved_bounds.T_final
-    for label, doubt in moved_bounds.near_threshold.items():
-        error_bounds.near_threshold[label] |= doubt
+    for label, close in moved_bounds.near_threshold.items():
+        error_bounds.near_threshold[label] |= close
     view = backend.render(seen)
     assert_seen(view)
     _same_render("whole.rigid", backend, backend.render(seen_moved), view, error_bounds)
