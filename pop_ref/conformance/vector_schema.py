@@ -23,7 +23,7 @@ ABOUT: Final = (
     "folder of your own: NAME.npz, or NAME.json holding nested lists by array name. Write as many of the arrays whose "
     "role is 'output' as you have, in the stated shape and any number type.",
     "A result is judged by its array's 'compare'. 'close': |result - expected| <= limit * error bound + tiny, with "
-    "limit and tiny of the precision that you compute in, and the array named by 'error_bound': what rounding may cost. "
+    "limit and tiny of your precision, and the array named by 'error_bound', which says what rounding may cost. "
     "'equal': result = expected.",
     "Only entries whose mask 'where' is true are compared: elsewhere rounding may decide either way. A mask covers the "
     "leading axes of its array: unambiguous [H, W] covers image [H, W, 3], a mask of shape [] all or nothing.",
