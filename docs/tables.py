@@ -22,7 +22,7 @@ from stages import ROOT, STAGES, files, functions, laws
 from paper_repro.results import SCALES, read_all
 from paper_repro.status import status_table
 from pop_fast.train.presets import options_for
-from pop_ref.conformance.abilities import STAGES as LAW_STAGES
+from pop_ref.conformance.capabilities import STAGES as LAW_STAGES
 from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM
 from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.conformance.teeth import UNITS

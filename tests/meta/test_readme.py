@@ -15,8 +15,8 @@ from types import ModuleType
 import pytest
 
 from pop_fast.cli import COMMANDS
-from pop_ref.conformance.abilities import STAGES as LAW_STAGES
 from pop_ref.conformance.backends import ELSEWHERE, SHIPPED
+from pop_ref.conformance.capabilities import STAGES as LAW_STAGES
 from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.conformance.plugin import pytest_addoption
 from pop_ref.constants import PROFILES
