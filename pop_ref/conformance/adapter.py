@@ -351,7 +351,7 @@ class OracleAdapter(Adapter):
 
     def _own(self, scene: Scene) -> tuple[Any, Any]:
         # a copy of the oracle has value types of its own
-        types = importlib.import_module(f"{self.package}.types")
+        types = importlib.import_module(f"{self.package}.records")
         g, c = scene.gaussians, scene.camera
         own_g = g if isinstance(g, types.Gaussians) else types.Gaussians(g.means, g.quats, g.scales, g.opacities, g.sh)
         own_c = c if isinstance(c, types.Camera) else types.Camera(c.viewmat, c.K, c.width, c.height)
