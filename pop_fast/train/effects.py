@@ -82,7 +82,7 @@ def find_warnings(config: TrainConfig, views: Sequence[ViewTensors]) -> Iterator
 
 def _off_centre(view: ViewTensors) -> float:
     """Give the distance of the principal point from the middle of the image, px."""
-    return math.hypot(float(view.K[0, 2]) - view.width / 2, float(view.K[1, 2]) - view.height / 2)
+    return math.hypot(float(view.K[0, 0, 2]) - view.width / 2, float(view.K[0, 1, 2]) - view.height / 2)
 
 
 def _density_steps(config: TrainConfig, every: int) -> range:
