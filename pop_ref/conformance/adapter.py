@@ -351,7 +351,11 @@ class OracleAdapter(Adapter):
 
     def _own(self, scene: Scene) -> tuple[Any, Any]:
         # a copy of the oracle has value types of its own
+<<<<<<< HEAD
         records = importlib.import_module(f"{self.package}.records")
+=======
+        types = importlib.import_module(f"{self.package}.records")
+>>>>>>> main
         g, c = scene.gaussians, scene.camera
         own_g = (
             g if isinstance(g, records.Gaussians) else records.Gaussians(g.means, g.quats, g.scales, g.opacities, g.sh)

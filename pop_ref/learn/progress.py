@@ -83,9 +83,9 @@ def picture(work: Work, size: int = 48) -> tuple[np.ndarray, list[str]]:
 
 
 def _rendered(borrowed: Borrowed, size: int) -> np.ndarray:
-    records, params = borrowed.module("records"), toy()
+    types, params = borrowed.module("records"), toy()
     gaussians = borrowed.module("training").gaussians_from_params(params)
-    image = borrowed.module("render").render(gaussians, records.Camera(*orbit(0.6, size))).image
+    image = borrowed.module("render").render(gaussians, types.Camera(*orbit(0.6, size))).image
     if image.shape != (size, size, 3) or not np.all(np.isfinite(image)):
         raise ValueError("the picture has numbers that are not finite")
     return image

@@ -46,7 +46,7 @@ def train(work: Work, steps: int = 60, size: int = 24, n: int = 100, every: int 
 
 
 def _steps(borrowed, steps: int, size: int, n: int, every: int, rng: np.random.Generator) -> Iterator[Told]:
-    training, records, recipes = (borrowed.module(name) for name in ("training", "records", "recipes"))
+    training, types, recipes = (borrowed.module(name) for name in ("training", "records", "recipes"))
     recipe = recipes.RECIPES["POP"]
     rates = replace(recipe.lr, means=4e-3, quats=1e-2, scales=2e-2, opacities=5e-2, sh0=3e-2)
     density = replace(recipe.density, refine_start_iter=0, refine_every=max(2, steps // 3), refine_stop_iter=steps)
@@ -58,10 +58,10 @@ def _steps(borrowed, steps: int, size: int, n: int, every: int, rng: np.random.G
     for step in range(steps):
         k = int(rng.integers(len(cameras)))
         state, loss = training.train_step(
-            state, records.Camera(*cameras[k]), photographs[k], 1.0, lambda n: rng.standard_normal((2, n, 3)), recipe
+            state, types.Camera(*cameras[k]), photographs[k], 1.0, lambda n: rng.standard_normal((2, n, 3)), recipe
         )
         if (step + 1) % every == 0 or step == steps - 1:
             gaussians = training.gaussians_from_params(state.rows.params)
-            image = borrowed.module("render").render(gaussians, records.Camera(*cameras[0])).image
+            image = borrowed.module("render").render(gaussians, types.Camera(*cameras[0])).image
             psnr = -10.0 * np.log10(l2(np.clip(image, 0.0, 1.0), target)[0])
             yield Told(step + 1, loss, float(psnr), len(gaussians), np.concatenate([target, image], axis=1))
