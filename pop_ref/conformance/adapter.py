@@ -351,16 +351,10 @@ class OracleAdapter(Adapter):
 
     def _own(self, scene: Scene) -> tuple[Any, Any]:
         # a copy of the oracle has value types of its own
-<<<<<<< HEAD
-        records = importlib.import_module(f"{self.package}.records")
-=======
         types = importlib.import_module(f"{self.package}.records")
->>>>>>> main
         g, c = scene.gaussians, scene.camera
-        own_g = (
-            g if isinstance(g, records.Gaussians) else records.Gaussians(g.means, g.quats, g.scales, g.opacities, g.sh)
-        )
-        own_c = c if isinstance(c, records.Camera) else records.Camera(c.viewmat, c.K, c.width, c.height)
+        own_g = g if isinstance(g, types.Gaussians) else types.Gaussians(g.means, g.quats, g.scales, g.opacities, g.sh)
+        own_c = c if isinstance(c, types.Camera) else types.Camera(c.viewmat, c.K, c.width, c.height)
         return own_g, own_c
 
     def _options(self, scene: Scene) -> dict[str, Any]:
