@@ -36,6 +36,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         default=[],
         help="a class derived from pop_ref.conformance.Adapter",
     )
+    group.addoption(
+        "--program",
+        metavar="COMMAND",
+        action="append",
+        default=[],
+        help="a program in any language that answers the protocol of pop_ref.conformance.program_adapter",
+    )
+    group.addoption(
+        "--program-timeout", metavar="SECONDS", type=float, default=60.0, help="for each of its answers, default 60"
+    )
     group.addoption("--stages", metavar="PACKAGE", help="a package whose stage modules carry the oracle's names")
     group.addoption("--dtype", default="float32", choices=["float32", "float64"], help="precision of --rasterizer")
     group.addoption("--device", default="cpu", help="torch device of --rasterizer")
@@ -82,7 +92,7 @@ def _chosen(config: pytest.Config) -> str:
     """Return the names of what the options choose to judge; empty for the oracle."""
     option: Any = config.getoption
     single = option("--rasterizer") or option("--stages")
-    return ", ".join([*option("--backend"), *option("--adapter"), *([single] if single else [])])
+    return ", ".join([*option("--backend"), *option("--adapter"), *option("--program"), *([single] if single else [])])
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -116,6 +126,8 @@ def _chosen_backends(config: pytest.Config) -> list[Any]:
 
 def _make_backends(config: pytest.Config) -> list[Any]:
     from pop_ref.conformance.backends import Unavailable, adapter_for, made_by, shipped, shipped_or_absent
+    from pop_ref.conformance.program_adapter import ProgramAdapter
+    from pop_ref.conformance.program_pipe import ProgramError
     from pop_ref.constants import profile_named
 
     try:
@@ -123,13 +135,14 @@ def _make_backends(config: pytest.Config) -> list[Any]:
         chosen = [shipped_or_absent(name) for name in option("--backend")] + [
             made_by(path) for path in option("--adapter")
         ]
+        chosen += [ProgramAdapter(command, option("--program-timeout")) for command in option("--program")]
         path, package = option("--rasterizer"), option("--stages")
         if path or package:
             profile = profile_named(option("--profile"))
             name = path or package
             ordered = not option("--unordered-sums")
             chosen.append(adapter_for(path, name, package, option("--dtype"), option("--device"), profile, ordered))
-    except (Unavailable, ValueError) as error:
+    except (Unavailable, ProgramError, ValueError) as error:
         raise pytest.UsageError(str(error)) from error
     return chosen or [shipped("oracle")]
 
