@@ -65,8 +65,9 @@ protocol, one line of words and raw arrays each way; `tests/port/port.cpp` is a 
 that ends, hangs (`--program-timeout`) or answers what cannot be read breaks the law that asked, and what it wrote to
 standard error is shown.
 
-Where no program can be started there are portable vectors: `pop vectors export DIR` writes scenes with all that is expected of them, and
-`DIR/index.json` explains every array and how it is compared; `pop vectors check DIR RESULTS` does the comparing.
+Where no program can be started there are portable vectors: `pop vectors export DIR` writes scenes with all that is
+expected of them, and `DIR/index.json` explains every array and how it is compared; `pop vectors check DIR RESULTS`
+does the comparing.
 
 Numbers are compared in units of eps times a magnitude that is computed from absolute values (`tolerances.py` has every
 tolerance beside the worst case that was measured); integers exactly; at a threshold a backend must equal one of the
