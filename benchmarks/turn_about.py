@@ -42,8 +42,8 @@ class Checkout:
         Raises:
             SystemExit: there is no package in the folder.
         """
-        if not (root / "pop_fast" / "rasterization.py").exists():
-            raise SystemExit(f"{root} has no pop_fast/rasterization.py; give the root of a checkout")
+        if not (root / "pop_fast" / "__init__.py").exists():
+            raise SystemExit(f"{root} has no pop_fast/__init__.py; give the root of a checkout")
         self.root, self._modules = root, dict[str, ModuleType]()
         with self.imports():
             self.run: Any = importlib.import_module("run")

@@ -55,7 +55,7 @@ def rasterization(
     deterministic: bool = True,
     family: Literal["columns", "splats"] = "columns",
 ) -> tuple[Tensor, Tensor, Meta]:
-    """Render Gaussians into C images; see `pop_fast.rasterization.rasterization` for arguments, results and meta.
+    """Render Gaussians into C images; see `pop_fast.api.rasterize.rasterization` for arguments, results and meta.
 
     Optimizations: exact tile lists, two narrow stable sorts, one warp a 16 x 8 tile, moment-form gradients.
 

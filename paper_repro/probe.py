@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from paper_repro.collect import PROBE
-from pop_fast import losses
 from pop_fast.data import Capture
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.read_back import read_json
+from pop_fast.stages import losses
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import engine_of
 from pop_fast.train.evaluate import gaussians_per_pixel

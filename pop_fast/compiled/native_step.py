@@ -18,8 +18,8 @@ from torch import Tensor
 
 from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, StepStats
 from pop_fast.compiled.library import Moments, call_library, stepper_functions
-from pop_fast.ssim import REACH, Padding, border_of, check_size, kept_windows
-from pop_fast.transmittance import Stop, below
+from pop_fast.stages.blend.transmittance import Stop, below
+from pop_fast.stages.ssim import REACH, Padding, border_of, check_size, kept_windows
 
 # steps that are taken before Python is asked again: Ctrl-C, a progress bar
 LONGEST: Final = 10

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pop_fast.camera import view_dirs_vjp
 from pop_fast.compiled.library import (
     Colors,
     ColorsBackward,
@@ -22,16 +21,17 @@ from pop_fast.compiled.library import (
     call_library,
     this_library,
 )
-from pop_fast.splatting import Splats, View
+from pop_fast.stages.camera import view_dirs_vjp
+from pop_fast.stages.splatting import Splats, View
 
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
-    """See `pop_fast.splatting.covariances`."""
+    """See `pop_fast.stages.splatting.covariances`."""
     return _Covariances.apply(quats, scales)
 
 
 def project(means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: View) -> Splats:
-    """See `pop_fast.splatting.project`; rows of culled Gaussians hold 0, but for depths and opacities.
+    """See `pop_fast.stages.splatting.project`; rows of culled Gaussians hold 0, but for depths and opacities.
 
     Optimizations: one pass over the Gaussians forward and one backward, which compute everything in between anew.
     """

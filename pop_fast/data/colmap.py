@@ -13,8 +13,8 @@ from pop_fast.data.colmap_binary import count_images_binary, read_binary
 from pop_fast.data.colmap_records import ImageRecord, Model
 from pop_fast.data.colmap_text import count_images_text, read_text
 from pop_fast.data.pinhole import require_colmap
+from pop_fast.data.posed_images import Cloud, Shot
 from pop_fast.data.rigid import rigid_from_quat
-from pop_fast.data.shots import Cloud, Shot
 from pop_fast.errors import CaptureError
 from pop_fast.io.points import FARTHEST, find_bad_coordinate
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from pop_fast.data.capture import Capture, Progress, View
 from pop_fast.data.colmap import find_models, read_model
+from pop_fast.data.diagnostics import about_other_models, about_random_points, about_unplaced
 from pop_fast.data.normalize import normalizing_transform, transform_points, transform_viewmats
-from pop_fast.data.notes import about_other_models, about_random_points, about_unplaced
-from pop_fast.data.photos import photo_folder, photographs, run_sfm
+from pop_fast.data.posed_images import Cloud, Shot
 from pop_fast.data.random_points import random_points
-from pop_fast.data.shots import Cloud, Shot
+from pop_fast.data.read_images import PhotoOptions, read_views
+from pop_fast.data.sfm import photo_folder, photographs, run_sfm
 from pop_fast.data.transforms import find_transforms, read_transforms
-from pop_fast.data.views import PhotoOptions, read_views
 from pop_fast.errors import CaptureError
 from pop_fast.io.images import find_image, unreadable_photographs
 

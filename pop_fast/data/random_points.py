@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pop_fast.data.capture import View
-from pop_fast.data.shots import Cloud
+from pop_fast.data.posed_images import Cloud
 from pop_fast.errors import CaptureError
 
 __all__ = ["random_points"]

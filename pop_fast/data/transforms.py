@@ -17,8 +17,8 @@ import numpy as np
 
 from pop_fast.data.capture import Split
 from pop_fast.data.pinhole import make_camera
+from pop_fast.data.posed_images import Cloud, Shot
 from pop_fast.data.rigid import nearest_rigid
-from pop_fast.data.shots import Cloud, Shot
 from pop_fast.errors import CaptureError
 from pop_fast.io.points import read_points
 

@@ -11,11 +11,11 @@ from typing import Any, Literal
 import torch
 
 from cuda_ext.train_settings import StepSettings
-from pop_fast.backends import get_backend
+from pop_fast.api.registry import get_backend
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.fused_stepper import Fused, FusedStepper, MakeFused, Rows, unsupported
-from pop_fast.train.on_device import OnDevice
+from pop_fast.train.gpu_proxy import OnDevice
 from pop_fast.train.stepper import Engine, Task
 from pop_fast.train.torch_stepper import TorchStepper
 from pop_fast.train.views import ViewTensors

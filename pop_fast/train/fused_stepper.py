@@ -15,8 +15,8 @@ from torch.nn import Parameter
 from torch.optim import Adam
 
 from cuda_ext.train_settings import Phase, Statistics, StepSettings, StepStats, Updates
-from pop_fast.density import blur_set
-from pop_fast.strategies.base import State
+from pop_fast.density.protocol import State
+from pop_fast.stages.density import blur_set
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.model import KEYS
 from pop_fast.train.stepper import Task

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from cuda_ext.train_settings import Phase
-from pop_fast.strategies.control import DensityControl
-from pop_fast.strategies.foreign import ForeignStrategy
+from pop_fast.density.control import DensityControl
+from pop_fast.density.foreign import ForeignStrategy
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.schedule import active_sh_degree
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from cuda_ext.train_settings import Phase, StepStats
-from pop_fast.strategies.base import StepEvent
+from pop_fast.density.protocol import StepEvent
 from pop_fast.train.config import TrainConfig
 
 

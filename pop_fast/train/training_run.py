@@ -23,15 +23,15 @@ from torch.nn import Parameter
 from tqdm import tqdm
 
 from cuda_ext.train_settings import Phase, StepStats
-from pop_fast.activations import opacities_from_logits
 from pop_fast.data.capture import Capture
 from pop_fast.data.initialize import initialize_params
+from pop_fast.density.densify import draws_of
+from pop_fast.density.foreign import ForeignStrategy
+from pop_fast.density.passes import Passes
+from pop_fast.density.protocol import Draws, StepEvent, Strategy
 from pop_fast.errors import PopError
 from pop_fast.io.ply import save_ply
-from pop_fast.passes import Passes
-from pop_fast.strategies.base import Draws, StepEvent, Strategy
-from pop_fast.strategies.densify import draws_of
-from pop_fast.strategies.foreign import ForeignStrategy
+from pop_fast.stages.activations import opacities_from_logits
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
@@ -39,10 +39,10 @@ from pop_fast.train.effects import facts, find_warnings
 from pop_fast.train.engines import engine_of
 from pop_fast.train.environment import reproducible, run_facts, versions
 from pop_fast.train.evaluate import evaluate
+from pop_fast.train.gpu_proxy import words_for_memory
 from pop_fast.train.lpips import load_nets
 from pop_fast.train.metrics import population
 from pop_fast.train.model import KEYS, first_unusable, make_optimizers
-from pop_fast.train.on_device import words_for_memory
 from pop_fast.train.phases import phase_at, stretch_end
 from pop_fast.train.preflight import check_start, check_views
 from pop_fast.train.records import Stretch, record_of

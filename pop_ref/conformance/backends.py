@@ -123,8 +123,9 @@ def program(name: str, package: str, backend: str, dtype: str) -> Any:
     from pop_ref.conformance.torch_adapter import TorchAdapter
     from pop_ref.conformance.torch_training import training_stages
 
-    rasterization = partial(function_named(f"{package}.rasterization:rasterization"), backend=backend)
-    stages, trains = package if backend == "fast" else f"{package}.{backend}", training_stages(package)
+    rasterization = partial(function_named(f"{package}.api.rasterize:rasterization"), backend=backend)
+    stages = f"{package}.stages" if backend == "fast" else f"{package}.{backend}"
+    trains = training_stages(package)
     if backend == "compiled" and dtype == "float32":
         # what trains in this precision is the native step, which has an Adam of its own
         native = importlib.import_module(f"{package}.compiled.optimizer")

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, StepStats
-from pop_fast.backends import get_backend
+from pop_fast.api.registry import get_backend
 from pop_fast.train.engines import LONGEST_ON_GPU
 from pop_fast.train.fused_stepper import FusedStepper
 from pop_fast.train.stepper import Engine

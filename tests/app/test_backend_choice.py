@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from pop_fast.backends import get_backend
+from pop_fast.api.rasterize import rasterization
+from pop_fast.api.registry import get_backend
 from pop_fast.cli.train import check_backend
+from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.rasterization import rasterization
-from pop_fast.strategies import POPStrategy
 from pop_fast.train import TrainingRun
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.engines import cuda_engine
-from pop_fast.train.on_device import OnDevice, renderer, words_for_memory
+from pop_fast.train.gpu_proxy import OnDevice, renderer, words_for_memory
 from pop_fast.train.views import ViewTensors, render_view
 from tests.app.conftest import TRAIN, Pop
 from tests.app.drift import drift_engine

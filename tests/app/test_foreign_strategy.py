@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import torch
 
+from pop_fast.density import POPStrategy, StepEvent
 from pop_fast.errors import PopError
-from pop_fast.strategies import POPStrategy, StepEvent
 from pop_fast.train import TrainingRun
 from tests.app.test_resume import assert_same_run
 from tests.app.tiny import tiny_capture, tiny_config

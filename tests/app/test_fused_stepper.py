@@ -10,8 +10,8 @@ import torch
 
 from cuda_ext.arrays import CudaMemoryError
 from cuda_ext.train_settings import GROUPS
+from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.strategies import POPStrategy
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.engines import LONGEST_ON_GPU

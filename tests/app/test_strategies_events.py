@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pop_fast.strategies import GsplatStrategy, POPStrategy, StepEvent
+from pop_fast.density import GsplatStrategy, POPStrategy, StepEvent
 from pop_ref import density as oracle
 from pop_ref.density_rows import Rows as OracleRows
 from tests.app.populations import HEIGHT, KEYS, WIDTH, make, make_info, moments, packed, run_event

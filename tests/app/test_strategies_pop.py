@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from pop_fast.strategies import GsplatStrategy, POPStrategy, StepEvent
+from pop_fast.density import GsplatStrategy, POPStrategy, StepEvent
 from tests.app.populations import HEIGHT, WIDTH, make, make_info, packed, run_event
 
 

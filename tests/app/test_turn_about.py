@@ -50,7 +50,7 @@ def test_nothing_is_timed_where_the_images_differ(turn_about):
 
 
 def test_a_folder_that_is_no_checkout_is_named(turn_about, tmp_path):
-    with pytest.raises(SystemExit, match=rf"{tmp_path} has no pop_fast/rasterization.py"):
+    with pytest.raises(SystemExit, match=rf"{tmp_path} has no pop_fast/__init__.py"):
         turn_about.Checkout(tmp_path)
 
 
@@ -59,7 +59,7 @@ def test_what_a_function_imports_when_it_is_called_is_its_own_checkouts(turn_abo
     for name in ("one", "other"):
         package = tmp_path / name / "pop_fast"
         package.mkdir(parents=True)
-        for file, words in {"__init__": "", "rasterization": "", "late": f"NAME = {name!r}\n"}.items():
+        for file, words in {"__init__": "", "late": f"NAME = {name!r}\n"}.items():
             (package / f"{file}.py").write_text(words)
     monkeypatch.setattr(turn_about, "HERE", tmp_path)
     loaded = turn_about._forget()

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pop_fast.data.capture import Capture, View
-from pop_fast.strategies import GsplatStrategy, InriaStrategy, POPStrategy
+from pop_fast.density import GsplatStrategy, InriaStrategy, POPStrategy
 from pop_fast.train import LearningRates, TrainConfig, TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.records import Stretch

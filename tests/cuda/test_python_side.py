@@ -165,7 +165,7 @@ def test_the_signature_is_the_cpus():
     import inspect
 
     from cuda_ext.ops import rasterization as on_gpu
-    from pop_fast.rasterization import rasterization as on_cpu
+    from pop_fast.api.rasterize import rasterization as on_cpu
 
     ours, theirs = (inspect.signature(function).parameters for function in (on_gpu, on_cpu))
     positional = [name for name, p in theirs.items() if p.kind is not p.KEYWORD_ONLY]

@@ -8,9 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from pop_fast import compiled, splatting
+from pop_fast import compiled
 from pop_fast.compiled import splatting as in_cpp
-from pop_fast.splatting import View
+from pop_fast.stages import splatting
+from pop_fast.stages.splatting import View
 from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER, Profile
 
 pytestmark = pytest.mark.skipif(not compiled.available(), reason=compiled.why_not() or "")

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from pop_fast.strategies import POPStrategy
-from pop_fast.strategies.densify import standard_normals
+from pop_fast.density import POPStrategy
+from pop_fast.density.densify import standard_normals
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.presets import values_of
 from pop_ref.activations import opacities_from_logits

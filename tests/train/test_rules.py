@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from pop_fast.data.initialize import initialize_params
-from pop_fast.strategies.base import Draws
+from pop_fast.density.protocol import Draws
 from pop_fast.train import TrainingRun
 from pop_fast.train.engines import torch_engine
 from pop_ref.optimizer import is_updated

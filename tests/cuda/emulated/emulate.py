@@ -217,9 +217,9 @@ def engine() -> Any:
     """Return the emulated GPU, once it is installed, as `pop train` takes one."""
     import torch
 
-    from pop_fast.backends import get_backend
+    from pop_fast.api.registry import get_backend
     from pop_fast.train.engines import cuda_stepper
-    from pop_fast.train.on_device import OnDevice
+    from pop_fast.train.gpu_proxy import OnDevice
     from pop_fast.train.stepper import Engine
 
     device = torch.device("cpu")

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from cuda_ext.train_settings import Phase
-from pop_fast.passes import Passes
+from pop_fast.density.passes import Passes
 from tests.cuda.emulated import emulate
 from tests.cuda.gpu.scene import HEIGHT, STEPS, WIDTH, training_scene
 from tests.cuda.gpu.steps import fused_trainer

@@ -41,9 +41,9 @@ def on_the_cpu(scene: TrainingScene, **readings):
     Returns:
         Losses, POP terms, parameters and the strategy's state.
     """
-    from pop_fast.losses import photometric_pop
-    from pop_fast.rasterization import rasterization
-    from pop_fast.strategies import POPStrategy
+    from pop_fast.api.rasterize import rasterization
+    from pop_fast.density import POPStrategy
+    from pop_fast.stages.losses import photometric_pop
 
     strategy = POPStrategy(refine_start_iter=STEPS, blur_start_iter=0, theta_blur=THETA, **readings)
     params = {name: value.clone().requires_grad_() for name, value in scene.params.items()}

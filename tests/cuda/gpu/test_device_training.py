@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.strategies import GsplatStrategy, POPStrategy
+from pop_fast.density import GsplatStrategy, POPStrategy
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config

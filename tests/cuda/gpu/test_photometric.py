@@ -44,7 +44,7 @@ def _found(device, photograph, image, mask, padding, l1, weights, cache):
 @pytest.mark.parametrize(("padding", "l1"), [("valid", False), ("same", True)])
 @pytest.mark.parametrize("size", SIZES)
 def test_values_and_gradient_are_those_of_float64(gpu, size, padding, l1, masked, cache):
-    from pop_fast import losses
+    from pop_fast.stages import losses
 
     photograph, image, mask = _photographs(*size, masked)
     weights = (0.7, 0.3)

@@ -75,7 +75,7 @@ def test_two_runs_give_the_same_bits(gpu):
 
 
 def test_a_trainer_of_ones_own_learns_through_the_autograd_functions(gpu):
-    from pop_fast.rasterization import rasterization
+    from pop_fast.api.rasterize import rasterization
 
     scene = training_scene()
     leaves = {name: value.to(gpu).clone().requires_grad_() for name, value in scene.params.items()}
@@ -122,7 +122,7 @@ def test_rasterization_and_its_gradients_give_the_same_bits_twice(gpu):
 @pytest.mark.parametrize("faint", [1, 44], ids=["one-bucket", "three-buckets"])
 def test_gradients_around_an_opaque_splat_keep_their_digits(gpu, family, faint):
     from cuda_ext.ops import rasterization as on_gpu
-    from pop_fast.rasterization import rasterization as on_cpu
+    from pop_fast.api.rasterize import rasterization as on_cpu
 
     n = 2 * faint + 1
 
@@ -150,7 +150,7 @@ def test_gradients_around_an_opaque_splat_keep_their_digits(gpu, family, faint):
 @pytest.mark.parametrize("options", [{"counts": True}, {"profile": "inria"}])
 def test_lists_of_the_callers_tiles_go_back_as_the_warps_own_do(gpu, options):
     from cuda_ext.ops import rasterization as on_gpu
-    from pop_fast.rasterization import rasterization as on_cpu
+    from pop_fast.api.rasterize import rasterization as on_cpu
 
     scene, grads = training_scene(), []
     # 36 px: the last row of 16 px tiles is less than half full, so that a warp's part of it lies outside
@@ -172,7 +172,7 @@ def test_lists_of_the_callers_tiles_go_back_as_the_warps_own_do(gpu, options):
 @pytest.mark.parametrize("packed", [False, True])
 def test_every_render_mode_is_the_cpus(gpu, mode, packed):
     from cuda_ext.ops import rasterization as on_gpu
-    from pop_fast.rasterization import rasterization as on_cpu
+    from pop_fast.api.rasterize import rasterization as on_cpu
 
     scene = training_scene()
 
