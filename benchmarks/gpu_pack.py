@@ -22,8 +22,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cuda_ext.gpu_check import commit_of
-from cuda_ext.gpu_check_tools import ROOT, write_json
+from cuda_ext.gpu_check.command import commit_of
+from cuda_ext.gpu_check.tools import ROOT, write_json
 from pop_fast.data import Capture, View, load_capture
 from pop_fast.errors import PopError
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture

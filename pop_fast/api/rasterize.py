@@ -108,7 +108,7 @@ def rasterization(
         dominance: compute the dominance keys of meta in the same pass; else they cost one more when first read.
         counts: likewise for n_contrib and n_traversed.
         backend: "fast" renders on the CPU, "compiled" too, with kernels in C++ (`pop_fast.compiled`), "cuda" on the
-            GPU that holds the tensors (`cuda_ext.ops.rasterization`), "ref" with the oracle (slow; harmonics, RGB and
+            GPU that holds the tensors (`cuda_ext`), "ref" with the oracle (slow; harmonics, RGB and
             `packed=False` only). "auto" takes the fastest that is there: "cuda" for tensors on a GPU, else "compiled"
             where it is built, else "fast".
 

@@ -81,7 +81,7 @@ def _load_ref() -> Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]:
 
 
 def _load_cuda() -> Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]:
-    from cuda_ext.ops import rasterization
+    from cuda_ext.render.ops import rasterization
 
     return rasterization
 

@@ -1,8 +1,8 @@
 """The whole training step in C++: from raw parameters to Adam's update, without a torch operation in between.
 
 `NativeTrainer` takes steps on tensors that it updates in place, and collects what density control reads; it has the
-interface of `cuda_ext.train_step.FusedTrainer`. Meaning: `pop_ref.training.train_step`; the order of work is explained
-in `step.h`. Results are the same bits for any number of threads.
+interface of `cuda_ext.training.train_step.FusedTrainer`. Meaning: `pop_ref.training.train_step`; the order of work is
+explained in `step.h`. Results are the same bits for any number of threads.
 """
 
 from __future__ import annotations

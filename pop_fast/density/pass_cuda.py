@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cuda_ext.scores import ScoredView
+from cuda_ext.render.scores import ScoredView
 from pop_fast.density.passes import Seen, Shot
 from pop_fast.stages.chord import DominantPoints, points_on_rays, towards_camera
 from pop_fast.stages.contributions import Contributions

@@ -121,8 +121,8 @@ def _fused_trainer(
     step: int,
 ) -> Fused:
     """Make the fused step, with the photographs on the GPU."""
-    from cuda_ext.resident import ResidentViews
-    from cuda_ext.train_step import FusedTrainer
+    from cuda_ext.training.resident import ResidentViews
+    from cuda_ext.training.train_step import FusedTrainer
 
     device = params["means"].device
     pixels = sum(view.height * view.width for view in views)

@@ -27,7 +27,7 @@ Rows = Mapping[str, Tensor]
 
 
 class Fused(Protocol):
-    """What takes whole steps: `cuda_ext.train_step.FusedTrainer`, where each of these is explained."""
+    """What takes whole steps: `cuda_ext.training.train_step.FusedTrainer`, where each of these is explained."""
 
     step: int
     # how often a step was taken again because its buffers were too small

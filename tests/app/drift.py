@@ -1,7 +1,8 @@
 """Something that takes whole steps without being a training step: numbers drift, deterministically, by what they are.
 
-It follows the interface of `cuda_ext.train_step.FusedTrainer` on the CPU and shows what the run does around such steps:
-stretches, densification steps, statistics, checkpoints, errors. What real steps compute is shown by real steppers.
+It follows the interface of `cuda_ext.training.train_step.FusedTrainer` on the CPU and shows what the run does around
+such steps: stretches, densification steps, statistics, checkpoints, errors. What real steps compute is shown by real
+steppers.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ Rows = Mapping[str, Tensor]
 
 
 class Drift:
-    """See `cuda_ext.train_step.FusedTrainer`; tests may set `before_step`, which is called with the step's number."""
+    """See `cuda_ext.training.train_step.FusedTrainer`; tests may set `before_step`, called with the step's number."""
 
     def __init__(
         self,

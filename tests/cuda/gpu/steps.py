@@ -12,9 +12,9 @@ THETA = 0.02
 
 def fused_trainer(scene: TrainingScene, device, masks=None, **options):
     """Return rows (parameters and moments) and the trainer of them."""
-    from cuda_ext.resident import ResidentViews
     from cuda_ext.train_settings import StepSettings, steady_updates
-    from cuda_ext.train_step import FusedTrainer
+    from cuda_ext.training.resident import ResidentViews
+    from cuda_ext.training.train_step import FusedTrainer
 
     params = {name: value.to(device).clone() for name, value in scene.params.items()}
     m, v = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))

@@ -22,7 +22,7 @@ def _photographs(height: int, width: int, masked: bool):
 def _found(device, photograph, image, mask, padding, l1, weights, cache):
     from cuda_ext import load
     from cuda_ext.arrays import fill, new_state, stream_of
-    from cuda_ext.resident import MARGIN, ResidentViews
+    from cuda_ext.training.resident import MARGIN, ResidentViews
 
     kernels, (height, width) = load(), photograph.shape[:2]
     masks = None if mask is None else [mask]

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from cuda_ext.arrays import Settings
-from cuda_ext.frame import Call, Meta
-from cuda_ext.inputs import RENDER_MODES, check_only, check_scene, check_tensor, check_values, resolved_profile
+from cuda_ext.render.frame import Call, Meta
+from cuda_ext.render.inputs import RENDER_MODES, check_only, check_scene, check_tensor, check_values, resolved_profile
 from pop_ref.constants import Profile
 
 

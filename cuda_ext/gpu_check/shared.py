@@ -10,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from cuda_ext.gpu_check_tools import ROOT, Command, python_path, run
+from cuda_ext.gpu_check.tools import ROOT, Command, python_path, run
 
 NOTHING: Mapping[str, str] = MappingProxyType({})
 

@@ -1,8 +1,8 @@
-// How arrays cross into the host mirror; tests/cuda/mirror.py has the same struct.
+// How arrays cross into the host mirror; pop_ref/conformance/mirror_library.py has the same struct.
 #pragma once
 
-#include "camera.cuh"
-#include "footprint.cuh"
+#include "../csrc/camera.cuh"
+#include "../csrc/footprint.cuh"
 
 namespace pop {
 namespace mirror {

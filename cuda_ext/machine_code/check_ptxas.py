@@ -1,6 +1,6 @@
 """Compile every kernel for the given architectures and read what ptxas says: registers, shared memory, spills.
 
-    python -m cuda_ext.check_ptxas [--arch sm_75 sm_80 sm_90] [--json out.json]
+    python -m cuda_ext.machine_code.check_ptxas [--arch sm_75 sm_80 sm_90] [--json out.json]
 
 Exit status 1 when a blend kernel spills or a file does not compile, 2 when there is no nvcc. No GPU is needed.
 """
@@ -20,7 +20,7 @@ from pathlib import Path
 
 from cuda_ext.toolkit import NVCC_FLAGS, find_nvcc
 
-CSRC = Path(__file__).resolve().parent / "csrc"
+CSRC = Path(__file__).resolve().parents[1] / "csrc"
 # in these a spill costs at every (splat, pixel) pair; elsewhere it costs once a Gaussian
 MUST_NOT_SPILL = ("blend_forward_kernel", "columns_kernel", "splats_kernel")
 

@@ -7,9 +7,9 @@
 #include <numeric>
 #include <vector>
 
-#include "compositing.cuh"
+#include "../csrc/compositing.cuh"
 #include "mirror.h"
-#include "splatting.cuh"
+#include "../csrc/splatting.cuh"
 
 namespace pop {
 namespace mirror {

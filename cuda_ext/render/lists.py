@@ -19,7 +19,7 @@ from cuda_ext.arrays import (
     new_state,
     stream_of,
 )
-from cuda_ext.capacity import MOST
+from cuda_ext.render.capacity import MOST
 
 WARP_TILE = (16, 8)  # px, what a warp blends
 BUCKET = 32

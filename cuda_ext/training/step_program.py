@@ -8,10 +8,10 @@ from torch import Tensor
 
 from cuda_ext import load
 from cuda_ext.arrays import fill, pointer, stream_of
-from cuda_ext.lists import splat_struct
-from cuda_ext.resident import MARGIN
-from cuda_ext.step_buffers import Frame, Population, Shared
+from cuda_ext.render.lists import splat_struct
 from cuda_ext.train_settings import GROUPS, Phase
+from cuda_ext.training.resident import MARGIN
+from cuda_ext.training.step_buffers import Frame, Population, Shared
 
 
 class StepProgram:

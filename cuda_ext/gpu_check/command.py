@@ -24,7 +24,6 @@ from __future__ import annotations
 import argparse
 import os
 import platform
-import signal
 import subprocess
 import sys
 import tempfile
@@ -34,10 +33,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cuda_ext.gpu_check_budget import SHORTEST, Budget
-from cuda_ext.gpu_check_shared import Check
-from cuda_ext.gpu_check_stages import JOBS, SHARES, STAGES
-from cuda_ext.gpu_check_tools import ROOT, first_line, python_path, read_json, write_json
+from cuda_ext.gpu_check.budget import SHORTEST, Budget
+from cuda_ext.gpu_check.shared import Check
+from cuda_ext.gpu_check.stages import JOBS, SHARES, STAGES
+from cuda_ext.gpu_check.tools import ROOT, first_line, python_path, read_json, write_json
 
 PLACE = ROOT / "out" / "gpu_check"
 PACKED = ROOT / "out" / "gpu_pack"
@@ -178,9 +177,3 @@ def main(argv: list[str] | None = None) -> int:
             command.kill()
     print(f"{path}: {'failed: ' + ', '.join(failed) if failed else 'every stage ran'}", flush=True)
     return 1 if failed else 0
-
-
-if __name__ == "__main__":
-    # a job that is ended takes its commands, which have sessions of their own, along
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    sys.exit(main())

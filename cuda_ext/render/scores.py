@@ -9,9 +9,9 @@ from torch import Tensor
 
 from cuda_ext import load
 from cuda_ext.arrays import Settings, empty, fill, kernel_profile, new_state, stream_of
-from cuda_ext.autograd import Blended, Instruments, Project
-from cuda_ext.inputs import check_scene, check_tensor
-from cuda_ext.lists import LOWER, list_tile, make_lists, splat_struct
+from cuda_ext.render.autograd import Blended, Instruments, Project
+from cuda_ext.render.inputs import check_scene, check_tensor
+from cuda_ext.render.lists import LOWER, list_tile, make_lists, splat_struct
 from pop_ref.constants import Profile
 
 # values of Score (csrc/launch.h)

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from cuda_ext.arrays import Settings, new_state
-from cuda_ext.autograd import Blend, Instruments, Project
-from cuda_ext.intersections import intersections
-from cuda_ext.lists import TileBuffers, list_tile, make_lists, splat_struct
+from cuda_ext.render.autograd import Blend, Instruments, Project
+from cuda_ext.render.intersections import intersections
+from cuda_ext.render.lists import TileBuffers, list_tile, make_lists, splat_struct
 
 
 class Meta(dict[str, Any]):

@@ -4,7 +4,7 @@
 #include <vector>
 
 #include "mirror.h"
-#include "ssim.cuh"
+#include "../csrc/ssim.cuh"
 
 namespace pop {
 namespace mirror {

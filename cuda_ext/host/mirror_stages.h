@@ -1,12 +1,12 @@
 // One entry a stage function: the scalar function over rows. Arguments follow the oracle's order.
 #pragma once
 
-#include "compositing.cuh"
-#include "density.cuh"
+#include "../csrc/compositing.cuh"
+#include "../csrc/density.cuh"
 #include "mirror.h"
-#include "optimizer.cuh"
-#include "polarization.cuh"
-#include "splatting.cuh"
+#include "../csrc/optimizer.cuh"
+#include "../csrc/polarization.cuh"
+#include "../csrc/splatting.cuh"
 
 namespace pop {
 namespace mirror {

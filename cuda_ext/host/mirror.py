@@ -20,9 +20,9 @@ FLAGS = ("-std=c++17", "-O1", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror"
 def mirror_sources() -> list[Path]:
     """List every file that the mirror is made of."""
     return [
-        HERE / "host_mirror.cpp",
-        *sorted((HERE / "csrc").glob("*.cuh")),
-        *sorted((HERE / "csrc").glob("mirror*.h")),
+        HERE / "mirror.cpp",
+        *sorted((HERE.parent / "csrc").glob("*.cuh")),
+        *sorted(HERE.glob("mirror*.h")),
     ]
 
 
@@ -50,7 +50,7 @@ def build_mirror(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     # beside and then renamed, so that two test processes cannot load half a library
     partial = library.with_suffix(f".{os.getpid()}")
-    command = [*compiler, *FLAGS, "-x", "c++", str(HERE / "host_mirror.cpp"), "-o", str(partial)]
+    command = [*compiler, *FLAGS, "-x", "c++", str(HERE / "mirror.cpp"), "-o", str(partial)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr}")

@@ -19,12 +19,13 @@ import sysconfig
 import types
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
-
-import pytest
+from typing import TYPE_CHECKING, Any
 
 import cuda_ext
 from cuda_ext.compiler import find_compiler
+
+if TYPE_CHECKING:
+    import pytest
 
 HERE, CUDA_EXT = Path(__file__).parent, Path(cuda_ext.__file__).parent
 # _setjmp and _longjmp switch fibers, which a fortified longjmp takes for an accident
@@ -91,7 +92,8 @@ def build(folder: Path) -> Path:
     compiler = find_compiler()
     assert compiler is not None
     # not what was compiled before, which lies below these folders
-    there = [*CUDA_EXT.glob("*"), *(CUDA_EXT / "csrc").rglob("*"), *HERE.glob("*"), *(HERE / "include").rglob("*")]
+    kernels, stand_ins = (CUDA_EXT / "csrc").rglob("*"), (HERE / "include").rglob("*")
+    there = [*CUDA_EXT.glob("*"), *kernels, HERE / "emulator.cpp", *stand_ins]
     files = sorted(file for file in there if file.suffix in (".cu", ".cuh", ".h", ".cpp"))
     digest = hashlib.sha256(" ".join((*compiler, sys.version, nanobind.__version__, *FLAGS)).encode())
     for file in files:
@@ -127,16 +129,18 @@ class Kernels:
     """The emulated module, with a tape for what is asked of it while a graph is captured."""
 
     def __init__(self, module: types.ModuleType) -> None:
-        self._module, self.tape = module, None
+        self._module = module
+        self.tape: list[Any] | None = None
 
     def __dir__(self) -> list[str]:
         return dir(self._module)
 
     def __getattr__(self, name: str) -> Any:
         found = getattr(self._module, name)
-        if self.tape is None or not callable(found) or isinstance(found, type) or name in QUERIES:
+        tape = self.tape
+        if tape is None or not callable(found) or isinstance(found, type) or name in QUERIES:
             return found
-        return lambda *arguments: self.tape.append((found, arguments))
+        return lambda *arguments: tape.append((found, arguments))
 
 
 def nodes(library: Path) -> dict[str, int]:
@@ -147,7 +151,7 @@ def nodes(library: Path) -> dict[str, int]:
 
 
 class NoWaiting:
-    """In the place of `cuda_ext.graphs.Watch`: there is nothing to wait for."""
+    """In the place of `cuda_ext.training.graphs.Watch`: there is nothing to wait for."""
 
     def __init__(self, state: Any, depth: int) -> None:
         self._state, self._depth, self._posted = state, depth, []
@@ -191,15 +195,22 @@ def install(patch: pytest.MonkeyPatch, library: Path) -> None:
     """Put the emulated kernels where the GPU's would be, and the CPU where torch would find a GPU."""
     import torch
 
-    from cuda_ext import arrays, train_step
+    from cuda_ext import arrays
+    from cuda_ext.training import train_step
 
     kernels = Kernels(loaded(library))
 
     def captured(launch: Callable[[], None], device: Any) -> Callable[[], None]:
-        kernels.tape = tape = []
+        tape: list[Any] = []
+        kernels.tape = tape
         launch()
         kernels.tape = None
-        return lambda: [function(*arguments) for function, arguments in tape] and None
+
+        def replayed() -> None:
+            for function, arguments in tape:
+                function(*arguments)
+
+        return replayed
 
     patch.setitem(sys.modules, "cuda_ext._kernels", kernels)
     patch.setattr(cuda_ext, "why_not", lambda: None)
@@ -211,16 +222,3 @@ def install(patch: pytest.MonkeyPatch, library: Path) -> None:
     patch.setattr(torch, "empty_like", _rubbish(torch.empty_like))
     patch.setattr(train_step, "Watch", NoWaiting)
     patch.setattr(train_step, "captured", captured)
-
-
-def engine() -> Any:
-    """Return the emulated GPU, once it is installed, as `pop train` takes one."""
-    import torch
-
-    from pop_fast.api.registry import get_backend
-    from pop_fast.train.engines import cuda_stepper
-    from pop_fast.train.gpu_proxy import OnDevice
-    from pop_fast.train.stepper import Engine
-
-    device = torch.device("cpu")
-    return Engine("cuda", device, OnDevice(get_backend("cuda"), device), cuda_stepper, lambda: {"gpu": "emulated"})

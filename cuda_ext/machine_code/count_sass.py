@@ -1,6 +1,6 @@
 """Count the instructions of every kernel's loops in the machine code, beside registers, shared memory and occupancy.
 
-    python -m cuda_ext.count_sass [--arch sm_80 sm_90] [--only blend] [--json out.json] [--notes NOTES.md]
+    python -m cuda_ext.machine_code.count_sass [--arch sm_80 sm_90] [--only blend] [--json out.json] [--notes NOTES.md]
 
 Needs nvcc and nvdisasm, but no GPU. Exit status 1 when a file does not compile, 2 when a tool is missing.
 """
@@ -22,8 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cuda_ext.check_ptxas import CSRC, KernelUse, compile_and_read, demangled, is_own
-from cuda_ext.sass import Code, Flow, Loop, find_loops, loop_line, outside_loops, parse_sass
+from cuda_ext.machine_code.check_ptxas import CSRC, KernelUse, compile_and_read, demangled, is_own
+from cuda_ext.machine_code.sass import Code, Flow, Loop, find_loops, loop_line, outside_loops, parse_sass
 from cuda_ext.toolkit import find_nvcc, nvcc_version
 
 ARCHS = ("sm_80", "sm_90")
@@ -171,7 +171,7 @@ def kernel_entry(code: Code, use: KernelUse, sources: dict[str, list[str]]) -> d
     """Describe one kernel on one architecture."""
     base = use.kernel.split("<")[0]
     if base not in KERNELS:
-        raise RuntimeError(f"{use.file}: add {base} to cuda_ext.count_sass.KERNELS, with its threads a block")
+        raise RuntimeError(f"{use.file}: add {base} to count_sass.KERNELS, with its threads a block")
     unit, threads = KERNELS[base]
     flow = Flow(code)
     loops = find_loops(flow)

@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from cuda_ext import load
 from cuda_ext.arrays import Settings, empty, fill, stream_of
-from cuda_ext.lists import LOWER, TileBuffers, splat_struct
+from cuda_ext.render.lists import LOWER, TileBuffers, splat_struct
 
 
 def _where_the_cotangents_are(backward: Callable[..., Any]) -> Callable[..., Any]:

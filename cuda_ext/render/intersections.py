@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from cuda_ext.arrays import Settings
-from cuda_ext.lists import make_lists, splat_struct
+from cuda_ext.render.lists import make_lists, splat_struct
 
 
 def intersections(settings: Settings, images: Sequence[Any]) -> dict[str, Any]:

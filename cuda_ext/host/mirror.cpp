@@ -1,13 +1,13 @@
 // The kernels' mathematics looped on the host, in float and in double, behind one C entry point a precision.
 //
 // It includes the very headers that the kernels include, so that a machine without a GPU can hold them to the laws.
-// Built by cuda_ext.build.build_mirror with any C++17 compiler; nothing but tests loads it.
+// Built by cuda_ext.host.mirror.build_mirror with any C++17 compiler; nothing but tests loads it.
 
 #include <string.h>
 
-#include "csrc/mirror_losses.h"
-#include "csrc/mirror_render.h"
-#include "csrc/mirror_stages.h"
+#include "mirror_losses.h"
+#include "mirror_render.h"
+#include "mirror_stages.h"
 
 namespace pop {
 namespace mirror {

@@ -10,10 +10,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from cuda_ext.gpu_check_budget import Share
-from cuda_ext.gpu_check_shared import NOTHING, Check, skipped
-from cuda_ext.gpu_check_tests import laws_of_splats_stage, laws_stage, sanitizer_stage, smoke_stage, steps_stage
-from cuda_ext.gpu_check_tools import ROOT, Command, python_path, read_json
+from cuda_ext.gpu_check.budget import Share
+from cuda_ext.gpu_check.shared import NOTHING, Check, skipped
+from cuda_ext.gpu_check.tests import laws_of_splats_stage, laws_stage, sanitizer_stage, smoke_stage, steps_stage
+from cuda_ext.gpu_check.tools import ROOT, Command, python_path, read_json
 
 _TRAIN = "from pop_fast.cli import main; raise SystemExit(main())"
 _COMPILE = "import time; t = time.time(); from gsplat.cuda._backend import _C; print(round(time.time() - t), 's');"

@@ -1,6 +1,6 @@
 """A pytest plugin: one line of JSON for every test that has ended, at once, so that a cut run tells how far it got.
 
-POP_OUTCOMES=laws.jsonl python -m pytest -p cuda_ext.gpu_check_outcomes ...
+POP_OUTCOMES=laws.jsonl python -m pytest -p cuda_ext.gpu_check.outcomes ...
 """
 
 from __future__ import annotations

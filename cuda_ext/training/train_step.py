@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 
 from cuda_ext.arrays import BAD_ROW, N_INSTANCES, NOT_BAD, OVERFLOW, STEP, VIEW
-from cuda_ext.capacity import Capacity, Size
-from cuda_ext.graphs import Watch, captured
-from cuda_ext.resident import ResidentViews
-from cuda_ext.step_buffers import Frame, Population, Shared
-from cuda_ext.step_program import StepProgram
+from cuda_ext.render.capacity import Capacity, Size
 from cuda_ext.train_settings import Phase, Statistics, StepSettings, StepStats
+from cuda_ext.training.graphs import Watch, captured
+from cuda_ext.training.resident import ResidentViews
+from cuda_ext.training.step_buffers import Frame, Population, Shared
+from cuda_ext.training.step_program import StepProgram
 
 LATE = 2  # steps between an overflow and its notice
 

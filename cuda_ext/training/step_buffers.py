@@ -10,10 +10,10 @@ from torch import Tensor
 
 from cuda_ext import load
 from cuda_ext.arrays import STEP, Settings, empty, new_state
-from cuda_ext.capacity import Size
-from cuda_ext.lists import LOWER, TileBuffers, list_tile
-from cuda_ext.resident import ResidentViews
+from cuda_ext.render.capacity import Size
+from cuda_ext.render.lists import LOWER, TileBuffers, list_tile
 from cuda_ext.train_settings import Statistics, StepSettings
+from cuda_ext.training.resident import ResidentViews
 
 Rows = Mapping[str, Tensor]
 

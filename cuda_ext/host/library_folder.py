@@ -10,10 +10,10 @@ import os
 import stat
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
+PACKAGE = Path(__file__).resolve().parents[1]
 
 
-def library_folder(package: Path = HERE) -> Path:
+def library_folder(package: Path = PACKAGE) -> Path:
     """Return the folder to compile into and to load from: `build` in the package's own, where that can be written to.
 
     Args:

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 TAIL = 4000  # characters of a command's words that are kept
 GRACE = 20.0  # seconds, at most, between asking a command to stop and making it
 
