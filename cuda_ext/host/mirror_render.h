@@ -29,7 +29,7 @@ struct Frame {
     BlendConstants<Real> constants;
     TileGrid grid;
     std::vector<SplatRow<Real>> splats;
-    std::vector<Blended<Real>> blended;
+    std::vector<PackedSplat<Real>> blended;
     std::vector<Vec3<Real>> colors;
     std::vector<std::vector<int>> lists;
 };
@@ -86,7 +86,7 @@ Frame<Real> make_frame(const Arguments<Real>& a) {
         const Vec3<Real> dir = view_dir(vec3(a.in[MEANS], i), frame.camera);
         const Vec3<Real> none = {Real(0), Real(0), Real(0)};
         frame.splats.push_back(s);
-        frame.blended.push_back(blended_from_splat(s.mean2d, s.conic, s.opacity, a.profile.alpha_floor));
+        frame.blended.push_back(packed_from_splat(s.mean2d, s.conic, s.opacity, a.profile.alpha_floor));
         frame.colors.push_back(seen(s) ? color_from_sh(sh_row(a, i), dir, a.integers[DEGREE]) : none);
     }
     list_splats(frame, a);
@@ -107,10 +107,10 @@ void for_each_column(const Frame<Real>& frame, F f) {
 
 template <class Real>
 void forward_column(const Frame<Real>& frame, const std::vector<int>& list, int x, int y, int rows,
-                    ForwardColumn<Real, CH, ROWS>& column, Instruments<Real, ROWS>& told) {
-    start_forward<Tell::everything>(column, told, rows);
+                    ForwardColumn<Real, CH, ROWS>& column, RenderStats<Real, ROWS>& stats) {
+    start_forward<Collect::everything>(column, stats, rows);
     for (size_t k = 0; k < list.size() && is_open(column, frame.constants.stop); ++k)
-        blend_forward<Tell::everything>(column, told, frame.blended[list[k]], &frame.colors[list[k]].x, list[k],
+        blend_forward<Collect::everything>(column, stats, frame.blended[list[k]], &frame.colors[list[k]].x, list[k],
                                         Real(x) + Real(0.5), Real(y) + Real(0.5), int(k), frame.constants);
 }
 
@@ -121,18 +121,18 @@ void render(Arguments<Real>& a) {
     const Frame<Real> frame = make_frame(a);
     for_each_column(frame, [&](const std::vector<int>& list, int x, int y, int rows) {
         ForwardColumn<Real, CH, ROWS> column;
-        Instruments<Real, ROWS> told;
-        forward_column(frame, list, x, y, rows, column, told);
+        RenderStats<Real, ROWS> stats;
+        forward_column(frame, list, x, y, rows, column, stats);
         for (int k = 0; k < rows; ++k) {
             const long long p = (long long)(y + k) * frame.grid.width + x;
             for (int c = 0; c < CH; ++c)
                 a.out[0][CH * p + c] = fused(column.T_final[k], a.in[BACKGROUND][c], column.color[k][c]);
             a.out[1][p] = column.T_final[k];
-            a.out[2][p] = told.best[k].weight;
-            a.ids[0][p] = told.best[k].id;
-            a.ids[1][p] = told.n_blended[k];
+            a.out[2][p] = stats.best[k].weight;
+            a.ids[0][p] = stats.best[k].id;
+            a.ids[1][p] = stats.n_blended[k];
             a.ids[2][p] = std::min(column.last[k] + 1, int(list.size()));
-            if (told.best[k].id >= 0) ++a.ids[3][told.best[k].id];
+            if (stats.best[k].id >= 0) ++a.ids[3][stats.best[k].id];
         }
     });
     for (long long i = 0; i < a.n; ++i) {
@@ -150,8 +150,8 @@ template <bool PASS, class Real>
 void backward_by_columns(const Frame<Real>& frame, const Arguments<Real>& a, std::vector<Real>& sums) {
     for_each_column(frame, [&](const std::vector<int>& list, int x, int y, int rows) {
         ForwardColumn<Real, CH, ROWS> forward;
-        Instruments<Real, ROWS> told;
-        forward_column(frame, list, x, y, rows, forward, told);
+        RenderStats<Real, ROWS> stats;
+        forward_column(frame, list, x, y, rows, forward, stats);
         BackwardColumn<Real, CH, ROWS> column = {};
         for (int k = 0; k < rows; ++k) {
             const long long p = (long long)(y + k) * frame.grid.width + x;
@@ -164,7 +164,7 @@ void backward_by_columns(const Frame<Real>& frame, const Arguments<Real>& a, std
             }
         }
         for (int k = int(list.size()) - 1; k >= 0; --k) {
-            const Blended<Real>& splat = frame.blended[list[k]];
+            const PackedSplat<Real>& splat = frame.blended[list[k]];
             const Real dx = add(splat.x, -(Real(x) + Real(0.5)));
             ColumnSums<Real, CH> of_column = {};
             blend_backward<true, PASS>(column, splat, &frame.colors[list[k]].x, dx, Real(y) + Real(0.5), k,
@@ -181,9 +181,9 @@ void backward_by_splats(const Frame<Real>& frame, const Arguments<Real>& a, std:
     for_each_column(frame, [&](const std::vector<int>& list, int x, int y, int rows) {
         for (int k = 0; k < rows; ++k) {
             ForwardColumn<Real, CH, 1> column;
-            Instruments<Real, 1> told;
+            RenderStats<Real, 1> stats;
             const Real px = Real(x) + Real(0.5), py = Real(y + k) + Real(0.5);
-            start_forward<Tell::nothing>(column, told, 1);
+            start_forward<Collect::nothing>(column, stats, 1);
             // the forward kernel's checkpoints: T before each bucket, and what the buckets behind it blended
             std::vector<Real> T;
             std::vector<std::array<Real, CH>> later;
@@ -192,7 +192,7 @@ void backward_by_splats(const Frame<Real>& frame, const Arguments<Real>& a, std:
                     T.push_back(column.T[0]);
                     later.push_back({});
                 }
-                blend_forward<Tell::nothing>(column, told, frame.blended[list[j]], &frame.colors[list[j]].x, 0, px,
+                blend_forward<Collect::nothing>(column, stats, frame.blended[list[j]], &frame.colors[list[j]].x, 0, px,
                                              py, int(j), frame.constants);
                 if (j % BUCKET == BUCKET - 1 || j + 1 == list.size())
                     for (int c = 0; c < CH; ++c) {
@@ -234,8 +234,8 @@ void render_vjp(Arguments<Real>& a) {
         a.profile.pass_ceiling ? backward_by_columns<true>(frame, a, sums) : backward_by_columns<false>(frame, a, sums);
     for_each_column(frame, [&](const std::vector<int>& list, int x, int y, int rows) {
         ForwardColumn<Real, CH, ROWS> column;
-        Instruments<Real, ROWS> told;
-        forward_column(frame, list, x, y, rows, column, told);
+        RenderStats<Real, ROWS> stats;
+        forward_column(frame, list, x, y, rows, column, stats);
         for (int k = 0; k < rows; ++k)
             for (int c = 0; c < CH; ++c)
                 a.out[6][c] += column.T_final[k] * a.in[V_IMAGE][CH * ((long long)(y + k) * frame.grid.width + x) + c];

@@ -137,7 +137,7 @@ const Entry<Real>* stage_table() {
         POP_ROWS("alpha_from_sigma_vjp",
                  put(a.out[0], i, alpha_from_sigma_vjp(a.in[0][i], a.in[1][i], a.in[2][i], a.profile))),
         POP_ROWS("alpha_as_blended", const Vec2<Real> mean2d = vec2(a.in[0], i);
-                 const Blended<Real> s = blended_from_splat(mean2d, conic(a.in[1], i), a.in[2][i],
+                 const PackedSplat<Real> s = packed_from_splat(mean2d, conic(a.in[1], i), a.in[2][i],
                                                             a.profile.alpha_floor);
                  const Real dx = s.x - a.numbers[0]; const Real dy = s.y - a.numbers[1];
                  const Real exponent = exponent_in_column(mul(mul(s.hA, dx), dx), mul(s.B, dx), s.hC, dy);

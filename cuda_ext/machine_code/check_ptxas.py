@@ -85,7 +85,7 @@ def demangled(names: list[str]) -> list[str]:
         return names
     done = subprocess.run([tool], input="\n".join(names), capture_output=True, text=True, check=True)
     short = [re.sub(r"\(anonymous namespace\)::|pop::|void ", "", line) for line in done.stdout.splitlines()]
-    return [re.sub(r"\(.*", "", re.sub(r"\((?:int|bool|Tell)\)", "", line)) for line in short]
+    return [re.sub(r"\(.*", "", re.sub(r"\((?:int|bool|Collect)\)", "", line)) for line in short]
 
 
 def is_own(mangled: str) -> bool:

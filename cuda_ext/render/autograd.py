@@ -110,7 +110,7 @@ class Project(torch.autograd.Function):
 
 
 @dataclass(frozen=True)
-class Instruments:
+class RenderStats:
     """What the telling instantiation of the blend found; ids index the rows that were blended.
 
     Attributes:
@@ -127,7 +127,7 @@ class Instruments:
     dominant_counts: Tensor
 
 
-class Blended:
+class BlendBuffers:
     """One forward blend and what its transpose needs."""
 
     def __init__(
@@ -151,7 +151,7 @@ class Blended:
             shape = (buffers.max_buckets, 1 + self.channels, kernels.TILE_PIXELS)
             self.checkpoints = empty("checkpoints", LOWER + ", or use family='columns'", shape, device)
 
-    def run(self, told: Instruments | None) -> None:
+    def run(self, stats: RenderStats | None) -> None:
         kernels = load()
         blend = fill(
             kernels.BlendForward(),
@@ -163,8 +163,8 @@ class Blended:
             last=self.last,
             checkpoints=self.checkpoints,
         )
-        if told is not None:
-            fill(blend, **told.__dict__)
+        if stats is not None:
+            fill(blend, **stats.__dict__)
         stream = stream_of(self.image.device)
         kernels.blend_forward(self.buffers.struct, blend, self.settings.kernel_profile(), stream)
 
@@ -212,11 +212,11 @@ class Blend(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:
-        means2d, conics, opacities, colors, background, buffers, settings, state, told, sink = inputs
+        means2d, conics, opacities, colors, background, buffers, settings, state, stats, sink = inputs
         rows = tuple(t.detach().contiguous() for t in (means2d, conics, opacities, colors))
         behind = None if background is None else background.detach().contiguous()
-        blended = Blended(rows, behind, buffers, settings)
-        blended.run(told)
+        blended = BlendBuffers(rows, behind, buffers, settings)
+        blended.run(stats)
         ctx.blended, ctx.state, ctx.sink = blended, state, sink
         # aliases: an output that its own graph node holds would never be freed
         return blended.image.detach(), blended.T_final.detach()

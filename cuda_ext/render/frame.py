@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from cuda_ext.arrays import Settings, new_state
-from cuda_ext.render.autograd import Blend, Instruments, Project
+from cuda_ext.render.autograd import Blend, Project, RenderStats
 from cuda_ext.render.intersections import intersections
 from cuda_ext.render.lists import TileBuffers, list_tile, make_lists, splat_struct
 
@@ -138,22 +138,22 @@ class Call:
         """Blend every image and complete meta."""
         pictures: list[Tensor] = []
         left: list[Tensor] = []
-        told: list[Instruments] = []
+        stats: list[RenderStats] = []
         for c, image in enumerate(images):
             image.buffers = image.lists(self.settings, counts)
             behind = self._behind(image, None if backgrounds is None else backgrounds[c])
             instruments = self._instruments(image) if dominance or counts else None
             picture, T_final = self._blended(image, behind, instruments)
-            told += [] if instruments is None else [instruments]
+            stats += [] if instruments is None else [instruments]
             pictures.append(self._finished(picture, T_final))
             left.append(T_final)
         T = torch.stack(left)
         ready = {**self.meta, **self._plain(len(images)), "final_T": T.detach()}
         later = self._later(images, n)
         if dominance:
-            ready |= self._dominance(images, told, n)
+            ready |= self._dominance(images, stats, n)
         if counts:
-            ready |= self._counts(told)
+            ready |= self._counts(stats)
         return torch.stack(pictures), (1.0 - T)[..., None], Meta(ready, later)
 
     def _behind(self, image: Image, background: Tensor | None) -> Tensor | None:
@@ -162,7 +162,7 @@ class Call:
         missing = image.colors.shape[1] - len(background)
         return torch.cat((background, background.new_zeros(missing))) if missing else background
 
-    def _blended(self, image: Image, behind: Tensor | None, told: Instruments | None) -> tuple[Tensor, Tensor]:
+    def _blended(self, image: Image, behind: Tensor | None, stats: RenderStats | None) -> tuple[Tensor, Tensor]:
         # any number of channels, by the widths that the kernels are made for; gradients add up by themselves
         pieces: list[Tensor] = []
         T_final: Tensor | None = None
@@ -178,7 +178,7 @@ class Call:
                 own = None if own is None else torch.cat((own, own.new_zeros(1)))
             rows = (image.means2d, image.conics, image.opacities, colors, own)
             # every piece leaves the same light; the first one carries its gradient
-            instruments = told if first == 0 else None
+            instruments = stats if first == 0 else None
             picture, T = Blend.apply(*rows, image.buffers, self.settings, image.state, instruments, image.sink)
             pieces.append(picture[..., :width])
             T_final = T if T_final is None else T_final
@@ -191,12 +191,12 @@ class Call:
         expected = picture[..., -1:] / (1.0 - T_final)[..., None].clamp_min(1e-10)
         return torch.cat((picture[..., :-1], expected), -1)
 
-    def _instruments(self, image: Image) -> Instruments:
+    def _instruments(self, image: Image) -> RenderStats:
         shape, device = (self.settings.height, self.settings.width), image.depths.device
         maps = [torch.empty(shape, dtype=torch.int32, device=device) for _ in range(3)]
         weights = torch.empty(shape, device=device)
         won = torch.zeros(max(len(image.depths), 1), dtype=torch.int32, device=device)
-        return Instruments(maps[0], weights, maps[1], maps[2], won)
+        return RenderStats(maps[0], weights, maps[1], maps[2], won)
 
     def _plain(self, n_cameras: int) -> dict[str, Any]:
         s = self.settings
@@ -204,40 +204,40 @@ class Call:
         size = {"width": s.width, "height": s.height, "tile_size": s.tile_size}
         return {**tiles, **size, "n_cameras": n_cameras, "n_batches": 1}
 
-    def _dominance(self, images: list[Image], told: list[Instruments], n: int) -> dict[str, Any]:
+    def _dominance(self, images: list[Image], stats: list[RenderStats], n: int) -> dict[str, Any]:
         ids: list[Tensor] = []
         won: list[Tensor] = []
-        for image, found in zip(images, told, strict=True):
+        for image, found in zip(images, stats, strict=True):
             rows, total = found.dominant_ids.long(), found.dominant_counts[: len(image.depths)].long()
             if image.gaussians is not None:
                 rows = torch.cat((image.gaussians, image.gaussians.new_tensor([-1])))[rows]
                 total = torch.zeros(n, dtype=torch.int64, device=rows.device).index_add_(0, image.gaussians, total)
             ids.append(rows)
             won.append(total)
-        weights = torch.stack([found.dominant_weights for found in told])
+        weights = torch.stack([found.dominant_weights for found in stats])
         return {
             "dominant_ids": torch.stack(ids),
             "dominant_weights": weights,
             "dominant_counts": torch.stack(won),
         }
 
-    def _counts(self, told: list[Instruments]) -> dict[str, Any]:
-        return {**self._blended_counts(told), "n_traversed": torch.stack([found.n_traversed for found in told])}
+    def _counts(self, stats: list[RenderStats]) -> dict[str, Any]:
+        return {**self._blended_counts(stats), "n_traversed": torch.stack([found.n_traversed for found in stats])}
 
-    def _blended_counts(self, told: list[Instruments]) -> dict[str, Any]:
+    def _blended_counts(self, stats: list[RenderStats]) -> dict[str, Any]:
         # unlike the entries that are visited, those that are blended do not depend on the lists' tiles
-        return {"n_contrib": torch.stack([found.n_blended for found in told])}
+        return {"n_contrib": torch.stack([found.n_blended for found in stats])}
 
     def _later(self, images: list[Image], n: int) -> dict[tuple[str, ...], Callable[[], dict[str, Any]]]:
         @torch.no_grad()
-        def again(counted: bool) -> list[Instruments]:
-            told = [self._instruments(image) for image in images]
-            for image, found in zip(images, told, strict=True):
+        def again(counted: bool) -> list[RenderStats]:
+            stats = [self._instruments(image) for image in images]
+            for image, found in zip(images, stats, strict=True):
                 buffers = image.lists(self.settings, counted)
                 colors = image.colors[:, :1].contiguous()
                 rows = (image.means2d, image.conics, image.opacities, colors, None)
                 Blend.apply(*rows, buffers, self.settings, image.state, found, None)
-            return told
+            return stats
 
         return {
             ("dominant_ids", "dominant_weights", "dominant_counts"): lambda: self._dominance(images, again(False), n),

@@ -154,12 +154,12 @@ def make_lists(
     buffers = TileBuffers(n, settings.width, settings.height, tile, exact, device, buckets)
     profile = settings.kernel_profile()
     kernels.count_instances(buffers.struct, splats, profile, state.data_ptr(), stream)
-    told = state.tolist()
-    if told[BAD_ROW] != NOT_BAD:
+    values = state.tolist()
+    if values[BAD_ROW] != NOT_BAD:
         raise ValueError(
-            f"Gaussian {told[BAD_ROW]} has a value that is not finite, or projects to one; look at row "
-            f"{told[BAD_ROW]} of means, quats, scales, opacities and colors for NaN, inf and numbers near 1e38"
+            f"Gaussian {values[BAD_ROW]} has a value that is not finite, or projects to one; look at row "
+            f"{values[BAD_ROW]} of means, quats, scales, opacities and colors for NaN, inf and numbers near 1e38"
         )
-    buffers.reserve(told[N_INSTANCES])
+    buffers.reserve(values[N_INSTANCES])
     kernels.make_tile_lists(buffers.struct, splats, profile, 0, state.data_ptr(), stream)
     return buffers

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cuda_ext import load
 from cuda_ext.arrays import Settings, empty, fill, kernel_profile, new_state, stream_of
-from cuda_ext.render.autograd import Blended, Instruments, Project
+from cuda_ext.render.autograd import BlendBuffers, Project, RenderStats
 from cuda_ext.render.inputs import check_scene, check_tensor
 from cuda_ext.render.lists import LOWER, list_tile, make_lists, splat_struct
 from pop_ref.constants import Profile
@@ -72,12 +72,12 @@ class ScoredView:
         tile, exact = list_tile(settings, counted=False)
         self._buffers = make_lists(settings, splats, len(self.depths), device, tile, exact, state)
         rows = (self._means2d, self._conics, self._opacities, self._colors)
-        self._blended = Blended(rows, self._background, self._buffers, settings)
+        self._blended = BlendBuffers(rows, self._background, self._buffers, settings)
         shape = (settings.height, settings.width)
         ids, blended, traversed = (torch.empty(shape, dtype=torch.int32, device=device) for _ in range(3))
         won = torch.zeros(max(len(self.depths), 1), dtype=torch.int32, device=device)
         weights = torch.empty(shape, device=device)
-        self._blended.run(Instruments(ids, weights, blended, traversed, won))
+        self._blended.run(RenderStats(ids, weights, blended, traversed, won))
         self.image, self.T_final, self.dominant_ids = self._blended.image, self._blended.T_final, ids
 
     def contributions(self, pixel_map: Tensor | None) -> Tensor:

@@ -33,8 +33,8 @@ class Shared:
         viewmat, K: this step's camera.
         constants: this step's learning rates.
         rates, numbers: of every step, `Updates`.
-        values: what the last step told.
-        history: what every step told.
+        values: the statistics of the last step.
+        history: the statistics of every step.
     """
 
     settings: StepSettings
@@ -138,14 +138,14 @@ class Frame:
         size: width and height, px.
         lists: splats by tile.
         image: the render.
-        told: of a phase that tells dominant Gaussians, by the blend's names.
+        render_stats: of a phase that tells dominant Gaussians, by the blend's names.
         work: what else blend and loss hand on.
     """
 
     size: Size
     lists: TileBuffers
     image: Tensor
-    told: dict[str, Tensor]
+    render_stats: dict[str, Tensor]
     work: dict[str, Tensor]
 
     @classmethod
@@ -161,9 +161,9 @@ class Frame:
         lists.reserve(capacity)
         shape = (size[1], size[0])
         maps = ("dominant_ids", *(("n_blended", "n_traversed") if s.counts else ()))
-        told = {name: empty("the image", "the image size", shape, device, torch.int32) for name in maps}
-        told["dominant_weights"] = empty("the image", "the image size", shape, device)
-        told["dominant_counts"] = torch.zeros(max(n, 1), dtype=torch.int32, device=device)
+        render_stats = {name: empty("the image", "the image size", shape, device, torch.int32) for name in maps}
+        render_stats["dominant_weights"] = empty("the image", "the image size", shape, device)
+        render_stats["dominant_counts"] = torch.zeros(max(n, 1), dtype=torch.int32, device=device)
         work = {
             "T_final": empty("the image", "the image size", shape, device),
             "last": empty("the image", "the image size", shape, device, torch.int32),
@@ -176,4 +176,4 @@ class Frame:
             work["rows"] = empty("gradient slots", LOWER + ", or use deterministic=False", rows, device)
         if lists.buckets:
             work["checkpoints"] = empty("checkpoints", LOWER, (lists.max_buckets, 4, kernels.TILE_PIXELS), device)
-        return cls(size, lists, empty("the image", "the image size", (*shape, 3), device), told, work)
+        return cls(size, lists, empty("the image", "the image size", (*shape, 3), device), render_stats, work)

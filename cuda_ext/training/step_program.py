@@ -50,7 +50,7 @@ class StepProgram:
         kernels.begin_step(self._schedule, pointer("constants", shared.constants), state, stream)
         kernels.project(self._gaussians, view, self._project, splats, state, stream)
         kernels.count_instances(lists, splats, profile, state, stream)
-        counts = self._frame.told["dominant_counts"] if self._phase.dominance else None
+        counts = self._frame.render_stats["dominant_counts"] if self._phase.dominance else None
         kernels.make_tile_lists(lists, splats, profile, pointer("dominant_counts", counts, "int32"), state, stream)
         kernels.blend_forward(lists, self._forward, profile, stream)
         kernels.photometric(self._photographs, self._loss, self._objective, state, stream)
@@ -100,7 +100,7 @@ def _blends(shared: Shared, rows: Population, frame: Frame, phase: Phase) -> tup
     drawn = {"channels": 3, "records": rows.records, "background": shared.background, "image": frame.image, **passed}
     forward = fill(kernels.BlendForward(), **drawn)
     if phase.dominance:
-        fill(forward, **frame.told, masks=shared.views.masks, state=shared.state)
+        fill(forward, **frame.render_stats, masks=shared.views.masks, state=shared.state)
     backward = fill(kernels.BlendBackward(), **drawn, absolute=False, v_image=frame.work["v_image"])
     fill(backward, v_T_final=None, rows=frame.work.get("rows"), sums=rows.sums)
     backward.set_family(frame.lists.buckets, not deterministic)
@@ -111,14 +111,16 @@ def _pop_term(shared: Shared, rows: Population, frame: Frame, phase: Phase) -> A
     s = shared.settings
     before: Tensor | None = rows.statistics.dominant_sum if s.pop_views == "window" else None
     shown: Tensor | None = rows.splats["radii"] if s.pop_over == "visible" else None
-    made = fill(load().PopTerm(), n=len(rows), dominant_counts=frame.told["dominant_counts"], window_counts=before)
+    made = fill(
+        load().PopTerm(), n=len(rows), dominant_counts=frame.render_stats["dominant_counts"], window_counts=before
+    )
     return fill(made, radii=shown, logits=rows.params["opacities"], sides=rows.pop_sides, sums=rows.pop_sums)
 
 
 def _update(shared: Shared, rows: Population, frame: Frame, phase: Phase) -> Any:
     s, found = shared.settings, rows.statistics
     made = fill(load().UpdateArrays(), n=len(rows), n_rest=rows.params["shN"].shape[1], sums=rows.sums)
-    counts = frame.told["dominant_counts"] if phase.dominance else None
+    counts = frame.render_stats["dominant_counts"] if phase.dominance else None
     fill(made, constants=shared.constants, dominant_counts=counts, pop_sides=rows.pop_sides)
     fill(made, sh_rest_sum=found.sh_rest_sum)
     made.lambda_pop = s.lambda_pop if phase.pop else 0.0

@@ -97,9 +97,9 @@ class FusedTrainer:
                 self.step += 1
                 if len(watch) <= LATE and self.step < until:
                     continue
-            told = watch.take()
-            if told[BAD_ROW] == NOT_BAD and told[OVERFLOW] == 0:
-                self._capacity.note(told[VIEW], told[N_INSTANCES])
+            values = watch.take()
+            if values[BAD_ROW] == NOT_BAD and values[OVERFLOW] == 0:
+                self._capacity.note(values[VIEW], values[N_INSTANCES])
             else:
                 self.step = self._recover()
 
@@ -124,7 +124,7 @@ class FusedTrainer:
 
     @property
     def values(self) -> Tensor:
-        """What the last step told, in the order of `StepStats`."""
+        """The statistics of the last step, in the order of `StepStats`."""
         return self._shared.values
 
     @property
@@ -137,12 +137,12 @@ class FusedTrainer:
         """Extents of the last step's splats, px, 0 where culled. [N, 2] int32"""
         return self._population.splats["radii"]
 
-    def told_maps(self) -> dict[Size, dict[str, Tensor]]:
-        """Return, by image size, what the last step of a phase that tells dominant Gaussians told of every pixel.
+    def render_stats(self) -> dict[Size, dict[str, Tensor]]:
+        """Return, by image size, what the last step of a phase that asks for dominant Gaussians found at every pixel.
 
         How many splats it blended and visited is among it where `settings.counts` asked for that.
         """
-        return {size: frame.told for size, frame in self._frames.items()}
+        return {size: frame.render_stats for size, frame in self._frames.items()}
 
     @property
     def capacities(self) -> dict[Size, int]:

@@ -12,7 +12,7 @@ from pop_fast.api.backend import Stages
 from pop_fast.api.meta import RenderMeta, intersections
 from pop_fast.stages.compositing import Composite
 from pop_fast.stages.dominance import dominant_counts
-from pop_fast.stages.splatting import Splats, View
+from pop_fast.stages.splatting import ProjectionSettings, Splats
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Frame:
 
     scene: Scene
     image_shape: tuple[int, ...]
-    view: View
+    view: ProjectionSettings
     tile_size: int
     sh_degree: int | None
     render_mode: str

@@ -20,7 +20,7 @@ from pop_fast.api.checks import (
 from pop_fast.api.frame import Frame, Scene
 from pop_fast.api.meta import RenderMeta
 from pop_fast.api.registry import fastest_backend, get_backend
-from pop_fast.stages.splatting import View
+from pop_fast.stages.splatting import ProjectionSettings
 from pop_ref.constants import Profile
 
 
@@ -172,7 +172,7 @@ def rasterization(
         n_cameras,
     )
     chosen = resolved_profile(profile, near_plane, far_plane, eps2d)
-    view = View(Ks, width, height, chosen, rasterize_mode == "antialiased", radius_clip)
+    view = ProjectionSettings(Ks, width, height, chosen, rasterize_mode == "antialiased", radius_clip)
     options = (tile_size, sh_degree, render_mode, packed, absgrad)
     frame = Frame(scene, (*batch, n_cameras), view, *options, stages)
     return frame.render(backgrounds, dominance, counts)

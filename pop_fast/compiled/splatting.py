@@ -22,7 +22,7 @@ from pop_fast.compiled.library import (
     this_library,
 )
 from pop_fast.stages.camera import view_dirs_vjp
-from pop_fast.stages.splatting import Splats, View
+from pop_fast.stages.splatting import ProjectionSettings, Splats
 
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
@@ -30,7 +30,7 @@ def covariances(quats: Tensor, scales: Tensor) -> Tensor:
     return _Covariances.apply(quats, scales)
 
 
-def project(means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: View) -> Splats:
+def project(means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: ProjectionSettings) -> Splats:
     """See `pop_fast.stages.splatting.project`; rows of culled Gaussians hold 0, but for depths and opacities.
 
     Optimizations: one pass over the Gaussians forward and one backward, which compute everything in between anew.
@@ -75,7 +75,7 @@ class _Covariances(torch.autograd.Function):
 class _Projection(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: View
+        ctx: Any, means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: ProjectionSettings
     ) -> tuple[Tensor | None, ...]:
         n = len(means)
         results = {
@@ -120,7 +120,7 @@ class _Projection(torch.autograd.Function):
         return (*found, v_viewmat, None)
 
 
-def _projection_numbers(n: int, view: View) -> dict[str, float]:
+def _projection_numbers(n: int, view: ProjectionSettings) -> dict[str, float]:
     profile = view.profile
     names = ("tile_size", "near_inclusive", "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas")
     return {

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from pop_fast.data.colmap import find_model, read_model
-from pop_fast.data.posed_images import Cloud, Shot
+from pop_fast.data.posed_images import PosedImage, SparsePoints
 from pop_fast.data.transforms import find_transforms, read_transforms
 from pop_fast.errors import CaptureError
 from pop_fast.io.images import find_image, list_images, read_image, read_mask
@@ -35,7 +35,7 @@ class Finding:
 class Photo:
     """What the file of one shot holds; `size` is (0, 0) where there is none or it cannot be read."""
 
-    shot: Shot
+    shot: PosedImage
     path: Path | None
     size: tuple[int, int] = (0, 0)
     alpha: bool = False
@@ -43,7 +43,7 @@ class Photo:
     problem: str = ""
 
 
-def read_listing(root: Path) -> tuple[str, list[Shot], Cloud | None]:
+def read_listing(root: Path) -> tuple[str, list[PosedImage], SparsePoints | None]:
     """Read where photographs were taken from: a COLMAP model or transforms.json; what it is, its shots, its points.
 
     Raises:
@@ -62,7 +62,7 @@ def read_listing(root: Path) -> tuple[str, list[Shot], Cloud | None]:
     raise CaptureError(f"{root}: has {photographs} photographs and nothing says where they were taken; {fix}")
 
 
-def read_photo(root: Path, shot: Shot) -> Photo:
+def read_photo(root: Path, shot: PosedImage) -> Photo:
     """Find and decode the photograph of one shot."""
     path = find_image(root / shot.folder, shot.file)
     if path is None:
@@ -82,7 +82,7 @@ def _is_rotated(path: Path) -> bool:
     return as_stored is not None and as_shown is not None and not np.array_equal(as_stored, as_shown)
 
 
-def about_cameras(shots: Sequence[Shot]) -> Iterator[Finding]:
+def about_cameras(shots: Sequence[PosedImage]) -> Iterator[Finding]:
     """Tell the lens models and sizes."""
     kinds: Counter[str] = Counter()
     for shot in shots:
@@ -166,7 +166,7 @@ def about_masks(photos: Sequence[Photo], root: Path) -> Iterator[Finding]:
         yield Finding("warn", "masks", f"{len(lone)} photographs have none, first {lone[0]}: all of their pixels count")
 
 
-def about_points(shots: Iterable[Shot], cloud: Cloud | None, sample: int = 2000) -> Iterator[Finding]:
+def about_points(shots: Iterable[PosedImage], cloud: SparsePoints | None, sample: int = 2000) -> Iterator[Finding]:
     """Project a sample of the points into every view: poses and points that do not belong together show here."""
     if cloud is None or len(cloud) == 0:
         yield Finding("warn", "points", "none: training starts from random points in the cameras' view")
@@ -209,7 +209,7 @@ def about_reprojection(root: Path) -> Iterator[Finding]:
     yield Finding(state, "reprojection", f"mean error {error:.2f} px over {observations:,} observations")
 
 
-def about_memory(photos: Sequence[Photo], cloud: Cloud | None, free: int) -> Iterator[Finding]:
+def about_memory(photos: Sequence[Photo], cloud: SparsePoints | None, free: int) -> Iterator[Finding]:
     """Estimate the memory that photographs take at each factor, and Gaussians in training."""
     pixels = sum(photo.size[0] * photo.size[1] for photo in photos)
     by_factor = ", ".join(f"{3 * pixels / f**2 / 2**20:,.0f} MiB at factor {f}" for f in (1, 2, 4, 8))

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pop_fast.data.capture import View
-from pop_fast.data.posed_images import Shot
+from pop_fast.data.posed_images import PosedImage
 from pop_fast.data.sfm import photographs
 
 __all__ = ["about_other_models", "about_random_points", "about_unplaced"]
@@ -32,7 +32,7 @@ def about_other_models(root: Path, models: Sequence[tuple[Path, int]]) -> list[s
     ]
 
 
-def about_unplaced(folder: Path, shots: Sequence[Shot]) -> list[str]:
+def about_unplaced(folder: Path, shots: Sequence[PosedImage]) -> list[str]:
     """Tell how many photographs of a folder have no camera.
 
     Args:

@@ -10,11 +10,11 @@ import numpy as np
 
 from pop_fast.data.capture import Split
 
-__all__ = ["Cloud", "Shot"]
+__all__ = ["SparsePoints", "PosedImage"]
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class PosedImage:
     """One listed photograph.
 
     Attributes:
@@ -39,7 +39,7 @@ class Shot:
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class SparsePoints:
     """Sparse points.
 
     Attributes:

@@ -22,7 +22,7 @@ import numpy as np
 
 from pop_fast.data.capture import Progress, View
 from pop_fast.data.pinhole import make_camera
-from pop_fast.data.posed_images import Shot
+from pop_fast.data.posed_images import PosedImage
 from pop_fast.data.resample import shrink_bicubic
 from pop_fast.data.undistort import Undistortion, undistortion
 from pop_fast.errors import CaptureError
@@ -46,14 +46,14 @@ class PhotoOptions:
 
 @dataclass(frozen=True)
 class _Photo:
-    shot: Shot
+    shot: PosedImage
     path: Path
     mask: Path | None
     shrink: int
 
 
 def read_views(
-    root: Path, listing: Path, shots: Sequence[Shot], options: PhotoOptions, progress: Progress | None
+    root: Path, listing: Path, shots: Sequence[PosedImage], options: PhotoOptions, progress: Progress | None
 ) -> tuple[list[View], list[str]]:
     """Read all photographs of a list, several at a time.
 
@@ -86,7 +86,9 @@ def read_views(
     return views, notes
 
 
-def _locate(root: Path, listing: Path, shots: Sequence[Shot], options: PhotoOptions) -> tuple[list[_Photo], list[str]]:
+def _locate(
+    root: Path, listing: Path, shots: Sequence[PosedImage], options: PhotoOptions
+) -> tuple[list[_Photo], list[str]]:
     """Pair every listed name with its file and its mask, by name."""
     photos: list[_Photo] = []
     absent: list[Path] = []

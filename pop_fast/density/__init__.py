@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
+
 from pop_fast.density.control import DensityControl
 from pop_fast.density.gsplat import GsplatStrategy, Inria2023Strategy, InriaStrategy
 from pop_fast.density.mini_splatting import MiniSplattingStrategy
 from pop_fast.density.pop import POPStrategy
-from pop_fast.density.protocol import StepEvent, Strategy
+from pop_fast.density.protocol import DensificationStep, Strategy
 from pop_fast.density.pup import PupStrategy
 from pop_fast.density.speedy_splat import SpeedySplatStrategy
 from pop_fast.density.taming import TamingStrategy
@@ -20,7 +22,15 @@ __all__ = [
     "POPStrategy",
     "PupStrategy",
     "SpeedySplatStrategy",
-    "StepEvent",
+    "DensificationStep",
     "Strategy",
     "TamingStrategy",
 ]
+
+
+def __getattr__(name: str) -> object:
+    # the name that a `DensificationStep` had before
+    if name != "StepEvent":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    warnings.warn(f"{__name__}.StepEvent is now {__name__}.DensificationStep", DeprecationWarning, stacklevel=2)
+    return DensificationStep

@@ -14,7 +14,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
-from pop_fast.density.protocol import Draws, Info, Optimizers, Params, Population, State, StepEvent, check_layout
+from pop_fast.density.protocol import (
+    DensificationStep,
+    Draws,
+    Info,
+    Optimizers,
+    Params,
+    Population,
+    State,
+    check_layout,
+)
 from pop_ref.settings import MAX_SH_DEGREE, DensityConfig, PopTerm, ScreenSizeRules, UpdateRules
 
 if TYPE_CHECKING:
@@ -161,7 +170,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
 
     def step_post_backward(
         self, params: Params, optimizers: Optimizers, state: State, step: int, info: Info, packed: bool = False
-    ) -> StepEvent | None:
+    ) -> DensificationStep | None:
         """Collect statistics; at a refine step grow, prune and start a new window; at a reset step reset.
 
         Returns:
@@ -194,7 +203,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         draws: Draws | None = None,
         passes: Passes | None = None,
         sh_degree: int = MAX_SH_DEGREE,
-    ) -> StepEvent | None:
+    ) -> DensificationStep | None:
         """Do what is due after a step whose statistics are collected.
 
         Args:
@@ -222,18 +231,18 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         with torch.no_grad():
             return self.edit(Population(params, optimizers, state, step, draws, passes, sh_degree))
 
-    def edit(self, of: Population) -> StepEvent:
+    def edit(self, of: Population) -> DensificationStep:
         """Do what is due after a step after which the population changes: refine, reset, prune for the last time."""
-        event = self.refine(of) if self.is_refine_step(of.step) else StepEvent()
+        event = self.refine(of) if self.is_refine_step(of.step) else DensificationStep()
         return self.prune_finally(of, self.reset(of, event))
 
-    def refine(self, of: Population) -> StepEvent:
+    def refine(self, of: Population) -> DensificationStep:
         """Clone, split and prune by the window's statistics."""
         from pop_fast.density import densify
 
         return densify.refine(self, of, *densify.who_grows(self, of), lambda: densify.who_goes(self, of))
 
-    def prune_finally(self, of: Population, event: StepEvent) -> StepEvent:
+    def prune_finally(self, of: Population, event: DensificationStep) -> DensificationStep:
         """Prune faint Gaussians once more if it is time, and say so in the event."""
         if of.step != self.final_prune_iter:
             return event
@@ -244,7 +253,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         faint = torch.sigmoid(of.params["opacities"].flatten()) < self.final_prune_opa
         return replace(event, pruned=event.pruned + densify.prune(of, faint))
 
-    def reset(self, of: Population, event: StepEvent) -> StepEvent:
+    def reset(self, of: Population, event: DensificationStep) -> DensificationStep:
         """Reset opacities if it is time, and say so in the event."""
         if not self.is_reset_step(of.step):
             return event

@@ -11,7 +11,7 @@ from torch import Tensor
 from pop_fast.density import rows as ops
 from pop_fast.density.control import DensityControl
 from pop_fast.density.info import dominant_counts, visible_from_radii, visible_in
-from pop_fast.density.protocol import Draws, Info, Params, Population, State, StepEvent
+from pop_fast.density.protocol import DensificationStep, Draws, Info, Params, Population, State
 from pop_fast.stages.density import SPLIT_CHILDREN, Statistics, blur_is_over, blur_set, grow_masks, prune_mask
 from pop_fast.stages.polarization import importance_mask, opacity_entropy, pop_loss
 
@@ -112,7 +112,7 @@ def draws_of(generator: torch.Generator) -> Draws:
 
 def refine(
     plan: DensityControl, of: Population, clones: Tensor, splits: Tensor, prunes: Callable[[], Tensor]
-) -> StepEvent:
+) -> DensificationStep:
     """Clone, split, prune, and start a new window.
 
     Args:
@@ -129,7 +129,7 @@ def refine(
         # a clone of this event is never split in it
         padded = torch.cat([splits, splits.new_zeros(n_clones)])
         ops.split(of.params, of.optimizers, of.state, padded, of.draws.normals(n_splits), plan.revised_opacity)
-    event = StepEvent(n_clones, n_splits, prune(of, prunes()))
+    event = DensificationStep(n_clones, n_splits, prune(of, prunes()))
     clear(of.state)
     if plan.verbose:
         print(f"step {of.step}: {event}, {len(of)} Gaussians")

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pop_fast.density.protocol import Draws, Info, Optimizers, Params, State, StepEvent, Strategy
+from pop_fast.density.protocol import DensificationStep, Draws, Info, Optimizers, Params, State, Strategy
 from pop_ref.settings import MAX_SH_DEGREE
 
 
@@ -18,7 +18,7 @@ class ForeignStrategy:
 
     Where it draws random numbers with torch's global generator, they come from one in `state` that is saved with it, so
     that a run that is resumed goes on to the same bits. When it changes the population is not known beforehand; a
-    `StepEvent` that it returns goes into the records.
+    `DensificationStep` that it returns goes into the records.
 
     Args:
         strategy: follows `pop_fast.density.protocol.Strategy`. A method `regularizer` or `needs_dominance`, where it
@@ -81,14 +81,14 @@ class ForeignStrategy:
         draws: Draws | None = None,
         passes: Any = None,
         sh_degree: int = MAX_SH_DEGREE,
-    ) -> StepEvent | None:
+    ) -> DensificationStep | None:
         """Call `step_post_backward`."""
         info, self._info = self._info, None
         if info is None:
             raise ValueError("change needs the info of the step before it; call collect first")
         with _drawing_from(state["generator"]) if self._lends else nullcontext():
             found: Any = self.strategy.step_post_backward(params, optimizers, state, step, info)
-        return found if isinstance(found, StepEvent) else None
+        return found if isinstance(found, DensificationStep) else None
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Final, Literal
 
 from pop_fast.density.gsplat import InriaStrategy
-from pop_fast.density.protocol import Population, StepEvent
+from pop_fast.density.protocol import DensificationStep, Population
 from pop_ref.recipes import BASELINES, Recipe
 
 _MINI: Final[Recipe] = BASELINES["Mini-Splatting"]
@@ -77,14 +77,14 @@ class MiniSplattingStrategy(InriaStrategy):
         """Tell whether the population is edited after this step."""
         return super().changes_after(step) or self.needs_passes(step)
 
-    def edit(self, of: Population) -> StepEvent:
+    def edit(self, of: Population) -> DensificationStep:
         """Do what is due after this step."""
         if of.step in self.adam_restarts:
-            from pop_fast.density import mini_splatting_events as events
+            from pop_fast.density import mini_splatting_steps as events
 
             if of.step in self.reinit_iters:
                 return events.set_anew_from_depth(self, of)
             return events.draw_by_importance(self, of) if of.step == self.sample_iter else events.prune(self, of)
         if self.is_refine_step(of.step) and len(of) >= self.max_gaussians:
-            return StepEvent()
+            return DensificationStep()
         return super().edit(of)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from cuda_ext.render.scores import ScoredView
-from pop_fast.density.passes import Seen, Shot
+from pop_fast.density.passes import PassInput, Seen
 from pop_fast.stages.chord import DominantPoints, points_on_rays, towards_camera
 from pop_fast.stages.contributions import Contributions
 from pop_fast.stages.fisher import fisher_blocks
@@ -25,7 +25,7 @@ class CudaView:
         PopError: the GPU has no room; says what to lower.
     """
 
-    def __init__(self, shot: Shot) -> None:
+    def __init__(self, shot: PassInput) -> None:
         self._shot = shot
         g, c = shot.gaussians, shot.camera
         rows = (g.means, g.quats, g.scales, g.opacities, g.sh)

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from pop_fast.api.backend import Stages
-from pop_fast.density.passes import Seen, Shot
+from pop_fast.density.passes import PassInput, Seen
 from pop_fast.stages.chord import DominantPoints
 from pop_fast.stages.contributions import Contributions
 from pop_fast.stages.fisher import fisher_blocks
-from pop_fast.stages.splatting import Splats, View, colors_of
+from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
 from pop_fast.stages.tiles import TileLists
 
 
@@ -26,7 +26,7 @@ class StagesView:
         lists: without the entries that reach no pixel.
     """
 
-    shot: Shot
+    shot: PassInput
     stages: Stages
     splats: Splats
     lists: TileLists
@@ -72,11 +72,11 @@ class StagesView:
         return self.splats, self.lists, shot.camera.width, shot.camera.height, size, shot.background, shot.profile
 
 
-def view_of(shot: Shot, stages: Stages) -> StagesView:
+def view_of(shot: PassInput, stages: Stages) -> StagesView:
     """Project and list a shot."""
     g, camera, profile = shot.gaussians, shot.camera, shot.profile
     covars = stages.covariances(g.quats, g.scales)
-    view = View(camera.K, camera.width, camera.height, profile, shot.antialiased)
+    view = ProjectionSettings(camera.K, camera.width, camera.height, profile, shot.antialiased)
     splats = stages.project(g.means, covars, g.opacities, camera.viewmat, view)
     visible = (splats.radii > 0).all(1).nonzero().squeeze(1)
     splats = replace(splats, colors=stages.colors_of_view(g.sh, g.means, camera.viewmat, shot.sh_degree, visible))

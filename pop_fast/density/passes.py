@@ -67,7 +67,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Shot:
+class PassInput:
     """What a pass draws: Gaussians, a camera, the bands of their colours in use, and how.
 
     Attributes:
@@ -87,7 +87,7 @@ class Shot:
     antialiased: bool
 
 
-class View(Protocol):
+class ViewPass(Protocol):
     """A shot that has been projected and listed."""
 
     def seen(self) -> Seen:
@@ -226,7 +226,7 @@ class Passes:
         found = self._open(self._shot(params, index, sh_degree)).dominant_points()
         return found.points, found.ids, found.T_final
 
-    def _shot(self, params: Mapping[str, Tensor], index: int, sh_degree: int, divisor: int = 1) -> Shot:
+    def _shot(self, params: Mapping[str, Tensor], index: int, sh_degree: int, divisor: int = 1) -> PassInput:
         raw = {name: value.detach() for name, value in params.items()}
         bands = (sh_degree + 1) ** 2
         sh = torch.cat((raw["sh0"], raw["shN"][:, : bands - 1]), 1)
@@ -234,7 +234,7 @@ class Passes:
         gaussians = Gaussians(raw["means"], raw["quats"], scales, opacities, sh)
         camera = _smaller(self._views[index], divisor, self._device)
         background = self._background.to(raw["means"])
-        return Shot(gaussians, camera, sh_degree, background, self._profile, self._antialiased)
+        return PassInput(gaussians, camera, sh_degree, background, self._profile, self._antialiased)
 
 
 def _smaller(view: ViewTensors, divisor: int, device: torch.device) -> Camera:
@@ -246,7 +246,7 @@ def _smaller(view: ViewTensors, divisor: int, device: torch.device) -> Camera:
     return Camera(view.viewmat[0].to(device), K.to(device), width, height)
 
 
-def _opener(name: str) -> Callable[[Shot], View]:
+def _opener(name: str) -> Callable[[PassInput], ViewPass]:
     """Return what projects and lists shots for a backend."""
     require_backend(name)
     if name == "ref":

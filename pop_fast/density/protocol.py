@@ -9,8 +9,8 @@ optimizer per key. Every step it calls, in this order,
     strategy.step_post_backward(params, optimizers, state, step, info)
 
 `info` is the dict that `rasterization()` returns last. `step` counts from 0. A strategy is a dataclass of settings;
-everything that changes lives in `state`. What a step did to the population is returned, as a `StepEvent`; gsplat's own
-strategies return nothing.
+everything that changes lives in `state`. What a step did to the population is returned, as a `DensificationStep`;
+gsplat's own strategies return nothing.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Population:
 
 
 @dataclass(frozen=True)
-class StepEvent:
+class DensificationStep:
     """What density control did to the population after a step.
 
     Attributes:
@@ -127,7 +127,7 @@ class Strategy(Protocol):
     def step_post_backward(
         self, params: Params, optimizers: Optimizers, state: State, step: int, info: Info, packed: bool = False
     ) -> Any:
-        """Collect statistics and, when it is time, change the population; may return a `StepEvent`."""
+        """Collect statistics and, when it is time, change the population; may return a `DensificationStep`."""
         ...
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from pop_fast.density.gsplat import InriaStrategy
-from pop_fast.density.protocol import Population, StepEvent
+from pop_fast.density.protocol import DensificationStep, Population
 from pop_ref.recipes import BASELINES, Recipe
 
 _PUP: Final[Recipe] = BASELINES["PUP-3DGS"]
@@ -45,7 +45,7 @@ class PupStrategy(InriaStrategy):
         """Tell whether the population is edited after this step."""
         return super().changes_after(step) or self.needs_passes(step)
 
-    def edit(self, of: Population) -> StepEvent:
+    def edit(self, of: Population) -> DensificationStep:
         """Refine and reset as 3DGS; at the beginning of a round prune and start Adam anew."""
         if of.step not in self.adam_restarts:
             return super().edit(of)
@@ -58,4 +58,4 @@ class PupStrategy(InriaStrategy):
         share = self.prune_shares[self.adam_restarts.index(of.step)]
         pruned = prune_lowest(of, log_det_scores(blocks), share)
         ops.restart(of.params, of.optimizers)
-        return StepEvent(pruned=pruned)
+        return DensificationStep(pruned=pruned)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from pop_fast.density.gsplat import InriaStrategy
-from pop_fast.density.protocol import Population, StepEvent
+from pop_fast.density.protocol import DensificationStep, Population
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,9 +45,9 @@ class SpeedySplatStrategy(InriaStrategy):
         """Tell whether the population is edited after this step."""
         return super().changes_after(step) or self.needs_passes(step)
 
-    def edit(self, of: Population) -> StepEvent:
+    def edit(self, of: Population) -> DensificationStep:
         """Refine, prune by sensitivity, reset: in this order."""
-        event = self.refine(of) if self.is_refine_step(of.step) else StepEvent()
+        event = self.refine(of) if self.is_refine_step(of.step) else DensificationStep()
         share = self.prune_share_at(of.step)
         if share > 0.0:
             from pop_fast.density.importance import prune_lowest, summed_over_views

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from pop_fast.density.gsplat import InriaStrategy
-from pop_fast.density.protocol import Population, StepEvent
+from pop_fast.density.protocol import DensificationStep, Population
 from pop_ref.recipes import BASELINES, Recipe
 
 _TAMING: Final[Recipe] = BASELINES["Taming-3DGS"]
@@ -57,11 +57,11 @@ class TamingStrategy(InriaStrategy):
         """Return which step of the parabola this is, from 1."""
         return (step - self.refine_start_iter) // self.refine_every
 
-    def refine(self, of: Population) -> StepEvent:
+    def refine(self, of: Population) -> DensificationStep:
         """Clone, split and prune who is drawn."""
-        from pop_fast.density import taming_events
+        from pop_fast.density import taming_steps
 
-        return taming_events.refine(self, of)
+        return taming_steps.refine(self, of)
 
     def target(self, first_count: int) -> int:
         """Return the budget."""

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pop_fast.density.passes import Seen, Shot
+from pop_fast.density.passes import PassInput, Seen
 from pop_fast.stages.chord import DominantPoints
 from pop_fast.stages.contributions import Contributions
 from pop_ref.chord import dominant_points
@@ -24,7 +24,7 @@ class OracleView:
         shot: what is drawn.
     """
 
-    def __init__(self, shot: Shot) -> None:
+    def __init__(self, shot: PassInput) -> None:
         g, c = shot.gaussians, shot.camera
         self._gaussians = Gaussians(*(_array(t) for t in (g.means, g.quats, g.scales, g.opacities, g.sh)))
         self._camera = Camera(_array(c.viewmat), _array(c.K), c.width, c.height)

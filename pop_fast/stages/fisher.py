@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.stages.blend.pairs import EntryRows, Pairs, PairWalk, background_or_black, check_grid
-from pop_fast.stages.splatting import Splats, View, colors_of, colors_of_view, covariances, project
+from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of, colors_of_view, covariances, project
 from pop_fast.stages.tiles import TileLists
 from pop_fast.stages.types import Camera, Gaussians
 from pop_ref.constants import PAPER, Profile
@@ -112,7 +112,7 @@ def fisher_blocks(
     with torch.enable_grad():
         means.requires_grad_()
         scales.requires_grad_()
-        view = View(K, camera.width, camera.height, profile)
+        view = ProjectionSettings(K, camera.width, camera.height, profile)
         splats = project(means, covariances(quats, scales), opacities, viewmat, view)
         visible = (splats.radii > 0).all(1).nonzero().squeeze(1)
         colors = colors_of_view(sh, means, viewmat, degree, visible).unbind(1)

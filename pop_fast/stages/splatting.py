@@ -80,7 +80,7 @@ def colors_of(splats: Splats) -> Tensor:
 
 
 @dataclass(frozen=True)
-class View:
+class ProjectionSettings:
     """What a projection needs of a camera.
 
     Attributes:
@@ -105,7 +105,7 @@ def covariances(quats: Tensor, scales: Tensor) -> Tensor:
     return _Covariances.apply(quats, scales)  # type: ignore[no-any-return]
 
 
-def project(means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: View) -> Splats:
+def project(means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: ProjectionSettings) -> Splats:
     """Project Gaussians; see `pop_ref.splatting.project`.
 
     Args:
@@ -151,7 +151,7 @@ class _Covariances(torch.autograd.Function):
 class _Projection(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: View
+        ctx: Any, means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: ProjectionSettings
     ) -> tuple[Tensor, ...]:
         camera = (view.K, view.width, view.height)
         profile = view.profile
@@ -189,7 +189,7 @@ class _Projection(torch.autograd.Function):
         v_factors: Tensor,
     ) -> tuple[Tensor | None, ...]:
         means, covars, opacities, viewmat, safe, covars_cam, jacobians, covars2d, blurred, shown = ctx.saved_tensors
-        view: View = ctx.view
+        view: ProjectionSettings = ctx.view
         camera, eps2d = (view.K, view.width, view.height), view.profile.eps2d
         v_covars2d = low_pass_vjp(covars2d, eps2d, conics_from_covars2d_vjp(blurred, v_conics))
         v_opacities = v_blended

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pop_fast.api.backend import Stages
 from pop_fast.density.pass_stages import view_of
-from pop_fast.density.passes import Shot
+from pop_fast.density.passes import PassInput
 from pop_fast.stages.contributions import Contributions
 from pop_fast.stages.losses import photometric_3dgs
 from pop_fast.stages.types import Camera, Gaussians
@@ -118,7 +118,7 @@ def taming_scores(
     black = gaussians.means.new_zeros(3) if background is None else background
     scores = torch.zeros(len(gaussians.means), dtype=torch.float64)
     for camera, photo in views:
-        view = view_of(Shot(gaussians, camera, degree, black, profile, antialiased=False), stages or Stages())
+        view = view_of(PassInput(gaussians, camera, degree, black, profile, antialiased=False), stages or Stages())
         seen = view.seen()
         found = view.contributions(pixel_weights(seen.image, photo))
         target = photo.to(seen.image.dtype) / 255.0

@@ -15,7 +15,7 @@ from pop_fast.errors import PopError
 _LESS = "use smaller images (--factor 2 or more), fewer Gaussians, or a card with more memory"
 
 
-class OnDevice:
+class GpuProxy:
     """Renders on a device what lies anywhere, and hands images and `info` back on the CPU.
 
     Args:
@@ -104,7 +104,7 @@ def renderer(name: str) -> tuple[Backend, str | None]:
     if name not in ("auto", "cuda", "compiled"):
         return get_backend(name), None
     if name != "compiled" and get_backend("cuda").available():
-        return OnDevice(get_backend("cuda"), torch.device("cuda", torch.cuda.current_device())), None
+        return GpuProxy(get_backend("cuda"), torch.device("cuda", torch.cuda.current_device())), None
     drawing = get_backend(fastest_backend("cpu"))
     if name in ("auto", drawing.name):
         return drawing, None

@@ -1,7 +1,7 @@
 """Something that takes whole steps without being a training step: numbers drift, deterministically, by what they are.
 
 It follows the interface of `cuda_ext.training.train_step.FusedTrainer` on the CPU and shows what the run does around
-such steps: stretches, densification steps, statistics, checkpoints, errors. What real steps compute is shown by real
+such steps: segments, densification steps, statistics, checkpoints, errors. What real steps compute is shown by real
 steppers.
 """
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 
-class Lit:
+class ActiveTiles:
     """Named states with a row per tile of a group, of which a shrinking choice is held close together.
 
     Attributes:

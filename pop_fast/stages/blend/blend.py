@@ -29,8 +29,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from pop_fast.stages.blend import buffers as workspace
-from pop_fast.stages.blend.active_tiles import Lit
+from pop_fast.stages.blend import buffers
+from pop_fast.stages.blend.active_tiles import ActiveTiles
 from pop_fast.stages.blend.alpha import Entries, exponent_coefficients, pixel_basis
 from pop_fast.stages.blend.tile_groups import BLOCK, TileGroup
 from pop_fast.stages.blend.transmittance import Stop, below, count_passed, weights_of_alphas
@@ -47,7 +47,7 @@ class Step:
     Attributes:
         blocks: of eight entries each, the null block where a list has ended. [n, K / 8]
         rows: which of the group's tiles took part: the first `n` of these, or of all when None.
-        light: T before the step; belongs to the workspace. [n, P]
+        light: T before the step; belongs to the buffers. [n, P]
     """
 
     blocks: Tensor
@@ -113,36 +113,36 @@ class Blender:
 
     def blend(self, group: TileGroup, counted: bool = False, dominance: bool = False, keep: bool = True) -> GroupBlend:
         """Blend a group front to back; `keep` what the transpose needs."""
-        lit = self._lit(group, counted, dominance)
+        active = self._active(group, counted, dominance)
         dominant = Dominance(self.table.dtype)
         steps: list[Step] = []
         start, n_pairs = 0, 0
-        with workspace.slabs(2, group.slab, self.table.dtype) as slabs:
-            while start < len(group.reached) and (n := lit.count_below(group.reached[start])) > 0:
-                blocks = group.blocks(lit.rows, n, start, group.step_blocks(start, n))
-                entries, light = self._entries(blocks), lit["light"][:n]
-                alpha, lights = _shaped(slabs, entries, group.n_pixels)
+        with buffers.acquired(2, group.slab, self.table.dtype) as scratch:
+            while start < len(group.reached) and (n := active.count_below(group.reached[start])) > 0:
+                blocks = group.blocks(active.rows, n, start, group.step_blocks(start, n))
+                entries, light = self._entries(blocks), active["light"][:n]
+                alpha, lights = _shaped(scratch, entries, group.n_pixels)
                 self._alphas(entries, alpha)
                 if counted:
-                    lit["n_passed"][:n].add_(count_passed(alpha, light, self.stop))
-                before = workspace.copy(light)
+                    active["n_passed"][:n].add_(count_passed(alpha, light, self.stop))
+                before = buffers.copy(light)
                 weight = self._weights(alpha, lights, before)
                 torch.ops.aten.threshold.out(lights[:, -1], self.stop.at, 0.0, out=light)
-                lit["image"][:n].baddbmm_(entries[:, :, 6:].transpose(1, 2), weight)
+                active["image"][:n].baddbmm_(entries[:, :, 6:].transpose(1, 2), weight)
                 if counted:
-                    lit["n_blended"][:n].add_((weight > 0.0).sum(1))
+                    active["n_blended"][:n].add_((weight > 0.0).sum(1))
                 if dominance:
-                    dominant.see(weight, start * BLOCK, lit["best"][:n], lit["codes"][:n], alpha)
+                    dominant.see(weight, start * BLOCK, active["best"][:n], active["codes"][:n], alpha)
                 start += blocks.shape[1]
                 n_pairs += weight.numel()
                 if keep:
-                    steps.append(Step(blocks, lit.rows, before))
+                    steps.append(Step(blocks, active.rows, before))
                 else:
-                    workspace.give(before)
-                lit.drop(n, light, COMPACT_BELOW)
-        return self._result(lit.whole(), steps, n_pairs)
+                    buffers.release(before)
+                active.drop(n, light, COMPACT_BELOW)
+        return self._result(active.whole(), steps, n_pairs)
 
-    def _lit(self, group: TileGroup, counted: bool, dominance: bool) -> Lit:
+    def _active(self, group: TileGroup, counted: bool, dominance: bool) -> ActiveTiles:
         size = (len(group.tiles), self.basis.shape[1])
         states = {
             "light": self.basis.new_ones(size),
@@ -152,7 +152,7 @@ class Blender:
             states |= {name: torch.zeros(size, dtype=torch.int64) for name in ("n_blended", "n_passed")}
         if dominance:
             states |= {"best": self.basis.new_zeros(size), "codes": self.basis.new_full(size, -1.0)}
-        return Lit(states)
+        return ActiveTiles(states)
 
     @staticmethod
     def _result(states: dict[str, Tensor], steps: list[Step], n_pairs: int) -> GroupBlend:
@@ -192,36 +192,36 @@ class Blender:
             Blocks [n K / 8] and their rows [n K / 8, 6 + D (+ 2), 8]: six moments of G, the gradient to the
             colours and, when asked for, the sums of absolute gradients along x and y.
         """
-        lit = Lit({"behind": v_image.new_zeros((v_image.shape[0], v_image.shape[2])), "v": v_image})
-        with workspace.slabs(3, group.slab, self.table.dtype) as slabs:
+        active = ActiveTiles({"behind": v_image.new_zeros((v_image.shape[0], v_image.shape[2])), "v": v_image})
+        with buffers.acquired(3, group.slab, self.table.dtype) as scratch:
             for step in reversed(blend.steps):
-                lit.select(step.rows)
+                active.select(step.rows)
                 n = len(step.blocks)
-                v, behind = lit["v"][:n], lit["behind"][:n]
-                entries, alpha, weight, q = self.again(group, step, slabs)
+                v, behind = active["v"][:n], active["behind"][:n]
+                entries, alpha, weight, q = self.again(group, step, scratch)
                 torch.bmm(entries[:, :, 6:], v, out=q)
                 for a, q_k in zip(reversed(alpha.unbind(1)), reversed(q.unbind(1)), strict=True):
                     q_k.sub_(behind)
                     behind.addcmul_(a, q_k)
                 # nothing lies behind a pixel that had stopped before this step
                 torch.ops.aten.threshold_backward.grad_input(behind, step.light, 0.0, grad_input=behind)
-                workspace.give(step.light)
+                buffers.release(step.light)
                 yield step.blocks.view(-1), self._rows(entries, alpha, weight, q, v, absolute)
 
-    def again(self, group: TileGroup, step: Step, slabs: list[Tensor]) -> list[Tensor]:
+    def again(self, group: TileGroup, step: Step, scratch: list[Tensor]) -> list[Tensor]:
         """Blend a step that was kept once more.
 
         Args:
             group: whose step it is.
             step: of a `blend` that kept what the transpose needs; its light stays.
-            slabs: two of `group.slab` numbers, or three.
+            scratch: two of `group.slab` numbers, or three.
 
         Returns:
-            The entries' rows of the table [n, K, 6 + D + 1], and in the slabs their alphas and weights, both 0 from
+            The entries' rows of the table [n, K, 6 + D + 1], and in the scratch their alphas and weights, both 0 from
             where a pixel stops [n, K, P], and of a third slab as much.
         """
         entries = self._entries(step.blocks)
-        alpha, lights, *rest = _shaped(slabs, entries, group.n_pixels)
+        alpha, lights, *rest = _shaped(scratch, entries, group.n_pixels)
         self._alphas(entries, alpha)
         return [entries, alpha, self._weights(alpha, lights, step.light), *rest]
 
@@ -271,8 +271,8 @@ class Blender:
         return torch.stack([(g * (c @ self.basis)).abs_().sum(1) for c in along])
 
 
-def _shaped(slabs: list[Tensor], entries: Tensor, n_pixels: int) -> list[Tensor]:
-    """Shape a step's slabs: alphas [n, K, P], lights [n, K + 1, P] and, if there is a third, another like the first."""
+def _shaped(scratch: list[Tensor], entries: Tensor, n_pixels: int) -> list[Tensor]:
+    """Shape scratch buffers: alphas [n, K, P], lights [n, K + 1, P] and, if there is a third, another like the first."""
     n, length, _ = entries.shape
     lengths = (length, length + 1, length)
-    return [slab[: n * k * n_pixels].view(n, k, n_pixels) for slab, k in zip(slabs, lengths, strict=False)]
+    return [slab[: n * k * n_pixels].view(n, k, n_pixels) for slab, k in zip(scratch, lengths, strict=False)]

@@ -20,21 +20,21 @@ class _Pool:
 _pool = _Pool()
 
 
-def take(numel: int, dtype: torch.dtype) -> Tensor:
+def acquire(numel: int, dtype: torch.dtype) -> Tensor:
     """Return a flat buffer of at least `numel` uninitialised numbers, used before if one is free.
 
     Lengths are powers of two, so that scenes whose sizes change from step to step go on sharing a few kinds of buffers.
     """
     length = 1 << max(numel - 1, 0).bit_length()
-    slabs = _pool.free.get((dtype, length))
-    if not slabs:
+    free = _pool.free.get((dtype, length))
+    if not free:
         return torch.empty(length, dtype=dtype)
     _pool.retained -= length * dtype.itemsize
-    return slabs.pop()
+    return free.pop()
 
 
-def give(slab: Tensor) -> None:
-    """Return a buffer from `take`, or a view of one's beginning; nobody may use it afterwards."""
+def release(slab: Tensor) -> None:
+    """Return a buffer from `acquire`, or a view of one's beginning; nobody may use it afterwards."""
     size = slab.untyped_storage().nbytes()
     slab = slab.as_strided((size // slab.itemsize,), (1,), 0)
     if _pool.retained + size <= RETAINED_BYTES:
@@ -43,19 +43,19 @@ def give(slab: Tensor) -> None:
 
 
 def copy(tensor: Tensor) -> Tensor:
-    """Return a copy in a buffer from `take`, which `give` takes back."""
-    return take(tensor.numel(), tensor.dtype)[: tensor.numel()].view(tensor.shape).copy_(tensor)
+    """Return a copy in a buffer from `acquire`, which `release` takes back."""
+    return acquire(tensor.numel(), tensor.dtype)[: tensor.numel()].view(tensor.shape).copy_(tensor)
 
 
 @contextmanager
-def slabs(n: int, numel: int, dtype: torch.dtype) -> Iterator[list[Tensor]]:
+def acquired(n: int, numel: int, dtype: torch.dtype) -> Iterator[list[Tensor]]:
     """Lend `n` buffers of at least `numel` numbers for a block of code."""
-    taken = [take(numel, dtype) for _ in range(n)]
+    taken = [acquire(numel, dtype) for _ in range(n)]
     try:
         yield taken
     finally:
         for slab in taken:
-            give(slab)
+            release(slab)
 
 
 def retained_bytes() -> int:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pop_fast.stages.blend import buffers as workspace
+from pop_fast.stages.blend import buffers
 from pop_fast.stages.blend.alpha import Entries
 from pop_fast.stages.blend.blend import Blender
 from pop_fast.stages.blend.tile_groups import BLOCK, PackedLists, TileGroup, tile_groups
@@ -101,10 +101,10 @@ class PairWalk:
     def _walk(self, backwards: bool) -> Iterator[Pairs]:
         for group in self.groups:
             blend = self.blender.blend(group)
-            with workspace.slabs(3, group.slab, self.blender.table.dtype) as slabs:
+            with buffers.acquired(3, group.slab, self.blender.table.dtype) as scratch:
                 for step in reversed(blend.steps) if backwards else blend.steps:
-                    yield self._pairs(group, step.rows, step.blocks, self.blender.again(group, step, slabs))
-                    workspace.give(step.light)
+                    yield self._pairs(group, step.rows, step.blocks, self.blender.again(group, step, scratch))
+                    buffers.release(step.light)
 
     def _pairs(self, group: TileGroup, chosen: Tensor | None, blocks: Tensor, made: list[Tensor]) -> Pairs:
         entries, alpha, weight, scratch = made

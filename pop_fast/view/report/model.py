@@ -40,7 +40,7 @@ class Histogram:
 
 
 @dataclass(frozen=True)
-class View:
+class ReportView:
     """One held-out view: what was rendered, what was photographed, how far they are apart. uint8 RGB."""
 
     name: str
@@ -78,6 +78,6 @@ class ReportData:
     resets: Sequence[int] = field(default_factory=tuple)
     histograms: Sequence[Histogram] = field(default_factory=tuple)
     dominant: tuple[str, np.ndarray, np.ndarray] | None = None
-    views: Sequence[View] = field(default_factory=tuple)
+    views: Sequence[ReportView] = field(default_factory=tuple)
     config: Mapping[str, Any] = field(default_factory=dict)
     events: Sequence[Mapping[str, Any]] = field(default_factory=tuple)

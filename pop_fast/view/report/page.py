@@ -11,7 +11,7 @@ import numpy as np
 
 from pop_fast.view import pictures
 from pop_fast.view.report.curves import Chart, Series, draw, draw_histogram
-from pop_fast.view.report.model import Histogram, ReportData, Tile, View
+from pop_fast.view.report.model import Histogram, ReportData, ReportView, Tile
 
 # (title, ((curve, legend, colour, dots), ...), log axis, axis from zero, unit)
 _CHARTS: Final = (
@@ -143,7 +143,7 @@ def _dominance(data: ReportData) -> str:
     )
 
 
-def _views(views: Sequence[View]) -> str:
+def _views(views: Sequence[ReportView]) -> str:
     if not views:
         return ""
     errors = [pictures.error_magnitude(view.render, view.photo) for view in views]

@@ -15,7 +15,7 @@ from pop_fast.io.read_back import check_record, parse_json, read_arrays, read_js
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.results import read_config
 from pop_fast.view.report.curves import Window
-from pop_fast.view.report.model import Histogram, ReportData, Tile, View
+from pop_fast.view.report.model import Histogram, ReportData, ReportView, Tile
 
 MIB: Final = 2**20
 # float32 numbers of a Gaussian: as gsplat's checkpoints hold it, and as Inria's PLY does (with three zero normals)
@@ -220,10 +220,10 @@ def _histograms(folder: Path, max_steps: int) -> Iterator[Histogram]:
         yield Histogram(title, counts.reshape(-1, 2).sum(axis=1))
 
 
-def _views(folder: Path) -> Iterator[View]:
+def _views(folder: Path) -> Iterator[ReportView]:
     for path in _last_view_files(folder):
         a = read_arrays(path, _VIEW, _AGAIN)
-        yield View(str(a["name"]), a["render"], a["photo"], float(a["psnr"]), float(a["ssim"]))
+        yield ReportView(str(a["name"]), a["render"], a["photo"], float(a["psnr"]), float(a["ssim"]))
 
 
 def _dominant(folder: Path) -> tuple[str, np.ndarray, np.ndarray] | None:

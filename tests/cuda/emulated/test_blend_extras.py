@@ -56,7 +56,7 @@ def told(gpu, counts: bool):
     settings = StepSettings(steady_updates(dict.fromkeys(params, 1e-3), 2), replay=False, counts=counts)
     trainer = FusedTrainer(params, m, v, views, [0, 0], settings)
     trainer.run(2, Phase(0, True, True, True))
-    ((_, maps),) = trainer.told_maps().items()
+    ((_, maps),) = trainer.render_stats().items()
     return maps, params
 
 

@@ -1,8 +1,8 @@
 """Time this checkout against another one, turn about in one process, so that a noisy machine is as noisy for both.
 
     git worktree add /tmp/before HEAD~1
-    python benchmarks/turn_about.py /tmp/before                    whole training steps and the blend, all cases
-    python benchmarks/turn_about.py /tmp/before --only blend --repeats 40
+    python benchmarks/ab_benchmark.py /tmp/before                    whole training steps and the blend, all cases
+    python benchmarks/ab_benchmark.py /tmp/before --only blend --repeats 40
 
 Each repeat runs one checkout and then the other, in changing order, and gives one ratio, this / other; what is reported
 is the median of the ratios and their quartiles. Nothing is timed unless the two render the same image.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.density import densify
-from pop_fast.density.protocol import Population, StepEvent
+from pop_fast.density.protocol import DensificationStep, Population
 from pop_fast.stages.density import average_grads
 from pop_fast.stages.losses import photometric_3dgs
 from pop_fast.stages.selection import sample_without_replacement
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pop_fast.density.taming import TamingStrategy
 
 
-def refine(plan: TamingStrategy, of: Population) -> StepEvent:
+def refine(plan: TamingStrategy, of: Population) -> DensificationStep:
     """Clone, split and prune, each by sampling."""
     scores, event = scores_of(plan, of), plan.event_at(of.step)
     clones, splits = densify.who_grows(plan, of)

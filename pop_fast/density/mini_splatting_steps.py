@@ -11,7 +11,7 @@ from torch import Tensor
 from pop_fast.data.initialize import SH_C0
 from pop_fast.density import densify
 from pop_fast.density import rows as ops
-from pop_fast.density.protocol import Params, Population, StepEvent
+from pop_fast.density.protocol import DensificationStep, Params, Population
 from pop_fast.stages.mini_splatting import nearest_log_scales, samples_per_view, view_importance
 from pop_fast.stages.selection import least_mass, sample_without_replacement
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pop_fast.density.mini_splatting import MiniSplattingStrategy
 
 
-def set_anew_from_depth(plan: MiniSplattingStrategy, of: Population) -> StepEvent:
+def set_anew_from_depth(plan: MiniSplattingStrategy, of: Population) -> DensificationStep:
     """Replace all Gaussians by points of the training views, with their pixels' colours."""
     points, colors = [], []
     for index in range(of.views.n_views):
@@ -56,7 +56,7 @@ def importance(plan: MiniSplattingStrategy, of: Population) -> Tensor:
     return torch.where(dominant_sum > 0, total, 0.0)
 
 
-def draw_by_importance(plan: MiniSplattingStrategy, of: Population) -> StepEvent:
+def draw_by_importance(plan: MiniSplattingStrategy, of: Population) -> DensificationStep:
     """Let a share of the Gaussians, drawn by importance, keep place and colour and begin anew; the others go."""
     weights = importance(plan, of)
     wanted = int(plan.sampling_factor * int((weights > 0.0).sum()))
@@ -65,18 +65,18 @@ def draw_by_importance(plan: MiniSplattingStrategy, of: Population) -> StepEvent
     return _begin_anew(plan, of, of.params["means"].detach()[drawn], of.params["sh0"].detach()[drawn])
 
 
-def prune(plan: MiniSplattingStrategy, of: Population) -> StepEvent:
+def prune(plan: MiniSplattingStrategy, of: Population) -> DensificationStep:
     """Remove the least important Gaussians, and start Adam anew."""
     mask = least_mass(importance(plan, of), plan.prune_mass)
     pruned = densify.prune(of, mask.to(of.params["means"].device))
     ops.restart(of.params, of.optimizers)
-    return StepEvent(pruned=pruned)
+    return DensificationStep(pruned=pruned)
 
 
-def _begin_anew(plan: MiniSplattingStrategy, of: Population, points: Tensor, sh0: Tensor) -> StepEvent:
+def _begin_anew(plan: MiniSplattingStrategy, of: Population, points: Tensor, sh0: Tensor) -> DensificationStep:
     densify.forget(of.state)
     ops.replace_rows(of.params, of.optimizers, of.state, _rows(of.params, points, sh0, plan.reinit_opacity))
-    return StepEvent(replaced=len(points))
+    return DensificationStep(replaced=len(points))
 
 
 def _rows(params: Params, points: Tensor, sh0: Tensor, opacity: float) -> Mapping[str, Tensor]:
