@@ -272,7 +272,7 @@ class Blender:
 
 
 def _shaped(scratch: list[Tensor], entries: Tensor, n_pixels: int) -> list[Tensor]:
-    """Shape scratch buffers: alphas [n, K, P], lights [n, K + 1, P] and, if there is a third, another like the first."""
+    """Shape scratch: alphas [n, K, P], lights [n, K + 1, P] and, if there is a third, another like the first."""
     n, length, _ = entries.shape
     lengths = (length, length + 1, length)
     return [slab[: n * k * n_pixels].view(n, k, n_pixels) for slab, k in zip(scratch, lengths, strict=False)]
