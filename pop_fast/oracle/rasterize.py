@@ -15,8 +15,8 @@ from pop_fast.api.checks import check_cameras, check_colors, check_gaussians, ch
 from pop_fast.api.rasterize import rasterization as on_every_backend
 from pop_fast.errors import PopError
 from pop_ref.constants import Profile
+from pop_ref.records import Camera, Gaussians, Render
 from pop_ref.render import render, render_vjp
-from pop_ref.types import Camera, Gaussians, Render
 
 
 def rasterization(

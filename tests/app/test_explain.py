@@ -23,7 +23,7 @@ from pop_fast.view.explain.maps import termination_depths
 from pop_fast.view.explain.table import WIDTH, table
 from pop_fast.view.explain.walk import candidates, oracle_splats, walk
 from pop_ref.constants import PAPER, Profile
-from pop_ref.types import Splats
+from pop_ref.records import Splats
 from tests.app.conftest import Pop
 from tests.app.tiny import tiny_capture
 
