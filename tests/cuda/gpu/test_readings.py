@@ -53,7 +53,7 @@ def test_the_share_that_blurs_is_of_the_pixels_that_a_view_keeps(gpu):
     differs = 0
     for step in range(STEPS):
         trainer.run(step + 1, Phase(3, True, True, True))
-        ((_, maps),) = trainer.told_maps().items()
+        ((_, maps),) = trainer.render_stats().items()
         counts, masked = maps["dominant_counts"].cpu(), masks[scene.order[step]] is not None
         kept = WIDTH // 4 * HEIGHT if masked else WIDTH * HEIGHT
         assert torch.equal(trainer.statistics.blurred.bool().cpu(), counts > THETA * kept), step
