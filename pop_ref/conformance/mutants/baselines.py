@@ -44,7 +44,7 @@ BASELINES: Final = (
         "the score leaves out the background behind the last splat",
         "sensitivity.py",
         "suffix_color = sum(black_or_given)",
-        "behind = 0.0",
+        "suffix_color = 0.0",
         "test_sensitivity:the_same_light_added_to_everything_changes_no_sensitivity",
     ),
     Mutant(
