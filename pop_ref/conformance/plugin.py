@@ -10,6 +10,8 @@ from __future__ import annotations
 import json
 import os
 import re
+import time
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -210,7 +212,19 @@ class _Recorder:
             detail = str(crash.message if crash else report.longrepr).splitlines()[0]
             told = tuple(TOLD.findall(report.longreprtext))
         backend, stage, law = named
-        self.card.entries.append(Entry(backend, stage, law, report.outcome, detail, report.duration, told))
+        cpu: Any = dict(report.user_properties).get("cpu", 0.0)
+        self.card.entries.append(Entry(backend, stage, law, report.outcome, detail, report.duration, told, cpu))
 
-    def pytest_sessionfinish(self) -> None:
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self, item: pytest.Item) -> Generator[None, Any, Any]:
+        start = time.process_time()
+        try:
+            return (yield)
+        finally:
+            item.user_properties.append(("cpu", time.process_time() - start))
+
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        from pop_ref.conformance.surface import surface_of
+
+        self.card.surfaces = {b.name: surface_of(b) for b in _chosen_backends(session.config)}
         self.card.write(self.path)
