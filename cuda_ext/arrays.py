@@ -36,6 +36,21 @@ def on_gpu(tensor: Tensor) -> bool:
     return tensor.device.type == "cuda"
 
 
+def check_tensor(name: str, tensor: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Return a float32 tensor of that shape that kernels can read.
+
+    Raises:
+        ValueError: names the tensor and what to do.
+    """
+    if not on_gpu(tensor):
+        raise ValueError(f"{name} is on {tensor.device}; backend 'cuda' needs it on the GPU: use {name}.cuda()")
+    if tensor.dtype != torch.float32:
+        raise ValueError(f"{name} has dtype {tensor.dtype}; backend 'cuda' computes in float32: use {name}.float()")
+    if tuple(tensor.shape) != shape:
+        raise ValueError(f"{name} has shape {list(tensor.shape)}; it must be {list(shape)}")
+    return tensor
+
+
 def pointer(name: str, tensor: Tensor | None, dtypes: str = "float32") -> int:
     """Return a tensor's address, 0 for None.
 
@@ -151,7 +166,7 @@ class Settings:
         antialiased: scale opacities by the low-pass compensation.
         radius_clip: px.
         absgrad: also sum |v_means2d|.
-        family: "columns" or "splats", which kernel goes back.
+        backward: "pixel_parallel" or "gaussian_parallel", which kernel goes back.
         deterministic: sum gradients through slots; False adds atomically and saves 48 bytes an instance.
     """
 
@@ -163,7 +178,7 @@ class Settings:
     antialiased: bool = False
     radius_clip: float = 0.0
     absgrad: bool = False
-    family: str = "columns"
+    backward: str = "pixel_parallel"
     deterministic: bool = True
 
     def kernel_profile(self) -> Any:
