@@ -38,7 +38,7 @@ CASES = {
     "gsplat": {"method": "gsplat"},
     "summed": with_pop(blur_window="sum", blur_min_pixels=40.0),
     "window": with_pop(pop_views="window", lambda_pop=0.05),
-    "own view": with_pop(blur_window="own_view"),
+    "any view": with_pop(blur_window="any_view"),
     "phases": with_pop(pop_start_iter=5, pop_stop_iter=13, blur_stop_iter=9, refine_stop_iter=18),
     "reset": with_gsplat(reset_every=7),
 }

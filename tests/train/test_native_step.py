@@ -42,7 +42,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "without the prior": {"lambda_pop": 0.0},
     "the prior over what is seen": {"pop_over": "visible"},
     "the prior over the window": {"pop_views": "window"},
-    "blur of its own view": {"blur_window": "own_view"},
+    "blur of any view": {"blur_window": "any_view"},
     "blur of summed counts": {"blur_window": "sum"},
     "profile inria": {"profile": "inria"},
     "profile gsplat_1_6": {"profile": "gsplat_1_6"},

@@ -44,7 +44,7 @@ CASES = {
         {"strategy": {"pop_views": "window", "refine_start_iter": 8, "refine_stop_iter": 7}},
         lambda capture: capture,
     ),
-    "own view": ({"strategy": {"blur_window": "own_view"}}, masked),
+    "any view": ({"strategy": {"blur_window": "any_view"}}, masked),
 }
 
 
