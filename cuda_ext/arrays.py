@@ -15,17 +15,6 @@ NOT_BAD = 2**31 - 1
 # places in DeviceState (csrc/launch.h)
 OVERFLOW, N_INSTANCES, N_BUCKETS, N_IMPORTANT, BAD_ROW, STEP, VIEW = range(7)
 
-_NUMBERS = (
-    "near_plane",
-    "far_plane",
-    "eps2d",
-    "frustum_margin",
-    "extent_sigmas",
-    "alpha_floor",
-    "alpha_ceiling",
-    "transmittance_stop",
-)
-
 
 class CudaMemoryError(RuntimeError):
     """The GPU has no room; the message says how much was asked for and what to lower."""
@@ -142,15 +131,8 @@ def new_state(device: torch.device) -> Tensor:
 def kernel_profile(profile: Profile, tile_size: int) -> Any:
     """Return the kernels' form of a profile."""
     made = load().Profile()
-    for name in _NUMBERS:
-        setattr(made, name, getattr(profile, name))
-    made.tile_size = tile_size
-    made.near_inclusive = profile.near_inclusive
-    made.centred = profile.principal_point == "centred"
-    made.inria_clamp = profile.clamp_gradient == "inria"
-    made.square = profile.extent == "square"
-    made.pass_ceiling = profile.ceiling_gradient == "pass"
-    made.stop_inclusive = profile.stop_inclusive
+    for name, value in {**profile.as_numbers(), "tile_size": tile_size}.items():
+        setattr(made, name, value)
     return made
 
 

@@ -169,8 +169,8 @@ def test_the_kit_runs_from_the_command_line_and_writes_a_scorecard(tmp_path: Pat
                 "--dtype", "float64", "--profile", "paper", "--scorecard", str(card))  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     told = json.loads(card.read_text())
-    assert set(told["summary"]["pop_fast.api.rasterize:rasterization"]) == {"camera"}
-    (laws,) = told["laws"]["pop_fast.api.rasterize:rasterization"].values()
+    assert set(told["summary"]["pop_fast.api:rasterization"]) == {"camera"}
+    (laws,) = told["laws"]["pop_fast.api:rasterization"].values()
     assert "a rigid motion keeps distances".replace(" ", "_") in laws
     assert all(came == "passed" or came.startswith("skipped: ") for came in laws.values())
     assert told["made"]["hypothesis profile"]
