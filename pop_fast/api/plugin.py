@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
+from pop_fast.errors import PopError
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -46,7 +48,14 @@ class DrawingBackend:
         return losses
 
     def rasterization(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, RenderMeta]:
-        """Render; see `pop_fast.api.rasterize.rasterization`."""
+        """Render; see `pop_fast.api.rasterize.rasterization`.
+
+        Raises:
+            PopError: it cannot run here; says why and what to do.
+        """
+        reason = self.why_not()
+        if reason is not None:
+            raise PopError(f"backend {self.name!r} cannot run: {reason}")
         from pop_fast.api.rasterize import rasterization
 
         return rasterization(*args, **kwargs, backend=cast("Backend", self))
