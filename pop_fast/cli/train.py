@@ -273,11 +273,9 @@ def check_backend(config: TrainConfig) -> None:
     Raises:
         PopError: says why and what to do.
     """
-    from pop_fast.api.registry import get_backend
+    from pop_fast.api.registry import require_backend
 
-    backend = get_backend(config.backend)
-    if not backend.available():
-        raise PopError(f"backend {config.backend!r} is not available: {backend.why_not()}")
+    require_backend(config.backend)
     if config.backend == "cuda":
         from pop_fast.train.fused_stepper import unsupported
 

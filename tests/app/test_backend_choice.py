@@ -88,7 +88,7 @@ def test_what_takes_the_steps_goes_with_the_backend(tmp_path):
 def test_cuda_asked_for_in_vain_is_one_sentence_before_anything_is_read(pop: Pop, tmp_path: Path) -> None:
     outcome = pop("train", tmp_path / "no such capture", "--backend", "cuda", "--out", tmp_path / "r")
     assert outcome.status == 2
-    assert outcome.err == f"pop: error: backend 'cuda' is not available: {NOT_BUILT}\n"
+    assert outcome.err == f"pop: error: backend 'cuda' cannot run: {NOT_BUILT}\n"
     with pytest.raises(PopError, match="not built"):
         cuda_engine()
     with pytest.raises(PopError, match="backend 'cuda' cannot run: the CUDA extension is not built"):

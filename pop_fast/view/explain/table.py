@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from textwrap import wrap
+from typing import TYPE_CHECKING
 
-from pop_fast.view.explain.model import PixelExplanation, Row
+if TYPE_CHECKING:
+    from pop_fast.view.explain.model import PixelExplanation, Row
 
 WIDTH = 120
 _KEPT = 20
