@@ -16,6 +16,7 @@ import numpy as np
 
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import write_atomically
+from pop_fast.io.image_header import LARGEST, size_of
 
 __all__ = [
     "FIX",
@@ -31,6 +32,7 @@ __all__ = [
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 # what telephones and cameras write and OpenCV cannot read: HEIF and raw formats
 _UNREADABLE = (".heic", ".heif", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
+_VIDEOS = (".mov", ".mp4", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp")
 FIX = "copy it again from its source, or remove it from the capture"
 
 
@@ -49,15 +51,30 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def unreadable_photographs(folder: Path) -> str | None:
-    """Say how many photographs of a folder are in a format that is not read, and how to convert them; None if none."""
-    found = [path.suffix for path in folder.rglob("*") if path.suffix.lower() in _UNREADABLE and path.is_file()]
-    if not found:
-        return None
-    kind = max(set(found), key=found.count)
-    return (
-        f"{len(found)} files are {kind[1:].upper()} or the like, which is not read: convert them to JPEG first, "
-        f"for example with ImageMagick: magick mogrify -format jpg *{kind}"
-    )
+    """Say how many files of a folder hold pictures in a format that is not read, and how to convert them; None if none.
+
+    Hidden files are left out, as `list_images` does.
+    """
+    files = [
+        path for path in folder.rglob("*") if not any(part.startswith(".") for part in path.relative_to(folder).parts)
+    ]
+    still = [path.suffix for path in files if path.suffix.lower() in _UNREADABLE and path.is_file()]
+    moving = [path for path in files if path.suffix.lower() in _VIDEOS and path.is_file()]
+    told: list[str] = []
+    if still:
+        kind = max(set(still), key=still.count)
+        what = f"{len(still)} files are" if len(still) > 1 else "1 file is"
+        told.append(
+            f"{what} {kind[1:].upper()} or the like, which is not read: convert them to JPEG first, "
+            f"for example with ImageMagick: magick mogrify -format jpg *{kind}"
+        )
+    if moving:
+        what = f"{len(moving)} files are videos, which are" if len(moving) > 1 else "1 file is a video, which is"
+        told.append(
+            f"{what} not read ({moving[0].name}): take sharp frames out first, "
+            f"for example with ffmpeg -i {moving[0].name} -vf fps=2 frame_%04d.jpg"
+        )
+    return "; ".join(told) or None
 
 
 def find_image(folder: Path, name: str) -> Path | None:
@@ -160,6 +177,12 @@ def _decode(path: Path) -> np.ndarray:
         raise CaptureError(f"{path}: the file is absent; restore it, or remove it from the capture") from None
     except OSError as error:
         raise CaptureError(f"{path}: could not be read: {error.strerror}; check the file's permissions") from error
+    size = size_of(data)
+    if size is not None and size[0] * size[1] > LARGEST:
+        raise CaptureError(
+            f"{path}: is {size[0]}x{size[1]} px by its header; more than {LARGEST // 10**6} million pixels are not "
+            "decoded: make it smaller"
+        )
     defect = _defect(data)
     if defect:
         raise CaptureError(f"{path}: {defect}; {FIX}")
