@@ -209,15 +209,14 @@ def about_points(shots: Iterable[Shot], cloud: Cloud | None, sample: int = 2000)
 
 def about_reprojection(root: Path) -> Iterator[Finding]:
     """Tell the mean reprojection error of the model's tracks, where it has any."""
-    import pycolmap
-
     from pop_fast.data.colmap import quiet_colmap
+    from pop_fast.data.pinhole import require_colmap
 
     model = find_model(root)
     if model is None:
         return
     with quiet_colmap():
-        reconstruction = pycolmap.Reconstruction(model)
+        reconstruction = require_colmap().Reconstruction(model)
         observations = int(reconstruction.compute_num_observations())
         if observations == 0:
             yield Finding("ok", "reprojection", "the model has no tracks, so its error cannot be told")

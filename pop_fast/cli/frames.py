@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
+from pop_fast.cli.progress import bars
 from pop_fast.cli.splat import Splat
 from pop_fast.data import Capture
 from pop_fast.errors import PopError
@@ -86,8 +86,9 @@ def rendered(
     backend, note = renderer(config.backend)
     if note:
         print(f"note: {note}", file=sys.stderr)
-    with reproducible(config.threads):
-        for view in tqdm(views, desc="rendering", unit="view", disable=None, leave=False):
+    with reproducible(config.threads), bars() as progress:
+        for done, view in enumerate(views):
+            progress("rendering", done, len(views))
             image = render_view(backend, splat.params, view, config, splat.sh_degree, counts=as_measured).image
             yield (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
 

@@ -118,12 +118,26 @@ def _train(config: TrainConfig, options: Any, chosen: str) -> int:
     try:
         stats = training.run()
     except KeyboardInterrupt:
-        stopped = f"stopped after step {training.step}; the same command with --resume goes on"
-        nothing = "stopped before the first step; nothing was written"
-        print(f"pop: {stopped if training.step else nothing}", file=sys.stderr)
+        print(f"pop: {_stopped(folder, training.step)}", file=sys.stderr)
         return EXIT_INTERRUPTED
     print(summary(stats), flush=True)
     return report(folder)
+
+
+def _stopped(folder: Path, step: int) -> str:
+    """Say where a run stopped and from which checkpoint it goes on: after a second Ctrl-C that is not the last step."""
+    from pop_fast.train.checkpoint import list_checkpoints
+
+    if step == 0:
+        return "stopped before the first step; nothing was written"
+    kept = [number + 1 for number, _ in list_checkpoints(folder)]
+    if not kept:
+        return (
+            f"stopped after step {step:,}, before a checkpoint was written; the same command with --resume starts anew"
+        )
+    if kept[-1] == step:
+        return f"stopped after step {step:,}; the same command with --resume goes on"
+    return f"stopped after step {step:,}; the same command with --resume goes on from step {kept[-1]:,}"
 
 
 def report(folder: Path) -> int:

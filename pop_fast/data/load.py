@@ -149,7 +149,7 @@ def _from_photos(root: Path, sfm: bool | SfmOptions, progress: Progress | None) 
         raise CaptureError(
             f"{root}: has {count} photographs but nothing says where they were taken; run pop sfm {root} first"
         )
-    run_sfm(photos, root, progress, **asdict(sfm if isinstance(sfm, SfmOptions) else SfmOptions()))
+    run_sfm(photos, root, progress=progress, **asdict(sfm if isinstance(sfm, SfmOptions) else SfmOptions()))
     return root / "sparse" / "0"
 
 

@@ -16,7 +16,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -35,6 +34,7 @@ _NEIGHBOURS: Final = 10
 # photographs, and the square of it pairs, between two reports of progress
 _BATCH: Final = 8
 FIX: Final = "take photographs that overlap by two thirds, from different places, of a scene with texture"
+_DONE: Final = b"."
 # letters of what COLMAP says that an error shows
 _LONGEST: Final = 300
 
@@ -103,6 +103,10 @@ def find_cameras(search: Search, progress: Progress | None) -> Any:
         try:
             end = _listen(child, search, progress)
             child.wait()
+            if child.stdin is not None:
+                with contextlib.suppress(BrokenPipeError):
+                    child.stdin.write(_DONE)
+                    child.stdin.flush()
         finally:
             child.kill()
             child.wait()
@@ -143,7 +147,7 @@ def main() -> None:
     out = os.fdopen(os.dup(1), "w", encoding="ascii")
     os.dup2(2, 1)
     search = Search(**json.loads(sys.stdin.buffer.readline()))
-    threading.Thread(target=_end_with_the_other, args=(search,), daemon=True).start()
+    _watch(search)
 
     def say(word: Any) -> None:
         out.write(json.dumps(word) + "\n")
@@ -160,12 +164,21 @@ def main() -> None:
         say(f"COLMAP failed: {said}; {FIX}")
 
 
-def _end_with_the_other(search: Search) -> None:
-    """Wait until the other process is gone, however it ended, and leave nothing of the search."""
-    while os.read(0, 4096):
-        pass
-    shutil.rmtree(search.work, ignore_errors=True)
-    os._exit(1)
+def _watch(search: Search) -> None:
+    """Leave a process behind that ends this one, and removes the folder of the search, when the other one is gone.
+
+    A thread could not: COLMAP keeps the interpreter to itself while it computes.
+    """
+    worker = os.getpid()
+    if not hasattr(os, "fork") or os.fork():
+        return
+    # the other process waits for the end of these too
+    os.closerange(1, 64)
+    if os.read(0, 1) != _DONE:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(worker, signal.SIGKILL)
+        shutil.rmtree(search.work, ignore_errors=True)
+    os._exit(0)
 
 
 def _made(folder: Path) -> Path:
