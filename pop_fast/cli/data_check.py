@@ -13,7 +13,7 @@ import tyro
 from pop_fast.cli.arguments import parse
 
 if TYPE_CHECKING:
-    from pop_fast.cli.finding import Finding
+    from pop_fast.data.finding import Finding
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -57,31 +57,33 @@ def run(argv: Sequence[str]) -> int:
 
 def look_over(root: Path, images: str | None = None) -> list[Finding]:
     """Examine a capture, or photographs alone; all findings in reading order."""
-    from pop_fast.cli import examine
     from pop_fast.cli.doctor import memory_bytes
-    from pop_fast.cli.examine_photos import about_quality, measure_file
-    from pop_fast.cli.finding import Finding
-    from pop_fast.data.photos import photo_folder, photographs
+    from pop_fast.data import check_dataset
+    from pop_fast.data.finding import Finding
+    from pop_fast.data.photo_quality import about_quality, measure_file
+    from pop_fast.data.sfm import photo_folder, photographs
 
-    listing = examine.read_listing(root, images)
+    listing = check_dataset.read_listing(root, images)
     if listing is None:
         folder = photo_folder(root)
         files = photographs(folder)
         shown, damage = _each(files, lambda path: measure_file(path, path.relative_to(folder).as_posix()), lambda p: p)
-        findings = [*examine.about_bare(root, shown), *(Finding("bad", "photographs", told) for told in damage)]
+        findings = [*check_dataset.about_bare(root, shown), *(Finding("bad", "photographs", told) for told in damage)]
         return [*findings, *about_quality(shown)]
     made_from, shots, cloud = listing
     findings = [Finding("ok" if len(shots) > 1 else "bad", "poses", f"{len(shots)} views from the {made_from}")]
-    findings += examine.about_cameras(shots)
-    paths = {id(shot): examine.file_of(root, shot) for shot in shots}
-    photos, damage = _each(shots, lambda shot: examine.read_photo(shot, paths[id(shot)]), lambda shot: paths[id(shot)])
-    findings += examine.about_photos(photos, root)
+    findings += check_dataset.about_cameras(shots)
+    paths = {id(shot): check_dataset.file_of(root, shot) for shot in shots}
+    photos, damage = _each(
+        shots, lambda shot: check_dataset.read_photo(shot, paths[id(shot)]), lambda shot: paths[id(shot)]
+    )
+    findings += check_dataset.about_photos(photos, root)
     findings += [Finding("bad", "photographs", told) for told in damage]
     findings += about_quality([photo.shown for photo in photos if photo.shown is not None])
-    findings += examine.about_masks(photos, root)
-    findings += examine.about_points(shots, cloud)
-    findings += examine.about_reprojection(root)
-    findings += examine.about_memory(photos, cloud, memory_bytes()[1])
+    findings += check_dataset.about_masks(photos, root)
+    findings += check_dataset.about_points(shots, cloud)
+    findings += check_dataset.about_reprojection(root)
+    findings += check_dataset.about_memory(photos, cloud, memory_bytes()[1])
     return findings
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Final, Literal
 import tyro
 
 from pop_fast.cli.arguments import parse
-from pop_fast.data.photos import SfmOptions
+from pop_fast.data.sfm import SfmOptions
 
 _EXAMPLES: Final = """
     pop sfm photos                 writes photos/sparse/0
@@ -45,7 +45,7 @@ def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "sfm", examples=_EXAMPLES)
     from pop_fast.cli.progress import bars
     from pop_fast.data import run_sfm
-    from pop_fast.data.photos import photo_folder
+    from pop_fast.data.sfm import photo_folder
     from pop_fast.io.images import unreadable_photographs
 
     with bars() as progress:

@@ -12,8 +12,8 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from pop_fast.data import load_capture
-from pop_fast.data.demo_scene import make_scene
-from pop_fast.data.demo_tracer import render_view
+from pop_fast.demo.scene import make_scene
+from pop_fast.demo.tracer import render_view
 from tests.app.captures import colmap_capture, look_at, photograph, write_photograph
 from tests.app.conftest import Pop
 

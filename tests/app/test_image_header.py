@@ -84,7 +84,7 @@ def test_a_photograph_of_another_shape_is_refused_before_it_is_decoded(
         decoded.append(path)
         return read_image(path)
 
-    monkeypatch.setattr("pop_fast.data.views.read_image", reading)
+    monkeypatch.setattr("pop_fast.data.read_images.read_image", reading)
     assert_one_line(lambda: load_capture(root), "02.png", "8000x8000 px", "another shape")
     assert root / "images" / "02.png" not in decoded
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pop_fast.data import load_capture, photos, run_sfm
+from pop_fast.data import load_capture, run_sfm, sfm
 from pop_fast.data.capture import View
 from tests.app.captures import PINHOLE, assert_one_line, camera, make_model, photograph, ring, write_photograph
 from tests.app.conftest import Pop
@@ -24,7 +24,7 @@ def _cameras_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
     def find(job: Any, *_: Any) -> Any:
         return make_model(job.names, ring(len(job.names)), [camera("PINHOLE", PINHOLE, 40, 30)])
 
-    monkeypatch.setattr(photos, "_find_cameras", find)
+    monkeypatch.setattr(sfm, "_find_cameras", find)
 
 
 def shoot(folder: Path) -> Path:
