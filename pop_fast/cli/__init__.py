@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import importlib
+import io
 import os
 import re
 import signal
@@ -19,6 +20,7 @@ from types import FrameType
 from typing import Final
 
 from pop_fast.cli.errors import describe
+from pop_fast.cli.printable import message
 
 COMMANDS: Final = {
     "train": "fit a splat to a capture or a folder of photographs",
@@ -35,6 +37,7 @@ COMMANDS: Final = {
     "build-cuda": "compile the CUDA extension (needs nvcc)",
     "learn": "build your own splatting in NumPy, judged stage by stage",
     "vectors": "write the conformance vectors for ports in other languages, and check a port's results",
+    "completion": "write a script by which a shell completes the words of pop",
     "doctor": "say what is installed, what is missing and how to get it",
 }
 
@@ -55,6 +58,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words or os.environ.get("POP_DEBUG", "") not in ("", "0")
     words = [word for word in words if word != "--debug"]
+    for stream in (sys.stdout, sys.stderr):
+        # a name that is no text is shown with escapes
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         with _terminable():
             status = _run(words)
@@ -73,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         line = describe(error)
         if debug or line is None:
             raise
-        print(f"pop: error: {line}", file=sys.stderr)
+        print(f"pop: error: {message(line)}", file=sys.stderr)
         return EXIT_BAD_INPUT
 
 

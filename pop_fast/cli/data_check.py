@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import tyro
 
 from pop_fast.cli.arguments import parse
+from pop_fast.cli.printable import printable
 
 if TYPE_CHECKING:
     from pop_fast.data.finding import Finding
@@ -46,12 +47,13 @@ def run(argv: Sequence[str]) -> int:
         kind = (finding.state, finding.about)
         shown[kind] = shown.get(kind, 0) + 1
         if args.all or shown[kind] <= 5:
-            print(f"{marks[finding.state]:<6}{finding.about:<{width}}{finding.text}")
+            print(printable(f"{marks[finding.state]:<6}{finding.about:<{width}}{finding.text}"))
     hidden = sum(count - 5 for count in shown.values() if count > 5)
     if hidden and not args.all:
         print(f"and {hidden} more of the same kinds; --all prints them")
     bad = sum(finding.state == "bad" for finding in findings)
-    print(f"{bad} problem{'s' if bad != 1 else ''} stand against training" if bad else "ready to train")
+    told = f"{bad} problem{'s stand' if bad != 1 else ' stands'} against training"
+    print(told if bad else "ready to train")
     return 1 if bad else 0
 
 

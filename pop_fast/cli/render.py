@@ -111,6 +111,6 @@ def listed_in(folder: Path) -> Callable[[Path], bool]:
     try:
         index = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
         files = {_INDEX, *(str(entry["file"]) for entry in index["renders"])}
-    except (OSError, ValueError, TypeError, KeyError):
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
         files = set()  # not there, or not this command's: then nothing in the folder is known to be
     return lambda file: file.as_posix() in files

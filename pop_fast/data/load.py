@@ -15,8 +15,9 @@ from pop_fast.data.normalize import normalizing_transform, transform_points, tra
 from pop_fast.data.posed_images import PosedImage, SparsePoints
 from pop_fast.data.random_points import random_points
 from pop_fast.data.read_images import PhotoOptions, read_views
-from pop_fast.data.sfm import SfmOptions, photo_folder, photographs, run_sfm
+from pop_fast.data.sfm import photo_folder, photographs, run_sfm
 from pop_fast.data.sfm_files import read_upright
+from pop_fast.data.sfm_options import SfmOptions
 from pop_fast.data.transforms import find_transforms, read_transforms
 from pop_fast.errors import CaptureError
 from pop_fast.io.images import find_image, unreadable_photographs

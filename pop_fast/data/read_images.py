@@ -112,10 +112,22 @@ def _locate(
     if masks and not any(photo.mask for photo in photos):
         raise CaptureError(f"{masks}: holds no mask named as a photograph (<name>.png or <name>.jpg.png); rename them")
     notes = [f"{len(absent)} of {len(shots)} listed images are absent and were skipped"] if absent else []
+    notes += _about_folders(root, shots, options)
     unmasked = [photo.path for photo in photos if photo.mask is None]
     if 0 < len(unmasked) < len(photos):
         notes.append(f"{len(unmasked)} of {len(photos)} photographs have no mask and count whole, first {unmasked[0]}")
     return photos, notes
+
+
+def _about_folders(root: Path, shots: Sequence[PosedImage], options: PhotoOptions) -> list[str]:
+    """Tell which photographs a factor is met by: those that were made smaller before, or the large ones."""
+    if options.factor == 1:
+        return []
+    read = {_image_folder(root, folder, options) for folder in {shot.folder for shot in shots}}
+    names = ", ".join(sorted(f"{chosen or '.'}/" for chosen, _ in read))
+    if all(shrink == 1 for _, shrink in read):
+        return [f"the photographs of {names} are used, made smaller before; --images says otherwise"]
+    return [f"the photographs of {names} are shrunk by {options.factor} here"]
 
 
 def _image_folder(root: Path, folder: str, options: PhotoOptions) -> tuple[str, int]:

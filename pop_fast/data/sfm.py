@@ -21,42 +21,15 @@ from typing import Any, Literal
 from pop_fast.data.capture import Progress
 from pop_fast.data.colmap import quiet_colmap
 from pop_fast.data.sfm_files import UPRIGHT, recognise_result, write_list
-from pop_fast.data.sfm_search import MATCHERS, Search, check_camera_model, find_cameras
+from pop_fast.data.sfm_options import SfmOptions
+from pop_fast.data.sfm_search import Search, check_camera_model, find_cameras
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import folder_atomically
 from pop_fast.io.image_header import read_exif
 from pop_fast.io.images import list_images, read_image, unreadable_photographs
 from pop_fast.io.jpeg import sound_jpegs
 
-__all__ = ["SfmOptions", "SfmResult", "photo_folder", "photographs", "run_sfm"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SfmOptions:
-    """How cameras are found.
-
-    Attributes:
-        max_size: longest side at which features are looked for, px; cameras are always in full size.
-        camera_model: COLMAP's name of the lens model.
-        single_camera: all photographs share one camera; by default when they are all of one size.
-        matcher: "exhaustive" matches all photographs with all, "sequential" each with its neighbours by name; "auto"
-            matches up to 60 exhaustively.
-        seed: of every random choice.
-    """
-
-    max_size: int = 1600
-    camera_model: str = "SIMPLE_RADIAL"
-    single_camera: bool | None = None
-    matcher: Literal["auto", "exhaustive", "sequential"] = "auto"
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.max_size < 64:
-            raise CaptureError(f"max_size is {self.max_size}; it must be at least 64 px, or there are no features")
-        if self.matcher not in MATCHERS:
-            raise CaptureError(f"matcher is {self.matcher!r}; use one of {', '.join(MATCHERS)}")
-        if not 0 <= self.seed < 2**31:
-            raise CaptureError(f"seed is {self.seed}; it must be a whole number from 0 to {2**31 - 1}")
+__all__ = ["SfmResult", "photo_folder", "photographs", "run_sfm"]
 
 
 @dataclass(frozen=True)
@@ -128,6 +101,11 @@ def run_sfm(
     check_camera_model(camera_model)
     capture, target = _place(photos, out_dir)
     names = [path.relative_to(photos) for path in photographs(photos) if not path.resolve().is_relative_to(target)]
+    for name in names:
+        if not _is_utf8(str(name)):
+            raise CaptureError(
+                f"{photos / name}: the name is not UTF-8, which COLMAP's files need; rename the photograph"
+            )
     if len(names) < 2:
         hint = unreadable_photographs(photos) or "a scene needs two or more that overlap"
         raise CaptureError(f"{photos}: has {len(names)} photograph(s); {hint}")
@@ -153,6 +131,14 @@ def run_sfm(
         write_list(sparse, folder, "sparse/" if in_place else "")
     error = float(best.compute_mean_reprojection_error())
     return SfmResult(capture, best.num_reg_images(), len(names), best.num_points3D(), error)
+
+
+def _is_utf8(name: str) -> bool:
+    try:
+        name.encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _place(photos: Path, out_dir: str | Path | None) -> tuple[Path, Path]:

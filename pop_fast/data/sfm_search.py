@@ -26,9 +26,8 @@ from pop_fast.data.colmap import quiet_colmap
 from pop_fast.data.pinhole import require_colmap
 from pop_fast.errors import CaptureError
 
-__all__ = ["MATCHERS", "Search", "check_camera_model", "find_cameras"]
+__all__ = ["Search", "check_camera_model", "find_cameras"]
 
-MATCHERS: Final = ("auto", "exhaustive", "sequential")
 _EXHAUSTIVE_UP_TO: Final = 60
 _NEIGHBOURS: Final = 10
 # photographs, and the square of it pairs, between two reports of progress

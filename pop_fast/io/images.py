@@ -5,6 +5,7 @@ EXIF orientation is ignored, because COLMAP ignores it: a model's width and heig
 
 from __future__ import annotations
 
+import base64
 import os
 import struct
 import threading
@@ -22,6 +23,7 @@ __all__ = [
     "FIX",
     "IMAGE_SUFFIXES",
     "find_image",
+    "inline_png",
     "list_images",
     "read_image",
     "read_mask",
@@ -146,6 +148,14 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
     stored = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
     _, data = cv2.imencode(".png", stored)
     write_atomically(path, lambda file: file.write(data.tobytes()))
+
+
+def inline_png(image: np.ndarray, longest: int) -> str:
+    """Return uint8 [H, W, 3] as an HTML picture that holds its own data, shrunk to sides of at most `longest` px."""
+    scale = longest / max(image.shape[:2])
+    small = image if scale >= 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    _, data = cv2.imencode(".png", cv2.cvtColor(small, cv2.COLOR_RGB2BGR))
+    return f'<img src="data:image/png;base64,{base64.b64encode(data.tobytes()).decode()}">'
 
 
 class _Quiet:
