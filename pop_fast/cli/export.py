@@ -13,7 +13,6 @@ import tyro
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
-from pop_fast.io.ply import Frame
 from pop_fast.train.load_result import Splat, frame_of_splat, load_splat, read_record
 
 _EXAMPLES: Final = """
@@ -97,6 +96,8 @@ def in_frame(splat: Splat, args: Args) -> Splat:
     Raises:
         PopError: the capture's frame was asked for and nothing says how it relates to the splat's.
     """
+    from pop_fast.io.ply import Frame
+
     now, transform = frame_of_splat(splat, args), known_transform(splat, args)
     wanted = args.frame or ("capture" if splat.folder is not None else now)
     if wanted is None or wanted == (now or "training"):
