@@ -18,7 +18,7 @@ import numpy as np
 
 from pop_fast.errors import PopError
 
-__all__ = ["Header", "column", "read_header", "read_vertices"]
+__all__ = ["Header", "column", "header_of", "read_header", "read_vertices"]
 
 _ORDERS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _SIGNED: Final = {"char": "i1", "short": "i2", "int": "i4", "float": "f4", "double": "f8"}
@@ -71,11 +71,22 @@ def read_header(path: Path) -> Header:
     """
     try:
         with open(path, "rb") as file:
-            return _parse(file.read(_LONGEST))
+            head = file.read(_LONGEST)
     except FileNotFoundError:
         raise PopError(f"{path}: the PLY file is absent; check the path") from None
     except OSError as error:
         raise PopError(f"{path}: could not be read: {error.strerror}; check the path and its permissions") from error
+    return header_of(head, path)
+
+
+def header_of(data: bytes, path: Path) -> Header:
+    """Read the header at the beginning of a file's bytes.
+
+    Raises:
+        PopError: cut off, or it breaks the format's rules; names the line.
+    """
+    try:
+        return _parse(data[:_LONGEST])
     except ValueError as error:
         raise PopError(f"{path}: the PLY file is truncated or corrupt: {error}; copy or write it again") from error
 
