@@ -101,12 +101,12 @@ def read_record(folder: Path | None) -> CaptureRecord | None:
 
 
 def load_splat(path: Path) -> Splat:
-    """Read a result folder (its last checkpoint), a checkpoint (ours or gsplat's) or a PLY.
+    """Read a result folder (its last checkpoint), a checkpoint (ours or gsplat's), a PLY or a file of another format.
 
     Raises:
         PopError: none of these, or damaged.
     """
-    from pop_fast.io.ply import is_antialiased, load_ply
+    from pop_fast.io.formats import is_splat_file, load_splat_file, splat_suffixes
     from pop_fast.train.checkpoint import load_splats
     from pop_fast.train.results import read_config
 
@@ -117,14 +117,15 @@ def load_splat(path: Path) -> Splat:
     folder = path.resolve().parent.parent
     owner = folder if (folder / "cfg.json").is_file() else None
     config = read_config(owner) if owner else TrainConfig()
-    kind = path.suffix.lower()
-    if kind == ".ply":
-        config = replace(config, antialiased=is_antialiased(path))
-        return Splat(path=path, params=load_ply(path), config=config, folder=owner)
-    if kind == ".pt":
+    if is_splat_file(path):
+        params, antialiased = load_splat_file(path)
+        return Splat(path=path, params=params, config=replace(config, antialiased=antialiased), folder=owner)
+    if path.suffix.lower() == ".pt":
         params, step = load_splats(path)
         return Splat(path=path, params=params, config=config, step=step, folder=owner)
-    raise PopError(f"{path}: is neither a result folder nor a checkpoint (.pt) nor a .ply")
+    raise PopError(
+        f"{path}: is neither a result folder nor a checkpoint (.pt) nor a splat ({', '.join(splat_suffixes())})"
+    )
 
 
 def _from_folder(folder: Path) -> Splat:

@@ -36,7 +36,8 @@ def codebook(values: np.ndarray) -> np.ndarray:
         counts = np.bincount(which, minlength=_CODES)
         sums = np.bincount(which, sample, _CODES)
         codes = np.sort(np.where(counts > 0, sums / np.maximum(counts, 1), codes))
-    return codes.astype(np.float32)
+    # six digits, which are written as a few characters
+    return np.array([float(f"{code:.6g}") for code in codes], np.float32)
 
 
 def nearest(codes: np.ndarray, values: np.ndarray) -> np.ndarray:

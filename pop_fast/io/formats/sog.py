@@ -73,13 +73,13 @@ def encode(cloud: Cloud) -> bytes:
             "files": [picture("means_l.webp", fixed & 255), picture("means_u.webp", fixed >> 8)],
         },
         "scales": {
-            "codebook": scales.tolist(),
+            "codebook": _numbers(scales),
             "files": [picture("scales.webp", nearest(scales, cloud.log_scales))],
         },
         "quats": {
             "files": [picture("quats.webp", np.concatenate([rotations, largest[:, None] + _FIRST_ROTATION], axis=1))]
         },
-        "sh0": {"codebook": colors.tolist(), "files": [picture("sh0.webp", rgba)]},
+        "sh0": {"codebook": _numbers(colors), "files": [picture("sh0.webp", rgba)]},
     }
     if cloud.degree and n:
         palette, labels = _palette(cloud)
@@ -91,10 +91,14 @@ def encode(cloud: Cloud) -> bytes:
         meta["shN"] = {
             "count": len(palette),
             "bands": cloud.degree,
-            "codebook": codes.tolist(),
+            "codebook": _numbers(codes),
             "files": [centroids, picture("shN_labels.webp", pairs)],
         }
     return _zipped(meta, images)
+
+
+def _numbers(codes: np.ndarray) -> list[float]:
+    return [float(f"{code:.6g}") for code in codes]
 
 
 def _palette(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:

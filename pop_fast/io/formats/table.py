@@ -53,8 +53,8 @@ _SPZ_LOSSES: Final = {
     "rotation": "0.28° (10 bits a component)",
     "opacity": _BYTE_OPACITY,
     "colour": "half of 1/136 (degree 0), cut off at -0.44 and 1.44",
-    "view dependence": "coefficients in [-1, 1], typically within 1/64 (degree 1) and 3/128 (2 and 3), the less visible a "
-    "Gaussian the coarser, down to 1/4",
+    "view dependence": "coefficients in [-1, 1], typically within 1/64 (degree 1) and 3/128 (2 and 3), the "
+    "less visible a Gaussian the coarser, down to 1/4",
 }
 
 FORMATS: Final[Mapping[str, Format]] = {
