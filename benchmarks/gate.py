@@ -10,9 +10,9 @@ from cases import GATE_CASE, gaussians_of
 from raster import SCENE, backends
 from torch import Tensor
 
-from pop_fast.backends import get_backend
+from pop_fast.api.registry import get_backend
+from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render, render_vjp
-from pop_ref.types import Camera, Gaussians
 
 GATE = {torch.float64: 1e-10, torch.float32: 5e-5}
 

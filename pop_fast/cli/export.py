@@ -11,9 +11,10 @@ import numpy as np
 import tyro
 
 from pop_fast.cli.arguments import parse
+from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
 from pop_fast.cli.limits import LimitOptions, Shown, limited
-from pop_fast.cli.splat import CaptureOptions, Splat, load_splat, open_capture, read_record
 from pop_fast.errors import PopError
+from pop_fast.train.load_result import Splat, load_splat, read_record
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -33,7 +34,7 @@ _EXAMPLES: Final = """
 
 
 @dataclass(frozen=True, kw_only=True)
-class Args(LimitOptions, CaptureOptions):
+class Args(LimitOptions, CaptureArguments):
     """Write a splat as one file (docs/FORMATS.md says what each format keeps), or a folder in Inria's layout."""
 
     splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|FILE")]
@@ -84,12 +85,12 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _inria(args: Args) -> int:
-    from pop_fast.cli.inria import write_inria_folder
+    from pop_fast.view.inria import write_inria_folder
 
     if args.out is None or args.to is not None or args.any:
         raise PopError("--layout inria writes all Gaussians into the folder --out; give --out, and no --to or limits")
     splat = load_splat(args.splat)
-    capture, config = open_capture(splat, args)
+    capture, config = open_with_bars(splat, args)
     write_inria_folder(replace(splat, config=config), capture, args.out, args.overwrite)
     print(f"{len(splat.params['means']):,} Gaussians, {len(capture.views)} cameras -> {args.out}")
     return 0
@@ -98,7 +99,7 @@ def _inria(args: Args) -> int:
 class _Opened:
     """The capture of a splat, loaded when it is first asked for."""
 
-    def __init__(self, splat: Splat, options: CaptureOptions) -> None:
+    def __init__(self, splat: Splat, options: CaptureArguments) -> None:
         self._splat, self._options, self._found = splat, options, None
         self.config = replace(splat.config, normalize=False) if options.own_frame else splat.config
 
@@ -110,7 +111,7 @@ class _Opened:
     def capture(self) -> Capture:
         """Return it, in the frame of the splat."""
         if self._found is None:
-            self._found, self.config = open_capture(self._splat, self._options)
+            self._found, self.config = open_with_bars(self._splat, self._options)
         return self._found
 
 
@@ -157,7 +158,7 @@ def check_file(out: Path, source: Path, overwrite: bool) -> None:
 def _writer(args: Args, name: str, splat: Splat, opened: _Opened) -> Callable[[dict[str, Tensor]], bytes]:
     """Return what makes the file's bytes of raw parameters in the training frame."""
     if name == HTML:
-        from pop_fast.html_view import cameras_of, page_of
+        from pop_fast.view.html import cameras_of, page_of
 
         cameras = cameras_of(opened.capture().train_views(opened.config.test_every)) if opened.known else []
         return lambda params: page_of(params, cameras, opened.config, splat.sh_degree, args.splat.resolve().name)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from pop_fast.data import Capture
-    from pop_fast.shrink import Score
+    from pop_fast.density.shrink import Score
     from pop_fast.train.config import TrainConfig
 
 # views that scores are summed over, at most: every so many of a larger capture
@@ -104,7 +104,7 @@ def limited(
     Raises:
         PopError: a limit cannot be met, or no Gaussian is left.
     """
-    from pop_fast import shrink
+    from pop_fast.density import shrink
 
     params, said = shown.params, list[str]()
 
@@ -150,7 +150,7 @@ def _means_of_capture(params: dict[str, Tensor], shown: Shown) -> Tensor:
 
 def _scores(shown: Shown, params: dict[str, Tensor], score: Score) -> Tensor:
     """Return the scores of all Gaussians."""
-    from pop_fast import shrink
+    from pop_fast.density import shrink
 
     if score == "visibility":
         return shrink.visibility(params)
@@ -159,8 +159,8 @@ def _scores(shown: Shown, params: dict[str, Tensor], score: Score) -> Tensor:
     import numpy as np
     import torch
 
-    from pop_fast.passes import Passes
-    from pop_fast.train.on_device import renderer
+    from pop_fast.density.passes import Passes
+    from pop_fast.train.gpu_proxy import renderer
     from pop_fast.train.views import ViewTensors
 
     views = shown.capture().train_views(shown.config.test_every)

@@ -20,11 +20,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from pop_fast.api.rasterize import rasterization
 from pop_fast.data.capture import Capture, View
-from pop_fast.rasterization import rasterization
-from pop_fast.report import write_report
-from pop_fast.strategies import POPStrategy
+from pop_fast.density import POPStrategy
 from pop_fast.train import LearningRates, TrainConfig, TrainingRun
+from pop_fast.view.report import write_report
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, MUTED, SECOND, THIRD, axes, show_image
 

@@ -11,10 +11,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from pop_fast.backends import get_backend
+from pop_fast.api.registry import get_backend
+from pop_fast.density import DensityControl
+from pop_fast.density.protocol import Draws
 from pop_fast.errors import PopError
-from pop_fast.strategies import DensityControl
-from pop_fast.strategies.base import Draws
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.model import KEYS
 from pop_fast.train.presets import METHODS
@@ -22,10 +22,10 @@ from pop_ref import fisher, mini_splatting, selection, taming
 from pop_ref.chord import dominant_points
 from pop_ref.contributions import contributions
 from pop_ref.density import average_grads
+from pop_ref.records import Camera
 from pop_ref.render import render
 from pop_ref.sensitivity import sensitivities
 from pop_ref.training import gaussians_from_params
-from pop_ref.types import Camera
 from tests.app.tiny import tiny_capture, tiny_config
 from tests.train.oracle_steps import state_of
 

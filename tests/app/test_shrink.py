@@ -7,9 +7,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pop_fast import shrink
+from pop_fast.density import shrink
+from pop_fast.density.passes import Passes
 from pop_fast.errors import PopError
-from pop_fast.passes import Passes
 from pop_fast.train.views import ViewTensors
 from tests.app.clouds import many
 from tests.app.tiny import tiny_capture

@@ -12,8 +12,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.backends import Absent, shipped_or_absent
-from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.failure_report import failure_report
 from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.mutants import MUTANTS, living
 from pop_ref.conformance.mutants.trial import law_named
@@ -22,10 +23,9 @@ from pop_ref.conformance.scene_files import load_scene, save_scene
 from pop_ref.conformance.scenes import Scene, cotangents, rounded_to, scene_as_code
 from pop_ref.conformance.scorecard import Entry, Scorecard
 from pop_ref.conformance.strategies import FLOOR, scenes
-from pop_ref.conformance.telling import tell
 from pop_ref.conformance.tolerances import TABLE
 from pop_ref.constants import INRIA
-from pop_ref.types import Camera, Gaussians
+from pop_ref.records import Camera, Gaussians
 
 ROOT = Path(__file__).resolve().parents[2]
 SEEN = settings(max_examples=200, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
@@ -127,7 +127,7 @@ def test_no_tolerance_is_far_above_the_worst_case_that_was_measured(key: str) ->
 def test_a_failing_law_tells_stage_gaussian_pixel_decision_and_scene() -> None:
     by_name = {mutant.name: mutant for mutant in MUTANTS}
     with living(by_name["jacobian_sign"]) as backend:
-        text = tell("test_some_law", backend, {"scene": golden_scene()})
+        text = failure_report("test_some_law", backend, {"scene": golden_scene()})
     assert "law some_law fails on jacobian_sign" in text
     assert "first stage that differs: projection_jacobians, Gaussian" in text
     assert "first pixel that differs: " in text
@@ -165,12 +165,12 @@ def _kit(*options: str) -> subprocess.CompletedProcess[str]:
 
 def test_the_kit_runs_from_the_command_line_and_writes_a_scorecard(tmp_path: Path) -> None:
     card = tmp_path / "card.json"
-    done = _kit("--rasterizer", "pop_fast.rasterization:rasterization", "--stages", "pop_fast", "--stage", "camera",
+    done = _kit("--rasterizer", "pop_fast.api:rasterization", "--stages", "pop_fast.stages", "--stage", "camera",
                 "--dtype", "float64", "--profile", "paper", "--scorecard", str(card))  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     told = json.loads(card.read_text())
-    assert set(told["summary"]["pop_fast.rasterization:rasterization"]) == {"camera"}
-    (laws,) = told["laws"]["pop_fast.rasterization:rasterization"].values()
+    assert set(told["summary"]["pop_fast.api.rasterize:rasterization"]) == {"camera"}
+    (laws,) = told["laws"]["pop_fast.api.rasterize:rasterization"].values()
     assert "a rigid motion keeps distances".replace(" ", "_") in laws
     assert all(came == "passed" or came.startswith("skipped: ") for came in laws.values())
     assert told["made"]["hypothesis profile"]
@@ -181,7 +181,7 @@ def test_a_session_that_judges_nothing_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "conftest.py").write_text("def pytest_addoption(parser): parser.addoption('--profile')\n")
     (tmp_path / "test_mine.py").write_text(
         "import sys\ndef test_mine(request):\n    assert request.config.getoption('--profile') == 'cpu'\n"
-        "    assert 'pop_fast.conformance_door' in sys.modules\n"
+        "    assert 'pop_fast.pytest_entry' in sys.modules\n"
         "    assert not {'pop_ref', 'torch'} & set(sys.modules)\n"
     )
     command = [
@@ -245,7 +245,7 @@ def test_poison_reaches_what_the_package_allocates_and_nothing_else() -> None:
 
 
 STRANGER = """
-from pop_fast.rasterization import rasterization as sound
+from pop_fast.api.rasterize import rasterization as sound
 
 def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane=0.01, far_plane=1e10,
                   radius_clip=0.0, eps2d=0.3, sh_degree=None, packed=True, tile_size=16, backgrounds=None,

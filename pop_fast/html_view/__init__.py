@@ -1,6 +1,0 @@
-"""A splat in one HTML file, which any browser with WebGL 2 opens."""
-
-from pop_fast.html_view.cameras import PageCamera, cameras_of
-from pop_fast.html_view.page import page_of
-
-__all__ = ["PageCamera", "cameras_of", "page_of"]

@@ -1,0 +1,236 @@
+"""Where a backend parts from the oracle: the first stage, Gaussian, pixel and gradient, and the nearest decision."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pop_ref.conformance.adapter import OracleAdapter, View
+from pop_ref.conformance.capabilities import GRADIENTS, RENDER
+from pop_ref.conformance.cases import sensitivity
+from pop_ref.conformance.error_bounds import REACH, PixelErrorBounds, pixel_error_bounds
+from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
+from pop_ref.conformance.scene_files import save_scene
+from pop_ref.conformance.scenes import Scene, cotangents, scene_as_code
+from pop_ref.margins import margins
+
+ORACLE = OracleAdapter()
+# what a rasterizer's meta may show of the stages before the pixel, in the order of a render
+SHOWN = (("depths", "means_cam_from_means"), ("means2d", "project_means"), ("conics", "conics_from_covars2d"))
+
+
+class Difference(NamedTuple):
+    """One place where the two sides differ."""
+
+    what: str
+    where: str
+    oracle: Any
+    backend: Any
+
+    def __str__(self) -> str:
+        return f"{self.what}, {self.where}: oracle {self.oracle}, backend {self.backend}"
+
+
+def _calls(scene: Scene) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    """Yield the stage functions in the order of a render with the oracle's own inputs; rows behind are left out."""
+    oracle = ORACLE.stage
+    camera, profile = scene.camera, scene.profile
+    depths = oracle("means_cam_from_means")(scene.gaussians.means, camera.viewmat)[:, 2]
+    yield "in_front", (depths, profile)
+    g = scene.rows(oracle("in_front")(depths, profile)).gaussians
+    pinhole = (camera.K, camera.width, camera.height, profile)
+    yield "rotmats_from_quats", (g.quats,)
+    yield "covars_from_quats_scales", (g.quats, g.scales)
+    yield "means_cam_from_means", (g.means, camera.viewmat)
+    covars = oracle("covars_from_quats_scales")(g.quats, g.scales)
+    yield "covars_cam_from_covars", (covars, camera.viewmat)
+    means_cam = oracle("means_cam_from_means")(g.means, camera.viewmat)
+    yield "project_means", (means_cam, *pinhole)
+    yield "projection_jacobians", (means_cam, *pinhole)
+    covars_cam = oracle("covars_cam_from_covars")(covars, camera.viewmat)
+    jacobians = oracle("projection_jacobians")(means_cam, *pinhole)
+    yield "project_covars", (covars_cam, jacobians)
+    covars2d = oracle("project_covars")(covars_cam, jacobians)
+    yield "low_pass", (covars2d, profile.eps2d)
+    blurred = oracle("low_pass")(covars2d, profile.eps2d)
+    yield "conics_from_covars2d", (blurred,)
+    yield "radii_from_covars2d", (blurred, g.opacities, profile)
+    dirs = oracle("view_dirs")(g.means, camera.viewmat)
+    degree = round(np.sqrt(g.sh.shape[1])) - 1 if scene.sh_degree is None else scene.sh_degree
+    yield "colors_from_sh", (g.sh, dirs, degree)
+
+
+def first_stage(backend: Any, scene: Scene) -> Difference | None:
+    """Find the first stage function that differs, each called with the oracle's inputs."""
+    eps = float(np.finfo(backend.dtype).eps)
+    for name, inputs in _calls(scene):
+        if not backend.has(name):
+            continue
+        function: Callable[..., Any] = ORACLE.stage(name)
+        expected = np.asarray(function(*inputs))
+        found = np.asarray(backend.stage(name)(*inputs))
+        if expected.dtype.kind in "bi":
+            wrong = found != expected
+        else:
+            wrong = ~(np.abs(found - expected) <= REACH * eps * sensitivity(function, inputs)[0])
+        if np.any(wrong):
+            i = tuple(int(k) for k in np.argwhere(wrong)[0])
+            return Difference(name, f"Gaussian {i[0]} of those in front, entry {list(i[1:])}", expected[i], found[i])
+    return None
+
+
+def first_shown(backend: Any, scene: Scene) -> Difference | list[str]:
+    """Find the first stage whose result, as the rasterizer's meta shows it, differs; else the names of those shown."""
+    found, expected, error_bounds = backend.render(scene), ORACLE.render(scene), _error_bounds(backend, scene)
+    alike = []
+    # rows that either side culls hold nothing to compare
+    drawn = np.all(expected.radii > 0, axis=1)
+    if found.radii is not None:
+        drawn &= np.all(found.radii > 0, axis=1)
+    for name, stage in SHOWN:
+        value = getattr(found, name)
+        if value is None:
+            continue
+        wanted, units = getattr(expected, name), getattr(error_bounds.screen, f"e_{name}")
+        for i in np.flatnonzero(drawn).tolist():
+            limit = error_bounds.reach * (units[i] + np.abs(wanted[i]))
+            if np.any(~(np.abs(value[i] - wanted[i]) <= limit)):
+                what = f"{name} as its meta shows them ({stage})"
+                return Difference(what, f"Gaussian {i}", np.asarray(wanted[i]).tolist(), np.asarray(value[i]).tolist())
+        alike.append(name)
+    return alike
+
+
+def _error_bounds(backend: Any, scene: Scene) -> PixelErrorBounds:
+    square = scene.profile.extent == "square"
+    return pixel_error_bounds(scene, backend.dtype, ORACLE.full_render(scene).tile_lists if square else None)
+
+
+def first_pixel(backend: Any, scene: Scene) -> tuple[Difference, tuple[int, int]] | None:
+    """Find the first pixel that differs by more than rounding, near a threshold or not."""
+    expected, found = ORACLE.render(scene), backend.render(scene)
+    error_bounds = _error_bounds(backend, scene)
+    limit = error_bounds.reach * (error_bounds.T_final + 1.0)
+    colors = error_bounds.reach * (error_bounds.image + error_bounds.absolute)
+    checks: list[tuple[str, Any]] = [
+        ("T_final", ~(np.abs(found.T_final - expected.T_final) <= limit)),
+        ("image", np.any(~(np.abs(found.image - expected.image) <= colors), axis=2)),
+    ]
+    for name in ("n_blended", "dominant_ids"):
+        if getattr(found, name) is not None:
+            checks.append((name, getattr(found, name) != getattr(expected, name)))
+    for name, wrong in checks:
+        if np.any(wrong):
+            y, x = (int(k) for k in np.argwhere(wrong)[0])
+            return _at(name, expected, found, x, y), (x, y)
+    return None
+
+
+def _at(name: str, expected: View, found: View, x: int, y: int) -> Difference:
+    values = [np.asarray(getattr(view, name))[y, x].tolist() for view in (expected, found)]
+    return Difference(name, f"pixel ({x}, {y})", *values)
+
+
+def first_gaussian(backend: Any, scene: Scene) -> str | None:
+    """Add Gaussians one by one from the front until a pixel differs, and say with which."""
+    V = scene.camera.viewmat
+    depths = scene.gaussians.means @ V[2, :3] + V[2, 3]
+    order = np.lexsort((np.arange(len(depths)), depths))
+    for k in range(len(order) + 1):
+        found = first_pixel(backend, scene.rows(np.sort(order[:k])))
+        if found is not None:
+            who = f"Gaussian {int(order[k - 1])} is added to those in front of it" if k else "there is no Gaussian"
+            return f"as soon as {who}: {found[0]}"
+    return None
+
+
+def first_gradient(backend: Any, scene: Scene) -> Difference | None:
+    """Find the first gradient that differs, of the standard cotangents where no decision is near its threshold."""
+    error_bounds = _error_bounds(backend, scene)
+    v_image, v_T_final = cotangents(scene)
+    v_image, v_T_final = v_image * error_bounds.smooth[..., None], v_T_final * error_bounds.smooth
+    expected, found = (side.gradients(scene, v_image, v_T_final) for side in (ORACLE, backend))
+    bounds = gradient_error_bounds(scene, error_bounds, v_image, v_T_final)
+    smooth = ~error_bounds.screen.kinked
+    for name in ("background", "sh", "opacities", "means2d", "means2d_abs", "scales", "quats", "means", "viewmat"):
+        if name not in found or (name == "viewmat" and not np.all(smooth)):
+            continue
+        wrong = ~(np.abs(found[name] - expected[name]) <= error_bounds.reach * bounds[name])
+        if name not in ("background", "viewmat"):
+            wrong[~smooth] = False
+        if np.any(wrong):
+            i = tuple(int(k) for k in np.argwhere(wrong)[0])
+            row = "entry" if name in ("background", "viewmat") else f"Gaussian {i[0]}, entry"
+            entry = i if name in ("background", "viewmat") else i[1:]
+            return Difference(f"v_{name}", f"{row} {list(entry)}", expected[name][i], found[name][i])
+    return None
+
+
+def nearest_decision(scene: Scene, pixel: tuple[int, int] | None) -> str:
+    """Name the decision closest to its threshold, at a pixel if one is given."""
+    found = margins(scene.gaussians, scene.camera, scene.sh_degree, scene.profile, scene.tile_size, scene.antialiased)
+    if pixel is not None:
+        x, y = pixel
+        label = min(found.pixels, key=lambda name: float(found.pixels[name][y, x]))
+        margin = float(found.pixels[label][y, x])
+        return f"nearest decision at that pixel: {label}, margin {margin:.3g} (float32 decides alike over 1e-6)"
+    if found.nearest is None:
+        return "no decision is near its threshold"
+    close = found.nearest
+    return f"nearest decision: {close.decision} of {close.where}, margin {close.margin:.3g}"
+
+
+def failure_report(name: str, backend: Any, scenes: dict[str, Scene]) -> str:
+    """Write a failing law's report: what differs first, the nearest decision, and the scene as code to paste.
+
+    Args:
+        name: the law.
+        backend: who broke it; as a law watched it, it says whether gradients were asked for.
+        scenes: what was drawn, by name; the first that the backend draws otherwise than the oracle is reported.
+    """
+    title = f"law {name.removeprefix('test_')} fails on {backend.name}"
+    reports = [(scene, *_findings(backend, scene)) for scene in scenes.values()]
+    if not reports:
+        return f"{title}\nit draws no scene; what was drawn stands above"
+    scene, lines, pixel = next((report for report in reports if report[1]), reports[0])
+    if not lines:
+        alike = "stages, pixels and gradients" if getattr(backend, "asked_for_gradients", True) else "stages and pixels"
+        lines = [f"{alike} of its scenes are the oracle's; the law breaks in what it compares"]
+    return "\n".join([title, *lines, nearest_decision(scene, pixel), f"scene to paste:\n{scene_as_code(scene)}"])
+
+
+def _findings(backend: Any, scene: Scene) -> tuple[list[str], tuple[int, int] | None]:
+    stage = first_stage(backend, scene)
+    lines = [] if stage is None else [f"first stage that differs: {stage}"]
+    pixel = first_pixel(backend, scene) if backend.has(RENDER) else None
+    if pixel is not None:
+        if stage is None:
+            shown = first_shown(backend, scene)
+            if isinstance(shown, list):
+                alike = f"{', '.join(shown)} are the oracle's, so it is" if shown else "it shows none before"
+                shown = f"{alike} alpha, order or blending"
+            lines.append(f"first stage that differs: {shown}")
+        lines.append(f"first pixel that differs: {pixel[0]}")
+        lines.append(f"first Gaussian: {first_gaussian(backend, scene)}")
+    elif getattr(backend, "asked_for_gradients", True) and backend.has(GRADIENTS):
+        # a law that asked for none is not broken by one
+        gradient = first_gradient(backend, scene)
+        lines += [] if gradient is None else [f"first gradient that differs: {gradient}"]
+    return lines, None if pixel is None else pixel[1]
+
+
+def failure_saver(folder: Path) -> Callable[[str, Any, dict[str, Scene]], str]:
+    """Return a teller that saves the scenes of a failing law."""
+
+    def save(name: str, backend: Any, scenes: dict[str, Scene]) -> str:
+        saved = []
+        for key, scene in scenes.items():
+            path = folder / f"{name.removeprefix('test_')}.{backend.name.replace(':', '.')}.{key}.npz"
+            save_scene(path, scene)
+            saved.append(f"saved as {path}")
+        return "\n".join(saved)
+
+    return save
