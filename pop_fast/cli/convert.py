@@ -10,8 +10,8 @@ from typing import Annotated, Final
 import tyro
 
 from pop_fast.cli.arguments import parse
-from pop_fast.cli.export import FormatName, check_file
-from pop_fast.cli.limits import LimitOptions, Shown, limited
+from pop_fast.cli.export import check_file
+from pop_fast.cli.limits import FormatName, LimitOptions, Shown, limited
 from pop_fast.errors import PopError
 
 _EXAMPLES: Final = """

@@ -12,7 +12,7 @@ import tyro
 
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
-from pop_fast.cli.limits import LimitOptions, Shown, limited
+from pop_fast.cli.limits import FormatName, LimitOptions, Shown, limited
 from pop_fast.errors import PopError
 from pop_fast.train.load_result import Splat, load_splat, read_record
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from pop_fast.data import Capture
 
-FormatName = Literal["ply", "compressed-ply", "spz", "sog", "splat", "gltf", "gltf-spz", "html"]
 HTML: Final = "html"
 _EXAMPLES: Final = """
     pop export out/scene_pop --out scene.ply                 for any viewer, in the capture's own world frame

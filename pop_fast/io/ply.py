@@ -15,9 +15,18 @@ import torch
 
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
-from pop_fast.io.ply_rows import Header, column, read_header, read_vertices
+from pop_fast.io.ply_rows import Header, column, read_header, read_vertices, vertices_of
 
-__all__ = ["MODE", "asks_for_antialiasing", "checked_params", "is_antialiased", "load_ply", "ply_bytes", "save_ply"]
+__all__ = [
+    "MODE",
+    "asks_for_antialiasing",
+    "checked_params",
+    "is_antialiased",
+    "load_ply",
+    "params_of_ply",
+    "ply_bytes",
+    "save_ply",
+]
 
 _SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3)}
 MODE = "SplatRenderMode:"
@@ -106,7 +115,23 @@ def load_ply(path: str | os.PathLike[str]) -> dict[str, torch.Tensor]:
         PopError: the file is absent, truncated or corrupt, is no splat, or holds NaN, Inf or a zero quaternion.
     """
     path = Path(path)
-    rows = read_vertices(path)
+    return _params(read_vertices(path), path)
+
+
+def params_of_ply(data: bytes, path: Path) -> dict[str, torch.Tensor]:
+    """Read splats from a PLY file's bytes; see `load_ply`.
+
+    Args:
+        data: the bytes.
+        path: their name, for errors.
+
+    Raises:
+        PopError: as `load_ply`.
+    """
+    return _params(vertices_of(data, path), path)
+
+
+def _params(rows: np.ndarray, path: Path) -> dict[str, torch.Tensor]:
     names = set(rows.dtype.names or ())
     needed = [c for c in _COLUMNS if not c.startswith(("n", "f_rest"))]
     absent = [name for name in needed if name not in names]

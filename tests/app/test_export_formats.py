@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pop_fast.cli.export import FormatName
+from pop_fast.cli.limits import FormatName
 from pop_fast.io.formats import FORMATS, format_names, load_splat_file
 from pop_fast.io.ply import load_ply
 from tests.app.conftest import Pop

@@ -2,6 +2,7 @@
 
 from pop_fast.io.formats.files import (
     PLY,
+    decoded,
     encoded,
     format_names,
     is_splat_file,
@@ -16,6 +17,7 @@ __all__ = [
     "FORMATS",
     "PLY",
     "Format",
+    "decoded",
     "encoded",
     "format_names",
     "is_splat_file",

@@ -14,7 +14,8 @@ from pop_fast.io.atomic import write_atomically
 from pop_fast.io.formats.cloud import Cloud
 from pop_fast.io.formats.compressed_ply import is_compressed
 from pop_fast.io.formats.table import FORMATS
-from pop_fast.io.ply import is_antialiased, load_ply, ply_bytes
+from pop_fast.io.ply import asks_for_antialiasing, params_of_ply, ply_bytes
+from pop_fast.io.ply_rows import header_of
 
 PLY: Final = "ply"
 
@@ -73,6 +74,26 @@ def encoded(name: str, params: Mapping[str, Tensor], antialiased: bool = False) 
     return format.encode(cloud if format.order is None else cloud.take(format.order(cloud)))
 
 
+def decoded(name: str, data: bytes, path: Path = Path("memory")) -> tuple[dict[str, Tensor], bool]:
+    """Read a splat from a file's bytes.
+
+    Args:
+        name: of the format.
+        data: the bytes.
+        path: their name, for errors.
+
+    Returns:
+        As `load_splat_file`.
+
+    Raises:
+        PopError: the bytes are damaged; names the field.
+    """
+    if name == PLY:
+        return params_of_ply(data, path), asks_for_antialiasing(header_of(data, path))
+    cloud = FORMATS[name].decode(data, path)
+    return cloud.params(), cloud.antialiased
+
+
 def save_as(path: str | os.PathLike[str], name: str, params: Mapping[str, Tensor], antialiased: bool = False) -> int:
     """Write a splat in a format, atomically.
 
@@ -101,13 +122,10 @@ def load_splat_file(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], bo
     if name in (PLY, "compressed-ply"):
         # either may stand under the name of the other
         name = "compressed-ply" if is_compressed(path) else PLY
-    if name == PLY:
-        return load_ply(path), is_antialiased(path)
     try:
         data = path.read_bytes()
     except FileNotFoundError:
         raise PopError(f"{path}: the file is absent; check the path") from None
     except OSError as error:
         raise PopError(f"{path}: could not be read: {error.strerror}; check the path and its permissions") from error
-    cloud = FORMATS[name].decode(data, path)
-    return cloud.params(), cloud.antialiased
+    return decoded(name, data, path)
