@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import torch
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch import Tensor
+
+from pop_fast.io.formats import FORMATS
+from pop_fast.io.formats.cloud import Cloud
 
 
 def _floats(low: float, high: float) -> st.SearchStrategy[float]:
@@ -50,3 +55,18 @@ def many(n: int, bands: int = 15, seed: int = 0) -> dict[str, Tensor]:
         "sh0": normal(n, 1, 3).clamp(-1.7, 1.7),
         "shN": (0.2 * normal(n, bands, 3)).clamp(-0.9, 0.9),
     }
+
+
+def decoded(name: str, params: dict[str, Tensor], antialiased: bool = False) -> tuple[Cloud, Cloud, bytes]:
+    """Return what went into a file, in its order, what came out, and the file."""
+    format, cloud = FORMATS[name], Cloud.of(params, antialiased)
+    cloud = cloud if format.order is None else cloud.take(format.order(cloud))
+    data = format.encode(cloud)
+    return cloud, format.decode(data, Path(f"x{format.suffix}")), data
+
+
+def degrees(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angles between rotations."""
+    a, b = a.astype(np.float64), b.astype(np.float64)
+    b = b * np.where((a * b).sum(1, keepdims=True) < 0.0, -1.0, 1.0)
+    return np.degrees(4.0 * np.arcsin(np.clip(np.linalg.norm(a - b, axis=1) / 2.0, 0.0, 1.0)))

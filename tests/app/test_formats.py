@@ -2,21 +2,11 @@
 
 from __future__ import annotations
 
-import gzip
-import importlib
-import io
-import json
-import struct
-import tempfile
-import zipfile
-from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 from torch import Tensor
@@ -28,27 +18,12 @@ from pop_fast.io.formats.palette import codebook, nearest, row_palette
 from pop_fast.io.ply import load_ply, save_ply
 from pop_ref.covariance import covars_from_quats_scales
 from pop_ref.harmonics import sh_basis
-from tests.app.clouds import many, splats
+from tests.app.clouds import decoded, degrees, many, splats
 
 LOSSY = ("compressed-ply", "spz", "sog", "gltf-spz", "splat")
 BYTE = 0.5 / 255.0
 # of degree 0, in coefficients
 COLOR_BYTE = BYTE / SH_C0
-
-
-def decoded(name: str, params: dict[str, Tensor], antialiased: bool = False) -> tuple[Cloud, Cloud, bytes]:
-    """Return what went into a file, in its order, what came out, and the file."""
-    format, cloud = FORMATS[name], Cloud.of(params, antialiased)
-    cloud = cloud if format.order is None else cloud.take(format.order(cloud))
-    data = format.encode(cloud)
-    return cloud, format.decode(data, Path(f"x{format.suffix}")), data
-
-
-def degrees(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angles between rotations."""
-    a, b = a.astype(np.float64), b.astype(np.float64)
-    b = b * np.where((a * b).sum(1, keepdims=True) < 0.0, -1.0, 1.0)
-    return np.degrees(4.0 * np.arcsin(np.clip(np.linalg.norm(a - b, axis=1) / 2.0, 0.0, 1.0)))
 
 
 def assert_within(was: np.ndarray, now: np.ndarray, bound: Any, what: str) -> None:
@@ -274,188 +249,3 @@ def test_the_name_says_the_format() -> None:
     assert named_format(Path("a.glb"), "gltf-spz") == "gltf-spz"
     assert named_format(Path("a.compressed.ply")) == "compressed-ply"
     assert named_format(Path("a"), "sog") == "sog"
-
-
-def header(**changes: int) -> bytes:
-    """An SPZ file of one Gaussian, with a field of its header changed."""
-    fields = {"magic": 0x5053474E, "version": 3, "n": 1, "degree": 0, "bits": 12, "flags": 0, "reserved": 0, **changes}
-    return gzip.compress(struct.pack("<IIIBBBB", *fields.values()) + bytes(20))
-
-
-@pytest.mark.parametrize(
-    ("data", "said"),
-    [
-        (b"", "is cut off in its header"),
-        (b"not gzip at all!", "its gzip stream is damaged"),
-        (header(magic=1), "begins with 0x1, not 0x5053474e"),
-        (header(version=9), "version is 9; write it as version 2 or 3"),
-        (header(degree=4), "shDegree is 4"),
-        (header(bits=30), "fractionalBits is 30"),
-        (header(n=2), "ends after 20 of 40 bytes"),
-        (header(n=2**31), "numPoints is 2147483648, more than"),
-        (struct.pack("<IIII", 0x5053474E, 4, 1, 0), "is SPZ of version 4 or later"),
-    ],
-    ids=["empty", "no gzip", "magic", "version", "degree", "bits", "cut off", "promise", "version 4"],
-)
-def test_a_damaged_spz_is_named(data: bytes, said: str) -> None:
-    with pytest.raises(PopError, match=f"x.spz: {said}"):
-        FORMATS["spz"].decode(data, Path("x.spz"))
-
-
-def changed(change: Callable[[dict[str, Any]], Any]) -> bytes:
-    """A SOG file of nine Gaussians with another meta.json."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(encoded("sog", many(9)))) as old, zipfile.ZipFile(buffer, "w") as new:
-        for name in old.namelist():
-            data = old.read(name)
-            if name == "meta.json":
-                meta = json.loads(data)
-                change(meta)
-                data = json.dumps(meta).encode()
-            new.writestr(name, data)
-    return buffer.getvalue()
-
-
-@pytest.mark.parametrize(
-    ("data", "said"),
-    [
-        (b"PK nothing", "is no readable ZIP file"),
-        (changed(lambda meta: meta.update(version=3)), "meta.json.version is 3"),
-        (changed(lambda meta: meta.update(count=-1)), "meta.json.count is -1"),
-        (changed(lambda meta: meta.update(count=10)), None),
-        (changed(lambda meta: meta.update(count=1000)), "means_l.webp is 3x3 pixels; 1000 are needed"),
-        (changed(lambda meta: meta.pop("sh0")), "meta.json is not that of SOG version 2"),
-        (changed(lambda meta: meta["scales"].update(codebook=[1.0])), "meta.json is not that of SOG version 2"),
-        (changed(lambda meta: meta["quats"].update(files=["gone.webp"])), "meta.json is not that of SOG version 2"),
-        (changed(lambda meta: meta["shN"].update(bands=4)), "meta.json.shN has 9 rows of 4 bands"),
-        (changed(lambda meta: meta["shN"].update(count=3)), "shN_labels names row 8 of a palette of 3"),
-        (changed(lambda meta: meta["means"].update(maxs=[1e30, 1, 1])), "means of Gaussian . is"),
-    ],
-    ids=["zip", "version", "count", "one more", "many more", "no colour", "codes", "image", "bands", "row", "overflow"],
-)
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_a_damaged_sog_is_named(data: bytes, said: str | None) -> None:
-    with pytest.raises(PopError, match=f"x.sog: {said or ''}"):
-        FORMATS["sog"].decode(data, Path("x.sog"))
-
-
-@pytest.mark.parametrize("name", FORMATS)
-@given(data=st.data())
-def test_a_file_that_lost_or_changed_bytes_is_read_or_refused_by_name(name: str, data: st.DataObject) -> None:
-    whole = encoded(name, many(5, 3))
-    at = data.draw(st.integers(0, len(whole) - 1))
-    damaged = whole[:at] if data.draw(st.booleans()) else whole[:at] + bytes([whole[at] ^ 0x55]) + whole[at + 1 :]
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"x{FORMATS[name].suffix}"
-        path.write_bytes(damaged)
-        found, refusal = read_or_refused(path)
-    assert str(path) in refusal if found is None else all(value.isfinite().all() for value in found.values())
-
-
-def read_or_refused(path: Path) -> tuple[dict[str, Tensor] | None, str]:
-    try:
-        return load_splat_file(path)[0], ""
-    except PopError as error:
-        return None, str(error)
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (lambda g: g["meshes"][0]["primitives"][0]["extensions"].clear(), "holds no splat"),
-        (lambda g: g["nodes"][0].update(translation=[1, 2, 3]), "a node moves its splat"),
-        (lambda g: g["meshes"][0]["primitives"][0]["attributes"].pop("POSITION"), "no attribute POSITION"),
-        (lambda g: g["accessors"][1].update(count=2**40), "ROTATION is cut off"),
-        (lambda g: g["accessors"][0].update(componentType=5123), "POSITION is not stored as float32"),
-        (lambda g: g["bufferViews"][0].update(byteLength=2**40), "reaches beyond the binary chunk"),
-        (lambda g: g["accessors"][0].update(count=4), "attributes have different counts"),
-        (lambda g: g.update(meshes=7), "does not follow glTF 2.0"),
-    ],
-    ids=["none", "moved", "absent", "cut off", "kind", "view", "counts", "meshes"],
-)
-def test_a_damaged_glb_is_named(change: Callable[[dict[str, Any]], Any], said: str) -> None:
-    whole = encoded("gltf", many(5))
-    length = struct.unpack("<I", whole[12:16])[0]
-    content = json.loads(whole[20 : 20 + length])
-    change(content)
-    text = json.dumps(content).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + whole[20 + length :]
-    with pytest.raises(PopError, match=said):
-        FORMATS["gltf"].decode(b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks, Path("x.glb"))
-
-
-def reader(name: str) -> ModuleType:
-    """Import another program's reader, or skip with the reason."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        pytest.skip(f"{name} is not installed ({error}); pip install 'pop-splatting[formats-test]'")
-
-
-@pytest.mark.parametrize("name", ["compressed-ply", "spz", "sog"])
-@pytest.mark.parametrize("bands", [0, 3, 8, 15])
-def test_gsply_reads_what_we_write(name: str, bands: int, tmp_path: Path) -> None:
-    module = reader({"compressed-ply": "gsply", "spz": "gsply.spz", "sog": "gsply.sog_reader"}[name])
-    if name == "sog":
-        reader("imagecodecs")
-    _, now, data = decoded(name, many(300, bands))
-    path = tmp_path / f"x{FORMATS[name].suffix}"
-    path.write_bytes(data)
-    found = {"compressed-ply": "plyread", "spz": "read_spz", "sog": "sogread"}[name]
-    theirs = getattr(module, found)(path)
-    # it leaves SPZ in the frame of the file
-    ours = now.turned("x") if name == "spz" else now
-    np.testing.assert_allclose(theirs.means, ours.means, atol=1e-5)
-    np.testing.assert_allclose(theirs.scales, ours.log_scales, atol=1e-5)
-    assert degrees(ours.quats, np.asarray(theirs.quats)).max() < 0.01
-    np.testing.assert_allclose(theirs.sh0, ours.sh0, atol=1e-5)
-    opacities = 1.0 / (1.0 + np.exp(-np.asarray(theirs.opacities, np.float64)))
-    np.testing.assert_allclose(opacities, ours.opacities, atol=0.0011)
-    if bands:
-        np.testing.assert_allclose(np.asarray(theirs.shN).reshape(ours.rest.shape), ours.rest, atol=1e-5)
-
-
-@pytest.mark.parametrize("bands", [0, 15])
-def test_pygltflib_reads_our_attributes(bands: int, tmp_path: Path) -> None:
-    pygltflib = reader("pygltflib")
-    was, _, data = decoded("gltf", many(20, bands))
-    (tmp_path / "x.glb").write_bytes(data)
-    gltf = pygltflib.GLTF2().load(str(tmp_path / "x.glb"))
-    primitive = gltf.meshes[0].primitives[0]
-    assert primitive.mode == pygltflib.POINTS
-    body = gltf.binary_blob()
-    attributes = {key: value for key, value in vars(primitive.attributes).items() if value is not None}
-    assert len(attributes) == 6 + bands
-    turned = was.turned("z")
-
-    def values(name: str) -> np.ndarray:
-        accessor = gltf.accessors[attributes[name]]
-        view = gltf.bufferViews[accessor.bufferView]
-        part = body[view.byteOffset : view.byteOffset + view.byteLength]
-        return np.frombuffer(part, "<f4").reshape(accessor.count, -1)
-
-    np.testing.assert_array_equal(values("POSITION"), turned.means)
-    np.testing.assert_allclose(values("KHR_gaussian_splatting:SCALE"), np.exp(turned.log_scales), rtol=1e-6)
-    np.testing.assert_allclose(values("KHR_gaussian_splatting:OPACITY")[:, 0], was.opacities, atol=1e-7)
-    np.testing.assert_array_equal(values("KHR_gaussian_splatting:ROTATION"), turned.quats[:, [1, 2, 3, 0]])
-    if bands:
-        np.testing.assert_array_equal(values("KHR_gaussian_splatting:SH_DEGREE_3_COEF_6"), turned.rest[:, 14])
-
-
-def test_the_bytes_of_an_spz_file_are_those_of_its_description() -> None:
-    """One Gaussian, computed by hand from the description."""
-    params = {
-        "means": torch.tensor([[1.0, -2.0, 0.5]]),
-        "scales": torch.tensor([[-10.0, -2.0, 0.0]]),
-        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        "opacities": torch.tensor([0.0]),
-        "sh0": torch.tensor([[[0.0, 1.0, -1.0]]]),
-        "shN": torch.zeros(1, 0, 3),
-    }
-    raw = gzip.decompress(encoded("spz", params))
-    bits = 20  # of the fraction: 2^20 times 2 fits into 23 bits
-    centre = b"".join(struct.pack("<i", round(value * 2**bits))[:3] for value in (1.0, 2.0, -0.5))
-    # y and z change their sign; 127.5 is rounded to the even 128; 38.25 a unit of colour; the largest component is w
-    rest = bytes([128]) + bytes([128, 166, 89]) + bytes([0, 128, 160]) + struct.pack("<I", 3 << 30)
-    assert raw == struct.pack("<IIIBBBB", 0x5053474E, 3, 1, 0, bits, 0, 0) + centre + rest

@@ -72,7 +72,7 @@ FORMATS: Final[Mapping[str, Format]] = {
                 "rotation": "0.28° (10 bits a component)",
                 "opacity": _BYTE_OPACITY,
                 "colour": "half of 1/255 of its chunk's range (degree 0)",
-                "view dependence": "coefficients in [-4, 4], within 1/32",
+                "view dependence": "coefficients in [-4, 4], within 1/64; none is 0",
             },
             readers="SuperSplat, PlayCanvas, Spark, GaussianSplats3D",
             encode=compressed_ply.encode,
@@ -98,7 +98,7 @@ FORMATS: Final[Mapping[str, Format]] = {
             source="https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog",
             size=("17, then WebP", "19 and a palette, then WebP"),
             losses={
-                "centre": "half of 1/65535 of the scene's extent in sign(x) log(1 + |x|)",
+                "centre": "half of 1/65535 of the scene's extent in sign(x) log(1 + abs(x))",
                 "scale": "nearest of 256 numbers that are fitted to the splat",
                 "rotation": "1.1° (8 bits a component)",
                 "opacity": _BYTE_OPACITY,

@@ -56,7 +56,7 @@ def encoding_rows(encodings: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...
         psnr = "" if entry["psnr"] is None else f"{entry['psnr']:.2f} dB"
         if entry is not whole and whole and None not in (entry["psnr"], whole["psnr"]):
             psnr += f" ({entry['psnr'] - whole['psnr']:+.2f})"
-        each = f"{entry['bytes'] / max(entry["num_gaussians"], 1):.1f}"
+        each = f"{entry['bytes'] / max(entry['num_gaussians'], 1):.1f}"
         rows.append((entry["format"], f"{entry['bytes'] / 1e6:.2f}", each, share, psnr))
     return rows
 
