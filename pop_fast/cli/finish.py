@@ -75,9 +75,9 @@ def _finish(folder: Path, capture: Capture, options: FinishOptions) -> None:
         return page_of(params, cameras, splat.config, splat.sh_degree, title)
 
     names = options.export or (("ply",) if options.any else ())
-    for name in names:
+    for index, name in enumerate(names):
         kept, said = _limited(splat, capture, options, name, page)
-        for line in said if name == names[0] or options.target_mb is not None else ():
+        for line in said if index == 0 or options.target_mb is not None else ():
             print(line)
         suffix = ".html" if name == "html" else _suffix(name)
         path = folder / EXPORTS / f"{title}{'-spz' if name == 'gltf-spz' else ''}{suffix}"

@@ -99,7 +99,9 @@ class Browser:
     def screenshot(self) -> np.ndarray:
         """Return what the window shows. uint8 RGB [H, W, 3]"""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None
+        return image[..., ::-1]
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 _CODES: Final = 256
-_ROUNDS: Final = 12
+_ROUNDS: Final = 8
 # rows that a palette is fitted to, at most
 _SAMPLE: Final = 2**18
 # distances held at once
@@ -31,7 +31,7 @@ def codebook(values: np.ndarray) -> np.ndarray:
     sample = rising[np.linspace(0, len(rising) - 1, min(len(rising), _SAMPLE)).round().astype(np.int64)]
     shares = (np.arange(_CODES) + 0.5) / _CODES
     codes = 0.5 * (np.quantile(sample, shares) + sample[0] + shares * (sample[-1] - sample[0]))
-    for _ in range(4 * _ROUNDS):
+    for _ in range(6 * _ROUNDS):
         which = nearest(codes, sample)
         counts = np.bincount(which, minlength=_CODES)
         sums = np.bincount(which, sample, _CODES)

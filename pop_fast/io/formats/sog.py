@@ -32,7 +32,7 @@ _FIRST_ROTATION: Final = 252
 _ROW: Final = 64
 _LARGEST_PALETTE: Final = 65536
 # Gaussians for a row of the palette
-_SHARED_BY: Final = 4
+_SHARED_BY: Final = 2
 _LOSSLESS: Final = (cv2.IMWRITE_WEBP_QUALITY, 101)
 _LARGEST_META: Final = 2**20
 _WRITE_AGAIN: Final = "copy or write the file again"

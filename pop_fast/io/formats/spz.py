@@ -29,15 +29,15 @@ _LARGEST: Final = 2**23 - 1
 _MOST_FRACTION_BITS: Final = 20
 # colours are bytes over a range wider than [0, 1]
 _COLOR: Final = 0.15 * 255.0
-# steps of the coefficients of a Gaussian of median visibility, and the widest, of 128 in [0, 1]
-_SH_STEP: Final = 4
+# steps of the coefficients of a Gaussian of typical visibility, and the widest, of 128 in [0, 1]
+_SH_STEP: Final = 2.5
 _WIDEST_STEP: Final = 64
 # what deflate can expand a byte to, at most
 _EXPANSION: Final = 1032
 _WRITE_AGAIN: Final = "copy or write the file again"
 
 
-def encode(cloud: Cloud, version: int = 3, sh_step: int = _SH_STEP) -> bytes:
+def encode(cloud: Cloud, version: int = 3, sh_step: float = _SH_STEP) -> bytes:
     """Write SPZ; the order of the Gaussians is kept.
 
     Every coefficient has a byte, of which gzip makes the less the rounder they are: the colours of Gaussians that are
@@ -46,7 +46,7 @@ def encode(cloud: Cloud, version: int = 3, sh_step: int = _SH_STEP) -> bytes:
     Args:
         cloud: what to write.
         version: 2 or 3, which differ in the rotations.
-        sh_step: what the coefficients of a Gaussian of median visibility are multiples of, in 1/128; 1 to 64.
+        sh_step: what the coefficients of a Gaussian of typical visibility are multiples of, in 1/128; 1 to 64.
 
     Returns:
         The file's bytes.
@@ -90,13 +90,19 @@ def _rotations(quats: np.ndarray, version: int) -> np.ndarray:
     return word.astype("<u4")
 
 
-def _coefficients(rest: np.ndarray, visibility: np.ndarray, step: int) -> np.ndarray:
-    """Round colour coefficients, those of degrees 2 and 3 half as finely again; 0 stays 0."""
-    typical = np.median(visibility) if len(visibility) else 1.0
-    of_row = step * np.sqrt(typical / np.maximum(visibility, 1e-30))
-    of_degree = np.where(np.arange(rest.shape[1]) < 3, 1.0, 1.5)
+def _coefficients(rest: np.ndarray, visibility: np.ndarray, step: float) -> np.ndarray:
+    """Round colour coefficients, those of degrees 2 and 3 a little more; 0 stays 0."""
+    of_row = step * np.sqrt(_typical(visibility) / np.maximum(visibility, 1e-30))
+    of_degree = np.where(np.arange(rest.shape[1]) < 3, 1.0, 1.25)
     steps = np.clip(np.rint(of_row[:, None] * of_degree), 1, _WIDEST_STEP)[..., None]
     return to_bytes(np.rint(128.0 * rest.astype(np.float64) / steps) * steps + 128.0)
+
+
+def _typical(visibility: np.ndarray) -> float:
+    """Return the visibility under which a fifth of all of it lies: that of what is seen, however many hardly are."""
+    rising = np.sort(visibility)
+    sums = np.cumsum(rising)
+    return float(rising[np.searchsorted(sums, 0.2 * sums[-1])]) if len(rising) else 1.0
 
 
 def decode(data: bytes, path: Path) -> Cloud:

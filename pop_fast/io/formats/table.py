@@ -53,8 +53,8 @@ _SPZ_LOSSES: Final = {
     "rotation": "0.28° (10 bits a component)",
     "opacity": _BYTE_OPACITY,
     "colour": "half of 1/136 (degree 0), cut off at -0.44 and 1.44",
-    "view dependence": "coefficients in [-1, 1], typically within 1/64 (degree 1) and 3/128 (2 and 3), the "
-    "less visible a Gaussian the coarser, down to 1/4",
+    "view dependence": "coefficients in [-1, 1], within 1/100 of a Gaussian that is well seen, coarser the less it is, "
+    "down to 1/4",
 }
 
 FORMATS: Final[Mapping[str, Format]] = {
@@ -103,7 +103,7 @@ FORMATS: Final[Mapping[str, Format]] = {
                 "rotation": "1.1° (8 bits a component)",
                 "opacity": _BYTE_OPACITY,
                 "colour": "nearest of 256 numbers that are fitted to the splat (degree 0); lost where the opacity is 0",
-                "view dependence": "nearest row of a fitted palette, one for four Gaussians, at most 65,536",
+                "view dependence": "nearest row of a fitted palette, one for two Gaussians, at most 65,536",
             },
             readers="SuperSplat, PlayCanvas, Babylon.js, Spark",
             encode=sog.encode,
