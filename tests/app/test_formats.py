@@ -14,6 +14,7 @@ from torch import Tensor
 from pop_fast.errors import PopError
 from pop_fast.io.formats import FORMATS, encoded, format_names, load_splat_file, named_format, save_as
 from pop_fast.io.formats.cloud import SH_C0, Cloud, morton_order
+from pop_fast.io.formats.compressed_ply import chunked
 from pop_fast.io.formats.palette import codebook, nearest, row_palette
 from pop_fast.io.ply import load_ply, save_ply
 from pop_ref.covariance import covars_from_quats_scales
@@ -125,7 +126,9 @@ def test_few_distinct_colours_are_kept_by_a_palette() -> None:
     params = many(2000)
     params["shN"] = many(40)["shN"].repeat(50, 1, 1)
     was, now, _ = decoded("sog", params)
-    assert np.abs(was.rest - now.rest).max() < 0.02
+    # each is a row of the palette, whose numbers are rounded to the nearest of 256, few of which are far out
+    assert np.sqrt(((was.rest - now.rest) ** 2).mean()) < 0.005
+    assert np.abs(was.rest - now.rest).max() < 0.03
 
 
 @given(values=st.lists(st.floats(-8.0, 8.0, width=32), max_size=60))
@@ -154,6 +157,17 @@ def test_the_space_filling_curve_is_a_permutation_that_keeps_neighbours_close() 
         np.linalg.norm(np.diff(means[order], axis=0), axis=1).mean()
         < 0.3 * np.linalg.norm(np.diff(means, axis=0), axis=1).mean()
     )
+
+
+@pytest.mark.parametrize("n", [0, 1, 256, 257, 20_000])
+def test_a_chunk_holds_what_is_close_together_however_far_away_others_are(n: int) -> None:
+    params = many(n, 0)
+    params["means"][::500] *= 100.0
+    cloud = Cloud.of(params)
+    order = chunked(cloud)
+    assert np.array_equal(np.sort(order), np.arange(n))
+    inner = np.abs(cloud.means[order]).max(axis=1, initial=0.0) < 10.0
+    assert n < 20_000 or np.median(chunk_extent(cloud.means[order])[inner]) < 2.0
 
 
 @pytest.mark.parametrize("axis", ["x", "z"])

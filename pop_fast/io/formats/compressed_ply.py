@@ -47,8 +47,29 @@ def is_compressed(path: Path) -> bool:
     return "chunk" in columns and set(_WORDS) <= columns.get("vertex", set())
 
 
+def chunked(cloud: Cloud) -> np.ndarray:
+    """Order Gaussians so that those of a chunk are close together: halves along the widest axis, down to chunks.
+
+    Returns:
+        A permutation. int64 [N]
+    """
+    means = cloud.means
+    waiting, done = [np.arange(len(means))], list[np.ndarray]()
+    while waiting:
+        rows = waiting.pop()
+        if len(rows) <= _CHUNK:
+            done.append(rows)
+            continue
+        values = means[rows, np.ptp(means[rows], axis=0).argmax()]
+        # whole chunks before the cut, so that every chunk is one of these parts
+        cut = _CHUNK * (-(-len(rows) // _CHUNK) // 2)
+        order = np.argsort(values, kind="stable")
+        waiting += [rows[order[cut:]], rows[order[:cut]]]
+    return np.concatenate(done)
+
+
 def encode(cloud: Cloud) -> bytes:
-    """Write compressed PLY; the order of the Gaussians is kept, and should be one where neighbours are close."""
+    """Write compressed PLY; the order of the Gaussians is kept, and should be that of `chunked`."""
     n = len(cloud)
     colors = 0.5 + SH_C0 * cloud.sh0.astype(np.float64)
     scales = np.clip(cloud.log_scales.astype(np.float64), -_SCALE_LIMIT, _SCALE_LIMIT)

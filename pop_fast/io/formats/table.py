@@ -77,7 +77,7 @@ FORMATS: Final[Mapping[str, Format]] = {
             readers="SuperSplat, PlayCanvas, Spark, GaussianSplats3D",
             encode=compressed_ply.encode,
             decode=compressed_ply.decode,
-            order=_by_place,
+            order=compressed_ply.chunked,
         ),
         Format(
             name="spz",
