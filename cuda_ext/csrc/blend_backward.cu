@@ -170,7 +170,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
     const int bucket = blockIdx.x * WARPS_PER_BLOCK + warp;
     if (bucket >= state->n_buckets) return;
     const int list = lists.bucket_tile[bucket];
-    // lists and warp tiles coincide in this family
+    // lists and warp tiles coincide here
     const WarpTile tile = {list % lists.grid.tiles_x * WARP_TILE_W, list / lists.grid.tiles_x * WARP_TILE_H, list, 0, 1};
     const int begin = lists.tile_begin[list], end = lists.tile_end[list];
     const int first = (bucket - lists.bucket_begin[list]) * WARP;
@@ -273,7 +273,7 @@ template <int CH, bool ABS, bool PASS, bool ATOMIC>
 void launch(const TileLists& lists, const BlendBackward& blend, const BlendConstants<float>& constants,
             const DeviceState* state, cudaStream_t stream) {
     const int threads = WARP * WARPS_PER_BLOCK;
-    if (blend.family == Family::columns) {
+    if (blend.backward == Backward::pixel_parallel) {
         const int tiles = n_warp_tiles(lists.grid);
         columns_kernel<CH, ABS, PASS, ATOMIC>
             <<<blocks_for(tiles, WARPS_PER_BLOCK), threads, 0, stream>>>(lists, blend, constants, tiles);
@@ -317,8 +317,8 @@ void launch(const TileLists& lists, const BlendBackward& blend, const Profile<fl
 void blend_backward(const TileLists& lists, const BlendBackward& blend, const Profile<float>& profile,
                     const DeviceState* state, cudaStream_t stream) {
     const bool own_tiles = lists.grid.tile_w == WARP_TILE_W && lists.grid.tile_h == WARP_TILE_H;
-    if (blend.family == Family::splats && (!own_tiles || blend.checkpoints == nullptr))
-        throw std::invalid_argument("blend_backward: family splats needs 16 x 8 lists and checkpoints");
+    if (blend.backward == Backward::gaussian_parallel && (!own_tiles || blend.checkpoints == nullptr))
+        throw std::invalid_argument("blend_backward: backward gaussian_parallel needs 16 x 8 lists and checkpoints");
     switch (blend.channels) {
         case 1: return launch<1>(lists, blend, profile, state, stream);
         case 3: return launch<3>(lists, blend, profile, state, stream);

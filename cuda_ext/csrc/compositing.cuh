@@ -169,7 +169,7 @@ POP_HD void sums_of_column(const ColumnSums<Real, CH>& column, Real dx, Real* su
     }
 }
 
-// A pixel on its way through the splats of a bucket, back to front: the other family, one splat a lane.
+// A pixel on its way through the splats of a bucket, back to front: the other backward, one splat a lane.
 template <class Real>
 struct Passing {
     Real T;       // transmittance behind the splat that is visited next

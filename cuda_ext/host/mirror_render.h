@@ -1,5 +1,5 @@
 // A whole render and its transpose on the host, from the functions that the kernels run, in the kernels' order: project,
-// sort by depth, list per tile, blend columns of four pixels, go back by either family, project back.
+// sort by depth, list per tile, blend columns of four pixels, go back either way, project back.
 #pragma once
 
 #include <algorithm>

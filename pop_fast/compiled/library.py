@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 
 _PRECISIONS: Final = ("float32", "float64")
 _POINTER, _WHOLE, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+# what projecting and culling read of `pop_ref.constants.Profile.as_numbers`
+PROJECTION_CONSTANTS: Final = (
+    *("near_inclusive", "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas", "alpha_floor"),
+    *("centred", "inria_clamp", "square"),
+)
 
 
 def _fields(kind: Any, *names: str) -> tuple[tuple[str, Any], ...]:

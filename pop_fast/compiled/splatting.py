@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pop_fast.compiled.library import (
+    PROJECTION_CONSTANTS,
     Colors,
     ColorsBackward,
     Covariances,
@@ -126,13 +127,9 @@ class _Projection(torch.autograd.Function):
 
 
 def _projection_numbers(n: int, view: ProjectionSettings) -> dict[str, float]:
-    profile = view.profile
-    names = ("tile_size", "near_inclusive", "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas")
+    constants = view.profile.as_numbers()
     return {
-        **{name: getattr(profile, name) for name in (*names, "alpha_floor")},
-        "centred": profile.principal_point == "centred",
-        "inria_clamp": profile.clamp_gradient == "inria",
-        "square": profile.extent == "square",
+        **{name: constants[name] for name in (*PROJECTION_CONSTANTS, "tile_size")},
         "antialiased": view.antialiased,
         "radius_clip": view.radius_clip,
         "width": view.width,

@@ -63,7 +63,7 @@ class Scorecard:
         """Write JSON, or a page if the name ends in .html."""
         from pop_ref.conformance.scorecard_page import page
 
-        text = page(self) if path.suffix == ".html" else _compact(self.as_dict())
+        text = page(self, versions()) if path.suffix == ".html" else _compact(self.as_dict())
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text + "\n", encoding="utf-8")
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pop_ref.conformance.scorecard import Entry, Scorecard, versions
+if TYPE_CHECKING:
+    from pop_ref.conformance.scorecard import Entry, Scorecard
 
 
-def page(card: Scorecard) -> str:
+def page(card: Scorecard, made_with: Mapping[str, str]) -> str:
     """Return the page."""
-    made = ", ".join(f"{name} {value}" for name, value in versions().items())
+    made = ", ".join(f"{name} {value}" for name, value in made_with.items())
     parts = [_HEAD.format(title=escape(card.title)), f"<p class=made>{escape(made)}</p>"]
     for backend, stages in card.summary().items():
         chosen = [entry for entry in card.entries if entry.backend == backend]

@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from cuda_ext.render.scores import ScoredView
-from pop_fast.density.passes import PassInput, Seen
 from pop_fast.stages.chord import DominantPoints, points_on_rays, towards_camera
 from pop_fast.stages.contributions import Contributions
 from pop_fast.stages.fisher import fisher_blocks
 from pop_fast.stages.projection import intrinsics
 from pop_fast.stages.types import Camera, Gaussians
+from pop_fast.stages.view_pass import PassInput, Seen
 from pop_fast.train.gpu_proxy import words_for_memory
 
 

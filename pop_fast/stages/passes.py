@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from torch import Tensor
 
-from pop_fast.api.backend import Stages
-from pop_fast.density.passes import PassInput, Seen
 from pop_fast.stages.chord import DominantPoints
 from pop_fast.stages.contributions import Contributions
 from pop_fast.stages.fisher import fisher_blocks
 from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
+from pop_fast.stages.stage_set import Stages
 from pop_fast.stages.tiles import TileLists
+from pop_fast.stages.view_pass import PassInput, Seen
 
 
 @dataclass(frozen=True)
@@ -75,15 +75,9 @@ class StagesView:
 def view_of(shot: PassInput, stages: Stages) -> StagesView:
     """Project and list a shot."""
     g, camera, profile = shot.gaussians, shot.camera, shot.profile
-    covars = stages.covariances(g.quats, g.scales)
-    view = ProjectionSettings(camera.K, camera.width, camera.height, profile, shot.antialiased)
-    splats = stages.project(g.means, covars, g.opacities, camera.viewmat, view)
-    visible = (splats.radii > 0).all(1).nonzero().squeeze(1)
-    splats = replace(splats, colors=stages.colors_of_view(g.sh, g.means, camera.viewmat, shot.sh_degree, visible))
+    settings = ProjectionSettings(camera.K, camera.width, camera.height, profile, shot.antialiased)
+    shapes = stages.covariances(g.quats, g.scales)
+    splats = stages.splats(g.means, shapes, g.opacities, g.sh, camera.viewmat, settings, shot.sh_degree)
     # in the profile whose square cuts visible alpha off, the grid is part of the meaning
-    size = profile.tile_size if profile.extent == "square" else stages.blend_tile(splats.radii)
-    exact = {"conics": splats.conics, "opacities": splats.opacities}
-    lists = stages.tile_lists(
-        splats.means2d, splats.radii, splats.depths, camera.width, camera.height, size, profile, **exact
-    )
-    return StagesView(shot, stages, splats, lists)
+    size = profile.tile_size if profile.extent == "square" else None
+    return StagesView(shot, stages, splats, stages.visible_lists(splats, settings, size))
