@@ -20,12 +20,12 @@ namespace pop {
 namespace {
 
 template <int CH>
-__device__ __forceinline__ float worth_behind(const BlendBackward& blend, const float* v_color, float v_T) {
-    float behind = v_T;
+__device__ __forceinline__ float background_dot_grad(const BlendBackward& blend, const float* v_color, float v_T) {
+    float dot = v_T;
     if (blend.background != nullptr)
 #pragma unroll
-        for (int c = 0; c < CH; ++c) behind += __ldg(blend.background + c) * v_color[c];
-    return behind;
+        for (int c = 0; c < CH; ++c) dot += __ldg(blend.background + c) * v_color[c];
+    return dot;
 }
 
 __device__ __forceinline__ float* row_of(const TileLists& lists, const BlendBackward& blend, const WarpTile& tile,
@@ -101,7 +101,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK, CH < 4 && !ABS ? 7 : 0)
 #pragma unroll
         for (int c = 0; c < CH; ++c) column.v_color[k][c] = inside ? blend.v_image[CH * pixel + c] : 0.0f;
         const float v_T = inside && blend.v_T_final != nullptr ? blend.v_T_final[pixel] : 0.0f;
-        column.behind[k] = worth_behind<CH>(blend, column.v_color[k], v_T);
+        column.suffix_dot_grad[k] = background_dot_grad<CH>(blend, column.v_color[k], v_T);
         last = max(last, column.last[k]);
     }
     last = begin + warp_max(last);
@@ -194,10 +194,11 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
                 p.v_color[c] = blend.v_image[CH * pixel + c];
                 later[c] = checkpoint[(1 + c) * TILE_PIXELS + k * WARP + lane];
             }
-            const float worth = worth_behind<CH>(blend, p.v_color, v_T);
+            const float background_dot = background_dot_grad<CH>(blend, p.v_color, v_T);
             const float* next = checkpoint + (1 + CH) * TILE_PIXELS;
-            p.behind = {T_final, worth};
-            if (goes_on) p.behind = passing_behind<float, CH>(next[k * WARP + lane], T_final, later, p.v_color, worth);
+            p.behind = {T_final, background_dot};
+            if (goes_on)
+                p.behind = passing_after<float, CH>(next[k * WARP + lane], T_final, later, p.v_color, background_dot);
         }
         pixels[warp][k * WARP + lane] = p;
         last = max(last, p.last);
@@ -222,7 +223,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
         for (int step = 0; step < TILE_PIXELS + WARP - 1; ++step) {  // per step
             // the pixel that the lane behind has just left
             passing.T = __shfl_down_sync(FULL_WARP, passing.T, 1);
-            passing.behind = __shfl_down_sync(FULL_WARP, passing.behind, 1);
+            passing.suffix_dot_grad = __shfl_down_sync(FULL_WARP, passing.suffix_dot_grad, 1);
             const int p = step - (WARP - 1 - lane);
             if (p < 0 || p >= TILE_PIXELS) continue;
             const BucketPixel<CH>& pixel = pixels[warp][p];

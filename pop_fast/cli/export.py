@@ -13,7 +13,7 @@ import tyro
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
-from pop_fast.train.load_result import Splat, load_splat, read_record
+from pop_fast.train.load_result import Splat, frame_of_splat, load_splat, read_record
 
 _EXAMPLES: Final = """
     pop export out/scene_pop --out scene.ply                 for any viewer, in the capture's own world frame
@@ -63,7 +63,7 @@ def run(argv: Sequence[str]) -> int:
     if args.out.suffix.lower() == ".splat":
         save_splat(args.out, splat.params)
     else:
-        save_ply(args.out, splat.params, splat.config.antialiased)
+        save_ply(args.out, splat.params, splat.config.antialiased, frame=splat.frame)
     print(f"{n:,} Gaussians, {args.out.stat().st_size / 2**20:.1f} MiB -> {args.out}")
     return 0
 
@@ -74,6 +74,12 @@ def check_file(args: Args) -> None:
     Raises:
         PopError: another kind of file, something that is not to be replaced, or the splat itself.
     """
+    name = args.out.name.lower()
+    if name.endswith(".compressed.ply"):
+        raise PopError(
+            f"{args.out}: .compressed.ply is a format of its own, which this command does not write; name it .ply, and "
+            "convert that with SuperSplat or splat-transform"
+        )
     if args.out.suffix.lower() not in (".ply", ".splat"):
         raise PopError(f"{args.out}: the name must end in .ply or .splat; for a folder give --layout inria")
     if args.out.is_dir():
@@ -90,17 +96,33 @@ def in_frame(splat: Splat, args: Args) -> Splat:
     Raises:
         PopError: the capture's frame was asked for and nothing says how it relates to the splat's.
     """
-    wanted = args.frame or ("capture" if splat.folder is not None else "training")
-    if wanted == "training" or args.own_frame or not splat.config.normalize:
-        return splat
-    record = read_record(splat.folder)
-    if args.capture is None and record is not None:
-        transform = np.array(record.world_transform)
-    else:
-        transform = open_with_bars(splat, args)[0].world_transform
+    from pop_fast.io.ply import Frame
+
+    now, transform = frame_of_splat(splat, args), known_transform(splat, args)
+    wanted = args.frame or ("capture" if splat.folder is not None else now)
+    if wanted is None or wanted == (now or "training"):
+        return splat if now is None else replace(splat, frame=Frame(now, _rows(transform)))
+    if transform is None:
+        as_trained = replace(splat, config=replace(splat.config, normalize=True), frame=Frame("training"))
+        transform = open_with_bars(as_trained, replace(args, own_frame=False))[0].world_transform
     from pop_fast.data import to_capture_frame
 
-    return replace(splat, params=to_capture_frame(splat.params, transform))
+    way = transform if wanted == "capture" else np.linalg.inv(transform)
+    return replace(splat, params=to_capture_frame(splat.params, way), frame=Frame(wanted, _rows(transform)))
+
+
+def known_transform(splat: Splat, args: Args) -> np.ndarray | None:
+    """Return what moves the capture's own frame into the training frame, where the file or its run says. [4, 4]"""
+    if splat.frame is not None and splat.frame.transform is not None:
+        return np.array(splat.frame.transform)
+    record = read_record(splat.folder)
+    if args.capture is not None or record is None or not splat.config.normalize:
+        return None
+    return np.array(record.world_transform)
+
+
+def _rows(transform: np.ndarray | None) -> tuple[tuple[float, ...], ...] | None:
+    return None if transform is None else tuple(map(tuple, transform.tolist()))
 
 
 def without_invisible(splat: Splat) -> Splat:

@@ -2,13 +2,16 @@
 
 One row a Gaussian, little-endian float32: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_0..44, opacity, scale_0..2,
 rot_0..3. Opacities are logits, scales logarithms, rotations wxyz of any norm; f_rest is channel-major: fifteen
-coefficients of red, then green, then blue. A header comment `SplatRenderMode: mip` marks antialiased splats.
+coefficients of red, then green, then blue. A header comment `SplatRenderMode: mip` marks antialiased splats, and one
+`pop-frame:` says which world they are in.
 """
 
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -17,11 +20,12 @@ from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.ply_rows import column, read_header, read_vertices
 
-__all__ = ["is_antialiased", "load_ply", "save_ply", "save_splat"]
+__all__ = ["Frame", "frame_of", "is_antialiased", "load_ply", "save_ply", "save_splat"]
 
 _SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3)}
 _SH_C0 = 0.28209479177387814
 _MODE = "SplatRenderMode:"
+_FRAME = "pop-frame:"
 # sigmoid(logit) >= 1/255, what a renderer can show at all
 _VISIBLE_LOGIT = -np.log(254.0)
 _COLUMNS = (
@@ -34,11 +38,25 @@ _COLUMNS = (
 )
 
 
+@dataclass(frozen=True)
+class Frame:
+    """The world that a splat is in.
+
+    Attributes:
+        name: "capture" is the capture's own, "training" the one that `pop train` moves it into.
+        transform: similarity, training frame = transform @ capture's own frame; None where it is not known. [4, 4]
+    """
+
+    name: Literal["capture", "training"]
+    transform: tuple[tuple[float, ...], ...] | None = None
+
+
 def save_ply(
     path: str | os.PathLike[str],
     params: dict[str, torch.Tensor],
     antialiased: bool = False,
     drop_transparent: bool = False,
+    frame: Frame | None = None,
 ) -> tuple[int, int]:
     """Write raw parameters as PLY, atomically.
 
@@ -47,6 +65,7 @@ def save_ply(
         params: means [N, 3], scales [N, 3], quats [N, 4], opacities [N], sh0 [N, 1, 3], shN [N, 0|3|8|15, 3], raw.
         antialiased: the splats were trained with antialiasing, and are to be drawn so.
         drop_transparent: leave out Gaussians with an opacity under 1/255, which no renderer shows.
+        frame: the world that they are in, where it is known; written as a comment.
 
     Returns:
         The number of Gaussians before and after that filter.
@@ -72,12 +91,15 @@ def save_ply(
         arrays["quats"],
     ]
     table = np.ascontiguousarray(np.concatenate(columns, axis=1), dtype="<f4")
-    write_atomically(path, lambda file: file.write(_header(n, antialiased) + table.tobytes()))
+    write_atomically(path, lambda file: file.write(_header(n, antialiased, frame) + table.tobytes()))
     return before, n
 
 
-def _header(n: int, antialiased: bool) -> bytes:
+def _header(n: int, antialiased: bool, frame: Frame | None) -> bytes:
     lines = ["ply", "format binary_little_endian 1.0", f"comment {_MODE} {'mip' if antialiased else 'default'}"]
+    if frame is not None:
+        rows = () if frame.transform is None else frame.transform
+        lines.append(" ".join([f"comment {_FRAME} {frame.name}", *(f"{x:.17g}" for row in rows for x in row)]))
     lines += [f"element vertex {n}", *(f"property float {name}" for name in _COLUMNS), "end_header", ""]
     return "\n".join(lines).encode("ascii")
 
@@ -137,6 +159,26 @@ def is_antialiased(path: str | os.PathLike[str]) -> bool:
     """Tell whether a PLY file asks to be drawn with antialiasing: its comment `SplatRenderMode: mip`."""
     comments = read_header(Path(path)).comments
     return any(comment.startswith(_MODE) and comment.split()[-1] == "mip" for comment in comments)
+
+
+def frame_of(path: str | os.PathLike[str]) -> Frame | None:
+    """Tell which world a PLY file's splats are in, by its comment; None where there is none, as of other programs.
+
+    Raises:
+        PopError: the comment is not one that this program writes.
+    """
+    for comment in read_header(Path(path)).comments:
+        if comment.startswith(_FRAME):
+            name, *numbers = comment.removeprefix(_FRAME).split() or [""]
+            try:
+                values = np.array([float(number) for number in numbers]).reshape(-1, 4)
+            except ValueError:
+                values = np.full((1, 4), np.nan)
+            if name not in ("capture", "training") or len(values) not in (0, 4) or not np.isfinite(values).all():
+                raise PopError(f"{path}: comment {comment[:60]!r} is damaged; remove it, or export the splat again")
+            rows = tuple(map(tuple, values.tolist())) if len(values) else None
+            return Frame("capture" if name == "capture" else "training", rows)
+    return None
 
 
 def save_splat(path: str | os.PathLike[str], params: dict[str, torch.Tensor]) -> int:

@@ -101,8 +101,9 @@ def tile_lists(
     splat = torch.repeat_interleave(counts)
     k = (torch.arange(len(splat)) - (counts.cumsum(0) - counts).index_select(0, splat)).to(torch.int32)
     per_row = columns_of_tiles.to(torch.int32).index_select(0, splat)
-    # both are small integers, whose float32 quotient never rounds up to the next one
-    row_of_rect = (k.to(torch.float32) / per_row).to(torch.int32)
+    # integers under 2^24, whose float32 quotient never rounds up to the next one
+    exact = torch.float32 if tiles_x * tiles_y <= 2**24 else torch.float64
+    row_of_rect = (k.to(exact) / per_row).to(torch.int32)
     tile_x = left.to(torch.int32).index_select(0, splat) + k - row_of_rect * per_row
     tile_y = top.to(torch.int32).index_select(0, splat) + row_of_rect
     if conics is not None and opacities is not None:

@@ -30,6 +30,7 @@ NOT_COMPILED = "the CPU kernels are not compiled"
 def _without_compiled_blend(monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a machine without a C++ compiler; `test_build_cpu` tells what there is with one."""
     monkeypatch.setattr("pop_fast.compiled.why_not", lambda: NOT_COMPILED)
+    monkeypatch.setattr("pop_fast.train.choose.has_gpu", lambda: True)
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.read_back import check_record, parse_json, read_arrays, read_json
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.results import read_config
+from pop_fast.view.report.compare import threads_of
 from pop_fast.view.report.curves import Window
 from pop_fast.view.report.model import Histogram, ReportData, ReportView, Tile
 
@@ -140,7 +141,7 @@ def _cost_tiles(stats: Mapping[str, Any]) -> list[Tile]:
 def _machine(stats: Mapping[str, Any]) -> str:
     versions = stats.get("versions") or {}
     torch = f"torch {versions['torch']}" if "torch" in versions else ""
-    threads = f"{stats['threads']} threads" if "threads" in stats else ""
+    threads = threads_of(stats) if "threads" in stats else ""
     return ", ".join(filter(None, [str(stats.get("machine") or ""), threads, torch]))
 
 
