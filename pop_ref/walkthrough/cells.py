@@ -8,12 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-Kind = Literal["prose", "code", "answer"]
+Kind = Literal["prose", "code", "setup", "answer"]
 
 FOLDER: Final = Path(__file__).resolve().parent
 
 _MARKER: Final = re.compile(r"^# %%(.*)$")
-_KINDS: Final[dict[str, Kind]] = {"": "code", "[markdown]": "prose", "answer": "answer"}
+_KINDS: Final[dict[str, Kind]] = {
+    "": "code",
+    "[markdown]": "prose",
+    "setup": "setup",
+    "answer": "answer",
+}
 _NAME: Final = re.compile(r"^chapter_(\d\d)_[a-z0-9_]+$")
 _TITLE: Final = re.compile(r"^# (\d+)\. (.+)$")
 _EXERCISE: Final = re.compile(r"^### Exercise (\d+)\b")
@@ -125,7 +130,7 @@ def _cells(path: Path, text: str) -> list[Cell]:
             raise ChapterError(
                 path,
                 start + 1,
-                f"a cell is marked '# %%', '# %% [markdown]' or '# %% answer', not {word!r}",
+                f"a cell is marked '# %%', '# %% [markdown]', '# %% setup' or '# %% answer', not {word!r}",
             )
         first, last = start + 1, end
         while first < last and not lines[first].strip():

@@ -88,7 +88,7 @@ print(
 #
 # Rasterizers add two rules that the paper does not print. An alpha under 1/255 changes an 8-bit image by less than one
 # level and is skipped (the *floor*, decision D5). And alpha is cut at 0.999 (the *ceiling*, D6), so that no splat
-# blocks everything: what lies behind keeps a trace of a say, and a gradient.
+# blocks everything: what lies behind still contributes a little, and has a gradient.
 
 # %%
 alpha, skipped = alpha_from_sigma(sigma, opacity)

@@ -82,9 +82,11 @@ print("depths:", depths.round(2))
 #
 # $$u = \left( \frac{f_x x}{z} + c_x, \; \frac{f_y y}{z} + c_y \right)$$
 #
-# with focal lengths $f$ and the principal point $c$ in px. This division bends straight things: what the pinhole makes
-# of a Gaussian is no Gaussian. EWA splatting, which 3DGS builds on, replaces the division by its linearisation at the
-# centre. A linear map does take Gaussians to Gaussians, and the covariance on the screen is
+# with focal lengths $f$ and the principal point $c$ in px. Straight lines stay straight under this map, but equal steps
+# along them do not stay equal, since near things look larger: the map is not affine. Only affine maps take Gaussians to
+# Gaussians, so what the pinhole makes of a Gaussian is not one. EWA splatting, which 3DGS builds on, replaces the map by
+# its linearisation at the centre, its matrix of first derivatives, the *Jacobian* $J$. Then the covariance on the screen
+# is
 #
 # $$\Sigma^{2D} = J W \Sigma W^\top J^\top, \qquad
 # J = \begin{pmatrix} f_x/z & 0 & -f_x x/z^2 \\ 0 & f_y/z & -f_y y/z^2 \end{pmatrix}$$
@@ -216,7 +218,7 @@ assert soft.max() / soft.min() < 1.02
 #
 # $$\rho = \sqrt{\det \Sigma^{2D} / \det(\Sigma^{2D} + 0.3\, I)}$$
 #
-# (Mip-Splatting, eq. 9), so that the whole amount of paint stays what it was.
+# (the 2D Mip filter of Mip-Splatting), so that the whole amount of paint stays what it was.
 
 # %%
 rho = compensations(needle, PAPER.eps2d)[0]
@@ -250,7 +252,8 @@ picture(
 # ## All of it at once
 #
 # `project` does what this chapter did, for every Gaussian: centre, conic and extent, as chapter 1 used them. It also
-# drops what lies in front of the near plane or does not reach the image.
+# *culls*, that is leaves out, what cannot be seen: a Gaussian whose centre lies behind the camera or nearer to it than
+# the *near plane*, at depth 0.01 (decision D1), and one that does not reach the image (D2).
 
 # %%
 scene = Gaussians(means, quats, scales, np.array([0.9, 0.6]), np.zeros((2, 1, 3)))

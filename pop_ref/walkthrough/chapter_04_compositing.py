@@ -68,7 +68,7 @@ assert np.allclose(pixel.weights, -np.diff([*pixel.transmittances, pixel.T_final
 # %% [markdown]
 # The order decides. The same six splats from back to front give another pixel (exercise 1 says how much a swap of two
 # neighbours costs). A renderer therefore sorts splats by depth before it blends. It need not go from front to back,
-# though: a painter's rule, $B_i = \alpha_i c_i + (1 - \alpha_i) B_{i+1}$ from the background forward, gives the same.
+# though: a painter's rule, $b_{i-1} = \alpha_i c_i + (1 - \alpha_i)\, b_i$ from the background $b_m = b$ forward, gives the same.
 # But only the walk from the front knows when to stop.
 
 # %%
@@ -135,10 +135,11 @@ picture(
 )
 
 # %% [markdown]
-# One detail is worth knowing, because every implementation shares it. The splat that would cross the line is *not
-# blended*: the pixel ends in front of it. If that splat is nearly opaque, it takes a good share of the light into
-# oblivion. Put one splat of alpha 0.91 before a wall of alpha 0.999. It leaves $T = 0.09$, the wall would leave $9
-# \cdot 10^{-5}$, so the wall is skipped, and nine percent of the pixel shows the background instead.
+# One detail is worth knowing. In the rasterizers of 3DGS and gsplat, and so in POP, the splat that would cross the line
+# is *not blended*: the pixel ends in front of it. (Faster-GS and LiteGS do blend it before they stop.) If that splat is
+# nearly opaque, a good share of the light is lost. Put one splat of alpha 0.91 before a wall of alpha 0.999. It leaves
+# $T = 0.09$, the wall would leave $9 \cdot 10^{-5}$, so the wall is skipped, and nine percent of the pixel shows the
+# background instead.
 
 # %%
 veil_and_wall = stack(np.array([0.91, 0.999]), np.array([[0.2, 0.2, 0.2], [0.0, 0.5, 1.0]]))

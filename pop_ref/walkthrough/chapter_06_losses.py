@@ -1,14 +1,15 @@
 # %% [markdown]
 # # 6. What a loss pulls with: L1, L2, SSIM
 #
-# A loss reaches the Gaussians only through its derivative by the image. At the end of this chapter you know what that
+# A loss reaches the Gaussians only through its derivative with respect to the image. At the end of this chapter you know what that
 # derivative looks like for the three losses of the method, why POP trades L1 for L2, and what the trade costs.
 
 # %% [markdown]
 # ## One pixel
 #
 # L1 averages $|\Delta|$ and L2 averages $\Delta^2$ over the $3HW$ numbers of an image, where
-# $\Delta = c - c^{\mathrm{GT}}$. By one of those numbers (POP paper, eq. 4)
+# $\Delta = c - c^{\mathrm{GT}}$ and GT is the photograph (the *ground truth*). The derivatives with respect to one of
+# those numbers are (POP paper, eq. 4)
 #
 # $$\frac{\partial L_1}{\partial c} = \frac{\mathrm{sign}(\Delta)}{3HW},
 # \qquad \frac{\partial L_2}{\partial c} = \frac{2 \Delta}{3HW} .$$
@@ -270,7 +271,7 @@ def pulls_at(params, factor=1.0):
 
 
 rates = {name: 5.0 * rate for name, rate in learning_rates(0, 4.0).items()}
-# round Gaussians have no gradient by rotation but rounding's, which Adam would follow
+# the rotation of a round Gaussian has no gradient but rounding errors, which Adam would follow
 rates["quats"] = 0.0
 zero = {name: np.zeros_like(value) for name, value in params.items()}
 moments = zero, zero

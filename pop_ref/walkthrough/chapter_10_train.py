@@ -206,8 +206,9 @@ picture(
 # **Opacities.** All began at 0.1. Without the prior few end over 0.9; with it more than twice the share does. That is
 # the polarization, and the reason for the next curve.
 #
-# **Gaussians per pixel.** How many splats a pixel blends before its light is used up. Opaque splats use it up sooner,
-# so the curve ends lower. Less work per pixel is what POP is after.
+# **Gaussians per pixel.** How many splats a pixel blends. With the prior the curve ends lower: fewer Gaussians are left,
+# and the faint ones reach less far ([chapter 8](chapter_08_polarized_opacity.py)). It is not that rays end early: in so
+# thin a scene hardly a pixel uses its light up, with the prior or without. Less work per pixel is what POP is after.
 #
 # **PSNR.** The two end within a decibel or so of each other; from other starting points, in runs that are not shown,
 # the prior cost up to two. Here it pushes twenty times harder than in the paper, where the ablation (section 5) reports

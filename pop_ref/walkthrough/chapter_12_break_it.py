@@ -2,13 +2,13 @@
 # # 12. Break it: each mutant, and the law that catches it
 #
 # A test that no bug fails is worth nothing. So the kit that judges rasterizers is judged itself: by broken copies of
-# the oracle, each wrong in one line, most of them as somebody's program once was. At the end of this chapter you have
+# the oracle, each wrong in one line, most of them as some program once was. At the end of this chapter you have
 # seen what such bugs do to a picture, that most of them do nothing to it, and which law catches which.
 #
 # ## A law and a mutant
 #
 # A **law** is a sentence that must hold for every input: doubling all scales quadruples the covariance; a pixel that
-# nobody reaches belongs to nobody. The kit draws inputs and looks for one that breaks it. A **mutant** is the oracle
+# no splat reaches has no dominant Gaussian. The kit draws inputs and looks for one that breaks it. A **mutant** is the oracle
 # with one line replaced. `living` imports it beside the oracle under another name, so that both can be asked the same.
 # Here is one of each: an alpha that equals the floor is blended (decision D5), and a copy in which it is not.
 
@@ -118,7 +118,7 @@ for k, (name, color) in enumerate(zip(pulls, (INK, ACCENT, SECOND, THIRD), stric
     places = np.arange(4) + 0.2 * (k - 1.5)
     ax.bar(places, pulls[name], 0.18, color=color, label=name.replace("_", " "))
 ax.set(xticks=range(4), xticklabels=("long", "round", "thin", "at the tile's edge"))
-ax.set_ylabel("gradient by opacity")
+ax.set_ylabel("gradient of the opacity")
 ax.legend(fontsize=8)
 picture(fig, "One picture, four gradients. Only the first belongs to it.")
 
