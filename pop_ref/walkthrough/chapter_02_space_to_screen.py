@@ -1,3 +1,5 @@
+# minutes: 30
+
 # %% [markdown]
 # # 2. From space to screen
 #
@@ -84,9 +86,9 @@ print("depths:", depths.round(2))
 #
 # with focal lengths $f$ and the principal point $c$ in px. Straight lines stay straight under this map, but equal steps
 # along them do not stay equal, since near things look larger: the map is not affine. Only affine maps take Gaussians to
-# Gaussians, so what the pinhole makes of a Gaussian is not one. EWA splatting, which 3DGS builds on, replaces the map by
-# its linearisation at the centre, its matrix of first derivatives, the *Jacobian* $J$. Then the covariance on the screen
-# is
+# Gaussians, so what the pinhole makes of a Gaussian is not one. EWA splatting, which 3DGS builds on, replaces the map
+# by its linearisation at the centre, its matrix of first derivatives, the *Jacobian* $J$. Then the covariance on the
+# screen is
 #
 # $$\Sigma^{2D} = J W \Sigma W^\top J^\top, \qquad
 # J = \begin{pmatrix} f_x/z & 0 & -f_x x/z^2 \\ 0 & f_y/z & -f_y y/z^2 \end{pmatrix}$$
@@ -279,7 +281,7 @@ def alone(mean: list[float], standard_deviations: list[float]) -> Gaussians:
 
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: derive
 # A Gaussian with the same standard deviation $s$ along all axes lies straight ahead at depth $z$. What is its standard
 # deviation on the screen before the blur? Why does it not matter how it is turned?
 
@@ -293,7 +295,7 @@ for each in (ball, turned):
     assert np.allclose(geometry(each, ahead).covars2d[0], (f * 0.2 / 5.0) ** 2 * np.eye(2))
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: derive
 # The same ball moves sideways to $x = z$. Which axis of its ellipse grows, and by what factor? (Use a screen so wide
 # that nothing is clamped.)
 
@@ -307,7 +309,7 @@ assert np.allclose(
 )
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: predict
 # A disc (one scale zero) is seen exactly edge-on. What is its screen covariance, and what does the blur do for it?
 
 # %% answer

@@ -1,9 +1,11 @@
+# minutes: 40
+
 # %% [markdown]
 # # 5. The backward pass, by hand
 #
-# Training needs the derivative of the loss with respect to every number of every Gaussian. At the end of this chapter you can
-# derive it for a pixel on paper, you know the one scalar that walks from back to front and carries all of it, and you
-# have two ways to convince yourself that a hand-written gradient is right.
+# Training needs the derivative of the loss with respect to every number of every Gaussian. At the end of this chapter
+# you can derive it for a pixel on paper, you know the one scalar that walks from back to front and carries all of it,
+# and you have two ways to convince yourself that a hand-written gradient is right.
 
 # %% [markdown]
 # ## One pixel, three splats
@@ -68,9 +70,9 @@ assert composite_pixel([0, 1, 2], three, 0.5, 0.5, [0.0]).color == [7 / 16]
 assert v_alphas_of(three, 0.0).tolist() == [1 / 8, -1 / 8, 1 / 4]
 
 # %% [markdown]
-# With three channels little changes. Let $g = \partial L / \partial C$ be the gradient of a loss $L$ with respect to the
-# pixel. Only the product of a colour with $g$ counts, $q_i = c_i \cdot g$, and with $b_i$ now the same product of the
-# light behind,
+# With three channels little changes. Let $g = \partial L / \partial C$ be the gradient of a loss $L$ with respect to
+# the pixel. Only the product of a colour with $g$ counts, $q_i = c_i \cdot g$, and with $b_i$ now the same product of
+# the light behind,
 #
 # $$\frac{\partial L}{\partial \alpha_i} = T_i\,(q_i - b_i),
 # \qquad \frac{\partial L}{\partial c_i} = T_i \alpha_i\, g .$$
@@ -125,7 +127,7 @@ S = np.array([np.sum((T * alphas * q)[i + 1 :]) for i in range(n)]) + pixel.T_fi
 np.testing.assert_allclose(T * q - S / (1.0 - alphas), v_alphas, rtol=1e-12)
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: derive
 #
 # A fourth splat with alpha 1/2 and colour $c$ is put *behind* the first three. (a) What is the derivative with respect
 # to its alpha? (b) For which $c$ does that with respect to the first splat's alpha vanish?
@@ -185,8 +187,8 @@ for sigma in (0.0, 10.0):
 # \quad \frac{\partial L}{\partial Q} = -\tfrac12 \sum \Gamma\, d d^\top .$$
 #
 # Read the middle one as forces: where $\Gamma$ is negative, more of this splat would lower the loss, and gradient
-# descent pulls its centre there; where $\Gamma$ is positive it pushes the centre away. Here the sums are collected one by
-# one and compared with the oracle's gradients.
+# descent pulls its centre there; where $\Gamma$ is positive it pushes the centre away. Here the sums are collected one
+# by one and compared with the oracle's gradients.
 
 # %%
 rng = np.random.default_rng(2)
@@ -259,10 +261,10 @@ picture(
 # ## Is it right? Differences
 #
 # The oldest check: move one parameter by $\pm h$ and divide. Below, the loss is $\langle V, \mathrm{image} \rangle$
-# with a random $V$; the oracle's `render_vjp` gives its gradient with respect to all parameters at once. The error of a central
-# difference falls as $h^2$ until rounding, which grows as $1/h$, takes over; with a wrong gradient it would stop
-# falling at the size of the mistake. Derivatives hold decisions fixed (who is skipped, where a pixel stops, who is in
-# front), so the scene is one where none of them flips on the way.
+# with a random $V$; the oracle's `render_vjp` gives its gradient with respect to all parameters at once. The error of a
+# central difference falls as $h^2$ until rounding, which grows as $1/h$, takes over; with a wrong gradient it would
+# stop falling at the size of the mistake. Derivatives hold decisions fixed (who is skipped, where a pixel stops, who is
+# in front), so the scene is one where none of them flips on the way.
 
 # %%
 rng = np.random.default_rng(11)
@@ -347,11 +349,11 @@ swapped[[7, 8]] = swapped[[8, 7]]
 assert abs(forward - swapped @ u) > 1e-4 * scale
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: code
 #
-# `render_vjp` also returns `means2d`, the gradient with respect to the projected centres, which density control reads (eq. 3). Move
-# the principal point of `K`: all splats shift together on the screen. Check that the loss changes by the sum of those
-# gradients.
+# `render_vjp` also returns `means2d`, the gradient with respect to the projected centres, which density control reads
+# (eq. 3). Move the principal point of `K`: all splats shift together on the screen. Check that the loss changes by the
+# sum of those gradients.
 
 
 # %% answer
@@ -364,7 +366,7 @@ v_shift = render_vjp(few, small, V).means2d.sum(axis=0) @ (0.6, -0.8)
 assert np.isclose((moved_by(1e-5) - moved_by(-1e-5)) / 2e-5, v_shift, rtol=1e-6)
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: predict
 #
 # The image jumps where a decision flips. A white splat of opacity 1 stands alone over black. By how much does a pixel
 # jump where its alpha crosses the floor, and what does the gradient say on either side?

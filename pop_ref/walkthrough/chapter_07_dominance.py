@@ -1,3 +1,5 @@
+# minutes: 30
+
 # %% [markdown]
 # # 7. The dominant Gaussian of a pixel, and the blur set
 #
@@ -63,7 +65,7 @@ for alpha in (0.01, 0.5, 0.99):
     assert dominant_id(*ray([alpha, alpha])) == 0
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: derive
 #
 # How opaque must the front splat be at a pixel so that nothing behind it can dominate, whatever it is?
 
@@ -78,9 +80,9 @@ assert dominant_id(*ray([0.49, 0.999])) == 1
 # %% [markdown]
 # ## Counting pixels
 #
-# The **dominant count** $\mathcal{D}_i$ of a view is the number of its pixels that Gaussian $i$ wins. Each pixel has at most one
-# winner, so the counts of a view sum to the number of pixels where anything blends. The map of winners is a mosaic:
-# with opacities near 1 it shows the surfaces that the camera sees.
+# The **dominant count** $\mathcal{D}_i$ of a view is the number of its pixels that Gaussian $i$ wins. Each pixel has at
+# most one winner, so the counts of a view sum to the number of pixels where anything blends. The map of winners is a
+# mosaic: with opacities near 1 it shows the surfaces that the camera sees.
 
 # %%
 SIZE = 40
@@ -169,7 +171,7 @@ for width, height in ((980, 545), (1557, 1038)):
     assert width * height / (smallest_blurred(width, height) - 1) >= 1.0 / THETA
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: derive
 #
 # Training collects the flags of all views since the last event. Two readings of "cumulative" are possible: flag a
 # Gaussian if *any* view's count passes the threshold, or if the *sum* over the views does. A Gaussian wins one pixel in
@@ -194,8 +196,8 @@ assert (100.0 / THETA, POP.blur_window) == (5e6, "any_view")
 # ## Where gradients are silent
 #
 # Why not just use the gradient rule (eq. 3)? It asks whether the loss would fall if a Gaussian *moved* on the screen,
-# and adds up the gradients of all its pixels with their signs. A splat in the middle of detail that is symmetric about it is
-# pulled to all sides at once: the sum is zero however wrong its pixels are. The count does not cancel.
+# and adds up the gradients of all its pixels with their signs. A splat in the middle of detail that is symmetric about
+# it is pulled to all sides at once: the sum is zero however wrong its pixels are. The count does not cancel.
 
 # %%
 blob = Gaussians(
@@ -230,9 +232,9 @@ picture(
 #
 # Now let the rule alone make a model grow. It begins with four large Gaussians before a painted picture of 24 x 24 px,
 # trained for 20 steps with L2 (eq. 4). Then the blur set is split, six steps of training follow, and so on. On 576
-# pixels the paper's $\theta$ would select every Gaussian that wins one; here $\theta = 1/48$, so that one that wins more
-# than twelve pixels is split. (Learning rates are four times the usual, the colours' forty times. Gaussians whose largest
-# scale is under a hundredth of the scene's would be cloned instead; none here is that small.)
+# pixels the paper's $\theta$ would select every Gaussian that wins one; here $\theta = 1/48$, so that one that wins
+# more than twelve pixels is split. (Learning rates are four times the usual, the colours' forty times. Gaussians whose
+# largest scale is under a hundredth of the scene's would be cloned instead; none here is that small.)
 
 # %%
 SMALL, THETA_HERE = 24, 1 / 48
@@ -322,7 +324,7 @@ assert (POP.blur_start_iter, POP.blur_stop_iter, POP.grow_on_gradient) == (3000,
 assert np.exp(rows.params["scales"]).max(axis=1).min() > POP.grow_scale3d
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: derive
 #
 # Why does the paper lower $\theta$ to a tenth of Mini-Splatting's 1/5,000, and what would it do to the number of
 # winners at which the rule falls silent?

@@ -1,3 +1,5 @@
+# minutes: 35
+
 # %% [markdown]
 # # 8. Gradient leakage and the polarized opacity prior
 #
@@ -40,7 +42,7 @@ from pop_ref.render import render, render_vjp
 from pop_ref.training import gaussians_from_params, params_vjp
 from pop_ref.types import Camera
 from pop_ref.walkthrough.pages import picture
-from pop_ref.walkthrough.style import ACCENT, MUTED, SECOND, axes
+from pop_ref.walkthrough.style import ACCENT, MUCH, MUTED, SECOND, axes
 
 
 def gradients_of(opacities, offset=0.0, v_color=1.0):
@@ -123,7 +125,7 @@ def steps_until(end, start, v_opacity, eps=1e-15):
 assert steps_until(0.9, 0.5, -1e-3) == steps_until(0.9, 0.5, -1e-9)
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: predict
 #
 # An opacity was reset to 0.01 (logit −4.6). From then on it feels $\partial L / \partial o = -10^{-9}$, a billionth, at
 # every step. Estimate after how many steps it is back over 1/2, with Adam's $\epsilon = 10^{-15}$ as in 3DGS. Would it
@@ -134,9 +136,9 @@ assert steps_until(0.9, 0.5, -1e-3) == steps_until(0.9, 0.5, -1e-9)
 # that, grows with the opacity, and Adam's running size lags behind. With $\epsilon = 10^{-8}$ the logit's gradient,
 # $10^{-11}$ at first, is a thousandth of $\epsilon$, the steps are as much shorter, and it takes 21,742 of them. So it
 # is the tiny $\epsilon$ of 3DGS that lets gradients leak so well.
-print(steps_until(0.5, 0.01, -1e-9), "and", steps_until(0.5, 0.01, -1e-9, eps=1e-8))
-assert steps_until(0.5, 0.01, -1e-9) == 69
-assert steps_until(0.5, 0.01, -1e-9, eps=1e-8) == 21_742
+back = [steps_until(0.5, 0.01, -1e-9, eps) for eps in (1e-15, 1e-8)]
+print(back, "steps")
+assert back == [69, 21_742]
 
 # %% [markdown]
 # ## The prior
@@ -166,7 +168,7 @@ assert pop_loss(np.array([1.0, 1.0, 0.0]), np.array([True, True, False])) == 0.0
 assert POP.prune_opa == 0.005
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: derive
 #
 # In every view 250 of 1,000 Gaussians are important. One of them is important in a fraction $f$ of the views. Leaving
 # the photographs aside, for which $f$ does the prior push it up on average?
@@ -327,7 +329,7 @@ for ax, (name, scenes) in zip((left, right), runs.items(), strict=True):
         aspect="auto",
         vmin=0.0,
         vmax=0.4,
-        cmap="Blues",
+        cmap=MUCH,
     )
     ax.set(xlabel="step", title=f"{name} the prior")
     ax.grid(False)
@@ -393,7 +395,7 @@ for camera in cameras:
     assert np.array_equal(view.n_traversed[0], listed)
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: predict
 #
 # A Gaussian with $o = 0.1$ lies where no photograph looks. The gradient of the prior is all it feels,
 # $\lambda / (N - N_{\mathrm{imp}})$ with $N - N_{\mathrm{imp}} = 750$. After how many steps is it under the pruning

@@ -1,15 +1,17 @@
+# minutes: 35
+
 # %% [markdown]
 # # 9. Clone, split, prune, and the reset that POP leaves out
 #
 # Training changes not only the Gaussians but how many there are. At the end of this chapter you know which are cloned,
-# which are split and which are pruned, what happens to the optimizer's memory when rows come and go, what an opacity reset does
-# to a picture, and what the Polarized Opacity Prior does in its place.
+# which are split and which are pruned, what happens to the optimizer's memory when rows come and go, what an opacity
+# reset does to a picture, and what the Polarized Opacity Prior does in its place.
 #
 # ## Which Gaussians need help
 #
 # A Gaussian that covers too much, or lies next to something that is not covered, has a large positional gradient: the
-# loss would fall if it moved. The gradient of its screen centre $\mu_i^{2D}$ is measured view by view, and a Gaussian is selected when the
-# average is large (POP paper, eq. 3; 3DGS, section 5.2):
+# loss would fall if it moved. The gradient of its screen centre $\mu_i^{2D}$ is measured view by view, and a Gaussian
+# is selected when the average is large (POP paper, eq. 3; 3DGS, section 5.2):
 #
 # $$\frac{1}{V} \sum_{k=1}^{V} \sqrt{\left(\frac{\partial L_k}{\partial \mu_i^{2D,x}}\right)^2 +
 # \left(\frac{\partial L_k}{\partial \mu_i^{2D,y}}\right)^2} > \tau_{\mathrm{Den}} .$$
@@ -350,8 +352,8 @@ panels[3].set(title="PSNR [dB], mean", xlabel="step")
 panels[3].legend(loc="lower right")
 picture(
     fig,
-    "The opacities of the first start under three methods, and the mean PSNR of all three starts. Blue should end at 1, "
-    "orange and green at 0.",
+    "The opacities of the first start under three methods, and the mean PSNR of all three starts. Blue should end at "
+    "1, orange and green at 0.",
 )
 
 # %% [markdown]
@@ -378,7 +380,7 @@ picture(
 # place of the prior end with 548 thousand Gaussians and 26.82 dB, the prior with 268 thousand and 27.01 dB.
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: predict
 #
 # Why half an image and not a pixel? Measure one pull in images of 24 by 24 and of 48 by 48 pixels, in both units. Leave
 # SSIM out (`lambda_ssim=0`), since its window is in pixels.
@@ -401,7 +403,7 @@ assert abs(per_px - 0.5) < 0.03
 assert abs(per_half_image - 1.0) < 0.06
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: predict
 #
 # An event finds 1,000 Gaussians. It selects 200 as pulled hard, 60 of which are large, and then prunes 90. How many are
 # there afterwards? How many rows of Adam's moments are zero?

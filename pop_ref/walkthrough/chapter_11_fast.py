@@ -1,3 +1,5 @@
+# minutes: 35
+
 # %% [markdown]
 # # 11. From oracle to fast: tiles, matrix products, six sums
 #
@@ -120,8 +122,8 @@ picture(
 # Stopping needs no branch either: where the next $T$ would be $10^{-4}$ or less, the splat is not blended and the pixel
 # ends (section 3.1), which is the same as setting its $T$ to 0 there, for all that follows is then multiplied by 0.
 #
-# The weights fill a matrix $\Omega$, one row a splat, one column a pixel. With it the image is a product, the dominant splat
-# (eq. 5) is the largest entry of a column, and a count of non-zeros is the number of splats blended.
+# The weights fill a matrix $\Omega$, one row a splat, one column a pixel. With it the image is a product, the dominant
+# splat (eq. 5) is the largest entry of a column, and a count of non-zeros is the number of splats blended.
 
 
 # %%
@@ -171,8 +173,8 @@ picture(
 # ## Backward with one number per pixel
 #
 # Let $g$ be the gradient of the loss with respect to a pixel's colour. That with respect to $\alpha_k$ compares the
-# splat's colour with the colour behind it, $b_k$, which is everything after $k$ as seen without $k$ (derivative of eq. 1, [chapter
-# 5](chapter_05_backward_by_hand.py)):
+# splat's colour with the colour behind it, $b_k$, which is everything after $k$ as seen without $k$ (derivative of eq.
+# 1, [chapter 5](chapter_05_backward_by_hand.py)):
 #
 # $$\frac{\partial L}{\partial \alpha_k} = T_k \, (c_k - b_k) \cdot g .$$
 #
@@ -203,10 +205,11 @@ assert np.allclose(v_opacities, wanted.v_opacities, rtol=1e-10, atol=1e-12)
 # %% [markdown]
 # ## Geometry needs six sums
 #
-# Everything else reaches the loss through the exponent. Since $\ln \alpha = f \cdot p$, the gradient with respect to $f_k$ is
-# $\sum_p \Gamma_{kp} \, p$: six sums over pixels,
+# Everything else reaches the loss through the exponent. Since $\ln \alpha = f \cdot p$, the gradient with respect to
+# $f_k$ is $\sum_p \Gamma_{kp} \, p$: six sums over pixels,
 #
-# $$\Gamma P^\top = \left(\textstyle\sum \Gamma,\; \sum \Gamma x,\; \sum \Gamma y,\; \sum \Gamma x^2,\; \sum \Gamma x y,\; \sum \Gamma y^2\right),$$
+# $$\Gamma P^\top = \left(\textstyle\sum \Gamma,\; \sum \Gamma x,\; \sum \Gamma y,\; \sum \Gamma x^2,\;
+# \sum \Gamma x y,\; \sum \Gamma y^2\right),$$
 #
 # one more product, 40 by 256 times 256 by 6. From there to centre, conic and opacity is the chain rule through
 # $f(u, v, A, B, C, o)$ with six numbers per splat, no longer with 256.
@@ -300,7 +303,7 @@ assert (listed >= oracle.n_traversed).all()
 assert (oracle.n_traversed >= oracle.n_blended).all()
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: code
 #
 # Why count $x$ and $y$ from the tile's centre and not from the corner of the image? Take a needle (standard deviations
 # 20 and 0.6 px, turned by 40 degrees) near pixel (1600, 900) and round the coefficients to float32 in both frames.
@@ -330,10 +333,10 @@ assert in_float32(middle) < 1e-4
 assert in_float32(np.zeros(2)) > 1e-2
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: code
 #
-# AbsGS asks for the sum over pixels of the absolute value of each pixel's gradient with respect to the centre. Can it be
-# had from the six sums? Compute it, and hold it to the oracle's `v_means2d_abs`.
+# AbsGS asks for the sum over pixels of the absolute value of each pixel's gradient with respect to the centre. Can it
+# be had from the six sums? Compute it, and hold it to the oracle's `v_means2d_abs`.
 
 # %% answer
 # No: the absolute value is not linear, so all 256 pixels are needed. The sum is never smaller than the signed one.
