@@ -207,11 +207,19 @@ def _hold_exercises(path: Path, cells: tuple[Cell, ...]) -> None:
                 "an answer must follow its exercise, a prose cell '# ### Exercise k: predict'",
             )
         if cell.kind == "answer" and not any(
-            isinstance(node, ast.Assert) for node in ast.walk(_parsed(path, cell))
+            _asserts(node) for node in ast.walk(_parsed(path, cell))
         ):
             raise ChapterError(
                 path, cell.line, f"the answer to exercise {asked} asserts nothing"
             )
+
+
+def _asserts(node: ast.AST) -> bool:
+    # `caught` asserts that a law of the kit notices a mistake
+    called = node.func if isinstance(node, ast.Call) else None
+    return isinstance(node, ast.Assert) or (
+        isinstance(called, ast.Name) and called.id == "caught"
+    )
 
 
 def _parsed(path: Path, cell: Cell) -> ast.Module:

@@ -115,8 +115,8 @@ assert valley(just_right[-1]) < valley(just_right[0])
 assert abs(too_large[-1, 0]) > 1.0
 
 # %% [markdown]
-# At 0.019 the steep coordinate jumps to and fro and slowly settles, while the flat one hardly moves: after sixty steps it
-# has a third of its way to go. At 0.0202 the walk diverges.
+# At 0.019 the steep coordinate jumps to and fro and slowly settles, while the flat one hardly moves: after sixty steps
+# it has a third of its way to go. At 0.0202 the walk diverges.
 #
 # ## Adam
 #
@@ -372,4 +372,3 @@ assert np.isclose((np.log((3.0 + h) * 5.0) - np.log((3.0 - h) * 5.0)) / (2 * h),
 # are a tenth of what they should be. A training would only look a little slow at the start: nobody would notice without
 # a law that measures the first step.
 print(caught("adam_without_bias_correction"))
-assert np.isclose(first_step(1.0, 1e-15), 1.0)
