@@ -173,7 +173,8 @@ picture(
 centers = np.array([each.camera_center for each in capture.views])
 radius = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
 print(
-    f"scene scale {capture.scene_scale():.3f}, rate of positions {learning_rates(0, capture.scene_scale())['means']:.2e}"
+    f"scene scale {capture.scene_scale():.3f},",
+    f"rate of positions {learning_rates(0, capture.scene_scale())['means']:.2e}",
 )
 assert np.isclose(capture.scene_scale(), 1.1 * radius)
 
@@ -185,8 +186,8 @@ assert np.isclose(capture.scene_scale(), 1.1 * radius)
 # - **centre**: the point; **rotation**: none, or any, since the Gaussian begins round;
 # - **colour**: $h_0 = (c - \frac12) / Y_0$ so that it looks as the point does; all higher harmonics 0;
 # - **opacity**: 0.1. Faint enough that light reaches what is behind, so that every Gaussian gets a gradient;
-# - **width**: the distance to its neighbours, so that together they just cover the surface: the root of the mean squared
-#   distance to the three nearest points.
+# - **width**: the distance to its neighbours, so that together they just cover the surface: the root of the mean
+#   squared distance to the three nearest points.
 
 # %%
 squared = np.sum((capture.points[:, None] - capture.points) ** 2, axis=2)
