@@ -42,12 +42,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from pop_fast.api.rasterize import rasterization
 from pop_fast.cli import main as command
 from pop_fast.data.capture import Capture, View
-from pop_fast.rasterization import rasterization
-from pop_fast.report import write_report
-from pop_fast.strategies import POPStrategy
+from pop_fast.density import POPStrategy
 from pop_fast.train import LearningRates, TrainConfig, TrainingRun
+from pop_fast.view.report import write_report
 from pop_ref.recipes import RECIPES
 from pop_ref.records import Camera
 from pop_ref.settings import LearningRates as Rates
@@ -442,11 +442,11 @@ for name in ("prior", "none"):
 
 # %% [markdown]
 # ### Exercise 4: find the bug
-# This function collects what density control looks at between two events. Something is forgotten.
+# This function collects what density control looks at between two events. One count is wrong.
 #
-# {{bug: blur_flag_forgets}}
+# {{bug: hidden_views_counted}}
 
 # %% answer
-# The blur flags of earlier views are overwritten: only the view of the event itself counts. One view in a hundred then
-# decides what is split, and the model grows too little, with no other sign of it than a lower PSNR.
-print(caught("blur_flag_forgets"))
+# The gradient's average divides by all views instead of those that see the Gaussian. What few views see is then pulled
+# less hard than it is, and is never cloned or split: the rims of the scene stay blurred, and nothing else tells.
+print(caught("hidden_views_counted"))
