@@ -243,7 +243,7 @@ with living(BY_NAME["no_half_in_the_exponent"]) as backend:
 # drawn, and a tie changes who dominates, not the colour.
 # it ends shortly behind a tile's border, with three deviations shortly before it
 screen = Camera(np.eye(4), K, WIDTH, HEIGHT)
-one = Scene(pack([Record(0.9, 12.0, 2.0, (4.953, 4.953, 4.953), opacity=1.0)], screen), screen)
+one = Scene(pack([Record(6.0, 12.0, 2.0, (3.0, 3.0, 3.0), opacity=1.0)], screen), screen)
 for name in ("weight_above_one", "tie_to_the_back", "extent_of_three_deviations"):
     with living(BY_NAME[name]) as backend:
         differs = np.abs(
