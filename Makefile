@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 TORCH := $(shell sed -n 's/^\(torch==.*\)/\1/p' constraints.txt)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo walkthrough repro test explore lint bench cuda sass emulate gpu-check docs-check clean
+.PHONY: help setup demo walkthrough repro site test explore lint bench cuda sass emulate gpu-check docs-check clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
@@ -35,6 +35,13 @@ repro: setup  ## train every row of the paper at toy scale (minutes), leave its 
 		$(BIN)/pop-repro table $$table --scale toy --results out/repro/results --out out/repro || exit 1; done
 	for figure in 1 2 3 4a 4b 5 6a 6b 7; do $(BIN)/pop-repro figure $$figure --scale toy --results out/repro/results \
 		--work out/repro/work --out out/repro || exit 1; done
+
+site: demo walkthrough  ## build docs/, the walk-through and the demo's report as one site into out/site
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
+	$(BIN)/mkdocs build --strict --quiet
+	cp -r out/walkthrough out/site/learn
+	mkdir -p out/site/demo && cp out/demo/report.html out/site/demo/
+	@echo "open out/site/index.html"
 
 test: setup  ## run every test
 	$(BIN)/python -m pytest

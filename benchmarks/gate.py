@@ -11,8 +11,8 @@ from raster import SCENE, backends
 from torch import Tensor
 
 from pop_fast.backends import get_backend
+from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render, render_vjp
-from pop_ref.types import Camera, Gaussians
 
 GATE = {torch.float64: 1e-10, torch.float32: 5e-5}
 

@@ -1,12 +1,12 @@
-"""The results tables of README.md, from the statistics of training runs.
+"""The tables of training results, from the statistics of training runs.
 
 Copy stats/val_step*.json of a finished run to benchmarks/results/training/<capture>_<method>_<seed>.json; then
 
     python benchmarks/results_table.py                      print the tables
-    python benchmarks/results_table.py --check README.md    exit with 1 when that file holds others
+    python benchmarks/results_table.py --check PAGE...      exit with 1 when these pages hold others
 
-`python docs/tables.py --write` puts them into README.md. Runs of one capture, method and weight of the POP term that
-differ in their seed share a row: means, and in brackets the smallest and largest PSNR and SSIM.
+`python docs/tables.py --write` puts them into README.md and docs/results.md. Runs of one capture, method and weight of
+the POP term that differ in their seed share a row: means, and in brackets the smallest and largest PSNR and SSIM.
 """
 
 from __future__ import annotations
@@ -29,6 +29,23 @@ Stats = dict[str, Any]
 def table(folder: Path = RUNS) -> str:
     """Make the table of all runs in a folder, by capture, POP before others."""
     return markdown([_row(runs) for runs in _groups(folder)])
+
+
+def summary(folder: Path = RUNS) -> str:
+    """Make the short table: POP at the paper's weight of its term, and the two baselines, a capture a line."""
+    chosen: dict[str, dict[str, Stats]] = {}
+    for stats in map(_mean, _groups(folder)):
+        # of several weights of the POP term the smallest, which is the paper's
+        chosen.setdefault(stats["capture"], {}).setdefault(stats["method"], stats)
+    lines = ["| capture | POP | gsplat's default strategy | 3DGS |", "| --- | --- | --- | --- |"]
+    for capture, methods in chosen.items():
+        cells = [_short(methods.get(name)) for name in ("pop", "gsplat", "3dgs")]
+        lines.append(f"| {capture} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _short(stats: Stats | None) -> str:
+    return "not run" if stats is None else f"{stats['psnr']:.2f} dB, {stats['num_GS']:,}"
 
 
 def differences(folder: Path = RUNS) -> str:
@@ -91,13 +108,13 @@ def _row(runs: Sequence[Stats]) -> list[str]:
 
 def main(words: list[str]) -> int:
     """Run the script."""
-    tables = (table(), differences())
+    tables = (table(), differences(), summary())
     if words[:1] != ["--check"]:
         print("\n\n".join(tables))
         return 0
-    text = Path(words[1]).read_text(encoding="utf-8")
+    text = "\n".join(Path(word).read_text(encoding="utf-8") for word in words[1:])
     if any(f"\n{made}\n" not in text for made in tables):
-        print(f"{words[1]}: a results table is not what the runs say; run 'python docs/tables.py --write'")
+        print(f"{' '.join(words[1:])}: a results table is not what the runs say; run 'python docs/tables.py --write'")
         return 1
     return 0
 

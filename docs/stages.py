@@ -63,7 +63,7 @@ STAGES = (
 )
 
 # modules of pop_ref that are data or types, not stages
-NOT_STAGES = frozenset({"__init__", "_shapes", "ambiguities", "constants", "notation", "settings", "types"})
+NOT_STAGES = frozenset({"__init__", "_shapes", "ambiguities", "constants", "notation", "settings", "records"})
 # stages whose laws stand in a file of another name: whole views, and what has a file of its own outside tests/laws
 LAWS_ELSEWHERE = {
     "render": "tests/laws/test_whole.py",

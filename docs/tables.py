@@ -1,13 +1,14 @@
-"""The tables of README.md and docs/MUTANTS.md, which are made from the sources and from runs.
+"""The tables of README.md and of the pages in docs/, which are made from the sources and from runs.
 
 python docs/tables.py            print them
-python docs/tables.py --write    put them into README.md, between their marks, and write docs/MUTANTS.md
-python docs/tables.py --check    exit with 1 when either holds something else
+python docs/tables.py --write    put them into their pages, between their marks, and write docs/MUTANTS.md
+python docs/tables.py --check    exit with 1 when a page holds something else
 """
 
 from __future__ import annotations
 
 import json
+import re
 import runpy
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -21,7 +22,7 @@ from stages import ROOT, STAGES, files, functions, laws
 from paper_repro.results import SCALES, read_all
 from paper_repro.status import status_table
 from pop_fast.train.presets import options_for
-from pop_ref.conformance.abilities import STAGES as LAW_STAGES
+from pop_ref.conformance.capabilities import STAGES as LAW_STAGES
 from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM
 from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.conformance.teeth import UNITS
@@ -30,6 +31,7 @@ from pop_ref.notation import SYMBOLS
 from pop_ref.recipes import BASELINES, L1_DIVIDED, RECIPES
 
 README = ROOT / "README.md"
+PAGES = (README, *sorted(path for path in (ROOT / "docs").glob("*.md") if path.name != "MUTANTS.md"))
 MUTANT_LIST = ROOT / "docs" / "MUTANTS.md"
 CARDS = ROOT / "benchmarks" / "results" / "scorecards"
 TEETH = ROOT / "benchmarks" / "results" / "teeth.json"
@@ -114,6 +116,11 @@ def reproduction() -> str:
 def results() -> str:
     """Make the table of training runs, as benchmarks/results_table.py does."""
     return str(runpy.run_path(str(ROOT / "benchmarks" / "results_table.py"))["table"]())
+
+
+def summary() -> str:
+    """Make README's short table of training runs, as benchmarks/results_table.py does."""
+    return str(runpy.run_path(str(ROOT / "benchmarks" / "results_table.py"))["summary"]())
 
 
 def differences() -> str:
@@ -260,6 +267,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "conventions": conventions,
     "profiles": profiles,
     "speed": speed,
+    "summary": summary,
     "results": results,
     "differences": differences,
     "recipes": recipes,
@@ -271,16 +279,28 @@ TABLES: dict[str, Callable[[], str]] = {
 }
 
 
-def with_tables(readme: str) -> str:
-    """Put every table between its marks, `<!-- NAME:begin -->` and `<!-- NAME:end -->`."""
-    for name, make in TABLES.items():
+def names_of(text: str) -> list[str]:
+    """Give the names of the tables that a page has marks for, `<!-- NAME:begin -->` and `<!-- NAME:end -->`."""
+    return re.findall(r"<!-- (\w+):begin -->", text)
+
+
+def with_tables(page: Path) -> str:
+    """Give the text of a page with every table between its marks; links lead from where the page lies.
+
+    Raises:
+        ValueError: the page has a mark of no table, or a beginning without an end.
+    """
+    text = page.read_text(encoding="utf-8")
+    up = "../" * (len(page.relative_to(ROOT).parts) - 1)
+    for name in names_of(text):
         begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
-        before, _, rest = readme.partition(begin)
+        before, _, rest = text.partition(begin)
         _, found, after = rest.partition(end)
-        if not found:
-            raise ValueError(f"README.md has no marks {begin} ... {end}; put them where the table belongs")
-        readme = f"{before}{begin}\n{make()}\n{end}{after}"
-    return readme
+        if not found or name not in TABLES:
+            raise ValueError(f"{page}: {begin} needs {end} after it and one of the names {', '.join(TABLES)}")
+        made = re.sub(r"\]\((?!https?:|#)", f"]({up}", TABLES[name]())
+        text = f"{before}{begin}\n{made}\n{end}{after}"
+    return text
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -297,12 +317,12 @@ def main(words: list[str]) -> int:
     if "--write" not in words and "--check" not in words:
         print("\n\n".join(make() for make in TABLES.values()))
         return 0
-    readme = README.read_text(encoding="utf-8")
     if "--write" in words:
-        README.write_text(with_tables(readme), encoding="utf-8")
+        for page in PAGES:
+            page.write_text(with_tables(page), encoding="utf-8")
         MUTANT_LIST.write_text(f"{mutants()}\n", encoding="utf-8")
         return 0
-    stale = [README.name] if with_tables(readme) != readme else []
+    stale = [page.name for page in PAGES if with_tables(page) != page.read_text(encoding="utf-8")]
     stale += [MUTANT_LIST.name] if MUTANT_LIST.read_text(encoding="utf-8") != f"{mutants()}\n" else []
     for name in stale:
         print(f"{name}: a table is not what sources and runs say; run 'python docs/tables.py --write'")

@@ -15,8 +15,8 @@ from pop_fast.errors import PopError
 from pop_fast.raster_inputs import check_cameras, check_colors, check_gaussians, check_tensor, resolved_profile
 from pop_fast.rasterization import rasterization as on_every_backend
 from pop_ref.constants import Profile
+from pop_ref.records import Camera, Gaussians, Render
 from pop_ref.render import render, render_vjp
-from pop_ref.types import Camera, Gaussians, Render
 
 
 def rasterization(

@@ -12,9 +12,9 @@ from pop_fast.passes import Seen, Shot
 from pop_ref.chord import dominant_points
 from pop_ref.contributions import contributions
 from pop_ref.fisher import fisher_blocks, screen_moments
+from pop_ref.records import Camera, Gaussians, Splats
 from pop_ref.render import render
 from pop_ref.sensitivity import sensitivities
-from pop_ref.types import Camera, Gaussians, Splats
 
 
 class OracleView:

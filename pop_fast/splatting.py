@@ -47,7 +47,7 @@ from pop_ref.constants import PAPER, Profile
 
 @dataclass(frozen=True)
 class Splats:
-    """Gaussians as one camera sees them, one row each; see `pop_ref.types.Splats`.
+    """Gaussians as one camera sees them, one row each; see `pop_ref.records.Splats`.
 
     Attributes:
         means2d: screen centres, px. [N, 2]

@@ -1,4 +1,4 @@
-"""Gaussians and a camera as tensors; meaning, names and shapes are those of `pop_ref.types`."""
+"""Gaussians and a camera as tensors; meaning, names and shapes are those of `pop_ref.records`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Gaussians:
-    """Activated Gaussians of a scene; see `pop_ref.types.Gaussians`.
+    """Activated Gaussians of a scene; see `pop_ref.records.Gaussians`.
 
     Attributes:
         means: centres, world units. [N, 3]
@@ -28,7 +28,7 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera in OpenCV's convention; see `pop_ref.types.Camera`.
+    """A pinhole camera in OpenCV's convention; see `pop_ref.records.Camera`.
 
     Attributes:
         viewmat: world -> camera. [4, 4]

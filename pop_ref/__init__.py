@@ -12,10 +12,10 @@ from pop_ref.constants import (
     Profile,
     profile_named,
 )
-from pop_ref.margins import Doubt, Margins, margins
+from pop_ref.margins import CloseDecision, Margins, margins
+from pop_ref.records import Camera, Gaussians, Render, Splats
 from pop_ref.render import RenderGradients, render, render_vjp
 from pop_ref.splatting import project, project_vjp
-from pop_ref.types import Camera, Gaussians, Render, Splats
 
 __all__ = [
     "Camera",
@@ -39,5 +39,5 @@ __all__ = [
     "render_vjp",
     "margins",
     "Margins",
-    "Doubt",
+    "CloseDecision",
 ]

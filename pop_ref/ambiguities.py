@@ -242,7 +242,7 @@ AMBIGUITIES: Final = (
         "L",
         "What is a Gaussian processed per pixel?",
         "both counts are kept: blended, and traversed",
-        "pop_ref.types:Render",
+        "pop_ref.records:Render",
         mark="n_traversed",
     ),
     Ambiguity(

@@ -17,8 +17,8 @@ from pop_ref.constants import PAPER, Profile
 from pop_ref.covariance import rotmats_from_quats
 from pop_ref.dominance import dominant_id
 from pop_ref.pixel import composite_pixel, rows_from_splats
+from pop_ref.records import Camera, Gaussians, Splats
 from pop_ref.tiles import listed_pixels
-from pop_ref.types import Camera, Gaussians, Splats
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from pop_ref._shapes import Float64
 from pop_ref.constants import PAPER, Profile
 from pop_ref.dominance import dominant_counts, dominant_id
 from pop_ref.pixel import BlendGradients, composite_pixel, composite_pixel_vjp, rows_from_splats, zero_gradients
+from pop_ref.records import Render, Splats
 from pop_ref.tiles import listed_pixels
-from pop_ref.types import Render, Splats
 
 __all__ = ["composite", "composite_vjp", "composite_pixel", "composite_pixel_vjp"]
 

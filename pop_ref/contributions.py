@@ -14,8 +14,8 @@ import numpy as np
 from pop_ref._shapes import Float64, Int64
 from pop_ref.constants import PAPER, Profile
 from pop_ref.pixel import composite_pixel, rows_from_splats
+from pop_ref.records import Splats
 from pop_ref.tiles import listed_pixels
-from pop_ref.types import Splats
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Final, Literal
 import numpy as np
 
 from pop_ref._shapes import Float64
-from pop_ref.types import Splats
+from pop_ref.records import Splats
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RENDER_MODES: Final = ("RGB", "D", "ED", "RGB+D", "RGB+ED")

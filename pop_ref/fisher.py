@@ -27,9 +27,9 @@ from pop_ref.alpha import alpha_from_sigma_vjp, sigma_at_pixel, sigma_at_pixel_v
 from pop_ref.compositing import background_or_black
 from pop_ref.constants import PAPER, Profile
 from pop_ref.pixel import composite_pixel, rows_from_splats
+from pop_ref.records import Camera, Gaussians, Splats
 from pop_ref.splatting import project_vjp
 from pop_ref.tiles import listed_pixels
-from pop_ref.types import Camera, Gaussians, Splats
 
 _N_SCREEN: Final = 5
 _UPPER: Final = np.triu_indices(_N_SCREEN)

@@ -19,7 +19,7 @@ from pop_ref._shapes import Float64
 from pop_ref.camera import camera_center
 from pop_ref.constants import PAPER, Profile
 from pop_ref.harmonics import sh_basis, sh_basis_vjp
-from pop_ref.types import Camera, Gaussians
+from pop_ref.records import Camera, Gaussians
 
 
 class Rounded:

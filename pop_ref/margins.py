@@ -6,7 +6,7 @@ both, and it is read against eps: with float32's 6e-8, a margin over 1e-6 means 
 be needed to flip the decision. Margins are infinite where both sides are exact, for instance dyadic depths that tie.
 
 Two questions are answered. Which Gaussians, and which pixels, must come out with the same integers from any sound
-implementation (`safe_gaussians`, `safe_pixels`)? And which decisions were close (`doubts`, `nearest`)? A doubtful D5,
+implementation (`safe_gaussians`, `safe_pixels`)? Which decisions were close (`near_threshold`, `nearest`)? A close D5,
 D6 or D7 can be taken the other way by moving the profile's constant by the tolerance.
 """
 
@@ -33,14 +33,14 @@ from pop_ref.magnitudes import (
     frustum_limits,
     splat_magnitudes,
 )
-from pop_ref.pixel_margins import PixelDoubts, pixel_doubts
+from pop_ref.pixel_margins import PixelMargins, pixel_margins
+from pop_ref.records import Camera, Gaussians, Render
 from pop_ref.render import render
-from pop_ref.types import Camera, Gaussians, Render
 
 _HORIZON = 1e-2
 
 
-class Doubt(NamedTuple):
+class CloseDecision(NamedTuple):
     """One decision and its distance from flipping.
 
     `where` is (Gaussian,) for D1, D2, D3, B1, B2; (Gaussian, Gaussian) for D4; (x, y, Gaussian) for D5, D6, D7;
@@ -64,16 +64,16 @@ class Margins:
 
     gaussians: dict[str, Float64[np.ndarray, " N"]]
     pixels: dict[str, Float64[np.ndarray, "H W"]]
-    near: tuple[Doubt, ...]
+    near: tuple[CloseDecision, ...]
 
     @property
-    def nearest(self) -> Doubt | None:
+    def nearest(self) -> CloseDecision | None:
         """Give the decision closest to flipping, None if all are farther than 0.01."""
         return self.near[0] if self.near else None
 
-    def doubts(self, tolerance: float) -> tuple[Doubt, ...]:
+    def near_threshold(self, tolerance: float) -> tuple[CloseDecision, ...]:
         """List the decisions within a tolerance (at most 0.01), nearest first."""
-        return tuple(doubt for doubt in self.near if doubt.margin <= tolerance)
+        return tuple(close for close in self.near if close.margin <= tolerance)
 
     def safe_pixels(self, tolerance: float, decisions: Iterable[str] = tuple(DECISIONS)) -> Bool[np.ndarray, "H W"]:
         """Tell which pixels no decision of these kinds within the tolerance can change.
@@ -115,7 +115,7 @@ def margins(
         >>> g = Gaussians([[0, 0, 4]], [[1, 0, 0, 0]], [[1, 1, 1]], [1 / 255], [[[0, 0, 0]]])
         >>> K = np.array([[8.0, 0.0, 0.5], [0.0, 8.0, 0.5], [0.0, 0.0, 1.0]])
         >>> margins(g, Camera(np.eye(4), K, 1, 1)).nearest
-        Doubt(decision='D2', where=(0,), margin=0.0)
+        CloseDecision(decision='D2', where=(0,), margin=0.0)
     """
     profile = replace(profile, tile_size=profile.tile_size if tile_size is None else tile_size)
     image = render(gaussians, camera, None, sh_degree, profile, None, antialiased)
@@ -128,7 +128,7 @@ def margins(
         _note_gaussian(book, i, depth, magnitudes[i], camera, profile)
     _note_kinks(book, gaussians, camera, image, magnitudes, sh_degree, profile)
     _note_pixels(book, gaussians, depths, magnitudes, image, profile)
-    return Margins(book.gaussians, book.pixels, tuple(sorted(book.near, key=lambda doubt: doubt.margin)))
+    return Margins(book.gaussians, book.pixels, tuple(sorted(book.near, key=lambda close: close.margin)))
 
 
 class _Book:
@@ -137,12 +137,12 @@ class _Book:
     def __init__(self, n: int, height: int, width: int, tile_size: int) -> None:
         self.gaussians = {name: np.full(n, math.inf) for name in ("D1", "D2", "D3", "D4", "B1", "B2")}
         self.pixels = {name: np.full((height, width), math.inf) for name in DECISIONS}
-        self.near: list[Doubt] = []
+        self.near: list[CloseDecision] = []
         self.tile_size = tile_size
 
     def note(self, decision: str, where: tuple[int, ...], margin: float) -> None:
         if margin <= _HORIZON:
-            self.near.append(Doubt(decision, where, margin))
+            self.near.append(CloseDecision(decision, where, margin))
         if decision in self.gaussians:
             for i in where:
                 self.gaussians[decision][i] = min(self.gaussians[decision][i], margin)
@@ -202,14 +202,14 @@ def _note_kinks(
     # a Gaussian at the camera's centre has no direction, hence no colour, and is culled
     seen: list[int] = np.flatnonzero(image.splats.visible).tolist()
     sums, errors = colors_magnitudes(gaussians, seen, camera, degree)
-    for i, doubt in zip(seen, np.abs(sums) / errors, strict=True):
+    for i, distances in zip(seen, np.abs(sums) / errors, strict=True):
         m = magnitudes[i]
         assert m is not None
         for k, size in enumerate((camera.width, camera.height)):
             focal = Rounded(float(camera.K[k, k]))
             for limit in frustum_limits(focal, Rounded(float(centers[k])), size, profile):
                 book.note("B1", (i,), distance(m.ratios[k], limit))
-        book.note("B2", (i,), float(np.min(doubt)))
+        book.note("B2", (i,), float(np.min(distances)))
 
 
 def _note_pixels(
@@ -232,11 +232,11 @@ def _note_pixels(
             # the entry after the terminating one is the last whose order can matter
             order = min(gaps[tile][: int(image.n_traversed[y, x])], default=math.inf)
             book.touch("D4", order, slice(y, y + 1), slice(x, x + 1))
-            _note_pixel(book, x, y, pixel_doubts(image.tile_lists[tile], magnitudes, x + 0.5, y + 0.5, profile))
+            _note_pixel(book, x, y, pixel_margins(image.tile_lists[tile], magnitudes, x + 0.5, y + 0.5, profile))
 
 
-def _note_pixel(book: _Book, x: int, y: int, doubts: PixelDoubts) -> None:
-    for decision, found in doubts.items():
+def _note_pixel(book: _Book, x: int, y: int, distances: PixelMargins) -> None:
+    for decision, found in distances.items():
         for ids, margin in found:
             book.note(decision, (x, y, *ids), margin)
 

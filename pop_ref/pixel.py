@@ -20,7 +20,7 @@ import numpy as np
 from pop_ref._shapes import Float64
 from pop_ref.alpha import alpha_from_sigma, alpha_from_sigma_vjp, sigma_at_pixel, sigma_at_pixel_vjp
 from pop_ref.constants import PAPER, Profile
-from pop_ref.types import Splats
+from pop_ref.records import Splats
 
 
 class SplatRows(NamedTuple):

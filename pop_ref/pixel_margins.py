@@ -13,12 +13,12 @@ from pop_ref.constants import Profile
 from pop_ref.magnitudes import Magnitudes, Rounded, constant, distance, in_float32
 from pop_ref.pixel import stops
 
-PixelDoubts = dict[str, list[tuple[tuple[int, ...], float]]]
+PixelMargins = dict[str, list[tuple[tuple[int, ...], float]]]
 
 
-def pixel_doubts(
+def pixel_margins(
     ids: Sequence[int], magnitudes: Sequence[Magnitudes | None], px: float, py: float, profile: Profile
-) -> PixelDoubts:
+) -> PixelMargins:
     """Measure D5 to D8 at one pixel, over the list entries visited until it stops.
 
     Source: Higham 2002, section 3.3, applied to `pixel.composite_pixel`.
@@ -39,13 +39,13 @@ def pixel_doubts(
         >>> from pop_ref.constants import PAPER
         >>> one, half = Rounded(1.0), Rounded(0.5)
         >>> m = Magnitudes(one, (half, half), (one, one), (one, Rounded(0.0), one), one, (one, Rounded(0.0), one), half)
-        >>> doubts = pixel_doubts([0, 1], [m, m], 0.5, 0.5, PAPER)
-        >>> doubts["D8"]
+        >>> found = pixel_margins([0, 1], [m, m], 0.5, 0.5, PAPER)
+        >>> found["D8"]
         [((0, 1), inf)]
     """
     floor, ceiling = constant(profile.alpha_floor), constant(profile.alpha_ceiling)
     stop = constant(profile.transmittance_stop)
-    doubts: PixelDoubts = {"D5": [], "D6": [], "D7": [], "D8": []}
+    found: PixelMargins = {"D5": [], "D6": [], "D7": [], "D8": []}
     left = Rounded(1.0)
     weights: list[tuple[int, Rounded]] = []
     for i in ids:
@@ -53,26 +53,26 @@ def pixel_doubts(
         assert m is not None
         sigma = _sigma(m, px, py)
         if sigma.value < 0.0:
-            doubts["D5"].append(((i,), distance(sigma, Rounded(0.0))))
+            found["D5"].append(((i,), distance(sigma, Rounded(0.0))))
             continue
         raw = _raw_alpha(sigma, m.opacity)
-        doubts["D5"].append(((i,), distance(raw, floor)))
+        found["D5"].append(((i,), distance(raw, floor)))
         if raw.value < floor.value:
             continue
         # sigma < 0 is only possible if rounding makes the conic indefinite
         definite = m.conic[0] * m.conic[2] - m.conic[1] * m.conic[1]
         sign = max(distance(sigma, Rounded(0.0)), distance(definite, Rounded(0.0)))
-        doubts["D5"].append(((i,), sign))
-        doubts["D6"].append(((i,), distance(raw, ceiling)))
+        found["D5"].append(((i,), sign))
+        found["D6"].append(((i,), distance(raw, ceiling)))
         alpha = raw if raw.value <= ceiling.value else ceiling
         next_left = left * (Rounded(1.0) - alpha)
-        doubts["D7"].append(((i,), distance(next_left, stop)))
+        found["D7"].append(((i,), distance(next_left, stop)))
         if stops(next_left.value, profile):
             break
         weights.append((i, left * alpha))
         left = next_left
-    doubts["D8"] = _dominance(weights)
-    return doubts
+    found["D8"] = _dominance(weights)
+    return found
 
 
 def _dominance(weights: Sequence[tuple[int, Rounded]]) -> list[tuple[tuple[int, ...], float]]:

@@ -10,9 +10,9 @@ from pop_ref._shapes import Float64
 from pop_ref.compositing import composite, composite_vjp
 from pop_ref.constants import PAPER, Profile
 from pop_ref.depth import RenderMode, expected_depth, expected_depth_vjp, with_depth_channel
+from pop_ref.records import Camera, Gaussians, Render
 from pop_ref.splatting import project, project_vjp
 from pop_ref.tiles import tile_lists
-from pop_ref.types import Camera, Gaussians, Render
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from pop_ref._shapes import Float64
 from pop_ref.compositing import background_or_black
 from pop_ref.constants import PAPER, Profile
 from pop_ref.pixel import composite_pixel, rows_from_splats
+from pop_ref.records import Splats
 from pop_ref.tiles import listed_pixels
-from pop_ref.types import Splats
 
 
 def sensitivities(

@@ -41,7 +41,7 @@ from pop_ref.projection import (
     projection_jacobians,
     projection_jacobians_vjp,
 )
-from pop_ref.types import Camera, Gaussians, Splats
+from pop_ref.records import Camera, Gaussians, Splats
 
 
 class Geometry(NamedTuple):

@@ -16,8 +16,8 @@ from pop_ref._shapes import Float64, Int64
 from pop_ref.constants import INRIA, Profile
 from pop_ref.contributions import Contributions, contributions
 from pop_ref.losses import photometric_3dgs
+from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render
-from pop_ref.types import Camera, Gaussians
 
 # weights of the nine terms, of the view and of the two halves of the pixel map
 GRAD, OPACITY, DEPTH, RADIUS, SCALE = 25.0, 100.0, 5.0, 10.0, 25.0

@@ -42,9 +42,9 @@ from pop_ref.density import (
 from pop_ref.optimizer import adam_step, learning_rates, sh_degree_at, update_numbers
 from pop_ref.polarization import importance_mask, opacity_entropy, opacity_entropy_vjp, pop_loss, pop_loss_vjp
 from pop_ref.recipes import RECIPES, Recipe
+from pop_ref.records import Camera, Gaussians, Render
 from pop_ref.render import RenderGradients, render, render_vjp
 from pop_ref.settings import LAMBDA_SSIM_3DGS
-from pop_ref.types import Camera, Gaussians, Render
 
 
 @dataclass(frozen=True)

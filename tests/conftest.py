@@ -35,6 +35,6 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 def pytest_configure() -> None:
     """Choose how many examples are drawn, before any test is collected."""
     # not at the top: the hook above must see pop_ref imported
-    from pop_ref.conformance.examples import load_profile
+    from pop_ref.conformance.hypothesis_profiles import load_profile
 
     load_profile(os.environ.get("HYPOTHESIS_PROFILE", "dev"))

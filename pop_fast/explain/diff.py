@@ -21,7 +21,7 @@ from pop_fast.explain.scene import TILE_SIZE, ExplainedView
 from pop_fast.explain.walk import Walk, candidates, oracle_splats, walk
 from pop_ref.constants import PROFILES, Profile
 from pop_ref.dominance import dominant_id
-from pop_ref.types import Splats
+from pop_ref.records import Splats
 
 # a colour that 8 bits can tell apart
 _SEEN = 1.0 / 255.0

@@ -12,9 +12,9 @@ from pop_fast.explain.scene import TILE_SIZE, ExplainedView
 from pop_ref.alpha import alpha_from_sigma, falloff, sigma_at_pixel
 from pop_ref.constants import Profile
 from pop_ref.pixel import Pixel, SplatRows, composite_pixel, rows_from_splats, stops
+from pop_ref.records import Camera, Gaussians, Splats
 from pop_ref.splatting import project
 from pop_ref.tiles import grid_size, tile_rects
-from pop_ref.types import Camera, Gaussians, Splats
 
 # px: extents are whole pixels and float32 may put one on the other side of a pixel's edge
 _SLACK = 2.0

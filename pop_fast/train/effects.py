@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.views import ViewTensors
+from pop_ref.constants import profile_named
 from pop_ref.settings import GSPLAT
 
 # theta_blur is about so many pixels in the smallest images of the paper (10.7 in 980 x 545, its section 4.1)
 ENOUGH_PIXELS: Final = 10
+# from a pixel on, a shifted image costs what a held-out PSNR shows
+ENOUGH_OFF_CENTRE: Final = 1.0
 # densification steps between two resets in 3DGS and in gsplat's default strategy: 3,000 steps, one each 100
 RECOVERY_EVENTS: Final = GSPLAT.reset_every // GSPLAT.refine_every
 
@@ -56,6 +60,15 @@ def find_warnings(config: TrainConfig, views: Sequence[ViewTensors]) -> Iterator
             "paper's smallest images make it 10.7: nearly every Gaussian that is seen will count as blur and grow; "
             f"--{config.method}.blur-min-pixels {ENOUGH_PIXELS} mends it"
         )
+    if profile_named(config.profile).principal_point == "centred":
+        away = {view.name: _off_centre(view) for view in views}
+        worst = max(away, key=lambda name: away[name])
+        if away[worst] > ENOUGH_OFF_CENTRE:
+            yield (
+                f"profile {config.profile} draws with the principal point in the middle of the image, as Inria's code, "
+                f"and that of {worst} lies {away[worst]:.1f} pixels from there: every photograph is compared with an "
+                "image that is shifted by as much; --profile gsplat_1_5 uses the principal point"
+            )
     resets = [step for step in _density_steps(config, plan.reset_every) if plan.is_reset_step(step)]
     left = [after - step for step, after in zip(resets, [*resets[1:], config.max_steps], strict=False)]
     if resets and min(left) < RECOVERY_EVENTS * plan.refine_every:
@@ -65,6 +78,11 @@ def find_warnings(config: TrainConfig, views: Sequence[ViewTensors]) -> Iterator
             f"densification steps) to recover, where 3DGS has {RECOVERY_EVENTS} densification steps; "
             f"--{config.method}.reset-every 0 leaves resets out"
         )
+
+
+def _off_centre(view: ViewTensors) -> float:
+    """Give the distance of the principal point from the middle of the image, px."""
+    return math.hypot(float(view.K[0, 0, 2]) - view.width / 2, float(view.K[0, 1, 2]) - view.height / 2)
 
 
 def _density_steps(config: TrainConfig, every: int) -> range:

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from pop_ref.conformance.abilities import (
+from pop_ref.conformance.calls import Call, Called, drawn_scene
+from pop_ref.conformance.capabilities import (
     ANTIALIASING,
     DETERMINISTIC,
     DOMINANCE,
@@ -27,16 +28,15 @@ from pop_ref.conformance.abilities import (
     ROWWISE,
     SCALE,
     SIGNATURE,
-    abilities_of,
+    capabilities_of,
     same_constants,
 )
-from pop_ref.conformance.calls import Call, Called, drawn_scene
 from pop_ref.conformance.scenes import Scene, rounded_to
 from pop_ref.conformance.views import ASKED, offers
 from pop_ref.constants import PAPER, Profile
+from pop_ref.records import Splats
 from pop_ref.splatting import project, project_vjp
 from pop_ref.tiles import tile_lists
-from pop_ref.types import Splats
 
 STAGE_MODULES = (
     "activations",
@@ -68,7 +68,7 @@ STAGE_MODULES = (
     "mini_splatting",
     "tight_tiles",
 )
-# what a view may tell of dominance, by ability
+# what a view may tell of dominance, by capability
 TOLD_OF_DOMINANCE = {
     DOMINANCE: "dominant_ids",
     DOMINANT_WEIGHTS: "dominant_weights",
@@ -78,7 +78,7 @@ TOLD_OF_DOMINANCE = {
 
 @dataclass(frozen=True)
 class View:
-    """What a rasterizer shows of one render; None where it does not tell.
+    """What a rasterizer shows of one render; None where it shows nothing.
 
     Attributes:
         image: [H, W, 3]
@@ -86,7 +86,7 @@ class View:
         dominant_ids, dominant_weights, n_blended, n_traversed: [H, W]
         dominant_counts: [N]
         radii: [N, 2]
-        means2d, depths, conics: [N, 2], [N], [N, 3]; read only where a failure is told
+        means2d, depths, conics: [N, 2], [N], [N, 3]; read only for the report of a failure
     """
 
     image: Any
@@ -111,9 +111,9 @@ class Adapter:
 
     Attributes:
         name: how reports call it.
-        dtype: the NumPy type of the precision it computes in; its rounding is charged in units of that type's eps.
+        dtype: the NumPy type of the precision it computes in; its rounding is bounded in units of that type's eps.
         profile: the constants that it implements; None when it takes any, which scenes then carry.
-        able: what nothing else tells: ANTIALIASING, DETERMINISTIC, DOMINANCE, ROWWISE of `abilities`.
+        able: what cannot be seen otherwise: ANTIALIASING, DETERMINISTIC, DOMINANCE, ROWWISE of `capabilities`.
 
     Example:
         >>> class Mine(Adapter):
@@ -131,7 +131,7 @@ class Adapter:
     able: tuple[str, ...] = ()
 
     def has(self, need: str) -> bool:
-        """Tell whether the implementation offers a stage function, or one of the abilities of `abilities`."""
+        """Tell whether the implementation offers a stage function, or one of the capabilities of `capabilities`."""
         if need == RENDER:
             return type(self).render is not Adapter.render or self.has("composite")
         if need == GRADIENTS:
@@ -146,7 +146,7 @@ class Adapter:
             return self.has(SIGNATURE) and self._offers(need)
         if need == SCALE:
             return self.has(RENDER)
-        return need in self.able or need in abilities_of(self.profile) or callable(getattr(self, need, None))
+        return need in self.able or need in capabilities_of(self.profile) or callable(getattr(self, need, None))
 
     def _offers(self, need: str) -> bool:
         known: dict[str, bool] = self.__dict__.setdefault("_known_offers", {})
@@ -195,8 +195,8 @@ class Adapter:
         drawn = self.stage("composite")(
             splats, lists, camera.width, camera.height, size, scene.background, scene.profile
         )
-        told = {f.name: getattr(drawn, f.name, None) for f in fields(View)}
-        return View(**{**told, **_shown(splats)})
+        found = {f.name: getattr(drawn, f.name, None) for f in fields(View)}
+        return View(**{**found, **_shown(splats)})
 
     def plainly(self, scene: Scene) -> View:
         """Draw a scene as training does that wants nothing but an image; what is not asked for is None."""
@@ -351,7 +351,7 @@ class OracleAdapter(Adapter):
 
     def _own(self, scene: Scene) -> tuple[Any, Any]:
         # a copy of the oracle has value types of its own
-        types = importlib.import_module(f"{self.package}.types")
+        types = importlib.import_module(f"{self.package}.records")
         g, c = scene.gaussians, scene.camera
         own_g = g if isinstance(g, types.Gaussians) else types.Gaussians(g.means, g.quats, g.scales, g.opacities, g.sh)
         own_c = c if isinstance(c, types.Camera) else types.Camera(c.viewmat, c.K, c.width, c.height)

@@ -16,9 +16,9 @@ from pop_ref.conformance.scenes import Scene
 from pop_ref.constants import Profile
 from pop_ref.covariance import covars_from_quats_scales
 from pop_ref.depth import RenderMode
+from pop_ref.records import Render
 from pop_ref.render import RenderGradients, render, render_vjp
 from pop_ref.splatting import project
-from pop_ref.types import Render
 
 
 @dataclass(frozen=True)

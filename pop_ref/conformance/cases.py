@@ -30,7 +30,7 @@ class Case:
         wrt: positions of the arguments that its transpose returns cotangents of; empty if it has none.
         cotangent_at: the position of v among the transpose's arguments; None puts it last.
         on_sphere: the argument is a unit vector: only the tangential part of its cotangent means anything.
-        magnitude: what one unit of the value is charged on; None measures it with `sensitivity`.
+        magnitude: what one unit of the value is eps times of; None measures it with `sensitivity`.
     """
 
     name: str
@@ -152,8 +152,8 @@ def rounded(inputs: tuple[Any, ...], dtype: Any) -> tuple[Any, ...]:
     )
 
 
-def charges_of(case: Case, function: Callable[..., Any], inputs: tuple[Any, ...]) -> tuple[np.ndarray, ...]:
-    """Charge each output of a function, or of its transpose with the cotangent bound."""
+def error_bounds_of(case: Case, function: Callable[..., Any], inputs: tuple[Any, ...]) -> tuple[np.ndarray, ...]:
+    """Bound the rounding of each output of a function, or of its transpose with the cotangent bound."""
     if case.magnitude is None:
         return sensitivity(function, inputs)
     size = case.magnitude(inputs)
@@ -166,14 +166,14 @@ def _outputs(value: Any) -> tuple[np.ndarray, ...]:
 
 
 def sensitivity(function: Callable[..., Any], inputs: tuple[Any, ...]) -> tuple[np.ndarray, ...]:
-    """Charge a function by how far its output moves when each entry of its input moves one eps, plus its own size.
+    """Bound rounding by how far a function's output moves when each entry of its input moves one eps, plus its size.
 
     This is the componentwise condition of the oracle's function, measured by differences; one array per output.
     """
 
     step = 2.0**-20
     here = _outputs(function(*inputs))
-    charges = [np.abs(h) + _row_size(h) for h in here]
+    error_bounds = [np.abs(h) + _row_size(h) for h in here]
     for k, argument in enumerate(inputs):
         if not (isinstance(argument, np.ndarray) and argument.dtype.kind == "f"):
             continue
@@ -181,9 +181,9 @@ def sensitivity(function: Callable[..., Any], inputs: tuple[Any, ...]) -> tuple[
             moved = argument.copy()
             moved[index] *= 1.0 + step
             there = _outputs(function(*inputs[:k], moved, *inputs[k + 1 :]))
-            for charge, a, b in zip(charges, here, there, strict=True):
-                charge += np.abs(b - a) / step
-    return tuple(charges)
+            for error_bound, a, b in zip(error_bounds, here, there, strict=True):
+                error_bound += np.abs(b - a) / step
+    return tuple(error_bounds)
 
 
 def _row_size(value: np.ndarray) -> np.ndarray:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import textwrap
 from pathlib import Path
 
-from pop_ref.conformance.abilities import STAGES
 from pop_ref.conformance.backends import ELSEWHERE, SHIPPED
+from pop_ref.conformance.capabilities import STAGES
 from pop_ref.conformance.mutants.trial import every_law
 
 FILE = Path(__file__).with_name("LAWS.md")
@@ -24,7 +24,7 @@ names, `--adapter` a class derived from `pop_ref.conformance.Adapter`, for singl
 `--backend` an adapter that comes with the kit; what is not installed is skipped with the reason. There are:
 BACKENDS
 
-`--profile` says which constants a rasterizer has; `--dtype float64` charges double precision; `--stage compositing`
+`--profile` says which constants a rasterizer has; `--dtype float64` allows double precision; `--stage compositing`
 keeps the laws of one stage; `--unordered-sums` is for a rasterizer that adds in another order on every run, as atomics
 do, and skips the laws that compare bits. `HYPOTHESIS_PROFILE` is `dev`, `ci` or `thorough`, which draw the same
 examples on every machine, or `explore`, which draws anew (`--hypothesis-seed N`). What an implementation does not offer
@@ -64,7 +64,7 @@ Programs in other languages: `pop vectors export DIR` writes scenes with all tha
 
 Numbers are compared in units of eps times a magnitude that is computed from absolute values (`tolerances.py` has every
 tolerance beside the worst case that was measured); integers exactly; at a threshold a backend must equal one of the
-oracle's outcomes with the doubtful decisions taken either way.
+oracle's outcomes with the decisions near their thresholds taken either way.
 """
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from pop_ref.conformance.scenes import Record, Scene, pack
 from pop_ref.conformance.strategies import rigid
-from pop_ref.types import Camera
+from pop_ref.records import Camera
 
 _TURN, _SHIFT = (1.0, -2.0, 0.5, 1.5), (0.5, -1.0, 2.0)
 # half the norm of a unit quaternion, and three of it

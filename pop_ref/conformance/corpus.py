@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from pop_ref.conformance.scenes import Scene
-from pop_ref.types import Camera, Gaussians
+from pop_ref.records import Camera, Gaussians
 
 # odd multipliers: i -> i M mod 2^16 visits every residue, each column of numbers in an order of its own
 _MULTIPLIERS: Final = (40503, 24571, 52711, 14009, 61001, 33391, 9973, 46337, 27737, 57193, 19249, 38839)

@@ -14,19 +14,19 @@ from typing import Any, Final
 import numpy as np
 
 from pop_ref.conformance.adapter import OracleAdapter
-from pop_ref.conformance.charges import REACH, PixelCharges, Window, charge
 from pop_ref.conformance.corpus import PLANS, corpus_scene
-from pop_ref.conformance.gradient_charges import Bound, charges_of_sums, sums_over_pixels
+from pop_ref.conformance.error_bounds import REACH, PixelErrorBounds, Window, pixel_error_bounds
+from pop_ref.conformance.gradient_error_bounds import Bound, error_bounds_of_sums, sums_over_pixels
 from pop_ref.conformance.scenes import Scene, cotangents
-from pop_ref.conformance.screen_charges import screen_charges
+from pop_ref.conformance.screen_error_bounds import screen_error_bounds
 
 FILE: Final = Path(__file__).with_name("corpus_answers.npz")
 BLOCK: Final = 8
-# side of what is charged at once, px
+# side of what is bounded at once, px
 WINDOW: Final = 16
 # this many runs of rows, or a little more
 RUNS: Final = 100
-MAPS: Final = ("certain", "smooth", "decided")
+MAPS: Final = ("unambiguous", "smooth", "decided")
 GRADIENTS: Final = ("means", "quats", "scales", "opacities", "sh", "means2d", "means2d_abs")
 
 
@@ -56,15 +56,15 @@ def picked_pixels(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return k // W, k % W
 
 
-def charged_windows(scene: Scene, at: Any = None) -> list[tuple[tuple[slice, slice], PixelCharges]]:
-    """Charge a scene in float32, a window at a time.
+def bounded_windows(scene: Scene, at: Any = None) -> list[tuple[tuple[slice, slice], PixelErrorBounds]]:
+    """Bound the rounding of a scene in float32, a window at a time.
 
     Args:
         scene: what is drawn.
         at: which of the windows; all for None.
     """
     H, W = scene.camera.height, scene.camera.width
-    screen = screen_charges(scene, REACH * float(np.finfo(np.float32).eps))
+    screen = screen_error_bounds(scene, REACH * float(np.finfo(np.float32).eps))
     # no splat is seen beyond these sigmas
     reach = scene.profile.extent_sigmas * np.sqrt(np.stack([screen.covars2d[:, k, k] for k in (0, 1)], 1)) + 1.0
     found = []
@@ -73,31 +73,33 @@ def charged_windows(scene: Scene, at: Any = None) -> list[tuple[tuple[slice, sli
         rows = np.all((screen.means2d + reach > low) & (screen.means2d - reach < high), axis=1)
         window = Window(left, top, int(high[0]), int(high[1]), screen, rows)
         place = (slice(top, window.bottom), slice(left, window.right))
-        found.append((place, charge(scene, np.float32, window=window)))
+        found.append((place, pixel_error_bounds(scene, np.float32, window=window)))
     return found
 
 
-def masks_of(windows: list[tuple[tuple[slice, slice], PixelCharges]], shape: tuple[int, int]) -> dict[str, np.ndarray]:
-    """Return where no decision of an image, of its gradient, and of its dominant splats is in doubt. [H, W] each"""
+def masks_of(
+    windows: list[tuple[tuple[slice, slice], PixelErrorBounds]], shape: tuple[int, int]
+) -> dict[str, np.ndarray]:
+    """Return where no decision of an image, its gradient, its dominant splats is near its threshold. [H, W] each"""
     found = {name: np.zeros(shape, dtype=bool) for name in MAPS}
-    for place, charges in windows:
+    for place, error_bounds in windows:
         for name, mask in found.items():
-            mask[place] = getattr(charges, name)
+            mask[place] = getattr(error_bounds, name)
     return found
 
 
-def image_charges(
-    windows: list[tuple[tuple[slice, slice], PixelCharges]], shape: tuple[int, int]
+def image_error_bounds(
+    windows: list[tuple[tuple[slice, slice], PixelErrorBounds]], shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return what rounding may cost the image and the remaining transmittance. [H, W, 3], [H, W]"""
-    image, light = np.zeros((*shape, 3)), np.zeros(shape)
-    for place, charges in windows:
-        image[place], light[place] = charges.image + charges.absolute, charges.T_final + 1.0
-    return image, light
+    image, transmittance = np.zeros((*shape, 3)), np.zeros(shape)
+    for place, error_bounds in windows:
+        image[place], transmittance[place] = error_bounds.image + error_bounds.absolute, error_bounds.T_final + 1.0
+    return image, transmittance
 
 
-def certain_cotangents(scene: Scene, smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return cotangents of the image and of T_final that are zero where a decision is in doubt."""
+def unambiguous_cotangents(scene: Scene, smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return cotangents of the image and of T_final that are zero where a decision is near its threshold."""
     v_image, v_T_final = cotangents(scene)
     return v_image * smooth[..., None], v_T_final * smooth
 
@@ -110,43 +112,45 @@ def answer(name: str) -> dict[str, np.ndarray]:
     """
     scene = corpus_scene(name)
     shape = scene.camera.height, scene.camera.width
-    drawn, windows = OracleAdapter().full_render(scene), charged_windows(scene)
+    drawn, windows = OracleAdapter().full_render(scene), bounded_windows(scene)
     screen = windows[0][1].screen
     if np.any(screen.kinked | screen.near):
         raise ValueError(f"{name}: Gaussians {np.flatnonzero(screen.kinked | screen.near).tolist()} are at a clamp")
-    masks, (e_image, e_light) = masks_of(windows, shape), image_charges(windows, shape)
-    at, sure = picked_pixels(scene), masks["certain"]
+    masks, (e_image, e_transmittance) = masks_of(windows, shape), image_error_bounds(windows, shape)
+    at, sure = picked_pixels(scene), masks["unambiguous"]
     seen = np.concatenate([drawn.image, drawn.T_final[..., None]], axis=2)
-    charged = np.concatenate([e_image, e_light[..., None]], axis=2)
+    bounds = np.concatenate([e_image, e_transmittance[..., None]], axis=2)
     found = {key: np.packbits(mask) for key, mask in masks.items()}
-    found |= {"pixels": seen[at], "e_pixels": _short(charged[at])}
-    found |= {"blocks": weighted_blocks(seen, sure), "e_blocks": _short(weighted_blocks(charged, sure))}
+    found |= {"pixels": seen[at], "e_pixels": _short(bounds[at])}
+    found |= {"blocks": weighted_blocks(seen, sure), "e_blocks": _short(weighted_blocks(bounds, sure))}
     found["blended"] = weighted_blocks(drawn.n_blended, sure)
     found["winners"] = weighted_blocks(drawn.dominant_ids, masks["decided"])
-    v_image, v_T_final = certain_cotangents(scene, masks["smooth"])
-    pulled, charges = OracleAdapter().gradients(scene, v_image, v_T_final), _gradient_charges(scene, windows)
+    v_image, v_T_final = unambiguous_cotangents(scene, masks["smooth"])
+    pulled, error_bounds = OracleAdapter().gradients(scene, v_image, v_T_final), _gradient_error_bounds(scene, windows)
     for key in GRADIENTS:
-        found[f"v_{key}"], found[f"e_{key}"] = weighted_runs(pulled[key]), _short(weighted_runs(charges[key]))
+        found[f"v_{key}"], found[f"e_{key}"] = weighted_runs(pulled[key]), _short(weighted_runs(error_bounds[key]))
     for key in ("background", "viewmat"):
-        found[f"v_{key}"], found[f"e_{key}"] = pulled[key], charges[key]
+        found[f"v_{key}"], found[f"e_{key}"] = pulled[key], error_bounds[key]
     return found
 
 
-def _short(charges: np.ndarray) -> np.ndarray:
-    # three digits of a charge are enough
-    return charges.astype(np.float32)
+def _short(error_bounds: np.ndarray) -> np.ndarray:
+    # three digits of an error bound are enough
+    return error_bounds.astype(np.float32)
 
 
-def _gradient_charges(scene: Scene, windows: list[tuple[tuple[slice, slice], PixelCharges]]) -> dict[str, np.ndarray]:
+def _gradient_error_bounds(
+    scene: Scene, windows: list[tuple[tuple[slice, slice], PixelErrorBounds]]
+) -> dict[str, np.ndarray]:
     total: dict[str, Bound] = {}
     background = np.zeros(3)
     masks = masks_of(windows, (scene.camera.height, scene.camera.width))
-    v_image, v_T_final = certain_cotangents(scene, masks["smooth"])
-    for place, charges in windows:
-        rows, behind = sums_over_pixels(scene, charges, v_image[place], v_T_final[place])
+    v_image, v_T_final = unambiguous_cotangents(scene, masks["smooth"])
+    for place, error_bounds in windows:
+        rows, behind = sums_over_pixels(scene, error_bounds, v_image[place], v_T_final[place])
         total = {name: total[name] + bound if name in total else bound for name, bound in rows.items()}
         background = background + behind
-    return charges_of_sums(scene, windows[0][1].screen, total, background)
+    return error_bounds_of_sums(scene, windows[0][1].screen, total, background)
 
 
 @functools.cache

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pop_ref.conformance.scenes import Record, Scene, pack
-from pop_ref.types import Camera
+from pop_ref.records import Camera
 
 
 def golden_scene() -> Scene:

@@ -1,8 +1,8 @@
 """An adapter for diff-gaussian-rasterization, Inria's CUDA rasterizer: its interface under gsplat's signature.
 
 Inria's takes transposed matrices, tangents of half the field of view and unit quaternions, returns the image channels
-first, and tells neither alpha nor screen centres; the remaining light is what a second render of black splats shows of
-a white background. Background and view matrix have no gradients there. Nothing of it is imported unasked.
+first, and shows neither alpha nor screen centres; the remaining transmittance is what a second render of black splats
+shows of a white background. Background and view matrix have no gradients there. Nothing of it is imported unasked.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import importlib
 from collections.abc import Callable
 from typing import Any
 
-from pop_ref.conformance.abilities import ANTIALIASING
+from pop_ref.conformance.capabilities import ANTIALIASING
 from pop_ref.conformance.torch_adapter import TorchAdapter
 from pop_ref.constants import INRIA
 
@@ -75,9 +75,9 @@ def gsplat_like(module: Any) -> Callable[..., Any]:
             return image.permute(1, 2, 0), radii
 
         image, radii = drawn(backgrounds[0].detach(), shs=colors)
-        light, _ = drawn(torch.ones_like(backgrounds[0]), colors_precomp=torch.zeros_like(means))
+        transmittance, _ = drawn(torch.ones_like(backgrounds[0]), colors_precomp=torch.zeros_like(means))
         meta = {"radii": radii[:, None].repeat(1, 2), **({"means2d": points} if points.requires_grad else {})}
-        return image[None], 1.0 - light[None, :, :, :1], meta
+        return image[None], 1.0 - transmittance[None, :, :, :1], meta
 
     return rasterization
 

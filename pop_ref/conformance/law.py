@@ -10,22 +10,22 @@ from typing import Any
 from hypothesis import example, given
 from hypothesis.errors import HypothesisException
 
-from pop_ref.conformance.abilities import STAGES
 from pop_ref.conformance.calls import Call
+from pop_ref.conformance.capabilities import STAGES
 from pop_ref.conformance.scenes import Scene
 
 
-def _tell(name: str, backend: Any, scenes: dict[str, Scene]) -> str:
-    from pop_ref.conformance.telling import tell
+def _report(name: str, backend: Any, scenes: dict[str, Scene]) -> str:
+    from pop_ref.conformance.failure_report import failure_report
 
-    return tell(name, backend, scenes)
+    return failure_report(name, backend, scenes)
 
 
-# Gaussians of a scene that is told about
+# Gaussians of a scene that a report shows
 MOST_TOLD = 64
 
-# what a failing law is told by: functions of its name, the backend and the scenes that were drawn
-TELL: list[Callable[[str, Any, dict[str, Scene]], str]] = [_tell]
+# what writes the report of a failing law: functions of its name, the backend and the scenes that were drawn
+FAILURE_REPORTS: list[Callable[[str, Any, dict[str, Scene]], str]] = [_report]
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Law:
 
     Attributes:
         stage: one of STAGES.
-        needs: names of stage functions, or abilities (`abilities`); a backend without them is not judged.
+        needs: names of stage functions, or capabilities (`capabilities`); a backend without them is not judged.
         sentence: the function, whose name reads as the law; it takes `backend` and the drawn values.
         strategies: what it quantifies over, by argument name.
         first: values that it is tried on before any is drawn, each by argument name.
@@ -81,7 +81,7 @@ def law(
 def _telling(sentence: Callable[..., None], quantified: Callable[..., Any]) -> Callable[..., None]:
     """Return the law as a test whose failure says where the backend parts from the oracle, with code to paste.
 
-    It is told once, about the last example that broke the law: the shrunk one.
+    It is written once, about the last example that broke the law: the shrunk one.
     """
     broken: list[_Watched] = []
 
@@ -101,20 +101,20 @@ def _telling(sentence: Callable[..., None], quantified: Callable[..., Any]) -> C
     test = quantified(watched)
 
     @functools.wraps(test)
-    def told(*args: Any, **named: Any) -> None:
+    def reported(*args: Any, **named: Any) -> None:
         __tracebackhide__ = True
         broken.clear()
         try:
             test(*args, **named)
         except Exception as error:
             for seen in broken:
-                for tell in TELL:
-                    error.add_note(_safely(tell, sentence.__name__, seen, seen.scenes))
+                for report in FAILURE_REPORTS:
+                    error.add_note(_safely(report, sentence.__name__, seen, seen.scenes))
             raise
         finally:
             broken.clear()
 
-    return told
+    return reported
 
 
 class _Watched:
@@ -149,7 +149,7 @@ class _Watched:
         return self.adapter.call(call, *cotangents)
 
     def _remember(self, scene: Scene) -> None:
-        # a scene of thousands is known by its name; to tell about it would take the oracle minutes
+        # a scene of thousands is known by its name; to report about it would take the oracle minutes
         if len(scene.gaussians) <= MOST_TOLD:
             self._made.append(scene)
 
@@ -163,9 +163,9 @@ class _Watched:
         return found
 
 
-def _safely(tell: Callable[..., str], *about: Any) -> str:
+def _safely(report: Callable[..., str], *about: Any) -> str:
     try:
-        return tell(*about)
+        return report(*about)
     except Exception as error:
         # a broken backend may fail in the report as well; the law's own failure is what must be seen
         return f"no report: {error!r}"

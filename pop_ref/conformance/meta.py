@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.calls import Call, Called, packed_index, unpacked
-from pop_ref.conformance.compare import assert_close, assert_same_bits
 from pop_ref.conformance.signature import Expected
 from pop_ref.margins import margins
 
@@ -45,15 +45,20 @@ def assert_rows(backend: Any, call: Call, called: Called, wanted: Wanted) -> Non
     rows = {name: unpacked(call, meta[name], meta) for name in (*ROWS, "radii") if name in meta}
     for b, row in enumerate(wanted):
         for c, e in enumerate(row):
-            s, clear = e.charges.screen, clear_of_extents(e, backend.dtype)
+            s, clear = e.error_bounds.screen, clear_of_extents(e, backend.dtype)
             drawn = clear & e.render.splats.visible
             if "radii" in rows:
                 assert_same_bits("meta radii", rows["radii"][b, c][clear], e.render.splats.radii[clear])
-            charges = {"means2d": s.e_means2d, "depths": s.e_depths, "conics": s.e_conics, "opacities": s.e_opacities}
+            error_bounds = {
+                "means2d": s.e_means2d,
+                "depths": s.e_depths,
+                "conics": s.e_conics,
+                "opacities": s.e_opacities,
+            }
             for name in ROWS:
                 if name in rows:
                     expected = getattr(e.render.splats, name)[drawn]
-                    size = charges[name][drawn] + np.abs(expected)
+                    size = error_bounds[name][drawn] + np.abs(expected)
                     assert_close("meta.rows", rows[name][b, c][drawn], expected, size, backend.dtype, True)
 
 
@@ -109,8 +114,8 @@ def _index(call: Call, meta: dict[str, Any], flat: np.ndarray) -> tuple[np.ndarr
 def _assert_list(e: Expected, clear: np.ndarray, tile: int, listed: np.ndarray, tiles_x: int) -> None:
     size, (y, x) = e.scene.tile_size or e.scene.profile.tile_size, divmod(tile, tiles_x)
     window = (slice(y * size, (y + 1) * size), slice(x * size, (x + 1) * size))
-    sure = e.charges.certain[window]
-    shown = [layer.id for layer in e.charges.layers if np.any(layer.blended[window] & sure)]
+    sure = e.error_bounds.unambiguous[window]
+    shown = [layer.id for layer in e.error_bounds.layers if np.any(layer.blended[window] & sure)]
     lost = [i for i in shown if i not in listed]
     assert not lost, f"tile {tile} does not list Gaussians {lost}, which are blended in it"
     allowed, listed = e.render.tile_lists[tile], listed[clear[listed]]

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from pop_ref.conformance.abilities import ANTIALIASING, DETERMINISTIC, DOMINANCE, ROWWISE
 from pop_ref.conformance.adapter import Adapter, View
+from pop_ref.conformance.capabilities import ANTIALIASING, DETERMINISTIC, DOMINANCE, ROWWISE
 from pop_ref.conformance.mirror_library import Mirror
 from pop_ref.conformance.mirror_stages import STAGES
 from pop_ref.conformance.scenes import Scene

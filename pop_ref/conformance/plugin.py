@@ -15,11 +15,11 @@ from typing import Any
 
 import pytest
 
-from pop_ref.conformance.abilities import STAGES
+from pop_ref.conformance.capabilities import STAGES
 
 LAWS = "pop_ref.conformance.laws"
 FAILURES = "conformance_failures"
-# the lines of a failure's report that say what differs first (`telling`)
+# the lines of a failure's report that say what differs first (`failure_report`)
 TOLD = re.compile(
     r"^E +((?:first|nearest|no) (?:stage|pixel|Gaussian|gradient|decision)\b.*|saved as .*)$", re.MULTILINE
 )
@@ -63,7 +63,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """Rewrite the laws' asserts, choose the number of examples, and start what the options ask for."""
     pytest.register_assert_rewrite(LAWS)
     if _chosen(config):
-        from pop_ref.conformance.examples import load_profile
+        from pop_ref.conformance.hypothesis_profiles import load_profile
 
         try:
             load_profile(os.environ.get("HYPOTHESIS_PROFILE", "dev"))
@@ -153,10 +153,10 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     """Have the scenes of failing laws saved."""
     folder = session.config.getoption("--failures")
     if folder and _chosen(session.config):
-        from pop_ref.conformance.law import TELL
-        from pop_ref.conformance.telling import failure_saver
+        from pop_ref.conformance.failure_report import failure_saver
+        from pop_ref.conformance.law import FAILURE_REPORTS
 
-        TELL.append(failure_saver(Path(folder)))
+        FAILURE_REPORTS.append(failure_saver(Path(folder)))
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from pop_ref.conformance.scenes import Scene
 from pop_ref.constants import Profile
-from pop_ref.types import Camera, Gaussians
+from pop_ref.records import Camera, Gaussians
 
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pop_ref.constants import PAPER, PROFILES, Profile
-from pop_ref.types import Camera, Gaussians
+from pop_ref.records import Camera, Gaussians
 
 SH_C0 = 0.28209479177387814
 
@@ -112,7 +112,7 @@ def scene_as_code(scene: Scene) -> str:
     return (
         "from pop_ref.conformance.scenes import Scene\n"
         "from pop_ref.constants import PROFILES, Profile\n"
-        "from pop_ref.types import Camera, Gaussians\n\n"
+        "from pop_ref.records import Camera, Gaussians\n\n"
         f"scene = {scene!r}\n"
     )
 

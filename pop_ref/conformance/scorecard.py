@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from pop_ref.conformance.abilities import STAGES
+from pop_ref.conformance.capabilities import STAGES
 
 
 @dataclass

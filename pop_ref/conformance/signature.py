@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from pop_ref.conformance.abilities import GRADIENTS
 from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.assertions import assert_close
 from pop_ref.conformance.calls import Call, Called, Frame, drawn_scene, oracle_frame, oracle_frame_vjp
-from pop_ref.conformance.charges import PixelCharges, charge
-from pop_ref.conformance.compare import assert_close
-from pop_ref.conformance.gradient_charges import gradient_charges
+from pop_ref.conformance.capabilities import GRADIENTS
+from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bounds
+from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scenes import Scene
-from pop_ref.conformance.screen_charges import ScreenCharges
+from pop_ref.conformance.screen_error_bounds import ScreenErrorBounds
 from pop_ref.covariance import covars_from_quats_scales_vjp
 from pop_ref.depth import SMALLEST_OPACITY
-from pop_ref.types import Render
+from pop_ref.records import Render
 
 OF_CAMERA = ("viewmats", "backgrounds")
 
@@ -27,31 +27,31 @@ class Expected:
 
     Attributes:
         scene: what it draws.
-        charges: of the frame's channels, depth accumulated.
+        error_bounds: of the frame's channels, depth accumulated.
         render: the oracle's.
-        v_image, v_T_final: cotangents, zero where a decision is in doubt.
+        v_image, v_T_final: cotangents, zero where a decision is near its threshold.
     """
 
     def __init__(self, call: Call, frame: Frame, dtype: Any, number: int) -> None:
         self.call, self.frame = call, frame
         self.scene = drawn_scene(call, frame)
-        self.charges = _frame_charges(call, frame, self.scene, dtype)
+        self.error_bounds = _frame_error_bounds(call, frame, self.scene, dtype)
         self.render: Render = oracle_frame(self.scene, frame.colors, call.render_mode)
         H, W, X = self.render.image.shape
         k = np.arange(H * W * X, dtype=np.float64).reshape(H, W, X)
-        sure = self.charges.smooth
+        sure = self.error_bounds.smooth
         # dyadic, of either sign, nowhere zero, and others for every frame
         self.v_image = (np.mod(k * 5.0 + 3.0 + 7.0 * number, 16.0) - 7.5) / 8.0 * sure[..., None]
         self.v_T_final = (np.mod(np.arange(H * W).reshape(H, W) * 3.0 + number, 8.0) - 3.5) / 8.0 * sure
 
     @property
-    def image_charges(self) -> np.ndarray:
-        """Return what one unit of the image is charged on; an expected depth pays for its quotient. [H, W, X]"""
-        found = self.charges.image + self.charges.absolute
+    def image_error_bounds(self) -> np.ndarray:
+        """Return what one unit of the image is eps times of; an expected depth pays for its quotient. [H, W, X]"""
+        found = self.error_bounds.image + self.error_bounds.absolute
         if self.call.render_mode.endswith("ED"):
             opacity, depth = self._opacity, np.abs(self.render.image[..., -1])
             found = found.copy()
-            found[..., -1] = (found[..., -1] + depth * (self.charges.T_final + 1.0)) / opacity + depth
+            found[..., -1] = (found[..., -1] + depth * (self.error_bounds.T_final + 1.0)) / opacity + depth
         return found
 
     @property
@@ -59,7 +59,7 @@ class Expected:
         return np.maximum(1.0 - self.render.T_final, SMALLEST_OPACITY)
 
     def gradients(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Return the oracle's gradients by the rasterizer's argument, and their charges."""
+        """Return the oracle's gradients by the rasterizer's argument, and their error bounds."""
         colors, mode = self.frame.colors, self.call.render_mode
         g = oracle_frame_vjp(self.scene, colors, mode, self.v_image, self.v_T_final)
         found = {name: getattr(g, name) for name in ("means", "quats", "scales", "opacities", "means2d", "means2d_abs")}
@@ -68,25 +68,25 @@ class Expected:
         v_image, v_T = np.abs(self.v_image), np.abs(self.v_T_final)
         if mode.endswith("ED"):
             # the cotangents of the quotient's two parts, with what rounding of the opacity does to them
-            share = 1.0 + (self.charges.T_final + 1.0) / self._opacity
+            share = 1.0 + (self.error_bounds.T_final + 1.0) / self._opacity
             v_depth = v_image[..., -1] / self._opacity * share
             v_T = v_T + v_depth * np.abs(self.render.image[..., -1]) * share
             v_image = np.concatenate((v_image[..., :-1], v_depth[..., None]), axis=2)
         plain = 0 if colors is None or not mode.startswith("RGB") else colors.shape[1]
-        bounds = gradient_charges(self.scene, self.charges, v_image, v_T, plain, mode != "RGB")
+        bounds = gradient_error_bounds(self.scene, self.error_bounds, v_image, v_T, plain, mode != "RGB")
         bounds |= {"viewmats": bounds["viewmat"], "backgrounds": bounds["background"][: len(g.background)]}
         bounds["colors"] = bounds["sh"] if colors is None else bounds["colors"]
         for name in ("backgrounds", "colors"):
-            # what the mode does not show has no gradient, and no charge
+            # what the mode does not show has no gradient, and no error bound
             if bounds[name].size == 0 or not mode.startswith("RGB"):
                 bounds[name] = np.zeros(found[name].shape)
         return found, bounds
 
 
-def _frame_charges(call: Call, frame: Frame, scene: Scene, dtype: Any) -> PixelCharges:
+def _frame_error_bounds(call: Call, frame: Frame, scene: Scene, dtype: Any) -> PixelErrorBounds:
     with_depth, colored = call.render_mode != "RGB", call.render_mode.startswith("RGB")
 
-    def channels(s: ScreenCharges) -> ScreenCharges:
+    def channels(s: ScreenErrorBounds) -> ScreenErrorBounds:
         plain = frame.colors
         colors, e_colors = (s.colors, s.e_colors) if plain is None else (plain, np.zeros_like(plain))
         values, errors = ([colors], [e_colors]) if colored else ([], [])
@@ -97,7 +97,7 @@ def _frame_charges(call: Call, frame: Frame, scene: Scene, dtype: Any) -> PixelC
 
     behind = np.append(scene.background if colored else [], [0.0] * with_depth)
     lists = OracleAdapter().full_render(scene).tile_lists if scene.profile.extent == "square" else None
-    return charge(scene.but(background=behind), dtype, lists, channels)
+    return pixel_error_bounds(scene.but(background=behind), dtype, lists, channels)
 
 
 def expectations(backend: Any, call: Call) -> list[list[Expected]]:
@@ -117,12 +117,14 @@ def assert_call_is_the_oracles(backend: Any, call: Call) -> tuple[Called, list[l
     called = backend.call(call, *cotangents)
     for b, row in enumerate(wanted):
         for c, e in enumerate(row):
-            sure, key = e.charges.certain, "agreement.image"
-            size, image, alpha = e.image_charges, called.images[b, c], called.alphas[b, c]
+            sure, key = e.error_bounds.unambiguous, "agreement.image"
+            size, image, alpha = e.image_error_bounds, called.images[b, c], called.alphas[b, c]
             assert image.shape == e.render.image.shape, f"images have shape {image.shape}, not {e.render.image.shape}"
             assert_close(key, image[sure], e.render.image[sure], size[sure], backend.dtype, True)
-            light = (e.charges.T_final + 1.0)[sure]
-            assert_close("agreement.T_final", 1.0 - alpha[sure], e.render.T_final[sure], light, backend.dtype, True)
+            transmittance = (e.error_bounds.T_final + 1.0)[sure]
+            assert_close(
+                "agreement.T_final", 1.0 - alpha[sure], e.render.T_final[sure], transmittance, backend.dtype, True
+            )
     if cotangents:
         _assert_gradients(backend, call, called, wanted)
     return called, wanted
@@ -135,7 +137,7 @@ def _assert_gradients(backend: Any, call: Call, called: Called, wanted: list[lis
     }
     for b, row in enumerate(wanted):
         pulled = [e.gradients() for e in row]
-        kinked = np.any([e.charges.screen.kinked for e in row], axis=0)
+        kinked = np.any([e.error_bounds.screen.kinked for e in row], axis=0)
         for name, value in found.items():
             own = name in OF_CAMERA or name.startswith("means2d") or (name == "colors" and call.camera_colors)
             if name == "covars":
@@ -152,7 +154,7 @@ def _assert_gradients(backend: Any, call: Call, called: Called, wanted: list[lis
 
 
 def _summed(pulled: list[Any], name: str) -> tuple[Any, Any]:
-    """Return an argument's gradient and its charge, summed over the cameras that share it."""
+    """Return an argument's gradient and its error bound, summed over the cameras that share it."""
     return sum(expected[name] for expected, _ in pulled), sum(bounds[name] for _, bounds in pulled)
 
 

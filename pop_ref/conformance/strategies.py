@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from pop_ref.conformance.scenes import Record, Scene, pack, rigid
 from pop_ref.constants import PAPER, Profile
-from pop_ref.types import Camera
+from pop_ref.records import Camera
 
 FLOOR = 1.0 / 255.0
 ANCHOR_SH = ((1.0, 0.5, 0.25),)

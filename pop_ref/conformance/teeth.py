@@ -21,13 +21,13 @@ import numpy as np
 from pop_ref.compositing import composite
 from pop_ref.conformance import tolerances
 from pop_ref.conformance.adapter import Adapter, OracleAdapter, projected
+from pop_ref.conformance.assertions import WORST_CONDITION
 from pop_ref.conformance.backends import Unavailable, shipped
-from pop_ref.conformance.charges import PixelCharges, charge
 from pop_ref.conformance.corners import corners
-from pop_ref.conformance.gradient_charges import gradient_charges
+from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bounds
+from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scenes import Scene, cotangents, rounded_to
-from pop_ref.conformance.verdicts import WORST_CONDITION
-from pop_ref.types import Splats
+from pop_ref.records import Splats
 
 # far below every decision's distance from its threshold, and far above rounding
 STEP: Final = 2.0**-30
@@ -42,12 +42,12 @@ MOVED: Final[dict[str, Callable[[Splats], Splats]]] = {
 }
 
 
-def _scenes(dtype: Any) -> Iterator[tuple[Scene, PixelCharges]]:
+def _scenes(dtype: Any) -> Iterator[tuple[Scene, PixelErrorBounds]]:
     for values in (*corners(3), *corners()):
         scene = rounded_to(values["scene"], dtype)
-        charges = charge(scene, dtype)
-        if charges.worst_condition() * charges.reach < WORST_CONDITION:
-            yield scene, charges
+        error_bounds = pixel_error_bounds(scene, dtype)
+        if error_bounds.worst_condition() * error_bounds.reach < WORST_CONDITION:
+            yield scene, error_bounds
 
 
 def _drawn(scene: Scene, moved: Callable[[Splats], Splats], background: float = 0.0) -> np.ndarray:
@@ -58,10 +58,10 @@ def _drawn(scene: Scene, moved: Callable[[Splats], Splats], background: float = 
     return np.concatenate([drawn.image, drawn.T_final[..., None]], axis=2)
 
 
-def _allowed(charges: PixelCharges, dtype: Any) -> np.ndarray:
-    image = tolerances.agreement("agreement.image", dtype) * (charges.image + charges.absolute)
-    light = tolerances.agreement("agreement.T_final", dtype) * (charges.T_final + 1.0)
-    return np.concatenate([image, light[..., None]], axis=2)
+def _allowed(error_bounds: PixelErrorBounds, dtype: Any) -> np.ndarray:
+    image = tolerances.agreement("agreement.image", dtype) * (error_bounds.image + error_bounds.absolute)
+    transmittance = tolerances.agreement("agreement.T_final", dtype) * (error_bounds.T_final + 1.0)
+    return np.concatenate([image, transmittance[..., None]], axis=2)
 
 
 def _least(allowed: np.ndarray, change: np.ndarray) -> float:
@@ -72,8 +72,8 @@ def _least(allowed: np.ndarray, change: np.ndarray) -> float:
 def image_teeth(dtype: Any) -> dict[str, float]:
     """Return the least error noticed in an image, by the quantity that it stands in."""
     found = dict.fromkeys((*MOVED, "background"), np.inf)
-    for scene, charges in _scenes(dtype):
-        here, room, sure = _drawn(scene, lambda s: s), _allowed(charges, dtype), charges.certain
+    for scene, error_bounds in _scenes(dtype):
+        here, room, sure = _drawn(scene, lambda s: s), _allowed(error_bounds, dtype), error_bounds.unambiguous
         moved = {name: _drawn(scene, move) for name, move in MOVED.items()}
         moved["background"] = _drawn(scene, lambda s: s, STEP)
         for name, there in moved.items():
@@ -90,25 +90,25 @@ def gradient_teeth(dtype: Any) -> dict[str, float]:
     return found
 
 
-def _pulled(dtype: Any) -> Iterator[tuple[Scene, PixelCharges, dict[str, Any], dict[str, Any], tuple[Any, Any]]]:
-    """Yield scenes with their charges, the oracle's gradients, what is allowed of each, and the cotangents."""
-    for scene, charges in _scenes(dtype):
+def _pulled(dtype: Any) -> Iterator[tuple[Scene, PixelErrorBounds, dict[str, Any], dict[str, Any], tuple[Any, Any]]]:
+    """Yield scenes with their error bounds, the oracle's gradients, what is allowed of each, and the cotangents."""
+    for scene, error_bounds in _scenes(dtype):
         v_image, v_T_final = cotangents(scene)
-        v = v_image * charges.smooth[..., None], v_T_final * charges.smooth
-        if np.any(charges.screen.kinked):
+        v = v_image * error_bounds.smooth[..., None], v_T_final * error_bounds.smooth
+        if np.any(error_bounds.screen.kinked):
             continue
-        expected, units = OracleAdapter().gradients(scene, *v), gradient_charges(scene, charges, *v)
+        expected, units = OracleAdapter().gradients(scene, *v), gradient_error_bounds(scene, error_bounds, *v)
         room = {name: tolerances.agreement(f"agreement.v_{name}", dtype) * units[name] for name in expected}
-        yield scene, charges, expected, room, v
+        yield scene, error_bounds, expected, room, v
 
 
 def shares(backend: Adapter) -> dict[str, float]:
     """Return which share of what is allowed a sound backend needs at worst, of images and of every gradient."""
     found = {"image": 0.0}
-    for scene, charges in _scenes(backend.dtype):
-        view, sure = backend.render(scene), charges.certain
+    for scene, error_bounds in _scenes(backend.dtype):
+        view, sure = backend.render(scene), error_bounds.unambiguous
         seen = np.concatenate([view.image, view.T_final[..., None]], axis=2)
-        off = np.abs(seen - _drawn(scene, lambda s: s)) / _allowed(charges, backend.dtype)
+        off = np.abs(seen - _drawn(scene, lambda s: s)) / _allowed(error_bounds, backend.dtype)
         found["image"] = max(found["image"], float(np.max(off[sure], initial=0.0)))
     for scene, _, expected, room, v in _pulled(backend.dtype):
         for name, value in backend.gradients(scene, *v).items():

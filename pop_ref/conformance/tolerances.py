@@ -1,7 +1,7 @@
 """Every tolerance, once, with the worst case that was measured.
 
 A tolerance is a number of units; one unit is eps of the backend's dtype times a magnitude that the law or the oracle
-computes from absolute values. So a float32 backend is charged its rounding and nothing else, and no tolerance depends
+computes from absolute values. So a float32 backend is allowed its rounding and nothing else, and no tolerance depends
 on where it runs. Against the oracle a float64 backend has to agree to 1e-12 of that same magnitude, or to 64 times the
 units that single precision is allowed where that is less: its rounding alone is far smaller, so anything that is left
 is a wrong formula.

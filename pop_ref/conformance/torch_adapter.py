@@ -18,7 +18,9 @@ from typing import Any
 import numpy as np
 from hypothesis import reject
 
-from pop_ref.conformance.abilities import (
+from pop_ref.conformance.adapter import TOLD_OF_DOMINANCE, Adapter, View, stage_function
+from pop_ref.conformance.calls import Call, Called, unpacked
+from pop_ref.conformance.capabilities import (
     ANTIALIASING,
     DETERMINISTIC,
     GRADIENTS,
@@ -27,8 +29,6 @@ from pop_ref.conformance.abilities import (
     SIGNATURE,
     same_constants,
 )
-from pop_ref.conformance.adapter import TOLD_OF_DOMINANCE, Adapter, View, stage_function
-from pop_ref.conformance.calls import Call, Called, unpacked
 from pop_ref.conformance.cases import BY_NAME, Case
 from pop_ref.conformance.scenes import Scene
 from pop_ref.constants import PAPER, Profile

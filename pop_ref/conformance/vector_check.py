@@ -22,7 +22,7 @@ class Verdict:
 
     Attributes:
         vector, array: names.
-        worst: the largest difference over its charge; for integers the number of wrong entries.
+        worst: the largest difference over its error bound; for integers the number of wrong entries.
         allowed: the largest that passes.
         told: where the worst entry is, with both values.
         unit: what `worst` and `allowed` count.
@@ -33,7 +33,7 @@ class Verdict:
     worst: float
     allowed: float
     told: str = ""
-    unit: str = "of its charge"
+    unit: str = "of its error_bound"
 
     @property
     def passed(self) -> bool:
@@ -179,16 +179,16 @@ def _judge(
     mask = np.True_ if compare["where"] is None else wanted[compare["where"]]
     # a mask covers the leading axes
     where = np.broadcast_to(np.reshape(mask, mask.shape + (1,) * (expected.ndim - mask.ndim)), expected.shape)
-    unit = "of its charge"
+    unit = "of its error_bound"
     if compare["rule"] == "equal":
         unit = "wrong entries"
         wrong = np.asarray((result != expected) & where, dtype=np.float64)
         worst, allowed = float(np.sum(wrong)), 0.0
     else:
         allowed = compare["limit"][precision]
-        # a charge of zero leaves `tiny`
-        charge = wanted[compare["charge"]] + index["tiny"][precision] / allowed
-        off = np.abs(result.astype(np.float64) - expected) / charge
+        # an error bound of zero leaves `tiny`
+        error_bound = wanted[compare["error_bound"]] + index["tiny"][precision] / allowed
+        off = np.abs(result.astype(np.float64) - expected) / error_bound
         wrong = np.where(where, np.where(np.isfinite(off), off, np.inf), 0.0)
         worst = float(np.max(wrong, initial=0.0))
     if worst <= allowed:

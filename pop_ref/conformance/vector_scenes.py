@@ -9,7 +9,7 @@ import numpy as np
 from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.scenes import Record, Scene, pack
 from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER, Profile
-from pop_ref.types import Camera
+from pop_ref.records import Camera
 
 _BANDS = tuple((0.125 * (k % 5) - 0.25, 0.0625 * (k % 7) - 0.125, 0.25 - 0.0625 * (k % 3)) for k in range(15))
 

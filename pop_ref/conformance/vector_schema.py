@@ -22,11 +22,11 @@ ABOUT: Final = (
     "Read the arrays whose role is 'input' and the vector's 'options', and write a result of the same name into a "
     "folder of your own: NAME.npz, or NAME.json holding nested lists by array name. Write as many of the arrays whose "
     "role is 'output' as you have, in the stated shape and any number type.",
-    "A result is judged by its array's 'compare'. 'close': |result - expected| <= limit * charge + tiny, with limit "
-    "and tiny of the precision that you compute in, and the array named 'charge', which says what rounding may cost. "
+    "A result is judged by its array's 'compare'. 'close': |result - expected| <= limit * error bound + tiny, with "
+    "limit and tiny of the precision that you compute in, and the array named by 'error_bound': what rounding may cost. "
     "'equal': result = expected.",
     "Only entries whose mask 'where' is true are compared: elsewhere rounding may decide either way. A mask covers the "
-    "leading axes of its array: certain [H, W] covers image [H, W, 3], a mask of shape [] all or nothing.",
+    "leading axes of its array: unambiguous [H, W] covers image [H, W, 3], a mask of shape [] all or nothing.",
     "'pop vectors check DIR RESULTS' does all of this.",
 )
 MODEL: Final = (
@@ -81,8 +81,14 @@ _INPUTS = {
     "viewmat": ("[4, 4]", "world -> camera: x right, y down, z forward"),
     "K": ("[3, 3]", "intrinsics fx, fy, cx, cy, px"),
     "background": ("[3]", "colour behind everything"),
-    "v_image": ("[H, W, 3]", "cotangent of image that the gradients belong to; zero where a decision is doubtful"),
-    "v_T_final": ("[H, W]", "cotangent of T_final that the gradients belong to; zero where a decision is doubtful"),
+    "v_image": (
+        "[H, W, 3]",
+        "cotangent of image that the gradients belong to; zero near thresholds",
+    ),
+    "v_T_final": (
+        "[H, W]",
+        "cotangent of T_final that the gradients belong to; zero near thresholds",
+    ),
 }
 _OUTPUTS = {
     "image": ("[H, W, 3]", "colours over the background, not clamped"),
@@ -94,8 +100,8 @@ _OUTPUTS = {
     "n_blended": ("[H, W]", "splats blended at the pixel"),
 }
 _MASKS = {
-    "certain": ("[H, W]", "every decision behind the pixel is clear of float32's rounding"),
-    "decided": ("[H, W]", "certain, and the dominant Gaussian is clear too"),
+    "unambiguous": ("[H, W]", "every decision behind the pixel is clear of float32's rounding"),
+    "decided": ("[H, W]", "unambiguous, and the dominant Gaussian is clear too"),
     "smooth_rows": ("[N]", "no kink of this Gaussian (B1 frustum clamp, B2 colour clamp) is within rounding"),
     "all_smooth": ("[]", "smooth_rows holds everywhere"),
 }
@@ -103,7 +109,7 @@ _AIDS = {
     "radii": ("[N, 2]", "extents along x and y, px, 0 where culled; not judged"),
     "means2d": ("[N, 2]", "screen centres, px; not judged"),
 }
-_WHERE = {"image": "certain", "T_final": "certain", "n_blended": "certain", "dominant_ids": "decided",
+_WHERE = {"image": "unambiguous", "T_final": "unambiguous", "n_blended": "unambiguous", "dominant_ids": "decided",
           "v_viewmat": "all_smooth", "v_background": None}  # fmt: skip
 _DECISIONS = {
     "D1": "near plane", "D2": "extent and cull", "D3": "tile overlap", "D4": "depth order", "D5": "alpha floor",
@@ -137,7 +143,9 @@ def _entries() -> list[dict[str, Any]]:
         rows.append(_entry(name, "output", "int64" if whole else "float64", shape, meaning, _rule(name)))
     for name, (shape, _) in outputs.items():
         if name not in ("dominant_ids", "n_blended"):
-            rows.append(_entry(f"charge_{name}", "charge", "float64", shape, f"what rounding may cost in {name}"))
+            rows.append(
+                _entry(f"error_bound_{name}", "error_bound", "float64", shape, f"what rounding may cost in {name}")
+            )
     rows += [_entry(name, "mask", "bool", *about) for name, about in _MASKS.items()]
     rows += [_entry(name, "aid", "int64" if name == "radii" else "float64", *about) for name, about in _AIDS.items()]
     for label, decision in _DECISIONS.items():
@@ -166,4 +174,4 @@ def _rule(name: str) -> dict[str, Any]:
         return {"rule": "equal", "where": where}
     units = tolerances.TABLE[f"agreement.{name}"].units
     limit = {"float32": units * float(np.finfo(np.float32).eps), "float64": tolerances.AGREEMENT_FLOAT64}
-    return {"rule": "close", "charge": f"charge_{name}", "limit": limit, "where": where}
+    return {"rule": "close", "error_bound": f"error_bound_{name}", "limit": limit, "where": where}

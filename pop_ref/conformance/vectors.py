@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from pop_ref.conformance.adapter import OracleAdapter
-from pop_ref.conformance.charges import PixelCharges, charge
-from pop_ref.conformance.gradient_charges import gradient_charges
+from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bounds
+from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scene_files import scene_arrays, scene_options
 from pop_ref.conformance.scenes import Scene, cotangents, rounded_to
 from pop_ref.conformance.vector_scenes import vector_scenes
@@ -23,36 +23,36 @@ from pop_ref.margins import margins
 
 
 def expected_arrays(scene: Scene) -> dict[str, np.ndarray]:
-    """Return a vector's arrays: inputs, outputs, charges, masks and margins.
+    """Return a vector's arrays: inputs, outputs, error bounds, masks and margins.
 
     Args:
         scene: every array exact in float32.
     """
     oracle = OracleAdapter()
     drawn = oracle.full_render(scene)
-    charges = charge(scene, np.float32, drawn.tile_lists if scene.profile.extent == "square" else None)
+    error_bounds = pixel_error_bounds(scene, np.float32, drawn.tile_lists if scene.profile.extent == "square" else None)
     v_image, v_T_final = cotangents(scene)
-    v_image, v_T_final = v_image * charges.smooth[..., None], v_T_final * charges.smooth
+    v_image, v_T_final = v_image * error_bounds.smooth[..., None], v_T_final * error_bounds.smooth
     gradients = oracle.gradients(scene, v_image, v_T_final)
-    bounds = gradient_charges(scene, charges, v_image, v_T_final)
+    bounds = gradient_error_bounds(scene, error_bounds, v_image, v_T_final)
     found = margins(scene.gaussians, scene.camera, scene.sh_degree, scene.profile, scene.tile_size, scene.antialiased)
     arrays = {**scene_arrays(scene), "v_image": v_image, "v_T_final": v_T_final}
     for name in ("image", "T_final", "dominant_ids", "n_blended"):
         arrays[name] = getattr(drawn, name)
     arrays |= {"radii": drawn.splats.radii, "means2d": drawn.splats.means2d}
-    arrays |= _charges(charges)
+    arrays |= _error_bounds(error_bounds)
     for name in GRADIENTS:
-        arrays[f"v_{name}"], arrays[f"charge_v_{name}"] = gradients[name], bounds[name]
+        arrays[f"v_{name}"], arrays[f"error_bound_v_{name}"] = gradients[name], bounds[name]
     return {**arrays, **{f"margin_{label}": values for label, values in found.pixels.items()}}
 
 
-def _charges(charges: PixelCharges) -> dict[str, np.ndarray]:
-    smooth = ~charges.screen.kinked
+def _error_bounds(error_bounds: PixelErrorBounds) -> dict[str, np.ndarray]:
+    smooth = ~error_bounds.screen.kinked
     return {
-        "charge_image": charges.image + charges.absolute,
-        "charge_T_final": charges.T_final + 1.0,
-        "certain": charges.certain,
-        "decided": charges.decided,
+        "error_bound_image": error_bounds.image + error_bounds.absolute,
+        "error_bound_T_final": error_bounds.T_final + 1.0,
+        "unambiguous": error_bounds.unambiguous,
+        "decided": error_bounds.decided,
         "smooth_rows": smooth,
         "all_smooth": np.array(np.all(smooth)),
     }

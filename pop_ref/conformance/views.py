@@ -7,10 +7,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from pop_ref.conformance import abilities
+from pop_ref.conformance import capabilities
 from pop_ref.conformance.calls import Call, Frame
 from pop_ref.conformance.scenes import Record, Scene, pack, rigid
-from pop_ref.types import Camera, Gaussians
+from pop_ref.records import Camera, Gaussians
 
 WIDTH, HEIGHT = 17, 11
 NEAREST, FARTHEST = 1.0, 6.0
@@ -86,32 +86,32 @@ def _call(backend: Any, entries: int = 1, count: int = 1, **options: Any) -> Cal
     return Call(rows, camera_colors=of_frames.get("camera_colors", False), **options)
 
 
-# by ability, a call that needs it and nothing else
+# by capability, a call that needs it and nothing else
 ASKED: Final[dict[str, Callable[[Any], Call]]] = {
-    abilities.CAMERAS: lambda backend: _call(backend, count=2),
-    abilities.BATCHES: lambda backend: _call(backend, 2, batched=True),
-    abilities.PACKED: lambda backend: _call(backend, packed=True),
-    abilities.DEPTH: lambda backend: _call(backend, render_mode="RGB+ED"),
-    abilities.COLORS: lambda backend: _call(backend, channels=3),
-    abilities.CHANNELS: lambda backend: _call(backend, channels=4),
-    abilities.CAMERA_COLORS: lambda backend: _call(backend, count=2, channels=3, camera_colors=True),
-    abilities.COVARS: lambda backend: _call(backend, covars=True),
-    abilities.RADIUS_CLIP: lambda backend: _call(backend, radius_clip=2.5),
-    abilities.PLANES: lambda backend: _call(backend, planes={"near_plane": 2.0, "far_plane": 4.0, "eps2d": 0.5}),
-    abilities.NO_BACKGROUND: lambda backend: _call(backend, black=True, no_background=True),
-    abilities.SPARSE_GRAD: lambda backend: _call(backend, packed=True, sparse_grad=True),
+    capabilities.CAMERAS: lambda backend: _call(backend, count=2),
+    capabilities.BATCHES: lambda backend: _call(backend, 2, batched=True),
+    capabilities.PACKED: lambda backend: _call(backend, packed=True),
+    capabilities.DEPTH: lambda backend: _call(backend, render_mode="RGB+ED"),
+    capabilities.COLORS: lambda backend: _call(backend, channels=3),
+    capabilities.CHANNELS: lambda backend: _call(backend, channels=4),
+    capabilities.CAMERA_COLORS: lambda backend: _call(backend, count=2, channels=3, camera_colors=True),
+    capabilities.COVARS: lambda backend: _call(backend, covars=True),
+    capabilities.RADIUS_CLIP: lambda backend: _call(backend, radius_clip=2.5),
+    capabilities.PLANES: lambda backend: _call(backend, planes={"near_plane": 2.0, "far_plane": 4.0, "eps2d": 0.5}),
+    capabilities.NO_BACKGROUND: lambda backend: _call(backend, black=True, no_background=True),
+    capabilities.SPARSE_GRAD: lambda backend: _call(backend, packed=True, sparse_grad=True),
 }
 
 
-def offers(backend: Any, ability: str) -> bool:
-    """Ask a backend once for a call that needs an ability; what it refuses, it does not offer.
+def offers(backend: Any, capability: str) -> bool:
+    """Ask a backend once for a call that needs an capability; what it refuses, it does not offer.
 
     Args:
         backend: has a method `call`.
-        ability: one of ASKED.
+        capability: one of ASKED.
     """
     try:
-        backend.call(ASKED[ability](backend))
+        backend.call(ASKED[capability](backend))
     except (NotImplementedError, TypeError, ValueError):
         return False
     return True

@@ -12,9 +12,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from pop_ref.conformance.abilities import DOMINANCE, GRADIENTS, RENDER, abilities_of
-from pop_ref.conformance.abilities import DOUBLE as IN_DOUBLE
 from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.capabilities import DOMINANCE, GRADIENTS, RENDER, capabilities_of
+from pop_ref.conformance.capabilities import DOUBLE as IN_DOUBLE
 from pop_ref.conformance.law import Law, missing
 from pop_ref.constants import PAPER, Profile
 from pop_ref.learn.course import Stage
@@ -91,7 +91,7 @@ class _Judged(OracleAdapter):
 
     def has(self, need: str) -> bool:
         """Tell that the student has written it."""
-        return need in self.written or need in self.able or need == IN_DOUBLE or need in abilities_of(PAPER)
+        return need in self.written or need in self.able or need == IN_DOUBLE or need in capabilities_of(PAPER)
 
     def stage(self, name: str) -> Callable[..., Any]:
         """Return the student's function, or the oracle's where a law needs more than the stage."""

@@ -83,7 +83,7 @@ def picture(work: Work, size: int = 48) -> tuple[np.ndarray, list[str]]:
 
 
 def _rendered(borrowed: Borrowed, size: int) -> np.ndarray:
-    types, params = borrowed.module("types"), toy()
+    types, params = borrowed.module("records"), toy()
     gaussians = borrowed.module("training").gaussians_from_params(params)
     image = borrowed.module("render").render(gaussians, types.Camera(*orbit(0.6, size))).image
     if image.shape != (size, size, 3) or not np.all(np.isfinite(image)):

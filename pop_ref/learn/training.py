@@ -46,7 +46,7 @@ def train(work: Work, steps: int = 60, size: int = 24, n: int = 100, every: int 
 
 
 def _steps(borrowed, steps: int, size: int, n: int, every: int, rng: np.random.Generator) -> Iterator[Told]:
-    training, types, recipes = (borrowed.module(name) for name in ("training", "types", "recipes"))
+    training, types, recipes = (borrowed.module(name) for name in ("training", "records", "recipes"))
     recipe = recipes.RECIPES["POP"]
     rates = replace(recipe.lr, means=4e-3, quats=1e-2, scales=2e-2, opacities=5e-2, sh0=3e-2)
     density = replace(recipe.density, refine_start_iter=0, refine_every=max(2, steps // 3), refine_stop_iter=steps)

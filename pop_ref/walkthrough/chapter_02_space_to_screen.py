@@ -32,8 +32,8 @@ from pop_ref.footprint import (
 )
 from pop_ref.pixel import SplatRows, composite_pixel
 from pop_ref.projection import project_covars, project_means, projection_jacobians
+from pop_ref.records import Camera, Gaussians
 from pop_ref.splatting import geometry, project
-from pop_ref.types import Camera, Gaussians
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, INK, MUTED, SECOND, THIRD, axes
 

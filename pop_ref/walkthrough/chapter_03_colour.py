@@ -24,8 +24,8 @@ import numpy as np
 
 from pop_ref.harmonics import colors_from_sh, sh_basis
 from pop_ref.optimizer import sh_degree_at
+from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render
-from pop_ref.types import Camera, Gaussians
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import (
     ACCENT,

@@ -22,8 +22,8 @@ import numpy as np
 
 from pop_ref.constants import PAPER
 from pop_ref.pixel import SplatRows, composite_pixel, stops
+from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render
-from pop_ref.types import Camera, Gaussians
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, INK, SECOND, THIRD, axes, show_image
 

@@ -33,8 +33,8 @@ from pop_ref.alpha import (
 )
 from pop_ref.compositing import composite_pixel, composite_pixel_vjp, composite_vjp
 from pop_ref.pixel import SplatRows, rows_from_splats, zero_gradients
+from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render, render_vjp
-from pop_ref.types import Camera, Gaussians
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, INK, MUTED, SECOND, axes, show_image
 

@@ -24,10 +24,10 @@ import numpy as np
 from pop_ref.losses import d_ssim, d_ssim_vjp, l1, l1_vjp, l2, l2_vjp, photometric_pop_vjp
 from pop_ref.optimizer import adam_step, learning_rates
 from pop_ref.polarization import pop_loss
+from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render, render_vjp
 from pop_ref.ssim import C1, C2
 from pop_ref.training import gaussians_from_params, params_vjp
-from pop_ref.types import Camera, Gaussians
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, SECOND, THIRD, axes, show_image
 

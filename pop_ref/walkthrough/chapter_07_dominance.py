@@ -38,9 +38,9 @@ from pop_ref.dominance import dominant_id
 from pop_ref.losses import l2, l2_vjp
 from pop_ref.optimizer import adam_step, learning_rates
 from pop_ref.pixel import SplatRows
+from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render, render_vjp
 from pop_ref.training import gaussians_from_params, params_vjp
-from pop_ref.types import Camera, Gaussians
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, axes, show_image
 

@@ -36,9 +36,9 @@ from pop_ref.losses import l2, l2_vjp
 from pop_ref.optimizer import adam_step, learning_rates
 from pop_ref.pixel import SplatRows, composite_pixel, composite_pixel_vjp, zero_gradients
 from pop_ref.polarization import importance_mask, pop_loss, pop_loss_vjp
+from pop_ref.records import Camera
 from pop_ref.render import render, render_vjp
 from pop_ref.training import gaussians_from_params, params_vjp
-from pop_ref.types import Camera
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, MUTED, SECOND, axes
 

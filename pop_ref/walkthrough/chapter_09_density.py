@@ -30,9 +30,9 @@ from pop_ref.compositing import composite, composite_vjp
 from pop_ref.losses import l2, l2_vjp, photometric_pop_vjp
 from pop_ref.optimizer import adam_step, learning_rates
 from pop_ref.polarization import importance_mask, pop_loss_vjp
+from pop_ref.records import Camera, Splats
 from pop_ref.render import render, render_vjp
 from pop_ref.tiles import tile_lists
-from pop_ref.types import Camera, Splats
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, MUTED, SECOND, THIRD, axes, show_image
 

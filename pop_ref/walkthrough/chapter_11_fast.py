@@ -23,8 +23,8 @@ from pop_ref.alpha import alpha_from_sigma, sigma_at_pixel
 from pop_ref.compositing import composite, composite_vjp
 from pop_ref.constants import PAPER
 from pop_ref.footprint import conics_from_covars2d, radii_from_covars2d
+from pop_ref.records import Splats
 from pop_ref.tiles import tile_lists
-from pop_ref.types import Splats
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import SECOND, axes, show_image
 

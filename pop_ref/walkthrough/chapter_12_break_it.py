@@ -22,7 +22,7 @@ from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.mutants import MUTANTS, Mutant, living
 from pop_ref.conformance.mutants.trial import every_law, killed_by, law_named, obeys
 from pop_ref.conformance.scenes import Record, Scene, pack
-from pop_ref.types import Camera
+from pop_ref.records import Camera
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, INK, SECOND, THIRD, axes, show_image
 

@@ -13,9 +13,13 @@ from pop_fast.train.views import ViewTensors
 from tests.app.tiny import tiny_capture, tiny_config
 
 
-def a_view(width: int, height: int, mask: torch.Tensor | None = None) -> ViewTensors:
+def a_view(
+    width: int, height: int, mask: torch.Tensor | None = None, moved: tuple[float, float] = (0.0, 0.0)
+) -> ViewTensors:
     photo = torch.zeros((height, width, 3), dtype=torch.uint8)
-    return ViewTensors("a.jpg", photo, mask, torch.eye(4)[None], torch.eye(3)[None])
+    K = torch.eye(3)[None].clone()
+    K[0, 0, 2], K[0, 1, 2] = width / 2 + moved[0], height / 2 + moved[1]
+    return ViewTensors("a.jpg", photo, mask, torch.eye(4)[None], K)
 
 
 def said_of(width: int = 980, height: int = 545, **settings: object) -> list[str]:
@@ -51,6 +55,16 @@ def test_a_short_schedule_has_no_resets_unless_they_are_asked_for(method):
     assert "reset after step 300 and have 300 steps (3 densification steps) to recover" in warning
     assert f"--{method}.reset-every 0" in warning
     assert said_of(method=method, preset="quick", **{f"{method}.reset_every": 0}) == []
+
+
+def test_a_centred_principal_point_is_warned_of_where_the_cameras_have_another():
+    away = [a_view(512, 512), a_view(512, 512, moved=(3.0, -4.0))]
+    (warning,) = find_warnings(TrainConfig.of(method="3dgs"), away)
+    assert "a.jpg lies 5.0 pixels from there" in warning
+    assert "--profile gsplat_1_5" in warning
+    assert list(find_warnings(TrainConfig.of(method="3dgs", profile="gsplat_1_5"), away)) == []
+    assert list(find_warnings(TrainConfig.of(method="gsplat"), away)) == []
+    assert list(find_warnings(TrainConfig.of(method="3dgs"), [a_view(512, 512, moved=(0.6, 0.6))])) == []
 
 
 def test_a_run_that_ends_soon_after_a_reset_is_warned_of():

@@ -23,7 +23,7 @@ from pop_fast.losses import photometric_pop
 from pop_fast.strategies import POPStrategy
 from pop_fast.train.config import TrainConfig
 from pop_ref.constants import PAPER, Profile
-from pop_ref.types import Splats
+from pop_ref.records import Splats
 from tests.app.conftest import Pop
 from tests.app.tiny import tiny_capture
 

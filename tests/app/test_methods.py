@@ -22,10 +22,10 @@ from pop_ref import fisher, mini_splatting, selection, taming
 from pop_ref.chord import dominant_points
 from pop_ref.contributions import contributions
 from pop_ref.density import average_grads
+from pop_ref.records import Camera
 from pop_ref.render import render
 from pop_ref.sensitivity import sensitivities
 from pop_ref.training import gaussians_from_params
-from pop_ref.types import Camera
 from tests.app.tiny import tiny_capture, tiny_config
 from tests.train.oracle_steps import state_of
 

@@ -95,7 +95,7 @@ def test_one_wrong_entry_is_found_and_named(pop: Pop, shared_vectors: Path, port
     outcome = pop("vectors", "check", shared_vectors, results)
     assert outcome.status == 1
     (line,) = (line for line in outcome.out.splitlines() if "golden: off by" in line)
-    assert re.search(r"off by \S+ of its charge, allowed \S+; ", line), line
+    assert re.search(r"off by \S+ of its error_bound, allowed \S+; ", line), line
     assert "at [3, 5, 1]: got " in outcome.out
 
 
@@ -174,7 +174,7 @@ def _without(name: str) -> Callable[[Path], None]:
         (lambda f: truncate(f / "golden.npz"), ("golden.npz", "is no npz file", "again")),
         (lambda f: (f / "golden.npz").write_text("hello"), ("golden.npz", "is no npz file")),
         (lambda f: np.savez(f / "golden.npz", other=np.zeros(3)), ("golden.npz", "has no array means", "again")),
-        (_without("charge_image"), ("golden.npz", "has no array charge_image")),
+        (_without("error_bound_image"), ("golden.npz", "has no array error_bound_image")),
         (_index(lambda i: i["vectors"]["golden"]["shapes"].update(image=[1])), ("golden.npz", "image has shape")),
     ],
     ids=lambda value: None if callable(value) else value[-1],

@@ -94,7 +94,7 @@ def judge(index: dict, wanted: Arrays, name: str, result: np.ndarray) -> bool:
     if rule["rule"] == "equal":
         good = result == wanted[name]
     else:
-        limit = rule["limit"]["float32"] * wanted[rule["charge"]] + index["tiny"]["float32"]
+        limit = rule["limit"]["float32"] * wanted[rule["error_bound"]] + index["tiny"]["float32"]
         good = np.abs(result - wanted[name]) <= limit
     return bool(np.all(good | ~mask))
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from cuda_ext.compiler import find_compiler
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.cases import CASES, cotangent_like, rounded, sensitivity, transposed
-from pop_ref.conformance.charges import charge
+from pop_ref.conformance.error_bounds import pixel_error_bounds
 from pop_ref.conformance.golden import golden_scene
-from pop_ref.conformance.gradient_charges import gradient_charges
+from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scenes import cotangents
 from pop_ref.conformance.strategies import arrays_of, scenes, viewmats
 from pop_ref.constants import PAPER
@@ -109,9 +109,9 @@ def test_both_backward_families_give_the_same_gradients(scene):
     v_image, v_T_final = cotangents(scene)
     columns = MirrorAdapter(FOLDER, np.float64).gradients(scene, v_image, v_T_final)
     splats = MirrorAdapter(FOLDER, np.float64, per_splat=True).gradients(scene, v_image, v_T_final)
-    charges = gradient_charges(scene, charge(scene, np.float64), v_image, v_T_final)
+    error_bounds = gradient_error_bounds(scene, pixel_error_bounds(scene, np.float64), v_image, v_T_final)
     for name, value in columns.items():
-        unit = np.finfo(np.float64).eps * charges[name]
+        unit = np.finfo(np.float64).eps * error_bounds[name]
         assert np.all(np.abs(splats[name] - value) <= APART[name] * unit), name
 
 

@@ -176,7 +176,7 @@ def test_the_signature_is_the_cpus():
 
 
 def test_the_laws_of_antialiased_mode_judge_every_kind_of_the_cuda_backend():
-    from pop_ref.conformance.abilities import ANTIALIASING, PROFILES
+    from pop_ref.conformance.capabilities import ANTIALIASING, PROFILES
     from tests.cuda.gpu.conftest import cuda_backends
 
     backends = cuda_backends("cpu", "cuda")

@@ -17,7 +17,7 @@ from pop_fast.train import TrainConfig
 from pop_fast.train.views import render_view
 from pop_ref.constants import PROFILES
 from pop_ref.fisher import log_det_scores
-from pop_ref.types import Camera, Gaussians
+from pop_ref.records import Camera, Gaussians
 from tests.fast.pass_scenes import HEIGHT, WIDTH, raw_params, views
 
 BACKENDS = [

@@ -14,8 +14,8 @@ import numpy as np
 
 from pop_ref.density import POP
 from pop_ref.recipes import RECIPES, Recipe
+from pop_ref.records import Camera
 from pop_ref.training import start, train_step
-from pop_ref.types import Camera
 
 FILE = Path(__file__).with_suffix(".txt")
 SIZE = 16

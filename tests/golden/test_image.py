@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from pop_ref.conformance.adapter import oracle_view
+from pop_ref.conformance.assertions import assert_same_bits, assert_same_image, assert_same_transmittance
 from pop_ref.conformance.backends import SHIPPED, shipped
-from pop_ref.conformance.charges import charge
-from pop_ref.conformance.compare import assert_same_bits
+from pop_ref.conformance.error_bounds import pixel_error_bounds
 from pop_ref.conformance.golden import golden_scene
-from pop_ref.conformance.outcomes import assert_one_of_the_oracles_outcomes
-from pop_ref.conformance.verdicts import assert_same_image, assert_same_light
+from pop_ref.conformance.threshold_outcomes import assert_one_of_the_oracles_outcomes
 from tests.golden.image import written
 
 
@@ -27,13 +26,15 @@ def test_the_oracle_draws_what_is_written() -> None:
 def test_a_backend_draws_what_is_written(name: str) -> None:
     backend, golden = shipped(name), written()
     scene = backend.sees(golden_scene())
-    # the file holds the scene in float64; a float32 backend is told its rounding, which these charges pay for
-    charges = charge(golden_scene(), backend.dtype)
+    # the file holds the scene in float64; a float32 backend is told its rounding, which these error bounds pay for
+    error_bounds = pixel_error_bounds(golden_scene(), backend.dtype)
     view = backend.render(scene)
-    assert_same_image("agreement.image", backend, view.image, golden.image, charges, against_oracle=True)
-    assert_same_light("agreement.T_final", backend, view.T_final, golden.T_final, charges, against_oracle=True)
-    assert_same_bits("winner", view.dominant_ids[charges.decided], golden.dominant_ids[charges.decided])
-    assert_one_of_the_oracles_outcomes(backend, scene, charge(scene, backend.dtype))
+    assert_same_image("agreement.image", backend, view.image, golden.image, error_bounds, against_oracle=True)
+    assert_same_transmittance(
+        "agreement.T_final", backend, view.T_final, golden.T_final, error_bounds, against_oracle=True
+    )
+    assert_same_bits("winner", view.dominant_ids[error_bounds.decided], golden.dominant_ids[error_bounds.decided])
+    assert_one_of_the_oracles_outcomes(backend, scene, pixel_error_bounds(scene, backend.dtype))
 
 
 def test_the_golden_scene_has_every_kind_of_splat() -> None:

@@ -14,16 +14,16 @@ import pytest
 
 from pop_ref.compositing import composite, composite_vjp
 from pop_ref.conformance import Adapter, Scene
-from pop_ref.conformance.abilities import DERIVATIVES, EXTENTS, GRADIENTS, INRIAS, LOWER_CEILING, PROFILES, RENDER
 from pop_ref.conformance.adapter import under
 from pop_ref.conformance.backends import ELSEWHERE, Absent, Unavailable, made_by, shipped, shipped_or_absent
+from pop_ref.conformance.capabilities import DERIVATIVES, EXTENTS, GRADIENTS, INRIAS, LOWER_CEILING, PROFILES, RENDER
+from pop_ref.conformance.failure_report import failure_report
 from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.inria_adapter import inria
 from pop_ref.conformance.law import missing
 from pop_ref.conformance.mutants import MUTANTS, living
 from pop_ref.conformance.mutants.trial import every_law, obeys
 from pop_ref.conformance.scenes import scene_as_code
-from pop_ref.conformance.telling import tell
 from pop_ref.conformance.torch_adapter import TorchAdapter
 from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER
 from pop_ref.constants import PROFILES as ALL_PROFILES
@@ -38,7 +38,7 @@ GRADIENT = "test_agreement:gradients_are_the_oracles"
 CEILING = "test_thresholds:at_the_alpha_ceiling_nothing_jumps"
 SQUARE = "test_thresholds:the_square_extent_cuts_where_inrias_does"
 BACKGROUND = "test_compositing:the_background_enters_with_the_remaining_light"
-TELLING = (
+SHOWING = (
     *(IMAGE, GRADIENT, CEILING, SQUARE, BACKGROUND),
     "test_agreement:the_image_of_inrias_profile_is_the_oracles",
     "test_agreement:the_antialiased_image_is_one_of_the_oracles_outcomes",
@@ -52,7 +52,7 @@ TELLING = (
 def broken(backend: Any, *paths: str) -> list[str]:
     """Try laws that a backend has what they need for, and return those that break."""
     found = []
-    for path in paths or TELLING:
+    for path in paths or SHOWING:
         if not missing(backend, LAWS[path].needs):
             try:
                 breaks = obeys(LAWS[path], backend, FEW)
@@ -223,29 +223,29 @@ class ForgetsOpaqueSplats(Blending):
 
 def test_a_failure_is_told_by_elimination_where_stages_are_hidden() -> None:
     seen = golden_scene()
-    text = tell("test_some_law", ForgetsOpaqueSplats(), {"scene": seen})
+    text = failure_report("test_some_law", ForgetsOpaqueSplats(), {"scene": seen})
     assert (
         "first stage that differs: depths, means2d, conics are the oracle's, so it is alpha, order or blending" in text
     )
     assert re.search(r"first pixel that differs: T_final, pixel \(\d+, \d+\): oracle 0\.\d+, backend 0\.\d+", text)
     assert "first Gaussian: as soon as Gaussian 1 is added to those in front of it" in text
-    text = tell("test_some_law", ForgetsBackground(), {"scene": seen})
+    text = failure_report("test_some_law", ForgetsBackground(), {"scene": seen})
     assert "first Gaussian: as soon as there is no Gaussian: image, pixel (0, 0): oracle [0.125, 0.25, 0.5]" in text
 
 
 def test_the_scene_that_is_told_is_the_first_that_differs() -> None:
     other = golden_scene().rows([0])
-    text = tell("test_some_law", ForgetsOpaqueSplats(), {"one": other, "both": golden_scene()})
+    text = failure_report("test_some_law", ForgetsOpaqueSplats(), {"one": other, "both": golden_scene()})
     assert text.endswith(scene_as_code(golden_scene()))
-    text = tell("test_some_law", Blending(), {"one": other})
+    text = failure_report("test_some_law", Blending(), {"one": other})
     assert "stages, pixels and gradients of its scenes are the oracle's; the law breaks in what it compares" in text
-    assert "draws no scene" in tell("test_some_law", OneStage(), {})
+    assert "draws no scene" in failure_report("test_some_law", OneStage(), {})
 
 
 def test_a_wrong_gradient_of_a_right_image_is_told() -> None:
     by_name = {mutant.name: mutant for mutant in MUTANTS}
     with living(by_name["conic_off_diagonal_twice"]) as backend:
-        text = tell("test_some_law", backend, {"scene": golden_scene()})
+        text = failure_report("test_some_law", backend, {"scene": golden_scene()})
     assert "first pixel" not in text
     assert re.search(r"first gradient that differs: v_scales, Gaussian \d, entry \[\d\]: oracle \S+, backend \S+", text)
     assert "nearest decision: D" in text

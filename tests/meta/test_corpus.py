@@ -11,7 +11,7 @@ from pop_ref.conformance.corpus_answers import (
     MAPS,
     answer,
     answers,
-    charged_windows,
+    bounded_windows,
     picked_pixels,
     weighted_blocks,
     weighted_runs,
@@ -41,12 +41,12 @@ def test_the_images_and_two_windows_of_the_answers_are_the_oracles(name: str) ->
     drawn = OracleAdapter().full_render(scene)
     seen = np.concatenate([drawn.image, drawn.T_final[..., None]], axis=2)
     np.testing.assert_allclose(seen[picked_pixels(scene)], kept["pixels"], rtol=1e-10)
-    np.testing.assert_allclose(weighted_blocks(seen, kept["certain"]), kept["blocks"], rtol=1e-10)
-    assert np.array_equal(weighted_blocks(drawn.n_blended, kept["certain"]), kept["blended"])
+    np.testing.assert_allclose(weighted_blocks(seen, kept["unambiguous"]), kept["blocks"], rtol=1e-10)
+    assert np.array_equal(weighted_blocks(drawn.n_blended, kept["unambiguous"]), kept["blended"])
     assert np.array_equal(weighted_blocks(drawn.dominant_ids, kept["decided"]), kept["winners"])
-    for place, charges in charged_windows(scene, slice(1, 3)):
+    for place, error_bounds in bounded_windows(scene, slice(1, 3)):
         for key in MAPS:
-            assert np.array_equal(getattr(charges, key), kept[key][place])
+            assert np.array_equal(getattr(error_bounds, key), kept[key][place])
 
 
 def test_the_corpus_has_long_lists_many_tiles_many_entries_and_cut_tiles() -> None:
@@ -58,7 +58,7 @@ def test_the_corpus_has_long_lists_many_tiles_many_entries_and_cut_tiles() -> No
         blended.append(int(drawn.n_blended.max()))
         tiles.append(len(lengths))
         entries.append(sum(lengths))
-        assert answers(name)["certain"].mean() > 0.5
+        assert answers(name)["unambiguous"].mean() > 0.5
         assert 50 <= plan.n <= 5000
     for length in (8, 32, 256, 1024):
         assert max(longest) > length

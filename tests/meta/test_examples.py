@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pop_ref.conformance.examples import EXAMPLES
+from pop_ref.conformance.hypothesis_profiles import EXAMPLES
 
 ROOT = Path(__file__).resolve().parents[2]
 UNHEARD_OF = (0.1234567, -77123.25, 31.0625)
@@ -57,7 +57,7 @@ def test_exploring_draws_by_the_seed(tmp_path: Path) -> None:
     test = tmp_path / "test_drawn.py"
     test.write_text(
         "from hypothesis import given, strategies as st\n"
-        "from pop_ref.conformance.examples import load_profile\n"
+        "from pop_ref.conformance.hypothesis_profiles import load_profile\n"
         "load_profile('explore')\n"
         "@given(st.integers(0, 10**9))\n"
         "def test_it(n):\n"

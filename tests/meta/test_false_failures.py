@@ -11,14 +11,14 @@ import pytest
 import torch
 
 from pop_fast.rasterization import rasterization as fast
-from pop_ref.conformance.abilities import DETERMINISTIC, DOMINANCE, DOMINANT_WEIGHTS, GRADIENTS, HOMOGENEOUS, RENDER
 from pop_ref.conformance.adapter import Adapter, OracleAdapter, View, stage_function
+from pop_ref.conformance.capabilities import DETERMINISTIC, DOMINANCE, DOMINANT_WEIGHTS, GRADIENTS, HOMOGENEOUS, RENDER
+from pop_ref.conformance.failure_report import failure_report
 from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.law import missing
 from pop_ref.conformance.laws.test_whole import test_an_empty_scene_is_the_background as empty_scene_law
 from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
 from pop_ref.conformance.scenes import Scene
-from pop_ref.conformance.telling import tell
 from pop_ref.conformance.torch_adapter import TorchAdapter
 from pop_ref.conformance.views import ASKED
 from pop_ref.constants import GSPLAT_1_5, INRIA, Profile
@@ -161,7 +161,7 @@ def test_an_empty_scene_has_a_report() -> None:
     assert "no report" not in report
     assert "first pixel that differs: image, pixel (0, 0)" in report
     no_gaussians = golden_scene().rows([])
-    assert "no report" not in tell("test_some_law", OracleAdapter(), {"scene": no_gaussians})
+    assert "no report" not in failure_report("test_some_law", OracleAdapter(), {"scene": no_gaussians})
 
 
 class WrongGradients(OracleAdapter):
@@ -174,9 +174,11 @@ class WrongGradients(OracleAdapter):
 
 def test_a_law_that_asked_for_no_gradient_is_not_explained_by_one() -> None:
     backend = WrongGradients()
-    assert "first gradient that differs: v_background" in tell("test_some_law", backend, {"scene": golden_scene()})
+    assert "first gradient that differs: v_background" in failure_report(
+        "test_some_law", backend, {"scene": golden_scene()}
+    )
     backend.asked_for_gradients = False  # type: ignore[attr-defined]
-    report = tell("test_some_law", backend, {"scene": golden_scene()})
+    report = failure_report("test_some_law", backend, {"scene": golden_scene()})
     assert "gradient" not in report
     assert "the law breaks in what it compares" in report
 

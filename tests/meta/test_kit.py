@@ -12,8 +12,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.backends import Absent, shipped_or_absent
-from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.failure_report import failure_report
 from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.mutants import MUTANTS, living
 from pop_ref.conformance.mutants.trial import law_named
@@ -22,10 +23,9 @@ from pop_ref.conformance.scene_files import load_scene, save_scene
 from pop_ref.conformance.scenes import Scene, cotangents, rounded_to, scene_as_code
 from pop_ref.conformance.scorecard import Entry, Scorecard
 from pop_ref.conformance.strategies import FLOOR, scenes
-from pop_ref.conformance.telling import tell
 from pop_ref.conformance.tolerances import TABLE
 from pop_ref.constants import INRIA
-from pop_ref.types import Camera, Gaussians
+from pop_ref.records import Camera, Gaussians
 
 ROOT = Path(__file__).resolve().parents[2]
 SEEN = settings(max_examples=200, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
@@ -127,7 +127,7 @@ def test_no_tolerance_is_far_above_the_worst_case_that_was_measured(key: str) ->
 def test_a_failing_law_tells_stage_gaussian_pixel_decision_and_scene() -> None:
     by_name = {mutant.name: mutant for mutant in MUTANTS}
     with living(by_name["jacobian_sign"]) as backend:
-        text = tell("test_some_law", backend, {"scene": golden_scene()})
+        text = failure_report("test_some_law", backend, {"scene": golden_scene()})
     assert "law some_law fails on jacobian_sign" in text
     assert "first stage that differs: projection_jacobians, Gaussian" in text
     assert "first pixel that differs: " in text

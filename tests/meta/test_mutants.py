@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from pop_ref.conformance.abilities import STAGES
 from pop_ref.conformance.backends import shipped
+from pop_ref.conformance.capabilities import STAGES
 from pop_ref.conformance.catalogue import FILE, catalogue
 from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM, BlackBox
 from pop_ref.conformance.mutants.__main__ import main

@@ -1,4 +1,4 @@
-"""README.md says what is true: its tables, names, paths and commands."""
+"""README.md and the pages of docs/ say what is true: their tables, names, paths and commands."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from types import ModuleType
 import pytest
 
 from pop_fast.cli import COMMANDS
-from pop_ref.conformance.abilities import STAGES as LAW_STAGES
 from pop_ref.conformance.backends import ELSEWHERE, SHIPPED
+from pop_ref.conformance.capabilities import STAGES as LAW_STAGES
 from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.conformance.plugin import pytest_addoption
 from pop_ref.constants import PROFILES
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
 
 # functions whose fast twin cannot have the oracle's parameters, and why
 OTHER_PARAMETERS = {
@@ -54,13 +56,34 @@ BOTH_ROOMS = [
 ]
 
 
-def test_tables_are_what_sources_and_runs_say() -> None:
-    assert tables.with_tables(README) == README, "run 'python docs/tables.py --write'"
+@pytest.mark.parametrize("page", tables.PAGES, ids=lambda page: page.name)
+def test_tables_are_what_sources_and_runs_say(page: Path) -> None:
+    assert tables.with_tables(page) == page.read_text(encoding="utf-8"), "run 'python docs/tables.py --write'"
+
+
+def test_every_table_stands_on_one_page() -> None:
+    named = [name for page in tables.PAGES for name in tables.names_of(page.read_text(encoding="utf-8"))]
+    assert sorted(named) == sorted(tables.TABLES)
+
+
+def test_the_readme_is_short_and_leads_to_every_page() -> None:
+    assert len(README.splitlines()) < 90
+    assert all(f"(docs/{page.name})" in README for page in PAGES[1:])
+
+
+@pytest.mark.parametrize("text", ["<!-- nothing:begin -->\n<!-- nothing:end -->\n", "<!-- kit:begin -->\n"])
+def test_marks_of_no_table_are_refused(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(text, encoding="utf-8")
+    monkeypatch.setattr(tables, "ROOT", tmp_path)
+    with pytest.raises(ValueError, match="needs"):
+        tables.with_tables(page)
 
 
 def test_the_results_script_agrees_with_the_readme() -> None:
     script = ROOT / "benchmarks" / "results_table.py"
-    done = subprocess.run([sys.executable, script, "--check", ROOT / "README.md"], capture_output=True, text=True)
+    pages = [ROOT / "README.md", ROOT / "docs" / "results.md"]
+    done = subprocess.run([sys.executable, script, "--check", *pages], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -93,15 +116,24 @@ def test_documented_differences_are_still_there() -> None:
     assert set(OTHER_PARAMETERS) <= {name for name, _, _ in BOTH_ROOMS}
 
 
-@pytest.mark.parametrize("target", sorted(set(re.findall(r"\]\(([^)#]+)\)", README))))
-def test_every_link_leads_somewhere(target: str) -> None:
+LINKS = sorted(
+    {
+        (page, target)
+        for page in PAGES
+        for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
+    }
+)
+
+
+@pytest.mark.parametrize(("page", "target"), LINKS, ids=lambda value: getattr(value, "name", value))
+def test_every_link_leads_somewhere(page: Path, target: str) -> None:
     assert "://" not in target
-    assert (ROOT / target).exists()
+    assert (page.parent / target).exists()
 
 
 def shell_lines() -> list[str]:
-    """Give the commands of README's shell blocks, without comments."""
-    blocks = re.findall(r"```sh\n(.*?)```", README, flags=re.DOTALL)
+    """Give the commands of the pages' shell blocks, without comments."""
+    blocks = re.findall(r"```sh\n(.*?)```", TEXT, flags=re.DOTALL)
     return [line.partition("  #")[0].strip() for block in blocks for line in block.splitlines() if line.strip()]
 
 
@@ -166,7 +198,7 @@ def test_every_make_target_of_the_readme_exists(line: str) -> None:
 
 
 def test_names_in_python_blocks_resolve() -> None:
-    blocks = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    blocks = re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL)
     imports = [node for block in blocks for node in ast.parse(block).body if isinstance(node, ast.ImportFrom)]
     assert imports
     for node in imports:
@@ -176,6 +208,6 @@ def test_names_in_python_blocks_resolve() -> None:
 
 
 def test_the_pictures_are_small_and_made_of_our_own_scene() -> None:
-    pictures = re.findall(r"!\[[^]]*\]\(([^)]+)\)", README)
-    assert pictures == ["docs/demo.png", "paper_repro/results/toy/figures/figure_7.svg"]
-    assert all((ROOT / picture).stat().st_size < 300_000 for picture in pictures)
+    pictures = re.findall(r"!\[[^]]*\]\(([^)]+)\)", TEXT)
+    assert set(pictures) == {"docs/demo.png", "../paper_repro/results/toy/figures/figure_7.svg"}
+    assert all((ROOT / picture.removeprefix("../")).stat().st_size < 300_000 for picture in pictures)

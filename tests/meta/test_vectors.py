@@ -86,7 +86,7 @@ def test_every_rule_names_arrays_that_are_there(folder: Path) -> None:
             assert arrays[rule["where"]]["role"] == "mask"
             assert entry["shape"].startswith(arrays[rule["where"]]["shape"].rstrip("]"))
         if rule.get("rule") == "close":
-            assert arrays[rule["charge"]]["shape"] == entry["shape"]
+            assert arrays[rule["error_bound"]]["shape"] == entry["shape"]
             assert set(rule["limit"]) == {"float32", "float64"}
         elif rule:
             assert entry["dtype"] == "int64"

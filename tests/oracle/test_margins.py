@@ -82,9 +82,9 @@ def test_d3_is_near_for_an_extent_that_ends_at_a_tile_s_edge() -> None:
 def test_d4_is_near_for_depths_that_almost_tie() -> None:
     means = [[0.1, 0.0, 4.1], [0.0, 0.1, 4.1 + TINY], [0.0, 0.0, 8.3]]
     got = margins(grey([0.5, 0.5, 0.5], means=means), tilted_camera())
-    near = [doubt for doubt in got.near if doubt.decision == "D4"]
+    near = [close for close in got.near if close.decision == "D4"]
     assert got.gaussians["D4"][2] > 1e-3
-    assert len({frozenset(doubt.where) for doubt in near}) <= 1
+    assert len({frozenset(close.where) for close in near}) <= 1
 
 
 def test_d4_is_infinite_for_coincident_copies_and_for_exact_ties() -> None:
@@ -108,7 +108,7 @@ def test_d5_is_near_where_alpha_is_next_to_the_floor() -> None:
     got = margins(grey([opacity]), dyadic_camera(3, 3))
     assert got.pixels["D5"][1, 0] < 1e-7
     assert got.pixels["D5"][1, 1] > 1e-3
-    aimed = [doubt.where for doubt in got.doubts(1e-7) if doubt.decision == "D5"]
+    aimed = [close.where for close in got.near_threshold(1e-7) if close.decision == "D5"]
     assert aimed == [(1, 0, 0), (0, 1, 0), (2, 1, 0), (1, 2, 0)] or sorted(aimed) == [
         (0, 1, 0),
         (1, 0, 0),
@@ -128,7 +128,7 @@ def test_d7_is_near_where_the_next_transmittance_is_the_stop() -> None:
     # 1e-3 is left behind the first, a tenth of it behind the second
     got = margins(grey([1.0, 0.9]), dyadic_camera(1, 1))
     assert got.pixels["D7"][0, 0] < 1e-7
-    assert [d.where for d in got.doubts(1e-7)] == [(0, 0, 1)]
+    assert [d.where for d in got.near_threshold(1e-7)] == [(0, 0, 1)]
     assert margins(grey([1.0, 0.8]), dyadic_camera(1, 1)).pixels["D7"][0, 0] > 1e-4
 
 
@@ -144,7 +144,7 @@ def test_d8_is_near_where_two_weights_almost_tie() -> None:
     # 1/3 in front, then half of the 2/3 that are left
     got = margins(grey([1.0 / 3.0 + TINY, 0.5]), dyadic_camera(1, 1))
     assert got.pixels["D8"][0, 0] < 1e-7
-    assert [(d.decision, d.where) for d in got.doubts(1e-7)] == [("D8", (0, 0, 0, 1))]
+    assert [(d.decision, d.where) for d in got.near_threshold(1e-7)] == [("D8", (0, 0, 0, 1))]
     assert math.isinf(margins(grey([0.5]), dyadic_camera(1, 1)).pixels["D8"][0, 0])
 
 
@@ -158,7 +158,7 @@ def test_b1_and_b2_are_near_at_their_kinks() -> None:
     assert margins(gaussians, view).gaussians["B2"][0] > 1e-2
 
 
-def test_an_empty_scene_has_no_doubts() -> None:
+def test_an_empty_scene_has_nothing_near_a_threshold() -> None:
     got = margins(Gaussians([], [], [], [], []), camera())
     assert got.nearest is None
     assert np.all(got.safe_pixels(1.0))

@@ -7,7 +7,7 @@ from dataclasses import fields
 import pytest
 
 from pop_ref.notation import AXES, SYMBOLS, symbol_named
-from pop_ref.types import Camera, Gaussians, Render, Splats
+from pop_ref.records import Camera, Gaussians, Render, Splats
 
 # containers, not symbols
 _CONTAINERS = {"splats"}

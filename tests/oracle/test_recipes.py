@@ -19,9 +19,9 @@ from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER, Profile
 from pop_ref.optimizer import adam_step, learning_rates, sh_degree_at
 from pop_ref.polarization import pop_loss, pop_loss_vjp
 from pop_ref.recipes import L1_DIVIDED, RECIPES, Recipe
+from pop_ref.records import Render
 from pop_ref.render import render, render_vjp
 from pop_ref.training import Training, gaussians_from_params, params_vjp, start, train_step
-from pop_ref.types import Render
 from tests.golden import ten_losses
 
 CAMERA, PHOTO = ten_losses.cameras()[0], ten_losses.photographs()[0]

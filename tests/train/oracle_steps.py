@@ -4,7 +4,7 @@ Before each step the run's parameters, moments and statistics are taken as the o
 step; losses, parameters, moments, statistics and events are compared. A trajectory is so judged at every place that it
 comes to, though float32 and float64 would go apart at the first decision that rounding turns.
 
-A tolerance is eps times a magnitude. The kit's running error analysis (`conformance.gradient_charges`) bounds what
+A tolerance is eps times a magnitude. The kit's running error analysis (`conformance.gradient_error_bounds`) bounds what
 rounding costs in each gradient; of that bound, which adds the worst of every operation, engines need a small share
 (`SHARE`). Adam's update is then bounded over all moments and denominators that the gradient's error allows: a row whose
 gradient is nothing but rounding may move either way, others may not.
@@ -24,8 +24,8 @@ from pop_fast.strategies.densify import standard_normals
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.presets import values_of
 from pop_ref.activations import opacities_from_logits
-from pop_ref.conformance.charges import REACH, charge
-from pop_ref.conformance.gradient_charges import gradient_charges
+from pop_ref.conformance.error_bounds import REACH, pixel_error_bounds
+from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scenes import Scene
 from pop_ref.density import (
     Rows,
@@ -38,10 +38,10 @@ from pop_ref.density import (
 )
 from pop_ref.margins import margins
 from pop_ref.optimizer import learning_rates, sh_degree_at
+from pop_ref.records import Camera
 from pop_ref.render import render, render_vjp
 from pop_ref.settings import BETAS, EPS, DensityConfig, PopTerm, Recipe, UpdateRules
 from pop_ref.training import Training, control, gaussians_from_params, objective, params_vjp, train_step
-from pop_ref.types import Camera
 
 KEYS = ("means", "scales", "quats", "opacities", "sh0", "shN")
 # of the bound on a gradient's error, what is allowed; the worst of all steps and engines took a fifth of it
@@ -184,8 +184,8 @@ class Bounds:
         found = render_vjp(gaussians, camera, v_image, sh_degree=degree, profile=recipe.profile)
         grads = params_vjp(params, found, v_opacities)
         scene = Scene(gaussians, camera, profile=recipe.profile, sh_degree=degree)
-        charges = charge(scene, np.float32 if eps > 1e-10 else np.float64)
-        units = gradient_charges(scene, charges, np.abs(v_image), np.zeros(v_image.shape[:2]))
+        bounds = pixel_error_bounds(scene, np.float32 if eps > 1e-10 else np.float64)
+        units = gradient_error_bounds(scene, bounds, np.abs(v_image), np.zeros(v_image.shape[:2]))
         o = gaussians.opacities
         # 1 - o loses digits where o is near 1
         logit = (1.0 - o) * (units["opacities"] + np.abs(v_opacities)) + np.abs(found.opacities + v_opacities)
@@ -227,7 +227,7 @@ class Bounds:
     def doubtful(self) -> bool:
         """Tell whether a decision of the render, or a kink of its gradient, was within reach of rounding."""
         seen = margins(self.scene.gaussians, self.scene.camera, self.scene.sh_degree, self.scene.profile)
-        return bool(seen.doubts(CLOSE * self.eps))
+        return bool(seen.near_threshold(CLOSE * self.eps))
 
 
 def reasons(moved: Training, scene_scale: float, density: DensityConfig) -> set[str]:

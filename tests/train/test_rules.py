@@ -15,9 +15,9 @@ from pop_fast.strategies.base import Draws
 from pop_fast.train import TrainingRun
 from pop_fast.train.engines import torch_engine
 from pop_ref.optimizer import is_updated
+from pop_ref.records import Camera
 from pop_ref.settings import Recipe, UpdateRules
 from pop_ref.training import train_step
-from pop_ref.types import Camera
 from tests.train.oracle_steps import KEYS, config_of, state_of
 from tests.train.scene import SHORT, capture
 

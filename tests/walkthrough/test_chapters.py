@@ -19,7 +19,7 @@ from pop_ref.walkthrough.layout import chapter_page, index_page
 from pop_ref.walkthrough.pages import Outcome, run_chapter
 
 CHAPTERS = chapter_files()
-README = Path(__file__).resolve().parents[2] / "README.md"
+LEARN = Path(__file__).resolve().parents[2] / "docs" / "learn.md"
 VOID = {"meta", "br", "img", "hr", "link", "input"}
 
 
@@ -102,9 +102,9 @@ def test_numbers_follow_each_other_and_the_contents_names_them_all() -> None:
     assert _read(page).links == [chapter.page for chapter in chapters]
 
 
-def test_the_readme_lists_the_chapters_by_title() -> None:
-    text = README.read_text(encoding="utf-8")
-    listed = re.findall(r"^(\d+)\. \[(.+)\]\(pop_ref/walkthrough/(chapter_\w+\.py)\)$", text, re.MULTILINE)
+def test_the_page_on_learning_lists_the_chapters_by_title() -> None:
+    text = LEARN.read_text(encoding="utf-8")
+    listed = re.findall(r"^(\d+)\. \[(.+)\]\(\.\./pop_ref/walkthrough/(chapter_\w+\.py)\)$", text, re.MULTILINE)
     chapters = [read_chapter(path) for path in CHAPTERS]
     assert listed == [(str(each.number), each.title, each.path.name) for each in chapters]
 

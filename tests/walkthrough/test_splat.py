@@ -15,9 +15,9 @@ from pop_ref.density import DensityConfig, Rows, densify_and_prune, zero_statist
 from pop_ref.learn import splat
 from pop_ref.optimizer import adam_step
 from pop_ref.polarization import pop_loss_vjp
+from pop_ref.records import Camera
 from pop_ref.render import render, render_vjp
 from pop_ref.training import gaussians_from_params, params_vjp
-from pop_ref.types import Camera
 
 SIZE = 24
 

@@ -8,7 +8,15 @@ import numpy as np
 from hypothesis import assume
 from hypothesis import strategies as st
 
-from pop_ref.conformance.abilities import (
+from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.assertions import (
+    assert_close,
+    assert_same_bits,
+    assert_same_image,
+    assert_same_transmittance,
+    with_error_bounds,
+)
+from pop_ref.conformance.capabilities import (
     ANTIALIASING,
     DOMINANCE,
     DOMINANT_WEIGHTS,
@@ -18,16 +26,13 @@ from pop_ref.conformance.abilities import (
     LOWER_CEILING,
     RENDER,
 )
-from pop_ref.conformance.adapter import OracleAdapter
-from pop_ref.conformance.cases import CASES, charges_of, cotangent_like, rounded, tangential, transposed
-from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.cases import CASES, cotangent_like, error_bounds_of, rounded, tangential, transposed
 from pop_ref.conformance.corners import corners
-from pop_ref.conformance.gradient_charges import gradient_charges
+from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.law import law
-from pop_ref.conformance.outcomes import assert_one_of_the_oracles_outcomes
 from pop_ref.conformance.scenes import cotangents
 from pop_ref.conformance.strategies import plain_sizes, scenes, wide_scene
-from pop_ref.conformance.verdicts import assert_same_image, assert_same_light, charged
+from pop_ref.conformance.threshold_outcomes import assert_one_of_the_oracles_outcomes
 from pop_ref.constants import GSPLAT_1_6, INRIA, Profile
 
 ORACLE = OracleAdapter()
@@ -43,7 +48,7 @@ def _agreement(case):
         function = ORACLE.stage(case.name)
         expected = _values(function(*inputs))
         found = _values(backend.stage(case.name)(*inputs))
-        for a, e, c in zip(found, expected, charges_of(case, function, inputs), strict=True):
+        for a, e, c in zip(found, expected, error_bounds_of(case, function, inputs), strict=True):
             assert_close(f"agreement.{case.name}", a, e, c, backend.dtype, against_oracle=True)
 
     sentence.__name__ = f"test_{case.name}_is_the_oracles"
@@ -61,7 +66,7 @@ def _transpose_agreement(case):
             return transposed(case, ORACLE.stage(name), args, v)
 
         found = transposed(case, backend.stage(name), inputs, v)
-        for a, e, c in zip(found, oracle(*inputs), charges_of(case, oracle, inputs), strict=True):
+        for a, e, c in zip(found, oracle(*inputs), error_bounds_of(case, oracle, inputs), strict=True):
             assert_close(f"agreement.{name}", a, e, c, backend.dtype, against_oracle=True)
 
     sentence.__name__ = f"test_{name}_is_the_oracles"
@@ -126,8 +131,8 @@ del _case, _make, _test
 
 @law("compositing", RENDER, first=corners(3), scene=scenes(max_degree=3))
 def test_the_image_is_one_of_the_oracles_outcomes(backend, scene):
-    seen, charges = charged(backend, scene)
-    assert_one_of_the_oracles_outcomes(backend, seen, charges)
+    seen, error_bounds = with_error_bounds(backend, scene)
+    assert_one_of_the_oracles_outcomes(backend, seen, error_bounds)
 
 
 @law(
@@ -137,22 +142,24 @@ def test_the_image_is_one_of_the_oracles_outcomes(backend, scene):
     scene=st.one_of(scenes(max_degree=3), st.integers(0, 2**16).map(wide_scene)),
 )
 def test_the_image_that_training_draws_is_one_of_the_oracles_outcomes(backend, scene):
-    seen, charges = charged(backend, scene)
-    assert_one_of_the_oracles_outcomes(backend, seen, charges, backend.plainly(seen))
+    seen, error_bounds = with_error_bounds(backend, scene)
+    assert_one_of_the_oracles_outcomes(backend, seen, error_bounds, backend.plainly(seen))
 
 
 @law("compositing", RENDER, LOWER_CEILING, first=corners(3, profile=GSPLAT_1_6), scene=scenes(profile=GSPLAT_1_6))
 def test_the_image_under_the_lower_ceiling_is_one_of_the_oracles_outcomes(backend, scene):
-    seen, charges = charged(backend, scene)
-    assert_one_of_the_oracles_outcomes(backend, seen, charges)
+    seen, error_bounds = with_error_bounds(backend, scene)
+    assert_one_of_the_oracles_outcomes(backend, seen, error_bounds)
 
 
 @law("compositing", RENDER, INRIAS, scene=scenes(profile=INRIA, size=plain_sizes(), max_side=16))
 def test_the_image_of_inrias_profile_is_the_oracles(backend, scene):
-    seen, charges = charged(backend, scene)
+    seen, error_bounds = with_error_bounds(backend, scene)
     expected, view = ORACLE.render(seen), backend.render(seen)
-    assert_same_image("agreement.image", backend, view.image, expected.image, charges, against_oracle=True)
-    assert_same_light("agreement.T_final", backend, view.T_final, expected.T_final, charges, against_oracle=True)
+    assert_same_image("agreement.image", backend, view.image, expected.image, error_bounds, against_oracle=True)
+    assert_same_transmittance(
+        "agreement.T_final", backend, view.T_final, expected.T_final, error_bounds, against_oracle=True
+    )
 
 
 @law(
@@ -163,24 +170,24 @@ def test_the_image_of_inrias_profile_is_the_oracles(backend, scene):
     scene=scenes(max_gaussians=4, anchored=True, size=plain_sizes()).map(lambda s: s.but(antialiased=True)),
 )
 def test_the_antialiased_image_is_one_of_the_oracles_outcomes(backend, scene):
-    seen, charges = charged(backend, scene)
-    assert_one_of_the_oracles_outcomes(backend, seen, charges)
+    seen, error_bounds = with_error_bounds(backend, scene)
+    assert_one_of_the_oracles_outcomes(backend, seen, error_bounds)
 
 
 @law("dominance", RENDER, DOMINANCE, first=corners(), scene=scenes(anchored=True))
 def test_dominant_ids_are_the_oracles(backend, scene):
-    seen, charges = charged(backend, scene)
+    seen, error_bounds = with_error_bounds(backend, scene)
     expected, view = ORACLE.render(seen), backend.render(seen)
-    sure = charges.decided
+    sure = error_bounds.decided
     assert_same_bits("winner", view.dominant_ids[sure], expected.dominant_ids[sure])
 
 
 @law("dominance", RENDER, DOMINANCE, DOMINANT_WEIGHTS, scene=scenes(anchored=True))
 def test_dominant_weights_are_the_oracles(backend, scene):
-    seen, charges = charged(backend, scene)
+    seen, error_bounds = with_error_bounds(backend, scene)
     expected, view = ORACLE.render(seen), backend.render(seen)
-    magnitude = charges.dominant_weight + 1.0
-    at = charges.certain
+    magnitude = error_bounds.dominant_weight + 1.0
+    at = error_bounds.unambiguous
     weights = (view.dominant_weights[at], expected.dominant_weights[at])
     assert_close("agreement.weight", *weights, magnitude[at], backend.dtype, against_oracle=True)
 
@@ -213,15 +220,15 @@ def test_antialiased_gradients_are_the_oracles(backend, scene):
 
 
 def _gradients_agree(backend, scene):
-    """Compare every gradient where decisions are certain: doubtful pixels get no cotangent."""
-    seen, charges = charged(backend, scene)
-    sure = charges.smooth
+    """Compare every gradient where decisions are unambiguous: other pixels get no cotangent."""
+    seen, error_bounds = with_error_bounds(backend, scene)
+    sure = error_bounds.smooth
     v_image, v_T_final = cotangents(seen)
     v_image, v_T_final = v_image * sure[..., None], v_T_final * sure
     expected = ORACLE.gradients(seen, v_image, v_T_final)
     found = backend.gradients(seen, v_image, v_T_final)
-    bounds = gradient_charges(seen, charges, v_image, v_T_final)
-    rows = ~charges.screen.kinked
+    bounds = gradient_error_bounds(seen, error_bounds, v_image, v_T_final)
+    rows = ~error_bounds.screen.kinked
     for name, value in found.items():
         pick = rows if len(rows) == len(value) and name not in ("background", "viewmat") else slice(None)
         if name == "viewmat" and not np.all(rows):

@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import assume
 from hypothesis import strategies as st
 
-from pop_ref.conformance.abilities import DOUBLE
-from pop_ref.conformance.compare import assert_close
+from pop_ref.conformance.assertions import assert_close
+from pop_ref.conformance.capabilities import DOUBLE
 from pop_ref.conformance.law import law
 from pop_ref.conformance.strategies import dyadic, opacities, reals
 from pop_ref.constants import PROFILES

@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 
 from pop_ref.chord import dominant_points
 from pop_ref.compositing import composite
-from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
 from pop_ref.conformance.scenes import Scene
-from pop_ref.conformance.score_charges import screened
+from pop_ref.conformance.score_error_bounds import screened
 from pop_ref.conformance.strategies import arrays_of, plain_sizes, quats, scenes
-from pop_ref.types import Camera, Gaussians
+from pop_ref.records import Camera, Gaussians
 
 vectors = arrays_of((3,), -4.0, 4.0)
 rays = vectors.map(lambda d: d if np.any(d) else np.array([0.0, 0.0, 1.0]))
@@ -60,7 +60,7 @@ def test_dominant_points_are_the_oracles(backend, scene):
     # what is ahead of the camera everywhere on its ellipsoid is ahead on every ray
     reach = np.linalg.norm(g.means + camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3], axis=1)
     ahead = bool(np.all(reach[given.splats.visible] > 4.0 * np.max(g.scales[given.splats.visible], initial=0.0)))
-    sure = given.charges.decided & ahead
+    sure = given.error_bounds.decided & ahead
     assert_same_bits("ids", found.ids[sure], expected.ids[sure])
     same = sure & (expected.ids >= 0)
     ids = expected.ids[same]
@@ -69,9 +69,9 @@ def test_dominant_points_are_the_oracles(backend, scene):
     size = (np.abs(expected.points[same]).max(axis=1) + reach[ids] + 2.0 * center) * spread
     ends = found.points[same], expected.points[same]
     assert_close("agreement.points", *ends, size[:, None], backend.dtype, against_oracle=True)
-    light = found.T_final[given.charges.certain], expected.T_final[given.charges.certain]
-    magnitude = (given.charges.T_final + 1.0)[given.charges.certain]
-    assert_close("agreement.points.T_final", *light, magnitude, backend.dtype, against_oracle=True)
+    transmittance = found.T_final[given.error_bounds.unambiguous], expected.T_final[given.error_bounds.unambiguous]
+    magnitude = (given.error_bounds.T_final + 1.0)[given.error_bounds.unambiguous]
+    assert_close("agreement.points.T_final", *transmittance, magnitude, backend.dtype, against_oracle=True)
 
 
 @law("chord", "dominant_points", scene=scenes(anchored=True))
@@ -122,7 +122,7 @@ def test_only_what_is_blended_at_a_pixel_gives_its_point(backend, scene):
     given = screened(backend, scene)
     found, _ = _drawn(backend, given)
     drawn = composite(*given.view, profile=given.scene.profile)
-    sure = given.charges.certain
+    sure = given.error_bounds.unambiguous
     assert np.all(found.ids[sure & (drawn.n_blended == 0)] == -1)
     assert np.all(given.splats.visible[found.ids[found.ids >= 0]])
     flat = np.any(given.scene.gaussians.scales == 0.0, axis=1)

@@ -8,8 +8,15 @@ import numpy as np
 from hypothesis import assume
 from hypothesis import strategies as st
 
-from pop_ref.conformance.abilities import PRINCIPAL_POINT, RENDER
-from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.assertions import (
+    assert_close,
+    assert_same_bits,
+    assert_same_image,
+    assert_same_transmittance,
+    assert_seen,
+    with_error_bounds,
+)
+from pop_ref.conformance.capabilities import PRINCIPAL_POINT, RENDER
 from pop_ref.conformance.corners import corners
 from pop_ref.conformance.law import law
 from pop_ref.conformance.scenes import SH_C0, Record, Scene, pack
@@ -22,9 +29,8 @@ from pop_ref.conformance.strategies import (
     plain_sizes,
     scenes,
 )
-from pop_ref.conformance.verdicts import assert_same_image, assert_same_light, assert_seen, charged
 from pop_ref.constants import PROFILES as ALL_PROFILES
-from pop_ref.types import Camera
+from pop_ref.records import Camera
 
 plain = scenes(anchored=True, size=plain_sizes())
 COLOURS = {name: np.arange(21.0).reshape(7, 3)[::step] / 16.0 for name, step in (("one", 1), ("other", -1))}
@@ -44,11 +50,11 @@ def camera_depths(scene):
 @law("compositing", RENDER, first=corners(), scene=plain)
 def test_weights_and_remaining_light_sum_to_one(backend, scene):
     white = colored(scene, np.ones((len(scene.gaussians), 3))).but(background=np.zeros(3))
-    seen, charges = charged(backend, white)
+    seen, error_bounds = with_error_bounds(backend, white)
     view = backend.render(seen)
     assert_seen(view)
     total = view.image + view.T_final[..., None]
-    magnitude = charges.image + charges.T_final[..., None] + 1.0
+    magnitude = error_bounds.image + error_bounds.T_final[..., None] + 1.0
     # whatever was decided, the identity holds at every pixel
     assert_close("compositing.sum", total, np.ones_like(total), magnitude, backend.dtype)
 
@@ -63,16 +69,16 @@ def test_remaining_light_lies_between_the_stop_and_one(backend, scene):
 
 @law("compositing", RENDER, first=corners(), scene=plain)
 def test_light_never_rises_when_a_splat_is_added_behind(backend, scene):
-    seen, charges = charged(backend, scene)
+    seen, error_bounds = with_error_bounds(backend, scene)
     rearmost = int(np.lexsort((np.arange(len(scene.gaussians)), camera_depths(seen)))[-1])
     without = backend.render(seen.rows(np.arange(len(scene.gaussians)) != rearmost)).T_final
-    allowed = 64.0 * np.finfo(backend.dtype).eps * (charges.T_final + 1.0)
-    assert np.all((backend.render(seen).T_final <= without + allowed)[charges.certain])
+    allowed = 64.0 * np.finfo(backend.dtype).eps * (error_bounds.T_final + 1.0)
+    assert np.all((backend.render(seen).T_final <= without + allowed)[error_bounds.unambiguous])
 
 
 @law("compositing", RENDER, scene=faint, cut=st.integers(1, 5))
 def test_a_list_composites_as_its_front_over_its_back(backend, scene, cut):
-    seen, charges = charged(backend, scene)
+    seen, error_bounds = with_error_bounds(backend, scene)
     order = np.lexsort((np.arange(len(seen.gaussians)), camera_depths(seen)))
     front, back = np.sort(order[:cut]), np.sort(order[cut:])
     over = backend.render(seen.rows(front).but(background=np.zeros(3)))
@@ -80,8 +86,8 @@ def test_a_list_composites_as_its_front_over_its_back(backend, scene, cut):
     expected = over.image + over.T_final[..., None] * under.image
     whole = backend.render(seen)
     assert_seen(whole)
-    assert_same_image("compositing.split", backend, whole.image, expected, charges)
-    assert_same_light("compositing.split", backend, whole.T_final, over.T_final * under.T_final, charges)
+    assert_same_image("compositing.split", backend, whole.image, expected, error_bounds)
+    assert_same_transmittance("compositing.split", backend, whole.T_final, over.T_final * under.T_final, error_bounds)
 
 
 @law(
@@ -95,10 +101,10 @@ def test_a_list_composites_as_its_front_over_its_back(backend, scene, cut):
 def test_the_image_is_linear_in_the_colours(backend, scene, one, other):
     n = len(scene.gaussians)
     dark = scene.but(background=np.zeros(3))
-    both, charges = charged(backend, colored(dark, one[:n] + other[:n]))
+    both, error_bounds = with_error_bounds(backend, colored(dark, one[:n] + other[:n]))
     parts = [backend.render(backend.sees(colored(dark, c[:n]))).image for c in (one, other)]
-    charges.absolute += 1.0  # a colour is written as an SH coefficient, offset by one half
-    assert_same_image("compositing.linear", backend, backend.render(both).image, parts[0] + parts[1], charges)
+    error_bounds.absolute += 1.0  # a colour is written as an SH coefficient, offset by one half
+    assert_same_image("compositing.linear", backend, backend.render(both).image, parts[0] + parts[1], error_bounds)
 
 
 @law(
@@ -109,12 +115,12 @@ def test_the_image_is_linear_in_the_colours(backend, scene, one, other):
     background=arrays_of((3,), 0.0, 2.0),
 )
 def test_the_background_enters_with_the_remaining_light(backend, scene, background):
-    seen, charges = charged(backend, scene.but(background=background))
+    seen, error_bounds = with_error_bounds(backend, scene.but(background=background))
     over_black = backend.render(seen.but(background=np.zeros(3)))
     over = backend.render(seen)
     expected = over_black.image + over_black.T_final[..., None] * background
-    assert_same_bits("remaining light", over.T_final, over_black.T_final)
-    assert_same_image("compositing.background", backend, over.image, expected, charges)
+    assert_same_bits("remaining transmittance", over.T_final, over_black.T_final)
+    assert_same_image("compositing.background", backend, over.image, expected, error_bounds)
 
 
 @law("compositing", RENDER, s=st.sampled_from([0.5, 0.25, 0.75, 0.125, 0.9375]), color=arrays_of((3,), 0.0, 1.0))
@@ -146,16 +152,16 @@ def test_a_round_splat_on_the_axis_looks_as_the_formula_says(backend, opacity, d
     # seen straight on, a sphere of s px has covariance s^2 + 0.3 in every direction
     camera = Camera(np.eye(4), np.array([[8.0, 0, x], [0, 8.0, y], [0, 0, 1]]), 8, 6)
     scene = Scene(pack([Record(x, y, depth, (size,) * 3, opacity=opacity)], camera), camera, np.zeros(3))
-    seen, charges = charged(backend, colored(scene, [[1.0, 0.5, 0.25]]))
+    seen, error_bounds = with_error_bounds(backend, colored(scene, [[1.0, 0.5, 0.25]]))
     profile = seen.profile
     px, py = np.meshgrid(np.arange(8) + 0.5, np.arange(6) + 0.5)
     o = float(seen.gaussians.opacities[0])
     raw = o * np.exp(-0.5 * ((px - x) ** 2 + (py - y) ** 2) / (size**2 + profile.eps2d))
     alpha = np.where(raw < profile.alpha_floor, 0.0, np.minimum(raw, profile.alpha_ceiling))
     view = backend.render(seen)
-    assert_same_light("compositing.formula", backend, view.T_final, 1.0 - alpha, charges)
+    assert_same_transmittance("compositing.formula", backend, view.T_final, 1.0 - alpha, error_bounds)
     expected = alpha[..., None] * np.array([1.0, 0.5, 0.25])
-    assert_same_image("compositing.formula", backend, view.image, expected, charges)
+    assert_same_image("compositing.formula", backend, view.image, expected, error_bounds)
 
 
 @law(

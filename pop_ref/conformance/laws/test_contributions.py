@@ -9,9 +9,9 @@ from hypothesis import assume
 from hypothesis import strategies as st
 
 from pop_ref.compositing import composite, composite_vjp
-from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
-from pop_ref.conformance.score_charges import screened, weight_charges
+from pop_ref.conformance.score_error_bounds import screened, weight_error_bounds
 from pop_ref.conformance.strategies import faint_opacities, plain_sizes, scenes
 from pop_ref.constants import INRIA
 from pop_ref.contributions import contributions
@@ -50,46 +50,46 @@ def test_contributions_of_inrias_profile_are_the_oracles(backend, scene):
 
 
 def _agree(backend, given):
-    H, W = given.charges.T_final.shape
+    H, W = given.error_bounds.T_final.shape
     args = (*given.view, pattern(H, W), given.scene.profile)
     expected, found = contributions(*args), backend.stage("contributions")(*args)
     rows = given.sure
-    weights, distances = weight_charges(given.charges)
+    weights, distances = weight_error_bounds(given.error_bounds)
     assert_same_bits("pixels", found.n_pixels[rows], expected.n_pixels[rows])
-    charges = {"weight_sum": weights, "map_sum": expected.n_pixels.astype(np.float64), "distance_sum": distances}
-    for name, charge in charges.items():
+    error_bounds = {"weight_sum": weights, "map_sum": expected.n_pixels.astype(np.float64), "distance_sum": distances}
+    for name, error_bound in error_bounds.items():
         ends = getattr(found, name)[rows], getattr(expected, name)[rows]
-        assert_close(f"agreement.{name}", *ends, charge[rows], backend.dtype, against_oracle=True)
+        assert_close(f"agreement.{name}", *ends, error_bound[rows], backend.dtype, against_oracle=True)
 
 
 @law("contributions", "contributions", scene=plain)
 def test_weights_and_the_light_that_is_left_cover_the_image(backend, scene):
     given = screened(backend, scene)
-    # where a decision is in doubt the oracle's remaining light may be another pixel's story
-    assume(bool(np.all(given.charges.certain)))
+    # where a decision is near its threshold the oracle's transmittance may be quite another
+    assume(bool(np.all(given.error_bounds.unambiguous)))
     drawn = composite(*given.view, profile=given.scene.profile)
     found = backend.stage("contributions")(*given.view, None, given.scene.profile)
     assert int(np.sum(found.n_pixels)) == int(np.sum(drawn.n_blended)) > 0
     total = np.sum(found.weight_sum) + np.sum(drawn.T_final)
-    magnitude = np.sum(weight_charges(given.charges)[0]) + drawn.T_final.size
+    magnitude = np.sum(weight_error_bounds(given.error_bounds)[0]) + drawn.T_final.size
     assert_close("contributions.cover", total, drawn.T_final.size, magnitude, backend.dtype)
 
 
 @law("contributions", "contributions", scene=plain)
 def test_a_weight_is_what_a_colour_of_one_channel_adds_to_the_image(backend, scene):
     given = screened(backend, scene)
-    splats, H, W = given.splats, *given.charges.T_final.shape
+    splats, H, W = given.splats, *given.error_bounds.T_final.shape
     grey = dataclasses.replace(splats, colors=splats.colors[:, :1])
     v_colors = composite_vjp(grey, *given.view[1:], np.ones((H, W, 1)), profile=given.scene.profile).v_colors[:, 0]
     found = backend.stage("contributions")(*given.view, None, given.scene.profile).weight_sum
-    rows, charge = given.sure, weight_charges(given.charges)[0]
-    assert_close("contributions.color", found[rows], v_colors[rows], charge[rows], backend.dtype)
+    rows, error_bound = given.sure, weight_error_bounds(given.error_bounds)[0]
+    assert_close("contributions.color", found[rows], v_colors[rows], error_bound[rows], backend.dtype)
 
 
 @law("contributions", "contributions", scene=scenes(anchored=True))
 def test_who_is_blended_at_no_pixel_contributes_exactly_nothing(backend, scene):
     given = screened(backend, scene)
-    H, W = given.charges.T_final.shape
+    H, W = given.error_bounds.T_final.shape
     found = backend.stage("contributions")(*given.view, pattern(H, W), given.scene.profile)
     nowhere = found.n_pixels == 0
     assert np.all(nowhere[~given.splats.visible])
@@ -117,7 +117,7 @@ def test_a_map_that_marks_the_upper_part_of_an_image_counts_its_pixels(backend, 
 def test_contributions_stay_with_their_rows(backend, scene, seed):
     given = screened(backend, scene)
     order = shuffled(seed, len(scene.gaussians))
-    profile, n_pixels = given.scene.profile, given.charges.T_final.shape
+    profile, n_pixels = given.scene.profile, given.error_bounds.T_final.shape
     count = backend.stage("contributions")
     one = count(*given.view, pattern(*n_pixels), profile)
     other = count(*permuted(given, order).view, pattern(*n_pixels), profile)

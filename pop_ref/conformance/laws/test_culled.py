@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from pop_ref.conformance.abilities import GRADIENTS, RENDER
-from pop_ref.conformance.compare import assert_same_bits
+from pop_ref.conformance.assertions import (
+    assert_same_bits,
+    assert_same_image,
+    assert_same_transmittance,
+    assert_seen,
+    with_error_bounds,
+)
+from pop_ref.conformance.capabilities import GRADIENTS, RENDER
 from pop_ref.conformance.law import law
 from pop_ref.conformance.scenes import Record, Scene, cotangents, pack
-from pop_ref.conformance.verdicts import assert_same_image, assert_same_light, assert_seen, charged
-from pop_ref.types import Camera, Gaussians
+from pop_ref.records import Camera, Gaussians
 
 CAMERA = Camera(np.eye(4), np.array([[8.0, 0.0, 4.0], [0.0, 8.0, 2.5], [0.0, 0.0, 1.0]]), 8, 5)
 DRAWN = [Record(3.25, 2.25, 2.0, (1.5, 1.0, 0.75), (0.5, 0.25, 1.0, 0.125), 0.5), Record(5.0, 3.0, 3.0, opacity=0.75)]
@@ -80,8 +85,8 @@ def test_what_cannot_be_projected_changes_no_pixel(backend):
     huge = 1e30 if backend.dtype == np.float32 else 1e200
     centres = [[0.0, 0.0, 0.0], [1.0, -0.5, 0.0], [huge, 0.0, -1.0 / huge], [huge, -huge, -huge]]
     seen = backend.sees(_scene(centres))
-    drawn, charges = charged(backend, seen.rows([0, len(centres) + 1]))
+    drawn, error_bounds = with_error_bounds(backend, seen.rows([0, len(centres) + 1]))
     whole, without = backend.render(seen), backend.render(drawn)
     assert_seen(without)
-    assert_same_image("whole.invisible", backend, whole.image, without.image, charges)
-    assert_same_light("whole.invisible", backend, whole.T_final, without.T_final, charges)
+    assert_same_image("whole.invisible", backend, whole.image, without.image, error_bounds)
+    assert_same_transmittance("whole.invisible", backend, whole.T_final, without.T_final, error_bounds)

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import reject
 from hypothesis import strategies as st
 
-from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
 from pop_ref.conformance.strategies import arrays_of, dyadic, opacities
 from pop_ref.density import POP, Rows, Statistics, densify_and_prune

@@ -7,16 +7,15 @@ import dataclasses
 import numpy as np
 from hypothesis import strategies as st
 
-from pop_ref.conformance.abilities import DOMINANCE, DOMINANT_COUNTS, DOMINANT_WEIGHTS, PROFILES, RENDER
-from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.assertions import assert_close, assert_same_bits, assert_seen, with_error_bounds
+from pop_ref.conformance.capabilities import DOMINANCE, DOMINANT_COUNTS, DOMINANT_WEIGHTS, PROFILES, RENDER
 from pop_ref.conformance.corners import corners
 from pop_ref.conformance.law import law
 from pop_ref.conformance.laws.test_compositing import colored
 from pop_ref.conformance.scenes import Record, Scene, pack
 from pop_ref.conformance.strategies import arrays_of, dyadic, plain_sizes, scenes
-from pop_ref.conformance.verdicts import assert_seen, charged
 from pop_ref.constants import PAPER
-from pop_ref.types import Camera
+from pop_ref.records import Camera
 
 plain = scenes(anchored=True, size=plain_sizes())
 maps = st.lists(st.integers(-1, 3), min_size=6, max_size=6).map(lambda ids: np.array(ids).reshape(2, 3))
@@ -58,22 +57,22 @@ def test_the_counts_of_a_render_are_those_of_its_map(backend, scene):
 
 @law("dominance", RENDER, DOMINANCE, first=corners(), scene=scenes())
 def test_a_pixel_without_blended_splats_belongs_to_nobody(backend, scene):
-    seen, charges = charged(backend, scene)
+    seen, error_bounds = with_error_bounds(backend, scene)
     view = backend.render(seen)
     nobody = view.dominant_ids < 0
-    assert_same_bits("remaining light of empty pixels", view.T_final[nobody], np.ones(int(np.sum(nobody))))
+    assert_same_bits("remaining transmittance of empty pixels", view.T_final[nobody], np.ones(int(np.sum(nobody))))
     if view.dominant_weights is not None:
         assert_same_bits("weights of empty pixels", view.dominant_weights[nobody], np.zeros(int(np.sum(nobody))))
     if view.n_blended is not None:
         # what counts may be drawn anew, and decide for itself where rounding does
-        sure = charges.certain
+        sure = error_bounds.unambiguous
         assert_same_bits("empty pixels", (view.n_blended == 0)[sure], nobody[sure])
 
 
 @law("dominance", RENDER, DOMINANCE, first=corners(), scene=plain)
 def test_the_winner_is_the_splat_whose_weight_shows_most_in_the_image(backend, scene):
     # a Gaussian that is white among black ones paints its own weight
-    seen, charges = charged(backend, scene.but(background=np.zeros(3)))
+    seen, error_bounds = with_error_bounds(backend, scene.but(background=np.zeros(3)))
     view = backend.render(seen)
     assert_seen(view)
     n = len(scene.gaussians)
@@ -81,8 +80,8 @@ def test_the_winner_is_the_splat_whose_weight_shows_most_in_the_image(backend, s
         [backend.render(colored(seen, np.eye(n)[:, i : i + 1] * np.ones(3))).image[..., 0] for i in range(n)]
     )
     largest = np.max(weights, axis=0)
-    sure = charges.decided & (largest > 0.0)
-    magnitude = 2.0 * charges.T_final + 1.0
+    sure = error_bounds.decided & (largest > 0.0)
+    magnitude = 2.0 * error_bounds.T_final + 1.0
     if view.dominant_weights is not None:
         assert_close("dominance.weight", view.dominant_weights[sure], largest[sure], magnitude[sure], backend.dtype)
     assert_same_bits("winner", view.dominant_ids[sure], np.argmax(weights, axis=0)[sure])

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
-from pop_ref.conformance.compare import assert_close, assert_same_bits
-from pop_ref.conformance.gradient_charges import parameter_charges
+from pop_ref.conformance.assertions import assert_close, assert_same_bits
+from pop_ref.conformance.gradient_error_bounds import parameter_error_bounds
 from pop_ref.conformance.law import law
 from pop_ref.conformance.laws.test_contributions import permuted, plain, shuffled
-from pop_ref.conformance.score_charges import moment_charges, screened
+from pop_ref.conformance.score_error_bounds import moment_error_bounds, screened
 from pop_ref.conformance.strategies import arrays_of, plain_sizes, scenes
 from pop_ref.constants import INRIA
 from pop_ref.contributions import contributions
@@ -26,9 +26,9 @@ def _moments(backend, given):
 def _agree(backend, given):
     expected = screen_moments(*given.view, given.scene.background, given.scene.profile)
     rows = given.smooth
-    charge = moment_charges(given.charges, 0.5 * given.tile_size)
+    error_bound = moment_error_bounds(given.error_bounds, 0.5 * given.tile_size)
     ends = _moments(backend, given)[rows], expected[rows]
-    assert_close("agreement.screen_moments", *ends, charge[rows], backend.dtype, against_oracle=True)
+    assert_close("agreement.screen_moments", *ends, error_bound[rows], backend.dtype, against_oracle=True)
 
 
 @law("fisher", "screen_moments", scene=scenes(anchored=True, max_gaussians=5))
@@ -55,8 +55,8 @@ def test_moments_stay_with_their_rows(backend, scene, seed):
     given = screened(backend, scene)
     order = shuffled(seed, len(scene.gaussians))
     one, other = _moments(backend, given), _moments(backend, permuted(given, order))
-    charge = moment_charges(given.charges, 0.5 * given.tile_size)[order]
-    assert_close("fisher.rows", other, one[order], charge, backend.dtype)
+    error_bound = moment_error_bounds(given.error_bounds, 0.5 * given.tile_size)[order]
+    assert_close("fisher.rows", other, one[order], error_bound, backend.dtype)
 
 
 def _second_moments(moments):
@@ -78,16 +78,16 @@ def test_fisher_blocks_are_the_oracles(backend, scene):
     args = (seen.gaussians, seen.camera, moments, seen.sh_degree, seen.profile)
     expected, found = fisher_blocks(*args), backend.stage("fisher_blocks")(*args)
     assert np.any(expected != 0.0), "no block has anything in it"
-    # twice the Jacobian times its charge, about the absolute values of the moments
-    J = parameter_charges(seen, given.charges.screen)
+    # twice the Jacobian times its error bound, about the absolute values of the moments
+    J = parameter_error_bounds(seen, given.error_bounds.screen)
     seconds = np.abs(_second_moments(moments))
-    charge = np.zeros((len(moments), 6, 6))
+    error_bound = np.zeros((len(moments), 6, 6))
     for c in range(3):
         K = np.concatenate([J[:, :5], J[:, 5 + c : 6 + c]], axis=1)
-        charge += np.swapaxes(K, 1, 2) @ seconds[:, c] @ K
-    rows = ~given.charges.screen.kinked & given.splats.visible
+        error_bound += np.swapaxes(K, 1, 2) @ seconds[:, c] @ K
+    rows = ~given.error_bounds.screen.kinked & given.splats.visible
     assert_close(
-        "agreement.fisher_blocks", found[rows], expected[rows], charge[rows], backend.dtype, against_oracle=True
+        "agreement.fisher_blocks", found[rows], expected[rows], error_bound[rows], backend.dtype, against_oracle=True
     )
 
 
@@ -104,7 +104,7 @@ def test_blocks_are_symmetric_and_no_direction_has_negative_information(backend,
     D = np.sqrt(np.where(diagonals > 0.0, diagonals, 1.0))
     assert np.all(diagonals >= 0.0)
     least = np.linalg.eigvalsh(blocks / D[:, :, None] / D[:, None, :])[:, :1]
-    resolved = ~given.charges.screen.kinked & given.splats.visible
+    resolved = ~given.error_bounds.screen.kinked & given.splats.visible
     assert np.all(least[resolved] >= -(2.0**14) * np.finfo(backend.dtype).eps)
     assert np.all(blocks[~given.splats.visible] == 0.0)
 

@@ -8,8 +8,8 @@ import math
 import numpy as np
 from hypothesis import strategies as st
 
-from pop_ref.conformance.abilities import INRIAS, PROFILES
-from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.assertions import assert_close, assert_same_bits
+from pop_ref.conformance.capabilities import INRIAS, PROFILES
 from pop_ref.conformance.law import law
 from pop_ref.conformance.strategies import dyadic, opacities, reals
 from pop_ref.constants import INRIA, PAPER

@@ -7,17 +7,24 @@ import pytest
 from hypothesis import assume
 from hypothesis import strategies as st
 
-from pop_ref.conformance.abilities import DERIVATIVES, DETERMINISTIC, DOUBLE, GRADIENTS, INSTRUMENTS, RENDER
-from pop_ref.conformance.charges import charge
-from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.assertions import (
+    assert_close,
+    assert_same_bits,
+    assert_same_image,
+    assert_same_transmittance,
+    assert_seen,
+    require,
+    with_error_bounds,
+)
+from pop_ref.conformance.capabilities import DERIVATIVES, DETERMINISTIC, DOUBLE, GRADIENTS, INSTRUMENTS, RENDER
 from pop_ref.conformance.corners import corners
-from pop_ref.conformance.gradient_charges import gradient_charges
+from pop_ref.conformance.error_bounds import pixel_error_bounds
+from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.law import law
 from pop_ref.conformance.laws.test_compositing import colored
 from pop_ref.conformance.scenes import SH_C0, cotangents
-from pop_ref.conformance.screen_charges import screen_charges
+from pop_ref.conformance.screen_error_bounds import screen_error_bounds
 from pop_ref.conformance.strategies import arrays_of, plain_sizes, scenes, wide_scene
-from pop_ref.conformance.verdicts import assert_same_image, assert_same_light, assert_seen, charged, require
 
 plain = scenes(anchored=True, size=plain_sizes(), max_gaussians=4)
 banded = scenes(anchored=True, size=plain_sizes(), max_gaussians=3, max_degree=3)
@@ -33,23 +40,23 @@ def _pulled(backend, seen):
     return g, v_image, v_T_final
 
 
-def _pulled_where_certain(backend, seen, charges):
-    """Return gradients for cotangents of those pixels alone at which no decision is in doubt.
+def _pulled_where_unambiguous(backend, seen, error_bounds):
+    """Return gradients for cotangents of those pixels alone at which no decision is near its threshold.
 
     A gradient and a render may come from different code of the backend; where rounding decides, each decides by itself.
     """
-    v_image, v_T_final = _at_certain_pixels(seen, charges)
+    v_image, v_T_final = _at_unambiguous_pixels(seen, error_bounds)
     g = backend.gradients(seen, v_image, v_T_final)
-    if np.all(charges.certain):
+    if np.all(error_bounds.unambiguous):
         _assert_signal(g)
     else:
         assume(all(np.any(g[name] != 0.0) for name in SIGNAL))
     return g, v_image, v_T_final
 
 
-def _at_certain_pixels(seen, charges):
+def _at_unambiguous_pixels(seen, error_bounds):
     v_image, v_T_final = cotangents(seen)
-    return v_image * charges.certain[..., None], v_T_final * charges.certain
+    return v_image * error_bounds.unambiguous[..., None], v_T_final * error_bounds.unambiguous
 
 
 def _assert_signal(g):
@@ -75,9 +82,9 @@ def test_twice_the_cotangent_is_exactly_twice_the_gradient(backend, scene):
 
 @law("gradients", GRADIENTS, first=corners(), scene=plain)
 def test_gradients_add_over_pixels(backend, scene):
-    seen, charges = charged(backend, scene)
+    seen, error_bounds = with_error_bounds(backend, scene)
     whole, v_image, v_T_final = _pulled(backend, seen)
-    bounds = gradient_charges(seen, charges, v_image, v_T_final)
+    bounds = gradient_error_bounds(seen, error_bounds, v_image, v_T_final)
     left = (np.arange(seen.camera.width) % 2 == 0)[None, :] & np.ones((seen.camera.height, 1), dtype=bool)
     parts = [backend.gradients(seen, v_image * m[..., None], v_T_final * m) for m in (left, ~left)]
     for name, value in whole.items():
@@ -86,10 +93,10 @@ def test_gradients_add_over_pixels(backend, scene):
 
 @law("gradients", GRADIENTS, first=corners(), scene=plain)
 def test_the_quaternion_gradient_of_an_image_is_orthogonal_to_the_quaternion(backend, scene):
-    seen, charges = charged(backend, scene)
+    seen, error_bounds = with_error_bounds(backend, scene)
     g, v_image, v_T_final = _pulled(backend, seen)
     q = seen.gaussians.quats
-    bounds = gradient_charges(seen, charges, v_image, v_T_final)["quats"]
+    bounds = gradient_error_bounds(seen, error_bounds, v_image, v_T_final)["quats"]
     radial = np.sum(q * g["quats"], axis=1)
     assert_close("gradients.radial", radial, 0.0 * radial, np.sum(np.abs(q) * bounds, axis=1), backend.dtype)
 
@@ -110,10 +117,10 @@ def test_culled_gaussians_get_exactly_zero(backend, scene):
 @law("gradients", GRADIENTS, first=corners(), scene=plain)
 def test_moving_world_and_camera_together_has_no_gradient(backend, scene):
     # degree 0: shifts by d and turns by w of the world, undone by the camera
-    seen, charges = charged(backend, scene)
+    seen, error_bounds = with_error_bounds(backend, scene)
     g, v_image, v_T_final = _pulled(backend, seen)
     require(backend, g, "viewmat")
-    bounds = gradient_charges(seen, charges, v_image, v_T_final)
+    bounds = gradient_error_bounds(seen, error_bounds, v_image, v_T_final)
     R = seen.camera.viewmat[:3, :3]
     shift = np.sum(g["means"], axis=0) - R.T @ g["viewmat"][:3, 3]
     size = np.sum(bounds["means"], axis=0) + np.abs(R.T) @ bounds["viewmat"][:3, 3]
@@ -132,8 +139,8 @@ def test_moving_world_and_camera_together_has_no_gradient(backend, scene):
 
 @law("gradients", RENDER, GRADIENTS, first=corners(), scene=plain)
 def test_the_background_gradient_is_the_cotangent_seen_through_the_remaining_light(backend, scene):
-    seen, charges = charged(backend, scene)
-    g, v_image, _ = _pulled_where_certain(backend, seen, charges)
+    seen, error_bounds = with_error_bounds(backend, scene)
+    g, v_image, _ = _pulled_where_unambiguous(backend, seen, error_bounds)
     require(backend, g, "background")
     T_final = backend.render(seen).T_final
     expected = np.einsum("hw,hwc->c", T_final, v_image)
@@ -146,25 +153,27 @@ def test_the_colour_gradient_is_what_the_colour_adds_to_the_image(backend, scene
     # the image is linear in colours, so a finite change of a colour measures its gradient exactly
     n = len(scene.gaussians)
     bright = colored(scene, np.full((n, 3), 1.0))
-    seen, charges = charged(backend, bright)
-    g, v_image, v_T_final = _pulled_where_certain(backend, seen, charges)
-    bounds = gradient_charges(seen, charges, v_image, v_T_final)["sh"]
+    seen, error_bounds = with_error_bounds(backend, bright)
+    g, v_image, v_T_final = _pulled_where_unambiguous(backend, seen, error_bounds)
+    bounds = gradient_error_bounds(seen, error_bounds, v_image, v_T_final)["sh"]
     for i in range(n):
         brighter = np.full((n, 3), 1.0)
         brighter[i] += 1.0
         more = backend.sees(colored(scene, brighter))
         moved = backend.render(more).image - backend.render(seen).image
         gained = np.sum(v_image * moved, axis=(0, 1)) * SH_C0
-        size = bounds[i, 0] + np.sum(np.abs(v_image) * (charges.image + 2.0 * charges.absolute), axis=(0, 1))
+        size = bounds[i, 0] + np.sum(np.abs(v_image) * (error_bounds.image + 2.0 * error_bounds.absolute), axis=(0, 1))
         assert_close("gradients.color", gained, g["sh"][i, 0], size, backend.dtype)
 
 
 @law("gradients", GRADIENTS, first=corners(), scene=plain)
 def test_absolute_screen_gradients_are_at_least_the_signed_ones(backend, scene):
-    seen, charges = charged(backend, scene)
+    seen, error_bounds = with_error_bounds(backend, scene)
     g, v_image, v_T_final = _pulled(backend, seen)
     require(backend, g, "means2d_abs")
-    slack = 64.0 * np.finfo(backend.dtype).eps * gradient_charges(seen, charges, v_image, v_T_final)["means2d"]
+    slack = (
+        64.0 * np.finfo(backend.dtype).eps * gradient_error_bounds(seen, error_bounds, v_image, v_T_final)["means2d"]
+    )
     assert np.all(g["means2d_abs"] + slack >= np.abs(g["means2d"]))
     assert np.any(g["means2d_abs"] > 0.0)
 
@@ -173,13 +182,13 @@ def test_absolute_screen_gradients_are_at_least_the_signed_ones(backend, scene):
     "gradients", GRADIENTS, first=corners(with_={"x": 3, "y": 4}), scene=plain, x=st.integers(0, 7), y=st.integers(0, 7)
 )
 def test_absolute_and_signed_screen_gradients_agree_in_size_for_one_pixel(backend, scene, x, y):
-    seen, charges = charged(backend, scene)
+    seen, error_bounds = with_error_bounds(backend, scene)
     v_image = np.zeros((seen.camera.height, seen.camera.width, 3))
     v_image[y % seen.camera.height, x % seen.camera.width] = [1.0, -0.5, 0.25]
     v_T_final = np.zeros(v_image.shape[:2])
     g = backend.gradients(seen, v_image, v_T_final)
     require(backend, g, "means2d_abs")
-    bounds = gradient_charges(seen, charges, v_image, v_T_final)["means2d"]
+    bounds = gradient_error_bounds(seen, error_bounds, v_image, v_T_final)["means2d"]
     assert_close("gradients.absgrad", g["means2d_abs"], np.abs(g["means2d"]), bounds, backend.dtype)
 
 
@@ -196,9 +205,9 @@ def test_absolute_and_signed_screen_gradients_agree_in_size_for_one_pixel(backen
 def test_a_step_along_any_direction_changes_the_image_as_the_gradient_says(backend, scene, direction):
     # <v, J u> = <J^T v, u>, with J u by central differences; in double precision only
     seen = backend.sees(scene)
-    charges = charge(seen, np.float32)
+    error_bounds = pixel_error_bounds(seen, np.float32)
     g, v_image, v_T_final = _pulled(backend, seen)
-    sure = charges.smooth
+    sure = error_bounds.smooth
     v_image, v_T_final = v_image * sure[..., None], v_T_final * sure
     g = backend.gradients(seen, v_image, v_T_final)
     rng = np.random.default_rng(direction)
@@ -212,11 +221,11 @@ def test_a_step_along_any_direction_changes_the_image_as_the_gradient_says(backe
     for sign in (1.0, -1.0):
         moved = seen.but(**{name: values[name] + sign * h * steps[name] for name in PARAMETERS})
         # a decision that flips within the step is not a derivative's business
-        moved_charges = charge(moved, np.float64)
+        moved_bounds = pixel_error_bounds(moved, np.float64)
         same = all(
-            np.array_equal(a.blended, b.blended) for a, b in zip(charges.layers, moved_charges.layers, strict=True)
+            np.array_equal(a.blended, b.blended) for a, b in zip(error_bounds.layers, moved_bounds.layers, strict=True)
         )
-        assume(same and [a.id for a in charges.layers] == [b.id for b in moved_charges.layers])
+        assume(same and [a.id for a in error_bounds.layers] == [b.id for b in moved_bounds.layers])
         view = backend.render(moved)
         ends.append(np.sum(v_image * view.image) + np.sum(v_T_final * view.T_final))
     measured = (ends[0] - ends[1]) / (2.0 * h)
@@ -229,7 +238,7 @@ def test_a_step_along_any_direction_changes_the_image_as_the_gradient_says(backe
 
 def _no_kink_near(seen, h):
     """Set scenes aside whose colours or frustum clamps lie at a kink (B1, B2)."""
-    assume(not np.any(screen_charges(seen, 64.0 * h).kinked))
+    assume(not np.any(screen_error_bounds(seen, 64.0 * h).kinked))
 
 
 @law(
@@ -262,13 +271,15 @@ def test_gradients_ignore_the_coefficients_of_other_bands(backend, scene, opacit
 )
 def test_asking_for_dominance_and_counts_changes_neither_image_nor_gradient(backend, scene):
     # what is asked for nothing, as in training, may choose tiles of its own and leave out what reaches no pixel
-    seen, charges = charged(backend, scene)
-    v_image, v_T_final = _at_certain_pixels(seen, charges)
-    bounds = gradient_charges(seen, charges, v_image, v_T_final)
+    seen, error_bounds = with_error_bounds(backend, scene)
+    v_image, v_T_final = _at_unambiguous_pixels(seen, error_bounds)
+    bounds = gradient_error_bounds(seen, error_bounds, v_image, v_T_final)
     (plain_view, plain_gradients), *others = backend.otherwise(seen, v_image, v_T_final).values()
     assert_seen(plain_view)
     for view, gradients in others:
-        assert_same_image("gradients.instruments.image", backend, view.image, plain_view.image, charges)
-        assert_same_light("gradients.instruments.image", backend, view.T_final, plain_view.T_final, charges)
+        assert_same_image("gradients.instruments.image", backend, view.image, plain_view.image, error_bounds)
+        assert_same_transmittance(
+            "gradients.instruments.image", backend, view.T_final, plain_view.T_final, error_bounds
+        )
         for name, value in gradients.items():
             assert_close("gradients.instruments", value, plain_gradients[name], bounds[name], backend.dtype)

@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import strategies as st
 
 from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.cases import pattern
-from pop_ref.conformance.compare import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
 from pop_ref.conformance.strategies import dyadic
 from pop_ref.loss_magnitudes import d_ssim_magnitudes, pixelwise_magnitudes
@@ -30,29 +30,29 @@ def _mask(seed):
 masks = st.integers(0, 63).map(_mask)
 
 
-def _similarity_charges(image, target, padding, mask):
-    """Charge D-SSIM and its gradient for whoever writes it as the textbook does, or as a difference."""
+def _similarity_error_bounds(image, target, padding, mask):
+    """Bound the rounding of D-SSIM and its gradient for whoever writes it as the textbook does, or as a difference."""
     forms = [d_ssim_magnitudes(image, target, padding, mask, form) for form in ("textbook", "difference")]
     return max(form.value for form in forms) + 1.0, np.maximum(*[form.gradient for form in forms])
 
 
-def _agrees(backend, name, image, target, charges, arguments):
+def _agrees(backend, name, image, target, error_bounds, arguments):
     image, target = (a.astype(backend.dtype).astype(np.float64) for a in (image, target))
-    of_value, of_gradient = charges
+    of_value, of_gradient = error_bounds
     expected = ORACLE.stage(name)(image, target, *arguments)
     found = backend.stage(name)(image, target, *arguments)
     assert_close("agreement.losses", found, expected, of_value, backend.dtype, against_oracle=True)
     pulled = ORACLE.stage(f"{name}_vjp")(image, target, 0.75, *arguments)
     found = backend.stage(f"{name}_vjp")(image, target, 0.75, *arguments)
-    # one unit of a pixel's share beside its own charge: a gradient may vanish where its terms cancel
+    # one unit of a pixel's share beside its own error bound: a gradient may vanish where its terms cancel
     size = of_gradient + 1.0 / image.size
     assert_close("agreement.losses_vjp", found, pulled, size, backend.dtype, against_oracle=True)
 
 
 @law("losses", "ssim", "ssim_vjp", image=pictures, target=pictures, padding=paddings)
 def test_the_similarity_and_its_gradient_are_the_oracles_with_either_border(backend, image, target, padding):
-    charges = _similarity_charges(image, target, padding, None)
-    _agrees(backend, "ssim", image, target, charges, (padding,))
+    error_bounds = _similarity_error_bounds(image, target, padding, None)
+    _agrees(backend, "ssim", image, target, error_bounds, (padding,))
 
 
 @law(
@@ -66,15 +66,15 @@ def test_the_similarity_and_its_gradient_are_the_oracles_with_either_border(back
     halved=st.booleans(),
 )
 def test_the_dissimilarity_of_what_a_mask_keeps_is_the_oracles(backend, image, target, padding, mask, halved):
-    charges = _similarity_charges(image, target, padding, mask)
-    _agrees(backend, "d_ssim", image, target, charges, (padding, mask, halved))
+    error_bounds = _similarity_error_bounds(image, target, padding, mask)
+    _agrees(backend, "d_ssim", image, target, error_bounds, (padding, mask, halved))
 
 
 @law("losses", "l1", "l2", "l1_vjp", "l2_vjp", image=pictures, target=pictures, mask=masks)
 def test_pixelwise_losses_of_what_a_mask_keeps_are_the_oracles(backend, image, target, mask):
     for power, name in ((1, "l1"), (2, "l2")):
-        charges = pixelwise_magnitudes(image, target, power, mask)
-        _agrees(backend, name, image, target, charges, (mask,))
+        error_bounds = pixelwise_magnitudes(image, target, power, mask)
+        _agrees(backend, name, image, target, error_bounds, (mask,))
 
 
 @law(
@@ -90,11 +90,11 @@ def test_pixelwise_losses_of_what_a_mask_keeps_are_the_oracles(backend, image, t
     scale=st.sampled_from([1.0, 0.5, 3.0]),
 )
 def test_the_objectives_with_every_option_are_the_oracles(backend, image, target, padding, mask, halved, share, scale):
-    of_value, of_gradient = _similarity_charges(image, target, padding, mask)
+    of_value, of_gradient = _similarity_error_bounds(image, target, padding, mask)
     for name, power in OBJECTIVES.items():
         pixels = pixelwise_magnitudes(image, target, power, mask)
-        charges = of_value + scale * pixels.value, of_gradient + scale * pixels.gradient
-        _agrees(backend, name, image, target, charges, (share, padding, mask, halved, scale))
+        error_bounds = of_value + scale * pixels.value, of_gradient + scale * pixels.gradient
+        _agrees(backend, name, image, target, error_bounds, (share, padding, mask, halved, scale))
 
 
 @law("losses", "d_ssim_vjp", "l1_vjp", "l2_vjp", image=pictures, target=pictures, mask=masks, padding=paddings)

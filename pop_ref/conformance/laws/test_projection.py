@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 from hypothesis import strategies as st
 
-from pop_ref.conformance.abilities import HOMOGENEOUS
-from pop_ref.conformance.abilities import PROFILES as PROFILES_NEEDED
-from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.assertions import assert_close, assert_same_bits
+from pop_ref.conformance.capabilities import HOMOGENEOUS
+from pop_ref.conformance.capabilities import PROFILES as PROFILES_NEEDED
 from pop_ref.conformance.law import law
 from pop_ref.conformance.strategies import arrays_of, dyadic, reals
 from pop_ref.constants import INRIA, PAPER, PROFILES

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from pop_ref.conformance.abilities import DERIVATIVES, DOMINANCE, EXTENTS, GRADIENTS, PRINCIPAL_POINT, RENDER, SCALE
-from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.assertions import assert_close, assert_same_bits
+from pop_ref.conformance.capabilities import DERIVATIVES, DOMINANCE, EXTENTS, GRADIENTS, PRINCIPAL_POINT, RENDER, SCALE
 from pop_ref.conformance.corpus import PLANS, corpus_scene
 from pop_ref.conformance.corpus_answers import (
     GRADIENTS as ROWS,
 )
 from pop_ref.conformance.corpus_answers import (
     answers,
-    certain_cotangents,
     picked_pixels,
+    unambiguous_cotangents,
     weighted_blocks,
     weighted_runs,
 )
@@ -24,7 +24,7 @@ def _image(name, *needs):
     def sentence(backend):
         scene, expected = corpus_scene(name), answers(name)
         view = backend.plainly(scene)
-        sure, at = expected["certain"], picked_pixels(scene)
+        sure, at = expected["unambiguous"], picked_pixels(scene)
         seen = np.concatenate([view.image, view.T_final[..., None]], axis=2)
         picked = sure[at]
         pixels = (seen[at][picked], expected["pixels"][picked], expected["e_pixels"][picked])
@@ -44,7 +44,7 @@ def _integers(name, *needs):
         winners = weighted_blocks(view.dominant_ids, expected["decided"])
         assert_same_bits("weighted sums of dominant ids over blocks", winners, expected["winners"])
         if view.n_blended is not None:
-            blended = weighted_blocks(view.n_blended, expected["certain"])
+            blended = weighted_blocks(view.n_blended, expected["unambiguous"])
             assert_same_bits("weighted sums of blended counts over blocks", blended, expected["blended"])
 
     sentence.__name__ = f"test_dominant_ids_and_counts_of_{name}_are_the_oracles"
@@ -54,11 +54,11 @@ def _integers(name, *needs):
 def _gradients(name, *needs):
     def sentence(backend):
         scene, expected = corpus_scene(name), answers(name)
-        found = backend.gradients(scene, *certain_cotangents(scene, expected["smooth"]))
+        found = backend.gradients(scene, *unambiguous_cotangents(scene, expected["smooth"]))
         for key, value in found.items():
             sums = weighted_runs(value) if key in ROWS else value
-            charge = expected[f"e_{key}"]
-            assert_close(f"scale.v_{key}", sums, expected[f"v_{key}"], charge, backend.dtype, against_oracle=True)
+            error_bound = expected[f"e_{key}"]
+            assert_close(f"scale.v_{key}", sums, expected[f"v_{key}"], error_bound, backend.dtype, against_oracle=True)
 
     sentence.__name__ = f"test_the_gradients_of_{name}_are_the_oracles"
     return law("gradients", GRADIENTS, EXTENTS, PRINCIPAL_POINT, DERIVATIVES, *needs)(sentence)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from pop_ref.conformance.compare import assert_same_bits
+from pop_ref.conformance.assertions import assert_same_bits
 from pop_ref.conformance.law import law
 from pop_ref.conformance.strategies import dyadic
 

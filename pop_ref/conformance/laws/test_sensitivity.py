@@ -8,15 +8,15 @@ import math
 import numpy as np
 from hypothesis import strategies as st
 
-from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
 from pop_ref.conformance.laws.test_contributions import permuted, plain, shuffled
-from pop_ref.conformance.score_charges import screened, sensitivity_charges
+from pop_ref.conformance.score_error_bounds import screened, sensitivity_error_bounds
 from pop_ref.conformance.strategies import dyadic, plain_sizes, scenes
 from pop_ref.constants import INRIA, PROFILES
 from pop_ref.contributions import contributions
+from pop_ref.records import Splats
 from pop_ref.sensitivity import sensitivities
-from pop_ref.types import Splats
 
 
 def _scored(backend, given, background=None):
@@ -26,9 +26,11 @@ def _scored(backend, given, background=None):
 
 def _agree(backend, given):
     expected = sensitivities(*given.view, given.scene.background, given.scene.profile)
-    rows, charge = given.sure, sensitivity_charges(given.charges)
+    rows, error_bound = given.sure, sensitivity_error_bounds(given.error_bounds)
     found = _scored(backend, given)
-    assert_close("agreement.sensitivity", found[rows], expected[rows], charge[rows], backend.dtype, against_oracle=True)
+    assert_close(
+        "agreement.sensitivity", found[rows], expected[rows], error_bound[rows], backend.dtype, against_oracle=True
+    )
 
 
 @law("sensitivity", "sensitivities", scene=scenes(anchored=True))
@@ -56,8 +58,8 @@ def test_sensitivities_stay_with_their_rows(backend, scene, seed):
     given = screened(backend, scene)
     order = shuffled(seed, len(scene.gaussians))
     one, other = _scored(backend, given), _scored(backend, permuted(given, order))
-    charge = sensitivity_charges(given.charges)[order]
-    assert_close("sensitivity.rows", other, one[order], charge, backend.dtype)
+    error_bound = sensitivity_error_bounds(given.error_bounds)[order]
+    assert_close("sensitivity.rows", other, one[order], error_bound, backend.dtype)
 
 
 @law("sensitivity", "sensitivities", scene=plain)
@@ -77,11 +79,11 @@ def test_the_same_light_added_to_everything_changes_no_sensitivity(backend, scen
     lit = dataclasses.replace(given, splats=dataclasses.replace(given.splats, colors=given.splats.colors + more))
     under = given.scene.but(background=given.scene.background + more)
     bright = _scored(backend, lit, under.background)
-    # a charge is of absolute values, so take it of the brighter scene
-    charges = dataclasses.replace(given.charges, scene=under)
-    charges.screen = dataclasses.replace(given.charges.screen, colors=given.charges.screen.colors + more)
-    charge = sensitivity_charges(charges)
-    assert_close("sensitivity.light", bright, _scored(backend, given), charge, backend.dtype)
+    # an error bound is of absolute values, so take it of the brighter scene
+    error_bounds = dataclasses.replace(given.error_bounds, scene=under)
+    error_bounds.screen = dataclasses.replace(given.error_bounds.screen, colors=given.error_bounds.screen.colors + more)
+    error_bound = sensitivity_error_bounds(error_bounds)
+    assert_close("sensitivity.light", bright, _scored(backend, given), error_bound, backend.dtype)
 
 
 @law(

@@ -6,7 +6,8 @@ import dataclasses
 
 import numpy as np
 
-from pop_ref.conformance.abilities import (
+from pop_ref.conformance.calls import Call
+from pop_ref.conformance.capabilities import (
     CAMERAS,
     CHANNELS,
     COLORS,
@@ -20,7 +21,6 @@ from pop_ref.conformance.abilities import (
     SIGNATURE,
     SPARSE_GRAD,
 )
-from pop_ref.conformance.calls import Call
 from pop_ref.conformance.law import law
 from pop_ref.conformance.meta import clear_of_extents
 from pop_ref.conformance.signature import assert_call_is_the_oracles, expectations

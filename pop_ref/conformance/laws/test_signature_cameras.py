@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
-from pop_ref.conformance.abilities import BATCHES, CAMERA_COLORS, CAMERAS, EXTENTS, PACKED, PRINCIPAL_POINT, SIGNATURE
 from pop_ref.conformance.calls import Call
+from pop_ref.conformance.capabilities import (
+    BATCHES,
+    CAMERA_COLORS,
+    CAMERAS,
+    EXTENTS,
+    PACKED,
+    PRINCIPAL_POINT,
+    SIGNATURE,
+)
 from pop_ref.conformance.law import law
 from pop_ref.conformance.meta import assert_rows
 from pop_ref.conformance.signature import assert_call_is_the_oracles

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from pop_ref.conformance.abilities import CAMERAS, EXTENTS, PACKED, PRINCIPAL_POINT, SIGNATURE
 from pop_ref.conformance.calls import Call
+from pop_ref.conformance.capabilities import CAMERAS, EXTENTS, PACKED, PRINCIPAL_POINT, SIGNATURE
 from pop_ref.conformance.law import law
 from pop_ref.conformance.meta import ROWS, TILES, assert_rows, assert_sizes, assert_tiles
 from pop_ref.conformance.signature import expectations

@@ -8,11 +8,11 @@ import numpy as np
 from hypothesis import strategies as st
 
 from pop_ref.compositing import composite
+from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.cases import rounded
-from pop_ref.conformance.compare import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
 from pop_ref.conformance.laws.test_contributions import plain
-from pop_ref.conformance.score_charges import screened
+from pop_ref.conformance.score_error_bounds import screened
 from pop_ref.conformance.strategies import scenes
 from pop_ref.constants import INRIA, PAPER, SPEEDY_SPLAT
 
@@ -90,7 +90,7 @@ def _listed(backend, given):
 
 def _same_image(backend, given):
     tight, wide = _listed(backend, given)
-    at, sure = given.charges.certain, (*given.view[2:], given.scene.background, given.scene.profile)
+    at, sure = given.error_bounds.unambiguous, (*given.view[2:], given.scene.background, given.scene.profile)
     one, other = (composite(given.splats, lists, *sure) for lists in (tight, wide))
     # blended by the oracle both times: what is left out was blended nowhere
     for name in ("image", "T_final", "dominant_ids", "n_blended"):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
-from pop_ref.conformance.abilities import INRIAS
-from pop_ref.conformance.compare import assert_same_bits
+from pop_ref.conformance.assertions import assert_same_bits
+from pop_ref.conformance.capabilities import INRIAS
 from pop_ref.conformance.law import law
 from pop_ref.conformance.strategies import dyadic
 from pop_ref.constants import INRIA

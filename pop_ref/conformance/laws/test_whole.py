@@ -7,14 +7,20 @@ import dataclasses
 import numpy as np
 from hypothesis import strategies as st
 
-from pop_ref.conformance.abilities import DETERMINISTIC, EXTENTS, HOMOGENEOUS, PRINCIPAL_POINT, RENDER, ROWWISE
-from pop_ref.conformance.compare import assert_close, assert_same_bits
+from pop_ref.conformance.assertions import (
+    assert_close,
+    assert_same_bits,
+    assert_same_image,
+    assert_same_transmittance,
+    assert_seen,
+    with_error_bounds,
+)
+from pop_ref.conformance.capabilities import DETERMINISTIC, EXTENTS, HOMOGENEOUS, PRINCIPAL_POINT, RENDER, ROWWISE
 from pop_ref.conformance.corners import corners
 from pop_ref.conformance.law import law
 from pop_ref.conformance.scenes import Record, Scene, pack
 from pop_ref.conformance.strategies import backgrounds, cameras, plain_sizes, quats, records, rigid, scenes
-from pop_ref.conformance.verdicts import assert_same_image, assert_same_light, assert_seen, charged
-from pop_ref.types import Camera, Gaussians
+from pop_ref.records import Camera, Gaussians
 
 plain = scenes(anchored=True, size=plain_sizes())
 
@@ -23,15 +29,15 @@ def _tallies(view):
     return [(n, getattr(view, n)) for n in ("dominant_ids", "n_blended") if getattr(view, n) is not None]
 
 
-def _same_image_and_light(key, backend, one, other, charges):
-    assert_same_image(key, backend, one.image, other.image, charges)
-    assert_same_light(key, backend, one.T_final, other.T_final, charges)
+def _same_image_and_transmittance(key, backend, one, other, error_bounds):
+    assert_same_image(key, backend, one.image, other.image, error_bounds)
+    assert_same_transmittance(key, backend, one.T_final, other.T_final, error_bounds)
 
 
-def _same_render(key, backend, one, other, charges):
-    _same_image_and_light(key, backend, one, other, charges)
+def _same_render(key, backend, one, other, error_bounds):
+    _same_image_and_transmittance(key, backend, one, other, error_bounds)
     for (name, a), (_, b) in zip(_tallies(one), _tallies(other), strict=True):
-        sure = charges.decided
+        sure = error_bounds.decided
         assert_same_bits(name, a[sure], b[sure])
 
 
@@ -40,7 +46,7 @@ def test_two_runs_give_the_same_bits(backend, scene):
     seen = backend.sees(scene)
     one, other = backend.render(seen), backend.render(seen)
     assert_same_bits("image", one.image, other.image)
-    assert_same_bits("remaining light", one.T_final, other.T_final)
+    assert_same_bits("remaining transmittance", one.T_final, other.T_final)
     for (name, a), (_, b) in zip(_tallies(one), _tallies(other), strict=True):
         assert_same_bits(name, a, b)
 
@@ -50,16 +56,16 @@ def test_an_empty_scene_is_the_background(backend, camera, background):
     view = backend.render(backend.sees(Scene(pack([], camera), camera, background)))
     H, W = camera.height, camera.width
     assert_same_bits("image", view.image, np.broadcast_to(np.array(background), (H, W, 3)))
-    assert_same_bits("remaining light", view.T_final, np.ones((H, W)))
+    assert_same_bits("remaining transmittance", view.T_final, np.ones((H, W)))
 
 
 @law("whole", RENDER, EXTENTS, first=corners(with_={"size": 5}), scene=plain, size=st.sampled_from([1, 2, 3, 5, 16]))
 def test_any_tile_size_gives_the_same_image(backend, scene, size):
     # D3: where extents hold all visible alpha, tiling is only an optimisation
-    seen, charges = charged(backend, scene)
+    seen, error_bounds = with_error_bounds(backend, scene)
     view = backend.render(seen)
     assert_seen(view)
-    _same_render("whole.tiles", backend, backend.render(seen.but(tile_size=size)), view, charges)
+    _same_render("whole.tiles", backend, backend.render(seen.but(tile_size=size)), view, error_bounds)
 
 
 @law("whole", RENDER, scene=plain, seed=st.randoms(use_true_random=False))
@@ -67,13 +73,13 @@ def test_permuting_gaussians_permutes_ids_only(backend, scene, seed):
     # depths are made distinct: memory order decides ties (D4)
     depths = scene.gaussians.means @ scene.camera.viewmat[2, :3] + scene.camera.viewmat[2, 3]
     _, first = np.unique(np.round(depths, 4), return_index=True)
-    seen, charges = charged(backend, scene.rows(np.sort(first)))
+    seen, error_bounds = with_error_bounds(backend, scene.rows(np.sort(first)))
     order = list(range(len(seen.gaussians)))
     seed.shuffle(order)
     one, other = backend.render(seen), backend.render(seen.rows(order))
-    assert_same_image("whole.permutation", backend, other.image, one.image, charges)
+    assert_same_image("whole.permutation", backend, other.image, one.image, error_bounds)
     if one.dominant_ids is not None:
-        sure = charges.decided & (other.dominant_ids >= 0)
+        sure = error_bounds.decided & (other.dominant_ids >= 0)
         assert_same_bits("winner", np.array(order)[other.dominant_ids[sure]], one.dominant_ids[sure])
 
 
@@ -103,9 +109,9 @@ def _joined(scene, hidden, at):
 
 @law("whole", RENDER, scene=scenes(max_gaussians=4), hidden=invisible, at=st.integers(0, 4))
 def test_an_invisible_gaussian_changes_nothing(backend, scene, hidden, at):
-    seen, charges = charged(backend, scene)
+    seen, error_bounds = with_error_bounds(backend, scene)
     more = backend.render(backend.sees(_joined(scene, hidden, at)))
-    _same_image_and_light("whole.invisible", backend, more, backend.render(seen), charges)
+    _same_image_and_transmittance("whole.invisible", backend, more, backend.render(seen), error_bounds)
 
 
 @law("whole", RENDER, DETERMINISTIC, ROWWISE, scene=scenes(max_gaussians=4), hidden=invisible, at=st.integers(0, 4))
@@ -113,7 +119,7 @@ def test_an_invisible_gaussian_changes_no_bit(backend, scene, hidden, at):
     one = backend.render(backend.sees(scene))
     other = backend.render(backend.sees(_joined(scene, hidden, at)))
     assert_same_bits("image", other.image, one.image)
-    assert_same_bits("remaining light", other.T_final, one.T_final)
+    assert_same_bits("remaining transmittance", other.T_final, one.T_final)
 
 
 @law(
@@ -138,7 +144,7 @@ def test_scaling_the_world_by_a_power_of_two_changes_no_bit(backend, scene, powe
     one, other = backend.render(seen.rows(clear)), backend.render(bigger.rows(clear))
     assert_seen(one)
     assert_same_bits("image", other.image, one.image)
-    assert_same_bits("remaining light", other.T_final, one.T_final)
+    assert_same_bits("remaining transmittance", other.T_final, one.T_final)
 
 
 @law(
@@ -159,15 +165,15 @@ def test_moving_world_and_camera_together_changes_nothing(backend, scene, turn, 
     moved = scene.but(
         means=g.means @ R.T + t, quats=g.quats @ left.T, viewmat=scene.camera.viewmat @ np.linalg.inv(motion)
     )
-    seen, charges = charged(backend, scene)
-    seen_moved, moved_charges = charged(backend, moved)
-    charges.image += moved_charges.image
-    charges.T_final += moved_charges.T_final
-    for label, doubt in moved_charges.doubts.items():
-        charges.doubts[label] |= doubt
+    seen, error_bounds = with_error_bounds(backend, scene)
+    seen_moved, moved_bounds = with_error_bounds(backend, moved)
+    error_bounds.image += moved_bounds.image
+    error_bounds.T_final += moved_bounds.T_final
+    for label, close in moved_bounds.near_threshold.items():
+        error_bounds.near_threshold[label] |= close
     view = backend.render(seen)
     assert_seen(view)
-    _same_render("whole.rigid", backend, backend.render(seen_moved), view, charges)
+    _same_render("whole.rigid", backend, backend.render(seen_moved), view, error_bounds)
 
 
 @law(
@@ -188,12 +194,12 @@ def test_cropping_commutes_with_rendering(backend, scene, left, top):
     p = scene.gaussians.means @ scene.camera.viewmat[:3, :3].T + scene.camera.viewmat[:3, 3]
     u, v = (scene.camera.K[a, a] * p[:, a] / p[:, 2] + scene.camera.K[a, 2] for a in (0, 1))
     inside = (p[:, 2] > 0.0) & (u > left) & (u < W) & (v > top) & (v < H)
-    seen, charges = charged(backend, scene.rows(inside))
+    seen, error_bounds = with_error_bounds(backend, scene.rows(inside))
     crop = backend.sees(seen.but(K=K, width=W - left, height=H - top))
     whole, part = backend.render(seen), backend.render(crop)
     window = (slice(top, None), slice(left, None))
-    sure = charges.certain[window]
-    size = (charges.image + charges.absolute + charges.T_final[..., None])[window]
+    sure = error_bounds.unambiguous[window]
+    size = (error_bounds.image + error_bounds.absolute + error_bounds.T_final[..., None])[window]
     assert_close("whole.crop", part.image[sure], whole.image[window][sure], size[sure], backend.dtype)
 
 
@@ -212,10 +218,10 @@ def test_a_mirrored_world_makes_a_mirrored_image(backend, scene):
     mirrored = upright.but(
         means=g.means * mirror, quats=g.quats * np.array([1.0, 1.0, -1.0, -1.0]), K=K, viewmat=viewmat
     )
-    seen, charges = charged(backend, upright)
+    seen, error_bounds = with_error_bounds(backend, upright)
     view, flipped = backend.render(seen), backend.render(backend.sees(mirrored))
-    assert_same_image("whole.mirror", backend, flipped.image[:, ::-1], view.image, charges)
-    assert_same_light("whole.mirror", backend, flipped.T_final[:, ::-1], view.T_final, charges)
+    assert_same_image("whole.mirror", backend, flipped.image[:, ::-1], view.image, error_bounds)
+    assert_same_transmittance("whole.mirror", backend, flipped.T_final[:, ::-1], view.T_final, error_bounds)
 
 
 denormals = st.sampled_from([5e-324, 1e-310, 1e-45, 1e-40, 1e-30])

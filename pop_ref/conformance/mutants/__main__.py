@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Sequence
 
-from pop_ref.conformance.examples import EXAMPLES
+from pop_ref.conformance.hypothesis_profiles import EXAMPLES
 from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM, BlackBox, Mutant
 from pop_ref.conformance.mutants.trial import killed_by, killers
 

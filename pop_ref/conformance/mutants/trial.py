@@ -13,7 +13,7 @@ from hypothesis.errors import HypothesisException
 
 from pop_ref.conformance import laws
 from pop_ref.conformance.adapter import OracleAdapter
-from pop_ref.conformance.examples import EXAMPLES
+from pop_ref.conformance.hypothesis_profiles import EXAMPLES
 from pop_ref.conformance.law import Law, missing
 from pop_ref.conformance.mutants.black_box import BlackBox
 from pop_ref.conformance.mutants.copies import Mutant, living

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render
-from pop_ref.types import Camera, Gaussians
 
 from .scene import HEIGHT, LR, WIDTH, training_scene
 

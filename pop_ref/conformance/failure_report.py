@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pop_ref.conformance.abilities import GRADIENTS, RENDER
 from pop_ref.conformance.adapter import OracleAdapter, View
+from pop_ref.conformance.capabilities import GRADIENTS, RENDER
 from pop_ref.conformance.cases import sensitivity
-from pop_ref.conformance.charges import REACH, PixelCharges, charge
-from pop_ref.conformance.gradient_charges import gradient_charges
+from pop_ref.conformance.error_bounds import REACH, PixelErrorBounds, pixel_error_bounds
+from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scene_files import save_scene
 from pop_ref.conformance.scenes import Scene, cotangents, scene_as_code
 from pop_ref.margins import margins
@@ -84,7 +84,7 @@ def first_stage(backend: Any, scene: Scene) -> Difference | None:
 
 def first_shown(backend: Any, scene: Scene) -> Difference | list[str]:
     """Find the first stage whose result, as the rasterizer's meta shows it, differs; else the names of those shown."""
-    found, expected, charges = backend.render(scene), ORACLE.render(scene), _charged(backend, scene)
+    found, expected, error_bounds = backend.render(scene), ORACLE.render(scene), _error_bounds(backend, scene)
     alike = []
     # rows that either side culls hold nothing to compare
     drawn = np.all(expected.radii > 0, axis=1)
@@ -94,27 +94,27 @@ def first_shown(backend: Any, scene: Scene) -> Difference | list[str]:
         value = getattr(found, name)
         if value is None:
             continue
-        wanted, units = getattr(expected, name), getattr(charges.screen, f"e_{name}")
+        wanted, units = getattr(expected, name), getattr(error_bounds.screen, f"e_{name}")
         for i in np.flatnonzero(drawn).tolist():
-            limit = charges.reach * (units[i] + np.abs(wanted[i]))
+            limit = error_bounds.reach * (units[i] + np.abs(wanted[i]))
             if np.any(~(np.abs(value[i] - wanted[i]) <= limit)):
-                told = f"{name} as its meta shows them ({stage})"
-                return Difference(told, f"Gaussian {i}", np.asarray(wanted[i]).tolist(), np.asarray(value[i]).tolist())
+                what = f"{name} as its meta shows them ({stage})"
+                return Difference(what, f"Gaussian {i}", np.asarray(wanted[i]).tolist(), np.asarray(value[i]).tolist())
         alike.append(name)
     return alike
 
 
-def _charged(backend: Any, scene: Scene) -> PixelCharges:
+def _error_bounds(backend: Any, scene: Scene) -> PixelErrorBounds:
     square = scene.profile.extent == "square"
-    return charge(scene, backend.dtype, ORACLE.full_render(scene).tile_lists if square else None)
+    return pixel_error_bounds(scene, backend.dtype, ORACLE.full_render(scene).tile_lists if square else None)
 
 
 def first_pixel(backend: Any, scene: Scene) -> tuple[Difference, tuple[int, int]] | None:
-    """Find the first pixel that differs by more than rounding, doubtful or not."""
+    """Find the first pixel that differs by more than rounding, near a threshold or not."""
     expected, found = ORACLE.render(scene), backend.render(scene)
-    charges = _charged(backend, scene)
-    limit = charges.reach * (charges.T_final + 1.0)
-    colors = charges.reach * (charges.image + charges.absolute)
+    error_bounds = _error_bounds(backend, scene)
+    limit = error_bounds.reach * (error_bounds.T_final + 1.0)
+    colors = error_bounds.reach * (error_bounds.image + error_bounds.absolute)
     checks: list[tuple[str, Any]] = [
         ("T_final", ~(np.abs(found.T_final - expected.T_final) <= limit)),
         ("image", np.any(~(np.abs(found.image - expected.image) <= colors), axis=2)),
@@ -148,17 +148,17 @@ def first_gaussian(backend: Any, scene: Scene) -> str | None:
 
 
 def first_gradient(backend: Any, scene: Scene) -> Difference | None:
-    """Find the first gradient that differs, of the standard cotangents where no decision is in doubt."""
-    charges = _charged(backend, scene)
+    """Find the first gradient that differs, of the standard cotangents where no decision is near its threshold."""
+    error_bounds = _error_bounds(backend, scene)
     v_image, v_T_final = cotangents(scene)
-    v_image, v_T_final = v_image * charges.smooth[..., None], v_T_final * charges.smooth
+    v_image, v_T_final = v_image * error_bounds.smooth[..., None], v_T_final * error_bounds.smooth
     expected, found = (side.gradients(scene, v_image, v_T_final) for side in (ORACLE, backend))
-    bounds = gradient_charges(scene, charges, v_image, v_T_final)
-    smooth = ~charges.screen.kinked
+    bounds = gradient_error_bounds(scene, error_bounds, v_image, v_T_final)
+    smooth = ~error_bounds.screen.kinked
     for name in ("background", "sh", "opacities", "means2d", "means2d_abs", "scales", "quats", "means", "viewmat"):
         if name not in found or (name == "viewmat" and not np.all(smooth)):
             continue
-        wrong = ~(np.abs(found[name] - expected[name]) <= charges.reach * bounds[name])
+        wrong = ~(np.abs(found[name] - expected[name]) <= error_bounds.reach * bounds[name])
         if name not in ("background", "viewmat"):
             wrong[~smooth] = False
         if np.any(wrong):
@@ -179,17 +179,17 @@ def nearest_decision(scene: Scene, pixel: tuple[int, int] | None) -> str:
         return f"nearest decision at that pixel: {label}, margin {margin:.3g} (float32 decides alike over 1e-6)"
     if found.nearest is None:
         return "no decision is near its threshold"
-    doubt = found.nearest
-    return f"nearest decision: {doubt.decision} of {doubt.where}, margin {doubt.margin:.3g}"
+    close = found.nearest
+    return f"nearest decision: {close.decision} of {close.where}, margin {close.margin:.3g}"
 
 
-def tell(name: str, backend: Any, scenes: dict[str, Scene]) -> str:
+def failure_report(name: str, backend: Any, scenes: dict[str, Scene]) -> str:
     """Write a failing law's report: what differs first, the nearest decision, and the scene as code to paste.
 
     Args:
         name: the law.
         backend: who broke it; as a law watched it, it says whether gradients were asked for.
-        scenes: what was drawn, by name; the first that the backend draws otherwise than the oracle is told.
+        scenes: what was drawn, by name; the first that the backend draws otherwise than the oracle is reported.
     """
     title = f"law {name.removeprefix('test_')} fails on {backend.name}"
     reports = [(scene, *_findings(backend, scene)) for scene in scenes.values()]

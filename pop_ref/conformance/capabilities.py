@@ -74,8 +74,8 @@ DERIVATIVES: Final = "gradients without exceptions"
 HOMOGENEOUS: Final = "projection without a constant beside the depth"
 
 
-def abilities_of(profile: Profile | None) -> frozenset[str]:
-    """Return the abilities that follow from the one profile an implementation has, or from its taking any (None)."""
+def capabilities_of(profile: Profile | None) -> frozenset[str]:
+    """Return the capabilities that follow from the one profile an implementation has, or from its taking any (None)."""
     if profile is None:
         return frozenset((PROFILES, LOWER_CEILING, INRIAS, EXTENTS, PRINCIPAL_POINT, DERIVATIVES, HOMOGENEOUS))
     found = {

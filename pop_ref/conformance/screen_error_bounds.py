@@ -1,8 +1,8 @@
 """What rounding costs up to the screen: a running error analysis of projection, one row a Gaussian.
 
-Every quantity x carries a charge e(x), so that a computation in precision eps may be wrong by about eps * e(x). Charges
-follow the textbook rule on absolute values, `e(f(x)) = |df/dx| e(x) + |terms of f|`, so they grow where terms cancel
-(needles, splats seen edge-on) and nowhere else. Charges are of first order and hold for any order of evaluation.
+Every quantity x carries an error bound e(x), so that a computation in precision eps may be wrong by about eps * e(x).
+Bounds follow the textbook rule on absolute values, `e(f(x)) = |df/dx| e(x) + |terms of f|`, so they grow where terms
+cancel (needles, splats seen edge-on) and nowhere else. Bounds are of first order and hold for any order of evaluation.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ TINY = np.finfo(np.float64).tiny
 
 
 @dataclass(frozen=True)
-class ScreenCharges:
-    """Screen quantities in float64 with their charges; rows behind the near plane are left at zero.
+class ScreenErrorBounds:
+    """Screen quantities in float64 with their error bounds; rows behind the near plane are left at zero.
 
     Attributes:
         kept: in front of the near plane with a positive determinant. [N]
@@ -72,7 +72,7 @@ def _in_float32(values: np.ndarray) -> np.ndarray:
     return values.astype(np.float32).astype(np.float64) == values
 
 
-def _camera_charges(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def _camera_error_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Return e(means_cam) and e(covars_cam)."""
     g, viewmat = scene.gaussians, scene.camera.viewmat
     R, t = viewmat[:3, :3], viewmat[:3, 3]
@@ -89,7 +89,7 @@ def _camera_charges(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return e_means_cam, np.abs(R) @ (e_covars + 4.0 * covars) @ np.abs(R).T
 
 
-def _jacobian_charges(means_cam: np.ndarray, e: np.ndarray, J: np.ndarray) -> np.ndarray:
+def _jacobian_error_bounds(means_cam: np.ndarray, e: np.ndarray, J: np.ndarray) -> np.ndarray:
     z = np.maximum(np.abs(means_cam[:, 2]), TINY)
     relative = e[:, 2] / z + 2.0
     e_J = np.abs(J) * relative[:, None, None]
@@ -99,7 +99,7 @@ def _jacobian_charges(means_cam: np.ndarray, e: np.ndarray, J: np.ndarray) -> np
     return e_J
 
 
-def _conic_charges(covars2d: np.ndarray, e_covars2d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _conic_error_bounds(covars2d: np.ndarray, e_covars2d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     a, b, c = covars2d[:, 0, 0], np.abs(covars2d[:, 0, 1]), covars2d[:, 1, 1]
     e_a, e_b, e_c = e_covars2d[:, 0, 0], e_covars2d[:, 0, 1], e_covars2d[:, 1, 1]
     det = covars2d[:, 0, 0] * covars2d[:, 1, 1] - covars2d[:, 0, 1] * covars2d[:, 1, 0]
@@ -109,8 +109,8 @@ def _conic_charges(covars2d: np.ndarray, e_covars2d: np.ndarray) -> tuple[np.nda
     return det, e_det, e_conics
 
 
-def _color_charges(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return colours, their charges, and the sums before the clamp at 0."""
+def _color_error_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return colours, their error bounds, and the sums before the clamp at 0."""
     g = scene.gaussians
     degree = round(np.sqrt(g.sh.shape[1])) - 1 if scene.sh_degree is None else scene.sh_degree
     n_sh = (degree + 1) ** 2
@@ -141,11 +141,11 @@ def _clamp_in_reach(scene: Scene, p: np.ndarray, e_p: np.ndarray, reach: float) 
     return near
 
 
-def screen_charges(scene: Scene, reach: float) -> ScreenCharges:
-    """Carry charges from the scene to the screen; decisions within reach times their charge are doubtful."""
+def screen_error_bounds(scene: Scene, reach: float) -> ScreenErrorBounds:
+    """Carry error bounds from the scene to the screen; note decisions within reach of them."""
     g, camera, profile = scene.gaussians, scene.camera, scene.profile
     N = len(g)
-    e_p, e_S = _camera_charges(scene)
+    e_p, e_S = _camera_error_bounds(scene)
     p = means_cam_from_means(g.means, camera.viewmat)
     kept = in_front(p[:, 2], profile)
     depths = p[:, 2]
@@ -164,19 +164,19 @@ def screen_charges(scene: Scene, reach: float) -> ScreenCharges:
     )
     S = covars_cam_from_covars(covars_from_quats_scales(g.quats, g.scales), camera.viewmat)
     J = projection_jacobians(p, camera.K, camera.width, camera.height, profile)
-    e_J = _jacobian_charges(p, e_p, J)
+    e_J = _jacobian_error_bounds(p, e_p, J)
     A = np.abs(J)
     e_2d = A @ (e_S + 4.0 * np.abs(S)) @ _t(A) + e_J @ np.abs(S) @ _t(A) + A @ np.abs(S) @ _t(e_J)
     raw = project_covars(S, J)
     covars2d = low_pass(raw, profile.eps2d)
     e_2d = e_2d + np.abs(covars2d)
-    det, e_det, e_conics = _conic_charges(covars2d, e_2d)
+    det, e_det, e_conics = _conic_error_bounds(covars2d, e_2d)
     opacities, e_opacities = g.opacities, g.opacities.copy()
     if scene.antialiased:
         opacities, e_opacities = _antialiased(g.opacities, raw, e_2d, det, e_det, profile.eps2d)
-    colors, e_colors, sums = _color_charges(scene) if N else (np.zeros((0, 3)),) * 3
+    colors, e_colors, sums = _color_error_bounds(scene) if N else (np.zeros((0, 3)),) * 3
     kinked = _clamp_in_reach(scene, p, e_p, reach) | np.any(np.abs(sums) <= reach * e_colors, axis=1)
-    return ScreenCharges(
+    return ScreenErrorBounds(
         kept=kept & (det > 0.0), near=near, kinked=kinked, depths=depths, e_depths=e_p[:, 2],
         means2d=means2d, e_means2d=e_means2d, conics=conics_from_covars2d(covars2d), e_conics=e_conics,
         det=det, e_det=e_det, opacities=opacities, e_opacities=e_opacities, colors=colors, e_colors=e_colors,
@@ -189,7 +189,7 @@ def _antialiased(
     opacities: np.ndarray, raw: np.ndarray, e_2d: np.ndarray, det: np.ndarray, e_det: np.ndarray, eps2d: float
 ) -> tuple[np.ndarray, np.ndarray]:
     factors = compensations(raw, eps2d)
-    raw_det, e_raw_det, _ = _conic_charges(raw, e_2d)
+    raw_det, e_raw_det, _ = _conic_error_bounds(raw, e_2d)
     relative = e_raw_det / np.maximum(raw_det, TINY) + e_det / np.maximum(det, TINY) + 4.0
     # near zero sqrt(max(0, x)) is wrong by the root of x's error, which no multiple of eps bounds: let it be huge
     return opacities * factors, opacities * factors * np.minimum(relative, 1e30)

@@ -1,8 +1,8 @@
 """What rounding costs in gradients: the backward pass on absolute values.
 
-Every cotangent carries a pair: an upper bound m of its terms' absolute sum, and a charge e in units of eps. The rule is
-that of `screen_charges`: a product a v costs `|a| e(v) + e(a) m(v) + |a| m(v)`. Sums over pixels may be taken about a
-tile's centre, so an offset counts as itself plus half a tile.
+Every cotangent carries a pair: an upper bound m of its terms' absolute sum, and an error bound e in units of eps. The
+rule is that of `screen_error_bounds`: a product a v costs `|a| e(v) + e(a) m(v) + |a| m(v)`. Sums over pixels may be
+taken about a tile's centre, so an offset counts as itself plus half a tile.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pop_ref.camera import camera_center
-from pop_ref.conformance.charges import Layer, PixelCharges
+from pop_ref.conformance.error_bounds import Layer, PixelErrorBounds
 from pop_ref.conformance.scenes import Scene
-from pop_ref.conformance.screen_charges import TINY, ScreenCharges
+from pop_ref.conformance.screen_error_bounds import TINY, ScreenErrorBounds
 from pop_ref.covariance import covars_from_quats_scales, rotmats_from_quats
 
 # of what a splat has of each
@@ -23,7 +23,7 @@ _WIDTHS = {"means2d": (2,), "conics": (3,), "opacities": (), "colors": (3,)}
 
 @dataclass
 class Bound:
-    """A bound of absolute values and its charge in units of eps; arithmetic follows the module's rule."""
+    """A bound of absolute values and its error bound in units of eps; arithmetic follows the module's rule."""
 
     m: np.ndarray
     e: np.ndarray
@@ -32,7 +32,7 @@ class Bound:
         return Bound(self.m + other.m, self.e + other.e)
 
     def times(self, a: np.ndarray | float, e_a: np.ndarray | float | None = None) -> Bound:
-        """Return the product with a known factor, whose own charge defaults to its rounding."""
+        """Return the product with a known factor, whose own error bound defaults to its rounding."""
         size = np.abs(a)
         return Bound(size * self.m, size * self.e + (size if e_a is None else e_a + size) * self.m)
 
@@ -47,55 +47,55 @@ class Bound:
         return Bound(m, left @ self.e @ right + e_left @ self.m @ right + left @ self.m @ e_right + 4.0 * m)
 
     @property
-    def charge(self) -> np.ndarray:
-        """Return what a comparison is charged: the error's units and one of the bound itself."""
+    def error_bound(self) -> np.ndarray:
+        """Return what a comparison allows: the error's units and one of the bound itself."""
         return self.e + self.m
 
 
-def gradient_charges(
+def gradient_error_bounds(
     scene: Scene,
-    charges: PixelCharges,
+    error_bounds: PixelErrorBounds,
     v_image: np.ndarray,
     v_T_final: np.ndarray,
     plain: int = 0,
     with_depth: bool = False,
 ) -> dict[str, np.ndarray]:
-    """Return the charge of every gradient by name, in units of eps.
+    """Return the error bound of every gradient by name, in units of eps.
 
     Args:
         scene: what is drawn.
-        charges: of the scene, with the same channels as the cotangent.
+        error_bounds: of the scene, with the same channels as the cotangent.
         v_image: cotangent of the image. [H, W, D]
         v_T_final: cotangent of the remaining transmittance. [H, W]
         plain: how many of the first channels are plain colours; with none, they are of harmonics.
         with_depth: whether the last channel is depth.
     """
-    found = sums_over_pixels(scene, charges, v_image, v_T_final)
-    return charges_of_sums(scene, charges.screen, *found, plain, with_depth)
+    found = sums_over_pixels(scene, error_bounds, v_image, v_T_final)
+    return error_bounds_of_sums(scene, error_bounds.screen, *found, plain, with_depth)
 
 
 def sums_over_pixels(
-    scene: Scene, charges: PixelCharges, v_image: np.ndarray, v_T_final: np.ndarray
+    scene: Scene, error_bounds: PixelErrorBounds, v_image: np.ndarray, v_T_final: np.ndarray
 ) -> tuple[dict[str, Bound], np.ndarray]:
-    """Bound the cotangents of splats, by name, and charge that of the background; windows of one image add up."""
+    """Bound the cotangents of splats, by name, and the error bound of the background's; windows of one image add up."""
     N = len(scene.gaussians)
     size = scene.tile_size or scene.profile.tile_size
-    pixels = _pixel_bounds(scene, charges, np.abs(v_image), np.abs(v_T_final), 0.5 * size)
-    T = charges.layers[-1].T_after if charges.layers else np.ones(v_T_final.shape)
-    background = np.einsum("hw,hwc->c", 2.0 * T + charges.T_final, np.abs(v_image))
+    pixels = _pixel_bounds(scene, error_bounds, np.abs(v_image), np.abs(v_T_final), 0.5 * size)
+    T = error_bounds.layers[-1].T_after if error_bounds.layers else np.ones(v_T_final.shape)
+    background = np.einsum("hw,hwc->c", 2.0 * T + error_bounds.T_final, np.abs(v_image))
     shapes = {"means2d": (2,), "conics": (3,), "opacities": (), "colors": v_image.shape[2:]}
     return {name: _gather(values, (N, *shapes[name])) for name, values in pixels.items()}, background
 
 
-def charges_of_sums(
+def error_bounds_of_sums(
     scene: Scene,
-    screen: ScreenCharges,
+    screen: ScreenErrorBounds,
     rows: dict[str, Bound],
     background: np.ndarray,
     plain: int = 0,
     with_depth: bool = False,
 ) -> dict[str, np.ndarray]:
-    """Return the charge of every gradient by name from what `sums_over_pixels` found."""
+    """Return the error bound of every gradient by name from what `sums_over_pixels` found."""
     N, rows = len(scene.gaussians), dict(rows)
     given, nothing = rows["colors"], np.zeros((N, 3))
     if with_depth:
@@ -105,9 +105,9 @@ def charges_of_sums(
     elif with_depth:
         rows["colors"] = Bound(given.m[:, :-1], given.e[:, :-1])
     found = _world_bounds(scene, screen, rows) if N else _no_bounds(scene)
-    found["colors"] = given.charge[:, :plain]
+    found["colors"] = given.error_bound[:, :plain]
     found["background"] = background
-    found["means2d"] = found["means2d_abs"] = rows["means2d"].charge
+    found["means2d"] = found["means2d_abs"] = rows["means2d"].error_bound
     return found
 
 
@@ -125,14 +125,14 @@ def _gather(values: dict[int, Bound], shape: tuple[int, ...]) -> Bound:
 
 
 def _pixel_bounds(
-    scene: Scene, charges: PixelCharges, v: np.ndarray, v_T: np.ndarray, half_tile: float
+    scene: Scene, error_bounds: PixelErrorBounds, v: np.ndarray, v_T: np.ndarray, half_tile: float
 ) -> dict[str, dict[int, Bound]]:
-    s = charges.screen
+    s = error_bounds.screen
     out: dict[str, dict[int, Bound]] = {"means2d": {}, "conics": {}, "opacities": {}, "colors": {}}
     # of the channels that are drawn: depth has a background of 0
-    worth_behind = v_T + v @ np.abs(charges.scene.background)
+    worth_behind = v_T + v @ np.abs(error_bounds.scene.background)
     behind = Bound(worth_behind, 2.0 * worth_behind)
-    for layer in reversed(charges.layers):
+    for layer in reversed(error_bounds.layers):
         i, shown = layer.id, layer.blended.astype(np.float64)
         T, T_error, alpha, e_alpha = (layer.T, layer.T_error, layer.alpha, layer.e_alpha)
         weight = Bound(T * alpha * shown, (T_error * alpha + T * e_alpha) * shown)
@@ -152,7 +152,7 @@ def _pixel_bounds(
     return out
 
 
-def exponent_slopes(layer: Layer, s: ScreenCharges, v_sigma: Bound, half_tile: float) -> list[Bound]:
+def exponent_slopes(layer: Layer, s: ScreenErrorBounds, v_sigma: Bound, half_tile: float) -> list[Bound]:
     """Bound what a cotangent of the exponent is worth to (mean2d x, y, conic xx, xy, yy) at each pixel. [H, W] each"""
     dx, dy = np.abs(layer.dx) + half_tile, np.abs(layer.dy) + half_tile
     e_dx, e_dy = layer.e_dx + half_tile, layer.e_dy + half_tile
@@ -168,17 +168,17 @@ def exponent_slopes(layer: Layer, s: ScreenCharges, v_sigma: Bound, half_tile: f
     return [v_sigma.times(a, e_a) for a, e_a in factors]
 
 
-def parameter_charges(scene: Scene, s: ScreenCharges) -> np.ndarray:
-    """Charge the derivatives of (mean2d, conic, colour) by (mean, log scale). [N, 8, 6]"""
+def parameter_error_bounds(scene: Scene, s: ScreenErrorBounds) -> np.ndarray:
+    """Bound the rounding of the derivatives of (mean2d, conic, colour) by (mean, log scale). [N, 8, 6]"""
     n = len(scene.gaussians)
-    charges = np.zeros((n, 8, 6))
+    error_bounds = np.zeros((n, 8, 6))
     for row in range(8 * (n > 0)):
         v = np.zeros((n, 8))
         v[:, row] = 1.0
         parts = {"means2d": v[:, :2], "conics": v[:, 2:5], "opacities": np.zeros(n), "colors": v[:, 5:]}
         found = _world_bounds(scene, s, {name: Bound(part, np.zeros_like(part)) for name, part in parts.items()})
-        charges[:, row] = np.concatenate([found["means"], found["scales"] * scene.gaussians.scales], axis=1)
-    return charges
+        error_bounds[:, row] = np.concatenate([found["means"], found["scales"] * scene.gaussians.scales], axis=1)
+    return error_bounds
 
 
 def _stack(*bounds: Bound) -> Bound:
@@ -194,7 +194,7 @@ def _matrix(conics: np.ndarray, half: float = 1.0) -> np.ndarray:
     return np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)
 
 
-def _world_bounds(scene: Scene, s: ScreenCharges, rows: dict[str, Bound]) -> dict[str, np.ndarray]:
+def _world_bounds(scene: Scene, s: ScreenErrorBounds, rows: dict[str, Bound]) -> dict[str, np.ndarray]:
     g, camera = scene.gaussians, scene.camera
     R = np.abs(camera.viewmat[:3, :3])
     Q, e_Q = np.abs(_matrix(s.conics)), _matrix(s.e_conics)
@@ -218,16 +218,16 @@ def _world_bounds(scene: Scene, s: ScreenCharges, rows: dict[str, Bound]) -> dic
     quats, scales = _shape_bounds(scene, v_covars)
     viewmat = _viewmat_bound(scene, v_p, v_S, v_dirs)
     return {
-        "means": v_means.charge,
+        "means": v_means.error_bound,
         "quats": quats,
         "scales": scales,
-        "opacities": opacity.charge,
+        "opacities": opacity.error_bound,
         "sh": sh,
         "viewmat": viewmat,
     }
 
 
-def _antialiasing(v_opacities: Bound, s: ScreenCharges) -> Bound:
+def _antialiasing(v_opacities: Bound, s: ScreenErrorBounds) -> Bound:
     # v_Sigma = v_rho rho / 2 (raw^-1 - blurred^-1); the raw inverse is bounded by the conic over the squared factor
     factor = np.minimum(s.e_opacities / np.maximum(s.opacities, TINY), 1e15)
     spread = np.abs(_matrix(s.conics)) * factor[:, None, None]
@@ -235,7 +235,7 @@ def _antialiasing(v_opacities: Bound, s: ScreenCharges) -> Bound:
     return Bound(m, m * (factor[:, None, None] + 4.0) + (v_opacities.e * s.opacities)[:, None, None] * spread)
 
 
-def _point_bound(s: ScreenCharges, K: np.ndarray, v_means2d: Bound, v_J: Bound) -> Bound:
+def _point_bound(s: ScreenErrorBounds, K: np.ndarray, v_means2d: Bound, v_J: Bound) -> Bound:
     z, e_z = s.means_cam[:, 2], s.e_means_cam[:, 2]
     total = Bound(np.zeros((len(z), 3)), np.zeros((len(z), 3)))
     for axis in range(2):
@@ -270,7 +270,7 @@ def _color_bounds(scene: Scene, v_colors: Bound) -> tuple[Bound, np.ndarray]:
     height = np.sqrt((2.0 * np.floor(np.sqrt(np.arange(n_sh))) + 1.0) / (4.0 * np.pi))
     basis = Bound(np.broadcast_to(height, (len(g), n_sh)), height * (1.0 + 2.0 * degree * e_dirs[:, None]))
     sh = np.zeros(g.sh.shape)
-    sh[:, :n_sh] = basis.m[..., None] * v_colors.charge[:, None] + basis.e[..., None] * v_colors.m[:, None]
+    sh[:, :n_sh] = basis.m[..., None] * v_colors.error_bound[:, None] + basis.e[..., None] * v_colors.m[:, None]
     worth = np.einsum("nkc,nc->n", np.abs(g.sh[:, :n_sh]), v_colors.m)
     e_worth = np.einsum("nkc,nc->n", np.abs(g.sh[:, :n_sh]), v_colors.e)
     slope = 2.0 * degree * np.max(height) / length
@@ -293,7 +293,7 @@ def _shape_bounds(scene: Scene, v_covars: Bound) -> tuple[np.ndarray, np.ndarray
     # the slopes' own rounding, and that of the radial part, which is projected out
     e = e + 4.0 * m
     radial = np.sum(units * (e + 4.0 * m), axis=1, keepdims=True)
-    return (e + units * radial) / length, v_scales.charge
+    return (e + units * radial) / length, v_scales.error_bound
 
 
 def _rotation_slopes(units: np.ndarray) -> np.ndarray:
@@ -312,8 +312,8 @@ def _viewmat_bound(scene: Scene, v_p: Bound, v_S: Bound, v_dirs: Bound) -> np.nd
     g, viewmat = scene.gaussians, scene.camera.viewmat
     R, t = np.abs(viewmat[:3, :3]), np.abs(viewmat[:3, 3])
     covars = np.abs(covars_from_quats_scales(g.quats, g.scales)) + np.max(g.scales, axis=1)[:, None, None] ** 2
-    charge = np.zeros((4, 4))
-    charge[:3, :3] = np.sum(v_p.charge[:, :, None] * np.abs(g.means)[:, None, :], 0)
-    charge[:3, :3] += np.sum(2.0 * v_S.charge @ R @ covars, 0) + np.outer(t, np.sum(v_dirs.charge, 0))
-    charge[:3, 3] = np.sum(v_p.charge, 0) + R @ np.sum(v_dirs.charge, 0)
-    return charge
+    error_bound = np.zeros((4, 4))
+    error_bound[:3, :3] = np.sum(v_p.error_bound[:, :, None] * np.abs(g.means)[:, None, :], 0)
+    error_bound[:3, :3] += np.sum(2.0 * v_S.error_bound @ R @ covars, 0) + np.outer(t, np.sum(v_dirs.error_bound, 0))
+    error_bound[:3, 3] = np.sum(v_p.error_bound, 0) + R @ np.sum(v_dirs.error_bound, 0)
+    return error_bound

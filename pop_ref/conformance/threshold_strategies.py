@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from pop_ref.conformance.scenes import Record, Scene, pack
 from pop_ref.conformance.strategies import dyadic, quats, viewmats
 from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER, Profile
-from pop_ref.types import Camera
+from pop_ref.records import Camera
 
 profiles = st.sampled_from([PAPER, GSPLAT_1_6, GSPLAT_1_5])
 slight = st.sampled_from(

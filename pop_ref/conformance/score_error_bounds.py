@@ -1,7 +1,8 @@
-"""What rounding costs in the scores of pruning and budgeting methods: sums over pixels of products of charged terms.
+"""What rounding costs in the scores of pruning and budgeting methods: sums over pixels of products of bounded terms.
 
 The functions that are judged take splats and tile lists; these are the oracle's, rounded to the backend's precision, so
-the charges of a whole render bound theirs. A Gaussian is compared where every pixel that it may reach is certain.
+the error bounds of a whole render bound theirs. A Gaussian is compared where every pixel that it may reach is
+unambiguous.
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from pop_ref.conformance.adapter import projected
+from pop_ref.conformance.assertions import with_error_bounds
 from pop_ref.conformance.cases import rounded
-from pop_ref.conformance.charges import Layer, PixelCharges
-from pop_ref.conformance.gradient_charges import Bound, exponent_slopes
+from pop_ref.conformance.error_bounds import Layer, PixelErrorBounds
+from pop_ref.conformance.gradient_error_bounds import Bound, exponent_slopes
 from pop_ref.conformance.scenes import Scene
-from pop_ref.conformance.verdicts import charged
-from pop_ref.types import Splats
+from pop_ref.records import Splats
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Screened:
         splats: rounded to the backend's precision.
         lists: ids front to back, tile by tile.
         tile_size: px.
-        charges: of the render.
+        error_bounds: of the render.
         sure: every pixel that the row may reach is clear of rounding. [N]
         smooth: and so is the ceiling there (D6). [N]
     """
@@ -38,7 +39,7 @@ class Screened:
     splats: Splats
     lists: list[list[int]]
     tile_size: int
-    charges: PixelCharges
+    error_bounds: PixelErrorBounds
     sure: np.ndarray
     smooth: np.ndarray
 
@@ -51,54 +52,54 @@ class Screened:
 
 def screened(backend: Any, scene: Scene) -> Screened:
     """Project a scene for a backend; scenes that its precision cannot resolve are set aside."""
-    seen, charges = charged(backend, scene)
+    seen, error_bounds = with_error_bounds(backend, scene)
     splats, lists = projected(seen)
     columns = ("means2d", "depths", "conics", "opacities", "colors")
     near = rounded(tuple(getattr(splats, name) for name in columns), backend.dtype)
     size = seen.profile.tile_size if seen.tile_size is None else seen.tile_size
-    sure, smooth = (_clear_rows(charges, where) for where in (charges.certain, charges.smooth))
+    sure, smooth = (_clear_rows(error_bounds, where) for where in (error_bounds.unambiguous, error_bounds.smooth))
     splats = replace(splats, **dict(zip(columns, near, strict=True)))
-    return Screened(seen, splats, lists, size, charges, sure, smooth)
+    return Screened(seen, splats, lists, size, error_bounds, sure, smooth)
 
 
-def _clear_rows(charges: PixelCharges, certain: np.ndarray) -> np.ndarray:
-    clear = np.ones(len(charges.scene.gaussians), dtype=bool)
-    floor = charges.scene.profile.alpha_floor * (1.0 - 1e-3)
-    for layer in charges.layers:
-        clear[layer.id] = bool(np.all(certain[layer.raw >= floor]))
+def _clear_rows(error_bounds: PixelErrorBounds, unambiguous: np.ndarray) -> np.ndarray:
+    clear = np.ones(len(error_bounds.scene.gaussians), dtype=bool)
+    floor = error_bounds.scene.profile.alpha_floor * (1.0 - 1e-3)
+    for layer in error_bounds.layers:
+        clear[layer.id] = bool(np.all(unambiguous[layer.raw >= floor]))
     return clear
 
 
-def weight_charges(charges: PixelCharges) -> tuple[np.ndarray, np.ndarray]:
-    """Charge sums of weights, and of distances, over the pixels of each Gaussian. [N], [N]"""
-    n = len(charges.scene.gaussians)
+def weight_error_bounds(error_bounds: PixelErrorBounds) -> tuple[np.ndarray, np.ndarray]:
+    """Bound the rounding of sums of weights, and of distances, over the pixels of each Gaussian. [N], [N]"""
+    n = len(error_bounds.scene.gaussians)
     weights, distances = np.zeros(n), np.zeros(n)
-    for layer in charges.layers:
-        weights[layer.id] = np.sum(_weight(layer).charge)
+    for layer in error_bounds.layers:
+        weights[layer.id] = np.sum(_weight(layer).error_bound)
         away = np.hypot(layer.dx, layer.dy) + layer.e_dx + layer.e_dy
         distances[layer.id] = np.sum(away * layer.blended)
     return weights, distances
 
 
-def sensitivity_charges(charges: PixelCharges) -> np.ndarray:
-    """Charge Speedy-Splat's score: twice a term times its charge, over pixels. [N]"""
-    s = charges.screen
-    found = np.zeros(len(charges.scene.gaussians))
-    for layer, channels in _alpha_bounds(charges):
+def sensitivity_error_bounds(error_bounds: PixelErrorBounds) -> np.ndarray:
+    """Bound the rounding of Speedy-Splat's score: twice a term times its error bound, over pixels. [N]"""
+    s = error_bounds.screen
+    found = np.zeros(len(error_bounds.scene.gaussians))
+    for layer, channels in _alpha_bounds(error_bounds):
         opacity = float(s.opacities[layer.id])
         term = sum(channels[1:], start=channels[0]).times(opacity, s.e_opacities[layer.id])
-        found[layer.id] = np.sum(2.0 * term.m * term.charge)
+        found[layer.id] = np.sum(2.0 * term.m * term.error_bound)
     return found
 
 
-def moment_charges(charges: PixelCharges, half_tile: float) -> np.ndarray:
-    """Charge the screen moments of Fisher blocks. [N, 31]"""
-    s = charges.screen
-    found = np.zeros((len(charges.scene.gaussians), 31))
-    passes = charges.scene.profile.ceiling_gradient == "pass"
-    for layer, channels in _alpha_bounds(charges):
+def moment_error_bounds(error_bounds: PixelErrorBounds, half_tile: float) -> np.ndarray:
+    """Bound the rounding of the screen moments of Fisher blocks. [N, 31]"""
+    s = error_bounds.screen
+    found = np.zeros((len(error_bounds.scene.gaussians), 31))
+    passes = error_bounds.scene.profile.ceiling_gradient == "pass"
+    for layer, channels in _alpha_bounds(error_bounds):
         weight = _weight(layer)
-        open_ = 1.0 if passes else np.where(layer.raw > charges.scene.profile.alpha_ceiling, 0.0, 1.0)
+        open_ = 1.0 if passes else np.where(layer.raw > error_bounds.scene.profile.alpha_ceiling, 0.0, 1.0)
         seconds = np.zeros((5, 5))
         for c, v_alpha in enumerate(channels):
             v_sigma = v_alpha.times(layer.raw * open_, (layer.raw * layer.e_sigma + layer.raw) * open_)
@@ -119,13 +120,13 @@ def _product(a: Bound, b: Bound) -> np.ndarray:
     return a.m * b.e + a.e * b.m + 2.0 * a.m * b.m
 
 
-def _alpha_bounds(charges: PixelCharges) -> list[tuple[Layer, list[Bound]]]:
+def _alpha_bounds(error_bounds: PixelErrorBounds) -> list[tuple[Layer, list[Bound]]]:
     """Bound dC_c/dalpha of every layer and channel at each pixel, from back to front."""
-    s = charges.screen
-    shape = charges.T_final.shape
-    behind = [Bound(np.full(shape, abs(b)), np.full(shape, abs(b))) for b in charges.scene.background.tolist()]
+    s = error_bounds.screen
+    shape = error_bounds.T_final.shape
+    behind = [Bound(np.full(shape, abs(b)), np.full(shape, abs(b))) for b in error_bounds.scene.background.tolist()]
     found: list[tuple[Layer, list[Bound]]] = []
-    for layer in reversed(charges.layers):
+    for layer in reversed(error_bounds.layers):
         shown = layer.blended.astype(np.float64)
         channels: list[Bound] = []
         for c in range(len(behind)):

@@ -1,0 +1,122 @@
+"""Assertions that say what differs, where first, and by how many units: of arrays, and of whole renders."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import assume
+
+from pop_ref.conformance import tolerances
+from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bounds
+from pop_ref.conformance.scenes import Scene
+from pop_ref.margins import margins
+
+# beyond this many units a conic has no digits left to compare: the scene is set aside by a computed number
+WORST_CONDITION = 1.0 / 64.0
+
+
+def assert_close(
+    key: str,
+    actual: Any,
+    expected: Any,
+    magnitude: Any,
+    dtype: Any,
+    against_oracle: bool = False,
+) -> None:
+    """Assert that every entry differs by at most the key's tolerance times eps times its magnitude.
+
+    Args:
+        key: the tolerance, and the name in the message.
+        actual, expected: arrays of one shape.
+        magnitude: what one unit is a multiple of eps of; broadcasts.
+        dtype: the precision whose eps is meant.
+        against_oracle: True gives a float64 backend the room of `tolerances.agreement`.
+    """
+    actual, expected = np.asarray(actual, dtype=np.float64), np.asarray(expected, dtype=np.float64)
+    assert actual.shape == expected.shape, f"{key}: shape {actual.shape}, expected {expected.shape}"
+    if actual.size == 0:
+        return
+    assert np.all(np.isfinite(actual)), f"{key}: {_first(~np.isfinite(actual), actual, expected)} is not finite"
+    eps = float(np.finfo(dtype).eps)
+    # the smallest normal number keeps a magnitude of zero from asking for more than the format can hold
+    scale = np.broadcast_to(np.asarray(magnitude, dtype=np.float64), actual.shape) + np.finfo(dtype).tiny / eps
+    difference = np.abs(actual - expected)
+    tolerances.record(key, dtype, float(np.max(difference / (eps * scale))))
+    limit = tolerances.agreement(key, dtype) if against_oracle else tolerances.allowed(key, dtype)
+    wrong = difference > limit * scale
+    if np.any(wrong):
+        where = tuple(int(i) for i in np.argwhere(wrong)[0])
+        units = difference[where] / (eps * scale[where])
+        raise AssertionError(
+            f"{key}: {_first(wrong, actual, expected)}; differs by {difference[where]:.3e} = {units:.3g} units,"
+            f" allowed {limit / eps:.3g} units of {eps * scale[where]:.3e}; {int(np.sum(wrong))} of {wrong.size} differ"
+        )
+
+
+def assert_same_bits(what: str, actual: Any, expected: Any) -> None:
+    """Assert equality of every entry; 0.0 and -0.0 are the same value."""
+    actual, expected = np.asarray(actual), np.asarray(expected)
+    assert actual.shape == expected.shape, f"{what}: shape {actual.shape}, expected {expected.shape}"
+    wrong = ~((actual == expected) | (np.isnan(actual) & np.isnan(expected)))
+    assert not np.any(wrong), f"{what}: {_first(wrong, actual, expected)}; must be equal exactly"
+
+
+def _first(wrong: Any, actual: Any, expected: Any) -> str:
+    where = tuple(int(i) for i in np.argwhere(wrong)[0])
+    return f"first at {list(where)}: got {actual[where].item()!r}, expected {expected[where].item()!r}"
+
+
+def with_error_bounds(backend: Any, scene: Scene) -> tuple[Scene, PixelErrorBounds]:
+    """Return the scene as the backend reads it, and its error bounds; set aside what its precision cannot resolve."""
+    seen, lists = backend.sees(scene), None
+    if seen.profile.extent == "square":
+        # here extents and tile lists are part of the meaning; where rounding decides them, nothing is said
+        assume(not extent_near_threshold(seen, backend.dtype))
+        lists = OracleAdapter().full_render(seen).tile_lists
+    error_bounds = pixel_error_bounds(seen, backend.dtype, lists)
+    assume(error_bounds.worst_condition() * error_bounds.reach < WORST_CONDITION)
+    return seen, error_bounds
+
+
+def extent_near_threshold(scene: Scene, dtype: Any, decisions: tuple[str, ...] = ("D1", "D2", "D3")) -> bool:
+    """Tell whether an extent or a tile rectangle is within reach of rounding."""
+    found = margins(scene.gaussians, scene.camera, scene.sh_degree, scene.profile, scene.tile_size, scene.antialiased)
+    return not bool(np.all(found.safe_gaussians(64.0 * float(np.finfo(dtype).eps), decisions)))
+
+
+def assert_same_image(
+    key: str,
+    backend: Any,
+    actual: Any,
+    expected: Any,
+    error_bounds: PixelErrorBounds,
+    against_oracle: bool = False,
+    at: Any = None,
+) -> None:
+    """Assert that two images agree where no decision is near its threshold, within their error bounds."""
+    where = error_bounds.unambiguous if at is None else error_bounds.unambiguous & at
+    magnitude = error_bounds.image + error_bounds.absolute
+    assert_close(key, actual[where], expected[where], magnitude[where], backend.dtype, against_oracle)
+
+
+def assert_same_transmittance(
+    key: str, backend: Any, actual: Any, expected: Any, error_bounds: PixelErrorBounds, against_oracle: bool = False
+) -> None:
+    """Assert that two maps of remaining transmittance agree where no decision is near its threshold."""
+    where = error_bounds.unambiguous
+    magnitude = error_bounds.T_final + 1.0
+    assert_close(key, actual[where], expected[where], magnitude[where], backend.dtype, against_oracle)
+
+
+def require(backend: Any, offered: dict[str, Any], name: str) -> None:
+    """Skip a law, by name, that reads a gradient which the backend does not offer."""
+    if name not in offered:
+        pytest.skip(f"{backend.name} has no gradient of {name}")
+
+
+def assert_seen(view: Any) -> None:
+    """Assert that the image is not empty: no law may pass on a blank picture."""
+    assert np.min(view.T_final) < 1.0, "nothing was blended anywhere; the comparison would say nothing"

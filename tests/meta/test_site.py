@@ -1,0 +1,69 @@
+"""The hook of `make site`: links of the repository lead to the same files on the site."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+spec = importlib.util.spec_from_file_location("site_hook", ROOT / "docs" / "site.py")
+assert spec is not None
+assert spec.loader is not None
+site = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(site)
+
+
+@pytest.mark.parametrize(
+    ("path", "where"),
+    [
+        ("README.md", "index.md"),
+        ("docs/kit.md", "kit.md"),
+        ("docs/demo.png", "demo.png"),
+        ("pop_ref/alpha.py", "source/pop_ref/alpha.py.md"),
+        ("pop_ref/conformance/LAWS.md", "source/pop_ref/conformance/LAWS.md"),
+        ("benchmarks/results/scorecards", "source/benchmarks/results/scorecards.md"),
+    ],
+)
+def test_every_file_has_its_place(path: str, where: str) -> None:
+    assert site.place(path) == where
+
+
+@pytest.mark.parametrize(
+    ("page", "link", "turned"),
+    [
+        ("README.md", "docs/kit.md", "kit.md"),
+        ("README.md", "pop_ref/learn/splat.py", "source/pop_ref/learn/splat.py.md"),
+        ("docs/kit.md", "MUTANTS.md", "MUTANTS.md"),
+        ("docs/learn.md", "../README.md", "index.md"),
+        ("docs/speed.md", "../benchmarks/NOTES.md#where", "source/benchmarks/NOTES.md#where"),
+        ("paper_repro/README.md", "claims.py", "claims.py.md"),
+        ("paper_repro/README.md", "../docs/paper.md", "../../paper.md"),
+        ("docs/kit.md", "https://example.org/a.py", "https://example.org/a.py"),
+    ],
+)
+def test_links_are_turned(page: str, link: str, turned: str) -> None:
+    assert site.with_links_of_the_site(f"see [it]({link}).", page) == f"see [it]({turned})."
+
+
+def test_all_that_pages_lead_to_is_there_and_pages_in_markdown_are_followed() -> None:
+    made = site.linked(["README.md", "docs/paper.md"])
+    assert "paper_repro/protocol.md" in made
+    assert "pop_ref/settings.py" in made  # protocol.md leads there, not docs/paper.md
+    assert all((ROOT / path).exists() for path in made)
+
+
+def test_a_fence_is_longer_than_any_within() -> None:
+    made = site.content("docs/site.py")
+    inside = max(len(run) for run in re.findall(r"`+", (ROOT / "docs" / "site.py").read_text(encoding="utf-8")))
+    fence = re.findall(r"^(`+)\{\.python", made, re.MULTILINE)[0]
+    assert len(fence) > inside
+
+
+def test_formulas_need_no_script() -> None:
+    made = site.with_formulas("the mean $\\mu_i$, and `$HOME` stays")
+    assert "<math" in made
+    assert "\\mu" not in made
+    assert "`$HOME` stays" in made
