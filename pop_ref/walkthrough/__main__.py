@@ -33,7 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("folder", type=Path, help="where the pages go; it is made")
     parser.add_argument(
-        "--only", type=int, nargs="+", metavar="N", help="run these chapters only"
+        "--only", nargs="+", metavar="N", help="run these chapters only, 4 or 4b"
     )
     wanted = parser.parse_args(arguments)
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
@@ -51,18 +51,19 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def write(folder: Path, only: list[int] | None = None) -> None:
+def write(folder: Path, only: list[str] | None = None) -> None:
     """Write the pages into a folder.
 
     Args:
         folder: made if it is not there.
-        only: numbers of the chapters to run, default all. The contents then lists what can be read: while one
-            chapter is being written, another may be out of form.
+        only: numbers of the chapters to run, such as 4 or 4b, default all. The contents then lists what can be
+            read: while one chapter is being written, another may be out of form.
 
     Raises:
         ChapterError: a chapter failed; pages of earlier chapters are written.
     """
-    from pop_ref.walkthrough.layout import chapter_page, index_page
+    from pop_ref.walkthrough.glossary import GLOSSARY_PAGE
+    from pop_ref.walkthrough.layout import chapter_page, glossary_page, index_page
     from pop_ref.walkthrough.pages import run_chapter
 
     chapters = [
@@ -77,7 +78,8 @@ def write(folder: Path, only: list[int] | None = None) -> None:
             page = chapter_page(chapter, run_chapter(chapter), chapters)
             _write(folder / chapter.page, page)
             took = time.perf_counter() - start
-            print(f"{chapter.number:2}  {chapter.title}  {took:.1f} s", flush=True)
+            print(f"{chapter.number:>3}  {chapter.title}  {took:.1f} s", flush=True)
+    _write(folder / GLOSSARY_PAGE, glossary_page())
     _write(folder / "index.html", index_page(chapters))
     print(f"open {folder / 'index.html'}")
 

@@ -1,3 +1,5 @@
+# minutes: 25
+
 # %% [markdown]
 # # 1. One Gaussian, one pixel
 #
@@ -88,7 +90,7 @@ print(
 #
 # Rasterizers add two rules that the paper does not print. An alpha under 1/255 changes an 8-bit image by less than one
 # level and is skipped (the *floor*, decision D5). And alpha is cut at 0.999 (the *ceiling*, D6), so that no splat
-# blocks everything: what lies behind keeps a trace of a say, and a gradient.
+# blocks everything: what lies behind still contributes a little, and has a gradient.
 
 # %%
 alpha, skipped = alpha_from_sigma(sigma, opacity)
@@ -211,7 +213,7 @@ ax.set(xlabel="x, px", ylabel="y, px")
 picture(fig, "The same splat blended over a warm background, pixel by pixel.")
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: predict
 # A splat has opacity 0.5. How many standard deviations from its centre has its alpha fallen to 0.25? Does the answer
 # depend on the covariance?
 
@@ -224,7 +226,7 @@ for axis in range(2):
     assert np.isclose(alpha_from_sigma(sigma_at(*end), 0.5)[0], 0.25)
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: derive
 # How much paint is in a splat? Integrate $o\, e^{-\sigma}$ over the plane, and compare with the sum of `alphas` above.
 # Why is the sum a little smaller?
 
@@ -236,7 +238,7 @@ assert np.isclose(alphas.sum(), paint * (1 - 1 / (255 * opacity)), rtol=5e-3)
 assert alphas.sum() < paint
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: predict
 # Shrink the splat to a standard deviation of 0.1 px and put it at (8, 8), on the corner between four pixels. What does
 # the image show? (Chapter 2 has the remedy.)
 

@@ -1,3 +1,5 @@
+# minutes: 30
+
 # %% [markdown]
 # # 2. From space to screen
 #
@@ -82,9 +84,11 @@ print("depths:", depths.round(2))
 #
 # $$u = \left( \frac{f_x x}{z} + c_x, \; \frac{f_y y}{z} + c_y \right)$$
 #
-# with focal lengths $f$ and the principal point $c$ in px. This division bends straight things: what the pinhole makes
-# of a Gaussian is no Gaussian. EWA splatting, which 3DGS builds on, replaces the division by its linearisation at the
-# centre. A linear map does take Gaussians to Gaussians, and the covariance on the screen is
+# with focal lengths $f$ and the principal point $c$ in px. Straight lines stay straight under this map, but equal steps
+# along them do not stay equal, since near things look larger: the map is not affine. Only affine maps take Gaussians to
+# Gaussians, so what the pinhole makes of a Gaussian is not one. EWA splatting, which 3DGS builds on, replaces the map
+# by its linearisation at the centre, its matrix of first derivatives, the *Jacobian* $J$. Then the covariance on the
+# screen is
 #
 # $$\Sigma^{2D} = J W \Sigma W^\top J^\top, \qquad
 # J = \begin{pmatrix} f_x/z & 0 & -f_x x/z^2 \\ 0 & f_y/z & -f_y y/z^2 \end{pmatrix}$$
@@ -216,7 +220,7 @@ assert soft.max() / soft.min() < 1.02
 #
 # $$\rho = \sqrt{\det \Sigma^{2D} / \det(\Sigma^{2D} + 0.3\, I)}$$
 #
-# (Mip-Splatting, eq. 9), so that the whole amount of paint stays what it was.
+# (the 2D Mip filter of Mip-Splatting), so that the whole amount of paint stays what it was.
 
 # %%
 rho = compensations(needle, PAPER.eps2d)[0]
@@ -250,7 +254,8 @@ picture(
 # ## All of it at once
 #
 # `project` does what this chapter did, for every Gaussian: centre, conic and extent, as chapter 1 used them. It also
-# drops what lies in front of the near plane or does not reach the image.
+# *culls*, that is leaves out, what cannot be seen: a Gaussian whose centre lies behind the camera or nearer to it than
+# the *near plane*, at depth 0.01 (decision D1), and one that does not reach the image (D2).
 
 # %%
 scene = Gaussians(means, quats, scales, np.array([0.9, 0.6]), np.zeros((2, 1, 3)))
@@ -276,7 +281,7 @@ def alone(mean: list[float], standard_deviations: list[float]) -> Gaussians:
 
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: derive
 # A Gaussian with the same standard deviation $s$ along all axes lies straight ahead at depth $z$. What is its standard
 # deviation on the screen before the blur? Why does it not matter how it is turned?
 
@@ -290,7 +295,7 @@ for each in (ball, turned):
     assert np.allclose(geometry(each, ahead).covars2d[0], (f * 0.2 / 5.0) ** 2 * np.eye(2))
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: derive
 # The same ball moves sideways to $x = z$. Which axis of its ellipse grows, and by what factor? (Use a screen so wide
 # that nothing is clamped.)
 
@@ -304,7 +309,7 @@ assert np.allclose(
 )
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: predict
 # A disc (one scale zero) is seen exactly edge-on. What is its screen covariance, and what does the blur do for it?
 
 # %% answer

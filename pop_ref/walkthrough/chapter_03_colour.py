@@ -1,3 +1,5 @@
+# minutes: 25
+
 # %% [markdown]
 # # 3. Colour from harmonics
 #
@@ -208,7 +210,7 @@ for step, degree in ((0, 0), (999, 0), (1000, 1), (2000, 2), (3000, 3), (30_000,
     assert sh_degree_at(step) == degree
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: derive
 # Which $h_0$ makes a Gaussian of degree 0 look orange, $(1, 0.6, 0.1)$, from everywhere?
 
 # %% answer
@@ -219,7 +221,7 @@ seen = colors_from_sh(np.repeat(h_0[None, None], len(sphere), axis=0), sphere, 0
 assert np.allclose(seen, orange)
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: derive
 # With degree 1 only, in which direction $d$ is a channel brightest, given its $h_1, h_2, h_3$? And how much brighter
 # than its mean is it there?
 
@@ -236,7 +238,7 @@ assert np.isclose(brightest, 0.5 + np.linalg.norm(vector))
 assert brightest >= everywhere.max()
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: predict
 # A camera looks at a Gaussian and then from the exact opposite side. Which coefficients make the two colours differ?
 
 # %% answer

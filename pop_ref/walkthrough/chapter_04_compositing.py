@@ -1,3 +1,5 @@
+# minutes: 25
+
 # %% [markdown]
 # # 4. Compositing and early ray termination
 #
@@ -68,8 +70,8 @@ assert np.allclose(pixel.weights, -np.diff([*pixel.transmittances, pixel.T_final
 # %% [markdown]
 # The order decides. The same six splats from back to front give another pixel (exercise 1 says how much a swap of two
 # neighbours costs). A renderer therefore sorts splats by depth before it blends. It need not go from front to back,
-# though: a painter's rule, $B_i = \alpha_i c_i + (1 - \alpha_i) B_{i+1}$ from the background forward, gives the same.
-# But only the walk from the front knows when to stop.
+# though: a painter's rule, $b_{i-1} = \alpha_i c_i + (1 - \alpha_i)\, b_i$ from the background $b_m = b$ forward, gives
+# the same. But only the walk from the front knows when to stop.
 
 # %%
 assert not np.allclose(
@@ -135,10 +137,11 @@ picture(
 )
 
 # %% [markdown]
-# One detail is worth knowing, because every implementation shares it. The splat that would cross the line is *not
-# blended*: the pixel ends in front of it. If that splat is nearly opaque, it takes a good share of the light into
-# oblivion. Put one splat of alpha 0.91 before a wall of alpha 0.999. It leaves $T = 0.09$, the wall would leave $9
-# \cdot 10^{-5}$, so the wall is skipped, and nine percent of the pixel shows the background instead.
+# One detail is worth knowing. In the rasterizers of 3DGS and gsplat, and so in POP, the splat that would cross the line
+# is *not blended*: the pixel ends in front of it. (Faster-GS and LiteGS do blend it before they stop.) If that splat is
+# nearly opaque, a good share of the light is lost. Put one splat of alpha 0.91 before a wall of alpha 0.999. It leaves
+# $T = 0.09$, the wall would leave $9 \cdot 10^{-5}$, so the wall is skipped, and nine percent of the pixel shows the
+# background instead.
 
 # %%
 veil_and_wall = stack(np.array([0.91, 0.999]), np.array([[0.2, 0.2, 0.2], [0.0, 0.5, 1.0]]))
@@ -210,7 +213,7 @@ picture(
 # would end soon behind the first surface. Chapters 7 and 8 do that.
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: derive
 # Two neighbours with alphas $\alpha_1, \alpha_2$ and colours $c_1, c_2$ lie behind a transmittance $T$. By how much
 # does the pixel change when they swap places?
 
@@ -223,7 +226,7 @@ T = pixel.transmittances[2]
 assert np.allclose(change, T * alphas[2] * alphas[3] * (colors[3] - colors[2]))
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: predict
 # A pixel looks into an endless row of splats of alpha 0.2. How many does it visit, by formula and by loop?
 
 # %% answer
@@ -231,7 +234,7 @@ assert np.allclose(change, T * alphas[2] * alphas[3] * (colors[3] - colors[2]))
 assert math.ceil(math.log(1e-4) / math.log(0.8)) == 42 == visited(0.2)
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: derive
 # What is the largest share of light that the stop can throw away, given the ceiling of 0.999? And if the ceiling is
 # 0.99, as in gsplat 1.6?
 

@@ -1,14 +1,18 @@
+# minutes: 35
+
 # %% [markdown]
 # # 6. What a loss pulls with: L1, L2, SSIM
 #
-# A loss reaches the Gaussians only through its derivative by the image. At the end of this chapter you know what that
-# derivative looks like for the three losses of the method, why POP trades L1 for L2, and what the trade costs.
+# A loss reaches the Gaussians only through its derivative with respect to the image. At the end of this chapter you
+# know what that derivative looks like for the three losses of the method, why POP trades L1 for L2, and what the trade
+# costs.
 
 # %% [markdown]
 # ## One pixel
 #
 # L1 averages $|\Delta|$ and L2 averages $\Delta^2$ over the $3HW$ numbers of an image, where
-# $\Delta = c - c^{\mathrm{GT}}$. By one of those numbers (POP paper, eq. 4)
+# $\Delta = c - c^{\mathrm{GT}}$ and GT is the photograph (the *ground truth*). The derivatives with respect to one of
+# those numbers are (POP paper, eq. 4)
 #
 # $$\frac{\partial L_1}{\partial c} = \frac{\mathrm{sign}(\Delta)}{3HW},
 # \qquad \frac{\partial L_2}{\partial c} = \frac{2 \Delta}{3HW} .$$
@@ -98,7 +102,7 @@ picture(fig, "Left: eq. 4. Right: L1 holds or breaks, L2 bends.")
 # L2 brings is not more force but force that knows how wrong a pixel is.
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: predict
 #
 # A splat of one flat colour covers 100 pixels. In 90 of them the photograph is 0.2, in 10 it is 1 (a lamp). Which
 # colour minimises L1, and which L2?
@@ -132,7 +136,7 @@ assert 25.0 < dark / light < 35.0
 assert np.isclose(l2(0.2 * flat, 0.1 * flat), l2(0.9 * flat, 0.8 * flat))
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: derive
 #
 # The render has the photograph's brightness exactly but is flat, while the photograph has a texture of standard
 # deviation $s$. What is S for $s = 0.03$ and for $s = 0.3$? What does that say about blur?
@@ -270,7 +274,7 @@ def pulls_at(params, factor=1.0):
 
 
 rates = {name: 5.0 * rate for name, rate in learning_rates(0, 4.0).items()}
-# round Gaussians have no gradient by rotation but rounding's, which Adam would follow
+# the rotation of a round Gaussian has no gradient but rounding errors, which Adam would follow
 rates["quats"] = 0.0
 zero = {name: np.zeros_like(value) for name, value in params.items()}
 moments = zero, zero
@@ -310,7 +314,7 @@ assert np.all(size_l2[20:] < 3.0 * size_ssim[20:])
 assert np.all(20.0 * size_ssim[20:] > 5.0 * size_l2[20:])
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: predict
 #
 # Is L2 just a smaller L1? The paper divides L1 by $n$ to see. What changes if the whole loss is divided by 10: Adam's
 # steps, the growth of eq. 3, the balance against a prior of fixed weight?

@@ -1,5 +1,7 @@
+# minutes: 30
+
 # %% [markdown]
-# # 7. Who dominates a pixel, and the blur set
+# # 7. The dominant Gaussian of a pixel, and the blur set
 #
 # Many Gaussians blend at a pixel, but one of them gives the most. At the end of this chapter you know how POP finds it,
 # what the count of pixels that a Gaussian wins says about it, and how that count makes a model grow where gradients are
@@ -14,8 +16,8 @@
 #
 # It need not be the front one, nor the most opaque. Below, a veil of alpha 0.3 hangs before a splat of 0.6, which
 # stands before one of 0.9: the weights are 0.3, 0.42 and 0.252. The paper leaves two cases open, and the oracle decides
-# them as Mini-Splatting's kernel does: a tie goes to the front, and a pixel where nothing blends belongs to nobody
-# (-1).
+# them as Mini-Splatting's kernel does: a tie goes to the front (decision D8), and a pixel where nothing blends has no
+# dominant Gaussian (-1).
 
 # %%
 import itertools
@@ -63,7 +65,7 @@ for alpha in (0.01, 0.5, 0.99):
     assert dominant_id(*ray([alpha, alpha])) == 0
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: derive
 #
 # How opaque must the front splat be at a pixel so that nothing behind it can dominate, whatever it is?
 
@@ -78,9 +80,9 @@ assert dominant_id(*ray([0.49, 0.999])) == 1
 # %% [markdown]
 # ## Counting pixels
 #
-# The **dominant count** $D_i$ of a view is the number of its pixels that Gaussian $i$ wins. Each pixel has at most one
-# winner, so the counts of a view sum to the number of pixels where anything blends. The map of winners is a mosaic:
-# with opacities near 1 it shows the surfaces that the camera sees.
+# The **dominant count** $\mathcal{D}_i$ of a view is the number of its pixels that Gaussian $i$ wins. Each pixel has at
+# most one winner, so the counts of a view sum to the number of pixels where anything blends. The map of winners is a
+# mosaic: with opacities near 1 it shows the surfaces that the camera sees.
 
 # %%
 SIZE = 40
@@ -106,7 +108,7 @@ assert counts.sum() == np.sum(view.n_blended > 0)
 assert np.array_equal(view.dominant_ids < 0, view.n_blended == 0)
 assert np.all(counts[:few] > counts[few:].max())
 
-# a colour for each Gaussian, and white for nobody
+# a colour for each Gaussian, and white where there is none
 mosaic = ListedColormap(
     np.vstack([[1.0, 1.0, 1.0], np.random.default_rng(1).uniform(0.15, 0.9, (999, 3))])
 )
@@ -135,7 +137,7 @@ right.bar(np.arange(1, len(ranked) + 1), ranked, color=ACCENT, width=1.0)
 right.set(xlabel="Gaussians, largest first", ylabel="pixels won", title="dominant counts")
 picture(
     fig,
-    "One view. White pixels belong to nobody. A few large Gaussians win most of the picture.",
+    "One view. At white pixels nothing is blended. A few large Gaussians win most of the picture.",
 )
 
 # %% [markdown]
@@ -144,7 +146,7 @@ picture(
 # A Gaussian that wins very many pixels paints an area with one smooth colour: if there was detail, it is blurred. Eq. 6
 # collects those that win more than a share $\theta$ of the view:
 #
-# $$\mathcal{G}_{\mathrm{blur}} = \{\, \mathcal{G}_i \mid D_i > \theta_{\mathrm{blur}}\, H W \,\}, \qquad
+# $$\mathcal{G}_{\mathrm{blur}} = \{\, \mathcal{G}_i \mid \mathcal{D}_i > \theta_{\mathrm{blur}}\, H W \,\}, \qquad
 #   \theta_{\mathrm{blur}} = 2 \times 10^{-5} .$$
 #
 # On a photograph of 980 x 545 px that is eleven pixels, on one of 1557 x 1038 px thirty-three. Since the counts of a
@@ -169,12 +171,12 @@ for width, height in ((980, 545), (1557, 1038)):
     assert width * height / (smallest_blurred(width, height) - 1) >= 1.0 / THETA
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: derive
 #
 # Training collects the flags of all views since the last event. Two readings of "cumulative" are possible: flag a
 # Gaussian if *any* view's count passes the threshold, or if the *sum* over the views does. A Gaussian wins one pixel in
 # each of 100 views of 980 x 545 px. Is it in the set under each reading? How many winners must a covered scene then
-# have at least, once everybody has escaped?
+# have at least, once no Gaussian is selected any more?
 
 # %% answer
 # Any view: 1 < 11, no. Sum: 100 > 10.68, yes; the counts now sum to $100\,HW$, so at least $100/\theta$, five million.
@@ -193,9 +195,9 @@ assert (100.0 / THETA, POP.blur_window) == (5e6, "any_view")
 # %% [markdown]
 # ## Where gradients are silent
 #
-# Why not just use the gradient rule (eq. 3)? It asks whether the loss wants to *move* a Gaussian on the screen, and
-# adds up the wishes of all its pixels with their signs. A splat in the middle of detail that is symmetric about it is
-# pulled to all sides at once: the sum is zero however wrong its pixels are. The count does not cancel.
+# Why not just use the gradient rule (eq. 3)? It asks whether the loss would fall if a Gaussian *moved* on the screen,
+# and adds up the gradients of all its pixels with their signs. A splat in the middle of detail that is symmetric about
+# it is pulled to all sides at once: the sum is zero however wrong its pixels are. The count does not cancel.
 
 # %%
 blob = Gaussians(
@@ -230,9 +232,9 @@ picture(
 #
 # Now let the rule alone make a model grow. It begins with four large Gaussians before a painted picture of 24 x 24 px,
 # trained for 20 steps with L2 (eq. 4). Then the blur set is split, six steps of training follow, and so on. On 576
-# pixels the paper's $\theta$ would select everybody who wins one; here $\theta = 1/48$, so that whoever wins more than
-# twelve pixels is split. (Learning rates are four times the usual, the colours' forty times. Gaussians whose largest
-# scale is under a hundredth of the scene's would be cloned instead; none here is that small.)
+# pixels the paper's $\theta$ would select every Gaussian that wins one; here $\theta = 1/48$, so that one that wins
+# more than twelve pixels is split. (Learning rates are four times the usual, the colours' forty times. Gaussians whose
+# largest scale is under a hundredth of the scene's would be cloned instead; none here is that small.)
 
 # %%
 SMALL, THETA_HERE = 24, 1 / 48
@@ -253,7 +255,7 @@ target[np.hypot(x - 0.5, y + 0.5) < 0.5] = 0.95, 0.8, 0.2
 config = replace(POP, theta_blur=THETA_HERE, grow_on_gradient=False)
 rates = {name: 4.0 * rate for name, rate in learning_rates(0, 4.0).items()}
 rates["sh0"] *= 10.0
-# round Gaussians have no gradient by rotation but rounding's, which Adam would follow
+# the rotation of a round Gaussian has no gradient but rounding errors, which Adam would follow
 rates["quats"] = 0.0
 rng = np.random.default_rng(3)
 corners = np.array([[-0.75, -0.75], [0.75, -0.75], [-0.75, 0.75], [0.75, 0.75]])
@@ -300,7 +302,7 @@ picture(
 )
 
 # %% [markdown]
-# At first everybody is too large and the number doubles; a split opens holes, which the training between two events
+# At first all are too large and the number doubles; a split opens holes, which the training between two events
 # closes. As the counts come down growth slows to under a tenth per event, at a little over $2/\theta$ Gaussians. No
 # budget was set and no gradient asked: the threshold is the budget. In the paper the rule is active from step 3,000 to
 # 7,000 only, beside the gradient rule.
@@ -322,7 +324,7 @@ assert (POP.blur_start_iter, POP.blur_stop_iter, POP.grow_on_gradient) == (3000,
 assert np.exp(rows.params["scales"]).max(axis=1).min() > POP.grow_scale3d
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: derive
 #
 # Why does the paper lower $\theta$ to a tenth of Mini-Splatting's 1/5,000, and what would it do to the number of
 # winners at which the rule falls silent?

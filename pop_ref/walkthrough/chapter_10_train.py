@@ -1,3 +1,5 @@
+# minutes: 35
+
 # %% [markdown]
 # # 10. Train a small scene and read its report
 #
@@ -206,8 +208,10 @@ picture(
 # **Opacities.** All began at 0.1. Without the prior few end over 0.9; with it more than twice the share does. That is
 # the polarization, and the reason for the next curve.
 #
-# **Gaussians per pixel.** How many splats a pixel blends before its light is used up. Opaque splats use it up sooner,
-# so the curve ends lower. Less work per pixel is what POP is after.
+# **Gaussians per pixel.** How many splats a pixel blends. With the prior the curve ends lower: fewer Gaussians are
+# left, and the faint ones reach less far ([chapter 8](chapter_08_polarized_opacity.py)). It is not that rays end early:
+# in so thin a scene hardly a pixel uses its light up, with the prior or without. Less work per pixel is what POP is
+# after.
 #
 # **PSNR.** The two end within a decibel or so of each other; from other starting points, in runs that are not shown,
 # the prior cost up to two. Here it pushes twenty times harder than in the paper, where the ablation (section 5) reports
@@ -276,7 +280,7 @@ print(f"{report.name}, {report.stat().st_size / 1024:.0f} KiB; beside it:")
 print(*sorted(path.name for path in report.parent.iterdir() if path != report))
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: code
 #
 # Keep the books: from `metrics.jsonl` alone, check that every change of the count is explained by what was cloned,
 # split and pruned.
@@ -291,7 +295,7 @@ for name in stats:
     assert n == stats[name]["num_GS"]
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: code
 #
 # A record holds the loss and its terms. Put the loss together by eq. 9. Until when is the prior in it?
 
@@ -304,7 +308,7 @@ assert max(record["step"] for record in records["prior"] if "pop" in record) < 1
 assert not any("pop" in record for record in records["none"])
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: predict
 #
 # Compute the PSNR of the held-out view from the picture that was kept. Why is it not exactly what `stats` says?
 

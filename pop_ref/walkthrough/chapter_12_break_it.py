@@ -1,16 +1,18 @@
+# minutes: 25
+
 # %% [markdown]
 # # 12. Break it: each mutant, and the law that catches it
 #
 # A test that no bug fails is worth nothing. So the kit that judges rasterizers is judged itself: by broken copies of
-# the oracle, each wrong in one line, most of them as somebody's program once was. At the end of this chapter you have
+# the oracle, each wrong in one line, most of them as some program once was. At the end of this chapter you have
 # seen what such bugs do to a picture, that most of them do nothing to it, and which law catches which.
 #
 # ## A law and a mutant
 #
-# A **law** is a sentence that must hold for every input: doubling all scales quadruples the covariance; a pixel that
-# nobody reaches belongs to nobody. The kit draws inputs and looks for one that breaks it. A **mutant** is the oracle
-# with one line replaced. `living` imports it beside the oracle under another name, so that both can be asked the same.
-# Here is one of each: an alpha that equals the floor is blended (decision D5), and a copy in which it is not.
+# A **law** is a sentence that must hold for every input: doubling all scales quadruples the covariance; a pixel that no
+# splat reaches has no dominant Gaussian. The kit draws inputs and looks for one that breaks it. A **mutant** is the
+# oracle with one line replaced. `living` imports it beside the oracle under another name, so that both can be asked the
+# same. Here is one of each: an alpha that equals the floor is blended (decision D5), and a copy in which it is not.
 
 # %%
 import inspect
@@ -24,7 +26,7 @@ from pop_ref.conformance.mutants.trial import every_law, killed_by, law_named, o
 from pop_ref.conformance.scenes import Record, Scene, pack
 from pop_ref.records import Camera
 from pop_ref.walkthrough.pages import picture
-from pop_ref.walkthrough.style import ACCENT, INK, SECOND, THIRD, axes, show_image
+from pop_ref.walkthrough.style import ACCENT, INK, MUCH, SECOND, THIRD, axes, show_image
 
 BY_NAME = {mutant.name: mutant for mutant in MUTANTS}
 
@@ -118,7 +120,7 @@ for k, (name, color) in enumerate(zip(pulls, (INK, ACCENT, SECOND, THIRD), stric
     places = np.arange(4) + 0.2 * (k - 1.5)
     ax.bar(places, pulls[name], 0.18, color=color, label=name.replace("_", " "))
 ax.set(xticks=range(4), xticklabels=("long", "round", "thin", "at the tile's edge"))
-ax.set_ylabel("gradient by opacity")
+ax.set_ylabel("gradient of the opacity")
 ax.legend(fontsize=8)
 picture(fig, "One picture, four gradients. Only the first belongs to it.")
 
@@ -152,7 +154,7 @@ assert not broken[0].any(), "the oracle obeys all"
 assert np.diag(broken[1:]).all(), "every mutant breaks its own law"
 
 fig, ax = axes(1, height=3.9)
-ax.imshow(broken, aspect="auto", cmap="Greys", vmin=0, vmax=1.4)
+ax.imshow(broken, aspect="auto", cmap=MUCH, vmin=0, vmax=1.2)
 numbered = [f"{name.replace('_', ' ')}  {k}" for k, name in enumerate(tried, start=1)]
 ax.set_yticks(range(len(tried) + 1), ["the oracle", *numbered])
 ax.set_xticks(range(len(laws)), [str(k + 1) for k in range(len(laws))])
@@ -187,7 +189,7 @@ for mutant in (mutant for same in of_files.values() for mutant in same[:2]):
 assert {mutant.law for mutant in MUTANTS} <= set(every_law())
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: code
 #
 # Write a mutant of your own: in `polarization.py` let every Gaussian be important, and find which laws of that stage
 # notice.
@@ -209,7 +211,7 @@ assert len(notice) < len(of_the_stage)
 print(*(name.partition(":")[2].replace("_", " ") for name in notice), sep="\n")
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: code
 #
 # Write a law of your own that kills `half_pixel_shift`, as a function of a backend: a round splat in the middle of an
 # image must look the same in a mirror. Does the law also kill `no_half_in_the_exponent`?
