@@ -5,9 +5,11 @@ from __future__ import annotations
 import ast
 import json
 import re
+from collections.abc import Sequence
+from html import escape
 from typing import Any, Final
 
-from pop_ref.walkthrough.cells import Cell, Chapter
+from pop_ref.walkthrough.cells import FOLDER, Cell, Chapter
 from pop_ref.walkthrough.directives import expanded
 from pop_ref.walkthrough.folding import parts, said_and_done
 
@@ -47,7 +49,11 @@ def notebook(chapter: Chapter) -> str:
     for i, each in enumerate(cells):
         each["id"] = f"cell-{i}"
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
-    metadata = {"kernelspec": kernel, "language_info": {"name": "python"}, "title": chapter.title}
+    metadata = {
+        "kernelspec": kernel,
+        "language_info": {"name": "python"},
+        "title": chapter.title,
+    }
     whole = {"cells": cells, "metadata": metadata, "nbformat": 4, "nbformat_minor": 5}
     return json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
 
@@ -55,6 +61,22 @@ def notebook(chapter: Chapter) -> str:
 def notebook_name(chapter: Chapter) -> str:
     """Name the file of the chapter's notebook."""
     return f"{chapter.path.stem}.ipynb"
+
+
+def notebook_index(chapters: Sequence[Chapter]) -> str:
+    """Write a page that lists the notebooks, for where a folder does not list itself."""
+    items = "".join(
+        f'<li><a href="{notebook_name(each)}" download>{each.number}. {escape(each.title)}</a></li>'
+        for each in chapters
+    )
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Notebooks</title>'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f"<style>{(FOLDER / 'page.css').read_text(encoding='utf-8')}</style></head><body><main><h1>Notebooks</h1>"
+        "<p>Every chapter as a Jupyter notebook, to be run where pop-splatting is installed: "
+        "<code>pip install 'pop-splatting[walkthrough]' jupyterlab</code>, then <code>jupyter lab</code>.</p>"
+        f"<ul>{items}</ul></main></body></html>\n"
+    )
 
 
 def _told(cell: Cell) -> list[dict[str, Any]]:
@@ -86,7 +108,12 @@ def _prose(text: str) -> dict[str, Any]:
 def _code(text: str, folded: bool) -> dict[str, Any]:
     metadata = {"jupyter": {"source_hidden": True}} if folded else {}
     empty = {"execution_count": None, "outputs": []}
-    return {"cell_type": "code", "metadata": metadata, "source": _lines(_quiet(text)), **empty}
+    return {
+        "cell_type": "code",
+        "metadata": metadata,
+        "source": _lines(_quiet(text)),
+        **empty,
+    }
 
 
 def _quiet(code: str) -> str:

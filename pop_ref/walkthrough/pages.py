@@ -52,7 +52,7 @@ _walls: list[list[Picture]] = []
 
 
 def picture(figure: Figure, caption: str) -> None:
-    """Hand a figure to the page under construction and close it; show it in a notebook; in a plain script, just close it.
+    """Hand a figure to the page under construction, or show it in a notebook, and close it.
 
     Args:
         figure: a matplotlib figure.
@@ -67,7 +67,10 @@ def picture(figure: Figure, caption: str) -> None:
 
 def _show_in_notebook(figure: Figure, caption: str) -> None:
     """Show a figure and its caption where this runs in Jupyter, which alone has both modules and a kernel."""
-    jupyter, shown = sys.modules.get("ipykernel.zmqshell"), sys.modules.get("IPython.display")
+    jupyter, shown = (
+        sys.modules.get("ipykernel.zmqshell"),
+        sys.modules.get("IPython.display"),
+    )
     if jupyter is None or shown is None or not jupyter.ZMQInteractiveShell.initialized():
         return
     png = io.BytesIO()
