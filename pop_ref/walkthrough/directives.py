@@ -13,6 +13,8 @@ import re
 from pathlib import Path
 from typing import Final
 
+from pop_ref.walkthrough.cells import MINUTES, chapter_files
+
 DIRECTIVE: Final = re.compile(r"^\{\{(\w+)(?:: ([^}]+))?\}\}$", re.MULTILINE)
 
 
@@ -42,7 +44,23 @@ def _expanded(name: str, argument: str, whole: str) -> str:
         from pop_ref.walkthrough.glossary import stages
 
         return stages()
+    if name == "chapters":
+        return chapters()
     raise ValueError(f"{whole} is not a directive")
+
+
+def chapters() -> str:
+    """List the chapters with their minutes, as a markdown table."""
+    rows = []
+    for path in chapter_files():
+        text = path.read_text(encoding="utf-8")
+        title, minutes = (
+            re.search(r"^# # (.+)$", text, re.MULTILINE),
+            re.search(MINUTES, text),
+        )
+        if title is not None and minutes is not None:
+            rows.append(f"| [{title[1]}]({path.name}) | {minutes[1]} |")
+    return "\n".join(["| chapter | minutes |\n|---|---|", *rows])
 
 
 def source_of(path: str) -> tuple[str, str]:

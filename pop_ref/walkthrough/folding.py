@@ -72,7 +72,7 @@ def _roles(body: list[ast.stmt]) -> list[Role]:
         if function and not drawing:
             roles.append("draws" if called & _OPENS or _takes_axes(node) else "plain")
             continue
-        drawing = drawing or bool(called & _OPENS)
+        drawing = drawing or bool(called & (_OPENS | _CLOSES))
         roles.append("draws" if drawing else _role(node))
         if called & _CLOSES:
             drawing = False

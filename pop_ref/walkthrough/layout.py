@@ -220,7 +220,7 @@ def _figure(chapter: Chapter, cell: Cell, name: str, picture: Picture) -> str:
         shown = f'<img src="data:image/png;base64,{data}" {size} alt="{escape(picture.caption)}">'
     else:
         shown = _inline_svg(picture.svg, name, picture.caption)
-    return f"<figure>{shown}<figcaption>{caption}</figcaption></figure>"
+    return f'<figure><div class="wide">{shown}</div><figcaption>{caption}</figcaption></figure>'
 
 
 def _inline_svg(svg: str, name: str, caption: str) -> str:
