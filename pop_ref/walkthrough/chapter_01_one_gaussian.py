@@ -186,6 +186,10 @@ picture(
 )
 
 # %% [markdown]
+# The same splat, to be moved and shaped. What this chapter computed stands beside it.
+#
+# {{widget: splat2d}}
+#
 # ## The colour of the pixel
 #
 # With a single splat, the rendering equation (POP paper, eq. 1) says little more than a painter would: the splat gives

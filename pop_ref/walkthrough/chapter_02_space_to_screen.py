@@ -178,6 +178,10 @@ assert PAPER.frustum_margin == 2 * 0.15
 assert np.isclose(projection_jacobians(aside, K, width, height)[0, 0, 2], -f * limit)
 
 # %% [markdown]
+# A Gaussian to walk around. Its points go through the true pinhole, its ellipse through $J$.
+#
+# {{widget: orbit}}
+#
 # ## A little blur
 #
 # A pixel looks at one point only. A splat much thinner than a pixel hits a centre or falls between two, and flickers as

@@ -152,6 +152,10 @@ assert np.isclose(odd.T_final, 0.09)
 assert np.allclose(odd.color, 0.91 * np.array([0.2, 0.2, 0.2]) + 0.09 * background)
 
 # %% [markdown]
+# One pixel, to be rearranged. Its last column is the subject of chapter 5.
+#
+# {{widget: stack}}
+#
 # ## A whole image
 #
 # `render` does for every pixel what we did for one: project, list the splats by depth, blend, stop. Here is a box full

@@ -395,6 +395,11 @@ for camera in cameras:
     assert np.array_equal(view.n_traversed[0], listed)
 
 # %% [markdown]
+# And in three dimensions: two recorded trainings of the toy of `pop_ref/learn/splat.py`.
+#
+# {{widget: scrubber}}
+
+# %% [markdown]
 # ### Exercise 3: predict
 #
 # A Gaussian with $o = 0.1$ lies where no photograph looks. The gradient of the prior is all it feels,
