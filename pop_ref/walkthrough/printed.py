@@ -40,7 +40,8 @@ def book(told: Sequence[tuple[Chapter, Sequence[Outcome]]]) -> str:
     )
     title = escape(layout.TITLE)
     return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{style}</style></head>'
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+        f"<style>{style}</style></head>"
         f'<body class="book"><main><header><h1>{title}</h1><p>{escape(layout.LEAD)}</p><ol class="lines">{lines}</ol>'
         f"</header>{articles}</main></body></html>\n"
     )

@@ -5,27 +5,34 @@
   const noted = bar.querySelector("[data-notes]");
   let here = 0;
 
-  // text that is too long for its slide is set smaller, down to three fifths
+  // what is too large for its slide is made smaller: a widget as a whole, text down to three fifths
   const fit = () => {
     const face = slides[here].querySelector(".face");
+    const [room, widget] = [face.querySelector(".body"), face.querySelector(".pop-widget")];
+    const over = () => face.scrollHeight > face.clientHeight + 1;
     face.style.fontSize = "";
-    const size = parseFloat(getComputedStyle(face).fontSize);
-    for (let share = 1; share >= 0.6 && face.scrollHeight > face.clientHeight + 1; share -= 0.05) {
-      face.style.fontSize = `${share * size}px`;
+    if (widget) {
+      widget.style.zoom = "";
+      const share = Math.min(1, room.clientHeight / widget.offsetHeight);
+      widget.style.zoom = share;
     }
-    face.style.overflow = face.scrollHeight > face.clientHeight + 1 ? "auto" : "";
+    const size = parseFloat(getComputedStyle(face).fontSize);
+    for (let share = 1; share >= 0.6 && over(); share -= 0.05) face.style.fontSize = `${share * size}px`;
+    face.style.overflow = over() ? "auto" : "";
   };
+  // a widget that has just come into sight is drawn before it is measured
+  const settle = () => { fit(); requestAnimationFrame(() => requestAnimationFrame(fit)); };
   const go = (to, named = true) => {
     here = Math.min(Math.max(to, 0), slides.length - 1);
     slides.forEach((slide, i) => slide.classList.toggle("here", i === here));
     bar.querySelector("output").textContent = `${here + 1} of ${slides.length}`;
     body.style.setProperty("--done", `${(100 * (here + 1)) / slides.length}%`);
     if (named) history.replaceState(null, "", `#${here + 1}`);
-    fit();
+    settle();
   };
   const notes = () => {
     noted.setAttribute("aria-pressed", String(body.classList.toggle("noted")));
-    fit();
+    settle();
   };
   const busy = (node) => node.closest?.("input, button, summary, a, [tabindex], .pop-widget");
 
@@ -61,7 +68,7 @@
     began = null;
   });
   addEventListener("hashchange", () => go(Number(location.hash.slice(1)) - 1 || 0, false));
-  addEventListener("resize", fit);
+  addEventListener("resize", settle);
 
   body.classList.add("turning");
   go(Number(location.hash.slice(1)) - 1 || 0, false);

@@ -134,6 +134,10 @@ def _merged(slides: list[Slide]) -> list[Slide]:
         before = merged[-1] if merged else None
         if before is None or before.heading != slide.heading or before.kind == "title":
             merged.append(slide)
+        elif before.light and slide.kind == "widget":
+            # a widget needs the whole slide
+            merged[-1] = slide
+            slide.notes = before.notes + slide.notes
         elif before.light and slide.kind == "picture":
             merged[-1] = Slide(
                 slide.chapter,
@@ -251,5 +255,9 @@ def _section(chapter: Chapter, slide: Slide, number: int, minutes: tuple[int, in
 
 
 def _rendered(chapter: Chapter, text: str) -> str:
-    # a label leads to the glossary of the pages, which is not here
-    return re.sub(r'<a class="label"[^>]*>(.*?)</a>', r"\1", layout.rendered(chapter, text))
+    # what leads to the pages would lead nowhere: they need not be here
+    return re.sub(
+        r'<a [^>]*?href="(?:chapter_|glossary)[^>]*>(.*?)</a>',
+        r"\1",
+        layout.rendered(chapter, text),
+    )

@@ -46,6 +46,7 @@ class Page:
         self._session = self.call("Target.attachToTarget", targetId=page["targetId"], flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Log"):
             self.call(f"{domain}.enable")
+        self.call("Page.setLifecycleEventsEnabled", enabled=True)
 
     def __enter__(self) -> Self:
         return self
@@ -80,9 +81,11 @@ class Page:
         self.call("Emulation.setTouchEmulationEnabled", enabled=width < 600)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[scheme])
-        self.call("Page.navigate", url=path.as_uri())
-        while (told := self._next()).get("method") != "Page.loadEventFired":
-            assert told is not None
+        loader = self.call("Page.navigate", url=path.as_uri())["loaderId"]
+        while (told := self._next()).get("method") != "Page.lifecycleEvent" or (
+            told["params"]["name"] != "load" or told["params"]["loaderId"] != loader
+        ):
+            pass
         if scripts:
             self.ask("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))")
 
