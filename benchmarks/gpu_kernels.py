@@ -29,8 +29,8 @@ from gpu_steps import kernel_times, step_kernels, whole_step
 from torch import Tensor
 
 import cuda_ext
-from cuda_ext.gpu_check_tools import write_json
-from cuda_ext.ops import rasterization
+from cuda_ext.gpu_check.tools import write_json
+from cuda_ext.render.ops import rasterization
 
 WARM_UP, REPEATS, STEPS = 5, 50, 200
 LEAVES = ("means", "quats", "scales", "opacities", "sh")

@@ -1,6 +1,6 @@
 // The kernels' host functions for Python: structs of pointers and numbers, no mathematics, no torch.
 //
-// Pointers cross as integers (tensor.data_ptr()); ops.py checks device, type, shape and contiguity before it takes one.
+// Pointers cross as integers (tensor.data_ptr()); cuda_ext.arrays checks device, type, shape and contiguity before it takes one.
 
 #include "bindings.h"
 

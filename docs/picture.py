@@ -13,7 +13,7 @@ import matplotlib as mpl
 import numpy as np
 from PIL import Image
 
-from pop_fast.report.pictures import error_magnitude, error_picture, id_colors
+from pop_fast.view.pictures import error_magnitude, error_picture, id_colors
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt

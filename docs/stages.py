@@ -31,10 +31,10 @@ STAGES = (
     Stage("projection of means and covariances (EWA)", "3.1", ("projection",)),
     Stage("low-pass, conics, extents, off-screen cull", "3.1", ("footprint",)),
     Stage("tile lists in depth order", "3.1", ("tiles",), ("compiled/tiles.py",)),
-    Stage("falloff and alpha of one splat at one pixel", "eqs. 1, 11", ("alpha",)),
+    Stage("falloff and alpha of one splat at one pixel", "eqs. 1, 11", ("alpha",), ("stages/blend/alpha.py",)),
     Stage("blending with early ray termination", "eq. 1", ("compositing", "pixel"), ("compiled/compositing.py",)),
     Stage("dominant Gaussians", "eq. 5", ("dominance",)),
-    Stage("a whole view", "eq. 1", ("render", "splatting", "depth"), ("rasterization.py", "compiled/splatting.py")),
+    Stage("a whole view", "eq. 1", ("render", "splatting", "depth"), ("api/rasterize.py", "compiled/splatting.py")),
     Stage(
         "L1, L2, SSIM and both objectives", "eqs. 2, 4, 9", ("losses", "ssim", "loss_magnitudes"), ("compiled/ssim.py",)
     ),
@@ -84,9 +84,10 @@ def functions(path: Path) -> dict[str, list[str]]:
 def files(room: str, stage: Stage) -> Iterator[Path]:
     """Give the files of a stage in one room, where they exist."""
     suffixes = (".cuh", ".cu") if room == "cuda_ext/csrc" else (".py",)
+    folder = ROOT / ("pop_fast/stages" if room == "pop_fast" else room)
     for module in stage.modules:
         for suffix in suffixes:
-            path = ROOT / room / f"{module}{suffix}"
+            path = folder / f"{module}{suffix}"
             if path.is_file():
                 yield path
     if room == "pop_fast":

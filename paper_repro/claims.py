@@ -10,12 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 from math import exp, log
+from statistics import fmean
 from typing import Final
 
 from paper_repro.evidence import (
-    BLUR_STOP,
     DATASETS,
-    DENSITY_STOP,
     Claim,
     Evidence,
     Group,
@@ -26,6 +25,7 @@ from paper_repro.evidence import (
     difference,
     groups,
     ids,
+    implied_rates,
     implied_shares,
     paper_ratios,
 )
@@ -138,28 +138,28 @@ def window(found: Groups, told: Paper) -> Claim:
 
 def decay_after_the_window(found: Groups, told: Paper) -> Claim:
     """C-decay: N peaks when the window closes and POP takes it down from there until density control ends."""
-    implied = implied_shares(told)
-    bound = _SLACK * max(implied)
+    implied, rates = implied_shares(told), implied_rates(told)
+    bound = min(rates) / _SLACK
 
     def ask(pop: Group) -> tuple[str, bool | None]:
-        shares = [share for run in pop.runs if (share := decay(run)) is not None]
-        if not shares:
+        found = [seen for run in pop.runs if (seen := decay(run)) is not None]
+        if not found:
             return "no curve of N", None
-        closing, kept = (sum(values) / len(shares) for values in zip(*shares, strict=True))
-        top = max(pop.runs[0].curve, key=lambda point: point["num_gaussians"])
-        rate = -log(kept) / ((DENSITY_STOP - BLUR_STOP) / 1000)
-        text = f"N is {closing:,.0f} when the window closes and {kept:.1%} of that when density control ends"
-        text += (
-            f", {rate:.3f} per 1,000 steps of the whole schedule; largest {top['num_gaussians']:,} at {top['step']:,}"
+        closing, kept, rate = (
+            fmean(values) for values in zip(*((f.closing, f.kept, f.rate) for f in found), strict=True)
         )
-        return text, kept <= bound
+        top = max(pop.runs[0].curve, key=lambda point: point["num_gaussians"])
+        text = f"N is {closing:,.0f} when the window closes and {kept:.1%} of that when density control ends, "
+        text += f"{found[0].steps:,} steps later: {rate:.3f} per 1,000 steps; "
+        text += f"largest {top['num_gaussians']:,} at {top['step']:,}"
+        return text, rate >= bound
 
-    rates = [-log(share) / ((DENSITY_STOP - BLUR_STOP) / 1000) for share in implied]
     return claim(
         "decay",
         "the number of Gaussians peaks near step 7,000 and POP about halves it by 15,000",
         f"implied by the schedules' counts: {_percents(implied)} left, a rate of {_list(rates, 3)} per 1,000 steps",
-        f"at most {bound:.0%} of N at the window's end is left: the paper's largest share and a fifth",
+        f"a rate of {bound:.3f} per 1,000 steps or more: the smallest that the paper's tables imply, less a sixth; "
+        "rates are compared, because a shortened schedule scales neither learning rates nor the weight of the prior",
         _by_scene(found, ("pop",), ask),
     )
 

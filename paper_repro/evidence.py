@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import hypot, sqrt
+from math import hypot, log, sqrt
 from statistics import fmean, stdev
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 from paper_repro.paper import Paper
 from paper_repro.results import Result
@@ -28,6 +28,7 @@ __all__ = [
     "difference",
     "groups",
     "ids",
+    "implied_rates",
     "implied_shares",
     "paper_ratios",
 ]
@@ -158,15 +159,34 @@ def ids(found: Sequence[Group]) -> tuple[str, ...]:
     return tuple(id for group in found for id in group.ids)
 
 
-def decay(run: Result) -> tuple[float, float] | None:
-    """Give N as the blur window closes and the share of it left as density control ends, or None without a curve."""
+class Decay(NamedTuple):
+    """What became of N from the end of the blur window to the end of density control.
+
+    Attributes:
+        closing: N as the blur window closes.
+        kept: the share of it that is left as density control ends.
+        steps: from the one to the other.
+    """
+
+    closing: float
+    kept: float
+    steps: int
+
+    @property
+    def rate(self) -> float:
+        """The rate per 1,000 steps: a shortened schedule scales neither learning rates nor the weight of the prior."""
+        return -log(self.kept) / (self.steps / 1000)
+
+
+def decay(run: Result) -> Decay | None:
+    """Read the decay of N off the curve of a run, or None without a curve."""
     steps = setting(run, "max_steps") or float(STEPS)
     closes = setting(run, "blur_stop_iter") or steps * BLUR_STOP / STEPS
     ends = setting(run, "refine_stop_iter") or steps * DENSITY_STOP / STEPS
-    at = run.at(round(closes)), run.at(round(ends))
-    if at[0] is None or at[1] is None or min(at[0], at[1]) <= 0.0:
+    closing, left = run.at(round(closes)), run.at(round(ends))
+    if closing is None or left is None or min(closing, left) <= 0.0 or ends <= closes:
         return None
-    return at[0], at[1] / at[0]
+    return Decay(closing, left / closing, round(ends) - round(closes))
 
 
 def paper_ratios(told: Paper, row: str, base: str) -> tuple[float, ...]:
@@ -181,3 +201,8 @@ def implied_shares(told: Paper) -> tuple[float, ...]:
     reaches about as much, and POP takes it down from there.
     """
     return paper_ratios(told, "pop", "blur_3k_15k")
+
+
+def implied_rates(told: Paper) -> tuple[float, ...]:
+    """Give the rates of decay per 1,000 steps that `implied_shares` comes to, by data set."""
+    return tuple(Decay(1.0, share, DENSITY_STOP - BLUR_STOP).rate for share in implied_shares(told))

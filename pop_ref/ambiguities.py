@@ -52,9 +52,9 @@ AMBIGUITIES: Final = (
         "A2",
         "H",
         "Over what is a dominant count cumulative in the blur rule?",
-        "over one view's pixels; a flag stays up until the next event",
+        "over the pixels of the view that the densification step follows",
         _CONFIG,
-        ("DensityConfig.blur_window = sum", "DensityConfig.blur_window = own_view"),
+        ("DensityConfig.blur_window = any_view", "DensityConfig.blur_window = sum"),
     ),
     Ambiguity(
         "A3",

@@ -55,8 +55,8 @@ class DensityConfig:
             divided the loss by two to the power of this (`density.blur_is_over`); 0 leaves that out. The paper calls
             its fixed window its first limitation.
         blur_stop_span: events whose windows are averaged for that, before and after.
-        blur_window: "any_view" tests each view by itself and keeps the flag until the event, "sum" adds the
-            counts of the window up and tests the sum, "own_view" tests the event's own view only (A2).
+        blur_window: "own_view" tests the densification step's own view only, "any_view" tests each view since the last
+            one by itself and keeps the flag, "sum" adds the counts of those views up and tests the sum (A2).
         blur_rule: "by_scale" clones small blurred Gaussians and splits large ones, "split" splits all (A14).
         revised_opacity: split children get 1 - sqrt(1 - o) instead of o (A26).
         reset_every: reset opacities each so many steps before `refine_stop_iter`; 0 never (A22, A29).
@@ -86,7 +86,7 @@ class DensityConfig:
     blur_stop_iter: int = 7000
     blur_stop_gain: float = 0.0
     blur_stop_span: int = 5
-    blur_window: Literal["any_view", "sum", "own_view"] = "any_view"
+    blur_window: Literal["any_view", "sum", "own_view"] = "own_view"
     blur_rule: Literal["by_scale", "split"] = "by_scale"
     revised_opacity: bool = False
     reset_every: int = 0

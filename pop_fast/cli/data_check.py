@@ -13,7 +13,7 @@ import tyro
 from pop_fast.cli.arguments import parse
 
 if TYPE_CHECKING:
-    from pop_fast.cli.examine import Finding
+    from pop_fast.data.check_dataset import Finding
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,24 +51,25 @@ def run(argv: Sequence[str]) -> int:
 
 def look_over(root: Path) -> list[Finding]:
     """Examine a capture; all findings in reading order."""
-    from pop_fast.cli import examine
     from pop_fast.cli.doctor import memory_bytes
     from pop_fast.cli.progress import bars
+    from pop_fast.data import check_dataset
     from pop_fast.io.jpeg import jpeg_damage
 
-    made_from, shots, cloud = examine.read_listing(root)
-    findings = [examine.Finding("ok" if len(shots) > 1 else "bad", "poses", f"{len(shots)} views from the {made_from}")]
-    findings += examine.about_cameras(shots)
+    made_from, shots, cloud = check_dataset.read_listing(root)
+    posed = f"{len(shots)} views from the {made_from}"
+    findings = [check_dataset.Finding("ok" if len(shots) > 1 else "bad", "poses", posed)]
+    findings += check_dataset.about_cameras(shots)
     with bars() as progress, ThreadPoolExecutor(max_workers=4) as pool:
-        photos: list[examine.Photo] = []
-        for photo in pool.map(lambda shot: examine.read_photo(root, shot), shots):
+        photos: list[check_dataset.Photo] = []
+        for photo in pool.map(lambda shot: check_dataset.read_photo(root, shot), shots):
             photos.append(photo)
             progress("looking at photographs", len(photos), len(shots))
     with jpeg_damage([photo.path for photo in photos if photo.path is not None]) as damage:
-        findings += examine.about_photos(photos, root)
-    findings += [examine.Finding("bad", "photographs", message) for message in damage.values()]
-    findings += examine.about_masks(photos, root)
-    findings += examine.about_points(shots, cloud)
-    findings += examine.about_reprojection(root)
-    findings += examine.about_memory(photos, cloud, memory_bytes()[1])
+        findings += check_dataset.about_photos(photos, root)
+    findings += [check_dataset.Finding("bad", "photographs", message) for message in damage.values()]
+    findings += check_dataset.about_masks(photos, root)
+    findings += check_dataset.about_points(shots, cloud)
+    findings += check_dataset.about_reprojection(root)
+    findings += check_dataset.about_memory(photos, cloud, memory_bytes()[1])
     return findings

@@ -11,8 +11,9 @@ import numpy as np
 import tyro
 
 from pop_fast.cli.arguments import parse
-from pop_fast.cli.splat import CaptureOptions, Splat, load_splat, open_capture, read_record
+from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
+from pop_fast.train.load_result import Splat, load_splat, read_record
 
 _EXAMPLES: Final = """
     pop export out/scene_pop --out scene.ply                 for any viewer, in the capture's own world frame
@@ -23,7 +24,7 @@ _EXAMPLES: Final = """
 
 
 @dataclass(frozen=True, kw_only=True)
-class Args(CaptureOptions):
+class Args(CaptureArguments):
     """Write a splat as PLY (Inria's 62 properties), .splat, or a folder in Inria's layout."""
 
     splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|PLY")]
@@ -47,9 +48,9 @@ def run(argv: Sequence[str]) -> int:
         check_file(args)
     splat = load_splat(args.splat)
     if args.layout == "inria":
-        from pop_fast.cli.inria import write_inria_folder
+        from pop_fast.view.inria import write_inria_folder
 
-        capture, config = open_capture(splat, args)
+        capture, config = open_with_bars(splat, args)
         write_inria_folder(replace(splat, config=config), capture, args.out, args.overwrite)
         print(f"{len(splat.params['means']):,} Gaussians, {len(capture.views)} cameras -> {args.out}")
         return 0
@@ -96,7 +97,7 @@ def in_frame(splat: Splat, args: Args) -> Splat:
     if args.capture is None and record is not None:
         transform = np.array(record.world_transform)
     else:
-        transform = open_capture(splat, args)[0].world_transform
+        transform = open_with_bars(splat, args)[0].world_transform
     from pop_fast.data import to_capture_frame
 
     return replace(splat, params=to_capture_frame(splat.params, transform))

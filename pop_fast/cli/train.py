@@ -22,8 +22,8 @@ from pop_fast.train.config import TrainConfig
 from pop_fast.train.presets import ALIASES, METHODS, Given
 
 if TYPE_CHECKING:
-    from pop_fast.cli.splat import CaptureRecord
     from pop_fast.data import Capture
+    from pop_fast.train.load_result import CaptureRecord
 
 _EXAMPLES: Final = """
     pop train scene                          POP, the paper's 30,000 steps, results in out/scene_pop
@@ -96,7 +96,7 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _train(config: TrainConfig, options: Any, chosen: str) -> int:
-    from pop_fast.cli.splat import RECORD, record_text
+    from pop_fast.train.load_result import RECORD, record_text
 
     folder, start = Path(config.result_dir), time.perf_counter()
     capture = open_capture(config, options)
@@ -134,7 +134,7 @@ def report(folder: Path) -> int:
     """
     left = f"the results in {folder} are complete, and pop report {folder} writes it"
     try:
-        from pop_fast.report import write_report
+        from pop_fast.view.report import write_report
 
         print(f"report: {write_report(folder)}")
     except KeyboardInterrupt:
@@ -246,7 +246,7 @@ def as_begun(folder: Path, options: Any) -> Any:
     Raises:
         PopError: capture.json is damaged.
     """
-    from pop_fast.cli.splat import read_record
+    from pop_fast.train.load_result import read_record
 
     record = read_record(folder) if options.resume else None
     if record is None:
@@ -273,7 +273,7 @@ def check_backend(config: TrainConfig) -> None:
     Raises:
         PopError: says why and what to do.
     """
-    from pop_fast.backends import get_backend
+    from pop_fast.api.registry import get_backend
 
     backend = get_backend(config.backend)
     if not backend.available():
@@ -315,7 +315,7 @@ def open_capture(config: TrainConfig, options: Any) -> Capture:
 
 
 def _record(capture: Capture, options: Any) -> CaptureRecord:
-    from pop_fast.cli.splat import CaptureRecord
+    from pop_fast.train.load_result import CaptureRecord
 
     return CaptureRecord(
         images=options.images,

@@ -1,8 +1,8 @@
 """The whole training step in C++: from raw parameters to Adam's update, without a torch operation in between.
 
 `NativeTrainer` takes steps on tensors that it updates in place, and collects what density control reads; it has the
-interface of `cuda_ext.train_step.FusedTrainer`. Meaning: `pop_ref.training.train_step`; the order of work is explained
-in `step.h`. Results are the same bits for any number of threads.
+interface of `cuda_ext.training.train_step.FusedTrainer`. Meaning: `pop_ref.training.train_step`; the order of work is
+explained in `step.h`. Results are the same bits for any number of threads.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from torch import Tensor
 
 from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, StepStats
 from pop_fast.compiled.library import Moments, call_library, stepper_functions
-from pop_fast.ssim import REACH, Padding, border_of, check_size, kept_windows
-from pop_fast.transmittance import Stop, below
+from pop_fast.stages.blend.transmittance import Stop, below
+from pop_fast.stages.ssim import REACH, Padding, border_of, check_size, kept_windows
 
 # steps that are taken before Python is asked again: Ctrl-C, a progress bar
 LONGEST: Final = 10

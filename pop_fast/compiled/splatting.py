@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pop_fast.camera import view_dirs_vjp
 from pop_fast.compiled.library import (
     Colors,
     ColorsBackward,
@@ -22,16 +21,17 @@ from pop_fast.compiled.library import (
     call_library,
     this_library,
 )
-from pop_fast.splatting import Splats, View
+from pop_fast.stages.camera import view_dirs_vjp
+from pop_fast.stages.splatting import ProjectionSettings, Splats
 
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
-    """See `pop_fast.splatting.covariances`."""
+    """See `pop_fast.stages.splatting.covariances`."""
     return _Covariances.apply(quats, scales)
 
 
-def project(means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: View) -> Splats:
-    """See `pop_fast.splatting.project`; rows of culled Gaussians hold 0, but for depths and opacities.
+def project(means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: ProjectionSettings) -> Splats:
+    """See `pop_fast.stages.splatting.project`; rows of culled Gaussians hold 0, but for depths and opacities.
 
     Optimizations: one pass over the Gaussians forward and one backward, which compute everything in between anew.
     """
@@ -75,7 +75,7 @@ class _Covariances(torch.autograd.Function):
 class _Projection(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: View
+        ctx: Any, means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: ProjectionSettings
     ) -> tuple[Tensor | None, ...]:
         n = len(means)
         results = {
@@ -120,7 +120,7 @@ class _Projection(torch.autograd.Function):
         return (*found, v_viewmat, None)
 
 
-def _projection_numbers(n: int, view: View) -> dict[str, float]:
+def _projection_numbers(n: int, view: ProjectionSettings) -> dict[str, float]:
     profile = view.profile
     names = ("tile_size", "near_inclusive", "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas")
     return {

@@ -10,13 +10,13 @@ import numpy as np
 
 from pop_fast.data.capture import Capture, Progress, View
 from pop_fast.data.colmap import find_models, read_model
+from pop_fast.data.diagnostics import about_other_models, about_random_points, about_unplaced
 from pop_fast.data.normalize import normalizing_transform, transform_points, transform_viewmats
-from pop_fast.data.notes import about_other_models, about_random_points, about_unplaced
-from pop_fast.data.photos import photo_folder, photographs, run_sfm
+from pop_fast.data.posed_images import PosedImage, SparsePoints
 from pop_fast.data.random_points import random_points
-from pop_fast.data.shots import Cloud, Shot
+from pop_fast.data.read_images import PhotoOptions, read_views
+from pop_fast.data.sfm import photo_folder, photographs, run_sfm
 from pop_fast.data.transforms import find_transforms, read_transforms
-from pop_fast.data.views import PhotoOptions, read_views
 from pop_fast.errors import CaptureError
 from pop_fast.io.images import find_image, unreadable_photographs
 
@@ -102,7 +102,7 @@ def _background(color: tuple[float, float, float]) -> tuple[float, float, float]
 
 def _read_listing(
     root: Path, source: Source, sfm: bool, progress: Progress | None
-) -> tuple[Path, list[Shot], Cloud | None, str, list[str]]:
+) -> tuple[Path, list[PosedImage], SparsePoints | None, str, list[str]]:
     models = find_models(root) if source in ("auto", "colmap") else []
     if models:
         return models[0][0], *read_model(models[0][0]), "COLMAP model", about_other_models(root, models)
@@ -119,7 +119,7 @@ def _read_listing(
     return model, *read_model(model), "COLMAP model", []
 
 
-def _beside_the_model(root: Path, shots: list[Shot], images: str | None) -> list[Shot]:
+def _beside_the_model(root: Path, shots: list[PosedImage], images: str | None) -> list[PosedImage]:
     """Look for a COLMAP model's photographs in `images`, or in the capture itself where there is no such folder."""
     if (root / (images or "images")).is_dir():
         return shots
@@ -148,7 +148,7 @@ def _assemble(
     root: Path,
     listing: Path,
     views: list[View],
-    cloud: Cloud | None,
+    cloud: SparsePoints | None,
     made_from: str,
     notes: list[str],
     normalize: bool,
@@ -163,7 +163,7 @@ def _assemble(
             moved = transform_viewmats(transform, viewmats)
             views = [replace(view, viewmat=viewmat) for view, viewmat in zip(views, moved, strict=True)]
         if cloud:
-            cloud = Cloud(transform_points(transform, cloud.xyz), cloud.rgb)
+            cloud = SparsePoints(transform_points(transform, cloud.xyz), cloud.rgb)
             source = f"{made_from}: {len(views)} views, {len(cloud)} points"
         else:
             cloud = random_points(views, points, seed)

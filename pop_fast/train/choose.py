@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pop_fast.backends import get_backend
+from pop_fast.api.registry import get_backend
 from pop_fast.train.config import TrainConfig
 
 

@@ -11,11 +11,11 @@ from typing import Any, Literal
 import torch
 
 from cuda_ext.train_settings import StepSettings
-from pop_fast.backends import get_backend
+from pop_fast.api.registry import get_backend
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.fused_stepper import Fused, FusedStepper, MakeFused, Rows, unsupported
-from pop_fast.train.on_device import OnDevice
+from pop_fast.train.gpu_proxy import GpuProxy
 from pop_fast.train.stepper import Engine, Task
 from pop_fast.train.torch_stepper import TorchStepper
 from pop_fast.train.views import ViewTensors
@@ -103,7 +103,7 @@ def cuda_engine() -> Engine:
         memory = torch.cuda.max_memory_allocated(device)
         return {"gpu": torch.cuda.get_device_name(device), "gpu_memory_bytes": memory}
 
-    return Engine("cuda", device, OnDevice(backend, device), cuda_stepper, facts)
+    return Engine("cuda", device, GpuProxy(backend, device), cuda_stepper, facts)
 
 
 def cuda_stepper(task: Task) -> FusedStepper:
@@ -121,8 +121,8 @@ def _fused_trainer(
     step: int,
 ) -> Fused:
     """Make the fused step, with the photographs on the GPU."""
-    from cuda_ext.resident import ResidentViews
-    from cuda_ext.train_step import FusedTrainer
+    from cuda_ext.training.resident import ResidentViews
+    from cuda_ext.training.train_step import FusedTrainer
 
     device = params["means"].device
     pixels = sum(view.height * view.width for view in views)

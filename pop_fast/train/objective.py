@@ -8,8 +8,8 @@ from types import ModuleType
 from torch import Tensor
 
 from cuda_ext.train_settings import Phase
-from pop_fast import losses
-from pop_fast.losses import TargetMoments, target_moments
+from pop_fast.stages import losses
+from pop_fast.stages.losses import TargetMoments, target_moments
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.views import ViewTensors
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 from torch import Tensor
 
+from pop_fast.api.checks import check_cameras
 from pop_fast.errors import PopError
-from pop_fast.raster_inputs import check_cameras
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.metrics import too_small
 from pop_fast.train.model import first_unusable

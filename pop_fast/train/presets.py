@@ -22,8 +22,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, Final, Literal, NamedTuple, Self, TypeAlias
 
-from pop_fast.errors import PopError
-from pop_fast.strategies import (
+from pop_fast.density import (
     DensityControl,
     GsplatStrategy,
     Inria2023Strategy,
@@ -34,6 +33,7 @@ from pop_fast.strategies import (
     SpeedySplatStrategy,
     TamingStrategy,
 )
+from pop_fast.errors import PopError
 from pop_fast.train.jsonable import from_plain, to_plain
 from pop_ref.recipes import BASELINES, RECIPES, Recipe
 from pop_ref.settings import DensityConfig, PopTerm, UpdateRules

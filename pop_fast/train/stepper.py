@@ -11,10 +11,10 @@ from torch.nn import Parameter
 from torch.optim import Adam
 
 from cuda_ext.train_settings import Phase, StepStats, Updates
-from pop_fast.backends import Backend
-from pop_fast.strategies.base import State
-from pop_fast.strategies.control import DensityControl
-from pop_fast.strategies.foreign import ForeignStrategy
+from pop_fast.api.registry import Backend
+from pop_fast.density.control import DensityControl
+from pop_fast.density.foreign import ForeignStrategy
+from pop_fast.density.protocol import State
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.views import ViewTensors
 

@@ -11,8 +11,8 @@ from torch.nn import Parameter
 from torch.optim import Adam
 
 from cuda_ext.train_settings import Phase, StepStats
-from pop_fast.backends import Backend
-from pop_fast.strategies.base import State
+from pop_fast.api.registry import Backend
+from pop_fast.density.protocol import State
 from pop_fast.train.evaluate import gaussians_per_pixel
 from pop_fast.train.model import adam_step
 from pop_fast.train.objective import Objective

@@ -51,7 +51,7 @@ def _structs(real: Any) -> tuple[Any, Any]:
 @cache
 def library(folder: Path) -> ctypes.CDLL:
     """Build the mirror if it is not there yet, and load it."""
-    return ctypes.CDLL(str(importlib.import_module("cuda_ext.host_mirror").build_mirror(folder)))
+    return ctypes.CDLL(str(importlib.import_module("cuda_ext.host.mirror").build_mirror(folder)))
 
 
 class Mirror:

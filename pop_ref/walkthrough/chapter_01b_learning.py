@@ -40,9 +40,9 @@ from pop_ref.activations import (
 )
 from pop_ref.losses import l2, l2_vjp
 from pop_ref.optimizer import adam_step
+from pop_ref.records import Camera
 from pop_ref.render import render, render_vjp
 from pop_ref.training import gaussians_from_params, params_vjp
-from pop_ref.types import Camera
 from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import film, picture
 from pop_ref.walkthrough.style import ACCENT, MUTED, SECOND, axes

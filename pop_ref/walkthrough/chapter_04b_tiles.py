@@ -24,9 +24,9 @@ import numpy as np
 
 from pop_ref.constants import PAPER
 from pop_ref.footprint import conics_from_covars2d, radii_from_covars2d
+from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render
 from pop_ref.tiles import grid_size, tile_lists, tile_rects
-from pop_ref.types import Camera, Gaussians
 from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, INK, SECOND, axes, show_image

@@ -60,8 +60,8 @@ from pop_ref.projection import (
     projection_jacobians,
     projection_jacobians_vjp,
 )
+from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render, render_vjp
-from pop_ref.types import Camera, Gaussians
 from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, SECOND, THIRD, axes, show_image

@@ -19,8 +19,8 @@ import time
 import numpy as np
 import torch
 
-from pop_fast import compositing as fast
-from pop_fast import tiles as fast_tiles
+from pop_fast.stages import compositing as fast
+from pop_fast.stages import tiles as fast_tiles
 from pop_ref.alpha import alpha_from_sigma, sigma_at_pixel
 from pop_ref.compositing import composite, composite_vjp
 from pop_ref.constants import PAPER
@@ -233,8 +233,8 @@ print(f"{np.abs(v_means2d - wanted.v_means2d).max():.0e}")
 # %% [markdown]
 # ## The real one
 #
-# `pop_fast.compositing.composite` does this for all tiles of a screen. What it adds is bookkeeping: tiles of similar
-# list length are treated together, a few list entries at a time, so that what is being worked on stays in the
+# `pop_fast.stages.compositing.composite` does this for all tiles of a screen. What it adds is bookkeeping: tiles of
+# similar list length are treated together, a few list entries at a time, so that what is being worked on stays in the
 # processor's cache; tiles whose pixels have all stopped drop out; and the backward pass keeps little and makes alphas
 # again. In training it runs in float32; here in float64, against the oracle, on a screen of four tiles.
 

@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from pop_fast.backends import get_backend
+from pop_fast.api.rasterize import rasterization
+from pop_fast.api.registry import get_backend
 from pop_fast.cli.train import check_backend
+from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.rasterization import rasterization
-from pop_fast.strategies import POPStrategy
 from pop_fast.train import TrainingRun
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.engines import cuda_engine
-from pop_fast.train.on_device import OnDevice, renderer, words_for_memory
+from pop_fast.train.gpu_proxy import GpuProxy, renderer, words_for_memory
 from pop_fast.train.views import ViewTensors, render_view
 from tests.app.conftest import TRAIN, Pop
 from tests.app.drift import drift_engine
@@ -133,7 +133,7 @@ def test_a_result_of_a_gpu_can_be_measured_without_one(pop: Pop, result: Path, m
 def test_images_and_what_is_told_of_them_come_back_from_the_device(tmp_path):
     trainer = TrainingRun(tiny_config(tmp_path), tiny_capture())
     view: ViewTensors = trainer._train[0]
-    on = OnDevice(get_backend("fast"), torch.device("cpu"))
+    on = GpuProxy(get_backend("fast"), torch.device("cpu"))
     there = render_view(on, trainer.params, view, trainer.config, 0, counts=True)
     here = render_view(get_backend("fast"), trainer.params, view, trainer.config, 0, counts=True)
     assert torch.equal(there.image, here.image.detach())

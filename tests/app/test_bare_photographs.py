@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from pop_fast.data import load_capture, photos, run_sfm
+from pop_fast.data import load_capture, run_sfm
+from pop_fast.data import sfm as photos
 from tests.app.captures import assert_one_line, make_model, photograph, ring, write_photograph
 from tests.app.damage import contents
 

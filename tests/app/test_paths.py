@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pop_fast.errors import PopError
-from pop_fast.paths import PATHS, VideoFile, camera_path, interpolate, orbit
-from pop_fast.paths.cameras import camera_centers, focus_point, look_at, mean_up
-from pop_fast.paths.video import frames_in
+from pop_fast.view.paths import PATHS, VideoFile, camera_path, interpolate, orbit
+from pop_fast.view.paths.cameras import camera_centers, focus_point, look_at, mean_up
+from pop_fast.view.paths.video import frames_in
 from tests.app.captures import assert_one_line
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -152,7 +152,7 @@ _LIMITED = """
 import resource, signal, sys
 from pathlib import Path
 import numpy as np
-from pop_fast.paths import VideoFile
+from pop_fast.view.paths import VideoFile
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
 with VideoFile(Path(sys.argv[1])) as video:

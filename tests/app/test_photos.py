@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from pop_fast.data import load_capture, run_sfm
-from pop_fast.data.demo_scene import make_scene
-from pop_fast.data.demo_tracer import render_view
-from pop_fast.data.photos import _pairs  # pyright: ignore[reportPrivateUsage]
+from pop_fast.data.sfm import _pairs  # pyright: ignore[reportPrivateUsage]
+from pop_fast.demo.scene import make_scene
+from pop_fast.demo.tracer import render_view
 from tests.app.captures import assert_one_line, look_at, photograph, write_photograph
 
 K = np.array([[300.0, 0.0, 160.0], [0.0, 300.0, 120.0], [0.0, 0.0, 1.0]])

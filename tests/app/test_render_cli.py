@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from pop_fast.cli.frames import write_pictures
 from pop_fast.errors import PopError
-from pop_fast.paths.video import frames_in
+from pop_fast.view.frames import write_pictures
+from pop_fast.view.paths.video import frames_in
 from tests.app.captures import (
     camera,
     edit_transforms,

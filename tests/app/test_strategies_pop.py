@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from pop_fast.strategies import GsplatStrategy, POPStrategy, StepEvent
+from pop_fast.density import DensificationStep, GsplatStrategy, POPStrategy
 from tests.app.populations import HEIGHT, WIDTH, make, make_info, packed, run_event
 
 
@@ -63,7 +63,7 @@ def test_blur_flags_are_forgotten_after_an_event():
 
 
 def test_blur_clones_small_and_splits_large_or_splits_all():
-    for rule, event in (("by_scale", StepEvent(1, 1)), ("split", StepEvent(0, 2))):
+    for rule, event in (("by_scale", DensificationStep(1, 1)), ("split", DensificationStep(0, 2))):
         params, optimizers = make(2)
         params["scales"].data[1] = math.log(0.05)
         info = make_info(2, counts=torch.tensor([99, 99]))

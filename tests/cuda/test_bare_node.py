@@ -13,7 +13,8 @@ from typing import Any
 
 import pytest
 
-from cuda_ext.gpu_check_stages import JOBS
+from cuda_ext.gpu_check.stages import JOBS
+from cuda_ext.host import emulate
 from pop_fast.cli import main as pop
 from tests.cuda.bare_node import (
     ABSENT,
@@ -23,7 +24,6 @@ from tests.cuda.bare_node import (
     make_bare_node,
     stand_in_gsplat,
 )
-from tests.cuda.emulated import emulate
 
 ROOT = Path(__file__).resolve().parents[2]
 WHEELS = ("plyfile", "tyro", "typeguard", "docstring_parser", "typing_extensions")

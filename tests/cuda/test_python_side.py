@@ -13,7 +13,7 @@ import torch
 import cuda_ext
 from cuda_ext import build as build_module
 from cuda_ext.build import BuildError
-from cuda_ext.check_ptxas import KernelUse, as_table, offenders, parse_ptxas
+from cuda_ext.machine_code.check_ptxas import KernelUse, as_table, offenders, parse_ptxas
 from cuda_ext.toolkit import find_nvcc
 
 PTXAS = """
@@ -138,7 +138,7 @@ def test_a_failing_compiler_is_quoted():
 
 
 def test_rasterization_refuses_what_it_does_not_support_and_names_what_is_wrong():
-    from cuda_ext.ops import rasterization
+    from cuda_ext.render.ops import rasterization
 
     rows = {
         "means": torch.zeros(1, 3),
@@ -164,8 +164,8 @@ def test_rasterization_refuses_what_it_does_not_support_and_names_what_is_wrong(
 def test_the_signature_is_the_cpus():
     import inspect
 
-    from cuda_ext.ops import rasterization as on_gpu
-    from pop_fast.rasterization import rasterization as on_cpu
+    from cuda_ext.render.ops import rasterization as on_gpu
+    from pop_fast.api.rasterize import rasterization as on_cpu
 
     ours, theirs = (inspect.signature(function).parameters for function in (on_gpu, on_cpu))
     positional = [name for name, p in theirs.items() if p.kind is not p.KEYWORD_ONLY]
@@ -206,6 +206,6 @@ def test_every_kernel_file_is_built():
 @pytest.mark.slow
 @pytest.mark.skipif(find_nvcc() is None, reason="no nvcc: the kernels are not compiled here (install a CUDA toolkit)")
 def test_the_blend_kernels_compile_for_turing_without_spills():
-    from cuda_ext.check_ptxas import check
+    from cuda_ext.machine_code.check_ptxas import check
 
     assert offenders(check(["sm_75"], only="blend")) == []

@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from pop_fast import compiled
-from pop_fast.compositing import Composite
-from pop_fast.compositing import composite as composite_in_torch
-from pop_fast.raster_inputs import check_cameras
-from pop_fast.raster_stages import stages_of
-from pop_fast.tiles import TileLists, tile_lists
+from pop_fast.api.backend import stages_of
+from pop_fast.api.checks import check_cameras
+from pop_fast.stages.compositing import Composite
+from pop_fast.stages.compositing import composite as composite_in_torch
+from pop_fast.stages.tiles import TileLists, tile_lists
 from pop_ref.constants import INRIA, PAPER, Profile
 
 pytestmark = pytest.mark.skipif(not compiled.available(), reason=compiled.why_not() or "")
@@ -161,7 +161,7 @@ def test_threads_of_its_own_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) 
 def test_running_out_of_memory_is_an_error_and_not_the_end(tmp_path: Path) -> None:
     program = """
         import resource, torch
-        from pop_fast.rasterization import rasterization
+        from pop_fast.api.rasterize import rasterization
 
         def render(tile_size):
             means, quats = torch.tensor([[0.0, 0.0, 4.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])

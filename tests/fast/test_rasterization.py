@@ -11,10 +11,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from pop_fast import workspace
-from pop_fast.backends import backend_names, fastest_backend, get_backend
+from pop_fast.api.rasterize import rasterization as program
+from pop_fast.api.registry import backend_names, fastest_backend, get_backend
 from pop_fast.errors import PopError
-from pop_fast.rasterization import rasterization as program
+from pop_fast.stages.blend import buffers
 
 WIDTH, HEIGHT, N = 21, 18, 24
 
@@ -138,7 +138,7 @@ def test_any_number_of_channels_is_blended() -> None:
 
 
 def test_covariances_can_replace_quaternions_and_scales() -> None:
-    from pop_fast.covariance import covars_from_quats_scales
+    from pop_fast.stages.covariance import covars_from_quats_scales
 
     given = scene()
     covars = covars_from_quats_scales(given["quats"], given["scales"])
@@ -206,12 +206,12 @@ def test_absolute_gradients_bound_the_signed_ones() -> None:
 def test_buffers_are_reused_and_can_be_freed() -> None:
     leaf = scene(4)["means"].requires_grad_()
     rasterization(**{**scene(4), "means": leaf}, **cameras())[0].sum().backward()
-    taken = workspace.take(64, torch.float64)
-    workspace.give(taken)
-    assert workspace.take(64, torch.float64).data_ptr() == taken.data_ptr()
-    assert workspace.retained_bytes() > 0
-    workspace.clear()
-    assert workspace.retained_bytes() == 0
+    taken = buffers.acquire(64, torch.float64)
+    buffers.release(taken)
+    assert buffers.acquire(64, torch.float64).data_ptr() == taken.data_ptr()
+    assert buffers.retained_bytes() > 0
+    buffers.clear()
+    assert buffers.retained_bytes() == 0
 
 
 def test_an_empty_scene_is_the_background() -> None:
@@ -289,7 +289,7 @@ def test_auto_is_the_default_and_takes_the_fastest_that_is_there(
     compiled: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from pop_fast import compiled as kernels
-    from pop_fast import rasterization as module
+    from pop_fast.api import rasterize as module
 
     asked: list[str] = []
     stages = module.stages_of

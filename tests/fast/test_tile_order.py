@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.tiles import tile_lists
+from pop_fast.stages.tiles import tile_lists
 
 
 @pytest.mark.parametrize("n", [0, 1, 4_096, 4_097, 30_000, 32_767, 32_768, 40_000])

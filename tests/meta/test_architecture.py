@@ -24,9 +24,8 @@ VALUES = {"pop_ref.constants", "pop_ref.settings", "pop_ref.recipes"}
 SHARED_WITH_FAST = VALUES | {"pop_ref.notation", "pop_ref.records"}
 # rooms of the program whose work is to show what the oracle does
 SHOW_THE_ORACLE = (
-    "pop_fast/explain/",
-    "pop_fast/oracle_backend.py",
-    "pop_fast/oracle_passes.py",
+    "pop_fast/view/explain/",
+    "pop_fast/oracle/",
     "pop_fast/cli/vectors.py",
     "pop_fast/cli/learn.py",
 )
@@ -220,7 +219,7 @@ WITHOUT = [
         "with reproducible(): make_optimizers({'means': Parameter(torch.zeros(1, 3))})",
         ("torch._dynamo", "torch._inductor", "sympy"),
     ),
-    ("import pop_fast.train.training_run", ("torch._dynamo", "matplotlib", "pycolmap", "pop_fast.report.page")),
+    ("import pop_fast.train.training_run", ("torch._dynamo", "matplotlib", "pycolmap", "pop_fast.view.report.page")),
 ]
 
 
@@ -304,7 +303,7 @@ def test_the_oracles_docstrings_name_source_departures_arguments_and_an_example(
 
 def test_the_fast_twins_point_to_the_oracle() -> None:
     complaints = []
-    for path in (p for p in sorted((ROOT / "pop_fast").glob("*.py")) if p.stem in STAGES):
+    for path in (p for p in sorted((ROOT / "pop_fast" / "stages").glob("*.py")) if p.stem in STAGES):
         twins = {f.name for f in _public_functions(ROOT / "pop_ref" / path.name)}
         for function in _public_functions(path):
             if function.name in twins and "`pop_ref." not in (ast.get_docstring(function) or ""):

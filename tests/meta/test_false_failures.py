@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.rasterization import rasterization as fast
+from pop_fast.api.rasterize import rasterization as fast
 from pop_ref.conformance.adapter import Adapter, OracleAdapter, View, stage_function
 from pop_ref.conformance.capabilities import DETERMINISTIC, DOMINANCE, DOMINANT_WEIGHTS, GRADIENTS, HOMOGENEOUS, RENDER
 from pop_ref.conformance.failure_report import failure_report

@@ -165,12 +165,12 @@ def _kit(*options: str) -> subprocess.CompletedProcess[str]:
 
 def test_the_kit_runs_from_the_command_line_and_writes_a_scorecard(tmp_path: Path) -> None:
     card = tmp_path / "card.json"
-    done = _kit("--rasterizer", "pop_fast.rasterization:rasterization", "--stages", "pop_fast", "--stage", "camera",
+    done = _kit("--rasterizer", "pop_fast.api:rasterization", "--stages", "pop_fast.stages", "--stage", "camera",
                 "--dtype", "float64", "--profile", "paper", "--scorecard", str(card))  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     told = json.loads(card.read_text())
-    assert set(told["summary"]["pop_fast.rasterization:rasterization"]) == {"camera"}
-    (laws,) = told["laws"]["pop_fast.rasterization:rasterization"].values()
+    assert set(told["summary"]["pop_fast.api.rasterize:rasterization"]) == {"camera"}
+    (laws,) = told["laws"]["pop_fast.api.rasterize:rasterization"].values()
     assert "a rigid motion keeps distances".replace(" ", "_") in laws
     assert all(came == "passed" or came.startswith("skipped: ") for came in laws.values())
     assert told["made"]["hypothesis profile"]
@@ -181,7 +181,7 @@ def test_a_session_that_judges_nothing_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "conftest.py").write_text("def pytest_addoption(parser): parser.addoption('--profile')\n")
     (tmp_path / "test_mine.py").write_text(
         "import sys\ndef test_mine(request):\n    assert request.config.getoption('--profile') == 'cpu'\n"
-        "    assert 'pop_fast.conformance_door' in sys.modules\n"
+        "    assert 'pop_fast.pytest_entry' in sys.modules\n"
         "    assert not {'pop_ref', 'torch'} & set(sys.modules)\n"
     )
     command = [
@@ -245,7 +245,7 @@ def test_poison_reaches_what_the_package_allocates_and_nothing_else() -> None:
 
 
 STRANGER = """
-from pop_fast.rasterization import rasterization as sound
+from pop_fast.api.rasterize import rasterization as sound
 
 def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane=0.01, far_plane=1e10,
                   radius_clip=0.0, eps2d=0.3, sh_degree=None, packed=True, tile_size=16, backgrounds=None,

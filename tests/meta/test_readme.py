@@ -50,7 +50,7 @@ BOTH_ROOMS = [
     (f"{module}.{name}", reference, fast[name])
     for stage in stages.STAGES
     for module in stage.modules
-    if (fast := stages.functions(ROOT / "pop_fast" / f"{module}.py")) is not None
+    if (fast := stages.functions(ROOT / "pop_fast" / "stages" / f"{module}.py")) is not None
     for name, reference in stages.functions(ROOT / "pop_ref" / f"{module}.py").items()
     if name in fast
 ]

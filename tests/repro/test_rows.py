@@ -47,7 +47,7 @@ OTHERS: dict[str, Recipe] = {
 # rows that read an open question otherwise, with the one value in which they differ from POP
 READINGS = {
     "pop_visible": ("pop_over", "visible"),
-    "pop_own_view": ("blur_window", "own_view"),
+    "pop_any_view": ("blur_window", "any_view"),
     "pop_prune_002": ("prune_opa", 0.02),
     "pop_sum": ("blur_window", "sum"),
     "pop_no_size_prune": ("prune_too_big", False),

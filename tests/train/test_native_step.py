@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.backends import get_backend
+from pop_fast.api.registry import get_backend
 from pop_fast.data.initialize import initialize_params
+from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.strategies import POPStrategy
 from pop_fast.train import TrainingRun
 from pop_fast.train.engines import engine_of, native_engine, torch_engine
 from pop_fast.train.model import KEYS
@@ -42,7 +42,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "without the prior": {"lambda_pop": 0.0},
     "the prior over what is seen": {"pop_over": "visible"},
     "the prior over the window": {"pop_views": "window"},
-    "blur of its own view": {"blur_window": "own_view"},
+    "blur of any view": {"blur_window": "any_view"},
     "blur of summed counts": {"blur_window": "sum"},
     "profile inria": {"profile": "inria"},
     "profile gsplat_1_6": {"profile": "gsplat_1_6"},

@@ -41,7 +41,7 @@ class BlackBox:
 
     def rasterization(self) -> Rasterization:
         """Return the broken function, with the arguments that gsplat has."""
-        sound = partial(function_named("pop_fast.rasterization:rasterization"), backend="fast")
+        sound = partial(function_named("pop_fast.api.rasterize:rasterization"), backend="fast")
 
         def rasterization(
             means: Any, quats: Any, scales: Any, opacities: Any, colors: Any, viewmats: Any, Ks: Any, width: int,

@@ -21,7 +21,7 @@ DOMINANCE = ("dominant_ids", "dominant_weights", "dominant_counts")
 
 def rasterizer(family: str, deterministic: bool = True) -> Any:
     """Return the CUDA rasterization with one backward family; visits are counted where the tile allows it."""
-    from cuda_ext.ops import rasterization
+    from cuda_ext.render.ops import rasterization
 
     # the kit reads off the signature what it may ask for: a mode that is not named here is not judged
     def draw(

@@ -14,7 +14,7 @@ from .scene import HEIGHT, LR, WIDTH, training_scene
 
 @pytest.mark.parametrize("family", ["columns", "splats"])
 def test_a_render_is_the_oracles(gpu, family):
-    from cuda_ext.ops import rasterization
+    from cuda_ext.render.ops import rasterization
 
     scene = training_scene()
     p = {name: value.to(gpu) for name, value in scene.params.items()}
@@ -33,9 +33,9 @@ def test_a_render_is_the_oracles(gpu, family):
 
 
 def test_fused_steps_launched_one_by_one_give_the_same_bits_twice_and_learn(gpu):
-    from cuda_ext.resident import ResidentViews
     from cuda_ext.train_settings import Phase, StepSettings, steady_updates
-    from cuda_ext.train_step import FusedTrainer
+    from cuda_ext.training.resident import ResidentViews
+    from cuda_ext.training.train_step import FusedTrainer
 
     found = []
     for _ in range(2):

@@ -46,7 +46,7 @@ def test_graphs_of_several_sizes_and_phases_are_replayed_in_turn(gpu, options):
 
 @pytest.mark.graph
 def test_buffers_that_overflow_grow_and_nothing_is_lost(gpu, monkeypatch):
-    from cuda_ext import capacity
+    from cuda_ext.render import capacity
 
     expected = fused(training_scene(), gpu)[1]
     monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 1))
@@ -75,7 +75,7 @@ def test_two_runs_give_the_same_bits(gpu):
 
 
 def test_a_trainer_of_ones_own_learns_through_the_autograd_functions(gpu):
-    from pop_fast.rasterization import rasterization
+    from pop_fast.api.rasterize import rasterization
 
     scene = training_scene()
     leaves = {name: value.to(gpu).clone().requires_grad_() for name, value in scene.params.items()}
@@ -100,7 +100,7 @@ def test_a_trainer_of_ones_own_learns_through_the_autograd_functions(gpu):
 
 
 def test_rasterization_and_its_gradients_give_the_same_bits_twice(gpu):
-    from cuda_ext.ops import rasterization
+    from cuda_ext.render.ops import rasterization
 
     scene = training_scene()
     grads = []
@@ -121,8 +121,8 @@ def test_rasterization_and_its_gradients_give_the_same_bits_twice(gpu):
 @pytest.mark.parametrize("family", ["columns", "splats"])
 @pytest.mark.parametrize("faint", [1, 44], ids=["one-bucket", "three-buckets"])
 def test_gradients_around_an_opaque_splat_keep_their_digits(gpu, family, faint):
-    from cuda_ext.ops import rasterization as on_gpu
-    from pop_fast.rasterization import rasterization as on_cpu
+    from cuda_ext.render.ops import rasterization as on_gpu
+    from pop_fast.api.rasterize import rasterization as on_cpu
 
     n = 2 * faint + 1
 
@@ -149,8 +149,8 @@ def test_gradients_around_an_opaque_splat_keep_their_digits(gpu, family, faint):
 
 @pytest.mark.parametrize("options", [{"counts": True}, {"profile": "inria"}])
 def test_lists_of_the_callers_tiles_go_back_as_the_warps_own_do(gpu, options):
-    from cuda_ext.ops import rasterization as on_gpu
-    from pop_fast.rasterization import rasterization as on_cpu
+    from cuda_ext.render.ops import rasterization as on_gpu
+    from pop_fast.api.rasterize import rasterization as on_cpu
 
     scene, grads = training_scene(), []
     # 36 px: the last row of 16 px tiles is less than half full, so that a warp's part of it lies outside
@@ -171,8 +171,8 @@ def test_lists_of_the_callers_tiles_go_back_as_the_warps_own_do(gpu, options):
 @pytest.mark.parametrize("mode", ["D", "ED", "RGB+D", "RGB+ED"])
 @pytest.mark.parametrize("packed", [False, True])
 def test_every_render_mode_is_the_cpus(gpu, mode, packed):
-    from cuda_ext.ops import rasterization as on_gpu
-    from pop_fast.rasterization import rasterization as on_cpu
+    from cuda_ext.render.ops import rasterization as on_gpu
+    from pop_fast.api.rasterize import rasterization as on_cpu
 
     scene = training_scene()
 
@@ -204,7 +204,7 @@ def test_every_render_mode_is_the_cpus(gpu, mode, packed):
     ],
 )
 def test_a_bad_value_is_named_with_its_index(gpu, name, index, value, words):
-    from cuda_ext.ops import rasterization
+    from cuda_ext.render.ops import rasterization
 
     scene = training_scene()
     p = {key: tensor.to(gpu).clone() for key, tensor in scene.params.items()}
