@@ -198,6 +198,10 @@ picture(
 )
 
 # %% [markdown]
+# The same splat, to be moved and shaped. What this chapter computed stands beside it.
+#
+# {{widget: splat2d}}
+#
 # ## The colour of the pixel
 #
 # With a single splat, the rendering equation (POP paper, eq. 1) says little more than a painter would: the splat gives
@@ -226,9 +230,6 @@ fig, ax = axes(width=4.2, height=2.7)
 show_image(ax, image)
 ax.set(xlabel="x, px", ylabel="y, px")
 picture(fig, "The same splat blended over a warm background, pixel by pixel.")
-
-# %% [markdown]
-# {{widget: splat2d}}
 
 # %% [markdown]
 # ### Exercise 1: predict

@@ -177,8 +177,6 @@ picture(
 )
 
 # %% [markdown]
-# {{widget: orbit}}
-#
 # Far outside the image the linearisation is worse than poor: $x/z$ grows without bound and with it the ellipse.
 # Rasterizers therefore evaluate $J$ no farther out than 15 % of the image's width (and height) beyond its border. The
 # papers do not print this (kink B1 of the oracle).
@@ -190,6 +188,10 @@ assert PAPER.frustum_margin == 2 * 0.15
 assert np.isclose(projection_jacobians(aside, K, width, height)[0, 0, 2], -f * limit)
 
 # %% [markdown]
+# A Gaussian to walk around. Its points go through the true pinhole, its ellipse through $J$.
+#
+# {{widget: orbit}}
+#
 # ## A little blur
 #
 # A pixel looks at one point only. A splat much thinner than a pixel hits a centre or falls between two, and flickers as

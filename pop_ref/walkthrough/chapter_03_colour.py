@@ -81,9 +81,10 @@ for k in range(16):
 picture(fig, "The sixteen harmonics, one row a degree.")
 
 # %% [markdown]
+# Their sum, with a slider for each coefficient. The middle of the globe is the view direction.
+#
 # {{widget: harmonics}}
-
-# %% [markdown]
+#
 # ## Why these polynomials
 #
 # They are *orthonormal*: over the whole sphere, $\int Y_j Y_k \, d\omega$ is 1 for $j = k$ and 0 otherwise (Ramamoorthi

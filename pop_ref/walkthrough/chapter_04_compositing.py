@@ -75,9 +75,6 @@ assert np.isclose(sum(pixel.weights) + pixel.T_final, 1)
 assert np.allclose(pixel.weights, -np.diff([*pixel.transmittances, pixel.T_final]))
 
 # %% [markdown]
-# {{widget: stack}}
-
-# %% [markdown]
 # The order decides. The same six splats from back to front give another pixel (exercise 1 says how much a swap of two
 # neighbours costs). A renderer therefore sorts splats by depth before it blends. It need not go from front to back,
 # though: a painter's rule, $b_{i-1} = \alpha_i c_i + (1 - \alpha_i)\, b_i$ from the background $b_m = b$ forward, gives
@@ -163,6 +160,10 @@ assert np.isclose(odd.T_final, 0.09)
 assert np.allclose(odd.color, 0.91 * np.array([0.2, 0.2, 0.2]) + 0.09 * background)
 
 # %% [markdown]
+# One pixel, to be rearranged. Its last column is the subject of chapter 5.
+#
+# {{widget: stack}}
+#
 # ## A whole image
 #
 # `render` does for every pixel what we did for one: project, list the splats by depth, blend, stop. Here is a box full

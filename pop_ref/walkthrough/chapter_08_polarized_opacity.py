@@ -387,9 +387,6 @@ right.legend()
 picture(fig, "What the prior saves (compare the paper's figure 4b), and what it costs.")
 
 # %% [markdown]
-# {{widget: scrubber}}
-
-# %% [markdown]
 # It is not free. When the prior ends the error is three times that of the run without it, and the ratio hardly changes
 # after: 4.8 dB of PSNR at the end. Forty Gaussians cannot spare any. Where there are enough, the price is small: in the
 # paper's ablation on Mip-NeRF 360 the prior takes the model from 583k to 268k Gaussians and from 27.22 to 27.01 dB.
@@ -410,6 +407,11 @@ for camera in cameras:
     view = render(with_prior[POP_STEPS], camera)
     listed = np.array([len(ids) for ids in view.tile_lists])[np.arange(WIDTH) // 16]
     assert np.array_equal(view.n_traversed[0], listed)
+
+# %% [markdown]
+# And in three dimensions: two recorded trainings of the toy of `pop_ref/learn/splat.py`.
+#
+# {{widget: scrubber}}
 
 # %% [markdown]
 # ### Exercise 3: predict

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import base64
-import importlib
-import importlib.util
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any, Final
 from xml.etree import ElementTree
@@ -18,6 +16,7 @@ from pygments import highlight
 from pygments.formatters.html import HtmlFormatter
 from pygments.lexers.python import PythonLexer
 
+from pop_ref.walkthrough import widgets
 from pop_ref.walkthrough.cells import FOLDER, Cell, Chapter, ChapterError
 from pop_ref.walkthrough.directives import expanded
 from pop_ref.walkthrough.folding import parts, said_and_done
@@ -25,8 +24,8 @@ from pop_ref.walkthrough.glossary import GLOSSARY_PAGE, glossary
 from pop_ref.walkthrough.pages import Outcome, Picture
 from pop_ref.walkthrough.style import VARIABLES
 
-_TITLE: Final = "Splats with polarized opacity, step by step"
-_LEAD: Final = (
+TITLE: Final = "Splats with polarized opacity, step by step"
+LEAD: Final = (
     "3D Gaussian Splatting and the Polarized Opacity Prior, for a reader who knows linear algebra and Python and has "
     "never heard of splats. Every chapter is a script on the oracle's own functions: what it claims is checked as it "
     "runs, and each of its exercises has an answer that runs."
@@ -85,7 +84,7 @@ def chapter_page(
     file = f"pop_ref/walkthrough/{chapter.path.name}"
     return _document(
         f"{chapter.number}. {chapter.title}",
-        f'<nav><a href="index.html">{_TITLE}</a><span>{chapter.minutes} minutes · '
+        f'<nav><a href="index.html">{TITLE}</a><span>{chapter.minutes} minutes · '
         f'<a href="{GLOSSARY_PAGE}">glossary</a></span></nav>'
         f'<article>{"".join(body)}</article><nav class="turn">{turn}</nav>'
         f"<footer>This page is <code>{file}</code>, run and laid out. Change it and run it: "
@@ -93,8 +92,13 @@ def chapter_page(
     )
 
 
-def index_page(chapters: Sequence[Chapter]) -> str:
-    """Lay out the contents: every chapter's title, minutes and opening paragraph."""
+def index_page(chapters: Sequence[Chapter], beside: Mapping[str, str] | None = None) -> str:
+    """Lay out the contents: every chapter's title, minutes and opening paragraph.
+
+    Args:
+        chapters: in order.
+        beside: other forms of the chapters, name to place relative to the page.
+    """
     items = [
         f'<li><h2><a href="{chapter.page}">{chapter.number}. {_inline(chapter, chapter.title)}</a> '
         f"<small>{chapter.minutes} min</small></h2>"
@@ -102,9 +106,13 @@ def index_page(chapters: Sequence[Chapter]) -> str:
         for chapter in chapters
     ]
     hours = sum(chapter.minutes for chapter in chapters) / 60.0
-    about = f'{_LEAD} All of it takes about {hours:.0f} hours. <a href="{GLOSSARY_PAGE}">Glossary</a>'
+    about = f'{LEAD} All of it takes about {hours:.0f} hours. <a href="{GLOSSARY_PAGE}">Glossary</a>'
+    for name, place in (beside or {}).items():
+        about += (
+            f' · <a href="{place}{"/index.html" if name == "notebooks" else ""}">{name}</a>'
+        )
     return _document(
-        _TITLE, f'<h1>{_TITLE}</h1><p>{about}</p><ol class="contents">{"".join(items)}</ol>'
+        TITLE, f'<h1>{TITLE}</h1><p>{about}</p><ol class="contents">{"".join(items)}</ol>'
     )
 
 
@@ -116,7 +124,7 @@ def glossary_page() -> str:
     )
     return _document(
         "Glossary",
-        f'<nav><a href="index.html">{_TITLE}</a></nav><h1>Glossary</h1><article>{body}</article>',
+        f'<nav><a href="index.html">{TITLE}</a></nav><h1>Glossary</h1><article>{body}</article>',
     )
 
 
@@ -286,7 +294,7 @@ def _prose(chapter: Chapter, cell: Cell) -> str:
         raise ChapterError(chapter.path, cell.line, str(error)) from error
     try:
         rendered = _LABEL.sub(_label, _MARKDOWN.render(text))
-        return _WIDGET.sub(lambda found: _widget(found[1]), rendered)
+        return _WIDGET.sub(lambda found: widgets.html(found[1]), rendered)
     except Exception as error:
         raise ChapterError(
             chapter.path, _line_of(cell, error), f"a formula cannot be set: {error}"
@@ -295,13 +303,6 @@ def _prose(chapter: Chapter, cell: Cell) -> str:
 
 def _label(found: re.Match[str]) -> str:
     return found[1] or f'<a class="label" href="{GLOSSARY_PAGE}#{found[3]}">{found[3]}</a>'
-
-
-def _widget(name: str) -> str:
-    """Return what a page shows of a widget; nothing where the widgets are not installed."""
-    if importlib.util.find_spec("pop_ref.walkthrough.widgets") is None:
-        return ""
-    return importlib.import_module("pop_ref.walkthrough.widgets").html(name)
 
 
 def _film(name: str, picture: Picture, caption: str) -> str:
@@ -334,3 +335,17 @@ def _inline(chapter: Chapter, text: str, line: int = 1) -> str:
         raise ChapterError(
             chapter.path, line, f"a formula cannot be set in {text!r}: {error}"
         ) from error
+
+
+def rendered(chapter: Chapter, text: str) -> str:
+    """Set markdown of a chapter as its page does.
+
+    Raises:
+        ChapterError: a formula cannot be set.
+    """
+    return _prose(chapter, Cell("prose", text, 1))
+
+
+def figure(chapter: Chapter, cell: Cell, name: str, picture: Picture) -> str:
+    """Set a picture of a chapter as its page does; `name` is what its ids begin with."""
+    return _figure(chapter, cell, name, picture)

@@ -52,7 +52,7 @@ _walls: list[list[Picture]] = []
 
 
 def picture(figure: Figure, caption: str) -> None:
-    """Hand a figure to the page under construction and close it; in a plain script, just close it.
+    """Hand a figure to the page under construction, or show it in a notebook, and close it.
 
     Args:
         figure: a matplotlib figure.
@@ -60,7 +60,23 @@ def picture(figure: Figure, caption: str) -> None:
     """
     if _walls:
         _walls[-1].append(_drawn(figure, caption))
+    else:
+        _show_in_notebook(figure, caption)
     plt.close(figure)
+
+
+def _show_in_notebook(figure: Figure, caption: str) -> None:
+    """Show a figure and its caption where this runs in Jupyter, which alone has both modules and a kernel."""
+    jupyter, shown = (
+        sys.modules.get("ipykernel.zmqshell"),
+        sys.modules.get("IPython.display"),
+    )
+    if jupyter is None or shown is None or not jupyter.ZMQInteractiveShell.initialized():
+        return
+    png = io.BytesIO()
+    figure.savefig(png, format="png", dpi=_DPI, facecolor="white")
+    width = round(100 * float(figure.get_size_inches()[0]))
+    shown.display(shown.Image(png.getvalue(), width=width), shown.Markdown(caption))
 
 
 def film(
