@@ -11,9 +11,9 @@
 # Everything here happens on the screen, where lengths are pixels, $x$ runs right and $y$ runs down. A splat has
 #
 # - a centre $\mu$, two numbers, px;
-# - a covariance $\Sigma$, a symmetric 2 × 2 matrix, px²: its eigenvectors are the axes of the ellipse, the roots of its
+# - a *covariance* $\Sigma$, a symmetric 2 × 2 matrix, px²: its eigenvectors are the axes of the ellipse, the roots of its
 #   eigenvalues the standard deviations along them;
-# - an opacity $o$ between 0 and 1;
+# - an *opacity* $o$ between 0 and 1: how much it hides at its centre;
 # - a colour $c$, three numbers.
 #
 # How a Gaussian in space becomes a splat is chapter 2. Here is one to look at; the widget at the end of the page lets
@@ -89,8 +89,8 @@ print(
 #
 # $$\alpha(p) = o\, e^{-\sigma(p)}$$
 #
-# This is POP paper, eq. 11, again. Alpha is the share of the light from behind that the splat blocks at this pixel. It
-# is not a probability density: the bell is 1 at its top whatever its width, so a wider splat covers more and is no
+# This is POP paper, eq. 11, again. *Alpha* is the share of the light from behind that the splat blocks at this pixel.
+# It is not a probability density: the bell is 1 at its top whatever its width, so a wider splat covers more and is no
 # fainter.
 #
 # Rasterizers add two rules that the paper does not print. An alpha under 1/255 changes an 8-bit image by less than one
@@ -205,7 +205,7 @@ picture(
 # ## The colour of the pixel
 #
 # With a single splat, the rendering equation (POP paper, eq. 1) says little more than a painter would: the splat gives
-# its colour with weight $\alpha$, and what is left of the light, $T = 1 - \alpha$, comes from behind.
+# its colour times $\alpha$, and what is left of the light, $T = 1 - \alpha$, comes from behind.
 #
 # $$C = \alpha\, c + (1 - \alpha)\, b$$
 #

@@ -56,7 +56,7 @@ assert np.array_equal(grey, [[0.5, 0.5, 0.5]])
 
 # %% [markdown]
 # Here they are. Each globe shows one $Y_k$ as seen from the front; blue is positive, orange negative. The first is
-# constant, the next three split the sphere in halves, and so on to finer and finer patterns.
+# constant, the next three divide the sphere in halves, and so on to finer and finer patterns.
 
 # %%
 side = np.linspace(-1, 1, 64)

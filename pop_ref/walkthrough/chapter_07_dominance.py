@@ -250,10 +250,11 @@ picture(
 # ## Growing by the rule alone
 #
 # Now let the rule alone make a model grow. It begins with four large Gaussians before a painted picture of 24 x 24 px,
-# trained for 20 steps with L2 (eq. 4). Then the blur set is split, six steps of training follow, and so on. On 576
-# pixels the paper's $\theta$ would select every Gaussian that wins one; here $\theta = 1/48$, so that one that wins
-# more than twelve pixels is split. (Learning rates are four times the usual, the colours' forty times. Gaussians whose
-# largest scale is under a hundredth of the scene's would be cloned instead; none here is that small.)
+# trained for 20 steps with L2 (eq. 4). Then each Gaussian of the blur set is *split*, that is replaced by two smaller
+# ones (chapter 9), six steps of training follow, and so on. On 576 pixels the paper's $\theta$ would select every
+# Gaussian that wins one; here $\theta = 1/48$, so that one that wins more than twelve pixels is split. (Learning rates
+# are four times the usual, the colours' forty times. Gaussians whose largest scale is under a hundredth of the scene's
+# would be cloned instead; none here is that small.)
 
 # %% setup
 SMALL, THETA_HERE = 24, 1 / 48

@@ -166,7 +166,7 @@ picture(
 # $m$, a running mean of the gradient, and $v$, one of its square (Kingma and Ba 2015). A row operation moves all three
 # together. Survivors keep their bits; newcomers start with zero moments; Adam's step counter belongs to the tensor and
 # runs on. Where $m$ and $v$ are not moved along, every Gaussian after the first removed row continues with the momentum
-# of another: a bug that has happened, and one of the mutants of [chapter 12](chapter_12_break_it.py).
+# of another: a bug that has happened, and one of the bugs that are hunted in [chapter 12](chapter_12_break_it.py).
 
 # %%
 for before, now in ((rows.params, after.params), (rows.m, after.m), (rows.v, after.v)):
