@@ -11,8 +11,8 @@
 # Everything here happens on the screen, where lengths are pixels, $x$ runs right and $y$ runs down. A splat has
 #
 # - a centre $\mu$, two numbers, px;
-# - a *covariance* $\Sigma$, a symmetric 2 × 2 matrix, px²: its eigenvectors are the axes of the ellipse, the roots of its
-#   eigenvalues the standard deviations along them;
+# - a *covariance* $\Sigma$, a symmetric 2 × 2 matrix, px²: its eigenvectors are the axes of the ellipse, the roots of
+#   its eigenvalues the standard deviations along them;
 # - an *opacity* $o$ between 0 and 1: how much it hides at its centre;
 # - a colour $c$, three numbers.
 #
