@@ -10,7 +10,7 @@
 # ## Photographs
 #
 # The scene is a still life of toys. It is made up and ray-traced by this package, so that every reader has it: `pop
-# demo` makes it in any size. Twelve photographs are taken from around it, of 80 by 60 pixels, small enough that all of
+# demo` makes it in any size. Sixteen photographs are taken from around it, of 80 by 60 pixels, small enough that all of
 # this page can be computed while it is made. One of them is put aside and never trained on, to judge the result by.
 
 # %%
@@ -29,18 +29,18 @@ from pop_ref.walkthrough.style import ACCENT, INK, MUTED, SECOND, axes, show_ima
 
 WIDTH, HEIGHT, UNSEEN = 80, 60, 8
 with tempfile.TemporaryDirectory() as folder:
-    make_demo(Path(folder) / "demo", views=12, width=WIDTH, height=HEIGHT)
+    make_demo(Path(folder) / "demo", views=16, width=WIDTH, height=HEIGHT)
     capture = load_capture(Path(folder) / "demo")
 photographs = [view.image / 255.0 for view in capture.views]
 cameras = [(view.viewmat, view.K, WIDTH, HEIGHT) for view in capture.views]
-seen = [k for k in range(12) if k != UNSEEN]
+seen = [k for k in range(16) if k != UNSEEN]
 
 fig, panels = axes(4, height=1.6)
-for panel, k in zip(panels, (0, 3, 10, UNSEEN), strict=True):
+for panel, k in zip(panels, (0, 4, 12, UNSEEN), strict=True):
     title = "put aside" if k == UNSEEN else f"photograph {k}"
     show_image(panel, photographs[k], title)
     panel.set(xticks=[], yticks=[])
-picture(fig, "Four of the twelve photographs. The last is not trained on.")
+picture(fig, "Four of the sixteen photographs. The last is not trained on.")
 
 # %% [markdown]
 # ## Points
@@ -150,17 +150,17 @@ picture(
 #    This is the *gradient*. That it can be computed, for all numbers at once, is the heart of the method.
 # 4. **Step**: change each number a little in the direction that lowers the loss.
 #
-# Here are sixty turns of the loop, watched through the camera whose photograph the training never sees. The code is
+# Here are seventy turns of the loop, watched through the camera whose photograph the training never sees. The code is
 # that of `pop_ref/learn/splat.py`, the whole method in 300 lines of
 # NumPy: `python -m pop_ref.learn.splat` trains another small scene before your eyes in a minute.
 
 # %%
-STEPS = 60
+STEPS = 70
 rates = {"means": 3e-3, "quats": 2e-2, "scales": 4e-2, "opacities": 8e-2, "sh0": 3e-2}
 m, v = ({name: np.zeros_like(x) for name, x in params.items()} for _ in range(2))
 frames, labels, curve = [], [], []
 for step in range(STEPS + 1):
-    if step in (0, 2, 4, 7, 10, 15, 20, 25, 30, 35, 40, 45, 50, 55, 60):
+    if step in (0, 2, 4, 7, 10, 15, 20, 25, 30, 35, 40, 45, 50, 60, 70):
         frames.append(drawn(params))
         curve.append((step, psnr(frames[-1], photographs[UNSEEN])))
         labels.append(f"step {step}: {curve[-1][1]:.1f} dB")
@@ -197,7 +197,7 @@ for panel in panels:
     panel.set(xticks=[], yticks=[])
 picture(
     fig,
-    "After sixty steps. The Gaussians have found their sizes and turned into the surfaces. A real training takes "
+    "After seventy steps. The Gaussians have found their sizes and turned into the surfaces. A real training takes "
     "30,000 steps on large photographs, and ends with hundreds of thousands of Gaussians.",
 )
 
@@ -314,13 +314,13 @@ assert min(moved, key=lambda name: moved[name]) == "means"
 
 # %% [markdown]
 # ### Exercise 2: derive
-# How many numbers are in the eleven photographs, and how many in the Gaussians? Is it surprising that the photographs
+# How many numbers are in the fifteen photographs, and how many in the Gaussians? Is it surprising that the photographs
 # decide them?
 
 # %% answer
-# $11 \cdot 80 \cdot 60 \cdot 3 = 158{,}400$ against 14 a Gaussian, fewer than twenty thousand: each number has to suit
-# some ten measurements. Where a surface is seen by few photographs, though, many answers suit them equally well.
+# $15 \cdot 80 \cdot 60 \cdot 3 = 216{,}000$ against 14 a Gaussian, fewer than twenty thousand: each number has to suit
+# some twelve measurements. Where a surface is seen by few photographs, though, many answers suit them equally well.
 numbers = sum(x.size for x in params.values())
-print(11 * HEIGHT * WIDTH * 3, numbers)
+print(15 * HEIGHT * WIDTH * 3, numbers)
 assert numbers == 14 * n < 20_000
-assert 11 * HEIGHT * WIDTH * 3 == 158_400
+assert 15 * HEIGHT * WIDTH * 3 == 216_000
