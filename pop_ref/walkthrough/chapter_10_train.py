@@ -386,12 +386,12 @@ picture(fig, "A view that no step has seen, and the pixel that is furthest off."
 assert command(["explain", out, "--view", "0", "--pixel", f"{x},{y}"]) == 0
 
 # %% [markdown]
-# Read such a table in this order. Compare **colour** and **photograph**. Look for the line with the star, the dominant
-# Gaussian: is it the thing that should be there? Look at the *first* lines: splats at a depth of a tenth or so, far
-# from the pixel in px and yet covering it, are *floaters*, large faint Gaussians right before the camera. No training
-# view looks at them from where this held-out view stands, so nothing removed them. Look at the **sum**: at which line
-# does the colour leave the right track? And at **dL/do**: minus its sign is the direction in which training with *this*
-# pixel would move each opacity; the last column says where the prior pulls.
+# Read such a table in this order. Compare **colour** and **photograph**. Then follow the **sum**: at which line does it
+# leave the right track? If that is the line with the star, the dominant Gaussian, something stands there that should
+# not; if it happens little by little over the first lines, look at their depths: splats at a depth of a few tenths,
+# many px away from the pixel and yet covering it, are *floaters*, large faint Gaussians right before the camera, which
+# no training view saw from this side. Last, look at **dL/do**: minus its sign is the direction in which training with
+# *this* pixel would move each opacity. It knows what is wrong; the other photographs decide whether it may.
 #
 # `--html why.html` makes a page of it, with the splats' outlines drawn over the picture. It is the best way to end a
 # training: pick the worst pixel, and ask.
