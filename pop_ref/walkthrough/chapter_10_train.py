@@ -319,8 +319,8 @@ for panel in panels:
     panel.set(xticks=[], yticks=[])
 picture(
     fig,
-    "View 00.png, held out. In the last panel every Gaussian has its own colour; at black pixels nothing is blended. Large "
-    "patches are what the blur rule looks for.",
+    "View 00.png, held out. In the last panel every Gaussian has its own colour; at black pixels nothing is blended. "
+    "Large patches are what the blur rule looks for.",
 )
 assert kept["name"] == "00.png"
 
