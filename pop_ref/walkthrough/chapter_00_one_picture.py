@@ -20,7 +20,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.patches import FancyBboxPatch
 
-from pop_fast.data import load_capture, make_demo
+from pop_fast.data import load_capture
+from pop_fast.demo import make_demo
 from pop_ref.learn import splat
 from pop_ref.walkthrough.glossary import STAGES, shapes
 from pop_ref.walkthrough.pages import film, picture

@@ -310,7 +310,7 @@ film(frames, labels, "Left the splat that learns, right its target.", enlarged=1
 
 # %% [markdown]
 # Ninety steps, five kinds of numbers, one rule. The third width stays what it was, since the camera looks along it: a
-# single photograph cannot know it. That is why captures have many.
+# single photograph cannot know it. That is why one takes many.
 
 # %% [markdown]
 # ### Exercise 1: predict

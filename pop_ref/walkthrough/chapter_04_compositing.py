@@ -14,7 +14,10 @@
 #
 # $$C = \sum_{i=1}^{m} T_i\, \alpha_i\, c_i + T_{m+1}\, b, \qquad T_1 = 1, \quad T_{i+1} = T_i (1 - \alpha_i)$$
 #
-# This is POP paper, eq. 1, with a background $b$ behind it. Written as a loop it is five lines:
+# This is POP paper, eq. 1, with a background $b$ behind it. Written as a loop it is five lines. The oracle's loop does
+# the same, and also keeps what the backward pass will need, skips what is under the floor, and stops (below):
+#
+# {{source: pop_ref.pixel.composite_pixel}}
 
 # %%
 import math
@@ -26,6 +29,7 @@ from pop_ref.constants import PAPER
 from pop_ref.pixel import SplatRows, composite_pixel, stops
 from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render
+from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, INK, SECOND, THIRD, axes, show_image
 
@@ -50,6 +54,9 @@ rng = np.random.default_rng(4)
 alphas, colors = rng.uniform(0.05, 0.7, 6), rng.uniform(0, 1, (6, 3))
 background = np.array([1.0, 1.0, 0.9])
 pixel = composite_pixel(range(6), stack(alphas, colors), 0.5, 0.5, background.tolist())
+print("alphas       ", alphas.round(2))
+print("transmittance", np.round(pixel.transmittances, 2))
+print("weights      ", np.round(pixel.weights, 2), " left:", round(pixel.T_final, 2))
 assert np.allclose(pixel.color, blend(alphas, colors, background))
 
 # %% [markdown]
@@ -146,6 +153,7 @@ picture(
 # %%
 veil_and_wall = stack(np.array([0.91, 0.999]), np.array([[0.2, 0.2, 0.2], [0.0, 0.5, 1.0]]))
 odd = composite_pixel([0, 1], veil_and_wall, 0.5, 0.5, background.tolist())
+print(f"looked at {odd.n_traversed}, blended {odd.ids}, light left {odd.T_final:.2f}")
 assert odd.ids == [0]
 assert odd.n_traversed == 2
 assert np.isclose(odd.T_final, 0.09)
@@ -253,3 +261,34 @@ for ceiling, most in ((0.999, 0.1), (0.99, 0.01)):
         ended = composite_pixel(range(3), three, 0.5, 0.5, [0.0] * 3, profile)
         lost.append(ended.T_final if len(ended.ids) == 2 else 0.0)
     assert 0.9 * most < max(lost) <= most
+
+# %% [markdown]
+# ### Exercise 4: code
+# Blend a list in two halves, each by itself over black, and put the halves together. Which numbers of each half do you
+# need? (This is how a long list is shared among workers.)
+
+
+# %% answer
+# Colour and transmittance of each: $C = C_1 + T_1 C_2$ and $T = T_1 T_2$. Blending is associative, like the product of
+# matrices, though not commutative. Only the stop spoils it, since the second half does not know what the first has
+# left.
+def part(ids: range) -> tuple[np.ndarray, float]:
+    half = composite_pixel(ids, stack(alphas, colors), 0.5, 0.5, [0.0] * 3)
+    return np.array(half.color), half.T_final
+
+
+(first, T_1), (second, T_2) = part(range(3)), part(range(3, 6))
+print((first + T_1 * second + T_1 * T_2 * background).round(6), np.round(pixel.color, 6))
+assert np.allclose(first + T_1 * second + T_1 * T_2 * background, pixel.color)
+
+# %% [markdown]
+# ### Exercise 5: find the bug
+# Compare this loop with the oracle's. For which pixels does it give another colour?
+#
+# {{bug: terminating_splat_blended}}
+
+# %% answer
+# The test for the stop comes after the blending, so the splat that crosses the line is blended before the pixel ends.
+# Every pixel that stops gets a little more light, at most $10^{-4}$ over; with a nearly opaque last splat it is much
+# more, as for the wall above. Two programs do it on purpose; whoever compares with gsplat must not.
+print(caught("terminating_splat_blended"))

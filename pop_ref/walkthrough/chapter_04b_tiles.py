@@ -184,9 +184,9 @@ print(
 #
 # ## Equal depths, and what depth means
 #
-# Two splats of one depth have one key, and a sort may return them either way. Clones (chapter 9) have equal depths by
-# construction, so it matters: the sort must be *stable*, that is keep the order of the indices (decision D4). If it is
-# not, the same scene gives different pictures from run to run.
+# Two splats of one depth have one key, and a sort may return them either way. Training makes exact copies of Gaussians
+# (chapter 9), which have equal depths, so it matters: the sort must be *stable*, that is keep the order of the indices
+# (decision D4). If it is not, the same scene gives different pictures from run to run.
 #
 # And the depth is that of the *centre*. A long splat may be in front of another at one pixel and behind it at the next,
 # but it is sorted once for the whole view. When the camera moves, the order of two centres flips at some moment, and

@@ -36,6 +36,7 @@ from pop_ref.compositing import composite_pixel, composite_pixel_vjp, composite_
 from pop_ref.pixel import SplatRows, rows_from_splats, zero_gradients
 from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render, render_vjp
+from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import (
     ACCENT,
@@ -78,7 +79,9 @@ assert v_alphas_of(three, 0.0).tolist() == [1 / 8, -1 / 8, 1 / 4]
 # \qquad \frac{\partial L}{\partial c_i} = T_i \alpha_i\, g .$$
 #
 # So one scalar, walked from back to front, is all that the backward pass of a pixel carries, however many channels it
-# has.
+# has. In the oracle it is called `behind`, and $q_i$ is `worth`; the last lines belong to the next section:
+#
+# {{source: pop_ref.pixel.composite_pixel_vjp}}
 
 # %%
 rng = np.random.default_rng(5)
@@ -92,6 +95,8 @@ b = np.full(n, 0.3)
 for i in reversed(range(1, n)):
     b[i - 1] = alphas[i] * q[i] + (1.0 - alphas[i]) * b[i]
 v_alphas = T * (q - b)
+print("light behind", b.round(3))
+print("derivatives ", v_alphas.round(3))
 np.testing.assert_allclose(v_alphas, v_alphas_of(ray, 0.3), rtol=1e-12)
 # the pixel grows with a splat's alpha exactly where the splat is brighter than what it covers
 assert np.array_equal(v_alphas > 0.0, q > b)
@@ -150,8 +155,12 @@ assert (four[3], four[0]) == (1 / 8, 0.0)
 # \quad \frac{\partial L}{\partial Q} = \frac{\partial L}{\partial \sigma} \tfrac12 d d^\top .$$
 #
 # What POP says about leakage (eq. 10) is already here: the gradient of the centre has $\alpha$, and so $o$, as a
-# factor. Two decisions cut the chain: a splat under the floor 1/255 is skipped, and one at the ceiling 0.999 passes
-# nothing, because the clamped alpha does not move.
+# factor. Two decisions cut the chain: a splat under the floor 1/255 is skipped (D5), and one at the ceiling 0.999
+# passes nothing, because the clamped alpha does not move (kink B3).
+#
+# {{source: pop_ref.alpha.alpha_from_sigma_vjp}}
+#
+# {{source: pop_ref.alpha.sigma_at_pixel_vjp}}
 
 # %%
 mean2d, conic = (2.0, 1.0), (1.0, 0.5, 2.0)
@@ -308,6 +317,10 @@ by_difference = np.array([[difference(unit, h) for unit in np.eye(56)] for h in 
 errors = np.linalg.norm(by_difference - by_hand, axis=1) / np.linalg.norm(by_hand)
 # a hundredfold for each tenfold, until rounding
 np.testing.assert_allclose(errors[-2:] / errors[-3:-1], 100.0, rtol=0.1)
+print(
+    "relative difference:",
+    " ".join(f"h={h:.0e}: {e:.0e}" for h, e in zip(steps, errors, strict=True)),
+)
 assert errors.min() < 1e-9 < 1e-8 < errors[0]
 
 fig, ax = axes(1, width=4.6, height=2.8)
@@ -341,6 +354,7 @@ picture(
 u = rng.normal(size=56)
 scale = np.linalg.norm(by_hand) * np.linalg.norm(u)
 forward = difference(u, 1e-5)
+print(f"<v, J u> = {forward:.9f}   <J^T v, u> = {by_hand @ u:.9f}")
 assert abs(forward - by_hand @ u) < 1e-7 * scale
 
 # the test has teeth: two entries that are swapped are seen
@@ -377,3 +391,14 @@ edge = np.log(255.0)
 assert [alpha_from_sigma(edge + e, 1.0)[1] for e in (-1e-9, 1e-9)] == [False, True]
 assert np.isclose(alpha_from_sigma_vjp(edge - 1e-9, 1.0, 1.0)[0], -1.0 / 255.0)
 assert alpha_from_sigma_vjp(edge + 1e-9, 1.0, 1.0) == (0.0, 0.0)
+
+# %% [markdown]
+# ### Exercise 4: find the bug
+# The walk from back to front with one mistake. In which pictures does it make no difference?
+#
+# {{bug: background_behind_forgotten}}
+
+# %% answer
+# The light behind the last splat starts at 0 instead of the background's. Over black, and wherever the light is used up
+# before the background, nothing changes; over white every gradient of alpha is wrong.
+print(caught("background_behind_forgotten"))

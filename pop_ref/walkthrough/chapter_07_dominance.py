@@ -10,7 +10,7 @@
 # %% [markdown]
 # ## The largest weight
 #
-# At a pixel, splat $i$ contributes with the weight $T_i \alpha_i$. The dominant one is (POP paper, eq. 5)
+# At a pixel, splat $i$ contributes with the weight $T_i \alpha_i$. The *dominant* one is (POP paper, eq. 5)
 #
 # $$i^*(p) = \mathrm{argmax}_i \; T_i \alpha_i .$$
 #
@@ -18,6 +18,8 @@
 # stands before one of 0.9: the weights are 0.3, 0.42 and 0.252. The paper leaves two cases open, and the oracle decides
 # them as Mini-Splatting's kernel does: a tie goes to the front (decision D8), and a pixel where nothing blends has no
 # dominant Gaussian (-1).
+#
+# {{source: pop_ref.dominance.dominant_id}}
 
 # %%
 import itertools
@@ -43,6 +45,7 @@ from pop_ref.pixel import SplatRows
 from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render, render_vjp
 from pop_ref.training import gaussians_from_params, params_vjp
+from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, axes, show_image
 
@@ -56,6 +59,7 @@ def ray(alphas):
 
 
 ids, weights = ray([0.3, 0.6, 0.9])
+print("weights", np.round(weights, 3), " dominant:", dominant_id(ids, weights))
 np.testing.assert_allclose(weights, [0.3, 0.42, 0.252])
 assert dominant_id(ids, weights) == 1
 assert dominant_id([4, 2, 7], [0.25, 0.5, 0.5]) == 2
@@ -65,7 +69,7 @@ for alpha in (0.01, 0.5, 0.99):
     assert dominant_id(*ray([alpha, alpha])) == 0
 
 # %% [markdown]
-# ### Exercise 1: derive
+# ### Exercise 1: predict
 #
 # How opaque must the front splat be at a pixel so that nothing behind it can dominate, whatever it is?
 
@@ -84,7 +88,7 @@ assert dominant_id(*ray([0.49, 0.999])) == 1
 # most one winner, so the counts of a view sum to the number of pixels where anything blends. The map of winners is a
 # mosaic: with opacities near 1 it shows the surfaces that the camera sees.
 
-# %%
+# %% setup
 SIZE = 40
 camera = Camera(
     np.eye(4), np.array([[53.2, 0.0, 20.0], [0.0, 53.2, 20.0], [0.0, 0.0, 1.0]]), SIZE, SIZE
@@ -102,8 +106,17 @@ scene = Gaussians(
     opacities=np.concatenate([np.full(few, 0.9), rng.uniform(0.4, 0.95, many)]),
     sh=rng.uniform(-1.2, 1.2, (few + many, 1, 3)),
 )
-view = render(scene, camera)
+# %%
+overview = view = render(scene, camera)
 counts = view.dominant_counts
+print(
+    "the largest counts:",
+    np.sort(counts)[::-1][:8],
+    " winners:",
+    np.sum(counts > 0),
+    "of",
+    len(counts),
+)
 assert counts.sum() == np.sum(view.n_blended > 0)
 assert np.array_equal(view.dominant_ids < 0, view.n_blended == 0)
 assert np.all(counts[:few] > counts[few:].max())
@@ -165,6 +178,7 @@ def smallest_blurred(width, height):
     return int(counts[blur_set(counts, width, height, THETA)][0])
 
 
+print("least counts:", smallest_blurred(980, 545), smallest_blurred(1557, 1038))
 assert (smallest_blurred(980, 545), smallest_blurred(1557, 1038)) == (11, 33)
 for width, height in ((980, 545), (1557, 1038)):
     assert width * height // smallest_blurred(width, height) < 1.0 / THETA
@@ -216,6 +230,8 @@ over_rings = render(blob, camera)
 pull = l2_vjp(over_rings.image, rings, 1.0)
 silent = render_vjp(blob, camera, pull)
 signed, unsigned = np.linalg.norm(silent.means2d[0]), np.linalg.norm(silent.means2d_abs[0])
+print(f"gradient of the centre: signed {signed:.0e}, of absolute values {unsigned:.0e}")
+print(f"pixels won: {over_rings.dominant_counts[0]}")
 assert signed < 1e-9 * unsigned
 assert over_rings.dominant_counts[0] > 300
 
@@ -234,12 +250,13 @@ picture(
 # ## Growing by the rule alone
 #
 # Now let the rule alone make a model grow. It begins with four large Gaussians before a painted picture of 24 x 24 px,
-# trained for 20 steps with L2 (eq. 4). Then the blur set is split, six steps of training follow, and so on. On 576
-# pixels the paper's $\theta$ would select every Gaussian that wins one; here $\theta = 1/48$, so that one that wins
-# more than twelve pixels is split. (Learning rates are four times the usual, the colours' forty times. Gaussians whose
-# largest scale is under a hundredth of the scene's would be cloned instead; none here is that small.)
+# trained for 20 steps with L2 (eq. 4). Then each Gaussian of the blur set is *split*, that is replaced by two smaller
+# ones (chapter 9), six steps of training follow, and so on. On 576 pixels the paper's $\theta$ would select every
+# Gaussian that wins one; here $\theta = 1/48$, so that one that wins more than twelve pixels is split. (Learning rates
+# are four times the usual, the colours' forty times. Gaussians whose largest scale is under a hundredth of the scene's
+# would be cloned instead; none here is that small.)
 
-# %%
+# %% setup
 SMALL, THETA_HERE = 24, 1 / 48
 camera = Camera(
     np.eye(4), np.array([[32.0, 0, 12.0], [0, 32.0, 12.0], [0, 0, 1.0]]), SMALL, SMALL
@@ -271,6 +288,7 @@ rows = rows_from_params(
         "sh0": np.zeros((4, 1, 3)),
     }
 )
+# %%
 history, steps = [], itertools.count(1)
 for event in range(10):
     for _ in range(6 if event else 20):
@@ -340,3 +358,30 @@ for theta, least in ((1.0 / 5000.0, 5000), (THETA, 50000)):
     each = int(theta * pixels)
     assert not np.any(blur_set(np.full(least, each), 1000, 1000, theta))
     assert least * each == pixels
+
+# %% [markdown]
+# ### Exercise 4: code
+# From the map of winners alone, compute the dominant counts, and how many Gaussians a pixel's winner has as neighbours
+# that are other Gaussians (above, below, left, right). What does the share of equal neighbours say about blur?
+
+# %% answer
+# `bincount` counts. Where nearly all neighbours are the same, one smooth splat paints an area: on the left of the
+# picture; on the right the mosaic is fine.
+winners = overview.dominant_ids
+mine = np.bincount(winners[winners >= 0], minlength=len(scene))
+same = [np.mean(part[:, 1:] == part[:, :-1]) for part in (winners[:, :20], winners[:, 20:])]
+print(f"equal neighbours: left {same[0]:.2f}, right {same[1]:.2f}")
+assert np.array_equal(mine, overview.dominant_counts)
+assert same[0] > same[1]
+
+# %% [markdown]
+# ### Exercise 5: find the bug
+# A short function with one wrong character. When does it matter?
+#
+# {{bug: tie_to_the_back}}
+
+# %% answer
+# `>=` lets a later splat of equal weight take over, so ties go to the back. Clones lie exactly on their originals and
+# tie at small alphas: the copy would win, and the original would be called unimportant and die. (With weights of 0 it
+# even makes a winner of a splat that gives nothing.)
+print(caught("tie_to_the_back"))

@@ -41,6 +41,7 @@ from pop_ref.polarization import importance_mask, pop_loss, pop_loss_vjp
 from pop_ref.records import Camera
 from pop_ref.render import render, render_vjp
 from pop_ref.training import gaussians_from_params, params_vjp
+from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, MUCH, MUTED, SECOND, axes
 
@@ -149,6 +150,8 @@ assert back == [69, 21_742]
 # $$L_{\mathrm{POP}} = \frac{1}{N_{\mathrm{imp}}} \sum_i M_i (1 - o_i)
 # + \frac{1}{N - N_{\mathrm{imp}}} \sum_i (1 - M_i)\, o_i .$$
 #
+# {{source: pop_ref.polarization.pop_loss}}
+#
 # The mask is a constant of the step, so the gradient is as simple as can be: $-1/N_{\mathrm{imp}}$ for the important,
 # $+1/(N - N_{\mathrm{imp}})$ for the rest, whatever the opacity. Through the sigmoid a logit feels that times
 # $o (1 - o)$: most at 1/2, nothing at the poles.
@@ -165,6 +168,12 @@ np.testing.assert_allclose(
     pop_loss_vjp(opacities, important, 1.0), [-1 / 2, -1 / 2, 1 / 3, 1 / 3, 1 / 3]
 )
 assert pop_loss(np.array([1.0, 1.0, 0.0]), np.array([True, True, False])) == 0.0
+print(
+    "loss",
+    round(pop_loss(opacities, important), 3),
+    " gradient",
+    pop_loss_vjp(opacities, important, 1.0).round(3),
+)
 assert POP.prune_opa == 0.005
 
 # %% [markdown]
@@ -203,7 +212,7 @@ assert np.isclose(mean_gradient(0.25), 0.0)
 # Gaussians are pruned as long as it lasts. So few steps need a faster clock: learning rates are five times the usual,
 # Adam's second moment forgets in 20 steps instead of 1,000, and $\lambda_{\mathrm{POP}}$ is 0.01 instead of 0.001.
 
-# %%
+# %% setup
 WIDTH, N, STEPS, POP_STEPS, WEIGHT = 28, 40, 180, 120, 0.01
 C0 = 0.28209479177387814
 
@@ -239,6 +248,7 @@ z = 0.3 * np.sin(2 * x) + rng.uniform(-0.6, 0.6, N)
 first = params_at(x, z, 0.12, 0.1, rng.normal(0.0, 0.3, (N, 3)))
 
 
+# %%
 def train(weight):
     """Train with this weight of the prior; give the scene before each step and at the end."""
     rows, scenes = rows_from_params(first), []
@@ -360,6 +370,10 @@ faint = with_prior[POP_STEPS].opacities < 0.1
 assert np.any(with_prior[-1].opacities[faint] > 0.2)
 error_without, blended_without = measured(without[POP_STEPS])
 error_with, blended_with = measured(with_prior[POP_STEPS])
+print(f"blended per pixel: {blended_without:.1f} without, {blended_with:.1f} with")
+print(
+    f"at a pole: {at_poles(without[POP_STEPS]):.0%} without, {at_poles(with_prior[POP_STEPS]):.0%} with"
+)
 assert np.allclose([blended_without, blended_with], [13.5, 9.6], atol=0.05)
 
 fig, (left, right) = axes(2, height=2.8)
@@ -409,4 +423,42 @@ for camera in cameras:
 # %% answer
 # 132 in both cases: to Adam only the sign counts, so for the unseen the weight of the prior means nothing. The
 # weight matters where photographs pull as well.
-assert steps_until(0.005, 0.1, 1e-3 / 750) == steps_until(0.005, 0.1, 1e-6 / 750) == 132
+unseen = [steps_until(0.005, 0.1, weight / 750) for weight in (1e-3, 1e-6)]
+print(unseen, "steps")
+assert unseen == [132, 132]
+
+# %% [markdown]
+# ### Exercise 4: code
+# Write the prior and its gradient from eq. 8, with care for the cases that all Gaussians or none are important. Check
+# the gradient by differences.
+
+
+# %% answer
+# An empty sum is 0, so its mean is taken as 0; dividing by `max(n, 1)` does it without a branch.
+def prior(o, mask):
+    n, rest = max(mask.sum(), 1), max((~mask).sum(), 1)
+    return np.sum(1 - o[mask]) / n + np.sum(o[~mask]) / rest, np.where(
+        mask, -1 / n, 1 / rest
+    )
+
+
+for mask in (important, np.ones(5, dtype=bool), np.zeros(5, dtype=bool)):
+    value, gradient = prior(opacities, mask)
+    by_difference = [
+        (prior(opacities + h, mask)[0] - prior(opacities - h, mask)[0]) / 2e-6
+        for h in 1e-6 * np.eye(5)
+    ]
+    assert np.isclose(value, pop_loss(opacities, mask))
+    assert np.allclose(gradient, by_difference)
+    assert np.array_equal(gradient, pop_loss_vjp(opacities, mask, 1.0))
+
+# %% [markdown]
+# ### Exercise 5: find the bug
+# Eq. 8 with one mistake. With 250 important of 1,000 Gaussians, how much stronger or weaker does each side become?
+#
+# {{bug: prior_over_all}}
+
+# %% answer
+# Both sums are divided by $N$. The important are pulled up with $1/1000$ instead of $1/250$, a quarter; the others down
+# with $1/1000$ instead of $1/750$, three quarters. The balance shifts by three towards 0, and the model gets too small.
+print(caught("prior_over_all"))

@@ -35,6 +35,7 @@ from pop_ref.polarization import importance_mask, pop_loss_vjp
 from pop_ref.records import Camera, Splats
 from pop_ref.render import render, render_vjp
 from pop_ref.tiles import tile_lists
+from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, INK, SECOND, THIRD, axes, show_image
 
@@ -103,6 +104,13 @@ print("pull: too short {:.4f}, too wide {:.4f}, right {:.4f}, faint {:.4f}".form
 # its place. Small means that the largest scale is at most 0.01 of the scene's. Then **prune**: what has an opacity
 # under 0.005 is removed, and late in the training what is far too large. (A child's place is drawn at random; here two
 # draws are picked that make a clear picture.)
+#
+# {{source: pop_ref.density.grow_masks}}
+#
+# The blur rule of [chapter 7](chapter_07_dominance.py) adds its own; how it counts among the two is a setting. A split
+# in full:
+#
+# {{source: pop_ref.density_rows.split_rows}}
 
 # %%
 SCENE_SCALE, STEP = 30.0, 600
@@ -158,7 +166,7 @@ picture(
 # $m$, a running mean of the gradient, and $v$, one of its square (Kingma and Ba 2015). A row operation moves all three
 # together. Survivors keep their bits; newcomers start with zero moments; Adam's step counter belongs to the tensor and
 # runs on. Where $m$ and $v$ are not moved along, every Gaussian after the first removed row continues with the momentum
-# of another: a bug that has happened, and one of the mutants of [chapter 12](chapter_12_break_it.py).
+# of another: a bug that has happened, and one of the bugs that are hunted in [chapter 12](chapter_12_break_it.py).
 
 # %%
 for before, now in ((rows.params, after.params), (rows.m, after.m), (rows.v, after.v)):
@@ -226,7 +234,7 @@ def pulled_back(params, v_image, weights, alpha, light, order):
     return np.sum(v_alpha * falloffs[params["who"]], axis=1), weights @ g
 
 
-def a_start(seed):
+def a_start(seed, first_opacity=0.1):
     """Return the photograph and the first parameters of a random start."""
     rng = np.random.default_rng(seed)
     hue = rng.uniform(0.1, 0.9, (6, 3))
@@ -237,7 +245,7 @@ def a_start(seed):
     true = {"who": np.arange(6), "opacities": np.full(6, 4.0), "colors": hue}
     return blended(true)[0], {
         "who": np.arange(14),
-        "opacities": np.full(14, logit(0.1)),
+        "opacities": np.broadcast_to(logit(first_opacity), 14),
         "colors": guess,
     }
 
@@ -265,9 +273,9 @@ for ours, wanted in zip(
 
 
 # %%
-def trained(seed, resets=(), lambda_pop=0.0):
+def trained(seed, resets=(), lambda_pop=0.0, first_opacity=0.1):
     """Train; return PSNR and opacities (nan where pruned) before every step."""
-    photograph, first = a_start(seed)
+    photograph, first = a_start(seed, first_opacity)
     rows = density.rows_from_params(first)
     rates = {"who": 0.0, "opacities": 0.05, "colors": 0.0025}
     psnr, opacities = np.zeros(STEPS), np.full((STEPS, 14), np.nan)
@@ -373,7 +381,7 @@ picture(
 # opaque too, and the picture pays for it. The prior sharpens whatever the picture looks like while it acts. It cannot
 # know that the haze is wrong; the photographs must say so, and one photograph of a scene that stands still says it
 # weakly. Start the same toy with the wall at 0.5 and the haze at 0.1, and the prior finds the perfect answer; start all
-# at 0.5, and it keeps more haze than here (exercise 5).
+# at 0.5, and it keeps more haze than here (exercise 4).
 #
 # So the toy shows what either rule *does*, not which is better: that takes real scenes, with many views, in which haze
 # that suits one photograph is contradicted by others. In the paper's ablation (section 5.2, Mip-NeRF 360) resets in
@@ -403,7 +411,7 @@ assert abs(per_px - 0.5) < 0.03
 assert abs(per_half_image - 1.0) < 0.06
 
 # %% [markdown]
-# ### Exercise 2: predict
+# ### Exercise 2: derive
 #
 # An event finds 1,000 Gaussians. It selects 200 as pulled hard, 60 of which are large, and then prunes 90. How many are
 # there afterwards? How many rows of Adam's moments are zero?
@@ -422,4 +430,70 @@ few = density.rows_from_params(
     }
 )
 copied = density.clone_rows(few, np.arange(10) < 3)
+print(1000 + clones + splits - pruned, "Gaussians")
 assert len(copied) == 13
+
+# %% [markdown]
+# ### Exercise 3: code
+# A split draws two places from the parent's own distribution and divides its scales by 1.6. Draw many children of one
+# Gaussian and compare: how wide is the mixture of all children, along each axis, next to the parent? Which factor, in
+# place of 1.6, would keep the width?
+
+# %% answer
+# The places have the parent's variance $s^2$, and each child adds its own, $(s/1.6)^2$: together $s^2 (1 + 1/2.56)$, so
+# the mixture is 1.18 times as wide as the parent. No factor keeps it while the places are drawn from the whole parent;
+# with the places drawn from a distribution of $s \sqrt{1 - 1/2.56}$, 1.6 would.
+parent = {
+    "means": np.zeros((1, 3)),
+    "quats": np.array([[1.0, 0.0, 0.0, 0.0]]),
+    "scales": np.log([[0.4, 0.2, 0.1]]),
+}
+draws = np.random.default_rng(0)
+children = [
+    density.split_rows(
+        density.rows_from_params(parent), np.array([True]), draws.standard_normal((2, 1, 3))
+    ).params
+    for _ in range(4000)
+]
+places = np.concatenate([child["means"] for child in children])
+width = np.sqrt(np.var(places, axis=0) + np.exp(children[0]["scales"][0]) ** 2)
+print(
+    "mixture / parent:",
+    (width / [0.4, 0.2, 0.1]).round(3),
+    " predicted",
+    round(np.sqrt(1 + 1 / 1.6**2), 3),
+)
+assert np.allclose(width / [0.4, 0.2, 0.1], np.sqrt(1 + 1 / 1.6**2), rtol=0.03)
+
+# %% [markdown]
+# ### Exercise 4: predict
+# Start the toy of the reset with the wall at 0.5, the hidden at 0.3 and the haze at 0.1, instead of all at 0.1. What
+# does the prior do now? And with all at 0.5?
+
+# %% answer
+# With the answer already in the start, the prior finds it: only the wall dominates any pixel. With all at 0.5 the haze
+# dominates from the first step, and ends thicker. So a toy shows what its start says, and an experiment that starts
+# from the answer shows nothing.
+guided, haze = np.repeat([0.5, 0.3, 0.1], [6, 6, 2]), {}
+for name, start in (("guided", guided), ("all at 0.5", 0.5)):
+    each = [
+        trained(seed, **METHODS["prior"], first_opacity=start) for seed in range(N_STARTS)
+    ]
+    last = np.array([np.nan_to_num(run[1][-1]) for run in each])
+    haze[name] = last[:, KINDS["haze"]].mean()
+    print(
+        f"{name:10} PSNR {np.mean([run[0][-1] for run in each]):.1f} dB, haze ends at {haze[name]:.2f}"
+    )
+assert haze["guided"] < 0.1
+assert haze["all at 0.5"] > ends["prior"]["haze"]
+
+# %% [markdown]
+# ### Exercise 5: find the bug
+# The function that removes and appends rows. What happens to the Gaussians after the first one that is removed?
+#
+# {{bug: moments_left_behind}}
+
+# %% answer
+# The moments are cut to the right length instead of gathered by the same rows, so each Gaussian after a removed one
+# goes on with the momentum of its predecessor. For some hundred steps they move in wrong directions, after every event.
+print(caught("moments_left_behind"))

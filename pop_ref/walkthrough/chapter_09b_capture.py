@@ -36,7 +36,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pop_fast.data import load_capture, make_demo
+from pop_fast.data import load_capture
+from pop_fast.demo import make_demo
 from pop_ref.optimizer import learning_rates
 from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render

@@ -27,6 +27,7 @@ from pop_ref.constants import PAPER
 from pop_ref.footprint import conics_from_covars2d, radii_from_covars2d
 from pop_ref.records import Splats
 from pop_ref.tiles import tile_lists
+from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import SECOND, axes, show_image
 
@@ -217,6 +218,7 @@ assert np.allclose(v_opacities, wanted.v_opacities, rtol=1e-10, atol=1e-12)
 # %%
 s0, sx, sy, sxx, sxy, syy = (gain @ P.T).T
 (u, v), (A, B, C) = (splats.means2d - center).T, splats.conics.T
+splat_u, splat_v = u, v
 du, dv = u * s0 - sx, v * s0 - sy
 v_means2d = -np.stack([A * du + B * dv, B * du + C * dv], axis=1)
 v_a, v_c = -0.5 * (u * (du - sx) + sxx), -0.5 * (v * (dv - sy) + syy)
@@ -348,3 +350,42 @@ absolute = np.stack([along_x, along_y], axis=1)
 assert np.allclose(absolute, wanted.v_means2d_abs, rtol=1e-9, atol=1e-11)
 assert (absolute >= np.abs(v_means2d) - 1e-12).all()
 assert absolute.sum() > 2.0 * np.abs(v_means2d).sum()
+
+# %% [markdown]
+# ### Exercise 3: predict
+# The tile of this chapter: how many multiplications and additions does the image take as a product, $3 \times 40$ by
+# $40 \times 256$, and how many if every pixel loops over the splats that it blends? Which is faster on a processor that
+# multiplies eight numbers at once?
+
+# %% answer
+# The product takes $2 \cdot 3 \cdot 40 \cdot 256 = 61{,}440$, zeros included; the loop only those of the weights that
+# are not zero, here about half. The product is faster all the same: it is one stream of equal operations without
+# branches.
+n_product, n_loop = 2 * 3 * 40 * 256, 2 * 3 * int(np.sum(weights > 0.0))
+print(n_product, n_loop)
+assert n_product == 61_440
+assert 0.2 * n_product < n_loop < 0.9 * n_product
+
+# %% [markdown]
+# ### Exercise 4: derive
+# From $f_1 = g_x = A u + B v$ and the other coefficients derive $\partial L / \partial u$ by the six sums, and see that
+# it is the first component of `v_means2d` above.
+
+# %% answer
+# $u$ stands in $f_0 = \ln o - \frac12 (A u^2 + 2 B u v + C v^2)$ with derivative $-(A u + B v)$, in $f_1$ with $A$ and
+# in $f_2 = B u + C v$ with $B$. So $\partial L / \partial u = -(A u + B v)\, s_0 + A s_x + B s_y = -(A\, d_u + B\,
+# d_v)$ with $d_u = u s_0 - s_x$ and $d_v = v s_0 - s_y$.
+A, B, C = splats.conics.T
+by_sums = -(A * splat_u + B * splat_v) * s0 + A * sx + B * sy
+assert np.allclose(by_sums, v_means2d[:, 0])
+
+# %% [markdown]
+# ### Exercise 5: find the bug
+# Fast programs remember where each pixel stopped and start the backward pass there. What is lost here?
+#
+# {{bug: stale_last_contributor}}
+
+# %% answer
+# The walk begins one splat too early in the list, so the last splat that a pixel blended gets no gradient from it. It
+# is usually the one that hides the background: surfaces stay a little transparent, and nothing crashes.
+print(caught("stale_last_contributor"))

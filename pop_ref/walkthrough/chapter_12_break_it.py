@@ -25,6 +25,7 @@ from pop_ref.conformance.mutants import MUTANTS, Mutant, living
 from pop_ref.conformance.mutants.trial import every_law, killed_by, law_named, obeys
 from pop_ref.conformance.scenes import Record, Scene, pack
 from pop_ref.records import Camera
+from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, INK, MUCH, SECOND, THIRD, axes, show_image
 
@@ -231,3 +232,45 @@ with living(BY_NAME["half_pixel_shift"]) as backend:
 # a splat of the wrong width is symmetric, too: one law is never enough
 with living(BY_NAME["no_half_in_the_exponent"]) as backend:
     assert mirrored(backend)
+
+# %% [markdown]
+# ### Exercise 3: predict
+# Which of these mutants can be seen in *some* picture: a gradient that is wrong, a tie that goes to the back, an extent
+# that is cut at three standard deviations?
+
+# %% answer
+# Only the last changes a picture: it cuts off what is visible between 3 and 3.33 standard deviations. Gradients are not
+# drawn, and a tie changes who dominates, not the colour.
+# it ends shortly behind a tile's border, with three deviations shortly before it
+screen = Camera(np.eye(4), K, WIDTH, HEIGHT)
+one = Scene(pack([Record(6.0, 12.0, 2.0, (3.0, 3.0, 3.0), opacity=1.0)], screen), screen)
+for name in ("weight_above_one", "tie_to_the_back", "extent_of_three_deviations"):
+    with living(BY_NAME[name]) as backend:
+        differs = np.abs(
+            backend.render(one).image - OracleAdapter().render(one).image
+        ).max()
+    print(f"{name:28} {differs:.4f}")
+    assert (differs > 0) == (name == "extent_of_three_deviations")
+
+# %% [markdown]
+# ### Exercise 4: derive
+# Two splats get depths that are drawn at random from $n$ values. How large is the chance that they tie? Why does the
+# kit not draw depths uniformly from an interval?
+
+# %% answer
+# $1/n$. For an interval of float64 numbers $n$ is about $2^{52}$: a law that speaks of ties would never see one. So the
+# kit draws from few round numbers on purpose, and aims at thresholds.
+draws = np.random.default_rng(0).integers(0, 8, (20_000, 2))
+print(np.mean(draws[:, 0] == draws[:, 1]))
+assert np.isclose(np.mean(draws[:, 0] == draws[:, 1]), 1 / 8, atol=0.01)
+
+# %% [markdown]
+# ### Exercise 5: find the bug
+# The mutant of exercise 3, as it stands in the code.
+#
+# {{bug: extent_of_three_deviations}}
+
+# %% answer
+# 3 in place of the profile's 3.33: the first program of 3DGS does so and cuts alphas of up to 0.011 off, three steps of
+# an 8-bit picture. Later ones reach as far as alpha is over the floor.
+print(caught("extent_of_three_deviations"))

@@ -86,7 +86,7 @@ TERMS: Final = (
         "1b",
         "vector-Jacobian product: takes the cotangent of a function's result to that of its input",
     ),
-    Term("Jacobian", "2", "the matrix of a function's first derivatives"),
+    Term("Jacobian", "1b", "the matrix of a function's first derivatives"),
     Term("near plane", "2", "the depth in front of which nothing is drawn"),
     Term(
         "spherical harmonics",
@@ -109,14 +109,14 @@ TERMS: Final = (
         "6",
         "minus ten times the decimal logarithm of the mean squared error, in decibels (dB)",
     ),
-    Term("dominant", "7", "of all splats at a pixel, the one with the largest weight"),
+    Term("dominant", "4", "of all splats at a pixel, the one with the largest weight"),
     Term(
         "gradient leakage",
         "8",
         "hidden or faint Gaussians still receive gradients and stay alive",
     ),
     Term("clone", "9", "a copy of a small Gaussian that is pulled hard"),
-    Term("split", "9", "two smaller Gaussians in place of a large one that is pulled hard"),
+    Term("split", "7", "two smaller Gaussians in place of a large one that is pulled hard"),
     Term("prune", "9", "to remove Gaussians that are all but transparent"),
     Term(
         "capture",

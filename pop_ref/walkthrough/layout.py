@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import base64
-import importlib
-import importlib.util
 import re
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -18,6 +16,7 @@ from pygments import highlight
 from pygments.formatters.html import HtmlFormatter
 from pygments.lexers.python import PythonLexer
 
+from pop_ref.walkthrough import widgets
 from pop_ref.walkthrough.cells import FOLDER, Cell, Chapter, ChapterError
 from pop_ref.walkthrough.directives import expanded
 from pop_ref.walkthrough.folding import parts, said_and_done
@@ -295,7 +294,7 @@ def _prose(chapter: Chapter, cell: Cell) -> str:
         raise ChapterError(chapter.path, cell.line, str(error)) from error
     try:
         rendered = _LABEL.sub(_label, _MARKDOWN.render(text))
-        return _WIDGET.sub(lambda found: _widget(found[1]), rendered)
+        return _WIDGET.sub(lambda found: widgets.html(found[1]), rendered)
     except Exception as error:
         raise ChapterError(
             chapter.path, _line_of(cell, error), f"a formula cannot be set: {error}"
@@ -304,13 +303,6 @@ def _prose(chapter: Chapter, cell: Cell) -> str:
 
 def _label(found: re.Match[str]) -> str:
     return found[1] or f'<a class="label" href="{GLOSSARY_PAGE}#{found[3]}">{found[3]}</a>'
-
-
-def _widget(name: str) -> str:
-    """Return what a page shows of a widget; nothing where the widgets are not installed."""
-    if importlib.util.find_spec("pop_ref.walkthrough.widgets") is None:
-        return ""
-    return importlib.import_module("pop_ref.walkthrough.widgets").html(name)
 
 
 def _film(name: str, picture: Picture, caption: str) -> str:
