@@ -25,7 +25,15 @@ from pop_ref.walkthrough.cells import (
 if TYPE_CHECKING:
     from pop_ref.walkthrough.pages import Outcome
 
-_NEEDED = ("matplotlib", "markdown_it", "mdit_py_plugins", "latex2mathml", "pygments")
+# the mistakes that readers look for are judged by the kit, which needs hypothesis
+_NEEDED = (
+    "matplotlib",
+    "markdown_it",
+    "mdit_py_plugins",
+    "latex2mathml",
+    "pygments",
+    "hypothesis",
+)
 # what `--all` writes into the folder of the pages, and what the contents calls it
 NOTEBOOKS: Final = "notebooks"
 SLIDES: Final = "slides.html"

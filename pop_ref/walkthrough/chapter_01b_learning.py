@@ -231,7 +231,7 @@ picture(fig, "To Adam a gradient has a sign and hardly a size, down to about $\\
 #
 # The function that computes it is the *vjp* of $f$, its vector-Jacobian product. In `pop_ref` each function `f` has its
 # `f_vjp` beside it, which takes what `f` took and the cotangent of what `f` gave, and returns the cotangents of what
-# `f` took. Nobody ever writes $J$ down: it would have a row for every number of the image and a column for every
+# `f` took. $J$ is never written down: it would have a row for every number of the image and a column for every
 # parameter. Training calls all functions forwards, and then all their vjps backwards.
 #
 # {{source: pop_ref.activations.opacities_from_logits_vjp}}
@@ -369,6 +369,6 @@ assert np.isclose((np.log((3.0 + h) * 5.0) - np.log((3.0 - h) * 5.0)) / (2 * h),
 
 # %% answer
 # $m$ is not divided by $1 - \beta_1^t$. It starts at 0 and has only a tenth of the first gradient, so the first steps
-# are a tenth of what they should be. A training would only look a little slow at the start: nobody would notice without
-# a law that measures the first step.
+# are a tenth of what they should be. A training would only look a little slow at the start, and it
+# would not be noticed without a law that measures the first step.
 print(caught("adam_without_bias_correction"))

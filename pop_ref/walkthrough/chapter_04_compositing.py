@@ -290,5 +290,5 @@ assert np.allclose(first + T_1 * second + T_1 * T_2 * background, pixel.color)
 # %% answer
 # The test for the stop comes after the blending, so the splat that crosses the line is blended before the pixel ends.
 # Every pixel that stops gets a little more light, at most $10^{-4}$ over; with a nearly opaque last splat it is much
-# more, as for the wall above. Two programs do it on purpose; whoever compares with gsplat must not.
+# more, as for the wall above. Two programs do it on purpose; a program that is compared with gsplat must not.
 print(caught("terminating_splat_blended"))

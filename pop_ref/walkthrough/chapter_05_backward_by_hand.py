@@ -272,8 +272,8 @@ picture(
 # The oldest check: move one parameter by $\pm h$ and divide. Below, the loss is $\langle V, \mathrm{image} \rangle$
 # with a random $V$; the oracle's `render_vjp` gives its gradient with respect to all parameters at once. The error of a
 # central difference falls as $h^2$ until rounding, which grows as $1/h$, takes over; with a wrong gradient it would
-# stop falling at the size of the mistake. Derivatives hold decisions fixed (who is skipped, where a pixel stops, who is
-# in front), so the scene is one where none of them flips on the way.
+# stop falling at the size of the mistake. Derivatives hold decisions fixed (which splat is skipped, where a pixel
+# stops, which is in front), so the scene is one where none of them flips on the way.
 
 # %%
 rng = np.random.default_rng(11)

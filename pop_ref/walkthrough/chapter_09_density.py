@@ -21,7 +21,7 @@
 # third is right, and the fourth is all but transparent. (With four Gaussians in 576 pixels every pull is strong, so the
 # threshold is $3 \cdot 10^{-3}$ here; in training it is $\tau_{\mathrm{Den}} = 2 \cdot 10^{-4}$.)
 
-# %%
+# %% setup
 from dataclasses import replace
 
 import numpy as np
@@ -78,6 +78,7 @@ def pulled(params, camera, target, **options):
     return view, render_vjp(gaussians, camera, v_image, background=WHITE)
 
 
+# %%
 camera, right = camera_of(24), "-1.0 1.1 0.4 0.4 0.95 green"
 short, stripe = "-1.25 -0.8 0.15 0.15 0.95 blue", "-0.95 -0.8 0.45 0.15 0.95 blue"
 wide = "0.9 -0.7 0.5 0.5 0.8 orange"
@@ -351,7 +352,7 @@ for panel, (name, each) in zip(panels, runs.items(), strict=False):
         lines = panel.plot(each[0][1][:, rows], color=shades[kind], lw=1.0)
         lines[0].set_label(kind)
     panel.set(title=f"opacities: {name}", xlabel="step", ylim=(-0.02, 1.02))
-panels[0].legend(loc="upper left")
+panels[2].legend(loc="center right")
 for (name, each), shade in zip(runs.items(), (INK, SECOND, ACCENT), strict=True):
     panels[3].plot(
         np.mean([run[0] for run in each], axis=0), color=shade, lw=1.2, label=name

@@ -74,8 +74,8 @@ print(
 # %% [markdown]
 # ## What COLMAP does
 #
-# Nobody writes poses down while taking photographs. *Structure from motion* finds them, and COLMAP is the program that
-# most captures come from. It works in four steps:
+# Poses are not written down while photographs are taken. *Structure from motion* finds them, and COLMAP is the program
+# that most captures come from. It works in four steps:
 #
 # 1. **Features**: find some thousand corners and blobs in each photograph, and describe what each looks like.
 # 2. **Matches**: find the same feature in several photographs. A chain of matches is a *track*.
@@ -234,14 +234,14 @@ light = [each.T_final.mean() for each in drawn.values()]
 assert light == sorted(light, reverse=True)
 
 # %% [markdown]
-# Too small, and most pixels see the background: what no splat covers has no gradient, so nobody can grow into it. Too
+# Too small, and most pixels see the background: what no splat covers has no gradient, so no Gaussian grows into it. Too
 # large, and everything is fog: each Gaussian covers half the picture, and all are pulled by the same pixels. The rule
 # of the three neighbours is right wherever points lie evenly on a surface, and wrong for a lonely point in the sky;
 # training repairs it.
 
 # %% [markdown]
 # ### Exercise 1: predict
-# Somebody halves the photographs (80 by 60 to 40 by 30) to train faster, and leaves $K$ as it was. What does the first
+# A user halves the photographs (80 by 60 to 40 by 30) to train faster, and leaves $K$ as it was. What does the first
 # picture show? Which four numbers have to be halved?
 
 # %% answer

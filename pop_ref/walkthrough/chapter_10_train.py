@@ -17,9 +17,9 @@
 # **rendered** (2 to 4b). The **objective** (6, 8) gives the loss, its gradient with respect to the image, and what the
 # prior adds to the opacities; which Gaussians are important is read off this very render (7). The image's gradient goes
 # **back** to the Gaussians (5, 5b) and to the raw parameters (1b). The entropy term belongs to another method and is
-# off. `update` is **Adam** (1b). Then **density control** (9): the screen gradients, who is visible and the dominant
-# counts are added to the window's statistics, and where the calendar says so, `control` clones, splits and prunes.
-# "Windows" and "waiting" serve options of other methods.
+# off. `update` is **Adam** (1b). Then **density control** (9): the screen gradients, which Gaussians are visible, and
+# the dominant counts are added to the window's statistics, and where the calendar says so, `control` clones, splits and
+# prunes. "Windows" and "waiting" serve options of other methods.
 #
 # This is what is minimised, and where eq. 9 stands:
 #
@@ -319,8 +319,8 @@ for panel in panels:
     panel.set(xticks=[], yticks=[])
 picture(
     fig,
-    "View 00.png, held out. In the last panel every Gaussian has its own colour; black pixels belong to nobody. Large "
-    "patches are what the blur rule looks for.",
+    "View 00.png, held out. In the last panel every Gaussian has its own colour; at black pixels nothing is blended. "
+    "Large patches are what the blur rule looks for.",
 )
 assert kept["name"] == "00.png"
 
@@ -346,8 +346,8 @@ print(*sorted(path.name for path in report.parent.iterdir() if path != report))
 # %% [markdown]
 # ## The demo capture, and one bad pixel
 #
-# Now something that nobody drew from Gaussians: the still life of chapter 0, at 96 by 72 pixels, by the commands that a
-# user types, `pop demo scene`, `pop train scene --preset quick`. A thousand steps, with views 0 and 8 held out.
+# Now something that was not drawn from Gaussians: the still life of chapter 0, at 96 by 72 pixels, by the commands that
+# a user types, `pop demo scene`, `pop train scene --preset quick`. A thousand steps, with views 0 and 8 held out.
 
 # %%
 with redirect_stdout(io.StringIO()) as said:
@@ -386,12 +386,12 @@ picture(fig, "A view that no step has seen, and the pixel that is furthest off."
 assert command(["explain", out, "--view", "0", "--pixel", f"{x},{y}"]) == 0
 
 # %% [markdown]
-# Read such a table in this order. Compare **colour** and **photograph**. Look for the line with the star, the dominant
-# Gaussian: is it the thing that should be there? Look at the *first* lines: splats at a depth of a tenth or so, far
-# from the pixel in px and yet covering it, are *floaters*, large faint Gaussians right before the camera. No training
-# view looks at them from where this held-out view stands, so nothing removed them. Look at the **sum**: at which line
-# does the colour leave the right track? And at **dL/do**: minus its sign is the direction in which training with *this*
-# pixel would move each opacity; the last column says where the prior pulls.
+# Read such a table in this order. Compare **colour** and **photograph**. Then follow the **sum**: at which line does it
+# leave the right track? If that is the line with the star, the dominant Gaussian, something stands there that should
+# not; if it happens little by little over the first lines, look at their depths: splats at a depth of a few tenths,
+# many px away from the pixel and yet covering it, are *floaters*, large faint Gaussians right before the camera, which
+# no training view saw from this side. Last, look at **dL/do**: minus its sign is the direction in which training with
+# *this* pixel would move each opacity. It knows what is wrong; the other photographs decide whether it may.
 #
 # `--html why.html` makes a page of it, with the splats' outlines drawn over the picture. It is the best way to end a
 # training: pick the worst pixel, and ask.

@@ -1,4 +1,4 @@
-# minutes: 35
+# minutes: 40
 
 # %% [markdown]
 # # 11. From oracle to fast: tiles, matrix products, six sums
@@ -13,7 +13,7 @@
 # Take one tile, its 256 pixels and a list of 40. That is 10,240 pairs of a splat and a pixel, and each pair asks for
 # the same dozen floating-point operations: work for arrays.
 
-# %%
+# %% setup
 import time
 
 import numpy as np
@@ -48,6 +48,7 @@ def random_splats(n, size, seed, widest=6.0):
     return Splats(means, depths, conics_from_covars2d(covars), opacities, colors, radii)
 
 
+# %%
 splats, white = random_splats(40, TILE, seed=5), np.ones(3)
 lists = tile_lists(splats.means2d, splats.radii, splats.depths, TILE, TILE, TILE)
 oracle = composite(splats, lists, TILE, TILE, TILE, background=white)

@@ -198,7 +198,7 @@ assert {mutant.law for mutant in MUTANTS} <= set(every_law())
 # %% answer
 mine = Mutant(
     name="all_important",
-    story="the mask is true for whoever dominates no pixel, too",
+    story="the mask is true for Gaussians that dominate no pixel, too",
     file="polarization.py",
     old="return dominant_counts > 0",
     new="return dominant_counts >= 0",

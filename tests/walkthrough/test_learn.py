@@ -18,6 +18,7 @@ from pop_ref.learn.mistakes import MISTAKES
 from pop_ref.learn.progress import PASSED, WRITTEN, course_map, note_passed, picture, state
 from pop_ref.learn.student import borrowing, read_work
 from pop_ref.learn.telling import told
+from pop_ref.walkthrough.cells import chapter_files, chapter_number
 
 ROOT = Path(__file__).resolve().parents[2]
 ORACLE = ROOT / "pop_ref"
@@ -174,6 +175,10 @@ def test_a_counterexample_is_drawn_with_what_came_out_and_what_should(
     write(mine, stage)
     assert main(["learn", "check", stage, str(mine)]) == 0
     assert not picture.exists()
+
+
+def test_the_chapter_that_explains_a_stage_is_there() -> None:
+    assert {stage.chapter for stage in COURSE} <= {chapter_number(path) for path in chapter_files()}
 
 
 def test_every_mistake_that_is_known_is_one_and_of_a_function_of_the_course(mine: Path) -> None:
