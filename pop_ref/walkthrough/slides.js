@@ -13,8 +13,8 @@
     face.style.fontSize = "";
     if (widget) {
       widget.style.zoom = "";
-      const share = Math.min(1, room.clientHeight / widget.offsetHeight);
-      widget.style.zoom = share;
+      // on a phone it is scrolled rather than made too small to touch
+      widget.style.zoom = Math.min(1, Math.max(0.62, (0.98 * room.clientHeight) / widget.offsetHeight));
     }
     const size = parseFloat(getComputedStyle(face).fontSize);
     for (let share = 1; share >= 0.6 && over(); share -= 0.05) face.style.fontSize = `${share * size}px`;

@@ -28,6 +28,7 @@ _LIGHT: Final = 3.2
 _BRIEF: Final = 48
 _HEADING: Final = re.compile(r"^(#{1,3}) (.+)$")
 _WIDGET: Final = re.compile(r"^\{\{widget: \w+\}\}$")
+_FILE: Final = re.compile(r"^`[\w/]+\.py`:$")
 _ITEM: Final = re.compile(r"^(?:[-*] |\d+\. )")
 _SENTENCE_ENDS: Final = re.compile(r"[.?!:][\")\u201d*]*\s+(?=[A-Z$*`\u201c(])")
 _NO_END: Final = re.compile(r"(?:\beqs?|\bet al|\be\.g|\bi\.e|\bvs|\bfigs?|\bsec)\.$")
@@ -178,7 +179,9 @@ def _put(slides: list[Slide], block: str, short: str) -> None:
     if slides[-1].kind in ("picture", "widget") or (full and slides[-1].blocks):
         slides.append(Slide(slides[-1].chapter, slides[-1].heading))
     slides[-1].blocks.append(short)
-    slides[-1].notes.append(block)
+    # code is on the slide as it stands
+    if "```" not in block:
+        slides[-1].notes.append(block)
 
 
 def _blocks(text: str) -> list[str]:
@@ -186,7 +189,8 @@ def _blocks(text: str) -> list[str]:
     blocks: list[str] = []
     for piece in re.split(r"\n\s*\n", text):
         inside_code = bool(blocks) and blocks[-1].count("```") % 2 == 1
-        if inside_code:
+        names_its_file = bool(blocks) and piece.startswith("```") and _FILE.match(blocks[-1])
+        if inside_code or names_its_file:
             blocks[-1] += f"\n\n{piece}"
             continue
         first, _, rest = piece.strip("\n").partition("\n")

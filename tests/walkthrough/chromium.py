@@ -14,7 +14,17 @@ from typing import Any, Self
 
 from pop_ref.walkthrough.browser import OPTIONS, chromium
 
+# where pictures are kept to be looked at; without it they are taken and judged only
+SCREENSHOTS = os.environ.get("POP_SCREENSHOTS")
+
 WHY_NOT = "" if chromium() else "there is no Chromium here (apt install chromium)"
+
+
+def keep(png: bytes, name: str) -> None:
+    """Write a picture into the folder that the environment's `POP_SCREENSHOTS` names, if it names one."""
+    if SCREENSHOTS:
+        Path(SCREENSHOTS).mkdir(parents=True, exist_ok=True)
+        (Path(SCREENSHOTS) / name).write_bytes(png)
 
 
 class Page:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 import re
 import subprocess
@@ -16,13 +15,13 @@ from pop_ref.constants import DECISIONS, KINKS
 from pop_ref.notation import AXES, SYMBOLS
 from pop_ref.walkthrough import widgets
 from pop_ref.walkthrough.__main__ import main
-from pop_ref.walkthrough.cells import TIERS, Chapter, ChapterError, chapter_files, read_chapter
+from pop_ref.walkthrough.cells import TIERS, ChapterError, read_chapter
 from pop_ref.walkthrough.folding import Part, parts, said_and_done
 from pop_ref.walkthrough.glossary import GLOSSARY_PAGE, TERMS, Term
 from pop_ref.walkthrough.layout import chapter_page, index_page
-from pop_ref.walkthrough.pages import Outcome, run_chapter
+from pop_ref.walkthrough.pages import run_chapter
+from tests.walkthrough.ran import CHAPTERS, ran
 
-CHAPTERS = chapter_files()
 ROOT = Path(__file__).resolve().parents[2]
 LEARN = ROOT / "docs" / "learn.md"
 VOID = {"meta", "br", "img", "hr", "link", "input"}
@@ -63,15 +62,9 @@ def _read(page: str) -> _Reader:
     return reader
 
 
-@functools.cache
-def _ran(path: Path) -> tuple[Chapter, list[Outcome]]:
-    chapter = read_chapter(path)
-    return chapter, run_chapter(chapter)
-
-
 @pytest.mark.parametrize("path", CHAPTERS, ids=lambda path: path.stem)
 def test_a_chapter_runs_and_holds_what_a_chapter_must(path: Path) -> None:
-    chapter, outcomes = _ran(path)
+    chapter, outcomes = ran(path)
     # chapter 0 shows what is not yet explained
     assert set(chapter.tiers) == set(TIERS if chapter.number != "0" else TIERS[:2])
     assert chapter.tiers.count("find the bug") == (chapter.number != "0")
@@ -84,7 +77,7 @@ def test_a_chapter_runs_and_holds_what_a_chapter_must(path: Path) -> None:
 
 @pytest.mark.parametrize("path", CHAPTERS, ids=lambda path: path.stem)
 def test_a_chapter_becomes_a_page(path: Path) -> None:
-    chapter, outcomes = _ran(path)
+    chapter, outcomes = ran(path)
     every = [read_chapter(each) for each in CHAPTERS]
     page = chapter_page(chapter, outcomes, every)
     read = _read(page)

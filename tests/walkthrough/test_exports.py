@@ -12,11 +12,12 @@ import pytest
 from pop_ref.walkthrough import __main__ as command
 from pop_ref.walkthrough import browser
 from pop_ref.walkthrough.__main__ import main
-from pop_ref.walkthrough.cells import Chapter, chapter_files, read_chapter
+from pop_ref.walkthrough.cells import Chapter, chapter_number, read_chapter
 from pop_ref.walkthrough.pages import Outcome, run_chapter
 from pop_ref.walkthrough.printed import book
 from pop_ref.walkthrough.slides import LECTURE, MINUTES, deck
-from tests.walkthrough.chromium import WHY_NOT, Page
+from tests.walkthrough.chromium import WHY_NOT, Page, keep
+from tests.walkthrough.ran import CHAPTERS, ran
 
 in_browser = pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)
 
@@ -134,16 +135,14 @@ def test_slides_turn_by_key_button_and_finger_and_show_notes(
 @in_browser
 @pytest.mark.slow
 def test_every_slide_of_the_lecture_fits_its_screen(page: Page, tmp_path: Path) -> None:
-    # chapter 0 trains for half a minute; its slides are of the same making
-    chapters = [read_chapter(path) for path in chapter_files()]
-    told = [(chapter, run_chapter(chapter)) for chapter in chapters if chapter.number in LECTURE[1:]]
-    assert len(told) == len(LECTURE) - 1
+    told = [ran(path) for path in CHAPTERS if chapter_number(path) in LECTURE]
+    assert len(told) == len(LECTURE)
     file = tmp_path / "slides.html"
     file.write_text(deck(told), encoding="utf-8")
     page.open(file, width=1280, height=720)
     n = page.ask("document.querySelectorAll('.slide').length")
     assert 30 <= n <= 80
-    for _ in range(n):
+    for number in range(1, n + 1):
         page.ask("new Promise(done => setTimeout(() => done(1), 120))")
         face = "document.querySelector('.slide.here .face')"
         assert page.ask(f"{face}.scrollHeight <= {face}.clientHeight + 1"), page.ask(f"{face}.textContent.slice(0, 80)")
@@ -151,6 +150,7 @@ def test_every_slide_of_the_lecture_fits_its_screen(page: Page, tmp_path: Path) 
             "each => each.getBoundingClientRect().bottom <= innerHeight + 1 && each.getBoundingClientRect().top >= -1"
         )
         assert page.ask(f"[...{face}.querySelectorAll('.body > *')].every({inside})"), page.ask(f"{face}.textContent")
+        keep(page.picture(".slide.here .face"), f"slide_{number:02}.png")
         page.press("PageDown")
     assert page.complaints == []
 

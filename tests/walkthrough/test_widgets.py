@@ -16,7 +16,7 @@ import pytest
 from pop_ref.walkthrough.cells import FOLDER
 from pop_ref.walkthrough.widgets import FOLDER as WIDGET_FOLDER
 from pop_ref.walkthrough.widgets import WIDGETS, html, record
-from tests.walkthrough.chromium import WHY_NOT, Page
+from tests.walkthrough.chromium import WHY_NOT, Page, keep
 
 NAMES = list(WIDGETS)
 browser = pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)
@@ -80,7 +80,7 @@ def test_the_markup_loads_nothing_and_stays_hidden_without_scripts(name: str) ->
 @pytest.mark.parametrize("width", [900, 400])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_widget_is_drawn_without_complaint_and_fits(
-    page: Page, files: dict[str, Path], name: str, width: int, dark: bool, tmp_path: Path
+    page: Page, files: dict[str, Path], name: str, width: int, dark: bool
 ) -> None:
     page.open(files[name], width=width, dark=dark)
     _settle(page)
@@ -88,7 +88,7 @@ def test_a_widget_is_drawn_without_complaint_and_fits(
     assert page.ask("document.documentElement.scrollWidth") == width
     assert page.ask(BEYOND) == []
     png = page.picture(".pop-widget")
-    (tmp_path / f"{name}.png").write_bytes(png)
+    keep(png, f"widget_{name}_{width}_{'dark' if dark else 'light'}.png")
     image = _image(png)
     ground = image[image.shape[0] // 2, 4]
     assert (ground.mean() < 0.3) == dark
