@@ -347,7 +347,7 @@ left.set(ylabel="opacity")
 right.axvline(POP_STEPS, color=SECOND, lw=1.2)
 picture(
     fig,
-    "Histograms of opacity, one column a step, darker for more. Right of the line the prior is off.",
+    "Histograms of opacity, one column a step, stronger for more. Right of the line the prior is off.",
 )
 
 # %% [markdown]

@@ -350,12 +350,12 @@ print(*sorted(path.name for path in report.parent.iterdir() if path != report))
 # a user types, `pop demo scene`, `pop train scene --preset quick`. Five hundred steps, with views 0 and 8 held out.
 
 # %%
+scene, out = str(home / "scene"), str(home / "demo")
 with redirect_stdout(io.StringIO()) as said:
-    scene = str(home / "scene")
-    assert command(["demo", scene, "--views", "16", "--width", "96", "--height", "72"]) == 0
-    out = str(home / "demo")
+    made = command(["demo", scene, "--views", "16", "--width", "96", "--height", "72"])
     asked = ["--out", out, "--preset", "quick", "--max-steps", "500"]
-    assert command(["train", scene, *asked]) == 0
+    trained = command(["train", scene, *asked])
+assert (made, trained) == (0, 0)
 print(*[line for line in said.getvalue().splitlines() if "PSNR" in line], sep="\n")
 held_out = sorted((home / "demo" / "report_data").glob("val_step*_0000.npz"))[-1]
 kept = np.load(held_out)
@@ -383,7 +383,8 @@ picture(fig, "A view that no step has seen, and the pixel that is furthest off."
 # weight and colour, the colour so far; then what the gradients of chapter 5 and the prior of chapter 8 would do to it.
 
 # %%
-assert command(["explain", out, "--view", "0", "--pixel", f"{x},{y}"]) == 0
+explained = command(["explain", out, "--view", "0", "--pixel", f"{x},{y}"])
+assert explained == 0
 
 # %% [markdown]
 # Read such a table in this order. Compare **colour** and **photograph**. Then follow the **sum**: at which line does it

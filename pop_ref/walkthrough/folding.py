@@ -88,7 +88,7 @@ def _role(node: ast.stmt) -> Role:
 def _only_asserts(node: ast.stmt) -> bool:
     if isinstance(node, ast.Assert):
         return True
-    if isinstance(node, ast.For | ast.With):
+    if isinstance(node, ast.For):
         # names that a loop binds on the way to its assertion are of use to nothing else
         return _only_asserts(node.body[-1]) and all(
             _only_asserts(n) or isinstance(n, ast.Assign) for n in node.body

@@ -189,7 +189,9 @@ def _blocks(text: str) -> list[str]:
     blocks: list[str] = []
     for piece in re.split(r"\n\s*\n", text):
         inside_code = bool(blocks) and blocks[-1].count("```") % 2 == 1
-        names_its_file = bool(blocks) and piece.startswith("```") and _FILE.match(blocks[-1])
+        names_its_file = (
+            bool(blocks) and piece.startswith("```") and _FILE.match(blocks[-1])
+        )
         if inside_code or names_its_file:
             blocks[-1] += f"\n\n{piece}"
             continue
