@@ -163,7 +163,7 @@ ax.set(xlabel="law that is named for mutant k")
 ax.grid(False)
 picture(
     fig,
-    "Dark: the law breaks. The oracle breaks none, every mutant its own. Mutants 4 and 5 are named the same law.",
+    "Blue: the law breaks. The oracle breaks none, every mutant its own. Mutants 4 and 5 are named the same law.",
 )
 assert laws[3] == laws[4]
 assert broken.sum() < 0.25 * broken.size
