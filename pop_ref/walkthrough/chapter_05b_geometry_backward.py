@@ -22,7 +22,7 @@
 #
 # The last follows from $X Y = I$, so $dX\, Y + X\, dY = 0$. With these the whole geometry can be walked back.
 #
-# The way forwards, from chapter 2, and the way back, below:
+# The way forwards, from chapter 2 (3DGS, eq. 6 and eq. 5), and the way back, below:
 #
 # $$q, s \;\to\; M = R\,\mathrm{diag}(s) \;\to\; \Sigma = M M^\top \;\to\; \Sigma_{\mathrm{cam}} \;\to\;
 # \Sigma^{2D} = J \Sigma_{\mathrm{cam}} J^\top \;\to\; Q = (\Sigma^{2D} + 0.3\, I)^{-1}$$

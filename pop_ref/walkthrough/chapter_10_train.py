@@ -347,14 +347,14 @@ print(*sorted(path.name for path in report.parent.iterdir() if path != report))
 # ## The demo capture, and one bad pixel
 #
 # Now something that was not drawn from Gaussians: the still life of chapter 0, at 96 by 72 pixels, by the commands that
-# a user types, `pop demo scene`, `pop train scene --preset quick`. A thousand steps, with views 0 and 8 held out.
+# a user types, `pop demo scene`, `pop train scene --preset quick`. Five hundred steps, with views 0 and 8 held out.
 
 # %%
 with redirect_stdout(io.StringIO()) as said:
     scene = str(home / "scene")
     assert command(["demo", scene, "--views", "16", "--width", "96", "--height", "72"]) == 0
     out = str(home / "demo")
-    asked = ["--out", out, "--preset", "quick", "--max-steps", "1000"]
+    asked = ["--out", out, "--preset", "quick", "--max-steps", "500"]
     assert command(["train", scene, *asked]) == 0
 print(*[line for line in said.getvalue().splitlines() if "PSNR" in line], sep="\n")
 held_out = sorted((home / "demo" / "report_data").glob("val_step*_0000.npz"))[-1]
