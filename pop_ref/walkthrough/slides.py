@@ -24,6 +24,8 @@ MINUTES: Final = 90
 _FULL: Final = 11.5
 _CHARACTERS_A_LINE: Final = 72
 _LIGHT: Final = 3.2
+# code of more lines cannot be read from the last row: it is in the notes
+_LONGEST_CODE: Final = 24
 # a first sentence shorter than this says too little without the next
 _BRIEF: Final = 48
 _HEADING: Final = re.compile(r"^(#{1,3}) (.+)$")
@@ -178,9 +180,10 @@ def _put(slides: list[Slide], block: str, short: str) -> None:
     full = sum(_lines(each) for each in slides[-1].blocks) + _lines(short) > _FULL
     if slides[-1].kind in ("picture", "widget") or (full and slides[-1].blocks):
         slides.append(Slide(slides[-1].chapter, slides[-1].heading))
-    slides[-1].blocks.append(short)
-    # code is on the slide as it stands
-    if "```" not in block:
+    if short:
+        slides[-1].blocks.append(short)
+    # code that is on the slide as it stands need not be read out
+    if "```" not in short:
         slides[-1].notes.append(block)
 
 
@@ -204,7 +207,12 @@ def _blocks(text: str) -> list[str]:
 
 
 def _short(block: str, introduces: bool) -> str:
-    """Shorten a paragraph to its first sentence, and the one that leads on to what follows; keep all else."""
+    """Shorten a paragraph to its first sentence, and the one that leads on to what follows; keep all else.
+
+    Of long code the name of its file is left.
+    """
+    if block.count("\n") > _LONGEST_CODE and "```" in block:
+        return block.partition("```")[0].strip()
     if (
         _ITEM.match(block)
         or block.startswith(("$$", "|", "```", ">", "`pop_ref"))

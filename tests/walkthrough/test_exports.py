@@ -59,6 +59,10 @@ assert two == 2
 #
 # It has a widget and a label, D5.
 #
+# {{source: pop_ref.alpha.falloff}}
+#
+# {{source: pop_ref.pixel.composite_pixel}}
+#
 # {{widget: stack}}
 """
 
@@ -85,7 +89,7 @@ def test_a_slide_has_first_sentences_formulas_lists_and_pictures_and_the_notes_h
 ) -> None:
     text = deck([small])
     faces = _faces(text)
-    assert len(faces) == 4
+    assert len(faces) == 5
     assert "<h1>Title</h1>" in faces[0]
     assert "What the reader will know. And more of it." in re.sub(r"<[^>]*>", "", faces[0])
     assert "<h2>A section</h2>" in faces[1]
@@ -94,7 +98,13 @@ def test_a_slide_has_first_sentences_formulas_lists_and_pictures_and_the_notes_h
     assert "<li>another</li>" in faces[1]
     assert "The second." in text
     assert "<figcaption>A line.</figcaption>" in faces[2]
-    assert 'data-widget="stack"' in faces[3]
+    plain = re.sub(r"<[^>]*>", "", faces[3])
+    assert "pop_ref/alpha.py:\ndef falloff" in plain
+    # what is too long to be read from afar is named on the slide, and stands in its notes
+    assert "pop_ref/pixel.py:" in plain
+    assert "def composite_pixel" not in plain
+    assert "composite_pixel" in text
+    assert 'data-widget="stack"' in faces[4]
     assert "What is two?" not in text
     assert "label, D5." in text
     assert not re.search(r'href="(?!#)', text)
@@ -114,7 +124,7 @@ def test_slides_turn_by_key_button_and_finger_and_show_notes(
     page.open(file, width=1280, height=720)
     here = "[...document.querySelectorAll('.slide')].findIndex(each => getComputedStyle(each).display !== 'none')"
     assert page.ask(here) == 0
-    for key, then in (("ArrowRight", 1), (" ", 2), ("End", 3), ("ArrowRight", 3), ("ArrowLeft", 2), ("Home", 0)):
+    for key, then in (("ArrowRight", 1), (" ", 2), ("End", 4), ("ArrowRight", 4), ("ArrowLeft", 3), ("Home", 0)):
         page.press(key)
         assert page.ask(here) == then, key
     page.ask("document.querySelector('[data-go=\"1\"]').click()")
