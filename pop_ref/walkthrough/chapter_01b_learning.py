@@ -139,8 +139,9 @@ def adam(rate: float) -> Callable:
     state = {"m": {"x": np.zeros(2)}, "v": {"x": np.zeros(2)}}
 
     def update(x: np.ndarray, gradient: np.ndarray, step: int) -> np.ndarray:
+        grads = {"x": gradient}
         moved, state["m"], state["v"] = adam_step(
-            {"x": x}, {"x": gradient}, **state, step=step, lr={"x": rate}
+            {"x": x}, grads, state["m"], state["v"], step, lr={"x": rate}
         )
         return moved["x"]
 

@@ -99,7 +99,7 @@ def film(
             Picture(None, None, images[0].shape[1] * enlarged / 100.0, caption, frames)
         )
         return
-    shown = np.linspace(0, len(images) - 1, min(5, len(images))).astype(int).tolist()
+    shown = [round(float(k)) for k in np.linspace(0, len(images) - 1, min(5, len(images)))]
     figure, panels = style.axes(len(shown), height=7.2 / len(shown))
     for panel, k in zip(np.atleast_1d(panels), shown, strict=True):
         style.show_image(panel, images[k], labels[k])
