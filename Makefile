@@ -26,8 +26,8 @@ demo: setup  ## write the demo capture, train POP on it, leave report.html, PLY,
 	$(BIN)/pop train out/demo_capture --out out/demo --preset quick --overwrite
 	@echo "open out/demo/report.html"
 
-walkthrough: setup  ## run the twelve chapters and write their pages with pictures to out/walkthrough
-	$(BIN)/python -m pop_ref.walkthrough out/walkthrough
+walkthrough: setup  ## run the chapters and write pages, notebooks, slides and (with a Chromium) a PDF to out/walkthrough
+	$(BIN)/python -m pop_ref.walkthrough out/walkthrough --all
 
 repro: setup  ## train every row of the paper at toy scale (minutes), leave its tables and figures in out/repro
 	$(BIN)/pop-repro queue --scale toy --out out/repro/results --work out/repro/work
