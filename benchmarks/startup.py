@@ -58,7 +58,7 @@ def _first_step(capture: str, factor: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         out, said = Path(folder) / "run", Path(folder) / "said"
         # one step, or its record would wait for the others of its segment
-        words = ["train", capture, "--factor", str(factor), "--preset", "quick", "--max-steps", "1", "--quiet"]
+        words = ["train", capture, "--factor", str(factor), "--preset", "quick", "--max-steps", "1", "--no-progress"]
         start = time.perf_counter()
         with (
             said.open("wb") as to,

@@ -139,8 +139,8 @@ void bind_blend(nb::module_& m) {
     backward.def(nb::init<>());
     VALUE(backward, BlendBackward, channels);
     VALUE(backward, BlendBackward, absolute);
-    backward.def("set_family", [](BlendBackward& s, bool splats, bool atomics) {
-        s.family = splats ? Family::splats : Family::columns;
+    backward.def("set_backward", [](BlendBackward& s, bool splats, bool atomics) {
+        s.backward = splats ? Backward::gaussian_parallel : Backward::pixel_parallel;
         s.gather = atomics ? Gather::atomics : Gather::slots;
     });
     POINTER(backward, BlendBackward, records);

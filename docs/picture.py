@@ -33,7 +33,9 @@ def before(result: Path, view: int) -> np.ndarray:
     capture = load_capture(config.data, factor=config.factor, normalize=config.normalize)
     params = initialize_params(capture, config.seed, config.init_opacity, config.init_scale)
     with torch.no_grad():
-        made = render_view(get_backend("fast"), params, ViewTensors.of(capture.test_views(config.test_every)[view]), config, 0)
+        made = render_view(
+            get_backend("fast"), params, ViewTensors.of(capture.test_views(config.test_every)[view]), config, 0
+        )
     return made.image.clamp(0.0, 1.0).numpy()
 
 

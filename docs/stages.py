@@ -64,10 +64,10 @@ STAGES = (
 
 # modules of pop_ref that are data or types, not stages
 NOT_STAGES = frozenset({"__init__", "_shapes", "ambiguities", "constants", "notation", "settings", "records"})
-# stages whose laws stand in a file of another name: whole views, and what has a file of its own outside tests/laws
+# stages whose laws stand in a file of another name: whole views, and what is tested elsewhere
 LAWS_ELSEWHERE = {
-    "render": "tests/laws/test_whole.py",
-    "depth": "tests/laws/test_signature_depth.py",
+    "render": "pop_ref/conformance/laws/test_whole.py",
+    "depth": "pop_ref/conformance/laws/test_signature_depth.py",
     "training": "tests/golden",
     "margins": "tests/thresholds",
 }
@@ -97,9 +97,10 @@ def files(room: str, stage: Stage) -> Iterator[Path]:
 
 
 def laws(stage: Stage) -> Iterator[Path]:
-    """Give the law files of a stage: tests/laws/test_<module>*.py, or the place named in `LAWS_ELSEWHERE`."""
+    """Give the law files of a stage, those of its modules, or the place named in `LAWS_ELSEWHERE`."""
     for module in stage.modules:
         if module in LAWS_ELSEWHERE:
             yield ROOT / LAWS_ELSEWHERE[module]
-        yield from sorted((ROOT / "tests" / "laws").glob(f"test_{module}.py"))
-        yield from sorted((ROOT / "tests" / "laws").glob(f"test_{module}_*.py"))
+        folder = ROOT / "pop_ref" / "conformance" / "laws"
+        yield from sorted(folder.glob(f"test_{module}.py"))
+        yield from sorted(folder.glob(f"test_{module}_*.py"))

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Sequence
 from importlib.machinery import ModuleSpec
 from types import ModuleType
-from typing import Final
+from typing import Any, Final
 
 MOVED: Final = {
     "backends": "api.registry",
@@ -31,6 +31,13 @@ MOVED: Final = {
 }
 
 
+class _OldModule(ModuleType):
+    """A module whose name is also that of a function that the package gives: it can be called as that."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return getattr(self, self.__name__.rpartition(".")[2])(*args, **kwargs)
+
+
 class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     def __init__(self, package: str) -> None:
         self._new = {f"{package}.{old}": f"{package}.{new}" for old, new in MOVED.items()}
@@ -42,6 +49,10 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         if fullname not in self._new:
             return None
         return importlib.util.spec_from_loader(fullname, self, is_package=True)
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        """Make the empty module."""
+        return _OldModule(spec.name)
 
     def exec_module(self, module: ModuleType) -> None:
         """Fill the module with the names of its successor."""

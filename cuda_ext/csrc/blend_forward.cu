@@ -15,7 +15,7 @@ namespace {
 constexpr int GROUP = 4;
 static_assert(WARP % GROUP == 0, "groups fill a batch");
 
-// Where a lane's pixels keep what family "splats" reads of a bucket: T before it, then the colour that later buckets
+// Where a lane's pixels keep what the gaussian_parallel backward reads of a bucket: T before it, then the colour that later buckets
 // blended. Until the list is done, the colour is what this bucket blended.
 template <int CH>
 __device__ __forceinline__ float* checkpoint_of(const TileLists& lists, const BlendForward& blend, int list, int bucket,

@@ -39,7 +39,7 @@ struct RenderStats {
 template <class Real, int CH, int ROWS>
 struct BackwardColumn {
     Real T[ROWS];        // transmittance behind the splat that is visited next
-    Real behind[ROWS];   // what the light that passes that splat is worth
+    Real suffix_dot_grad[ROWS];  // the colour behind that splat, dotted with the pixel's cotangent
     Real v_color[ROWS][CH];
     int last[ROWS];
 };
@@ -131,14 +131,14 @@ POP_HD bool blend_backward(BackwardColumn<Real, CH, ROWS>& column, const PackedS
         // an approximate 1 / 1 must not add up over the splats that do not take part
         if (reached) column.T[k] = T;
         const Real weight = T * alpha;
-        Real gain = -column.behind[k];
+        Real gain = -column.suffix_dot_grad[k];
         POP_UNROLL
         for (int c = 0; c < CH; ++c) {
             gain += color[c] * column.v_color[k][c];
             const Real v_color = weight * column.v_color[k][c];
             sums.v_color[c] = k == 0 ? v_color : sums.v_color[c] + v_color;
         }
-        column.behind[k] += alpha * gain;
+        column.suffix_dot_grad[k] += alpha * gain;
         const Real G = exponent_cotangent<PASS>(unclamped, constants.ceiling, weight, T, gain), G_dy = G * dy;
         // the first is not added to a zero, which costs as much as another
         sums.m0 = k == 0 ? G : sums.m0 + G;
@@ -169,19 +169,20 @@ POP_HD void sums_of_column(const ColumnSums<Real, CH>& column, Real dx, Real* su
     }
 }
 
-// A pixel on its way through the splats of a bucket, back to front: the other family, one splat a lane.
+// A pixel on its way through the splats of a bucket, back to front: the other backward, one splat a lane.
 template <class Real>
 struct Passing {
     Real T;       // transmittance behind the splat that is visited next
-    Real behind;  // what the light that passes that splat is worth
+    Real suffix_dot_grad;  // the colour behind that splat, dotted with the pixel's cotangent
 };
 
 // The pixel as it leaves its last splat of a bucket, by what the forward pass left at the bucket's end: transmittance,
 // and the colour that later buckets blended. That colour is a sum from the back: taking what lies in front off the
 // whole image would leave the rounding of all of it where little is left, and an opaque splat then divides by 1 - alpha.
 template <class Real, int CH>
-POP_HD Passing<Real> passing_behind(Real T, Real T_final, const Real* later, const Real* v_color, Real worth_behind) {
-    Real left = T_final * worth_behind;
+POP_HD Passing<Real> passing_after(Real T, Real T_final, const Real* later, const Real* v_color,
+                                   Real background_dot_grad) {
+    Real left = T_final * background_dot_grad;
     POP_UNROLL
     for (int c = 0; c < CH; ++c) left += later[c] * v_color[c];
     return {T, left * reciprocal(T)};
@@ -198,13 +199,13 @@ POP_HD void pass_pixel(Passing<Real>& pixel, const PackedSplat<Real>& splat, con
     const Real alpha = least(constants.ceiling, unclamped);
     const Real T = pixel.T * reciprocal(add(Real(1), -alpha));
     const Real weight = T * alpha;
-    Real gain = -pixel.behind;
+    Real gain = -pixel.suffix_dot_grad;
     POP_UNROLL
     for (int c = 0; c < CH; ++c) {
         gain += color[c] * v_color[c];
         sums[c] += weight * v_color[c];
     }
-    pixel.behind += alpha * gain;
+    pixel.suffix_dot_grad += alpha * gain;
     pixel.T = T;
     const Real G = exponent_cotangent<PASS>(unclamped, constants.ceiling, weight, T, gain);
     const Real G_dx = G * dx, G_dy = G * dy;

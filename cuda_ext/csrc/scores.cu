@@ -133,7 +133,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
     for (int k = 0; k < COLUMN_ROWS; ++k) {
         pixels[k].T = k < column.rows ? scores.T_final[pixel_of(lists.grid, column, k)] : 1.0f;
 #pragma unroll
-        for (int c = 0; c < CH; ++c) pixels[k].behind[c] = __ldg(scores.background + c);
+        for (int c = 0; c < CH; ++c) pixels[k].suffix_color[c] = __ldg(scores.background + c);
     }
     each_splat<CH, true>(lists, scores, column, staged[warp], lane, [&](int place, PackedSplat<float> splat,
                                                                        const float* color) {

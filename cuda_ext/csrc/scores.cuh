@@ -34,11 +34,11 @@ POP_HD void add_contribution(Real* sums, Real weight, Real map, Real dx, Real dy
     sums[3] += sqrt(dx * dx + dy * dy);
 }
 
-// A pixel on its way back: transmittance behind the splat that is visited next, and the light that passes it.
+// A pixel on its way back: transmittance behind the splat that is visited next, and the colour behind that one.
 template <class Real, int CH>
 struct Returning {
     Real T;
-    Real behind[CH];
+    Real suffix_color[CH];
 };
 
 // Goes before one splat and tells T there and c - B, how far its colour exceeds the light from behind: dC/dalpha / T.
@@ -47,8 +47,8 @@ POP_HD Real go_before(Returning<Real, CH>& pixel, Real alpha, const Real* color,
     pixel.T = pixel.T * reciprocal(add(Real(1), -alpha));
     POP_UNROLL
     for (int c = 0; c < CH; ++c) {
-        more[c] = color[c] - pixel.behind[c];
-        pixel.behind[c] += alpha * more[c];
+        more[c] = color[c] - pixel.suffix_color[c];
+        pixel.suffix_color[c] += alpha * more[c];
     }
     return pixel.T;
 }

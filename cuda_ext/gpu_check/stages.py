@@ -12,7 +12,13 @@ from typing import Any
 
 from cuda_ext.gpu_check.budget import Share
 from cuda_ext.gpu_check.shared import NOTHING, Check, skipped
-from cuda_ext.gpu_check.tests import laws_of_splats_stage, laws_stage, sanitizer_stage, smoke_stage, steps_stage
+from cuda_ext.gpu_check.tests import (
+    laws_of_gaussian_parallel_stage,
+    laws_stage,
+    sanitizer_stage,
+    smoke_stage,
+    steps_stage,
+)
 from cuda_ext.gpu_check.tools import ROOT, Command, python_path, read_json
 
 _TRAIN = "from pop_fast.cli import main; raise SystemExit(main())"
@@ -104,7 +110,7 @@ def train_one(check: Check, path: Path, limit: float, backend: str = "cuda") -> 
     """Train on one capture, or go on with the training of an earlier call at the same commit."""
     folder = check.work / f"{path.name}_{backend}_{check.steps_scaler:g}_{check.commit[:12]}"
     words = ["train", str(path), "--out", str(folder), "--backend", backend]
-    words += ["--steps-scaler", str(check.steps_scaler), "--quiet", "--max-renders", "1"]
+    words += ["--steps-scaler", str(check.steps_scaler), "--no-progress", "--max-renders", "1"]
     words += ["--resume"] if (folder / "cfg.json").exists() else []
     found = check.run(check.python("-c", _TRAIN, *words), limit)
     stats = sorted((folder / "stats").glob("val_step*.json"), key=lambda file: int(file.stem.split("step")[1]))
@@ -154,7 +160,7 @@ STAGES: dict[str, Callable[[Check], dict[str, Any]]] = {
     "steps": steps_stage,
     "sanitizer": sanitizer_stage,
     "train": train_stage,
-    "laws_of_splats": laws_of_splats_stage,
+    "laws_of_gaussian_parallel": laws_of_gaussian_parallel_stage,
     "reproduce": reproduce_stage,
 }
 # what settles the paper's claims, first of all the two rows of the whole schedule
@@ -169,11 +175,11 @@ SHARES = {
     "steps": Share(45, 150),
     "sanitizer": Share(40, 90),
     "train": Share(90, 250),
-    "laws_of_splats": Share(20, 1e9),
+    "laws_of_gaussian_parallel": Share(20, 1e9),
     "reproduce": Share(120, 1e9),
 }
 JOBS = {
     1: ("wheels", "build", "smoke", "bench", "gsplat"),
-    2: ("wheels", "build", "laws", "steps", "sanitizer", "train", "laws_of_splats"),
+    2: ("wheels", "build", "laws", "steps", "sanitizer", "train", "laws_of_gaussian_parallel"),
     3: ("wheels", "build", "reproduce"),
 }

@@ -56,9 +56,9 @@ def laws_stage(check: Check) -> dict[str, Any]:
     return _laws(check, "laws", "columns atomics")
 
 
-def laws_of_splats_stage(check: Check) -> dict[str, Any]:
-    """Hold the laws to the other backward family, which is not the default."""
-    return _laws(check, "laws_of_splats", "splats")
+def laws_of_gaussian_parallel_stage(check: Check) -> dict[str, Any]:
+    """Hold the laws to the other backward kernel, which is not the default."""
+    return _laws(check, "laws_of_gaussian_parallel", "gaussian_parallel")
 
 
 def steps_stage(check: Check) -> dict[str, Any]:

@@ -1,5 +1,5 @@
 // A whole render and its transpose on the host, from the functions that the kernels run, in the kernels' order: project,
-// sort by depth, list per tile, blend columns of four pixels, go back by either family, project back.
+// sort by depth, list per tile, blend columns of four pixels, go back either way, project back.
 #pragma once
 
 #include <algorithm>
@@ -157,10 +157,10 @@ void backward_by_columns(const Frame<Real>& frame, const Arguments<Real>& a, std
             const long long p = (long long)(y + k) * frame.grid.width + x;
             column.T[k] = forward.T_final[k];
             column.last[k] = forward.last[k];
-            column.behind[k] = a.in[V_T_FINAL][p];
+            column.suffix_dot_grad[k] = a.in[V_T_FINAL][p];
             for (int c = 0; c < CH; ++c) {
                 column.v_color[k][c] = a.in[V_IMAGE][CH * p + c];
-                column.behind[k] += a.in[BACKGROUND][c] * column.v_color[k][c];
+                column.suffix_dot_grad[k] += a.in[BACKGROUND][c] * column.v_color[k][c];
             }
         }
         for (int k = int(list.size()) - 1; k >= 0; --k) {
@@ -209,13 +209,14 @@ void backward_by_splats(const Frame<Real>& frame, const Arguments<Real>& a, std:
                 }
             const long long p = (long long)(y + k) * frame.grid.width + x;
             const Real* v_color = a.in[V_IMAGE] + CH * p;
-            Real worth = a.in[V_T_FINAL][p];
-            for (int c = 0; c < CH; ++c) worth += a.in[BACKGROUND][c] * v_color[c];
-            Passing<Real> pixel = {column.T_final[0], worth};
+            Real background_dot_grad = a.in[V_T_FINAL][p];
+            for (int c = 0; c < CH; ++c) background_dot_grad += a.in[BACKGROUND][c] * v_color[c];
+            Passing<Real> pixel = {column.T_final[0], background_dot_grad};
             for (int j = column.last[0] - 1; j >= 0; --j) {
                 const size_t bucket = size_t(j) / BUCKET;
                 if (j % BUCKET == BUCKET - 1 && j + 1 < column.last[0])
-                    pixel = passing_behind<Real, CH>(T[bucket + 1], column.T_final[0], later[bucket].data(), v_color, worth);
+                    pixel = passing_after<Real, CH>(T[bucket + 1], column.T_final[0], later[bucket].data(), v_color,
+                                                    background_dot_grad);
                 pass_pixel<true, PASS, Real, CH>(pixel, frame.blended[list[j]], &frame.colors[list[j]].x, v_color, px,
                                                  py, frame.constants, &sums[size_t(N_SUMS) * list[j]]);
             }

@@ -138,7 +138,7 @@ class BlendBuffers:
         H, W, self.channels = settings.height, settings.width, colors.shape[1]
         self.rows, self.background, self.buffers, self.settings = rows, background, buffers, settings
         # only lists of the warps' own tiles are numbered in buckets; the others go back column by column
-        self.by_splats = settings.family == "splats" and buffers.buckets
+        self.gaussian_parallel = settings.backward == "gaussian_parallel" and buffers.buckets
         self.records = empty("packed splats", LOWER, (max(n, 1), kernels.RECORD), device)
         self.splats = fill(kernels.Splats(), means2d=means2d, conics=conics, opacities=opacities, colors=colors)
         floor = settings.profile.alpha_floor
@@ -147,9 +147,9 @@ class BlendBuffers:
         self.T_final = empty("the image", "the image size", (H, W), device)
         self.last = empty("the image", "the image size", (H, W), device, torch.int32)
         self.checkpoints: Tensor | None = None
-        if self.by_splats:
+        if self.gaussian_parallel:
             shape = (buffers.max_buckets, 1 + self.channels, kernels.TILE_PIXELS)
-            self.checkpoints = empty("checkpoints", LOWER + ", or use family='columns'", shape, device)
+            self.checkpoints = empty("checkpoints", LOWER + ", or use backward='pixel_parallel'", shape, device)
 
     def run(self, stats: RenderStats | None) -> None:
         kernels = load()
@@ -192,7 +192,7 @@ class BlendBuffers:
             rows=rows,
             sums=sums,
         )
-        blend.set_family(self.by_splats, not slots)
+        blend.set_backward(self.gaussian_parallel, not slots)
         stream, profile = stream_of(device), self.settings.kernel_profile()
         kernels.blend_backward(self.buffers.struct, blend, profile, state.data_ptr(), stream)
         found: dict[str, Tensor | None] = {

@@ -35,7 +35,7 @@ class TileBuffers:
         tile: px, (width, height) of a list's tile.
         exact: leave out tiles that no pixel centre reaches.
         device: where.
-        buckets: also number buckets of 32 entries, for backward family "splats".
+        buckets: also number buckets of 32 entries, for backward "gaussian_parallel".
     """
 
     def __init__(
@@ -150,7 +150,7 @@ def make_lists(
     """
     kernels, stream = load(), stream_of(device)
     state = new_state(device) if state is None else state
-    buckets = settings.family == "splats" and tile == WARP_TILE
+    buckets = settings.backward == "gaussian_parallel" and tile == WARP_TILE
     buffers = TileBuffers(n, settings.width, settings.height, tile, exact, device, buckets)
     profile = settings.kernel_profile()
     kernels.count_instances(buffers.struct, splats, profile, state.data_ptr(), stream)

@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from cuda_ext import load
-from cuda_ext.arrays import Settings, empty, fill, kernel_profile, new_state, stream_of
+from cuda_ext.arrays import Settings, check_tensor, empty, fill, kernel_profile, new_state, stream_of
 from cuda_ext.render.autograd import BlendBuffers, Project, RenderStats
-from cuda_ext.render.inputs import check_scene, check_tensor
 from cuda_ext.render.lists import LOWER, list_tile, make_lists, splat_struct
 from pop_ref.constants import Profile
 
@@ -55,7 +54,10 @@ class ScoredView:
         profile: Profile,
         antialiased: bool,
     ) -> None:
-        check_scene(*gaussians, sh_degree, 1)
+        n, of = len(gaussians[0]), ("means", "quats", "scales", "opacities")
+        for name, tensor, shape in zip(of, gaussians, ((n, 3), (n, 4), (n, 3), (n,)), strict=False):
+            check_tensor(name, tensor, shape)
+        check_tensor("sh", gaussians[4], (n, gaussians[4].shape[1], 3))
         check_tensor("viewmat", viewmat, (4, 4))
         check_tensor("K", K, (3, 3))
         self._background = check_tensor("background", background, (3,)).contiguous()

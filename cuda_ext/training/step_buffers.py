@@ -79,7 +79,7 @@ class Shared:
     def render(self, size: Size, sh_degree: int) -> Settings:
         """Return what a render of that size depends on."""
         s = self.settings
-        return Settings(*size, s.profile, s.profile.tile_size, sh_degree, s.antialiased, family=s.family)
+        return Settings(*size, s.profile, s.profile.tile_size, sh_degree, s.antialiased, backward=s.backward)
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ class Frame:
         """
         kernels, device, s = load(), shared.device, shared.settings
         tile, exact = list_tile(shared.render(size, 0), counted=False)
-        lists = TileBuffers(n, *size, tile, exact, device, s.family == "splats" and exact)
+        lists = TileBuffers(n, *size, tile, exact, device, s.backward == "gaussian_parallel" and exact)
         lists.reserve(capacity)
         shape = (size[1], size[0])
         maps = ("dominant_ids", *(("n_blended", "n_traversed") if s.counts else ()))

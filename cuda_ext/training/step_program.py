@@ -103,7 +103,7 @@ def _blends(shared: Shared, rows: Population, frame: Frame, phase: Phase) -> tup
         fill(forward, **frame.render_stats, masks=shared.views.masks, state=shared.state)
     backward = fill(kernels.BlendBackward(), **drawn, absolute=False, v_image=frame.work["v_image"])
     fill(backward, v_T_final=None, rows=frame.work.get("rows"), sums=rows.sums)
-    backward.set_family(frame.lists.buckets, not deterministic)
+    backward.set_backward(frame.lists.buckets, not deterministic)
     return forward, backward
 
 

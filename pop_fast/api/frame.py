@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from pop_fast.api.backend import Stages
+from pop_fast.api.backend import ViewStages
 from pop_fast.api.meta import RenderMeta, intersections
 from pop_fast.stages.compositing import Composite
 from pop_fast.stages.dominance import dominant_counts
-from pop_fast.stages.splatting import ProjectionSettings, Splats
+from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
+
+_GATHERED = ("means2d", "depths", "conics", "opacities", "radii")
 
 
 @dataclass(frozen=True)
@@ -21,7 +24,9 @@ class Scene:
 
     Attributes:
         means: [B, N, 3]
-        covars: [B, N, 3, 3]
+        quats: [B, N, 4], None where covariances were given.
+        scales: [B, N, 3], likewise.
+        covars: [B, N, 3, 3], None where quaternions and scales were given.
         opacities: [B, N]
         colors: [B or I, N, D] or [B or I, N, K, 3]
         per_camera: whether `colors` holds one row per image.
@@ -31,7 +36,9 @@ class Scene:
     """
 
     means: Tensor
-    covars: Tensor
+    quats: Tensor | None
+    scales: Tensor | None
+    covars: Tensor | None
     opacities: Tensor
     colors: Tensor
     per_camera: bool
@@ -41,26 +48,21 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Rows:
-    """What one image blends: rows of the tensors in meta, so that gradients pass through those.
+class Image:
+    """What one image blends.
 
     Attributes:
-        means2d: [M, 2]
-        depths: [M]
-        conics: [M, 3]
-        opacities: [M]
-        colors: [M, D], depth as the last channel where the mode asks for it.
-        radii: [M, 2]
+        rows: of the tensors in meta, so that gradients pass through those; depth is the last channel of the colours
+            where the mode asks for it.
+        seen: all Gaussians as the camera sees them.
+        settings: of the view.
         gaussians: the Gaussian of every row, None when row i is Gaussian i.
         absgrad: where |dL/dmeans2d| goes, or None. [M, 2]
     """
 
-    means2d: Tensor
-    depths: Tensor
-    conics: Tensor
-    opacities: Tensor
-    colors: Tensor
-    radii: Tensor
+    rows: Splats
+    seen: Splats
+    settings: ProjectionSettings
     gaussians: Tensor | None
     absgrad: Tensor | None
 
@@ -72,7 +74,7 @@ class Frame:
     Attributes:
         scene: Gaussians and cameras.
         image_shape: batch dimensions and cameras.
-        view: size, profile and mode; its K is replaced per image.
+        settings: size, profile and mode; its K is replaced per image.
         tile_size: px.
         sh_degree: bands, None for plain colours.
         render_mode: as `rasterization` takes it.
@@ -83,82 +85,80 @@ class Frame:
 
     scene: Scene
     image_shape: tuple[int, ...]
-    view: ProjectionSettings
+    settings: ProjectionSettings
     tile_size: int
     sh_degree: int | None
     render_mode: str
     packed: bool
     absgrad: bool
-    stages: Stages
+    stages: ViewStages
 
     def render(self, backgrounds: Tensor | None, dominance: bool, counts: bool) -> tuple[Tensor, Tensor, RenderMeta]:
         """Return images, alphas and meta."""
-        splats = self._splats()
-        visible = [(s.radii > 0).all(1).nonzero().squeeze(1) for s in splats]
-        colors = self._colors(visible)
-        meta, rows = self._packed(splats, visible, colors) if self.packed else self._unpacked(splats, colors)
-        blends = [self._blend(r, dominance, counts) for r in rows]
-        images = self._stacked([self._finish(i, blend, backgrounds) for i, blend in enumerate(blends)])
+        views = [replace(self.settings, K=K) for K in self.scene.Ks]
+        seen = self._seen(views)
+        meta, images = self._packed(seen, views) if self.packed else self._unpacked(seen, views)
+        behind = self._behind(backgrounds, images)
+        blends = [
+            self._blend(image, background, dominance, counts) for image, background in zip(images, behind, strict=True)
+        ]
         alphas = self._stacked([blend.alphas[..., None] for blend in blends])
         meta["final_T"] = 1.0 - alphas.detach()[..., 0]
-        meta["n_pairs"] = sum(blend.n_pairs for blend in blends)
-        self._add_instruments(meta, rows, blends, dominance, counts)
-        return images, alphas, meta
+        pairs = [blend.n_pairs for blend in blends if blend.n_pairs is not None]
+        if len(pairs) == len(blends):
+            meta["n_pairs"] = sum(pairs)
+        self._add_stats(meta, images, blends, dominance, counts)
+        return self._stacked([self._finished(blend) for blend in blends]), alphas, meta
 
-    def _splats(self) -> list[Splats]:
-        scene, n = self.scene, self.scene.n_cameras
-        scenes = list(zip(_items(scene.means), _items(scene.covars), _items(scene.opacities), strict=True))
+    def _seen(self, views: Sequence[ProjectionSettings]) -> list[Splats]:
+        scene, n, stages = self.scene, self.scene.n_cameras, self.stages
+        if scene.covars is not None:
+            shapes = _items(scene.covars)
+        else:
+            assert scene.quats is not None
+            assert scene.scales is not None
+            shapes = [stages.covariances(*pair) for pair in zip(_items(scene.quats), _items(scene.scales), strict=True)]
+        means, opacities, given = _items(scene.means), _items(scene.opacities), _items(scene.colors)
         return [
-            self.stages.project(*scenes[i // n], viewmat, replace(self.view, K=K))
-            for i, (viewmat, K) in enumerate(zip(_items(scene.viewmats), scene.Ks, strict=True))
+            stages.splats(
+                *(means[i // n], shapes[i // n], opacities[i // n], given[i if scene.per_camera else i // n]),
+                *(viewmat, views[i], self.sh_degree),
+            )
+            for i, viewmat in enumerate(_items(scene.viewmats))
         ]
 
-    def _colors(self, visible: list[Tensor]) -> list[Tensor]:
-        scene, n, degree = self.scene, self.scene.n_cameras, self.sh_degree
-        given = _items(scene.colors)
-        colors = given if scene.per_camera else [given[i // n] for i in range(len(visible))]
-        if degree is None:
-            return colors
-        means, viewmats = _items(scene.means), _items(scene.viewmats)
-        color = self.stages.colors_of_view
-        return [color(colors[i], means[i // n], viewmats[i], degree, rows) for i, rows in enumerate(visible)]
-
-    def _unpacked(self, splats: list[Splats], colors: list[Tensor]) -> tuple[RenderMeta, list[Rows]]:
-        names = ("means2d", "depths", "conics", "opacities", "radii")
-        stacked = {name: self._stacked([getattr(s, name) for s in splats]) for name in names}
+    def _unpacked(self, seen: Sequence[Splats], views: Sequence[ProjectionSettings]) -> tuple[RenderMeta, list[Image]]:
+        stacked = {name: self._stacked([getattr(s, name) for s in seen]) for name in _GATHERED}
         meta = self._meta(stacked, {"batch_ids": None, "camera_ids": None, "gaussian_ids": None})
         sink = self._sink(meta["means2d"])
         last_outer = len(self.image_shape) - 1
         items = {name: _items(tensor.flatten(0, last_outer)) for name, tensor in stacked.items()}
-        sinks = [None] * len(splats) if sink is None else _items(sink.flatten(0, last_outer))
+        sinks = [None] * len(seen) if sink is None else _items(sink.flatten(0, last_outer))
+        rows = [{name: tensors[i] for name, tensors in items.items()} for i in range(len(seen))]
         return meta, [
-            self._rows({name: tensors[i] for name, tensors in items.items()}, colors[i], None, sinks[i])
-            for i in range(len(splats))
+            Image(self._rows(rows[i], colors_of(of)), of, views[i], None, sinks[i]) for i, of in enumerate(seen)
         ]
 
-    def _packed(
-        self, splats: list[Splats], visible: list[Tensor], colors: list[Tensor]
-    ) -> tuple[RenderMeta, list[Rows]]:
-        names = ("means2d", "depths", "conics", "opacities", "radii")
+    def _packed(self, seen: Sequence[Splats], views: Sequence[ProjectionSettings]) -> tuple[RenderMeta, list[Image]]:
+        visible = [(s.radii > 0).all(1).nonzero().squeeze(1) for s in seen]
         joined = {
-            name: torch.cat([getattr(s, name)[v] for s, v in zip(splats, visible, strict=True)]) for name in names
+            name: torch.cat([getattr(s, name)[v] for s, v in zip(seen, visible, strict=True)]) for name in _GATHERED
         }
-        sizes = [len(v) for v in visible]
-        image = torch.repeat_interleave(torch.tensor(sizes))
-        n_cameras = self.scene.n_cameras
+        sizes, n_cameras = [len(v) for v in visible], self.scene.n_cameras
+        image = torch.repeat_interleave(torch.tensor(sizes)).to(joined["radii"].device)
         ids = {"batch_ids": image // n_cameras, "camera_ids": image % n_cameras, "gaussian_ids": torch.cat(visible)}
         meta = self._meta(joined, ids)
         sink = self._sink(meta["means2d"])
         ends = torch.tensor(sizes).cumsum(0).tolist()
-        rows: list[Rows] = []
+        images: list[Image] = []
         for i, (end, size, gaussians) in enumerate(zip(ends, sizes, visible, strict=True)):
             part = slice(end - size, end)
-            own = {name: tensor[part] for name, tensor in joined.items()}
-            rows.append(self._rows(own, colors[i][gaussians], gaussians, None if sink is None else sink[part]))
-        return meta, rows
+            rows = self._rows({name: tensor[part] for name, tensor in joined.items()}, colors_of(seen[i])[gaussians])
+            images.append(Image(rows, seen[i], views[i], gaussians, None if sink is None else sink[part]))
+        return meta, images
 
     def _meta(self, splats: dict[str, Tensor], ids: dict[str, Any]) -> RenderMeta:
-        view, size = self.view, self.tile_size
+        view, size = self.settings, self.tile_size
         tiles = {"tile_width": -(-view.width // size), "tile_height": -(-view.height // size), "tile_size": size}
         counts = {"n_batches": len(self.scene.means), "n_cameras": self.scene.n_cameras}
         return RenderMeta({**ids, **splats, **tiles, **counts, "width": view.width, "height": view.height})
@@ -170,54 +170,42 @@ class Frame:
         means2d.absgrad = sink  # type: ignore[attr-defined]
         return sink
 
-    def _rows(self, splat: dict[str, Tensor], colors: Tensor, gaussians: Tensor | None, sink: Tensor | None) -> Rows:
+    def _rows(self, splat: dict[str, Tensor], colors: Tensor) -> Splats:
         if self.render_mode != "RGB":
             depth = splat["depths"][:, None]
             colors = depth if self.render_mode in ("D", "ED") else torch.cat((colors, depth), 1)
-        return Rows(**splat, colors=colors, gaussians=gaussians, absgrad=sink)
+        return Splats(**splat, colors=colors)
 
-    def _blend(self, rows: Rows, dominance: bool, counts: bool) -> Composite:
-        width, height, profile = self.view.width, self.view.height, self.view.profile
-        # counting visited entries needs the asked-for tiles and their full lists; without it, entries that reach no
-        # pixel are left out, and small splats are listed in small tiles
-        exact = {} if counts else {"conics": rows.conics.detach(), "opacities": rows.opacities.detach()}
-        size = self.tile_size if counts or profile.extent == "square" else self.stages.blend_tile(rows.radii)
-        lists = self.stages.tile_lists(
-            rows.means2d.detach(), rows.radii, rows.depths.detach(), width, height, size, profile, **exact
-        )
-        return self.stages.composite(
-            rows.means2d,
-            rows.conics,
-            rows.opacities,
-            rows.colors,
-            lists,
-            width,
-            height,
-            profile,
+    def _behind(self, backgrounds: Tensor | None, images: Sequence[Image]) -> list[Tensor | None]:
+        """Return what is behind every image: nothing is behind depth."""
+        if backgrounds is None or self.render_mode in ("D", "ED"):
+            return [None] * len(images)
+        flat = backgrounds.reshape(len(images), backgrounds.shape[-1])
+        if self.render_mode != "RGB":
+            flat = torch.cat((flat, flat.new_zeros((len(images), 1))), 1)
+        return list(_items(flat))
+
+    def _blend(self, image: Image, background: Tensor | None, dominance: bool, counts: bool) -> Composite:
+        return self.stages.blend(
+            *(image.rows, image.seen, image.settings, self.tile_size, background),
             dominance=dominance,
             counts=counts,
-            absgrad_sink=rows.absgrad,
+            absgrad_sink=image.absgrad,
         )
 
-    def _finish(self, i: int, blend: Composite, backgrounds: Tensor | None) -> Tensor:
-        image = blend.image
-        n_plain = image.shape[-1] - (self.render_mode != "RGB")
-        if backgrounds is not None and n_plain > 0:
-            background = backgrounds.reshape(len(self.scene.viewmats), n_plain)[i]
-            behind = (1.0 - blend.alphas)[..., None] * background
-            image = torch.cat((image[..., :n_plain] + behind, image[..., n_plain:]), -1)
-        if self.render_mode.endswith("ED"):
-            expected = image[..., -1:] / blend.alphas[..., None].clamp_min(1e-10)
-            image = torch.cat((image[..., :-1], expected), -1)
-        return image
+    def _finished(self, blend: Composite) -> Tensor:
+        if not self.render_mode.endswith("ED"):
+            return blend.image
+        expected = blend.image[..., -1:] / blend.alphas[..., None].clamp_min(1e-10)
+        return torch.cat((blend.image[..., :-1], expected), -1)
 
-    def _add_instruments(
-        self, meta: RenderMeta, rows: list[Rows], blends: list[Composite], dominance: bool, counts: bool
+    def _add_stats(
+        self, meta: RenderMeta, images: list[Image], blends: list[Composite], dominance: bool, counts: bool
     ) -> None:
         n = self.scene.means.shape[1]
 
         def dominant(of: list[Composite]) -> dict[str, Tensor]:
-            ids = [_as_gaussians(blend.dominant_ids, r.gaussians) for blend, r in zip(of, rows, strict=True)]
+            ids = [_as_gaussians(b.dominant_ids, image.gaussians) for b, image in zip(of, images, strict=True)]
             return {
                 "dominant_ids": self._stacked(ids),
                 "dominant_weights": self._stacked([_present(blend.dominant_weights) for blend in of]),
@@ -232,25 +220,28 @@ class Frame:
 
         @torch.no_grad()
         def again(with_dominance: bool) -> list[Composite]:
-            return [self._blend(r, with_dominance, not with_dominance) for r in rows]
+            return [self._blend(image, None, with_dominance, not with_dominance) for image in images]
 
-        view, size = self.view, self.tile_size
-        geometry = [(r.means2d.detach(), r.radii, r.depths.detach()) for r in rows]
+        def overlaps() -> dict[str, Any]:
+            lists = [self.stages.tile_lists(image.rows, image.settings, self.tile_size) for image in images]
+            return intersections(lists, [image.rows.depths for image in images], self.image_shape)
+
         if dominance:
             meta.update(dominant(blends))
-        else:
-            meta.defer(("dominant_ids", "dominant_weights", "dominant_counts"), lambda: dominant(again(True)))
         if counts:
             meta.update(counted(blends))
-        else:
+        meta.defer(("dominant_ids", "dominant_weights", "dominant_counts"), lambda: dominant(again(True)))
+        if self.stages.counts_entries(self.tile_size):
             meta.defer(("n_contrib", "n_traversed"), lambda: counted(again(False)))
-        meta.defer(
-            ("tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets"),
-            lambda: intersections(geometry, self.image_shape, view.width, view.height, size, view.profile),
-        )
+        else:
+            # unlike the entries that are visited, those that are blended do not depend on the lists' tiles
+            meta.defer(
+                ("n_contrib",), lambda: {"n_contrib": self._stacked([_present(b.n_blended) for b in again(True)])}
+            )
+        meta.defer(("tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets"), overlaps)
 
-    def _stacked(self, tensors: list[Tensor]) -> Tensor:
-        joined = tensors[0][None] if len(tensors) == 1 else torch.stack(tensors)
+    def _stacked(self, tensors: Sequence[Tensor]) -> Tensor:
+        joined = tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
         return joined.reshape(*self.image_shape, *tensors[0].shape)
 
 

@@ -7,19 +7,20 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from pop_fast.api.backend import stages_of
+from pop_fast.api.backend import Backend
 from pop_fast.api.checks import (
+    RASTERIZE_MODES,
     RENDER_MODES,
-    check_cameras,
-    check_colors,
-    check_gaussians,
+    Checks,
+    check_choice,
+    check_sizes,
     check_supported,
-    check_tensor,
     resolved_profile,
 )
 from pop_fast.api.frame import Frame, Scene
 from pop_fast.api.meta import RenderMeta
-from pop_fast.api.registry import fastest_backend, get_backend
+from pop_fast.api.registry import fastest_backend, require_backend
+from pop_fast.errors import PopError
 from pop_fast.stages.splatting import ProjectionSettings
 from pop_ref.constants import Profile
 
@@ -63,7 +64,7 @@ def rasterization(
     profile: str | Profile = "paper",
     dominance: bool = False,
     counts: bool = False,
-    backend: Literal["auto", "fast", "compiled", "cuda", "ref"] = "auto",
+    backend: str | Backend = "auto",
 ) -> tuple[Tensor, Tensor, RenderMeta]:
     """Render Gaussians into C images, with gsplat 1.5.3's signature, results and meta keys.
 
@@ -107,10 +108,10 @@ def rasterization(
         profile: constants and strictness: "paper", "gsplat_1_5", "gsplat_1_6", "inria", or a `Profile`.
         dominance: compute the dominance keys of meta in the same pass; else they cost one more when first read.
         counts: likewise for n_contrib and n_traversed.
-        backend: "fast" renders on the CPU, "compiled" too, with kernels in C++ (`pop_fast.compiled`), "cuda" on the
-            GPU that holds the tensors (`cuda_ext`), "ref" with the oracle (slow; harmonics, RGB and
-            `packed=False` only). "auto" takes the fastest that is there: "cuda" for tensors on a GPU, else "compiled"
-            where it is built, else "fast".
+        backend: a name that `pop_fast.api.registry` knows, or a backend. "fast" renders on the CPU, "compiled" too with
+            kernels in C++ (`pop_fast.compiled`), "cuda" on the GPU that holds the tensors (`cuda_ext`), "ref" with the
+            oracle, slowly. "auto" takes the fastest that is there: "cuda" for tensors on a GPU, else "compiled" where
+            it is built, else "fast".
 
     Returns:
         Images [..., C, H, W, X], not clamped; alphas [..., C, H, W, 1]; meta with gsplat's keys and `dominant_ids`
@@ -122,57 +123,70 @@ def rasterization(
         NotImplementedError: an argument is not supported.
         PopError: the backend is unknown, cannot run here, or does not offer an argument; says why and what to do.
     """
-    if backend == "auto":
-        backend = fastest_backend(means.device.type)
-    if backend not in ("fast", "compiled"):
-        given = dict(locals())
-        del given["backend"]
-        return get_backend(backend).rasterization(**given)  # type: ignore[return-value]
-    check_supported(
-        {
-            "sparse_grad": (sparse_grad, False, "gradients are dense"),
-            "distributed": (distributed, False, "this backend is one process"),
-            "camera_model": (camera_model, "pinhole", "undistort the images first; `pop train` does it"),
-            "segmented": (segmented, False, "it chooses a CUDA sort"),
-            "with_ut": (with_ut, False, "only the EWA projection is implemented"),
-            "with_eval3d": (with_eval3d, False, "splats are evaluated in screen space"),
-            "radial_coeffs": (radial_coeffs, None, "undistort the images first"),
-            "tangential_coeffs": (tangential_coeffs, None, "undistort the images first"),
-            "thin_prism_coeffs": (thin_prism_coeffs, None, "undistort the images first"),
-            "ftheta_coeffs": (ftheta_coeffs, None, "undistort the images first"),
-            "rolling_shutter": (rolling_shutter, None, "only global shutters"),
-            "viewmats_rs": (viewmats_rs, None, "only global shutters"),
-        }
-    )
-    if render_mode not in RENDER_MODES:
-        raise ValueError(f"render_mode is {render_mode!r}; it must be one of {', '.join(RENDER_MODES)}")
-    if rasterize_mode not in ("classic", "antialiased"):
-        raise ValueError(f"rasterize_mode is {rasterize_mode!r}; it must be classic or antialiased")
-    batch = check_gaussians(means, quats, scales, opacities, covars)
-    n_cameras = check_cameras(viewmats, Ks, width, height, tile_size, batch, means.dtype)
-    per_camera = check_colors(colors, sh_degree, batch, n_cameras, means.shape[-2], means.dtype)
-    if backgrounds is not None:
-        n_plain = 3 if sh_degree is not None else colors.shape[-1]
-        check_tensor("backgrounds", backgrounds, (*batch, n_cameras, n_plain), means.dtype)
-    n, stages = means.shape[-2], stages_of(backend)
-    if covars is None:
-        assert quats is not None
-        assert scales is not None
-        covars = stages.covariances(quats.reshape(-1, 4), scales.reshape(-1, 3))
-    n_scenes = math.prod(batch)
-    n_images = n_scenes * n_cameras
-    scene = Scene(
-        means.reshape(n_scenes, n, 3),
-        covars.reshape(n_scenes, n, 3, 3),
-        opacities.reshape(n_scenes, n),
-        colors.reshape(n_images if per_camera else n_scenes, *colors.shape[len(batch) + per_camera :]),
-        per_camera,
-        viewmats.reshape(n_images, 4, 4),
-        Ks.reshape(n_images, 3, 3),
-        n_cameras,
-    )
+    drawing = _backend_for(backend, means)
+    given = {
+        "sparse_grad": sparse_grad,
+        "distributed": distributed,
+        "camera_model": camera_model,
+        "segmented": segmented,
+        "with_ut": with_ut,
+        "with_eval3d": with_eval3d,
+        "radial_coeffs": radial_coeffs,
+        "tangential_coeffs": tangential_coeffs,
+        "thin_prism_coeffs": thin_prism_coeffs,
+        "ftheta_coeffs": ftheta_coeffs,
+        "rolling_shutter": rolling_shutter,
+        "viewmats_rs": viewmats_rs,
+        "covars": covars,
+        "radius_clip": radius_clip,
+    }
+    check_supported(given, drawing)
+    check_choice("render_mode", render_mode, RENDER_MODES)
+    check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
+    if not radius_clip >= 0.0:
+        raise ValueError(f"radius_clip is {radius_clip}; it must be >= 0 px")
     chosen = resolved_profile(profile, near_plane, far_plane, eps2d)
-    view = ProjectionSettings(Ks, width, height, chosen, rasterize_mode == "antialiased", radius_clip)
+    check_sizes(width, height, tile_size)
+    checks = Checks(drawing, means.dtype)
+    batch = checks.gaussians(means, quats, scales, opacities, covars)
+    n_cameras = checks.cameras(viewmats, Ks, width, height, tile_size, batch)
+    per_camera = checks.colors(colors, sh_degree, batch, n_cameras, means.shape[-2])
+    if backgrounds is not None:
+        checks.tensor("backgrounds", backgrounds, (*batch, n_cameras, 3 if sh_degree is not None else colors.shape[-1]))
+    checks.values()
+    n, n_scenes = means.shape[-2], math.prod(batch)
+    n_images = n_scenes * n_cameras
+    rows = {"quats": quats, "scales": scales} if covars is None else {}
+    flat = {name: None if t is None else t.reshape(n_scenes, n, t.shape[-1]) for name, t in rows.items()}
+    scene = Scene(
+        means=means.reshape(n_scenes, n, 3),
+        quats=flat.get("quats"),
+        scales=flat.get("scales"),
+        covars=None if covars is None else covars.reshape(n_scenes, n, 3, 3),
+        opacities=opacities.reshape(n_scenes, n),
+        colors=colors.reshape(n_images if per_camera else n_scenes, *colors.shape[len(batch) + per_camera :]),
+        per_camera=per_camera,
+        viewmats=viewmats.reshape(n_images, 4, 4),
+        Ks=Ks.reshape(n_images, 3, 3),
+        n_cameras=n_cameras,
+    )
+    settings = ProjectionSettings(Ks, width, height, chosen, rasterize_mode == "antialiased", radius_clip)
     options = (tile_size, sh_degree, render_mode, packed, absgrad)
-    frame = Frame(scene, (*batch, n_cameras), view, *options, stages)
+    frame = Frame(scene, (*batch, n_cameras), settings, *options, drawing.stages())
     return frame.render(backgrounds, dominance, counts)
+
+
+def _backend_for(backend: str | Backend, means: Tensor) -> Backend:
+    """Return the backend that was asked for, which can run here.
+
+    Raises:
+        PopError: it is unknown, or cannot; says why and what to do.
+    """
+    if backend == "auto":
+        return fastest_backend(means.device.type)
+    if isinstance(backend, str):
+        return require_backend(backend)
+    reason = backend.why_not()
+    if reason is not None:
+        raise PopError(f"backend {backend.name!r} cannot run: {reason}")
+    return backend

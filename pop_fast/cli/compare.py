@@ -43,8 +43,8 @@ def _stats(folder: Path) -> dict[str, object]:
     from pop_fast.train.results import read_config
     from pop_fast.view.report.source import read_last_stats
 
-    read_config(folder)
+    planned = read_config(folder).max_steps
     stats = read_last_stats(folder)
     if not stats:
         raise PopError(f"{folder}: has no statistics yet; train to the first evaluation, or run pop eval {folder}")
-    return stats
+    return {**stats, "max_steps": planned}

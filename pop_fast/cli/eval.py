@@ -79,6 +79,7 @@ def run(argv: Sequence[str]) -> int:
 
 def measure_splat(splat: Splat, config: TrainConfig, views: list[ViewTensors], nets: Sequence[LPIPS]) -> dict[str, Any]:
     """Measure a splat on views; the numbers are those that training itself would write."""
+    from pop_fast.io.heartbeat import Heartbeat
     from pop_fast.train.environment import reproducible
     from pop_fast.train.evaluate import evaluate
     from pop_fast.train.gpu_proxy import renderer
@@ -87,7 +88,8 @@ def measure_splat(splat: Splat, config: TrainConfig, views: list[ViewTensors], n
     backend, note = renderer(config.backend)
     if note:
         print(f"note: {note}", file=sys.stderr)
-    with reproducible(config.threads):
+    with reproducible(config.threads), Heartbeat() as beat:
+        beat.say(f"measuring {len(views)} views")
         measured = evaluate(backend, splat.params, views, config, splat.sh_degree, nets)
         return {**population(splat.params["opacities"].sigmoid()), **measured}
 

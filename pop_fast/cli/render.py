@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _INDEX: Final = "renders.json"
 _EXAMPLES: Final = """
     pop render out/scene_pop --out views                     the held-out views, one PNG each
-    pop render out/scene_pop --path orbit --video orbit.mp4  a video around the scene
+    pop render out/scene_pop --path orbit --video orbit.webm  a video around the scene
     pop render a.ply --capture scene --path interpolate --frames 240 --out frames
 """
 
@@ -40,7 +40,7 @@ class Args(CaptureArguments):
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Write one PNG a view into this new folder, and renders.json, which lists them."""
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Write a video: .mp4, .webm or .avi."""
+    """Write a video: .webm, .avi, or .mp4 where OpenCV can write H.264."""
     path: Literal["views", "orbit", "ellipse", "interpolate"] = "views"
     """"views" are the held-out views; the others are paths made from the training cameras."""
     frames: int = 120
@@ -111,6 +111,6 @@ def listed_in(folder: Path) -> Callable[[Path], bool]:
     try:
         index = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
         files = {_INDEX, *(str(entry["file"]) for entry in index["renders"])}
-    except (OSError, ValueError, TypeError, KeyError):
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
         files = set()  # not there, or not this command's: then nothing in the folder is known to be
     return lambda file: file.as_posix() in files

@@ -95,7 +95,7 @@ def blend_numbers(inputs: tuple[Tensor, ...], options: BlendOptions) -> dict[str
         "stop": Stop.of(profile, dtype).at,
         "pixel_stride": inputs[3].shape[1],
         "channel_stride": 1,
-        "ceiling_passes": profile.ceiling_gradient != "zero",
+        "ceiling_passes": profile.as_numbers()["pass_ceiling"],
     }
 
 

@@ -4,31 +4,24 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
 
 from pop_fast.data.colmap import find_model, read_model
+from pop_fast.data.finding import Finding, State
+from pop_fast.data.load import beside_the_model, turned_upright
+from pop_fast.data.photo_quality import Shown, about_number, measure
 from pop_fast.data.posed_images import PosedImage, SparsePoints
+from pop_fast.data.sfm import photo_folder, photographs
 from pop_fast.data.transforms import find_transforms, read_transforms
 from pop_fast.errors import CaptureError
-from pop_fast.io.images import find_image, list_images, read_image, read_mask
+from pop_fast.io.images import find_image, list_images, read_image, read_mask, unreadable_photographs
 
-State = Literal["ok", "warn", "bad"]
 # bytes of a Gaussian in training: 59 float32 numbers, each with its gradient and two moments of Adam
 BYTES_IN_TRAINING = 59 * 4 * 4
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One line: how bad, about what, and what was found."""
-
-    state: State
-    about: str
-    text: str
 
 
 @dataclass(frozen=True)
@@ -41,37 +34,60 @@ class Photo:
     alpha: bool = False
     rotated: bool = False
     problem: str = ""
+    shown: Shown | None = None
 
 
-def read_listing(root: Path) -> tuple[str, list[PosedImage], SparsePoints | None]:
+def read_listing(root: Path, images: str | None = None) -> tuple[str, list[PosedImage], SparsePoints | None] | None:
     """Read where photographs were taken from: a COLMAP model or transforms.json; what it is, its shots, its points.
 
+    Args:
+        root: the capture's folder.
+        images: the folder in it with the photographs, in place of the listed one.
+
+    Returns:
+        None where there is neither, but photographs that cameras can be found for.
+
     Raises:
-        CaptureError: the folder is absent, or what says so is damaged.
+        CaptureError: the folder is absent or holds no photographs, or what says so is damaged.
     """
     if not root.is_dir():
         raise CaptureError(f"{root}: no such folder; give the folder that holds the photographs and their cameras")
     model = find_model(root)
     if model is not None:
-        return f"COLMAP model in {model.relative_to(root)}", *read_model(model)
+        shots, cloud = read_model(model)
+        # as training reads them: beside the model, where the capture was made in place
+        shots = turned_upright(root, beside_the_model(root, shots, images), model)
+        return f"COLMAP model in {model.relative_to(root)}", _in_folder(shots, images), cloud
     lists = find_transforms(root)
     if lists:
-        return " and ".join(path.name for path in lists), *read_transforms(lists)
-    photographs = len(list_images(root))
-    fix = f"run pop sfm {root}" if photographs >= 2 else "give the folder of a capture"
-    raise CaptureError(f"{root}: has {photographs} photographs and nothing says where they were taken; {fix}")
+        shots, cloud = read_transforms(lists)
+        return " and ".join(path.name for path in lists), _in_folder(shots, images), cloud
+    folder = photo_folder(root)
+    if not photographs(folder):
+        hint = unreadable_photographs(folder) or "give the folder of a capture"
+        raise CaptureError(f"{root}: has no photographs, no COLMAP model and no transforms.json; {hint}")
+    return None
 
 
-def read_photo(root: Path, shot: PosedImage) -> Photo:
-    """Find and decode the photograph of one shot."""
-    path = find_image(root / shot.folder, shot.file)
+def _in_folder(shots: list[PosedImage], images: str | None) -> list[PosedImage]:
+    return shots if images is None else [replace(shot, folder=images) for shot in shots]
+
+
+def file_of(root: Path, shot: PosedImage) -> Path | None:
+    """Find the photograph of a shot."""
+    return find_image(root / shot.folder, shot.file)
+
+
+def read_photo(shot: PosedImage, path: Path | None) -> Photo:
+    """Decode and measure the photograph of a shot, found at `path`."""
     if path is None:
         return Photo(shot, None, problem="absent")
     try:
         image = read_image(path)
     except CaptureError as error:
         return Photo(shot, path, problem=str(error))
-    return Photo(shot, path, (image.shape[1], image.shape[0]), image.shape[2] == 4, _is_rotated(path))
+    size, alpha = (image.shape[1], image.shape[0]), image.shape[2] == 4
+    return Photo(shot, path, size, alpha, _is_rotated(path), shown=measure(path, image, shot.name))
 
 
 def _is_rotated(path: Path) -> bool:
@@ -112,7 +128,10 @@ def about_photos(photos: Sequence[Photo], root: Path) -> Iterator[Finding]:
             yield Finding("bad", "photographs", photo.problem)
         elif photo.shot.camera is not None and photo.path is not None:
             yield from _about_size(photo)
-    rotated = [photo.shot.name for photo in photos if photo.rotated]
+    turned = sum(photo.shot.turns > 0 for photo in photos)
+    if turned:
+        yield Finding("ok", "EXIF", f"{turned} are stored turned and shown upright, as pop sfm noted")
+    rotated = [photo.shot.name for photo in photos if photo.rotated and not photo.shot.turns]
     if rotated:
         note = "the pixels are used as stored, as COLMAP does; poses must have been made so too"
         yield Finding("warn", "EXIF", f"{len(rotated)} ask to be rotated, first {rotated[0]}: {note}")
@@ -190,15 +209,14 @@ def about_points(shots: Iterable[PosedImage], cloud: SparsePoints | None, sample
 
 def about_reprojection(root: Path) -> Iterator[Finding]:
     """Tell the mean reprojection error of the model's tracks, where it has any."""
-    import pycolmap
-
     from pop_fast.data.colmap import quiet_colmap
+    from pop_fast.data.pinhole import require_colmap
 
     model = find_model(root)
     if model is None:
         return
     with quiet_colmap():
-        reconstruction = pycolmap.Reconstruction(model)
+        reconstruction = require_colmap().Reconstruction(model)
         observations = int(reconstruction.compute_num_observations())
         if observations == 0:
             yield Finding("ok", "reprojection", "the model has no tracks, so its error cannot be told")
@@ -217,3 +235,26 @@ def about_memory(photos: Sequence[Photo], cloud: SparsePoints | None, free: int)
     yield Finding("warn" if too_much else "ok", "memory", f"photographs take {by_factor}")
     start = f"; training starts with {len(cloud):,}" if cloud is not None else ""
     yield Finding("ok", "memory", f"Gaussians take {BYTES_IN_TRAINING * 1e6 / 2**20:,.0f} MiB a million{start}")
+
+
+def about_bare(root: Path, shown: Sequence[Shown]) -> Iterator[Finding]:
+    """Tell what there is where nothing says where the photographs were taken."""
+    sound = [one for one in shown if not one.problem]
+    enough = len(sound) >= 2
+    fix = (
+        "pop train finds their cameras first, or pop sfm alone" if enough else "a scene needs two or more that overlap"
+    )
+    yield Finding("ok" if enough else "bad", "poses", f"none yet, {len(sound)} photographs: {fix}")
+    sizes = Counter(one.size for one in sound)
+    listed = ", ".join(f"{count} of {w}x{h} px" for (w, h), count in sizes.most_common(4))
+    yield Finding("ok" if sizes else "bad", "photographs", listed or "none could be read")
+    for one in shown:
+        if one.problem:
+            yield Finding("bad", "photographs", one.problem)
+    yield from about_number(len(sound))
+    left = unreadable_photographs(photo_folder(root))
+    if left:
+        yield Finding("warn", "photographs", left)
+    turned = sum(one.exif.orientation in (3, 6, 8) for one in sound)
+    if turned:
+        yield Finding("ok", "EXIF", f"{turned} are stored turned; what is trained on is upright")

@@ -26,6 +26,8 @@ class PosedImage:
         angle_x: horizontal field of view in radians, where `camera` is None.
         mask: the mask file that the list names, if any.
         split: the list's own assignment, if any.
+        turns: quarter turns clockwise that make the photograph upright; `camera` and `viewmat` are those of its pixels
+            as they are stored.
     """
 
     name: str
@@ -36,6 +38,7 @@ class PosedImage:
     angle_x: float | None = None
     mask: Path | None = None
     split: Split | None = None
+    turns: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ import os
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -26,6 +26,7 @@ from pop_fast.data.posed_images import PosedImage
 from pop_fast.data.resample import shrink_bicubic
 from pop_fast.data.undistort import Undistortion, undistortion
 from pop_fast.errors import CaptureError
+from pop_fast.io.image_header import read_size
 from pop_fast.io.images import find_image, read_image, read_mask
 from pop_fast.io.jpeg import sound_jpegs
 
@@ -111,10 +112,22 @@ def _locate(
     if masks and not any(photo.mask for photo in photos):
         raise CaptureError(f"{masks}: holds no mask named as a photograph (<name>.png or <name>.jpg.png); rename them")
     notes = [f"{len(absent)} of {len(shots)} listed images are absent and were skipped"] if absent else []
+    notes += _about_folders(root, shots, options)
     unmasked = [photo.path for photo in photos if photo.mask is None]
     if 0 < len(unmasked) < len(photos):
         notes.append(f"{len(unmasked)} of {len(photos)} photographs have no mask and count whole, first {unmasked[0]}")
     return photos, notes
+
+
+def _about_folders(root: Path, shots: Sequence[PosedImage], options: PhotoOptions) -> list[str]:
+    """Tell which photographs a factor is met by: those that were made smaller before, or the large ones."""
+    if options.factor == 1:
+        return []
+    read = {_image_folder(root, folder, options) for folder in {shot.folder for shot in shots}}
+    names = ", ".join(sorted(f"{chosen or '.'}/" for chosen, _ in read))
+    if all(shrink == 1 for _, shrink in read):
+        return [f"the photographs of {names} are used, made smaller before; --images says otherwise"]
+    return [f"the photographs of {names} are shrunk by {options.factor} here"]
 
 
 def _image_folder(root: Path, folder: str, options: PhotoOptions) -> tuple[str, int]:
@@ -149,6 +162,7 @@ def _rectifier() -> Any:
 
 
 def _read(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
+    _check_header(photo)
     image = read_image(photo.path)
     height, width = image.shape[:2]
     camera = photo.shot.camera or _camera_from_angle(photo.shot.angle_x or 1.0, width, height)
@@ -165,12 +179,35 @@ def _read(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
         raise CaptureError(f"{photo.path}: is {width}x{height} px, too small for factor {photo.shrink}; lower it")
     mask = None
     if photo.mask is not None:
-        mask = _read_mask(photo.mask, (width, height), rectification, size)
+        mask = _read_mask(photo.mask, (width, height), rectification, size, photo.shot.turns)
     K = rectification.K.copy()
     if size != (width, height):
         image = _shrunk(image, size, options.resize)
         K[:2] *= np.array([size[0] / width, size[1] / height])[:, None]
-    return View(photo.shot.name, image, photo.shot.viewmat, K, mask, photo.shot.split)
+    return _upright(View(photo.shot.name, image, photo.shot.viewmat, K, mask, photo.shot.split), photo.shot.turns)
+
+
+def _check_header(photo: _Photo) -> None:
+    """Refuse a photograph or mask of another shape before it is decoded, which may take gigabytes."""
+    size, camera = read_size(photo.path), photo.shot.camera
+    if size is None:
+        return
+    if camera is not None and camera.width > 0 and camera.height > 0:
+        _check_shape(photo.path, "the photograph", size, "its camera", (camera.width, camera.height))
+    masked = None if photo.mask is None else read_size(photo.mask)
+    if photo.mask is not None and masked is not None and not (photo.shot.turns % 2 and _same_shape(masked[::-1], size)):
+        _check_shape(photo.mask, "the mask", masked, "its photograph", size)
+
+
+def _upright(view: View, turns: int) -> View:
+    """Turn a view clockwise by quarters: pixel (u, v) of an image of height H becomes (H - v, u)."""
+    for _ in range(turns):
+        K = view.K
+        turned = np.array([[K[1, 1], 0.0, view.height - K[1, 2]], [0.0, K[0, 0], K[0, 2]], [0.0, 0.0, 1.0]])
+        x, y, *rest = view.viewmat
+        image, mask = (None if a is None else np.ascontiguousarray(np.rot90(a, -1)) for a in (view.image, view.mask))
+        view = replace(view, image=image, mask=mask, K=turned, viewmat=np.stack([-y, x, *rest]))
+    return view
 
 
 def _camera_from_angle(angle_x: float, width: int, height: int) -> Any:
@@ -181,13 +218,17 @@ def _camera_from_angle(angle_x: float, width: int, height: int) -> Any:
 
 def _check_shape(path: Path, what: str, size: tuple[int, int], whose: str, other: tuple[int, int]) -> None:
     """Accept another size, but only of the same shape to within a pixel of rounding."""
-    off_width = abs(size[0] - other[0] * size[1] / other[1])
-    off_height = abs(size[1] - other[1] * size[0] / other[0])
-    if min(off_width, off_height) > 1.0:
+    if not _same_shape(size, other):
         raise CaptureError(
             f"{path}: {what} is {size[0]}x{size[1]} px but {whose} is {other[0]}x{other[1]}, another shape; "
             "use the photographs that the poses were made from, neither cropped nor rotated"
         )
+
+
+def _same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    off_width = abs(size[0] - other[0] * size[1] / max(other[1], 1))
+    off_height = abs(size[1] - other[1] * size[0] / max(other[0], 1))
+    return min(off_width, off_height) <= 1.0
 
 
 def _over(rgba: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
@@ -197,8 +238,14 @@ def _over(rgba: np.ndarray, background: tuple[float, float, float]) -> np.ndarra
     return np.rint(mixed).astype(np.uint8)
 
 
-def _read_mask(path: Path, stored: tuple[int, int], rectification: Undistortion, size: tuple[int, int]) -> np.ndarray:
+def _read_mask(
+    path: Path, stored: tuple[int, int], rectification: Undistortion, size: tuple[int, int], turns: int
+) -> np.ndarray:
     mask = read_mask(path)
+    height, width = mask.shape
+    if turns % 2 and not _same_shape((width, height), stored) and _same_shape((height, width), stored):
+        # drawn over the photograph as viewers show it
+        mask = np.ascontiguousarray(np.rot90(mask, turns))
     _check_shape(path, "the mask", (mask.shape[1], mask.shape[0]), "its photograph", stored)
     mask = rectification.mask(_resize_mask(mask, stored))
     mask = _resize_mask(mask, size)

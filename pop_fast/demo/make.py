@@ -53,10 +53,12 @@ def make_demo(
         overwrite: replace an existing folder.
 
     Raises:
-        CaptureError: too few views or pixels.
+        CaptureError: too few views or pixels, or a negative seed.
     """
     if views < 4 or min(width, height) < 16:
         raise CaptureError(f"the demo was asked for with {views} views of {width}x{height}; use 4 and 16x16 or more")
+    if seed < 0:
+        raise CaptureError(f"seed is {seed}; it must be at least 0")
     # asked for before the minutes of tracing, not after
     require_colmap()
     scene = make_scene(seed)

@@ -11,6 +11,7 @@ what works on tensors stands in `densify`, which is imported when there are some
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 
     from pop_fast.density.passes import Passes
 
+# in a view's `info`: its prior has been asked for
+_REGULARIZED = "pop_regularized"
 _NEEDED = ("means", "scales", "quats", "opacities")
 # steps between a reset and what it has to be recovered from by; see `DensityControl.scaled`
 _RECOVERY = ("reset_every", "pause_refine_after_reset")
@@ -143,6 +146,8 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
             return None
         from pop_fast.density import densify
 
+        if isinstance(info, dict):
+            info[_REGULARIZED] = True
         return densify.regularizer(self, opacities, state, info)
 
     def is_blur_step(self, step: int) -> bool:
@@ -175,7 +180,16 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
 
         Returns:
             What happened to the population, or None where this is no step at which it changes.
+
+        Warns:
+            UserWarning: the loss of this step should have had the term of `regularizer`, which nobody has asked for.
         """
+        if self.regularizes(step) and _REGULARIZED not in info:
+            warnings.warn(
+                f"{type(self).__name__} trains without its prior on opacities: add strategy.regularizer(torch.sigmoid("
+                "params['opacities']), state, step, info) to the loss, or set lambda_pop=0",
+                stacklevel=2,
+            )
         self.collect(params, state, step, info, packed)
         return self.change(params, optimizers, state, step)
 

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from pop_fast.density import rows as ops
-from pop_fast.density.control import DensityControl
+from pop_fast.density import rows
 from pop_fast.density.info import dominant_counts, visible_from_radii, visible_in
 from pop_fast.density.protocol import DensificationStep, Draws, Info, Params, Population, State
 from pop_fast.stages.density import SPLIT_CHILDREN, Statistics, blur_is_over, blur_set, grow_masks, prune_mask
 from pop_fast.stages.polarization import importance_mask, opacity_entropy, pop_loss
+
+if TYPE_CHECKING:
+    from pop_fast.density.control import DensityControl
 
 
 def initialize_state(scene_scale: float, seed: int, count: int) -> State:
@@ -124,11 +127,11 @@ def refine(
     """
     n_clones, n_splits = int(clones.sum()), int(splits.sum())
     if n_clones:
-        ops.clone(of.params, of.optimizers, of.state, clones)
+        rows.clone(of.params, of.optimizers, of.state, clones)
     if n_splits:
         # a clone of this event is never split in it
         padded = torch.cat([splits, splits.new_zeros(n_clones)])
-        ops.split(of.params, of.optimizers, of.state, padded, of.draws.normals(n_splits), plan.revised_opacity)
+        rows.split(of.params, of.optimizers, of.state, padded, of.draws.normals(n_splits), plan.revised_opacity)
     event = DensificationStep(n_clones, n_splits, prune(of, prunes()))
     clear(of.state)
     if plan.verbose:
@@ -140,7 +143,7 @@ def prune(of: Population, mask: Tensor) -> int:
     """Remove the selected Gaussians and return how many they were."""
     n_pruned = int(mask.sum())
     if n_pruned:
-        ops.prune(of.params, of.optimizers, of.state, mask)
+        rows.prune(of.params, of.optimizers, of.state, mask)
     return n_pruned
 
 
@@ -190,7 +193,7 @@ def who_goes(plan: DensityControl, of: Population) -> Tensor:
 
 def reset(plan: DensityControl, of: Population) -> None:
     """Lower all opacities to the ceiling of a reset."""
-    ops.reset_opacities(of.params, of.optimizers, ceiling=plan.reset_opa)
+    rows.reset_opacities(of.params, of.optimizers, ceiling=plan.reset_opa)
 
 
 def clear(state: State) -> None:

@@ -27,7 +27,7 @@ def dominant_counts(info: Info) -> Tensor:
     counts = info.get("dominant_counts")
     if counts is None:
         raise ValueError(
-            "info has no 'dominant_counts', which POP is built on: render with pop_fast.api.rasterize.rasterization "
+            "info has no 'dominant_counts', which POP is built on: render with pop_fast.rasterization "
             "(a drop-in for gsplat's), or put into info how many pixels, [cameras, Gaussians], each one dominates, "
             "that is, has the largest blending weight at"
         )

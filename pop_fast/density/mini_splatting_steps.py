@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.data.initialize import SH_C0
-from pop_fast.density import densify
-from pop_fast.density import rows as ops
+from pop_fast.density import densify, rows
 from pop_fast.density.protocol import DensificationStep, Params, Population
 from pop_fast.stages.mini_splatting import nearest_log_scales, samples_per_view, view_importance
 from pop_fast.stages.selection import least_mass, sample_without_replacement
@@ -69,13 +68,13 @@ def prune(plan: MiniSplattingStrategy, of: Population) -> DensificationStep:
     """Remove the least important Gaussians, and start Adam anew."""
     mask = least_mass(importance(plan, of), plan.prune_mass)
     pruned = densify.prune(of, mask.to(of.params["means"].device))
-    ops.restart(of.params, of.optimizers)
+    rows.restart(of.params, of.optimizers)
     return DensificationStep(pruned=pruned)
 
 
 def _begin_anew(plan: MiniSplattingStrategy, of: Population, points: Tensor, sh0: Tensor) -> DensificationStep:
     densify.forget(of.state)
-    ops.replace_rows(of.params, of.optimizers, of.state, _rows(of.params, points, sh0, plan.reinit_opacity))
+    rows.replace_rows(of.params, of.optimizers, of.state, _rows(of.params, points, sh0, plan.reinit_opacity))
     return DensificationStep(replaced=len(points))
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -16,10 +16,10 @@ from torch import Tensor
 from pop_fast.api.registry import require_backend
 from pop_fast.errors import PopError
 from pop_fast.stages.activations import opacities_from_logits, scales_from_log_scales
-from pop_fast.stages.chord import DominantPoints
 from pop_fast.stages.contributions import Contributions
 from pop_fast.stages.dominance import dominant_counts
 from pop_fast.stages.types import Camera, Gaussians
+from pop_fast.stages.view_pass import PassInput
 from pop_ref.constants import Profile, profile_named
 
 if TYPE_CHECKING:
@@ -49,68 +49,6 @@ class ViewContributions(Contributions):
         return (self.radii > 0).all(1)
 
 
-@dataclass(frozen=True)
-class Seen:
-    """A view before its sums.
-
-    Attributes:
-        image: [H, W, 3]
-        dominant_ids: -1 where none. [H, W]
-        radii: [N, 2]
-        depths: [N]
-    """
-
-    image: Tensor
-    dominant_ids: Tensor
-    radii: Tensor
-    depths: Tensor
-
-
-@dataclass(frozen=True)
-class PassInput:
-    """What a pass draws: Gaussians, a camera, the bands of their colours in use, and how.
-
-    Attributes:
-        gaussians: activated.
-        camera: the view.
-        sh_degree: bands to use.
-        background: colour behind everything. [3]
-        profile: constants and strictness.
-        antialiased: scale opacities by the antialiasing factor.
-    """
-
-    gaussians: Gaussians
-    camera: Camera
-    sh_degree: int
-    background: Tensor
-    profile: Profile
-    antialiased: bool
-
-
-class ViewPass(Protocol):
-    """A shot that has been projected and listed."""
-
-    def seen(self) -> Seen:
-        """Draw it."""
-        ...
-
-    def contributions(self, pixel_map: Tensor | None) -> Contributions:
-        """As `pop_fast.stages.contributions.contributions`."""
-        ...
-
-    def sensitivities(self) -> Tensor:
-        """As `pop_fast.stages.sensitivity.sensitivities`."""
-        ...
-
-    def fisher_blocks(self) -> Tensor:
-        """As `pop_fast.stages.fisher.fisher_blocks`, of its own screen moments."""
-        ...
-
-    def dominant_points(self) -> DominantPoints:
-        """As `pop_fast.stages.chord.dominant_points`."""
-        ...
-
-
 class Passes:
     """Passes over views by one backend.
 
@@ -135,7 +73,7 @@ class Passes:
         antialiased: bool = False,
         device: torch.device | None = None,
     ) -> None:
-        self._open = _opener(backend if isinstance(backend, str) else backend.name)
+        self._open = require_backend(backend if isinstance(backend, str) else backend.name).open_view
         self._views = views
         self._profile = profile_named(profile) if isinstance(profile, str) else profile
         self._background, self._antialiased = torch.tensor(background), antialiased
@@ -244,21 +182,3 @@ def _smaller(view: ViewTensors, divisor: int, device: torch.device) -> Camera:
     K[0] *= width / view.width
     K[1] *= height / view.height
     return Camera(view.viewmat[0].to(device), K.to(device), width, height)
-
-
-def _opener(name: str) -> Callable[[PassInput], ViewPass]:
-    """Return what projects and lists shots for a backend."""
-    require_backend(name)
-    if name == "ref":
-        from pop_fast.oracle.passes import OracleView
-
-        return OracleView
-    if name == "cuda":
-        from pop_fast.density.pass_cuda import CudaView
-
-        return CudaView
-    from pop_fast.api.backend import stages_of
-    from pop_fast.density.pass_stages import view_of
-
-    stages = stages_of(name)
-    return lambda shot: view_of(shot, stages)

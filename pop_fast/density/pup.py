@@ -49,7 +49,7 @@ class PupStrategy(InriaStrategy):
         """Refine and reset as 3DGS; at the beginning of a round prune and start Adam anew."""
         if of.step not in self.adam_restarts:
             return super().edit(of)
-        from pop_fast.density import rows as ops
+        from pop_fast.density import rows
         from pop_fast.density.importance import prune_lowest, summed_over_views
         from pop_fast.stages.fisher import log_det_scores
 
@@ -57,5 +57,5 @@ class PupStrategy(InriaStrategy):
         blocks = summed_over_views(of, lambda index: views.fisher(of.params, index, of.sh_degree, divisor))
         share = self.prune_shares[self.adam_restarts.index(of.step)]
         pruned = prune_lowest(of, log_det_scores(blocks), share)
-        ops.restart(of.params, of.optimizers)
+        rows.restart(of.params, of.optimizers)
         return DensificationStep(pruned=pruned)

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pop_fast.density.passes import PassInput, Seen
 from pop_fast.stages.chord import DominantPoints
 from pop_fast.stages.contributions import Contributions
+from pop_fast.stages.view_pass import PassInput, Seen
 from pop_ref.chord import dominant_points
 from pop_ref.contributions import contributions
 from pop_ref.fisher import fisher_blocks, screen_moments

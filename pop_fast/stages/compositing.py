@@ -27,7 +27,7 @@ class Composite:
         dominant_weights: [H, W], or None when not asked for
         n_blended: [H, W] int32, or None when not asked for
         n_traversed: list entries visited, the terminating one included. [H, W] int32, or None when not asked for
-        n_pairs: (entry, pixel) pairs evaluated.
+        n_pairs: (entry, pixel) pairs evaluated, None where nobody counts them.
     """
 
     image: Tensor
@@ -36,7 +36,7 @@ class Composite:
     dominant_weights: Tensor | None
     n_blended: Tensor | None
     n_traversed: Tensor | None
-    n_pairs: int
+    n_pairs: int | None
 
 
 def composite(

@@ -118,8 +118,10 @@ def project(means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, v
     Returns:
         The splats; everything but `radii` is differentiable.
     """
-    means2d, depths, conics, blended, radii, factors = _Projection.apply(means, covars, opacities, viewmat, view)
-    return Splats(means2d, depths, conics, blended, radii, factors if view.antialiased else None)
+    means2d, depths, conics, effective_opacities, radii, factors = _Projection.apply(
+        means, covars, opacities, viewmat, view
+    )
+    return Splats(means2d, depths, conics, effective_opacities, radii, factors if view.antialiased else None)
 
 
 def colors_of_view(sh: Tensor, means: Tensor, viewmat: Tensor, degree: int, visible: Tensor) -> Tensor:
@@ -166,16 +168,16 @@ class _Projection(torch.autograd.Function):
         covars2d = project_covars(covars_cam, jacobians)
         blurred = low_pass(covars2d, profile.eps2d)
         factors = compensations(covars2d, profile.eps2d) if view.antialiased else torch.ones_like(depths)
-        blended = opacities * factors if view.antialiased else opacities.clone()
+        effective_opacities = opacities * factors if view.antialiased else opacities.clone()
         means2d = project_means(safe.T, *camera, profile)
-        radii = radii_from_covars2d(blurred, blended, profile)
+        radii = radii_from_covars2d(blurred, effective_opacities, profile)
         shown = front & on_screen(means2d, radii, view.width, view.height, profile)
         shown &= (radii > view.radius_clip).any(1)
         radii = torch.where(shown, radii.T, 0).T
         ctx.view = view
         ctx.save_for_backward(means, covars, opacities, viewmat, safe, covars_cam, jacobians, covars2d, blurred, shown)
         ctx.mark_non_differentiable(radii)
-        return means2d, depths.clone(), conics_from_covars2d(blurred), blended, radii, factors
+        return means2d, depths.clone(), conics_from_covars2d(blurred), effective_opacities, radii, factors
 
     @staticmethod
     @once_differentiable
@@ -184,7 +186,7 @@ class _Projection(torch.autograd.Function):
         v_means2d: Tensor,
         v_depths: Tensor,
         v_conics: Tensor,
-        v_blended: Tensor,
+        v_effective_opacities: Tensor,
         _v_radii: Tensor,
         v_factors: Tensor,
     ) -> tuple[Tensor | None, ...]:
@@ -192,10 +194,10 @@ class _Projection(torch.autograd.Function):
         view: ProjectionSettings = ctx.view
         camera, eps2d = (view.K, view.width, view.height), view.profile.eps2d
         v_covars2d = low_pass_vjp(covars2d, eps2d, conics_from_covars2d_vjp(blurred, v_conics))
-        v_opacities = v_blended
+        v_opacities = v_effective_opacities
         if view.antialiased:
-            v_opacities = v_blended * compensations(covars2d, eps2d)
-            v_covars2d = v_covars2d + compensations_vjp(covars2d, eps2d, v_blended * opacities + v_factors)
+            v_opacities = v_effective_opacities * compensations(covars2d, eps2d)
+            v_covars2d = v_covars2d + compensations_vjp(covars2d, eps2d, v_effective_opacities * opacities + v_factors)
         v_covars_cam, v_jacobians = project_covars_vjp(covars_cam, jacobians, v_covars2d)
         v_means_cam = projection_jacobians_vjp(safe.T, *camera, v_jacobians, view.profile)
         v_means_cam = v_means_cam + project_means_vjp(safe.T, *camera, v_means2d, view.profile)

@@ -11,6 +11,9 @@ from torch import Tensor
 from pop_fast.stages.layout import columns, from_columns
 from pop_ref.constants import PAPER, Profile
 
+# what the test of a tile allows for rounding, of the exponent and of the terms that cancel in it: needles cancel;
+# cuda_ext/csrc/tiles.cuh has the same two numbers, for the compiled lists and those of the GPU
+SLACK, SLACK_SHARE = 1e-3, 1e-5
 _RADIX = 1 << 15  # integers from which torch sorts by digits, up to six times faster than it sorts fewer
 
 
@@ -98,8 +101,9 @@ def tile_lists(
     splat = torch.repeat_interleave(counts)
     k = (torch.arange(len(splat)) - (counts.cumsum(0) - counts).index_select(0, splat)).to(torch.int32)
     per_row = columns_of_tiles.to(torch.int32).index_select(0, splat)
-    # both are small integers, whose float32 quotient never rounds up to the next one
-    row_of_rect = (k.to(torch.float32) / per_row).to(torch.int32)
+    # integers under 2^24, whose float32 quotient never rounds up to the next one
+    exact = torch.float32 if tiles_x * tiles_y <= 2**24 else torch.float64
+    row_of_rect = (k.to(exact) / per_row).to(torch.int32)
     tile_x = left.to(torch.int32).index_select(0, splat) + k - row_of_rect * per_row
     tile_y = top.to(torch.int32).index_select(0, splat) + row_of_rect
     if conics is not None and opacities is not None:
@@ -171,8 +175,7 @@ def _touches(
     along_x = torch.minimum(torch.maximum(-b * edge_y / a, left), right)
     vertical, size_v = _sigma_and_size(a, b, c, edge_x, along_y)
     horizontal, size_h = _sigma_and_size(a, b, c, along_x, edge_y)
-    # needles cancel: the slack grows with the terms that were subtracted
-    slack = 1e-3 + 1e-5 * torch.maximum(size_v, size_h)
+    slack = SLACK + SLACK_SHARE * torch.maximum(size_v, size_h)
     # what overflowed on the way is not a number, and listed
     return ~(torch.minimum(vertical, horizontal) > limit + slack)
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from pop_fast.api.registry import Backend, fastest_backend, get_backend
+from pop_fast.api.backend import Renderer
+from pop_fast.api.meta import RenderMeta
+from pop_fast.api.registry import fastest_backend, get_backend
 from pop_fast.errors import PopError
 
 _LESS = "use smaller images (--factor 2 or more), fewer Gaussians, or a card with more memory"
@@ -23,7 +25,7 @@ class GpuProxy:
         device: where.
     """
 
-    def __init__(self, backend: Backend, device: torch.device) -> None:
+    def __init__(self, backend: Renderer, device: torch.device) -> None:
         self._backend, self.device = backend, device
 
     @property
@@ -39,7 +41,7 @@ class GpuProxy:
         """Return why it cannot run here and what to do, or None."""
         return self._backend.why_not()
 
-    def rasterization(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    def rasterization(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, RenderMeta]:
         """Render; see `pop_fast.api.rasterize.rasterization`. No gradient comes back.
 
         Raises:
@@ -49,30 +51,14 @@ class GpuProxy:
         named = {key: self._moved(value) for key, value in kwargs.items()}
         with words_for_memory(), torch.no_grad():
             image, alphas, info = self._backend.rasterization(*there, **named)
-        return image.cpu(), alphas.cpu(), _Fetched(info)
+        return image.cpu(), alphas.cpu(), info.changed(_fetched)
 
     def _moved(self, value: Any) -> Any:
         return value.to(self.device) if isinstance(value, Tensor) else value
 
 
-class _Fetched(dict[str, Any]):
-    """Values of an `info` on the CPU, each fetched when it is first read."""
-
-    def __init__(self, info: Mapping[str, Any]) -> None:
-        super().__init__()
-        self._info = info
-
-    def __missing__(self, key: str) -> Any:
-        value = self._info[key]
-        self[key] = value.detach().cpu() if isinstance(value, Tensor) else value
-        return self[key]
-
-    def __contains__(self, key: object) -> bool:
-        return super().__contains__(key) or key in self._info
-
-    def get(self, key: str, default: Any = None) -> Any:
-        """Return the value on the CPU, or `default`."""
-        return self[key] if key in self else default  # noqa: SIM401 - `get` itself
+def _fetched(value: Any) -> Any:
+    return value.detach().cpu() if isinstance(value, Tensor) else value
 
 
 @contextmanager
@@ -92,7 +78,7 @@ def words_for_memory() -> Iterator[None]:
         raise PopError(f"the GPU has no room ({str(error).split('. ')[0]}); {_LESS}") from error
 
 
-def renderer(name: str) -> tuple[Backend, str | None]:
+def renderer(name: str) -> tuple[Renderer, str | None]:
     """Return the backend for CPU tensors under a name of settings, and a note where another one stands in for it.
 
     "auto" is the first of "cuda", "compiled" and "fast" that can run; results trained by one of these that cannot are
@@ -105,7 +91,7 @@ def renderer(name: str) -> tuple[Backend, str | None]:
         return get_backend(name), None
     if name != "compiled" and get_backend("cuda").available():
         return GpuProxy(get_backend("cuda"), torch.device("cuda", torch.cuda.current_device())), None
-    drawing = get_backend(fastest_backend("cpu"))
+    drawing = fastest_backend("cpu")
     if name in ("auto", drawing.name):
         return drawing, None
     return drawing, f"backend {drawing.name!r} stands in for {name!r}: {get_backend(name).why_not()}"

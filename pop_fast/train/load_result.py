@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
     from pop_fast.data import Capture
     from pop_fast.data.capture import Progress
+    from pop_fast.io.ply import Frame
 
 RECORD = "capture.json"
 
@@ -31,6 +33,7 @@ class Splat:
         config: the settings they were trained with; the defaults for a lone file.
         step: the last step taken, from 0; None for a lone PLY.
         folder: the result folder it belongs to, if any.
+        frame: the world it is in, where that is known.
     """
 
     path: Path
@@ -38,6 +41,7 @@ class Splat:
     config: TrainConfig
     step: int | None = None
     folder: Path | None = None
+    frame: Frame | None = None
 
     @property
     def sh_degree(self) -> int:
@@ -101,12 +105,13 @@ def read_record(folder: Path | None) -> CaptureRecord | None:
 
 
 def load_splat(path: Path) -> Splat:
-    """Read a result folder (its last checkpoint), a checkpoint (ours or gsplat's) or a PLY.
+    """Read a result folder (its last checkpoint), a checkpoint (ours or gsplat's), a PLY or a file of another format.
 
     Raises:
         PopError: none of these, or damaged.
     """
-    from pop_fast.io.ply import is_antialiased, load_ply
+    from pop_fast.io.formats import is_splat_file, load_splat_file, splat_suffixes
+    from pop_fast.io.ply import frame_of
     from pop_fast.train.checkpoint import load_splats
     from pop_fast.train.results import read_config
 
@@ -117,18 +122,21 @@ def load_splat(path: Path) -> Splat:
     folder = path.resolve().parent.parent
     owner = folder if (folder / "cfg.json").is_file() else None
     config = read_config(owner) if owner else TrainConfig()
-    kind = path.suffix.lower()
-    if kind == ".ply":
-        config = replace(config, antialiased=is_antialiased(path))
-        return Splat(path=path, params=load_ply(path), config=config, folder=owner)
-    if kind == ".pt":
+    if is_splat_file(path):
+        params, antialiased = load_splat_file(path)
+        config = replace(config, antialiased=antialiased)
+        frame = frame_of(path) if path.suffix.lower() == ".ply" else None
+        return Splat(path=path, params=params, config=config, folder=owner, frame=frame)
+    if path.suffix.lower() == ".pt":
         params, step = load_splats(path)
         return Splat(path=path, params=params, config=config, step=step, folder=owner)
-    raise PopError(f"{path}: is neither a result folder nor a checkpoint (.pt) nor a .ply")
+    raise PopError(
+        f"{path}: is neither a result folder nor a checkpoint (.pt) nor a splat ({', '.join(splat_suffixes())})"
+    )
 
 
 def _from_folder(folder: Path) -> Splat:
-    from pop_fast.io.ply import load_ply
+    from pop_fast.io.ply import frame_of, load_ply
     from pop_fast.train.checkpoint import list_checkpoints, load_splats
     from pop_fast.train.results import read_config
 
@@ -140,7 +148,8 @@ def _from_folder(folder: Path) -> Splat:
     plys = sorted((folder / "ply").glob("point_cloud_*.ply"), key=lambda p: (len(p.name), p.name))
     if not plys:
         raise PopError(f"{folder}: holds no checkpoint and no PLY yet; train longer, or continue with --resume")
-    return Splat(path=plys[-1], params=load_ply(plys[-1]), config=config, folder=folder)
+    frame = frame_of(plys[-1])
+    return Splat(path=plys[-1], params=load_ply(plys[-1]), config=config, folder=folder, frame=frame)
 
 
 def open_capture(
@@ -169,8 +178,12 @@ def open_capture(
         changes["factor"] = options.factor
     if options.test_every is not None:
         changes["test_every"] = options.test_every
-    if options.own_frame:
-        changes["normalize"] = False
+    frame = frame_of_splat(splat, options)
+    if frame is not None:
+        changes["normalize"] = frame == "training"
+    elif splat.path.suffix.lower() != ".pt":
+        told = "says nothing of its world, and is taken to be in pop's training frame"
+        print(f"note: {splat.path}: {told}; that of another program needs --own-frame", file=sys.stderr)
     config = replace(splat.config, **changes)
     capture = load_capture(
         data,
@@ -185,7 +198,37 @@ def open_capture(
         resize=config.resize,
         seed=config.seed,
     )
+    if config.normalize:
+        _check_same_frame(splat, capture)
     return capture, config
+
+
+def frame_of_splat(splat: Splat, options: CaptureOptions) -> Literal["capture", "training"] | None:
+    """Tell which world a splat is in: as the command says, else its file, else its run; None where nothing does."""
+    if options.own_frame:
+        return "capture"
+    if splat.frame is not None:
+        return splat.frame.name
+    if splat.folder is None:
+        return None
+    return "training" if splat.config.normalize else "capture"
+
+
+def _check_same_frame(splat: Splat, capture: Capture) -> None:
+    """Refuse a capture that is not normalized as the one that the splat was trained on.
+
+    Raises:
+        PopError: its training frame is another one.
+    """
+    if splat.frame is None or splat.frame.transform is None:
+        return
+    theirs, ours = np.array(splat.frame.transform), capture.world_transform
+    # what a view of the scene's size would be off by, as a share of that size
+    if not np.allclose(theirs, ours, rtol=1e-3, atol=1e-3):
+        raise PopError(
+            f"{splat.path}: was trained on a capture that normalizes otherwise than {capture.name}: other views, "
+            "points or poses; give the capture that it was trained on, or pop export --frame capture and measure that"
+        )
 
 
 def paths_read(splat: Splat, root: Path, capture: Capture) -> list[Path]:

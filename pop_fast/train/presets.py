@@ -78,9 +78,8 @@ class Given:
         method: "pop", "gsplat" for gsplat's default strategy, "3dgs" for Inria's constants, learning rates, SSIM and
             rasterizer, "3dgs-2023" for those before October 2024, and on top of these "pup", "mini-splatting",
             "taming" and "speedy-splat".
-        preset: "paper" is the whole schedule; "quick" a tenth of it, for a CPU, in which a Gaussian must dominate more
-            than 10 pixels to count as blur, and none is pruned for its size. It gives defaults: what is said besides
-            wins.
+        preset: "paper" is the paper's 30,000 steps, for a GPU or a night; "quick" a tenth of them, with thresholds for
+            small images. It gives defaults: what is said besides wins.
         steps_scaler: multiplies the default of every step number; None takes the preset's.
         scale_lambda_pop: divide the default of lambda_pop by the scaler, so that the push of the prior adds up to the
             same over a short schedule; it then weighs more against the photographs than in the paper.

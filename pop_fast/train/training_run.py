@@ -30,7 +30,8 @@ from pop_fast.density.foreign import ForeignStrategy
 from pop_fast.density.passes import Passes
 from pop_fast.density.protocol import DensificationStep, Draws, Strategy
 from pop_fast.errors import PopError
-from pop_fast.io.ply import save_ply
+from pop_fast.io.heartbeat import Heartbeat, duration
+from pop_fast.io.ply import Frame, save_ply
 from pop_fast.stages.activations import opacities_from_logits
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.choose import choose_backend
@@ -115,6 +116,8 @@ class TrainingRun:
         self._started = 0.0
         # the first Gaussians' opacities while the folder is still as it was found
         self._unwritten: np.ndarray | None = None
+        # the training PSNR of the last record, in words
+        self._latest = ""
 
     def _updates(self) -> Updates:
         config, plan = self.config, self.strategy
@@ -165,6 +168,7 @@ class TrainingRun:
                 self._results.close()
 
     def _begin(self) -> None:
+        self._results.hold()
         self._results.check(self._resume, self._overwrite)
         found = ckpt.list_checkpoints(self._results.path) if self._resume else []
         if found:
@@ -178,11 +182,13 @@ class TrainingRun:
 
     def _loop(self, stop: threading.Event) -> dict[str, Any]:
         config = self.config
-        with tqdm(total=config.max_steps, initial=self.step, disable=None if config.progress else True) as bar:
+        bars = tqdm(total=config.max_steps, initial=self.step, disable=None if config.progress else True)
+        with bars as bar, Heartbeat(config.progress) as beat:
             while self.step < config.max_steps:
                 longest = self.stepper.longest
                 segment = self.take_steps(segment_end(config, self.strategy, self.step, longest))
                 self._log(segment, bar)
+                beat.say(self._so_far())
                 if self._unwritten is not None:
                     # a rate can be so high that the first step is the last; that is no reason to replace anything
                     self._require_finite()
@@ -194,6 +200,12 @@ class TrainingRun:
                     raise KeyboardInterrupt
         last = config.max_steps - 1
         return self._results.read_stats("val", last) or self._evaluate(last)
+
+    def _so_far(self) -> str:
+        seconds = self._train_seconds
+        left = seconds * (self.config.max_steps - self.step) / self.step
+        told = f"step {self.step:,} of {self.config.max_steps:,}, {len(self.params['means']):,} Gaussians"
+        return f"{told}{self._latest}, {self.step / max(seconds, 1e-9):.1f} steps a second, {duration(left)} left"
 
     def take_steps(self, last: int) -> Segment:
         """Take the steps up to `last`, and the densification step that is due after them.
@@ -296,6 +308,7 @@ class TrainingRun:
             record = record_of(segment, step, self.config, lr_means, self._train_seconds)
             if record is not None:
                 self._results.log(record)
+                self._latest = f", PSNR {record['psnr']:.2f}"
                 bar.set_postfix_str(f"PSNR {record['psnr']:.2f}, N {record['num_gaussians']:,}", refresh=False)
         self._train_seconds += segment.seconds
         bar.update(self.step - segment.first)
@@ -309,7 +322,12 @@ class TrainingRun:
         if taken in config.eval_steps or last:
             self._evaluate(step)
         if taken in config.save_steps or last:
-            save_ply(self._results.path / "ply" / f"point_cloud_{step}.ply", self._detached(), config.antialiased)
+            save_ply(
+                self._results.path / "ply" / f"point_cloud_{step}.ply",
+                self._detached(),
+                config.antialiased,
+                frame=self._frame,
+            )
         # the checkpoint comes last: a run that is killed in between does this step's milestones again
         due = config.checkpoint_every > 0 and taken % config.checkpoint_every == 0
         if due or taken in config.save_steps or last:
@@ -381,6 +399,13 @@ class TrainingRun:
         self._started -= content["seconds"]["total"]
         self.step = content["step"] + 1
         self._stepper = None
+
+    @property
+    def _frame(self) -> Frame:
+        """The world of the run's Gaussians."""
+        if not self.config.normalize:
+            return Frame("capture")
+        return Frame("training", tuple(map(tuple, self._capture.world_transform.tolist())))
 
     @property
     def _total_seconds(self) -> float:

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from pop_fast.data import Capture
 from pop_fast.errors import PopError
+from pop_fast.io.heartbeat import Heartbeat
 from pop_fast.io.images import write_png
 from pop_fast.io.names import inside
 from pop_fast.train.config import TrainConfig
@@ -86,8 +87,9 @@ def rendered(
     backend, note = renderer(config.backend)
     if note:
         print(f"note: {note}", file=sys.stderr)
-    with reproducible(config.threads):
-        for view in tqdm(views, desc="rendering", unit="view", disable=None, leave=False):
+    with reproducible(config.threads), Heartbeat() as beat:
+        for done, view in enumerate(tqdm(views, desc="rendering", unit="view", disable=None, leave=False)):
+            beat.say(f"rendering: {done:,} of {len(views):,}")
             image = render_view(backend, splat.params, view, config, splat.sh_degree, counts=as_measured).image
             yield (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
 

@@ -13,7 +13,7 @@ import numpy as np
 from pop_fast.data import Capture, View, to_capture_frame
 from pop_fast.io.atomic import folder_atomically
 from pop_fast.io.images import write_png
-from pop_fast.io.ply import save_ply
+from pop_fast.io.ply import Frame, save_ply
 from pop_fast.train.load_result import Splat, paths_read
 from pop_fast.train.views import ViewTensors
 from pop_fast.view.frames import rendered
@@ -46,7 +46,8 @@ def write_inria_folder(splat: Splat, capture: Capture, out: Path, overwrite: boo
     keeps = paths_read(splat, Path(splat.config.data), capture)
     with folder_atomically(out, overwrite, keeps=keeps, recognise=_exported_to(out)) as folder:
         params = to_capture_frame(splat.params, transform)
-        save_ply(folder / "point_cloud" / f"iteration_{steps}" / "point_cloud.ply", params, splat.config.antialiased)
+        path = folder / "point_cloud" / f"iteration_{steps}" / "point_cloud.ply"
+        save_ply(path, params, splat.config.antialiased, frame=Frame("capture"))
         cameras = [_camera(i, view, transform, capture.world_scale) for i, view in enumerate(capture.views)]
         (folder / "cameras.json").write_text(json.dumps(cameras), encoding="utf-8")
         (folder / "cfg_args").write_text(_cfg_args(splat, out), encoding="utf-8")

@@ -94,7 +94,7 @@ def _elsewhere(name: str) -> Any:
         reason = importlib.import_module("cuda_ext").why_not()
         if reason is not None:
             raise Unavailable(reason)
-        return adapter_for("cuda_ext.render.ops:rasterization", name, None, "float32", "cuda")
+        return adapter_for("pop_fast.cuda:rasterization", name, None, "float32", "cuda")
     if name.startswith("gsplat-torch"):
         return importlib.import_module(f"{kit}.gsplat_adapter").gsplat_torch(name, _dtype(name))
     # the packages first: what is not installed cannot run anywhere

@@ -30,6 +30,7 @@ NOT_COMPILED = "the CPU kernels are not compiled"
 def _without_compiled_blend(monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a machine without a C++ compiler; `test_build_cpu` tells what there is with one."""
     monkeypatch.setattr("pop_fast.compiled.why_not", lambda: NOT_COMPILED)
+    monkeypatch.setattr("pop_fast.train.choose.has_gpu", lambda: True)
 
 
 @pytest.fixture
@@ -88,7 +89,7 @@ def test_what_takes_the_steps_goes_with_the_backend(tmp_path):
 def test_cuda_asked_for_in_vain_is_one_sentence_before_anything_is_read(pop: Pop, tmp_path: Path) -> None:
     outcome = pop("train", tmp_path / "no such capture", "--backend", "cuda", "--out", tmp_path / "r")
     assert outcome.status == 2
-    assert outcome.err == f"pop: error: backend 'cuda' is not available: {NOT_BUILT}\n"
+    assert outcome.err == f"pop: error: backend 'cuda' cannot run: {NOT_BUILT}\n"
     with pytest.raises(PopError, match="not built"):
         cuda_engine()
     with pytest.raises(PopError, match="backend 'cuda' cannot run: the CUDA extension is not built"):

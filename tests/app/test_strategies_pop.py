@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import pytest
 import torch
@@ -121,3 +122,19 @@ def test_importance_can_be_kept_for_the_window_and_the_loss_for_the_visible():
         term = strategy.regularizer(opacities, state, 2, each)
         assert term is not None
         assert term.item() == pytest.approx(1e-3 * (0.75 + 0.5))
+
+
+def test_a_trainer_that_leaves_out_the_prior_is_warned() -> None:
+    params, optimizers = make(2)
+    strategy = POPStrategy()
+    state = strategy.initialize_state()
+    with pytest.warns(UserWarning, match=r"add strategy\.regularizer"):
+        strategy.step_post_backward(params, optimizers, state, 1, make_info(2))
+    info = make_info(2)
+    strategy.regularizer(torch.sigmoid(params["opacities"]), state, 2, info)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        strategy.step_post_backward(params, optimizers, state, 2, info)
+        # nothing is missed where there is no prior
+        strategy.step_post_backward(params, optimizers, state, strategy.pop_stop_iter, make_info(2))
+        GsplatStrategy().step_post_backward(params, optimizers, GsplatStrategy().initialize_state(), 1, make_info(2))

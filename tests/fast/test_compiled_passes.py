@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pop_fast import compiled
-from pop_fast.api.backend import stages_of
+from pop_fast.api.registry import get_backend
 from pop_fast.density.passes import Passes
 from pop_fast.stages.contributions import contributions
 from pop_fast.stages.fisher import screen_moments
@@ -48,7 +48,7 @@ def sums(functions: tuple[Callable, Callable, Callable], drawn: Drawn, profile: 
 
 
 def native() -> tuple[Callable, Callable, Callable]:
-    stages = stages_of("compiled")
+    stages = get_backend("compiled").stages()
     return stages.contributions, stages.sensitivities, stages.screen_moments
 
 

@@ -106,7 +106,7 @@ WRONG = {
     ),
     "a gradient without the tail": (
         "compositing",
-        ("        v_alpha = T * (worth - behind)\n", "        v_alpha = T * worth\n"),
+        ("        v_alpha = T * (color_dot_grad - suffix_dot_grad)\n", "        v_alpha = T * color_dot_grad\n"),
         "tail is missing",
     ),
     "a factor": ("losses", ("return v_l2 * 2.0 * difference", "return v_l2 * 8.0 * difference"), "4 times"),

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from textwrap import wrap
+from typing import TYPE_CHECKING
 
-from pop_fast.view.explain.model import PixelExplanation, Row
+if TYPE_CHECKING:
+    from pop_fast.view.explain.model import PixelExplanation, Row
 
 WIDTH = 120
 _KEPT = 20
-_HEAD = "    #      id  depth   dist     G   raw alpha     T weight  colour r g b    sum r g b       dL/dalpha  dL/do"
+_HEAD = "    #      id  depth   dist     G     o alpha     T weight  colour r g b    sum r g b       dL/dalpha  dL/do"
 _HEAD_POP = "        POP"
 
 
@@ -73,7 +75,7 @@ def _above(e: PixelExplanation) -> Iterator[str]:
 def _line(row: Row, has_pop: bool) -> str:
     depth = f"{row.depth:.3f}" if row.depth < 100.0 else f"{row.depth:.0f}"
     line = f"{'*' if row.dominant else ' '}{row.rank:4d} {row.id:7d} {depth:>6} {row.distance:6.1f} "
-    line += f"{number(row.falloff)} {number(row.alpha_raw)} {number(row.alpha)}{'^' if row.clamped else ' '}"
+    line += f"{number(row.falloff)} {number(row.opacity)} {number(row.alpha)}{'^' if row.clamped else ' '}"
     if row.T is None or row.status != "blended":
         return f"{line} {row.status}, {row.reason}"[:WIDTH]
     return (
@@ -97,7 +99,7 @@ def _folded(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def _below(e: PixelExplanation) -> Iterator[str]:
-    yield "* dominant (D8)   ^ clamped to the ceiling (D6)   G falloff   raw o G   dL/do: through this pixel alone"
+    yield "* dominant (D8)   ^ clamped to the ceiling (D6)   G falloff   o opacity   dL/do: through this pixel alone"
     where = " POP: where it moves it, and |dL_POP/do|" if e.lambda_pop else ""
     yield f"descent moves against dL/do: a negative one raises the opacity.{where}"
     for text in (_about_dominant(e), *_about_pop(e)):

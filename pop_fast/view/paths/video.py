@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
-from contextlib import ExitStack
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from functools import cache
 from pathlib import Path
 from types import TracebackType
 from typing import Final
@@ -14,8 +17,8 @@ import numpy as np
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import file_atomically
 
-# vp9 first: the wheels of opencv carry its encoder and browsers play it; mpeg-4 part 2 where a build lacks vp9
-_CODECS: Final = {".mp4": ("vp09", "mp4v"), ".webm": ("VP90",), ".avi": ("MJPG",)}
+# what players expect behind each ending: H.264, VP9, Motion JPEG
+_CODECS: Final = {".webm": "VP90", ".mp4": "avc1", ".avi": "MJPG"}
 # frames a second that all of these containers can store; beyond them encoders fail, round to another rate, or hang
 _FPS: Final = (0.5, 600.0)
 
@@ -24,7 +27,8 @@ class VideoFile:
     """A video under construction: frames go to a hidden file beside `path`, which appears when the block ends well.
 
     Args:
-        path: the file to make or to replace: .mp4, .webm or .avi; missing parent folders are made.
+        path: the file to make or to replace: .webm (VP9), .avi (Motion JPEG), or .mp4 (H.264), for which the wheels of
+            OpenCV have no encoder; missing parent folders are made.
         fps: frames a second, from 0.5 to 600.
 
     Raises:
@@ -32,7 +36,7 @@ class VideoFile:
             when the block ends, for a file that does not play to its last frame. `path` is then as it was.
 
     Example:
-        with VideoFile(Path("path.mp4"), fps=30) as video:
+        with VideoFile(Path("path.webm"), fps=30) as video:
             video.add(frame)  # uint8 [H, W, 3], RGB
     """
 
@@ -43,6 +47,12 @@ class VideoFile:
             raise PopError(f"{path}: a folder of this name is in the way; give the video another name")
         if not _FPS[0] <= fps <= _FPS[1]:
             raise PopError(f"{path}: fps is {fps}; it must be a number from {_FPS[0]:g} to {_FPS[1]:g}, such as 30")
+        if path.suffix.lower() == ".mp4" and not has_h264():
+            raise PopError(
+                f"{path}: this build of OpenCV cannot write H.264, which players expect in .mp4; name it "
+                f"{path.with_suffix('.webm').name}, which browsers, VLC and ffmpeg play, or turn that into .mp4 with "
+                f"ffmpeg -i {path.with_suffix('.webm').name} {path.name}"
+            )
         self.path = path
         self.fps = fps
         self._count = 0
@@ -53,10 +63,7 @@ class VideoFile:
 
     def __enter__(self) -> VideoFile:
         self._part = self._steps.enter_context(file_atomically(self.path))
-        # what goes wrong is found by playing the file and raised as one line; the libraries' own log would add dozens
-        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-        level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        self._steps.callback(cv2.utils.logging.setLogLevel, level)
+        self._steps.enter_context(_quiet())
         self._steps.push(self._finish)
         return self
 
@@ -100,13 +107,35 @@ class VideoFile:
             )
 
     def _open(self, size: tuple[int, int]) -> cv2.VideoWriter:
-        for codec in _CODECS[self.path.suffix.lower()]:
-            writer = cv2.VideoWriter(str(self._part), cv2.VideoWriter.fourcc(*codec), self.fps, size)
-            if writer.isOpened():
-                return writer
+        codec = _CODECS[self.path.suffix.lower()]
+        writer = cv2.VideoWriter(str(self._part), cv2.VideoWriter.fourcc(*codec), self.fps, size)
+        if writer.isOpened():
+            return writer
         # an encoder that cannot write fails in the same way: this raises where the disk is at fault
         self._part.write_bytes(bytes(4096))
         raise PopError(f"{self.path}: this build of OpenCV has no encoder for {self.path.suffix}; try another ending")
+
+
+@cache
+def has_h264() -> bool:
+    """Tell whether this build of OpenCV can write H.264, by writing a frame."""
+    with tempfile.TemporaryDirectory(prefix="pop_video_") as folder, _quiet():
+        code = cv2.VideoWriter.fourcc(*_CODECS[".mp4"])
+        writer = cv2.VideoWriter(str(Path(folder, "probe.mp4")), code, 30.0, (64, 64))
+        works = writer.isOpened()
+        writer.release()
+        return works
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the log of OpenCV and ffmpeg off the terminal: what goes wrong is found by playing the file, and raised."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
 
 
 def frames_in(path: Path) -> int:

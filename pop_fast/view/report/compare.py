@@ -33,12 +33,12 @@ def row(stats: Mapping[str, Any]) -> list[str]:
     steps = stats.get("step")
     method = str(stats.get("method", "–"))
     machine = [str(stats.get("machine", "–")), *([stats["backend"]] if stats.get("backend") else [])]
-    machine += [f"{stats['threads']} threads"] if "threads" in stats else []
+    machine += [threads_of(stats)] if "threads" in stats else []
     return [
         str(stats.get("capture", "–")),
         _METHODS.get(method, method),
         "–" if not stats.get("lambda_pop") else f"{stats['lambda_pop']:g}",
-        "–" if steps is None else f"{steps + 1:,}",
+        "–" if steps is None else _steps(steps + 1, stats.get("max_steps")),
         cell("{:.2f}", "psnr"),
         cell("{:.4f}", "ssim"),
         cell("{:,}", "num_GS"),
@@ -48,6 +48,16 @@ def row(stats: Mapping[str, Any]) -> list[str]:
         cell("{:,.0f}", "seconds"),
         ", ".join(machine),
     ]
+
+
+def _steps(taken: int, planned: Any) -> str:
+    """Write how many steps a row is of, and of how many where the run has not come to its end."""
+    return f"{taken:,}" if not isinstance(planned, int) or taken >= planned else f"{taken:,} of {planned:,}, unfinished"
+
+
+def threads_of(stats: Mapping[str, Any]) -> str:
+    """Write how many threads a run had."""
+    return f"{stats['threads']} thread{'' if stats['threads'] == 1 else 's'}"
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:

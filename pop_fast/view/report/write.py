@@ -19,7 +19,8 @@ def write_report(result_dir: str | Path) -> Path:
         PopError: the folder is not a result of `pop train`, or one of its files cannot be read.
     """
     folder = Path(result_dir)
-    html = page(read_result(folder)).encode("utf-8")
+    # a name that is no text is shown with escapes
+    html = page(read_result(folder)).encode("utf-8", "backslashreplace")
     target = folder / "report.html"
     write_atomically(target, lambda file: file.write(html))
     return target

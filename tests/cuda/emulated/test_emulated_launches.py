@@ -112,7 +112,7 @@ def test_fused_steps_are_launched_on_the_tensors_device(guarded):
 
 
 def test_a_render_and_its_gradients_are_launched_on_the_tensors_device(guarded):
-    from cuda_ext.render.ops import rasterization
+    from pop_fast.cuda import rasterization
 
     scene = training_scene()
     p = {name: value.requires_grad_() for name, value in scene.params.items()}

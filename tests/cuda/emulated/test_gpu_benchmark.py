@@ -71,9 +71,9 @@ def test_every_number_of_the_benchmark_is_measured(bench, gpu, monkeypatch, tmp_
         *("project", "count_instances", "make_tile_lists", "blend_forward", "photometric"),
         *("blend_backward", "update"),
     }
-    for family in ("columns", "columns_atomic", "splats", "splats_atomic"):
-        assert found[family]["step_with_pop_ms"] > 0.0
-    assert found["columns"]["step_kernels"].keys() == {"skipped"}
+    for backward in ("pixel_parallel", "pixel_parallel_atomic", "gaussian_parallel", "gaussian_parallel_atomic"):
+        assert found[backward]["step_with_pop_ms"] > 0.0
+    assert found["pixel_parallel"]["step_kernels"].keys() == {"skipped"}
 
 
 def test_gsplat_is_measured_beside_the_same_case(bench, monkeypatch, tmp_path):

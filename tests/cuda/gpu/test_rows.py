@@ -135,8 +135,8 @@ def test_rows_that_begin_anywhere_take_the_same_step(gpu, degree, n_rest):
 @pytest.mark.parametrize("floats", [0, 1])
 @pytest.mark.parametrize(("degree", "n_rest"), DEGREES)
 def test_coefficients_of_any_width_and_place_give_the_cpus_image_and_gradient(gpu, degree, n_rest, floats):
-    from cuda_ext.render.ops import rasterization as on_gpu
     from pop_fast.api.rasterize import rasterization as on_cpu
+    from pop_fast.cuda import rasterization as on_gpu
 
     scene = _scene(n_rest)
     whole = torch.cat((scene.params["sh0"], scene.params["shN"]), 1)
