@@ -15,7 +15,6 @@ from pop_ref.conformance.vector_check import check
 from pop_ref.conformance.vector_schema import schema
 from pop_ref.conformance.vectors import export, kinds
 
-
 ROOT = Path(__file__).parents[2]
 
 
