@@ -18,6 +18,8 @@ import tyro
 from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.errors import describe
+from pop_fast.cli.finish import FinishOptions, finish
+from pop_fast.cli.limits import LimitOptions
 from pop_fast.cli.printable import printable
 from pop_fast.cli.said import PLAN, plan_of, said
 from pop_fast.data.sfm_options import SfmOptions
@@ -38,6 +40,7 @@ _EXAMPLES: Final = """
     pop train scene --method taming          or pup, mini-splatting, speedy-splat: the paper's other methods
     pop train scene --out out/a --resume     go on from the last checkpoint
     pop train scene --backend fast           on the CPU, also where a GPU is
+    pop train scene --export sog html        also as a small file and as a page, in out/scene_pop/export
     pop train scene --pop.lambda-pop 0.01    any setting, taken as it is; --help-all lists them all
 """
 
@@ -48,7 +51,7 @@ _SHOWN: Final = frozenset(
         *("factor", "test_every", "antialiased", "background", "lpips_vgg", "lpips_alex"),
     }
 )
-_DOCUMENTED: Final = (Given, TrainConfig)
+_DOCUMENTED: Final = (FinishOptions, LimitOptions, Given, TrainConfig)
 # words of other trainers' command lines: Inria's, gsplat's
 _ALIASES: Final = {
     **dict.fromkeys(("-s", "--source-path", "--data-dir", "--data"), "DATA"),
@@ -62,7 +65,7 @@ _IGNORED: Final = frozenset({"--eval"})  # Inria: hold out every 8th view; here 
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Run:
+class _Run(FinishOptions):
     """Fit a splat to a capture or a folder of photographs.
 
     DATA is a folder with a COLMAP model (the largest in sparse), with transforms.json, or with photographs alone.
@@ -95,6 +98,7 @@ def run(argv: Sequence[str]) -> int:
     from pop_fast.train.choose import choose_backend
 
     folder = Path(config.result_dir)
+    options.check()
     with _stdout_closed() if options.quiet else nullcontext():
         check_output(folder, options)
         options = as_begun(folder, options)
@@ -137,7 +141,7 @@ def _train(config: TrainConfig, options: Any, chosen: str) -> int:
         print(f"pop: {_stopped(folder, training.step)}", file=sys.stderr)
         return EXIT_INTERRUPTED
     print(summary(stats), flush=True)
-    return report(folder)
+    return finish(folder, capture, options) or report(folder)
 
 
 def takes_hours(config: TrainConfig) -> bool:

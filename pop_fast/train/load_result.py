@@ -105,12 +105,13 @@ def read_record(folder: Path | None) -> CaptureRecord | None:
 
 
 def load_splat(path: Path) -> Splat:
-    """Read a result folder (its last checkpoint), a checkpoint (ours or gsplat's) or a PLY.
+    """Read a result folder (its last checkpoint), a checkpoint (ours or gsplat's), a PLY or a file of another format.
 
     Raises:
         PopError: none of these, or damaged.
     """
-    from pop_fast.io.ply import frame_of, is_antialiased, load_ply
+    from pop_fast.io.formats import is_splat_file, load_splat_file, splat_suffixes
+    from pop_fast.io.ply import frame_of
     from pop_fast.train.checkpoint import load_splats
     from pop_fast.train.results import read_config
 
@@ -121,14 +122,17 @@ def load_splat(path: Path) -> Splat:
     folder = path.resolve().parent.parent
     owner = folder if (folder / "cfg.json").is_file() else None
     config = read_config(owner) if owner else TrainConfig()
-    kind = path.suffix.lower()
-    if kind == ".ply":
-        config = replace(config, antialiased=is_antialiased(path))
-        return Splat(path=path, params=load_ply(path), config=config, folder=owner, frame=frame_of(path))
-    if kind == ".pt":
+    if is_splat_file(path):
+        params, antialiased = load_splat_file(path)
+        config = replace(config, antialiased=antialiased)
+        frame = frame_of(path) if path.suffix.lower() == ".ply" else None
+        return Splat(path=path, params=params, config=config, folder=owner, frame=frame)
+    if path.suffix.lower() == ".pt":
         params, step = load_splats(path)
         return Splat(path=path, params=params, config=config, step=step, folder=owner)
-    raise PopError(f"{path}: is neither a result folder nor a checkpoint (.pt) nor a .ply")
+    raise PopError(
+        f"{path}: is neither a result folder nor a checkpoint (.pt) nor a splat ({', '.join(splat_suffixes())})"
+    )
 
 
 def _from_folder(folder: Path) -> Splat:
@@ -177,9 +181,9 @@ def open_capture(
     frame = frame_of_splat(splat, options)
     if frame is not None:
         changes["normalize"] = frame == "training"
-    elif splat.path.suffix.lower() == ".ply":
+    elif splat.path.suffix.lower() != ".pt":
         told = "says nothing of its world, and is taken to be in pop's training frame"
-        print(f"note: {splat.path}: {told}; a PLY of another program needs --own-frame", file=sys.stderr)
+        print(f"note: {splat.path}: {told}; that of another program needs --own-frame", file=sys.stderr)
     config = replace(splat.config, **changes)
     capture = load_capture(
         data,

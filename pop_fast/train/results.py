@@ -6,11 +6,14 @@
     ckpts/ckpt_{step}_rank0.pt      checkpoints; `step` counts from 0 here and below, so 30,000 steps end at 29999
     ply/point_cloud_{step}.ply      Gaussians in Inria's layout
     stats/train_step{step}.json     Gaussians, opacities, seconds, memory, machine, versions
-    stats/val_step{step}.json       the same and PSNR, SSIM, LPIPS of the held-out views, and each view's own
+    stats/val_step{step}.json       the same and PSNR, SSIM, LPIPS of the held-out views, and each view's own; of the
+                                    last step also encodings: bytes in every file format, and the PSNR from there
     renders/val_step{step}_{i}.png        render | photograph | error
     renders/dominant_step{step}_{i}.png   every pixel in the colour of its dominant Gaussian
     report_data/opacity_step{step}.npz    counts [100] of opacities in equal bins of [0, 1]; step -1 is the start
     report_data/val_step{step}_{i}.npz    name, render, photo (uint8 [H, W, 3]), dominant_ids (int32 [H, W]), psnr, ssim
+    viewer.html                     a page that shows the splat in a browser
+    export/                         files that `pop train --export` asked for
 
 A record of metrics.jsonl holds: step, view, loss, l1 or l2 (the pixel-wise term), d_ssim, pop (weighted, absent when
 off), psnr (of the training view), num_gaussians, n_blended and n_traversed (per pixel; not in runs on a GPU),
@@ -38,7 +41,10 @@ from pop_fast.io.read_back import read_json
 from pop_fast.train.config import TrainConfig
 
 # cfg.json is the first to step aside and the first to be written anew: where it is, the new run has begun
-_OURS = ("cfg.json", "metrics.jsonl", "ckpts", "ply", "stats", "renders", "report_data", "report.html", "capture.json")
+_OURS = (
+    *("cfg.json", "metrics.jsonl", "ckpts", "ply", "stats", "renders", "report_data", "report.html", "capture.json"),
+    *("viewer.html", "export"),
+)
 # holds what a new run replaces while that is being done
 _ASIDE = ".replaced"
 OPACITY_BINS = 100

@@ -67,6 +67,8 @@ class ReportData:
         views: held-out views.
         config: setting -> value, in reading order.
         events: one mapping a density event or reset.
+        files: a row a file format: name, size, bytes a Gaussian, share of the PLY's size, PSNR.
+        viewer: the page that shows the splat.
     """
 
     title: str
@@ -81,3 +83,5 @@ class ReportData:
     views: Sequence[ReportView] = field(default_factory=tuple)
     config: Mapping[str, Any] = field(default_factory=dict)
     events: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
+    files: Sequence[Sequence[str]] = field(default_factory=tuple)
+    viewer: str | None = None

@@ -11,6 +11,7 @@ import numpy as np
 
 from pop_fast.view import pictures
 from pop_fast.view.report.curves import Chart, Series, draw, draw_histogram
+from pop_fast.view.report.files_section import sizes_section, viewer_section
 from pop_fast.view.report.model import Histogram, ReportData, ReportView, Tile
 
 # (title, ((curve, legend, colour, dots), ...), log axis, axis from zero, unit)
@@ -50,6 +51,8 @@ def page(data: ReportData) -> str:
             _opacities(data.histograms),
             _dominance(data),
             _views(data.views),
+            viewer_section(data.viewer),
+            sizes_section(data.files),
             _tables(data),
             "<footer>Written by <code>pop</code> from the files beside it; nothing comes from the network.</footer>",
         ]

@@ -16,6 +16,7 @@ from pop_fast.train.config import TrainConfig
 from pop_fast.train.results import read_config
 from pop_fast.view.report.compare import threads_of
 from pop_fast.view.report.curves import Window
+from pop_fast.view.report.files_section import checked_encodings, encoding_rows
 from pop_fast.view.report.model import Histogram, ReportData, ReportView, Tile
 
 MIB: Final = 2**20
@@ -63,10 +64,25 @@ def read_result(folder: Path) -> ReportData:
         views=views,
         config=_settings(config),
         events=[{key: event.get(key) for key in _EVENT_COLUMNS} for event in events],
+        files=_files(stats, str(folder)),
+        viewer=_viewer(folder),
     )
 
 
 _EVENT_COLUMNS: Final = ("step", "cloned", "split", "pruned", "reset", "num_gaussians")
+
+
+def _files(stats: Mapping[str, Any], where: str) -> list[tuple[str, ...]]:
+    entries = checked_encodings(stats.get("encodings") or [], where, "train again with --resume, which measures them")
+    return encoding_rows(entries)
+
+
+def _viewer(folder: Path) -> str | None:
+    path = folder / "viewer.html"
+    try:
+        return path.read_text(encoding="utf-8", errors="replace") if path.is_file() else None
+    except OSError as error:
+        raise PopError(f"{path}: could not be read: {error.strerror}; remove it, or check its permissions") from error
 
 
 def read_records(folder: Path) -> list[dict[str, Any]]:
