@@ -10,7 +10,7 @@ import numpy as np
 
 from pop_ref import losses, ssim
 from pop_ref.activations import opacities_from_logits, scales_from_log_scales
-from pop_ref.conformance.cases import pattern
+from pop_ref.conformance.scenes import pattern
 from pop_ref.conformance.vector_schema import entry, equal, output
 from pop_ref.density import Statistics, densify_and_prune, grow_masks, rows_from_params
 from pop_ref.loss_magnitudes import d_ssim_magnitudes, pixelwise_magnitudes

@@ -3,7 +3,7 @@
 `export` writes one npz a vector and an `index.json` that explains every array and how it is compared (`vector_schema`):
 single images with every stage on the way (`vector_scenes`), calls of several cameras (`vector_calls`), the corpus at
 scale (`vector_large`), losses and training steps (`vector_training`). `vector_check` judges a port's results by that
-index alone. Needs numpy, and Hypothesis, which the kit's modules import.
+index alone. Needs numpy only.
 """
 
 from __future__ import annotations

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from pop_ref.conformance.backends import SHIPPED, shipped
-from pop_ref.conformance.mutants import MUTANTS, living
+from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM, living
 from pop_ref.conformance.vector_answer import answer
 from pop_ref.conformance.vector_check import check
 from pop_ref.conformance.vector_schema import schema
 from pop_ref.conformance.vectors import export, kinds
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -131,3 +133,11 @@ def test_vectors_of_an_older_version_are_refused(folder: Path, tmp_path: Path) -
     (tmp_path / "index.json").write_text(json.dumps(index))
     with pytest.raises(ValueError, match="version is 2, this program reads 3; write the vectors again"):
         check(tmp_path, tmp_path)
+
+
+def test_what_is_published_of_the_vectors_is_of_todays_mutants_and_no_sound_backend_is_refused() -> None:
+    kept = json.loads((ROOT / "benchmarks" / "results" / "vector_kills.json").read_text())
+    families = {"stages of the oracle": MUTANTS, "the program that trains": PROGRAM, "whole rasterizers": BLACK_BOXES}
+    for family, mutants in families.items():
+        assert set(kept[family]) == {mutant.name for mutant in mutants}, "run pop_ref.conformance.vector_kills again"
+    assert set(kept["sound"].values()) == {None}
