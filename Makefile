@@ -43,8 +43,9 @@ site: demo walkthrough  ## build docs/, the walk-through and the demo's report a
 	mkdir -p out/site/demo && cp out/demo/report.html out/site/demo/
 	@echo "open out/site/index.html"
 
+# a worker a core, each with one thread: two that take both cores wait for each other
 test: setup  ## run every test
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --dist worksteal
 
 explore: setup  ## run the tests that draw examples with fresh ones, once for each of SEEDS="1 2 3"
 	@broken=; for seed in $(or $(SEEDS),$$(date +%s)); do \

@@ -235,7 +235,7 @@ def pulled_back(params, v_image, weights, alpha, light, order):
     return np.sum(v_alpha * falloffs[params["who"]], axis=1), weights @ g
 
 
-def a_start(seed, first_opacity=0.1):
+def a_start(seed, first_opacity: float | np.ndarray = 0.1):
     """Return the photograph and the first parameters of a random start."""
     rng = np.random.default_rng(seed)
     hue = rng.uniform(0.1, 0.9, (6, 3))
@@ -274,7 +274,7 @@ for ours, wanted in zip(
 
 
 # %%
-def trained(seed, resets=(), lambda_pop=0.0, first_opacity=0.1):
+def trained(seed, resets=(), lambda_pop=0.0, first_opacity: float | np.ndarray = 0.1):
     """Train; return PSNR and opacities (nan where pruned) before every step."""
     photograph, first = a_start(seed, first_opacity)
     rows = density.rows_from_params(first)

@@ -360,9 +360,11 @@ print(*[line for line in said.getvalue().splitlines() if "PSNR" in line], sep="\
 held_out = sorted((home / "demo" / "report_data").glob("val_step*_0000.npz"))[-1]
 kept = np.load(held_out)
 render, photo = (kept[key] / 255.0 for key in ("render", "photo"))
-wrong = np.abs(render - photo).mean(axis=2)
+wrong = np.mean(np.abs(render - photo), axis=2)
 # the worst pixel that is no edge: of blocks of three by three the worst, and its middle
-blocks = sum(wrong[i : i + 70, j : j + 94] for i in range(3) for j in range(3)) / 9
+blocks = np.mean(
+    [wrong[i : i + 70, j : j + 94] for i in range(3) for j in range(3)], axis=0
+)
 y, x = np.array(np.unravel_index(blocks.argmax(), blocks.shape)) + 1
 print(
     f"the worst: column {x}, row {y}; error {wrong[y, x]:.2f}, on average {wrong.mean():.3f}"
