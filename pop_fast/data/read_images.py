@@ -195,11 +195,10 @@ def _check_header(photo: _Photo) -> None:
     if camera is not None and camera.width > 0 and camera.height > 0:
         _check_shape(photo.path, "the photograph", size, "its camera", (camera.width, camera.height))
     masked = None if photo.mask is None else read_size(photo.mask)
-    if (
-        photo.mask is not None
-        and masked is not None
-        and not (photo.shot.turns % 2 and _same_shape((masked[1], masked[0]), size))
-    ):
+    if photo.mask is None or masked is None:
+        return
+    turned = photo.shot.turns % 2 == 1 and _same_shape((masked[1], masked[0]), size)
+    if not turned:
         _check_shape(photo.mask, "the mask", masked, "its photograph", size)
 
 
