@@ -30,6 +30,7 @@ from pop_fast.train.presets import ALIASES, METHODS, Given
 if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train.load_result import CaptureRecord
+    from pop_fast.train.ranks import Ranks
 
 _EXAMPLES: Final = """
     pop train scene                          POP, the paper's 30,000 steps, results in out/scene_pop
@@ -39,6 +40,8 @@ _EXAMPLES: Final = """
     pop train scene --method 3dgs            Inria's constants, learning rates, SSIM and rasterizer
     pop train scene --method taming          or pup, mini-splatting, speedy-splat: the paper's other methods
     pop train scene --out out/a --resume     go on from the last checkpoint
+    torchrun --nproc-per-node 4 --no-python pop train scene --batch-size 4
+                                             four processes, a view of each step for each
     pop train scene --backend fast           on the CPU, also where a GPU is
     pop train scene --export sog html        also as a small file and as a page, in out/scene_pop/export
     pop train scene --pop.lambda-pop 0.01    any setting, taken as it is; --help-all lists them all
@@ -99,12 +102,27 @@ def run(argv: Sequence[str]) -> int:
 
     folder = Path(config.result_dir)
     options.check()
-    with _stdout_closed() if options.quiet else nullcontext():
-        check_output(folder, options)
+    ranks = _ranks()
+    with _stdout_closed() if options.quiet or not _writes(ranks) else nullcontext():
+        if _writes(ranks):
+            check_output(folder, options)
         options = as_begun(folder, options)
         config, chosen = choose_backend(config, options.resume)
         check_backend(config)
-        return _train(config, options, chosen)
+        return _train(config, options, chosen, ranks)
+
+
+def _ranks() -> Ranks | None:
+    """Meet the processes that torchrun started with this one; without any this is None, and torch stays out."""
+    if "WORLD_SIZE" not in os.environ:
+        return None
+    from pop_fast.train.ranks import join
+
+    return join()
+
+
+def _writes(ranks: Ranks | None) -> bool:
+    return ranks is None or ranks.writes
 
 
 @contextmanager
@@ -113,13 +131,14 @@ def _stdout_closed() -> Iterator[None]:
         yield
 
 
-def _train(config: TrainConfig, options: Any, chosen: str) -> int:
+def _train(config: TrainConfig, options: Any, chosen: str, ranks: Ranks | None) -> int:
     from pop_fast.train.load_result import RECORD, record_text
 
     folder, start = Path(config.result_dir), time.perf_counter()
-    capture = open_capture(config, options)
+    capture = _open_in_turn(config, options, ranks)
     loading = time.perf_counter() - start
     from pop_fast.train.environment import keep_freed_memory
+    from pop_fast.train.ranks import ALONE
     from pop_fast.train.training_run import TrainingRun
 
     keep_freed_memory()
@@ -129,7 +148,12 @@ def _train(config: TrainConfig, options: Any, chosen: str) -> int:
     print(chosen)
     if takes_hours(config):
         print(f"note: {config.max_steps:,} steps take hours on a CPU; --preset quick takes a tenth of the schedule")
-    how = {"resume": options.resume, "overwrite": options.overwrite, "loading_seconds": loading}
+    how = {
+        "resume": options.resume,
+        "overwrite": options.overwrite,
+        "loading_seconds": loading,
+        "ranks": ranks or ALONE,
+    }
     beside = {RECORD: record_text(_record(capture, options))}
     # absolute, so that the result can be looked at from another folder too
     training = TrainingRun(replace(config, data=str(Path(config.data).absolute())), capture, beside=beside, **how)
@@ -138,8 +162,11 @@ def _train(config: TrainConfig, options: Any, chosen: str) -> int:
     try:
         stats = training.run()
     except KeyboardInterrupt:
-        print(f"pop: {_stopped(folder, training.step)}", file=sys.stderr)
+        if _writes(ranks):
+            print(f"pop: {_stopped(folder, training.step)}", file=sys.stderr)
         return EXIT_INTERRUPTED
+    if not _writes(ranks):
+        return 0
     print(summary(stats), flush=True)
     return finish(folder, capture, options) or report(folder)
 
@@ -327,6 +354,18 @@ def check_backend(config: TrainConfig) -> None:
         reason = unsupported(config)
         if reason is not None:
             raise PopError(reason)
+
+
+def _open_in_turn(config: TrainConfig, options: Any, ranks: Ranks | None) -> Capture:
+    """Load the capture, the process that writes first: it may find cameras, and keep them for the others to read."""
+    if ranks is None:
+        return open_capture(config, options)
+    if not ranks.writes:
+        ranks.wait()
+        return open_capture(replace(config, progress=False), options)
+    capture = open_capture(config, options)
+    ranks.wait()
+    return capture
 
 
 def open_capture(config: TrainConfig, options: Any) -> Capture:

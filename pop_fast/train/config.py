@@ -39,7 +39,9 @@ class TrainConfig:
     Attributes:
         data: the capture: a COLMAP folder, a folder with transforms.json, or a folder of photographs.
         result_dir: where the run writes.
-        max_steps: training steps, one view each.
+        max_steps: training steps, of `batch_size` views each.
+        batch_size: views of a step; the loss is the mean over them of the loss that a step of each alone would have.
+            Rates and step numbers stay as they are. Backend "cuda" takes one view a step.
         seed: of the view order, the initial rotations and the split noise.
         backend: what renders and trains: "fast" (CPU), "compiled" (CPU, with kernels in C++), "cuda", "ref" (the
             oracle, slow), or "auto": "cuda" where a GPU and the build are there, else "compiled" where that was
@@ -85,6 +87,7 @@ class TrainConfig:
     data: str = ""
     result_dir: str = "results"
     max_steps: int = Recipe.max_steps
+    batch_size: int = 1
     seed: int = 42
     backend: Literal["auto", "fast", "compiled", "cuda", "ref"] = "auto"
     profile: Literal["paper", "gsplat_1_5", "gsplat_1_6", "inria", "speedy_splat"] = "paper"
@@ -231,7 +234,9 @@ class TrainConfig:
 
     def binding(self) -> dict[str, Any]:
         """Return the settings that a resumed run must share, flat."""
-        return {name: value for name, value in self.flat().items() if name not in _FREE}
+        # a batch of one is what every run had before there were others: its checkpoints say nothing of it
+        free = _FREE | {"batch_size"} if self.batch_size == 1 else _FREE
+        return {name: value for name, value in self.flat().items() if name not in free}
 
     def flat(self) -> dict[str, Any]:
         """Return all settings as they are run, as plain values by dotted name."""

@@ -13,6 +13,7 @@ import torch
 from cuda_ext.train_settings import StepSettings
 from pop_fast.api.backend import Backend
 from pop_fast.api.registry import require_backend
+from pop_fast.train.batch_stepper import BatchStepper
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.fused_stepper import Fused, FusedStepper, MakeFused, Rows
 from pop_fast.train.gpu_proxy import GpuProxy
@@ -52,7 +53,11 @@ def torch_engine(backend: str | Backend) -> Engine:
         PopError: it is unknown or cannot run here.
     """
     drawing = require_backend(backend if isinstance(backend, str) else backend.name)
-    return Engine(drawing.name, torch.device("cpu"), drawing, lambda task: TorchStepper(task, drawing))
+    return Engine(drawing.name, torch.device("cpu"), drawing, lambda task: _by_autograd(task, drawing))
+
+
+def _by_autograd(task: Task, drawing: Backend) -> TorchStepper:
+    return (TorchStepper if task.config.batch_size == 1 else BatchStepper)(task, drawing)
 
 
 def native_engine(backend: str | Backend = "compiled") -> Engine:

@@ -11,6 +11,7 @@ from pop_fast.errors import PopError
 
 _AT_LEAST: Final = {
     "max_steps": 1,
+    "batch_size": 1,
     "seed": 0,
     "factor": 1,
     "sh_degree": 0,

@@ -16,6 +16,7 @@ from pop_fast.density.control import DensityControl
 from pop_fast.density.foreign import ForeignStrategy
 from pop_fast.density.protocol import State
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.ranks import ALONE, Ranks
 from pop_fast.train.views import ViewTensors
 
 
@@ -60,9 +61,10 @@ class Task:
         config: step numbers as they are run.
         strategy: the population's.
         views: to train on.
-        order: the view of every step, `config.max_steps` of them.
+        order: the views of every step, `config.batch_size` of them a step.
         updates: whom Adam moves at which step.
         step: steps taken.
+        ranks: the processes that draw the views of a step.
     """
 
     config: TrainConfig
@@ -71,6 +73,7 @@ class Task:
     order: Sequence[int]
     updates: Updates
     step: int
+    ranks: Ranks = ALONE
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
@@ -18,6 +19,17 @@ from pop_fast.train.model import adam_step
 from pop_fast.train.objective import Objective
 from pop_fast.train.stepper import Task
 from pop_fast.train.views import Rendered, render_view
+
+
+@dataclass(frozen=True)
+class Look:
+    """A view after its backward pass: its index, render, photometric loss, prior or None, and their sum."""
+
+    index: int
+    rendered: Rendered
+    objective: Tensor
+    term: Tensor | None
+    loss: Tensor
 
 
 class TorchStepper:
@@ -54,20 +66,24 @@ class TorchStepper:
         return {}
 
     def _take(self, step: int, phase: Phase) -> StepStats:
+        look = self._look(self._task.order[step], step, phase)
+        self._require_finite(look.loss, look.index, step)
+        stats = self._measured(look, step, phase)
+        adam_step(self._params, self._optimizers, self._task.updates, step, self._state)
+        self._task.strategy.collect(self._params, self._state, step, look.rendered.info)
+        self.step = step + 1
+        return stats
+
+    def _look(self, index: int, step: int, phase: Phase) -> Look:
+        """Render a view, compare it with its photograph and go back to the gradients of the parameters."""
         strategy, params, optimizers, state = self._task.strategy, self._params, self._optimizers, self._state
-        index = self._task.order[step]
         rendered = self._render(index, step, phase)
         objective = self._objective(rendered.image, index, phase)
         term = strategy.regularizer(rendered.opacities, state, step, rendered.info)
         strategy.step_pre_backward(params, optimizers, state, step, rendered.info)
         loss = objective if term is None else objective + term
         loss.backward()
-        self._require_finite(loss, index, step)
-        stats = self._measured(rendered, index, step, phase, objective, term)
-        adam_step(params, optimizers, self._task.updates, step, state)
-        strategy.collect(params, state, step, rendered.info)
-        self.step = step + 1
-        return stats
+        return Look(index, rendered, objective, term, loss)
 
     def _render(self, index: int, step: int, phase: Phase) -> Rendered:
         config, strategy = self._task.config, self._task.strategy
@@ -86,12 +102,11 @@ class TorchStepper:
         if not math.isfinite(loss.item()):
             raise ValueError(f"the loss of view {self._task.views[index].name} is {loss.item()} at step {step}")
 
-    def _measured(
-        self, rendered: Rendered, index: int, step: int, phase: Phase, objective: Tensor, term: Tensor | None
-    ) -> StepStats:
+    def _measured(self, look: Look, step: int, phase: Phase) -> StepStats:
         """Return the loss's parts, and where a record is due everything else too."""
-        photometric, pop = objective.item(), 0.0 if term is None else term.item()
+        photometric, pop = look.objective.item(), 0.0 if look.term is None else look.term.item()
         if step % self._task.config.log_every != 0 and not self._task.strategy.changes_after(step):
             return StepStats(math.nan, math.nan, photometric, math.nan, pop)
-        pixelwise, structural, square = self._objective.measure(rendered.image.detach(), index, phase.l1)
+        rendered = look.rendered
+        pixelwise, structural, square = self._objective.measure(rendered.image.detach(), look.index, phase.l1)
         return StepStats(pixelwise, structural, photometric, square, pop, *gaussians_per_pixel(rendered.info))

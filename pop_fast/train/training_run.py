@@ -34,6 +34,7 @@ from pop_fast.io.heartbeat import Heartbeat, duration
 from pop_fast.io.ply import Frame, save_ply
 from pop_fast.stages.activations import opacities_from_logits
 from pop_fast.train import checkpoint as ckpt
+from pop_fast.train.batch_stepper import check_batch
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.effects import facts, find_warnings
@@ -45,7 +46,9 @@ from pop_fast.train.lpips import load_nets
 from pop_fast.train.metrics import population
 from pop_fast.train.model import KEYS, first_unusable, make_optimizers
 from pop_fast.train.phases import phase_at, segment_end
+from pop_fast.train.placement import moved_to, on_cpu
 from pop_fast.train.preflight import check_start, check_views
+from pop_fast.train.ranks import ALONE, Ranks
 from pop_fast.train.records import Segment, record_of
 from pop_fast.train.results import ResultFolder
 from pop_fast.train.schedule import Updates, ViewOrder, active_sh_degree, updates_of
@@ -79,6 +82,7 @@ class TrainingRun:
         strategy: Strategy | None = None,
         initial: Mapping[str, Tensor] | None = None,
         engine: Engine | None = None,
+        ranks: Ranks = ALONE,
     ) -> None:
         """Prepare a run; nothing is written yet.
 
@@ -93,11 +97,14 @@ class TrainingRun:
             initial: raw parameters to start from; None makes them from the capture's points. Their precision is that of
                 the training; a GPU trains in float32 only.
             engine: takes the steps; None takes the one for `config.backend`.
+            ranks: the processes that train together, of which this is one; the first one writes.
 
         Raises:
             PopError: the capture cannot be trained on, weights are missing, or the backend is not available or does
                 not know a setting.
         """
+        check_batch(config, strategy is None, ranks)
+        self._ranks = ranks
         self._engine = engine_of(choose_backend(config, resume)[0], strategy is None) if engine is None else engine
         self.config = replace(config, backend=self._engine.name)
         self._resume, self._overwrite, self._beside = resume, overwrite, beside or {}
@@ -151,14 +158,15 @@ class TrainingRun:
         take any leaves the folder as it was.
 
         Returns:
-            The statistics of the last step, as in stats/val_step{step}.json.
+            The statistics of the last step, as in stats/val_step{step}.json; none from a process that does not write.
 
         Raises:
             PopError: the folder is in use, a checkpoint does not fit, or a number is no longer finite.
             KeyboardInterrupt: after Ctrl-C or SIGTERM, when a checkpoint has been written; or at once after the second.
         """
-        for warning in [] if isinstance(self.strategy, ForeignStrategy) else find_warnings(self.config, self._train):
-            print(f"warning: {warning}", file=sys.stderr, flush=True)
+        if self._ranks.writes and not isinstance(self.strategy, ForeignStrategy):
+            for warning in find_warnings(self.config, self._train):
+                print(f"warning: {warning}", file=sys.stderr, flush=True)
         self._started = time.perf_counter()
         with reproducible(self.config.threads), stop_requests() as stop:
             try:
@@ -168,12 +176,16 @@ class TrainingRun:
                 self._results.close()
 
     def _begin(self) -> None:
-        self._results.hold()
-        self._results.check(self._resume, self._overwrite)
+        writes = self._ranks.writes
+        if writes:
+            self._results.hold()
+            self._results.check(self._resume, self._overwrite)
+        self._ranks.wait()
         found = ckpt.list_checkpoints(self._results.path) if self._resume else []
         if found:
             self._restore(found[-1][1])
-            self._results.write_settings(self.config, self._beside)
+            if writes:
+                self._results.write_settings(self.config, self._beside)
         else:
             self._unwritten = self._opacities().numpy()
         start = time.perf_counter()
@@ -182,8 +194,9 @@ class TrainingRun:
 
     def _loop(self, stop: threading.Event) -> dict[str, Any]:
         config = self.config
-        bars = tqdm(total=config.max_steps, initial=self.step, disable=None if config.progress else True)
-        with bars as bar, Heartbeat(config.progress) as beat:
+        shown = config.progress and self._ranks.writes
+        bars = tqdm(total=config.max_steps, initial=self.step, disable=None if shown else True)
+        with bars as bar, Heartbeat(shown) as beat:
             while self.step < config.max_steps:
                 longest = self.stepper.longest
                 segment = self.take_steps(segment_end(config, self.strategy, self.step, longest))
@@ -192,13 +205,16 @@ class TrainingRun:
                 if self._unwritten is not None:
                     # a rate can be so high that the first step is the last; that is no reason to replace anything
                     self._require_finite()
-                    self._results.begin(self.config, self._beside, self._unwritten, self._overwrite)
+                    if self._ranks.writes:
+                        self._results.begin(self.config, self._beside, self._unwritten, self._overwrite)
                     self._unwritten = None
                 self._milestones(self.step - 1)
-                if stop.is_set() and self.step < config.max_steps:
+                if self._ranks.any(stop.is_set()) and self.step < config.max_steps:
                     self._save()
                     raise KeyboardInterrupt
         last = config.max_steps - 1
+        if not self._ranks.writes:
+            return {}
         return self._results.read_stats("val", last) or self._evaluate(last)
 
     def _so_far(self) -> str:
@@ -223,7 +239,8 @@ class TrainingRun:
         """
         start, first, before = time.perf_counter(), self.step, len(self.params["means"])
         phase, stepper = phase_at(self.config, self.strategy, first), self.stepper
-        views = [self._train[self._order.next()].name for _ in range(first, last)]
+        size = self.config.batch_size
+        views = [", ".join(self._train[self._order.next()].name for _ in range(size)) for _ in range(first, last)]
         with words_for_memory():
             stats = self._measured(stepper, first, last, phase)
             event = self._change(last - 1)
@@ -242,7 +259,7 @@ class TrainingRun:
             raise PopError(f"{error}; {self._what_is_left}") from error
         self.step = last
         if "loss_sum" in self.state and phase.statistics:
-            self.state["loss_sum"] += sum(found.objective + found.pop for found in stats)
+            self.state["loss_sum"] += self.config.batch_size * sum(found.objective + found.pop for found in stats)
         for step, found in enumerate(stats, first):
             if not math.isfinite(found.objective + found.pop):
                 self._require_finite()
@@ -279,8 +296,9 @@ class TrainingRun:
             # the views of steps that were taken are not known any more
             ahead = ViewOrder(len(self._train), self.config.seed)
             ahead.load_state_dict(self._order.state_dict())
-            order = [0] * self.step + [ahead.next() for _ in range(self.step, self.config.max_steps)]
-            task = Task(self.config, self.strategy, self._train, order, self.updates, self.step)
+            size = self.config.batch_size
+            order = [0] * size * self.step + [ahead.next() for _ in range(size * (self.config.max_steps - self.step))]
+            task = Task(self.config, self.strategy, self._train, order, self.updates, self.step, self._ranks)
             self._stepper = self._engine.make_stepper(task)
             with words_for_memory():
                 self._stepper.rebind(self.params, self.optimizers, self.state)
@@ -288,25 +306,16 @@ class TrainingRun:
 
     def _place(self) -> None:
         """Move parameters, moments and statistics to the engine's device."""
-        device = self._engine.device
-        if device.type == "cpu":
-            return
-        moments = ckpt.pack_optimizers(self.optimizers)
-        with words_for_memory():
-            self.params = {key: Parameter(self.params[key].detach().to(device)) for key in KEYS}
-            self.optimizers = make_optimizers(self.params)
-            for key, found in moments.items():
-                there = {name: value if name == "step" else value.to(device) for name, value in found.items()}
-                self.optimizers[key].state[self.params[key]] = there
-            for key, value in self.state.items():
-                self.state[key] = value.to(device) if isinstance(value, Tensor) else value
+        if self._engine.device.type != "cpu":
+            with words_for_memory():
+                self.params, self.optimizers = moved_to(self._engine.device, self.params, self.optimizers, self.state)
 
     def _log(self, segment: Segment, bar: tqdm) -> None:
         """Write the records of a segment."""
         for step in range(segment.first, self.step):
             lr_means = float(self.updates.rates[step, KEYS.index("means")])
             record = record_of(segment, step, self.config, lr_means, self._train_seconds)
-            if record is not None:
+            if record is not None and self._ranks.writes:
                 self._results.log(record)
                 self._latest = f", PSNR {record['psnr']:.2f}"
                 bar.set_postfix_str(f"PSNR {record['psnr']:.2f}, N {record['num_gaussians']:,}", refresh=False)
@@ -314,24 +323,27 @@ class TrainingRun:
         bar.update(self.step - segment.first)
 
     def _milestones(self, step: int) -> None:
-        """After a step (counted from 0): keep histograms, measure, write PLY and checkpoint when it is time."""
+        """After a step (counted from 0): do what is due, a checkpoint last."""
         config, taken = self.config, step + 1
         last = taken == config.max_steps
+        # the checkpoint comes last: a run that is killed in between does this step's milestones again
+        due = config.checkpoint_every > 0 and taken % config.checkpoint_every == 0
+        saves = due or taken in config.save_steps or last
+        if self._ranks.writes:
+            self._write_milestones(step, last)
+        if saves:
+            self._save()
+
+    def _write_milestones(self, step: int, last: bool) -> None:
+        """Keep histograms, measure, write the PLY."""
+        config, taken = self.config, step + 1
         if taken == config.strategy.blur_stop_iter or last:
             self._results.write_opacities(step, self._opacities().numpy())
         if taken in config.eval_steps or last:
             self._evaluate(step)
         if taken in config.save_steps or last:
-            save_ply(
-                self._results.path / "ply" / f"point_cloud_{step}.ply",
-                self._detached(),
-                config.antialiased,
-                frame=self._frame,
-            )
-        # the checkpoint comes last: a run that is killed in between does this step's milestones again
-        due = config.checkpoint_every > 0 and taken % config.checkpoint_every == 0
-        if due or taken in config.save_steps or last:
-            self._save()
+            path = self._results.path / "ply" / f"point_cloud_{step}.ply"
+            save_ply(path, self._detached(), config.antialiased, frame=self._frame)
 
     def _evaluate(self, step: int) -> dict[str, Any]:
         self._require_finite()
@@ -367,12 +379,16 @@ class TrainingRun:
         }
 
     def _save(self) -> None:
+        """Write a checkpoint, if this is the process that writes and all hold the same."""
         self._require_finite()
+        self._ranks.require_same(self._detached(), self.step)
+        if not self._ranks.writes:
+            return
         content = {
             "step": self.step - 1,
             "splats": self._detached(),
-            "optimizers": _on_cpu(ckpt.pack_optimizers(self.optimizers)),
-            "strategy": _on_cpu(ckpt.pack_strategy(self.state)),
+            "optimizers": on_cpu(ckpt.pack_optimizers(self.optimizers)),
+            "strategy": on_cpu(ckpt.pack_strategy(self.state)),
             "view_order": self._order.state_dict(),
             "config": self.config.binding(),
             "capture": self._fingerprint(),
@@ -394,7 +410,8 @@ class TrainingRun:
         ckpt.unpack_optimizers(self.optimizers, content["optimizers"])
         ckpt.unpack_strategy(self.state, content["strategy"])
         self._order.load_state_dict(content["view_order"])
-        self._results.open_metrics(content["metrics_bytes"])
+        if self._ranks.writes:
+            self._results.open_metrics(content["metrics_bytes"])
         self._train_seconds = content["seconds"]["train"]
         self._started -= content["seconds"]["total"]
         self.step = content["step"] + 1
@@ -425,17 +442,9 @@ class TrainingRun:
         return "the latest checkpoint is kept" if self._unwritten is None else "nothing was written"
 
     def _require_finite(self) -> None:
-        found = first_unusable(self._detached())
-        if found:
+        if found := first_unusable(self._detached()):
             name, index, value = found
             raise PopError(
                 f"{name}{index} is {value} after {self.step} steps; {self._what_is_left}: lower the learning rate of "
                 f"{name} and start again, or look at the photographs and masks of the capture"
             )
-
-
-def _on_cpu(content: Any) -> Any:
-    """Return nested dicts with their tensors on the CPU; those that are there already are not copied."""
-    if isinstance(content, Mapping):
-        return {key: _on_cpu(value) for key, value in content.items()}
-    return content.cpu() if isinstance(content, Tensor) else content

@@ -1,0 +1,178 @@
+"""Processes that train one model together: whose views are whose, and how what each has found is put together.
+
+Every process holds all parameters, moments and statistics and takes every decision itself; only the drawing of a step's
+views is shared out. What is added up is added view by view in the order of the batch, wherever a view was drawn, so
+that the bits do not depend on the number of processes. torch carries it: gloo between CPUs, NCCL between GPUs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from datetime import timedelta
+from typing import Any, Final, TypeVar
+
+import torch
+from torch import Tensor
+
+from pop_fast.errors import PopError
+
+__all__ = ["ALONE", "Ranks", "TorchRanks", "join"]
+
+T = TypeVar("T")
+
+# what torchrun, and other launchers after it, tell a process of itself
+_TOLD: Final = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+# rank 0 may load photographs, find cameras or measure held-out views for hours while the others wait
+_PATIENCE: Final = timedelta(days=2)
+
+
+class Ranks:
+    """One process that trains by itself; `TorchRanks` is one of several.
+
+    Attributes:
+        rank: number of this process, from 0; the one that writes and prints is 0.
+        size: how many there are.
+    """
+
+    rank: int = 0
+    size: int = 1
+
+    @property
+    def writes(self) -> bool:
+        """Tell whether this process is the one that writes and prints."""
+        return self.rank == 0
+
+    def positions(self, batch: int) -> range:
+        """Return which views of a batch this process draws, by their place in it; `batch` is a multiple of `size`."""
+        share = batch // self.size
+        return range(self.rank * share, (self.rank + 1) * share)
+
+    def gather(self, mine: Sequence[Tensor]) -> list[Tensor]:
+        """Return the tensors of all views of a batch, in its order.
+
+        Args:
+            mine: of the views of this process; all are of one shape and type.
+        """
+        return list(mine)
+
+    def total(self, mine: Iterable[Tensor]) -> Tensor:
+        """Return the sum over all views of a batch, added one after the other in its order. [P]
+
+        Args:
+            mine: vectors of the views of this process. [P]
+        """
+        parts = iter(mine)
+        total = next(parts).clone()
+        for part in parts:
+            total += part
+        return total
+
+    def any(self, flag: bool) -> bool:
+        """Tell whether any process says so."""
+        return flag
+
+    def require_same(self, params: Mapping[str, Tensor], step: int) -> None:
+        """Compare what the processes hold, bit by bit.
+
+        Args:
+            params: raw parameters, on the CPU.
+            step: steps taken.
+
+        Raises:
+            PopError: they differ, as machines of different kinds or libraries may round otherwise.
+        """
+
+    def wait(self) -> None:
+        """Wait until all processes are here."""
+
+    def leave(self) -> None:
+        """Take leave of the others."""
+
+
+class TorchRanks(Ranks):
+    """One of the processes of torch's default process group, which `join` makes."""
+
+    def __init__(self) -> None:
+        import torch.distributed
+
+        self._group: Any = torch.distributed
+        self.rank, self.size = self._group.get_rank(), self._group.get_world_size()
+
+    def gather(self, mine: Sequence[Tensor]) -> list[Tensor]:
+        """See `Ranks.gather`."""
+        sent = torch.stack(list(mine))
+        received = [torch.empty_like(sent) for _ in range(self.size)]
+        self._together(lambda: self._group.all_gather(received, sent))
+        return [one for part in received for one in part]
+
+    def total(self, mine: Iterable[Tensor]) -> Tensor:
+        """See `Ranks.total`: each process adds up its share of the entries over all views, and tells the others."""
+        parts = torch.stack(list(mine))
+        length, share = parts.shape[1], -(-parts.shape[1] // self.size)
+        padded = torch.nn.functional.pad(parts, (0, share * self.size - length))
+        sent = padded.reshape(len(parts), self.size, share).transpose(0, 1).contiguous()
+        received = torch.empty_like(sent)
+        self._together(lambda: self._group.all_to_all_single(received, sent))
+        added = super().total(received.reshape(-1, share))
+        whole = [torch.empty_like(added) for _ in range(self.size)]
+        self._together(lambda: self._group.all_gather(whole, added))
+        return torch.cat(whole)[:length]
+
+    def any(self, flag: bool) -> bool:
+        """See `Ranks.any`."""
+        return any(bool(said) for said in self.gather([torch.tensor(flag)]))
+
+    def require_same(self, params: Mapping[str, Tensor], step: int) -> None:
+        """See `Ranks.require_same`."""
+        digest = hashlib.sha256()
+        for value in params.values():
+            digest.update(value.contiguous().numpy().data)
+        found = self.gather([torch.frombuffer(bytearray(digest.digest()), dtype=torch.uint8)])
+        if any(not torch.equal(one, found[0]) for one in found):
+            raise PopError(
+                f"the {self.size} processes no longer hold the same Gaussians after {step} steps; the latest "
+                "checkpoint is kept: use machines of one kind with the same versions and --threads"
+            )
+
+    def wait(self) -> None:
+        """See `Ranks.wait`."""
+        self._together(self._group.barrier)
+
+    def leave(self) -> None:
+        """See `Ranks.leave`."""
+        self._group.destroy_process_group()
+
+    def _together(self, call: Callable[[], T]) -> T:
+        try:
+            return call()
+        except RuntimeError as error:
+            raise PopError(
+                f"process {self.rank} of {self.size} lost the others: one of them has ended, and its own message says "
+                "why; the same command with --resume continues from the last checkpoint"
+            ) from error
+
+
+ALONE: Final = Ranks()
+
+
+def join() -> Ranks:
+    """Meet the other processes that were launched with this one, or return `ALONE` where there are none.
+
+    Raises:
+        PopError: what the launcher says is damaged, or the others cannot be reached.
+    """
+    if not all(os.environ.get(name) for name in _TOLD) or os.environ["WORLD_SIZE"] == "1":
+        return ALONE
+    import torch.distributed as group
+
+    if not group.is_available():
+        raise PopError("this torch was built without torch.distributed; start one process, or install another build")
+    by_gpu = torch.cuda.is_available() and group.is_nccl_available()
+    try:
+        group.init_process_group("cpu:gloo,cuda:nccl" if by_gpu else "gloo", timeout=_PATIENCE)
+    except (RuntimeError, ValueError) as error:
+        told = ", ".join(f"{name}={os.environ[name]}" for name in _TOLD)
+        raise PopError(f"cannot meet the other processes ({told}): {error}; start them with torchrun") from error
+    return TorchRanks()
