@@ -17,7 +17,7 @@ from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
 from pop_fast.train.batch_stepper import BatchStepper
 from pop_fast.train.engines import engine_of, torch_engine
-from pop_fast.train.fused_stepper import FusedStepper
+from pop_fast.train.fused_stepper import FusedStepper, unsupported
 from pop_fast.train.phases import phase_at
 from pop_fast.train.stepper import Task
 from pop_fast.train.torch_stepper import TorchStepper
@@ -28,13 +28,13 @@ STEP = 12
 VIEWS = [2, 0, 3]
 
 
-def one_step(views: list[int], mask: Any = None, **plan: Any) -> tuple[TrainingRun, Any]:
+def one_step(views: list[int], mask: Any = None, **plan: Any) -> tuple[Any, Any]:
     """Take one step at STEP of these views, in float64, without an event; return the run and its measurements."""
     config = tiny_config("unused", batch_size=len(views), strategy=strategy(**plan), log_every=1)
     start = TrainingRun(config, tiny_capture(mask=mask))
     initial = {key: value.detach().double() for key, value in start.params.items()}
     initial["shN"] += 0.05
-    run = TrainingRun(config, tiny_capture(mask=mask), initial=initial)
+    run: Any = TrainingRun(config, tiny_capture(mask=mask), initial=initial)
     order = [0] * len(views) * STEP + views
     task = Task(config, run.strategy, run._train, order, run.updates, STEP)
     kind = TorchStepper if len(views) == 1 else BatchStepper
@@ -45,12 +45,12 @@ def one_step(views: list[int], mask: Any = None, **plan: Any) -> tuple[TrainingR
 
 
 def strategy(**plan: Any) -> POPStrategy:
-    return tiny_config("unused").strategy.__class__(
+    return POPStrategy(
         refine_start_iter=3, refine_stop_iter=24, blur_start_iter=8, blur_stop_iter=16, theta_blur=0.02, **plan
     )
 
 
-def moment(run: TrainingRun, key: str) -> torch.Tensor:
+def moment(run: Any, key: str) -> torch.Tensor:
     return run.optimizers[key].state[run.params[key]]["exp_avg"]
 
 
@@ -59,7 +59,7 @@ def test_the_gradient_of_a_batch_is_the_mean_of_its_views_gradients() -> None:
     alone = [one_step([view]) for view in VIEWS]
     for key in batch.params:
         # Adam's first moment, from zero, is a tenth of the gradient
-        expected = sum(moment(run, key) for run, _ in alone) / len(VIEWS)
+        expected = torch.stack([moment(run, key) for run, _ in alone]).mean(0)
         assert expected.abs().max() > 0
         assert torch.allclose(moment(batch, key), expected, rtol=1e-12, atol=1e-18), key
     for name in ("objective", "pop", "square", "pixelwise", "ssim", "n_blended"):
@@ -78,13 +78,13 @@ def test_density_control_sees_the_views_one_after_the_other(window: str, masked:
     alone = [one_step([view], mask, **plan)[0].state for view in VIEWS]
     state = batch.state
     for key in ("grad2d", "count"):
-        assert torch.allclose(state[key], sum(one[key] for one in alone), rtol=1e-12), key
+        assert torch.allclose(state[key], torch.stack([one[key] for one in alone]).sum(0), rtol=1e-12), key
     assert state["count"].max() == len(VIEWS)
     assert state["views"] == len(VIEWS)
     assert torch.equal(state["radii"], torch.stack([one["radii"] for one in alone]).amax(0))
     blurred = torch.stack([one["blurred"] for one in alone])
     if window == "sum":
-        total = sum(one["dominant_sum"] for one in alone)
+        total = torch.stack([one["dominant_sum"] for one in alone]).sum(0)
         assert torch.equal(state["dominant_sum"], total)
         kept = HEIGHT * WIDTH if mask is None else int(mask.sum())
         assert torch.equal(state["blurred"], total > batch.config.strategy.theta_blur * kept)
@@ -145,10 +145,14 @@ def test_the_step_in_cpp_leaves_batches_to_autograd() -> None:
     assert isinstance(run.stepper, BatchStepper)
 
 
+def test_the_fused_step_on_a_gpu_refuses_batches() -> None:
+    reason = unsupported(tiny_config("x", batch_size=2))
+    assert reason is not None
+    assert "batch_size = 1 only, not 2; use --backend fast, or leave batch_size as it is" in reason
+
+
 def test_a_strategy_of_somebody_else_takes_one_view_a_step() -> None:
     with pytest.raises(PopError, match="batch_size is 2; it must be 1 with a strategy of somebody else"):
-        TrainingRun(
-            tiny_config("x", batch_size=2), tiny_capture(), strategy=POPStrategy(), engine=torch_engine("fast")
-        )
+        TrainingRun(tiny_config("x", batch_size=2), tiny_capture(), strategy=POPStrategy(), engine=torch_engine("fast"))
     with pytest.raises(PopError, match="batch_size is 0; it must be at least 1"):
         tiny_config("x", batch_size=0)

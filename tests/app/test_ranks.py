@@ -70,7 +70,9 @@ def test_two_processes_train_to_the_bits_of_one(together: Path, tmp_path: Path, 
     same(theirs, tmp_path / "alone")
     # density control had something to decide, and the second process wrote nothing of its own
     assert len(last_checkpoint(theirs)[".splats.means"]) > 70
-    assert sorted(path.name for path in theirs.iterdir()) == sorted(path.name for path in (tmp_path / "alone").iterdir())
+    assert sorted(path.name for path in theirs.iterdir()) == sorted(
+        path.name for path in (tmp_path / "alone").iterdir()
+    )
 
 
 def test_one_process_goes_on_with_what_two_began(together: Path) -> None:
