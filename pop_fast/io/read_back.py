@@ -102,7 +102,8 @@ def read_arrays(path: Path, forms: Mapping[str, tuple[str, int]], fix: str) -> d
     """
     try:
         with np.load(path, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files if name in forms or f"{name}?" in forms}
+            # what is no array in such a file is bytes
+            arrays = {name: np.asarray(stored[name]) for name in stored.files if name in forms or f"{name}?" in forms}
     # a damaged zip ends in errors of many kinds
     except Exception as error:
         raise PopError(f"{path}: is damaged ({error}); {fix}") from error

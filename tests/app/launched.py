@@ -23,8 +23,9 @@ def launched(words: Sequence[object], size: int = 2, seconds: float = 300.0) -> 
         for rank in range(size):
             told = {name: str(value) for name, value in {**together, "RANK": rank}.items()}
             command = [sys.executable, *map(str, words)]
-            pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-            started.append(subprocess.Popen(command, env={**os.environ, **told}, cwd=ROOT, text=True, **pipes))
+            pipe, environment = subprocess.PIPE, {**os.environ, **told}
+            child = subprocess.Popen(command, stdout=pipe, stderr=pipe, env=environment, cwd=ROOT, text=True)
+            started.append(child)
         ended = [(child.communicate(timeout=seconds), child.returncode) for child in started]
     finally:
         for child in started:
