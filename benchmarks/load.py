@@ -44,7 +44,7 @@ STEPS, POINTS, FOCAL = 3, 5_000, 0.8
 # bytes: of the program with torch; of a pixel of all photographs (kept as 8-bit colours, with room for the one that is
 # decoded); of a pixel of the image that is drawn, with its gradients and what SSIM keeps; of a Gaussian that is drawn:
 # 59 numbers as they are in the file, as parameters and as they are drawn, and its share of the tile lists
-PROGRAM, PHOTOGRAPHS, DRAWN, TRAINED, RENDERED = 0.5 * 2**30, 3.5, 200.0, 5_000.0, 1_000.0
+PROGRAM, PHOTOGRAPHS, DRAWN, TRAINED, RENDERED = 0.5 * 2**30, 3.5, 200.0, 5_000.0, 600.0
 
 
 @dataclass(frozen=True)

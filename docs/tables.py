@@ -133,6 +133,11 @@ def differences() -> str:
     return str(runpy.run_path(str(ROOT / "benchmarks" / "results_table.py"))["differences"]())
 
 
+def _of_faults(name: str) -> Callable[[], str]:
+    """Make a table as benchmarks/fault_tables.py does."""
+    return lambda: str(runpy.run_path(str(ROOT / "benchmarks" / "fault_tables.py"))[name]())
+
+
 def scorecards() -> str:
     """Make the table of what the kit found: rows are stages, cells say laws passed, failed and skipped."""
     columns = [card(file)["summary"][backend] for file, backend in JUDGED.values()]
@@ -306,6 +311,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "summary": summary,
     "results": results,
     "differences": differences,
+    **{name: _of_faults(name) for name in ("fuzzed", "disturbed", "loads")},
     "recipes": recipes,
     "reproduction": reproduction,
     "kit": kit,
