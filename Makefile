@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 TORCH := $(shell sed -n 's/^\(torch==.*\)/\1/p' constraints.txt)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo walkthrough repro site test explore lint bench cuda sass emulate gpu-check docs-check clean
+.PHONY: help setup demo walkthrough repro site test explore lint bench faults cuda sass emulate gpu-check docs-check clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
@@ -56,6 +56,10 @@ lint: setup  ## ruff (rules and format) and pyright
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+
+faults: setup  ## damaged files, kills, crashes, full disks, sanitizers, then large captures (half an hour)
+	$(BIN)/python -m benchmarks.faults --minutes 10
+	$(BIN)/python -m benchmarks.load
 
 bench: setup  ## check the fast path against the oracle, then time it
 	$(BIN)/python benchmarks/run.py

@@ -109,7 +109,10 @@ def run(argv: Sequence[str]) -> int:
         options = as_begun(folder, options)
         config, chosen = choose_backend(config, options.resume)
         check_backend(config)
-        return _train(config, options, chosen, ranks)
+        status = _train(config, options, chosen, ranks)
+    if ranks is not None:
+        ranks.leave()
+    return status
 
 
 def _ranks() -> Ranks | None:
