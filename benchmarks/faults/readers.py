@@ -46,7 +46,8 @@ def _splat(path: Path) -> dict[str, torch.Tensor]:
 
 def _photograph(path: Path) -> Any:
     # a header that tells nothing is no error; the decoder judges the file
-    read_exif(path), read_size(path)
+    read_exif(path)
+    read_size(path)
     return read_image(path)
 
 

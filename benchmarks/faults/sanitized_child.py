@@ -60,13 +60,12 @@ def _draw(name: str, dtype: torch.dtype) -> int:
         tensor(getattr(gaussians, key)).requires_grad_() for key in ("means", "quats", "scales", "opacities", "sh")
     ]
     degree = int(gaussians.sh.shape[1] ** 0.5) - 1
-    viewmat, K = tensor(camera.viewmat)[None], tensor(camera.K)[None]
     image, alpha, _ = rasterization(
-        *inputs,
-        viewmat,
-        K,
-        camera.width,
-        camera.height,
+        **dict(zip(("means", "quats", "scales", "opacities", "colors"), inputs, strict=True)),
+        viewmats=tensor(camera.viewmat)[None],
+        Ks=tensor(camera.K)[None],
+        width=camera.width,
+        height=camera.height,
         sh_degree=degree,
         backend="compiled",
         packed=False,
