@@ -26,8 +26,8 @@ demo: setup  ## write the demo capture, train POP on it, leave report.html, PLY,
 	$(BIN)/pop train out/demo_capture --out out/demo --preset quick --overwrite
 	@echo "open out/demo/report.html"
 
-walkthrough: setup  ## run the twelve chapters and write their pages with pictures to out/walkthrough
-	$(BIN)/python -m pop_ref.walkthrough out/walkthrough
+walkthrough: setup  ## run the chapters and write pages, notebooks, slides and (with a Chromium) a PDF to out/walkthrough
+	$(BIN)/python -m pop_ref.walkthrough out/walkthrough --all
 
 repro: setup  ## train every row of the paper at toy scale (minutes), leave its tables and figures in out/repro
 	$(BIN)/pop-repro queue --scale toy --out out/repro/results --work out/repro/work
@@ -43,8 +43,9 @@ site: demo walkthrough  ## build docs/, the walk-through and the demo's report a
 	mkdir -p out/site/demo && cp out/demo/report.html out/site/demo/
 	@echo "open out/site/index.html"
 
+# a worker a core, each with one thread: two that take both cores wait for each other
 test: setup  ## run every test
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --dist worksteal
 
 explore: setup  ## run the tests that draw examples with fresh ones, once for each of SEEDS="1 2 3"
 	@broken=; for seed in $(or $(SEEDS),$$(date +%s)); do \
@@ -65,11 +66,11 @@ cuda: setup  ## compile the CUDA extension (needs nvcc; no GPU)
 
 sass: setup  ## count the kernels' machine instructions into benchmarks (needs nvcc; no GPU)
 	$(BIN)/python -m pip install --quiet -e '.[sass]'
-	$(BIN)/python -m cuda_ext.count_sass --json benchmarks/results/sass.json
+	$(BIN)/python -m cuda_ext.machine_code.count_sass --json benchmarks/results/sass.json
 	$(BIN)/python benchmarks/gpu_predictions.py --write
 
 emulate: setup  ## run the CUDA kernels' own source on the host, warp by warp: every law, training steps (minutes)
-	POP_EMULATED_LAWS=1 POP_CUDA_KINDS="columns atomics splats" $(BIN)/python -m pytest -q tests/cuda/emulated
+	POP_EMULATED_LAWS=1 POP_CUDA_KINDS="pixel_parallel atomics gaussian_parallel" $(BIN)/python -m pytest -q tests/cuda/emulated
 
 # no environment is made and nothing installed: it runs on a node with a GPU, torch and nvcc, and writes to $$OUT
 gpu-check:  ## JOB=1: build, smoke, times; JOB=2: laws, steps, sanitizer, training on CAPTURES="a b" (needs a GPU)

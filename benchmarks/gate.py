@@ -10,7 +10,7 @@ from cases import GATE_CASE, gaussians_of
 from raster import SCENE, backends
 from torch import Tensor
 
-from pop_fast.backends import get_backend
+from pop_fast.api.registry import get_backend
 from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render, render_vjp
 

@@ -23,8 +23,8 @@ from torch import Tensor
 import cuda_ext
 from cuda_ext import load
 from cuda_ext.arrays import fill, new_state, stream_of
-from cuda_ext.ops import rasterization
-from cuda_ext.resident import MARGIN, ResidentViews
+from cuda_ext.training.resident import MARGIN, ResidentViews
+from pop_fast.cuda import rasterization
 
 LAMBDA_SSIM = 0.01
 COMPARED = ("forward", "forward_backward", "step")

@@ -29,12 +29,12 @@ from gpu_steps import kernel_times, step_kernels, whole_step
 from torch import Tensor
 
 import cuda_ext
-from cuda_ext.gpu_check_tools import write_json
-from cuda_ext.ops import rasterization
+from cuda_ext.gpu_check.tools import write_json
+from pop_fast.cuda import rasterization
 
 WARM_UP, REPEATS, STEPS = 5, 50, 200
 LEAVES = ("means", "quats", "scales", "opacities", "sh")
-FAMILIES = ("columns", "splats")
+BACKWARDS = ("pixel_parallel", "gaussian_parallel")
 APART = 1e-2  # of the largest gradient, how far the two families may differ
 
 
@@ -83,9 +83,9 @@ def forward_backward(
 def families_differ(scene: dict[str, Any], case: GpuCase) -> dict[str, float]:
     """Compare the gradients of the two families: the largest difference over the largest gradient."""
     found: list[dict[str, Any]] = []
-    for family in FAMILIES:
+    for backward in BACKWARDS:
         leaves = {**scene, **{name: scene[name].clone().requires_grad_() for name in LEAVES}}
-        draw(rasterization, leaves, case, family=family)[0].square().mean().backward()
+        draw(rasterization, leaves, case, backward=backward)[0].square().mean().backward()
         found.append({name: leaves[name].grad for name in LEAVES})
     return {name: float((found[0][name] - found[1][name]).abs().max() / found[0][name].abs().max()) for name in LEAVES}
 
@@ -100,9 +100,9 @@ def photograph_of(scene: dict[str, Tensor], case: GpuCase) -> Tensor:
     return ((image + noise).clamp(0.0, 1.0) * 255.0).to(torch.uint8)
 
 
-def by_kernel(scene: dict[str, Tensor], photograph: Tensor, card: Card, family: str) -> dict[str, Any]:
+def by_kernel(scene: dict[str, Tensor], photograph: Tensor, card: Card, backward: str) -> dict[str, Any]:
     """Time every kernel of a POP step, beside its work and floor."""
-    times, loads = kernel_times(scene, photograph, max(STEPS // 4, 1), family=family)
+    times, loads = kernel_times(scene, photograph, max(STEPS // 4, 1), backward=backward)
     least = floors(loads, card)
     pixels = loads.pixels
     return {
@@ -150,12 +150,12 @@ def measure(case: GpuCase, scene: dict[str, Tensor], card: Card, record: Record)
     photograph = record.part("photograph", lambda: photograph_of(scene, case), keep=False)
     if photograph is None:
         return
-    for family in FAMILIES:
-        record.part(f"{family}_by_kernel", lambda family=family: by_kernel(scene, photograph, card, family))
+    for backward in BACKWARDS:
+        record.part(f"{backward}_by_kernel", lambda backward=backward: by_kernel(scene, photograph, card, backward))
     for deterministic in (True, False):
-        for family in FAMILIES:
-            options = {"family": family, "deterministic": deterministic}
-            name = f"{family}{'' if deterministic else '_atomic'}"
+        for backward in BACKWARDS:
+            options = {"backward": backward, "deterministic": deterministic}
+            name = f"{backward}{'' if deterministic else '_atomic'}"
 
             def both(options: dict[str, Any] = options) -> dict[str, Any]:
                 found = forward_backward(rasterization, scene, case, **options)
@@ -170,10 +170,10 @@ def measure(case: GpuCase, scene: dict[str, Tensor], card: Card, record: Record)
 
 def shares(result: dict[str, Any]) -> dict[str, float]:
     """Say what dominant Gaussians and bits that repeat cost."""
-    ours, told = result["columns"], result["with_dominance"]
+    ours, told = result["pixel_parallel"], result["with_dominance"]
     return {
         "dominance_share": told["forward_ms"] / ours["forward_ms"] - 1.0,
-        "deterministic_costs_ms": ours["step_ms"] - result["columns_atomic"]["step_ms"],
+        "deterministic_costs_ms": ours["step_ms"] - result["pixel_parallel_atomic"]["step_ms"],
     }
 
 

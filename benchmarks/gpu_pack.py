@@ -22,11 +22,11 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cuda_ext.gpu_check import commit_of
-from cuda_ext.gpu_check_tools import ROOT, write_json
-from pop_fast.cli.splat import CaptureOptions, load_splat, open_capture
+from cuda_ext.gpu_check.command import commit_of
+from cuda_ext.gpu_check.tools import ROOT, write_json
 from pop_fast.data import Capture, View, load_capture
 from pop_fast.errors import PopError
+from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
 
 LIMIT: Final = 64 * 2**20  # bytes that travel, with the repository's own files
 QUALITY: Final = 92  # of a photograph's JPEG

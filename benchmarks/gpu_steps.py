@@ -14,10 +14,10 @@ from gpu_floors import Loads
 from gpu_profile import kernel_sums
 from torch import Tensor
 
-from cuda_ext import step_program
-from cuda_ext.resident import ResidentViews
 from cuda_ext.train_settings import Phase, StepSettings, steady_updates
-from cuda_ext.train_step import FusedTrainer
+from cuda_ext.training import step_program
+from cuda_ext.training.resident import ResidentViews
+from cuda_ext.training.train_step import FusedTrainer
 
 PLAIN, POP = Phase(3, False, False, False), Phase(3, True, True, True)
 # what a step launches, in order (`StepProgram.launch`)
@@ -74,7 +74,7 @@ def step_kernels(scene: dict[str, Tensor], photograph: Tensor, steps: int, **set
 
 def step_loads(trainer: FusedTrainer) -> Loads:
     """Count what the trainer's last step had to do; it must have told dominant Gaussians and counts."""
-    ((size, told),) = trainer.told_maps().items()
+    ((size, told),) = trainer.render_stats().items()
     width, height = size
     tiles = torch.nn.functional.pad(told["n_traversed"], (0, -width % 16, 0, -height % 8)).view(-(-height // 8), 8, -1)
     longest = tiles.view(tiles.shape[0], 8, -1, 16).amax((1, 3))

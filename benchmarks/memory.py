@@ -16,7 +16,7 @@ from cases import MEMORY_CASE, Case, gaussians_of
 from raster import SCENE
 from steps import run_of_case, take_turn
 
-from pop_fast.backends import get_backend
+from pop_fast.api.registry import get_backend
 from pop_fast.train.environment import keep_freed_memory
 
 HERE = Path(__file__).resolve().parent

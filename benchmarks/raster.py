@@ -12,9 +12,9 @@ from cases import Case, gaussians_of
 from timing import turns_ms
 from torch import Tensor
 
-from pop_fast.backends import backend_names, get_backend
-from pop_fast.compositing import Composite, composite
-from pop_fast.tiles import TileLists, tile_lists
+from pop_fast.api.registry import backend_names, get_backend
+from pop_fast.stages.compositing import Composite, composite
+from pop_fast.stages.tiles import TileLists, tile_lists
 
 SCENE = ("means", "quats", "scales", "opacities", "colors")
 

@@ -36,7 +36,7 @@ from steps import capture_runs, engines, first_view, run_of, run_of_case, steppi
 
 from pop_fast.train.environment import keep_freed_memory, reproducible
 
-# `turn_about` finds here what it times of each checkout
+# `ab_benchmark` finds here what it times of each checkout
 __all__ = [
     "RASTER_CASES",
     "blend_of",

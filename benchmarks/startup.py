@@ -57,8 +57,8 @@ def _first_step(capture: str, factor: int) -> dict[str, float]:
     """Time from the command to the first record, which is written as soon as the first step has been taken."""
     with tempfile.TemporaryDirectory() as folder:
         out, said = Path(folder) / "run", Path(folder) / "said"
-        # one step, or its record would wait for the others of its stretch
-        words = ["train", capture, "--factor", str(factor), "--preset", "quick", "--max-steps", "1", "--quiet"]
+        # one step, or its record would wait for the others of its segment
+        words = ["train", capture, "--factor", str(factor), "--preset", "quick", "--max-steps", "1", "--no-progress"]
         start = time.perf_counter()
         with (
             said.open("wb") as to,

@@ -1,6 +1,6 @@
 """Training steps of POP by every engine, in turns, and where those of the native step go.
 
-All are taken as a user's run takes them, by a `TrainingRun` that asks its stepper for stretches; the POP term,
+All are taken as a user's run takes them, by a `TrainingRun` that asks its stepper for segments; the POP term,
 dominance and the statistics of density control are on, and the population stays as it is.
 """
 
@@ -18,7 +18,7 @@ from cases import Case, capture_of, gaussians_of
 from timing import median_ratio, turns
 
 import pop_fast.train
-from pop_fast.backends import get_backend
+from pop_fast.api.registry import get_backend
 from pop_fast.data import Capture, load_capture
 from pop_fast.train import TrainConfig
 from pop_fast.train.environment import reproducible
@@ -57,7 +57,7 @@ def run_of(case: Case, folder: str, backend: str = "fast") -> Any:
 
 def stepping(training: Any) -> Callable[[], Any]:
     """Return what takes one step of a run."""
-    # `turn_about` calls this of checkouts too in which a run was called a trainer
+    # `ab_benchmark` calls this of checkouts too in which a run was called a trainer
     return getattr(training, "train_step", None) or (lambda: training.take_steps(training.step + 1))
 
 
@@ -70,14 +70,14 @@ def first_view(training: Any, capture: Capture) -> Rendered:
 
 def take_turn(training: Any, steps: int, threads: int) -> None:
     """Take steps of a run as its own loop does, with so many threads; 0 leaves their number as it is."""
-    from pop_fast.train.phases import stretch_end
+    from pop_fast.train.phases import segment_end
 
     if threads > 0:
         torch.set_num_threads(threads)
     last = training.step + steps
     while training.step < last:
         longest = min(training.stepper.longest, last - training.step)
-        training.take_steps(stretch_end(training.config, training.strategy, training.step, longest))
+        training.take_steps(segment_end(training.config, training.strategy, training.step, longest))
 
 
 def _engine(name: str) -> Any:

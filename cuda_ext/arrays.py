@@ -15,17 +15,6 @@ NOT_BAD = 2**31 - 1
 # places in DeviceState (csrc/launch.h)
 OVERFLOW, N_INSTANCES, N_BUCKETS, N_IMPORTANT, BAD_ROW, STEP, VIEW = range(7)
 
-_NUMBERS = (
-    "near_plane",
-    "far_plane",
-    "eps2d",
-    "frustum_margin",
-    "extent_sigmas",
-    "alpha_floor",
-    "alpha_ceiling",
-    "transmittance_stop",
-)
-
 
 class CudaMemoryError(RuntimeError):
     """The GPU has no room; the message says how much was asked for and what to lower."""
@@ -34,6 +23,21 @@ class CudaMemoryError(RuntimeError):
 def on_gpu(tensor: Tensor) -> bool:
     """Tell whether kernels can read a tensor."""
     return tensor.device.type == "cuda"
+
+
+def check_tensor(name: str, tensor: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Return a float32 tensor of that shape that kernels can read.
+
+    Raises:
+        ValueError: names the tensor and what to do.
+    """
+    if not on_gpu(tensor):
+        raise ValueError(f"{name} is on {tensor.device}; backend 'cuda' needs it on the GPU: use {name}.cuda()")
+    if tensor.dtype != torch.float32:
+        raise ValueError(f"{name} has dtype {tensor.dtype}; backend 'cuda' computes in float32: use {name}.float()")
+    if tuple(tensor.shape) != shape:
+        raise ValueError(f"{name} has shape {list(tensor.shape)}; it must be {list(shape)}")
+    return tensor
 
 
 def pointer(name: str, tensor: Tensor | None, dtypes: str = "float32") -> int:
@@ -127,15 +131,8 @@ def new_state(device: torch.device) -> Tensor:
 def kernel_profile(profile: Profile, tile_size: int) -> Any:
     """Return the kernels' form of a profile."""
     made = load().Profile()
-    for name in _NUMBERS:
-        setattr(made, name, getattr(profile, name))
-    made.tile_size = tile_size
-    made.near_inclusive = profile.near_inclusive
-    made.centred = profile.principal_point == "centred"
-    made.inria_clamp = profile.clamp_gradient == "inria"
-    made.square = profile.extent == "square"
-    made.pass_ceiling = profile.ceiling_gradient == "pass"
-    made.stop_inclusive = profile.stop_inclusive
+    for name, value in {**profile.as_numbers(), "tile_size": tile_size}.items():
+        setattr(made, name, value)
     return made
 
 
@@ -151,7 +148,7 @@ class Settings:
         antialiased: scale opacities by the low-pass compensation.
         radius_clip: px.
         absgrad: also sum |v_means2d|.
-        family: "columns" or "splats", which kernel goes back.
+        backward: "pixel_parallel" or "gaussian_parallel", which kernel goes back.
         deterministic: sum gradients through slots; False adds atomically and saves 48 bytes an instance.
     """
 
@@ -163,7 +160,7 @@ class Settings:
     antialiased: bool = False
     radius_clip: float = 0.0
     absgrad: bool = False
-    family: str = "columns"
+    backward: str = "pixel_parallel"
     deterministic: bool = True
 
     def kernel_profile(self) -> Any:

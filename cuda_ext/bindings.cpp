@@ -1,6 +1,6 @@
 // The kernels' host functions for Python: structs of pointers and numbers, no mathematics, no torch.
 //
-// Pointers cross as integers (tensor.data_ptr()); ops.py checks device, type, shape and contiguity before it takes one.
+// Pointers cross as integers (tensor.data_ptr()); cuda_ext.arrays checks device, type, shape and contiguity before it takes one.
 
 #include "bindings.h"
 
@@ -139,8 +139,8 @@ void bind_blend(nb::module_& m) {
     backward.def(nb::init<>());
     VALUE(backward, BlendBackward, channels);
     VALUE(backward, BlendBackward, absolute);
-    backward.def("set_family", [](BlendBackward& s, bool splats, bool atomics) {
-        s.family = splats ? Family::splats : Family::columns;
+    backward.def("set_backward", [](BlendBackward& s, bool splats, bool atomics) {
+        s.backward = splats ? Backward::gaussian_parallel : Backward::pixel_parallel;
         s.gather = atomics ? Gather::atomics : Gather::slots;
     });
     POINTER(backward, BlendBackward, records);

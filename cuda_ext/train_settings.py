@@ -65,7 +65,7 @@ class StepSettings:
         theta_blur: share of the image a Gaussian must dominate to be blurred.
         blur_min_pixels: and at least so many pixels.
         background: colour behind everything.
-        profile, antialiased, family, deterministic: as in `cuda_ext.ops.rasterization`.
+        profile, antialiased, backward, deterministic: as `cuda_ext.arrays.Settings` says.
         betas, eps: Adam's.
         replay: replay steps as CUDA graphs; False launches every kernel anew, for debuggers and profilers.
         counts: also tell how many splats every pixel blends and visits, which training does not read.
@@ -84,7 +84,7 @@ class StepSettings:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     profile: Profile = Recipe.profile
     antialiased: bool = False
-    family: str = "columns"
+    backward: str = "pixel_parallel"
     deterministic: bool = True
     betas: tuple[float, float] = BETAS
     eps: float = EPS

@@ -31,10 +31,10 @@ STAGES = (
     Stage("projection of means and covariances (EWA)", "3.1", ("projection",)),
     Stage("low-pass, conics, extents, off-screen cull", "3.1", ("footprint",)),
     Stage("tile lists in depth order", "3.1", ("tiles",), ("compiled/tiles.py",)),
-    Stage("falloff and alpha of one splat at one pixel", "eqs. 1, 11", ("alpha",)),
+    Stage("falloff and alpha of one splat at one pixel", "eqs. 1, 11", ("alpha",), ("stages/blend/alpha.py",)),
     Stage("blending with early ray termination", "eq. 1", ("compositing", "pixel"), ("compiled/compositing.py",)),
     Stage("dominant Gaussians", "eq. 5", ("dominance",)),
-    Stage("a whole view", "eq. 1", ("render", "splatting", "depth"), ("rasterization.py", "compiled/splatting.py")),
+    Stage("a whole view", "eq. 1", ("render", "splatting", "depth"), ("api/rasterize.py", "compiled/splatting.py")),
     Stage(
         "L1, L2, SSIM and both objectives", "eqs. 2, 4, 9", ("losses", "ssim", "loss_magnitudes"), ("compiled/ssim.py",)
     ),
@@ -64,10 +64,10 @@ STAGES = (
 
 # modules of pop_ref that are data or types, not stages
 NOT_STAGES = frozenset({"__init__", "_shapes", "ambiguities", "constants", "notation", "settings", "records"})
-# stages whose laws stand in a file of another name: whole views, and what has a file of its own outside tests/laws
+# stages whose laws stand in a file of another name: whole views, and what is tested elsewhere
 LAWS_ELSEWHERE = {
-    "render": "tests/laws/test_whole.py",
-    "depth": "tests/laws/test_signature_depth.py",
+    "render": "pop_ref/conformance/laws/test_whole.py",
+    "depth": "pop_ref/conformance/laws/test_signature_depth.py",
     "training": "tests/golden",
     "margins": "tests/thresholds",
 }
@@ -84,9 +84,10 @@ def functions(path: Path) -> dict[str, list[str]]:
 def files(room: str, stage: Stage) -> Iterator[Path]:
     """Give the files of a stage in one room, where they exist."""
     suffixes = (".cuh", ".cu") if room == "cuda_ext/csrc" else (".py",)
+    folder = ROOT / ("pop_fast/stages" if room == "pop_fast" else room)
     for module in stage.modules:
         for suffix in suffixes:
-            path = ROOT / room / f"{module}{suffix}"
+            path = folder / f"{module}{suffix}"
             if path.is_file():
                 yield path
     if room == "pop_fast":
@@ -96,9 +97,10 @@ def files(room: str, stage: Stage) -> Iterator[Path]:
 
 
 def laws(stage: Stage) -> Iterator[Path]:
-    """Give the law files of a stage: tests/laws/test_<module>*.py, or the place named in `LAWS_ELSEWHERE`."""
+    """Give the law files of a stage, those of its modules, or the place named in `LAWS_ELSEWHERE`."""
     for module in stage.modules:
         if module in LAWS_ELSEWHERE:
             yield ROOT / LAWS_ELSEWHERE[module]
-        yield from sorted((ROOT / "tests" / "laws").glob(f"test_{module}.py"))
-        yield from sorted((ROOT / "tests" / "laws").glob(f"test_{module}_*.py"))
+        folder = ROOT / "pop_ref" / "conformance" / "laws"
+        yield from sorted(folder.glob(f"test_{module}.py"))
+        yield from sorted(folder.glob(f"test_{module}_*.py"))

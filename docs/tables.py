@@ -25,6 +25,7 @@ from pop_fast.train.presets import options_for
 from pop_ref.conformance.capabilities import STAGES as LAW_STAGES
 from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM
 from pop_ref.conformance.mutants.trial import every_law
+from pop_ref.conformance.scorecard import outcomes
 from pop_ref.conformance.teeth import UNITS
 from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER, SPEEDY_SPLAT
 from pop_ref.notation import SYMBOLS
@@ -35,6 +36,7 @@ PAGES = (README, *sorted(path for path in (ROOT / "docs").glob("*.md") if path.n
 MUTANT_LIST = ROOT / "docs" / "MUTANTS.md"
 CARDS = ROOT / "benchmarks" / "results" / "scorecards"
 TEETH = ROOT / "benchmarks" / "results" / "teeth.json"
+VECTOR_KILLS = ROOT / "benchmarks" / "results" / "vector_kills.json"
 CPU_TIMES = ROOT / "benchmarks" / "results" / "cpu.json"
 # the judged, in the order of their columns, and the card that each stands on
 JUDGED = {
@@ -47,6 +49,9 @@ JUDGED = {
     "gsplat torch float64": ("gsplat.json", "gsplat-torch64"),
     "gsplat torch float32": ("gsplat.json", "gsplat-torch32"),
 }
+
+OURS = {title: judged for title, judged in JUDGED.items() if not title.startswith("gsplat")}
+FAMILIES = {"stages of the oracle": MUTANTS, "the program that trains": PROGRAM, "whole rasterizers": BLACK_BOXES}
 
 
 def rosetta() -> str:
@@ -153,10 +158,41 @@ def broken_laws() -> str:
     """List the laws that a judged backend breaks."""
     lines = []
     for title, (file, backend) in JUDGED.items():
-        for outcomes in card(file)["laws"][backend].values():
-            names = [law for law, came in outcomes.items() if came.startswith("failed")]
+        for of_stage in card(file)["laws"][backend].values():
+            names = [law for law, came in outcomes(of_stage).items() if came.startswith("failed")]
             lines += [f"- {title}: {law.replace('_', ' ')}" for law in names]
     return "\n".join(lines) or "None is broken."
+
+
+def surfaces() -> str:
+    """Make the table of how much of each judged backend the laws reach, and of what they cost."""
+    rows = []
+    for title, (file, backend) in JUDGED.items():
+        told = card(file)
+        surface, counts = told["surface"][backend], told["summary"][backend].values()
+        judged, every = sum(c["passed"] + c["failed"] for c in counts), sum(sum(c.values()) for c in counts)
+        groups = [surface[group] for group in ("whole views", "arguments", "stage functions")]
+        reached = [f"{len(g['offered'])} of {len(g['offered']) + len(g['not'])}" for g in groups]
+        rows.append([title, f"{judged} of {every}", surface["profile"], *reached])
+    head = ["", "laws tried", "constants", "of whole views", "of gsplat's arguments", "stage functions"]
+    return _table(head, rows)
+
+
+def power() -> str:
+    """Make the table of what the kit kills, and of sound backends that it refuses."""
+    vectors = json.loads(VECTOR_KILLS.read_text(encoding="utf-8"))
+    rows = []
+    for family, count in ((name, len(mutants)) for name, mutants in FAMILIES.items()):
+        noticed = sum(first is not None for first in vectors[family].values())
+        rows.append([family, str(count), f"{count} of {count}", f"{noticed} of {len(vectors[family])}"])
+    failed = {title: sum(c["failed"] for c in card(file)["summary"][b].values()) for title, (file, b) in OURS.items()}
+    refused = sum(1 for count in failed.values() if count)
+    of_vectors = [first for first in vectors["sound"].values() if first is not None]
+    sound = f"{refused} of {len(failed)} refused", f"{len(of_vectors)} of {len(vectors['sound'])} refused"
+    rows.append(["sound backends of this project", "", *sound])
+    return _table(
+        ["broken on purpose", "mutants", "killed by a named law", "noticed by the portable vectors alone"], rows
+    )
 
 
 def speed() -> str:
@@ -275,6 +311,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "kit": kit,
     "teeth": teeth,
     "scorecards": scorecards,
+    "surfaces": surfaces,
+    "power": power,
     "broken": broken_laws,
 }
 

@@ -17,14 +17,14 @@ import torch
 from torch import Tensor
 
 from paper_repro.collect import PROBE
-from pop_fast import losses
 from pop_fast.data import Capture
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.read_back import read_json
+from pop_fast.stages import losses
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import engine_of
 from pop_fast.train.evaluate import gaussians_per_pixel
-from pop_fast.train.records import Stretch
+from pop_fast.train.records import Segment
 from pop_fast.train.schedule import active_sh_degree
 from pop_fast.train.training_run import TrainingRun
 from pop_fast.train.views import ViewTensors, render_view
@@ -68,8 +68,8 @@ class ProbedRun(TrainingRun):
         finally:
             self._write()
 
-    def take_steps(self, last: int) -> Stretch:
-        """See `TrainingRun.take_steps`; a stretch ends where a probe is due."""
+    def take_steps(self, last: int) -> Segment:
+        """See `TrainingRun.take_steps`; a segment ends where a probe is due."""
         if self._points is None:
             self._points = self._read()
         if self.step % self._every == 0:

@@ -128,7 +128,7 @@ def capture_folder(scene: Scene, options: Options) -> Path:
     folder = options.work / "demo"
     with only_one(options.work / "demo.lock", f"{folder}: another process makes it", wait=True):
         if not folder.is_dir():
-            from pop_fast.data import make_demo
+            from pop_fast.demo import make_demo
 
             (width, height), views = scene.size, scene.n_images
             make_demo(folder, seed=_DEMO_SEED, views=views, width=width, height=height)

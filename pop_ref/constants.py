@@ -22,7 +22,7 @@ stop `T <= 1e-4`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -86,6 +86,20 @@ class Profile:
     transmittance_stop: float
     stop_inclusive: bool
     tile_size: int
+
+    def as_numbers(self) -> dict[str, float]:
+        """Return the constants as compiled code has them: numbers by name, and every choice of two as a flag.
+
+        The flags are `centred` (the principal point), `inria_clamp` (B1), `square` (D2, D3) and `pass_ceiling` (B3).
+        """
+        words = {"name", "principal_point", "clamp_gradient", "extent", "ceiling_gradient"}
+        return {
+            **{field.name: getattr(self, field.name) for field in fields(self) if field.name not in words},
+            "centred": self.principal_point == "centred",
+            "inria_clamp": self.clamp_gradient == "inria",
+            "square": self.extent == "square",
+            "pass_ceiling": self.ceiling_gradient == "pass",
+        }
 
 
 GSPLAT_1_5: Final = Profile(

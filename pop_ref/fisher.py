@@ -80,22 +80,22 @@ def screen_moments(
     if splats.colors.shape[1] != _N_CHANNELS:
         raise ValueError(f"splats have {splats.colors.shape[1]} colour channels; they must have {_N_CHANNELS}")
     rows = rows_from_splats(splats)
-    behind_all = background_or_black(background, _N_CHANNELS)
+    black_or_given = background_or_black(background, _N_CHANNELS)
     moments = np.zeros((len(rows.opacities), _N_UPPER + _N_CHANNELS * _N_SCREEN + 1))
     for x, y, ids in listed_pixels(lists, width, height, tile_size):
         px, py = x + 0.5, y + 0.5
-        pixel = composite_pixel(ids, rows, px, py, behind_all, profile)
-        behind = np.array(behind_all)
+        pixel = composite_pixel(ids, rows, px, py, black_or_given, profile)
+        suffix_color = np.array(black_or_given)
         for i, alpha, T in zip(
             reversed(pixel.ids), reversed(pixel.alphas), reversed(pixel.transmittances), strict=True
         ):
-            more = np.array(rows.colors[i]) - behind
+            more = np.array(rows.colors[i]) - suffix_color
             sigma = sigma_at_pixel(rows.means2d[i], rows.conics[i], px, py)
             dsigma, _ = alpha_from_sigma_vjp(sigma, rows.opacities[i], 1.0, profile)
             v_mean2d, v_conic = sigma_at_pixel_vjp(rows.means2d[i], rows.conics[i], px, py, dsigma)
             of_alpha = np.array([*v_mean2d, *v_conic])
             moments[i] += _moments_of(T * np.outer(more, of_alpha), T * alpha)
-            behind = behind + alpha * more
+            suffix_color = suffix_color + alpha * more
     return moments
 
 

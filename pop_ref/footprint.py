@@ -69,7 +69,7 @@ def compensations(covars2d: Float64[np.ndarray, "N 2 2"], eps2d: float) -> Float
 
     Multiplies the opacity in antialiased mode; classic mode does not use it.
 
-    Source: Yu et al. 2024 (Mip-Splatting), eq. 9, as gsplat's antialiased mode.
+    Source: Yu et al. 2024 (Mip-Splatting), the 2D Mip filter, as gsplat's antialiased mode.
     Departs: nothing.
 
     Args:

@@ -1,7 +1,7 @@
 """One pixel: front-to-back blending with early ray termination, and its transpose.
 
 With T_1 = 1 and T_{i+1} = T_i (1 - alpha_i), a pixel is C = sum_i T_i alpha_i c_i + T_final background. Let g be the
-cotangent of C, q_i = c_i . g what splat i is worth to it, and B_i what the light that passes splat i is worth:
+cotangent of C, q_i = c_i . g the product of splat i's colour with it, and B_i that of the colour behind splat i:
 B_m = background . g + v_T_final behind the last splat, and B_{i-1} = alpha_i q_i + (1 - alpha_i) B_i. Then
     dL/dalpha_i = T_i (q_i - B_i),    dL/dc_i = T_i alpha_i g,
 so one scalar, walked from back to front, is all the backward pass carries: it never divides by 1 - alpha.
@@ -33,7 +33,7 @@ class SplatRows(NamedTuple):
 
 
 class Pixel(NamedTuple):
-    """One blended pixel: its colour, the light left, and of each blended splat its id, alpha and T before it."""
+    """One blended pixel: its colour, what is left of T, and of each blended splat its id, alpha and T before it."""
 
     color: list[float]
     T_final: float
@@ -200,17 +200,17 @@ def composite_pixel_vjp(
         >>> totals.v_opacities, totals.v_colors, totals.v_background
         (array([-7.]), array([[0.5]]), array([0.5]))
     """
-    behind = v_T_final
+    suffix_dot_grad = v_T_final
     for k, b in enumerate(background):
         totals.v_background[k] += pixel.T_final * v_color[k]
-        behind += b * v_color[k]
+        suffix_dot_grad += b * v_color[k]
     for i, alpha, T in zip(reversed(pixel.ids), reversed(pixel.alphas), reversed(pixel.transmittances), strict=True):
-        worth = 0.0
+        color_dot_grad = 0.0
         for k, c in enumerate(rows.colors[i]):
-            worth += c * v_color[k]
+            color_dot_grad += c * v_color[k]
             totals.v_colors[i, k] += T * alpha * v_color[k]
-        v_alpha = T * (worth - behind)
-        behind += alpha * (worth - behind)
+        v_alpha = T * (color_dot_grad - suffix_dot_grad)
+        suffix_dot_grad += alpha * (color_dot_grad - suffix_dot_grad)
         sigma = sigma_at_pixel(rows.means2d[i], rows.conics[i], px, py)
         v_sigma, v_opacity = alpha_from_sigma_vjp(sigma, rows.opacities[i], v_alpha, profile)
         v_mean2d, v_conic = sigma_at_pixel_vjp(rows.means2d[i], rows.conics[i], px, py, v_sigma)

@@ -1,9 +1,9 @@
 """How much a view changes where one splat's Gaussian does: the pruning score of Speedy-Splat.
 
 With alpha = o g, g the splat's Gaussian at a pixel, the summed colour of a pixel changes with g by
-    d(sum_c C_c)/dg = o sum_c dC_c/dalpha = o T (sum_c c_c - behind),
-where `behind` is the summed colour of what lies behind the splat: behind the last one the background, and then
-behind <- behind + alpha (sum_c c_c - behind) from back to front. The score adds the squares over pixels.
+    d(sum_c C_c)/dg = o sum_c dC_c/dalpha = o T (sum_c c_c - suffix_color),
+where `suffix_color` is the summed colour of what lies behind the splat: behind the last one the background, and then
+suffix_color <- suffix_color + alpha (sum_c c_c - suffix_color) from back to front. The score adds squares over pixels.
 """
 
 from __future__ import annotations
@@ -57,15 +57,15 @@ def sensitivities(
         (array([2.25]), array([0.25]))
     """
     rows = rows_from_splats(splats)
-    behind_all = background_or_black(background, splats.colors.shape[1])
+    black_or_given = background_or_black(background, splats.colors.shape[1])
     scores = np.zeros(len(rows.opacities))
     for x, y, ids in listed_pixels(lists, width, height, tile_size):
-        pixel = composite_pixel(ids, rows, x + 0.5, y + 0.5, behind_all, profile)
-        behind = sum(behind_all)
+        pixel = composite_pixel(ids, rows, x + 0.5, y + 0.5, black_or_given, profile)
+        suffix_color = sum(black_or_given)
         for i, alpha, T in zip(
             reversed(pixel.ids), reversed(pixel.alphas), reversed(pixel.transmittances), strict=True
         ):
-            more = sum(rows.colors[i]) - behind
+            more = sum(rows.colors[i]) - suffix_color
             scores[i] += (rows.opacities[i] * T * more) ** 2
-            behind += alpha * more
+            suffix_color += alpha * more
     return scores

@@ -1,14 +1,33 @@
-"""Which backends the laws are run over here."""
+"""Which laws are run here, and over which backends."""
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
+from collections.abc import Iterable
 from typing import Any
 
 import pytest
 
+from pop_ref.conformance import laws
 from pop_ref.conformance.backends import SHIPPED, Absent, shipped, shipped_or_absent
 from pop_ref.conformance.law import missing
 from pop_ref.conformance.plugin import parametrize_backends
+
+# test_alpha is written alpha
+LAW_MODULES = tuple(sorted(m.name.removeprefix("test_") for m in pkgutil.iter_modules(laws.__path__)))
+
+
+def law_classes(modules: Iterable[str]) -> dict[str, type]:
+    """Return a class for each module of laws, as TestAlpha, which holds the laws as its tests."""
+    found = {}
+    for name in modules:
+        module = importlib.import_module(f"{laws.__name__}.test_{name}")
+        tests = {key: staticmethod(value) for key, value in vars(module).items() if hasattr(value, "law")}
+        assert tests, f"test_{name} holds no law"
+        title = "Test" + "".join(word.capitalize() for word in name.split("_"))
+        found[title] = type(title, (), {"__doc__": module.__doc__, **tests})
+    return found
 
 
 def judge_own_backends(metafunc: pytest.Metafunc) -> None:

@@ -78,7 +78,7 @@ inline BlendConstants<Real> blend_constants(const Profile<Real>& profile) {
 
 // a splat as the kernels blend it
 template <class Real>
-struct Blended {
+struct PackedSplat {
     Real x, y;
     Real hA, B, hC;
     Real opacity;
@@ -86,7 +86,7 @@ struct Blended {
 };
 
 template <class Real>
-POP_HD Blended<Real> blended_from_splat(Vec2<Real> mean2d, Conic<Real> conic, Real opacity, Real floor) {
+POP_HD PackedSplat<Real> packed_from_splat(Vec2<Real> mean2d, Conic<Real> conic, Real opacity, Real floor) {
     const Real half_log2_e = Real(0.5 * LOG2_E), log2_e = Real(LOG2_E);
     const Real reach = log2(opacity / floor);
     const Real beyond = reach >= Real(0) ? Real(nextafter(reach, Real(INFINITY))) : Real(0);

@@ -20,12 +20,12 @@ namespace pop {
 namespace {
 
 template <int CH>
-__device__ __forceinline__ float worth_behind(const BlendBackward& blend, const float* v_color, float v_T) {
-    float behind = v_T;
+__device__ __forceinline__ float background_dot_grad(const BlendBackward& blend, const float* v_color, float v_T) {
+    float dot = v_T;
     if (blend.background != nullptr)
 #pragma unroll
-        for (int c = 0; c < CH; ++c) behind += __ldg(blend.background + c) * v_color[c];
-    return behind;
+        for (int c = 0; c < CH; ++c) dot += __ldg(blend.background + c) * v_color[c];
+    return dot;
 }
 
 __device__ __forceinline__ float* row_of(const TileLists& lists, const BlendBackward& blend, const WarpTile& tile,
@@ -101,7 +101,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK, CH < 4 && !ABS ? 7 : 0)
 #pragma unroll
         for (int c = 0; c < CH; ++c) column.v_color[k][c] = inside ? blend.v_image[CH * pixel + c] : 0.0f;
         const float v_T = inside && blend.v_T_final != nullptr ? blend.v_T_final[pixel] : 0.0f;
-        column.behind[k] = worth_behind<CH>(blend, column.v_color[k], v_T);
+        column.suffix_dot_grad[k] = background_dot_grad<CH>(blend, column.v_color[k], v_T);
         last = max(last, column.last[k]);
     }
     last = begin + warp_max(last);
@@ -170,7 +170,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
     const int bucket = blockIdx.x * WARPS_PER_BLOCK + warp;
     if (bucket >= state->n_buckets) return;
     const int list = lists.bucket_tile[bucket];
-    // lists and warp tiles coincide in this family
+    // lists and warp tiles coincide here
     const WarpTile tile = {list % lists.grid.tiles_x * WARP_TILE_W, list / lists.grid.tiles_x * WARP_TILE_H, list, 0, 1};
     const int begin = lists.tile_begin[list], end = lists.tile_end[list];
     const int first = (bucket - lists.bucket_begin[list]) * WARP;
@@ -194,10 +194,11 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
                 p.v_color[c] = blend.v_image[CH * pixel + c];
                 later[c] = checkpoint[(1 + c) * TILE_PIXELS + k * WARP + lane];
             }
-            const float worth = worth_behind<CH>(blend, p.v_color, v_T);
+            const float background_dot = background_dot_grad<CH>(blend, p.v_color, v_T);
             const float* next = checkpoint + (1 + CH) * TILE_PIXELS;
-            p.behind = {T_final, worth};
-            if (goes_on) p.behind = passing_behind<float, CH>(next[k * WARP + lane], T_final, later, p.v_color, worth);
+            p.behind = {T_final, background_dot};
+            if (goes_on)
+                p.behind = passing_after<float, CH>(next[k * WARP + lane], T_final, later, p.v_color, background_dot);
         }
         pixels[warp][k * WARP + lane] = p;
         last = max(last, p.last);
@@ -222,7 +223,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
         for (int step = 0; step < TILE_PIXELS + WARP - 1; ++step) {  // per step
             // the pixel that the lane behind has just left
             passing.T = __shfl_down_sync(FULL_WARP, passing.T, 1);
-            passing.behind = __shfl_down_sync(FULL_WARP, passing.behind, 1);
+            passing.suffix_dot_grad = __shfl_down_sync(FULL_WARP, passing.suffix_dot_grad, 1);
             const int p = step - (WARP - 1 - lane);
             if (p < 0 || p >= TILE_PIXELS) continue;
             const BucketPixel<CH>& pixel = pixels[warp][p];
@@ -272,7 +273,7 @@ template <int CH, bool ABS, bool PASS, bool ATOMIC>
 void launch(const TileLists& lists, const BlendBackward& blend, const BlendConstants<float>& constants,
             const DeviceState* state, cudaStream_t stream) {
     const int threads = WARP * WARPS_PER_BLOCK;
-    if (blend.family == Family::columns) {
+    if (blend.backward == Backward::pixel_parallel) {
         const int tiles = n_warp_tiles(lists.grid);
         columns_kernel<CH, ABS, PASS, ATOMIC>
             <<<blocks_for(tiles, WARPS_PER_BLOCK), threads, 0, stream>>>(lists, blend, constants, tiles);
@@ -316,8 +317,8 @@ void launch(const TileLists& lists, const BlendBackward& blend, const Profile<fl
 void blend_backward(const TileLists& lists, const BlendBackward& blend, const Profile<float>& profile,
                     const DeviceState* state, cudaStream_t stream) {
     const bool own_tiles = lists.grid.tile_w == WARP_TILE_W && lists.grid.tile_h == WARP_TILE_H;
-    if (blend.family == Family::splats && (!own_tiles || blend.checkpoints == nullptr))
-        throw std::invalid_argument("blend_backward: family splats needs 16 x 8 lists and checkpoints");
+    if (blend.backward == Backward::gaussian_parallel && (!own_tiles || blend.checkpoints == nullptr))
+        throw std::invalid_argument("blend_backward: backward gaussian_parallel needs 16 x 8 lists and checkpoints");
     switch (blend.channels) {
         case 1: return launch<1>(lists, blend, profile, state, stream);
         case 3: return launch<3>(lists, blend, profile, state, stream);

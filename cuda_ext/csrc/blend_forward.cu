@@ -15,7 +15,7 @@ namespace {
 constexpr int GROUP = 4;
 static_assert(WARP % GROUP == 0, "groups fill a batch");
 
-// Where a lane's pixels keep what family "splats" reads of a bucket: T before it, then the colour that later buckets
+// Where a lane's pixels keep what the gaussian_parallel backward reads of a bucket: T before it, then the colour that later buckets
 // blended. Until the list is done, the colour is what this bucket blended.
 template <int CH>
 __device__ __forceinline__ float* checkpoint_of(const TileLists& lists, const BlendForward& blend, int list, int bucket,
@@ -44,13 +44,13 @@ __device__ __forceinline__ void sum_from_the_back(const TileLists& lists, const 
 }
 
 // blocks that must fit a multiprocessor at a time: as many as leave every value its register
-constexpr int least_blocks(int channels, Tell tell, bool checkpoint) {
-    const int wide = channels == MAX_CHANNELS, most = tell == Tell::everything;
-    return tell == Tell::nothing ? 8 - checkpoint - wide : 7 - checkpoint - most - 2 * wide;
+constexpr int least_blocks(int channels, Collect collect, bool checkpoint) {
+    const int wide = channels == MAX_CHANNELS, most = collect == Collect::everything;
+    return collect == Collect::nothing ? 8 - checkpoint - wide : 7 - checkpoint - most - 2 * wide;
 }
 
-template <int CH, Tell TELL, bool CHECKPOINT>
-__global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK, least_blocks(CH, TELL, CHECKPOINT))
+template <int CH, Collect COLLECT, bool CHECKPOINT>
+__global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK, least_blocks(CH, COLLECT, CHECKPOINT))
     blend_forward_kernel(TileLists lists, BlendForward blend, BlendConstants<float> constants, int n_warp_tiles) {
     __shared__ float4 staged[WARPS_PER_BLOCK][WARP][RECORD / 4];
     const int lane = threadIdx.x & (WARP - 1), warp = threadIdx.x / WARP;
@@ -63,8 +63,8 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK, least_blocks(CH, TELL, 
     const int begin = lists.tile_begin[tile.list], end = lists.tile_end[tile.list];
 
     ForwardColumn<float, CH, COLUMN_ROWS> column;
-    Instruments<float, COLUMN_ROWS> told;
-    start_forward<TELL>(column, told, rows);
+    RenderStats<float, COLUMN_ROWS> stats;
+    start_forward<COLLECT>(column, stats, rows);
     const float4(*own)[RECORD / 4] = pinned_shared(staged[warp]);
     int n_buckets = 0;
     for (int first = begin; first < end; first += WARP) {  // per 32 records
@@ -102,7 +102,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK, least_blocks(CH, TELL, 
                 record.color<CH>(color);
                 // a pixel's winner is known by its place in the list until all are blended
                 const int place = first - begin + g;
-                blend_forward<TELL>(column, told, record.splat(), color, place, px, py, place, constants);
+                blend_forward<COLLECT>(column, stats, record.splat(), color, place, px, py, place, constants);
             }
         }
     }
@@ -120,23 +120,23 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK, least_blocks(CH, TELL, 
         }
         blend.T_final[pixel] = T;
         blend.last[pixel] = min(column.last[k], end - begin);
-        if (TELL != Tell::nothing) {
-            if (told.best[k].id >= 0) told.best[k].id = int(lists.listed[begin + told.best[k].id]);
-            blend.dominant_ids[pixel] = told.best[k].id;
-            blend.dominant_weights[pixel] = told.best[k].weight;
+        if (COLLECT != Collect::nothing) {
+            if (stats.best[k].id >= 0) stats.best[k].id = int(lists.listed[begin + stats.best[k].id]);
+            blend.dominant_ids[pixel] = stats.best[k].id;
+            blend.dominant_weights[pixel] = stats.best[k].weight;
         }
-        if (TELL == Tell::everything) {
-            blend.n_blended[pixel] = told.n_blended[k];
+        if (COLLECT == Collect::everything) {
+            blend.n_blended[pixel] = stats.n_blended[k];
             blend.n_traversed[pixel] = min(column.last[k] + 1, end - begin);
         }
     }
-    if (TELL != Tell::nothing) {
+    if (COLLECT != Collect::nothing) {
         const bool masked = blend.masks != nullptr && !halted(blend.state);
         const uint8_t* mask = masked ? blend.masks[blend.state->view] : nullptr;
         // neighbours mostly agree on the winner: one integer addition a group of equal winners, in any order
 #pragma unroll
         for (int k = 0; k < COLUMN_ROWS; ++k) {
-            int id = k < rows ? told.best[k].id : -1;
+            int id = k < rows ? stats.best[k].id : -1;
             if (id >= 0 && mask != nullptr && mask[size_t(y + k) * lists.grid.width + x] == 0) id = -1;
             unsigned group = __match_any_sync(FULL_WARP, id);
             if (id >= 0 && lane == __ffs(group) - 1) atomicAdd(blend.dominant_counts + id, __popc(group));
@@ -144,15 +144,15 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK, least_blocks(CH, TELL, 
     }
 }
 
-template <int CH, Tell TELL>
+template <int CH, Collect COLLECT>
 void launch(const TileLists& lists, const BlendForward& blend, const BlendConstants<float>& constants,
             cudaStream_t stream) {
     const int tiles = n_warp_tiles(lists.grid), blocks = blocks_for(tiles, WARPS_PER_BLOCK);
     const int threads = WARP * WARPS_PER_BLOCK;
     if (blend.checkpoints != nullptr)
-        blend_forward_kernel<CH, TELL, true><<<blocks, threads, 0, stream>>>(lists, blend, constants, tiles);
+        blend_forward_kernel<CH, COLLECT, true><<<blocks, threads, 0, stream>>>(lists, blend, constants, tiles);
     else
-        blend_forward_kernel<CH, TELL, false><<<blocks, threads, 0, stream>>>(lists, blend, constants, tiles);
+        blend_forward_kernel<CH, COLLECT, false><<<blocks, threads, 0, stream>>>(lists, blend, constants, tiles);
     POP_LAUNCHED("blend_forward_kernel");
 }
 
@@ -160,11 +160,11 @@ template <int CH>
 void launch(const TileLists& lists, const BlendForward& blend, const BlendConstants<float>& constants,
             cudaStream_t stream) {
     if (blend.dominant_ids == nullptr)
-        launch<CH, Tell::nothing>(lists, blend, constants, stream);
+        launch<CH, Collect::nothing>(lists, blend, constants, stream);
     else if (blend.n_blended == nullptr)
-        launch<CH, Tell::dominant>(lists, blend, constants, stream);
+        launch<CH, Collect::dominant>(lists, blend, constants, stream);
     else
-        launch<CH, Tell::everything>(lists, blend, constants, stream);
+        launch<CH, Collect::everything>(lists, blend, constants, stream);
 }
 
 }  // namespace

@@ -28,24 +28,24 @@ struct ForwardColumn {
 };
 
 // what a forward pass tells beside the image
-enum class Tell { nothing, dominant, everything };
+enum class Collect { nothing, dominant, everything };
 
 template <class Real, int ROWS>
-struct Instruments {
+struct RenderStats {
     Dominant<Real> best[ROWS];
-    int n_blended[ROWS];  // with Tell::everything
+    int n_blended[ROWS];  // with Collect::everything
 };
 
 template <class Real, int CH, int ROWS>
 struct BackwardColumn {
     Real T[ROWS];        // transmittance behind the splat that is visited next
-    Real behind[ROWS];   // what the light that passes that splat is worth
+    Real suffix_dot_grad[ROWS];  // the colour behind that splat, dotted with the pixel's cotangent
     Real v_color[ROWS][CH];
     int last[ROWS];
 };
 
-template <Tell TELL, class Real, int CH, int ROWS>
-POP_HD void start_forward(ForwardColumn<Real, CH, ROWS>& column, Instruments<Real, ROWS>& told, int rows_inside) {
+template <Collect COLLECT, class Real, int CH, int ROWS>
+POP_HD void start_forward(ForwardColumn<Real, CH, ROWS>& column, RenderStats<Real, ROWS>& stats, int rows_inside) {
     POP_UNROLL
     for (int k = 0; k < ROWS; ++k) {
         column.T[k] = k < rows_inside ? Real(1) : Real(0);
@@ -53,8 +53,8 @@ POP_HD void start_forward(ForwardColumn<Real, CH, ROWS>& column, Instruments<Rea
         column.last[k] = 0;
         POP_UNROLL
         for (int c = 0; c < CH; ++c) column.color[k][c] = Real(0);
-        if (TELL != Tell::nothing) told.best[k] = no_dominant<Real>();
-        if (TELL == Tell::everything) told.n_blended[k] = 0;
+        if (COLLECT != Collect::nothing) stats.best[k] = no_dominant<Real>();
+        if (COLLECT == Collect::everything) stats.n_blended[k] = 0;
     }
 }
 
@@ -69,9 +69,9 @@ POP_HD bool is_open(const ForwardColumn<Real, CH, ROWS>& column, Real stop) {
 // Without branches, so that the pixels' exponentials overlap: nearly every splat of a tile's list reaches some pixel of
 // a row of its warp. A splat that is not within reach is blended with weight 0: its colour must be finite. x, y: the first pixel's centre; position: the splat's place in the list; id: what the winner of a
 // pixel is known by.
-template <Tell TELL, class Real, int CH, int ROWS>
-POP_HD void blend_forward(ForwardColumn<Real, CH, ROWS>& column, Instruments<Real, ROWS>& told,
-                          const Blended<Real>& splat, const Real* color, int id, Real x, Real y, int position,
+template <Collect COLLECT, class Real, int CH, int ROWS>
+POP_HD void blend_forward(ForwardColumn<Real, CH, ROWS>& column, RenderStats<Real, ROWS>& stats,
+                          const PackedSplat<Real>& splat, const Real* color, int id, Real x, Real y, int position,
                           const BlendConstants<Real>& constants) {
     const Real dx = add(splat.x, -x);
     const Real squared_x = mul(mul(splat.hA, dx), dx), cross = mul(splat.B, dx);
@@ -91,8 +91,8 @@ POP_HD void blend_forward(ForwardColumn<Real, CH, ROWS>& column, Instruments<Rea
             POP_UNROLL
             for (int c = 0; c < CH; ++c) column.color[k][c] = fused(weight, color[c], column.color[k][c]);
         }
-        if (TELL == Tell::everything) told.n_blended[k] += goes_on & (alpha > Real(0));
-        if (TELL != Tell::nothing) compete(told.best[k], id, goes_on ? weight : Real(0));
+        if (COLLECT == Collect::everything) stats.n_blended[k] += goes_on & (alpha > Real(0));
+        if (COLLECT != Collect::nothing) compete(stats.best[k], id, goes_on ? weight : Real(0));
     }
 }
 
@@ -113,7 +113,7 @@ POP_HD Real exponent_cotangent(Real unclamped, Real ceiling, Real weight, Real T
 
 // One splat, back to front, without branches as in blend_forward. Returns whether any pixel took part.
 template <bool ABS, bool PASS, class Real, int CH, int ROWS>
-POP_HD bool blend_backward(BackwardColumn<Real, CH, ROWS>& column, const Blended<Real>& splat, const Real* color,
+POP_HD bool blend_backward(BackwardColumn<Real, CH, ROWS>& column, const PackedSplat<Real>& splat, const Real* color,
                            Real dx, Real y, int position, const BlendConstants<Real>& constants,
                            ColumnSums<Real, CH>& sums) {
     const Real squared_x = mul(mul(splat.hA, dx), dx), cross = mul(splat.B, dx);
@@ -131,14 +131,14 @@ POP_HD bool blend_backward(BackwardColumn<Real, CH, ROWS>& column, const Blended
         // an approximate 1 / 1 must not add up over the splats that do not take part
         if (reached) column.T[k] = T;
         const Real weight = T * alpha;
-        Real gain = -column.behind[k];
+        Real gain = -column.suffix_dot_grad[k];
         POP_UNROLL
         for (int c = 0; c < CH; ++c) {
             gain += color[c] * column.v_color[k][c];
             const Real v_color = weight * column.v_color[k][c];
             sums.v_color[c] = k == 0 ? v_color : sums.v_color[c] + v_color;
         }
-        column.behind[k] += alpha * gain;
+        column.suffix_dot_grad[k] += alpha * gain;
         const Real G = exponent_cotangent<PASS>(unclamped, constants.ceiling, weight, T, gain), G_dy = G * dy;
         // the first is not added to a zero, which costs as much as another
         sums.m0 = k == 0 ? G : sums.m0 + G;
@@ -169,26 +169,27 @@ POP_HD void sums_of_column(const ColumnSums<Real, CH>& column, Real dx, Real* su
     }
 }
 
-// A pixel on its way through the splats of a bucket, back to front: the other family, one splat a lane.
+// A pixel on its way through the splats of a bucket, back to front: the other backward, one splat a lane.
 template <class Real>
 struct Passing {
     Real T;       // transmittance behind the splat that is visited next
-    Real behind;  // what the light that passes that splat is worth
+    Real suffix_dot_grad;  // the colour behind that splat, dotted with the pixel's cotangent
 };
 
 // The pixel as it leaves its last splat of a bucket, by what the forward pass left at the bucket's end: transmittance,
 // and the colour that later buckets blended. That colour is a sum from the back: taking what lies in front off the
 // whole image would leave the rounding of all of it where little is left, and an opaque splat then divides by 1 - alpha.
 template <class Real, int CH>
-POP_HD Passing<Real> passing_behind(Real T, Real T_final, const Real* later, const Real* v_color, Real worth_behind) {
-    Real left = T_final * worth_behind;
+POP_HD Passing<Real> passing_after(Real T, Real T_final, const Real* later, const Real* v_color,
+                                   Real background_dot_grad) {
+    Real left = T_final * background_dot_grad;
     POP_UNROLL
     for (int c = 0; c < CH; ++c) left += later[c] * v_color[c];
     return {T, left * reciprocal(T)};
 }
 
 template <bool ABS, bool PASS, class Real, int CH>
-POP_HD void pass_pixel(Passing<Real>& pixel, const Blended<Real>& splat, const Real* color, const Real* v_color,
+POP_HD void pass_pixel(Passing<Real>& pixel, const PackedSplat<Real>& splat, const Real* color, const Real* v_color,
                        Real px, Real py, const BlendConstants<Real>& constants, Real* sums) {
     const Real dx = add(splat.x, -px), dy = add(splat.y, -py);
     const Real squared_x = mul(mul(splat.hA, dx), dx), cross = mul(splat.B, dx);
@@ -198,13 +199,13 @@ POP_HD void pass_pixel(Passing<Real>& pixel, const Blended<Real>& splat, const R
     const Real alpha = least(constants.ceiling, unclamped);
     const Real T = pixel.T * reciprocal(add(Real(1), -alpha));
     const Real weight = T * alpha;
-    Real gain = -pixel.behind;
+    Real gain = -pixel.suffix_dot_grad;
     POP_UNROLL
     for (int c = 0; c < CH; ++c) {
         gain += color[c] * v_color[c];
         sums[c] += weight * v_color[c];
     }
-    pixel.behind += alpha * gain;
+    pixel.suffix_dot_grad += alpha * gain;
     pixel.T = T;
     const Real G = exponent_cotangent<PASS>(unclamped, constants.ceiling, weight, T, gain);
     const Real G_dx = G * dx, G_dy = G * dy;

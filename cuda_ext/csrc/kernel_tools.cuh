@@ -16,7 +16,7 @@ static_assert(WARP * COLUMN_ROWS == TILE_PIXELS, "a lane owns a column of four p
 struct Record {
     float4 a, b, c;
 
-    __device__ __forceinline__ Blended<float> splat() const { return {a.x, a.y, a.z, a.w, b.x, b.y, b.z}; }
+    __device__ __forceinline__ PackedSplat<float> splat() const { return {a.x, a.y, a.z, a.w, b.x, b.y, b.z}; }
 
     template <int CH>
     __device__ __forceinline__ void color(float* out) const {

@@ -107,20 +107,20 @@ struct BlendForward {
     const DeviceState* state;  // read with masks
 };
 
-enum class Family : int { columns = 0, splats = 1 };
+enum class Backward : int { pixel_parallel = 0, gaussian_parallel = 1 };
 enum class Gather : int { slots = 0, atomics = 1 };
 
 struct BlendBackward {
     int channels;
-    Family family;
+    Backward backward;
     Gather gather;
     bool absolute;            // also sum |v_means2d|
     const float* records;
     const float* background;
-    const float* image;       // read by family splats
+    const float* image;       // read by backward gaussian_parallel
     const float* T_final;
     const int* last;
-    const float* checkpoints; // read by family splats
+    const float* checkpoints; // read by backward gaussian_parallel
     const float* v_image;
     const float* v_T_final;   // or null
     float* rows;              // [capacity * tiles of a list tile, RECORD], for slots

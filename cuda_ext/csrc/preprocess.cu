@@ -23,7 +23,7 @@ __device__ __forceinline__ bool all_finite(const GaussianRow<float>& g) {
            isfinite(g.scale.y) && isfinite(g.scale.z) && isfinite(g.opacity);
 }
 
-__device__ __forceinline__ void store_record(float* records, int i, const Blended<float>& s,
+__device__ __forceinline__ void store_record(float* records, int i, const PackedSplat<float>& s,
                                              const float color[MAX_CHANNELS]) {
     float4* row = reinterpret_cast<float4*>(records + size_t(RECORD) * i);
     row[0] = {s.x, s.y, s.hA, s.B};
@@ -78,7 +78,7 @@ __global__ void __launch_bounds__(PROJECT_BLOCK, 8)
         if (splats.records != nullptr && seen) {
             const float channels[MAX_CHANNELS] = {color.x, color.y, color.z, 0.0f};
             store_record(splats.records, i,
-                         blended_from_splat(s.mean2d, s.conic, s.opacity, settings.profile.alpha_floor), channels);
+                         packed_from_splat(s.mean2d, s.conic, s.opacity, settings.profile.alpha_floor), channels);
         }
     }
     // found here, before the sort: most culls are comparisons that a NaN fails, so that it would vanish without a word
@@ -89,7 +89,7 @@ __global__ void pack_kernel(int n, int channels, SplatArrays splats, float alpha
     const int i = blockIdx.x * blockDim.x + threadIdx.x;
     if (i >= n) return;
     const float* q = splats.conics + 3 * i;
-    const Blended<float> s = blended_from_splat(Vec2<float>{splats.means2d[2 * i], splats.means2d[2 * i + 1]},
+    const PackedSplat<float> s = packed_from_splat(Vec2<float>{splats.means2d[2 * i], splats.means2d[2 * i + 1]},
                                                 Conic<float>{q[0], q[1], q[2]}, splats.opacities[i], alpha_floor);
     float color[MAX_CHANNELS] = {0.0f, 0.0f, 0.0f, 0.0f};
     for (int c = 0; c < channels; ++c) color[c] = splats.colors[size_t(channels) * i + c];

@@ -99,7 +99,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
         const bool given = scores.pixel_map != nullptr && k < column.rows;
         map[k] = given ? scores.pixel_map[pixel_of(lists.grid, column, k)] : 0.0f;
     }
-    each_splat<1, false>(lists, scores, column, staged[warp], lane, [&](int place, Blended<float> splat, const float*) {
+    each_splat<1, false>(lists, scores, column, staged[warp], lane, [&](int place, PackedSplat<float> splat, const float*) {
         float sums[N_CONTRIBUTIONS] = {};
         const float dx = add(splat.x, -column.px);
         bool any = false;
@@ -133,9 +133,9 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
     for (int k = 0; k < COLUMN_ROWS; ++k) {
         pixels[k].T = k < column.rows ? scores.T_final[pixel_of(lists.grid, column, k)] : 1.0f;
 #pragma unroll
-        for (int c = 0; c < CH; ++c) pixels[k].behind[c] = __ldg(scores.background + c);
+        for (int c = 0; c < CH; ++c) pixels[k].suffix_color[c] = __ldg(scores.background + c);
     }
-    each_splat<CH, true>(lists, scores, column, staged[warp], lane, [&](int place, Blended<float> splat,
+    each_splat<CH, true>(lists, scores, column, staged[warp], lane, [&](int place, PackedSplat<float> splat,
                                                                        const float* color) {
         float sums[N] = {};
         const float dx = add(splat.x, -column.px);
@@ -179,7 +179,7 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
         T[k] = 1.0f;
         best[k] = no_dominant<float>();
     }
-    each_splat<3, false>(lists, scores, column, staged[warp], lane, [&](int place, Blended<float> splat,
+    each_splat<3, false>(lists, scores, column, staged[warp], lane, [&](int place, PackedSplat<float> splat,
                                                                        const float* g) {
         const float dx = add(splat.x, -column.px);
 #pragma unroll

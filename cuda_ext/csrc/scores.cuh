@@ -19,7 +19,7 @@ struct PixelAlpha {
 
 // in the operations of blend_forward, so that a pass blends what a render does
 template <class Real>
-POP_HD PixelAlpha<Real> alpha_at_pixel(const Blended<Real>& splat, Real dx, Real dy, Real ceiling) {
+POP_HD PixelAlpha<Real> alpha_at_pixel(const PackedSplat<Real>& splat, Real dx, Real dy, Real ceiling) {
     const Real squared_x = mul(mul(splat.hA, dx), dx), cross = mul(splat.B, dx);
     const Real exponent = exponent_in_column(squared_x, cross, splat.hC, dy);
     const Real unclamped = within(exponent, splat.beyond) ? mul(splat.opacity, power_of_two(-exponent)) : Real(0);
@@ -34,11 +34,11 @@ POP_HD void add_contribution(Real* sums, Real weight, Real map, Real dx, Real dy
     sums[3] += sqrt(dx * dx + dy * dy);
 }
 
-// A pixel on its way back: transmittance behind the splat that is visited next, and the light that passes it.
+// A pixel on its way back: transmittance behind the splat that is visited next, and the colour behind that one.
 template <class Real, int CH>
 struct Returning {
     Real T;
-    Real behind[CH];
+    Real suffix_color[CH];
 };
 
 // Goes before one splat and tells T there and c - B, how far its colour exceeds the light from behind: dC/dalpha / T.
@@ -47,8 +47,8 @@ POP_HD Real go_before(Returning<Real, CH>& pixel, Real alpha, const Real* color,
     pixel.T = pixel.T * reciprocal(add(Real(1), -alpha));
     POP_UNROLL
     for (int c = 0; c < CH; ++c) {
-        more[c] = color[c] - pixel.behind[c];
-        pixel.behind[c] += alpha * more[c];
+        more[c] = color[c] - pixel.suffix_color[c];
+        pixel.suffix_color[c] += alpha * more[c];
     }
     return pixel.T;
 }
@@ -56,7 +56,7 @@ POP_HD Real go_before(Returning<Real, CH>& pixel, Real alpha, const Real* color,
 // With s = dsigma/d(mean2d, conic) and G_c = alpha dC_c/dalpha: dC_c/d(mean2d, conic) = -G_c s. The fifteen second
 // moments row by row, the five mixed with T alpha of each channel, and (T alpha)^2.
 template <class Real>
-POP_HD void add_moments(Real* sums, const Blended<Real>& splat, Real dx, Real dy, Real weight, const Real* G) {
+POP_HD void add_moments(Real* sums, const PackedSplat<Real>& splat, Real dx, Real dy, Real weight, const Real* G) {
     // the kernels' conic carries log2(e)
     const Real A = Real(2 * LN_2) * splat.hA, B = Real(LN_2) * splat.B, C = Real(2 * LN_2) * splat.hC, half = Real(0.5);
     const Real s[N_SCREEN] = {A * dx + B * dy, B * dx + C * dy, half * dx * dx, dx * dy, half * dy * dy};

@@ -55,12 +55,12 @@ POP_HD SplatRow<Real> splat_in_front(Vec3<Real> mean_cam, const Mat3<Real>& cova
     const Mat3<Real> covar_cam = covar_cam_from_covar(covar, camera);
     const Mat2<Real> covar2d = project_covar(covar_cam, projection_jacobian(mean_cam, camera, profile));
     const Mat2<Real> blurred = low_pass(covar2d, profile.eps2d);
-    const Real blended = options.antialiased ? opacity * compensation(covar2d, profile.eps2d) : opacity;
+    const Real effective_opacity = options.antialiased ? opacity * compensation(covar2d, profile.eps2d) : opacity;
     const Vec2<Real> mean2d = project_mean(mean_cam, camera);
-    const Radii radii = radii_from_covar2d(blurred, blended, profile);
+    const Radii radii = radii_from_covar2d(blurred, effective_opacity, profile);
     const bool clipped = Real(radii.x) <= options.radius_clip && Real(radii.y) <= options.radius_clip;
     if (clipped || !on_screen(mean2d, radii, camera.width, camera.height, profile)) return culled(mean_cam.z);  // D2
-    return {mean2d, mean_cam.z, conic_from_covar2d(blurred), blended, radii};
+    return {mean2d, mean_cam.z, conic_from_covar2d(blurred), effective_opacity, radii};
 }
 
 template <class Real>

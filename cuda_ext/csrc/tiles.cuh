@@ -57,16 +57,19 @@ POP_HD TileRect tile_rect(Vec2<Real> mean2d, Radii radii, TileGrid grid, const P
     return {x.first, y.first, x.last, y.last};
 }
 
-// the exponent on an edge of a box at offset `fixed`, at its least over the other offset in [low, high]
+// What the test of a tile allows for rounding, of the exponent and of the terms that cancel in it: needles cancel, and a
+// tile is only dropped when it is certain. pop_fast/stages/tiles.py has the same two numbers.
+constexpr double TILE_SLACK = 1e-3, TILE_SLACK_SHARE = 1e-5;
+
+// the exponent on an edge of a box at offset `fixed`, at its least over the other offset in [low, high], less the slack
 template <class Real>
 POP_HD Real least_on_edge(Real fixed_coefficient, Real cross, Real free_coefficient, Real fixed, Real low, Real high) {
     // rounded where it is written: the kernel that counts tiles and the one that lists them must agree to the bit
     const Real offset = clamped(mul(-cross, fixed) / free_coefficient, low, high);
     const Real across = mul(mul(fixed_coefficient, fixed), fixed), along = mul(mul(free_coefficient, offset), offset);
     const Real squares = mul(Real(0.5), add(across, along)), mixed = mul(mul(cross, fixed), offset);
-    // charged 16 roundings of the terms, so that a tile is only dropped when it is certain
-    const Real slack = sizeof(Real) == 4 ? Real(16 * 1.1920929e-7) : Real(16 * 2.220446049250313e-16);
-    return add(add(squares, mixed), -mul(slack, add(squares, Real(fabs(mixed)))));
+    const Real slack = add(Real(TILE_SLACK), mul(Real(TILE_SLACK_SHARE), squares));
+    return add(add(squares, mixed), -slack);
 }
 
 // The least sigma that any pixel centre of a tile can have, or a little less. sigma is convex: outside the box of

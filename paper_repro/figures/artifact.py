@@ -84,7 +84,7 @@ def six_panels(asked: Asked) -> Drawn:
 
 def panels_of(found: Pushed) -> list[Panel]:
     """Make the error and the three gradients with respect to the image."""
-    from pop_fast import losses
+    from pop_fast.stages import losses
 
     slope = 1.0 / found.image.numel()
     error = (found.image - found.photo).abs().mean(dim=2).numpy()

@@ -46,19 +46,19 @@ class OpacityOne:
     weight: float = WEIGHT
 
     def check_sanity(self, params: Any, optimizers: Any) -> None:
-        """See `pop_fast.strategies.Strategy`; any parameters will do."""
+        """See `pop_fast.density.Strategy`; any parameters will do."""
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
-        """See `pop_fast.strategies.Strategy`; nothing is remembered."""
+        """See `pop_fast.density.Strategy`; nothing is remembered."""
         return {}
 
     def step_pre_backward(self, params: Any, optimizers: Any, state: Any, step: int, info: Any) -> None:
-        """See `pop_fast.strategies.Strategy`."""
+        """See `pop_fast.density.Strategy`."""
 
     def step_post_backward(
         self, params: Any, optimizers: Any, state: Any, step: int, info: Any, packed: bool = False
     ) -> None:
-        """See `pop_fast.strategies.Strategy`; the population stays."""
+        """See `pop_fast.density.Strategy`; the population stays."""
 
     def regularizer(self, opacities: Tensor, state: Any, step: int, info: Any) -> Tensor:
         """Return the term that is added to the loss."""
@@ -137,7 +137,7 @@ def _base(asked: Asked, job: Job) -> tuple[Result, Path]:
 
 
 def _config(asked: Asked, job: Job, folder: Path) -> TrainConfig:
-    from pop_fast.backends import get_backend
+    from pop_fast.api.registry import get_backend
 
     whole = job.config()
     ended = whole.lr.means * whole.lr.means_decay
@@ -165,9 +165,9 @@ def _train(config: TrainConfig, capture: Capture, ply: Path) -> None:
 def _seen(config: TrainConfig, capture: Capture, base: Result, ply: Path) -> Pushed:
     import torch
 
-    from pop_fast.activations import opacities_from_logits
-    from pop_fast.backends import get_backend
+    from pop_fast.api.registry import get_backend
     from pop_fast.io.ply import load_ply
+    from pop_fast.stages.activations import opacities_from_logits
     from pop_fast.train.views import ViewTensors, render_view
 
     params = load_ply(ply)

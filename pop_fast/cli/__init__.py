@@ -6,22 +6,29 @@ public function, `run(argv) -> int`, and prints nothing but its result; all erro
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib
+import io
 import os
 import re
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from types import FrameType
 from typing import Final
 
 from pop_fast.cli.errors import describe
+from pop_fast.cli.printable import message
 
 COMMANDS: Final = {
     "train": "fit a splat to a capture or a folder of photographs",
     "eval": "measure a result, a checkpoint or a PLY on the held-out views",
     "render": "write held-out views, or a camera path as pictures or a video",
     "explain": "say why a pixel looks as it does, and where two renderers part",
-    "export": "write a result as PLY, .splat or an Inria-style folder",
+    "export": "write a result as PLY, SPZ, SOG, glTF, ..., a page that shows it, or an Inria-style folder",
+    "convert": "turn a splat's file into another format",
     "compare": "put several results side by side in one table",
     "report": "write report.html again from the files of a result",
     "sfm": "find the cameras of a folder of photographs (pycolmap)",
@@ -31,6 +38,7 @@ COMMANDS: Final = {
     "build-cuda": "compile the CUDA extension (needs nvcc)",
     "learn": "build your own splatting in NumPy, judged stage by stage",
     "vectors": "write the conformance vectors for ports in other languages, and check a port's results",
+    "completion": "write a script by which a shell completes the words of pop",
     "doctor": "say what is installed, what is missing and how to get it",
 }
 
@@ -46,20 +54,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: the words after `pop`; the process's own when None.
 
     Returns:
-        0, or 1 where something is missing, or 2 for bad input and bad usage, or 130 after Ctrl-C.
+        0, or 1 where something is missing, or 2 for bad input and bad usage, or 130 after Ctrl-C, or 143 after SIGTERM.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words or os.environ.get("POP_DEBUG", "") not in ("", "0")
     words = [word for word in words if word != "--debug"]
+    for stream in (sys.stdout, sys.stderr):
+        # a name that is no text is shown with escapes
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
-        status = _run(words)
+        with _terminable():
+            status = _run(words)
         sys.stdout.flush()
         return status
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 0
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         print("pop: interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
+        return 128 + signal.SIGTERM if isinstance(stop, _Terminated) else EXIT_INTERRUPTED
     except BrokenPipeError:
         # the reader has gone, as in `pop train --help | head`: what is still buffered has nowhere to go
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -68,8 +81,30 @@ def main(argv: Sequence[str] | None = None) -> int:
         line = describe(error)
         if debug or line is None:
             raise
-        print(f"pop: error: {line}", file=sys.stderr)
+        print(f"pop: error: {message(line)}", file=sys.stderr)
         return EXIT_BAD_INPUT
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM: as orderly an end as after Ctrl-C."""
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """Let SIGTERM end the block as Ctrl-C does, so that nothing half made is left, unless somebody handles it."""
+    here = threading.current_thread() is threading.main_thread()
+    if not here or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+
+    def end(number: int, frame: FrameType | None) -> None:
+        raise _Terminated
+
+    signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _run(words: list[str]) -> int:

@@ -10,7 +10,8 @@ import tyro
 
 T = TypeVar("T")
 
-_STYLE: Final = (tyro.conf.FlagCreatePairsOff, tyro.conf.HelptextFromCommentsOff)
+# a switch is shown with its opposite, so that one sentence is right for both
+_STYLE: Final = (tyro.conf.HelptextFromCommentsOff,)
 
 
 def parse(kind: type[T], argv: Sequence[str], command: str, default: T | None = None, examples: str = "") -> T:

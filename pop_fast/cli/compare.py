@@ -32,7 +32,7 @@ def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "compare", examples=_EXAMPLES)
     if not args.results:
         raise PopError("nothing to compare; name one or more result folders")
-    from pop_fast.report.compare import markdown, plain, row
+    from pop_fast.view.report.compare import markdown, plain, row
 
     rows = [row(_stats(folder)) for folder in args.results]
     print(markdown(rows) if args.markdown else plain(rows))
@@ -40,11 +40,11 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _stats(folder: Path) -> dict[str, object]:
-    from pop_fast.report.source import read_last_stats
     from pop_fast.train.results import read_config
+    from pop_fast.view.report.source import read_last_stats
 
-    read_config(folder)
+    planned = read_config(folder).max_steps
     stats = read_last_stats(folder)
     if not stats:
         raise PopError(f"{folder}: has no statistics yet; train to the first evaluation, or run pop eval {folder}")
-    return stats
+    return {**stats, "max_steps": planned}

@@ -2,29 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import tyro
 
 from pop_fast.cli.arguments import parse
+from pop_fast.cli.printable import printable
 
 if TYPE_CHECKING:
-    from pop_fast.cli.examine import Finding
+    from pop_fast.data.finding import Finding
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Look a capture over before training: lenses, sizes, EXIF, pairing, masks, points, reprojection, memory.
+    """Look a capture over before training: lenses, sizes, EXIF, pairing, masks, points, reprojection, memory; and its
+    photographs: blur, exposure, copies. A folder of photographs alone can be looked over too.
 
     Exit status 0 when nothing stands against training, 1 when something does.
     """
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """The capture."""
+    images: str | None = None
+    """The photographs are in this folder of the capture."""
     all: bool = False
     """Print every finding, not only the first five of a kind."""
 
@@ -32,7 +39,7 @@ class Args:
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "data check")
-    findings = look_over(args.capture)
+    findings = look_over(args.capture, args.images)
     marks = {"ok": "ok", "warn": "LOOK", "bad": "BAD"}
     width = max(len(finding.about) for finding in findings) + 2
     shown: dict[tuple[str, str], int] = {}
@@ -40,35 +47,62 @@ def run(argv: Sequence[str]) -> int:
         kind = (finding.state, finding.about)
         shown[kind] = shown.get(kind, 0) + 1
         if args.all or shown[kind] <= 5:
-            print(f"{marks[finding.state]:<6}{finding.about:<{width}}{finding.text}")
+            print(printable(f"{marks[finding.state]:<6}{finding.about:<{width}}{finding.text}"))
     hidden = sum(count - 5 for count in shown.values() if count > 5)
     if hidden and not args.all:
         print(f"and {hidden} more of the same kinds; --all prints them")
     bad = sum(finding.state == "bad" for finding in findings)
-    print(f"{bad} problem{'s' if bad != 1 else ''} stand against training" if bad else "ready to train")
+    told = f"{bad} problem{'s stand' if bad != 1 else ' stands'} against training"
+    print(told if bad else "ready to train")
     return 1 if bad else 0
 
 
-def look_over(root: Path) -> list[Finding]:
-    """Examine a capture; all findings in reading order."""
-    from pop_fast.cli import examine
+def look_over(root: Path, images: str | None = None) -> list[Finding]:
+    """Examine a capture, or photographs alone; all findings in reading order."""
     from pop_fast.cli.doctor import memory_bytes
+    from pop_fast.data import check_dataset
+    from pop_fast.data.finding import Finding
+    from pop_fast.data.photo_quality import about_quality, measure_file
+    from pop_fast.data.sfm import photo_folder, photographs
+
+    listing = check_dataset.read_listing(root, images)
+    if listing is None:
+        folder = photo_folder(root)
+        files = photographs(folder)
+        shown, damage = _each(files, lambda path: measure_file(path, path.relative_to(folder).as_posix()), lambda p: p)
+        findings = [*check_dataset.about_bare(root, shown), *(Finding("bad", "photographs", told) for told in damage)]
+        return [*findings, *about_quality(shown)]
+    made_from, shots, cloud = listing
+    findings = [Finding("ok" if len(shots) > 1 else "bad", "poses", f"{len(shots)} views from the {made_from}")]
+    findings += check_dataset.about_cameras(shots)
+    paths = {id(shot): check_dataset.file_of(root, shot) for shot in shots}
+    photos, damage = _each(
+        shots, lambda shot: check_dataset.read_photo(shot, paths[id(shot)]), lambda shot: paths[id(shot)]
+    )
+    findings += check_dataset.about_photos(photos, root)
+    findings += [Finding("bad", "photographs", told) for told in damage]
+    findings += about_quality([photo.shown for photo in photos if photo.shown is not None])
+    findings += check_dataset.about_masks(photos, root)
+    findings += check_dataset.about_points(shots, cloud)
+    findings += check_dataset.about_reprojection(root)
+    findings += check_dataset.about_memory(photos, cloud, memory_bytes()[1])
+    return findings
+
+
+def _each(items: Sequence[T], read: Callable[[T], R], file_of: Callable[[T], Path | None]) -> tuple[list[R], list[str]]:
+    """Read photographs, several at a time, with progress; what was read, and a line for each JPEG with damage."""
     from pop_fast.cli.progress import bars
     from pop_fast.io.jpeg import jpeg_damage
 
-    made_from, shots, cloud = examine.read_listing(root)
-    findings = [examine.Finding("ok" if len(shots) > 1 else "bad", "poses", f"{len(shots)} views from the {made_from}")]
-    findings += examine.about_cameras(shots)
-    with bars() as progress, ThreadPoolExecutor(max_workers=4) as pool:
-        photos: list[examine.Photo] = []
-        for photo in pool.map(lambda shot: examine.read_photo(root, shot), shots):
-            photos.append(photo)
-            progress("looking at photographs", len(photos), len(shots))
-    with jpeg_damage([photo.path for photo in photos if photo.path is not None]) as damage:
-        findings += examine.about_photos(photos, root)
-    findings += [examine.Finding("bad", "photographs", message) for message in damage.values()]
-    findings += examine.about_masks(photos, root)
-    findings += examine.about_points(shots, cloud)
-    findings += examine.about_reprojection(root)
-    findings += examine.about_memory(photos, cloud, memory_bytes()[1])
-    return findings
+    files = [path for path in map(file_of, items) if path is not None]
+    found: list[R] = []
+    with bars() as progress, jpeg_damage(files) as damage, ThreadPoolExecutor(max_workers=4) as pool:
+        jobs = [pool.submit(read, item) for item in items]
+        try:
+            for job in jobs:
+                found.append(job.result())
+                progress("looking at photographs", len(found), len(jobs))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return found, list(damage.values())

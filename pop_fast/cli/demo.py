@@ -38,7 +38,7 @@ def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "demo", examples=_EXAMPLES)
     from pop_fast.cli.progress import bars
-    from pop_fast.data import make_demo
+    from pop_fast.demo import make_demo
 
     with bars() as progress:
         folder = make_demo(

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from pop_fast.backends import backend_names, get_backend
+from pop_fast.api.registry import backend_names, get_backend
 from pop_fast.cli.arguments import parse
 from pop_fast.machine import machine_name
 from pop_fast.torch_install import cuda_version, why_torch_fails

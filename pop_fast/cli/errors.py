@@ -20,6 +20,8 @@ def describe(error: BaseException) -> str | None:
         return _describe_os_error(error)
     if isinstance(error, MemoryError) or "not enough memory" in str(error) or "can't allocate memory" in str(error):
         return "out of memory; use smaller images (--factor 2 or more) or fewer Gaussians"
+    if isinstance(error, RuntimeError) and "can't start new thread" in str(error):
+        return "the system allows no further thread; raise the limit (ulimit -u), or use fewer: --threads 1"
     if isinstance(error, ValueError | NotImplementedError) and _raised_here(error):
         return re.sub(r"\s*\n\s*", " ", str(error))
     return None

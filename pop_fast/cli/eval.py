@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import tyro
 
 from pop_fast.cli.arguments import parse
-from pop_fast.cli.splat import CaptureOptions, Splat, load_splat, open_capture
+from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
+from pop_fast.train.load_result import Splat, load_splat
 
 if TYPE_CHECKING:
     from pop_fast.train.config import TrainConfig
@@ -29,7 +30,7 @@ _EXAMPLES: Final = """
 
 
 @dataclass(frozen=True, kw_only=True)
-class Args(CaptureOptions):
+class Args(CaptureArguments):
     """Measure a splat on the held-out views of a capture: PSNR, SSIM, LPIPS where weights are given.
 
     For a result folder the numbers also go into its stats and its report.
@@ -55,7 +56,7 @@ def run(argv: Sequence[str]) -> int:
 
     splat = load_splat(args.splat)
     nets = _nets(args, splat.config)
-    capture, config = open_capture(splat, args)
+    capture, config = open_with_bars(splat, args)
     views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
     if not views:
         raise PopError(f"{capture.name}: holds no view out; give --test-every 8 or another number over 0")
@@ -78,15 +79,17 @@ def run(argv: Sequence[str]) -> int:
 
 def measure_splat(splat: Splat, config: TrainConfig, views: list[ViewTensors], nets: Sequence[LPIPS]) -> dict[str, Any]:
     """Measure a splat on views; the numbers are those that training itself would write."""
+    from pop_fast.io.heartbeat import Heartbeat
     from pop_fast.train.environment import reproducible
     from pop_fast.train.evaluate import evaluate
+    from pop_fast.train.gpu_proxy import renderer
     from pop_fast.train.metrics import population
-    from pop_fast.train.on_device import renderer
 
     backend, note = renderer(config.backend)
     if note:
         print(f"note: {note}", file=sys.stderr)
-    with reproducible(config.threads):
+    with reproducible(config.threads), Heartbeat() as beat:
+        beat.say(f"measuring {len(views)} views")
         measured = evaluate(backend, splat.params, views, config, splat.sh_degree, nets)
         return {**population(splat.params["opacities"].sigmoid()), **measured}
 
@@ -99,9 +102,9 @@ def _nets(args: Args, config: TrainConfig) -> list[LPIPS]:
 
 
 def _record(folder: Path, step: int, stats: dict[str, Any]) -> None:
-    from pop_fast.report import write_report
-    from pop_fast.report.source import read_stats
     from pop_fast.train.results import ResultFolder
+    from pop_fast.view.report import write_report
+    from pop_fast.view.report.source import read_stats
 
     results = ResultFolder(folder)
     path = results.stats_path("val", step)

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import tyro
 
 from pop_fast.cli.arguments import parse
-from pop_fast.cli.splat import CaptureOptions, load_splat, open_capture
+from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import folder_atomically, write_atomically
+from pop_fast.train.load_result import load_splat
 
 if TYPE_CHECKING:
     from pop_fast.data import Capture, View
@@ -28,7 +29,7 @@ _EXAMPLES: Final = """
 
 
 @dataclass(frozen=True, kw_only=True)
-class Args(CaptureOptions):
+class Args(CaptureArguments):
     """Explain a pixel: what it is blended from, why entries were skipped, what the loss and POP do to them."""
 
     splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|PLY")]
@@ -65,17 +66,17 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _explain(args: Args, at: tuple[int, int] | None) -> int:
-    from pop_fast.explain import explain_pixel, explain_view
-    from pop_fast.explain.diff import difference
-    from pop_fast.explain.maps import view_maps, write_maps
-    from pop_fast.explain.page import page
-    from pop_fast.explain.pixel import check_inside
-    from pop_fast.explain.scene import with_objective
-    from pop_fast.explain.table import WIDTH, table
     from pop_fast.train.environment import reproducible
+    from pop_fast.view.explain import explain_pixel, explain_view
+    from pop_fast.view.explain.diff import difference
+    from pop_fast.view.explain.maps import view_maps, write_maps
+    from pop_fast.view.explain.page import page
+    from pop_fast.view.explain.pixel import check_inside
+    from pop_fast.view.explain.scene import with_objective
+    from pop_fast.view.explain.table import WIDTH, table
 
     splat = load_splat(args.splat)
-    capture, config = open_capture(splat, args)
+    capture, config = open_with_bars(splat, args)
     view = chosen_view(capture, args.view)
     if at is not None:
         check_inside(view, *at)
@@ -137,4 +138,4 @@ def chosen_view(capture: Capture, which: str) -> View:
 
 
 def _write(path: Path, text: str) -> None:
-    write_atomically(path, lambda file: file.write(text.encode()))
+    write_atomically(path, lambda file: file.write(text.encode("utf-8", "backslashreplace")))

@@ -1,35 +1,49 @@
-"""`pop export`: a result as PLY, `.splat` or a folder as Inria's trainer leaves it."""
+"""`pop export`: a result as one file, in the format that is asked for, or as a folder as Inria's trainer leaves it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import numpy as np
 import tyro
 
 from pop_fast.cli.arguments import parse
-from pop_fast.cli.splat import CaptureOptions, Splat, load_splat, open_capture, read_record
+from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
+from pop_fast.cli.limits import FormatName, LimitOptions, Shown, limited
 from pop_fast.errors import PopError
+from pop_fast.train.load_result import Splat, frame_of_splat, load_splat, read_record
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from pop_fast.data import Capture
+    from pop_fast.io.ply import Frame
+
+HTML: Final = "html"
 _EXAMPLES: Final = """
     pop export out/scene_pop --out scene.ply                 for any viewer, in the capture's own world frame
-    pop export out/scene_pop --out scene.ply --drop-invisible
-    pop export out/scene_pop --out scene.splat               32 bytes a Gaussian, colours without view dependence
+    pop export out/scene_pop --to sog                        scene_pop.sog, a tenth of the PLY's size
+    pop export out/scene_pop --to html                       scene_pop.html, one page that shows the splat in a browser
+    pop export out/scene_pop --to spz --target-mb 5          at most five megabytes
+    pop export out/scene_pop --out scene.splat --min-opacity 0.05 --crop -2 -2 -2 2 2 2
     pop export out/scene_pop --out scene_inria --layout inria
 """
 
 
 @dataclass(frozen=True, kw_only=True)
-class Args(CaptureOptions):
-    """Write a splat as PLY (Inria's 62 properties), .splat, or a folder in Inria's layout."""
+class Args(LimitOptions, CaptureArguments):
+    """Write a splat as one file (docs/FORMATS.md says what each format keeps), or a folder in Inria's layout."""
 
-    splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|PLY")]
+    splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|FILE")]
     """What to export."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE|DIR")]
-    """Where to: a .ply, a .splat, or with --layout inria a new folder."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE|DIR")] = None
+    """Where to: a file whose name says the format, or with --layout inria a new folder; by default a file beside here
+    with the name of what is exported."""
+    to: FormatName | None = None
+    """The format, where the name does not say it; "gltf-spz" is glTF with an SPZ stream, a draft."""
     layout: Literal["file", "inria"] = "file"
     """"inria" writes point_cloud/, cameras.json, cfg_args, and held-out renders, as many tools expect."""
     frame: Literal["capture", "training"] | None = None
@@ -43,63 +57,178 @@ class Args(CaptureOptions):
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "export", examples=_EXAMPLES)
-    if args.layout == "file":
-        check_file(args)
-    splat = load_splat(args.splat)
+    args.check()
     if args.layout == "inria":
-        from pop_fast.cli.inria import write_inria_folder
-
-        capture, config = open_capture(splat, args)
-        write_inria_folder(replace(splat, config=config), capture, args.out, args.overwrite)
-        print(f"{len(splat.params['means']):,} Gaussians, {len(capture.views)} cameras -> {args.out}")
-        return 0
-    splat = in_frame(splat, args)
+        return _inria(args)
+    out, name = planned_file(args)
+    splat = load_splat(args.splat)
+    opened = _Opened(splat, args)
     if args.drop_invisible:
         splat = without_invisible(splat)
-    from pop_fast.io.ply import save_ply, save_splat
-
-    n = len(splat.params["means"])
-    if args.out.suffix.lower() == ".splat":
-        save_splat(args.out, splat.params)
-    else:
-        save_ply(args.out, splat.params, splat.config.antialiased)
-    print(f"{n:,} Gaussians, {args.out.stat().st_size / 2**20:.1f} MiB -> {args.out}")
+    write = _writer(args, name, splat, opened)
+    params, said = limited(
+        Shown(
+            params=splat.params,
+            sh_degree=splat.sh_degree,
+            config=opened.config,
+            world_transform=_training_frame(splat, args, opened) if args.crop is not None else None,
+            capture=opened.capture if opened.known else None,
+        ),
+        args,
+        lambda params: len(write(params)),
+    )
+    for line in said:
+        print(line)
+    size = _write(out, write(params))
+    print(f"{len(params['means']):,} Gaussians, {size / 2**20:.1f} MiB -> {out}")
     return 0
 
 
-def check_file(args: Args) -> None:
+def _inria(args: Args) -> int:
+    from pop_fast.view.inria import write_inria_folder
+
+    if args.out is None or args.to is not None or args.any:
+        raise PopError("--layout inria writes all Gaussians into the folder --out; give --out, and no --to or limits")
+    splat = load_splat(args.splat)
+    capture, config = open_with_bars(splat, args)
+    write_inria_folder(replace(splat, config=config), capture, args.out, args.overwrite)
+    print(f"{len(splat.params['means']):,} Gaussians, {len(capture.views)} cameras -> {args.out}")
+    return 0
+
+
+class _Opened:
+    """The capture of a splat, loaded when it is first asked for."""
+
+    def __init__(self, splat: Splat, options: CaptureArguments) -> None:
+        self._splat, self._options, self._found = splat, options, None
+        self.config = (
+            replace(splat.config, normalize=False) if frame_of_splat(splat, options) == "capture" else splat.config
+        )
+
+    @property
+    def known(self) -> bool:
+        """Tell whether there is one to load."""
+        return self._options.capture is not None or bool(self.config.data and Path(self.config.data).is_dir())
+
+    def capture(self) -> Capture:
+        """Return it, in the frame of the splat."""
+        if self._found is None:
+            self._found, self.config = open_with_bars(self._splat, self._options)
+        return self._found
+
+
+def planned_file(args: Args) -> tuple[Path, str]:
+    """Return the file to write and its format, which must agree.
+
+    Raises:
+        PopError: nothing says the format, the name is another's, or the place may not be written to.
+    """
+    from pop_fast.io.formats import FORMATS, named_format
+
+    if args.out is None and args.to is None:
+        raise PopError("nothing says what to write; give --out FILE or --to FORMAT")
+    if args.out is None:
+        suffix = {"ply": ".ply", HTML: ".html"}.get(str(args.to)) or FORMATS[str(args.to)].suffix
+        stem = args.splat.resolve().name
+        out = Path((stem if args.splat.is_dir() else stem.split(".")[0]) + suffix)
+    else:
+        out = args.out
+    is_page = out.suffix.lower() in (".html", ".htm")
+    if is_page != (args.to == HTML) and (args.to is not None):
+        raise PopError(f"{out}: a page ends in .html, and --to {args.to} was asked for; let them agree")
+    name = HTML if is_page else named_format(out, args.to)
+    if name == HTML and args.frame is not None:
+        raise PopError(f"{out}: a page has no frame of its own; leave --frame out")
+    check_file(out, args.splat, args.overwrite)
+    return out, name
+
+
+def check_file(out: Path, source: Path, overwrite: bool) -> None:
     """Check that one file may be written where it is asked for.
 
     Raises:
-        PopError: another kind of file, something that is not to be replaced, or the splat itself.
+        PopError: something is in the way that is not to be replaced, or it is the splat itself.
     """
-    if args.out.suffix.lower() not in (".ply", ".splat"):
-        raise PopError(f"{args.out}: the name must end in .ply or .splat; for a folder give --layout inria")
-    if args.out.is_dir():
-        raise PopError(f"{args.out}: a folder of this name is in the way; choose another --out")
-    if args.out.exists() and args.splat.exists() and args.out.samefile(args.splat):
-        raise PopError(f"{args.out}: is the splat that is read; choose another --out")
-    if args.out.exists() and not args.overwrite:
-        raise PopError(f"{args.out}: exists; pass --overwrite or another --out")
+    if out.is_dir():
+        raise PopError(f"{out}: a folder of this name is in the way; choose another --out")
+    if out.exists() and source.exists() and out.samefile(source):
+        raise PopError(f"{out}: is the splat that is read; choose another --out")
+    if out.exists() and not overwrite:
+        raise PopError(f"{out}: exists; pass --overwrite or another --out")
 
 
-def in_frame(splat: Splat, args: Args) -> Splat:
-    """Move a splat into the frame that was asked for.
+def _writer(args: Args, name: str, splat: Splat, opened: _Opened) -> Callable[[dict[str, Tensor]], bytes]:
+    """Return what makes the file's bytes of raw parameters in the training frame."""
+    if name == HTML:
+        from pop_fast.view.html import cameras_of, page_of
 
-    Raises:
-        PopError: the capture's frame was asked for and nothing says how it relates to the splat's.
-    """
-    wanted = args.frame or ("capture" if splat.folder is not None else "training")
-    if wanted == "training" or args.own_frame or not splat.config.normalize:
-        return splat
-    record = read_record(splat.folder)
-    if args.capture is None and record is not None:
-        transform = np.array(record.world_transform)
-    else:
-        transform = open_capture(splat, args)[0].world_transform
+        cameras = cameras_of(opened.capture().train_views(opened.config.test_every)) if opened.known else []
+        return lambda params: page_of(params, cameras, opened.config, splat.sh_degree, args.splat.resolve().name)
     from pop_fast.data import to_capture_frame
+    from pop_fast.io.formats import encoded
 
-    return replace(splat, params=to_capture_frame(splat.params, transform))
+    transform, frame = _output_frame(splat, args, opened)
+    antialiased = splat.config.antialiased
+
+    def write(params: dict[str, Tensor]) -> bytes:
+        moved = params if transform is None else to_capture_frame(params, transform)
+        return encoded(name, moved, antialiased, frame)
+
+    return write
+
+
+def _write(out: Path, data: bytes) -> int:
+    from pop_fast.io.atomic import write_atomically
+
+    write_atomically(out, lambda file: file.write(data))
+    return len(data)
+
+
+def _output_frame(splat: Splat, args: Args, opened: _Opened) -> tuple[np.ndarray | None, Frame | None]:
+    """Return what `to_capture_frame` is given to move the splat into the file's frame, and that frame.
+
+    Returns:
+        The similarity [4, 4], or None where nothing moves; the frame, or None where nothing says which it is.
+    """
+    from pop_fast.io.ply import Frame
+
+    now, transform = frame_of_splat(splat, args), known_transform(splat, args)
+    wanted = args.frame or ("capture" if splat.folder is not None else now)
+    if wanted is None or wanted == (now or "training"):
+        return None, None if now is None else Frame(now, _rows(transform))
+    if transform is None:
+        transform = _loaded_transform(splat, args)
+    return transform if wanted == "capture" else np.linalg.inv(transform), Frame(wanted, _rows(transform))
+
+
+def _training_frame(splat: Splat, args: Args, opened: _Opened) -> np.ndarray | None:
+    """Return the training frame from the capture's; None where the splat is in the capture's own frame."""
+    now = frame_of_splat(splat, args)
+    if now == "capture" or (now is None and args.frame is None and not opened.known):
+        return None
+    known = known_transform(splat, args)
+    return _loaded_transform(splat, args) if known is None else known
+
+
+def _loaded_transform(splat: Splat, args: Args) -> np.ndarray:
+    from pop_fast.io.ply import Frame
+
+    as_trained = replace(splat, config=replace(splat.config, normalize=True), frame=Frame("training"))
+    return open_with_bars(as_trained, replace(args, own_frame=False))[0].world_transform
+
+
+def known_transform(splat: Splat, args: Args) -> np.ndarray | None:
+    """Return what moves the capture's own frame into the training frame, where the file or its run says. [4, 4]"""
+    if splat.frame is not None and splat.frame.transform is not None:
+        return np.array(splat.frame.transform)
+    record = read_record(splat.folder)
+    if args.capture is not None or record is None or not splat.config.normalize:
+        return None
+    return np.array(record.world_transform)
+
+
+def _rows(transform: np.ndarray | None) -> tuple[tuple[float, ...], ...] | None:
+    return None if transform is None else tuple(map(tuple, transform.tolist()))
 
 
 def without_invisible(splat: Splat) -> Splat:

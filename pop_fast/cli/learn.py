@@ -104,11 +104,21 @@ def _check(args: Check) -> int:
 
     stage, work = stage_named(args.stage), read_work(args.folder)
     needs_of_judging()
+    from pop_ref.learn.drawing import drawn_counterexample
     from pop_ref.learn.judge import judge
+    from pop_ref.learn.splat import write_png
     from pop_ref.learn.telling import told
 
     verdict = judge(work, stage)
     print(told(stage, verdict))
+    picture = args.folder / f"counterexample_{stage.name}.png"
+    image = drawn_counterexample(verdict)
+    if image is None:
+        # an earlier one is not of this file
+        picture.unlink(missing_ok=True)
+    else:
+        write_png(picture, image)
+        print(f"the counterexample, yours in orange and what it should be in blue -> {picture}")
     if verdict.passed:
         note_passed(args.folder, stage)
     if args.answer and (verdict.passed or asked_before(args.folder, stage)):

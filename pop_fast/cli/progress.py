@@ -1,4 +1,4 @@
-"""A progress bar for work that reports (stage, done, total)."""
+"""Progress of work that reports (stage, done, total): a bar in a terminal, elsewhere a line every half minute."""
 
 from __future__ import annotations
 
@@ -7,15 +7,18 @@ from contextlib import contextmanager
 
 from tqdm import tqdm
 
+from pop_fast.io.heartbeat import Heartbeat
+
 Report = Callable[[str, int, int], None]
 
 
 @contextmanager
 def bars(show: bool = True) -> Iterator[Report]:
-    """Show one bar a stage on standard error when it is a terminal; yields the function to report to."""
+    """Show one bar a stage on standard error, or lines where that is no terminal; yields the function to report to."""
     current: dict[str, tqdm] = {}
 
     def report(stage: str, done: int, total: int) -> None:
+        beat.say(f"{stage}: {done:,} of {total:,}")
         if stage not in current:
             _close(current)
             current[stage] = tqdm(total=total, desc=stage, disable=None if show else True, leave=False)
@@ -23,10 +26,11 @@ def bars(show: bool = True) -> Iterator[Report]:
         bar.total = total
         bar.update(done - bar.n)
 
-    try:
-        yield report
-    finally:
-        _close(current)
+    with Heartbeat(show) as beat:
+        try:
+            yield report
+        finally:
+            _close(current)
 
 
 def _close(current: dict[str, tqdm]) -> None:

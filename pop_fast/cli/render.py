@@ -15,24 +15,24 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import tyro
 
 from pop_fast.cli.arguments import parse
-from pop_fast.cli.splat import CaptureOptions, Splat, load_splat, open_capture
+from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import folder_atomically, write_atomically
+from pop_fast.train.load_result import load_splat, paths_read
 
 if TYPE_CHECKING:
-    from pop_fast.data import Capture
-    from pop_fast.paths import VideoFile
+    from pop_fast.view.paths import VideoFile
 
 _INDEX: Final = "renders.json"
 _EXAMPLES: Final = """
     pop render out/scene_pop --out views                     the held-out views, one PNG each
-    pop render out/scene_pop --path orbit --video orbit.mp4  a video around the scene
+    pop render out/scene_pop --path orbit --video orbit.webm  a video around the scene
     pop render a.ply --capture scene --path interpolate --frames 240 --out frames
 """
 
 
 @dataclass(frozen=True, kw_only=True)
-class Args(CaptureOptions):
+class Args(CaptureArguments):
     """Render the held-out views, or a camera path through the capture."""
 
     splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|PLY")]
@@ -40,7 +40,7 @@ class Args(CaptureOptions):
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Write one PNG a view into this new folder, and renders.json, which lists them."""
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Write a video: .mp4, .webm or .avi."""
+    """Write a video: .webm, .avi, or .mp4 where OpenCV can write H.264."""
     path: Literal["views", "orbit", "ellipse", "interpolate"] = "views"
     """"views" are the held-out views; the others are paths made from the training cameras."""
     frames: int = 120
@@ -60,12 +60,12 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _render(args: Args) -> int:
-    from pop_fast.cli.frames import check_one_size, planned_views, rendered, write_pictures, write_video
     from pop_fast.io.names import picture_names
+    from pop_fast.view.frames import check_one_size, planned_views, rendered, write_pictures, write_video
 
     video = planned_video(args)
     splat = load_splat(args.splat)
-    capture, config = open_capture(splat, args)
+    capture, config = open_with_bars(splat, args)
     views = planned_views(capture, config, args.path, args.frames)
     if video is not None:
         check_one_size(video, views)
@@ -94,7 +94,7 @@ def planned_video(args: Args) -> VideoFile | None:
     """
     if args.video is None:
         return None
-    from pop_fast.paths import VideoFile
+    from pop_fast.view.paths import VideoFile
 
     video = VideoFile(args.video, args.fps)
     if args.out is not None and args.video.resolve().is_relative_to(args.out.resolve()):
@@ -106,28 +106,11 @@ def planned_video(args: Args) -> VideoFile | None:
     return video
 
 
-def paths_read(splat: Splat, root: Path, capture: Capture) -> list[Path]:
-    """List what the rendering of a splat reads: it, its result folder, the capture and where its photographs lie.
-
-    Args:
-        splat: what is rendered.
-        root: the capture's folder.
-        capture: the capture.
-
-    Returns:
-        Files and folders; no output may take the place of one.
-    """
-    own = [splat.path] if splat.folder is None else [splat.path, splat.folder]
-    # listed names may lead out of the capture, and so may its links
-    listed = {(root / view.name).parent for view in capture.views}
-    return [*own, root, *sorted(listed), *(entry for entry in sorted(root.iterdir()) if entry.is_symlink())]
-
-
 def listed_in(folder: Path) -> Callable[[Path], bool]:
     """Tell which files of a folder an earlier render wrote: those that its renders.json lists, and that itself."""
     try:
         index = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
         files = {_INDEX, *(str(entry["file"]) for entry in index["renders"])}
-    except (OSError, ValueError, TypeError, KeyError):
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
         files = set()  # not there, or not this command's: then nothing in the folder is known to be
     return lambda file: file.as_posix() in files

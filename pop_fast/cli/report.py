@@ -23,7 +23,7 @@ class Args:
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "report")
-    from pop_fast.report import write_report
+    from pop_fast.view.report import write_report
 
     print(write_report(args.result))
     return 0

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import tyro
 
 from pop_fast.cli.arguments import parse
+from pop_fast.data.sfm_options import SfmOptions
 
 _EXAMPLES: Final = """
     pop sfm photos                 writes photos/sparse/0
@@ -25,11 +26,15 @@ class Args:
     """The folder with the photographs."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Make a capture here; without it, sparse/0 is written beside the photographs."""
-    max_size: int = 1600
+    max_size: int = SfmOptions.max_size
     """Longest side at which features are looked for, px."""
-    camera_model: str = "SIMPLE_RADIAL"
-    """COLMAP's name of the lens model."""
-    seed: int = 0
+    camera_model: str = SfmOptions.camera_model
+    """COLMAP's name of the lens model: SIMPLE_RADIAL, OPENCV, OPENCV_FISHEYE, ..."""
+    single_camera: bool | None = SfmOptions.single_camera
+    """All photographs share one camera; by default when they are all of one size."""
+    matcher: Literal["auto", "exhaustive", "sequential"] = SfmOptions.matcher
+    """Compare all photographs with all, or each with its neighbours by name; "auto" compares up to 60 with all."""
+    seed: int = SfmOptions.seed
     """Of every random choice."""
     overwrite: bool = False
     """Replace an earlier result of pop sfm; a folder that holds anything else is left alone."""
@@ -40,6 +45,8 @@ def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "sfm", examples=_EXAMPLES)
     from pop_fast.cli.progress import bars
     from pop_fast.data import run_sfm
+    from pop_fast.data.sfm import photo_folder
+    from pop_fast.io.images import unreadable_photographs
 
     with bars() as progress:
         found = run_sfm(
@@ -48,9 +55,14 @@ def run(argv: Sequence[str]) -> int:
             progress,
             max_size=args.max_size,
             camera_model=args.camera_model,
+            single_camera=args.single_camera,
+            matcher=args.matcher,
             seed=args.seed,
             overwrite=args.overwrite,
         )
+    left = unreadable_photographs(photo_folder(args.photos))
+    if left:
+        print(f"note: {left}")
     print(
         f"{found.registered} of {found.photographs} photographs placed, {found.points:,} points, "
         f"mean reprojection error {found.reprojection_error:.2f} px -> {found.capture}"

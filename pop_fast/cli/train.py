@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import sys
 import time
 import typing
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
@@ -16,14 +18,18 @@ import tyro
 from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.errors import describe
+from pop_fast.cli.finish import FinishOptions, finish
+from pop_fast.cli.limits import LimitOptions
+from pop_fast.cli.printable import printable
 from pop_fast.cli.said import PLAN, plan_of, said
+from pop_fast.data.sfm_options import SfmOptions
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.presets import ALIASES, METHODS, Given
 
 if TYPE_CHECKING:
-    from pop_fast.cli.splat import CaptureRecord
     from pop_fast.data import Capture
+    from pop_fast.train.load_result import CaptureRecord
 
 _EXAMPLES: Final = """
     pop train scene                          POP, the paper's 30,000 steps, results in out/scene_pop
@@ -34,6 +40,7 @@ _EXAMPLES: Final = """
     pop train scene --method taming          or pup, mini-splatting, speedy-splat: the paper's other methods
     pop train scene --out out/a --resume     go on from the last checkpoint
     pop train scene --backend fast           on the CPU, also where a GPU is
+    pop train scene --export sog html        also as a small file and as a page, in out/scene_pop/export
     pop train scene --pop.lambda-pop 0.01    any setting, taken as it is; --help-all lists them all
 """
 
@@ -44,12 +51,13 @@ _SHOWN: Final = frozenset(
         *("factor", "test_every", "antialiased", "background", "lpips_vgg", "lpips_alex"),
     }
 )
-_DOCUMENTED: Final = (Given, TrainConfig)
+_DOCUMENTED: Final = (FinishOptions, LimitOptions, Given, TrainConfig)
 # words of other trainers' command lines: Inria's, gsplat's
 _ALIASES: Final = {
     **dict.fromkeys(("-s", "--source-path", "--data-dir", "--data"), "DATA"),
     **dict.fromkeys(("-m", "--model-path", "--result-dir", "-o"), "--out"),
     "--data-factor": "--factor",
+    "--iterations": "--max-steps",
 }
 # what trains, and takes longest to import
 _TRAINING: Final = ("pop_fast.train.training_run", "pop_fast.compiled.native_step")
@@ -57,7 +65,7 @@ _IGNORED: Final = frozenset({"--eval"})  # Inria: hold out every 8th view; here 
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Run:
+class _Run(FinishOptions):
     """Fit a splat to a capture or a folder of photographs.
 
     DATA is a folder with a COLMAP model (the largest in sparse), with transforms.json, or with photographs alone.
@@ -70,7 +78,8 @@ class _Run:
         images: read the photographs from this folder of the capture.
         ignore_masks: do not use the capture's masks (where white means keep).
         source: where cameras come from; "auto" takes the first that is there.
-        quiet: show no progress bars.
+        sfm: how the cameras of bare photographs are found.
+        quiet: print nothing but warnings and errors; --no-progress leaves out the bars alone.
     """
 
     resume: bool = False
@@ -79,6 +88,7 @@ class _Run:
     images: str | None = None
     ignore_masks: bool = False
     source: Literal["auto", "colmap", "transforms", "photos"] = "auto"
+    sfm: SfmOptions = dataclasses.field(default_factory=SfmOptions)
     quiet: bool = False
 
 
@@ -88,15 +98,23 @@ def run(argv: Sequence[str]) -> int:
     from pop_fast.train.choose import choose_backend
 
     folder = Path(config.result_dir)
-    check_output(folder, options)
-    options = as_begun(folder, options)
-    config, chosen = choose_backend(config, options.resume)
-    check_backend(config)
-    return _train(config, options, chosen)
+    options.check()
+    with _stdout_closed() if options.quiet else nullcontext():
+        check_output(folder, options)
+        options = as_begun(folder, options)
+        config, chosen = choose_backend(config, options.resume)
+        check_backend(config)
+        return _train(config, options, chosen)
+
+
+@contextmanager
+def _stdout_closed() -> Iterator[None]:
+    with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere):
+        yield
 
 
 def _train(config: TrainConfig, options: Any, chosen: str) -> int:
-    from pop_fast.cli.splat import RECORD, record_text
+    from pop_fast.train.load_result import RECORD, record_text
 
     folder, start = Path(config.result_dir), time.perf_counter()
     capture = open_capture(config, options)
@@ -106,9 +124,11 @@ def _train(config: TrainConfig, options: Any, chosen: str) -> int:
 
     keep_freed_memory()
     for note in capture.notes:
-        print(f"note: {note}")
-    print(f"{capture.name}: {capture.source}; {_plan(config)}")
+        print(f"note: {printable(note)}")
+    print(printable(f"{capture.name}: {capture.source}; {_plan(config)}"))
     print(chosen)
+    if takes_hours(config):
+        print(f"note: {config.max_steps:,} steps take hours on a CPU; --preset quick takes a tenth of the schedule")
     how = {"resume": options.resume, "overwrite": options.overwrite, "loading_seconds": loading}
     beside = {RECORD: record_text(_record(capture, options))}
     # absolute, so that the result can be looked at from another folder too
@@ -118,12 +138,33 @@ def _train(config: TrainConfig, options: Any, chosen: str) -> int:
     try:
         stats = training.run()
     except KeyboardInterrupt:
-        stopped = f"stopped after step {training.step}; the same command with --resume goes on"
-        nothing = "stopped before the first step; nothing was written"
-        print(f"pop: {stopped if training.step else nothing}", file=sys.stderr)
+        print(f"pop: {_stopped(folder, training.step)}", file=sys.stderr)
         return EXIT_INTERRUPTED
     print(summary(stats), flush=True)
-    return report(folder)
+    return finish(folder, capture, options) or report(folder)
+
+
+def takes_hours(config: TrainConfig) -> bool:
+    """Tell whether a CPU is given the paper's schedule by nobody's word: neither a preset nor steps were said."""
+    given = config.given
+    said = given is None or given.steps_scaler is not None or "max_steps" in given.settings
+    return not said and config.preset == "paper" and config.backend != "cuda"
+
+
+def _stopped(folder: Path, step: int) -> str:
+    """Say where a run stopped and from which checkpoint it goes on: after a second Ctrl-C that is not the last step."""
+    from pop_fast.train.checkpoint import list_checkpoints
+
+    if step == 0:
+        return "stopped before the first step; nothing was written"
+    kept = [number + 1 for number, _ in list_checkpoints(folder)]
+    if not kept:
+        return (
+            f"stopped after step {step:,}, before a checkpoint was written; the same command with --resume starts anew"
+        )
+    if kept[-1] == step:
+        return f"stopped after step {step:,}; the same command with --resume goes on"
+    return f"stopped after step {step:,}; the same command with --resume goes on from step {kept[-1]:,}"
 
 
 def report(folder: Path) -> int:
@@ -134,7 +175,7 @@ def report(folder: Path) -> int:
     """
     left = f"the results in {folder} are complete, and pop report {folder} writes it"
     try:
-        from pop_fast.report import write_report
+        from pop_fast.view.report import write_report
 
         print(f"report: {write_report(folder)}")
     except KeyboardInterrupt:
@@ -175,6 +216,10 @@ def rename_aliases(argv: Sequence[str]) -> list[str]:
     rest = list(argv)
     while rest:
         word = rest.pop(0)
+        if not word.startswith("-"):
+            # a path may hold "="
+            words.append(word)
+            continue
         word = word.replace("--adc.", "--gsplat.", 1) if word.startswith("--adc.") else word
         name, equals, value = word.partition("=")
         name = name.replace("_", "-") if name.startswith("--") else name
@@ -246,7 +291,7 @@ def as_begun(folder: Path, options: Any) -> Any:
     Raises:
         PopError: capture.json is damaged.
     """
-    from pop_fast.cli.splat import read_record
+    from pop_fast.train.load_result import read_record
 
     record = read_record(folder) if options.resume else None
     if record is None:
@@ -273,11 +318,9 @@ def check_backend(config: TrainConfig) -> None:
     Raises:
         PopError: says why and what to do.
     """
-    from pop_fast.backends import get_backend
+    from pop_fast.api.registry import require_backend
 
-    backend = get_backend(config.backend)
-    if not backend.available():
-        raise PopError(f"backend {config.backend!r} is not available: {backend.why_not()}")
+    require_backend(config.backend)
     if config.backend == "cuda":
         from pop_fast.train.fused_stepper import unsupported
 
@@ -309,13 +352,13 @@ def open_capture(config: TrainConfig, options: Any) -> Capture:
             source=options.source,
             images=options.images,
             resize=config.resize,
-            sfm=True,
+            sfm=options.sfm,
             seed=config.seed,
         )
 
 
 def _record(capture: Capture, options: Any) -> CaptureRecord:
-    from pop_fast.cli.splat import CaptureRecord
+    from pop_fast.train.load_result import CaptureRecord
 
     return CaptureRecord(
         images=options.images,

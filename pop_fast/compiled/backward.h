@@ -59,15 +59,16 @@ template <class Real> struct Again {
 // A tile's cotangents, the colour from behind, and what a chunk's entries sum up in each lane.
 template <class Real> struct Transpose : Again<Real> {
   using Again<Real>::padded;
-  std::vector<Real> v, behind, sums;
+  std::vector<Real> v, suffix_dot_grad, sums;
 
   Transpose(const Pixels<Real> &pixels, int64_t channels)
-      : Again<Real>(pixels), v((channels + 1) * padded), behind(padded), sums((channels + 8) * CHUNK * LANES<Real>) {}
+      : Again<Real>(pixels), v((channels + 1) * padded), suffix_dot_grad(padded),
+        sums((channels + 8) * CHUNK * LANES<Real>) {}
 
   void begin(const Blend<Real> &blend, const Place<Real> &place) {
     const int64_t D = blend.channels, n = place.columns();
     std::fill(v.begin(), v.end(), Real(0));
-    std::fill(behind.begin(), behind.end(), Real(0));
+    std::fill(suffix_dot_grad.begin(), suffix_dot_grad.end(), Real(0));
     place.each_row([&](int64_t pixel, int64_t from) {
       for (int64_t d = 0; blend.v_image && d < D; d++) {
         const Real *line = blend.v_image + from * blend.pixel_stride + d * blend.channel_stride;
@@ -100,12 +101,13 @@ void entry_sums(const Blend<Real> &blend, const Thresholds<Real> &thresholds, co
   const Real *color = D ? entries.rgb[k] : entries.color[k], *all_x = pixels.x.data(), *all_y = pixels.y.data();
   const Real *alphas = &state.alphas[k * padded], *weights = &state.weights[k * padded], *all_v = state.v.data();
   const Real u = entries.u[k], v_center = entries.v[k];
-  Real *all_behind = state.behind.data();
+  Real *all_suffix_dot_grad = state.suffix_dot_grad.data();
   Vec<Real> m{}, mx{}, my{}, mxx{}, mxy{}, myy{}, along_x{}, along_y{}, colors[D ? D : 1]{};
   const auto of_strip = [&](int strip) {
     const int at = strip * LANES<Real>;
-    const Vec<Real> alpha = load(alphas + at), weight = load(weights + at), behind = load(all_behind + at);
-    Vec<Real> q = load(all_v + channels * padded + at) - behind;
+    const Vec<Real> alpha = load(alphas + at), weight = load(weights + at);
+    const Vec<Real> suffix_dot_grad = load(all_suffix_dot_grad + at);
+    Vec<Real> q = load(all_v + channels * padded + at) - suffix_dot_grad;
     for (int d = 0; d < D; d++) {
       const Vec<Real> v = load(all_v + d * padded + at);
       q += v * color[d];
@@ -117,7 +119,7 @@ void entry_sums(const Blend<Real> &blend, const Thresholds<Real> &thresholds, co
       q += v * color[d];
       store(sum, load(sum) + weight * v);
     }
-    store(all_behind + at, behind + alpha * q);
+    store(all_suffix_dot_grad + at, suffix_dot_grad + alpha * q);
     const Vec<Real> x = load(all_x + at), y = load(all_y + at), dx = u - x;
     Vec<Real> G = weight * q;
     if (any(alpha >= thresholds.ceiling))

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import torch
 
-from pop_fast.chord import DominantPoints, points_on_rays, towards_camera
 from pop_fast.compiled.library import PointScores
 from pop_fast.compiled.scores import scored
-from pop_fast.pairs import check_grid
-from pop_fast.projection import intrinsics
-from pop_fast.splatting import Splats
-from pop_fast.tiles import TileLists
-from pop_fast.types import Camera, Gaussians
+from pop_fast.stages.blend.pairs import check_grid
+from pop_fast.stages.chord import DominantPoints, points_on_rays, towards_camera
+from pop_fast.stages.projection import intrinsics
+from pop_fast.stages.splatting import Splats
+from pop_fast.stages.tiles import TileLists
+from pop_fast.stages.types import Camera, Gaussians
 from pop_ref.constants import PAPER, Profile
 
 
@@ -25,7 +25,7 @@ def dominant_points(
 ) -> DominantPoints:
     """See `pop_ref.chord.dominant_points`. A Gaussian with a scale of 0 does not compete.
 
-    Optimizations: those of `pop_fast.chord`; the walk through the lists is in C++ (`scores.h`).
+    Optimizations: those of `pop_fast.stages.chord`; the walk through the lists is in C++ (`scores.h`).
     """
     width, height = camera.width, camera.height
     check_grid(lists, width, height, tile_size)

@@ -15,10 +15,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pop_fast.compiled.library import Blend, BlendBackward, call_library, this_library
-from pop_fast.compositing import BlendOptions
-from pop_fast.compositing import composite as composite_in_torch
-from pop_fast.tiles import TileLists
-from pop_fast.transmittance import Stop, below
+from pop_fast.stages.blend.transmittance import Stop, below
+from pop_fast.stages.compositing import BlendOptions
+from pop_fast.stages.compositing import composite as composite_in_torch
+from pop_fast.stages.tiles import TileLists
 
 
 class _Composite(torch.autograd.Function):
@@ -95,7 +95,7 @@ def blend_numbers(inputs: tuple[Tensor, ...], options: BlendOptions) -> dict[str
         "stop": Stop.of(profile, dtype).at,
         "pixel_stride": inputs[3].shape[1],
         "channel_stride": 1,
-        "ceiling_passes": profile.ceiling_gradient != "zero",
+        "ceiling_passes": profile.as_numbers()["pass_ceiling"],
     }
 
 

@@ -7,10 +7,10 @@ from torch import Tensor
 
 from pop_fast.compiled.library import Scores
 from pop_fast.compiled.scores import totals
-from pop_fast.contributions import Contributions, checked_map
-from pop_fast.pairs import check_grid
-from pop_fast.splatting import Splats
-from pop_fast.tiles import TileLists
+from pop_fast.stages.blend.pairs import check_grid
+from pop_fast.stages.contributions import Contributions, checked_map
+from pop_fast.stages.splatting import Splats
+from pop_fast.stages.tiles import TileLists
 from pop_ref.constants import PAPER, Profile
 
 

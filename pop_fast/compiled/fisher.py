@@ -7,12 +7,12 @@ from torch import Tensor
 from pop_fast.compiled.library import MomentScores
 from pop_fast.compiled.scores import totals
 from pop_fast.compiled.splatting import colors_of_view, covariances, project
-from pop_fast.fisher import N_MOMENTS, three_channels
-from pop_fast.fisher import fisher_blocks as fisher_blocks_of_stages
-from pop_fast.pairs import background_or_black, check_grid
-from pop_fast.splatting import Splats
-from pop_fast.tiles import TileLists
-from pop_fast.types import Camera, Gaussians
+from pop_fast.stages.blend.pairs import background_or_black, check_grid
+from pop_fast.stages.fisher import N_MOMENTS, three_channels
+from pop_fast.stages.fisher import fisher_blocks as fisher_blocks_of_stages
+from pop_fast.stages.splatting import Splats
+from pop_fast.stages.tiles import TileLists
+from pop_fast.stages.types import Camera, Gaussians
 from pop_ref.constants import PAPER, Profile
 
 
@@ -27,7 +27,7 @@ def screen_moments(
 ) -> Tensor:
     """See `pop_ref.fisher.screen_moments`. [N, 31] float64
 
-    Optimizations: those of `pop_fast.fisher.screen_moments`, in C++, there and back (`scores.h`).
+    Optimizations: those of `pop_fast.stages.fisher.screen_moments`, in C++, there and back (`scores.h`).
 
     Raises:
         ValueError: there are not three channels, or the lists are not of that grid.

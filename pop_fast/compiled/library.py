@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 
 _PRECISIONS: Final = ("float32", "float64")
 _POINTER, _WHOLE, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+# what projecting and culling read of `pop_ref.constants.Profile.as_numbers`
+PROJECTION_CONSTANTS: Final = (
+    *("near_inclusive", "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas", "alpha_floor"),
+    *("centred", "inria_clamp", "square"),
+)
 
 
 def _fields(kind: Any, *names: str) -> tuple[tuple[str, Any], ...]:
@@ -51,8 +56,8 @@ class Projection(ctypes.Structure):
         *_fields(_WHOLE, "near_inclusive", "centred", "inria_clamp", "square", "antialiased"),
         *_fields(_REAL, "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas", "alpha_floor"),
         *_fields(_REAL, "radius_clip"),
-        *_fields(_POINTER, "means2d", "depths", "conics", "blended", "factors", "radii"),
-        *_fields(_POINTER, "v_means2d", "v_depths", "v_conics", "v_blended", "v_factors"),
+        *_fields(_POINTER, "means2d", "depths", "conics", "effective_opacities", "factors", "radii"),
+        *_fields(_POINTER, "v_means2d", "v_depths", "v_conics", "v_effective_opacities", "v_factors"),
         *_fields(_POINTER, "v_means", "v_covars", "v_opacities", "v_viewmats"),
     )
 

@@ -6,6 +6,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "cuda_ext/csrc/tiles.cuh"
 #include "threads.h"
 
 namespace pop {
@@ -43,8 +44,7 @@ inline bool touches(Real a, Real b, Real c, Real limit, Real left, Real top, Rea
   const Real x = std::min(std::max(left, none), right), y = std::min(std::max(top, none), bottom);
   const Least<Real> vertical = least_on_line(a, b, c, x, top, bottom);
   const Least<Real> horizontal = least_on_line(c, b, a, y, left, right);
-  // needles cancel: the slack grows with the terms that were subtracted
-  const Real slack = Real(1e-3) + Real(1e-5) * std::max(vertical.size, horizontal.size);
+  const Real slack = Real(TILE_SLACK) + Real(TILE_SLACK_SHARE) * std::max(vertical.size, horizontal.size);
   // what overflowed on the way is not a number, and listed
   return !(vertical.sigma > limit + slack && horizontal.sigma > limit + slack);
 }

@@ -1,4 +1,4 @@
-"""The losses that hold SSIM, by the compiled library; see `pop_fast.losses` for each."""
+"""The losses that hold SSIM, by the compiled library; see `pop_fast.stages.losses` for each."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 
 from torch import Tensor
 
-from pop_fast import losses
 from pop_fast.compiled.ssim import mean_dissimilarity
+from pop_fast.stages import losses
 
 
 def _by_the_library(loss: Callable[..., Tensor]) -> Callable[..., Tensor]:

@@ -1,8 +1,8 @@
 """The whole training step in C++: from raw parameters to Adam's update, without a torch operation in between.
 
 `NativeTrainer` takes steps on tensors that it updates in place, and collects what density control reads; it has the
-interface of `cuda_ext.train_step.FusedTrainer`. Meaning: `pop_ref.training.train_step`; the order of work is explained
-in `step.h`. Results are the same bits for any number of threads.
+interface of `cuda_ext.training.train_step.FusedTrainer`. Meaning: `pop_ref.training.train_step`; the order of work is
+explained in `step.h`. Results are the same bits for any number of threads.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, StepStats
-from pop_fast.compiled.library import Moments, call_library, stepper_functions
-from pop_fast.ssim import REACH, Padding, border_of, check_size, kept_windows
-from pop_fast.transmittance import Stop, below
+from pop_fast.compiled.library import PROJECTION_CONSTANTS, Moments, call_library, stepper_functions
+from pop_fast.stages.blend.transmittance import Stop, below
+from pop_fast.stages.ssim import REACH, Padding, border_of, check_size, kept_windows
 
 # steps that are taken before Python is asked again: Ctrl-C, a progress bar
 LONGEST: Final = 10
@@ -238,14 +238,11 @@ class NativeTrainer:
     def _describe(self) -> None:
         """Set what stays the same over a run."""
         given, settings, profile = self._given, self.settings, self.settings.profile
-        for name in ("near_inclusive", "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas"):
-            setattr(given, name, getattr(profile, name))
-        given.alpha_floor, given.alpha_ceiling = profile.alpha_floor, profile.alpha_ceiling
-        given.centred = profile.principal_point == "centred"
-        given.inria_clamp = profile.clamp_gradient == "inria"
-        given.square = profile.extent == "square"
+        constants = profile.as_numbers()
+        for name in (*PROJECTION_CONSTANTS, "alpha_ceiling"):
+            setattr(given, name, constants[name])
         given.antialiased = settings.antialiased
-        given.ceiling_passes = profile.ceiling_gradient != "zero"
+        given.ceiling_passes = constants["pass_ceiling"]
         given.floor_below = below(profile.alpha_floor, torch.float32)
         given.stop = Stop.of(profile, torch.float32).at
         given.background = (_REAL * 3)(*settings.background)

@@ -29,9 +29,11 @@ template <class Real> struct Projection {
   int64_t n, threads, width, height, tile_size;
   int64_t near_inclusive, centred, inria_clamp, square, antialiased;  // see profile.cuh
   double near_plane, far_plane, eps2d, frustum_margin, extent_sigmas, alpha_floor, radius_clip;
-  Real *means2d, *depths, *conics, *blended, *factors;  // [N, 2], [N], [N, 3], [N], [N]; factors only if antialiased
+  // [N, 2], [N], [N, 3], [N], [N]; factors only if antialiased
+  Real *means2d, *depths, *conics, *effective_opacities, *factors;
   int32_t *radii;                                       // 0 where culled; the transpose takes them. [N, 2]
-  const Real *v_means2d, *v_depths, *v_conics, *v_blended, *v_factors;  // component rows: [2, N], [N], [3, N], [N], [N]
+  // component rows: [2, N], [N], [3, N], [N], [N]
+  const Real *v_means2d, *v_depths, *v_conics, *v_effective_opacities, *v_factors;
   Real *v_means, *v_covars, *v_opacities;                               // [N, 3], [N, 3, 3], [N]
   Real *v_viewmats;  // rows of [R | t], a sum for every ROWS_AT_A_TIME Gaussians, or null. [parts, 12]
 
@@ -115,7 +117,7 @@ template <class Real>
   given.radii[2 * i] = splat.radii.x;
   given.radii[2 * i + 1] = splat.radii.y;
   // what is culled keeps its opacity, as gsplat has it
-  given.blended[i] = seer.options.antialiased ? splat.opacity : opacity;
+  given.effective_opacities[i] = seer.options.antialiased ? splat.opacity : opacity;
   if (!seer.options.antialiased) return;
   const Mat3<Real> covar_cam = covar_cam_from_covar(covar, seer.camera);
   const Mat2<Real> covar2d = project_covar(covar_cam, projection_jacobian(mean_cam, seer.camera, seer.profile));
@@ -131,7 +133,7 @@ template <class Real>
     const SplatCotangents<Real> of = {{given.v_means2d[i], given.v_means2d[n + i]},
                                       given.v_depths[i],
                                       {given.v_conics[i], given.v_conics[n + i], given.v_conics[2 * n + i]},
-                                      given.v_blended[i],
+                                      given.v_effective_opacities[i],
                                       seer.options.antialiased ? given.v_factors[i] : Real(0)};
     v = splat_in_front_vjp(given.mean(i), load_mat3(given.covars + 9 * i), given.opacities[i], seer.camera,
                            seer.profile, seer.options, of, v_viewmat);

@@ -148,12 +148,12 @@ template <class Real, int D> struct BackState {
   LaneSums<Real> sums;
   std::vector<Real> lights;       // T before every chunk. [chunks, pixels]
   std::vector<uint16_t> reached;  // [chunks, strips]
-  std::vector<Real> behind;       // [D, pixels]
+  std::vector<Real> suffix_color;       // [D, pixels]
 
   BackState(const Pixels<Real> &pixels, int columns)
-      : light(pixels), again(pixels), sums(columns), behind(D * pixels.padded()) {}
+      : light(pixels), again(pixels), sums(columns), suffix_color(D * pixels.padded()) {}
 
-  Real *behind_of(int d, int at) { return &behind[d * again.padded + at]; }
+  Real *suffix_color_of(int d, int at) { return &suffix_color[d * again.padded + at]; }
 };
 
 // Blend a tile's list, and go back through it: entry(k) for those that blend somewhere, the farthest first.
@@ -175,7 +175,7 @@ void walk_back(const Scores<Real> &scores, const Pixels<Real> &pixels, int64_t t
       [](int, int, Vec<Real>, Vec<Real>) {},
       [&](int strip, uint32_t took) { state.reached[n_chunks * strips + strip] = uint16_t(took); },
       [&](int64_t, int64_t) { n_chunks++; });
-  for (int d = 0; d < D; d++) std::fill_n(state.behind_of(d, 0), padded, scores.background[d]);
+  for (int d = 0; d < D; d++) std::fill_n(state.suffix_color_of(d, 0), padded, scores.background[d]);
   const int64_t n_reached = scores.n_reached[tile];
   for (int64_t chunk = n_chunks - 1; chunk >= 0; chunk--) {
     const int64_t first = place.begin + chunk * CHUNK;
@@ -202,8 +202,8 @@ void sensitivities_of_tile(const Scores<Real> &scores, const Pixels<Real> &pixel
     again.each_strip(k, [&](int strip) {
       const int at = strip * LANES<Real>, place = k * again.padded + at;
       const Vec<Real> alpha = load(&again.alphas[place]), weight = load(&again.weights[place]), none = {};
-      const Vec<Real> behind = load(state.behind_of(0, at)), q = color - behind;
-      store(state.behind_of(0, at), behind + alpha * q);
+      const Vec<Real> suffix_color = load(state.suffix_color_of(0, at)), q = color - suffix_color;
+      store(state.suffix_color_of(0, at), suffix_color + alpha * q);
       const Vec<Real> slope = alpha > Real(0) ? q * (weight / alpha) : none;
       total += slope * slope;
     });
@@ -233,8 +233,8 @@ void moments_of_tile(const Scores<Real> &scores, const Pixels<Real> &pixels, int
       const Vec<Real> s[5] = {A * dx + B * dy, B * dx + C * dy, half * dx * dx, dx * dy, half * dy * dy};
       Vec<Real> G[3], squares = {};
       for (int c = 0; c < 3; c++) {
-        const Vec<Real> behind = load(state.behind_of(c, at)), more = entries.rgb[k][c] - behind;
-        store(state.behind_of(c, at), behind + alpha * more);
+        const Vec<Real> suffix_color = load(state.suffix_color_of(c, at)), more = entries.rgb[k][c] - suffix_color;
+        store(state.suffix_color_of(c, at), suffix_color + alpha * more);
         G[c] = through * more;
         squares += G[c] * G[c];
         G[c] *= weight;

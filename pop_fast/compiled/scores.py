@@ -11,9 +11,9 @@ from torch import Tensor
 
 from pop_fast.compiled.compositing import aligned_records, blend_numbers
 from pop_fast.compiled.library import Scores, call_library, this_library
-from pop_fast.compositing import BlendOptions
-from pop_fast.splatting import Splats
-from pop_fast.tiles import TileLists
+from pop_fast.stages.compositing import BlendOptions
+from pop_fast.stages.splatting import Splats
+from pop_fast.stages.tiles import TileLists
 from pop_ref.constants import Profile
 
 

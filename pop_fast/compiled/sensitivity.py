@@ -6,9 +6,9 @@ from torch import Tensor
 
 from pop_fast.compiled.library import SensitivityScores
 from pop_fast.compiled.scores import totals
-from pop_fast.pairs import background_or_black, check_grid
-from pop_fast.splatting import Splats, colors_of
-from pop_fast.tiles import TileLists
+from pop_fast.stages.blend.pairs import background_or_black, check_grid
+from pop_fast.stages.splatting import Splats, colors_of
+from pop_fast.stages.tiles import TileLists
 from pop_ref.constants import PAPER, Profile
 
 

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pop_fast.camera import view_dirs_vjp
 from pop_fast.compiled.library import (
+    PROJECTION_CONSTANTS,
     Colors,
     ColorsBackward,
     Covariances,
@@ -22,16 +22,17 @@ from pop_fast.compiled.library import (
     call_library,
     this_library,
 )
-from pop_fast.splatting import Splats, View
+from pop_fast.stages.camera import view_dirs_vjp
+from pop_fast.stages.splatting import ProjectionSettings, Splats
 
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
-    """See `pop_fast.splatting.covariances`."""
+    """See `pop_fast.stages.splatting.covariances`."""
     return _Covariances.apply(quats, scales)
 
 
-def project(means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: View) -> Splats:
-    """See `pop_fast.splatting.project`; rows of culled Gaussians hold 0, but for depths and opacities.
+def project(means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: ProjectionSettings) -> Splats:
+    """See `pop_fast.stages.splatting.project`; rows of culled Gaussians hold 0, but for depths and opacities.
 
     Optimizations: one pass over the Gaussians forward and one backward, which compute everything in between anew.
     """
@@ -75,14 +76,14 @@ class _Covariances(torch.autograd.Function):
 class _Projection(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: View
+        ctx: Any, means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: ProjectionSettings
     ) -> tuple[Tensor | None, ...]:
         n = len(means)
         results = {
             "means2d": means.new_empty((n, 2)),
             "depths": means.new_empty(n),
             "conics": means.new_empty((n, 3)),
-            "blended": means.new_empty(n),
+            "effective_opacities": means.new_empty(n),
             "radii": torch.empty((n, 2), dtype=torch.int32),
             "factors": means.new_empty(n) if view.antialiased else None,
         }
@@ -100,7 +101,7 @@ class _Projection(torch.autograd.Function):
         v_means2d: Tensor,
         v_depths: Tensor,
         v_conics: Tensor,
-        v_blended: Tensor,
+        v_effective_opacities: Tensor,
         _v_radii: None,
         v_factors: Tensor | None,
     ) -> tuple[Tensor | None, ...]:
@@ -109,7 +110,12 @@ class _Projection(torch.autograd.Function):
         found = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in (means, covars, opacities)]
         v_viewmats = means.new_empty((n_parts, 3, 4)) if ctx.needs_input_grad[3] else None
         given = {"means": means, "covars": covars, "opacities": opacities, "viewmat": viewmat, "K": ctx.view.K}
-        given |= {"v_means2d": v_means2d.T, "v_depths": v_depths, "v_conics": v_conics.T, "v_blended": v_blended}
+        given |= {
+            "v_means2d": v_means2d.T,
+            "v_depths": v_depths,
+            "v_conics": v_conics.T,
+            "v_effective_opacities": v_effective_opacities,
+        }
         given |= {"v_factors": v_factors, "radii": ctx.radii, "v_viewmats": v_viewmats}
         given |= dict(zip(("v_means", "v_covars", "v_opacities"), found, strict=True))
         call_library(ProjectionBackward, means.dtype, _projection_numbers(len(means), ctx.view), given)
@@ -120,14 +126,10 @@ class _Projection(torch.autograd.Function):
         return (*found, v_viewmat, None)
 
 
-def _projection_numbers(n: int, view: View) -> dict[str, float]:
-    profile = view.profile
-    names = ("tile_size", "near_inclusive", "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas")
+def _projection_numbers(n: int, view: ProjectionSettings) -> dict[str, float]:
+    constants = view.profile.as_numbers()
     return {
-        **{name: getattr(profile, name) for name in (*names, "alpha_floor")},
-        "centred": profile.principal_point == "centred",
-        "inria_clamp": profile.clamp_gradient == "inria",
-        "square": profile.extent == "square",
+        **{name: constants[name] for name in (*PROJECTION_CONSTANTS, "tile_size")},
         "antialiased": view.antialiased,
         "radius_clip": view.radius_clip,
         "width": view.width,

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.compiled.library import Lists, call_library
-from pop_fast.tiles import TileLists, depth_order, grid_size, tile_rects
+from pop_fast.stages.tiles import TileLists, depth_order, grid_size, tile_rects
 from pop_ref.constants import PAPER, Profile
 
 
@@ -22,7 +22,7 @@ def tile_lists(
     conics: Tensor | None = None,
     opacities: Tensor | None = None,
 ) -> TileLists:
-    """See `pop_ref.tiles.tile_lists` (D3, D4), and `pop_fast.tiles.tile_lists` for `conics` and `opacities`.
+    """See `pop_ref.tiles.tile_lists` (D3, D4), and `pop_fast.stages.tiles.tile_lists` for `conics` and `opacities`.
 
     Optimizations: rectangles and depth order are torch's; a counting sort by tile of entries that are made in depth
     order (`lists.h`).

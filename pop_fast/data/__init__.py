@@ -1,4 +1,4 @@
-"""Captures: a COLMAP model, transforms.json, a folder of photographs, or the demo that the package makes itself."""
+"""Captures: a COLMAP model, transforms.json, or a folder of photographs."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from pop_fast.lazy import given_by
 
 if TYPE_CHECKING:
     from pop_fast.data.capture import Capture, View
-    from pop_fast.data.demo import make_demo
     from pop_fast.data.initialize import initialize_params
     from pop_fast.data.load import load_capture
-    from pop_fast.data.photos import run_sfm
+    from pop_fast.data.sfm import run_sfm
     from pop_fast.data.similarity import apply_similarity, to_capture_frame
 
 __all__ = [
@@ -22,7 +21,6 @@ __all__ = [
     "apply_similarity",
     "initialize_params",
     "load_capture",
-    "make_demo",
     "run_sfm",
     "to_capture_frame",
 ]
@@ -32,10 +30,10 @@ __getattr__ = given_by(
     __name__,
     {
         "capture": ("Capture", "View"),
-        "demo": ("make_demo",),
         "initialize": ("initialize_params",),
         "load": ("load_capture",),
-        "photos": ("run_sfm",),
+        "sfm": ("run_sfm",),
         "similarity": ("apply_similarity", "to_capture_frame"),
     },
+    moved={"make_demo": "pop_fast.demo"},
 )

@@ -7,6 +7,7 @@ they are stored.
 
 from __future__ import annotations
 
+import html
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
@@ -61,6 +62,12 @@ class View:
         mask = "" if self.mask is None else ", masked"
         return f"View({self.name!r}, {self.width}x{self.height}{mask})"
 
+    def _repr_html_(self) -> str:
+        """Show the photograph in a notebook, with sides of up to 480 px."""
+        from pop_fast.io.images import inline_png
+
+        return f"<figure>{inline_png(self.image, 480)}<figcaption>{html.escape(repr(self))}</figcaption></figure>"
+
 
 @dataclass(frozen=True, eq=False)
 class Capture:
@@ -89,6 +96,18 @@ class Capture:
         if len(self.views) < 2:
             raise CaptureError(f"{self.name}: has {len(self.views)} view(s); a scene needs two or more")
         object.__setattr__(self, "views", tuple(sorted(self.views, key=lambda view: view.name)))
+
+    def __repr__(self) -> str:
+        return f"Capture({self.name!r}, {len(self.views)} views, {len(self.points):,} points, {self.source!r})"
+
+    def _repr_html_(self) -> str:
+        """Show up to eight of the photographs in a notebook, from the first to the last."""
+        from pop_fast.io.images import inline_png
+
+        places = np.unique(np.linspace(0, len(self.views) - 1, 8).round().astype(int))
+        notes = "".join(f"<li>{html.escape(note)}</li>" for note in self.notes)
+        pictures = " ".join(inline_png(self.views[i].image, 160) for i in places)
+        return f"<p>{html.escape(repr(self))}</p><p>{pictures}</p><ul>{notes}</ul>"
 
     @property
     def world_scale(self) -> float:

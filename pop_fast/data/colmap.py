@@ -13,8 +13,8 @@ from pop_fast.data.colmap_binary import count_images_binary, read_binary
 from pop_fast.data.colmap_records import ImageRecord, Model
 from pop_fast.data.colmap_text import count_images_text, read_text
 from pop_fast.data.pinhole import require_colmap
+from pop_fast.data.posed_images import PosedImage, SparsePoints
 from pop_fast.data.rigid import rigid_from_quat
-from pop_fast.data.shots import Cloud, Shot
 from pop_fast.errors import CaptureError
 from pop_fast.io.points import FARTHEST, find_bad_coordinate
 
@@ -74,7 +74,7 @@ def quiet_colmap() -> Iterator[None]:
         log.minloglevel = before
 
 
-def read_model(model: Path) -> tuple[list[Shot], Cloud]:
+def read_model(model: Path) -> tuple[list[PosedImage], SparsePoints]:
     """Read cameras, poses and points of a model.
 
     Args:
@@ -94,7 +94,7 @@ def read_model(model: Path) -> tuple[list[Shot], Cloud]:
     found = read_binary(model) if suffix == ".bin" else read_text(model)
     for camera in found.cameras.values():
         _check_camera(model / f"cameras{suffix}", camera)
-    shots: dict[str, Shot] = {}
+    shots: dict[str, PosedImage] = {}
     for image in found.images:
         shot = _shot(model / f"images{suffix}", image, found.cameras)
         if shot.name in shots:
@@ -118,7 +118,7 @@ def _check_camera(path: Path, camera: Any) -> None:
         raise CaptureError(f"{where}: has focal length {focal.min()}; it must be > 0; {_FIX}")
 
 
-def _shot(path: Path, image: ImageRecord, cameras: dict[int, Any]) -> Shot:
+def _shot(path: Path, image: ImageRecord, cameras: dict[int, Any]) -> PosedImage:
     where = f"{path}: {image.where}"
     if image.camera_id not in cameras:
         raise CaptureError(f"{where}: its CAMERA_ID {image.camera_id} is not in cameras{path.suffix}; {_FIX}")
@@ -127,10 +127,10 @@ def _shot(path: Path, image: ImageRecord, cameras: dict[int, Any]) -> Shot:
     except ValueError as error:
         raise CaptureError(f"{where}: {error}; {_FIX}") from error
     name = image.name.replace("\\", "/")
-    return Shot(name=name, folder="images", file=name, camera=cameras[image.camera_id], viewmat=viewmat)
+    return PosedImage(name=name, folder="images", file=name, camera=cameras[image.camera_id], viewmat=viewmat)
 
 
-def _cloud(path: Path, model: Model) -> Cloud:
+def _cloud(path: Path, model: Model) -> SparsePoints:
     order = np.argsort(model.point_ids, kind="stable")
     xyz = model.xyz[order]
     bad = find_bad_coordinate(xyz)
@@ -140,4 +140,4 @@ def _cloud(path: Path, model: Model) -> Cloud:
             f"{path}: point {model.point_ids[order[row]]}: {'XYZ'[axis]} is {xyz[row, axis]}; every coordinate must be "
             f"finite and within {FARTHEST:.0e}; {_FIX}"
         )
-    return Cloud(xyz, model.rgb[order])
+    return SparsePoints(xyz, model.rgb[order])

@@ -76,6 +76,10 @@ class _Line:
             raise CaptureError(f"{self.where}: {field} is {word!r}; it must be {what}") from None
 
 
+# COLMAP's ids have 32 bits, and the last one means none
+_INVALID_ID = 2**32 - 1
+
+
 def _whole(word: str) -> int:
     value = int(word)
     if not 0 <= value < 2**63:
@@ -134,6 +138,8 @@ def _camera(line: _Line) -> Any:
         raise CaptureError(f"{line.where}: PARAMS[] has {len(words)} numbers; {model} has {parameter_count(model)}")
     params = [line.parse(f"PARAMS[{i}]", word, float) for i, word in enumerate(words)]
     camera_id, width, height = (line.number(field, _whole) for field in ("CAMERA_ID", "WIDTH", "HEIGHT"))
+    if camera_id >= _INVALID_ID:
+        raise CaptureError(f"{line.where}: CAMERA_ID is {camera_id}; it must be under 2^32 - 1")
     return make_camera(camera_id, model, width, height, params)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Literal
 
@@ -10,17 +10,19 @@ import numpy as np
 
 from pop_fast.data.capture import Capture, Progress, View
 from pop_fast.data.colmap import find_models, read_model
+from pop_fast.data.diagnostics import about_other_models, about_random_points, about_unplaced
 from pop_fast.data.normalize import normalizing_transform, transform_points, transform_viewmats
-from pop_fast.data.notes import about_other_models, about_random_points, about_unplaced
-from pop_fast.data.photos import photo_folder, photographs, run_sfm
+from pop_fast.data.posed_images import PosedImage, SparsePoints
 from pop_fast.data.random_points import random_points
-from pop_fast.data.shots import Cloud, Shot
+from pop_fast.data.read_images import PhotoOptions, read_views
+from pop_fast.data.sfm import photo_folder, photographs, run_sfm
+from pop_fast.data.sfm_files import read_upright
+from pop_fast.data.sfm_options import SfmOptions
 from pop_fast.data.transforms import find_transforms, read_transforms
-from pop_fast.data.views import PhotoOptions, read_views
 from pop_fast.errors import CaptureError
 from pop_fast.io.images import find_image, unreadable_photographs
 
-__all__ = ["load_capture"]
+__all__ = ["beside_the_model", "load_capture", "turned_upright"]
 
 Source = Literal["auto", "colmap", "transforms", "photos"]
 
@@ -37,7 +39,7 @@ def load_capture(
     source: Source = "auto",
     images: str | None = None,
     resize: Literal["area", "bicubic"] = "area",
-    sfm: bool = False,
+    sfm: bool | SfmOptions = False,
     points: int = 30_000,
     seed: int = 0,
 ) -> Capture:
@@ -61,7 +63,8 @@ def load_capture(
             `_<factor>`.
         resize: how they are shrunk: "area" averages, "bicubic" does as Pillow does, and so
             gsplat's example trainer (A32).
-        sfm: for a bare folder of photographs: find the cameras first, and write them to `<path>/sparse/0`.
+        sfm: for a bare folder of photographs: find the cameras first, by these options, and write them to
+            `<path>/sparse/0`.
         points: how many random points to make where the capture brings none.
         seed: of the random points.
 
@@ -83,7 +86,7 @@ def load_capture(
     if len(shots) < 2:
         raise CaptureError(f"{listing}: has {len(shots)} view(s) with a known camera; a scene needs two or more")
     if made_from == "COLMAP model":
-        shots = _beside_the_model(root, shots, images)
+        shots = turned_upright(root, beside_the_model(root, shots, images), listing)
         notes += about_unplaced(root / (images or shots[0].folder), shots)
     views, more = read_views(root, listing, shots, options, progress)
     notes += more
@@ -101,8 +104,8 @@ def _background(color: tuple[float, float, float]) -> tuple[float, float, float]
 
 
 def _read_listing(
-    root: Path, source: Source, sfm: bool, progress: Progress | None
-) -> tuple[Path, list[Shot], Cloud | None, str, list[str]]:
+    root: Path, source: Source, sfm: bool | SfmOptions, progress: Progress | None
+) -> tuple[Path, list[PosedImage], SparsePoints | None, str, list[str]]:
     models = find_models(root) if source in ("auto", "colmap") else []
     if models:
         return models[0][0], *read_model(models[0][0]), "COLMAP model", about_other_models(root, models)
@@ -116,10 +119,11 @@ def _read_listing(
     if source == "transforms":
         raise CaptureError(f"{root}: has no transforms.json and no transforms_train.json; choose another --source")
     model = _from_photos(root, sfm, progress)
-    return model, *read_model(model), "COLMAP model", []
+    left = unreadable_photographs(photo_folder(root))
+    return model, *read_model(model), "COLMAP model", [left] if left else []
 
 
-def _beside_the_model(root: Path, shots: list[Shot], images: str | None) -> list[Shot]:
+def beside_the_model(root: Path, shots: list[PosedImage], images: str | None) -> list[PosedImage]:
     """Look for a COLMAP model's photographs in `images`, or in the capture itself where there is no such folder."""
     if (root / (images or "images")).is_dir():
         return shots
@@ -130,7 +134,13 @@ def _beside_the_model(root: Path, shots: list[Shot], images: str | None) -> list
     )
 
 
-def _from_photos(root: Path, sfm: bool, progress: Progress | None) -> Path:
+def turned_upright(root: Path, shots: list[PosedImage], model: Path) -> list[PosedImage]:
+    """Note which photographs are to be turned, where the model is one that `run_sfm` made."""
+    turns = read_upright(root / "sparse") if model == root / "sparse" / "0" else {}
+    return [replace(shot, turns=turns.get(shot.file, 0)) for shot in shots] if turns else shots
+
+
+def _from_photos(root: Path, sfm: bool | SfmOptions, progress: Progress | None) -> Path:
     photos = photo_folder(root)
     count = len(photographs(photos))
     if count == 0:
@@ -140,7 +150,7 @@ def _from_photos(root: Path, sfm: bool, progress: Progress | None) -> Path:
         raise CaptureError(
             f"{root}: has {count} photographs but nothing says where they were taken; run pop sfm {root} first"
         )
-    run_sfm(photos, root, progress=progress)
+    run_sfm(photos, root, progress=progress, **asdict(sfm if isinstance(sfm, SfmOptions) else SfmOptions()))
     return root / "sparse" / "0"
 
 
@@ -148,7 +158,7 @@ def _assemble(
     root: Path,
     listing: Path,
     views: list[View],
-    cloud: Cloud | None,
+    cloud: SparsePoints | None,
     made_from: str,
     notes: list[str],
     normalize: bool,
@@ -163,7 +173,7 @@ def _assemble(
             moved = transform_viewmats(transform, viewmats)
             views = [replace(view, viewmat=viewmat) for view, viewmat in zip(views, moved, strict=True)]
         if cloud:
-            cloud = Cloud(transform_points(transform, cloud.xyz), cloud.rgb)
+            cloud = SparsePoints(transform_points(transform, cloud.xyz), cloud.rgb)
             source = f"{made_from}: {len(views)} views, {len(cloud)} points"
         else:
             cloud = random_points(views, points, seed)

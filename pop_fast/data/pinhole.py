@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+import sys
+import threading
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -75,8 +78,13 @@ def require_colmap() -> Any:
     Raises:
         CaptureError: it is not installed.
     """
+    first = "pycolmap" not in sys.modules
     try:
         import pycolmap
+
+        if first and threading.current_thread() is threading.main_thread():
+            # its log takes SIGTERM to print where the program was
+            signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
     except ImportError as error:
         raise CaptureError(
             f"pycolmap cannot be imported ({error}), which finds cameras and reads all with distortion; pip install "

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pop_fast.data.capture import View
-from pop_fast.data.shots import Cloud
+from pop_fast.data.posed_images import SparsePoints
 from pop_fast.errors import CaptureError
 
 __all__ = ["random_points"]
@@ -15,7 +15,7 @@ __all__ = ["random_points"]
 _ROUNDS = 20
 
 
-def random_points(views: Sequence[View], count: int = 30_000, seed: int = 0) -> Cloud:
+def random_points(views: Sequence[View], count: int = 30_000, seed: int = 0) -> SparsePoints:
     """Draw points uniformly from the cameras' bounding cube, and keep those in the pictures of two views or more.
 
     The cube stands around the bounding box of the camera centres, with that box's longest side. Every point gets the
@@ -45,7 +45,7 @@ def random_points(views: Sequence[View], count: int = 30_000, seed: int = 0) -> 
             "there are no points, and no two views look at the same part of the space around the cameras"
         )
     color = np.mean([view.image.mean(axis=(0, 1)) for view in views], axis=0)
-    return Cloud(xyz, np.tile(np.rint(color).astype(np.uint8), (len(xyz), 1)))
+    return SparsePoints(xyz, np.tile(np.rint(color).astype(np.uint8), (len(xyz), 1)))
 
 
 def _times_seen(points: np.ndarray, views: Sequence[View]) -> np.ndarray:

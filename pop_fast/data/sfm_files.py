@@ -1,16 +1,21 @@
-"""Remember which files structure from motion wrote, so that replacing its result never removes anything else.
+"""What structure from motion leaves beside its model: a list of its files, and which photographs are to be turned.
 
-The list lies beside the model as `sparse/sfm.sha256`, in the format of `sha256sum`, with paths relative to the capture.
+With the list, replacing a result never removes anything else. It lies beside the model as `sparse/sfm.sha256`, in the
+format of `sha256sum`, with paths relative to the capture.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable
 from pathlib import Path
 
-__all__ = ["recognise_result", "write_list"]
+from pop_fast.errors import CaptureError
 
+__all__ = ["UPRIGHT", "read_upright", "recognise_result", "write_list"]
+
+UPRIGHT = "upright.json"
 _LIST = "sfm.sha256"
 
 
@@ -25,6 +30,25 @@ def write_list(sparse: Path, folder: Path, prefix: str = "") -> None:
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     lines = [f"{_sha256(path)}  {prefix}{path.relative_to(folder).as_posix()}\n" for path in files]
     (sparse / _LIST).write_text("".join(lines), encoding="utf-8", errors="surrogateescape")
+
+
+def read_upright(sparse: Path) -> dict[str, int]:
+    """Read by how many quarter turns clockwise photographs are to be turned, by name; those that are not are absent.
+
+    Raises:
+        CaptureError: the file is damaged.
+    """
+    path = sparse / UPRIGHT
+    if not path.is_file():
+        return {}
+    fix = "run pop sfm again with --overwrite"
+    try:
+        turns = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise CaptureError(f"{path}: is not JSON ({error}); {fix}") from error
+    if not isinstance(turns, dict) or not all(type(count) is int and 1 <= count <= 3 for count in turns.values()):
+        raise CaptureError(f"{path}: must hold quarter turns, 1 to 3, by the photograph's name; {fix}")
+    return turns
 
 
 def recognise_result(capture: Path, target: Path) -> Callable[[Path], bool]:

@@ -7,7 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from pop_fast.errors import PopError
-from pop_fast.harmonics import sh_basis
+from pop_fast.stages.harmonics import sh_basis
 
 __all__ = ["apply_similarity", "rotate_sh", "to_capture_frame"]
 

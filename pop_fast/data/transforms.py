@@ -17,8 +17,8 @@ import numpy as np
 
 from pop_fast.data.capture import Split
 from pop_fast.data.pinhole import make_camera
+from pop_fast.data.posed_images import PosedImage, SparsePoints
 from pop_fast.data.rigid import nearest_rigid
-from pop_fast.data.shots import Cloud, Shot
 from pop_fast.errors import CaptureError
 from pop_fast.io.points import read_points
 
@@ -42,7 +42,7 @@ def find_transforms(folder: Path) -> list[Path]:
     return [path for path in (train, held_out) if path.is_file()]
 
 
-def read_transforms(paths: list[Path]) -> tuple[list[Shot], Cloud | None]:
+def read_transforms(paths: list[Path]) -> tuple[list[PosedImage], SparsePoints | None]:
     """Read cameras and poses, and the points beside them.
 
     Args:
@@ -55,7 +55,7 @@ def read_transforms(paths: list[Path]) -> tuple[list[Shot], Cloud | None]:
     Raises:
         CaptureError: names the file, the frame, the field and what it should be.
     """
-    shots: list[Shot] = []
+    shots: list[PosedImage] = []
     named: Path | None = None
     for path in paths:
         listing = _load(path)
@@ -70,7 +70,7 @@ def read_transforms(paths: list[Path]) -> tuple[list[Shot], Cloud | None]:
     if twice:
         raise CaptureError(f"{paths[0]}: frames lists {twice[0]} twice; remove one of them")
     found = [named] if named else [f for f in (paths[0].parent / name for name in _POINTS) if f.is_file()]
-    return sorted(shots, key=lambda shot: shot.name), Cloud(*read_points(found[0])) if found else None
+    return sorted(shots, key=lambda shot: shot.name), SparsePoints(*read_points(found[0])) if found else None
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -88,9 +88,9 @@ def _load(path: Path) -> dict[str, Any]:
     return listing
 
 
-def _read_listing(path: Path, listing: dict[str, Any], split: Split | None) -> list[Shot]:
+def _read_listing(path: Path, listing: dict[str, Any], split: Split | None) -> list[PosedImage]:
     splits = _named_splits(path, listing)
-    shots: list[Shot] = []
+    shots: list[PosedImage] = []
     for index, frame in enumerate(listing["frames"]):
         where = f"{path}: frames[{index}]"
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
@@ -106,7 +106,7 @@ def _read_listing(path: Path, listing: dict[str, Any], split: Split | None) -> l
         angle = _angle(where, fields)
         camera = None if angle is not None else _camera(where, fields, index + 1)
         folder, file = name.split("/", 1) if "/" in name and not name.startswith("/") else ("", name)
-        shots.append(Shot(name, folder, file, camera, _viewmat(where, frame), angle, mask, own))
+        shots.append(PosedImage(name, folder, file, camera, _viewmat(where, frame), angle, mask, own))
     return shots
 
 

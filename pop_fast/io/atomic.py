@@ -1,15 +1,18 @@
 """Write files and folders whole or not at all: beside the target first, flushed to the disk, then renamed over it.
 
 A rename within one folder is atomic on POSIX and Windows, so a reader, or a run resumed after SIGKILL, sees the old
-content or the new content and never a mixture. What a killed writer left beside the target carries its process id in
-its name and is swept away by the next write to the same target.
+content or the new content and never a mixture. A folder with content is exchanged for another in one step where the
+system can, as Linux does. What a killed writer left beside the target carries its process id in its name and is swept
+away by the next write to the same target.
 """
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import shutil
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from itertools import islice
@@ -20,6 +23,8 @@ from pop_fast.errors import PopError
 
 __all__ = ["file_atomically", "folder_atomically", "write_atomically"]
 
+# of renameat2(2)
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 _NAMED = 3  # files of somebody else that a message names
 _LITTER = {".DS_Store", "Thumbs.db", "desktop.ini"}  # what file browsers leave in every folder that they show
 
@@ -111,6 +116,10 @@ def folder_atomically(
     # renamed is the folder itself and not a link to it, and ".." has no name to put a partial beside
     path = path.resolve() if path.is_symlink() or path.name in ("", "..") else path
     inputs = [Path(kept) for kept in keeps]
+    if path.parent.is_dir():
+        # a folder that another writer had set aside when it was killed is seen again
+        with _os_errors_name(path):
+            _sweep(path)
     _check_replaceable(path, overwrite, inputs, recognise)
     with _beside(path) as partial:
         partial.mkdir()
@@ -181,6 +190,9 @@ def _swap_in(partial: Path, path: Path) -> None:
     if not path.exists():
         os.replace(partial, path)
         return
+    if _exchange(partial, path):
+        # what stands in the place of the partial now is the old folder, and is removed with it
+        return
     # a folder with content cannot be renamed over: the old one steps aside first and comes back if that fails
     old = path.with_name(f".{path.name}.{os.getpid()}.old")
     os.replace(path, old)
@@ -192,6 +204,17 @@ def _swap_in(partial: Path, path: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
+def _exchange(one: Path, other: Path) -> bool:
+    """Exchange two names in one step; False, and nothing happens, where the system or the file system cannot."""
+    if not sys.platform.startswith("linux"):
+        return False
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if rename is None:
+        return False
+    # relative to the working folder, as any other name: absolute ones are taken as they are
+    return rename(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) == 0
+
+
 def _partial(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}.partial")
 
@@ -201,10 +224,16 @@ def _sweep(path: Path) -> None:
     prefix = f".{path.name}."
     for left in path.parent.iterdir():
         parts = left.name.removeprefix(prefix).split(".")
-        if left.name.startswith(prefix) and parts[0].isdigit() and parts[1:] == ["partial"]:
-            pid = int(parts[0])
-            if pid == os.getpid() or not _alive(pid):
-                _remove(left)
+        if not (left.name.startswith(prefix) and parts[0].isdigit() and parts[1:] in (["partial"], ["old"])):
+            continue
+        pid = int(parts[0])
+        if pid != os.getpid() and _alive(pid):
+            continue
+        if parts[1] == "old" and not path.exists():
+            # its writer ended between two renames: the folder comes back
+            os.replace(left, path)
+        else:
+            _remove(left)
 
 
 def _remove(left: Path) -> None:

@@ -5,6 +5,7 @@ EXIF orientation is ignored, because COLMAP ignores it: a model's width and heig
 
 from __future__ import annotations
 
+import base64
 import os
 import struct
 import threading
@@ -16,11 +17,13 @@ import numpy as np
 
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import write_atomically
+from pop_fast.io.image_header import LARGEST, size_of
 
 __all__ = [
     "FIX",
     "IMAGE_SUFFIXES",
     "find_image",
+    "inline_png",
     "list_images",
     "read_image",
     "read_mask",
@@ -31,6 +34,7 @@ __all__ = [
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 # what telephones and cameras write and OpenCV cannot read: HEIF and raw formats
 _UNREADABLE = (".heic", ".heif", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
+_VIDEOS = (".mov", ".mp4", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp")
 FIX = "copy it again from its source, or remove it from the capture"
 
 
@@ -49,15 +53,30 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def unreadable_photographs(folder: Path) -> str | None:
-    """Say how many photographs of a folder are in a format that is not read, and how to convert them; None if none."""
-    found = [path.suffix for path in folder.rglob("*") if path.suffix.lower() in _UNREADABLE and path.is_file()]
-    if not found:
-        return None
-    kind = max(set(found), key=found.count)
-    return (
-        f"{len(found)} files are {kind[1:].upper()} or the like, which is not read: convert them to JPEG first, "
-        f"for example with ImageMagick: magick mogrify -format jpg *{kind}"
-    )
+    """Say how many files of a folder hold pictures in a format that is not read, and how to convert them; None if none.
+
+    Hidden files are left out, as `list_images` does.
+    """
+    files = [
+        path for path in folder.rglob("*") if not any(part.startswith(".") for part in path.relative_to(folder).parts)
+    ]
+    still = [path.suffix for path in files if path.suffix.lower() in _UNREADABLE and path.is_file()]
+    moving = [path for path in files if path.suffix.lower() in _VIDEOS and path.is_file()]
+    told: list[str] = []
+    if still:
+        kind = max(set(still), key=still.count)
+        what = f"{len(still)} files are" if len(still) > 1 else "1 file is"
+        told.append(
+            f"{what} {kind[1:].upper()} or the like, which is not read: convert them to JPEG first, "
+            f"for example with ImageMagick: magick mogrify -format jpg *{kind}"
+        )
+    if moving:
+        what = f"{len(moving)} files are videos, which are" if len(moving) > 1 else "1 file is a video, which is"
+        told.append(
+            f"{what} not read ({moving[0].name}): take sharp frames out first, "
+            f"for example with ffmpeg -i {moving[0].name} -vf fps=2 frame_%04d.jpg"
+        )
+    return "; ".join(told) or None
 
 
 def find_image(folder: Path, name: str) -> Path | None:
@@ -131,6 +150,14 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
     write_atomically(path, lambda file: file.write(data.tobytes()))
 
 
+def inline_png(image: np.ndarray, longest: int) -> str:
+    """Return uint8 [H, W, 3] as an HTML picture that holds its own data, shrunk to sides of at most `longest` px."""
+    scale = longest / max(image.shape[:2])
+    small = image if scale >= 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    _, data = cv2.imencode(".png", cv2.cvtColor(small, cv2.COLOR_RGB2BGR))
+    return f'<img src="data:image/png;base64,{base64.b64encode(data.tobytes()).decode()}">'
+
+
 class _Quiet:
     """Keep OpenCV's own log off the terminal while any thread decodes: what matters of it is raised as one line."""
 
@@ -160,6 +187,12 @@ def _decode(path: Path) -> np.ndarray:
         raise CaptureError(f"{path}: the file is absent; restore it, or remove it from the capture") from None
     except OSError as error:
         raise CaptureError(f"{path}: could not be read: {error.strerror}; check the file's permissions") from error
+    size = size_of(data)
+    if size is not None and size[0] * size[1] > LARGEST:
+        raise CaptureError(
+            f"{path}: is {size[0]}x{size[1]} px by its header; more than {LARGEST // 10**6} million pixels are not "
+            "decoded: make it smaller"
+        )
     defect = _defect(data)
     if defect:
         raise CaptureError(f"{path}: {defect}; {FIX}")

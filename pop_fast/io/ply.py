@@ -1,27 +1,41 @@
-"""Read and write splats in the PLY layout of the 3DGS reference code, which every viewer opens, and in `.splat`.
+"""Read and write splats in the PLY layout of the 3DGS reference code, which every viewer opens.
 
 One row a Gaussian, little-endian float32: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_0..44, opacity, scale_0..2,
 rot_0..3. Opacities are logits, scales logarithms, rotations wxyz of any norm; f_rest is channel-major: fifteen
-coefficients of red, then green, then blue. A header comment `SplatRenderMode: mip` marks antialiased splats.
+coefficients of red, then green, then blue. A header comment `SplatRenderMode: mip` marks antialiased splats, and one
+`pop-frame:` says which world they are in.
 """
 
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
-from pop_fast.io.ply_rows import column, read_header, read_vertices
+from pop_fast.io.ply_rows import Header, column, read_header, read_vertices, vertices_of
 
-__all__ = ["is_antialiased", "load_ply", "save_ply", "save_splat"]
+__all__ = [
+    "MODE",
+    "Frame",
+    "asks_for_antialiasing",
+    "checked_params",
+    "frame_of",
+    "is_antialiased",
+    "load_ply",
+    "params_of_ply",
+    "ply_bytes",
+    "save_ply",
+]
 
 _SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3)}
-_SH_C0 = 0.28209479177387814
-_MODE = "SplatRenderMode:"
+MODE = "SplatRenderMode:"
+_FRAME = "pop-frame:"
 # sigmoid(logit) >= 1/255, what a renderer can show at all
 _VISIBLE_LOGIT = -np.log(254.0)
 _COLUMNS = (
@@ -34,11 +48,25 @@ _COLUMNS = (
 )
 
 
+@dataclass(frozen=True)
+class Frame:
+    """The world that a splat is in.
+
+    Attributes:
+        name: "capture" is the capture's own, "training" the one that `pop train` moves it into.
+        transform: similarity, training frame = transform @ capture's own frame; None where it is not known. [4, 4]
+    """
+
+    name: Literal["capture", "training"]
+    transform: tuple[tuple[float, ...], ...] | None = None
+
+
 def save_ply(
     path: str | os.PathLike[str],
     params: dict[str, torch.Tensor],
     antialiased: bool = False,
     drop_transparent: bool = False,
+    frame: Frame | None = None,
 ) -> tuple[int, int]:
     """Write raw parameters as PLY, atomically.
 
@@ -47,6 +75,7 @@ def save_ply(
         params: means [N, 3], scales [N, 3], quats [N, 4], opacities [N], sh0 [N, 1, 3], shN [N, 0|3|8|15, 3], raw.
         antialiased: the splats were trained with antialiasing, and are to be drawn so.
         drop_transparent: leave out Gaussians with an opacity under 1/255, which no renderer shows.
+        frame: the world that they are in, where it is known; written as a comment.
 
     Returns:
         The number of Gaussians before and after that filter.
@@ -54,11 +83,25 @@ def save_ply(
     Raises:
         PopError: a parameter is absent, of the wrong shape, NaN or Inf; or the file cannot be written.
     """
-    arrays = _checked(params)
+    arrays = checked_params(params)
     before = len(arrays["means"])
     if drop_transparent:
         visible = arrays["opacities"] >= _VISIBLE_LOGIT
         arrays = {name: array[visible] for name, array in arrays.items()}
+    write_atomically(path, lambda file: file.write(_file(arrays, antialiased, frame)))
+    return before, len(arrays["means"])
+
+
+def ply_bytes(params: dict[str, torch.Tensor], antialiased: bool = False, frame: Frame | None = None) -> bytes:
+    """Return what `save_ply` writes.
+
+    Raises:
+        PopError: a parameter is absent, of the wrong shape, NaN or Inf.
+    """
+    return _file(checked_params(params), antialiased, frame)
+
+
+def _file(arrays: dict[str, np.ndarray], antialiased: bool, frame: Frame | None) -> bytes:
     n = len(arrays["means"])
     rest = np.zeros((n, 15, 3), np.float32)
     rest[:, : arrays["shN"].shape[1]] = arrays["shN"]
@@ -72,12 +115,14 @@ def save_ply(
         arrays["quats"],
     ]
     table = np.ascontiguousarray(np.concatenate(columns, axis=1), dtype="<f4")
-    write_atomically(path, lambda file: file.write(_header(n, antialiased) + table.tobytes()))
-    return before, n
+    return _header(n, antialiased, frame) + table.tobytes()
 
 
-def _header(n: int, antialiased: bool) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", f"comment {_MODE} {'mip' if antialiased else 'default'}"]
+def _header(n: int, antialiased: bool, frame: Frame | None) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {MODE} {'mip' if antialiased else 'default'}"]
+    if frame is not None:
+        rows = () if frame.transform is None else frame.transform
+        lines.append(" ".join([f"comment {_FRAME} {frame.name}", *(f"{x:.17g}" for row in rows for x in row)]))
     lines += [f"element vertex {n}", *(f"property float {name}" for name in _COLUMNS), "end_header", ""]
     return "\n".join(lines).encode("ascii")
 
@@ -94,7 +139,23 @@ def load_ply(path: str | os.PathLike[str]) -> dict[str, torch.Tensor]:
         PopError: the file is absent, truncated or corrupt, is no splat, or holds NaN, Inf or a zero quaternion.
     """
     path = Path(path)
-    rows = read_vertices(path)
+    return _params(read_vertices(path), path)
+
+
+def params_of_ply(data: bytes, path: Path) -> dict[str, torch.Tensor]:
+    """Read splats from a PLY file's bytes; see `load_ply`.
+
+    Args:
+        data: the bytes.
+        path: their name, for errors.
+
+    Raises:
+        PopError: as `load_ply`.
+    """
+    return _params(vertices_of(data, path), path)
+
+
+def _params(rows: np.ndarray, path: Path) -> dict[str, torch.Tensor]:
     names = set(rows.dtype.names or ())
     needed = [c for c in _COLUMNS if not c.startswith(("n", "f_rest"))]
     absent = [name for name in needed if name not in names]
@@ -135,36 +196,40 @@ def load_ply(path: str | os.PathLike[str]) -> dict[str, torch.Tensor]:
 
 def is_antialiased(path: str | os.PathLike[str]) -> bool:
     """Tell whether a PLY file asks to be drawn with antialiasing: its comment `SplatRenderMode: mip`."""
-    comments = read_header(Path(path)).comments
-    return any(comment.startswith(_MODE) and comment.split()[-1] == "mip" for comment in comments)
+    return asks_for_antialiasing(read_header(Path(path)))
 
 
-def save_splat(path: str | os.PathLike[str], params: dict[str, torch.Tensor]) -> int:
-    """Write `.splat`, 32 bytes a Gaussian, the largest and most opaque first, atomically; degree-0 colour only.
+def asks_for_antialiasing(header: Header) -> bool:
+    """Tell whether a header has the comment `SplatRenderMode: mip`."""
+    return any(comment.startswith(MODE) and comment.split()[-1] == "mip" for comment in header.comments)
 
-    Position 3 float32, scale 3 float32 (activated), RGBA 4 uint8, quaternion wxyz 4 uint8 as 128 + 128 q.
 
-    Returns:
-        The number of bytes written.
+def frame_of(path: str | os.PathLike[str]) -> Frame | None:
+    """Tell which world a PLY file's splats are in, by its comment; None where there is none, as of other programs.
 
     Raises:
-        PopError: as `save_ply`.
+        PopError: the comment is not one that this program writes.
     """
-    arrays = {name: array.astype(np.float64) for name, array in _checked(params).items()}
-    opacities = 1.0 / (1.0 + np.exp(-arrays["opacities"]))
-    order = np.argsort(-np.exp(arrays["scales"].sum(axis=1)) * opacities, kind="stable")
-    rgba = np.concatenate([0.5 + _SH_C0 * arrays["sh0"][:, 0], opacities[:, None]], axis=1)
-    unit = arrays["quats"] / np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
-    rows = np.zeros(len(order), [("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rot", "u1", 4)])
-    rows["xyz"] = arrays["means"][order]
-    rows["scale"] = np.exp(arrays["scales"][order])
-    rows["rgba"] = np.clip(np.rint(255.0 * rgba[order]), 0, 255)
-    rows["rot"] = np.clip(np.rint(128.0 + 128.0 * unit[order]), 0, 255)
-    write_atomically(path, lambda file: file.write(rows.tobytes()))
-    return rows.nbytes
+    for comment in read_header(Path(path)).comments:
+        if comment.startswith(_FRAME):
+            name, *numbers = comment.removeprefix(_FRAME).split() or [""]
+            try:
+                values = np.array([float(number) for number in numbers]).reshape(-1, 4)
+            except ValueError:
+                values = np.full((1, 4), np.nan)
+            if name not in ("capture", "training") or len(values) not in (0, 4) or not np.isfinite(values).all():
+                raise PopError(f"{path}: comment {comment[:60]!r} is damaged; remove it, or export the splat again")
+            rows = tuple(map(tuple, values.tolist())) if len(values) else None
+            return Frame("capture" if name == "capture" else "training", rows)
+    return None
 
 
-def _checked(params: dict[str, torch.Tensor]) -> dict[str, np.ndarray]:
+def checked_params(params: dict[str, torch.Tensor]) -> dict[str, np.ndarray]:
+    """Return raw parameters as float32 arrays.
+
+    Raises:
+        PopError: one is absent, of the wrong shape, NaN or Inf, or a quaternion is zero; names the entry.
+    """
     arrays: dict[str, np.ndarray] = {}
     for name in (*_SHAPES, "shN"):
         if name not in params:

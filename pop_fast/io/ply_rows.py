@@ -18,7 +18,7 @@ import numpy as np
 
 from pop_fast.errors import PopError
 
-__all__ = ["Header", "column", "read_header", "read_vertices"]
+__all__ = ["Header", "column", "header_of", "read_header", "read_vertices", "vertices_of"]
 
 _ORDERS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _SIGNED: Final = {"char": "i1", "short": "i2", "int": "i4", "float": "f4", "double": "f8"}
@@ -71,11 +71,22 @@ def read_header(path: Path) -> Header:
     """
     try:
         with open(path, "rb") as file:
-            return _parse(file.read(_LONGEST))
+            head = file.read(_LONGEST)
     except FileNotFoundError:
         raise PopError(f"{path}: the PLY file is absent; check the path") from None
     except OSError as error:
         raise PopError(f"{path}: could not be read: {error.strerror}; check the path and its permissions") from error
+    return header_of(head, path)
+
+
+def header_of(data: bytes, path: Path) -> Header:
+    """Read the header at the beginning of a file's bytes.
+
+    Raises:
+        PopError: cut off, or it breaks the format's rules; names the line.
+    """
+    try:
+        return _parse(data[:_LONGEST])
     except ValueError as error:
         raise PopError(f"{path}: the PLY file is truncated or corrupt: {error}; copy or write it again") from error
 
@@ -86,21 +97,40 @@ def read_vertices(path: Path) -> np.ndarray:
     Raises:
         PopError: as `read_header`; or the file has no vertices as element, or fewer rows than its header says.
     """
-    header = read_header(path)
-    names = [element.name for element in header.elements]
-    if "vertex" not in names:
-        raise PopError(f"{path}: has no element 'vertex'; it is not a point cloud or a splat")
+    # a file that is no splat is told by its beginning
+    _vertex_elements(read_header(path), path)
     try:
         data = path.read_bytes()
+    except OSError as error:
+        raise PopError(f"{path}: could not be read: {error.strerror}; check the path and its permissions") from error
+    except MemoryError as error:
+        raise PopError(f"{path}: does not fit into memory; crop or thin it out first") from error
+    return vertices_of(data, path)
+
+
+def vertices_of(data: bytes, path: Path) -> np.ndarray:
+    """Return the rows of the element `vertex` of a file's bytes; see `read_vertices`.
+
+    Raises:
+        PopError: as `read_vertices`.
+    """
+    header = header_of(data, path)
+    read = _vertex_elements(header, path)
+    try:
         _check_size(header, len(data))
-        read = header.elements[: names.index("vertex") + 1]
         if header.order and not any(element.lists for element in read):
             return _block(header, read, data)
         return _row_by_row(header, data)
-    except OSError as error:
-        raise PopError(f"{path}: could not be read: {error.strerror}; check the path and its permissions") from error
     except (ValueError, IndexError, OverflowError, MemoryError, TypeError) as error:
         raise PopError(f"{path}: the PLY file is truncated or corrupt: {error}; copy or write it again") from error
+
+
+def _vertex_elements(header: Header, path: Path) -> tuple[Element, ...]:
+    """Return the elements up to `vertex`."""
+    names = [element.name for element in header.elements]
+    if "vertex" not in names:
+        raise PopError(f"{path}: has no element 'vertex'; it is not a point cloud or a splat")
+    return header.elements[: names.index("vertex") + 1]
 
 
 def column(path: Path, rows: np.ndarray, name: str, kind: type) -> np.ndarray:

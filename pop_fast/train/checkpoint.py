@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -20,10 +21,10 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from pop_fast.data.capture import Capture
+from pop_fast.density.protocol import State
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.torch_file import read_torch_file
-from pop_fast.strategies.base import State
 from pop_fast.train.checkpoint_checks import check_content, check_splats, shown
 from pop_fast.train.config import TrainConfig, first_difference
 
@@ -193,7 +194,7 @@ def capture_fingerprint(capture: Capture, test_every: int) -> dict[str, str]:
     views = capture.train_views(test_every)
     parts: dict[str, list[Any]] = {"view names": [], "photographs": [], "masks": [], "cameras": [], "sparse points": []}
     for view in views:
-        parts["view names"].append(view.name.encode())
+        parts["view names"].append(os.fsencode(view.name))
         parts["photographs"].append(view.image)
         parts["masks"].append(b"none" if view.mask is None else view.mask)
         parts["cameras"] += [view.viewmat, view.K]

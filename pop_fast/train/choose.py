@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pop_fast.backends import get_backend
+from pop_fast.api.registry import get_backend
 from pop_fast.train.config import TrainConfig
 
 
@@ -29,6 +30,8 @@ def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConf
     if begun is not None:
         return replace(config, backend=begun), f"backend {begun}, with which the run was begun"
     reason = get_backend("cuda").why_not()
+    if reason is not None and not has_gpu():
+        reason = "there is no NVIDIA GPU here"
     if reason is None:
         from pop_fast.train.fused_stepper import unsupported
 
@@ -39,6 +42,11 @@ def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConf
     if not_compiled is None:
         return replace(config, backend="compiled"), f"backend compiled (CPU): {reason}"
     return replace(config, backend="fast"), f"backend fast (CPU): {not_compiled}; {reason}"
+
+
+def has_gpu() -> bool:
+    """Tell whether the system shows an NVIDIA GPU: its driver's devices, or on WSL the host's."""
+    return any(Path(device).exists() for device in ("/dev/nvidiactl", "/dev/nvidia0", "/dev/dxg")) or os.name == "nt"
 
 
 def _begun_with(folder: Path) -> Any:

@@ -11,8 +11,8 @@ import json
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final, Literal, Self
 
+from pop_fast.density import DensityControl, POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.strategies import DensityControl, POPStrategy
 from pop_fast.train.jsonable import from_plain, to_plain
 from pop_fast.train.limits import check_values
 from pop_fast.train.presets import METHODS, MILESTONES, Given, defaults, laid_over, method_of

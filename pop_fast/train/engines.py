@@ -6,16 +6,16 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
 from cuda_ext.train_settings import StepSettings
-from pop_fast.backends import get_backend
-from pop_fast.errors import PopError
+from pop_fast.api.backend import Backend
+from pop_fast.api.registry import require_backend
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.fused_stepper import Fused, FusedStepper, MakeFused, Rows, unsupported
-from pop_fast.train.on_device import OnDevice
+from pop_fast.train.fused_stepper import Fused, FusedStepper, MakeFused, Rows
+from pop_fast.train.gpu_proxy import GpuProxy
 from pop_fast.train.stepper import Engine, Task
 from pop_fast.train.torch_stepper import TorchStepper
 from pop_fast.train.views import ViewTensors
@@ -32,9 +32,6 @@ _BYTES_OF_MOMENTS = 24  # a pixel
 def engine_of(config: TrainConfig, own_strategy: bool = True) -> Engine:
     """Return the engine for a run's backend and settings.
 
-    "cuda" is the fused step and nothing else; a setting that it does not know is refused. "compiled" is the native step
-    where that knows all settings, else autograd over compiled stages. All other backends' steps are torch's.
-
     Args:
         config: with a backend's name; "auto" is "fast" here, see `choose_backend`.
         own_strategy: whether the population's strategy is one of this package.
@@ -42,39 +39,34 @@ def engine_of(config: TrainConfig, own_strategy: bool = True) -> Engine:
     Raises:
         PopError: the backend is unknown or cannot run here, or does not know a setting.
     """
-    if config.backend == "cuda":
-        reason = unsupported(config)
-        if not own_strategy:
-            reason = "backend 'cuda' trains with the strategies of this package only; use --backend fast"
-        if reason is not None:
-            raise PopError(reason)
-        return cuda_engine()
-    if config.backend == "compiled" and own_strategy and unsupported(config) is None:
-        return native_engine()
-    return torch_engine("fast" if config.backend == "auto" else config.backend)
+    return require_backend("fast" if config.backend == "auto" else config.backend).make_engine(config, own_strategy)
 
 
-def torch_engine(name: Literal["fast", "compiled", "ref"]) -> Engine:
+def torch_engine(backend: str | Backend) -> Engine:
     """Return autograd over the stages of a backend for CPU tensors.
+
+    Args:
+        backend: it, or its name.
 
     Raises:
         PopError: it is unknown or cannot run here.
     """
-    backend = get_backend(name)
-    if not backend.available():
-        raise PopError(f"backend {name!r} is not available: {backend.why_not()}")
-    return Engine(name, torch.device("cpu"), backend, lambda task: TorchStepper(task, backend))
+    drawing = require_backend(backend if isinstance(backend, str) else backend.name)
+    return Engine(drawing.name, torch.device("cpu"), drawing, lambda task: TorchStepper(task, drawing))
 
 
-def native_engine() -> Engine:
+def native_engine(backend: str | Backend = "compiled") -> Engine:
     """Return the whole step in C++.
+
+    Args:
+        backend: what draws for measurements.
 
     Raises:
         PopError: it is not compiled.
     """
-    engine = torch_engine("compiled")
     return replace(
-        engine, make_stepper=lambda task: FusedStepper(task, "native", LONGEST_ON_CPU, _native_trainer(task))
+        torch_engine(backend),
+        make_stepper=lambda task: FusedStepper(task, "native", LONGEST_ON_CPU, _native_trainer(task)),
     )
 
 
@@ -91,10 +83,7 @@ def cuda_engine() -> Engine:
     Raises:
         PopError: backend "cuda" cannot run here.
     """
-    backend = get_backend("cuda")
-    reason = backend.why_not()
-    if reason is not None:
-        raise PopError(f"backend 'cuda' is not available: {reason}")
+    backend = require_backend("cuda")
     # without it, torch's deterministic mode refuses the small products that place the children of a split
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     device = torch.device("cuda", torch.cuda.current_device())
@@ -103,7 +92,7 @@ def cuda_engine() -> Engine:
         memory = torch.cuda.max_memory_allocated(device)
         return {"gpu": torch.cuda.get_device_name(device), "gpu_memory_bytes": memory}
 
-    return Engine("cuda", device, OnDevice(backend, device), cuda_stepper, facts)
+    return Engine("cuda", device, GpuProxy(backend, device), cuda_stepper, facts)
 
 
 def cuda_stepper(task: Task) -> FusedStepper:
@@ -121,8 +110,8 @@ def _fused_trainer(
     step: int,
 ) -> Fused:
     """Make the fused step, with the photographs on the GPU."""
-    from cuda_ext.resident import ResidentViews
-    from cuda_ext.train_step import FusedTrainer
+    from cuda_ext.training.resident import ResidentViews
+    from cuda_ext.training.train_step import FusedTrainer
 
     device = params["means"].device
     pixels = sum(view.height * view.width for view in views)

@@ -1,7 +1,7 @@
 """Training steps by something that takes a whole step by itself: the fused step on a GPU, or one like it.
 
 What it is told are rows, the photographs and `StepSettings`; it holds the statistics of density control in its own
-arrays, which are copied into the strategy's state after every stretch, in the strategy's own types.
+arrays, which are copied into the strategy's state after every segment, in the strategy's own types.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from torch.nn import Parameter
 from torch.optim import Adam
 
 from cuda_ext.train_settings import Phase, Statistics, StepSettings, StepStats, Updates
-from pop_fast.density import blur_set
-from pop_fast.strategies.base import State
+from pop_fast.density.protocol import State
+from pop_fast.stages.density import blur_set
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.model import KEYS
 from pop_fast.train.stepper import Task
@@ -27,7 +27,7 @@ Rows = Mapping[str, Tensor]
 
 
 class Fused(Protocol):
-    """What takes whole steps: `cuda_ext.train_step.FusedTrainer`, where each of these is explained."""
+    """What takes whole steps: `cuda_ext.training.train_step.FusedTrainer`, where each of these is explained."""
 
     step: int
     # how often a step was taken again because its buffers were too small

@@ -11,6 +11,7 @@ from pop_fast.errors import PopError
 
 _AT_LEAST: Final = {
     "max_steps": 1,
+    "seed": 0,
     "factor": 1,
     "sh_degree": 0,
     "sh_interval": 1,
@@ -23,6 +24,8 @@ _AT_LEAST: Final = {
     "target_cache_mb": 0,
     "l2_stop_iter": 0,
 }
+# each takes memory of its own, and beyond what the system allows the libraries end the process
+_MOST_THREADS: Final = 512
 # numbers that are divided by, or of which a logarithm is taken
 _OVER_ZERO: Final = ("init_scale", "photometric_divisor", "lr.means_decay")
 # of the strategy, whose settings errors call by the method's name as the command line does
@@ -56,6 +59,8 @@ def check_values(config: Any) -> None:
     for name, smallest in at_least.items():
         if values[name] is not None and values[name] < smallest:
             raise PopError(f"{name} is {values[name]}; it must be at least {smallest}")
+    if values["threads"] > _MOST_THREADS:
+        raise PopError(f"threads is {values['threads']}; it must be at most {_MOST_THREADS}; 0 takes all cores")
     if values["sh_degree"] > 3:
         raise PopError(f"sh_degree is {values['sh_degree']}; it must be 0, 1, 2 or 3")
     if not 0.0 < values["init_opacity"] < 1.0:

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pop_fast.losses import ssim
-from pop_fast.ssim import WINDOW_SIZE
+from pop_fast.stages.losses import ssim
+from pop_fast.stages.ssim import WINDOW_SIZE
 from pop_fast.train.lpips import LPIPS, VARIANTS
 from pop_fast.train.views import ViewTensors
 

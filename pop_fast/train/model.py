@@ -11,8 +11,8 @@ from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
 from cuda_ext.train_settings import GROUPS, Updates
-from pop_fast.activations import scales_from_log_scales
-from pop_fast.strategies.base import State
+from pop_fast.density.protocol import State
+from pop_fast.stages.activations import scales_from_log_scales
 from pop_ref.settings import BETAS, EPS
 
 KEYS: Final = GROUPS

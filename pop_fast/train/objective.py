@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import ModuleType
 
 from torch import Tensor
 
 from cuda_ext.train_settings import Phase
-from pop_fast import losses
-from pop_fast.losses import TargetMoments, target_moments
+from pop_fast.api.registry import get_backend
+from pop_fast.stages import losses
+from pop_fast.stages.losses import TargetMoments, target_moments
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.views import ViewTensors
 
@@ -23,7 +23,7 @@ class Objective:
     Args:
         config: step numbers as they are run.
         views: to train on.
-        backend: "compiled" for its losses; all others take torch's.
+        backend: whose losses are taken.
     """
 
     def __init__(self, config: TrainConfig, views: Sequence[ViewTensors], backend: str) -> None:
@@ -31,7 +31,7 @@ class Objective:
         self._views = views
         self._kept: dict[int, TargetMoments] = {}
         self._room = config.target_cache_mb * 2**20
-        self._losses = _losses_of(backend)
+        self._losses = get_backend(backend).losses()
 
     def __call__(self, image: Tensor, index: int, phase: Phase) -> Tensor:
         """Return the loss of a render [H, W, 3] of view `index`."""
@@ -60,11 +60,3 @@ class Objective:
             self._room -= needed
             self._kept[index] = moments
         return moments
-
-
-def _losses_of(backend: str) -> ModuleType:
-    if backend != "compiled":
-        return losses
-    from pop_fast.compiled import losses as compiled
-
-    return compiled

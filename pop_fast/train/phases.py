@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from cuda_ext.train_settings import Phase
-from pop_fast.strategies.control import DensityControl
-from pop_fast.strategies.foreign import ForeignStrategy
+from pop_fast.density.control import DensityControl
+from pop_fast.density.foreign import ForeignStrategy
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.schedule import active_sh_degree
 
@@ -30,7 +30,7 @@ def phase_at(config: TrainConfig, strategy: DensityControl | ForeignStrategy, st
     )
 
 
-def stretch_end(config: TrainConfig, strategy: DensityControl | ForeignStrategy, first: int, longest: int) -> int:
+def segment_end(config: TrainConfig, strategy: DensityControl | ForeignStrategy, first: int, longest: int) -> int:
     """Return how far a stepper goes by itself: to a densification step, a milestone, another phase, or far enough.
 
     Args:
@@ -40,7 +40,7 @@ def stretch_end(config: TrainConfig, strategy: DensityControl | ForeignStrategy,
         longest: most steps at a time.
 
     Returns:
-        One more than the last step of the stretch.
+        One more than the last step of the segment.
     """
     phase, step = phase_at(config, strategy, first), first
     while True:

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 
 from torch import Tensor
 
+from pop_fast.api.checks import Checks
 from pop_fast.errors import PopError
-from pop_fast.raster_inputs import check_cameras
+from pop_fast.stages.backend import FAST
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.metrics import too_small
 from pop_fast.train.model import first_unusable
@@ -28,7 +29,9 @@ def check_views(config: TrainConfig, name: str, train: Sequence[ViewTensors], te
     """
     for view in (*train, *test):
         try:
-            check_cameras(view.viewmat, view.K, view.width, view.height, 1, (), view.viewmat.dtype)
+            checks = Checks(FAST, view.viewmat.dtype)
+            checks.cameras(view.viewmat, view.K, view.width, view.height, 1, ())
+            checks.values()
         except ValueError as error:
             raise PopError(f"{name}: camera of {view.name}: {error}; mend it, or leave the view out") from error
     in_loss = too_small(train) if config.ssim_padding == "valid" else None

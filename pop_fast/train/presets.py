@@ -22,8 +22,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, Final, Literal, NamedTuple, Self, TypeAlias
 
-from pop_fast.errors import PopError
-from pop_fast.strategies import (
+from pop_fast.density import (
     DensityControl,
     GsplatStrategy,
     Inria2023Strategy,
@@ -34,6 +33,7 @@ from pop_fast.strategies import (
     SpeedySplatStrategy,
     TamingStrategy,
 )
+from pop_fast.errors import PopError
 from pop_fast.train.jsonable import from_plain, to_plain
 from pop_ref.recipes import BASELINES, RECIPES, Recipe
 from pop_ref.settings import DensityConfig, PopTerm, UpdateRules
@@ -78,9 +78,8 @@ class Given:
         method: "pop", "gsplat" for gsplat's default strategy, "3dgs" for Inria's constants, learning rates, SSIM and
             rasterizer, "3dgs-2023" for those before October 2024, and on top of these "pup", "mini-splatting",
             "taming" and "speedy-splat".
-        preset: "paper" is the whole schedule; "quick" a tenth of it, for a CPU, in which a Gaussian must dominate more
-            than 10 pixels to count as blur, and none is pruned for its size. It gives defaults: what is said besides
-            wins.
+        preset: "paper" is the paper's 30,000 steps, for a GPU or a night; "quick" a tenth of them, with thresholds for
+            small images. It gives defaults: what is said besides wins.
         steps_scaler: multiplies the default of every step number; None takes the preset's.
         scale_lambda_pop: divide the default of lambda_pop by the scaler, so that the push of the prior adds up to the
             same over a short schedule; it then weighs more against the photographs than in the paper.

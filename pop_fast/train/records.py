@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from cuda_ext.train_settings import Phase, StepStats
-from pop_fast.strategies.base import StepEvent
+from pop_fast.density.protocol import DensificationStep
 from pop_fast.train.config import TrainConfig
 
 
 @dataclass(frozen=True)
-class Stretch:
+class Segment:
     """Steps of one phase, taken one after the other, and the densification step after the last of them.
 
     Attributes:
@@ -30,34 +30,34 @@ class Stretch:
     phase: Phase
     views: list[str]
     stats: list[StepStats]
-    event: StepEvent | None
+    event: DensificationStep | None
     before: int
     after: int
     seconds: float
 
 
 def record_of(
-    stretch: Stretch, step: int, config: TrainConfig, lr_means: float, seconds_before: float
+    segment: Segment, step: int, config: TrainConfig, lr_means: float, seconds_before: float
 ) -> dict[str, Any] | None:
     """Make the record of a step, or None where none is due: every `log_every` steps there is one, and at every event.
 
     What the engine has not measured is left out.
 
     Args:
-        stretch: that the step belongs to.
+        segment: that the step belongs to.
         step: its number.
         config: step numbers as they are run.
         lr_means: learning rate of the means at that step, world units.
-        seconds_before: of training, before the stretch.
+        seconds_before: of training, before the segment.
     """
-    place = step - stretch.first
-    stats, last = stretch.stats[place], place + 1 == len(stretch.stats)
-    event = stretch.event if last else None
+    place = step - segment.first
+    stats, last = segment.stats[place], place + 1 == len(segment.stats)
+    event = segment.event if last else None
     if step % config.log_every != 0 and event is None:
         return None
     halved = 0.5 if config.d_ssim_halved else 1.0
     measured = {
-        "l1" if stretch.phase.l1 else "l2": stats.pixelwise,
+        "l1" if segment.phase.l1 else "l2": stats.pixelwise,
         "d_ssim": halved * (1.0 - stats.ssim),
         "psnr": -10.0 * math.log10(stats.square) if stats.square != 0.0 else math.inf,
         "n_blended": stats.n_blended,
@@ -65,14 +65,14 @@ def record_of(
     }
     return {
         "step": step,
-        "view": stretch.views[place],
+        "view": segment.views[place],
         "loss": stats.objective + stats.pop,
         **{name: value for name, value in measured.items() if not math.isnan(value)},
-        **({"pop": stats.pop} if stretch.phase.pop or stats.pop != 0.0 else {}),
-        "num_gaussians": stretch.before if event is None else stretch.after,
-        "sh_degree": stretch.phase.sh_degree,
+        **({"pop": stats.pop} if segment.phase.pop or stats.pop != 0.0 else {}),
+        "num_gaussians": segment.before if event is None else segment.after,
+        "sh_degree": segment.phase.sh_degree,
         "lr_means": lr_means,
-        "it_per_s": len(stretch.stats) / stretch.seconds,
-        "seconds": seconds_before + stretch.seconds * (place + 1) / len(stretch.stats),
+        "it_per_s": len(segment.stats) / segment.seconds,
+        "seconds": seconds_before + segment.seconds * (place + 1) / len(segment.stats),
         **({} if event is None else event.record()),
     }

@@ -6,11 +6,14 @@
     ckpts/ckpt_{step}_rank0.pt      checkpoints; `step` counts from 0 here and below, so 30,000 steps end at 29999
     ply/point_cloud_{step}.ply      Gaussians in Inria's layout
     stats/train_step{step}.json     Gaussians, opacities, seconds, memory, machine, versions
-    stats/val_step{step}.json       the same and PSNR, SSIM, LPIPS of the held-out views, and each view's own
+    stats/val_step{step}.json       the same and PSNR, SSIM, LPIPS of the held-out views, and each view's own; of the
+                                    last step also encodings: bytes in every file format, and the PSNR from there
     renders/val_step{step}_{i}.png        render | photograph | error
     renders/dominant_step{step}_{i}.png   every pixel in the colour of its dominant Gaussian
     report_data/opacity_step{step}.npz    counts [100] of opacities in equal bins of [0, 1]; step -1 is the start
     report_data/val_step{step}_{i}.npz    name, render, photo (uint8 [H, W, 3]), dominant_ids (int32 [H, W]), psnr, ssim
+    viewer.html                     a page that shows the splat in a browser
+    export/                         files that `pop train --export` asked for
 
 A record of metrics.jsonl holds: step, view, loss, l1 or l2 (the pixel-wise term), d_ssim, pop (weighted, absent when
 off), psnr (of the training view), num_gaussians, n_blended and n_traversed (per pixel; not in runs on a GPU),
@@ -25,6 +28,7 @@ import math
 import os
 import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +36,15 @@ import numpy as np
 
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
+from pop_fast.io.lock import FolderLock
 from pop_fast.io.read_back import read_json
 from pop_fast.train.config import TrainConfig
 
 # cfg.json is the first to step aside and the first to be written anew: where it is, the new run has begun
-_OURS = ("cfg.json", "metrics.jsonl", "ckpts", "ply", "stats", "renders", "report_data", "report.html", "capture.json")
+_OURS = (
+    *("cfg.json", "metrics.jsonl", "ckpts", "ply", "stats", "renders", "report_data", "report.html", "capture.json"),
+    *("viewer.html", "export"),
+)
 # holds what a new run replaces while that is being done
 _ASIDE = ".replaced"
 OPACITY_BINS = 100
@@ -47,6 +55,9 @@ class ResultFolder:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
+        self._lock = FolderLock(self.path)
+        # what `check` found
+        self._found_used: bool | None = None
         self._metrics: Any = None
         self._waiting: list[bytes] = []
 
@@ -61,12 +72,31 @@ class ResultFolder:
             True when an earlier replacement had been cut short and the results that it had set aside are back.
 
         Raises:
-            PopError: the folder is in use and neither `resume` nor `overwrite` is set, or it is not a result folder.
+            PopError: the folder is in use and neither `resume` nor `overwrite` is set, or it is not a result folder, or
+                another run is writing to it.
         """
         if self.path.exists() and not self.path.is_dir():
             raise PopError(f"{self.path}: is a file; choose another result folder")
+        if self._lock.held:
+            return self._check(resume, overwrite)
+        self.hold()
+        try:
+            return self._check(resume, overwrite)
+        finally:
+            self._lock.release()
+
+    def hold(self) -> None:
+        """Lock the folder until `close`, where it is there already; `begin` locks one that it makes.
+
+        Raises:
+            PopError: another run is writing to it.
+        """
+        if self.path.is_dir():
+            self._lock.take()
+
+    def _check(self, resume: bool, overwrite: bool) -> bool:
         came_back = self._recover()
-        used = self._is_used()
+        self._found_used = used = self._is_used()
         if used and not resume and not overwrite:
             raise PopError(f"{self.path}: exists and is not empty; pass --resume, --overwrite or another result folder")
         if used and not (self.path / "cfg.json").is_file():
@@ -86,6 +116,7 @@ class ResultFolder:
             PopError: the operating system refused; the folder is as it was.
         """
         exists = self.path.exists()
+        self._reserve(overwrite)
         alone = overwrite or not self._is_used()
         if overwrite and exists:
             self._set_aside()
@@ -94,16 +125,26 @@ class ResultFolder:
             self.open_metrics(keep_bytes=0)
             self.write_opacities(-1, opacities)
         except BaseException:
-            self.close()
+            self._close_metrics()
             if alone:
                 for name in _OURS:
                     _remove(self.path / name)
                 self._recover()
             if not exists and self.path.is_dir() and not any(self.path.iterdir()):
                 self.path.rmdir()
+            self._lock.release()
             raise
         # what cannot be removed now is removed by the next run in this folder
         shutil.rmtree(self.path / _ASIDE, ignore_errors=True)
+
+    def _reserve(self, overwrite: bool) -> None:
+        """Lock the folder, making it where it was not there; two runs that found none do not both get it."""
+        with suppress(OSError):  # what is wrong is said by the first write
+            self.path.mkdir(parents=True, exist_ok=True)
+        self._lock.take()
+        if self._found_used is False and not overwrite and self._is_used():
+            self._lock.release()
+            raise PopError(f"{self.path}: another run has begun in this folder; choose another result folder")
 
     def write_settings(self, config: TrainConfig, beside: Mapping[str, str]) -> None:
         """Write cfg.json, then other texts by file name."""
@@ -167,7 +208,11 @@ class ResultFolder:
         return self._metrics.tell()
 
     def close(self) -> None:
-        """Close metrics.jsonl."""
+        """Close metrics.jsonl and give the lock back."""
+        self._close_metrics()
+        self._lock.release()
+
+    def _close_metrics(self) -> None:
         if self._metrics is not None:
             self._metrics.close()
             self._metrics = None

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a polite request: finish the step, write a checkpoint, then stop."""
+"""Ctrl-C, SIGTERM and SIGHUP as a polite request: finish the step, write a checkpoint, then stop."""
 
 from __future__ import annotations
 
@@ -11,15 +11,19 @@ from types import FrameType
 
 @contextlib.contextmanager
 def stop_requests() -> Iterator[threading.Event]:
-    """Turn the first Ctrl-C or SIGTERM into an event that a loop looks at between steps.
+    """Turn the first Ctrl-C, SIGTERM or SIGHUP (the terminal is gone) into an event that a loop looks at between steps.
 
-    The second one is obeyed at once. Outside the main thread, where Python delivers no signals, the event is never set.
+    The second one is obeyed at once. SIGHUP stays ignored where it is, as under nohup. Outside the main thread, where
+    Python delivers no signals, the event is never set.
     """
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    hangup = getattr(signal, "SIGHUP", None)  # not on Windows
+    if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:
+        before[hangup] = signal.getsignal(hangup)
 
     def restore() -> None:
         for number, handler in before.items():

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import torch
 from torch.nn import Parameter
 from torch.optim import Adam
 
 from cuda_ext.train_settings import Phase, StepStats, Updates
-from pop_fast.backends import Backend
-from pop_fast.strategies.base import State
-from pop_fast.strategies.control import DensityControl
-from pop_fast.strategies.foreign import ForeignStrategy
+from pop_fast.api.backend import Renderer
+from pop_fast.density.control import DensityControl
+from pop_fast.density.foreign import ForeignStrategy
+from pop_fast.density.protocol import State
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.views import ViewTensors
 
@@ -85,8 +85,8 @@ class Engine:
         facts: goes into the statistics of a run.
     """
 
-    name: Literal["fast", "compiled", "cuda", "ref"]
+    name: str
     device: torch.device
-    backend: Backend
+    backend: Renderer
     make_stepper: Callable[[Task], Stepper]
     facts: Callable[[], dict[str, Any]] = dict

@@ -11,8 +11,8 @@ from torch.nn import Parameter
 from torch.optim import Adam
 
 from cuda_ext.train_settings import Phase, StepStats
-from pop_fast.backends import Backend
-from pop_fast.strategies.base import State
+from pop_fast.api.backend import Renderer
+from pop_fast.density.protocol import State
 from pop_fast.train.evaluate import gaussians_per_pixel
 from pop_fast.train.model import adam_step
 from pop_fast.train.objective import Objective
@@ -33,7 +33,7 @@ class TorchStepper:
     name = "torch"
     longest = 1
 
-    def __init__(self, task: Task, backend: Backend) -> None:
+    def __init__(self, task: Task, backend: Renderer) -> None:
         self.step = task.step
         self._task, self._backend = task, backend
         self._objective = Objective(task.config, task.views, backend.name)

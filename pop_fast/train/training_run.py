@@ -23,15 +23,16 @@ from torch.nn import Parameter
 from tqdm import tqdm
 
 from cuda_ext.train_settings import Phase, StepStats
-from pop_fast.activations import opacities_from_logits
 from pop_fast.data.capture import Capture
 from pop_fast.data.initialize import initialize_params
+from pop_fast.density.densify import draws_of
+from pop_fast.density.foreign import ForeignStrategy
+from pop_fast.density.passes import Passes
+from pop_fast.density.protocol import DensificationStep, Draws, Strategy
 from pop_fast.errors import PopError
-from pop_fast.io.ply import save_ply
-from pop_fast.passes import Passes
-from pop_fast.strategies.base import Draws, StepEvent, Strategy
-from pop_fast.strategies.densify import draws_of
-from pop_fast.strategies.foreign import ForeignStrategy
+from pop_fast.io.heartbeat import Heartbeat, duration
+from pop_fast.io.ply import Frame, save_ply
+from pop_fast.stages.activations import opacities_from_logits
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
@@ -39,13 +40,13 @@ from pop_fast.train.effects import facts, find_warnings
 from pop_fast.train.engines import engine_of
 from pop_fast.train.environment import reproducible, run_facts, versions
 from pop_fast.train.evaluate import evaluate
+from pop_fast.train.gpu_proxy import words_for_memory
 from pop_fast.train.lpips import load_nets
 from pop_fast.train.metrics import population
 from pop_fast.train.model import KEYS, first_unusable, make_optimizers
-from pop_fast.train.on_device import words_for_memory
-from pop_fast.train.phases import phase_at, stretch_end
+from pop_fast.train.phases import phase_at, segment_end
 from pop_fast.train.preflight import check_start, check_views
-from pop_fast.train.records import Stretch, record_of
+from pop_fast.train.records import Segment, record_of
 from pop_fast.train.results import ResultFolder
 from pop_fast.train.schedule import Updates, ViewOrder, active_sh_degree, updates_of
 from pop_fast.train.signals import stop_requests
@@ -115,6 +116,8 @@ class TrainingRun:
         self._started = 0.0
         # the first Gaussians' opacities while the folder is still as it was found
         self._unwritten: np.ndarray | None = None
+        # the training PSNR of the last record, in words
+        self._latest = ""
 
     def _updates(self) -> Updates:
         config, plan = self.config, self.strategy
@@ -165,6 +168,7 @@ class TrainingRun:
                 self._results.close()
 
     def _begin(self) -> None:
+        self._results.hold()
         self._results.check(self._resume, self._overwrite)
         found = ckpt.list_checkpoints(self._results.path) if self._resume else []
         if found:
@@ -178,11 +182,13 @@ class TrainingRun:
 
     def _loop(self, stop: threading.Event) -> dict[str, Any]:
         config = self.config
-        with tqdm(total=config.max_steps, initial=self.step, disable=None if config.progress else True) as bar:
+        bars = tqdm(total=config.max_steps, initial=self.step, disable=None if config.progress else True)
+        with bars as bar, Heartbeat(config.progress) as beat:
             while self.step < config.max_steps:
                 longest = self.stepper.longest
-                stretch = self.take_steps(stretch_end(config, self.strategy, self.step, longest))
-                self._log(stretch, bar)
+                segment = self.take_steps(segment_end(config, self.strategy, self.step, longest))
+                self._log(segment, bar)
+                beat.say(self._so_far())
                 if self._unwritten is not None:
                     # a rate can be so high that the first step is the last; that is no reason to replace anything
                     self._require_finite()
@@ -195,10 +201,16 @@ class TrainingRun:
         last = config.max_steps - 1
         return self._results.read_stats("val", last) or self._evaluate(last)
 
-    def take_steps(self, last: int) -> Stretch:
+    def _so_far(self) -> str:
+        seconds = self._train_seconds
+        left = seconds * (self.config.max_steps - self.step) / self.step
+        told = f"step {self.step:,} of {self.config.max_steps:,}, {len(self.params['means']):,} Gaussians"
+        return f"{told}{self._latest}, {self.step / max(seconds, 1e-9):.1f} steps a second, {duration(left)} left"
+
+    def take_steps(self, last: int) -> Segment:
         """Take the steps up to `last`, and the densification step that is due after them.
 
-        All are of one phase, and none but the last is followed by a densification step; see `phases.stretch_end`.
+        All are of one phase, and none but the last is followed by a densification step; see `phases.segment_end`.
 
         Args:
             last: how many steps will have been taken, over `step`.
@@ -216,7 +228,7 @@ class TrainingRun:
             stats = self._measured(stepper, first, last, phase)
             event = self._change(last - 1)
         after, seconds = len(self.params["means"]), time.perf_counter() - start
-        return Stretch(first, phase, views, stats, event, before, after, seconds)
+        return Segment(first, phase, views, stats, event, before, after, seconds)
 
     def _measured(self, stepper: Stepper, first: int, last: int, phase: Phase) -> list[StepStats]:
         try:
@@ -237,7 +249,7 @@ class TrainingRun:
                 raise PopError(f"the loss of step {step} is {found.objective + found.pop}; {self._what_is_left}")
         return stats
 
-    def _change(self, step: int) -> StepEvent | None:
+    def _change(self, step: int) -> DensificationStep | None:
         """Let density control edit the population, if that is due."""
         if not self.strategy.changes_after(step):
             return None
@@ -289,16 +301,17 @@ class TrainingRun:
             for key, value in self.state.items():
                 self.state[key] = value.to(device) if isinstance(value, Tensor) else value
 
-    def _log(self, stretch: Stretch, bar: tqdm) -> None:
-        """Write the records of a stretch."""
-        for step in range(stretch.first, self.step):
+    def _log(self, segment: Segment, bar: tqdm) -> None:
+        """Write the records of a segment."""
+        for step in range(segment.first, self.step):
             lr_means = float(self.updates.rates[step, KEYS.index("means")])
-            record = record_of(stretch, step, self.config, lr_means, self._train_seconds)
+            record = record_of(segment, step, self.config, lr_means, self._train_seconds)
             if record is not None:
                 self._results.log(record)
+                self._latest = f", PSNR {record['psnr']:.2f}"
                 bar.set_postfix_str(f"PSNR {record['psnr']:.2f}, N {record['num_gaussians']:,}", refresh=False)
-        self._train_seconds += stretch.seconds
-        bar.update(self.step - stretch.first)
+        self._train_seconds += segment.seconds
+        bar.update(self.step - segment.first)
 
     def _milestones(self, step: int) -> None:
         """After a step (counted from 0): keep histograms, measure, write PLY and checkpoint when it is time."""
@@ -309,7 +322,12 @@ class TrainingRun:
         if taken in config.eval_steps or last:
             self._evaluate(step)
         if taken in config.save_steps or last:
-            save_ply(self._results.path / "ply" / f"point_cloud_{step}.ply", self._detached(), config.antialiased)
+            save_ply(
+                self._results.path / "ply" / f"point_cloud_{step}.ply",
+                self._detached(),
+                config.antialiased,
+                frame=self._frame,
+            )
         # the checkpoint comes last: a run that is killed in between does this step's milestones again
         due = config.checkpoint_every > 0 and taken % config.checkpoint_every == 0
         if due or taken in config.save_steps or last:
@@ -381,6 +399,13 @@ class TrainingRun:
         self._started -= content["seconds"]["total"]
         self.step = content["step"] + 1
         self._stepper = None
+
+    @property
+    def _frame(self) -> Frame:
+        """The world of the run's Gaussians."""
+        if not self.config.normalize:
+            return Frame("capture")
+        return Frame("training", tuple(map(tuple, self._capture.world_transform.tolist())))
 
     @property
     def _total_seconds(self) -> float:

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pop_fast.activations import opacities_from_logits, scales_from_log_scales
 from pop_fast.data.capture import View
+from pop_fast.stages.activations import opacities_from_logits, scales_from_log_scales
 from pop_fast.train.config import TrainConfig
 
 

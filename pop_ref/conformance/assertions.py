@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pytest
-from hypothesis import assume
 
 from pop_ref.conformance import tolerances
 from pop_ref.conformance.adapter import OracleAdapter
@@ -71,6 +69,9 @@ def _first(wrong: Any, actual: Any, expected: Any) -> str:
 
 def with_error_bounds(backend: Any, scene: Scene) -> tuple[Scene, PixelErrorBounds]:
     """Return the scene as the backend reads it, and its error bounds; set aside what its precision cannot resolve."""
+    # not at the top: portable vectors are made and checked without Hypothesis
+    from hypothesis import assume
+
     seen, lists = backend.sees(scene), None
     if seen.profile.extent == "square":
         # here extents and tile lists are part of the meaning; where rounding decides them, nothing is said
@@ -114,6 +115,8 @@ def assert_same_transmittance(
 def require(backend: Any, offered: dict[str, Any], name: str) -> None:
     """Skip a law, by name, that reads a gradient which the backend does not offer."""
     if name not in offered:
+        import pytest
+
         pytest.skip(f"{backend.name} has no gradient of {name}")
 
 

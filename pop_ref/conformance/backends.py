@@ -94,7 +94,7 @@ def _elsewhere(name: str) -> Any:
         reason = importlib.import_module("cuda_ext").why_not()
         if reason is not None:
             raise Unavailable(reason)
-        return adapter_for("cuda_ext.ops:rasterization", name, None, "float32", "cuda")
+        return adapter_for("pop_fast.cuda:rasterization", name, None, "float32", "cuda")
     if name.startswith("gsplat-torch"):
         return importlib.import_module(f"{kit}.gsplat_adapter").gsplat_torch(name, _dtype(name))
     # the packages first: what is not installed cannot run anywhere
@@ -123,8 +123,9 @@ def program(name: str, package: str, backend: str, dtype: str) -> Any:
     from pop_ref.conformance.torch_adapter import TorchAdapter
     from pop_ref.conformance.torch_training import training_stages
 
-    rasterization = partial(function_named(f"{package}.rasterization:rasterization"), backend=backend)
-    stages, trains = package if backend == "fast" else f"{package}.{backend}", training_stages(package)
+    rasterization = partial(function_named(f"{package}.api.rasterize:rasterization"), backend=backend)
+    stages = f"{package}.stages" if backend == "fast" else f"{package}.{backend}"
+    trains = training_stages(package)
     if backend == "compiled" and dtype == "float32":
         # what trains in this precision is the native step, which has an Adam of its own
         native = importlib.import_module(f"{package}.compiled.optimizer")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
+from pop_ref.conformance.scenes import pattern
 from pop_ref.conformance.strategies import arrays_of, dyadic, opacities, quats, reals, viewmats
 from pop_ref.constants import PROFILES
 
@@ -48,12 +49,6 @@ def _stacked(rows: Inputs) -> st.SearchStrategy[np.ndarray]:
 
 def _vectors(n: int, low: float = -2.0, high: float = 2.0) -> st.SearchStrategy[np.ndarray]:
     return _stacked(st.tuples(*[reals(low, high)] * n))
-
-
-def pattern(seed: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a picture of dyadic numbers in [0, 1], another for each seed."""
-    k = np.arange(int(np.prod(shape)), dtype=np.float64).reshape(shape)
-    return np.mod(k * (2.0 * seed + 1.0) + np.floor(k / 7.0) * seed, 17.0) / 16.0
 
 
 def _apart_from_zero(array: np.ndarray) -> np.ndarray:

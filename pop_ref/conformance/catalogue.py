@@ -59,8 +59,15 @@ class Mine(Adapter):  # pytest --pyargs pop_ref.conformance --adapter my.module:
         return my_blend(...)  # anything with image [H, W, 3] and T_final [H, W]
 ```
 
-Programs in other languages: `pop vectors export DIR` writes scenes with all that is expected of them, and
-`DIR/index.json` explains every array and how it is compared; `pop vectors check DIR RESULTS` does the comparing.
+Programs in other languages are judged over their standard input and output: `--program "./port words"` starts one,
+sends it the scenes that laws make, and reads images, ids, transmittance and gradients. `program_adapter.py` states the
+protocol, one line of words and raw arrays each way; `tests/port/port.cpp` is a port in C++ that speaks it. A program
+that ends, hangs (`--program-timeout`) or answers what cannot be read breaks the law that asked, and what it wrote to
+standard error is shown.
+
+Where no program can be started there are portable vectors: `pop vectors export DIR` writes scenes with all that is
+expected of them, and `DIR/index.json` explains every array and how it is compared; `pop vectors check DIR RESULTS`
+does the comparing.
 
 Numbers are compared in units of eps times a magnitude that is computed from absolute values (`tolerances.py` has every
 tolerance beside the worst case that was measured); integers exactly; at a threshold a backend must equal one of the

@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.assertions import extent_near_threshold
 from pop_ref.conformance.corpus import PLANS, corpus_scene
 from pop_ref.conformance.error_bounds import REACH, PixelErrorBounds, Window, pixel_error_bounds
 from pop_ref.conformance.gradient_error_bounds import Bound, error_bounds_of_sums, sums_over_pixels
@@ -67,13 +68,14 @@ def bounded_windows(scene: Scene, at: Any = None) -> list[tuple[tuple[slice, sli
     screen = screen_error_bounds(scene, REACH * float(np.finfo(np.float32).eps))
     # no splat is seen beyond these sigmas
     reach = scene.profile.extent_sigmas * np.sqrt(np.stack([screen.covars2d[:, k, k] for k in (0, 1)], 1)) + 1.0
+    lists = OracleAdapter().full_render(scene).tile_lists if scene.profile.extent == "square" else None
     found = []
     for top, left in [(y, x) for y in range(0, H, WINDOW) for x in range(0, W, WINDOW)][at or slice(None)]:
         low, high = np.array([left, top]), np.array([min(left + WINDOW, W), min(top + WINDOW, H)])
         rows = np.all((screen.means2d + reach > low) & (screen.means2d - reach < high), axis=1)
         window = Window(left, top, int(high[0]), int(high[1]), screen, rows)
         place = (slice(top, window.bottom), slice(left, window.right))
-        found.append((place, pixel_error_bounds(scene, np.float32, window=window)))
+        found.append((place, pixel_error_bounds(scene, np.float32, lists, window=window)))
     return found
 
 
@@ -108,7 +110,7 @@ def answer(name: str) -> dict[str, np.ndarray]:
     """Ask the oracle about a scene of the corpus; some seconds for each.
 
     Raises:
-        ValueError: a Gaussian lies where rounding decides about a clamp, so that its gradient is not one number.
+        ValueError: rounding decides about a Gaussian's clamp, so that its gradient is not one number, or its extent.
     """
     scene = corpus_scene(name)
     shape = scene.camera.height, scene.camera.width
@@ -116,6 +118,8 @@ def answer(name: str) -> dict[str, np.ndarray]:
     screen = windows[0][1].screen
     if np.any(screen.kinked | screen.near):
         raise ValueError(f"{name}: Gaussians {np.flatnonzero(screen.kinked | screen.near).tolist()} are at a clamp")
+    if scene.profile.extent == "square" and extent_near_threshold(scene, np.float32):
+        raise ValueError(f"{name}: rounding decides an extent, which is part of the meaning in this profile")
     masks, (e_image, e_transmittance) = masks_of(windows, shape), image_error_bounds(windows, shape)
     at, sure = picked_pixels(scene), masks["unambiguous"]
     seen = np.concatenate([drawn.image, drawn.T_final[..., None]], axis=2)

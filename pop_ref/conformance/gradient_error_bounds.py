@@ -130,17 +130,19 @@ def _pixel_bounds(
     s = error_bounds.screen
     out: dict[str, dict[int, Bound]] = {"means2d": {}, "conics": {}, "opacities": {}, "colors": {}}
     # of the channels that are drawn: depth has a background of 0
-    worth_behind = v_T + v @ np.abs(error_bounds.scene.background)
-    behind = Bound(worth_behind, 2.0 * worth_behind)
+    size = v_T + v @ np.abs(error_bounds.scene.background)
+    suffix_dot_grad = Bound(size, 2.0 * size)
     for layer in reversed(error_bounds.layers):
         i, shown = layer.id, layer.blended.astype(np.float64)
         T, T_error, alpha, e_alpha = (layer.T, layer.T_error, layer.alpha, layer.e_alpha)
         weight = Bound(T * alpha * shown, (T_error * alpha + T * e_alpha) * shown)
         out["colors"][i] = Bound(weight.m[..., None] * v, (weight.e + weight.m)[..., None] * v).summed((0, 1))
-        worth = Bound(v @ np.abs(s.colors[i]), v @ s.e_colors[i] + 2.0 * v @ np.abs(s.colors[i]))
-        v_alpha = (worth + behind).times(T * shown, T_error * shown)
-        step = worth.times(alpha, e_alpha) + behind.times(1.0 - alpha, e_alpha)
-        behind = Bound(np.where(shown > 0, step.m, behind.m), np.where(shown > 0, step.e, behind.e))
+        color_dot_grad = Bound(v @ np.abs(s.colors[i]), v @ s.e_colors[i] + 2.0 * v @ np.abs(s.colors[i]))
+        v_alpha = (color_dot_grad + suffix_dot_grad).times(T * shown, T_error * shown)
+        step = color_dot_grad.times(alpha, e_alpha) + suffix_dot_grad.times(1.0 - alpha, e_alpha)
+        suffix_dot_grad = Bound(
+            np.where(shown > 0, step.m, suffix_dot_grad.m), np.where(shown > 0, step.e, suffix_dot_grad.e)
+        )
         if scene.profile.ceiling_gradient == "zero":
             v_alpha = v_alpha.times(np.where(layer.raw > scene.profile.alpha_ceiling, 0.0, 1.0))
         raw = layer.raw

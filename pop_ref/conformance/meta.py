@@ -104,6 +104,21 @@ def assert_tiles(backend: Any, call: Call, called: Called, wanted: Wanted) -> No
         assert np.all(np.diff(keys) >= 0), "meta['isect_ids'] are not sorted"
 
 
+def assert_keys(meta: dict[str, Any], n_images: int, n_tiles: int) -> None:
+    """Assert that an intersection's key holds, from the high bits down, its image, its tile and its float32 depth.
+
+    The tile takes as many bits as the number of tiles has, the depth the low 32, so that keys sort front to back.
+    """
+    keys, flat = np.asarray(meta["isect_ids"], dtype=np.int64), np.asarray(meta["flatten_ids"])
+    counts = np.diff(np.append(np.asarray(meta["isect_offsets"]).reshape(-1), len(flat)))
+    lists = np.repeat(np.arange(n_images * n_tiles), counts)
+    bits = n_tiles.bit_length()
+    assert_same_bits("images in meta isect_ids", keys >> (32 + bits), lists // n_tiles)
+    assert_same_bits("tiles in meta isect_ids", (keys >> 32) & ((1 << bits) - 1), lists % n_tiles)
+    depths = np.asarray(meta["depths"]).reshape(-1)[flat].astype(np.float32)
+    assert_same_bits("depths in meta isect_ids", keys & 0xFFFFFFFF, depths.view(np.int32).astype(np.int64))
+
+
 def _index(call: Call, meta: dict[str, Any], flat: np.ndarray) -> tuple[np.ndarray, ...]:
     if call.packed:
         return tuple(each[flat] for each in packed_index(meta))

@@ -17,7 +17,7 @@ from pop_ref.conformance.mirror_library import Mirror
 from pop_ref.conformance.mirror_stages import STAGES
 from pop_ref.conformance.scenes import Scene
 
-FOLDER: Path = importlib.import_module("cuda_ext.library_folder").library_folder()
+FOLDER: Path = importlib.import_module("cuda_ext.host.library_folder").library_folder()
 
 
 def mirror(name: str) -> MirrorAdapter:

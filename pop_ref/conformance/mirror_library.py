@@ -51,7 +51,7 @@ def _structs(real: Any) -> tuple[Any, Any]:
 @cache
 def library(folder: Path) -> ctypes.CDLL:
     """Build the mirror if it is not there yet, and load it."""
-    return ctypes.CDLL(str(importlib.import_module("cuda_ext.host_mirror").build_mirror(folder)))
+    return ctypes.CDLL(str(importlib.import_module("cuda_ext.host.mirror").build_mirror(folder)))
 
 
 class Mirror:
@@ -114,13 +114,4 @@ class Mirror:
         return [*(a.astype(np.float64) for a in outputs), *id_outputs]
 
     def _profile(self, profile: Profile) -> Any:
-        return self._profile_struct(
-            **{name: getattr(profile, name) for name in _NUMBERS},
-            tile_size=profile.tile_size,
-            near_inclusive=profile.near_inclusive,
-            centred=profile.principal_point == "centred",
-            inria_clamp=profile.clamp_gradient == "inria",
-            square=profile.extent == "square",
-            pass_ceiling=profile.ceiling_gradient == "pass",
-            stop_inclusive=profile.stop_inclusive,
-        )
+        return self._profile_struct(**profile.as_numbers())

@@ -10,6 +10,8 @@ from __future__ import annotations
 import json
 import os
 import re
+import time
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +37,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="append",
         default=[],
         help="a class derived from pop_ref.conformance.Adapter",
+    )
+    group.addoption(
+        "--program",
+        metavar="COMMAND",
+        action="append",
+        default=[],
+        help="a program in any language that answers the protocol of pop_ref.conformance.program_adapter",
+    )
+    group.addoption(
+        "--program-timeout", metavar="SECONDS", type=float, default=60.0, help="for each of its answers, default 60"
     )
     group.addoption("--stages", metavar="PACKAGE", help="a package whose stage modules carry the oracle's names")
     group.addoption("--dtype", default="float32", choices=["float32", "float64"], help="precision of --rasterizer")
@@ -82,7 +94,7 @@ def _chosen(config: pytest.Config) -> str:
     """Return the names of what the options choose to judge; empty for the oracle."""
     option: Any = config.getoption
     single = option("--rasterizer") or option("--stages")
-    return ", ".join([*option("--backend"), *option("--adapter"), *([single] if single else [])])
+    return ", ".join([*option("--backend"), *option("--adapter"), *option("--program"), *([single] if single else [])])
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -116,6 +128,8 @@ def _chosen_backends(config: pytest.Config) -> list[Any]:
 
 def _make_backends(config: pytest.Config) -> list[Any]:
     from pop_ref.conformance.backends import Unavailable, adapter_for, made_by, shipped, shipped_or_absent
+    from pop_ref.conformance.program_adapter import ProgramAdapter
+    from pop_ref.conformance.program_pipe import ProgramError
     from pop_ref.constants import profile_named
 
     try:
@@ -123,13 +137,14 @@ def _make_backends(config: pytest.Config) -> list[Any]:
         chosen = [shipped_or_absent(name) for name in option("--backend")] + [
             made_by(path) for path in option("--adapter")
         ]
+        chosen += [ProgramAdapter(command, option("--program-timeout")) for command in option("--program")]
         path, package = option("--rasterizer"), option("--stages")
         if path or package:
             profile = profile_named(option("--profile"))
             name = path or package
             ordered = not option("--unordered-sums")
             chosen.append(adapter_for(path, name, package, option("--dtype"), option("--device"), profile, ordered))
-    except (Unavailable, ValueError) as error:
+    except (Unavailable, ProgramError, ValueError) as error:
         raise pytest.UsageError(str(error)) from error
     return chosen or [shipped("oracle")]
 
@@ -197,7 +212,19 @@ class _Recorder:
             detail = str(crash.message if crash else report.longrepr).splitlines()[0]
             told = tuple(TOLD.findall(report.longreprtext))
         backend, stage, law = named
-        self.card.entries.append(Entry(backend, stage, law, report.outcome, detail, report.duration, told))
+        cpu: Any = dict(report.user_properties).get("cpu", 0.0)
+        self.card.entries.append(Entry(backend, stage, law, report.outcome, detail, report.duration, told, cpu))
 
-    def pytest_sessionfinish(self) -> None:
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self, item: pytest.Item) -> Generator[None, Any, Any]:
+        start = time.process_time()
+        try:
+            return (yield)
+        finally:
+            item.user_properties.append(("cpu", time.process_time() - start))
+
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        from pop_ref.conformance.surface import surface_of
+
+        self.card.surfaces = {b.name: surface_of(b) for b in _chosen_backends(session.config)}
         self.card.write(self.path)

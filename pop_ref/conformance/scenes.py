@@ -172,3 +172,9 @@ def cotangents(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     v_image = (np.mod(k * 5.0 + 3.0, 16.0) - 7.5) / 8.0
     v_T_final = (np.mod(np.arange(H * W, dtype=np.float64).reshape(H, W) * 3.0, 8.0) - 3.5) / 8.0
     return v_image, v_T_final
+
+
+def pattern(seed: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a picture of dyadic numbers in [0, 1], another for each seed."""
+    k = np.arange(int(np.prod(shape)), dtype=np.float64).reshape(shape)
+    return np.mod(k * (2.0 * seed + 1.0) + np.floor(k / 7.0) * seed, 17.0) / 16.0

@@ -124,18 +124,22 @@ def _alpha_bounds(error_bounds: PixelErrorBounds) -> list[tuple[Layer, list[Boun
     """Bound dC_c/dalpha of every layer and channel at each pixel, from back to front."""
     s = error_bounds.screen
     shape = error_bounds.T_final.shape
-    behind = [Bound(np.full(shape, abs(b)), np.full(shape, abs(b))) for b in error_bounds.scene.background.tolist()]
+    suffix_color = [
+        Bound(np.full(shape, abs(b)), np.full(shape, abs(b))) for b in error_bounds.scene.background.tolist()
+    ]
     found: list[tuple[Layer, list[Bound]]] = []
     for layer in reversed(error_bounds.layers):
         shown = layer.blended.astype(np.float64)
         channels: list[Bound] = []
-        for c in range(len(behind)):
+        for c in range(len(suffix_color)):
             color, e_color = abs(float(s.colors[layer.id, c])), float(s.e_colors[layer.id, c])
-            worth = Bound(np.full(shape, color), np.full(shape, e_color + color))
-            channels.append((worth + behind[c]).times(layer.T * shown, layer.T_error * shown))
-            mixed = worth.times(layer.alpha, layer.e_alpha) + behind[c].times(1.0 - layer.alpha, layer.e_alpha)
-            behind[c] = Bound(
-                np.where(layer.blended, mixed.m, behind[c].m), np.where(layer.blended, mixed.e, behind[c].e)
+            color_bound = Bound(np.full(shape, color), np.full(shape, e_color + color))
+            channels.append((color_bound + suffix_color[c]).times(layer.T * shown, layer.T_error * shown))
+            mixed = color_bound.times(layer.alpha, layer.e_alpha) + suffix_color[c].times(
+                1.0 - layer.alpha, layer.e_alpha
+            )
+            suffix_color[c] = Bound(
+                np.where(layer.blended, mixed.m, suffix_color[c].m), np.where(layer.blended, mixed.e, suffix_color[c].e)
             )
         found.append((layer, channels))
     return found

@@ -1,4 +1,4 @@
-"""The scorecard: which laws a backend obeys, by stage, as JSON or as a page."""
+"""The scorecard: which laws a backend obeys, by stage, and how much of it they have reached; as JSON or as a page."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ class Entry:
         detail: the first line of the failure, or why it was skipped.
         seconds: how long it took.
         told: of a failure, what differs first and where, a line each.
+        cpu: seconds of this process; a program that is judged has its own beside.
     """
 
     backend: str
@@ -33,6 +34,7 @@ class Entry:
     detail: str
     seconds: float
     told: tuple[str, ...] = ()
+    cpu: float = 0.0
 
 
 @dataclass
@@ -42,10 +44,12 @@ class Scorecard:
     Attributes:
         title: what was judged.
         entries: in the order in which they ran.
+        surfaces: by backend, what of it laws can reach (`surface.surface_of`).
     """
 
     title: str
     entries: list[Entry] = field(default_factory=list)
+    surfaces: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def summary(self) -> dict[str, dict[str, dict[str, int]]]:
         """Count outcomes by backend and stage, stages in the order of a render."""
@@ -59,19 +63,50 @@ class Scorecard:
         """Write JSON, or a page if the name ends in .html."""
         from pop_ref.conformance.scorecard_page import page
 
-        text = page(self) if path.suffix == ".html" else json.dumps(self.as_dict(), indent=1)
+        text = page(self, versions()) if path.suffix == ".html" else _compact(self.as_dict())
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text + "\n", encoding="utf-8")
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what the JSON file holds: counts, and by backend and stage what came of each law."""
-        laws: dict[str, dict[str, dict[str, str]]] = {}
+        """Return what the JSON file holds: counts, and by backend, stage and outcome the names of laws.
+
+        An outcome is passed, "skipped: REASON" or "failed: DETAIL".
+        """
+        laws: dict[str, dict[str, dict[str, list[str]]]] = {}
         for entry in sorted(self.entries, key=lambda e: STAGES.index(e.stage)):
-            told = f"{entry.outcome}: {entry.detail}" if entry.detail else entry.outcome
-            laws.setdefault(entry.backend, {}).setdefault(entry.stage, {})[entry.law] = told
-        seconds = round(sum(entry.seconds for entry in self.entries))
-        made = {**versions(), "seconds": seconds}
-        return {"title": self.title, "made": made, "summary": self.summary(), "laws": laws}
+            outcome = f"{entry.outcome}: {entry.detail}" if entry.detail else entry.outcome
+            of_stage = laws.setdefault(entry.backend, {}).setdefault(entry.stage, {})
+            of_stage.setdefault(outcome, []).append(entry.law)
+        made: dict[str, Any] = {**versions(), "seconds": round(sum(entry.seconds for entry in self.entries))}
+        cpu = {b: round(sum(e.cpu for e in self.entries if e.backend == b)) for b in laws}
+        made |= {"cpu seconds": cpu} if any(cpu.values()) else {}
+        return {
+            "title": self.title,
+            "made": made,
+            "surface": self.surfaces,
+            "summary": self.summary(),
+            "laws": laws,
+        }
+
+
+def outcomes(of_stage: dict[str, list[str]]) -> dict[str, str]:
+    """Return the outcome of each law of a stage, as a scorecard's JSON holds them."""
+    return {law: outcome for outcome, laws in of_stage.items() for law in laws}
+
+
+def _compact(card: dict[str, Any]) -> str:
+    """Write JSON with a line for each stage of each backend."""
+    lines = []
+    for key, value in card.items():
+        if key not in ("summary", "laws", "surface"):
+            lines.append(f" {json.dumps(key)}: {json.dumps(value)}")
+            continue
+        parts = []
+        for backend, rows in value.items():
+            inner = ",\n".join(f"   {json.dumps(name)}: {json.dumps(row)}" for name, row in rows.items())
+            parts.append(f"  {json.dumps(backend)}: {{\n{inner}\n  }}")
+        lines.append(f" {json.dumps(key)}: {{\n" + ",\n".join(parts) + "\n }")
+    return "{\n" + ",\n".join(lines) + "\n}"
 
 
 def versions() -> dict[str, str]:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from html import escape
+from typing import TYPE_CHECKING, Any
 
-from pop_ref.conformance.scorecard import Entry, Scorecard, versions
+if TYPE_CHECKING:
+    from pop_ref.conformance.scorecard import Entry, Scorecard
 
 
-def page(card: Scorecard) -> str:
+def page(card: Scorecard, made_with: Mapping[str, str]) -> str:
     """Return the page."""
-    made = ", ".join(f"{name} {value}" for name, value in versions().items())
+    made = ", ".join(f"{name} {value}" for name, value in made_with.items())
     parts = [_HEAD.format(title=escape(card.title)), f"<p class=made>{escape(made)}</p>"]
     for backend, stages in card.summary().items():
         chosen = [entry for entry in card.entries if entry.backend == backend]
-        parts += [f"<section><h2>{escape(backend)}</h2>", _verdict(chosen), _table(stages)]
+        parts += [f"<section><h2>{escape(backend)}</h2>", _verdict(chosen)]
+        parts += [_surface(card.surfaces.get(backend, {})), _table(stages)]
         parts += [*_broken(chosen), *_skipped(chosen), "</section>"]
     return "\n".join(parts)
 
@@ -28,6 +32,17 @@ def _verdict(entries: list[Entry]) -> str:
         return "<p>Nothing could be judged.</p>"
     words = f"breaks {failed} of {passed + failed} laws" if failed else f"obeys all {passed} laws that could be tried"
     return f"<p class={'bad' if failed else 'good'}>{words}; {skipped} skipped</p>"
+
+
+def _surface(surface: dict[str, Any]) -> str:
+    if not surface:
+        return ""
+    lines = [f"Constants: {surface['profile']}; precision: {surface['dtype']}."]
+    for group in ("whole views", "arguments", "stage functions"):
+        offered, lacks = surface[group]["offered"], surface[group]["not"]
+        lines.append(f"Reached of {group}: {len(offered)} of {len(offered) + len(lacks)}.")
+        lines += [f"Not reached: {', '.join(lacks)}."] if lacks else []
+    return "<p class=made>" + "<br>".join(map(escape, lines)) + "</p>"
 
 
 def _table(stages: dict[str, dict[str, int]]) -> str:

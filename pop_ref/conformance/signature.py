@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.assertions import assert_close
 from pop_ref.conformance.calls import Call, Called, Frame, drawn_scene, oracle_frame, oracle_frame_vjp
 from pop_ref.conformance.capabilities import GRADIENTS
@@ -96,7 +95,8 @@ def _frame_error_bounds(call: Call, frame: Frame, scene: Scene, dtype: Any) -> P
         return replace(s, colors=np.concatenate(values, axis=1), e_colors=np.concatenate(errors, axis=1))
 
     behind = np.append(scene.background if colored else [], [0.0] * with_depth)
-    lists = OracleAdapter().full_render(scene).tile_lists if scene.profile.extent == "square" else None
+    square = scene.profile.extent == "square"
+    lists = oracle_frame(scene, frame.colors, call.render_mode).tile_lists if square else None
     return pixel_error_bounds(scene.but(background=behind), dtype, lists, channels)
 
 

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-# at float64 a formula that is wrong is wrong by more than this many times what single precision is charged
+# at float64 a formula that is wrong is wrong by more than this many times what single precision is allowed
 ROOM_FLOAT64: Final = 64.0
 AGREEMENT_FLOAT64: Final = 1e-12
 

@@ -45,7 +45,7 @@ def training_stages(package: str) -> dict[str, Callable[..., Any]]:
     Args:
         package: the trainer's.
     """
-    trainer, density = Trainer(package), importlib.import_module(f"{package}.density")
+    trainer, density = Trainer(package), importlib.import_module(f"{package}.stages.density")
     # what a strategy decides by is a function already; everything else is what it does
     decided = ("average_grads", "grow_masks", "prune_mask")
     done = [name for name in vars(Trainer) if not name.startswith("_")]
@@ -53,19 +53,19 @@ def training_stages(package: str) -> dict[str, Callable[..., Any]]:
 
 
 class Trainer:
-    """A trainer with the modules `strategies`, `strategies.ops`, `train.model`, `train.schedule` and `train.config`.
+    """A trainer with the modules `density`, `density.rows`, `train.model`, `train.schedule` and `train.config`.
 
     Every method has the name, the parameters and the meaning of a function of the oracle, on tensors.
     """
 
     def __init__(self, package: str) -> None:
         self._torch: Any = importlib.import_module("torch")
-        self._ops: Any = importlib.import_module(f"{package}.strategies.ops")
+        self._ops: Any = importlib.import_module(f"{package}.density.rows")
         self._model: Any = importlib.import_module(f"{package}.train.model")
         self._schedule: Any = importlib.import_module(f"{package}.train.schedule")
         self._config: Any = importlib.import_module(f"{package}.train.config")
-        self._Draws: Any = importlib.import_module(f"{package}.strategies.base").Draws
-        self._Strategy: Any = importlib.import_module(f"{package}.strategies").POPStrategy
+        self._Draws: Any = importlib.import_module(f"{package}.density.protocol").Draws
+        self._Strategy: Any = importlib.import_module(f"{package}.density").POPStrategy
 
     def rows_from_params(self, params: Mapping[str, Any]) -> Rows:
         """See `pop_ref.density_rows.rows_from_params`."""

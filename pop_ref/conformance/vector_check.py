@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from pop_ref.conformance.corpus_answers import weighted_blocks, weighted_runs
 from pop_ref.conformance.vector_schema import FORMAT, VERSION
 
 AGAIN = "write the vectors again with 'pop vectors export'"
@@ -78,29 +79,33 @@ def check(folder: Path, results: Path, precision: str = "float32") -> Judgement:
     index = read_index(folder)
     if not results.is_dir():
         raise ValueError(f"{results}: no such folder; a port writes its results there, NAME.npz or NAME.json a vector")
-    outputs = {name: entry for name, entry in index["arrays"].items() if entry["role"] == "output"}
     found = Judgement()
     known = {f"{name}{suffix}" for name in index["vectors"] for suffix in (".npz", ".json")}
     found.strange = sorted(path.name for path in results.iterdir() if path.name not in known)
     seen: set[str] = set()
+    known_outputs: dict[str, None] = {}
     for name, vector in index["vectors"].items():
+        arrays = index["kinds"][vector["kind"]]["arrays"]
+        outputs = {array: entry for array, entry in arrays.items() if entry["role"] == "output"}
+        known_outputs |= dict.fromkeys(outputs)
         path = next((p for p in (results / f"{name}.npz", results / f"{name}.json") if p.exists()), None)
         if path is None:
             found.missing.append(name)
             continue
-        wanted, result = _vector(folder / vector["file"], vector["shapes"]), read_arrays(path)
+        stored = {a: shape for a, shape in vector["shapes"].items() if arrays[a].get("stored", True)}
+        wanted, result = _vector(folder / vector["file"], stored), read_arrays(path)
         found.strange += [f"{path.name}: {array}" for array in result if array not in outputs]
         for array in (a for a in outputs if a in result):
             seen.add(array)
-            _check_shape(path, array, result[array], wanted[array])
-            found.verdicts.append(
-                _judge(name, array, wanted, result[array], outputs[array]["compare"], index, precision)
-            )
+            _check_shape(path, array, result[array], vector["shapes"][array])
+            for rule in outputs[array]["compare"]:
+                found.verdicts.append(_judge(name, array, wanted, result[array], rule, index["tiny"], precision))
     if not found.verdicts:
         raise ValueError(
-            f"{results}: holds nothing to judge; write {next(iter(index['vectors']))}.npz with {', '.join(outputs)}"
+            f"{results}: holds nothing to judge; write one file for each vector, as "
+            f"{next(iter(index['vectors']))}.npz with {', '.join(known_outputs)}"
         )
-    found.absent = [array for array in outputs if array not in seen]
+    found.absent = [array for array in known_outputs if array not in seen]
     return found
 
 
@@ -123,7 +128,7 @@ def read_index(folder: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: format is not {FORMAT!r}, so it is no index of vectors; {AGAIN}")
     if index.get("version") != VERSION:
         raise ValueError(f"{path}: version is {index.get('version')}, this program reads {VERSION}; {AGAIN}")
-    lacks = [name for name in ("arrays", "vectors", "tiny") if name not in index]
+    lacks = [name for name in ("kinds", "vectors", "tiny") if name not in index]
     if lacks:
         raise ValueError(f"{path}: {lacks[0]} is absent; {AGAIN}")
     return index
@@ -159,11 +164,11 @@ def _vector(path: Path, shapes: dict[str, list[int]]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _check_shape(path: Path, array: str, result: np.ndarray, wanted: np.ndarray) -> None:
+def _check_shape(path: Path, array: str, result: np.ndarray, wanted: list[int]) -> None:
     if result.dtype.kind not in "fiub":
         raise ValueError(f"{path}: {array} has type {result.dtype}; it must hold numbers")
-    if result.shape != wanted.shape:
-        raise ValueError(f"{path}: {array} has shape {list(result.shape)}; it must be {list(wanted.shape)}")
+    if list(result.shape) != wanted:
+        raise ValueError(f"{path}: {array} has shape {list(result.shape)}; it must be {wanted}")
 
 
 def _judge(
@@ -171,28 +176,37 @@ def _judge(
     array: str,
     wanted: dict[str, np.ndarray],
     result: np.ndarray,
-    compare: dict[str, Any],
-    index: dict[str, Any],
+    rule: dict[str, Any],
+    tiny: dict[str, float],
     precision: str,
 ) -> Verdict:
-    expected = wanted[array]
-    mask = np.True_ if compare["where"] is None else wanted[compare["where"]]
+    expected = wanted[rule.get("expected", array)]
+    mask = np.array(True) if rule["where"] is None else wanted[rule["where"]]
+    if "reduce" in rule:
+        result, mask = _reduced(rule["reduce"], np.asarray(result, dtype=np.float64), mask), np.array(True)
     # a mask covers the leading axes
     where = np.broadcast_to(np.reshape(mask, mask.shape + (1,) * (expected.ndim - mask.ndim)), expected.shape)
     unit = "of its error_bound"
-    if compare["rule"] == "equal":
+    if rule["rule"] == "equal":
         unit = "wrong entries"
         wrong = np.asarray((result != expected) & where, dtype=np.float64)
         worst, allowed = float(np.sum(wrong)), 0.0
     else:
-        allowed = compare["limit"][precision]
+        allowed = rule["limit"][precision]
         # an error bound of zero leaves `tiny`
-        error_bound = wanted[compare["error_bound"]] + index["tiny"][precision] / allowed
+        error_bound = wanted[rule["error_bound"]] + tiny[precision] / allowed
         off = np.abs(result.astype(np.float64) - expected) / error_bound
         wrong = np.where(where, np.where(np.isfinite(off), off, np.inf), 0.0)
         worst = float(np.max(wrong, initial=0.0))
     if worst <= allowed:
         return Verdict(vector, array, worst, allowed, unit=unit)
     at = tuple(int(i) for i in np.unravel_index(np.argmax(wrong), wrong.shape))
-    told = f"at {list(at)}: got {result[at]}, expected {expected[at]}"
+    told = f"at {list(at)}{' of its sums' if 'reduce' in rule else ''}: got {result[at]}, expected {expected[at]}"
     return Verdict(vector, array, worst, allowed, told, unit)
+
+
+def _reduced(how: str, values: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Reduce a result to weighted sums, as the index says."""
+    if how == "blocks":
+        return weighted_blocks(values, np.broadcast_to(mask, values.shape[:2]))
+    return weighted_runs(values)

@@ -12,21 +12,27 @@ import numpy as np
 from pop_ref.conformance import tolerances
 
 FORMAT: Final = "pop-vectors"
-VERSION: Final = 2
+VERSION: Final = 3
 GRADIENTS: Final = ("means", "quats", "scales", "opacities", "sh", "viewmat", "background", "means2d", "means2d_abs")
 
 ABOUT: Final = (
     "Scenes of 3D Gaussian Splatting with everything an exact renderer makes of them, to judge a renderer in any "
     "language.",
     "A vector is one file NAME.npz: a zip archive of .npy arrays, little-endian, in C order, float64, int64 or bool.",
+    "A vector is of one of the 'kinds', which says what it is about and explains every array.",
     "Read the arrays whose role is 'input' and the vector's 'options', and write a result of the same name into a "
     "folder of your own: NAME.npz, or NAME.json holding nested lists by array name. Write as many of the arrays whose "
-    "role is 'output' as you have, in the stated shape and any number type.",
-    "A result is judged by its array's 'compare'. 'close': |result - expected| <= limit * error bound + tiny, with "
-    "limit and tiny of the precision that you compute in, and the array named by 'error_bound': what rounding may cost. "
-    "'equal': result = expected.",
+    "role is 'output' as you have, in the vector's 'shapes' and any number type.",
+    "A result is judged by the rules of its array's 'compare', a list. 'close': |result - expected| <= limit * error "
+    "bound + tiny, with limit and tiny of your precision, and the array named by 'error_bound', which says what "
+    "rounding may cost. 'equal': result = expected. Expected is the array of the same name, or the one that "
+    "'expected' names.",
     "Only entries whose mask 'where' is true are compared: elsewhere rounding may decide either way. A mask covers the "
     "leading axes of its array: unambiguous [H, W] covers image [H, W, 3], a mask of shape [] all or nothing.",
+    "Where a rule says 'reduce', result and mask are reduced first. 'blocks': entries of an [H, W, D] map where the "
+    "mask is true, each times 1 + (7 x + 13 y) mod 16, are summed over blocks of 8 x 8 pixels; row r of the expected "
+    "[blocks, D] is block (r mod columns, r div columns). 'runs': rows i of an array, flattened to [N, K], each times "
+    "1 + 7 i mod 16, are summed over runs of max(1, N div 100) rows.",
     "'pop vectors check DIR RESULTS' does all of this.",
 )
 MODEL: Final = (
@@ -44,6 +50,12 @@ MODEL: Final = (
     "T *= 1 - alpha; last image += T background.",
 )
 AXES: Final = {
+    "C": "cameras",
+    "D": "channels of plain colours",
+    "X": "channels of an image: colours, or depth, or both, depth last",
+    "B": "channels of a background",
+    "M": "Gaussians after the step",
+    "blocks, runs": "sums that a large result is reduced to",
     "N": "Gaussians",
     "H": "rows of the image, from the top",
     "W": "columns of the image, from the left",
@@ -72,7 +84,8 @@ OPTIONS: Final = {
     "not blended and ends the pixel (D7)",
 }
 
-_INPUTS = {
+Rule = dict[str, Any]
+INPUTS: Final = {
     "means": ("[N, 3]", "centres, world units"),
     "quats": ("[N, 4]", "rotations w x y z, of any norm > 0"),
     "scales": ("[N, 3]", "standard deviations, world units"),
@@ -81,16 +94,10 @@ _INPUTS = {
     "viewmat": ("[4, 4]", "world -> camera: x right, y down, z forward"),
     "K": ("[3, 3]", "intrinsics fx, fy, cx, cy, px"),
     "background": ("[3]", "colour behind everything"),
-    "v_image": (
-        "[H, W, 3]",
-        "cotangent of image that the gradients belong to; zero near thresholds",
-    ),
-    "v_T_final": (
-        "[H, W]",
-        "cotangent of T_final that the gradients belong to; zero near thresholds",
-    ),
+    "v_image": ("[H, W, 3]", "cotangent of image that the gradients belong to; zero near thresholds"),
+    "v_T_final": ("[H, W]", "cotangent of T_final that the gradients belong to; zero near thresholds"),
 }
-_OUTPUTS = {
+IMAGES: Final = {
     "image": ("[H, W, 3]", "colours over the background, not clamped"),
     "T_final": ("[H, W]", "transmittance behind the last blended splat"),
     "dominant_ids": (
@@ -99,26 +106,67 @@ _OUTPUTS = {
     ),
     "n_blended": ("[H, W]", "splats blended at the pixel"),
 }
+STAGES: Final = {
+    "depths": ("[N]", "camera z, world units"),
+    "means2d": ("[N, 2]", "screen centres, px"),
+    "conics": ("[N, 3]", "inverse of the blurred screen covariance: xx, xy, yy, px^-2"),
+    "effective_opacities": ("[N]", "opacities, in antialiased mode times the compensation"),
+    "colors": ("[N, 3]", "of the harmonics, not under 0"),
+    "radii": ("[N, 2]", "extents along x and y, px, 0 where culled"),
+}
 _MASKS = {
     "unambiguous": ("[H, W]", "every decision behind the pixel is clear of float32's rounding"),
     "decided": ("[H, W]", "unambiguous, and the dominant Gaussian is clear too"),
     "smooth_rows": ("[N]", "no kink of this Gaussian (B1 frustum clamp, B2 colour clamp) is within rounding"),
     "all_smooth": ("[]", "smooth_rows holds everywhere"),
+    "clear_rows": ("[N]", "no cull and no extent of this Gaussian is within rounding (D1, D2, D3)"),
+    "visible_rows": ("[N]", "clear_rows, and the Gaussian is not culled"),
 }
-_AIDS = {
-    "radii": ("[N, 2]", "extents along x and y, px, 0 where culled; not judged"),
-    "means2d": ("[N, 2]", "screen centres, px; not judged"),
-}
-_WHERE = {"image": "unambiguous", "T_final": "unambiguous", "n_blended": "unambiguous", "dominant_ids": "decided",
-          "v_viewmat": "all_smooth", "v_background": None}  # fmt: skip
+WHERE: Final = {
+    "image": "unambiguous", "T_final": "unambiguous", "n_blended": "unambiguous", "dominant_ids": "decided",
+    "radii": "clear_rows", "v_viewmat": "all_smooth", "v_background": None,
+    **dict.fromkeys(("depths", "means2d", "conics", "effective_opacities", "colors"), "visible_rows"),
+}  # fmt: skip
+INTEGERS: Final = frozenset({"dominant_ids", "n_blended", "radii"})
 _DECISIONS = {
     "D1": "near plane", "D2": "extent and cull", "D3": "tile overlap", "D4": "depth order", "D5": "alpha floor",
     "D6": "alpha ceiling", "D7": "transmittance stop", "D8": "dominance tie",
 }  # fmt: skip
 
 
-def schema() -> dict[str, Any]:
-    """Return what the index says beside the list of vectors."""
+def entry(role: str, shape: str, meaning: str, dtype: str = "float64", compare: list[Rule] | None = None) -> Rule:
+    """Return what the index says of an array."""
+    said: Rule = {"role": role, "dtype": dtype, "shape": shape, "meaning": meaning}
+    return said if compare is None else {**said, "compare": compare}
+
+
+def close(key: str, error_bound: str, where: str | None = None, **more: str) -> Rule:
+    """Return the rule that a result differs by rounding at most, with the tolerance of that key."""
+    units = tolerances.TABLE[key].units
+    limit = {"float32": units * float(np.finfo(np.float32).eps), "float64": tolerances.AGREEMENT_FLOAT64}
+    return {"rule": "close", "error_bound": error_bound, "limit": limit, "where": where, **more}
+
+
+def equal(where: str | None = None, **more: str) -> Rule:
+    """Return the rule that a result is the expected number."""
+    return {"rule": "equal", "where": where, **more}
+
+
+def output(name: str, shape: str, meaning: str, key: str, where: str | None = None) -> dict[str, Rule]:
+    """Return the entries of an output that is compared up to rounding, and of its error bound."""
+    bound = f"error_bound_{name}"
+    return {
+        name: entry("output", shape, meaning, compare=[close(key, bound, where)]),
+        bound: entry("error_bound", shape, f"what rounding may cost in {name}"),
+    }
+
+
+def schema(kinds: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return what the index says beside the list of vectors.
+
+    Args:
+        kinds: of vectors, by name: what each is about, and its arrays.
+    """
     tiny = {"float32": float(np.finfo(np.float32).tiny), "float64": float(np.finfo(np.float64).tiny)}
     return {
         "format": FORMAT,
@@ -128,50 +176,33 @@ def schema() -> dict[str, Any]:
         "axes": AXES,
         "options": OPTIONS,
         "tiny": tiny,
-        "arrays": {entry["name"]: {k: v for k, v in entry.items() if k != "name"} for entry in _entries()},
+        "kinds": kinds,
     }
 
 
-def _entries() -> list[dict[str, Any]]:
-    rows = [_entry(name, "input", "float64", *about) for name, about in _INPUTS.items()]
-    shapes = {**{name: shape for name, (shape, _) in _INPUTS.items()}, "means2d": "[N, 2]", "means2d_abs": "[N, 2]"}
-    outputs = dict(_OUTPUTS)
+def render_kind() -> dict[str, Any]:
+    """Return what the index says of vectors of one image."""
+    arrays = {name: entry("input", *about) for name, about in INPUTS.items()}
+    for name, (shape, meaning) in {**IMAGES, **STAGES}.items():
+        where = WHERE[name]
+        if name in INTEGERS:
+            arrays[name] = entry("output", shape, meaning, "int64", [equal(where)])
+        else:
+            arrays |= output(name, shape, meaning, f"agreement.{name}" if name in IMAGES else "meta.rows", where)
+    shapes = {**{name: shape for name, (shape, _) in INPUTS.items()}, "means2d": "[N, 2]", "means2d_abs": "[N, 2]"}
     for name in GRADIENTS:
-        outputs[f"v_{name}"] = (shapes[name], _gradient(name))
-    for name, (shape, meaning) in outputs.items():
-        whole = name in ("dominant_ids", "n_blended")
-        rows.append(_entry(name, "output", "int64" if whole else "float64", shape, meaning, _rule(name)))
-    for name, (shape, _) in outputs.items():
-        if name not in ("dominant_ids", "n_blended"):
-            rows.append(
-                _entry(f"error_bound_{name}", "error_bound", "float64", shape, f"what rounding may cost in {name}")
-            )
-    rows += [_entry(name, "mask", "bool", *about) for name, about in _MASKS.items()]
-    rows += [_entry(name, "aid", "int64" if name == "radii" else "float64", *about) for name, about in _AIDS.items()]
+        where = WHERE.get(f"v_{name}", "smooth_rows")
+        arrays |= output(f"v_{name}", shapes[name], gradient(name), f"agreement.v_{name}", where)
+    arrays |= {name: entry("mask", *about, "bool") for name, about in _MASKS.items()}
     for label, decision in _DECISIONS.items():
         meaning = f"distance of {decision} decisions ({label}) from flipping; float32 decides alike over 1e-6"
-        rows.append(_entry(f"margin_{label}", "margin", "float64", "[H, W]", meaning))
-    return rows
+        arrays[f"margin_{label}"] = entry("margin", "[H, W]", meaning)
+    return {"about": "one image with all that lies on the way to it, and its gradients", "arrays": arrays}
 
 
-def _entry(
-    name: str, role: str, dtype: str, shape: str, meaning: str, compare: dict[str, Any] | None = None
-) -> dict[str, Any]:
-    entry = {"name": name, "role": role, "dtype": dtype, "shape": shape, "meaning": meaning}
-    return entry if compare is None else {**entry, "compare": compare}
-
-
-def _gradient(name: str) -> str:
+def gradient(name: str) -> str:
+    """Return the meaning of a gradient."""
     if name == "means2d_abs":
         return "absolute values of the pixels' shares of v_means2d, summed (AbsGS)"
     place = {"means2d": " to the screen centres, per px", "quats": " to the quaternions as given, not normalised"}
     return f"derivative of sum(v_image image) + sum(v_T_final T_final){place.get(name, f' to {name}')}"
-
-
-def _rule(name: str) -> dict[str, Any]:
-    where = _WHERE.get(name, "smooth_rows")
-    if name in ("dominant_ids", "n_blended"):
-        return {"rule": "equal", "where": where}
-    units = tolerances.TABLE[f"agreement.{name}"].units
-    limit = {"float32": units * float(np.finfo(np.float32).eps), "float64": tolerances.AGREEMENT_FLOAT64}
-    return {"rule": "close", "error_bound": f"error_bound_{name}", "limit": limit, "where": where}

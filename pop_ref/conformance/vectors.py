@@ -1,7 +1,9 @@
-"""Portable vectors: scenes with what the oracle makes of them, so that ports are judged without Python.
+"""Portable vectors: what an exact renderer makes of fixed inputs, so that ports are judged without Python.
 
-`export` writes one npz a scene and an `index.json` that explains every array and how it is compared (`vector_schema`);
-`vector_check` judges a port's results by that index alone. Needs numpy only.
+`export` writes one npz a vector and an `index.json` that explains every array and how it is compared (`vector_schema`):
+single images with every stage on the way (`vector_scenes`), calls of several cameras (`vector_calls`), the corpus at
+scale (`vector_large`), losses and training steps (`vector_training`). `vector_check` judges a port's results by that
+index alone. Needs numpy only.
 """
 
 from __future__ import annotations
@@ -12,14 +14,38 @@ from typing import Any
 
 import numpy as np
 
+from pop_ref.conformance import vector_training as training
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bounds
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scene_files import scene_arrays, scene_options
 from pop_ref.conformance.scenes import Scene, cotangents, rounded_to
+from pop_ref.conformance.vector_calls import call_arrays, call_kind, calls
+from pop_ref.conformance.vector_large import large_kind, large_vectors
 from pop_ref.conformance.vector_scenes import vector_scenes
-from pop_ref.conformance.vector_schema import GRADIENTS, schema
+from pop_ref.conformance.vector_schema import GRADIENTS, render_kind, schema
 from pop_ref.margins import margins
+
+_TRAINING = {
+    "loss": training.loss_vectors,
+    "pop": training.pop_vectors,
+    "adam": training.adam_vectors,
+    "density": training.density_vectors,
+}
+
+
+def kinds() -> dict[str, dict[str, Any]]:
+    """Return what the index says of each kind of vector."""
+    return {
+        "render": render_kind(),
+        "call": call_kind(plain=False),
+        "call_plain": call_kind(plain=True),
+        "large": large_kind(),
+        "loss": training.loss_kind(),
+        "pop": training.pop_kind(),
+        "adam": training.adam_kind(),
+        "density": training.density_kind(),
+    }
 
 
 def expected_arrays(scene: Scene) -> dict[str, np.ndarray]:
@@ -36,13 +62,14 @@ def expected_arrays(scene: Scene) -> dict[str, np.ndarray]:
     gradients = oracle.gradients(scene, v_image, v_T_final)
     bounds = gradient_error_bounds(scene, error_bounds, v_image, v_T_final)
     found = margins(scene.gaussians, scene.camera, scene.sh_degree, scene.profile, scene.tile_size, scene.antialiased)
+    clear = found.safe_gaussians(64.0 * float(np.finfo(np.float32).eps), ("D1", "D2", "D3"))
     arrays = {**scene_arrays(scene), "v_image": v_image, "v_T_final": v_T_final}
     for name in ("image", "T_final", "dominant_ids", "n_blended"):
         arrays[name] = getattr(drawn, name)
-    arrays |= {"radii": drawn.splats.radii, "means2d": drawn.splats.means2d}
-    arrays |= _error_bounds(error_bounds)
+    arrays |= _error_bounds(error_bounds) | _stages(drawn.splats, error_bounds)
     for name in GRADIENTS:
         arrays[f"v_{name}"], arrays[f"error_bound_v_{name}"] = gradients[name], bounds[name]
+    arrays |= {"clear_rows": clear, "visible_rows": clear & drawn.splats.visible}
     return {**arrays, **{f"margin_{label}": values for label, values in found.pixels.items()}}
 
 
@@ -58,17 +85,46 @@ def _error_bounds(error_bounds: PixelErrorBounds) -> dict[str, np.ndarray]:
     }
 
 
+def _stages(splats: Any, error_bounds: PixelErrorBounds) -> dict[str, np.ndarray]:
+    s = error_bounds.screen
+    values = {
+        "depths": (splats.depths, s.e_depths),
+        "means2d": (splats.means2d, s.e_means2d),
+        "conics": (splats.conics, s.e_conics),
+        "effective_opacities": (splats.opacities, s.e_opacities),
+        "colors": (splats.colors, s.e_colors),
+    }
+    # what is culled holds no number
+    found = {name: np.where(np.isfinite(value), value, 0.0) for name, (value, _) in values.items()}
+    for name, (value, e) in values.items():
+        bound = e + np.abs(value)
+        found[f"error_bound_{name}"] = np.where(np.isfinite(bound), bound, 0.0)
+    return {**found, "radii": splats.radii}
+
+
 def export(folder: Path) -> list[str]:
     """Write every vector and the index into a folder; return the vectors' names."""
     folder.mkdir(parents=True, exist_ok=True)
     vectors: dict[str, Any] = {}
+
+    def write(name: str, kind: str, arrays: dict[str, Any], options: dict[str, Any], more: Any = None) -> None:
+        np.savez_compressed(folder / f"{name}.npz", **arrays)
+        shapes = {key: list(np.shape(array)) for key, array in arrays.items()} | (more or {})
+        vectors[name] = {"kind": kind, "file": f"{name}.npz", "options": options, "shapes": shapes}
+
     for name, drawn in vector_scenes().items():
         scene = rounded_to(drawn, np.float32)
-        arrays: dict[str, Any] = expected_arrays(scene)
-        np.savez_compressed(folder / f"{name}.npz", **arrays)
-        shapes = {key: list(np.shape(array)) for key, array in arrays.items()}
-        vectors[name] = {"file": f"{name}.npz", "options": _full_options(scene), "shapes": shapes}
-    index = {**schema(), "vectors": vectors}
+        write(name, "render", expected_arrays(scene), _full_options(scene))
+    for name, call in calls().items():
+        kind = "call" if call.sh_degree is not None else "call_plain"
+        options = _full_options(call.frames[0][0].scene) | {"render_mode": call.render_mode}
+        write(name, kind, call_arrays(call), options)
+    for name, (arrays, scene, shapes) in large_vectors().items():
+        write(name, "large", arrays, _full_options(scene), shapes)
+    for kind, made in _TRAINING.items():
+        for name, (arrays, options) in made().items():
+            write(name, kind, arrays, options)
+    index = {**schema(kinds()), "vectors": vectors}
     (folder / "index.json").write_text(json.dumps(index, indent=1) + "\n", encoding="utf-8")
     return list(vectors)
 

@@ -10,18 +10,26 @@ import numpy as np
 from pop_ref.conformance import capabilities
 from pop_ref.conformance.calls import Call, Frame
 from pop_ref.conformance.scenes import Record, Scene, pack, rigid
+from pop_ref.constants import PAPER
 from pop_ref.records import Camera, Gaussians
 
 WIDTH, HEIGHT = 17, 11
 NEAREST, FARTHEST = 1.0, 6.0
 
 
-def cameras(count: int) -> list[Camera]:
-    """Return cameras side by side, each turned and shifted a little and with intrinsics of its own."""
+def cameras(count: int, centred: bool = False) -> list[Camera]:
+    """Return cameras side by side, each turned and shifted a little and with intrinsics of its own.
+
+    Args:
+        count: of cameras.
+        centred: whether every principal point is the middle of the image.
+    """
     found, base = [], rigid((0.9, 0.2, -0.3, 0.15), (0.25, -0.5, 0.75))
     for c in range(count):
         moved = rigid((1.0, 0.03 * c, -0.05 * c, 0.02 * c), (0.125 * c, -0.0625 * c, 0.1875 * c)) @ base
         K = np.array([[18.0 + 3.0 * c, 0.0, 8.25 + c], [0.0, 16.0 + 2.0 * c, 5.75 - 0.5 * c], [0.0, 0.0, 1.0]])
+        if centred:
+            K[:2, 2] = 0.5 * WIDTH, 0.5 * HEIGHT
         found.append(Camera(moved, K, WIDTH, HEIGHT))
     return found
 
@@ -70,11 +78,14 @@ def frames(
     g, rng = gaussians(seed, degree), np.random.default_rng(1000 + seed)
     shared = rng.uniform(0.125, 1.0, (len(g), channels))
     found = []
-    for c, camera in enumerate(cameras(count)):
+    profile = backend.profile or PAPER
+    # where extents are square the grid is the profile's own
+    size = None if profile.extent == "square" else 4
+    for c, camera in enumerate(cameras(count, profile.principal_point == "centred")):
         mixed = camera_colors * 0.125 * c
         own = Gaussians(g.means, g.quats, g.scales, g.opacities, g.sh * (1.0 - mixed))
         behind = np.zeros(channels or 3) if black else np.round(16.0 * rng.uniform(0.1, 1.0, channels or 3)) / 16.0
-        scene = backend.sees(Scene(own, camera, behind, tile_size=4))
+        scene = backend.sees(Scene(own, camera, behind, tile_size=size))
         colors = (shared * (1.0 - mixed)).astype(backend.dtype).astype(np.float64) if channels else None
         found.append(Frame(scene, colors))
     return tuple(found)
@@ -104,7 +115,7 @@ ASKED: Final[dict[str, Callable[[Any], Call]]] = {
 
 
 def offers(backend: Any, capability: str) -> bool:
-    """Ask a backend once for a call that needs an capability; what it refuses, it does not offer.
+    """Ask a backend once for a call that needs a capability; what it refuses, it does not offer.
 
     Args:
         backend: has a method `call`.

@@ -21,7 +21,7 @@ class Stage:
 
     name: str
     does: str
-    chapter: int
+    chapter: str
     functions: dict[str, tuple[str, ...]]
     laws: tuple[str, ...] = ()
     more_laws: tuple[str, ...] = field(default=())
@@ -45,28 +45,28 @@ COURSE: Final = (
     Stage(
         "activations",
         "raw parameters to scales, opacities, unit quaternions",
-        1,
+        "1b",
         {"activations": _with_transposes("scales_from_log_scales", "opacities_from_logits", "unit_quats_from_quats")},
         ("activations",),
     ),
     Stage(
         "covariance",
         "quaternions and scales to ellipsoids",
-        1,
+        "2",
         {"covariance": _with_transposes("rotmats_from_quats", "covars_from_quats_scales")},
         ("covariance",),
     ),
     Stage(
         "harmonics",
         "coefficients and directions to colours",
-        3,
+        "3",
         {"harmonics": _with_transposes("sh_basis", "colors_from_sh")},
         ("harmonics",),
     ),
     Stage(
         "camera",
         "from the world into the camera's frame",
-        2,
+        "2",
         {
             "camera": (
                 *_with_transposes("camera_center", "view_dirs", "means_cam_from_means", "covars_cam_from_covars"),
@@ -78,35 +78,35 @@ COURSE: Final = (
     Stage(
         "projection",
         "from the camera's frame to the screen: ellipsoids to ellipses",
-        2,
+        "2",
         {"projection": _with_transposes("project_means", "projection_jacobians", "project_covars")},
         ("projection",),
     ),
     Stage(
         "footprint",
         "a little blur, the inverse covariance, and how far a splat reaches",
-        2,
+        "2",
         {"footprint": (*_with_transposes("low_pass", "conics_from_covars2d"), "radii_from_covars2d", "on_screen")},
         ("footprint",),
     ),
     Stage(
         "tiles",
         "which splats a tile must look at, front to back",
-        11,
+        "4b",
         {"tiles": ("grid_size", "tile_span", "tile_rects", "tile_lists")},
         ("tiles",),
     ),
     Stage(
         "alpha",
         "one splat at one pixel",
-        4,
+        "1",
         {"alpha": _with_transposes("sigma_at_pixel", "falloff", "alpha_from_sigma")},
         ("alpha",),
     ),
     Stage(
         "compositing",
         "one pixel from front to back, its gradient from back to front, and who dominates it",
-        4,
+        "4",
         {
             "pixel": ("stops", *_with_transposes("composite_pixel")),
             "dominance": ("dominant_id", "dominant_counts"),
@@ -121,21 +121,21 @@ COURSE: Final = (
     Stage(
         "losses",
         "how far a picture is from its photograph, and opacities from their poles",
-        6,
+        "6",
         {"losses": _with_transposes("l1", "l2"), "polarization": ("importance_mask", *_with_transposes("pop_loss"))},
         ("losses", "polarization"),
     ),
     Stage(
         "optimizer",
         "Adam, which moves every parameter",
-        6,
+        "1b",
         {"optimizer": ("adam_step",)},
         ("optimizer",),
     ),
     Stage(
         "density",
         "clone, split and prune: more Gaussians where they are needed, fewer where not",
-        9,
+        "9",
         {"density_rows": ("clone_rows", "split_rows", "prune_rows"), "density": ("grow_masks", "prune_mask")},
         ("density",),
     ),

@@ -8,15 +8,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-Kind = Literal["prose", "code", "answer"]
+Kind = Literal["prose", "code", "setup", "answer"]
 
 FOLDER: Final = Path(__file__).resolve().parent
 
 _MARKER: Final = re.compile(r"^# %%(.*)$")
-_KINDS: Final[dict[str, Kind]] = {"": "code", "[markdown]": "prose", "answer": "answer"}
-_NAME: Final = re.compile(r"^chapter_(\d\d)_[a-z0-9_]+$")
-_TITLE: Final = re.compile(r"^# (\d+)\. (.+)$")
-_EXERCISE: Final = re.compile(r"^### Exercise (\d+)\b")
+_KINDS: Final[dict[str, Kind]] = {
+    "": "code",
+    "[markdown]": "prose",
+    "setup": "setup",
+    "answer": "answer",
+}
+_NAME: Final = re.compile(r"^chapter_(\d\d)([a-z]?)_[a-z0-9_]+$")
+_TITLE: Final = re.compile(r"^# (\d+[a-z]?)\. (.+)$")
+MINUTES: Final = re.compile(r"^# minutes: (\d+)$", re.MULTILINE)
+_EXERCISE: Final = re.compile(r"^### Exercise (\d+): (\w[\w ]*)$", re.MULTILINE)
+# in the order of a chapter: guess, then prove, then program, then read what is wrong
+TIERS: Final = ("predict", "derive", "code", "find the bug")
 
 
 class ChapterError(Exception):
@@ -37,11 +45,16 @@ class Cell:
 
 @dataclass(frozen=True)
 class Chapter:
-    """A chapter: its number and title from the first heading, the paragraph under it, and all cells in order."""
+    """A chapter: its number ("4b") and title from the first heading, the paragraph under it, and all cells in order.
+
+    Attributes:
+        minutes: that a reader needs, exercises included.
+    """
 
     path: Path
-    number: int
+    number: str
     title: str
+    minutes: int
     opening: str
     cells: tuple[Cell, ...]
 
@@ -56,6 +69,15 @@ class Chapter:
         return f"{__package__}.{self.path.stem}"
 
     @property
+    def tiers(self) -> list[str]:
+        """List what kind each exercise is of, in order."""
+        return [
+            found[2]
+            for cell in self.cells
+            if cell.kind == "prose" and (found := _EXERCISE.match(cell.text))
+        ]
+
+    @property
     def n_exercises(self) -> int:
         """Count the exercises, each of which has an answer."""
         return sum(cell.kind == "answer" for cell in self.cells)
@@ -66,8 +88,8 @@ def chapter_files(folder: Path = FOLDER) -> list[Path]:
     return sorted(folder.glob("chapter_*.py"))
 
 
-def chapter_number(path: Path) -> int:
-    """Read a chapter's number off its file's name.
+def chapter_number(path: Path) -> str:
+    """Read a chapter's number off its file's name: "4", or "4b" for what stands between 4 and 5.
 
     Raises:
         ChapterError: the name is not `chapter_NN_short_name.py`.
@@ -75,7 +97,7 @@ def chapter_number(path: Path) -> int:
     named = _NAME.match(path.stem)
     if named is None:
         raise ChapterError(path, 1, "a chapter's file is named chapter_NN_short_name.py")
-    return int(named[1])
+    return f"{int(named[1])}{named[2]}"
 
 
 def read_chapter(path: Path, text: str | None = None) -> Chapter:
@@ -88,13 +110,14 @@ def read_chapter(path: Path, text: str | None = None) -> Chapter:
     Raises:
         ChapterError: a cell, the title or an exercise does not have its form.
     """
-    cells = tuple(_cells(path, path.read_text(encoding="utf-8") if text is None else text))
+    text = path.read_text(encoding="utf-8") if text is None else text
+    cells = tuple(_cells(path, text))
     number = chapter_number(path)
     if not cells or cells[0].kind != "prose":
         raise ChapterError(path, 1, "the first cell must be prose, '# %% [markdown]'")
     heading, _, rest = cells[0].text.partition("\n")
     titled = _TITLE.match(heading)
-    if titled is None or int(titled[1]) != number:
+    if titled is None or titled[1] != number:
         wanted = f"# # {number}. Title"
         raise ChapterError(
             path,
@@ -109,7 +132,12 @@ def read_chapter(path: Path, text: str | None = None) -> Chapter:
             "a paragraph on what the chapter teaches must follow the title",
         )
     _hold_exercises(path, cells)
-    return Chapter(path, int(titled[1]), titled[2], opening, cells)
+    minutes = MINUTES.search(text)
+    if minutes is None:
+        raise ChapterError(
+            path, 1, "a line '# minutes: 20' must tell how long the chapter takes"
+        )
+    return Chapter(path, number, titled[2], int(minutes[1]), opening, cells)
 
 
 def _cells(path: Path, text: str) -> list[Cell]:
@@ -125,7 +153,7 @@ def _cells(path: Path, text: str) -> list[Cell]:
             raise ChapterError(
                 path,
                 start + 1,
-                f"a cell is marked '# %%', '# %% [markdown]' or '# %% answer', not {word!r}",
+                f"a cell is marked '# %%', '# %% [markdown]', '# %% setup' or '# %% answer', not {word!r}",
             )
         first, last = start + 1, end
         while first < last and not lines[first].strip():
@@ -160,6 +188,12 @@ def _hold_exercises(path: Path, cells: tuple[Cell, ...]) -> None:
                 raise ChapterError(
                     path, cell.line, f"this is exercise {asked}, not {exercise[1]}"
                 )
+            if exercise[2] not in TIERS:
+                raise ChapterError(
+                    path,
+                    cell.line,
+                    f"exercise {asked} is one of {', '.join(TIERS)}, not {exercise[2]!r}",
+                )
             if after is None or after.kind != "answer":
                 raise ChapterError(
                     path,
@@ -170,14 +204,22 @@ def _hold_exercises(path: Path, cells: tuple[Cell, ...]) -> None:
             raise ChapterError(
                 path,
                 after.line,
-                "an answer must follow its exercise, a prose cell '# ### Exercise k'",
+                "an answer must follow its exercise, a prose cell '# ### Exercise k: predict'",
             )
         if cell.kind == "answer" and not any(
-            isinstance(node, ast.Assert) for node in ast.walk(_parsed(path, cell))
+            _asserts(node) for node in ast.walk(_parsed(path, cell))
         ):
             raise ChapterError(
                 path, cell.line, f"the answer to exercise {asked} asserts nothing"
             )
+
+
+def _asserts(node: ast.AST) -> bool:
+    # `caught` asserts that a law of the kit notices a mistake
+    called = node.func if isinstance(node, ast.Call) else None
+    return isinstance(node, ast.Assert) or (
+        isinstance(called, ast.Name) and called.id == "caught"
+    )
 
 
 def _parsed(path: Path, cell: Cell) -> ast.Module:

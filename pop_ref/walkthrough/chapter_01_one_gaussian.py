@@ -1,3 +1,5 @@
+# minutes: 25
+
 # %% [markdown]
 # # 1. One Gaussian, one pixel
 #
@@ -9,12 +11,13 @@
 # Everything here happens on the screen, where lengths are pixels, $x$ runs right and $y$ runs down. A splat has
 #
 # - a centre $\mu$, two numbers, px;
-# - a covariance $\Sigma$, a symmetric 2 × 2 matrix, px²: its eigenvectors are the axes of the ellipse, the roots of its
-#   eigenvalues the standard deviations along them;
-# - an opacity $o$ between 0 and 1;
+# - a *covariance* $\Sigma$, a symmetric 2 × 2 matrix, px²: its eigenvectors are the axes of the ellipse, the roots of
+#   its eigenvalues the standard deviations along them;
+# - an *opacity* $o$ between 0 and 1: how much it hides at its centre;
 # - a colour $c$, three numbers.
 #
-# How a Gaussian in space becomes a splat is chapter 2. Here is one to look at.
+# How a Gaussian in space becomes a splat is chapter 2. Here is one to look at; the widget at the end of the page lets
+# you drag one about.
 
 # %%
 import math
@@ -25,6 +28,7 @@ from pop_ref.alpha import alpha_from_sigma, falloff, sigma_at_pixel
 from pop_ref.constants import PAPER
 from pop_ref.footprint import conics_from_covars2d, radii_from_covars2d
 from pop_ref.pixel import SplatRows, composite_pixel
+from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, INK, MUTED, SECOND, THIRD, axes, show_image
 
@@ -51,7 +55,10 @@ print("standard deviations, px:", np.sqrt(lambdas).round(2))
 # / 2$ on that of $k$.
 #
 # The inverse is needed at every pixel, so a renderer makes it once per splat and keeps its three different entries, the
-# *conic* $(A, B, C)$. With $d = \mu - p$ the exponent is then $\sigma = (A d_x^2 + C d_y^2)/2 + B d_x d_y$.
+# *conic* $(A, B, C)$. With $d = \mu - p$ the exponent is then $\sigma = (A d_x^2 + C d_y^2)/2 + B d_x d_y$. In the
+# oracle:
+#
+# {{source: pop_ref.alpha.sigma_at_pixel}}
 
 # %%
 p = np.array([17.5, 10.5])
@@ -82,16 +89,20 @@ print(
 #
 # $$\alpha(p) = o\, e^{-\sigma(p)}$$
 #
-# This is POP paper, eq. 11, again. Alpha is the share of the light from behind that the splat blocks at this pixel. It
-# is not a probability density: the bell is 1 at its top whatever its width, so a wider splat covers more and is no
+# This is POP paper, eq. 11, again. *Alpha* is the share of the light from behind that the splat blocks at this pixel.
+# It is not a probability density: the bell is 1 at its top whatever its width, so a wider splat covers more and is no
 # fainter.
 #
 # Rasterizers add two rules that the paper does not print. An alpha under 1/255 changes an 8-bit image by less than one
 # level and is skipped (the *floor*, decision D5). And alpha is cut at 0.999 (the *ceiling*, D6), so that no splat
-# blocks everything: what lies behind keeps a trace of a say, and a gradient.
+# blocks everything: what lies behind still contributes a little, and has a gradient. All of it in five lines, where
+# `falloff` is $e^{-\sigma}$:
+#
+# {{source: pop_ref.alpha.alpha_from_sigma}}
 
 # %%
 alpha, skipped = alpha_from_sigma(sigma, opacity)
+print(f"falloff {falloff(sigma):.4f}, alpha {alpha:.4f}")
 assert alpha == opacity * falloff(sigma)
 assert not skipped
 
@@ -116,6 +127,9 @@ for j, i in np.ndindex(HEIGHT, WIDTH):
 k = math.sqrt(2 * math.log(255 * opacity))
 assert round(math.sqrt(2 * math.log(255)), 2) == 3.33 == PAPER.extent_sigmas
 reach = radii_from_covars2d(covar2d[None], np.array([opacity]))[0]
+print(
+    f"the splat ends at {k:.2f} standard deviations, {reach} px from its centre along x and y"
+)
 assert reach.tolist() == [math.ceil(k * math.sqrt(10.0)), math.ceil(k * math.sqrt(4.0))]
 
 assert np.array_equal(alphas > 0, sigmas <= k * k / 2)
@@ -184,10 +198,14 @@ picture(
 )
 
 # %% [markdown]
+# The same splat, to be moved and shaped. What this chapter computed stands beside it.
+#
+# {{widget: splat2d}}
+#
 # ## The colour of the pixel
 #
 # With a single splat, the rendering equation (POP paper, eq. 1) says little more than a painter would: the splat gives
-# its colour with weight $\alpha$, and what is left of the light, $T = 1 - \alpha$, comes from behind.
+# its colour times $\alpha$, and what is left of the light, $T = 1 - \alpha$, comes from behind.
 #
 # $$C = \alpha\, c + (1 - \alpha)\, b$$
 #
@@ -197,6 +215,9 @@ picture(
 # %%
 rows = SplatRows([mean2d.tolist()], [conic], [opacity], [color.tolist()])
 pixel = composite_pixel([0], rows, p[0], p[1], background.tolist())
+print(
+    "colour of the pixel", np.round(pixel.color, 3), " light left", round(pixel.T_final, 3)
+)
 assert np.allclose(pixel.color, alpha * color + (1 - alpha) * background)
 assert np.isclose(pixel.T_final, 1 - alpha)
 
@@ -211,7 +232,7 @@ ax.set(xlabel="x, px", ylabel="y, px")
 picture(fig, "The same splat blended over a warm background, pixel by pixel.")
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: predict
 # A splat has opacity 0.5. How many standard deviations from its centre has its alpha fallen to 0.25? Does the answer
 # depend on the covariance?
 
@@ -224,7 +245,7 @@ for axis in range(2):
     assert np.isclose(alpha_from_sigma(sigma_at(*end), 0.5)[0], 0.25)
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: derive
 # How much paint is in a splat? Integrate $o\, e^{-\sigma}$ over the plane, and compare with the sum of `alphas` above.
 # Why is the sum a little smaller?
 
@@ -236,7 +257,7 @@ assert np.isclose(alphas.sum(), paint * (1 - 1 / (255 * opacity)), rtol=5e-3)
 assert alphas.sum() < paint
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: predict
 # Shrink the splat to a standard deviation of 0.1 px and put it at (8, 8), on the corner between four pixels. What does
 # the image show? (Chapter 2 has the remedy.)
 
@@ -246,3 +267,36 @@ tiny = conics_from_covars2d(0.01 * np.eye(2)[None])[0].tolist()
 nearest = sigma_at_pixel((8.0, 8.0), tiny, 7.5, 7.5)
 assert round(math.sqrt(2 * nearest), 1) == 7.1
 assert alpha_from_sigma(nearest, 1.0)[1]
+
+# %% [markdown]
+# ### Exercise 4: code
+# A viewer wants to draw the ellipse where a splat ends, so it needs the lengths of its half axes in px and the angle of
+# the longer one. Write the function, and check that alpha on its outline is 1/255.
+
+
+# %% answer
+# The half axes are $k$ times the roots of the eigenvalues, along the eigenvectors.
+def outline(covar2d: np.ndarray, opacity: float) -> tuple[float, float, float]:
+    lambdas, directions = np.linalg.eigh(covar2d)
+    k = math.sqrt(2 * math.log(255 * opacity))
+    short, long = k * np.sqrt(lambdas)
+    return long, short, math.degrees(math.atan2(directions[1, 1], directions[0, 1]))
+
+
+long, short, degrees = outline(covar2d, opacity)
+print(f"half axes {long:.2f} and {short:.2f} px, turned by {degrees % 180:.1f} degrees")
+tip = mean2d + long * np.array(
+    [math.cos(math.radians(degrees)), math.sin(math.radians(degrees))]
+)
+assert np.isclose(alpha_from_sigma(sigma_at(*tip), opacity)[0], 1 / 255)
+
+# %% [markdown]
+# ### Exercise 5: find the bug
+# What would a picture look like that is drawn with this function? Which number in it is wrong?
+#
+# {{bug: no_half_in_the_exponent}}
+
+# %% answer
+# The half is missing, so $\sigma$ is twice what it should be, and every splat is smaller by $\sqrt 2$. Training makes
+# up for it with larger scales, so the pictures look right; only the files are wrong for every other program.
+print(caught("no_half_in_the_exponent"))

@@ -1,3 +1,5 @@
+# minutes: 30
+
 # %% [markdown]
 # # 2. From space to screen
 #
@@ -14,7 +16,10 @@
 # $$\Sigma = R S S^\top R^\top, \qquad R = R(q), \quad S = \operatorname{diag}(s)$$
 #
 # This is 3DGS, eq. 6. Whatever numbers are put in, $\Sigma$ is a covariance. The quaternion is divided by its norm
-# first, so its length does not matter, and $q$ and $-q$ are the same rotation.
+# first, so its length does not matter, and $q$ and $-q$ are the same rotation. (What training moves are the logarithms
+# of $s$, chapter 1b.)
+#
+# {{source: pop_ref.covariance.covars_from_quats_scales}}
 
 # %%
 from dataclasses import replace
@@ -34,6 +39,7 @@ from pop_ref.pixel import SplatRows, composite_pixel
 from pop_ref.projection import project_covars, project_means, projection_jacobians
 from pop_ref.records import Camera, Gaussians
 from pop_ref.splatting import geometry, project
+from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, INK, MUTED, SECOND, THIRD, axes
 
@@ -82,14 +88,21 @@ print("depths:", depths.round(2))
 #
 # $$u = \left( \frac{f_x x}{z} + c_x, \; \frac{f_y y}{z} + c_y \right)$$
 #
-# with focal lengths $f$ and the principal point $c$ in px. This division bends straight things: what the pinhole makes
-# of a Gaussian is no Gaussian. EWA splatting, which 3DGS builds on, replaces the division by its linearisation at the
-# centre. A linear map does take Gaussians to Gaussians, and the covariance on the screen is
+# with focal lengths $f$ and the principal point $c$ in px. Straight lines stay straight under this map, but equal steps
+# along them do not stay equal, since near things look larger: the map is not affine. Only affine maps take Gaussians to
+# Gaussians, so what the pinhole makes of a Gaussian is not one. EWA splatting, which 3DGS builds on, replaces the map
+# by its linearisation at the centre, its matrix of first derivatives, the *Jacobian* $J$. Then the covariance on the
+# screen is
 #
 # $$\Sigma^{2D} = J W \Sigma W^\top J^\top, \qquad
 # J = \begin{pmatrix} f_x/z & 0 & -f_x x/z^2 \\ 0 & f_y/z & -f_y y/z^2 \end{pmatrix}$$
 #
-# which is 3DGS, eq. 5, with the Jacobian of EWA, eq. 29. Differences confirm $J$:
+# which is 3DGS, eq. 5, with the Jacobian of EWA, eq. 29. In the oracle, where `tx` is $x$, but for the clamp that comes
+# below:
+#
+# {{source: pop_ref.projection.projection_jacobians}}
+#
+# Differences confirm $J$:
 
 # %%
 J = projection_jacobians(means_cam, K, width, height)
@@ -101,6 +114,7 @@ for axis in range(3):
     assert np.allclose((ahead - behind) / (2 * step), J[:, :, axis], atol=1e-5)
 
 means2d = project_means(means_cam, K, width, height)
+print("J of the first:", J[0].round(2).tolist())
 covars2d = project_covars(covars_cam, J)
 assert np.allclose(covars2d[0], J[0] @ covars_cam[0] @ J[0].T)
 
@@ -174,6 +188,10 @@ assert PAPER.frustum_margin == 2 * 0.15
 assert np.isclose(projection_jacobians(aside, K, width, height)[0, 0, 2], -f * limit)
 
 # %% [markdown]
+# A Gaussian to walk around. Its points go through the true pinhole, its ellipse through $J$.
+#
+# {{widget: orbit}}
+#
 # ## A little blur
 #
 # A pixel looks at one point only. A splat much thinner than a pixel hits a centre or falls between two, and flickers as
@@ -216,7 +234,7 @@ assert soft.max() / soft.min() < 1.02
 #
 # $$\rho = \sqrt{\det \Sigma^{2D} / \det(\Sigma^{2D} + 0.3\, I)}$$
 #
-# (Mip-Splatting, eq. 9), so that the whole amount of paint stays what it was.
+# (the 2D Mip filter of Mip-Splatting), so that the whole amount of paint stays what it was.
 
 # %%
 rho = compensations(needle, PAPER.eps2d)[0]
@@ -250,7 +268,8 @@ picture(
 # ## All of it at once
 #
 # `project` does what this chapter did, for every Gaussian: centre, conic and extent, as chapter 1 used them. It also
-# drops what lies in front of the near plane or does not reach the image.
+# *culls*, that is leaves out, what cannot be seen: a Gaussian whose centre lies behind the camera or nearer to it than
+# the *near plane*, at depth 0.01 (decision D1), and one that does not reach the image (D2).
 
 # %%
 scene = Gaussians(means, quats, scales, np.array([0.9, 0.6]), np.zeros((2, 1, 3)))
@@ -261,6 +280,9 @@ assert np.allclose(splats.means2d, means2d)
 assert np.allclose(splats.conics, conics_from_covars2d(ours))
 assert np.array_equal(splats.radii, radii_from_covars2d(ours, scene.opacities))
 assert np.allclose(splats.depths, depths)
+print(
+    "centres, px:", splats.means2d.round(1).tolist(), " extents, px:", splats.radii.tolist()
+)
 assert splats.visible.all()
 
 
@@ -276,7 +298,7 @@ def alone(mean: list[float], standard_deviations: list[float]) -> Gaussians:
 
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: derive
 # A Gaussian with the same standard deviation $s$ along all axes lies straight ahead at depth $z$. What is its standard
 # deviation on the screen before the blur? Why does it not matter how it is turned?
 
@@ -290,7 +312,7 @@ for each in (ball, turned):
     assert np.allclose(geometry(each, ahead).covars2d[0], (f * 0.2 / 5.0) ** 2 * np.eye(2))
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: derive
 # The same ball moves sideways to $x = z$. Which axis of its ellipse grows, and by what factor? (Use a screen so wide
 # that nothing is clamped.)
 
@@ -304,7 +326,7 @@ assert np.allclose(
 )
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: predict
 # A disc (one scale zero) is seen exactly edge-on. What is its screen covariance, and what does the blur do for it?
 
 # %% answer
@@ -317,3 +339,46 @@ assert np.array_equal(conics_from_covars2d(chain.covars2d)[0], [0.0, 0.0, 0.0])
 assert np.linalg.det(chain.blurred[0]) > 0.0
 assert round(np.sqrt(chain.blurred[0, 1, 1]), 2) == 0.55
 assert project(disc, ahead).visible[0]
+
+# %% [markdown]
+# ### Exercise 4: code
+# Write the whole chapter in ten lines: from a mean, a quaternion, scales and a camera to the centre and the blurred
+# covariance on the screen, without the oracle (leave the clamp out). Compare with `geometry`.
+
+
+# %% answer
+# Rotation of a quaternion, $R S S^\top R^\top$, into the camera, through the pinhole, plus 0.3.
+def to_screen(mean, quat, scale, viewmat, K):
+    w, x, y, z = quat / np.linalg.norm(quat)
+    R = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    M = viewmat[:3, :3] @ R @ np.diag(scale)
+    x, y, z = viewmat[:3, :3] @ mean + viewmat[:3, 3]
+    J = np.array(
+        [[K[0, 0] / z, 0, -K[0, 0] * x / z**2], [0, K[1, 1] / z, -K[1, 1] * y / z**2]]
+    )
+    centre = np.array([K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]])
+    return centre, J @ M @ M.T @ J.T + 0.3 * np.eye(2)
+
+
+for k in range(2):
+    centre, covar = to_screen(means[k], quats[k], scales[k], viewmat, K)
+    print(centre.round(2), covar.round(2).tolist())
+    assert np.allclose(centre, means2d[k])
+    assert np.allclose(covar, ours[k])
+
+# %% [markdown]
+# ### Exercise 5: find the bug
+# The oracle's Jacobian with one mistake. Would you see it in a picture?
+#
+# {{bug: jacobian_sign}}
+
+# %% answer
+# One entry of the last column has the wrong sign. On the axis $x = 0$ nothing changes, and everywhere else ellipses
+# lean the wrong way, the more the farther out they lie. In a photograph of a real scene it is hard to see.
+print(caught("jacobian_sign"))

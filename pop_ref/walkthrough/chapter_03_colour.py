@@ -1,3 +1,5 @@
+# minutes: 25
+
 # %% [markdown]
 # # 3. Colour from harmonics
 #
@@ -15,7 +17,15 @@
 #
 # The $Y_k$ are fixed polynomials of the direction, up to degree 3 here: one of degree 0, three of degree 1, five of
 # degree 2, seven of degree 3. The $h_k$ are the Gaussian's own, three numbers each, one per colour channel. The offset
-# of a half makes a Gaussian without coefficients grey.
+# of a half makes a Gaussian without coefficients grey. Here are all sixteen, for a unit vector $(x, y, z)$:
+#
+# {{source: pop_ref.harmonics._basis_one}}
+#
+# with `_C0` = $\sqrt{1/4\pi} \approx 0.2821$, `_C1` = $\sqrt{3/4\pi} \approx 0.4886$, and so on: constants that make
+# the mean of each square over the sphere the same. Mind the signs of degree 1, $(-y, z, -x)$: programs that leave them
+# out make scenes whose highlights wander to the wrong side in every other program. The colour is then
+#
+# {{source: pop_ref.harmonics.colors_from_sh}}
 
 # %%
 import math
@@ -26,6 +36,7 @@ from pop_ref.harmonics import colors_from_sh, sh_basis
 from pop_ref.optimizer import sh_degree_at
 from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render
+from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import (
     ACCENT,
@@ -45,7 +56,7 @@ assert np.array_equal(grey, [[0.5, 0.5, 0.5]])
 
 # %% [markdown]
 # Here they are. Each globe shows one $Y_k$ as seen from the front; blue is positive, orange negative. The first is
-# constant, the next three split the sphere in halves, and so on to finer and finer patterns.
+# constant, the next three divide the sphere in halves, and so on to finer and finer patterns.
 
 # %%
 side = np.linspace(-1, 1, 64)
@@ -70,6 +81,10 @@ for k in range(16):
 picture(fig, "The sixteen harmonics, one row a degree.")
 
 # %% [markdown]
+# Their sum, with a slider for each coefficient. The middle of the globe is the view direction.
+#
+# {{widget: harmonics}}
+#
 # ## Why these polynomials
 #
 # They are *orthonormal*: over the whole sphere, $\int Y_j Y_k \, d\omega$ is 1 for $j = k$ and 0 otherwise (Ramamoorthi
@@ -89,6 +104,7 @@ sphere = np.stack(
 weights = np.repeat(z_weights, 48) * 2 * np.pi / 48
 
 Y = sh_basis(sphere, 3)
+print("integrals of Y_1 Y_j, j = 0..5:", (Y[:, 1] * weights @ Y[:, :6]).round(12) + 0.0)
 assert np.isclose(weights.sum(), 4 * np.pi)
 assert np.allclose(Y.T @ (weights[:, None] * Y), np.eye(16), atol=1e-12)
 
@@ -208,7 +224,7 @@ for step, degree in ((0, 0), (999, 0), (1000, 1), (2000, 2), (3000, 3), (30_000,
     assert sh_degree_at(step) == degree
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: derive
 # Which $h_0$ makes a Gaussian of degree 0 look orange, $(1, 0.6, 0.1)$, from everywhere?
 
 # %% answer
@@ -219,7 +235,7 @@ seen = colors_from_sh(np.repeat(h_0[None, None], len(sphere), axis=0), sphere, 0
 assert np.allclose(seen, orange)
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: derive
 # With degree 1 only, in which direction $d$ is a channel brightest, given its $h_1, h_2, h_3$? And how much brighter
 # than its mean is it there?
 
@@ -236,10 +252,42 @@ assert np.isclose(brightest, 0.5 + np.linalg.norm(vector))
 assert brightest >= everywhere.max()
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: predict
 # A camera looks at a Gaussian and then from the exact opposite side. Which coefficients make the two colours differ?
 
 # %% answer
 # Those of odd degree: $Y_k(-d) = -Y_k(d)$ for degrees 1 and 3, $Y_k(-d) = Y_k(d)$ for degrees 0 and 2.
 sign = np.array([1] + [-1] * 3 + [1] * 5 + [-1] * 7)
 assert np.allclose(sh_basis(-sphere, 3), sign * Y)
+
+# %% [markdown]
+# ### Exercise 4: code
+# Eight photographs see a Gaussian from eight sides and give its red there: fit the four coefficients of degrees 0 and 1
+# by least squares. Try it on the ball of this chapter, and remember the offset.
+
+# %% answer
+# $Y h = c - \frac12$, one row a photograph, four unknowns: `lstsq` does it. Where a colour was cut off at 0, the fit
+# would be wrong; here none is.
+around = np.array(
+    [
+        [math.sin(2 * math.pi * k / 8), 0.2 * (k % 3), math.cos(2 * math.pi * k / 8)]
+        for k in range(8)
+    ]
+)
+around /= np.linalg.norm(around, axis=1, keepdims=True)
+reds = colors_from_sh(np.repeat(coefficients, 8, axis=0), around, 1)[:, 0]
+fitted, *_ = np.linalg.lstsq(sh_basis(around, 1), reds - 0.5, rcond=None)
+print("fitted", fitted.round(6) + 0.0, " true", coefficients[0, :, 0])
+assert reds.min() > 0.0
+assert np.allclose(fitted, coefficients[0, :, 0])
+
+# %% [markdown]
+# ### Exercise 5: find the bug
+# One sign of the sixteen polynomials is wrong. Which?
+#
+# {{bug: sh_sign}}
+
+# %% answer
+# The first of degree 1 must be $-y$. A scene that is trained and drawn by this program looks right, since it learns
+# coefficients of the other sign; exchanged with any other program it is lit from the wrong side.
+print(caught("sh_sign"))

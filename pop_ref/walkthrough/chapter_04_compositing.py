@@ -1,3 +1,5 @@
+# minutes: 25
+
 # %% [markdown]
 # # 4. Compositing and early ray termination
 #
@@ -12,7 +14,10 @@
 #
 # $$C = \sum_{i=1}^{m} T_i\, \alpha_i\, c_i + T_{m+1}\, b, \qquad T_1 = 1, \quad T_{i+1} = T_i (1 - \alpha_i)$$
 #
-# This is POP paper, eq. 1, with a background $b$ behind it. Written as a loop it is five lines:
+# This is POP paper, eq. 1, with a background $b$ behind it. Written as a loop it is five lines. The oracle's loop does
+# the same, and also keeps what the backward pass will need, skips what is under the floor, and stops (below):
+#
+# {{source: pop_ref.pixel.composite_pixel}}
 
 # %%
 import math
@@ -24,6 +29,7 @@ from pop_ref.constants import PAPER
 from pop_ref.pixel import SplatRows, composite_pixel, stops
 from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render
+from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, INK, SECOND, THIRD, axes, show_image
 
@@ -48,6 +54,9 @@ rng = np.random.default_rng(4)
 alphas, colors = rng.uniform(0.05, 0.7, 6), rng.uniform(0, 1, (6, 3))
 background = np.array([1.0, 1.0, 0.9])
 pixel = composite_pixel(range(6), stack(alphas, colors), 0.5, 0.5, background.tolist())
+print("alphas       ", alphas.round(2))
+print("transmittance", np.round(pixel.transmittances, 2))
+print("weights      ", np.round(pixel.weights, 2), " left:", round(pixel.T_final, 2))
 assert np.allclose(pixel.color, blend(alphas, colors, background))
 
 # %% [markdown]
@@ -68,8 +77,8 @@ assert np.allclose(pixel.weights, -np.diff([*pixel.transmittances, pixel.T_final
 # %% [markdown]
 # The order decides. The same six splats from back to front give another pixel (exercise 1 says how much a swap of two
 # neighbours costs). A renderer therefore sorts splats by depth before it blends. It need not go from front to back,
-# though: a painter's rule, $B_i = \alpha_i c_i + (1 - \alpha_i) B_{i+1}$ from the background forward, gives the same.
-# But only the walk from the front knows when to stop.
+# though: a painter's rule, $b_{i-1} = \alpha_i c_i + (1 - \alpha_i)\, b_i$ from the background $b_m = b$ forward, gives
+# the same. But only the walk from the front knows when to stop.
 
 # %%
 assert not np.allclose(
@@ -135,20 +144,26 @@ picture(
 )
 
 # %% [markdown]
-# One detail is worth knowing, because every implementation shares it. The splat that would cross the line is *not
-# blended*: the pixel ends in front of it. If that splat is nearly opaque, it takes a good share of the light into
-# oblivion. Put one splat of alpha 0.91 before a wall of alpha 0.999. It leaves $T = 0.09$, the wall would leave $9
-# \cdot 10^{-5}$, so the wall is skipped, and nine percent of the pixel shows the background instead.
+# One detail is worth knowing. In the rasterizers of 3DGS and gsplat, and so in POP, the splat that would cross the line
+# is *not blended*: the pixel ends in front of it. (Faster-GS and LiteGS do blend it before they stop.) If that splat is
+# nearly opaque, a good share of the light is lost. Put one splat of alpha 0.91 before a wall of alpha 0.999. It leaves
+# $T = 0.09$, the wall would leave $9 \cdot 10^{-5}$, so the wall is skipped, and nine percent of the pixel shows the
+# background instead.
 
 # %%
 veil_and_wall = stack(np.array([0.91, 0.999]), np.array([[0.2, 0.2, 0.2], [0.0, 0.5, 1.0]]))
 odd = composite_pixel([0, 1], veil_and_wall, 0.5, 0.5, background.tolist())
+print(f"looked at {odd.n_traversed}, blended {odd.ids}, light left {odd.T_final:.2f}")
 assert odd.ids == [0]
 assert odd.n_traversed == 2
 assert np.isclose(odd.T_final, 0.09)
 assert np.allclose(odd.color, 0.91 * np.array([0.2, 0.2, 0.2]) + 0.09 * background)
 
 # %% [markdown]
+# One pixel, to be rearranged. Its last column is the subject of chapter 5.
+#
+# {{widget: stack}}
+#
 # ## A whole image
 #
 # `render` does for every pixel what we did for one: project, list the splats by depth, blend, stop. Here is a box full
@@ -210,7 +225,7 @@ picture(
 # would end soon behind the first surface. Chapters 7 and 8 do that.
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: derive
 # Two neighbours with alphas $\alpha_1, \alpha_2$ and colours $c_1, c_2$ lie behind a transmittance $T$. By how much
 # does the pixel change when they swap places?
 
@@ -223,7 +238,7 @@ T = pixel.transmittances[2]
 assert np.allclose(change, T * alphas[2] * alphas[3] * (colors[3] - colors[2]))
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: predict
 # A pixel looks into an endless row of splats of alpha 0.2. How many does it visit, by formula and by loop?
 
 # %% answer
@@ -231,7 +246,7 @@ assert np.allclose(change, T * alphas[2] * alphas[3] * (colors[3] - colors[2]))
 assert math.ceil(math.log(1e-4) / math.log(0.8)) == 42 == visited(0.2)
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: derive
 # What is the largest share of light that the stop can throw away, given the ceiling of 0.999? And if the ceiling is
 # 0.99, as in gsplat 1.6?
 
@@ -246,3 +261,34 @@ for ceiling, most in ((0.999, 0.1), (0.99, 0.01)):
         ended = composite_pixel(range(3), three, 0.5, 0.5, [0.0] * 3, profile)
         lost.append(ended.T_final if len(ended.ids) == 2 else 0.0)
     assert 0.9 * most < max(lost) <= most
+
+# %% [markdown]
+# ### Exercise 4: code
+# Blend a list in two halves, each by itself over black, and put the halves together. Which numbers of each half do you
+# need? (This is how a long list is shared among workers.)
+
+
+# %% answer
+# Colour and transmittance of each: $C = C_1 + T_1 C_2$ and $T = T_1 T_2$. Blending is associative, like the product of
+# matrices, though not commutative. Only the stop spoils it, since the second half does not know what the first has
+# left.
+def part(ids: range) -> tuple[np.ndarray, float]:
+    half = composite_pixel(ids, stack(alphas, colors), 0.5, 0.5, [0.0] * 3)
+    return np.array(half.color), half.T_final
+
+
+(first, T_1), (second, T_2) = part(range(3)), part(range(3, 6))
+print((first + T_1 * second + T_1 * T_2 * background).round(6), np.round(pixel.color, 6))
+assert np.allclose(first + T_1 * second + T_1 * T_2 * background, pixel.color)
+
+# %% [markdown]
+# ### Exercise 5: find the bug
+# Compare this loop with the oracle's. For which pixels does it give another colour?
+#
+# {{bug: terminating_splat_blended}}
+
+# %% answer
+# The test for the stop comes after the blending, so the splat that crosses the line is blended before the pixel ends.
+# Every pixel that stops gets a little more light, at most $10^{-4}$ over; with a nearly opaque last splat it is much
+# more, as for the wall above. Two programs do it on purpose; a program that is compared with gsplat must not.
+print(caught("terminating_splat_blended"))

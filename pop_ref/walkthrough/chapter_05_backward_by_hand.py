@@ -1,29 +1,30 @@
+# minutes: 40
+
 # %% [markdown]
 # # 5. The backward pass, by hand
 #
-# Training needs the derivative of the image by every number of every Gaussian. At the end of this chapter you can
-# derive it for a pixel on paper, you know the one scalar that walks from back to front and carries all of it, and you
-# have two ways to convince yourself that a hand-written gradient is right.
+# Training needs the derivative of the loss with respect to every number of every Gaussian. At the end of this chapter
+# you can derive it for a pixel on paper, you know the one scalar that walks from back to front and carries all of it,
+# and you have two ways to convince yourself that a hand-written gradient is right.
 
 # %% [markdown]
 # ## One pixel, three splats
 #
 # A pixel is $C = \sum_i T_i \alpha_i c_i + T_{\mathrm{final}}\, b$ with $T_1 = 1$ and $T_{i+1} = T_i (1 - \alpha_i)$
 # (POP paper, eq. 1, with a background $b$). What happens if one $\alpha_i$ grows a little? Splat $i$ shows more of its
-# own colour, and everything behind it is dimmed. Call $B_i$ the light that arrives at the back of splat $i$. Then
+# own colour, and everything behind it is dimmed. Call $b_i$ the light that arrives at the back of splat $i$. Then
 #
-# $$\frac{\partial C}{\partial \alpha_i} = T_i \,(c_i - B_i), \qquad B_{i-1} = \alpha_i c_i + (1 - \alpha_i) B_i,
-# \qquad B_m = b .$$
+# $$\frac{\partial C}{\partial \alpha_i} = T_i \,(c_i - b_i), \qquad b_{i-1} = \alpha_i c_i + (1 - \alpha_i) b_i,
+# \qquad b_m = b .$$
 #
 # The recurrence is eq. 1 read from back to front. Take three grey splats of alpha 1/2 and colours 1/2, 1/4 and 1 over
-# black. On paper: $T = (1, 1/2, 1/4)$; from the back $B_3 = 0$, $B_2 = 1/2$, $B_1 = 3/8$; so the derivatives are $1/8$,
+# black. On paper: $T = (1, 1/2, 1/4)$; from the back $b_3 = 0$, $b_2 = 1/2$, $b_1 = 3/8$; so the derivatives are $1/8$,
 # $-1/8$ and $1/4$. The middle splat is darker than what it covers: the pixel would be brighter without it.
 
 # %%
 from dataclasses import replace
 
 import numpy as np
-from matplotlib.colors import LinearSegmentedColormap
 
 from pop_ref.alpha import (
     alpha_from_sigma,
@@ -35,8 +36,17 @@ from pop_ref.compositing import composite_pixel, composite_pixel_vjp, composite_
 from pop_ref.pixel import SplatRows, rows_from_splats, zero_gradients
 from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render, render_vjp
+from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
-from pop_ref.walkthrough.style import ACCENT, INK, MUTED, SECOND, axes, show_image
+from pop_ref.walkthrough.style import (
+    ACCENT,
+    DIVERGING,
+    INK,
+    MUTED,
+    SECOND,
+    axes,
+    show_image,
+)
 
 
 def stack(alphas, greys):
@@ -48,7 +58,7 @@ def stack(alphas, greys):
 
 
 def v_alphas_of(rows, background):
-    """Differentiate the grey pixel by each alpha, with the oracle's transpose."""
+    """Differentiate the grey pixel with respect to each alpha, with the oracle's transpose."""
     n = len(rows.opacities)
     pixel = composite_pixel(range(n), rows, 0.5, 0.5, [background])
     totals = zero_gradients(n, 1)
@@ -61,14 +71,17 @@ assert composite_pixel([0, 1, 2], three, 0.5, 0.5, [0.0]).color == [7 / 16]
 assert v_alphas_of(three, 0.0).tolist() == [1 / 8, -1 / 8, 1 / 4]
 
 # %% [markdown]
-# Colour changes little. Let $g = \partial L / \partial C$ be what the loss wants of the pixel. Only what a splat is
-# *worth* to the loss counts, $q_i = c_i \cdot g$, and with $B_i$ now the worth of the light behind,
+# With three channels little changes. Let $g = \partial L / \partial C$ be the gradient of a loss $L$ with respect to
+# the pixel. Only the product of a colour with $g$ counts, $q_i = c_i \cdot g$, and with $b_i$ now the same product of
+# the light behind,
 #
-# $$\frac{\partial L}{\partial \alpha_i} = T_i\,(q_i - B_i),
+# $$\frac{\partial L}{\partial \alpha_i} = T_i\,(q_i - b_i),
 # \qquad \frac{\partial L}{\partial c_i} = T_i \alpha_i\, g .$$
 #
 # So one scalar, walked from back to front, is all that the backward pass of a pixel carries, however many channels it
-# has.
+# has. In the oracle it is called `behind`, and $q_i$ is `worth`; the last lines belong to the next section:
+#
+# {{source: pop_ref.pixel.composite_pixel_vjp}}
 
 # %%
 rng = np.random.default_rng(5)
@@ -78,18 +91,22 @@ pixel = composite_pixel(range(n), ray, 0.5, 0.5, [0.3])
 T, alphas, q = np.array(pixel.transmittances), np.array(pixel.alphas), np.ravel(ray.colors)
 
 # the walk
-B = np.full(n, 0.3)
+b = np.full(n, 0.3)
 for i in reversed(range(1, n)):
-    B[i - 1] = alphas[i] * q[i] + (1.0 - alphas[i]) * B[i]
-v_alphas = T * (q - B)
+    b[i - 1] = alphas[i] * q[i] + (1.0 - alphas[i]) * b[i]
+v_alphas = T * (q - b)
+print("light behind", b.round(3))
+print("derivatives ", v_alphas.round(3))
 np.testing.assert_allclose(v_alphas, v_alphas_of(ray, 0.3), rtol=1e-12)
-# a splat gains by growing exactly where it is worth more than what it covers
-assert np.array_equal(v_alphas > 0.0, q > B)
+# the pixel grows with a splat's alpha exactly where the splat is brighter than what it covers
+assert np.array_equal(v_alphas > 0.0, q > b)
 
 fig, (left, right) = axes(2, height=3.0)
 where = np.arange(1, n + 1)
-left.bar(where, q, color=[str(grey) for grey in q], edgecolor=MUTED, label=r"worth $q_i$")
-left.plot(where, B, color=SECOND, marker="o", ms=4, label=r"light behind $B_i$")
+left.bar(
+    where, q, color=[str(grey) for grey in q], edgecolor=MUTED, label=r"the splat, $q_i$"
+)
+left.plot(where, b, color=SECOND, marker="o", ms=4, label=r"light behind $b_i$")
 left.set(xlabel="splat, front to back", ylabel="grey", xticks=where, ylim=(0.0, 1.3))
 left.legend(loc="upper right", ncols=2)
 right.bar(where, v_alphas, color=[ACCENT if v > 0.0 else SECOND for v in v_alphas])
@@ -100,13 +117,14 @@ right.set(
 right.legend()
 picture(
     fig,
-    "One ray. A splat that outshines the light behind it gains by growing; depth only scales.",
+    "One ray. Where a splat is brighter than the light behind it, more of it makes the pixel brighter (blue), and "
+    "darker otherwise (orange); the transmittance in front of it only scales this.",
 )
 
 # %% [markdown]
-# CUDA codes write the derivative with the sum over what lies behind,
+# CUDA programs write the derivative with the sum over what lies behind,
 # $S_i = \sum_{j>i} T_j \alpha_j c_j + T_{\mathrm{final}}\, b$, as $T_i c_i - S_i / (1 - \alpha_i)$. It is the same
-# number, because $S_i = T_i (1 - \alpha_i) B_i$, but it divides by what an opaque splat makes zero. The walk never
+# number, because $S_i = T_i (1 - \alpha_i) b_i$, but it divides by what an opaque splat makes zero. The walk never
 # divides.
 
 # %%
@@ -114,14 +132,14 @@ S = np.array([np.sum((T * alphas * q)[i + 1 :]) for i in range(n)]) + pixel.T_fi
 np.testing.assert_allclose(T * q - S / (1.0 - alphas), v_alphas, rtol=1e-12)
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: derive
 #
-# A fourth splat with alpha 1/2 and colour $c$ is put *behind* the first three. (a) What is its own derivative? (b) For
-# which $c$ does the first splat's derivative vanish?
+# A fourth splat with alpha 1/2 and colour $c$ is put *behind* the first three. (a) What is the derivative with respect
+# to its alpha? (b) For which $c$ does that with respect to the first splat's alpha vanish?
 
 # %% answer
-# (a) Nothing lies behind it, so it is $T_4 c = c/8$. (b) $B_1$ must be $c_1 = 1/2$. From the back, $B_3 = c/2$,
-# $B_2 = 1/2 + c/4$ and $B_1 = 1/8 + 1/4 + c/8$, which is $1/2$ at $c = 1$.
+# (a) Nothing lies behind it, so it is $T_4 c = c/8$. (b) $b_1$ must be $c_1 = 1/2$. From the back, $b_3 = c/2$,
+# $b_2 = 1/2 + c/4$ and $b_1 = 1/8 + 1/4 + c/8$, which is $1/2$ at $c = 1$.
 four = v_alphas_of(stack([0.5] * 4, [0.5, 0.25, 1.0, 1.0]), 0.0)
 assert (four[3], four[0]) == (1 / 8, 0.0)
 
@@ -137,8 +155,12 @@ assert (four[3], four[0]) == (1 / 8, 0.0)
 # \quad \frac{\partial L}{\partial Q} = \frac{\partial L}{\partial \sigma} \tfrac12 d d^\top .$$
 #
 # What POP says about leakage (eq. 10) is already here: the gradient of the centre has $\alpha$, and so $o$, as a
-# factor. Two decisions cut the chain: a splat under the floor 1/255 is skipped, and one at the ceiling 0.999 passes
-# nothing, because the clamped alpha does not move.
+# factor. Two decisions cut the chain: a splat under the floor 1/255 is skipped (D5), and one at the ceiling 0.999
+# passes nothing, because the clamped alpha does not move (kink B3).
+#
+# {{source: pop_ref.alpha.alpha_from_sigma_vjp}}
+#
+# {{source: pop_ref.alpha.sigma_at_pixel_vjp}}
 
 # %%
 mean2d, conic = (2.0, 1.0), (1.0, 0.5, 2.0)
@@ -164,18 +186,18 @@ for sigma in (0.0, 10.0):
 #
 # Put the halves together. For one splat at one pixel let
 #
-# $$G = T \alpha\, (q - B),$$
+# $$\Gamma = T \alpha\, (q - b) = \alpha \frac{\partial L}{\partial \alpha},$$
 #
-# the weight that the forward pass had, times how much more the splat is worth than what it hides. Then
-# $\partial L / \partial \sigma = -G$, and every gradient of the splat's shape and opacity is linear in six sums over
-# its pixels, the moments of $G$ up to degree two:
+# the weight that the forward pass had, times the difference between the splat and what it hides. Then
+# $\partial L / \partial \sigma = -\Gamma$, and every gradient of the splat's shape and opacity is linear in six sums
+# over its pixels, of $\Gamma$ times 1, $d_x$, $d_y$, $d_x^2$, $d_x d_y$ and $d_y^2$:
 #
-# $$\frac{\partial L}{\partial o} = \frac1o \sum G, \quad \frac{\partial L}{\partial \mu} = -Q \sum G\, d,
-# \quad \frac{\partial L}{\partial Q} = -\tfrac12 \sum G\, d d^\top .$$
+# $$\frac{\partial L}{\partial o} = \frac1o \sum \Gamma, \quad \frac{\partial L}{\partial \mu} = -Q \sum \Gamma\, d,
+# \quad \frac{\partial L}{\partial Q} = -\tfrac12 \sum \Gamma\, d d^\top .$$
 #
-# Read the middle one as mechanics: where $G$ is negative, more of this splat would lower the loss, and gradient descent
-# pulls its centre there; where $G$ is positive it pushes the centre away. Here the sums are collected in the open and
-# compared with the oracle's gradients.
+# Read the middle one as forces: where $\Gamma$ is negative, more of this splat would lower the loss, and gradient
+# descent pulls its centre there; where $\Gamma$ is positive it pushes the centre away. Here the sums are collected one
+# by one and compared with the oracle's gradients.
 
 # %%
 rng = np.random.default_rng(2)
@@ -196,40 +218,44 @@ splats, (everyone,) = view.splats, view.tile_lists
 g = view.image - 0.5
 
 rows = rows_from_splats(splats)
-G, moments = np.zeros((n, size, size)), np.zeros((n, 6))
+gain, sums = np.zeros((n, size, size)), np.zeros((n, 6))
 for y, x in np.ndindex(size, size):
     pixel = composite_pixel(everyone, rows, x + 0.5, y + 0.5, [0.0, 0.0, 0.0])
     behind = 0.0
     blended = list(zip(pixel.ids, pixel.alphas, pixel.weights, strict=True))
     for i, alpha, weight in reversed(blended):
         more = splats.colors[i] @ g[y, x] - behind
-        G[i, y, x] = weight * more
+        gain[i, y, x] = weight * more
         behind += alpha * more
         dx, dy = splats.means2d[i] - (x + 0.5, y + 0.5)
-        moments[i] += G[i, y, x] * np.array([1.0, dx, dy, dx * dx, dx * dy, dy * dy])
+        sums[i] += gain[i, y, x] * np.array([1.0, dx, dy, dx * dx, dx * dy, dy * dy])
 
 exact = composite_vjp(splats, view.tile_lists, size, size, 32, g)
 A, B, C = splats.conics.T
-_, gx, gy, *_ = moments.T
-np.testing.assert_allclose(moments[:, 0] / splats.opacities, exact.v_opacities, rtol=1e-9)
+_, gx, gy, *_ = sums.T
+np.testing.assert_allclose(sums[:, 0] / splats.opacities, exact.v_opacities, rtol=1e-9)
 np.testing.assert_allclose(
     -np.array([A * gx + B * gy, B * gx + C * gy]).T, exact.v_means2d, rtol=1e-9
 )
-np.testing.assert_allclose(-moments[:, 3:] * [0.5, 1.0, 0.5], exact.v_conics, rtol=1e-9)
+np.testing.assert_allclose(-sums[:, 3:] * [0.5, 1.0, 0.5], exact.v_conics, rtol=1e-9)
 
 # %%
 pushed = int(np.argmax(np.linalg.norm(exact.v_means2d, axis=1)))
-two_signs = LinearSegmentedColormap.from_list("two signs", [SECOND, "white", ACCENT])
 centre, downhill = splats.means2d[pushed], -exact.v_means2d[pushed]
 tip = centre + 6.0 * downhill / np.linalg.norm(downhill)
-span = np.max(np.abs(G[pushed]))
+span = np.max(np.abs(gain[pushed]))
 fig, (left, right) = axes(2)
 show_image(left, view.image, "render")
 shown = show_image(
-    right, G[pushed], "$G$ of the splat at the cross", cmap=two_signs, vmin=-span, vmax=span
+    right,
+    gain[pushed],
+    r"$\Gamma$ of the splat at the cross",
+    cmap=DIVERGING,
+    vmin=-span,
+    vmax=span,
 )
 fig.colorbar(shown, ax=right, shrink=0.8)
-for ax, colour in ((left, "white"), (right, "#1d1c1a")):
+for ax, colour in ((left, "white"), (right, INK)):
     ax.plot(*centre, "+", color=colour)
     ax.annotate(
         "", tip, centre, arrowprops={"arrowstyle": "->", "color": colour, "lw": 1.5}
@@ -237,17 +263,17 @@ for ax, colour in ((left, "white"), (right, "#1d1c1a")):
     ax.set(xlabel="x, px", ylabel="y, px")
 picture(
     fig,
-    "The arrow is the way downhill for the splat's centre: the sum of $G d$ over its pixels, through $Q$.",
+    r"The arrow is the way downhill for the splat\'s centre: the sum of $\Gamma d$ over its pixels, times $Q$.",
 )
 
 # %% [markdown]
 # ## Is it right? Differences
 #
 # The oldest check: move one parameter by $\pm h$ and divide. Below, the loss is $\langle V, \mathrm{image} \rangle$
-# with a random $V$, which the oracle's `render_vjp` differentiates by all parameters at once. The error of a central
-# difference falls as $h^2$ until rounding, which grows as $1/h$, takes over; with a wrong gradient it would stop
-# falling at the size of the mistake. Derivatives hold decisions fixed (who is skipped, where a pixel stops, who is in
-# front), so the scene is one where none of them flips on the way.
+# with a random $V$; the oracle's `render_vjp` gives its gradient with respect to all parameters at once. The error of a
+# central difference falls as $h^2$ until rounding, which grows as $1/h$, takes over; with a wrong gradient it would
+# stop falling at the size of the mistake. Derivatives hold decisions fixed (which splat is skipped, where a pixel
+# stops, which is in front), so the scene is one where none of them flips on the way.
 
 # %%
 rng = np.random.default_rng(11)
@@ -291,6 +317,10 @@ by_difference = np.array([[difference(unit, h) for unit in np.eye(56)] for h in 
 errors = np.linalg.norm(by_difference - by_hand, axis=1) / np.linalg.norm(by_hand)
 # a hundredfold for each tenfold, until rounding
 np.testing.assert_allclose(errors[-2:] / errors[-3:-1], 100.0, rtol=0.1)
+print(
+    "relative difference:",
+    " ".join(f"h={h:.0e}: {e:.0e}" for h, e in zip(steps, errors, strict=True)),
+)
 assert errors.min() < 1e-9 < 1e-8 < errors[0]
 
 fig, ax = axes(1, width=4.6, height=2.8)
@@ -324,6 +354,7 @@ picture(
 u = rng.normal(size=56)
 scale = np.linalg.norm(by_hand) * np.linalg.norm(u)
 forward = difference(u, 1e-5)
+print(f"<v, J u> = {forward:.9f}   <J^T v, u> = {by_hand @ u:.9f}")
 assert abs(forward - by_hand @ u) < 1e-7 * scale
 
 # the test has teeth: two entries that are swapped are seen
@@ -332,11 +363,11 @@ swapped[[7, 8]] = swapped[[8, 7]]
 assert abs(forward - swapped @ u) > 1e-4 * scale
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: code
 #
-# `render_vjp` also returns `means2d`, the gradient by the projected centres, which density control reads (eq. 3). Move
-# the principal point of `K`: all splats shift together on the screen. Check that the loss changes by the sum of those
-# gradients.
+# `render_vjp` also returns `means2d`, the gradient with respect to the projected centres, which density control reads
+# (eq. 3). Move the principal point of `K`: all splats shift together on the screen. Check that the loss changes by the
+# sum of those gradients.
 
 
 # %% answer
@@ -349,7 +380,7 @@ v_shift = render_vjp(few, small, V).means2d.sum(axis=0) @ (0.6, -0.8)
 assert np.isclose((moved_by(1e-5) - moved_by(-1e-5)) / 2e-5, v_shift, rtol=1e-6)
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: predict
 #
 # The image jumps where a decision flips. A white splat of opacity 1 stands alone over black. By how much does a pixel
 # jump where its alpha crosses the floor, and what does the gradient say on either side?
@@ -360,3 +391,14 @@ edge = np.log(255.0)
 assert [alpha_from_sigma(edge + e, 1.0)[1] for e in (-1e-9, 1e-9)] == [False, True]
 assert np.isclose(alpha_from_sigma_vjp(edge - 1e-9, 1.0, 1.0)[0], -1.0 / 255.0)
 assert alpha_from_sigma_vjp(edge + 1e-9, 1.0, 1.0) == (0.0, 0.0)
+
+# %% [markdown]
+# ### Exercise 4: find the bug
+# The walk from back to front with one mistake. In which pictures does it make no difference?
+#
+# {{bug: background_behind_forgotten}}
+
+# %% answer
+# The light behind the last splat starts at 0 instead of the background's. Over black, and wherever the light is used up
+# before the background, nothing changes; over white every gradient of alpha is wrong.
+print(caught("background_behind_forgotten"))

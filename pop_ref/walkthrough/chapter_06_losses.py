@@ -1,20 +1,27 @@
+# minutes: 35
+
 # %% [markdown]
 # # 6. What a loss pulls with: L1, L2, SSIM
 #
-# A loss reaches the Gaussians only through its derivative by the image. At the end of this chapter you know what that
-# derivative looks like for the three losses of the method, why POP trades L1 for L2, and what the trade costs.
+# A loss reaches the Gaussians only through its derivative with respect to the image. At the end of this chapter you
+# know what that derivative looks like for the three losses of the method, why POP trades L1 for L2, and what the trade
+# costs.
 
 # %% [markdown]
 # ## One pixel
 #
 # L1 averages $|\Delta|$ and L2 averages $\Delta^2$ over the $3HW$ numbers of an image, where
-# $\Delta = c - c^{\mathrm{GT}}$. By one of those numbers (POP paper, eq. 4)
+# $\Delta = c - c^{\mathrm{GT}}$ and GT is the photograph (the *ground truth*). The derivatives with respect to one of
+# those numbers are (POP paper, eq. 4)
 #
 # $$\frac{\partial L_1}{\partial c} = \frac{\mathrm{sign}(\Delta)}{3HW},
 # \qquad \frac{\partial L_2}{\partial c} = \frac{2 \Delta}{3HW} .$$
 #
-# L1 pulls equally hard at every error, L2 in proportion. In units of $1/(3HW)$ L1 pulls with 1; L2 with 2/255 at an
-# error of one step of a byte, with 2 at the largest error there is, and with 1 at an error of 1/2.
+# {{source: pop_ref.losses.l2_vjp}}
+#
+# (A mask, where one is given, leaves pixels out.) L1 pulls equally hard at every error, L2 in proportion. In units of
+# $1/(3HW)$ L1 pulls with 1; L2 with 2/255 at an error of one step of a byte, with 2 at the largest error there is, and
+# with 1 at an error of 1/2.
 
 # %%
 from dataclasses import replace
@@ -28,6 +35,7 @@ from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render, render_vjp
 from pop_ref.ssim import C1, C2
 from pop_ref.training import gaussians_from_params, params_vjp
+from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, SECOND, THIRD, axes, show_image
 
@@ -44,8 +52,8 @@ assert np.array_equal(pull_l2[1:] > pull_l1[1:], errors[1:] > 0.5)
 # ## Against a prior
 #
 # POP's argument is about what happens when something else pushes. Take one white splat over black at one pixel, so that
-# the colour *is* its opacity $o$, a photograph of grey 0.2, and a prior $\lambda (1 - o)$ that wants the splat opaque
-# (the first term of eq. 8). Where does it come to rest?
+# the colour *is* its opacity $o$, a photograph of grey 0.2, and a *prior* $\lambda (1 - o)$, a term of the loss that
+# does not look at the photograph and wants the splat opaque (the first term of eq. 8). Where does it come to rest?
 #
 # Under L1 it is all or nothing: below $\lambda = 1$ the prior does not move it at all, above it wins outright. Under L2
 # the splat gives way by $\lambda / 2$ and is fully lost only at $\lambda = 1.6$: the more wrong, the stronger the pull
@@ -98,7 +106,7 @@ picture(fig, "Left: eq. 4. Right: L1 holds or breaks, L2 bends.")
 # L2 brings is not more force but force that knows how wrong a pixel is.
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: predict
 #
 # A splat of one flat colour covers 100 pixels. In 90 of them the photograph is 0.2, in 10 it is 1 (a lamp). Which
 # colour minimises L1, and which L2?
@@ -115,8 +123,8 @@ for loss, best in ((l1, 0.2), (l2, 0.28)):
 # %% [markdown]
 # ## SSIM looks at windows
 #
-# SSIM compares means, variances and the covariance under a Gaussian window of 11 x 11 px (Wang et al. 2004, eq. 13; the
-# D-SSIM of eqs. 2 and 9 is $1 - \mathrm{SSIM}$ in the code that everyone runs):
+# *SSIM*, the structural similarity, compares means, variances and the covariance under a Gaussian window of 11 x 11 px
+# (Wang et al. 2004, eq. 13; the D-SSIM of eqs. 2 and 9 is $1 - \mathrm{SSIM}$ in the code that everyone runs):
 #
 # $$S = \frac{(2 \mu_x \mu_y + C_1)(2 \sigma_{xy} + C_2)}{(\mu_x^2 + \mu_y^2 + C_1)(\sigma_x^2 + \sigma_y^2 + C_2)} .$$
 #
@@ -127,12 +135,13 @@ for loss, best in ((l1, 0.2), (l2, 0.28)):
 # %%
 flat = np.ones((11, 11, 1))
 dark, light = d_ssim(0.2 * flat, 0.1 * flat), d_ssim(0.9 * flat, 0.8 * flat)
+print(f"an error of 0.1: D-SSIM {dark:.3f} in the dark, {light:.4f} in the light")
 assert np.isclose(dark, 1.0 - (2 * 0.2 * 0.1 + C1) / (0.2**2 + 0.1**2 + C1))
 assert 25.0 < dark / light < 35.0
 assert np.isclose(l2(0.2 * flat, 0.1 * flat), l2(0.9 * flat, 0.8 * flat))
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: derive
 #
 # The render has the photograph's brightness exactly but is flat, while the photograph has a texture of standard
 # deviation $s$. What is S for $s = 0.03$ and for $s = 0.3$? What does that say about blur?
@@ -153,7 +162,7 @@ for s, similarity in ((0.03, 1 / 2), (0.3, 1 / 101)):
 # under 0.15 (in the paper's figure 2 a third of a trained scene is under 0.1). The photograph is that scene; the render
 # is the same scene with all opacities set to 1.
 
-# %%
+# %% setup
 SIZE = 32
 C0 = 0.28209479177387814
 
@@ -193,6 +202,7 @@ def together(a, b):
     return Gaussians(*(np.concatenate([vars(a)[name], vars(b)[name]]) for name in vars(a)))
 
 
+# %%
 rng = np.random.default_rng(6)
 x, y = rng.uniform(-1.5, 1.5, (2, 40))
 z, scales, faint = rng.uniform((3.0, 0.08, 0.03), (3.8, 0.2, 0.15), (40, 3)).T
@@ -229,6 +239,7 @@ np.testing.assert_allclose(pulls["L2"], 2.0 * error / (3 * SIZE * SIZE))
 inner = np.s_[10:-10, 10:-10]
 of_error, of_ssim = np.abs(error[inner]).ravel(), np.abs(pulls["D-SSIM"][inner]).ravel()
 correlation = np.corrcoef(of_error, of_ssim)[0, 1]
+print(f"correlation of the size of SSIM's gradient with the error: {correlation:.2f}")
 assert 0.4 < correlation < 0.6
 
 # %% [markdown]
@@ -242,7 +253,7 @@ assert 0.4 < correlation < 0.6
 #
 # and with learning rates five times the usual, so that 40 steps show something.
 
-# %%
+# %% setup
 camera, target = camera_of(20), render(wall(15), camera_of(20)).image
 rng = np.random.default_rng(7)
 x, y = rng.uniform(-1.5, 1.5, (2, 50))
@@ -269,8 +280,9 @@ def pulls_at(params, factor=1.0):
     return terms, render_vjp(gaussians, camera, v_image)
 
 
+# %%
 rates = {name: 5.0 * rate for name, rate in learning_rates(0, 4.0).items()}
-# round Gaussians have no gradient by rotation but rounding's, which Adam would follow
+# the rotation of a round Gaussian has no gradient but rounding errors, which Adam would follow
 rates["quats"] = 0.0
 zero = {name: np.zeros_like(value) for name, value in params.items()}
 moments = zero, zero
@@ -282,6 +294,9 @@ for step in range(1, 41):
     params, *moments = adam_step(params, grads, *moments, step, rates)
 
 size_l1, size_l2, size_ssim = np.array(logged).T
+print("mean |gradient| at steps 1, 20, 40, in 1 / (3HW)")
+for name, size in (("L1", size_l1), ("L2", size_l2), ("0.01 D-SSIM", size_ssim)):
+    print(f"{name:12}", size[[0, 19, 39]].round(3))
 fig, ax = axes(1, width=4.8, height=3.0)
 ax.semilogy(size_l1, color=SECOND, label="L1")
 ax.semilogy(size_l2, color=ACCENT, label="L2")
@@ -310,7 +325,7 @@ assert np.all(size_l2[20:] < 3.0 * size_ssim[20:])
 assert np.all(20.0 * size_ssim[20:] > 5.0 * size_l2[20:])
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: predict
 #
 # Is L2 just a smaller L1? The paper divides L1 by $n$ to see. What changes if the whole loss is divided by 10: Adam's
 # steps, the growth of eq. 3, the balance against a prior of fixed weight?
@@ -327,3 +342,36 @@ for name in params:
     assert np.allclose(one[name], other[name], rtol=1e-6, atol=1e-9)
 assert np.allclose(tenth.means2d, 0.1 * whole.means2d, rtol=1e-9, atol=1e-15)
 assert (rest_error(l1, 0.5), rest_error(lambda *both: 0.1 * l1(*both), 0.5)) == (0.0, 0.8)
+
+# %% [markdown]
+# ### Exercise 4: code
+# The quality of a held-out view is told as *PSNR*, $-10 \log_{10} L_2$ in decibels (dB). Write it. What does the same
+# error of a tenth give everywhere, and what does halving every error gain? What happens if only one pixel in a hundred
+# is wrong, by 1?
+
+
+# %% answer
+# 20 dB; 6.02 dB, whatever the errors are; and 20 dB again: PSNR does not tell a slight error everywhere from a gross
+# one in a few places.
+def psnr(image, target):
+    return -10.0 * np.log10(l2(image, target))
+
+
+black = np.zeros((10, 10, 3))
+spot = black.copy()
+spot[0, 0] = 1.0
+print(psnr(black + 0.1, black), psnr(black + 0.05, black), psnr(spot, black))
+assert np.isclose(psnr(black + 0.1, black), 20.0)
+assert np.isclose(psnr(black + 0.05, black) - 20.0, 6.0206, atol=1e-4)
+assert np.isclose(psnr(spot, black), 20.0)
+
+# %% [markdown]
+# ### Exercise 5: find the bug
+# Many textbooks write the loss like this. Why is it wrong here, although its minimum is the same?
+#
+# {{bug: halved_l2}}
+
+# %% answer
+# It is half of the mean square. Alone that would not matter; beside SSIM and the prior, whose weights are fixed, it
+# shifts the balance by two (eq. 9), and eq. 3 compares its gradients with a fixed threshold.
+print(caught("halved_l2"))

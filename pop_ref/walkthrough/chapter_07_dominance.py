@@ -1,5 +1,7 @@
+# minutes: 30
+
 # %% [markdown]
-# # 7. Who dominates a pixel, and the blur set
+# # 7. The dominant Gaussian of a pixel, and the blur set
 #
 # Many Gaussians blend at a pixel, but one of them gives the most. At the end of this chapter you know how POP finds it,
 # what the count of pixels that a Gaussian wins says about it, and how that count makes a model grow where gradients are
@@ -8,14 +10,16 @@
 # %% [markdown]
 # ## The largest weight
 #
-# At a pixel, splat $i$ contributes with the weight $T_i \alpha_i$. The dominant one is (POP paper, eq. 5)
+# At a pixel, splat $i$ contributes with the weight $T_i \alpha_i$. The *dominant* one is (POP paper, eq. 5)
 #
 # $$i^*(p) = \mathrm{argmax}_i \; T_i \alpha_i .$$
 #
 # It need not be the front one, nor the most opaque. Below, a veil of alpha 0.3 hangs before a splat of 0.6, which
 # stands before one of 0.9: the weights are 0.3, 0.42 and 0.252. The paper leaves two cases open, and the oracle decides
-# them as Mini-Splatting's kernel does: a tie goes to the front, and a pixel where nothing blends belongs to nobody
-# (-1).
+# them as Mini-Splatting's kernel does: a tie goes to the front (decision D8), and a pixel where nothing blends has no
+# dominant Gaussian (-1).
+#
+# {{source: pop_ref.dominance.dominant_id}}
 
 # %%
 import itertools
@@ -41,6 +45,7 @@ from pop_ref.pixel import SplatRows
 from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render, render_vjp
 from pop_ref.training import gaussians_from_params, params_vjp
+from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, axes, show_image
 
@@ -54,6 +59,7 @@ def ray(alphas):
 
 
 ids, weights = ray([0.3, 0.6, 0.9])
+print("weights", np.round(weights, 3), " dominant:", dominant_id(ids, weights))
 np.testing.assert_allclose(weights, [0.3, 0.42, 0.252])
 assert dominant_id(ids, weights) == 1
 assert dominant_id([4, 2, 7], [0.25, 0.5, 0.5]) == 2
@@ -63,7 +69,7 @@ for alpha in (0.01, 0.5, 0.99):
     assert dominant_id(*ray([alpha, alpha])) == 0
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: predict
 #
 # How opaque must the front splat be at a pixel so that nothing behind it can dominate, whatever it is?
 
@@ -78,11 +84,11 @@ assert dominant_id(*ray([0.49, 0.999])) == 1
 # %% [markdown]
 # ## Counting pixels
 #
-# The **dominant count** $D_i$ of a view is the number of its pixels that Gaussian $i$ wins. Each pixel has at most one
-# winner, so the counts of a view sum to the number of pixels where anything blends. The map of winners is a mosaic:
-# with opacities near 1 it shows the surfaces that the camera sees.
+# The **dominant count** $\mathcal{D}_i$ of a view is the number of its pixels that Gaussian $i$ wins. Each pixel has at
+# most one winner, so the counts of a view sum to the number of pixels where anything blends. The map of winners is a
+# mosaic: with opacities near 1 it shows the surfaces that the camera sees.
 
-# %%
+# %% setup
 SIZE = 40
 camera = Camera(
     np.eye(4), np.array([[53.2, 0.0, 20.0], [0.0, 53.2, 20.0], [0.0, 0.0, 1.0]]), SIZE, SIZE
@@ -100,13 +106,22 @@ scene = Gaussians(
     opacities=np.concatenate([np.full(few, 0.9), rng.uniform(0.4, 0.95, many)]),
     sh=rng.uniform(-1.2, 1.2, (few + many, 1, 3)),
 )
-view = render(scene, camera)
+# %%
+overview = view = render(scene, camera)
 counts = view.dominant_counts
+print(
+    "the largest counts:",
+    np.sort(counts)[::-1][:8],
+    " winners:",
+    np.sum(counts > 0),
+    "of",
+    len(counts),
+)
 assert counts.sum() == np.sum(view.n_blended > 0)
 assert np.array_equal(view.dominant_ids < 0, view.n_blended == 0)
 assert np.all(counts[:few] > counts[few:].max())
 
-# a colour for each Gaussian, and white for nobody
+# a colour for each Gaussian, and white where there is none
 mosaic = ListedColormap(
     np.vstack([[1.0, 1.0, 1.0], np.random.default_rng(1).uniform(0.15, 0.9, (999, 3))])
 )
@@ -135,7 +150,7 @@ right.bar(np.arange(1, len(ranked) + 1), ranked, color=ACCENT, width=1.0)
 right.set(xlabel="Gaussians, largest first", ylabel="pixels won", title="dominant counts")
 picture(
     fig,
-    "One view. White pixels belong to nobody. A few large Gaussians win most of the picture.",
+    "One view. At white pixels nothing is blended. A few large Gaussians win most of the picture.",
 )
 
 # %% [markdown]
@@ -144,7 +159,7 @@ picture(
 # A Gaussian that wins very many pixels paints an area with one smooth colour: if there was detail, it is blurred. Eq. 6
 # collects those that win more than a share $\theta$ of the view:
 #
-# $$\mathcal{G}_{\mathrm{blur}} = \{\, \mathcal{G}_i \mid D_i > \theta_{\mathrm{blur}}\, H W \,\}, \qquad
+# $$\mathcal{G}_{\mathrm{blur}} = \{\, \mathcal{G}_i \mid \mathcal{D}_i > \theta_{\mathrm{blur}}\, H W \,\}, \qquad
 #   \theta_{\mathrm{blur}} = 2 \times 10^{-5} .$$
 #
 # On a photograph of 980 x 545 px that is eleven pixels, on one of 1557 x 1038 px thirty-three. Since the counts of a
@@ -163,13 +178,14 @@ def smallest_blurred(width, height):
     return int(counts[blur_set(counts, width, height, THETA)][0])
 
 
+print("least counts:", smallest_blurred(980, 545), smallest_blurred(1557, 1038))
 assert (smallest_blurred(980, 545), smallest_blurred(1557, 1038)) == (11, 33)
 for width, height in ((980, 545), (1557, 1038)):
     assert width * height // smallest_blurred(width, height) < 1.0 / THETA
     assert width * height / (smallest_blurred(width, height) - 1) >= 1.0 / THETA
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: derive
 #
 # A densification step follows a hundred views. Three readings of "cumulative" are possible: test the count of the last
 # view, flag a Gaussian if *any* view's count passes the threshold, or test the *sum* over the views. A Gaussian wins
@@ -196,9 +212,9 @@ assert (100.0 / THETA, POP.blur_window) == (5e6, "own_view")
 # %% [markdown]
 # ## Where gradients are silent
 #
-# Why not just use the gradient rule (eq. 3)? It asks whether the loss wants to *move* a Gaussian on the screen, and
-# adds up the wishes of all its pixels with their signs. A splat in the middle of detail that is symmetric about it is
-# pulled to all sides at once: the sum is zero however wrong its pixels are. The count does not cancel.
+# Why not just use the gradient rule (eq. 3)? It asks whether the loss would fall if a Gaussian *moved* on the screen,
+# and adds up the gradients of all its pixels with their signs. A splat in the middle of detail that is symmetric about
+# it is pulled to all sides at once: the sum is zero however wrong its pixels are. The count does not cancel.
 
 # %%
 blob = Gaussians(
@@ -214,6 +230,8 @@ over_rings = render(blob, camera)
 pull = l2_vjp(over_rings.image, rings, 1.0)
 silent = render_vjp(blob, camera, pull)
 signed, unsigned = np.linalg.norm(silent.means2d[0]), np.linalg.norm(silent.means2d_abs[0])
+print(f"gradient of the centre: signed {signed:.0e}, of absolute values {unsigned:.0e}")
+print(f"pixels won: {over_rings.dominant_counts[0]}")
 assert signed < 1e-9 * unsigned
 assert over_rings.dominant_counts[0] > 300
 
@@ -232,12 +250,13 @@ picture(
 # ## Growing by the rule alone
 #
 # Now let the rule alone make a model grow. It begins with four large Gaussians before a painted picture of 24 x 24 px,
-# trained for 20 steps with L2 (eq. 4). Then the blur set is split, six steps of training follow, and so on. On 576
-# pixels the paper's $\theta$ would select everybody who wins one; here $\theta = 1/48$, so that whoever wins more than
-# twelve pixels is split. (Learning rates are four times the usual, the colours' forty times. Gaussians whose largest
-# scale is under a hundredth of the scene's would be cloned instead; none here is that small.)
+# trained for 20 steps with L2 (eq. 4). Then each Gaussian of the blur set is *split*, that is replaced by two smaller
+# ones (chapter 9), six steps of training follow, and so on. On 576 pixels the paper's $\theta$ would select every
+# Gaussian that wins one; here $\theta = 1/48$, so that one that wins more than twelve pixels is split. (Learning rates
+# are four times the usual, the colours' forty times. Gaussians whose largest scale is under a hundredth of the scene's
+# would be cloned instead; none here is that small.)
 
-# %%
+# %% setup
 SMALL, THETA_HERE = 24, 1 / 48
 camera = Camera(
     np.eye(4), np.array([[32.0, 0, 12.0], [0, 32.0, 12.0], [0, 0, 1.0]]), SMALL, SMALL
@@ -256,7 +275,7 @@ target[np.hypot(x - 0.5, y + 0.5) < 0.5] = 0.95, 0.8, 0.2
 config = replace(POP, theta_blur=THETA_HERE, grow_on_gradient=False)
 rates = {name: 4.0 * rate for name, rate in learning_rates(0, 4.0).items()}
 rates["sh0"] *= 10.0
-# round Gaussians have no gradient by rotation but rounding's, which Adam would follow
+# the rotation of a round Gaussian has no gradient but rounding errors, which Adam would follow
 rates["quats"] = 0.0
 rng = np.random.default_rng(3)
 corners = np.array([[-0.75, -0.75], [0.75, -0.75], [-0.75, 0.75], [0.75, 0.75]])
@@ -269,6 +288,7 @@ rows = rows_from_params(
         "sh0": np.zeros((4, 1, 3)),
     }
 )
+# %%
 history, steps = [], itertools.count(1)
 for event in range(10):
     for _ in range(6 if event else 20):
@@ -303,7 +323,7 @@ picture(
 )
 
 # %% [markdown]
-# At first everybody is too large and the number doubles; a split opens holes, which the training between two events
+# At first all are too large and the number doubles; a split opens holes, which the training between two events
 # closes. As the counts come down growth slows to under a tenth per event, at a little over $2/\theta$ Gaussians. No
 # budget was set and no gradient asked: the threshold is the budget. In the paper the rule is active from step 3,000 to
 # 7,000 only, beside the gradient rule.
@@ -325,7 +345,7 @@ assert (POP.blur_start_iter, POP.blur_stop_iter, POP.grow_on_gradient) == (3000,
 assert np.exp(rows.params["scales"]).max(axis=1).min() > POP.grow_scale3d
 
 # %% [markdown]
-# ### Exercise 3
+# ### Exercise 3: derive
 #
 # Why does the paper lower $\theta$ to a tenth of Mini-Splatting's 1/5,000, and what would it do to the number of
 # winners at which the rule falls silent?
@@ -338,3 +358,30 @@ for theta, least in ((1.0 / 5000.0, 5000), (THETA, 50000)):
     each = int(theta * pixels)
     assert not np.any(blur_set(np.full(least, each), 1000, 1000, theta))
     assert least * each == pixels
+
+# %% [markdown]
+# ### Exercise 4: code
+# From the map of winners alone, compute the dominant counts, and how many Gaussians a pixel's winner has as neighbours
+# that are other Gaussians (above, below, left, right). What does the share of equal neighbours say about blur?
+
+# %% answer
+# `bincount` counts. Where nearly all neighbours are the same, one smooth splat paints an area: on the left of the
+# picture; on the right the mosaic is fine.
+winners = overview.dominant_ids
+mine = np.bincount(winners[winners >= 0], minlength=len(scene))
+same = [np.mean(part[:, 1:] == part[:, :-1]) for part in (winners[:, :20], winners[:, 20:])]
+print(f"equal neighbours: left {same[0]:.2f}, right {same[1]:.2f}")
+assert np.array_equal(mine, overview.dominant_counts)
+assert same[0] > same[1]
+
+# %% [markdown]
+# ### Exercise 5: find the bug
+# A short function with one wrong character. When does it matter?
+#
+# {{bug: tie_to_the_back}}
+
+# %% answer
+# `>=` lets a later splat of equal weight take over, so ties go to the back. Clones lie exactly on their originals and
+# tie at small alphas: the copy would win, and the original would be called unimportant and die. (With weights of 0 it
+# even makes a winner of a splat that gives nothing.)
+print(caught("tie_to_the_back"))

@@ -1,7 +1,9 @@
+# minutes: 35
+
 # %% [markdown]
 # # 8. Gradient leakage and the polarized opacity prior
 #
-# A trained scene is full of faint Gaussians that add next to nothing and refuse to die. At the end of this chapter you
+# A trained scene is full of faint Gaussians that add next to nothing and are not pruned. At the end of this chapter you
 # know what keeps them alive, how the Polarized Opacity Prior pulls every opacity to one of two poles, and what that
 # does, and costs, in a scene small enough to watch whole.
 
@@ -21,7 +23,7 @@
 # \frac{\partial \alpha_i}{\partial \mu_i},
 # \qquad \alpha_i = o_i\, e^{-\sigma_i} ,$$
 #
-# and of the three factors $\partial c / \partial \alpha_i = T_i (c_i - B_i)$ of chapter 5 does not contain $o_i$, while
+# and of the three factors $\partial c / \partial \alpha_i = T_i (c_i - b_i)$ of chapter 5 does not contain $o_i$, while
 # the last is proportional to it: faint Gaussians are pulled faintly, opaque ones strongly. (The paper counts
 # $\partial L / \partial c$ as independent of $o_i$ as well. That holds for a given error; the error itself depends on
 # every opacity along the ray.)
@@ -39,8 +41,9 @@ from pop_ref.polarization import importance_mask, pop_loss, pop_loss_vjp
 from pop_ref.records import Camera
 from pop_ref.render import render, render_vjp
 from pop_ref.training import gaussians_from_params, params_vjp
+from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
-from pop_ref.walkthrough.style import ACCENT, MUTED, SECOND, axes
+from pop_ref.walkthrough.style import ACCENT, MUCH, MUTED, SECOND, axes
 
 
 def gradients_of(opacities, offset=0.0, v_color=1.0):
@@ -98,13 +101,16 @@ picture(
 )
 
 # %% [markdown]
-# Why is a small gradient enough to survive on? Because Adam is scale-free: it divides a gradient by its own running
-# size, so that one which keeps its sign moves a parameter by about the learning rate a step, however small it is. An
-# opacity reset does not help where a pixel leaks a steady wish.
+# Why is a small gradient enough to survive on? Because Adam divides a gradient by its own running size, so that one
+# which keeps its sign moves a parameter by about the learning rate a step, however small it is. This holds as long as
+# the gradient is large beside Adam's $\epsilon$, the number added to the divisor to keep it from being 0. The programs
+# of 3DGS and gsplat set $\epsilon = 10^{-15}$, so for them it holds for practically every gradient; with
+# $\epsilon = 10^{-8}$, the default of torch, gradients much smaller than that would move next to nothing. An opacity
+# reset does not help where a small gradient keeps its sign.
 
 
 # %%
-def steps_until(end, start, v_opacity):
+def steps_until(end, start, v_opacity, eps=1e-15):
     """Count Adam's steps of 0.05 until an opacity, under a fixed gradient, has passed `end`."""
     logits = {"opacities": np.array([np.log(start / (1.0 - start))])}
     m, v = {"opacities": np.zeros(1)}, {"opacities": np.zeros(1)}
@@ -112,7 +118,7 @@ def steps_until(end, start, v_opacity):
     while (o[0] - end) * (start - end) > 0.0:
         step += 1
         grads = {"opacities": v_opacity * o * (1.0 - o)}
-        logits, m, v = adam_step(logits, grads, m, v, step, {"opacities": 0.05})
+        logits, m, v = adam_step(logits, grads, m, v, step, {"opacities": 0.05}, eps=eps)
         o = opacities_from_logits(logits["opacities"])
     return step
 
@@ -120,24 +126,31 @@ def steps_until(end, start, v_opacity):
 assert steps_until(0.9, 0.5, -1e-3) == steps_until(0.9, 0.5, -1e-9)
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: predict
 #
 # An opacity was reset to 0.01 (logit −4.6). From then on it feels $\partial L / \partial o = -10^{-9}$, a billionth, at
-# every step. Estimate after how many steps it is back over 1/2.
+# every step. Estimate after how many steps it is back over 1/2, with Adam's $\epsilon = 10^{-15}$ as in 3DGS. Would it
+# be different with $10^{-8}$?
 
 # %% answer
 # $4.6 / 0.05 = 92$ steps of a learning rate each. In fact it is 69, because the logit's gradient, $o (1 - o)$ times
-# that, grows with the opacity, and Adam's running size lags behind.
-assert steps_until(0.5, 0.01, -1e-9) == 69
+# that, grows with the opacity, and Adam's running size lags behind. With $\epsilon = 10^{-8}$ the logit's gradient,
+# $10^{-11}$ at first, is a thousandth of $\epsilon$, the steps are as much shorter, and it takes 21,742 of them. So it
+# is the tiny $\epsilon$ of 3DGS that lets gradients leak so well.
+back = [steps_until(0.5, 0.01, -1e-9, eps) for eps in (1e-15, 1e-8)]
+print(back, "steps")
+assert back == [69, 21_742]
 
 # %% [markdown]
 # ## The prior
 #
-# POP splits the Gaussians of a view in two. Important is who dominates at least one pixel (chapter 7),
-# $M_i = \mathbf{1}[D_i > 0]$ (eq. 7), and with $N_{\mathrm{imp}} = \sum M_i$ the prior is (eq. 8)
+# POP splits the Gaussians of a view in two. Important are those that dominate at least one pixel (chapter 7),
+# $M_i = \mathbf{1}[\mathcal{D}_i > 0]$ (eq. 7), and with $N_{\mathrm{imp}} = \sum M_i$ the prior is (eq. 8)
 #
 # $$L_{\mathrm{POP}} = \frac{1}{N_{\mathrm{imp}}} \sum_i M_i (1 - o_i)
 # + \frac{1}{N - N_{\mathrm{imp}}} \sum_i (1 - M_i)\, o_i .$$
+#
+# {{source: pop_ref.polarization.pop_loss}}
 #
 # The mask is a constant of the step, so the gradient is as simple as can be: $-1/N_{\mathrm{imp}}$ for the important,
 # $+1/(N - N_{\mathrm{imp}})$ for the rest, whatever the opacity. Through the sigmoid a logit feels that times
@@ -155,18 +168,24 @@ np.testing.assert_allclose(
     pop_loss_vjp(opacities, important, 1.0), [-1 / 2, -1 / 2, 1 / 3, 1 / 3, 1 / 3]
 )
 assert pop_loss(np.array([1.0, 1.0, 0.0]), np.array([True, True, False])) == 0.0
+print(
+    "loss",
+    round(pop_loss(opacities, important), 3),
+    " gradient",
+    pop_loss_vjp(opacities, important, 1.0).round(3),
+)
 assert POP.prune_opa == 0.005
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: derive
 #
 # In every view 250 of 1,000 Gaussians are important. One of them is important in a fraction $f$ of the views. Leaving
 # the photographs aside, for which $f$ does the prior push it up on average?
 
 
 # %% answer
-# The mean gradient is $-f/250 + (1 - f)/750$, which is negative for $f > 1/4$: whoever dominates in more views than
-# the average Gaussian goes up, the rest goes down, even what is merely outside most views.
+# The mean gradient is $-f/250 + (1 - f)/750$, which is negative for $f > 1/4$: a Gaussian that dominates in more views
+# than the average one goes up, the rest goes down, even what is merely outside most views.
 def mean_gradient(f, n_views=100):
     total = 0.0
     for view in range(n_views):
@@ -193,7 +212,7 @@ assert np.isclose(mean_gradient(0.25), 0.0)
 # Gaussians are pruned as long as it lasts. So few steps need a faster clock: learning rates are five times the usual,
 # Adam's second moment forgets in 20 steps instead of 1,000, and $\lambda_{\mathrm{POP}}$ is 0.01 instead of 0.001.
 
-# %%
+# %% setup
 WIDTH, N, STEPS, POP_STEPS, WEIGHT = 28, 40, 180, 120, 0.01
 C0 = 0.28209479177387814
 
@@ -229,6 +248,7 @@ z = 0.3 * np.sin(2 * x) + rng.uniform(-0.6, 0.6, N)
 first = params_at(x, z, 0.12, 0.1, rng.normal(0.0, 0.3, (N, 3)))
 
 
+# %%
 def train(weight):
     """Train with this weight of the prior; give the scene before each step and at the end."""
     rows, scenes = rows_from_params(first), []
@@ -289,7 +309,7 @@ for row, (name, scenes) in enumerate(runs.items()):
                     (mean[0], mean[2]),
                     1.5 * scale[0],
                     fc=(*colour, o),
-                    ec=(0.4, 0.4, 0.4, 0.4),
+                    ec=MUTED,
                     lw=0.5,
                 )
             )
@@ -319,7 +339,7 @@ for ax, (name, scenes) in zip((left, right), runs.items(), strict=True):
         aspect="auto",
         vmin=0.0,
         vmax=0.4,
-        cmap="Blues",
+        cmap=MUCH,
     )
     ax.set(xlabel="step", title=f"{name} the prior")
     ax.grid(False)
@@ -327,7 +347,7 @@ left.set(ylabel="opacity")
 right.axvline(POP_STEPS, color=SECOND, lw=1.2)
 picture(
     fig,
-    "Histograms of opacity, one column a step, darker for more. Right of the line the prior is off.",
+    "Histograms of opacity, one column a step, stronger for more. Right of the line the prior is off.",
 )
 
 # %% [markdown]
@@ -350,6 +370,10 @@ faint = with_prior[POP_STEPS].opacities < 0.1
 assert np.any(with_prior[-1].opacities[faint] > 0.2)
 error_without, blended_without = measured(without[POP_STEPS])
 error_with, blended_with = measured(with_prior[POP_STEPS])
+print(f"blended per pixel: {blended_without:.1f} without, {blended_with:.1f} with")
+print(
+    f"at a pole: {at_poles(without[POP_STEPS]):.0%} without, {at_poles(with_prior[POP_STEPS]):.0%} with"
+)
 assert np.allclose([blended_without, blended_with], [13.5, 9.6], atol=0.05)
 
 fig, (left, right) = axes(2, height=2.8)
@@ -385,7 +409,12 @@ for camera in cameras:
     assert np.array_equal(view.n_traversed[0], listed)
 
 # %% [markdown]
-# ### Exercise 3
+# And in three dimensions: two recorded trainings of the toy of `pop_ref/learn/splat.py`.
+#
+# {{widget: scrubber}}
+
+# %% [markdown]
+# ### Exercise 3: predict
 #
 # A Gaussian with $o = 0.1$ lies where no photograph looks. The gradient of the prior is all it feels,
 # $\lambda / (N - N_{\mathrm{imp}})$ with $N - N_{\mathrm{imp}} = 750$. After how many steps is it under the pruning
@@ -394,4 +423,42 @@ for camera in cameras:
 # %% answer
 # 132 in both cases: to Adam only the sign counts, so for the unseen the weight of the prior means nothing. The
 # weight matters where photographs pull as well.
-assert steps_until(0.005, 0.1, 1e-3 / 750) == steps_until(0.005, 0.1, 1e-6 / 750) == 132
+unseen = [steps_until(0.005, 0.1, weight / 750) for weight in (1e-3, 1e-6)]
+print(unseen, "steps")
+assert unseen == [132, 132]
+
+# %% [markdown]
+# ### Exercise 4: code
+# Write the prior and its gradient from eq. 8, with care for the cases that all Gaussians or none are important. Check
+# the gradient by differences.
+
+
+# %% answer
+# An empty sum is 0, so its mean is taken as 0; dividing by `max(n, 1)` does it without a branch.
+def prior(o, mask):
+    n, rest = max(mask.sum(), 1), max((~mask).sum(), 1)
+    return np.sum(1 - o[mask]) / n + np.sum(o[~mask]) / rest, np.where(
+        mask, -1 / n, 1 / rest
+    )
+
+
+for mask in (important, np.ones(5, dtype=bool), np.zeros(5, dtype=bool)):
+    value, gradient = prior(opacities, mask)
+    by_difference = [
+        (prior(opacities + h, mask)[0] - prior(opacities - h, mask)[0]) / 2e-6
+        for h in 1e-6 * np.eye(5)
+    ]
+    assert np.isclose(value, pop_loss(opacities, mask))
+    assert np.allclose(gradient, by_difference)
+    assert np.array_equal(gradient, pop_loss_vjp(opacities, mask, 1.0))
+
+# %% [markdown]
+# ### Exercise 5: find the bug
+# Eq. 8 with one mistake. With 250 important of 1,000 Gaussians, how much stronger or weaker does each side become?
+#
+# {{bug: prior_over_all}}
+
+# %% answer
+# Both sums are divided by $N$. The important are pulled up with $1/1000$ instead of $1/250$, a quarter; the others down
+# with $1/1000$ instead of $1/750$, three quarters. The balance shifts by three towards 0, and the model gets too small.
+print(caught("prior_over_all"))

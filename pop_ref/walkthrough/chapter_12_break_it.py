@@ -1,16 +1,18 @@
+# minutes: 25
+
 # %% [markdown]
 # # 12. Break it: each mutant, and the law that catches it
 #
 # A test that no bug fails is worth nothing. So the kit that judges rasterizers is judged itself: by broken copies of
-# the oracle, each wrong in one line, most of them as somebody's program once was. At the end of this chapter you have
+# the oracle, each wrong in one line, most of them as some program once was. At the end of this chapter you have
 # seen what such bugs do to a picture, that most of them do nothing to it, and which law catches which.
 #
 # ## A law and a mutant
 #
-# A **law** is a sentence that must hold for every input: doubling all scales quadruples the covariance; a pixel that
-# nobody reaches belongs to nobody. The kit draws inputs and looks for one that breaks it. A **mutant** is the oracle
-# with one line replaced. `living` imports it beside the oracle under another name, so that both can be asked the same.
-# Here is one of each: an alpha that equals the floor is blended (decision D5), and a copy in which it is not.
+# A **law** is a sentence that must hold for every input: doubling all scales quadruples the covariance; a pixel that no
+# splat reaches has no dominant Gaussian. The kit draws inputs and looks for one that breaks it. A **mutant** is the
+# oracle with one line replaced. `living` imports it beside the oracle under another name, so that both can be asked the
+# same. Here is one of each: an alpha that equals the floor is blended (decision D5), and a copy in which it is not.
 
 # %%
 import inspect
@@ -23,8 +25,9 @@ from pop_ref.conformance.mutants import MUTANTS, Mutant, living
 from pop_ref.conformance.mutants.trial import every_law, killed_by, law_named, obeys
 from pop_ref.conformance.scenes import Record, Scene, pack
 from pop_ref.records import Camera
+from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
-from pop_ref.walkthrough.style import ACCENT, INK, SECOND, THIRD, axes, show_image
+from pop_ref.walkthrough.style import ACCENT, INK, MUCH, SECOND, THIRD, axes, show_image
 
 BY_NAME = {mutant.name: mutant for mutant in MUTANTS}
 
@@ -118,7 +121,7 @@ for k, (name, color) in enumerate(zip(pulls, (INK, ACCENT, SECOND, THIRD), stric
     places = np.arange(4) + 0.2 * (k - 1.5)
     ax.bar(places, pulls[name], 0.18, color=color, label=name.replace("_", " "))
 ax.set(xticks=range(4), xticklabels=("long", "round", "thin", "at the tile's edge"))
-ax.set_ylabel("gradient by opacity")
+ax.set_ylabel("gradient of the opacity")
 ax.legend(fontsize=8)
 picture(fig, "One picture, four gradients. Only the first belongs to it.")
 
@@ -152,7 +155,7 @@ assert not broken[0].any(), "the oracle obeys all"
 assert np.diag(broken[1:]).all(), "every mutant breaks its own law"
 
 fig, ax = axes(1, height=3.9)
-ax.imshow(broken, aspect="auto", cmap="Greys", vmin=0, vmax=1.4)
+ax.imshow(broken, aspect="auto", cmap=MUCH, vmin=0, vmax=1.2)
 numbered = [f"{name.replace('_', ' ')}  {k}" for k, name in enumerate(tried, start=1)]
 ax.set_yticks(range(len(tried) + 1), ["the oracle", *numbered])
 ax.set_xticks(range(len(laws)), [str(k + 1) for k in range(len(laws))])
@@ -160,7 +163,7 @@ ax.set(xlabel="law that is named for mutant k")
 ax.grid(False)
 picture(
     fig,
-    "Dark: the law breaks. The oracle breaks none, every mutant its own. Mutants 4 and 5 are named the same law.",
+    "Blue: the law breaks. The oracle breaks none, every mutant its own. Mutants 4 and 5 are named the same law.",
 )
 assert laws[3] == laws[4]
 assert broken.sum() < 0.25 * broken.size
@@ -187,7 +190,7 @@ for mutant in (mutant for same in of_files.values() for mutant in same[:2]):
 assert {mutant.law for mutant in MUTANTS} <= set(every_law())
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: code
 #
 # Write a mutant of your own: in `polarization.py` let every Gaussian be important, and find which laws of that stage
 # notice.
@@ -195,7 +198,7 @@ assert {mutant.law for mutant in MUTANTS} <= set(every_law())
 # %% answer
 mine = Mutant(
     name="all_important",
-    story="the mask is true for whoever dominates no pixel, too",
+    story="the mask is true for Gaussians that dominate no pixel, too",
     file="polarization.py",
     old="return dominant_counts > 0",
     new="return dominant_counts >= 0",
@@ -209,7 +212,7 @@ assert len(notice) < len(of_the_stage)
 print(*(name.partition(":")[2].replace("_", " ") for name in notice), sep="\n")
 
 # %% [markdown]
-# ### Exercise 2
+# ### Exercise 2: code
 #
 # Write a law of your own that kills `half_pixel_shift`, as a function of a backend: a round splat in the middle of an
 # image must look the same in a mirror. Does the law also kill `no_half_in_the_exponent`?
@@ -229,3 +232,45 @@ with living(BY_NAME["half_pixel_shift"]) as backend:
 # a splat of the wrong width is symmetric, too: one law is never enough
 with living(BY_NAME["no_half_in_the_exponent"]) as backend:
     assert mirrored(backend)
+
+# %% [markdown]
+# ### Exercise 3: predict
+# Which of these mutants can be seen in *some* picture: a gradient that is wrong, a tie that goes to the back, an extent
+# that is cut at three standard deviations?
+
+# %% answer
+# Only the last changes a picture: it cuts off what is visible between 3 and 3.33 standard deviations. Gradients are not
+# drawn, and a tie changes who dominates, not the colour.
+# it ends shortly behind a tile's border, with three deviations shortly before it
+screen = Camera(np.eye(4), K, WIDTH, HEIGHT)
+one = Scene(pack([Record(6.0, 12.0, 2.0, (3.0, 3.0, 3.0), opacity=1.0)], screen), screen)
+for name in ("weight_above_one", "tie_to_the_back", "extent_of_three_deviations"):
+    with living(BY_NAME[name]) as backend:
+        differs = np.abs(
+            backend.render(one).image - OracleAdapter().render(one).image
+        ).max()
+    print(f"{name:28} {differs:.4f}")
+    assert (differs > 0) == (name == "extent_of_three_deviations")
+
+# %% [markdown]
+# ### Exercise 4: derive
+# Two splats get depths that are drawn at random from $n$ values. How large is the chance that they tie? Why does the
+# kit not draw depths uniformly from an interval?
+
+# %% answer
+# $1/n$. For an interval of float64 numbers $n$ is about $2^{52}$: a law that speaks of ties would never see one. So the
+# kit draws from few round numbers on purpose, and aims at thresholds.
+draws = np.random.default_rng(0).integers(0, 8, (20_000, 2))
+print(np.mean(draws[:, 0] == draws[:, 1]))
+assert np.isclose(np.mean(draws[:, 0] == draws[:, 1]), 1 / 8, atol=0.01)
+
+# %% [markdown]
+# ### Exercise 5: find the bug
+# The mutant of exercise 3, as it stands in the code.
+#
+# {{bug: extent_of_three_deviations}}
+
+# %% answer
+# 3 in place of the profile's 3.33: the first program of 3DGS does so and cuts alphas of up to 0.011 off, three steps of
+# an 8-bit picture. Later ones reach as far as alpha is over the floor.
+print(caught("extent_of_three_deviations"))

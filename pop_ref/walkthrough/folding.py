@@ -1,28 +1,31 @@
-"""Tell the code that draws from the code that a reader is here for."""
+"""Tell the code that a reader is here for from imports, checks and the code that draws."""
 
 from __future__ import annotations
 
 import ast
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
+
+Role = Literal["plain", "imports", "checks", "draws"]
 
 _OPENS: Final = {"axes", "subplots", "figure"}
-_CLOSES: Final = {"picture"}
+_CLOSES: Final = {"picture", "film"}
 
 
 @dataclass(frozen=True)
 class Part:
-    """A run of whole statements of a cell, and whether they draw."""
+    """A run of whole statements of a cell, and what they are there for."""
 
     text: str
-    draws: bool
+    role: Role
 
 
 def parts(code: str) -> list[Part]:
-    """Cut a cell where drawing begins and ends.
+    """Cut a cell by what its statements are there for.
 
-    Drawing begins with the statement that makes axes and ends with the one that calls `picture`; a function that makes
-    axes, or takes them as `ax`, is drawing by itself. Comments right above a part belong to it.
+    Drawing begins with the statement that makes axes and ends with the one that calls `picture` or `film`; a function
+    that makes axes, or takes them as `ax`, is drawing by itself. Outside of drawing, imports are imports, and an
+    assertion, or a loop that does nothing but assert, is a check. Comments right above a statement belong to it.
 
     Args:
         code: a cell that Python can parse.
@@ -31,30 +34,23 @@ def parts(code: str) -> list[Part]:
         The parts in order; together they are the code, but for blank lines between them.
     """
     lines = code.split("\n")
-    cut: list[tuple[int, int]] = []
-    start = None
-    for node in ast.parse(code).body:
-        called = _called(node)
-        if start is None and (called & _OPENS or _takes_axes(node)):
-            start = _with_comments(lines, node.lineno - 1)
-            # drawing that goes on where drawing ended is one part
-            if cut and not "".join(lines[cut[-1][1] : start]).strip():
-                start = cut.pop()[0]
-        defined = isinstance(node, ast.FunctionDef)
-        if start is not None and (defined or called & _CLOSES):
-            cut.append((start, node.end_lineno or node.lineno))
-            start = None
-    if start is not None:
-        cut.append((start, len(lines)))
-    found: list[Part] = []
-    done = 0
-    for first, last in [*cut, (len(lines), len(lines))]:
-        found += [
-            Part("\n".join(lines[done:first]).strip("\n"), False),
-            Part("\n".join(lines[first:last]), True),
-        ]
-        done = last
-    return [part for part in found if part.text]
+    body = ast.parse(code).body
+    roles = _roles(body)
+    cut: list[tuple[int, int, Role]] = []
+    for i, (node, role) in enumerate(zip(body, roles, strict=True)):
+        first, last = _with_comments(lines, node.lineno - 1), node.end_lineno or node.lineno
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.decorator_list:
+            first = _with_comments(lines, node.decorator_list[0].lineno - 1)
+        # what follows the last statement on lines of its own is a comment, and belongs to it
+        last = len(lines) if i == len(body) - 1 else last
+        if cut and cut[-1][2] == role:
+            cut[-1] = (cut[-1][0], last, role)
+        else:
+            cut.append((first, last, role))
+    found = [
+        Part("\n".join(lines[first:last]).strip("\n"), role) for first, last, role in cut
+    ]
+    return found or [Part(code, "plain")]
 
 
 def said_and_done(code: str) -> tuple[str, str]:
@@ -65,6 +61,44 @@ def said_and_done(code: str) -> tuple[str, str]:
     )
     said = "\n".join(line.removeprefix("#").removeprefix(" ") for line in lines[:n_said])
     return said, "\n".join(lines[n_said:]).strip("\n")
+
+
+def _roles(body: list[ast.stmt]) -> list[Role]:
+    roles: list[Role] = []
+    drawing = False
+    for node in body:
+        called = _called(node)
+        function = isinstance(node, ast.FunctionDef)
+        if function and not drawing:
+            roles.append("draws" if called & _OPENS or _takes_axes(node) else "plain")
+            continue
+        drawing = drawing or bool(called & (_OPENS | _CLOSES))
+        roles.append("draws" if drawing else _role(node))
+        if called & _CLOSES:
+            drawing = False
+    return roles
+
+
+def _role(node: ast.stmt) -> Role:
+    if isinstance(node, ast.Import | ast.ImportFrom):
+        return "imports"
+    return "checks" if _only_asserts(node) else "plain"
+
+
+def _only_asserts(node: ast.stmt) -> bool:
+    if isinstance(node, ast.Assert):
+        return True
+    if isinstance(node, ast.For):
+        # names that a loop binds on the way to its assertion are of use to nothing else
+        return _only_asserts(node.body[-1]) and all(
+            _only_asserts(n) or isinstance(n, ast.Assign) for n in node.body
+        )
+    called = (
+        node.value.func
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)
+        else None
+    )
+    return isinstance(called, ast.Attribute) and called.attr.startswith("assert_")
 
 
 def _called(node: ast.AST) -> set[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any, Final
 from xml.etree import ElementTree
@@ -16,16 +16,19 @@ from pygments import highlight
 from pygments.formatters.html import HtmlFormatter
 from pygments.lexers.python import PythonLexer
 
+from pop_ref.walkthrough import widgets
 from pop_ref.walkthrough.cells import FOLDER, Cell, Chapter, ChapterError
+from pop_ref.walkthrough.directives import expanded
 from pop_ref.walkthrough.folding import parts, said_and_done
+from pop_ref.walkthrough.glossary import GLOSSARY_PAGE, glossary
 from pop_ref.walkthrough.pages import Outcome, Picture
 from pop_ref.walkthrough.style import VARIABLES
 
-_TITLE: Final = "Splats with polarized opacity, step by step"
-_LEAD: Final = (
-    "Twelve chapters on 3D Gaussian Splatting and the Polarized Opacity Prior, for a reader who knows linear algebra "
-    "and Python. Every chapter is a script on the oracle's own functions: what it claims, it asserts, and each of its "
-    "exercises has an answer that runs."
+TITLE: Final = "Splats with polarized opacity, step by step"
+LEAD: Final = (
+    "3D Gaussian Splatting and the Polarized Opacity Prior, for a reader who knows linear algebra and Python and has "
+    "never heard of splats. Every chapter is a script on the oracle's own functions: what it claims is checked as it "
+    "runs, and each of its exercises has an answer that runs."
 )
 
 
@@ -47,6 +50,11 @@ _MATHML: Final = "{http://www.w3.org/1998/Math/MathML}"
 ElementTree.register_namespace("", _MATHML[1:-1])
 
 
+# labels of decisions and kinks in prose; what code quotes is left alone
+_LABEL: Final = re.compile(r"(<(pre|code|a|math|h\d)\b.*?</\2>)|\b([DB][1-8])\b", re.DOTALL)
+_WIDGET: Final = re.compile(r"<p>\{\{widget: (\w+)\}\}</p>")
+
+
 class _FormulaError(Exception):
     pass
 
@@ -64,7 +72,11 @@ def chapter_page(
     Raises:
         ChapterError: a formula cannot be set; the message names the chapter's file and line.
     """
-    body = [_cell(chapter, f"p{i}", outcome) for i, outcome in enumerate(outcomes)]
+    tiers = iter(chapter.tiers)
+    body = []
+    for i, outcome in enumerate(outcomes):
+        tier = next(tiers) if outcome.cell.kind == "answer" else ""
+        body.append(_cell(chapter, f"p{i}", outcome, tier))
     at = [each.number for each in chapters].index(chapter.number)
     before = chapters[at - 1] if at > 0 else None
     after = chapters[at + 1] if at + 1 < len(chapters) else None
@@ -72,31 +84,59 @@ def chapter_page(
     file = f"pop_ref/walkthrough/{chapter.path.name}"
     return _document(
         f"{chapter.number}. {chapter.title}",
-        f'<nav><a href="index.html">{_TITLE}</a><span>{chapter.number} of {len(chapters)}</span></nav>'
+        f'<nav><a href="index.html">{TITLE}</a><span>{chapter.minutes} minutes · '
+        f'<a href="{GLOSSARY_PAGE}">glossary</a></span></nav>'
         f'<article>{"".join(body)}</article><nav class="turn">{turn}</nav>'
         f"<footer>This page is <code>{file}</code>, run and laid out. Change it and run it: "
         f"<code>python -m {chapter.module}</code></footer>",
     )
 
 
-def index_page(chapters: Sequence[Chapter]) -> str:
-    """Lay out the contents: every chapter's title and opening paragraph."""
+def index_page(chapters: Sequence[Chapter], beside: Mapping[str, str] | None = None) -> str:
+    """Lay out the contents: every chapter's title, minutes and opening paragraph.
+
+    Args:
+        chapters: in order.
+        beside: other forms of the chapters, name to place relative to the page.
+    """
     items = [
-        f'<li><h2><a href="{chapter.page}">{chapter.number}. {_inline(chapter, chapter.title)}</a></h2>'
+        f'<li><h2><a href="{chapter.page}">{chapter.number}. {_inline(chapter, chapter.title)}</a> '
+        f"<small>{chapter.minutes} min</small></h2>"
         f"<p>{_inline(chapter, chapter.opening)}</p></li>"
         for chapter in chapters
     ]
+    hours = sum(chapter.minutes for chapter in chapters) / 60.0
+    about = f'{LEAD} All of it takes about {hours:.0f} hours. <a href="{GLOSSARY_PAGE}">Glossary</a>'
+    for name, place in (beside or {}).items():
+        about += (
+            f' · <a href="{place}{"/index.html" if name == "notebooks" else ""}">{name}</a>'
+        )
     return _document(
-        _TITLE, f'<h1>{_TITLE}</h1><p>{_LEAD}</p><ol class="contents">{"".join(items)}</ol>'
+        TITLE, f'<h1>{TITLE}</h1><p>{about}</p><ol class="contents">{"".join(items)}</ol>'
+    )
+
+
+def glossary_page() -> str:
+    """Lay out the glossary, to which labels such as D5 in every chapter lead."""
+    # where the chapters' labels lead
+    body = re.sub(
+        r"<td>([DB]\d)</td>", r'<td id="\1">\1</td>', _MARKDOWN.render(glossary())
+    )
+    return _document(
+        "Glossary",
+        f'<nav><a href="index.html">{TITLE}</a></nav><h1>Glossary</h1><article>{body}</article>',
     )
 
 
 def _document(title: str, body: str) -> str:
-    style = (FOLDER / "page.css").read_text(encoding="utf-8")
+    style, script = (
+        (FOLDER / f"page.{kind}").read_text(encoding="utf-8") for kind in ("css", "js")
+    )
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{style}</style></head><body><main>{body}</main></body></html>\n"
+        f"<title>{escape(title)}</title><style>{style}</style></head><body><main>{body}</main>"
+        f"<script>{script}</script></body></html>\n"
     )
 
 
@@ -106,27 +146,51 @@ def _turn(chapter: Chapter | None, left: str, right: str) -> str:
     return f'<a href="{chapter.page}">{left}{chapter.number}. {escape(chapter.title)}{right}</a>'
 
 
-def _cell(chapter: Chapter, name: str, outcome: Outcome) -> str:
+def _cell(chapter: Chapter, name: str, outcome: Outcome, tier: str) -> str:
     cell = outcome.cell
     if cell.kind == "prose":
         return _prose(chapter, cell)
     said, code = said_and_done(cell.text) if cell.kind == "answer" else ("", cell.text)
     shown = [_prose(chapter, Cell("prose", said, cell.line))] if said else []
-    plain, drawing = (
-        "\n\n".join(part.text for part in parts(code) if part.draws is draws)
-        for draws in (False, True)
-    )
+    by_role: dict[str, list[str]] = {"plain": [], "imports": [], "checks": [], "draws": []}
+    for part in parts(code):
+        by_role[part.role].append(part.text)
+    plain, imports, checks, drawing = ("\n\n".join(by_role[role]) for role in by_role)
+    if imports:
+        shown.append(_aside("Imports", imports))
     if plain:
-        shown.append(_code(plain))
+        shown.append(
+            _aside("What this example is made of", plain)
+            if cell.kind == "setup"
+            else _code(plain)
+        )
     if outcome.printed.strip():
         shown.append(f'<pre class="printed">{escape(outcome.printed.rstrip())}</pre>')
     for i, each in enumerate(outcome.pictures):
         shown.append(_figure(chapter, cell, f"{name}-{i}", each))
-    # how a picture is drawn is a footnote to it
+    # how a picture is drawn, and what is checked, are footnotes
     if drawing:
-        shown.append(_folded("The code that draws", _code(drawing), ' class="drawing"'))
+        shown.append(_aside("The code that draws", drawing))
+    if checks:
+        shown.append(_aside("What was checked as this page was made", checks))
     whole = "".join(shown)
-    return _folded("Answer", whole) if cell.kind == "answer" else whole
+    return _asked(name, tier, whole) if cell.kind == "answer" else whole
+
+
+def _asked(name: str, tier: str, answer: str) -> str:
+    """Fold an answer; where a guess is asked for, put a box for it before, which a script shows and reads."""
+    if tier not in ("predict", "find the bug"):
+        return _folded("Answer", answer)
+    asks = "Your prediction" if tier == "predict" else "Which line, and why?"
+    box = (
+        f'<p class="guess" hidden><label for="{name}-guess">{asks}</label> '
+        f'<input id="{name}-guess" autocomplete="off"><span role="status"></span></p>'
+    )
+    return f'<div class="asked">{box}{_folded("Answer", answer)}</div>'
+
+
+def _aside(title: str, code: str) -> str:
+    return _folded(title, _code(code), ' class="drawing"')
 
 
 def _folded(title: str, body: str, attributes: str = "") -> str:
@@ -134,18 +198,28 @@ def _folded(title: str, body: str, attributes: str = "") -> str:
 
 
 def _code(text: str) -> str:
-    return f"<pre><code>{highlight(text, PythonLexer(), HtmlFormatter(nowrap=True))}</code></pre>"
+    return f"<pre><code>{_colored(text, 'python', '')}</code></pre>"
+
+
+def _colored(text: str, language: str, _: str) -> str:
+    return (
+        highlight(text, PythonLexer(), HtmlFormatter(nowrap=True))
+        if language == "python"
+        else escape(text)
+    )
 
 
 def _figure(chapter: Chapter, cell: Cell, name: str, picture: Picture) -> str:
     caption = _inline(chapter, picture.caption, cell.line)
+    if picture.frames:
+        return _film(name, picture, caption)
     if picture.svg is None:
         data = base64.b64encode(picture.png or b"").decode("ascii")
         size = f'width="{picture.width * 100:.0f}"'
         shown = f'<img src="data:image/png;base64,{data}" {size} alt="{escape(picture.caption)}">'
     else:
         shown = _inline_svg(picture.svg, name, picture.caption)
-    return f"<figure>{shown}<figcaption>{caption}</figcaption></figure>"
+    return f'<figure><div class="wide">{shown}</div><figcaption>{caption}</figcaption></figure>'
 
 
 def _inline_svg(svg: str, name: str, caption: str) -> str:
@@ -204,20 +278,48 @@ def _link(self: Any, tokens: Any, at: int, options: Any, env: Any) -> str:
 
 
 _MARKDOWN: Final = (
-    MarkdownIt("commonmark", {"html": False})
+    MarkdownIt("commonmark", {"html": False, "highlight": _colored})
     .enable("table")
     .use(dollarmath_plugin, renderer=_formula)
 )
 _MARKDOWN.add_render_rule("link_open", _link)
+_MARKDOWN.add_render_rule("table_open", lambda *_: '<div class="wide"><table>')
+_MARKDOWN.add_render_rule("table_close", lambda *_: "</table></div>")
 
 
 def _prose(chapter: Chapter, cell: Cell) -> str:
     try:
-        return _MARKDOWN.render(cell.text)
+        text = expanded(cell.text)
+    except ValueError as error:
+        raise ChapterError(chapter.path, cell.line, str(error)) from error
+    try:
+        rendered = _LABEL.sub(_label, _MARKDOWN.render(text))
+        return _WIDGET.sub(lambda found: widgets.html(found[1]), rendered)
     except Exception as error:
         raise ChapterError(
             chapter.path, _line_of(cell, error), f"a formula cannot be set: {error}"
         ) from error
+
+
+def _label(found: re.Match[str]) -> str:
+    return found[1] or f'<a class="label" href="{GLOSSARY_PAGE}#{found[3]}">{found[3]}</a>'
+
+
+def _film(name: str, picture: Picture, caption: str) -> str:
+    """Lay frames out as a strip; a script turns the strip into one frame with a slider."""
+    frames = "".join(
+        f'<li><img src="data:image/png;base64,{base64.b64encode(png).decode("ascii")}" alt="{escape(label)}">'
+        f"<span>{escape(label)}</span></li>"
+        for png, label in picture.frames
+    )
+    controls = (
+        f'<p hidden><button type="button">Play</button> <input type="range" min="0" '
+        f'max="{len(picture.frames) - 1}" value="0" aria-label="frame" id="{name}-frame"> <output></output></p>'
+    )
+    return (
+        f'<figure class="film" style="--wide:{picture.width * 100:.0f}px"><ol>{frames}</ol>{controls}'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
 
 
 def _line_of(cell: Cell, error: Exception) -> int:
@@ -233,3 +335,17 @@ def _inline(chapter: Chapter, text: str, line: int = 1) -> str:
         raise ChapterError(
             chapter.path, line, f"a formula cannot be set in {text!r}: {error}"
         ) from error
+
+
+def rendered(chapter: Chapter, text: str) -> str:
+    """Set markdown of a chapter as its page does.
+
+    Raises:
+        ChapterError: a formula cannot be set.
+    """
+    return _prose(chapter, Cell("prose", text, 1))
+
+
+def figure(chapter: Chapter, cell: Cell, name: str, picture: Picture) -> str:
+    """Set a picture of a chapter as its page does; `name` is what its ids begin with."""
+    return _figure(chapter, cell, name, picture)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Final
 
 import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib.figure import Figure
 
 from pop_ref.walkthrough import style
@@ -24,12 +25,17 @@ _DPI: Final = 200
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure as it stands in a page: SVG text, or PNG bytes where the SVG would be huge; inches; a caption."""
+    """A figure as it stands in a page: SVG text, or PNG bytes where the SVG would be huge; inches; a caption.
+
+    Attributes:
+        frames: of a film, PNG bytes and a label each; a film has no other picture.
+    """
 
     svg: str | None
     png: bytes | None
     width: float
     caption: str
+    frames: tuple[tuple[bytes, str], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,7 @@ _walls: list[list[Picture]] = []
 
 
 def picture(figure: Figure, caption: str) -> None:
-    """Hand a figure to the page under construction and close it; in a plain script, just close it.
+    """Hand a figure to the page under construction, or show it in a notebook, and close it.
 
     Args:
         figure: a matplotlib figure.
@@ -54,7 +60,61 @@ def picture(figure: Figure, caption: str) -> None:
     """
     if _walls:
         _walls[-1].append(_drawn(figure, caption))
+    else:
+        _show_in_notebook(figure, caption)
     plt.close(figure)
+
+
+def _show_in_notebook(figure: Figure, caption: str) -> None:
+    """Show a figure and its caption where this runs in Jupyter, which alone has both modules and a kernel."""
+    jupyter, shown = (
+        sys.modules.get("ipykernel.zmqshell"),
+        sys.modules.get("IPython.display"),
+    )
+    if jupyter is None or shown is None or not jupyter.ZMQInteractiveShell.initialized():
+        return
+    png = io.BytesIO()
+    figure.savefig(png, format="png", dpi=_DPI, facecolor="white")
+    width = round(100 * float(figure.get_size_inches()[0]))
+    shown.display(shown.Image(png.getvalue(), width=width), shown.Markdown(caption))
+
+
+def film(
+    images: Sequence[np.ndarray], labels: Sequence[str], caption: str, enlarged: int = 4
+) -> None:
+    """Hand a sequence of images to the page under construction, which plays them; elsewhere show some as a strip.
+
+    Args:
+        images: [H, W, 3] linear rgb each, clipped to [0, 1] here.
+        labels: one an image, such as "step 20".
+        caption: one or two sentences of markdown, formulas allowed.
+        enlarged: how many pixels of the page an image's pixel is wide.
+    """
+    if _walls:
+        frames = tuple(
+            (_enlarged(image, enlarged), label)
+            for image, label in zip(images, labels, strict=True)
+        )
+        _walls[-1].append(
+            Picture(None, None, images[0].shape[1] * enlarged / 100.0, caption, frames)
+        )
+        return
+    shown = [round(float(k)) for k in np.linspace(0, len(images) - 1, min(5, len(images)))]
+    figure, panels = style.axes(len(shown), height=7.2 / len(shown))
+    for panel, k in zip(np.atleast_1d(panels), shown, strict=True):
+        style.show_image(panel, images[k], labels[k])
+        panel.set(xticks=[], yticks=[])
+    picture(figure, caption)
+
+
+def _enlarged(image: np.ndarray, times: int) -> bytes:
+    file = io.BytesIO()
+    plt.imsave(
+        file,
+        np.clip(image, 0.0, 1.0).repeat(times, axis=0).repeat(times, axis=1),
+        format="png",
+    )
+    return file.getvalue()
 
 
 def run_chapter(chapter: Chapter) -> list[Outcome]:

@@ -18,10 +18,11 @@ ACCENT: Final = "#2563c9"
 SECOND: Final = "#d2622a"
 THIRD: Final = "#23835a"
 
-# negative, zero, positive
+# negative, zero, positive; and none, much: what is nothing is transparent, so that it suits light and dark pages
 DIVERGING: Final = LinearSegmentedColormap.from_list(
-    "diverging", [SECOND, "#f6f4f0", ACCENT]
+    "diverging", [(0.0, f"{SECOND}ff"), (0.5, f"{MUTED}10"), (1.0, f"{ACCENT}ff")]
 )
+MUCH: Final = LinearSegmentedColormap.from_list("much", [f"{ACCENT}00", f"{ACCENT}ff"])
 
 # what the pages' style sheet calls them; it gives each a form for dark screens
 VARIABLES: Final = {

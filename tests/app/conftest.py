@@ -27,7 +27,7 @@ class Outcome:
 
 Pop = Callable[..., Outcome]
 # a capture of 8 photographs; 30 steps with a change of the population and all other events in them
-TRAIN = ("--steps-scaler", "0.001", "--quiet", "--pop.grow-grad2d", "1e-6")
+TRAIN = ("--steps-scaler", "0.001", "--no-progress", "--pop.grow-grad2d", "1e-6")
 
 
 @pytest.fixture

@@ -1,7 +1,8 @@
 """Something that takes whole steps without being a training step: numbers drift, deterministically, by what they are.
 
-It follows the interface of `cuda_ext.train_step.FusedTrainer` on the CPU and shows what the run does around such steps:
-stretches, densification steps, statistics, checkpoints, errors. What real steps compute is shown by real steppers.
+It follows the interface of `cuda_ext.training.train_step.FusedTrainer` on the CPU and shows what the run does around
+such steps: segments, densification steps, statistics, checkpoints, errors. What real steps compute is shown by real
+steppers.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, StepStats
-from pop_fast.backends import get_backend
+from pop_fast.api.registry import get_backend
 from pop_fast.train.engines import LONGEST_ON_GPU
 from pop_fast.train.fused_stepper import FusedStepper
 from pop_fast.train.stepper import Engine
@@ -22,7 +23,7 @@ Rows = Mapping[str, Tensor]
 
 
 class Drift:
-    """See `cuda_ext.train_step.FusedTrainer`; tests may set `before_step`, which is called with the step's number."""
+    """See `cuda_ext.training.train_step.FusedTrainer`; tests may set `before_step`, called with the step's number."""
 
     def __init__(
         self,

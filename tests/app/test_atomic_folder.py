@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import errno
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from pop_fast.io import atomic
 from pop_fast.io.atomic import folder_atomically
 from tests.app.captures import assert_one_line
 from tests.app.damage import contents
+from tests.app.interruptions import Killed, killed_after
 
 
 def test_a_folder_appears_only_when_its_block_ends(tmp_path: Path) -> None:
@@ -181,3 +184,34 @@ def test_an_empty_folder_is_filled_without_being_asked(tmp_path: Path) -> None:
 def test_a_file_in_the_way_of_a_folder_is_named(tmp_path: Path) -> None:
     (tmp_path / "x").write_text("")
     assert_one_line(lambda: fill(tmp_path / "x", True), str(tmp_path / "x"), "in the way")
+
+
+@pytest.mark.parametrize("can_exchange", [True, False])
+def test_a_killed_replacement_never_hides_the_old_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, can_exchange: bool
+) -> None:
+    if not can_exchange:
+        monkeypatch.setattr(atomic, "_exchange", lambda *_: False)
+    kills = 0
+    for changes in range(12):
+        target = old_folder(tmp_path / str(changes) / "folder", "a.txt")
+        try:
+            with killed_after(changes):
+                fill(target, True, "a.txt", recognise=by_name("a.txt"))
+        except Killed:
+            kills += 1
+        if can_exchange:
+            assert (target / "a.txt").read_text() in ("old", "new")
+        # whoever writes there next finds the one or the other
+        assert_one_line(lambda target=target: fill(target, recognise=by_name("a.txt")), "not empty")
+        assert (target / "a.txt").read_text() in ("old", "new")
+        assert os.listdir(target.parent) == ["folder"]
+    assert 3 <= kills < 12
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no exchange of names that Python reaches")
+def test_two_folders_are_exchanged_in_one_step(tmp_path: Path) -> None:
+    one, other = old_folder(tmp_path / "one", "a.txt"), old_folder(tmp_path / "other", "b.txt")
+    assert atomic._exchange(one, other)  # pyright: ignore[reportPrivateUsage]
+    assert (os.listdir(one), os.listdir(other)) == (["b.txt"], ["a.txt"])
+    assert not atomic._exchange(one, tmp_path / "absent")  # pyright: ignore[reportPrivateUsage]

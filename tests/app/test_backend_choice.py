@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from pop_fast.backends import get_backend
+from pop_fast.api.rasterize import rasterization
+from pop_fast.api.registry import get_backend
 from pop_fast.cli.train import check_backend
+from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.rasterization import rasterization
-from pop_fast.strategies import POPStrategy
 from pop_fast.train import TrainingRun
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.engines import cuda_engine
-from pop_fast.train.on_device import OnDevice, renderer, words_for_memory
+from pop_fast.train.gpu_proxy import GpuProxy, renderer, words_for_memory
 from pop_fast.train.views import ViewTensors, render_view
 from tests.app.conftest import TRAIN, Pop
 from tests.app.drift import drift_engine
@@ -30,6 +30,7 @@ NOT_COMPILED = "the CPU kernels are not compiled"
 def _without_compiled_blend(monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a machine without a C++ compiler; `test_build_cpu` tells what there is with one."""
     monkeypatch.setattr("pop_fast.compiled.why_not", lambda: NOT_COMPILED)
+    monkeypatch.setattr("pop_fast.train.choose.has_gpu", lambda: True)
 
 
 @pytest.fixture
@@ -88,7 +89,7 @@ def test_what_takes_the_steps_goes_with_the_backend(tmp_path):
 def test_cuda_asked_for_in_vain_is_one_sentence_before_anything_is_read(pop: Pop, tmp_path: Path) -> None:
     outcome = pop("train", tmp_path / "no such capture", "--backend", "cuda", "--out", tmp_path / "r")
     assert outcome.status == 2
-    assert outcome.err == f"pop: error: backend 'cuda' is not available: {NOT_BUILT}\n"
+    assert outcome.err == f"pop: error: backend 'cuda' cannot run: {NOT_BUILT}\n"
     with pytest.raises(PopError, match="not built"):
         cuda_engine()
     with pytest.raises(PopError, match="backend 'cuda' cannot run: the CUDA extension is not built"):
@@ -133,7 +134,7 @@ def test_a_result_of_a_gpu_can_be_measured_without_one(pop: Pop, result: Path, m
 def test_images_and_what_is_told_of_them_come_back_from_the_device(tmp_path):
     trainer = TrainingRun(tiny_config(tmp_path), tiny_capture())
     view: ViewTensors = trainer._train[0]
-    on = OnDevice(get_backend("fast"), torch.device("cpu"))
+    on = GpuProxy(get_backend("fast"), torch.device("cpu"))
     there = render_view(on, trainer.params, view, trainer.config, 0, counts=True)
     here = render_view(get_backend("fast"), trainer.params, view, trainer.config, 0, counts=True)
     assert torch.equal(there.image, here.image.detach())

@@ -77,7 +77,7 @@ def test_a_folder_that_may_not_be_written_is_named(pop: Pop, shared_capture: Pat
 def test_a_video_that_the_disk_has_no_room_for_leaves_the_old_one(
     pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ["render", shared_result, "--path", "orbit", "--frames", "3", "--video", tmp_path / "clip.mp4"]
+    words = ["render", shared_result, "--path", "orbit", "--frames", "3", "--video", tmp_path / "clip.webm"]
     assert pop(*words).status == 0
     before = contents(tmp_path)
     open_writer = cv2.VideoWriter
@@ -98,5 +98,5 @@ def test_a_video_that_the_disk_has_no_room_for_leaves_the_old_one(
             truncate(self.path)
 
     monkeypatch.setattr(cv2, "VideoWriter", Full)
-    says(pop(*words, "--overwrite"), f"{tmp_path / 'clip.mp4'}: only 0 of 3 frames", "free some space")
+    says(pop(*words, "--overwrite"), f"{tmp_path / 'clip.webm'}: only 0 of 3 frames", "free some space")
     assert contents(tmp_path) == before

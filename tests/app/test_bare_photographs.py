@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from pop_fast.data import load_capture, photos, run_sfm
+from pop_fast.data import load_capture, run_sfm, sfm
 from tests.app.captures import assert_one_line, make_model, photograph, ring, write_photograph
 from tests.app.damage import contents
 
@@ -21,7 +21,7 @@ def _cameras_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
     def find(job: Any, *_: Any) -> Any:
         return make_model(job.names[:3], ring(len(job.names[:3])))
 
-    monkeypatch.setattr(photos, "_find_cameras", find)
+    monkeypatch.setattr(sfm, "_find_cameras", find)
 
 
 def fill(folder: Path, names: tuple[str, ...] = ("0.png", "1.png", "2.png")) -> Path:

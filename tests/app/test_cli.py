@@ -138,7 +138,7 @@ def test_ctrl_c_says_how_to_go_on_and_exits_with_130(
     interrupt(monkeypatch, at=10)
     outcome = pop("train", shared_capture, "--out", tmp_path / "r", *TRAIN)
     assert outcome.status == 130
-    assert outcome.err.strip() == "pop: stopped after step 10; the same command with --resume goes on"
+    assert outcome.err.strip() == "pop: stopped after step 10; the same command with --resume goes on from step 7"
     interrupt(monkeypatch, at=0)
     outcome = pop("train", shared_capture, "--out", tmp_path / "s", *TRAIN)
     assert outcome.status == 130
@@ -198,10 +198,10 @@ def test_report_is_written_again_on_demand(pop: Pop, result: Path) -> None:
 
 
 def test_sfm_says_how_well_it_went(pop: Pop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pop_fast.data.photos import SfmResult
+    from pop_fast.data.sfm import SfmResult
 
     found = SfmResult(tmp_path / "scene", 7, 8, 1234, 0.75)
-    monkeypatch.setattr("pop_fast.data.photos.run_sfm", lambda *_, **__: found)
+    monkeypatch.setattr("pop_fast.data.sfm.run_sfm", lambda *_, **__: found)
     outcome = pop("sfm", tmp_path)
     assert outcome.status == 0
     assert "7 of 8 photographs placed, 1,234 points, mean reprojection error 0.75 px" in outcome.out
@@ -226,7 +226,7 @@ def test_a_fault_of_the_program_keeps_its_traceback(pop: Pop, monkeypatch: pytes
     def broken(_: object) -> None:
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("pop_fast.report.write.write_report", broken)
+    monkeypatch.setattr("pop_fast.view.report.write.write_report", broken)
     with pytest.raises(ZeroDivisionError):
         pop("report", ".")
 
@@ -235,7 +235,7 @@ def test_ctrl_c_anywhere_exits_with_130(pop: Pop, monkeypatch: pytest.MonkeyPatc
     def interrupted(_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pop_fast.report.write.write_report", interrupted)
+    monkeypatch.setattr("pop_fast.view.report.write.write_report", interrupted)
     outcome = pop("report", ".")
     assert outcome.status == 130
     assert outcome.err.strip() == "pop: interrupted"
@@ -265,7 +265,7 @@ def test_results_are_complete_before_the_report_and_whatever_becomes_of_it(
         raise fault
 
     with monkeypatch.context() as patch:
-        patch.setattr("pop_fast.report.write.write_report", broken)
+        patch.setattr("pop_fast.view.report.write.write_report", broken)
         outcome = pop("train", shared_capture, "--out", folder, *TRAIN)
     assert {"ckpts/ckpt_29_rank0.pt", "ply/point_cloud_29.ply", "stats/val_step0029.json", "cfg.json"} <= set(found)
     assert outcome.status == status

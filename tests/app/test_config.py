@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from cuda_ext.train_settings import GROUPS
 from pop_fast.cli.train import arguments
-from pop_fast.density import blur_set
+from pop_fast.density import DensityControl, GsplatStrategy, POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.strategies import DensityControl, GsplatStrategy, POPStrategy
+from pop_fast.stages.density import blur_set
 from pop_fast.train import LearningRates, TrainConfig
 from pop_fast.train.config import first_difference
 from pop_fast.train.jsonable import to_plain

@@ -10,10 +10,11 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from pop_fast.data import load_capture, make_demo
-from pop_fast.data.demo_scene import make_scene
-from pop_fast.data.demo_shapes import Ball, Box, Frustum, Shape, Torus
-from pop_fast.data.demo_tracer import first_hits, render_view
+from pop_fast.data import load_capture
+from pop_fast.demo import make_demo
+from pop_fast.demo.scene import make_scene
+from pop_fast.demo.shapes import Ball, Box, Frustum, Shape, Torus
+from pop_fast.demo.tracer import first_hits, render_view
 from pop_fast.io import images
 from tests.app.captures import assert_one_line, look_at
 
@@ -108,7 +109,7 @@ def test_a_failure_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.Mon
             raise OSError(28, "No space left on device", str(path))
         images.write_png(path, image)
 
-    monkeypatch.setattr("pop_fast.data.demo.write_png", break_third)
+    monkeypatch.setattr("pop_fast.demo.make.write_png", break_third)
     target = tmp_path / "demo"
     assert_one_line(lambda: make_demo(target, **SMALL), str(target), "view_002.png", "disk is full")
     assert list(tmp_path.iterdir()) == []

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 import torch
 
+from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.explain import ExplainedView, explain_pixel, explain_view
-from pop_fast.explain.diff import difference
-from pop_fast.explain.flips import first_flip
-from pop_fast.explain.maps import termination_depths
-from pop_fast.explain.table import WIDTH, table
-from pop_fast.explain.walk import candidates, oracle_splats, walk
-from pop_fast.losses import photometric_pop
-from pop_fast.strategies import POPStrategy
+from pop_fast.stages.losses import photometric_pop
 from pop_fast.train.config import TrainConfig
+from pop_fast.view.explain import ExplainedView, explain_pixel, explain_view
+from pop_fast.view.explain.diff import difference
+from pop_fast.view.explain.flips import first_flip
+from pop_fast.view.explain.maps import termination_depths
+from pop_fast.view.explain.table import WIDTH, table
+from pop_fast.view.explain.walk import candidates, oracle_splats, walk
 from pop_ref.constants import PAPER, Profile
 from pop_ref.records import Splats
 from tests.app.conftest import Pop
@@ -120,8 +120,8 @@ def test_the_views_derivatives_are_those_of_the_loss_that_is_trained(scene: Expl
 
 
 def rendered(view: ExplainedView) -> torch.Tensor:
-    from pop_fast.explain.scene import settings_of
-    from pop_fast.rasterization import rasterization
+    from pop_fast.api.rasterize import rasterization
+    from pop_fast.view.explain.scene import settings_of
 
     given = {**view.gaussians, "colors": view.gaussians["sh"]}
     del given["sh"]

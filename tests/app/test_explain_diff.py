@@ -14,15 +14,15 @@ import pytest
 import torch
 
 import cuda_ext
-from pop_fast import backends
+from pop_fast.api import registry as backends
+from pop_fast.api.rasterize import rasterization
 from pop_fast.cli.explain import chosen_view
 from pop_fast.errors import PopError
-from pop_fast.explain import ExplainedView, explain_pixel, explain_view
-from pop_fast.explain.diff import difference
-from pop_fast.explain.scene import with_objective
-from pop_fast.losses import photometric_3dgs, photometric_pop
-from pop_fast.rasterization import rasterization
+from pop_fast.stages.losses import photometric_3dgs, photometric_pop
 from pop_fast.train.config import TrainConfig
+from pop_fast.view.explain import ExplainedView, explain_pixel, explain_view
+from pop_fast.view.explain.diff import difference
+from pop_fast.view.explain.scene import with_objective
 from pop_ref.constants import PAPER
 from tests.app.conftest import Pop
 from tests.app.damage import says

@@ -109,7 +109,7 @@ def test_inria_s_cameras_are_those_of_the_colmap_model(
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        (["--out", "x.obj"], "must end in .ply or .splat"),
+        (["--out", "x.obj"], "must end in one of .compressed.ply, .glb, .ply, .sog, .splat, .spz"),
         (["--out", "there.ply"], "exists; pass --overwrite"),
         (["--out", "full", "--layout", "inria"], "full: holds what this command did not write (notes.txt)"),
         (["--out", "full", "--layout", "inria", "--overwrite"], "did not write (notes.txt)"),

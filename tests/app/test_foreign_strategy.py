@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import torch
 
+from pop_fast.density import DensificationStep, POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.strategies import POPStrategy, StepEvent
 from pop_fast.train import TrainingRun
 from tests.app.test_resume import assert_same_run
 from tests.app.tiny import tiny_capture, tiny_config
@@ -55,7 +55,7 @@ class Jitter:
             optimizer.param_groups[0]["params"] = [new]
             params[key] = new
         state["grad2d"] = state["count"] = None
-        return StepEvent(cloned=1) if self.tells else None
+        return DensificationStep(cloned=1) if self.tells else None
 
 
 def run(folder: Any, stop_after: int | None = None, resume: bool = False, **options: Any) -> TrainingRun:

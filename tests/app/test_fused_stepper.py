@@ -1,4 +1,4 @@
-"""A run whose engine takes many steps at a time: stretches, statistics, densification steps, checkpoints, errors."""
+"""A run whose engine takes many steps at a time: segments, statistics, densification steps, checkpoints, errors."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import torch
 
 from cuda_ext.arrays import CudaMemoryError
 from cuda_ext.train_settings import GROUPS
+from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.strategies import POPStrategy
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.engines import LONGEST_ON_GPU
 from pop_fast.train.fused_stepper import step_settings, unsupported
-from pop_fast.train.phases import phase_at, stretch_end
+from pop_fast.train.phases import phase_at, segment_end
 from pop_fast.train.schedule import updates_of
 from tests.app.drift import Drift, drift_engine
 from tests.app.tiny import HEIGHT, WIDTH, last_checkpoint, tiny_capture, tiny_config
@@ -73,7 +73,7 @@ def test_stopping_anywhere_and_going_on_changes_nothing(case, tmp_path):
     drifting(tmp_path / "whole", **changes).run()
     for place, stop_after in enumerate((3, 11, 13, 17, 29)):
         trainer = drifting(tmp_path / "parts", **changes, resume=place > 0)
-        # leave at once, without any clean-up, somewhere in a stretch
+        # leave at once, without any clean-up, somewhere in a segment
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Drift, "before_step", lambda self, step, stop=stop_after: interrupt(step, stop))
             with pytest.raises(KeyboardInterrupt):
@@ -90,7 +90,7 @@ def interrupt(step, stop):
         raise KeyboardInterrupt
 
 
-def test_a_polite_stop_ends_with_the_stretch_and_writes_a_checkpoint(tmp_path, monkeypatch):
+def test_a_polite_stop_ends_with_the_segment_and_writes_a_checkpoint(tmp_path, monkeypatch):
     import os
     import signal
 
@@ -115,11 +115,11 @@ def test_the_device_is_left_alone_between_events(tmp_path):
     assert [phase.statistics for _, _, phase in runs] == [phase.pop for _, _, phase in runs] == [True] * 8 + [False]
 
 
-def test_a_stretch_ends_where_something_is_due():
+def test_a_segment_ends_where_something_is_due():
     config = tiny_config("x", max_steps=9000, checkpoint_every=1000, strategy=POPStrategy())
     strategy, first = config.strategy, 0
     while first < config.max_steps:
-        end = stretch_end(config, strategy, first, LONGEST_ON_GPU)
+        end = segment_end(config, strategy, first, LONGEST_ON_GPU)
         assert first < end <= min(first + LONGEST_ON_GPU, config.max_steps)
         assert len({phase_at(config, strategy, step) for step in range(first, end)}) == 1
         assert not any(strategy.changes_after(step) for step in range(first, end - 1))

@@ -11,10 +11,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from pop_fast.backends import get_backend
+from pop_fast.api.registry import get_backend
+from pop_fast.density import DensityControl
+from pop_fast.density.protocol import Draws
 from pop_fast.errors import PopError
-from pop_fast.strategies import DensityControl
-from pop_fast.strategies.base import Draws
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.model import KEYS
 from pop_fast.train.presets import METHODS

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
-from pop_fast.covariance import covars_from_quats_scales
+from pop_fast.api.rasterize import rasterization
 from pop_fast.data import apply_similarity, load_capture, to_capture_frame
 from pop_fast.data.normalize import normalizing_transform, transform_points, transform_viewmats
 from pop_fast.data.similarity import rotate_sh
 from pop_fast.errors import PopError
-from pop_fast.harmonics import colors_from_sh, sh_basis
-from pop_fast.rasterization import rasterization
+from pop_fast.stages.covariance import covars_from_quats_scales
+from pop_fast.stages.harmonics import colors_from_sh, sh_basis
 from tests.app.captures import assert_one_line, cloud, colmap_capture, look_at, ring
 
 unit = st.floats(-1.0, 1.0, width=32)

@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pop_fast.errors import PopError
-from pop_fast.paths import PATHS, VideoFile, camera_path, interpolate, orbit
-from pop_fast.paths.cameras import camera_centers, focus_point, look_at, mean_up
-from pop_fast.paths.video import frames_in
+from pop_fast.view.paths import PATHS, VideoFile, camera_path, interpolate, orbit, video
+from pop_fast.view.paths.cameras import camera_centers, focus_point, look_at, mean_up
+from pop_fast.view.paths.video import frames_in, has_h264
 from tests.app.captures import assert_one_line
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -92,26 +92,26 @@ def test_bad_path_requests_name_the_field_and_the_choices() -> None:
 
 
 def test_a_video_holds_the_frames_that_were_added(tmp_path: Path) -> None:
-    path = tmp_path / "clip.mp4"
-    with VideoFile(path, fps=10) as video:
+    path = tmp_path / "clip.webm"
+    with VideoFile(path, fps=10) as film_of_grays:
         for shade in (0, 120, 240):
-            video.add(np.full((49, 64, 3), shade, np.uint8))  # an odd height loses its last row
+            film_of_grays.add(np.full((49, 64, 3), shade, np.uint8))  # an odd height loses its last row
     reader = cv2.VideoCapture(str(path))
     frames = [reader.read()[1] for _ in range(3)]
     assert frames[0].shape == (48, 64, 3)
     assert [abs(int(frame.mean()) - shade) < 8 for frame, shade in zip(frames, (0, 120, 240), strict=True)] == [
         True
     ] * 3
-    assert [p.name for p in tmp_path.iterdir()] == ["clip.mp4"]
+    assert [p.name for p in tmp_path.iterdir()] == ["clip.webm"]
 
 
 def film(path: Path, *sizes: tuple[int, int], fps: float = 30.0) -> None:
-    with VideoFile(path, fps) as video:
+    with VideoFile(path, fps) as clip:
         for i, (width, height) in enumerate(sizes):
-            video.add(np.random.default_rng(i).integers(0, 256, (height, width, 3), dtype=np.uint8))
+            clip.add(np.random.default_rng(i).integers(0, 256, (height, width, 3), dtype=np.uint8))
 
 
-@pytest.mark.parametrize("name", ["clip.mp4", "clip.webm", "clip.AVI"])
+@pytest.mark.parametrize("name", ["clip.webm", "clip.AVI"])
 @pytest.mark.parametrize("fps", [0.5, 29.97, 600.0])
 def test_every_kind_of_video_plays_to_its_last_frame(tmp_path: Path, name: str, fps: float) -> None:
     film(tmp_path / "new" / name, *[(32, 16)] * 5, fps=fps)
@@ -131,28 +131,28 @@ def test_every_kind_of_video_plays_to_its_last_frame(tmp_path: Path, name: str, 
 def test_a_video_that_fails_half_way_leaves_the_old_file(
     tmp_path: Path, sizes: list[tuple[int, int]], told: str
 ) -> None:
-    path = tmp_path / "clip.mp4"
+    path = tmp_path / "clip.webm"
     path.write_bytes(b"old")
     assert_one_line(lambda: film(path, *sizes), f"{path}: {told}")
     assert path.read_bytes() == b"old"
-    assert os.listdir(tmp_path) == ["clip.mp4"]
+    assert os.listdir(tmp_path) == ["clip.webm"]
 
 
 @pytest.mark.parametrize("fps", [0.0, -1.0, 0.4, 601.0, float("nan"), float("inf")])
 def test_a_rate_that_no_video_can_have_is_refused_at_once(tmp_path: Path, fps: float) -> None:
-    assert_one_line(lambda: VideoFile(tmp_path / "clip.mp4", fps), f"fps is {fps}", "from 0.5 to 600, such as 30")
+    assert_one_line(lambda: VideoFile(tmp_path / "clip.webm", fps), f"fps is {fps}", "from 0.5 to 600, such as 30")
 
 
 def test_a_folder_in_the_way_of_a_video_is_named(tmp_path: Path) -> None:
-    (tmp_path / "clip.mp4").mkdir()
-    assert_one_line(lambda: VideoFile(tmp_path / "clip.mp4"), "clip.mp4: a folder of this name is in the way")
+    (tmp_path / "clip.webm").mkdir()
+    assert_one_line(lambda: VideoFile(tmp_path / "clip.webm"), "clip.webm: a folder of this name is in the way")
 
 
 _LIMITED = """
 import resource, signal, sys
 from pathlib import Path
 import numpy as np
-from pop_fast.paths import VideoFile
+from pop_fast.view.paths import VideoFile
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
 with VideoFile(Path(sys.argv[1])) as video:
@@ -165,8 +165,7 @@ with VideoFile(Path(sys.argv[1])) as video:
 @pytest.mark.parametrize(
     ("name", "room", "told"),
     [
-        ("clip.mp4", 0, "could not be written: "),
-        ("clip.mp4", 4096, "only 0 of 12 frames could be read back after writing; the disk may be full: free some"),
+        ("clip.webm", 0, "of 12 frames could be read back after writing; the disk may be full: free some space"),
         ("clip.webm", 4096, "of 12 frames could be read back after writing; the disk may be full: free some space"),
         ("clip.avi", 4096, "of 12 frames could be read back after writing; the disk may be full: free some space"),
     ],
@@ -189,16 +188,35 @@ def test_a_video_that_the_disk_has_no_room_for_is_told_and_leaves_the_old_file(
 @pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may write anywhere")
 def test_a_video_in_a_folder_that_may_not_be_written_is_named_as_the_user_named_it(tmp_path: Path) -> None:
     (tmp_path / "locked").mkdir(mode=0o500)
-    path = tmp_path / "locked" / "clip.mp4"
+    path = tmp_path / "locked" / "clip.webm"
     assert_one_line(lambda: film(path, (16, 16)), f"{path}: could not be written: permission denied")
 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a folder where nobody can write")
 def test_a_video_that_cannot_be_placed_is_named_as_the_user_named_it() -> None:
-    path = Path("/proc/self/clip.mp4")
+    path = Path("/proc/self/clip.webm")
     assert_one_line(lambda: film(path, (16, 16)), f"{path}: could not be written: ", "choose another path")
 
 
 def test_an_unknown_video_ending_names_the_known_ones(tmp_path: Path) -> None:
     with pytest.raises(PopError, match=r"\.mp4"):
         VideoFile(tmp_path / "clip.gif")
+
+
+def test_an_mp4_that_would_hold_what_players_do_not_expect_is_refused_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(video, "has_h264", lambda: False)
+    words = ("cannot write H.264", "name it clip.webm", "ffmpeg -i clip.webm clip.mp4")
+    assert_one_line(lambda: VideoFile(tmp_path / "clip.mp4"), "clip.mp4", *words)
+    assert not os.listdir(tmp_path)
+
+
+def test_a_video_holds_what_its_ending_promises(tmp_path: Path) -> None:
+    names = {"clip.webm": ("VP90", "vp09"), "clip.avi": ("MJPG",)} | (
+        {"clip.mp4": ("avc1", "h264")} if has_h264() else {}
+    )
+    for name, codecs in names.items():
+        film(tmp_path / name, (64, 64), (64, 64))
+        code = int(cv2.VideoCapture(str(tmp_path / name)).get(cv2.CAP_PROP_FOURCC))
+        assert code.to_bytes(4, "little").decode() in codecs

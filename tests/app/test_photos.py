@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from pop_fast.data import load_capture, run_sfm
-from pop_fast.data.demo_scene import make_scene
-from pop_fast.data.demo_tracer import render_view
-from pop_fast.data.photos import _pairs  # pyright: ignore[reportPrivateUsage]
+from pop_fast.data.sfm_search import pairs_of
+from pop_fast.demo.scene import make_scene
+from pop_fast.demo.tracer import render_view
 from tests.app.captures import assert_one_line, look_at, photograph, write_photograph
 
 K = np.array([[300.0, 0.0, 160.0], [0.0, 300.0, 120.0], [0.0, 0.0, 1.0]])
@@ -125,8 +125,10 @@ def test_an_unknown_camera_model_is_refused(tmp_path: Path) -> None:
 
 
 def test_few_photographs_are_all_matched_and_many_with_their_neighbours() -> None:
-    assert len(_pairs(60)) == 60 * 59 // 2
-    many = _pairs(200)
+    assert len(pairs_of(60, "auto")) == 60 * 59 // 2
+    assert len(pairs_of(200, "exhaustive")) == 200 * 199 // 2
+    assert pairs_of(30, "sequential") == [pair for pair in pairs_of(200, "auto") if pair[1] < 30]
+    many = pairs_of(200, "auto")
     assert len(many) < 200 * 20
     assert {(0, 1), (0, 10), (0, 16), (0, 128), (198, 199)} <= set(many)
     assert all(i < j < 200 for i, j in many)

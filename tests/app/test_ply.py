@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from plyfile import PlyData, PlyElement
 
-from pop_fast.io.ply import is_antialiased, load_ply, save_ply, save_splat
+from pop_fast.io.formats import save_as
+from pop_fast.io.ply import is_antialiased, load_ply, save_ply
 from pop_fast.io.points import read_points
 from tests.app.captures import assert_one_line
 
@@ -143,7 +144,7 @@ def test_splat_rows_hold_32_bytes_with_the_most_visible_first(tmp_path: Path) ->
     params["opacities"] = torch.zeros(3)
     params["quats"] = torch.tensor([[2.0, 0.0, 0.0, 0.0], [0.0, -3.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0]])
     params["sh0"] = torch.tensor([[-9.0, 0.0, 9.0]]).repeat(3, 1)[:, None, :]
-    assert save_splat(tmp_path / "x.splat", params) == 96
+    assert save_as(tmp_path / "x.splat", "splat", params) == 96
     data = (tmp_path / "x.splat").read_bytes()
     rows = np.frombuffer(data, [("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rot", "u1", 4)])
     assert np.allclose(rows["scale"][:, 0], [1.0, 0.5, 0.25])
@@ -166,7 +167,7 @@ def test_bad_parameters_are_named_and_nothing_is_written(tmp_path: Path, name: s
     params = some_params()
     params[name] = change(params[name])
     assert_one_line(lambda: save_ply(tmp_path / "x.ply", params), *words)
-    assert_one_line(lambda: save_splat(tmp_path / "x.splat", params), *words)
+    assert_one_line(lambda: save_as(tmp_path / "x.splat", "splat", params), *words)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from pop_fast.cli.frames import write_pictures
 from pop_fast.errors import PopError
-from pop_fast.paths.video import frames_in
+from pop_fast.view.frames import write_pictures
+from pop_fast.view.paths.video import frames_in
 from tests.app.captures import (
     camera,
     edit_transforms,
@@ -46,14 +46,14 @@ def test_held_out_views_are_rendered_to_the_same_bytes_as_in_training(
 def test_a_path_gives_as_many_pictures_and_frames_as_asked(
     pop: Pop, shared_result: Path, tmp_path: Path, path: str
 ) -> None:
-    words = ["--path", path, "--frames", "3", "--out", tmp_path / "frames", "--video", tmp_path / "clip.mp4"]
+    words = ["--path", path, "--frames", "3", "--out", tmp_path / "frames", "--video", tmp_path / "clip.webm"]
     outcome = pop("render", shared_result, *words)
     assert outcome.status == 0, outcome.err
     pictures = sorted((tmp_path / "frames").glob("*.png"))
     assert [p.name for p in pictures] == [f"{path}_{i:04d}.png" for i in range(3)]
     assert all(read(p).shape == (32, 40, 3) for p in pictures)
     assert len({p.read_bytes() for p in pictures}) == 3
-    video = cv2.VideoCapture(str(tmp_path / "clip.mp4"))
+    video = cv2.VideoCapture(str(tmp_path / "clip.webm"))
     assert [video.read()[0] for _ in range(4)] == [True, True, True, False]
 
 
@@ -66,10 +66,10 @@ def test_a_video_alone_leaves_no_pictures(pop: Pop, shared_result: Path, tmp_pat
     ("words", "part"),
     [
         ([], "give --out DIR for pictures, --video FILE"),
-        (["--video", "clip.gif"], "must end in .mp4, .webm, .avi"),
-        (["--video", "clip.mp4", "--fps", "0"], "clip.mp4: fps is 0.0; it must be a number from 0.5 to 600"),
-        (["--video", "clip.mp4", "--fps", "nan"], "clip.mp4: fps is nan; it must be a number from 0.5 to 600"),
-        (["--out", "r", "--video", "r/clip.mp4"], "r/clip.mp4: lies in --out r, which holds pictures only"),
+        (["--video", "clip.gif"], "must end in .webm, .mp4, .avi"),
+        (["--video", "clip.webm", "--fps", "0"], "clip.webm: fps is 0.0; it must be a number from 0.5 to 600"),
+        (["--video", "clip.webm", "--fps", "nan"], "clip.webm: fps is nan; it must be a number from 0.5 to 600"),
+        (["--out", "r", "--video", "r/clip.webm"], "r/clip.webm: lies in --out r, which holds pictures only"),
         (["--out", "r", "--path", "orbit", "--frames", "0"], "frames is 0; give --frames 1 or more"),
         (["--out", "r", "--test-every", "0"], "holds no view out"),
         (["--out", "r", "--path", "orbit", "--test-every", "1"], "needs 1 or more training views and there are 0"),
@@ -99,11 +99,11 @@ def test_what_cannot_be_rendered_is_said_and_nothing_is_written(
 
 
 def test_an_earlier_video_is_replaced_only_when_asked(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
-    (tmp_path / "clip.mp4").write_text("mine")
-    says(pop("render", shared_result, "--video", tmp_path / "clip.mp4"), "clip.mp4", "exists; pass --overwrite")
-    assert (tmp_path / "clip.mp4").read_text() == "mine"
-    assert pop("render", shared_result, "--video", tmp_path / "clip.mp4", "--overwrite").status == 0
-    assert frames_in(tmp_path / "clip.mp4") == 1
+    (tmp_path / "clip.webm").write_text("mine")
+    says(pop("render", shared_result, "--video", tmp_path / "clip.webm"), "clip.webm", "exists; pass --overwrite")
+    assert (tmp_path / "clip.webm").read_text() == "mine"
+    assert pop("render", shared_result, "--video", tmp_path / "clip.webm", "--overwrite").status == 0
+    assert frames_in(tmp_path / "clip.webm") == 1
 
 
 def test_the_index_of_a_render_names_the_file_of_every_view(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
@@ -216,8 +216,8 @@ def test_a_video_of_views_of_two_sizes_is_refused_with_a_way_out(pop: Pop, share
     write_model(tmp_path / "scene" / "sparse" / "0", [f"{i}.png" for i in range(4)], ring(4), lenses)
     words = ["render", shared_result, "--capture", tmp_path / "scene", "--test-every", "1"]
     says(
-        pop(*words, "--video", tmp_path / "clip.mp4"),
-        "clip.mp4: the views have 2 sizes (1.png is 30 x 40 px, 0.png is 40 x 30 px)",
+        pop(*words, "--video", tmp_path / "clip.webm"),
+        "clip.webm: the views have 2 sizes (1.png is 30 x 40 px, 0.png is 40 x 30 px)",
         "write pictures with --out DIR, or film a path with --path orbit",
     )
     assert os.listdir(tmp_path) == ["scene"]

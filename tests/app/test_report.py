@@ -16,9 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pop_fast.errors import PopError
-from pop_fast.report import pictures, write_report
-from pop_fast.report.curves import Chart, Series, Window, draw, draw_histogram, nice_ticks, short_number
-from pop_fast.report.source import read_result, running_mean, thin_out
+from pop_fast.view import pictures
+from pop_fast.view.report import write_report
+from pop_fast.view.report.curves import Chart, Series, Window, draw, draw_histogram, nice_ticks, short_number
+from pop_fast.view.report.source import read_result, running_mean, thin_out
 from tests.app.result_folder import VIEWS, write_result
 
 

@@ -7,8 +7,8 @@ from dataclasses import FrozenInstanceError, fields
 import pytest
 import torch
 
-from pop_fast.strategies import GsplatStrategy, InriaStrategy, POPStrategy, Strategy
-from pop_fast.strategies.control import SHORTEST_REFINE_EVERY
+from pop_fast.density import GsplatStrategy, InriaStrategy, POPStrategy, Strategy
+from pop_fast.density.control import SHORTEST_REFINE_EVERY
 from pop_ref.recipes import RECIPES
 from pop_ref.settings import PopTerm
 from tests.app.populations import make, make_info, run_event

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pop_fast.strategies import GsplatStrategy, POPStrategy, StepEvent
+from pop_fast.density import DensificationStep, GsplatStrategy, POPStrategy
 from pop_ref import density as oracle
 from pop_ref.density_rows import Rows as OracleRows
 from tests.app.populations import HEIGHT, KEYS, WIDTH, make, make_info, moments, packed, run_event
@@ -23,7 +23,7 @@ def test_small_gaussians_are_cloned_with_their_bits_and_large_ones_split_in_two(
     first, second, steps = (x.clone() for x in moments(optimizers, params, "means"))
     grads = torch.tensor([[0.0, 0], [1.0, 0], [1.0, 0], [0.0, 0]])
     event = run_event(POPStrategy(), params, optimizers, make_info(4, grads), step=600)
-    assert event == StepEvent(cloned=1, split=1, pruned=0)
+    assert event == DensificationStep(cloned=1, split=1, pruned=0)
     assert event.record() == {"cloned": 1, "split": 1, "pruned": 0}
     # survivors 0, 1, 3; the clone of 1; two children of 2
     assert len(params["means"]) == 6

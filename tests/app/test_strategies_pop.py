@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import pytest
 import torch
 
-from pop_fast.strategies import GsplatStrategy, POPStrategy, StepEvent
+from pop_fast.density import DensificationStep, GsplatStrategy, POPStrategy
 from tests.app.populations import HEIGHT, WIDTH, make, make_info, packed, run_event
 
 
@@ -63,7 +64,7 @@ def test_blur_flags_are_forgotten_after_an_event():
 
 
 def test_blur_clones_small_and_splits_large_or_splits_all():
-    for rule, event in (("by_scale", StepEvent(1, 1)), ("split", StepEvent(0, 2))):
+    for rule, event in (("by_scale", DensificationStep(1, 1)), ("split", DensificationStep(0, 2))):
         params, optimizers = make(2)
         params["scales"].data[1] = math.log(0.05)
         info = make_info(2, counts=torch.tensor([99, 99]))
@@ -121,3 +122,19 @@ def test_importance_can_be_kept_for_the_window_and_the_loss_for_the_visible():
         term = strategy.regularizer(opacities, state, 2, each)
         assert term is not None
         assert term.item() == pytest.approx(1e-3 * (0.75 + 0.5))
+
+
+def test_a_trainer_that_leaves_out_the_prior_is_warned() -> None:
+    params, optimizers = make(2)
+    strategy = POPStrategy()
+    state = strategy.initialize_state()
+    with pytest.warns(UserWarning, match=r"add strategy\.regularizer"):
+        strategy.step_post_backward(params, optimizers, state, 1, make_info(2))
+    info = make_info(2)
+    strategy.regularizer(torch.sigmoid(params["opacities"]), state, 2, info)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        strategy.step_post_backward(params, optimizers, state, 2, info)
+        # nothing is missed where there is no prior
+        strategy.step_post_backward(params, optimizers, state, strategy.pop_stop_iter, make_info(2))
+        GsplatStrategy().step_post_backward(params, optimizers, GsplatStrategy().initialize_state(), 1, make_info(2))

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from cuda_ext.train_settings import Phase
-from pop_fast.backends import get_backend
+from pop_fast.api.registry import get_backend
+from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.io.ply import load_ply
-from pop_fast.strategies import POPStrategy
 from pop_fast.train import TrainingRun
 from pop_fast.train.model import KEYS, adam_step, first_non_finite, make_optimizers
 from pop_fast.train.objective import Objective

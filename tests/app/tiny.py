@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from pop_fast.data.capture import Capture, View
-from pop_fast.strategies import GsplatStrategy, InriaStrategy, POPStrategy
+from pop_fast.density import GsplatStrategy, InriaStrategy, POPStrategy
 from pop_fast.train import LearningRates, TrainConfig, TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from pop_fast.train.records import Stretch
+from pop_fast.train.records import Segment
 
 WIDTH, HEIGHT = 32, 24
 N_POINTS = 60
@@ -102,7 +102,7 @@ def tiny_config(folder: Path | str, method: str = "pop", **changes: Any) -> Trai
 class SlowRun(TrainingRun):
     """Leaves time to be stopped in."""
 
-    def take_steps(self, last: int) -> Stretch:
+    def take_steps(self, last: int) -> Segment:
         """Take a step, and a breath."""
         time.sleep(0.02)
         return super().take_steps(last)

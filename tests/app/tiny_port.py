@@ -82,13 +82,14 @@ def draw(a: Arrays, options: dict, shift: float = 0.5) -> Arrays:
     return {"image": image, "T_final": left, "dominant_ids": ids, "n_blended": counts}
 
 
-def within_reach(options: dict) -> bool:
-    return options["profile"]["extent"] == "opacity_aware" and options["sh_degree"] <= 1
+def within_reach(vector: dict) -> bool:
+    options = vector["options"]
+    return vector["kind"] == "render" and options["profile"]["extent"] == "opacity_aware" and options["sh_degree"] <= 1
 
 
 def judge(index: dict, wanted: Arrays, name: str, result: np.ndarray) -> bool:
     """Compare one output as the index says."""
-    rule = index["arrays"][name]["compare"]
+    (rule,) = index["kinds"]["render"]["arrays"][name]["compare"]
     mask = wanted[rule["where"]] if rule["where"] else np.array(True)
     mask = mask.reshape(mask.shape + (1,) * (result.ndim - mask.ndim))
     if rule["rule"] == "equal":
@@ -105,11 +106,13 @@ def run(vectors: Path, results: Path, shift: float = 0.5, as_json: bool = False)
     results.mkdir()
     failed = set()
     for name, vector in index["vectors"].items():
-        if not within_reach(vector["options"]):
+        if not within_reach(vector):
             continue
         with np.load(vectors / vector["file"]) as stored:
             wanted = {key: stored[key] for key in stored.files}
-        inputs = {key: value for key, value in wanted.items() if index["arrays"][key]["role"] == "input"}
+        inputs = {
+            key: value for key, value in wanted.items() if index["kinds"]["render"]["arrays"][key]["role"] == "input"
+        }
         drawn = draw(inputs, vector["options"], shift)
         if as_json:
             (results / f"{name}.json").write_text(json.dumps({key: value.tolist() for key, value in drawn.items()}))

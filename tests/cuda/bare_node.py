@@ -80,7 +80,7 @@ def stand_in_gsplat(folder: Path) -> Path:
     """Make a wheel whose `gsplat.rasterization` is the CPU's, and whose kernels are compiled at once."""
     target = folder / "gsplat-0.0-py3-none-any.whl"
     files = {
-        "gsplat/__init__.py": 'from pop_fast.rasterization import rasterization\n\n__version__ = "stand-in"\n',
+        "gsplat/__init__.py": 'from pop_fast.api.rasterize import rasterization\n\n__version__ = "stand-in"\n',
         "gsplat/cuda/__init__.py": "",
         "gsplat/cuda/_backend.py": "_C = object()\n",
         "gsplat-0.0.dist-info/METADATA": "Metadata-Version: 2.1\nName: gsplat\nVersion: 0.0\n",

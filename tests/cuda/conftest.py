@@ -30,5 +30,5 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("backend", [pytest.param(None, id="mirror", marks=[mark])])
         return
     # in double the mirror is the oracle to 1e-12, for which the laws are proved already; float has to stand by itself
-    agreement = metafunc.definition.path.stem == "test_host_mirror_agreement"
+    agreement = metafunc.cls is not None and metafunc.cls.__name__ == "TestAgreement"
     parametrize_backends(metafunc, mirrors() if agreement else mirrors()[1:])

@@ -13,7 +13,8 @@ from typing import Any
 
 import pytest
 
-from cuda_ext.gpu_check_stages import JOBS
+from cuda_ext.gpu_check.stages import JOBS
+from cuda_ext.host import emulate
 from pop_fast.cli import main as pop
 from tests.cuda.bare_node import (
     ABSENT,
@@ -23,7 +24,6 @@ from tests.cuda.bare_node import (
     make_bare_node,
     stand_in_gsplat,
 )
-from tests.cuda.emulated import emulate
 
 ROOT = Path(__file__).resolve().parents[2]
 WHEELS = ("plyfile", "tyro", "typeguard", "docstring_parser", "typing_extensions")
@@ -96,10 +96,10 @@ def test_job_one_builds_and_gives_numbers(node, tmp_path):
     assert list(bench) == list(beside) == ["tiny", "toy_pop", "toy_pop_enlarged"]
     for case in bench.values():
         assert "failed" not in case
-        assert case["columns"]["step_ms"] > 0.0
+        assert case["pixel_parallel"]["step_ms"] > 0.0
         assert case["columns_by_kernel"]["loads"]["contributing"] > 0
         # there are no kernels of a GPU to be profiled here, which is told and loses no time
-        assert "profiler" in case["columns"]["step_kernels"]["skipped"]
+        assert "profiler" in case["pixel_parallel"]["step_kernels"]["skipped"]
     assert bench["toy_pop_enlarged"]["width"] > bench["toy_pop"]["width"] == 40
     assert all(set(case["ratios"]) == {"forward", "forward_backward", "step"} for case in beside.values())
     assert stages["gsplat"]["results"]["gsplat"] == "stand-in"
@@ -117,7 +117,7 @@ def test_job_two_judges_and_trains(node, tmp_path):
     manifest = json.loads((node[1] / "out" / "gpu_pack" / "manifest.json").read_text())
     assert found["environment"]["commit"] == manifest["commit"] != "unknown"
     stages = found["stages"]
-    for name in ("laws", "laws_of_splats", "steps"):
+    for name in ("laws", "laws_of_gaussian_parallel", "steps"):
         assert stages[name]["tests"]["failed"] == 0
         assert stages[name]["tests"]["passed"] >= 1
         assert "shapes were NOT checked: beartype" in stages[name]["output"]

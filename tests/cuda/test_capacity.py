@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cuda_ext.capacity import GROWTH, MOST, Capacity
+from cuda_ext.render.capacity import GROWTH, MOST, Capacity
 
 BIG, SMALL = (1000, 800), (500, 400)
 

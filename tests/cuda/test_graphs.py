@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from cuda_ext.graphs import Watch, captured
+from cuda_ext.training.graphs import Watch, captured
 
 
 class Recorder:

@@ -70,7 +70,7 @@ def test_in_float_the_cameras_transpose_is_charged_its_rounding_only(viewmat, v)
     assert np.all(np.abs(found - function(viewmat, v)) <= 2.0 * np.finfo(np.float32).eps * (scale + 1e-30))
 
 
-@pytest.mark.parametrize("per_splat", [False, True], ids=["columns", "splats"])
+@pytest.mark.parametrize("per_splat", [False, True], ids=["pixel_parallel", "gaussian_parallel"])
 @pytest.mark.parametrize("kernel_tiles", [False, True], ids=["oracle-tiles", "kernel-tiles"])
 def test_the_golden_scene_and_its_gradients_are_the_oracles(per_splat, kernel_tiles):
     mirror, scene = MirrorAdapter(FOLDER, np.float64, per_splat, kernel_tiles), golden_scene()

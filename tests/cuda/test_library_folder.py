@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from cuda_ext import library_folder as place
 from cuda_ext.compiler import find_compiler
-from cuda_ext.host_mirror import build_mirror
+from cuda_ext.host import library_folder as place
+from cuda_ext.host.mirror import build_mirror
 
 ROOT = Path(__file__).parents[2]
 # what a library of somebody else would do: tell that it was loaded
@@ -26,7 +26,8 @@ LOAD = """
 import os
 from types import SimpleNamespace
 from unittest import mock
-from cuda_ext import host_mirror, library_folder
+from cuda_ext.host import mirror as host_mirror
+from cuda_ext.host import library_folder
 if {read_only}:
     library_folder.os = SimpleNamespace(**{{**vars(os), "access": lambda *_: False}})
 # compiling takes long, and which library is loaded is known before
@@ -118,7 +119,7 @@ def plant(folder: Path, tmp_path: Path) -> None:
 def build_mirror_name(tmp_path: Path) -> str:
     """Return the name that the mirror would get."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("cuda_ext.host_mirror.subprocess.run", lambda command, **_: stop(command[-1]))
+        patch.setattr("cuda_ext.host.mirror.subprocess.run", lambda command, **_: stop(command[-1]))
         try:
             build_mirror(tmp_path / "nothing")
         except StopIteration as stopped:

@@ -13,7 +13,7 @@ import torch
 import cuda_ext
 from cuda_ext import build as build_module
 from cuda_ext.build import BuildError
-from cuda_ext.check_ptxas import KernelUse, as_table, offenders, parse_ptxas
+from cuda_ext.machine_code.check_ptxas import KernelUse, as_table, offenders, parse_ptxas
 from cuda_ext.toolkit import find_nvcc
 
 PTXAS = """
@@ -137,8 +137,8 @@ def test_a_failing_compiler_is_quoted():
     assert "its words" in str(error.value)
 
 
-def test_rasterization_refuses_what_it_does_not_support_and_names_what_is_wrong():
-    from cuda_ext.ops import rasterization
+def test_rasterization_refuses_what_it_does_not_support_and_names_what_is_wrong(monkeypatch):
+    from pop_fast.cuda import rasterization
 
     rows = {
         "means": torch.zeros(1, 3),
@@ -151,28 +151,26 @@ def test_rasterization_refuses_what_it_does_not_support_and_names_what_is_wrong(
         "width": 4,
         "height": 4,
     }
-    with pytest.raises(NotImplementedError, match="covars"):
+    from pop_fast.cuda import backend
+
+    monkeypatch.setattr(backend.cuda_ext, "why_not", lambda: None)
+    with pytest.raises(NotImplementedError, match=r"covars=.* by backend 'cuda': the kernels start from quats"):
         rasterization(**rows, covars=torch.zeros(1, 3, 3))
     with pytest.raises(ValueError, match="render_mode"):
-        rasterization(**rows, render_mode="normals")  # type: ignore[arg-type]
+        rasterization(**rows, render_mode="normals")
     with pytest.raises(ValueError, match="width is 0"):
         rasterization(**{**rows, "width": 0})
-    with pytest.raises(ValueError, match=r"viewmats is on cpu.*viewmats\.cuda\(\)"):
+    with pytest.raises(ValueError, match=r"means is on cpu; backend 'cuda' reads cuda: use means\.cuda\(\)"):
         rasterization(**rows)
 
 
 def test_the_signature_is_the_cpus():
     import inspect
 
-    from cuda_ext.ops import rasterization as on_gpu
-    from pop_fast.rasterization import rasterization as on_cpu
+    from pop_fast.api import rasterization as on_every_backend
+    from pop_fast.cuda import rasterization as on_gpu
 
-    ours, theirs = (inspect.signature(function).parameters for function in (on_gpu, on_cpu))
-    positional = [name for name, p in theirs.items() if p.kind is not p.KEYWORD_ONLY]
-    assert list(ours)[: len(positional)] == positional
-    assert all(ours[name].default == theirs[name].default for name in positional)
-    # `backend` is how the one calls the other
-    assert set(theirs) - set(ours) == {"backend"}
+    assert inspect.signature(on_gpu) == inspect.signature(on_every_backend)
 
 
 def test_the_laws_of_antialiased_mode_judge_every_kind_of_the_cuda_backend():
@@ -180,7 +178,11 @@ def test_the_laws_of_antialiased_mode_judge_every_kind_of_the_cuda_backend():
     from tests.cuda.gpu.conftest import cuda_backends
 
     backends = cuda_backends("cpu", "cuda")
-    assert {backend.name for backend in backends} == {"cuda32-columns", "cuda32-splats", "cuda32-atomics"}
+    assert {backend.name for backend in backends} == {
+        "cuda32-pixel_parallel",
+        "cuda32-gaussian_parallel",
+        "cuda32-atomics",
+    }
     assert all(backend.has(need) for backend in backends for need in (ANTIALIASING, PROFILES))
 
 
@@ -206,6 +208,6 @@ def test_every_kernel_file_is_built():
 @pytest.mark.slow
 @pytest.mark.skipif(find_nvcc() is None, reason="no nvcc: the kernels are not compiled here (install a CUDA toolkit)")
 def test_the_blend_kernels_compile_for_turing_without_spills():
-    from cuda_ext.check_ptxas import check
+    from cuda_ext.machine_code.check_ptxas import check
 
     assert offenders(check(["sm_75"], only="blend")) == []

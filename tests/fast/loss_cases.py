@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from hypothesis import strategies as st
 
-from pop_fast import losses, ssim
+from pop_fast.stages import losses, ssim
 from pop_ref import losses as oracle
 
 

@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from pop_fast import compiled
-from pop_fast.compositing import Composite
-from pop_fast.compositing import composite as composite_in_torch
-from pop_fast.raster_inputs import check_cameras
-from pop_fast.raster_stages import stages_of
-from pop_fast.tiles import TileLists, tile_lists
+from pop_fast.api.checks import check_sizes
+from pop_fast.api.registry import get_backend
+from pop_fast.stages.compositing import Composite
+from pop_fast.stages.compositing import composite as composite_in_torch
+from pop_fast.stages.tiles import TileLists, tile_lists
 from pop_ref.constants import INRIA, PAPER, Profile
 
 pytestmark = pytest.mark.skipif(not compiled.available(), reason=compiled.why_not() or "")
@@ -161,7 +161,7 @@ def test_threads_of_its_own_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) 
 def test_running_out_of_memory_is_an_error_and_not_the_end(tmp_path: Path) -> None:
     program = """
         import resource, torch
-        from pop_fast.rasterization import rasterization
+        from pop_fast.api.rasterize import rasterization
 
         def render(tile_size):
             means, quats = torch.tensor([[0.0, 0.0, 4.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
@@ -198,12 +198,12 @@ def test_what_is_kept_for_the_transpose_goes_with_it() -> None:
 
 def test_a_tile_that_no_memory_holds_is_refused() -> None:
     with pytest.raises(ValueError, match="tile_size is 65536; it must be <= 4096"):
-        check_cameras(torch.eye(4)[None], torch.eye(3)[None], 16, 16, 65536, (), torch.float32)
+        check_sizes(16, 16, 65536)
 
 
 @pytest.mark.parametrize("lists", ["fast", "compiled"])
 def test_a_splat_whose_conic_vanished_is_listed_everywhere(lists: str) -> None:
-    listing = stages_of(lists).tile_lists
+    listing = get_backend(lists).stages().list_tiles
     conics, radii = torch.zeros(1, 3), torch.full((1, 2), 10**6, dtype=torch.int32)
     shape = {"conics": conics, "opacities": torch.tensor([0.5])}
     found = listing(torch.zeros(1, 2), radii, torch.ones(1), WIDTH, HEIGHT, 16, PAPER, **shape)

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from pop_fast import compiled
-from pop_fast.contributions import contributions
-from pop_fast.fisher import screen_moments
-from pop_fast.passes import Passes
-from pop_fast.raster_stages import stages_of
-from pop_fast.sensitivity import sensitivities
-from pop_fast.splatting import Splats
-from pop_fast.tiles import TileLists
+from pop_fast.api.registry import get_backend
+from pop_fast.density.passes import Passes
+from pop_fast.stages.contributions import contributions
+from pop_fast.stages.fisher import screen_moments
+from pop_fast.stages.sensitivity import sensitivities
+from pop_fast.stages.splatting import Splats
+from pop_fast.stages.tiles import TileLists
 from pop_ref.constants import PAPER, PROFILES, Profile
 from tests.fast.pass_scenes import raw_params, views
 from tests.fast.test_compiled import CEILINGS, HEIGHT, WIDTH
@@ -48,7 +48,7 @@ def sums(functions: tuple[Callable, Callable, Callable], drawn: Drawn, profile: 
 
 
 def native() -> tuple[Callable, Callable, Callable]:
-    stages = stages_of("compiled")
+    stages = get_backend("compiled").stages()
     return stages.contributions, stages.sensitivities, stages.screen_moments
 
 

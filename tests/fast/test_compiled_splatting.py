@@ -8,9 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from pop_fast import compiled, splatting
+from pop_fast import compiled
 from pop_fast.compiled import splatting as in_cpp
-from pop_fast.splatting import View
+from pop_fast.stages import splatting
+from pop_fast.stages.splatting import ProjectionSettings
 from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER, Profile
 
 pytestmark = pytest.mark.skipif(not compiled.available(), reason=compiled.why_not() or "")
@@ -31,7 +32,7 @@ def projected(stages: ModuleType, profile: Profile, antialiased: bool, n: int = 
     leaves = [tensor.requires_grad_() for tensor in inputs]
     means, quats, scales, opacities, viewmat = leaves
     K = torch.tensor([[40.0, 0.0, 21.0], [0.0, 37.0, 20.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    view = View(K, WIDTH, HEIGHT, profile, antialiased)
+    view = ProjectionSettings(K, WIDTH, HEIGHT, profile, antialiased)
     found = stages.project(means, stages.covariances(quats, scales), opacities, viewmat, view)
     shown = (found.radii > 0).all(1)
     names = ["means2d", "depths", "conics", "opacities", *(["compensations"] if antialiased else [])]

@@ -10,8 +10,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pop_fast import density as fast
-from pop_fast.strategies import ops
+from pop_fast.density import rows as ops
+from pop_fast.stages import density as fast
 from pop_fast.train.model import make_optimizers
 from pop_ref import density as oracle
 from pop_ref.conformance.backends import shipped

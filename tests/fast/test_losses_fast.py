@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast import compiled, losses, ssim
+from pop_fast import compiled
 from pop_fast.compiled import losses as compiled_losses
+from pop_fast.stages import losses, ssim
 from pop_ref import ssim as oracle_ssim
 from tests.fast.loss_cases import Case, bands_of, both
 

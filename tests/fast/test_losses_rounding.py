@@ -10,8 +10,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pop_fast import compiled, losses
+from pop_fast import compiled
 from pop_fast.compiled import losses as compiled_losses
+from pop_fast.stages import losses
 from pop_ref.loss_magnitudes import Form, LossMagnitudes, d_ssim_magnitudes, pixelwise_magnitudes
 from tests.fast.loss_cases import Case, bands_of, both, cases
 

@@ -8,7 +8,7 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from pop_fast.polarization import importance_mask, pop_loss, pop_loss_vjp
+from pop_fast.stages.polarization import importance_mask, pop_loss, pop_loss_vjp
 from pop_ref import polarization as oracle
 
 EPS = {torch.float64: 2.0**-52, torch.float32: 2.0**-23}

@@ -7,8 +7,8 @@ import itertools
 import pytest
 import torch
 
-from pop_fast.tight_tiles import tight_tile_lists
-from pop_fast.tiles import TileLists, tile_lists
+from pop_fast.stages.tight_tiles import tight_tile_lists
+from pop_fast.stages.tiles import TileLists, tile_lists
 from pop_ref.constants import INRIA, PAPER, SPEEDY_SPLAT, Profile
 from pop_ref.tight_tiles import tight_tile_lists as oracle_lists
 from tests.fast.test_compiled import HEIGHT, WIDTH

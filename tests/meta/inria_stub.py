@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from pop_fast.rasterization import rasterization
+from pop_fast.api.rasterize import rasterization
 from pop_ref.constants import INRIA
 
 

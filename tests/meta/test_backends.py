@@ -133,7 +133,7 @@ def test_a_slip_in_the_conversion_would_be_noticed(change: Callable[[Any], dict[
 
 def fixed(profile: str) -> TorchAdapter:
     """Judge pop_fast as a stranger who has one profile and gsplat's arguments."""
-    from pop_fast.rasterization import rasterization as sound
+    from pop_fast.api.rasterize import rasterization as sound
 
     def rasterization(*args: Any, rasterize_mode: str = "classic", **options: Any) -> Any:
         options["near_plane"] = ALL_PROFILES[profile].near_plane

@@ -18,7 +18,7 @@ from pop_ref.conformance.corpus_answers import (
 )
 
 # in seconds; of the others a part is computed again
-QUICK = ("fifty", "slanted", "hundreds_in_a_tile", "many_tiles")
+QUICK = ("fifty", "slanted", "hundreds_in_a_tile", "many_tiles", "fifty_of_inria", "hundreds_of_inria")
 
 
 @pytest.mark.parametrize("name", QUICK)

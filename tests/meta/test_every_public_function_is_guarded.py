@@ -170,7 +170,7 @@ TESTS = {
     "magnitudes.depths_magnitudes": FLOOR_MARGIN,
     "magnitudes.splat_magnitudes": FLOOR_MARGIN,
     "margins.margins": FLOOR_MARGIN,
-    "pixel_margins.pixel_doubts": FLOOR_MARGIN,
+    "pixel_margins.pixel_margins": FLOOR_MARGIN,
 }
 LADDER = (
     "training.start",

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.rasterization import rasterization as fast
+from pop_fast.api.rasterize import rasterization as fast
 from pop_ref.conformance.adapter import Adapter, OracleAdapter, View, stage_function
 from pop_ref.conformance.capabilities import DETERMINISTIC, DOMINANCE, DOMINANT_WEIGHTS, GRADIENTS, HOMOGENEOUS, RENDER
 from pop_ref.conformance.failure_report import failure_report
@@ -21,7 +21,7 @@ from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
 from pop_ref.conformance.scenes import Scene
 from pop_ref.conformance.torch_adapter import TorchAdapter
 from pop_ref.conformance.views import ASKED
-from pop_ref.constants import GSPLAT_1_5, INRIA, Profile
+from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, Profile
 
 sound = partial(fast, backend="fast")
 LAWS = every_law()
@@ -212,3 +212,27 @@ def test_an_argument_that_is_refused_or_not_there_is_a_skip_by_name() -> None:
         backend = TorchAdapter("partial", rasterization, dtype="float32")
         assert {name for name in ASKED if not backend.has(name)} == expected | {"sparse_grad"}
         assert backend.has(GRADIENTS), "an argument absgrad is no condition of gradients"
+
+
+def of_one_profile(profile: Profile) -> Any:
+    """Give a rasterizer that has the constants of one profile, and no argument to choose another."""
+
+    def rasterization(means: Any, quats: Any, scales: Any, opacities: Any, colors: Any, viewmats: Any, Ks: Any,
+                      width: int, height: int, packed: bool = True, render_mode: str = "RGB", absgrad: bool = False,
+                      covars: Any = None, **options: Any) -> Any:  # fmt: skip
+        given = {"packed": packed, "render_mode": render_mode, "absgrad": absgrad, "covars": covars, **options}
+        return sound(
+            means, quats, scales, opacities, colors, viewmats, Ks, width, height, profile=profile.name, **given
+        )
+
+    return TorchAdapter(profile.name, rasterization, dtype="float32", profile=profile)
+
+
+@pytest.mark.parametrize("profile", [GSPLAT_1_6, INRIA], ids=lambda profile: profile.name)
+def test_the_laws_of_the_signature_and_of_scale_judge_constants_of_any_profile(profile: Profile) -> None:
+    backend, judged = of_one_profile(profile), 0
+    for path, stated in LAWS.items():
+        if path.startswith(("test_signature", "test_scale")) and not missing(backend, stated.needs):
+            assert obeys(stated, backend) is None, path
+            judged += 1
+    assert judged >= (24 if profile is INRIA else 36)

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from pop_ref.conformance.backends import SHIPPED, shipped
-from pop_ref.conformance.mutants import MUTANTS, living
-from pop_ref.conformance.scene_files import scene_from
+from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM, living
+from pop_ref.conformance.vector_answer import answer
 from pop_ref.conformance.vector_check import check
-from pop_ref.conformance.vector_schema import GRADIENTS, schema
-from pop_ref.conformance.vectors import export
+from pop_ref.conformance.vector_schema import schema
+from pop_ref.conformance.vectors import export, kinds
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -23,27 +25,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-def answer(folder: Path, results: Path, backend: object) -> None:
-    """Do what a port does: read the inputs, write the outputs."""
-    results.mkdir()
-    vectors = json.loads((folder / "index.json").read_text())["vectors"]
-    for path in sorted(folder.glob("*.npz")):
-        with np.load(path) as inputs:
-            scene = scene_from(dict(inputs), vectors[path.stem]["options"])
-            gradients = backend.gradients(scene, inputs["v_image"], inputs["v_T_final"])  # type: ignore[attr-defined]
-        view = backend.render(scene)  # type: ignore[attr-defined]
-        outputs = {name: getattr(view, name) for name in ("image", "T_final", "dominant_ids", "n_blended")}
-        np.savez(results / path.name, **outputs, **{f"v_{name}": gradients[name] for name in GRADIENTS})
-
-
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_sound_port_passes_every_vector(folder: Path, tmp_path: Path, name: str) -> None:
     backend = shipped(name)
-    answer(folder, tmp_path / "results", backend)
+    unanswered = answer(folder, tmp_path / "results", backend)
     found = check(folder, tmp_path / "results", np.dtype(backend.dtype).name)
-    assert len(found.verdicts) == len(list(folder.glob("*.npz"))) * (4 + len(GRADIENTS))
     assert not found.failed, found.failed
-    assert (found.absent, found.missing, found.strange) == ([], [], [])
+    assert (found.missing, found.strange) == (unanswered, [])
+    # the oracle is too slow for thousands of Gaussians, and no rasterizer says what it does with colours on the way
+    large = [vector for vector in unanswered if vector.startswith("large_")]
+    assert unanswered == large
+    assert bool(large) == (name == "oracle")
+    assert found.absent == ([] if name == "oracle" else ["effective_opacities", "colors"])
+    assert len(found.verdicts) > 400
 
 
 def test_a_broken_port_is_told_which_vector_and_array(folder: Path, tmp_path: Path) -> None:
@@ -52,55 +46,98 @@ def test_a_broken_port_is_told_which_vector_and_array(folder: Path, tmp_path: Pa
         answer(folder, tmp_path / "results", backend)
     failed = {(v.vector, v.array) for v in check(folder, tmp_path / "results").failed}
     assert ("one_turned_splat", "v_quats") in failed
-    assert not any(array == "image" for _, array in failed)
+    assert ("three_cameras", "v_quats") in failed
+    assert not any(array in ("image", "images") for _, array in failed)
 
 
 def test_the_index_explains_every_array_of_every_vector(folder: Path) -> None:
     index = json.loads((folder / "index.json").read_text())
-    assert {key: value for key, value in index.items() if key != "vectors"} == schema()
-    axes = index["axes"]
+    assert {key: value for key, value in index.items() if key != "vectors"} == schema(kinds())
+    axes = {name for names in index["axes"] for name in names.split(", ")}
     for name, vector in index["vectors"].items():
         sizes: dict[str, int] = {}
+        arrays = index["kinds"][vector["kind"]]["arrays"]
+        assert set(arrays) == set(vector["shapes"]), name
         with np.load(folder / vector["file"]) as stored:
-            assert set(stored.files) == set(index["arrays"]) == set(vector["shapes"]), name
+            assert set(stored.files) == {key for key, entry in arrays.items() if entry.get("stored", True)}, name
             for key in stored.files:
-                stated = index["arrays"][key]
-                assert str(stored[key].dtype) == stated["dtype"], key
+                assert str(stored[key].dtype) == arrays[key]["dtype"], f"{name}: {key}"
                 assert stored[key].dtype.byteorder in "=|<"
-                assert np.all(np.isfinite(stored[key])) or stated["role"] == "margin", f"{name}: {key}"
-                symbols = [axis for axis in stated["shape"].strip("[]").split(", ") if axis]
+                assert np.all(np.isfinite(stored[key])) or arrays[key]["role"] == "margin", f"{name}: {key}"
                 assert list(stored[key].shape) == vector["shapes"][key]
-                # one letter is one length through all arrays of a vector
-                for symbol, length in zip(symbols, stored[key].shape, strict=True):
-                    assert sizes.setdefault(symbol, length) == length == (int(symbol) if symbol.isdigit() else length)
-                    assert symbol.isdigit() or symbol in axes
-        assert (sizes["W"], sizes["H"]) == (vector["options"]["width"], vector["options"]["height"])
+        for key, shape in vector["shapes"].items():
+            symbols = [axis for axis in arrays[key]["shape"].strip("[]").split(", ") if axis]
+            # one letter is one length through all arrays of a vector
+            for symbol, length in zip(symbols, shape, strict=True):
+                if symbol.isdigit():
+                    assert length == int(symbol), f"{name}: {key}"
+                elif symbol == "3 n_sh":
+                    assert length == 3 * sizes["n_sh"]
+                elif symbol != "runs":
+                    assert sizes.setdefault(symbol, length) == length, f"{name}: {key}"
+                    assert symbol in axes
+        if "width" in vector["options"]:
+            assert (sizes["W"], sizes["H"]) == (vector["options"]["width"], vector["options"]["height"])
 
 
-def test_every_rule_names_arrays_that_are_there(folder: Path) -> None:
-    arrays = json.loads((folder / "index.json").read_text())["arrays"]
+@pytest.mark.parametrize("kind", kinds())
+def test_every_rule_names_arrays_that_are_there(kind: str) -> None:
+    arrays = kinds()[kind]["arrays"]
     for name, entry in arrays.items():
         assert ("compare" in entry) == (entry["role"] == "output"), name
-        rule = entry.get("compare", {})
-        if rule.get("where"):
-            assert arrays[rule["where"]]["role"] == "mask"
-            assert entry["shape"].startswith(arrays[rule["where"]]["shape"].rstrip("]"))
-        if rule.get("rule") == "close":
-            assert arrays[rule["error_bound"]]["shape"] == entry["shape"]
-            assert set(rule["limit"]) == {"float32", "float64"}
-        elif rule:
-            assert entry["dtype"] == "int64"
+        for rule in entry.get("compare", []):
+            expected = arrays[rule.get("expected", name)]
+            if rule["where"]:
+                assert arrays[rule["where"]]["role"] == "mask"
+                assert entry["shape"].startswith(arrays[rule["where"]]["shape"].rstrip("]"))
+            if rule["rule"] == "close":
+                assert arrays[rule["error_bound"]]["shape"] == expected["shape"]
+                assert set(rule["limit"]) == {"float32", "float64"}
+            else:
+                assert entry["dtype"] == expected["dtype"] == "int64"
+
+
+def test_one_wrong_pixel_of_thousands_is_found_by_the_sums(folder: Path, tmp_path: Path) -> None:
+    backend = shipped("fast32")
+    answer(folder, tmp_path / "results", backend)
+    path = tmp_path / "results" / "large_five_thousand.npz"
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    arrays["image"][101, 77, 2] += 2e-3
+    np.savez(path, **arrays)
+    (failed,) = check(folder, tmp_path / "results").failed
+    assert (failed.vector, failed.array) == ("large_five_thousand", "image")
+    assert f"at [{101 // 8 * 25 + 77 // 8}, 2] of its sums" in failed.told
 
 
 def test_masks_leave_most_of_every_vector_to_be_compared(folder: Path) -> None:
     for path in folder.glob("*.npz"):
         with np.load(path) as stored:
-            assert np.mean(stored["decided"]) > 0.5, path.stem
-            assert np.any(stored["v_image"] != 0.0)
+            for mask in ("decided", "unambiguous", "clear_rows"):
+                assert mask not in stored.files or np.mean(stored[mask]) > 0.5, f"{path.stem}: {mask}"
+            for cotangent in ("v_image", "v_images"):
+                assert cotangent not in stored.files or np.any(stored[cotangent] != 0.0)
 
 
 def test_inputs_are_exact_in_float32(folder: Path) -> None:
-    for path in folder.glob("*.npz"):
-        with np.load(path) as stored:
-            for name in ("means", "quats", "scales", "opacities", "sh", "viewmat", "K", "background", "v_image"):
-                assert np.array_equal(stored[name], stored[name].astype(np.float32)), f"{path.name}: {name}"
+    index = json.loads((folder / "index.json").read_text())
+    for vector in index["vectors"].values():
+        arrays = index["kinds"][vector["kind"]]["arrays"]
+        with np.load(folder / vector["file"]) as stored:
+            for name in (name for name, entry in arrays.items() if entry["role"] == "input"):
+                assert np.array_equal(stored[name], stored[name].astype(np.float32)), f"{vector['file']}: {name}"
+
+
+def test_vectors_of_an_older_version_are_refused(folder: Path, tmp_path: Path) -> None:
+    index = json.loads((folder / "index.json").read_text()) | {"version": 2}
+    (tmp_path / "index.json").write_text(json.dumps(index))
+    with pytest.raises(ValueError, match="version is 2, this program reads 3; write the vectors again"):
+        check(tmp_path, tmp_path)
+
+
+def test_what_is_published_of_the_vectors_is_of_todays_mutants_and_no_sound_backend_is_refused() -> None:
+    kept = json.loads((ROOT / "benchmarks" / "results" / "vector_kills.json").read_text())
+    families = {"stages of the oracle": MUTANTS, "the program that trains": PROGRAM, "whole rasterizers": BLACK_BOXES}
+    for family, mutants in families.items():
+        assert set(kept[family]) == {mutant.name for mutant in mutants}, "run pop_ref.conformance.vector_kills again"
+    assert set(kept["sound"].values()) == {None}

@@ -11,7 +11,7 @@ from paper_repro.collect import PROBE
 from paper_repro.jobs import job_named
 from paper_repro.probe import VIEWS, ProbedRun, gradient_sizes
 from paper_repro.train_row import Options, capture_folder, load_capture_of
-from pop_fast import losses
+from pop_fast.stages import losses
 from pop_fast.train import TrainingRun
 from pop_fast.train.choose import choose_backend
 from tests.app.interruptions import interrupt

@@ -13,7 +13,8 @@ from paper_repro.data_check import HOLD_OUT, check_capture, check_scene, table
 from paper_repro.jobs import job_named
 from paper_repro.scales import SCALES
 from paper_repro.scenes import DATASETS, SCENES, Scene, find_folder, scene_named, source_of
-from pop_fast.data import load_capture, make_demo
+from pop_fast.data import load_capture
+from pop_fast.demo import make_demo
 from pop_fast.errors import PopError
 from pop_fast.io.images import read_image, write_png
 

@@ -44,7 +44,7 @@ def _close(found: Margins, label: str, tolerance: float) -> np.ndarray:
 
 
 @given(scene=scenes(max_gaussians=4))
-def test_charges_and_margins_doubt_the_same_pixels_of_plain_scenes(scene: Scene) -> None:
+def test_error_bounds_and_margins_agree_on_what_is_near_a_threshold_in_plain_scenes(scene: Scene) -> None:
     scene = rounded_to(scene, np.float32)
     error_bounds = pixel_error_bounds(scene, np.float32)
     if error_bounds.worst_condition() * error_bounds.reach >= 1.0 / 64.0:
@@ -54,14 +54,14 @@ def test_charges_and_margins_doubt_the_same_pixels_of_plain_scenes(scene: Scene)
         unseen = (
             (found.pixels[label] <= TOLERANCE / 8.0) & ~error_bounds.near_threshold[label] & error_bounds.unambiguous
         )
-        assert not np.any(unseen), f"{label}: within rounding by margins, unseen by error_bounds"
+        assert not np.any(unseen), f"{label}: within rounding by margins, unseen by error bounds"
     for label in ("D4", "D5", "D6", "D7"):
         near = error_bounds.near_threshold[label]
         assert np.all(_close(found, label, 8.0 * TOLERANCE)[near]), f"{label}: far from rounding by margins"
 
 
 @pytest.mark.parametrize("label", ["D5", "D6", "D7", "D8"])
-def test_charges_doubt_all_that_margins_call_close_in_aimed_scenes(label: str) -> None:
+def test_error_bounds_mark_all_that_margins_call_close_in_aimed_scenes(label: str) -> None:
     @TRIED
     @given(scene=threshold_strategies.AIMS[label]().map(lambda s: rounded_to(s, np.float32)))
     def agree(scene: Scene) -> None:

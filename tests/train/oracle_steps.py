@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from pop_fast.strategies import POPStrategy
-from pop_fast.strategies.densify import standard_normals
+from pop_fast.density import POPStrategy
+from pop_fast.density.densify import standard_normals
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.presets import values_of
 from pop_ref.activations import opacities_from_logits
@@ -124,9 +124,9 @@ def judged_step(run: TrainingRun, recipe: Recipe, scene_scale: float) -> Judged:
     """Let a run take a step and compare it with the oracle's."""
     before, generator = state_of(run), torch.Generator()
     generator.set_state(run.state["generator"].get_state())
-    stretch = run.take_steps(run.step + 1)
+    segment = run.take_steps(run.step + 1)
     after = state_of(run)
-    view = next(view for view in run._train if view.name == stretch.views[0])
+    view = next(view for view in run._train if view.name == segment.views[0])
     camera = Camera(_array(view.viewmat[0]), _array(view.K[0]), view.width, view.height)
     eps = float(torch.finfo(run.params["means"].dtype).eps)
     drawn: list[np.ndarray] = []
@@ -143,7 +143,7 @@ def judged_step(run: TrainingRun, recipe: Recipe, scene_scale: float) -> Judged:
     work = Bounds.of(before, camera, target, recipe, eps)
     rows = work.around(moved.rows, before, scene_scale)
     rows, statistics = control(rows, moved.statistics, scene_scale, before.step, normals, recipe.density)
-    found = stretch.stats[0].objective + stretch.stats[0].pop
+    found = segment.stats[0].objective + segment.stats[0].pop
     allowed = SHARE["loss"] * eps * abs(loss)
     differences = [] if abs(found - loss) <= allowed else [f"loss {found} instead of {loss}, {allowed:.2g} allowed"]
     differences += compared_rows(after.rows, rows, max((float(np.abs(d).max(initial=0.0)) for d in drawn), default=0.0))
@@ -152,7 +152,7 @@ def judged_step(run: TrainingRun, recipe: Recipe, scene_scale: float) -> Judged:
     doubtful = bool(differences) and (
         work.doubtful() or near_threshold(moved, work, before.step, scene_scale, normals, recipe.density)
     )
-    return Judged(before.step, stretch.event, found, differences, doubtful, reasons(moved, scene_scale, recipe.density))
+    return Judged(before.step, segment.event, found, differences, doubtful, reasons(moved, scene_scale, recipe.density))
 
 
 @dataclass

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.backends import get_backend
+from pop_fast.api.registry import get_backend
 from pop_fast.data.initialize import initialize_params
+from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.strategies import POPStrategy
 from pop_fast.train import TrainingRun
 from pop_fast.train.engines import engine_of, native_engine, torch_engine
 from pop_fast.train.model import KEYS

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from pop_fast.data.initialize import initialize_params
-from pop_fast.strategies.base import Draws
+from pop_fast.density.protocol import Draws
 from pop_fast.train import TrainingRun
 from pop_fast.train.engines import torch_engine
 from pop_ref.optimizer import is_updated
@@ -59,12 +59,12 @@ def test_ten_steps_in_double_precision_are_the_oracles(recipe: Recipe, tmp_path:
     run = run_of(recipe, tmp_path, torch_engine("fast"), torch.float64)
     state = state_of(run)
     for step in range(10):
-        stretch = run.take_steps(step + 1)
-        view = next(view for view in run._train if view.name == stretch.views[0])
+        segment = run.take_steps(step + 1)
+        view = next(view for view in run._train if view.name == segment.views[0])
         camera = Camera(view.viewmat[0].numpy(), view.K[0].numpy(), view.width, view.height)
         scene_scale = capture().scene_scale()
         state, loss = train_step(state, camera, view.photo.double().numpy() / 255.0, scene_scale, normals, recipe)
-        assert stretch.stats[0].objective + stretch.stats[0].pop == pytest.approx(loss, rel=1e-10)
+        assert segment.stats[0].objective + segment.stats[0].pop == pytest.approx(loss, rel=1e-10)
         for key in KEYS:
             np.testing.assert_allclose(run.params[key].detach().numpy(), state.rows.params[key], rtol=1e-7, atol=1e-9)
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from cuda_ext.train_settings import GROUPS, Phase, StepSettings, steady_updates
-from pop_fast.backends import get_backend
-from pop_fast.tiles import TileLists, tile_lists
+from pop_fast.api.registry import get_backend
+from pop_fast.stages.tiles import TileLists, tile_lists
 from pop_ref.constants import PAPER
 
 WIDTH, HEIGHT, TILE, CHUNK = 40, 24, 16, 16

@@ -57,9 +57,9 @@ def climb(engine: Any, folder: Path, dtype: torch.dtype = torch.float32) -> list
     run.draws = replace(run.draws, normals=lambda n: torch.tensor(ten_losses.draws(n)))
     rungs = []
     for step in range(STEPS):
-        stretch = run.take_steps(step + 1)
-        assert stretch.views == [f"{step % 3}.png"]
-        rungs.append(Rung(stretch.stats[0].objective + stretch.stats[0].pop, len(run.params["means"])))
+        segment = run.take_steps(step + 1)
+        assert segment.views == [f"{step % 3}.png"]
+        rungs.append(Rung(segment.stats[0].objective + segment.stats[0].pop, len(run.params["means"])))
     return rungs
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 import re
 import subprocess
@@ -12,14 +11,19 @@ from pathlib import Path
 
 import pytest
 
+from pop_ref.constants import DECISIONS, KINKS
+from pop_ref.notation import AXES, SYMBOLS
+from pop_ref.walkthrough import widgets
 from pop_ref.walkthrough.__main__ import main
-from pop_ref.walkthrough.cells import Chapter, ChapterError, chapter_files, read_chapter
+from pop_ref.walkthrough.cells import TIERS, ChapterError, read_chapter
 from pop_ref.walkthrough.folding import Part, parts, said_and_done
+from pop_ref.walkthrough.glossary import GLOSSARY_PAGE, TERMS, Term
 from pop_ref.walkthrough.layout import chapter_page, index_page
-from pop_ref.walkthrough.pages import Outcome, run_chapter
+from pop_ref.walkthrough.pages import run_chapter
+from tests.walkthrough.ran import CHAPTERS, ran
 
-CHAPTERS = chapter_files()
-LEARN = Path(__file__).resolve().parents[2] / "docs" / "learn.md"
+ROOT = Path(__file__).resolve().parents[2]
+LEARN = ROOT / "docs" / "learn.md"
 VOID = {"meta", "br", "img", "hr", "link", "input"}
 
 
@@ -58,69 +62,96 @@ def _read(page: str) -> _Reader:
     return reader
 
 
-@functools.cache
-def _ran(path: Path) -> tuple[Chapter, list[Outcome]]:
-    chapter = read_chapter(path)
-    return chapter, run_chapter(chapter)
-
-
 @pytest.mark.parametrize("path", CHAPTERS, ids=lambda path: path.stem)
 def test_a_chapter_runs_and_holds_what_a_chapter_must(path: Path) -> None:
-    chapter, outcomes = _ran(path)
-    assert 2 <= chapter.n_exercises <= 3
+    chapter, outcomes = ran(path)
+    # chapter 0 shows what is not yet explained
+    assert set(chapter.tiers) == set(TIERS if chapter.number != "0" else TIERS[:2])
+    assert chapter.tiers.count("find the bug") == (chapter.number != "0")
+    assert 10 <= chapter.minutes <= 60
     assert 1 <= sum(len(outcome.pictures) for outcome in outcomes) <= 6
-    assert sum(len(outcome.printed.splitlines()) for outcome in outcomes) <= 100
-    assert any("eq." in cell.text for cell in chapter.cells if cell.kind == "prose"), "no formula names its equation"
+    assert sum(len(outcome.printed.splitlines()) for outcome in outcomes) <= 130
+    told = [cell.text for cell in chapter.cells if cell.kind == "prose"]
+    assert any("eq." in text or "algorithm" in text or "section" in text for text in told), "no formula has a source"
 
 
 @pytest.mark.parametrize("path", CHAPTERS, ids=lambda path: path.stem)
 def test_a_chapter_becomes_a_page(path: Path) -> None:
-    chapter, outcomes = _ran(path)
+    chapter, outcomes = ran(path)
     every = [read_chapter(each) for each in CHAPTERS]
     page = chapter_page(chapter, outcomes, every)
     read = _read(page)
     assert page.count("<summary>Answer</summary>") == chapter.n_exercises
+    guessed = sum(tier in ("predict", "find the bug") for tier in chapter.tiers)
+    assert page.count('<p class="guess" hidden>') == guessed
     assert read.tags.count("figure") == sum(len(outcome.pictures) for outcome in outcomes)
     assert "math" in read.tags
-    assert "$" not in re.sub(r"<(pre|style|code)\b.*?</\1>|<svg.*?</svg>", "", page, flags=re.DOTALL), "a bare dollar"
+    # a widget makes its own ids, in its script
+    still = re.sub(r"<script\b.*?</script>", "", page, flags=re.DOTALL)
+    assert "$" not in re.sub(r"<(pre|style|code)\b.*?</\1>|<svg.*?</svg>", "", still, flags=re.DOTALL), "a bare dollar"
     # equal images in one picture share an id, which nothing refers to
-    for used in set(re.findall(r'(?:href="#|url\(#)([^")]+)', page)):
+    for used in set(re.findall(r'(?:href="#|url\(#)([^")]+)', still)):
         assert read.ids.count(used) == 1, used
-    pages = {each.page for each in every} | {"index.html"}
+    pages = {each.page for each in every} | {"index.html", GLOSSARY_PAGE}
+    labels = {f"{GLOSSARY_PAGE}#{label}" for label in DECISIONS | KINKS}
     for link in read.links:
-        assert link.startswith(("#", "data:image/png;base64,", "https://")) or link in pages, f"{link} leads nowhere"
+        assert link in labels or link.startswith(("#", "data:image/png;base64,", "https://")) or link in pages, (
+            f"{link} leads nowhere"
+        )
     # a page loads nothing: what is on the network is only linked to
-    assert not {"script", "link", "iframe", "object"} & set(read.tags)
+    assert not {"link", "iframe", "object"} & set(read.tags)
     assert all(source.startswith("data:") for source in read.sources)
     assert not re.search(r"@import|url\((?!#)", "".join(re.findall(r"<style>(.*?)</style>", page, re.DOTALL)))
 
 
 def test_numbers_follow_each_other_and_the_contents_names_them_all() -> None:
     chapters = [read_chapter(path) for path in CHAPTERS]
-    assert [chapter.number for chapter in chapters] == list(range(1, 13))
+    assert [chapter.number for chapter in chapters] == [
+        "0",
+        "1",
+        "1b",
+        "2",
+        "3",
+        "4",
+        "4b",
+        "5",
+        "5b",
+        "6",
+        "7",
+        "8",
+        "9",
+        "9b",
+        "10",
+        "11",
+        "12",
+    ]
     page = index_page(chapters)
-    assert _read(page).links == [chapter.page for chapter in chapters]
+    assert _read(page).links == [GLOSSARY_PAGE, *(chapter.page for chapter in chapters)]
 
 
 def test_the_page_on_learning_lists_the_chapters_by_title() -> None:
     text = LEARN.read_text(encoding="utf-8")
-    listed = re.findall(r"^(\d+)\. \[(.+)\]\(\.\./pop_ref/walkthrough/(chapter_\w+\.py)\)$", text, re.MULTILINE)
+    listed = re.findall(r"^- (\w+)\. \[(.+)\]\(\.\./pop_ref/walkthrough/(chapter_\w+\.py)\)$", text, re.MULTILINE)
     chapters = [read_chapter(path) for path in CHAPTERS]
-    assert listed == [(str(each.number), each.title, each.path.name) for each in chapters]
+    assert listed == [(each.number, each.title, each.path.name) for each in chapters]
 
 
 def test_a_chapter_runs_as_a_script() -> None:
-    done = subprocess.run([sys.executable, "-m", read_chapter(CHAPTERS[0]).module], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-m", read_chapter(CHAPTERS[1]).module], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
 def test_the_command_writes_pages_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(tmp_path / "pages"), "--only", "1"]) == 0
-    assert sorted(path.name for path in (tmp_path / "pages").iterdir()) == [f"{CHAPTERS[0].stem}.html", "index.html"]
+    assert sorted(path.name for path in (tmp_path / "pages").iterdir()) == sorted(
+        [f"{CHAPTERS[1].stem}.html", "glossary.html", "index.html"]
+    )
     assert "index.html" in capsys.readouterr().out
 
 
-GOOD = """# %% [markdown]
+GOOD = """# minutes: 5
+
+# %% [markdown]
 # # 1. Title
 #
 # What the reader will know, with $x^2$.
@@ -141,7 +172,7 @@ picture(fig, "A caption < with $y$.")
 print(Pair(1.0).x)
 
 # %% [markdown]
-# ### Exercise 1
+# ### Exercise 1: derive
 # What is two?
 
 # %% answer
@@ -153,7 +184,7 @@ NAME = Path("chapter_01_small.py")
 
 def test_a_small_chapter_shows_what_it_prints_draws_and_folds() -> None:
     chapter = read_chapter(NAME, GOOD)
-    assert (chapter.number, chapter.title) == (1, "Title")
+    assert (chapter.number, chapter.title, chapter.minutes, chapter.tiers) == ("1", "Title", 5, ["derive"])
     assert chapter.opening == "What the reader will know, with $x^2$."
     outcomes = run_chapter(chapter)
     assert [outcome.printed for outcome in outcomes] == ["", "1.0\n", "", ""]
@@ -163,19 +194,27 @@ def test_a_small_chapter_shows_what_it_prints_draws_and_folds() -> None:
     assert "<msup><mi>x</mi><mn>2</mn></msup>" in page
 
 
-def test_code_that_draws_is_folded_apart() -> None:
+def test_a_cell_is_cut_by_what_its_statements_are_for() -> None:
     drawing = "# a line\nfig, ax = axes(2)\nax.plot(x)\npicture(fig, 'A line.')"
     helper = "def bars():\n    return axes()"
-    assert parts(f"x = 1\n\n{drawing}\ny = 2\n\n{helper}") == [
-        Part("x = 1", False),
-        Part(drawing, True),
-        Part("y = 2", False),
-        Part(helper, True),
+    assert parts(f"import os\n\nx = 1\n\n{drawing}\ny = 2\n\n{helper}") == [
+        Part("import os", "imports"),
+        Part("x = 1", "plain"),
+        Part(drawing, "draws"),
+        Part("y = 2", "plain"),
+        Part(helper, "draws"),
     ]
     cross = "def cross(ax):\n    ax.plot(0)"
-    assert parts(f"x = 1\n\n{cross}\n\n\n{drawing}") == [Part("x = 1", False), Part(f"{cross}\n\n\n{drawing}", True)]
-    assert parts("x = 1\n\ny = 2") == [Part("x = 1\n\ny = 2", False)]
-    assert parts("fig, ax = plt.subplots()\nx = 1") == [Part("fig, ax = plt.subplots()\nx = 1", True)]
+    assert parts(f"x = 1\n\n{cross}\n\n\n{drawing}") == [
+        Part("x = 1", "plain"),
+        Part(f"{cross}\n\n\n{drawing}", "draws"),
+    ]
+    assert parts("x = 1\n\ny = 2") == [Part("x = 1\n\ny = 2", "plain")]
+    assert parts("fig, ax = plt.subplots()\nx = 1") == [Part("fig, ax = plt.subplots()\nx = 1", "draws")]
+    checks = "# it is\nassert x == 1\nfor y in z:\n    w = y\n    assert w\nnp.testing.assert_allclose(x, y)"
+    assert parts(f"x = 1\n{checks}") == [Part("x = 1", "plain"), Part(checks, "checks")]
+    assert parts("for y in z:\n    total += y") == [Part("for y in z:\n    total += y", "plain")]
+    assert parts("film(images, labels, 'A film.')") == [Part("film(images, labels, 'A film.')", "draws")]
 
 
 def test_the_comment_that_opens_an_answer_is_prose() -> None:
@@ -197,6 +236,66 @@ def test_names_of_functions_stand_apart_from_what_is_no_parenthesis() -> None:
     assert "<msub><mi>T</mi><mrow><mi>max</mi></mrow></msub>" in formula(r"T_{\max}")
 
 
+def test_a_prediction_is_asked_for_before_its_answer() -> None:
+    page = _whole(GOOD.replace("Exercise 1: derive", "Exercise 1: predict"))
+    assert page.index("What is two?") < page.index("Your prediction") < page.index("<summary>Answer</summary>")
+    assert "Your prediction" not in _whole(GOOD)
+
+
+def test_a_directive_stands_for_what_the_package_says() -> None:
+    page = _whole(GOOD.replace("# What is two?", "# {{source: pop_ref.alpha.falloff}}\n#\n# Decision D5 and `D6`."))
+    assert "pop_ref/alpha.py" in page
+    assert "Falloff" not in page, "the docstring is left out"
+    assert f'href="{GLOSSARY_PAGE}#D5"' in page
+    assert f'href="{GLOSSARY_PAGE}#D6"' not in page, "code is left alone"
+    bug = _whole(GOOD.replace("# What is two?", "# {{bug: no_half_in_the_exponent}}"))
+    assert "with one mistake" in bug
+    assert widgets.html("stack") in _whole(GOOD.replace("# What is two?", "# {{widget: stack}}"))
+
+
+def test_a_film_is_a_strip_without_a_script() -> None:
+    frames = "film([np.zeros((2, 3, 3))] * 4, list('abcd'), 'Four.')"
+    page = _whole(
+        GOOD.replace(
+            "print(Pair", f"import numpy as np\nfrom pop_ref.walkthrough.pages import film\n{frames}\nprint(Pair"
+        )
+    )
+    read = _read(page)
+    assert read.tags.count("li") == 4
+    assert sum(source.startswith("data:image/png") for source in read.sources) == 4
+    assert '<figure class="film"' in page
+
+
+def test_every_label_and_name_in_prose_is_defined() -> None:
+    known = {symbol.name for symbol in SYMBOLS} | set(AXES)
+    for path in (ROOT / "pop_ref").rglob("*.py"):
+        known |= set(re.findall(r"\b[A-Za-z_][A-Za-z_0-9]*\b", path.read_text(encoding="utf-8")))
+    for path in CHAPTERS:
+        chapter = read_chapter(path)
+        prose = "\n".join(cell.text for cell in chapter.cells if cell.kind == "prose")
+        for label in re.findall(r"\b(?:decision|kink) ([A-Z]\d+)", prose):
+            assert label in DECISIONS | KINKS, f"{path.name}: {label}"
+        for name in re.findall(r"`([a-z_]+)`", prose):
+            assert name in known, f"{path.name}: `{name}` is nothing in the package"
+
+
+@pytest.mark.parametrize("term", TERMS, ids=lambda term: term.word)
+def test_a_term_is_defined_where_it_is_first_used(term: Term) -> None:
+    chapters = [read_chapter(path) for path in CHAPTERS]
+    numbers = [each.number for each in chapters]
+    for chapter in chapters:
+        told = "\n".join([chapter.title, *(cell.text for cell in chapter.cells if cell.kind == "prose")])
+        # chapter 0 names what is to come
+        if 0 < numbers.index(chapter.number) < numbers.index(term.chapter):
+            used = re.search(rf"\b{term.word}s?\b", told, re.IGNORECASE)
+            assert used is None, (
+                f"{term.word} in chapter {chapter.number} before its own: ...{told[used.start() - 40 : used.end()]}"
+            )
+        if chapter.number == term.chapter:
+            shown = re.search(rf"\*{term.word}s?\*|\*\*{term.word}s?[\s*]", told, re.IGNORECASE)
+            assert shown, f"chapter {chapter.number} does not define {term.word}, by writing it *so*"
+
+
 def _whole(text: str) -> str:
     chapter = read_chapter(NAME, text)
     return chapter_page(chapter, run_chapter(chapter), [chapter])
@@ -215,29 +314,33 @@ def _fails(old: str, new: str) -> str:
 
 def test_a_false_claim_is_named_with_its_file_and_line() -> None:
     told = _fails("assert two == 2", "assert two == 3")
-    assert told == "chapter_01_small.py:27: AssertionError\n    assert two == 3"
+    assert told == "chapter_01_small.py:29: AssertionError\n    assert two == 3"
 
 
 def test_an_error_inside_the_oracle_is_named_where_the_chapter_calls() -> None:
     told = _fails("two = 2", "from pop_ref.constants import profile_named\ntwo = profile_named('none')")
-    assert told.startswith("chapter_01_small.py:27: ValueError: profile 'none' is unknown")
+    assert told.startswith("chapter_01_small.py:29: ValueError: profile 'none' is unknown")
     assert told.endswith("\n    two = profile_named('none')")
 
 
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
-        ("# %% answer\ntwo = 2\nassert two == 2\n", "", ":22: exercise 1 has no answer"),
-        ("# %% answer", "# %%", ":22: exercise 1 has no answer"),
-        ("assert two == 2\n", "", ":26: the answer to exercise 1 asserts nothing"),
-        ("# ### Exercise 1", "# ### Exercise 2", ":22: this is exercise 1, not 2"),
-        ("# ### Exercise 1", "# ### A question", ":26: an answer must follow its exercise"),
-        ("print(Pair(1.0).x)", "print(Pair(1.0).x", ":19: SyntaxError: '(' was never closed"),
-        ("# # 1. Title", "# # 2. Title", ":2: the first line must be '# # 1. Title'"),
-        ("# What is two?", "What is two?", ":23: a line of prose begins with '# '"),
-        ("# %% answer", "# %% solution", ":25: a cell is marked"),
-        ("$x^2$", r"$\nosuchthing{x}$", ":4: a formula cannot be set"),
-        ("$y$", r"$\\nosuchthing{x}$", ":7: a formula cannot be set in 'A caption"),
+        ("# %% answer\ntwo = 2\nassert two == 2\n", "", ":24: exercise 1 has no answer"),
+        ("# %% answer", "# %%", ":24: exercise 1 has no answer"),
+        ("assert two == 2\n", "", ":28: the answer to exercise 1 asserts nothing"),
+        ("# ### Exercise 1", "# ### Exercise 2", ":24: this is exercise 1, not 2"),
+        ("1: derive", "1: ponder", ":24: exercise 1 is one of predict, derive, code, find the bug, not 'ponder'"),
+        ("# minutes: 5\n", "", ":1: a line '# minutes: 20' must tell"),
+        ("# What is two?", "# {{sauce: pop_ref}}", ":24: {{sauce: pop_ref}} is not a directive"),
+        ("# What is two?", "# {{source: pop_ref.alpha.nothing}}", ":24: pop_ref.alpha.nothing: there is no such"),
+        ("# ### Exercise 1", "# ### A question", ":28: an answer must follow its exercise"),
+        ("print(Pair(1.0).x)", "print(Pair(1.0).x", ":21: SyntaxError: '(' was never closed"),
+        ("# # 1. Title", "# # 2. Title", ":4: the first line must be '# # 1. Title'"),
+        ("# What is two?", "What is two?", ":25: a line of prose begins with '# '"),
+        ("# %% answer", "# %% solution", ":27: a cell is marked"),
+        ("$x^2$", r"$\nosuchthing{x}$", ":6: a formula cannot be set"),
+        ("$y$", r"$\\nosuchthing{x}$", ":9: a formula cannot be set in 'A caption"),
     ],
 )
 def test_a_chapter_out_of_form_is_named_with_its_file_and_line(old: str, new: str, told: str) -> None:
@@ -250,7 +353,7 @@ def test_a_broken_chapter_ends_the_command_with_one_line(
     (tmp_path / NAME).write_text(GOOD.replace("assert two == 2", "assert two == 3"), encoding="utf-8")
     monkeypatch.setattr("pop_ref.walkthrough.__main__.chapter_files", lambda: [tmp_path / NAME])
     assert main([str(tmp_path / "pages")]) == 2
-    assert capsys.readouterr().err.startswith("chapter_01_small.py:27: AssertionError")
+    assert capsys.readouterr().err.startswith("chapter_01_small.py:29: AssertionError")
     assert list((tmp_path / "pages").iterdir()) == []
 
 

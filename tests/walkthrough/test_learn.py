@@ -12,11 +12,13 @@ import pytest
 from pop_fast.cli import main
 from pop_ref.learn import stubs
 from pop_ref.learn.course import BY_NAME, COURSE, stage_named
+from pop_ref.learn.drawing import ORACLES, SIDE, YOURS, drawn_counterexample
 from pop_ref.learn.judge import judge
 from pop_ref.learn.mistakes import MISTAKES
 from pop_ref.learn.progress import PASSED, WRITTEN, course_map, note_passed, picture, state
 from pop_ref.learn.student import borrowing, read_work
 from pop_ref.learn.telling import told
+from pop_ref.walkthrough.cells import chapter_files, chapter_number
 
 ROOT = Path(__file__).resolve().parents[2]
 ORACLE = ROOT / "pop_ref"
@@ -104,7 +106,7 @@ WRONG = {
     ),
     "a gradient without the tail": (
         "compositing",
-        ("        v_alpha = T * (worth - behind)\n", "        v_alpha = T * worth\n"),
+        ("        v_alpha = T * (color_dot_grad - suffix_dot_grad)\n", "        v_alpha = T * color_dot_grad\n"),
         "tail is missing",
     ),
     "a factor": ("losses", ("return v_l2 * 2.0 * difference", "return v_l2 * 8.0 * difference"), "4 times"),
@@ -136,6 +138,47 @@ def test_a_wrong_student_gets_the_sentence_that_helps(mine: Path, who: str) -> N
     else:
         assert f"{verdict.call.function} of" in text
         assert "and should give" in text
+
+
+def _colored(image: np.ndarray, color: np.ndarray) -> int:
+    return int(np.sum(np.abs(image - color).max(axis=2) < 0.02))
+
+
+@pytest.mark.parametrize(
+    ("stage", "change"),
+    [
+        ("covariance", WRONG["a transposed rotation"][1]),
+        ("covariance", ("        M = rotmats[i] * scales[i]\n", "        M = rotmats[i] * scales[i] ** 2\n")),
+        ("alpha", WRONG["no half at all"][1]),
+        ("compositing", WRONG["a gradient without the tail"][1]),
+    ],
+    ids=["axes", "ellipses", "bars", "scene and bars"],
+)
+def test_a_counterexample_is_drawn_with_what_came_out_and_what_should(
+    mine: Path, stage: str, change: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(mine, stage, change)
+    verdict = judge(read_work(mine), BY_NAME[stage])
+    image = drawn_counterexample(verdict)
+    assert image is not None
+    assert image.shape[0] == SIDE
+    assert image.min() >= 0.0
+    assert image.max() <= 1.0
+    yours, oracles = _colored(image, YOURS), _colored(image, ORACLES)
+    assert yours > 100, "what the student's function gives is seen"
+    assert oracles > 100, "and what it should give"
+    assert main(["learn", "check", stage, str(mine)]) == 1
+    picture = mine / f"counterexample_{stage}.png"
+    assert str(picture) in capsys.readouterr().out
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    # who has passed has no counterexample
+    write(mine, stage)
+    assert main(["learn", "check", stage, str(mine)]) == 0
+    assert not picture.exists()
+
+
+def test_the_chapter_that_explains_a_stage_is_there() -> None:
+    assert {stage.chapter for stage in COURSE} <= {chapter_number(path) for path in chapter_files()}
 
 
 def test_every_mistake_that_is_known_is_one_and_of_a_function_of_the_course(mine: Path) -> None:

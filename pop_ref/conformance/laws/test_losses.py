@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import strategies as st
 
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
-from pop_ref.conformance.cases import pattern
 from pop_ref.conformance.law import law
+from pop_ref.conformance.scenes import pattern
 from pop_ref.conformance.strategies import arrays_of, dyadic
 
 small = arrays_of((2, 3, 3), 0.0, 1.0)

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
-from pop_ref.conformance.cases import pattern
 from pop_ref.conformance.law import law
+from pop_ref.conformance.scenes import pattern
 from pop_ref.conformance.strategies import dyadic
 from pop_ref.loss_magnitudes import d_ssim_magnitudes, pixelwise_magnitudes
 

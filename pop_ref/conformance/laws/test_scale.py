@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
-from pop_ref.conformance.capabilities import DERIVATIVES, DOMINANCE, EXTENTS, GRADIENTS, PRINCIPAL_POINT, RENDER, SCALE
+from pop_ref.conformance.capabilities import DOMINANCE, EXTENTS, GRADIENTS, INRIAS, PRINCIPAL_POINT, RENDER, SCALE
 from pop_ref.conformance.corpus import PLANS, corpus_scene
 from pop_ref.conformance.corpus_answers import (
     GRADIENTS as ROWS,
@@ -18,6 +18,7 @@ from pop_ref.conformance.corpus_answers import (
     weighted_runs,
 )
 from pop_ref.conformance.law import law
+from pop_ref.constants import INRIA
 
 
 def _image(name, *needs):
@@ -34,7 +35,7 @@ def _image(name, *needs):
                 assert_close(f"{kind}.{key}", *(v[part] for v in values), backend.dtype, against_oracle=True)
 
     sentence.__name__ = f"test_the_image_of_{name}_is_the_oracles"
-    return law("whole", RENDER, EXTENTS, PRINCIPAL_POINT, *needs)(sentence)
+    return law("whole", RENDER, *needs)(sentence)
 
 
 def _integers(name, *needs):
@@ -48,7 +49,7 @@ def _integers(name, *needs):
             assert_same_bits("weighted sums of blended counts over blocks", blended, expected["blended"])
 
     sentence.__name__ = f"test_dominant_ids_and_counts_of_{name}_are_the_oracles"
-    return law("dominance", RENDER, DOMINANCE, EXTENTS, PRINCIPAL_POINT, *needs)(sentence)
+    return law("dominance", RENDER, DOMINANCE, *needs)(sentence)
 
 
 def _gradients(name, *needs):
@@ -61,11 +62,12 @@ def _gradients(name, *needs):
             assert_close(f"scale.v_{key}", sums, expected[f"v_{key}"], error_bound, backend.dtype, against_oracle=True)
 
     sentence.__name__ = f"test_the_gradients_of_{name}_are_the_oracles"
-    return law("gradients", GRADIENTS, EXTENTS, PRINCIPAL_POINT, DERIVATIVES, *needs)(sentence)
+    return law("gradients", GRADIENTS, *needs)(sentence)
 
 
 for _name, _plan in PLANS.items():
+    _needs = (INRIAS,) if _plan.profile == INRIA else (EXTENTS, PRINCIPAL_POINT)
     for _make in (_image, _integers, _gradients):
-        _test = _make(_name, *(() if _plan.small else (SCALE,)))
+        _test = _make(_name, *_needs, *(() if _plan.small else (SCALE,)))
         globals()[_test.law.sentence.__name__] = _test
-del _name, _plan, _make, _test
+del _name, _plan, _needs, _make, _test

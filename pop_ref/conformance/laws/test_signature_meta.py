@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 
 from pop_ref.conformance.calls import Call
-from pop_ref.conformance.capabilities import CAMERAS, EXTENTS, PACKED, PRINCIPAL_POINT, SIGNATURE
+from pop_ref.conformance.capabilities import CAMERAS, PACKED, SIGNATURE
 from pop_ref.conformance.law import law
-from pop_ref.conformance.meta import ROWS, TILES, assert_rows, assert_sizes, assert_tiles
+from pop_ref.conformance.meta import ROWS, TILES, assert_keys, assert_rows, assert_sizes, assert_tiles
 from pop_ref.conformance.signature import expectations
 from pop_ref.conformance.views import frames
 
-JUDGED = (SIGNATURE, EXTENTS, PRINCIPAL_POINT)
+JUDGED = (SIGNATURE,)
 SIZES = ("width", "height", "tile_size", "tile_width", "tile_height", "n_cameras", "n_batches")
 
 
@@ -47,3 +47,16 @@ def test_the_tile_lists_that_meta_shows_run_front_to_back_and_hold_who_is_blende
 def test_the_tile_lists_of_packed_rows_run_front_to_back_and_hold_who_is_blended(backend):
     call, called, wanted = _made(backend, TILES[1:3], needs_all=True, packed=True)
     assert_tiles(backend, call, called, wanted)
+
+
+@law("signature", *JUDGED, CAMERAS)
+def test_the_keys_of_intersections_hold_image_tile_and_depth(backend):
+    call, called, wanted = _made(backend, ("isect_ids", "flatten_ids", "isect_offsets", "depths"), needs_all=True)
+    assert_keys(called.meta, len(call.frames[0]), len(wanted[0][0].render.tile_lists))
+
+
+@law("signature", *JUDGED, CAMERAS, PACKED)
+def test_the_keys_of_packed_intersections_hold_image_tile_and_depth(backend):
+    names = ("isect_ids", "flatten_ids", "isect_offsets", "depths")
+    call, called, wanted = _made(backend, names, needs_all=True, packed=True)
+    assert_keys(called.meta, len(call.frames[0]), len(wanted[0][0].render.tile_lists))

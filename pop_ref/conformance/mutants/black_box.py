@@ -41,7 +41,7 @@ class BlackBox:
 
     def rasterization(self) -> Rasterization:
         """Return the broken function, with the arguments that gsplat has."""
-        sound = partial(function_named("pop_fast.rasterization:rasterization"), backend="fast")
+        sound = partial(function_named("pop_fast.api.rasterize:rasterization"), backend="fast")
 
         def rasterization(
             means: Any, quats: Any, scales: Any, opacities: Any, colors: Any, viewmats: Any, Ks: Any, width: int,
@@ -104,6 +104,14 @@ def _packed_by_gaussian(sound: Rasterization, given: dict[str, Any]) -> Any:
     return images, alphas, meta
 
 
+def _tile_above_the_image(sound: Rasterization, given: dict[str, Any]) -> Any:
+    images, alphas, meta = sound(**given)
+    keys, tiles = meta["isect_ids"], meta["tile_width"] * meta["tile_height"]
+    high, bits = keys >> 32, tiles.bit_length()
+    image, tile = high >> bits, high & ((1 << bits) - 1)
+    return images, alphas, {**meta, "isect_ids": (tile << 40) | (image << 32) | (keys & 0xFFFFFFFF)}
+
+
 def _accumulated_for_expected(given: dict[str, Any]) -> str:
     return given["render_mode"].replace("ED", "D")
 
@@ -159,6 +167,12 @@ BLACK_BOXES: Final = (
         "the indices of packed rows are sorted by Gaussian, the rows themselves by camera",
         _packed_by_gaussian,
         "test_signature_cameras:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same",
+    ),
+    BlackBox(
+        "keys_sort_by_tile_first",
+        "the key of an intersection has its tile above its image, eight bits each",
+        _tile_above_the_image,
+        "test_signature_meta:the_keys_of_intersections_hold_image_tile_and_depth",
     ),
     BlackBox(
         "expected_depth_not_divided",

@@ -107,7 +107,7 @@ PIXELS: Final = (
         "background_behind_forgotten",
         "dC/dalpha leaves out the background behind the last splat",
         "pixel.py",
-        "        behind += b * v_color[k]\n",
+        "        suffix_dot_grad += b * v_color[k]\n",
         "",
         "test_gradients:a_step_along_any_direction_changes_the_image_as_the_gradient_says",
     ),

@@ -26,7 +26,7 @@ _LINES: Final = (
     (
         "moments_of_the_next_row",
         "an edit gathers the moments one row off: every survivor goes on with its neighbour's momentum",
-        "strategies/ops.py",
+        "density/rows.py",
         "moments[name] = edited(value, None",
         "moments[name] = edited(value.roll(1, 0), None",
         PRUNING,
@@ -34,7 +34,7 @@ _LINES: Final = (
     (
         "copies_begin_with_momentum",
         "appended rows start with moments of their own values instead of zero",
-        "strategies/ops.py",
+        "density/rows.py",
         "None if tail is None else torch.zeros_like(tail)",
         "tail",
         CLONES,
@@ -42,7 +42,7 @@ _LINES: Final = (
     (
         "reset_keeps_moments",
         "a reset lowers the opacities and keeps their moments, which carry them up again",
-        "strategies/ops.py",
+        "density/rows.py",
         "value.shape == opacities.shape:\n            value.zero_()\n",
         "value.shape == opacities.shape:\n            pass\n",
         RESET,
@@ -50,7 +50,7 @@ _LINES: Final = (
     (
         "splits_keep_the_opacity",
         "the step forgets that revised opacities were asked for: two children are denser than their parent (A26)",
-        "strategies/densify.py",
+        "density/densify.py",
         "padded, of.draws.normals(n_splits), plan.revised_opacity)",
         "padded, of.draws.normals(n_splits))",
         STEP,
@@ -58,7 +58,7 @@ _LINES: Final = (
     (
         "square_pixels_of_ndc",
         "the screen gradient is scaled by the width along both axes",
-        "strategies/densify.py",
+        "density/densify.py",
         '0.5 * info["height"] * cameras',
         '0.5 * info["width"] * cameras',
         AVERAGE,
@@ -66,7 +66,7 @@ _LINES: Final = (
     (
         "every_view_counted",
         "views that do not show a Gaussian are counted in its average (A23)",
-        "strategies/densify.py",
+        "density/densify.py",
         'state["count"].add_(visible.sum(0))',
         'state["count"].add_(len(visible))',
         AVERAGE,
@@ -74,7 +74,7 @@ _LINES: Final = (
     (
         "window_without_end",
         "the views that showed a Gaussian are counted from the first step on, its gradients from the last change",
-        "strategies/densify.py",
+        "density/densify.py",
         '    state["count"].zero_()\n',
         "",
         STEP,
@@ -82,7 +82,7 @@ _LINES: Final = (
     (
         "growth_in_world_units",
         "the size that decides between clone and split is in world units: scene_scale is forgotten",
-        "strategies/densify.py",
+        "density/densify.py",
         'grow_masks(window(state), torch.exp(of.params["scales"]), state["scene_scale"]',
         'grow_masks(window(state), torch.exp(of.params["scales"]), 1.0',
         STEP,
@@ -90,7 +90,7 @@ _LINES: Final = (
     (
         "pruning_in_world_units",
         "the size over which a Gaussian is pruned is in world units: scene_scale is forgotten",
-        "strategies/densify.py",
+        "density/densify.py",
         'prune_mask(opacities, torch.exp(of.params["scales"]), state["scene_scale"]',
         'prune_mask(opacities, torch.exp(of.params["scales"]), 1.0',
         STEP,
@@ -98,7 +98,7 @@ _LINES: Final = (
     (
         "clones_before_survivors",
         "who is split is looked up as if the clones stood before the rest",
-        "strategies/densify.py",
+        "density/densify.py",
         "padded = torch.cat([splits, splits.new_zeros(n_clones)])",
         "padded = torch.cat([splits.new_zeros(n_clones), splits])",
         STEP,
@@ -106,7 +106,7 @@ _LINES: Final = (
     (
         "reset_at_the_first_step",
         "opacities are reset at step 0, before anything has been learnt (A25)",
-        "strategies/control.py",
+        "density/control.py",
         "(step > 0 or self.reset_at_zero)",
         "(step >= 0 or self.reset_at_zero)",
         RESETS,
@@ -114,7 +114,7 @@ _LINES: Final = (
     (
         "blur_flag_of_one_view",
         "the blur flag of earlier views is forgotten: only the last view counts (A2)",
-        "strategies/densify.py",
+        "density/densify.py",
         '        blurred |= state["blurred"]\n',
         "        blurred |= blurred\n",
         FLAGS,
@@ -122,7 +122,7 @@ _LINES: Final = (
     (
         "blur_bound_not_passed_on",
         "the least number of pixels of a blurred Gaussian is a setting that nothing reads",
-        "strategies/densify.py",
+        "density/densify.py",
         "plan.theta_blur, plan.blur_min_pixels, kept)",
         "plan.theta_blur, 0.0, kept)",
         "test_density:the_blur_set_dominates_strictly_more_than_its_share_of_pixels",
@@ -130,7 +130,7 @@ _LINES: Final = (
     (
         "share_of_masked_pixels",
         "the share of a blurred Gaussian is of all pixels, also of those that a mask leaves out",
-        "strategies/densify.py",
+        "density/densify.py",
         'kept = info.get("kept_pixels")',
         "kept = None",
         FLAGS,
@@ -138,7 +138,7 @@ _LINES: Final = (
     (
         "parent_opacity_for_children",
         "the children's opacity is revised twice",
-        "density.py",
+        "stages/density.py",
         "log_left = -0.5 *",
         "log_left = -0.25 *",
         SPLIT,
@@ -178,7 +178,7 @@ _LINES: Final = (
     (
         "ellipse_misses_its_tile",
         "the test that leaves tiles out follows the wrong diagonal; counting draws without it",
-        "tiles.py",
+        "stages/tiles.py",
         "torch.maximum(-b * edge_x / c, top)",
         "torch.maximum(b * edge_x / c, top)",
         ASKED,
@@ -186,7 +186,7 @@ _LINES: Final = (
     (
         "ellipse_of_a_fainter_splat",
         "tiles are left out where alpha is under ten times the floor; counting draws without it",
-        "tiles.py",
+        "stages/tiles.py",
         "torch.log(shapes[5] / profile.alpha_floor)",
         "torch.log(0.1 * shapes[5] / profile.alpha_floor)",
         ASKED,
@@ -194,7 +194,7 @@ _LINES: Final = (
     (
         "windows_of_the_corner",
         "whether a window of SSIM counts is read from its corner, not from its centre",
-        "ssim.py",
+        "stages/ssim.py",
         "mask[margin:-margin, margin:-margin]",
         "mask[: -2 * margin, : -2 * margin]",
         "test_masked_losses:the_dissimilarity_of_what_a_mask_keeps_is_the_oracles",
@@ -202,7 +202,7 @@ _LINES: Final = (
     (
         "tiles_end_where_they_are_wide",
         "the lower edge of a tile is reckoned from its left one; counting draws without the test",
-        "tiles.py",
+        "stages/tiles.py",
         "right, bottom = left + (tile_size - 1), top + (tile_size - 1)",
         "right, bottom = left + (tile_size - 1), left + (tile_size - 1)",
         PLAIN,
@@ -210,7 +210,7 @@ _LINES: Final = (
     (
         "sums_without_absolute_ones",
         "where no absolute gradients are asked for, as 3DGS trains, the exponent's moments change places",
-        "blender.py",
+        "stages/blend/blend.py",
         "rows[:, :6] = torch.mm(self.basis, pairs.T)",
         "rows[:, :6] = torch.mm(self.basis if absolute else self.basis[[0, 2, 1, 3, 4, 5]], pairs.T)",
         ASKED,
@@ -218,7 +218,7 @@ _LINES: Final = (
     (
         "lists_of_thirty_two",
         "a tile blends the first 32 entries of its list",
-        "tile_groups.py",
+        "stages/blend/tile_groups.py",
         "torch.arange(int(n_blocks[0]))",
         "torch.arange(min(int(n_blocks[0]), 4))",
         "test_scale:the_image_of_fifty_is_the_oracles",
@@ -226,7 +226,7 @@ _LINES: Final = (
     (
         "lists_of_256",
         "a tile blends the first 256 entries of its list: nobody sees it in small scenes",
-        "tile_groups.py",
+        "stages/blend/tile_groups.py",
         "torch.arange(int(n_blocks[0]))",
         "torch.arange(min(int(n_blocks[0]), 32))",
         "test_scale:the_image_of_hundreds_in_a_tile_is_the_oracles",
@@ -234,7 +234,7 @@ _LINES: Final = (
     (
         "lists_of_1024",
         "a tile blends the first 1,024 entries of its list",
-        "tile_groups.py",
+        "stages/blend/tile_groups.py",
         "torch.arange(int(n_blocks[0]))",
         "torch.arange(min(int(n_blocks[0]), 128))",
         "test_scale:the_image_of_a_thousand_in_a_tile_is_the_oracles",
@@ -242,7 +242,7 @@ _LINES: Final = (
     (
         "tiles_in_eight_bits",
         "entries are sorted by tile numbers of eight bits",
-        "tiles.py",
+        "stages/tiles.py",
         "tile.to(torch.int16 if n_tiles < 2**15 else torch.int32)",
         "tile.to(torch.int8)",
         "test_scale:the_image_of_five_thousand_is_the_oracles",
@@ -250,7 +250,7 @@ _LINES: Final = (
     (
         "entries_in_sixteen_bits",
         "where a tile's list begins is counted in sixteen bits",
-        "tiles.py",
+        "stages/tiles.py",
         "return TileLists(ids.index_select(0, order), offsets,",
         "return TileLists(ids.index_select(0, order), offsets % 2**16,",
         "test_scale:dominant_ids_and_counts_of_five_thousand_are_the_oracles",
@@ -258,7 +258,7 @@ _LINES: Final = (
     (
         "winners_in_eight_bits",
         "dominant ids are kept in eight bits",
-        "compositing.py",
+        "stages/compositing.py",
         "ids.masked_fill_(places < 0, -1))",
         "(ids % 256).masked_fill_(places < 0, -1))",
         "test_scale:dominant_ids_and_counts_of_hundreds_in_a_tile_are_the_oracles",
@@ -266,7 +266,7 @@ _LINES: Final = (
     (
         "counts_in_eight_bits",
         "blended splats are counted in eight bits",
-        "compositing.py",
+        "stages/compositing.py",
         "blend.n_blended.to(torch.int32)",
         "(blend.n_blended % 256).to(torch.int32)",
         "test_scale:dominant_ids_and_counts_of_a_thousand_in_a_tile_are_the_oracles",
@@ -274,7 +274,7 @@ _LINES: Final = (
     (
         "gradients_of_256",
         "the backward pass ends after 256 entries of a list",
-        "compositing.py",
+        "stages/compositing.py",
         "gradients.add(group, blend, tiles.index_select(0, group.tiles))",
         "del blend.steps[32:]; gradients.add(group, blend, tiles.index_select(0, group.tiles))",
         "test_scale:the_gradients_of_a_thousand_in_a_tile_are_the_oracles",

@@ -85,14 +85,15 @@ def _bound(stated: Law, backend: Any) -> Callable[..., None]:
     return function
 
 
-def _alive(mutant: Mutant | BlackBox) -> AbstractContextManager[Any]:
+def alive(mutant: Mutant | BlackBox) -> AbstractContextManager[Any]:
+    """Return a context in which the mutant lives, which gives its adapter."""
     return nullcontext(mutant.adapter()) if isinstance(mutant, BlackBox) else living(mutant)
 
 
 def killed_by(mutant: Mutant | BlackBox) -> str | None:
     """Return how the mutant's named law breaks on it, None if the mutant survives."""
     stated = law_named(mutant.law)
-    with _alive(mutant) as backend:
+    with alive(mutant) as backend:
         # a law that is skipped notices nothing
         return None if missing(backend, stated.needs) else obeys(stated, backend)
 
@@ -100,7 +101,7 @@ def killed_by(mutant: Mutant | BlackBox) -> str | None:
 def killers(mutant: Mutant | BlackBox, examples: int = EXAMPLES["ci"]) -> list[str]:
     """Return the paths of every law that breaks on a mutant."""
     found = []
-    with _alive(mutant) as backend:
+    with alive(mutant) as backend:
         for path, stated in every_law().items():
             if not missing(backend, stated.needs) and obeys(stated, backend, examples) is not None:
                 found.append(path)

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from cuda_ext.library_folder import library_folder
-from tests.cuda.emulated import emulate
+from cuda_ext.host import emulate
+from cuda_ext.host.library_folder import library_folder
 
 pytest.register_assert_rewrite("pop_ref.conformance.laws")
 
@@ -62,4 +62,6 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 def engine(gpu: Any) -> Any:
     """Return the emulated GPU as `pop train` takes one."""
 
-    return emulate.engine()
+    from tests.cuda.emulated.engine import emulated_engine
+
+    return emulated_engine()

@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from cuda_ext.arrays import Settings
-from cuda_ext.lists import WARP_TILE, make_lists, splat_struct
-from cuda_ext.resident import ResidentViews
+from cuda_ext.render.lists import WARP_TILE, make_lists, splat_struct
 from cuda_ext.train_settings import Phase, StepSettings, steady_updates
-from cuda_ext.train_step import FusedTrainer
+from cuda_ext.training.resident import ResidentViews
+from cuda_ext.training.train_step import FusedTrainer
 from pop_ref.constants import PAPER
 
 WIDTH, HEIGHT = 90, 50
@@ -56,7 +56,7 @@ def told(gpu, counts: bool):
     settings = StepSettings(steady_updates(dict.fromkeys(params, 1e-3), 2), replay=False, counts=counts)
     trainer = FusedTrainer(params, m, v, views, [0, 0], settings)
     trainer.run(2, Phase(0, True, True, True))
-    ((_, maps),) = trainer.told_maps().items()
+    ((_, maps),) = trainer.render_stats().items()
     return maps, params
 
 

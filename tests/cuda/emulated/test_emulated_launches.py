@@ -9,9 +9,9 @@ from contextlib import contextmanager
 import pytest
 import torch
 
+from cuda_ext.host import emulate
 from cuda_ext.train_settings import Phase
-from pop_fast.passes import Passes
-from tests.cuda.emulated import emulate
+from pop_fast.density.passes import Passes
 from tests.cuda.gpu.scene import HEIGHT, STEPS, WIDTH, training_scene
 from tests.cuda.gpu.steps import fused_trainer
 from tests.fast.pass_scenes import raw_params, views
@@ -51,7 +51,7 @@ def test_a_step_without_dominance_does_not_count_importance(gpu):
 
 
 def test_a_step_is_captured_when_its_kind_comes_again_and_once(gpu, monkeypatch):
-    from cuda_ext import train_step
+    from cuda_ext.training import train_step
 
     captured, captures = train_step.captured, []
 
@@ -112,7 +112,7 @@ def test_fused_steps_are_launched_on_the_tensors_device(guarded):
 
 
 def test_a_render_and_its_gradients_are_launched_on_the_tensors_device(guarded):
-    from cuda_ext.ops import rasterization
+    from pop_fast.cuda import rasterization
 
     scene = training_scene()
     p = {name: value.requires_grad_() for name, value in scene.params.items()}

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.cuda.emulated import emulate
-from tests.cuda.emulated.emulate import FLAGS, HERE, translated
+from cuda_ext.host import emulate
+from cuda_ext.host.emulate import FLAGS, HERE, translated
 
 from .conftest import FOLDER
 

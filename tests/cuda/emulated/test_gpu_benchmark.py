@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import torch
 
-import pop_fast.rasterization
+import pop_fast.api.rasterize
 from pop_fast.cli import main
 from tests.app.captures import HEIGHT, WIDTH, colmap_capture
 from tests.cuda.emulated.rehearse import stand_in_card
 
 BENCHMARKS = Path(__file__).resolve().parents[3] / "benchmarks"
-STAND_IN = 'from pop_fast.rasterization import rasterization\n\n__version__ = "stand-in"\n'
+STAND_IN = 'from pop_fast.api.rasterize import rasterization\n\n__version__ = "stand-in"\n'
 
 
 @pytest.fixture
@@ -71,9 +71,9 @@ def test_every_number_of_the_benchmark_is_measured(bench, gpu, monkeypatch, tmp_
         *("project", "count_instances", "make_tile_lists", "blend_forward", "photometric"),
         *("blend_backward", "update"),
     }
-    for family in ("columns", "columns_atomic", "splats", "splats_atomic"):
-        assert found[family]["step_with_pop_ms"] > 0.0
-    assert found["columns"]["step_kernels"].keys() == {"skipped"}
+    for backward in ("pixel_parallel", "pixel_parallel_atomic", "gaussian_parallel", "gaussian_parallel_atomic"):
+        assert found[backward]["step_with_pop_ms"] > 0.0
+    assert found["pixel_parallel"]["step_kernels"].keys() == {"skipped"}
 
 
 def test_gsplat_is_measured_beside_the_same_case(bench, monkeypatch, tmp_path):
@@ -137,7 +137,7 @@ def test_the_loss_that_gsplat_is_given_is_the_objective(bench, gpu):
     from gpu_gsplat import LAMBDA_SSIM, FusedLoss
     from gpu_scenes import TINY, activated_scene
 
-    from pop_fast.losses import photometric_pop
+    from pop_fast.stages.losses import photometric_pop
 
     g = torch.Generator().manual_seed(3)
     photograph = torch.randint(0, 256, (24, 40, 3), generator=g, dtype=torch.uint8)
@@ -152,7 +152,7 @@ def test_a_packed_scene_is_what_the_run_left_behind(bench, gpu, tmp_path, capsys
     from gpu_pack import pack_scene
     from gpu_scenes import packed_scene
 
-    from pop_fast.cli.splat import load_splat
+    from pop_fast.train.load_result import load_splat
 
     capture, folder = colmap_capture(tmp_path / "scene"), tmp_path / "run"
     words = ["train", str(capture), "--out", str(folder), "--max-steps", "3", "--backend", "fast", "--quiet"]
@@ -165,12 +165,12 @@ def test_a_packed_scene_is_what_the_run_left_behind(bench, gpu, tmp_path, capsys
     torch.testing.assert_close(scene["sh"][:, :1], params["sh0"], rtol=1e-3, atol=1e-3)
     assert scene["sh"].shape == (case.n, 16, 3)
     assert scene["photograph"].shape == (HEIGHT, WIDTH, 3)
-    image = bench.draw(pop_fast.rasterization.rasterization, scene, case)[0]
+    image = bench.draw(pop_fast.api.rasterize.rasterization, scene, case)[0]
     assert image.std() > 0.01
     # the same picture, larger
     large_case, large = packed_scene(path, gpu, 4.0 * WIDTH * HEIGHT)
     assert (large_case.width / WIDTH, large_case.height / HEIGHT) == pytest.approx((2.0, 2.0), rel=0.4)
-    drawn = bench.draw(pop_fast.rasterization.rasterization, large, large_case)[0][0]
+    drawn = bench.draw(pop_fast.api.rasterize.rasterization, large, large_case)[0][0]
     shrunk = torch.nn.functional.interpolate(drawn.permute(2, 0, 1)[None], (HEIGHT, WIDTH), mode="area")[0]
     assert float((shrunk.permute(1, 2, 0) - image[0]).abs().mean()) < 0.5 * float(image.std())
     assert packed_scene(path, gpu, 1.5 * WIDTH * HEIGHT) is None

@@ -31,7 +31,7 @@ def test_the_predicted_case_is_what_was_predicted(gpu, monkeypatch):
     assert loads.evaluated / loads.pixels == pytest.approx(EVALUATED, rel=0.1)
     assert loads.contributing / loads.pixels == pytest.approx(CONTRIBUTING, rel=0.1)
     # lists are as unequal as those of captures
-    ((size, told),) = trainer.told_maps().items()
+    ((size, told),) = trainer.render_stats().items()
     assert size == (case.width, case.height)
     walked = told["n_traversed"].float()
     assert float(walked.quantile(0.99)) > 1.5 * float(walked.mean())

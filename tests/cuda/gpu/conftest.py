@@ -19,16 +19,16 @@ TOLD = ("means2d", "radii", "depths", "conics", "opacities", "final_T")
 DOMINANCE = ("dominant_ids", "dominant_weights", "dominant_counts")
 
 
-def rasterizer(family: str, deterministic: bool = True) -> Any:
-    """Return the CUDA rasterization with one backward family; visits are counted where the tile allows it."""
-    from cuda_ext.ops import rasterization
+def rasterizer(backward: str, deterministic: bool = True) -> Any:
+    """Return the CUDA rasterization with one backward kernel; visits are counted where the tile allows it."""
+    from pop_fast.cuda import rasterization
 
     # the kit reads off the signature what it may ask for: a mode that is not named here is not judged
     def draw(
         *args: Any, profile: Any = "paper", rasterize_mode: Any = "classic", dominance: bool = False, **options: Any
     ) -> Any:
         settings = {"profile": profile, "rasterize_mode": rasterize_mode, "dominance": dominance, **options}
-        image, alphas, meta = rasterization(*args, family=family, deterministic=deterministic, **settings)
+        image, alphas, meta = rasterization(*args, backward=backward, deterministic=deterministic, **settings)
         visits = ("n_traversed",) if options.get("tile_size", 16) % 16 == 0 else ()
         return image, alphas, {key: meta[key] for key in (*TOLD, *DOMINANCE, "n_contrib", *visits)}
 
@@ -38,7 +38,11 @@ def rasterizer(family: str, deterministic: bool = True) -> Any:
 def cuda_backends(device: str, name: str) -> list[Any]:
     from pop_ref.conformance.torch_adapter import TorchAdapter
 
-    kinds = {"columns": ("columns", True), "splats": ("splats", True), "atomics": ("columns", False)}
+    kinds = {
+        "pixel_parallel": ("pixel_parallel", True),
+        "gaussian_parallel": ("gaussian_parallel", True),
+        "atomics": ("pixel_parallel", False),
+    }
     asked = os.environ.get("POP_CUDA_KINDS", " ".join(kinds)).split()
     return [
         TorchAdapter(f"{name}32-{kind}", rasterizer(*kinds[kind]), None, "float32", device=device) for kind in asked

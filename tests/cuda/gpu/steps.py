@@ -12,9 +12,9 @@ THETA = 0.02
 
 def fused_trainer(scene: TrainingScene, device, masks=None, **options):
     """Return rows (parameters and moments) and the trainer of them."""
-    from cuda_ext.resident import ResidentViews
     from cuda_ext.train_settings import StepSettings, steady_updates
-    from cuda_ext.train_step import FusedTrainer
+    from cuda_ext.training.resident import ResidentViews
+    from cuda_ext.training.train_step import FusedTrainer
 
     params = {name: value.to(device).clone() for name, value in scene.params.items()}
     m, v = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))
@@ -41,9 +41,9 @@ def on_the_cpu(scene: TrainingScene, **readings):
     Returns:
         Losses, POP terms, parameters and the strategy's state.
     """
-    from pop_fast.losses import photometric_pop
-    from pop_fast.rasterization import rasterization
-    from pop_fast.strategies import POPStrategy
+    from pop_fast.api.rasterize import rasterization
+    from pop_fast.density import POPStrategy
+    from pop_fast.stages.losses import photometric_pop
 
     strategy = POPStrategy(refine_start_iter=STEPS, blur_start_iter=0, theta_blur=THETA, **readings)
     params = {name: value.clone().requires_grad_() for name, value in scene.params.items()}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.strategies import GsplatStrategy, POPStrategy
+from pop_fast.density import GsplatStrategy, POPStrategy
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config
@@ -112,7 +112,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(engine, method, tmp_path, m
 
 
 def test_buffers_that_overflow_between_views_of_several_sizes_lose_nothing(engine, tmp_path, monkeypatch):
-    from cuda_ext import capacity
+    from cuda_ext.render import capacity
 
     capture = mixed_sizes(tiny_capture())
     whole = TrainingRun(tiny_config(tmp_path / "whole"), capture, engine=engine)

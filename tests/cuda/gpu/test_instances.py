@@ -21,7 +21,7 @@ def wide_splats(gpu, n, lists):
     """Return splats that cover every tile of a huge grid, and the lists' struct made ready to count them."""
     from cuda_ext import load
     from cuda_ext.arrays import fill
-    from cuda_ext.lists import splat_struct
+    from cuda_ext.render.lists import splat_struct
 
     kernels = load()
     lists.n, lists.exact = n, False
@@ -77,7 +77,7 @@ def counted(gpu):
     """Return the state, the lists and the splats of the training scene, which has been counted."""
     from cuda_ext import load
     from cuda_ext.arrays import kernel_profile, new_state, stream_of
-    from cuda_ext.lists import TileBuffers, splat_struct
+    from cuda_ext.render.lists import TileBuffers, splat_struct
 
     g = torch.Generator().manual_seed(0)
     made = {
@@ -103,7 +103,7 @@ def test_more_entries_than_the_kernels_can_number_are_refused_in_one_line(gpu):
 
 
 def test_room_shrinks_after_a_phase_of_fat_splats_and_the_steps_stay_the_same(gpu, monkeypatch):
-    from cuda_ext import capacity
+    from cuda_ext.render import capacity
     from cuda_ext.train_settings import Phase
 
     monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 64))

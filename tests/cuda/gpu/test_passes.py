@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pop_fast.passes import Passes, ViewContributions
+from pop_fast.density.passes import Passes, ViewContributions
 from pop_ref.constants import PROFILES
 from tests.fast.pass_scenes import HEIGHT, WIDTH, raw_params, views
 

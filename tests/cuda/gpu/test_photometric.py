@@ -22,7 +22,7 @@ def _photographs(height: int, width: int, masked: bool):
 def _found(device, photograph, image, mask, padding, l1, weights, cache):
     from cuda_ext import load
     from cuda_ext.arrays import fill, new_state, stream_of
-    from cuda_ext.resident import MARGIN, ResidentViews
+    from cuda_ext.training.resident import MARGIN, ResidentViews
 
     kernels, (height, width) = load(), photograph.shape[:2]
     masks = None if mask is None else [mask]
@@ -44,7 +44,7 @@ def _found(device, photograph, image, mask, padding, l1, weights, cache):
 @pytest.mark.parametrize(("padding", "l1"), [("valid", False), ("same", True)])
 @pytest.mark.parametrize("size", SIZES)
 def test_values_and_gradient_are_those_of_float64(gpu, size, padding, l1, masked, cache):
-    from pop_fast import losses
+    from pop_fast.stages import losses
 
     photograph, image, mask = _photographs(*size, masked)
     weights = (0.7, 0.3)

@@ -16,15 +16,15 @@ READINGS = (
 )
 
 
-@pytest.mark.parametrize("family", ["columns", "splats"])
+@pytest.mark.parametrize("backward", ["pixel_parallel", "gaussian_parallel"])
 @pytest.mark.parametrize("reading", READINGS, ids=lambda reading: "-".join(reading.values()))
-def test_ten_fused_steps_under_another_reading_are_the_cpus(gpu, reading, family):
+def test_ten_fused_steps_under_another_reading_are_the_cpus(gpu, reading, backward):
     scene, strong = training_scene(), {"lambda_pop": 0.05}
     # no view shows all, and one shows others than the two beside it
     scene.params["means"][:16, 2] *= -1.0
     scene.viewmats[2, 0, 3] = 1.5
     window = reading.get("pop_views") == "window"
-    losses, params, trainer = fused(scene, gpu, window, family=family, theta_blur=THETA, **strong, **reading)
+    losses, params, trainer = fused(scene, gpu, window, backward=backward, theta_blur=THETA, **strong, **reading)
     expected, terms, wanted, state = on_the_cpu(scene, **strong, **reading)
     torch.testing.assert_close(torch.tensor(losses), torch.tensor(expected), rtol=1e-4, atol=1e-6)
     told = torch.tensor([values.pop for values in trainer.step_stats(0, STEPS)])
@@ -53,7 +53,7 @@ def test_the_share_that_blurs_is_of_the_pixels_that_a_view_keeps(gpu):
     differs = 0
     for step in range(STEPS):
         trainer.run(step + 1, Phase(3, True, True, True))
-        ((_, maps),) = trainer.told_maps().items()
+        ((_, maps),) = trainer.render_stats().items()
         counts, masked = maps["dominant_counts"].cpu(), masks[scene.order[step]] is not None
         kept = WIDTH // 4 * HEIGHT if masked else WIDTH * HEIGHT
         assert torch.equal(trainer.statistics.blurred.bool().cpu(), counts > THETA * kept), step

@@ -48,9 +48,9 @@ def _moments(
 
     Before it, `waits` steps are taken in which the harmonics beyond the first band take no part.
     """
-    from cuda_ext.resident import ResidentViews
     from cuda_ext.train_settings import Phase, StepSettings, steady_updates
-    from cuda_ext.train_step import FusedTrainer
+    from cuda_ext.training.resident import ResidentViews
+    from cuda_ext.training.train_step import FusedTrainer
 
     params = {name: _moved(value.to(device), floats) for name, value in scene.params.items()}
     m, v = ({name: _moved(torch.zeros_like(value), floats) for name, value in params.items()} for _ in range(2))
@@ -103,8 +103,8 @@ def _draw(function, scene: TrainingScene, sh: torch.Tensor, device, degree: int)
 
 @pytest.mark.parametrize(("degree", "n_rest"), DEGREES)
 def test_a_steps_gradients_are_the_cpus_at_every_degree(gpu, degree, n_rest):
-    from pop_fast.losses import photometric_pop
-    from pop_fast.rasterization import rasterization
+    from pop_fast.api.rasterize import rasterization
+    from pop_fast.stages.losses import photometric_pop
 
     scene = _scene(n_rest)
     found, after = _moments(scene, gpu, degree)
@@ -135,8 +135,8 @@ def test_rows_that_begin_anywhere_take_the_same_step(gpu, degree, n_rest):
 @pytest.mark.parametrize("floats", [0, 1])
 @pytest.mark.parametrize(("degree", "n_rest"), DEGREES)
 def test_coefficients_of_any_width_and_place_give_the_cpus_image_and_gradient(gpu, degree, n_rest, floats):
-    from cuda_ext.ops import rasterization as on_gpu
-    from pop_fast.rasterization import rasterization as on_cpu
+    from pop_fast.api.rasterize import rasterization as on_cpu
+    from pop_fast.cuda import rasterization as on_gpu
 
     scene = _scene(n_rest)
     whole = torch.cat((scene.params["sh0"], scene.params["shN"]), 1)

@@ -12,9 +12,9 @@ from pop_ref.render import render
 from .scene import HEIGHT, LR, WIDTH, training_scene
 
 
-@pytest.mark.parametrize("family", ["columns", "splats"])
-def test_a_render_is_the_oracles(gpu, family):
-    from cuda_ext.ops import rasterization
+@pytest.mark.parametrize("backward", ["pixel_parallel", "gaussian_parallel"])
+def test_a_render_is_the_oracles(gpu, backward):
+    from pop_fast.cuda import rasterization
 
     scene = training_scene()
     p = {name: value.to(gpu) for name, value in scene.params.items()}
@@ -22,7 +22,7 @@ def test_a_render_is_the_oracles(gpu, family):
     sh = torch.cat((p["sh0"], p["shN"]), 1)
     view = (scene.viewmats[:1].to(gpu), scene.Ks[:1].to(gpu), WIDTH, HEIGHT)
     image, alphas, _ = rasterization(
-        p["means"], p["quats"], p["scales"], p["opacities"], sh, *view, sh_degree=3, family=family
+        p["means"], p["quats"], p["scales"], p["opacities"], sh, *view, sh_degree=3, backward=backward
     )
     rows = [value.cpu().double().numpy() for value in (p["means"], p["quats"], p["scales"], p["opacities"], sh)]
     camera = Camera(scene.viewmats[0].double().numpy(), scene.Ks[0].double().numpy(), WIDTH, HEIGHT)
@@ -33,9 +33,9 @@ def test_a_render_is_the_oracles(gpu, family):
 
 
 def test_fused_steps_launched_one_by_one_give_the_same_bits_twice_and_learn(gpu):
-    from cuda_ext.resident import ResidentViews
     from cuda_ext.train_settings import Phase, StepSettings, steady_updates
-    from cuda_ext.train_step import FusedTrainer
+    from cuda_ext.training.resident import ResidentViews
+    from cuda_ext.training.train_step import FusedTrainer
 
     found = []
     for _ in range(2):

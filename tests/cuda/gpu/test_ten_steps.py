@@ -17,7 +17,9 @@ def test_steps_launched_anew_are_the_replayed_steps(gpu):
 
 
 @pytest.mark.graph
-@pytest.mark.parametrize("options", [{"family": "splats"}, {"deterministic": False}, {"antialiased": True}])
+@pytest.mark.parametrize(
+    "options", [{"backward": "gaussian_parallel"}, {"deterministic": False}, {"antialiased": True}]
+)
 def test_graphs_of_several_sizes_and_phases_are_replayed_in_turn(gpu, options):
     from cuda_ext.train_settings import Phase
 
@@ -46,7 +48,7 @@ def test_graphs_of_several_sizes_and_phases_are_replayed_in_turn(gpu, options):
 
 @pytest.mark.graph
 def test_buffers_that_overflow_grow_and_nothing_is_lost(gpu, monkeypatch):
-    from cuda_ext import capacity
+    from cuda_ext.render import capacity
 
     expected = fused(training_scene(), gpu)[1]
     monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 1))
@@ -56,10 +58,10 @@ def test_buffers_that_overflow_grow_and_nothing_is_lost(gpu, monkeypatch):
         assert torch.equal(value, small[name]), name
 
 
-@pytest.mark.parametrize("family", ["columns", "splats"])
-def test_ten_fused_steps_are_the_cpus_ten_steps(gpu, family):
+@pytest.mark.parametrize("backward", ["pixel_parallel", "gaussian_parallel"])
+def test_ten_fused_steps_are_the_cpus_ten_steps(gpu, backward):
     scene = training_scene()
-    losses, params, _ = fused(scene, gpu, family=family)
+    losses, params, _ = fused(scene, gpu, backward=backward)
     expected, _, wanted, _ = on_the_cpu(scene)
     assert expected[-1] < expected[0]
     torch.testing.assert_close(torch.tensor(losses), torch.tensor(expected), rtol=1e-4, atol=1e-6)
@@ -75,7 +77,7 @@ def test_two_runs_give_the_same_bits(gpu):
 
 
 def test_a_trainer_of_ones_own_learns_through_the_autograd_functions(gpu):
-    from pop_fast.rasterization import rasterization
+    from pop_fast.api.rasterize import rasterization
 
     scene = training_scene()
     leaves = {name: value.to(gpu).clone().requires_grad_() for name, value in scene.params.items()}
@@ -100,7 +102,7 @@ def test_a_trainer_of_ones_own_learns_through_the_autograd_functions(gpu):
 
 
 def test_rasterization_and_its_gradients_give_the_same_bits_twice(gpu):
-    from cuda_ext.ops import rasterization
+    from pop_fast.cuda import rasterization
 
     scene = training_scene()
     grads = []
@@ -118,11 +120,11 @@ def test_rasterization_and_its_gradients_give_the_same_bits_twice(gpu):
         assert torch.equal(value, grads[1][name]), name
 
 
-@pytest.mark.parametrize("family", ["columns", "splats"])
+@pytest.mark.parametrize("backward", ["pixel_parallel", "gaussian_parallel"])
 @pytest.mark.parametrize("faint", [1, 44], ids=["one-bucket", "three-buckets"])
-def test_gradients_around_an_opaque_splat_keep_their_digits(gpu, family, faint):
-    from cuda_ext.ops import rasterization as on_gpu
-    from pop_fast.rasterization import rasterization as on_cpu
+def test_gradients_around_an_opaque_splat_keep_their_digits(gpu, backward, faint):
+    from pop_fast.api.rasterize import rasterization as on_cpu
+    from pop_fast.cuda import rasterization as on_gpu
 
     n = 2 * faint + 1
 
@@ -143,23 +145,27 @@ def test_gradients_around_an_opaque_splat_keep_their_digits(gpu, family, faint):
         return means.grad.double().cpu()
 
     expected = gradient(on_cpu, "cpu", torch.float64)
-    found = gradient(on_gpu, gpu, torch.float32, family=family)
+    found = gradient(on_gpu, gpu, torch.float32, backward=backward)
     assert float((found - expected).abs().max() / expected.abs().max()) < 5e-6
 
 
 @pytest.mark.parametrize("options", [{"counts": True}, {"profile": "inria"}])
 def test_lists_of_the_callers_tiles_go_back_as_the_warps_own_do(gpu, options):
-    from cuda_ext.ops import rasterization as on_gpu
-    from pop_fast.rasterization import rasterization as on_cpu
+    from pop_fast.api.rasterize import rasterization as on_cpu
+    from pop_fast.cuda import rasterization as on_gpu
 
     scene, grads = training_scene(), []
     # 36 px: the last row of 16 px tiles is less than half full, so that a warp's part of it lies outside
-    for function, device, family in ((on_cpu, "cpu", {}), (on_gpu, gpu, {}), (on_gpu, gpu, {"family": "splats"})):
+    for function, device, backward in (
+        (on_cpu, "cpu", {}),
+        (on_gpu, gpu, {}),
+        (on_gpu, gpu, {"backward": "gaussian_parallel"}),
+    ):
         leaves = {name: value.to(device).requires_grad_() for name, value in scene.params.items()}
         image, _, _ = function(
             leaves["means"], leaves["quats"], leaves["scales"].exp(), torch.sigmoid(leaves["opacities"]),
             leaves["sh0"], scene.viewmats.to(device), scene.Ks.to(device), WIDTH, HEIGHT, sh_degree=0, **options,
-            **family,
+            **backward,
         )  # fmt: skip
         image.square().sum().backward()
         grads.append({name: leaf.grad.cpu() for name, leaf in leaves.items() if leaf.grad is not None})
@@ -171,8 +177,8 @@ def test_lists_of_the_callers_tiles_go_back_as_the_warps_own_do(gpu, options):
 @pytest.mark.parametrize("mode", ["D", "ED", "RGB+D", "RGB+ED"])
 @pytest.mark.parametrize("packed", [False, True])
 def test_every_render_mode_is_the_cpus(gpu, mode, packed):
-    from cuda_ext.ops import rasterization as on_gpu
-    from pop_fast.rasterization import rasterization as on_cpu
+    from pop_fast.api.rasterize import rasterization as on_cpu
+    from pop_fast.cuda import rasterization as on_gpu
 
     scene = training_scene()
 
@@ -204,7 +210,7 @@ def test_every_render_mode_is_the_cpus(gpu, mode, packed):
     ],
 )
 def test_a_bad_value_is_named_with_its_index(gpu, name, index, value, words):
-    from cuda_ext.ops import rasterization
+    from pop_fast.cuda import rasterization
 
     scene = training_scene()
     p = {key: tensor.to(gpu).clone() for key, tensor in scene.params.items()}

@@ -1,0 +1,53 @@
+"""A pytest plugin: one line of JSON for every test that has ended, at once, so that a cut run tells how far it got.
+
+POP_OUTCOMES=laws.jsonl python -m pytest -p cuda_ext.gpu_check.outcomes ...
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+FILE = "POP_OUTCOMES"
+SHOWN = 20  # failures that are told one by one
+_WORDS = 400  # characters of a failure's last lines
+
+
+def pytest_runtest_logreport(report: Any) -> None:
+    """Write down how a test ended; a test that passes has done so when its call has."""
+    if report.when == "call" or report.outcome != "passed":
+        _write(report.nodeid, report.outcome, report.duration, report.longreprtext)
+
+
+def pytest_collectreport(report: Any) -> None:
+    """Write down a file whose tests cannot be collected."""
+    if report.outcome == "failed":
+        _write(report.nodeid, "failed", 0.0, report.longreprtext)
+
+
+def _write(test: str, outcome: str, seconds: float, words: str) -> None:
+    path = os.environ.get(FILE)
+    # pytest-xdist's workers tell the process that started them
+    if path and "PYTEST_XDIST_WORKER" not in os.environ:
+        line = {"test": test, "outcome": outcome, "seconds": round(seconds, 2), "words": words[-_WORDS:]}
+        with open(path, "a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+
+
+def outcomes(path: Path) -> dict[str, Any]:
+    """Add up a file of outcomes: counts, the failures, the slowest tests, why tests were skipped."""
+    if not path.exists():
+        return {"passed": 0, "failed": 0, "skipped": 0}
+    tests = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    counts = Counter(test["outcome"] for test in tests)
+    slowest = sorted(tests, key=lambda test: -test["seconds"])[:5]
+    reasons = Counter(test["words"] for test in tests if test["outcome"] == "skipped")
+    return {
+        **{name: counts[name] for name in ("passed", "failed", "skipped")},
+        "failures": [test for test in tests if test["outcome"] == "failed"][:SHOWN],
+        "slowest": {test["test"]: test["seconds"] for test in slowest},
+        "skipped_for": dict(reasons.most_common(5)),
+    }

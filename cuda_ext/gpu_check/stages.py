@@ -1,0 +1,185 @@
+"""The stages of `gpu_check`: what each runs, and what it keeps of it."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from cuda_ext.gpu_check.budget import Share
+from cuda_ext.gpu_check.shared import NOTHING, Check, skipped
+from cuda_ext.gpu_check.tests import (
+    laws_of_gaussian_parallel_stage,
+    laws_stage,
+    sanitizer_stage,
+    smoke_stage,
+    steps_stage,
+)
+from cuda_ext.gpu_check.tools import ROOT, Command, python_path, read_json
+
+_TRAIN = "from pop_fast.cli import main; raise SystemExit(main())"
+_COMPILE = "import time; t = time.time(); from gsplat.cuda._backend import _C; print(round(time.time() - t), 's');"
+_COMPILE += "assert _C is not None, 'gsplat found no CUDA toolkit'"
+# what a training run is judged by
+_TOLD = ("step", "seconds", "seconds_loading", "seconds_total", "num_GS", "num_GS_above_floor", "psnr", "ssim", "views")
+_TOLD += ("gpu", "gpu_memory_bytes", "instance_buffers_grown")
+
+
+def wheels_stage(check: Check) -> dict[str, Any]:
+    """Install the wheels that were brought along into a scratch folder; go on without what is absent."""
+    wheels = sorted(map(str, (check.packed / "wheels").glob("*.whl"))) if check.packed else []
+    if not wheels:
+        return skipped("no wheels were brought along (--packed FOLDER, made by --pack)")
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--no-compile", "--upgrade"]
+    return check.run([*pip, "--target", str(check.site), *wheels], check.seconds) | {"wheels": list(map(_stem, wheels))}
+
+
+def build_stage(check: Check) -> dict[str, Any]:
+    """Build the extension for this machine's GPU; what an earlier call built is only built where sources changed."""
+    jobs = str(os.cpu_count() or 2)
+    found = check.run(check.python("-m", "cuda_ext.build", "--jobs", jobs), check.seconds)
+    if found["status"] == 0 and (check.site / "gsplat").is_dir():
+        _start_gsplat(check)
+    return found
+
+
+def bench_stage(check: Check) -> dict[str, Any]:
+    """Time every kernel and the whole step."""
+    return _benchmark(check, "gpu_kernels.py", check.seconds)
+
+
+def gsplat_stage(check: Check) -> dict[str, Any]:
+    """Time gsplat beside it, when its own compilation, begun beside earlier stages, has come to an end."""
+    compiling = check.beside.get("gsplat")
+    if compiling is None:
+        return skipped("gsplat is not among the wheels that were brought along, or nothing was built")
+    start = time.monotonic()
+    compiled = compiling.wait(0.6 * check.seconds)
+    check.note({"status": compiled["status"], "seconds": compiled["seconds"], "compilation": compiled})
+    if compiled["status"] != 0:
+        reason = "gsplat was not compiled: its words are under `compilation`; name build and gsplat alone in a call"
+        return skipped(reason) | {"compilation": compiled}
+    left = check.seconds - (time.monotonic() - start)
+    found = _benchmark(check, "gpu_gsplat.py", left, _of_gsplat(check))
+    return found | {"compilation": compiled}
+
+
+def train_stage(check: Check) -> dict[str, Any]:
+    """Train POP on every capture as `pop train --backend cuda` does; seconds, Gaussians, PSNR, SSIM."""
+    packed = sorted((check.packed / "captures").glob("*/")) if check.packed else []
+    captures = [*packed, *check.captures]
+    if not captures:
+        return skipped("no captures were given (--captures DIR ...) or brought along")
+    if importlib.util.find_spec("tyro") is None and not (check.site / "tyro").is_dir():
+        return skipped(
+            "`pop train` needs tyro, which is neither installed nor among the wheels that were brought along"
+        )
+    found: dict[str, Any] = {"status": 0, "seconds": 0.0, "runs": {}}
+    for k, path in enumerate(captures):
+        one = train_one(check, path, (check.seconds - found["seconds"]) / (len(captures) - k))
+        found["runs"][path.name] = one
+        found |= {"status": found["status"] or one["status"], "seconds": round(found["seconds"] + one["seconds"], 1)}
+        check.note(found)
+    return found
+
+
+def reproduce_stage(check: Check) -> dict[str, Any]:
+    """Train the rows of the paper's tables that are missing, the cheapest first, as `pop-repro queue` does.
+
+    Of the scenes that were brought along, at the scale whose rows take days on a CPU. A row that the time
+    ends in is begun anew by the next call, unless the folder survives.
+    """
+    folder = check.packed / "captures" if check.packed else check.captures[0].parent if check.captures else None
+    if folder is None:
+        return skipped("no captures were given (--captures DIR ...) or brought along")
+    results = check.out / "paper_repro"
+    words = ["-m", "paper_repro", "queue", "--scale", "toy" if check.rehearsal else "full", "--data", str(folder)]
+    words += ["--out", str(results), "--work", str(check.work / "paper_repro"), "--threads", "0"]
+    words += ["--backend", "fast" if check.rehearsal else "cuda", "--rows", *REPRODUCED]
+    found = check.run(check.python(*words), check.seconds)
+    if found["status"] == 130:
+        found |= {"status": 0, "note": "the time was up; the rows that were finished are under `rows`"}
+    return found | {"rows": sorted(str(path.relative_to(results)) for path in results.rglob("*.json"))}
+
+
+def train_one(check: Check, path: Path, limit: float, backend: str = "cuda") -> dict[str, Any]:
+    """Train on one capture, or go on with the training of an earlier call at the same commit."""
+    folder = check.work / f"{path.name}_{backend}_{check.steps_scaler:g}_{check.commit[:12]}"
+    words = ["train", str(path), "--out", str(folder), "--backend", backend]
+    words += ["--steps-scaler", str(check.steps_scaler), "--no-progress", "--max-renders", "1"]
+    words += ["--resume"] if (folder / "cfg.json").exists() else []
+    found = check.run(check.python("-c", _TRAIN, *words), limit)
+    stats = sorted((folder / "stats").glob("val_step*.json"), key=lambda file: int(file.stem.split("step")[1]))
+    if found["status"] == 130:
+        found |= {"status": 124, "note": "the time was up; where the folder survives, the next call goes on"}
+    elif found["status"] == 0 and not stats:
+        found["status"] = 1
+    if not stats:
+        return found
+    told = read_json(stats[-1])
+    result = {name: told.get(name) for name in _TOLD}
+    return {**result, **found, "seconds_training": told.get("seconds")}
+
+
+def _start_gsplat(check: Check) -> None:
+    environment = {"PYTHONPATH": python_path(ROOT, check.site), **_of_gsplat(check)}
+    command = [sys.executable, "-c", _COMPILE]
+    check.beside["gsplat"] = Command(command, check.work / "gsplat_compilation.log", environment)
+
+
+def _of_gsplat(check: Check) -> dict[str, str]:
+    jobs = str(max((os.cpu_count() or 2) // 2, 1))
+    return {"TORCH_EXTENSIONS_DIR": str(check.work / "torch_extensions"), "MAX_JOBS": jobs}
+
+
+def _benchmark(check: Check, script: str, limit: float, over: Mapping[str, str] = NOTHING) -> dict[str, Any]:
+    target = check.out / f"{script.removesuffix('.py')}.json"
+    target.unlink(missing_ok=True)
+    words = [str(ROOT / "benchmarks" / script), str(target), "--scenes", *check.scenes()]
+    words += ["--device", "cpu", "--cases", "tiny", "--full-size", "3000"] if check.rehearsal else []
+    found = check.run(check.python(*words), limit, over)
+    # case by case: also what was measured before the time was up
+    return found | {"results": read_json(target)}
+
+
+def _stem(path: str) -> str:
+    return "-".join(Path(path).name.split("-")[:2])
+
+
+STAGES: dict[str, Callable[[Check], dict[str, Any]]] = {
+    "wheels": wheels_stage,
+    "build": build_stage,
+    "smoke": smoke_stage,
+    "bench": bench_stage,
+    "gsplat": gsplat_stage,
+    "laws": laws_stage,
+    "steps": steps_stage,
+    "sanitizer": sanitizer_stage,
+    "train": train_stage,
+    "laws_of_gaussian_parallel": laws_of_gaussian_parallel_stage,
+    "reproduce": reproduce_stage,
+}
+# what settles the paper's claims, first of all the two rows of the whole schedule
+REPRODUCED = ("pop", "l2_blur", "reset", "gsplat", "3dgs", "pop_any_view", "l2", "l2_pop")
+SHARES = {
+    "wheels": Share(5, 40),
+    "build": Share(100, 300),
+    "smoke": Share(30, 90),
+    "bench": Share(120, 330),
+    "gsplat": Share(60, 1e9),
+    "laws": Share(90, 150),
+    "steps": Share(45, 150),
+    "sanitizer": Share(40, 90),
+    "train": Share(90, 250),
+    "laws_of_gaussian_parallel": Share(20, 1e9),
+    "reproduce": Share(120, 1e9),
+}
+JOBS = {
+    1: ("wheels", "build", "smoke", "bench", "gsplat"),
+    2: ("wheels", "build", "laws", "steps", "sanitizer", "train", "laws_of_gaussian_parallel"),
+    3: ("wheels", "build", "reproduce"),
+}

@@ -1,0 +1,165 @@
+"""Tile lists on the GPU: buffers, their growth, and what they say."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from cuda_ext import load
+from cuda_ext.arrays import (
+    BAD_ROW,
+    N_INSTANCES,
+    NOT_BAD,
+    CudaMemoryError,
+    Settings,
+    empty,
+    fill,
+    new_state,
+    stream_of,
+)
+from cuda_ext.render.capacity import MOST
+
+WARP_TILE = (16, 8)  # px, what a warp blends
+BUCKET = 32
+LOWER = "the number of Gaussians, their opacity extents or the image size"
+
+
+class TileBuffers:
+    """The buffers behind the kernels' `TileLists`, for n splats, an image and a capacity of instances.
+
+    Args:
+        n: splats.
+        width, height: px.
+        tile: px, (width, height) of a list's tile.
+        exact: leave out tiles that no pixel centre reaches.
+        device: where.
+        buckets: also number buckets of 32 entries, for backward "gaussian_parallel".
+    """
+
+    def __init__(
+        self, n: int, width: int, height: int, tile: tuple[int, int], exact: bool, device: torch.device, buckets: bool
+    ) -> None:
+        self.n, self.device, self.tile, self.buckets = n, device, tile, buckets
+        self.struct = load().TileLists()
+        self.struct.n, self.struct.exact = n, exact
+        self.struct.set_grid(width, height, *tile)
+        self.n_tiles: int = self.struct.n_tiles
+        self._kept: dict[str, Tensor] = {}
+        names = ("depth_keys", "depth_keys_sorted", "order_unsorted", "order", "counts", "offsets")
+        for name in (*names, "splat_begin", "splat_count"):
+            self._allocate(name, (n,))
+        for name in ("tile_begin", "tile_end", "tile_order"):
+            self._allocate(name, (self.n_tiles,))
+        self.capacity = -1
+        self.reserve(0)
+
+    def reserve(self, capacity: int) -> None:
+        """Make room for at least that many instances; buffers only grow.
+
+        Raises:
+            CudaMemoryError: no room, or more entries than the kernels can number.
+        """
+        if capacity <= self.capacity:
+            return
+        if capacity > MOST:
+            # a count stops at 2^31 - 1, so that it says "at least"
+            raise CudaMemoryError(
+                f"the tile lists would have {capacity:,} entries or more; the kernels number {MOST:,}: lower {LOWER}"
+            )
+        self.capacity = capacity
+        self.struct.capacity = capacity
+        wide = self.n_tiles >= 0xFFFF
+        for name in ("tile_keys", "tile_keys_sorted"):
+            self._allocate(name, (capacity,), torch.int32 if wide else torch.int16)
+        for name in ("slots_unsorted", "slots", "slot_splat", "listed"):
+            self._allocate(name, (capacity,))
+        if self.buckets:
+            self._allocate("bucket_begin", (self.n_tiles,))
+            self._allocate("bucket_tile", (self.max_buckets,))
+        bytes_needed = load().tile_workspace(self.n, capacity, self.n_tiles)
+        self._allocate("workspace", (bytes_needed,), torch.uint8)
+        self.struct.workspace_bytes = bytes_needed
+
+    @property
+    def max_buckets(self) -> int:
+        """Return how many buckets of 32 entries the capacity can make."""
+        return self.capacity // BUCKET + self.n_tiles
+
+    @property
+    def parts(self) -> int:
+        """Return how many warps share a list's tile, and so rows an instance's slot has."""
+        return (self.tile[0] // WARP_TILE[0]) * (self.tile[1] // WARP_TILE[1])
+
+    def tensor(self, name: str) -> Tensor:
+        """Return a buffer by the kernels' name for it."""
+        return self._kept[name]
+
+    def _allocate(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.int32) -> None:
+        self._kept[name] = empty(f"the tile lists ({name})", LOWER, shape, self.device, dtype)
+        fill(self.struct, **{name: self._kept[name]})
+
+
+def splat_struct(
+    means2d: Tensor, depths: Tensor, conics: Tensor, opacities: Tensor, radii: Tensor, colors: Tensor | None
+) -> Any:
+    """Return the kernels' view of projected Gaussians."""
+    return fill(
+        load().Splats(),
+        means2d=means2d,
+        depths=depths,
+        conics=conics,
+        opacities=opacities,
+        radii=radii,
+        colors=colors,
+    )
+
+
+def list_tile(settings: Settings, counted: bool) -> tuple[tuple[int, int], bool]:
+    """Choose the lists' tile and whether they may be exact.
+
+    Where extents enclose everything visible, the image does not depend on the tile and the kernels use their own; where
+    the tile has a meaning (profile "inria", counts of visited entries) it is the caller's.
+
+    Raises:
+        NotImplementedError: the caller's tile is not made of the warps' 16 x 8 tiles.
+    """
+    if settings.profile.extent == "opacity_aware" and not counted:
+        return WARP_TILE, True
+    if settings.tile_size % WARP_TILE[0] != 0:
+        why = "counts of visited entries" if counted else f"profile {settings.profile.name!r}"
+        raise NotImplementedError(f"tile_size={settings.tile_size} with {why}: the CUDA kernels need a multiple of 16")
+    return (settings.tile_size, settings.tile_size), False
+
+
+def make_lists(
+    settings: Settings,
+    splats: Any,
+    n: int,
+    device: torch.device,
+    tile: tuple[int, int],
+    exact: bool,
+    state: Tensor | None = None,
+) -> TileBuffers:
+    """List splats by tile, with buffers of exactly the size that is needed: one synchronisation.
+
+    Raises:
+        ValueError: a Gaussian projects to a value that is not finite; the message names its index.
+        CudaMemoryError: no room.
+    """
+    kernels, stream = load(), stream_of(device)
+    state = new_state(device) if state is None else state
+    buckets = settings.backward == "gaussian_parallel" and tile == WARP_TILE
+    buffers = TileBuffers(n, settings.width, settings.height, tile, exact, device, buckets)
+    profile = settings.kernel_profile()
+    kernels.count_instances(buffers.struct, splats, profile, state.data_ptr(), stream)
+    values = state.tolist()
+    if values[BAD_ROW] != NOT_BAD:
+        raise ValueError(
+            f"Gaussian {values[BAD_ROW]} has a value that is not finite, or projects to one; look at row "
+            f"{values[BAD_ROW]} of means, quats, scales, opacities and colors for NaN, inf and numbers near 1e38"
+        )
+    buffers.reserve(values[N_INSTANCES])
+    kernels.make_tile_lists(buffers.struct, splats, profile, 0, state.data_ptr(), stream)
+    return buffers

@@ -1,0 +1,193 @@
+"""The fused training step: photographs resident as bytes, one CUDA graph a step, no host synchronisation in the loop.
+
+`FusedTrainer.run(until)` replays begin -> project -> list -> blend -> loss -> blend back -> update -> end. The device
+holds the step counter, picks the view, makes the learning rates and keeps what every step tells, so that one graph
+serves all steps of a kind. When instances do not fit, the device raises a flag and does nothing from that step on; the
+host sees the flag two steps late, grows the buffers and goes on from the device's counter: nothing is cut or lost.
+Everything is asked of the tensors' device, whatever device is current.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from cuda_ext.arrays import BAD_ROW, N_INSTANCES, NOT_BAD, OVERFLOW, STEP, VIEW
+from cuda_ext.render.capacity import Capacity, Size
+from cuda_ext.train_settings import Phase, Statistics, StepSettings, StepStats
+from cuda_ext.training.graphs import Watch, captured
+from cuda_ext.training.resident import ResidentViews
+from cuda_ext.training.step_buffers import Frame, Population, Shared
+from cuda_ext.training.step_program import StepProgram
+
+LATE = 2  # steps between an overflow and its notice
+
+
+@dataclass
+class _Kind:
+    """Steps of one image size and one phase: how they are launched and, once they have come again, replayed."""
+
+    program: StepProgram
+    replay: Callable[[], None] | None = None
+
+
+class FusedTrainer:
+    """Owns the device's side of training between two density events.
+
+    Args:
+        params: raw float32 CUDA tensors by gsplat's keys; updated in place.
+        m, v: Adam's moments, likewise.
+        views: the resident photographs and cameras.
+        order: the view of every step of the schedule.
+        settings: objective and update.
+        step: the step to begin at.
+
+    Attributes:
+        grown: how often a step had to be taken again because its instances did not fit.
+    """
+
+    def __init__(
+        self,
+        params: Mapping[str, Tensor],
+        m: Mapping[str, Tensor],
+        v: Mapping[str, Tensor],
+        views: ResidentViews,
+        order: Sequence[int],
+        settings: StepSettings,
+        step: int = 0,
+    ) -> None:
+        self.settings, self.views, self.step, self.grown = settings, views, step, 0
+        self.device = params["means"].device
+        self._order = list(order)
+        self._capacity = Capacity(views.sizes)
+        with torch.cuda.device_of(params["means"]):
+            self._shared = Shared.make(settings, views, self._order, step, self.device)
+            self._watch = Watch(self._shared.state, LATE + 1)
+        self.rebind(params, m, v)
+
+    def rebind(self, params: Mapping[str, Tensor], m: Mapping[str, Tensor], v: Mapping[str, Tensor]) -> None:
+        """Take new rows after a density event: buffers, statistics and graphs start anew."""
+        # what the old number of Gaussians needed goes first, so that old and new need not fit side by side
+        self._kinds: dict[tuple[Size, Phase], _Kind] = {}
+        self._frames: dict[Size, Frame] = {}
+        self._rows = None
+        self._capacity.settle(len(params["means"]))
+        with torch.cuda.device_of(params["means"]):
+            self._rows = Population.make(params, m, v, self.settings.updates.sh_rest_every > 1)
+
+    def run(self, until: int, phase: Phase) -> None:
+        """Take steps until the counter stands at `until`, all of one phase.
+
+        Raises:
+            ValueError: a Gaussian is no longer finite; the message names its row and step.
+            CudaMemoryError: no room to grow.
+        """
+        with torch.cuda.device_of(self._shared.state):
+            self._run(until, phase)
+
+    def _run(self, until: int, phase: Phase) -> None:
+        watch = self._watch
+        while self.step < until or watch:
+            if self.step < until:
+                self._take(self.views.sizes[self._order[self.step]], phase)
+                watch.post()
+                self.step += 1
+                if len(watch) <= LATE and self.step < until:
+                    continue
+            values = watch.take()
+            if values[BAD_ROW] == NOT_BAD and values[OVERFLOW] == 0:
+                self._capacity.note(values[VIEW], values[N_INSTANCES])
+            else:
+                self.step = self._recover()
+
+    def step_stats(self, first: int, last: int) -> list[StepStats]:
+        """Return the measurements of the steps from `first` to before `last`, which `run` must have taken here."""
+        return [StepStats(*row) for row in self._shared.history[first:last].tolist()]
+
+    @property
+    def n(self) -> int:
+        """How many Gaussians there are."""
+        return len(self._population)
+
+    @property
+    def params(self) -> Mapping[str, Tensor]:
+        """Raw parameters by gsplat's keys."""
+        return self._population.params
+
+    @property
+    def statistics(self) -> Statistics:
+        """What density control reads; zeros after `rebind`."""
+        return self._population.statistics
+
+    @property
+    def values(self) -> Tensor:
+        """The statistics of the last step, in the order of `StepStats`."""
+        return self._shared.values
+
+    @property
+    def n_instances(self) -> int:
+        """How many list entries the last step had."""
+        return int(self._shared.state[N_INSTANCES])
+
+    @property
+    def radii(self) -> Tensor:
+        """Extents of the last step's splats, px, 0 where culled. [N, 2] int32"""
+        return self._population.splats["radii"]
+
+    def render_stats(self) -> dict[Size, dict[str, Tensor]]:
+        """Return, by image size, what the last step of a phase that asks for dominant Gaussians found at every pixel.
+
+        How many splats it blended and visited is among it where `settings.counts` asked for that.
+        """
+        return {size: frame.render_stats for size, frame in self._frames.items()}
+
+    @property
+    def capacities(self) -> dict[Size, int]:
+        """How many list entries have room, by the image sizes that were drawn since `rebind`."""
+        return {size: frame.lists.capacity for size, frame in self._frames.items()}
+
+    @property
+    def _population(self) -> Population:
+        assert self._rows is not None
+        return self._rows
+
+    def _recover(self) -> int:
+        """Handle what halted the device, and return the step to go on from."""
+        state = self._shared.state
+        # waits for all that was asked of the GPU: copies on their way, and graphs that use what goes now
+        flags = state.tolist()
+        self._watch.clear()
+        if flags[BAD_ROW] != NOT_BAD:
+            self.step = flags[STEP]
+            raise ValueError(f"step {flags[STEP]}: Gaussian {flags[BAD_ROW]} has a value that is not finite")
+        self.grown += 1
+        size = self._capacity.overflowed(flags[VIEW], flags[OVERFLOW])
+        self._kinds = {key: kind for key, kind in self._kinds.items() if key[0] != size}
+        del self._frames[size]
+        state[OVERFLOW] = 0
+        return int(flags[STEP])
+
+    def _take(self, size: Size, phase: Phase) -> None:
+        kind = self._kinds.get((size, phase))
+        if kind is None:
+            # the first step of a kind is launched as it is, which loads its kernels
+            kind = self._kinds[size, phase] = _Kind(
+                StepProgram(self._shared, self._population, self._frame(size), phase)
+            )
+            kind.program.launch()
+            return
+        if not self.settings.replay:
+            kind.program.launch()
+            return
+        # with many sizes most kinds come once between two density events, and a capture takes longer than a step
+        if kind.replay is None:
+            kind.replay = captured(kind.program.launch, self.device)
+        kind.replay()
+
+    def _frame(self, size: Size) -> Frame:
+        if size not in self._frames:
+            self._frames[size] = Frame.make(self._shared, self.n, size, self._capacity.room(size))
+        return self._frames[size]

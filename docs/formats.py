@@ -1,0 +1,89 @@
+"""docs/FORMATS.md, which is made from the table of file formats in the program.
+
+python docs/formats.py            print it
+python docs/formats.py --write    write docs/FORMATS.md
+python docs/formats.py --check    exit with 1 when the file holds something else
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from pop_fast.io.formats import FORMATS, Format
+
+PAGE = Path(__file__).resolve().parent / "FORMATS.md"
+_FIELDS = ("centre", "scale", "rotation", "opacity", "colour", "view dependence")
+
+
+def page() -> str:
+    """Make the page."""
+    sizes = [
+        ["`ply`", "`.ply`", "PLY as 3DGS writes it", "248", "248", "every program that knows splats"],
+        *([f"`{f.name}`", f"`{f.suffix}`", _described(f), *f.size, f.readers] for f in FORMATS.values()),
+        ["`html`", "`.html`", "a page that shows the splat", "4/3 of `spz`", "4/3 of `spz`", "browsers with WebGL 2"],
+    ]
+    losses = [["`ply`", *["none"] * len(_FIELDS)]]
+    losses += [[f"`{f.name}`", *(f.losses[field] for field in _FIELDS)] for f in FORMATS.values()]
+    return f"""# File formats
+
+`pop export RESULT --to FORMAT` and `pop convert IN OUT` write these; every command that takes a splat reads them, the
+page apart. `pop train` ends with the size of the splat in each and the held-out PSNR when it is read back from there.
+
+{_table(["format", "suffix", "what it is", "bytes a Gaussian, degree 0", "degree 3", "opened by"], sizes)}
+
+## What a round trip changes
+
+Bounds, which the tests hold every format to; opacities are meant activated, scales in world units, colour coefficients
+as they are.
+
+{_table(["format", *_FIELDS], losses)}
+
+- An opacity that is stored as a byte comes back between 0.001 and 0.999: a raw opacity has to be finite.
+- The order of the Gaussians changes where neighbours in the file should be neighbours in space (`compressed-ply`,
+  `spz`, `sog`) and in `.splat`, the largest and most opaque first. Colour degrees that are all zero are left out.
+- PLY, compressed PLY, SOG and `.splat` hold the frame as it is, with y down for a capture from COLMAP; SPZ and glTF
+  have y up, so that the scene is half a turn about x or z from there. Readers here turn it back.
+- SPZ is read in versions 2 and 3, SOG in version 2 as one file, glTF as one `.glb` with a splat that no node moves.
+- `html` holds SPZ, and loses what that loses. It draws as the training's rasterizer does, to degree 3, but ends no
+  pixel early; in the profile `inria` its cut-off is an ellipse of 3 standard deviations and not a square.
+
+## Smaller
+
+| option | what goes |
+|---|---|
+| `--min-opacity A` | Gaussians with a lower opacity; under 1/255 no picture changes |
+| `--crop XMIN YMIN ZMIN XMAX YMAX ZMAX` | those with their centre outside a box in the capture's own world frame |
+| `--final-prune SHARE` | those that contribute least and together make up this share of all blending weights |
+| `--max-gaussians N` | all but the N of the highest score |
+| `--target-mb M` | all but those of the highest score that make a file of at most M megabytes |
+
+Scores (`--score`) are Speedy-Splat's sensitivity, blending weights or dominated pixels, summed over the training views,
+or a guess from opacity and size where no capture is known. `pop train` takes the same options, for the files that
+`--export` names.
+"""
+
+
+def _described(format: Format) -> str:
+    return f"{format.title}, `{format.source.removeprefix('https://')}`"
+
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in lines)
+
+
+def main() -> int:
+    """Print, write or check the page."""
+    made = page()
+    if "--write" in sys.argv:
+        PAGE.write_text(made, encoding="utf-8")
+        return 0
+    if "--check" in sys.argv:
+        return 0 if PAGE.is_file() and PAGE.read_text(encoding="utf-8") == made else 1
+    print(made, end="")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

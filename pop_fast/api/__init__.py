@@ -1,0 +1,16 @@
+"""What a user imports: `rasterization()` with gsplat's signature, and the backends that it can render with."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pop_fast.lazy import given_by
+
+if TYPE_CHECKING:
+    from pop_fast.api.rasterize import rasterization
+    from pop_fast.api.registry import backend_names, get_backend
+
+__all__ = ["backend_names", "get_backend", "rasterization"]
+
+# which backends there are is told without torch
+__getattr__ = given_by(__name__, {"rasterize": ("rasterization",), "registry": ("backend_names", "get_backend")})

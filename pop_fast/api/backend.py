@@ -1,0 +1,163 @@
+"""What a backend is: a name, whether it can run here, the stages that it draws with, and the engine that trains on it.
+
+`rasterization` checks, gathers and makes `meta` for all of them; a backend supplies what is between. Stages take one
+scene and one camera at a time, and are differentiable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from pop_fast.api.meta import RenderMeta
+    from pop_fast.stages.compositing import Composite
+    from pop_fast.stages.splatting import ProjectionSettings, Splats
+    from pop_fast.stages.tiles import TileLists
+
+
+class ViewStages(Protocol):
+    """Draws views."""
+
+    def covariances(self, quats: Tensor, scales: Tensor) -> Any:
+        """Return what `splats` takes as the shapes of Gaussians: covariances [N, 3, 3], or whatever a backend likes."""
+        ...
+
+    def splats(
+        self,
+        means: Tensor,
+        shapes: Any,
+        opacities: Tensor,
+        colors: Tensor,
+        viewmat: Tensor,
+        settings: ProjectionSettings,
+        sh_degree: int | None,
+    ) -> Splats:
+        """Return the Gaussians as one camera sees them, with colours.
+
+        Args:
+            means: centres, world units. [N, 3]
+            shapes: from `covariances`, or covariances that were given. [N, 3, 3]
+            opacities: in [0, 1]. [N]
+            colors: any number of channels [N, D], or harmonics [N, n_sh, 3] when `sh_degree` is given.
+            viewmat: world -> camera. [4, 4]
+            settings: the rest of the camera.
+            sh_degree: bands to evaluate, None for given colours.
+        """
+        ...
+
+    def blend(
+        self,
+        rows: Splats,
+        seen: Splats,
+        settings: ProjectionSettings,
+        tile_size: int,
+        background: Tensor | None,
+        *,
+        dominance: bool,
+        counts: bool,
+        absgrad_sink: Tensor | None,
+    ) -> Composite:
+        """Blend the rows of one view over a background.
+
+        Args:
+            rows: what is blended: rows of `meta`, so that gradients pass through those; ids are places among them.
+            seen: what `splats` returned for the view, of which `rows` are a part.
+            settings: of the view.
+            tile_size: px, the caller's; it has a meaning for visited entries, and in profile "inria".
+            background: [D], or None for black.
+            dominance: also find dominant ids and weights.
+            counts: also count blended and visited entries.
+            absgrad_sink: [M, 2], to which the transpose adds the sum over pixels of |dL/dmeans2d|.
+        """
+        ...
+
+    def tile_lists(self, rows: Splats, settings: ProjectionSettings, tile_size: int) -> TileLists:
+        """List every tile's rows by their extents alone, as gsplat's meta has them (D3, D4)."""
+        ...
+
+    def counts_entries(self, tile_size: int) -> bool:
+        """Tell whether visited entries can be counted with tiles of that size."""
+        ...
+
+
+class Renderer(Protocol):
+    """What draws for measurements, pages and tests."""
+
+    @property
+    def name(self) -> str:
+        """Return the backend's name."""
+        ...
+
+    def available(self) -> bool:
+        """Tell whether it can run here."""
+        ...
+
+    def why_not(self) -> str | None:
+        """Return one sentence on why it cannot run here and what to do, or None."""
+        ...
+
+    def rasterization(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, RenderMeta]:
+        """Render; see `pop_fast.api.rasterize.rasterization`."""
+        ...
+
+
+class Backend(Renderer, Protocol):
+    """What renders and trains, by name; those of other packages stand in entry point group `pop_splatting.backends`."""
+
+    @property
+    def device(self) -> str:
+        """Return where its tensors are, as `torch.device.type` says it."""
+        ...
+
+    @property
+    def dtypes(self) -> tuple[str, ...]:
+        """Return the types that its tensors may have, as torch calls them."""
+        ...
+
+    @property
+    def speed(self) -> int | None:
+        """Return a rank, by which "auto" takes the largest that can run; None is never taken."""
+        ...
+
+    @property
+    def lacks(self) -> Mapping[str, tuple[Any, str]]:
+        """Return arguments of `rasterization` that only this backend lacks: the one value each may have, and why."""
+        ...
+
+    def holds(self, tensor: Tensor) -> bool:
+        """Tell whether a tensor is where this backend reads it."""
+        ...
+
+    def stages(self) -> ViewStages:
+        """Return what draws."""
+        ...
+
+    def losses(self) -> Any:
+        """Return the losses, in a module as `pop_fast.stages.losses`; a backend may leave them to that one."""
+        ...
+
+    def open_view(self, of: Any) -> Any:
+        """Project and list a view for passes over it.
+
+        Args:
+            of: a `pop_fast.stages.view_pass.PassInput`.
+
+        Returns:
+            A `pop_fast.stages.view_pass.ViewPass`.
+        """
+        ...
+
+    def make_engine(self, config: Any, own_strategy: bool) -> Any:
+        """Return the engine that takes the steps of a run, a `pop_fast.train.stepper.Engine`.
+
+        Args:
+            config: the settings, a `pop_fast.train.config.TrainConfig`.
+            own_strategy: whether the population's strategy is one of this package.
+
+        Raises:
+            PopError: the backend cannot take the steps of these settings.
+        """
+        ...

@@ -1,0 +1,285 @@
+"""Checks of what `rasterization` is given: every wrong input is named, with its index, before anything is drawn.
+
+Shapes, types and places are read at once. What only values can tell is asked in one go, so that a GPU
+is waited for once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, Final
+
+import torch
+from torch import Tensor
+
+from pop_fast.api.backend import Backend
+from pop_ref.constants import GSPLAT_1_5, Profile, profile_named
+
+LARGEST_TILE: Final = 4096  # px; no image needs more, and what a tile works with grows with its square
+RENDER_MODES: Final = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+RASTERIZE_MODES: Final = ("classic", "antialiased")
+_UNDISTORT: Final = "undistort the images first; `pop train` does it"
+# the one value that each of gsplat's other arguments may have, and why
+UNSUPPORTED: Final[Mapping[str, tuple[Any, str]]] = {
+    "sparse_grad": (False, "gradients are dense"),
+    "distributed": (False, "this is one process"),
+    "camera_model": ("pinhole", _UNDISTORT),
+    "segmented": (False, "there is one sort"),
+    "with_ut": (False, "only the EWA projection is implemented"),
+    "with_eval3d": (False, "splats are evaluated in screen space"),
+    "radial_coeffs": (None, _UNDISTORT),
+    "tangential_coeffs": (None, _UNDISTORT),
+    "thin_prism_coeffs": (None, _UNDISTORT),
+    "ftheta_coeffs": (None, _UNDISTORT),
+    "rolling_shutter": (None, "only global shutters"),
+    "viewmats_rs": (None, "only global shutters"),
+}
+
+
+def check_supported(given: Mapping[str, Any], backend: Backend) -> None:
+    """Raise for any argument that is not at the one value supported, by all backends or by this one.
+
+    Args:
+        given: arguments by name, those of `UNSUPPORTED` and of `backend.lacks` among them.
+        backend: what is to draw.
+
+    Raises:
+        NotImplementedError: names the argument.
+    """
+    for table, by in ((UNSUPPORTED, ""), (backend.lacks, f" by backend {backend.name!r}")):
+        for name, (supported, why) in table.items():
+            value = given[name]
+            if value is not supported and (isinstance(value, Tensor) or value != supported):
+                said = f"a tensor of shape {list(value.shape)}" if isinstance(value, Tensor) else repr(value)
+                raise NotImplementedError(f"{name}={said} is not supported{by}: {why}")
+
+
+def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    """Raise for a value that is not one of several.
+
+    Raises:
+        ValueError: names the argument.
+    """
+    if value not in choices:
+        raise ValueError(f"{name} is {value!r}; it must be one of {', '.join(choices)}")
+
+
+def resolved_profile(profile: str | Profile, near_plane: float, far_plane: float, eps2d: float) -> Profile:
+    """Return the profile with the caller's near plane, far plane and low-pass where they differ from gsplat's.
+
+    Raises:
+        ValueError: no such profile, or a number with which nothing can be drawn; names it.
+    """
+    if not isinstance(profile, (str, Profile)):
+        raise ValueError(f"profile is {profile!r}; it must be a name or a pop_ref.constants.Profile")
+    chosen = profile_named(profile) if isinstance(profile, str) else profile
+    given = {"near_plane": near_plane, "far_plane": far_plane, "eps2d": eps2d}
+    changed = {name: value for name, value in given.items() if value != getattr(GSPLAT_1_5, name)}
+    made = replace(chosen, **changed) if changed else chosen
+    _check_profile(made)
+    return made
+
+
+def _check_profile(profile: Profile) -> None:
+    for field in fields(profile):
+        value = getattr(profile, field.name)
+        if field.name != "name" and isinstance(value, (int, float)) and math.isnan(value):
+            raise ValueError(f"{field.name} is {value}; it must be a number")
+    p = profile
+    # a point on an inclusive near plane at 0 would be divided by its depth
+    rules = (
+        ("near_plane", 0.0 <= p.near_plane < math.inf, "finite and >= 0"),
+        ("far_plane", p.far_plane > p.near_plane, f"beyond near_plane, which is {p.near_plane}"),
+        ("eps2d", 0.0 <= p.eps2d < math.inf, "finite and >= 0 px^2"),
+        ("frustum_margin", p.frustum_margin >= 0.0, ">= 0"),
+        ("extent_sigmas", 0.0 < p.extent_sigmas < math.inf, "finite and > 0"),
+        ("alpha_floor", 0.0 < p.alpha_floor < 1.0, "in (0, 1)"),
+        ("alpha_ceiling", p.alpha_floor < p.alpha_ceiling < 1.0, "between alpha_floor and 1"),
+        ("transmittance_stop", 0.0 <= p.transmittance_stop < 1.0, "in [0, 1)"),
+        ("tile_size", p.tile_size >= 1, ">= 1"),
+    )
+    for name, holds, rule in rules:
+        if not holds:
+            raise ValueError(f"{name} is {getattr(p, name)}; it must be {rule}")
+
+
+@dataclass(frozen=True)
+class _Rule:
+    """A tensor, whether any entry or row of it may be bad, which are, and what it must be."""
+
+    name: str
+    tensor: Tensor
+    quick: Callable[[], Tensor]
+    bad: Callable[[], Tensor]
+    words: str
+
+
+class Checks:
+    """The checks of one call.
+
+    Args:
+        backend: which says where tensors must lie, and of which type.
+        dtype: of the means, that all others must have.
+    """
+
+    def __init__(self, backend: Backend, dtype: torch.dtype) -> None:
+        self._backend, self._dtype = backend, dtype
+        self._rules: list[_Rule] = []
+
+    def tensor(self, name: str, tensor: Tensor | None, shape: tuple[int, ...]) -> Tensor:
+        """Check one tensor's presence, place, type and shape, and return it; that it is finite is asked in `values`.
+
+        Raises:
+            ValueError: names the tensor.
+        """
+        if tensor is None:
+            raise ValueError(f"{name} is missing")
+        if not self._backend.holds(tensor):
+            # the backend's own device by the name of the method that moves a tensor there
+            device = self._backend.device
+            raise ValueError(
+                f"{name} is on {tensor.device}; backend {self._backend.name!r} reads {device}: use {name}.{device}()"
+            )
+        allowed = self._backend.dtypes
+        if str(tensor.dtype).removeprefix("torch.") not in allowed or tensor.dtype != self._dtype:
+            rule = f"be {allowed[0]} for backend {self._backend.name!r}" if len(allowed) == 1 else "have one type, "
+            rule += "" if len(allowed) == 1 else " or ".join(allowed)
+            raise ValueError(f"{name} has dtype {tensor.dtype}; all tensors must {rule}")
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} has shape {list(tensor.shape)}; it must be {list(shape)}")
+        t = tensor.detach()
+        # a sum is one fast pass, and only a suspicious one is looked at closely
+        self._rule(name, t, lambda: ~torch.isfinite(t.sum()), lambda: ~torch.isfinite(t), "must be finite")
+        return tensor
+
+    def gaussians(
+        self,
+        means: Tensor,
+        quats: Tensor | None,
+        scales: Tensor | None,
+        opacities: Tensor,
+        covars: Tensor | None,
+    ) -> tuple[int, ...]:
+        """Check the Gaussians' tensors, and return the batch dimensions.
+
+        Raises:
+            ValueError: names the tensor.
+        """
+        if means.dim() < 2 or means.shape[-1] != 3:
+            raise ValueError(f"means has shape {list(means.shape)}; it must be [..., N, 3]")
+        batch, n = tuple(means.shape[:-2]), means.shape[-2]
+        self.tensor("means", means, tuple(means.shape))
+        self._opacities(self.tensor("opacities", opacities, (*batch, n)).detach())
+        if covars is not None:
+            self.tensor("covars", covars, (*batch, n, 3, 3))
+        else:
+            self._quats(self.tensor("quats", quats, (*batch, n, 4)).detach())
+            self._scales(self.tensor("scales", scales, (*batch, n, 3)).detach())
+        return batch
+
+    def _opacities(self, o: Tensor) -> None:
+        self._each("opacities", o, lambda: ~((o >= 0.0) & (o <= 1.0)), "must be in [0, 1]")
+
+    def _quats(self, q: Tensor) -> None:
+        def zero() -> Tensor:
+            return q.abs().amax(-1) == 0.0
+
+        self._each("quats", q, zero, "must have a norm > 0")
+
+    def _scales(self, s: Tensor) -> None:
+        words = "must be >= 0; give standard deviations, not logarithms"
+        self._rule("scales", s, lambda: s.amin() < 0.0, lambda: s < 0.0, words)
+
+    def cameras(
+        self, viewmats: Tensor, Ks: Tensor, width: int, height: int, tile_size: int, batch: tuple[int, ...]
+    ) -> int:
+        """Check the cameras' tensors and sizes, and return how many there are.
+
+        Raises:
+            ValueError: names the argument.
+        """
+        if viewmats.dim() < 3:
+            raise ValueError(f"viewmats has shape {list(viewmats.shape)}; it must be [..., C, 4, 4]")
+        n = viewmats.shape[-3]
+        V = self.tensor("viewmats", viewmats, (*batch, n, 4, 4)).detach()
+        K = self.tensor("Ks", Ks, (*batch, n, 3, 3)).detach()
+        check_sizes(width, height, tile_size)
+        rows = "must be rigid: an orthonormal 3x3 rotation with determinant +1"
+        self._each("viewmats", V, lambda: _not_rigid(V[..., :3, :3]), rows)
+        last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=V.dtype, device=V.device)
+        self._each("viewmats", V, lambda: (V[..., 3, :] != last).any(-1), "must end in the row [0, 0, 0, 1]")
+        positive = "must have focal lengths > 0"
+        self._each("Ks", K, lambda: ~((K[..., 0, 0] > 0.0) & (K[..., 1, 1] > 0.0)), positive)
+        pinhole = "must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not supported"
+        self._each("Ks", K, lambda: _skewed(K), pinhole)
+        return n
+
+    def colors(self, colors: Tensor, sh_degree: int | None, batch: tuple[int, ...], n_cameras: int, n: int) -> bool:
+        """Check the colours or coefficients, and tell whether they are given per camera.
+
+        Raises:
+            ValueError: names the tensor.
+        """
+        tail = 1 if sh_degree is None else 2
+        channels = tuple(colors.shape[max(colors.dim() - tail, 0) :])
+        shared, per_camera = (*batch, n, *channels), (*batch, n_cameras, n, *channels)
+        if sh_degree is not None:
+            if sh_degree not in (0, 1, 2, 3):
+                raise ValueError(f"sh_degree is {sh_degree}; it must be None, 0, 1, 2 or 3")
+            need = (sh_degree + 1) ** 2
+            if len(channels) != 2 or channels[1] != 3 or channels[0] < need:
+                raise ValueError(
+                    f"colors has shape {list(colors.shape)}; sh_degree={sh_degree} needs [..., N, >={need}, 3]"
+                )
+        self.tensor("colors", colors, per_camera if tuple(colors.shape) == per_camera else shared)
+        return tuple(colors.shape) == per_camera
+
+    def values(self) -> None:
+        """Check what was left to be asked of values, in one go.
+
+        Raises:
+            ValueError: names the tensor and the index.
+        """
+        suspicious = torch.stack([rule.quick() for rule in self._rules]).tolist()
+        for asked, rule in zip(suspicious, self._rules, strict=True):
+            found = rule.bad().nonzero() if asked else None
+            if found is not None and len(found):
+                index = found[0].tolist()
+                raise ValueError(f"{rule.name}{index} is {rule.tensor[tuple(index)].tolist()}; it {rule.words}")
+
+    def _each(self, name: str, tensor: Tensor, bad: Callable[[], Tensor], words: str) -> None:
+        self._rule(name, tensor, lambda: bad().any(), bad, words)
+
+    def _rule(
+        self, name: str, tensor: Tensor, quick: Callable[[], Tensor], bad: Callable[[], Tensor], words: str
+    ) -> None:
+        if tensor.numel():
+            self._rules.append(_Rule(name, tensor, quick, bad, words))
+
+
+def check_sizes(width: int, height: int, tile_size: int) -> None:
+    """Raise for an image or a tile that is none.
+
+    Raises:
+        ValueError: names the size.
+    """
+    for name, value in {"width": width, "height": height, "tile_size": tile_size}.items():
+        if value < 1:
+            raise ValueError(f"{name} is {value}; it must be >= 1")
+    if tile_size > LARGEST_TILE:
+        raise ValueError(f"tile_size is {tile_size}; it must be <= {LARGEST_TILE}")
+
+
+def _not_rigid(rotations: Tensor) -> Tensor:
+    # products of rows: no matrix library, which torch's deterministic mode would have an opinion on
+    R = rotations.double()
+    products = (R[..., :, None, :] * R[..., None, :, :]).sum(-1)
+    off = (products - torch.eye(3, dtype=R.dtype, device=R.device)).abs().amax((-1, -2))
+    right_handed = (torch.linalg.cross(R[..., 0, :], R[..., 1, :]) * R[..., 2, :]).sum(-1) > 0.0
+    return ~((off < 1e-3) & right_handed)
+
+
+def _skewed(K: Tensor) -> Tensor:
+    return (K[..., 0, 1] != 0.0) | (K[..., 1, 0] != 0.0) | (K[..., 2, :2] != 0.0).any(-1) | (K[..., 2, 2] != 1.0)

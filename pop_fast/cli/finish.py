@@ -1,0 +1,150 @@
+"""What `pop train` does when the last step is taken: exports, the page that shows the splat, the table of sizes."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED
+from pop_fast.cli.errors import describe
+from pop_fast.cli.limits import FormatName, LimitOptions, Shown, limited
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from pop_fast.data import Capture
+    from pop_fast.train.load_result import Splat
+
+VIEWER: Final = "viewer.html"
+EXPORTS: Final = "export"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinishOptions(LimitOptions):
+    """What is written beside the results.
+
+    Attributes:
+        export: also write the splat in these formats into the result's folder export, in the capture's own frame. The
+            limits below hold for these files, for the table of sizes and for the page; the checkpoint and the PLY stay
+            whole.
+        skip_sizes: do not measure what the splat weighs in every format.
+    """
+
+    export: tuple[FormatName, ...] = ()
+    skip_sizes: bool = False
+
+
+def finish(folder: Path, capture: Capture, options: Any) -> int:
+    """Write what surrounds a run whose results are complete, which they stay whatever becomes of it.
+
+    Args:
+        folder: the result folder.
+        capture: in the training frame.
+        options: what has the attributes of `FinishOptions`.
+
+    Returns:
+        The exit status: 0, or 1 where something could not be written, or 130 after Ctrl-C.
+    """
+    left = f"the results in {folder} are complete, and pop export {folder} writes files of them"
+    try:
+        _finish(folder, capture, FinishOptions(**{f.name: getattr(options, f.name) for f in fields(FinishOptions)}))
+    except KeyboardInterrupt:
+        print(f"pop: stopped while writing exports; {left}", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except Exception as error:
+        reason = describe(error) or f"{type(error).__name__}: {error}"
+        print(f"pop: error: {reason}; {left}", file=sys.stderr)
+        return EXIT_INCOMPLETE
+    return 0
+
+
+def _finish(folder: Path, capture: Capture, options: FinishOptions) -> None:
+    from pop_fast.io.atomic import write_atomically
+    from pop_fast.train.load_result import load_splat
+    from pop_fast.view.html import cameras_of, page_of
+
+    splat = load_splat(folder)
+    cameras = cameras_of(capture.train_views(splat.config.test_every))
+    title = folder.resolve().name
+
+    def page(params: dict[str, Tensor]) -> bytes:
+        return page_of(params, cameras, splat.config, splat.sh_degree, title)
+
+    names = options.export or (("ply",) if options.any else ())
+    for index, name in enumerate(names):
+        kept, said = _limited(splat, capture, options, name, page)
+        for line in said if index == 0 or options.target_mb is not None else ():
+            print(line)
+        suffix = ".html" if name == "html" else _suffix(name)
+        path = folder / EXPORTS / f"{title}{'-spz' if name == 'gltf-spz' else ''}{suffix}"
+        data = _encoded(name, kept, splat, capture, page)
+        write_atomically(path, lambda file, data=data: file.write(data))
+        print(f"{len(kept['means']):,} Gaussians, {len(data) / 1e6:.2f} MB -> {path}")
+    kept, _ = _limited(splat, capture, dataclasses.replace(options, target_mb=None), "ply", page)
+    shown = page(kept)
+    write_atomically(folder / VIEWER, lambda file: file.write(shown))
+    if not options.skip_sizes:
+        _sizes(folder, splat, capture, kept)
+
+
+def _limited(
+    splat: Splat, capture: Capture, limits: LimitOptions, name: str, page: Any
+) -> tuple[dict[str, Tensor], list[str]]:
+    shown = Shown(
+        params=splat.params,
+        sh_degree=splat.sh_degree,
+        config=splat.config,
+        world_transform=capture.world_transform,
+        capture=lambda: capture,
+    )
+    return limited(shown, limits, lambda params: len(_encoded(name, params, splat, capture, page)))
+
+
+def _encoded(name: str, params: dict[str, Tensor], splat: Splat, capture: Capture, page: Any) -> bytes:
+    if name == "html":
+        return page(params)
+    from pop_fast.data import to_capture_frame
+    from pop_fast.io.formats import encoded
+    from pop_fast.io.ply import Frame
+
+    frame = Frame("capture", tuple(map(tuple, capture.world_transform.tolist())))
+    return encoded(name, to_capture_frame(params, capture.world_transform), splat.config.antialiased, frame)
+
+
+def _suffix(name: str) -> str:
+    from pop_fast.io.formats import FORMATS
+
+    return ".ply" if name == "ply" else FORMATS[name].suffix
+
+
+def _sizes(folder: Path, splat: Splat, capture: Capture, params: dict[str, Tensor]) -> None:
+    """Measure the encodings, print them and add them to the statistics."""
+    from pop_fast.train.encodings import measure_encodings
+    from pop_fast.train.environment import reproducible
+    from pop_fast.train.gpu_proxy import renderer
+    from pop_fast.train.results import ResultFolder
+    from pop_fast.train.views import ViewTensors
+    from pop_fast.view.report.files_section import HEADS, encoding_rows
+
+    config = splat.config
+    views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
+    backend, _ = renderer(config.backend)
+    with reproducible(config.threads):
+        found = measure_encodings(backend, params, views, config, splat.sh_degree, capture.world_transform)
+        entries = [encoding.entry() for encoding in found]
+    for line in table_lines([HEADS, *encoding_rows(entries)]):
+        print(line)
+    results = ResultFolder(folder)
+    before = results.read_stats("val", splat.step) if splat.step is not None else None
+    if before is not None and splat.step is not None:
+        results.write_stats("val", splat.step, {**before, "encodings": entries})
+
+
+def table_lines(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lay out a table: the first column to the left, the others to the right."""
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]

@@ -1,0 +1,32 @@
+"""`rasterization()` on the GPU, for those who choose its kernels: benchmarks, and the laws of each kernel."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal
+
+from pop_fast.api.rasterize import rasterization as on_every_backend
+from pop_fast.cuda.backend import CUDA
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from pop_fast.api.meta import RenderMeta
+
+
+@functools.wraps(on_every_backend)
+def rasterization(
+    *args: Any,
+    backward: Literal["pixel_parallel", "gaussian_parallel"] = "pixel_parallel",
+    deterministic: bool = True,
+    **kwargs: Any,
+) -> tuple[Tensor, Tensor, RenderMeta]:
+    """Render; see `pop_fast.api.rasterize.rasterization`.
+
+    Args:
+        args: as there.
+        backward, deterministic: as `pop_fast.cuda.backend.CudaBackend` says.
+        kwargs: as there, without `backend`.
+    """
+    return on_every_backend(*args, **kwargs, backend=replace(CUDA, backward=backward, deterministic=deterministic))

@@ -1,0 +1,172 @@
+"""The stages of a view by the CUDA kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from cuda_ext.arrays import Settings, new_state
+from cuda_ext.render.autograd import Blend, Project, RenderStats
+from cuda_ext.render.lists import WARP_TILE, list_tile, make_lists, splat_struct
+from pop_fast.stages.compositing import Composite
+from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
+from pop_fast.stages.tiles import TileLists
+
+WIDEST = 4  # channels that one launch blends
+
+
+class Shapes(NamedTuple):
+    """Rotations and sizes as they are: one kernel makes covariances and projects them."""
+
+    quats: Tensor
+    scales: Tensor
+
+
+@dataclass(frozen=True)
+class SplatsOnGpu(Splats):
+    """Splats, and the flags that the kernels have raised while they were made.
+
+    Attributes:
+        state: int32, on the device.
+    """
+
+    state: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class CudaStages:
+    """Draws views as `pop_fast.api.backend.ViewStages` says.
+
+    Optimizations: exact tile lists, two narrow stable sorts, one warp a 16 x 8 tile, moment-form gradients.
+
+    Attributes:
+        backward, deterministic: as `pop_fast.cuda.backend.CudaBackend` says.
+    """
+
+    backward: str
+    deterministic: bool
+
+    def covariances(self, quats: Tensor, scales: Tensor) -> Shapes:
+        """Return both as they are."""
+        return Shapes(quats, scales)
+
+    def splats(
+        self,
+        means: Tensor,
+        shapes: Shapes,
+        opacities: Tensor,
+        colors: Tensor,
+        viewmat: Tensor,
+        settings: ProjectionSettings,
+        sh_degree: int | None,
+    ) -> Splats:
+        """Project Gaussians, and shade them where harmonics are given."""
+        own = self._settings(settings, settings.profile.tile_size, sh_degree)
+        with _on_device_of(means):
+            state = new_state(means.device)
+            sh = None if sh_degree is None else colors
+            made = Project.apply(means, *shapes, opacities, sh, viewmat, settings.K, own, state)
+        means2d, depths, conics, blended, radii, shaded = made
+        return SplatsOnGpu(
+            means2d, depths, conics, blended, radii, colors=colors if sh is None else shaded, state=state
+        )
+
+    def blend(
+        self,
+        rows: Splats,
+        seen: Splats,
+        settings: ProjectionSettings,
+        tile_size: int,
+        background: Tensor | None,
+        *,
+        dominance: bool,
+        counts: bool,
+        absgrad_sink: Tensor | None,
+    ) -> Composite:
+        """List rows by tile and blend them, so many channels at a time as the kernels are made for.
+
+        Raises:
+            NotImplementedError: absolute gradients with more channels than one launch blends.
+        """
+        assert isinstance(seen, SplatsOnGpu)
+        assert seen.state is not None
+        colors, channels = colors_of(rows), colors_of(rows).shape[1]
+        if channels > WIDEST and absgrad_sink is not None:
+            raise NotImplementedError(
+                f"absgrad with more than {WIDEST} channels: absolute sums of pieces do not add up"
+            )
+        own = self._settings(settings, tile_size, absgrad=absgrad_sink is not None)
+        pieces: list[Tensor] = []
+        left: list[Tensor] = []
+        with _on_device_of(rows.means2d):
+            tile, exact = list_tile(own, counts)
+            lists = make_lists(own, _struct(rows), len(rows.depths), rows.depths.device, tile, exact, seen.state)
+            stats = _empty_stats(rows, settings) if dominance or counts else None
+            for first in range(0, channels, WIDEST):
+                piece = slice(first, min(first + WIDEST, channels))
+                own_colors, behind = _padded(colors[:, piece]), None if background is None else background[piece]
+                behind = None if behind is None else _padded(behind[None])[0]
+                inputs = (rows.means2d, rows.conics, rows.opacities, own_colors, behind)
+                # every piece leaves the same light; the first one carries its gradient
+                found = Blend.apply(*inputs, lists, own, seen.state, stats if first == 0 else None, absgrad_sink)
+                pieces.append(found[0][..., : piece.stop - first])
+                left.append(found[1])
+        image = pieces[0] if len(pieces) == 1 else torch.cat(pieces, -1)
+        if stats is None:
+            return Composite(image, 1.0 - left[0], None, None, None, None, None)
+        ids = stats.dominant_ids.long()
+        return Composite(image, 1.0 - left[0], ids, stats.dominant_weights, stats.n_blended, stats.n_traversed, None)
+
+    def tile_lists(self, rows: Splats, settings: ProjectionSettings, tile_size: int) -> TileLists:
+        """List every tile's rows by their extents alone."""
+        own, size = self._settings(settings, tile_size), (tile_size, tile_size)
+        with _on_device_of(rows.means2d):
+            found = make_lists(own, _struct(rows), len(rows.depths), rows.depths.device, size, False)
+            listed, begin, end = (found.tensor(name) for name in ("listed", "tile_begin", "tile_end"))
+        lengths = (end - begin).long()
+        offsets = torch.cat((lengths.new_zeros(1), lengths.cumsum(0)))
+        across, down = -(-settings.width // tile_size), -(-settings.height // tile_size)
+        return TileLists(listed.long(), offsets, tile_size, across, down)
+
+    def counts_entries(self, tile_size: int) -> bool:
+        """Visited entries are counted with tiles made of the warps' own."""
+        return tile_size % WARP_TILE[0] == 0
+
+    def _settings(
+        self, of: ProjectionSettings, tile_size: int, sh_degree: int | None = None, absgrad: bool = False
+    ) -> Settings:
+        return Settings(
+            *(of.width, of.height, of.profile, tile_size, sh_degree, of.antialiased, of.radius_clip, absgrad),
+            *(self.backward, self.deterministic),
+        )
+
+
+@contextmanager
+def _on_device_of(tensor: Tensor) -> Iterator[None]:
+    # kernels run on the current device, which need not be the tensors'
+    with torch.cuda.device_of(tensor):
+        yield
+
+
+def _padded(colors: Tensor) -> Tensor:
+    """Return colours of a width that the kernels are made for: 1, 3 or 4 channels."""
+    return torch.cat((colors, colors.new_zeros(len(colors), 1)), 1) if colors.shape[1] == 2 else colors
+
+
+def _struct(rows: Splats) -> object:
+    means2d, depths, conics, opacities = (
+        t.detach().contiguous() for t in (rows.means2d, rows.depths, rows.conics, rows.opacities)
+    )
+    return splat_struct(means2d, depths, conics, opacities, rows.radii.contiguous(), None)
+
+
+def _empty_stats(rows: Splats, settings: ProjectionSettings) -> RenderStats:
+    shape, device = (settings.height, settings.width), rows.depths.device
+    ids, blended, traversed = (torch.empty(shape, dtype=torch.int32, device=device) for _ in range(3))
+    counts = torch.zeros(max(len(rows.depths), 1), dtype=torch.int32, device=device)
+    return RenderStats(ids, torch.empty(shape, device=device), blended, traversed, counts)

@@ -1,0 +1,260 @@
+"""What `pop data check` finds out about a capture before anything is trained on it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pop_fast.data.colmap import find_model, read_model
+from pop_fast.data.finding import Finding, State
+from pop_fast.data.load import beside_the_model, turned_upright
+from pop_fast.data.photo_quality import Shown, about_number, measure
+from pop_fast.data.posed_images import PosedImage, SparsePoints
+from pop_fast.data.sfm import photo_folder, photographs
+from pop_fast.data.transforms import find_transforms, read_transforms
+from pop_fast.errors import CaptureError
+from pop_fast.io.images import find_image, list_images, read_image, read_mask, unreadable_photographs
+
+# bytes of a Gaussian in training: 59 float32 numbers, each with its gradient and two moments of Adam
+BYTES_IN_TRAINING = 59 * 4 * 4
+
+
+@dataclass(frozen=True)
+class Photo:
+    """What the file of one shot holds; `size` is (0, 0) where there is none or it cannot be read."""
+
+    shot: PosedImage
+    path: Path | None
+    size: tuple[int, int] = (0, 0)
+    alpha: bool = False
+    rotated: bool = False
+    problem: str = ""
+    shown: Shown | None = None
+
+
+def read_listing(root: Path, images: str | None = None) -> tuple[str, list[PosedImage], SparsePoints | None] | None:
+    """Read where photographs were taken from: a COLMAP model or transforms.json; what it is, its shots, its points.
+
+    Args:
+        root: the capture's folder.
+        images: the folder in it with the photographs, in place of the listed one.
+
+    Returns:
+        None where there is neither, but photographs that cameras can be found for.
+
+    Raises:
+        CaptureError: the folder is absent or holds no photographs, or what says so is damaged.
+    """
+    if not root.is_dir():
+        raise CaptureError(f"{root}: no such folder; give the folder that holds the photographs and their cameras")
+    model = find_model(root)
+    if model is not None:
+        shots, cloud = read_model(model)
+        # as training reads them: beside the model, where the capture was made in place
+        shots = turned_upright(root, beside_the_model(root, shots, images), model)
+        return f"COLMAP model in {model.relative_to(root)}", _in_folder(shots, images), cloud
+    lists = find_transforms(root)
+    if lists:
+        shots, cloud = read_transforms(lists)
+        return " and ".join(path.name for path in lists), _in_folder(shots, images), cloud
+    folder = photo_folder(root)
+    if not photographs(folder):
+        hint = unreadable_photographs(folder) or "give the folder of a capture"
+        raise CaptureError(f"{root}: has no photographs, no COLMAP model and no transforms.json; {hint}")
+    return None
+
+
+def _in_folder(shots: list[PosedImage], images: str | None) -> list[PosedImage]:
+    return shots if images is None else [replace(shot, folder=images) for shot in shots]
+
+
+def file_of(root: Path, shot: PosedImage) -> Path | None:
+    """Find the photograph of a shot."""
+    return find_image(root / shot.folder, shot.file)
+
+
+def read_photo(shot: PosedImage, path: Path | None) -> Photo:
+    """Decode and measure the photograph of a shot, found at `path`."""
+    if path is None:
+        return Photo(shot, None, problem="absent")
+    try:
+        image = read_image(path)
+    except CaptureError as error:
+        return Photo(shot, path, problem=str(error))
+    size, alpha = (image.shape[1], image.shape[0]), image.shape[2] == 4
+    return Photo(shot, path, size, alpha, _is_rotated(path), shown=measure(path, image, shot.name))
+
+
+def _is_rotated(path: Path) -> bool:
+    """Tell whether EXIF asks viewers to turn the picture: decoded small with and without obeying, is it another one."""
+    data = np.frombuffer(path.read_bytes(), np.uint8)
+    as_stored = cv2.imdecode(data, cv2.IMREAD_REDUCED_GRAYSCALE_8 | cv2.IMREAD_IGNORE_ORIENTATION)
+    as_shown = cv2.imdecode(data, cv2.IMREAD_REDUCED_GRAYSCALE_8)
+    return as_stored is not None and as_shown is not None and not np.array_equal(as_stored, as_shown)
+
+
+def about_cameras(shots: Sequence[PosedImage]) -> Iterator[Finding]:
+    """Tell the lens models and sizes."""
+    kinds: Counter[str] = Counter()
+    for shot in shots:
+        camera = shot.camera
+        if camera is None:
+            kinds[f"pinhole with a field of view of {np.degrees(shot.angle_x or 0.0):.1f} degrees"] += 1
+        else:
+            kinds[f"{camera.model_name} {camera.width}x{camera.height}, f = {camera.mean_focal_length():.1f} px"] += 1
+    for kind, count in kinds.most_common(8):
+        yield Finding("ok", "cameras", f"{count} x {kind}")
+    if len(kinds) > 8:
+        yield Finding("ok", "cameras", f"and {len(kinds) - 8} more kinds")
+
+
+def about_photos(photos: Sequence[Photo], root: Path) -> Iterator[Finding]:
+    """Tell which photographs are absent, damaged, of another size, rotated by EXIF, or not listed."""
+    sizes = Counter(photo.size for photo in photos if photo.size != (0, 0))
+    listed = ", ".join(f"{count} of {w}x{h} px" for (w, h), count in sizes.most_common(4))
+    yield Finding("ok" if sizes else "bad", "photographs", listed or "none could be read")
+    absent = [photo for photo in photos if photo.path is None]
+    if absent:
+        names = ", ".join(photo.shot.name for photo in absent[:3])
+        fix = "restore them or train with --missing skip"
+        yield Finding("bad", "photographs", f"{len(absent)} of {len(photos)} listed are absent, first {names}; {fix}")
+    for photo in photos:
+        if photo.path is not None and photo.problem:
+            yield Finding("bad", "photographs", photo.problem)
+        elif photo.shot.camera is not None and photo.path is not None:
+            yield from _about_size(photo)
+    turned = sum(photo.shot.turns > 0 for photo in photos)
+    if turned:
+        yield Finding("ok", "EXIF", f"{turned} are stored turned and shown upright, as pop sfm noted")
+    rotated = [photo.shot.name for photo in photos if photo.rotated and not photo.shot.turns]
+    if rotated:
+        note = "the pixels are used as stored, as COLMAP does; poses must have been made so too"
+        yield Finding("warn", "EXIF", f"{len(rotated)} ask to be rotated, first {rotated[0]}: {note}")
+    with_alpha = sum(photo.alpha for photo in photos)
+    if with_alpha:
+        yield Finding("ok", "alpha", f"{with_alpha} photographs have it: composited over the background, no mask")
+    yield from _about_unlisted(photos, root)
+
+
+def _about_size(photo: Photo) -> Iterator[Finding]:
+    camera, (width, height) = photo.shot.camera, photo.size
+    if (width, height) == (camera.width, camera.height) or camera.width < 1:
+        return
+    same_shape = abs(width * camera.height - height * camera.width) <= max(camera.width, camera.height)
+    note = "K is scaled to fit" if same_shape else "another shape: cropped or rotated since the poses were made"
+    text = f"{photo.shot.name} is {width}x{height} px, its camera {camera.width}x{camera.height}: {note}"
+    yield Finding("ok" if same_shape else "bad", "sizes", text)
+
+
+def _about_unlisted(photos: Sequence[Photo], root: Path) -> Iterator[Finding]:
+    used = {photo.path.resolve() for photo in photos if photo.path is not None}
+    for folder in sorted({photo.shot.folder for photo in photos}):
+        if folder and (root / folder).is_dir():
+            spare = [path.name for path in list_images(root / folder) if path.resolve() not in used]
+            if spare:
+                yield Finding("warn", "pairing", f"{len(spare)} files in {folder}/ are not listed, first {spare[0]}")
+
+
+def about_masks(photos: Sequence[Photo], root: Path) -> Iterator[Finding]:
+    """Tell how many masks there are and how much they keep; white means keep."""
+    folder = root / "masks"
+    kept: list[float] = []
+    lone: list[str] = []
+    for photo in photos:
+        path = photo.shot.mask or (find_image(folder, photo.shot.file) if folder.is_dir() else None)
+        if path is None:
+            lone.append(photo.shot.name)
+            continue
+        try:
+            kept.append(float(read_mask(path).mean()))
+        except CaptureError as error:
+            yield Finding("bad", "masks", str(error))
+    if not kept:
+        if folder.is_dir():
+            yield Finding("bad", "masks", f"{folder} holds none named as a photograph (<name>.png or <name>.jpg.png)")
+        return
+    mean = float(np.mean(kept))
+    text = f"{len(kept)} masks keep {100 * mean:.0f} % of the pixels (white = keep)"
+    yield Finding("warn" if mean < 0.35 else "ok", "masks", text + ("; are they inverted?" if mean < 0.35 else ""))
+    if lone:
+        yield Finding("warn", "masks", f"{len(lone)} photographs have none, first {lone[0]}: all of their pixels count")
+
+
+def about_points(shots: Iterable[PosedImage], cloud: SparsePoints | None, sample: int = 2000) -> Iterator[Finding]:
+    """Project a sample of the points into every view: poses and points that do not belong together show here."""
+    if cloud is None or len(cloud) == 0:
+        yield Finding("warn", "points", "none: training starts from random points in the cameras' view")
+        return
+    chosen = cloud.xyz[np.random.default_rng(0).permutation(len(cloud))[:sample]]
+    shares: dict[str, float] = {}
+    for shot in shots:
+        if shot.camera is None or shot.camera.width < 1:
+            continue
+        seen = chosen @ shot.viewmat[:3, :3].T + shot.viewmat[:3, 3]
+        front = seen[seen[:, 2] > 1e-6]
+        pixels = shot.camera.img_from_cam(front) if len(front) else np.zeros((0, 2))
+        inside = np.all((pixels >= 0.0) & (pixels <= [shot.camera.width, shot.camera.height]), axis=1)
+        shares[shot.name] = float(inside.sum()) / len(chosen)
+    blind = [name for name, share in shares.items() if share == 0.0]
+    mean = 100.0 * float(np.mean(list(shares.values()) or [0.0]))
+    yield Finding("ok", "points", f"{len(cloud):,}; a view sees {mean:.0f} % of them on average")
+    if blind:
+        yield Finding("warn", "points", f"{len(blind)} views see none, first {blind[0]}: are these poses right?")
+
+
+def about_reprojection(root: Path) -> Iterator[Finding]:
+    """Tell the mean reprojection error of the model's tracks, where it has any."""
+    from pop_fast.data.colmap import quiet_colmap
+    from pop_fast.data.pinhole import require_colmap
+
+    model = find_model(root)
+    if model is None:
+        return
+    with quiet_colmap():
+        reconstruction = require_colmap().Reconstruction(model)
+        observations = int(reconstruction.compute_num_observations())
+        if observations == 0:
+            yield Finding("ok", "reprojection", "the model has no tracks, so its error cannot be told")
+            return
+        reconstruction.update_point_3d_errors()
+        error = float(reconstruction.compute_mean_reprojection_error())
+    state: State = "ok" if error < 2.0 else "warn"
+    yield Finding(state, "reprojection", f"mean error {error:.2f} px over {observations:,} observations")
+
+
+def about_memory(photos: Sequence[Photo], cloud: SparsePoints | None, free: int) -> Iterator[Finding]:
+    """Estimate the memory that photographs take at each factor, and Gaussians in training."""
+    pixels = sum(photo.size[0] * photo.size[1] for photo in photos)
+    by_factor = ", ".join(f"{3 * pixels / f**2 / 2**20:,.0f} MiB at factor {f}" for f in (1, 2, 4, 8))
+    too_much = free > 0 and 3 * pixels > 0.7 * free
+    yield Finding("warn" if too_much else "ok", "memory", f"photographs take {by_factor}")
+    start = f"; training starts with {len(cloud):,}" if cloud is not None else ""
+    yield Finding("ok", "memory", f"Gaussians take {BYTES_IN_TRAINING * 1e6 / 2**20:,.0f} MiB a million{start}")
+
+
+def about_bare(root: Path, shown: Sequence[Shown]) -> Iterator[Finding]:
+    """Tell what there is where nothing says where the photographs were taken."""
+    sound = [one for one in shown if not one.problem]
+    enough = len(sound) >= 2
+    fix = (
+        "pop train finds their cameras first, or pop sfm alone" if enough else "a scene needs two or more that overlap"
+    )
+    yield Finding("ok" if enough else "bad", "poses", f"none yet, {len(sound)} photographs: {fix}")
+    sizes = Counter(one.size for one in sound)
+    listed = ", ".join(f"{count} of {w}x{h} px" for (w, h), count in sizes.most_common(4))
+    yield Finding("ok" if sizes else "bad", "photographs", listed or "none could be read")
+    for one in shown:
+        if one.problem:
+            yield Finding("bad", "photographs", one.problem)
+    yield from about_number(len(sound))
+    left = unreadable_photographs(photo_folder(root))
+    if left:
+        yield Finding("warn", "photographs", left)
+    turned = sum(one.exif.orientation in (3, 6, 8) for one in sound)
+    if turned:
+        yield Finding("ok", "EXIF", f"{turned} are stored turned; what is trained on is upright")

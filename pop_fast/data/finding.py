@@ -1,0 +1,17 @@
+"""One line of what an examination found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+State = Literal["ok", "warn", "bad"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line: how bad, about what, and what was found."""
+
+    state: State
+    about: str
+    text: str

@@ -1,0 +1,270 @@
+"""Read the photographs that a model or a transforms.json lists, and make pinhole views of them.
+
+A photograph is decoded, composited over the background where it has alpha, undistorted at its stored size, and then
+shrunk by averaging areas. K follows exactly: K of a photograph stored at another size than its camera's is scaled by
+the ratio of the two, each photograph by its own, and K of the shrunk image by the ratio of the sizes in whole pixels.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from pop_fast.data.capture import Progress, View
+from pop_fast.data.pinhole import make_camera
+from pop_fast.data.posed_images import PosedImage
+from pop_fast.data.resample import shrink_bicubic
+from pop_fast.data.undistort import Undistortion, undistortion
+from pop_fast.errors import CaptureError
+from pop_fast.io.image_header import read_size
+from pop_fast.io.images import find_image, read_image, read_mask
+from pop_fast.io.jpeg import sound_jpegs
+
+__all__ = ["PhotoOptions", "read_views"]
+
+
+@dataclass(frozen=True)
+class PhotoOptions:
+    """How photographs are read; see `pop_fast.data.load_capture`."""
+
+    factor: int = 1
+    masks: bool = True
+    missing: Literal["error", "skip"] = "error"
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    images: str | None = None
+    resize: Literal["area", "bicubic"] = "area"
+
+
+@dataclass(frozen=True)
+class _Photo:
+    shot: PosedImage
+    path: Path
+    mask: Path | None
+    shrink: int
+
+
+def read_views(
+    root: Path, listing: Path, shots: Sequence[PosedImage], options: PhotoOptions, progress: Progress | None
+) -> tuple[list[View], list[str]]:
+    """Read all photographs of a list, several at a time.
+
+    Args:
+        root: the capture's folder.
+        listing: the file that lists them, for messages.
+        shots: what is listed.
+        options: how to read them.
+        progress: called after every photograph.
+
+    Returns:
+        Views in the order of the shots, and notes.
+
+    Raises:
+        CaptureError: a photograph or mask is absent, damaged, or of another shape than its camera.
+    """
+    photos, notes = _locate(root, listing, shots, options)
+    rectify = _rectifier()
+    views: list[View] = []
+    with sound_jpegs([photo.path for photo in photos]), ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        jobs = [pool.submit(_read, photo, options, rectify) for photo in photos]
+        try:
+            for job in jobs:
+                views.append(job.result())
+                if progress is not None:
+                    progress("reading photographs", len(views), len(jobs))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return views, notes
+
+
+def _locate(
+    root: Path, listing: Path, shots: Sequence[PosedImage], options: PhotoOptions
+) -> tuple[list[_Photo], list[str]]:
+    """Pair every listed name with its file and its mask, by name."""
+    photos: list[_Photo] = []
+    absent: list[Path] = []
+    masks = root / "masks" if options.masks and (root / "masks").is_dir() else None
+    for shot in shots:
+        chosen, shrink = _image_folder(root, shot.folder, options)
+        path = find_image(root / chosen, shot.file)
+        if path is None:
+            absent.append(root / chosen / shot.file)
+            continue
+        mask = None
+        if options.masks:
+            mask = shot.mask or (find_image(masks, shot.file) if masks else None)
+        photos.append(_Photo(shot, path, mask, shrink))
+    if absent and (options.missing == "error" or not photos):
+        raise CaptureError(
+            f"{listing}: lists {len(shots)} images, {len(absent)} of them absent, first {absent[0]}; "
+            "restore them or pass --missing skip"
+        )
+    if masks and not any(photo.mask for photo in photos):
+        raise CaptureError(f"{masks}: holds no mask named as a photograph (<name>.png or <name>.jpg.png); rename them")
+    notes = [f"{len(absent)} of {len(shots)} listed images are absent and were skipped"] if absent else []
+    notes += _about_folders(root, shots, options)
+    unmasked = [photo.path for photo in photos if photo.mask is None]
+    if 0 < len(unmasked) < len(photos):
+        notes.append(f"{len(unmasked)} of {len(photos)} photographs have no mask and count whole, first {unmasked[0]}")
+    return photos, notes
+
+
+def _about_folders(root: Path, shots: Sequence[PosedImage], options: PhotoOptions) -> list[str]:
+    """Tell which photographs a factor is met by: those that were made smaller before, or the large ones."""
+    if options.factor == 1:
+        return []
+    read = {_image_folder(root, folder, options) for folder in {shot.folder for shot in shots}}
+    names = ", ".join(sorted(f"{chosen or '.'}/" for chosen, _ in read))
+    if all(shrink == 1 for _, shrink in read):
+        return [f"the photographs of {names} are used, made smaller before; --images says otherwise"]
+    return [f"the photographs of {names} are shrunk by {options.factor} here"]
+
+
+def _image_folder(root: Path, folder: str, options: PhotoOptions) -> tuple[str, int]:
+    """Choose the folder to read from, and by how much its photographs are still to be shrunk.
+
+    The folder that was asked for; else `<folder>_<factor>` where it exists; else the listed folder, shrunk here.
+    """
+    chosen = options.images or folder
+    if options.images is None and folder and options.factor > 1 and (root / f"{folder}_{options.factor}").is_dir():
+        chosen = f"{folder}_{options.factor}"
+    done = options.factor > 1 and chosen.endswith(f"_{options.factor}")
+    return chosen, 1 if done else options.factor
+
+
+def _rectifier() -> Any:
+    """Make a function (camera, width, height) -> Undistortion that remembers the last few."""
+
+    @lru_cache(maxsize=8)
+    def remembered(
+        model: str, params: tuple[float, ...], size: tuple[int, int], stored: tuple[int, int]
+    ) -> Undistortion:
+        return undistortion(make_camera(0, model, *size, list(params)), *stored)
+
+    # the threads that read photographs of one camera would all begin with the same plan
+    one_at_a_time = threading.Lock()
+
+    def rectify(camera: Any, width: int, height: int) -> Undistortion:
+        with one_at_a_time:
+            return remembered(camera.model_name, tuple(camera.params), (camera.width, camera.height), (width, height))
+
+    return rectify
+
+
+def _read(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
+    _check_header(photo)
+    image = read_image(photo.path)
+    height, width = image.shape[:2]
+    camera = photo.shot.camera or _camera_from_angle(photo.shot.angle_x or 1.0, width, height)
+    _check_shape(photo.path, "the photograph", (width, height), "its camera", (camera.width, camera.height))
+    if image.shape[2] == 4:
+        image = _over(image, options.background)
+    try:
+        rectification = rectify(camera, width, height)
+    except ValueError as error:
+        raise CaptureError(f"{photo.path}: its camera {camera.camera_id} {error}") from error
+    image = rectification.image(image)
+    size = (round(width / photo.shrink), round(height / photo.shrink))
+    if min(size) < 1:
+        raise CaptureError(f"{photo.path}: is {width}x{height} px, too small for factor {photo.shrink}; lower it")
+    mask = None
+    if photo.mask is not None:
+        mask = _read_mask(photo.mask, (width, height), rectification, size, photo.shot.turns)
+    K = rectification.K.copy()
+    if size != (width, height):
+        image = _shrunk(image, size, options.resize)
+        K[:2] *= np.array([size[0] / width, size[1] / height])[:, None]
+    return _upright(View(photo.shot.name, image, photo.shot.viewmat, K, mask, photo.shot.split), photo.shot.turns)
+
+
+def _check_header(photo: _Photo) -> None:
+    """Refuse a photograph or mask of another shape before it is decoded, which may take gigabytes."""
+    size, camera = read_size(photo.path), photo.shot.camera
+    if size is None:
+        return
+    if camera is not None and camera.width > 0 and camera.height > 0:
+        _check_shape(photo.path, "the photograph", size, "its camera", (camera.width, camera.height))
+    masked = None if photo.mask is None else read_size(photo.mask)
+    if (
+        photo.mask is not None
+        and masked is not None
+        and not (photo.shot.turns % 2 and _same_shape((masked[1], masked[0]), size))
+    ):
+        _check_shape(photo.mask, "the mask", masked, "its photograph", size)
+
+
+def _upright(view: View, turns: int) -> View:
+    """Turn a view clockwise by quarters: pixel (u, v) of an image of height H becomes (H - v, u)."""
+    for _ in range(turns):
+        K = view.K
+        turned = np.array([[K[1, 1], 0.0, view.height - K[1, 2]], [0.0, K[0, 0], K[0, 2]], [0.0, 0.0, 1.0]])
+        x, y, *rest = view.viewmat
+        image, mask = (None if a is None else np.ascontiguousarray(np.rot90(a, -1)) for a in (view.image, view.mask))
+        view = replace(view, image=image, mask=mask, K=turned, viewmat=np.stack([-y, x, *rest]))
+    return view
+
+
+def _camera_from_angle(angle_x: float, width: int, height: int) -> Any:
+    focal = 0.5 * width / math.tan(0.5 * angle_x)
+    params = [focal, focal, width / 2, height / 2]
+    return make_camera(0, "PINHOLE", width, height, params)
+
+
+def _check_shape(path: Path, what: str, size: tuple[int, int], whose: str, other: tuple[int, int]) -> None:
+    """Accept another size, but only of the same shape to within a pixel of rounding."""
+    if not _same_shape(size, other):
+        raise CaptureError(
+            f"{path}: {what} is {size[0]}x{size[1]} px but {whose} is {other[0]}x{other[1]}, another shape; "
+            "use the photographs that the poses were made from, neither cropped nor rotated"
+        )
+
+
+def _same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    off_width = abs(size[0] - other[0] * size[1] / max(other[1], 1))
+    off_height = abs(size[1] - other[1] * size[0] / max(other[0], 1))
+    return min(off_width, off_height) <= 1.0
+
+
+def _over(rgba: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
+    """Composite over the background: alpha * rgb + (1 - alpha) * background, rounded. uint8 [H, W, 3]"""
+    alpha = rgba[:, :, 3:].astype(np.float32) / 255.0
+    mixed = alpha * rgba[:, :, :3] + (1.0 - alpha) * (255.0 * np.asarray(background, np.float32))
+    return np.rint(mixed).astype(np.uint8)
+
+
+def _read_mask(
+    path: Path, stored: tuple[int, int], rectification: Undistortion, size: tuple[int, int], turns: int
+) -> np.ndarray:
+    mask = read_mask(path)
+    height, width = mask.shape
+    if turns % 2 and not _same_shape((width, height), stored) and _same_shape((height, width), stored):
+        # drawn over the photograph as viewers show it
+        mask = np.ascontiguousarray(np.rot90(mask, turns))
+    _check_shape(path, "the mask", (mask.shape[1], mask.shape[0]), "its photograph", stored)
+    mask = rectification.mask(_resize_mask(mask, stored))
+    mask = _resize_mask(mask, size)
+    if not mask.any():
+        raise CaptureError(f"{path}: the mask hides the whole photograph; white means keep: invert it or remove it")
+    return mask
+
+
+def _shrunk(image: np.ndarray, size: tuple[int, int], resize: Literal["area", "bicubic"]) -> np.ndarray:
+    if resize == "bicubic":
+        return shrink_bicubic(image, size)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def _resize_mask(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    if (mask.shape[1], mask.shape[0]) == size:
+        return mask
+    return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) >= 0.5

@@ -1,0 +1,279 @@
+"""The search for the cameras of photographs with pycolmap, in a process of its own.
+
+COLMAP computes for minutes inside one call, where no signal is heard. A process can be ended at any moment, and takes
+COLMAP's threads, its log and its memory with it. The words of the two processes are lines of JSON: one job, and for it
+any number of reports of progress and one end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from pop_fast.data.capture import Progress
+from pop_fast.data.colmap import quiet_colmap
+from pop_fast.data.pinhole import require_colmap
+from pop_fast.errors import CaptureError
+
+__all__ = ["Search", "check_camera_model", "find_cameras"]
+
+_EXHAUSTIVE_UP_TO: Final = 60
+_NEIGHBOURS: Final = 10
+# photographs, and the square of it pairs, between two reports of progress
+_BATCH: Final = 8
+FIX: Final = "take photographs that overlap by two thirds, from different places, of a scene with texture"
+_DONE: Final = b"."
+# letters of what COLMAP says that an error shows
+_LONGEST: Final = 300
+
+
+@dataclass(frozen=True)
+class Search:
+    """What to search.
+
+    Attributes:
+        photos: the folder that messages name.
+        work: a folder of the search's own, with the photographs in `images`; the model is written to `best`.
+        names: of the photographs.
+        camera_model: COLMAP's name.
+        single_camera: all photographs share one camera.
+        max_size: longest side at which features are looked for, px.
+        matcher: "exhaustive" matches all with all, "sequential" each with its neighbours by name; "auto" chooses by
+            their number.
+        seed: of every random choice.
+    """
+
+    photos: str
+    work: str
+    names: list[str]
+    camera_model: str
+    single_camera: bool
+    max_size: int
+    matcher: str
+    seed: int
+
+    @property
+    def database(self) -> Path:
+        """COLMAP's database."""
+        return Path(self.work, "database.db")
+
+    @property
+    def images(self) -> Path:
+        """The photographs under plain names."""
+        return Path(self.work, "images")
+
+
+def check_camera_model(name: str) -> None:
+    """Check that COLMAP has a camera model of this name.
+
+    Raises:
+        CaptureError: it has none; names those that it has.
+    """
+    known = [known for known in require_colmap().CameraModelId.__members__ if known != "INVALID"]
+    if name not in known:
+        raise CaptureError(f"camera_model is {name!r}; use one of {', '.join(known)}")
+
+
+def find_cameras(search: Search, progress: Progress | None) -> Any:
+    """Find cameras and points in a process of its own, which ends when this one is interrupted or ends.
+
+    Returns:
+        The largest model, a `pycolmap.Reconstruction`.
+
+    Raises:
+        CaptureError: there is none, or COLMAP failed.
+    """
+    # -P: no module of the working folder stands in for one of the program's
+    begin = f"import sys; sys.path.append(sys.argv[1]); from {__name__} import main; main()"
+    command = [sys.executable, "-P", "-c", begin, str(Path(__file__).parents[2])]
+    with tempfile.TemporaryFile() as log:
+        child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log)
+        try:
+            end = _listen(child, search, progress)
+            child.wait()
+            if child.stdin is not None:
+                with contextlib.suppress(BrokenPipeError):
+                    child.stdin.write(_DONE)
+                    child.stdin.flush()
+        finally:
+            child.kill()
+            child.wait()
+            for pipe in (child.stdin, child.stdout):
+                if pipe is not None:
+                    with contextlib.suppress(OSError):
+                        pipe.close()
+        if end is None:
+            log.seek(0)
+            said = log.read().decode("utf-8", "replace").strip().rpartition("\n")[2]
+            end = f"COLMAP failed: its process ended with status {child.returncode} {said}".strip()[:_LONGEST]
+            end += f"; fewer threads and smaller images need less memory; {FIX}"
+    if end:
+        raise CaptureError(f"{search.photos}: {end}")
+    return require_colmap().Reconstruction(Path(search.work, "best"))
+
+
+def _listen(child: subprocess.Popen[bytes], search: Search, progress: Progress | None) -> str | None:
+    """Hand over the job and read until its end: "" when a model was found, or an error; None when there was no end."""
+    if child.stdin is None or child.stdout is None:
+        return None
+    with contextlib.suppress(BrokenPipeError):
+        child.stdin.write(json.dumps(asdict(search)).encode() + b"\n")
+        child.stdin.flush()
+    for line in child.stdout:
+        word = json.loads(line)
+        if isinstance(word, str):
+            return word
+        if progress is not None:
+            progress(*word)
+    return None
+
+
+def main() -> None:
+    """Do the job on standard input; the words go to standard output."""
+    # Ctrl-C reaches every process of a terminal; the one that waits decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    out = os.fdopen(os.dup(1), "w", encoding="ascii")
+    os.dup2(2, 1)
+    search = Search(**json.loads(sys.stdin.buffer.readline()))
+    _watch(search)
+
+    def say(word: Any) -> None:
+        out.write(json.dumps(word) + "\n")
+        out.flush()
+
+    try:
+        with quiet_colmap():
+            _search(search, lambda *report: say(report)).write_binary(_made(Path(search.work, "best")))
+        say("")
+    except CaptureError as error:
+        say(str(error))
+    except (ValueError, RuntimeError, IndexError, TypeError, MemoryError) as error:
+        said = " ".join(str(error).split())[:_LONGEST]
+        say(f"COLMAP failed: {said}; {FIX}")
+
+
+def _watch(search: Search) -> None:
+    """Leave a process behind that ends this one, and removes the folder of the search, when the other one is gone.
+
+    A thread could not: COLMAP keeps the interpreter to itself while it computes.
+    """
+    worker = os.getpid()
+    if not hasattr(os, "fork") or os.fork():
+        return
+    # the other process waits for the end of these too
+    os.closerange(1, 64)
+    if os.read(0, 1) != _DONE:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(worker, signal.SIGKILL)
+        shutil.rmtree(search.work, ignore_errors=True)
+    os._exit(0)
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+def _search(job: Search, tell: Callable[[str, int, int], None]) -> Any:
+    _extract(job, tell)
+    _match(job, tell)
+    return _map(job, tell)
+
+
+def _extract(job: Search, tell: Progress) -> None:
+    """Find features, a few photographs at a time, so that progress can be told."""
+    pycolmap = require_colmap()
+    n = len(job.names)
+    # listed first and in order, because the threads that find features would number photographs as they finish
+    pycolmap.Database.open(job.database).close()
+    pycolmap.import_images(
+        job.database,
+        job.images,
+        camera_mode=pycolmap.CameraMode.SINGLE if job.single_camera else pycolmap.CameraMode.AUTO,
+        image_names=job.names,
+        options=pycolmap.ImageReaderOptions(camera_model=job.camera_model),
+    )
+    for start in range(0, n, _BATCH):
+        tell("finding features", start, n)
+        pycolmap.extract_features(
+            job.database,
+            job.images,
+            image_names=job.names[start : start + _BATCH],
+            extraction_options=pycolmap.FeatureExtractionOptions(max_image_size=job.max_size),
+            device=pycolmap.Device.cpu,
+        )
+    tell("finding features", n, n)
+
+
+def pairs_of(n: int, matcher: str) -> list[tuple[int, int]]:
+    """List which photographs to match: all with all, or each with its neighbours by name, near and 2^k further on."""
+    if matcher == "exhaustive" or (matcher == "auto" and n <= _EXHAUSTIVE_UP_TO):
+        return list(itertools.combinations(range(n), 2))
+    steps = {*range(1, _NEIGHBOURS + 1), *(2**k for k in range(_NEIGHBOURS))}
+    return sorted((i, i + step) for i in range(n) for step in steps if i + step < n)
+
+
+def _match(job: Search, tell: Progress) -> None:
+    pycolmap = require_colmap()
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = job.seed
+    pairs = pairs_of(len(job.names), job.matcher)
+    listing = Path(job.work, "pairs.txt")
+    for start in range(0, len(pairs), _BATCH**2):
+        tell("matching photographs", start, len(pairs))
+        batch = pairs[start : start + _BATCH**2]
+        listing.write_text("".join(f"{job.names[i]} {job.names[j]}\n" for i, j in batch), encoding="utf-8")
+        pycolmap.match_image_pairs(
+            job.database,
+            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listing),
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )
+    tell("matching photographs", len(pairs), len(pairs))
+
+
+def _map(job: Search, tell: Progress) -> Any:
+    pycolmap = require_colmap()
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = job.seed
+    options.mapper.random_seed = job.seed
+    options.triangulation.random_seed = job.seed
+    options.min_model_size = 3
+    # bundle adjustment adds in the order in which its threads finish: one thread gives the same bits every time
+    options.num_threads = 1
+    options.mapper.num_threads = 1
+    options.ba_min_num_residuals_for_cpu_multi_threading = 2**31 - 1
+    found = [0]
+
+    def advance(by: int) -> Callable[[], None]:
+        def callback() -> None:
+            found[0] += by
+            tell("finding cameras", min(found[0], len(job.names)), len(job.names))
+
+        return callback
+
+    tell("finding cameras", 0, len(job.names))
+    out = _made(Path(job.work, "models"))
+    models: dict[int, Any] = pycolmap.incremental_mapping(
+        job.database,
+        job.images,
+        out,
+        options=options,
+        initial_image_pair_callback=advance(2),
+        next_image_callback=advance(1),
+    )
+    best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+    if best is None or best.num_reg_images() < 2 or best.num_points3D() == 0:
+        raise CaptureError(f"no cameras could be found for these {len(job.names)} photographs; {FIX}")
+    return best

@@ -1,0 +1,159 @@
+"""The protocol that every population strategy follows; it is gsplat's, so that a strategy serves both trainers.
+
+A trainer holds a dict of raw parameters (`means`, `scales` in log, `quats`, `opacities` in logit, `sh0`, `shN`) and one
+optimizer per key. Every step it calls, in this order,
+
+    strategy.step_pre_backward(params, optimizers, state, step, info)
+    loss.backward()
+    optimizers step                       (gsplat >= 1.5: the optimizers move first, then the strategy looks)
+    strategy.step_post_backward(params, optimizers, state, step, info)
+
+`info` is the dict that `rasterization()` returns last. `step` counts from 0. A strategy is a dataclass of settings;
+everything that changes lives in `state`. What a step did to the population is returned, as a `DensificationStep`;
+gsplat's own strategies return nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, MutableMapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
+
+from pop_ref.settings import MAX_SH_DEGREE
+
+if TYPE_CHECKING:
+    from torch import Tensor
+    from torch.optim import Optimizer
+
+    from pop_fast.density.passes import Passes
+
+Params: TypeAlias = MutableMapping[str, Any]
+Optimizers: TypeAlias = "Mapping[str, Optimizer]"
+State: TypeAlias = dict[str, Any]
+Info: TypeAlias = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Where a change of the population takes its random numbers from.
+
+    Attributes:
+        normals: given n, standard normal draws for the children of n split parents, on the CPU. -> [2, n, 3]
+        uniforms: given n, draws from [0, 1), on the CPU. -> [n] float64
+    """
+
+    normals: Callable[[int], Tensor]
+    uniforms: Callable[[int], Tensor]
+
+
+@dataclass(frozen=True)
+class Population:
+    """The Gaussians at a step after which they may change, and what a change may ask for.
+
+    Attributes:
+        params: raw parameters, replaced under their keys.
+        optimizers: one per key.
+        state: the strategy's.
+        step: just taken, from 0.
+        draws: random numbers.
+        passes: over the training views; None in a trainer that has none.
+        sh_degree: colour bands that are drawn.
+    """
+
+    params: Params
+    optimizers: Optimizers
+    state: State
+    step: int
+    draws: Draws
+    passes: Passes | None = None
+    sh_degree: int = MAX_SH_DEGREE
+
+    def __len__(self) -> int:
+        return len(self.params["means"])
+
+    @property
+    def views(self) -> Passes:
+        """Return the passes over the training views.
+
+        Raises:
+            ValueError: the trainer has none.
+        """
+        if self.passes is None:
+            raise ValueError("this strategy looks at the training views when it changes the population; give it passes")
+        return self.passes
+
+
+@dataclass(frozen=True)
+class DensificationStep:
+    """What density control did to the population after a step.
+
+    Attributes:
+        cloned: Gaussians that were copied.
+        split: Gaussians that two smaller ones replaced.
+        pruned: Gaussians that were removed.
+        reset: whether all opacities were lowered.
+        replaced: Gaussians that took the place of all there were.
+    """
+
+    cloned: int = 0
+    split: int = 0
+    pruned: int = 0
+    reset: bool = False
+    replaced: int = 0
+
+    def record(self) -> dict[str, Any]:
+        """Return what a record of metrics.jsonl says about it; what is rare is mentioned only where it happened."""
+        counts = {"cloned": self.cloned, "split": self.split, "pruned": self.pruned}
+        rare = {"reset": self.reset, "replaced": self.replaced}
+        return {**counts, **{name: value for name, value in rare.items() if value}}
+
+
+@runtime_checkable
+class Strategy(Protocol):
+    """What a trainer asks of a strategy."""
+
+    def check_sanity(self, params: Params, optimizers: Optimizers) -> None:
+        """Raise ValueError when the parameters and the optimizers are not laid out as the protocol says."""
+        ...
+
+    def initialize_state(self, scene_scale: float = 1.0) -> State:
+        """Return what the strategy remembers between steps."""
+        ...
+
+    def step_pre_backward(self, params: Params, optimizers: Optimizers, state: State, step: int, info: Info) -> None:
+        """Prepare for the backward pass: ask autograd to keep the gradient of the screen centres."""
+        ...
+
+    def step_post_backward(
+        self, params: Params, optimizers: Optimizers, state: State, step: int, info: Info, packed: bool = False
+    ) -> Any:
+        """Collect statistics and, when it is time, change the population; may return a `DensificationStep`."""
+        ...
+
+
+class Regularized(Protocol):
+    """A strategy that adds a term to the loss; trainers that know it call it before the backward pass."""
+
+    def regularizer(self, opacities: Tensor, state: State, step: int, info: Info) -> Tensor | None:
+        """Return the weighted term, or None when it is off at this step."""
+        ...
+
+
+def check_layout(params: Params, optimizers: Optimizers, needed: tuple[str, ...]) -> None:
+    """Raise ValueError when keys, optimizers or row counts do not fit the protocol."""
+    missing = [key for key in needed if key not in params]
+    if missing:
+        raise ValueError(f"params has no {missing[0]!r}; a strategy needs {', '.join(needed)}")
+    trainable = {key for key, value in params.items() if value.requires_grad}
+    if trainable != set(optimizers):
+        odd = sorted(trainable.symmetric_difference(optimizers))[0]
+        have = "a parameter without an optimizer" if odd in trainable else "an optimizer without a trainable parameter"
+        raise ValueError(f"{odd!r} is {have}; give every trainable parameter its own optimizer under the same key")
+    rows = len(params[needed[0]])
+    for key, value in params.items():
+        if len(value) != rows:
+            raise ValueError(f"{key!r} has {len(value)} rows but {needed[0]!r} has {rows}; rows are Gaussians")
+    for key, optimizer in optimizers.items():
+        groups = optimizer.param_groups
+        if len(groups) != 1 or len(groups[0]["params"]) != 1 or groups[0]["params"][0] is not params[key]:
+            raise ValueError(f"optimizers[{key!r}] must hold exactly one tensor, params[{key!r}]")

@@ -1,0 +1,61 @@
+"""PUP-3DGS: two rounds of pruning by sensitivity and refining, after a whole training of 3DGS.
+
+Source: Hanson et al. 2025 and its code. The score of a Gaussian is the log-determinant of the Fisher block of its mean
+and log-scale, summed over pixels and channels of all training views at a quarter of their size (`pop_ref.fisher`). A
+round removes the lowest scores, starts Adam anew, and trains 5,000 steps without densification, with the positions'
+rate where the training has ended and all others falling by 5 % each 400 steps (`pop_ref.optimizer`). The rounds remove
+80 % and then 50 %; the paper's PUP* removes 70 % and then 50 %. What comes before is 3DGS of 2023.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from pop_fast.density.gsplat import InriaStrategy
+from pop_fast.density.protocol import DensificationStep, Population
+from pop_ref.recipes import BASELINES, Recipe
+
+_PUP: Final[Recipe] = BASELINES["PUP-3DGS"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PupStrategy(InriaStrategy):
+    """3DGS, then rounds of pruning by Fisher blocks and refining.
+
+    Attributes:
+        prune_shares: share of the Gaussians that each round removes at its beginning.
+        score_divisor: of the training views' width and height, where scores are taken.
+    """
+
+    rounds_start_iter: int = _PUP.updates.rounds_start_iter
+    prune_shares: tuple[float, ...] = (0.8, 0.5)
+    score_divisor: int = 4
+
+    @property
+    def adam_restarts(self) -> tuple[int, ...]:
+        """Return the first step of every round: it prunes, and moves nothing."""
+        return tuple(self.rounds_start_iter + k * self.round_steps for k in range(len(self.prune_shares)))
+
+    def needs_passes(self, step: int) -> bool:
+        """Tell whether Fisher blocks are asked for."""
+        return step in self.adam_restarts
+
+    def changes_after(self, step: int) -> bool:
+        """Tell whether the population is edited after this step."""
+        return super().changes_after(step) or self.needs_passes(step)
+
+    def edit(self, of: Population) -> DensificationStep:
+        """Refine and reset as 3DGS; at the beginning of a round prune and start Adam anew."""
+        if of.step not in self.adam_restarts:
+            return super().edit(of)
+        from pop_fast.density import rows
+        from pop_fast.density.importance import prune_lowest, summed_over_views
+        from pop_fast.stages.fisher import log_det_scores
+
+        views, divisor = of.views, self.score_divisor
+        blocks = summed_over_views(of, lambda index: views.fisher(of.params, index, of.sh_degree, divisor))
+        share = self.prune_shares[self.adam_restarts.index(of.step)]
+        pruned = prune_lowest(of, log_det_scores(blocks), share)
+        rows.restart(of.params, of.optimizers)
+        return DensificationStep(pruned=pruned)

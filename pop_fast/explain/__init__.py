@@ -1,9 +1,0 @@
-"""Why a pixel looks as it does: what it is blended from, what the loss and POP do to it, where two renderers part."""
-
-from __future__ import annotations
-
-from pop_fast.explain.model import PixelExplanation, Row
-from pop_fast.explain.pixel import explain_pixel
-from pop_fast.explain.scene import ExplainedView, explain_view
-
-__all__ = ["ExplainedView", "PixelExplanation", "Row", "explain_pixel", "explain_view"]

@@ -1,0 +1,138 @@
+"""Write and read files of splats by the name of the format, or by the file's name."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from torch import Tensor
+
+from pop_fast.errors import PopError
+from pop_fast.io.atomic import write_atomically
+from pop_fast.io.formats.cloud import Cloud
+from pop_fast.io.formats.compressed_ply import is_compressed
+from pop_fast.io.formats.table import FORMATS
+from pop_fast.io.ply import Frame, asks_for_antialiasing, params_of_ply, ply_bytes
+from pop_fast.io.ply_rows import header_of
+
+PLY: Final = "ply"
+
+
+def format_names() -> tuple[str, ...]:
+    """Return the names of all formats, PLY first."""
+    return (PLY, *FORMATS)
+
+
+def splat_suffixes() -> tuple[str, ...]:
+    """Return the suffixes of all formats, without repetition, the longest first."""
+    found = dict.fromkeys([".ply", *(format.suffix for format in FORMATS.values())])
+    return tuple(sorted(found, key=len, reverse=True))
+
+
+def is_splat_file(path: Path) -> bool:
+    """Tell whether a name ends as one of the formats' do."""
+    return path.name.lower().endswith(splat_suffixes())
+
+
+def named_format(path: Path, to: str | None = None) -> str:
+    """Return the format that a file is to be written in: the one that is asked for, or the one of its suffix.
+
+    Raises:
+        PopError: neither says, or the suffix is another format's.
+    """
+    name = path.name.lower()
+    suffix = next((s for s in splat_suffixes() if name.endswith(s)), None)
+    by_suffix = [PLY] if suffix == ".ply" else [key for key, format in FORMATS.items() if format.suffix == suffix]
+    if to is None:
+        if not by_suffix:
+            raise PopError(f"{path}: the name must end in one of {', '.join(sorted(splat_suffixes()))}, or give --to")
+        return by_suffix[0]
+    if to not in format_names():
+        raise PopError(f"--to {to}: no such format; it is one of {', '.join(format_names())}")
+    if by_suffix and to not in by_suffix:
+        wanted = ".ply" if to == PLY else FORMATS[to].suffix
+        raise PopError(f"{path}: ends in {suffix}, which is not how files of {to} end; name it *{wanted}")
+    return to
+
+
+def encoded(name: str, params: Mapping[str, Tensor], antialiased: bool = False, frame: Frame | None = None) -> bytes:
+    """Return a splat as a file's bytes.
+
+    Args:
+        name: of the format.
+        params: raw parameters, as for `pop_fast.io.ply.save_ply`.
+        antialiased: to be drawn with antialiasing.
+        frame: the world that they are in, where it is known; only PLY has a place for it.
+
+    Raises:
+        PopError: a parameter is absent, of the wrong shape, NaN or Inf, or the format cannot hold it.
+    """
+    if name == PLY:
+        return ply_bytes(dict(params), antialiased, frame)
+    format, cloud = FORMATS[name], Cloud.of(params, antialiased)
+    return format.encode(cloud if format.order is None else cloud.take(format.order(cloud)))
+
+
+def decoded(name: str, data: bytes, path: Path = Path("memory")) -> tuple[dict[str, Tensor], bool]:
+    """Read a splat from a file's bytes.
+
+    Args:
+        name: of the format.
+        data: the bytes.
+        path: their name, for errors.
+
+    Returns:
+        As `load_splat_file`.
+
+    Raises:
+        PopError: the bytes are damaged; names the field.
+    """
+    if name == PLY:
+        return params_of_ply(data, path), asks_for_antialiasing(header_of(data, path))
+    cloud = FORMATS[name].decode(data, path)
+    return cloud.params(), cloud.antialiased
+
+
+def save_as(
+    path: str | os.PathLike[str],
+    name: str,
+    params: Mapping[str, Tensor],
+    antialiased: bool = False,
+    frame: Frame | None = None,
+) -> int:
+    """Write a splat in a format, atomically.
+
+    Returns:
+        The number of bytes.
+
+    Raises:
+        PopError: as `encoded`, or the file cannot be written.
+    """
+    data = encoded(name, params, antialiased, frame)
+    write_atomically(path, lambda file: file.write(data))
+    return len(data)
+
+
+def load_splat_file(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], bool]:
+    """Read a splat in any format.
+
+    Returns:
+        Raw parameters, as `pop_fast.io.ply.load_ply` returns them, and whether they are to be drawn with antialiasing.
+
+    Raises:
+        PopError: the file is absent, of an unknown kind or damaged; names the field.
+    """
+    path = Path(path)
+    name = named_format(path)
+    if name in (PLY, "compressed-ply"):
+        # either may stand under the name of the other
+        name = "compressed-ply" if is_compressed(path) else PLY
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise PopError(f"{path}: the file is absent; check the path") from None
+    except OSError as error:
+        raise PopError(f"{path}: could not be read: {error.strerror}; check the path and its permissions") from error
+    return decoded(name, data, path)

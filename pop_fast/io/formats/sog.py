@@ -1,0 +1,227 @@
+"""PlayCanvas's SOG, version 2: lossless WebP images of bytes and meta.json, in one ZIP file.
+
+An image pixel is a Gaussian: centres with 16 bits in a logarithmic space, scales and colours as indices of 256 numbers,
+rotations as the smallest three components with 8 bits each, and the colours beyond degree 0 as an index of a palette of
+at most 65,536 rows. The frame is that of PLY, as PlayCanvas's own programs write it.
+
+Source: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import struct
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+
+from pop_fast.errors import PopError
+from pop_fast.io.formats.cloud import COEFFICIENTS, Cloud, logits_of_bytes, to_bytes
+from pop_fast.io.formats.palette import codebook, nearest, row_palette
+from pop_fast.io.formats.smallest_three import drop_largest, restore_largest
+
+_META: Final = "meta.json"
+_FIRST_ROTATION: Final = 252
+# palette rows in a row of the image of the palette
+_ROW: Final = 64
+_LARGEST_PALETTE: Final = 65536
+# Gaussians for a row of the palette
+_SHARED_BY: Final = 2
+_LOSSLESS: Final = (cv2.IMWRITE_WEBP_QUALITY, 101)
+_LARGEST_META: Final = 2**20
+_WRITE_AGAIN: Final = "copy or write the file again"
+
+
+def encode(cloud: Cloud) -> bytes:
+    """Write SOG; the order of the Gaussians is kept, and should be one where neighbours are close.
+
+    Returns:
+        The bytes of the ZIP file.
+    """
+    n = len(cloud)
+    width = max(1, math.isqrt(max(n - 1, 0)) + 1)
+    height = max(1, -(-n // width))
+    images: dict[str, np.ndarray] = {}
+
+    def picture(name: str, channels: np.ndarray, columns: int = width, rows: int = height) -> str:
+        pixels = np.zeros((columns * rows, channels.shape[1]), np.uint8)
+        pixels[: len(channels)] = channels
+        images[name] = pixels.reshape(rows, columns, -1)
+        return name
+
+    means = np.sign(cloud.means) * np.log1p(np.abs(cloud.means.astype(np.float64)))
+    low, high = (means.min(axis=0), means.max(axis=0)) if n else (np.zeros(3), np.zeros(3))
+    fixed = np.rint((means - low) / np.where(high > low, high - low, 1.0) * 65535.0).astype(np.uint16)
+    largest, three = drop_largest(cloud.quats)
+    rotations = to_bytes(255.0 * (three / math.sqrt(2.0) + 0.5))
+    scales, colors = codebook(cloud.log_scales.ravel()), codebook(cloud.sh0.ravel())
+    rgba = np.concatenate([nearest(colors, cloud.sh0), np.rint(255.0 * cloud.opacities)[:, None]], axis=1)
+    meta: dict[str, Any] = {
+        "version": 2,
+        "asset": {"generator": "pop-splatting"},
+        "count": n,
+        "antialias": cloud.antialiased,
+        "means": {
+            "mins": low.tolist(),
+            "maxs": high.tolist(),
+            "files": [picture("means_l.webp", fixed & 255), picture("means_u.webp", fixed >> 8)],
+        },
+        "scales": {
+            "codebook": _numbers(scales),
+            "files": [picture("scales.webp", nearest(scales, cloud.log_scales))],
+        },
+        "quats": {
+            "files": [picture("quats.webp", np.concatenate([rotations, largest[:, None] + _FIRST_ROTATION], axis=1))]
+        },
+        "sh0": {"codebook": _numbers(colors), "files": [picture("sh0.webp", rgba)]},
+    }
+    if cloud.degree and n:
+        palette, labels = _palette(cloud)
+        codes = codebook(palette.ravel())
+        rows = -(-len(palette) // _ROW)
+        indices = nearest(codes, palette).reshape(-1, 3)
+        centroids = picture("shN_centroids.webp", indices, _ROW * cloud.rest.shape[1], rows)
+        pairs = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1)
+        meta["shN"] = {
+            "count": len(palette),
+            "bands": cloud.degree,
+            "codebook": _numbers(codes),
+            "files": [centroids, picture("shN_labels.webp", pairs)],
+        }
+    return _zipped(meta, images)
+
+
+def _numbers(codes: np.ndarray) -> list[float]:
+    return [float(f"{code:.6g}") for code in codes]
+
+
+def _palette(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
+    rows = cloud.rest.reshape(len(cloud), -1)
+    count = min(_LARGEST_PALETTE, max(_ROW, len(rows) // _SHARED_BY))
+    seen = cloud.visibility
+    return row_palette(rows, seen / max(float(seen.mean()), 1e-30) + 1e-6, count)
+
+
+def _zipped(meta: Mapping[str, Any], images: Mapping[str, np.ndarray]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        # a fixed time, so that the same splat gives the same bytes
+        archive.writestr(zipfile.ZipInfo(_META), json.dumps(meta))
+        for name, pixels in images.items():
+            order = [2, 1, 0, 3][: pixels.shape[2]]
+            _, data = cv2.imencode(".webp", np.ascontiguousarray(pixels[..., order]), _LOSSLESS)
+            archive.writestr(zipfile.ZipInfo(name), data.tobytes())
+    return buffer.getvalue()
+
+
+def decode(data: bytes, path: Path) -> Cloud:
+    """Read SOG, as one file.
+
+    Args:
+        data: the file's bytes.
+        path: its name, for errors.
+
+    Raises:
+        PopError: it is damaged, of another version, or an image does not fit; names the entry.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            return _read(archive, path)
+    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
+        raise PopError(f"{path}: is no readable ZIP file ({error}); {_WRITE_AGAIN}") from error
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+        if isinstance(error, PopError):
+            raise
+        raise PopError(f"{path}: {_META} is not that of SOG version 2 ({error!r}); {_WRITE_AGAIN}") from error
+
+
+def _read(archive: zipfile.ZipFile, path: Path) -> Cloud:
+    if archive.getinfo(_META).file_size > _LARGEST_META:
+        raise PopError(f"{path}: {_META} has {archive.getinfo(_META).file_size} bytes; {_WRITE_AGAIN}")
+    meta = json.loads(archive.read(_META))
+    if meta.get("version") != 2:
+        raise PopError(
+            f"{path}: {_META}.version is {meta.get('version')}; write it as version 2, which this program reads"
+        )
+    n = meta["count"]
+    if not isinstance(n, int) or n < 0:
+        raise PopError(f"{path}: {_META}.count is {n}; it must be a number of Gaussians: {_WRITE_AGAIN}")
+
+    def pixels(entry: str, index: int, least: int = n) -> np.ndarray:
+        return _pixels(archive, str(meta[entry]["files"][index]), least, path)[:least]
+
+    low, high = (np.array(meta["means"][end], np.float64).reshape(3) for end in ("mins", "maxs"))
+    fixed = pixels("means", 0)[:, :3] + 256.0 * pixels("means", 1)[:, :3]
+    means = low + fixed / 65535.0 * (high - low)
+    rotations, colors = pixels("quats", 0), pixels("sh0", 0)
+    modes = rotations[:, 3].astype(np.int64) - _FIRST_ROTATION
+    if n and modes.min() < 0:
+        row = int(modes.argmin())
+        raise PopError(f"{path}: quats of Gaussian {row} has the mode {rotations[row, 3]}; it must be 252 to 255")
+    three = (rotations[:, :3] / 255.0 - 0.5) * math.sqrt(2.0)
+    cloud = Cloud(
+        means=(np.sign(means) * np.expm1(np.abs(means))).astype(np.float32),
+        log_scales=_codes(meta, "scales")[pixels("scales", 0)[:, :3]],
+        quats=restore_largest(modes, three).astype(np.float32),
+        logits=logits_of_bytes(colors[:, 3]),
+        sh0=_codes(meta, "sh0")[colors[:, :3]],
+        rest=_rest(meta, pixels, path) if "shN" in meta else np.zeros((n, 0, 3), np.float32),
+        antialiased=bool(meta.get("antialias", False)),
+    )
+    return cloud.checked(path)
+
+
+def _codes(meta: Mapping[str, Any], entry: str) -> np.ndarray:
+    return np.array(meta[entry]["codebook"], np.float32).reshape(256)
+
+
+def _rest(meta: Mapping[str, Any], pixels: Any, path: Path) -> np.ndarray:
+    count, bands = meta["shN"]["count"], meta["shN"]["bands"]
+    if bands not in (1, 2, 3) or not 0 < count <= _LARGEST_PALETTE:
+        raise PopError(f"{path}: {_META}.shN has {count} rows of {bands} bands; 1 to 65536 of 1 to 3 are allowed")
+    each = COEFFICIENTS[bands]
+    palette = _codes(meta, "shN")[pixels("shN", 0, count * each)[:, :3]].reshape(count, each, 3)
+    labels = pixels("shN", 1)[:, :2].astype(np.int64) @ np.array([1, 256])
+    if len(labels) and labels.max() >= count:
+        raise PopError(f"{path}: shN_labels names row {labels.max()} of a palette of {count}; {_WRITE_AGAIN}")
+    return palette[labels]
+
+
+def _pixels(archive: zipfile.ZipFile, name: str, least: int, path: Path) -> np.ndarray:
+    """Return an image's pixels in reading order, with four channels. uint8 [M, 4]"""
+    data = archive.read(name)
+    width, height = _size(data)
+    if width * height < least:
+        raise PopError(f"{path}: {name} is {width}x{height} pixels; {least} are needed: {_WRITE_AGAIN}")
+    if width * height > 4 * least + 2**16:
+        raise PopError(f"{path}: {name} is {width}x{height} pixels for {least} values; {_WRITE_AGAIN}")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim != 3 or image.dtype != np.uint8 or image.shape[0] * image.shape[1] < least:
+        raise PopError(f"{path}: {name} cannot be decoded as an image of colours; {_WRITE_AGAIN}")
+    flat = image[..., [2, 1, 0]].reshape(-1, 3)
+    # where all are opaque, there may be no fourth channel
+    fourth = image[..., 3].reshape(-1, 1) if image.shape[2] == 4 else np.full((len(flat), 1), 255, np.uint8)
+    return np.concatenate([flat, fourth], axis=1)
+
+
+def _size(data: bytes) -> tuple[int, int]:
+    """Return the width and the height that a WebP file states, 0 where it is none."""
+    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 30:
+        return 0, 0
+    kind = data[12:16]
+    if kind == b"VP8L" and data[20] == 0x2F:
+        bits = struct.unpack("<I", data[21:25])[0]
+        return (bits & 0x3FFF) + 1, ((bits >> 14) & 0x3FFF) + 1
+    if kind == b"VP8X":
+        width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
+        return width, height
+    if kind == b"VP8 ":
+        width, height = struct.unpack("<HH", data[26:30])
+        return width & 0x3FFF, height & 0x3FFF
+    return 0, 0

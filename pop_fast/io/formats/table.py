@@ -1,0 +1,163 @@
+"""The file formats of splats: names, what each keeps and loses, and the functions that write and read it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from pop_fast.io.formats import compressed_ply, dot_splat, gltf, sog, spz
+from pop_fast.io.formats.cloud import Cloud, morton_order
+
+
+@dataclass(frozen=True)
+class Format:
+    """A file format.
+
+    Attributes:
+        name: as `--to` takes it.
+        suffix: of its files.
+        title: what people call it.
+        source: where it is described.
+        size: bytes a Gaussian before general compression, without and with colours of degree 3.
+        losses: by field, what a round trip changes.
+        readers: programs that open it.
+        encode: makes a file's bytes of Gaussians in the file's order.
+        decode: reads them; the path is for errors.
+        order: of the Gaussians in the file; None keeps theirs.
+    """
+
+    name: str
+    suffix: str
+    title: str
+    source: str
+    size: tuple[str, str]
+    losses: Mapping[str, str]
+    readers: str
+    encode: Callable[[Cloud], bytes]
+    decode: Callable[[bytes, Path], Cloud]
+    order: Callable[[Cloud], np.ndarray] | None = None
+
+
+def _by_place(cloud: Cloud) -> np.ndarray:
+    return morton_order(cloud.means)
+
+
+_BYTE_OPACITY: Final = "half of 1/255"
+_SPZ_LOSSES: Final = {
+    "centre": "half of 2^-b units; b is the largest up to 20 that the farthest centre leaves",
+    "scale": "factor within 3.2 %, between 4.5e-5 and 380 units",
+    "rotation": "0.28° (10 bits a component)",
+    "opacity": _BYTE_OPACITY,
+    "colour": "half of 1/136 (degree 0), cut off at -0.44 and 1.44",
+    "view dependence": "coefficients in [-1, 1], within 1/100 of a Gaussian that is well seen, coarser the less it is, "
+    "down to 1/4",
+}
+
+FORMATS: Final[Mapping[str, Format]] = {
+    format.name: format
+    for format in (
+        Format(
+            name="compressed-ply",
+            suffix=".compressed.ply",
+            title="PlayCanvas compressed PLY",
+            source="https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/ply",
+            size=("16.3", "61.3"),
+            losses={
+                "centre": "half of 1/2047 (y: 1/1023) of its chunk's extent",
+                "scale": "logarithm within half of 1/2047 (y: 1/1023) of its chunk's range, in [-20, 20]",
+                "rotation": "0.28° (10 bits a component)",
+                "opacity": _BYTE_OPACITY,
+                "colour": "half of 1/255 of its chunk's range (degree 0)",
+                "view dependence": "coefficients in [-4, 4], within 1/64; none is 0",
+            },
+            readers="SuperSplat, PlayCanvas, Spark, GaussianSplats3D",
+            encode=compressed_ply.encode,
+            decode=compressed_ply.decode,
+            order=compressed_ply.chunked,
+        ),
+        Format(
+            name="spz",
+            suffix=".spz",
+            title="Niantic SPZ, version 3",
+            source="https://github.com/nianticlabs/spz",
+            size=("20, then gzip", "65, then gzip"),
+            losses=_SPZ_LOSSES,
+            readers="Scaniverse, SuperSplat, Babylon.js, Spark, Cesium",
+            encode=spz.encode,
+            decode=spz.decode,
+            order=_by_place,
+        ),
+        Format(
+            name="sog",
+            suffix=".sog",
+            title="PlayCanvas SOG, version 2",
+            source="https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog",
+            size=("17, then WebP", "19 and a palette, then WebP"),
+            losses={
+                "centre": "half of 1/65535 of the scene's extent in sign(x) log(1 + abs(x))",
+                "scale": "nearest of 256 numbers that are fitted to the splat",
+                "rotation": "1.1° (8 bits a component)",
+                "opacity": _BYTE_OPACITY,
+                "colour": "nearest of 256 numbers that are fitted to the splat (degree 0); lost where the opacity is 0",
+                "view dependence": "nearest row of a fitted palette, one for two Gaussians, at most 65,536",
+            },
+            readers="SuperSplat, PlayCanvas, Babylon.js, Spark",
+            encode=sog.encode,
+            decode=sog.decode,
+            order=_by_place,
+        ),
+        Format(
+            name="splat",
+            suffix=".splat",
+            title="antimatter15 .splat",
+            source="https://github.com/antimatter15/splat",
+            size=("32", "32"),
+            losses={
+                "centre": "none",
+                "scale": "rounding to float32",
+                "rotation": "1.2° (8 bits a component)",
+                "opacity": _BYTE_OPACITY,
+                "colour": "half of 1/255 (degree 0), cut off at 0 and 1",
+                "view dependence": "all of it",
+            },
+            readers="antimatter15/splat, SuperSplat, Babylon.js, Spark, viser",
+            encode=dot_splat.encode,
+            decode=dot_splat.decode,
+            order=dot_splat.largest_first,
+        ),
+        Format(
+            name="gltf",
+            suffix=".glb",
+            title="glTF with KHR_gaussian_splatting",
+            source=f"https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/{gltf.NAME}",
+            size=("60", "240"),
+            losses={
+                "centre": "none",
+                "scale": "rounding to float32",
+                "rotation": "none",
+                "opacity": "rounding to float32, at most 1 - 2^-24",
+                "colour": "none",
+                "view dependence": "none",
+            },
+            readers="Babylon.js, PlayCanvas, Cesium; others show points",
+            encode=gltf.encode,
+            decode=gltf.decode,
+        ),
+        Format(
+            name="gltf-spz",
+            suffix=".glb",
+            title=f"glTF with {gltf.SPZ_NAME} (a draft)",
+            source=f"https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/{gltf.SPZ_NAME}",
+            size=("19, then gzip", "64, then gzip"),
+            losses={**_SPZ_LOSSES, "rotation": "2.6° (xyz as bytes), up to 14° within 72° of a half turn"},
+            readers="Cesium",
+            encode=gltf.encode_spz,
+            decode=gltf.decode,
+            order=_by_place,
+        ),
+    )
+}

@@ -1,0 +1,198 @@
+"""What an image file says of itself before a pixel is decoded: its size, and its EXIF tags.
+
+A few kilobytes of header decide how much memory decoding takes, so the size is held against what is expected first.
+JPEG, PNG, WebP, BMP and TIFF are read; of any other or damaged file nothing is told, and the decoder judges it.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+__all__ = ["LARGEST", "Exif", "read_exif", "read_size", "size_of"]
+
+# pixels of one photograph: more than cameras have, and under 1 GiB decoded
+LARGEST: Final = 2**28
+_PNG: Final = b"\x89PNG\r\n\x1a\n"
+_TIFF: Final = {b"II*\0": "<", b"MM\0*": ">"}
+# start-of-frame markers; the others of the range are tables
+_FRAMES: Final = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
+# bytes of a value, by the type of its TIFF tag
+_WIDTHS: Final = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 7: 1, 9: 4, 10: 8}
+_LETTERS: Final = {1: "B", 3: "H", 4: "I", 9: "i"}
+_WIDTH, _HEIGHT, _MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x100, 0x101, 0x10F, 0x110, 0x112, 0x8769
+_EXPOSURE, _ISO, _FOCAL, _FOCAL_35MM = 0x829A, 0x8827, 0x920A, 0xA405
+# a JPEG holds its tags in segments of 64 kB before its pixels; TIFF and WebP may hold them anywhere
+_HEAD: Final = 2**20
+
+
+@dataclass(frozen=True)
+class Exif:
+    """What a camera wrote into a photograph; None where it did not.
+
+    Attributes:
+        orientation: 1 as stored, 3 half a turn, 6 a quarter turn clockwise to be upright, 8 counterclockwise; 2, 4, 5
+            and 7 are mirrored.
+        camera: make and model.
+        exposure: seconds.
+        iso: sensitivity.
+        focal: focal length, mm.
+        focal_35mm: focal length of the same view on 35 mm film, mm.
+    """
+
+    orientation: int = 1
+    camera: str | None = None
+    exposure: float | None = None
+    iso: float | None = None
+    focal: float | None = None
+    focal_35mm: float | None = None
+
+
+def read_size(path: Path) -> tuple[int, int] | None:
+    """Return width and height in px by the file's header, or None where it tells none."""
+    try:
+        with open(path, "rb") as file:
+            head = file.read(_HEAD)
+            return size_of(head) or (size_of(head + file.read()) if head[:4] in _TIFF else None)
+    except OSError:
+        return None
+
+
+def size_of(data: bytes) -> tuple[int, int] | None:
+    """Return width and height in px by a file's first bytes, or None where they tell none."""
+    try:
+        if data.startswith(_PNG):
+            return struct.unpack_from(">II", data, 16)
+        if data.startswith(b"\xff\xd8"):
+            return next((size for marker, size in _jpeg(data) if marker in _FRAMES), None)
+        if data.startswith(b"BM"):
+            width, height = struct.unpack_from("<ii", data, 18)
+            return width, abs(height)
+        if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
+            return _webp_size(data)
+        if data[:4] in _TIFF:
+            tags = _tags(data, 0)
+            return int(tags[_WIDTH]), int(tags[_HEIGHT])
+    except (struct.error, KeyError, ValueError, TypeError):
+        return None
+    return None
+
+
+def read_exif(path: Path) -> Exif:
+    """Read the EXIF tags of a photograph; those of a file without any, or a damaged one, are absent."""
+    try:
+        with open(path, "rb") as file:
+            data = file.read(_HEAD)
+            if not data.startswith(b"\xff\xd8"):
+                data += file.read()
+        at = _exif_at(data)
+        if at is None:
+            return Exif()
+        tags = _tags(data, at)
+        own = _tags(data, at, int(tags[_EXIF_IFD])) if _EXIF_IFD in tags else {}
+    except (OSError, struct.error, ValueError, KeyError, TypeError):
+        return Exif()
+    maker, model = (tags[key] if isinstance(tags.get(key), str) else "" for key in (_MAKE, _MODEL))
+    camera = model if model.startswith(maker) else f"{maker} {model}".strip()
+    turned = tags.get(_ORIENTATION, 1)
+    return Exif(
+        int(turned) if turned in range(1, 9) else 1,
+        camera or None,
+        _number(own, _EXPOSURE),
+        _number(own, _ISO),
+        _number(own, _FOCAL),
+        _number(own, _FOCAL_35MM),
+    )
+
+
+def _number(tags: dict[int, Any], key: int) -> float | None:
+    value = tags.get(key)
+    return float(value) if isinstance(value, (int, float)) and 0.0 < value < math.inf else None
+
+
+def _jpeg(data: bytes) -> list[tuple[int, Any]]:
+    """List a JPEG's segments before its pixels: marker, and the size of a frame or else where its content begins."""
+    found: list[tuple[int, Any]] = []
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
+        marker = data[at + 1]
+        if marker == 0xFF:  # fill byte
+            at += 1
+            continue
+        if marker in _FRAMES:
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            found.append((marker, (width, height)))
+        else:
+            found.append((marker, at + 4))
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return found
+
+
+def _webp_size(data: bytes) -> tuple[int, int] | None:
+    kind = data[12:16]
+    if kind == b"VP8X":
+        width, height = (int.from_bytes(data[at : at + 3], "little") for at in (24, 27))
+        return width + 1, height + 1
+    if kind == b"VP8L":
+        (bits,) = struct.unpack_from("<I", data, 21)
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    if kind == b"VP8 ":
+        width, height = struct.unpack_from("<HH", data, 26)
+        return width & 0x3FFF, height & 0x3FFF
+    return None
+
+
+def _exif_at(data: bytes) -> int | None:
+    """Find where the TIFF block of EXIF tags begins."""
+    if data[:4] in _TIFF:
+        return 0
+    if data.startswith(b"\xff\xd8"):
+        starts = [at for marker, at in _jpeg(data) if marker == 0xE1 and data[at : at + 6] == b"Exif\0\0"]
+        return starts[0] + 6 if starts else None
+    if data.startswith(_PNG):
+        return _chunk(data, 8, b"eXIf", ">I", 4, 0)
+    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
+        at = _chunk(data, 12, b"EXIF", "<I", 0, 4)
+        return at + 6 if at is not None and data[at : at + 6] == b"Exif\0\0" else at
+    return None
+
+
+def _chunk(data: bytes, at: int, name: bytes, form: str, name_at: int, length_at: int) -> int | None:
+    """Find the content of a PNG's or a WebP's chunk of this name."""
+    while at + 8 <= len(data):
+        (length,) = struct.unpack_from(form, data, at + length_at)
+        if data[at + name_at : at + name_at + 4] == name:
+            return at + 8
+        # a PNG's chunk ends in a checksum, a WebP's is filled up to an even length
+        at += 8 + length + (4 if name_at else length % 2)
+    return None
+
+
+def _tags(data: bytes, base: int, offset: int | None = None) -> dict[int, Any]:
+    """Read one TIFF directory: by tag, a text or the first of its numbers.
+
+    Raises:
+        struct.error: it leads out of the file.
+        KeyError: no TIFF block begins at `base`.
+    """
+    order = _TIFF[data[base : base + 4]]
+    start = base + (struct.unpack_from(f"{order}I", data, base + 4)[0] if offset is None else offset)
+    (count,) = struct.unpack_from(f"{order}H", data, start)
+    found: dict[int, Any] = {}
+    for entry in range(start + 2, start + 2 + 12 * count, 12):
+        tag, kind, length = struct.unpack_from(f"{order}HHI", data, entry)
+        if kind not in _WIDTHS:
+            continue
+        inline = _WIDTHS[kind] * length <= 4
+        at = entry + 8 if inline else base + struct.unpack_from(f"{order}I", data, entry + 8)[0]
+        if kind == 2:
+            found[tag] = data[at : at + min(length, 256)].split(b"\0")[0].decode("utf-8", "replace").strip()
+        elif kind in (5, 10):
+            over, under = struct.unpack_from(f"{order}{'II' if kind == 5 else 'ii'}", data, at)
+            found[tag] = over / under if under else math.nan
+        elif kind != 7:
+            (found[tag],) = struct.unpack_from(order + _LETTERS[kind], data, at)
+    return found

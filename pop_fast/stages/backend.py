@@ -1,0 +1,37 @@
+"""Backends on the CPU: torch's stages, and the engine that trains by autograd over them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from pop_fast.api.plugin import DrawingBackend
+
+if TYPE_CHECKING:
+    from pop_fast.stages.stage_set import Stages
+
+
+@dataclass(frozen=True)
+class TorchBackend(DrawingBackend):
+    """Draws with torch on the CPU."""
+
+    def stages(self) -> Stages:
+        """Return torch's stages."""
+        from pop_fast.stages.stage_set import Stages
+
+        return Stages()
+
+    def open_view(self, of: Any) -> Any:
+        """Project and list a view for passes over it."""
+        from pop_fast.stages.passes import view_of
+
+        return view_of(of, self.stages())
+
+    def make_engine(self, config: Any, own_strategy: bool) -> Any:
+        """Return autograd over the stages, which knows every setting."""
+        from pop_fast.train.engines import torch_engine
+
+        return torch_engine(self)
+
+
+FAST: Final = TorchBackend("fast", "cpu", ("float32", "float64"), speed=0)

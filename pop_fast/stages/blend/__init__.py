@@ -1,0 +1,1 @@
+"""Front-to-back blending in torch: alpha, tiles in groups, the walk through their lists, and reused buffers."""

@@ -1,0 +1,278 @@
+"""Front-to-back blending of a group of tiles with early ray termination, and its transpose.
+
+Meaning: `pop_ref.compositing`.
+One step of the blend takes a group of tiles, K list entries and all pixels of a tile, in this order:
+
+    alpha = 2^(coefficients @ basis), 0 under the floor (D5), the ceiling at most (D6)
+    T[k + 1] = T[k] - T[k] alpha[k];  where T[k + 1] passes the stop (D7): alpha[k] = 0
+    weight[k] = T[k] alpha[k];  image += colours @ weight
+
+T is the light that is still worth blending into. It never grows, so that the alphas of the terminating splat and of
+all behind it become 0 at once; at the end of the step a T that passed the stop becomes 0, too.
+
+Nothing of a step is kept but the light before it, 4 bytes for K pairs: the transpose makes alphas and weights anew
+in buffers that stay in the cache, which is cheaper than a way through memory and back. It goes back to front with one
+number per pixel, B, the light from behind dotted with the pixel's gradient:
+
+    q[k] = colour[k] . v_image - B;  B += alpha[k] q[k];  G[k] = weight[k] q[k]
+
+G = alpha dL/dalpha; its six moments over a tile's pixels give every geometric gradient (`alpha.splat_gradients`).
+There is no division by 1 - alpha.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from pop_fast.stages.blend import buffers
+from pop_fast.stages.blend.active_tiles import ActiveTiles
+from pop_fast.stages.blend.alpha import Entries, exponent_coefficients, pixel_basis
+from pop_fast.stages.blend.tile_groups import BLOCK, TileGroup
+from pop_fast.stages.blend.transmittance import Stop, below, count_passed, weights_of_alphas
+from pop_fast.stages.dominance import Dominance
+from pop_ref.constants import Profile
+
+COMPACT_BELOW = 0.8  # share of live tiles under which the group is compacted
+
+
+@dataclass(frozen=True)
+class Step:
+    """One blended step, as the transpose needs it.
+
+    Attributes:
+        blocks: of eight entries each, the null block where a list has ended. [n, K / 8]
+        rows: which of the group's tiles took part: the first `n` of these, or of all when None.
+        light: T before the step; belongs to the buffers. [n, P]
+    """
+
+    blocks: Tensor
+    rows: Tensor | None
+    light: Tensor
+
+
+@dataclass
+class GroupBlend:
+    """What blending a group gives.
+
+    Attributes:
+        image: weighted colours and, last, the sum of weights. [G, D + 1, P]
+        steps: front to back.
+        n_blended: [G, P], when counted.
+        n_passed: list entries that the pixel went past without stopping. [G, P], when counted.
+        dominant_weights: the largest weights, when asked for. [G, P]
+        dominant_places: and their places in the tile's list, -1 where nothing was blended. [G, P]
+        n_pairs: (entry, pixel) pairs evaluated.
+    """
+
+    image: Tensor
+    steps: list[Step] = field(default_factory=list)
+    n_blended: Tensor | None = None
+    n_passed: Tensor | None = None
+    dominant_weights: Tensor | None = None
+    dominant_places: Tensor | None = None
+    n_pairs: int = 0
+
+
+@dataclass(frozen=True)
+class Blender:
+    """The fixed numbers of a blend.
+
+    Attributes:
+        table: per entry, the exponent's coefficients, the colours and a 1, in blocks of eight. [B, 8, 6 + D + 1]
+        basis: pixel basis. [6, P]
+        profile: constants and strictness.
+        clamps: whether any alpha can pass the ceiling.
+    """
+
+    table: Tensor
+    basis: Tensor
+    profile: Profile
+    clamps: bool
+
+    @classmethod
+    def of(cls, entries: Entries, conics: Tensor, opacities: Tensor, colors: Tensor, profile: Profile) -> Blender:
+        """Make what blends entries of splats in the precision of their colours; padding has any colour."""
+        ids, n_colors = entries.lists.ids, colors.shape[1]
+        table = colors.new_empty((len(ids), 6 + n_colors + 1))
+        table[:, :6] = exponent_coefficients(entries, conics, opacities).T
+        table[:, 6:-1] = torch.cat((colors, colors.new_zeros((1, n_colors)))).index_select(0, ids)
+        table[:, -1] = 1.0
+        basis = pixel_basis(entries.lists.tile_size, colors.dtype)
+        clamps = bool((opacities > profile.alpha_ceiling).any())
+        return cls(table.view(-1, BLOCK, table.shape[1]), basis, profile, clamps)
+
+    @property
+    def stop(self) -> Stop:
+        """Return the transmittance that a pixel must stay above."""
+        return Stop.of(self.profile, self.table.dtype)
+
+    def blend(self, group: TileGroup, counted: bool = False, dominance: bool = False, keep: bool = True) -> GroupBlend:
+        """Blend a group front to back; `keep` what the transpose needs."""
+        active = self._active(group, counted, dominance)
+        dominant = Dominance(self.table.dtype)
+        steps: list[Step] = []
+        start, n_pairs = 0, 0
+        with buffers.acquired(2, group.slab, self.table.dtype) as scratch:
+            while start < len(group.reached) and (n := active.count_below(group.reached[start])) > 0:
+                blocks = group.blocks(active.rows, n, start, group.step_blocks(start, n))
+                entries, light = self._entries(blocks), active["light"][:n]
+                alpha, lights = _shaped(scratch, entries, group.n_pixels)
+                self._alphas(entries, alpha)
+                if counted:
+                    active["n_passed"][:n].add_(count_passed(alpha, light, self.stop))
+                before = buffers.copy(light)
+                weight = self._weights(alpha, lights, before)
+                torch.ops.aten.threshold.out(lights[:, -1], self.stop.at, 0.0, out=light)
+                active["image"][:n].baddbmm_(entries[:, :, 6:].transpose(1, 2), weight)
+                if counted:
+                    active["n_blended"][:n].add_((weight > 0.0).sum(1))
+                if dominance:
+                    dominant.see(weight, start * BLOCK, active["best"][:n], active["codes"][:n], alpha)
+                start += blocks.shape[1]
+                n_pairs += weight.numel()
+                if keep:
+                    steps.append(Step(blocks, active.rows, before))
+                else:
+                    buffers.release(before)
+                active.drop(n, light, COMPACT_BELOW)
+        return self._result(active.whole(), steps, n_pairs)
+
+    def _active(self, group: TileGroup, counted: bool, dominance: bool) -> ActiveTiles:
+        size = (len(group.tiles), self.basis.shape[1])
+        states = {
+            "light": self.basis.new_ones(size),
+            "image": self.basis.new_zeros((size[0], self.table.shape[2] - 6, size[1])),
+        }
+        if counted:
+            states |= {name: torch.zeros(size, dtype=torch.int64) for name in ("n_blended", "n_passed")}
+        if dominance:
+            states |= {"best": self.basis.new_zeros(size), "codes": self.basis.new_full(size, -1.0)}
+        return ActiveTiles(states)
+
+    @staticmethod
+    def _result(states: dict[str, Tensor], steps: list[Step], n_pairs: int) -> GroupBlend:
+        codes = states.get("codes")
+        return GroupBlend(
+            states["image"],
+            steps,
+            states.get("n_blended"),
+            states.get("n_passed"),
+            states.get("best"),
+            None if codes is None else Dominance.places(codes),
+            n_pairs,
+        )
+
+    def _entries(self, blocks: Tensor) -> Tensor:
+        """Gather a step's rows of the table. [n, K, 6 + D + 1]"""
+        return self.table.index_select(0, blocks.view(-1)).view(len(blocks), -1, self.table.shape[2])
+
+    def _alphas(self, entries: Tensor, alpha: Tensor) -> None:
+        flat = alpha.view(-1, alpha.shape[2])
+        torch.mm(entries.view(len(flat), entries.shape[2])[:, :6], self.basis, out=flat)
+        flat.exp2_()
+        torch.threshold_(flat, below(self.profile.alpha_floor, flat.dtype), 0.0)
+        if self.clamps:
+            flat.clamp_max_(self.profile.alpha_ceiling)
+
+    def _weights(self, alpha: Tensor, lights: Tensor, before: Tensor) -> Tensor:
+        lights[:, 0] = before
+        return weights_of_alphas(alpha, lights, self.stop)
+
+    def transpose(
+        self, group: TileGroup, blend: GroupBlend, v_image: Tensor, absolute: bool
+    ) -> Iterator[tuple[Tensor, Tensor]]:
+        """Pull the cotangent of a group's image ([G, D + 1, P]) back to its entries, step by step, back to front.
+
+        Yields:
+            Blocks [n K / 8] and their rows [n K / 8, 6 + D (+ 2), 8]: six moments of G, the gradient to the
+            colours and, when asked for, the sums of absolute gradients along x and y.
+        """
+        active = ActiveTiles({"behind": v_image.new_zeros((v_image.shape[0], v_image.shape[2])), "v": v_image})
+        with buffers.acquired(3, group.slab, self.table.dtype) as scratch:
+            for step in reversed(blend.steps):
+                active.select(step.rows)
+                n = len(step.blocks)
+                v, behind = active["v"][:n], active["behind"][:n]
+                entries, alpha, weight, q = self.again(group, step, scratch)
+                torch.bmm(entries[:, :, 6:], v, out=q)
+                for a, q_k in zip(reversed(alpha.unbind(1)), reversed(q.unbind(1)), strict=True):
+                    q_k.sub_(behind)
+                    behind.addcmul_(a, q_k)
+                # nothing lies behind a pixel that had stopped before this step
+                torch.ops.aten.threshold_backward.grad_input(behind, step.light, 0.0, grad_input=behind)
+                buffers.release(step.light)
+                yield step.blocks.view(-1), self._rows(entries, alpha, weight, q, v, absolute)
+
+    def again(self, group: TileGroup, step: Step, scratch: list[Tensor]) -> list[Tensor]:
+        """Blend a step that was kept once more.
+
+        Args:
+            group: whose step it is.
+            step: of a `blend` that kept what the transpose needs; its light stays.
+            scratch: two of `group.slab` numbers, or three.
+
+        Returns:
+            The entries' rows of the table [n, K, 6 + D + 1], and in the scratch their alphas and weights, both 0 from
+            where a pixel stops [n, K, P], and of a third slab as much.
+        """
+        entries = self._entries(step.blocks)
+        alpha, lights, *rest = _shaped(scratch, entries, group.n_pixels)
+        self._alphas(entries, alpha)
+        return [entries, alpha, self._weights(alpha, lights, step.light), *rest]
+
+    def _rows(self, entries: Tensor, alpha: Tensor, weight: Tensor, q: Tensor, v: Tensor, absolute: bool) -> Tensor:
+        n_colors, n_rows = v.shape[1] - 1, q.shape[0] * q.shape[1]
+        rows = q.new_empty((len(q), q.shape[1] // BLOCK, 6 + n_colors + 2 * absolute, BLOCK))
+        # [n, D, K] and, below, [6, n K], each cut into blocks
+        by_color = torch.bmm(v[:, :-1], weight.transpose(1, 2)).view(len(q), n_colors, -1, BLOCK)
+        rows[:, :, 6 : 6 + n_colors] = by_color.transpose(1, 2)
+        rows = rows.view(-1, rows.shape[2], BLOCK)
+        g = q.mul_(weight)
+        flat = entries.view(n_rows, entries.shape[2])[:, :6]
+        self.pass_ceiling(flat, alpha, g)
+        pairs = g.view(n_rows, g.shape[2])
+        rows[:, :6] = torch.mm(self.basis, pairs.T).view(6, -1, BLOCK).transpose(0, 1)
+        if absolute:
+            rows[:, 6 + n_colors :] = self._absolute(flat, pairs).view(2, -1, BLOCK).transpose(0, 1)
+        return rows
+
+    def pass_ceiling(self, coefficients: Tensor, alpha: Tensor, g: Tensor) -> None:
+        """Apply the profile's gradient rule to clamped alphas (B3), in place.
+
+        Args:
+            coefficients: of the exponents. [n K, 6]
+            alpha: clamped. [n, K, P]
+            g: alpha dL/dalpha, in and out. [n, K, P]
+        """
+        if not self.clamps:
+            return
+        ceiling = self.profile.alpha_ceiling
+        if self.profile.ceiling_gradient == "zero":
+            torch.ops.aten.hardtanh_backward.grad_input(g, alpha, -1.0, ceiling, grad_input=g)
+        else:
+            # passed through as if unclamped: G carries the clamped alpha, the chain rule wants the raw one
+            raw = torch.exp2(coefficients @ self.basis)
+            g.mul_((raw / ceiling).clamp_min_(1.0).view_as(g))
+
+    def _absolute(self, coefficients: Tensor, g: Tensor) -> Tensor:
+        """Sum |dL/du| and |dL/dv| over the pixels of each entry. [2, n K]"""
+        rows = coefficients / math.log2(math.e)
+        zero = torch.zeros_like(rows[:, 0])
+        # the derivative of sigma along x and y, again as coefficients of (1, x, y)
+        along = (
+            torch.stack((rows[:, 1], 2.0 * rows[:, 3], rows[:, 4], zero, zero, zero), 1),
+            torch.stack((rows[:, 2], rows[:, 4], 2.0 * rows[:, 5], zero, zero, zero), 1),
+        )
+        return torch.stack([(g * (c @ self.basis)).abs_().sum(1) for c in along])
+
+
+def _shaped(scratch: list[Tensor], entries: Tensor, n_pixels: int) -> list[Tensor]:
+    """Shape scratch: alphas [n, K, P], lights [n, K + 1, P] and, if there is a third, another like the first."""
+    n, length, _ = entries.shape
+    lengths = (length, length + 1, length)
+    return [slab[: n * k * n_pixels].view(n, k, n_pixels) for slab, k in zip(scratch, lengths, strict=False)]

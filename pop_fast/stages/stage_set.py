@@ -1,0 +1,142 @@
+"""The stages of a backend on the CPU: functions that may each be torch's or compiled, and a view made of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pop_fast.stages.chord import DominantPoints, dominant_points
+from pop_fast.stages.compositing import Composite, composite
+from pop_fast.stages.contributions import Contributions, contributions
+from pop_fast.stages.fisher import screen_moments
+from pop_fast.stages.sensitivity import sensitivities
+from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of, colors_of_view, covariances, project
+from pop_fast.stages.tiles import TileLists, tile_lists
+
+SMALL_TILE, LARGE_TILE = 8, 16  # px
+SMALL_TILE_BELOW = 14.0  # px, root mean square extent of the visible splats; see benchmarks/NOTES.md
+
+
+def torchs_tile(radii: Tensor) -> int:
+    """Choose the tile that torch blends the cheapest, px; the image does not depend on it.
+
+    Args:
+        radii: extents of the splats, px, 0 where culled. [N, 2]
+    """
+    visible = (radii > 0).all(1)
+    area = (radii * visible[:, None]).to(torch.float64).prod(1).sum() / visible.sum().clamp_min(1)
+    return SMALL_TILE if math.sqrt(float(area)) < SMALL_TILE_BELOW else LARGE_TILE
+
+
+def large_tile(radii: Tensor) -> int:
+    """Return the tile whose rows are one vector of the compiled blend, px; it passes over rows that a splat misses."""
+    return LARGE_TILE
+
+
+@dataclass(frozen=True)
+class Stages:
+    """Functions with the signatures and results of the torch path's, which are the defaults.
+
+    It draws views as `pop_fast.api.backend.ViewStages` says.
+
+    Attributes:
+        covariances: as `pop_fast.stages.splatting.covariances`.
+        project: as `pop_fast.stages.splatting.project`.
+        colors_of_view: as `pop_fast.stages.splatting.colors_of_view`.
+        list_tiles: as `pop_fast.stages.tiles.tile_lists`.
+        composite: as `pop_fast.stages.compositing.composite`.
+        blend_tile: given the splats' extents, the tile to blend them in.
+        contributions: as `pop_fast.stages.contributions.contributions`.
+        sensitivities: as `pop_fast.stages.sensitivity.sensitivities`.
+        screen_moments: as `pop_fast.stages.fisher.screen_moments`.
+        dominant_points: as `pop_fast.stages.chord.dominant_points`.
+    """
+
+    covariances: Callable[..., Tensor] = covariances
+    project: Callable[..., Splats] = project
+    colors_of_view: Callable[..., Tensor] = colors_of_view
+    list_tiles: Callable[..., TileLists] = tile_lists
+    composite: Callable[..., Composite] = composite
+    blend_tile: Callable[[Tensor], int] = torchs_tile
+    contributions: Callable[..., Contributions] = contributions
+    sensitivities: Callable[..., Tensor] = sensitivities
+    screen_moments: Callable[..., Tensor] = screen_moments
+    dominant_points: Callable[..., DominantPoints] = dominant_points
+
+    def splats(
+        self,
+        means: Tensor,
+        shapes: Any,
+        opacities: Tensor,
+        colors: Tensor,
+        viewmat: Tensor,
+        settings: ProjectionSettings,
+        sh_degree: int | None,
+    ) -> Splats:
+        """Project Gaussians, and shade the visible ones."""
+        made = self.project(means, shapes, opacities, viewmat, settings)
+        if sh_degree is not None:
+            visible = (made.radii > 0).all(1).nonzero().squeeze(1)
+            colors = self.colors_of_view(colors, means, viewmat, sh_degree, visible)
+        return replace(made, colors=colors)
+
+    def blend(
+        self,
+        rows: Splats,
+        seen: Splats,
+        settings: ProjectionSettings,
+        tile_size: int,
+        background: Tensor | None,
+        *,
+        dominance: bool,
+        counts: bool,
+        absgrad_sink: Tensor | None,
+    ) -> Composite:
+        """List rows by tile and blend them.
+
+        Counting visited entries needs the asked-for tiles and their full lists; without it, entries that reach no pixel
+        are left out, and small splats are listed in small tiles.
+        """
+        own_tile = counts or settings.profile.extent == "square"
+        lists = self.visible_lists(rows, settings, tile_size if own_tile else None, exact=not counts)
+        made = self.composite(
+            *(rows.means2d, rows.conics, rows.opacities, colors_of(rows), lists, settings.width, settings.height),
+            settings.profile,
+            dominance=dominance,
+            counts=counts,
+            absgrad_sink=absgrad_sink,
+        )
+        if background is None:
+            return made
+        return replace(made, image=made.image + (1.0 - made.alphas)[..., None] * background)
+
+    def visible_lists(
+        self, rows: Splats, settings: ProjectionSettings, tile_size: int | None, exact: bool = True
+    ) -> TileLists:
+        """List rows in tiles of that size, None for the cheapest.
+
+        Args:
+            rows: of one view.
+            settings: of the view.
+            tile_size: px, or None.
+            exact: leave out entries that reach no pixel.
+        """
+        shape = {"conics": rows.conics.detach(), "opacities": rows.opacities.detach()} if exact else {}
+        size = self.blend_tile(rows.radii) if tile_size is None else tile_size
+        place = (rows.means2d.detach(), rows.radii, rows.depths.detach(), settings.width, settings.height)
+        return self.list_tiles(*place, size, settings.profile, **shape)
+
+    def tile_lists(self, rows: Splats, settings: ProjectionSettings, tile_size: int) -> TileLists:
+        """List every tile's rows by their extents alone."""
+        # torch's, whatever blends: what meta shows is the same of all backends on the CPU
+        place = (rows.means2d.detach(), rows.radii, rows.depths.detach(), settings.width, settings.height)
+        return tile_lists(*place, tile_size, settings.profile)
+
+    def counts_entries(self, tile_size: int) -> bool:
+        """Visited entries are counted with tiles of any size."""
+        return True

@@ -1,0 +1,248 @@
+"""What `pop eval`, `render` and `export` start from: a result, a checkpoint or a PLY, and the capture it shows."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from pop_fast.errors import PopError
+from pop_fast.train.config import TrainConfig
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from pop_fast.data import Capture
+    from pop_fast.data.capture import Progress
+    from pop_fast.io.ply import Frame
+
+RECORD = "capture.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Splat:
+    """Gaussians and what is known about them.
+
+    Attributes:
+        path: the checkpoint or PLY that was read.
+        params: raw parameters.
+        config: the settings they were trained with; the defaults for a lone file.
+        step: the last step taken, from 0; None for a lone PLY.
+        folder: the result folder it belongs to, if any.
+        frame: the world it is in, where that is known.
+    """
+
+    path: Path
+    params: dict[str, Tensor]
+    config: TrainConfig
+    step: int | None = None
+    folder: Path | None = None
+    frame: Frame | None = None
+
+    @property
+    def sh_degree(self) -> int:
+        """The highest colour band to draw: all that the file has, or those that were active at its step."""
+        degree = {0: 0, 3: 1, 8: 2, 15: 3}[self.params["shN"].shape[1]]
+        if self.step is None or self.folder is None:
+            return degree
+        from pop_fast.train.schedule import active_sh_degree
+
+        return active_sh_degree(self.step, self.config.sh_interval, degree, self.config.strategy.sh_start_iter)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureOptions:
+    """Which photographs and cameras to use; what is not given is as in training."""
+
+    capture: Path | None = None
+    """The capture; by default the one it was trained on."""
+    factor: int | None = None
+    """Photographs are shrunk by it."""
+    test_every: int | None = None
+    """Every n-th view by file name is held out."""
+    images: str | None = None
+    """Read the photographs from this folder of the capture."""
+    missing: Literal["error", "skip"] | None = None
+    """What to do about photographs that are listed but absent."""
+    own_frame: bool = False
+    """The splat is in the capture's own world frame (Inria's trainer, 'pop export'), not in the training frame."""
+
+
+@dataclass(frozen=True)
+class CaptureRecord:
+    """What `pop train` leaves in capture.json: how the capture was read, and its training frame."""
+
+    images: str | None = None
+    missing: Literal["error", "skip"] = "error"
+    masks: bool = True
+    source: Literal["auto", "colmap", "transforms", "photos"] = "auto"
+    world_transform: list[list[float]] = field(default_factory=lambda: np.eye(4).tolist())
+
+
+def record_text(record: CaptureRecord) -> str:
+    """Return what capture.json holds."""
+    return json.dumps(asdict(record), indent=2) + "\n"
+
+
+def read_record(folder: Path | None) -> CaptureRecord | None:
+    """Read capture.json, or None where there is none.
+
+    Raises:
+        PopError: it is damaged; names it.
+    """
+    path = folder / RECORD if folder else None
+    if path is None or not path.is_file():
+        return None
+    try:
+        return CaptureRecord(**json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError, RecursionError) as error:
+        fix = "remove it, and say again how to read the capture (--images, --missing)"
+        raise PopError(f"{path}: is not what 'pop train' writes ({error}); {fix}") from error
+
+
+def load_splat(path: Path) -> Splat:
+    """Read a result folder (its last checkpoint), a checkpoint (ours or gsplat's), a PLY or a file of another format.
+
+    Raises:
+        PopError: none of these, or damaged.
+    """
+    from pop_fast.io.formats import is_splat_file, load_splat_file, splat_suffixes
+    from pop_fast.io.ply import frame_of
+    from pop_fast.train.checkpoint import load_splats
+    from pop_fast.train.results import read_config
+
+    if path.is_dir():
+        return _from_folder(path)
+    if not path.exists():
+        raise PopError(f"{path}: no such file or folder; give a result folder, a checkpoint (.pt) or a PLY")
+    folder = path.resolve().parent.parent
+    owner = folder if (folder / "cfg.json").is_file() else None
+    config = read_config(owner) if owner else TrainConfig()
+    if is_splat_file(path):
+        params, antialiased = load_splat_file(path)
+        config = replace(config, antialiased=antialiased)
+        frame = frame_of(path) if path.suffix.lower() == ".ply" else None
+        return Splat(path=path, params=params, config=config, folder=owner, frame=frame)
+    if path.suffix.lower() == ".pt":
+        params, step = load_splats(path)
+        return Splat(path=path, params=params, config=config, step=step, folder=owner)
+    raise PopError(
+        f"{path}: is neither a result folder nor a checkpoint (.pt) nor a splat ({', '.join(splat_suffixes())})"
+    )
+
+
+def _from_folder(folder: Path) -> Splat:
+    from pop_fast.io.ply import frame_of, load_ply
+    from pop_fast.train.checkpoint import list_checkpoints, load_splats
+    from pop_fast.train.results import read_config
+
+    config = read_config(folder)
+    checkpoints = list_checkpoints(folder)
+    if checkpoints:
+        params, step = load_splats(checkpoints[-1][1])
+        return Splat(path=checkpoints[-1][1], params=params, config=config, step=step, folder=folder)
+    plys = sorted((folder / "ply").glob("point_cloud_*.ply"), key=lambda p: (len(p.name), p.name))
+    if not plys:
+        raise PopError(f"{folder}: holds no checkpoint and no PLY yet; train longer, or continue with --resume")
+    frame = frame_of(plys[-1])
+    return Splat(path=plys[-1], params=load_ply(plys[-1]), config=config, folder=folder, frame=frame)
+
+
+def open_capture(
+    splat: Splat, options: CaptureOptions, progress: Progress | None = None
+) -> tuple[Capture, TrainConfig]:
+    """Load the capture that a splat shows, and give the settings to look at it with.
+
+    Args:
+        splat: what is looked at.
+        options: which photographs and cameras.
+        progress: is told (stage, done, total).
+
+    Raises:
+        PopError: no capture is known, or it cannot be read.
+    """
+    from pop_fast.data import load_capture
+
+    record = read_record(splat.folder) or CaptureRecord()
+    data = str(options.capture or splat.config.data)
+    if not data:
+        raise PopError(f"{splat.path}: nothing says which capture it shows; give --capture DIR")
+    if options.capture is None and not Path(data).is_dir():
+        raise PopError(f"{splat.path}: was trained on {data}, which is not there; give --capture DIR")
+    changes: dict[str, Any] = {"data": data}
+    if options.factor is not None:
+        changes["factor"] = options.factor
+    if options.test_every is not None:
+        changes["test_every"] = options.test_every
+    frame = frame_of_splat(splat, options)
+    if frame is not None:
+        changes["normalize"] = frame == "training"
+    elif splat.path.suffix.lower() != ".pt":
+        told = "says nothing of its world, and is taken to be in pop's training frame"
+        print(f"note: {splat.path}: {told}; that of another program needs --own-frame", file=sys.stderr)
+    config = replace(splat.config, **changes)
+    capture = load_capture(
+        data,
+        factor=config.factor,
+        normalize=config.normalize,
+        masks=record.masks,
+        missing=options.missing or record.missing,
+        background=config.background,
+        progress=progress,
+        source=record.source if options.capture is None else "auto",
+        images=options.images or record.images,
+        resize=config.resize,
+        seed=config.seed,
+    )
+    if config.normalize:
+        _check_same_frame(splat, capture)
+    return capture, config
+
+
+def frame_of_splat(splat: Splat, options: CaptureOptions) -> Literal["capture", "training"] | None:
+    """Tell which world a splat is in: as the command says, else its file, else its run; None where nothing does."""
+    if options.own_frame:
+        return "capture"
+    if splat.frame is not None:
+        return splat.frame.name
+    if splat.folder is None:
+        return None
+    return "training" if splat.config.normalize else "capture"
+
+
+def _check_same_frame(splat: Splat, capture: Capture) -> None:
+    """Refuse a capture that is not normalized as the one that the splat was trained on.
+
+    Raises:
+        PopError: its training frame is another one.
+    """
+    if splat.frame is None or splat.frame.transform is None:
+        return
+    theirs, ours = np.array(splat.frame.transform), capture.world_transform
+    # what a view of the scene's size would be off by, as a share of that size
+    if not np.allclose(theirs, ours, rtol=1e-3, atol=1e-3):
+        raise PopError(
+            f"{splat.path}: was trained on a capture that normalizes otherwise than {capture.name}: other views, "
+            "points or poses; give the capture that it was trained on, or pop export --frame capture and measure that"
+        )
+
+
+def paths_read(splat: Splat, root: Path, capture: Capture) -> list[Path]:
+    """List what the rendering of a splat reads: it, its result folder, the capture and where its photographs lie.
+
+    Args:
+        splat: what is rendered.
+        root: the capture's folder.
+        capture: the capture.
+
+    Returns:
+        Files and folders; no output may take the place of one.
+    """
+    own = [splat.path] if splat.folder is None else [splat.path, splat.folder]
+    # listed names may lead out of the capture, and so may its links
+    listed = {(root / view.name).parent for view in capture.views}
+    return [*own, root, *sorted(listed), *(entry for entry in sorted(root.iterdir()) if entry.is_symlink())]

@@ -1,0 +1,227 @@
+"""Where two renderers part: over the picture in numbers, and at a pixel by the first decision that falls otherwise.
+
+A renderer is a profile ("inria"), which the oracle can follow, or a backend ("fast", "ref") under the view's profile. A
+backend other than "ref" renders in float32, as in training; at a pixel its own projected splats are walked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from pop_fast.api.registry import backend_names, get_backend
+from pop_fast.errors import PopError
+from pop_fast.view.explain.flips import Flip, first_flip
+from pop_fast.view.explain.maps import Map, scaled
+from pop_fast.view.explain.scene import TILE_SIZE, ExplainedView
+from pop_fast.view.explain.walk import Walk, candidates, oracle_splats, walk
+from pop_ref.constants import PROFILES, Profile
+from pop_ref.dominance import dominant_id
+from pop_ref.records import Splats
+
+# a colour that 8 bits can tell apart
+_SEEN = 1.0 / 255.0
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One of the two: its constants, and what it renders in the region that is compared.
+
+    `info` is its own meta, None for the oracle, which is asked pixel by pixel.
+    """
+
+    name: str
+    profile: Profile
+    info: Mapping[str, Any] | None
+    image: np.ndarray
+    dominant: np.ndarray
+    blended: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """What `difference` found.
+
+    Attributes:
+        names: of the two.
+        lines: the result in words.
+        region: left, top, width and height of what was compared, px.
+        n_colors: pixels whose colours 8 bits can tell apart.
+        n_dominant: pixels with another dominant Gaussian.
+        n_blended: pixels that blend another number of Gaussians.
+        largest: the largest difference of a channel.
+        at: the pixel `flip` is about: the one asked for, or the worst where that one does not differ.
+        flip: the first decision there that falls otherwise; None where values differ and no decision does.
+        maps: pictures of the region.
+    """
+
+    names: tuple[str, str]
+    lines: tuple[str, ...]
+    region: tuple[int, int, int, int]
+    n_colors: int
+    n_dominant: int
+    n_blended: int
+    largest: float
+    at: tuple[int, int]
+    flip: Flip | None
+    maps: tuple[Map, ...]
+
+    def plain(self) -> dict[str, Any]:
+        """Give everything but the pictures, for JSON."""
+        kept = ("names", "lines", "region", "n_colors", "n_dominant", "n_blended", "largest", "at")
+        return {**{name: getattr(self, name) for name in kept}, "flip": None if self.flip is None else vars(self.flip)}
+
+
+def difference(scene: ExplainedView, a: str, b: str, x: int, y: int) -> Difference:
+    """Compare two renderers on a view, and at a pixel.
+
+    The oracle is slow, so where it is one of the two only the pixel's tile is compared.
+
+    Args:
+        scene: the view.
+        a: a profile or a backend.
+        b: another one.
+        x: column of the pixel.
+        y: row of the pixel.
+
+    Raises:
+        PopError: a name is neither a profile nor a backend that can run here.
+    """
+    width, height = scene.view.width, scene.view.height
+    left, top = x // TILE_SIZE * TILE_SIZE, y // TILE_SIZE * TILE_SIZE
+    tile = (left, top, min(TILE_SIZE, width - left), min(TILE_SIZE, height - top))
+    region = tile if "ref" in (a, b) else (0, 0, width, height)
+    sides = (_side(scene, a, region), _side(scene, b, region))
+    colors = np.abs(sides[0].image - sides[1].image).max(axis=2)
+    dominant, blended = sides[0].dominant != sides[1].dominant, sides[0].blended != sides[1].blended
+    at = (x, y)
+    flip, words = _at(scene, sides, *at)
+    lines = [*_overall(sides, region, colors, dominant, blended), *words]
+    asked = (y - region[1], x - region[0])
+    severity = colors * (colors > _SEEN) + dominant + 0.5 * blended
+    if flip is None and severity[asked] == 0.0 and severity.max() > 0.0:
+        worst = np.unravel_index(np.argmax(severity), colors.shape)
+        at = (int(worst[1]) + region[0], int(worst[0]) + region[1])
+        flip, words = _at(scene, sides, *at)
+        lines += words
+    return Difference(
+        names=(a, b),
+        lines=tuple(lines),
+        region=region,
+        n_colors=int((colors > _SEEN).sum()),
+        n_dominant=int(dominant.sum()),
+        n_blended=int(blended.sum()),
+        largest=float(colors.max()),
+        at=at,
+        flip=flip,
+        maps=tuple(_maps(sides, colors, dominant)),
+    )
+
+
+def _side(scene: ExplainedView, name: str, region: tuple[int, int, int, int]) -> Side:
+    left, top, width, height = region
+    part = (slice(top, top + height), slice(left, left + width))
+    if name == "ref":
+        return _oracle_side(scene, region)
+    if name in PROFILES:
+        profile = PROFILES[name]
+        image, info = scene.rasterized(profile=name)
+    elif name in backend_names():
+        backend, profile = get_backend(name), PROFILES[scene.config.profile]
+        image, info = scene.rasterized(torch.float32, backend)
+    else:
+        raise PopError(
+            f"diff names {name!r}, which is neither a profile ({', '.join(PROFILES)}) nor a backend "
+            f"({', '.join(backend_names())})"
+        )
+    return Side(
+        name,
+        profile,
+        info,
+        image.double().numpy()[part],
+        info["dominant_ids"][0].numpy()[part],
+        info["n_contrib"][0].numpy()[part],
+    )
+
+
+def _oracle_side(scene: ExplainedView, region: tuple[int, int, int, int]) -> Side:
+    left, top, width, height = region
+    profile = PROFILES[scene.config.profile]
+    ids = candidates(scene.info, left, top)
+    splats = oracle_splats(scene, ids, profile)
+    image = np.zeros((height, width, 3))
+    dominant = np.full((height, width), -1)
+    blended = np.zeros((height, width), dtype=np.int64)
+    for y, x in np.ndindex(height, width):
+        pixel = walk(scene, splats, left + x, top + y, profile).pixel
+        winner = dominant_id(pixel.ids, pixel.weights)
+        image[y, x], blended[y, x] = pixel.color, len(pixel.ids)
+        dominant[y, x] = ids[winner] if winner >= 0 else -1
+    return Side("ref", profile, None, image, dominant, blended)
+
+
+def _splats(scene: ExplainedView, side: Side, ids: np.ndarray) -> Splats:
+    splats = oracle_splats(scene, ids, side.profile)
+    if side.info is None or side.name in PROFILES:
+        return splats
+    info = {name: side.info[name][0].double().numpy()[ids] for name in ("means2d", "depths", "conics", "opacities")}
+    # colours are not in meta; no decision reads them
+    return Splats(**info, colors=splats.colors, radii=side.info["radii"][0].numpy()[ids].astype(np.int64))
+
+
+def _at(scene: ExplainedView, sides: tuple[Side, Side], x: int, y: int) -> tuple[Flip | None, list[str]]:
+    infos = [scene.info if side.info is None else side.info for side in sides]
+    ids = np.union1d(candidates(infos[0], x, y), candidates(infos[1], x, y))
+    a, b = (walk(scene, _splats(scene, side, ids), x, y, side.profile) for side in sides)
+    flip = first_flip(ids, (a, b), (sides[0].profile, sides[1].profile))
+    return flip, list(_words(sides, (a, b), ids, flip, x, y))
+
+
+def _words(
+    sides: tuple[Side, Side], walks: tuple[Walk, Walk], ids: np.ndarray, flip: Flip | None, x: int, y: int
+) -> Iterator[str]:
+    yield f"at pixel ({x}, {y}):"
+    size = max(len(side.name) for side in sides)
+    for side, walked in zip(sides, walks, strict=True):
+        pixel = walked.pixel
+        winner = dominant_id(pixel.ids, pixel.weights)
+        yield (
+            f"  {side.name:{size}}  colour {' '.join(f'{c:.4f}' for c in pixel.color)}  T_final {pixel.T_final:.2e}  "
+            f"{len(pixel.ids)} blended, dominant {int(ids[winner]) if winner >= 0 else 'none'}"
+        )
+    if flip is None:
+        far = max(abs(p - q) for p, q in zip(walks[0].pixel.color, walks[1].pixel.color, strict=True))
+        yield f"  every decision falls alike; the colours differ by {far:.1e}"
+        return
+    yield f"  {flip.decision} falls otherwise first, at Gaussian {flip.gaussian} (depth {flip.depth:.4g}):"
+    for side, words in zip(sides, (flip.first, flip.second), strict=True):
+        yield f"  {side.name:{size}}  {words}"
+    if flip.more:
+        yield f"  and {flip.more} more behind it"
+
+
+def _overall(
+    sides: tuple[Side, Side], region: tuple[int, int, int, int], colors: np.ndarray, dominant: np.ndarray, n: np.ndarray
+) -> Iterator[str]:
+    left, top, width, height = region
+    worst = np.unravel_index(np.argmax(colors), colors.shape)
+    yield f"{sides[0].name} | {sides[1].name}, {width} x {height} px from ({left}, {top}):"
+    yield (
+        f"  colours differ by over 1/255 at {int((colors > _SEEN).sum()):,} px, "
+        f"at most by {colors.max():.2e} at ({worst[1] + left}, {worst[0] + top})"
+    )
+    yield (
+        f"  another Gaussian dominates at {int(dominant.sum()):,} px, another number is blended at {int(n.sum()):,} px"
+    )
+
+
+def _maps(sides: tuple[Side, Side], colors: np.ndarray, dominant: np.ndarray) -> Iterator[Map]:
+    pair = f"{sides[0].name} | {sides[1].name}"
+    top = max(float(np.quantile(colors, 0.999)), 1e-12)
+    yield scaled("diff_color", f"Colour, {pair}", "largest difference of a channel", colors, "magma", top)
+    about = f"white: another dominant Gaussian, at {int(dominant.sum()):,} px"
+    yield Map("diff_dominant", f"Dominance, {pair}", about, np.repeat(dominant[..., None] * np.uint8(255), 3, axis=2))

@@ -1,0 +1,240 @@
+"""The explanation as one self-contained HTML page: the picture, the pixel, the splats' ellipses, the walk, the maps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from importlib.resources import files
+
+import numpy as np
+
+from pop_fast.view.explain.drawing import css_color, ellipse_of, light_bar, stage
+from pop_fast.view.explain.maps import Map, crop
+from pop_fast.view.explain.model import PixelExplanation, Row
+from pop_fast.view.explain.table import weighty
+from pop_fast.view.pictures import data_uri, fit
+
+_DRAWN = 14
+_ZOOM = (21, 81)  # px, the smallest and the largest close-up
+
+
+def page(e: PixelExplanation, maps: Sequence[Map], differences: Sequence[str] = ()) -> str:
+    """Lay out the page.
+
+    Args:
+        e: the explanation.
+        maps: of the same view, `view_maps`' and any others.
+        differences: lines that tell where two renderers part, if that was asked.
+    """
+    pictures = {entry.name: entry.picture for entry in maps}
+    drawn = sorted(e.blended, key=lambda row: -row.weight)[:_DRAWN]
+    body = "".join(
+        [
+            f"<header><h1>Why pixel ({e.x}, {e.y}) of {escape(e.view)} looks like that</h1>",
+            f"<p>{_subtitle(e)}</p></header>",
+            _tiles(e),
+            _stages(e, drawn, pictures),
+            _light(e),
+            _walk(e),
+            _differences(differences),
+            _maps(maps),
+            "<footer>Written by <code>pop explain</code>; the numbers are the oracle's, in float64.</footer>",
+        ]
+    )
+    style = _asset("pop_fast.view.report", "page.css") + _asset("pop_fast.view.explain", "page.css")
+    title = escape(f"{e.view} ({e.x}, {e.y})")
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f"<title>{title}</title><style>{style}</style></head>"
+        f"<body><main>{body}</main><script>{_asset('pop_fast.view.explain', 'page.js')}</script></body></html>\n"
+    )
+
+
+def _asset(package: str, name: str) -> str:
+    return files(package).joinpath(name).read_text(encoding="utf-8")
+
+
+def _subtitle(e: PixelExplanation) -> str:
+    term = f" + {e.lambda_pop:g} L_POP" if e.lambda_pop else ""
+    return escape(
+        f"{e.width} x {e.height} px, profile {e.profile}, {e.n_gaussians:,} Gaussians; loss {e.objective}{term}"
+    )
+
+
+def _tiles(e: PixelExplanation) -> str:
+    stop = e.stopped_by
+    dominant = next((row for row in e.rows if row.dominant), None)
+    error = float(np.mean([abs(a - b) for a, b in zip(e.color, e.photo, strict=True)]))
+    cells = [
+        ("Rendered", _swatch(e.color), " ".join(f"{c:.3f}" for c in e.color)),
+        ("Photograph", _swatch(e.photo), f"{' '.join(f'{c:.3f}' for c in e.photo)}; error {error:.3f}"),
+        (
+            "Blended",
+            f"{len(e.blended)} <i>of {e.n_traversed} visited</i>",
+            f"{len(e.rows)} in the tile; " + (f"#{stop.rank} ended the walk (D7)" if stop else "the list ran out"),
+        ),
+        (
+            "Dominant",
+            f"{dominant.id} <i>{100.0 * dominant.weight:.0f} %</i>" if dominant else "none",
+            f"opacity {dominant.opacity:.3f}; dominates {dominant.pixels_dominated:,} pixels" if dominant else "",
+        ),
+    ]
+    tiles = "".join(
+        f'<div class="tile"><small>{name}</small><b>{value}</b><small>{note}</small></div>'
+        for name, value, note in cells
+    )
+    return f'<section class="tiles">{tiles}</section>'
+
+
+def _swatch(color: Sequence[float]) -> str:
+    css = css_color(color)
+    return f'<span class="swatch" style="background:{css}"></span>{css}'
+
+
+def _stages(e: PixelExplanation, drawn: Sequence[Row], pictures: dict[str, np.ndarray]) -> str:
+    whole = fit(pictures["render"], max_side=960)
+    side = _close_up(drawn)
+    near, left, top = crop(pictures["render"], e.x, e.y, side)
+    box = (left, top, near.shape[1], near.shape[0])
+    kind = "tall" if e.height > e.width else "wide"
+    small = "".join(
+        f'<figure><img alt="{name}" src="{data_uri(crop(pictures[key], e.x, e.y, side)[0], lossless=True)}">'
+        f'<div class="caption">{name}</div></figure>'
+        for key, name in (
+            ("photo", "photograph"),
+            ("dominant_ids", "dominant Gaussian"),
+            ("pop_pull", "where POP pulls"),
+        )
+        if key in pictures
+    )
+    return (
+        f'<section class="duo {kind}"><figure>{stage(e, drawn, whole, (0, 0, e.width, e.height), box)}'
+        f'<div class="caption">The render. The cross marks the pixel, the dashed square what is enlarged; ellipses are '
+        f"the {len(drawn)} heaviest splats at one standard deviation.</div></figure><div>"
+        f'<figure>{stage(e, drawn, near, box, None)}<div class="caption">{box[2]} x {box[3]} px around it. Point at an '
+        "ellipse, a piece of the bar or a line of the table: the splat lights up everywhere, dashed where its alpha "
+        f'falls to the floor.</div></figure><div class="small3">{small}</div></div></section>'
+    )
+
+
+def _close_up(drawn: Sequence[Row]) -> int:
+    """Choose a side that shows whole ellipses of the splats that carry most of the pixel."""
+    heavy = [row for row in drawn if row.weight >= 0.02] or list(drawn)
+    reach = max((row.distance + max(ellipse_of(row.conic)[:2]) for row in heavy), default=0.0)
+    return min(max(2 * round(1.15 * reach) + 1, _ZOOM[0]), _ZOOM[1])
+
+
+def _light(e: PixelExplanation) -> str:
+    return (
+        "<h2>Where the light comes from</h2><p>Front to back: each splat takes its weight T alpha of the pixel, "
+        "in its own colour; hatched is the background, with what is left.</p>"
+        f'<div class="lightbox">{light_bar(e)}</div><div class="ticks"><span>front, T = 1</span>'
+        f"<span>T_final = {e.T_final:.5f}</span></div>"
+    )
+
+
+_POP_COLUMN = ("POP", "derivative of the weighted POP term; up: it raises the opacity")
+_COLUMNS = (
+    ("#", "place in the tile's list"),
+    ("id", "the Gaussian"),
+    ("depth", "camera z"),
+    ("dist", "px from the pixel's centre to the splat's"),
+    ("G", "falloff, exp(-sigma)"),
+    ("o", "opacity"),
+    ("o G", "alpha before the ceiling"),
+    ("alpha", "clamped (D6)"),
+    ("T", "transmittance in front"),
+    ("weight", "T alpha"),
+    ("colour", "of the splat from here"),
+    ("sum", "the pixel so far"),
+    ("dL/dalpha", "photometric, here"),
+    ("dL/do", "photometric, through this pixel"),
+    ("dL/do view", "photometric, through the whole view"),
+    _POP_COLUMN,
+    ("net", "where the whole objective, over the whole view, moves the opacity"),
+)
+
+
+def _walk(e: PixelExplanation) -> str:
+    chosen = weighty(e, 30)
+    has_pop = e.lambda_pop > 0.0
+    columns = [column for column in _COLUMNS if has_pop or column != _POP_COLUMN]
+    head = "".join(f'<th title="{escape(about)}">{name}</th>' for name, about in columns)
+    rows = "".join(_row(row, row.rank in chosen, has_pop) for row in e.rows)
+    pop = ""
+    if e.lambda_pop:
+        pop = (
+            f" {e.n_important:,} of {e.n_gaussians:,} Gaussians dominate a pixel of this view: POP pulls those up and "
+            "pushes the others down."
+        )
+    note = f" {escape(e.pop_note[0].upper() + e.pop_note[1:])}." if e.pop_note else ""
+    return (
+        f"<h2>The walk</h2><p>Descent moves against a derivative: a negative dL/do raises the opacity.{pop}{note}</p>"
+        f'<label class="switch"><input type="checkbox" id="all"> all {len(e.rows)} entries, the skipped too</label>'
+        f'<div class="scroll"><table class="walk"><thead><tr>{head}</tr></thead>'
+        f"<tbody>{rows}</tbody></table></div>"
+    )
+
+
+def _row(row: Row, chosen: bool, has_pop: bool) -> str:
+    blended = row.status == "blended"
+    kinds = [row.status, *["dominant"] * row.dominant, *["faint"] * (blended and not chosen)]
+    pill = '<span class="pill">D8</span>' if row.dominant else ""
+    clamp = '<span class="pill">D6</span>' if row.clamped else ""
+    front = [
+        f"{row.rank}",
+        f"{pill}{row.id}",
+        f"{row.depth:.3f}" if row.depth < 100.0 else f"{row.depth:.0f}",
+        f"{row.distance:.1f}",
+        f"{row.falloff:.4f}",
+        f"{row.opacity:.4f}",
+        f"{row.alpha_raw:.4f}",
+        f"{clamp}{row.alpha:.4f}",
+    ]
+    body = "".join(f"<td>{cell}</td>" for cell in front)
+    if blended:
+        walked = [f"{row.T:.4f}", f"{row.weight:.4f}", _dot(row.color), _dot(row.cumulative)]
+        walked += [f"{row.v_alpha:+.1e}", f"{row.v_opacity:+.1e}"]
+        body += "".join(f"<td>{cell}</td>" for cell in walked)
+    else:
+        body += f'<td class="why" colspan="6">{row.status}, {escape(row.reason)}</td>'
+    pull = "" if row.pop == "none" else f'<span class="{row.pop}">{row.pop} {abs(row.v_opacity_pop):.1e}</span>'
+    pull = f"<td>{pull}</td>" if has_pop else ""
+    body += f'<td>{row.v_opacity_view:+.1e}</td>{pull}<td class="{row.net}">{row.net}</td>'
+    return f'<tr class="{" ".join(kinds)}" data-id="{row.id}">{body}</tr>'
+
+
+def _dot(color: Sequence[float]) -> str:
+    values = " ".join(f"{c:.3f}" for c in color)
+    return f'<span class="swatch" title="{values}" style="background:{css_color(color)}"></span>'
+
+
+def _differences(lines: Sequence[str]) -> str:
+    return f"<h2>Where two renderers part</h2><pre>{escape(chr(10).join(lines))}</pre>" if lines else ""
+
+
+def _maps(maps: Sequence[Map]) -> str:
+    return f'<h2>The view as maps</h2><div class="maps">{"".join(_map(entry) for entry in maps)}</div>'
+
+
+def _map(entry: Map) -> str:
+    bar = ""
+    if entry.scale is not None:
+        from matplotlib import colormaps
+
+        name, low, top = entry.scale
+        stops = np.round(colormaps[name](np.linspace(0.0, 1.0, 10))[:, :3] * 255.0).astype(int)
+        colors = ",".join(f"rgb({r},{g},{b})" for r, g, b in stops.tolist())
+        gradient = f"linear-gradient(90deg,{colors})"
+        bar = f'<div class="bar">{_short(low)}<i style="background:{gradient}"></i>{_short(top)}</div>'
+    lossless = entry.name in ("dominant_ids", "importance_gaussians")
+    picture = data_uri(fit(entry.picture, nearest=lossless, max_side=480), lossless=lossless)
+    return (
+        f'<figure><img alt="{escape(entry.title)}" src="{picture}"><b>{escape(entry.title)}</b>{bar}'
+        f'<div class="caption">{escape(entry.about)}</div></figure>'
+    )
+
+
+def _short(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 100.0 else f"{value:.3g}"

@@ -1,0 +1,109 @@
+"""One HTML file that shows a splat: no network, the splat inside as SPZ, drawn by WebGL 2, sorted in a worker."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping, Sequence
+from html import escape
+from importlib.resources import files
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pop_fast.io.formats import encoded
+from pop_fast.train.config import TrainConfig
+from pop_fast.view.html.cameras import PageCamera, camera_of_points, view_distances
+from pop_ref.constants import profile_named
+
+_KEYS: Final = "drag: turn · shift or right button: move · wheel: nearer · arrows, + −, wasd · n, p: cameras · r: back"
+# nothing is fetched; the worker is made from the page's own text
+_POLICY: Final = (
+    "default-src 'none'; script-src 'unsafe-inline' blob:; style-src 'unsafe-inline'; worker-src blob:; img-src data:"
+)
+_TOUCH: Final = "one finger turns, two move and zoom"
+
+
+def page_of(
+    params: Mapping[str, Tensor],
+    cameras: Sequence[PageCamera],
+    config: TrainConfig,
+    sh_degree: int,
+    title: str,
+) -> bytes:
+    """Make the page.
+
+    It draws as the training's rasterizer does: the same projection, low-pass, cut-offs of alpha and background, colours
+    to degree 3. It loses what SPZ loses, ends no pixel early, and holds sums of layers in half precision.
+
+    Args:
+        params: raw parameters, in the frame of the cameras.
+        cameras: where it may start; none makes one that sees most of the splat.
+        config: profile, background and antialiasing are read.
+        sh_degree: highest colour band to draw.
+        title: of the page.
+
+    Returns:
+        The file's bytes.
+
+    Raises:
+        PopError: the splat does not fit into SPZ.
+    """
+    drawn = {**params, "shN": params["shN"][:, : (sh_degree + 1) ** 2 - 1]}
+    scene = _scene(params["means"].detach().cpu(), cameras, config)
+    data = base64.b64encode(encoded("spz", drawn, config.antialiased)).decode("ascii")
+    scripts = [
+        ("scene", "application/json", json.dumps(scene).replace("<", "\\u003c")),
+        ("splat", "application/octet-stream", data),
+        ("splat-vert", "x-shader/x-vertex", _asset("splat.vert")),
+        ("splat-frag", "x-shader/x-fragment", _asset("splat.frag")),
+        ("sorter", "text/x-worker", _asset("sorter.js")),
+    ]
+    held = "\n".join(f'<script id="{name}" type="{kind}">{content}</script>' for name, kind, content in scripts)
+    buttons = "".join(
+        f'<button id="{name}" aria-label="{what}" title="{what} ({key})">{sign}</button>'
+        for name, what, key, sign in (
+            ("previous", "previous camera", "p", "◀"),
+            ("reset", "back to the camera", "r", "⟲"),
+            ("next", "next camera", "n", "▶"),
+        )
+    )
+    keys = f'<span class="keys">{escape(_KEYS)}</span><span class="touch">{escape(_TOUCH)}</span>'
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
+        f"<title>{escape(title)}</title><style>{_asset('page.css')}</style></head>"
+        f'<body><canvas id="view" tabindex="0" aria-label="{escape(title)}: {escape(_KEYS)}"></canvas>'
+        '<div id="message" role="status"></div>'
+        f'<div id="panel"><span class="buttons">{buttons}</span><span id="name"></span>'
+        f'<span id="help">{keys}</span></div>'
+        f"{held}<script>{_asset('viewer.js')}</script></body></html>\n"
+    ).encode()
+
+
+def _scene(means: Tensor, cameras: Sequence[PageCamera], config: TrainConfig) -> dict[str, Any]:
+    profile = profile_named(config.profile)
+    chosen = list(cameras) or [camera_of_points(means)]
+    distances = view_distances(chosen, means)
+    upwards = -np.mean([camera.viewmat[1, :3] for camera in chosen], axis=0)
+    norm = np.linalg.norm(upwards)
+    return {
+        "cameras": [camera.entry(distance) for camera, distance in zip(chosen, distances, strict=True)],
+        "up": (upwards / norm if norm > 1e-3 else np.array([0.0, -1.0, 0.0])).tolist(),
+        "extent": max(distances),
+        "background": [float(value) for value in torch.tensor(config.background)],
+        "antialiased": config.antialiased,
+        "near": profile.near_plane,
+        "eps2d": profile.eps2d,
+        "margin": profile.frustum_margin,
+        "sigmas": profile.extent_sigmas,
+        "floor": profile.alpha_floor,
+        "ceiling": profile.alpha_ceiling,
+    }
+
+
+def _asset(name: str) -> str:
+    return files("pop_fast.view.html").joinpath(name).read_text(encoding="utf-8")

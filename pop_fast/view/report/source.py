@@ -1,0 +1,277 @@
+"""Read a result folder into what the report shows. Only files in the folder are read; what is absent is left out."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from pop_fast.errors import PopError
+from pop_fast.io.read_back import check_record, parse_json, read_arrays, read_json
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.results import read_config
+from pop_fast.view.report.compare import threads_of
+from pop_fast.view.report.curves import Window
+from pop_fast.view.report.files_section import checked_encodings, encoding_rows
+from pop_fast.view.report.model import Histogram, ReportData, ReportView, Tile
+
+MIB: Final = 2**20
+# float32 numbers of a Gaussian: as gsplat's checkpoints hold it, and as Inria's PLY does (with three zero normals)
+BYTES_CKPT: Final = 59 * 4
+BYTES_PLY: Final = 62 * 4
+_METHODS: Final = {"pop": "POP", "gsplat": "gsplat (default strategy)", "3dgs": "3DGS (Inria)"}
+_AGAIN: Final = "remove the file, or train again"
+_COUNTS: Final = {"counts": ("iu", 1)}
+_VIEW: Final = {
+    "name": ("U", 0),
+    "render": ("u", 3),
+    "photo": ("u", 3),
+    "psnr": ("f", 0),
+    "ssim": ("f", 0),
+    "dominant_ids?": ("i", 2),
+}
+_SMOOTH: Final = 0.03  # width of the running means, as a share of the records
+
+
+def read_result(folder: Path) -> ReportData:
+    """Read all that the report shows of a result folder.
+
+    Raises:
+        PopError: the folder is not a result of `pop train`, or one of its files cannot be read.
+    """
+    config = read_config(folder)
+    records = read_records(folder)
+    stats = read_last_stats(folder)
+    method = _METHODS.get(config.method, config.method)
+    histograms = list(_histograms(folder, config.max_steps))
+    views = list(_views(folder))
+    dominant = _dominant(folder)
+    events = [record for record in records if "cloned" in record or "reset" in record]
+    return ReportData(
+        title=f"{Path(config.data).resolve().name} · {_METHODS.get(config.method, config.method).split(' (')[0]}",
+        subtitle=" · ".join(filter(None, [method, _schedule_note(config), _views_note(stats), _machine(stats)])),
+        headline=headline(stats),
+        curves=_curves(records, folder),
+        max_steps=config.max_steps,
+        windows=_windows(config),
+        resets=[int(record["step"]) for record in events if record.get("reset")],
+        histograms=histograms,
+        dominant=dominant,
+        views=views,
+        config=_settings(config),
+        events=[{key: event.get(key) for key in _EVENT_COLUMNS} for event in events],
+        files=_files(stats, str(folder)),
+        viewer=_viewer(folder),
+    )
+
+
+_EVENT_COLUMNS: Final = ("step", "cloned", "split", "pruned", "reset", "num_gaussians")
+
+
+def _files(stats: Mapping[str, Any], where: str) -> list[tuple[str, ...]]:
+    entries = checked_encodings(stats.get("encodings") or [], where, "train again with --resume, which measures them")
+    return encoding_rows(entries)
+
+
+def _viewer(folder: Path) -> str | None:
+    path = folder / "viewer.html"
+    try:
+        return path.read_text(encoding="utf-8", errors="replace") if path.is_file() else None
+    except OSError as error:
+        raise PopError(f"{path}: could not be read: {error.strerror}; remove it, or check its permissions") from error
+
+
+def read_records(folder: Path) -> list[dict[str, Any]]:
+    """Read metrics.jsonl; a last line that was cut off by a kill is ignored."""
+    path = folder / "metrics.jsonl"
+    if not path.is_file():
+        return []
+    lines = path.read_bytes().split(b"\n")
+    records: list[dict[str, Any]] = []
+    # behind the last line's end stands nothing, or what a kill left of a line
+    for number, line in enumerate(lines[:-1], start=1):
+        where = f"{path}: line {number}"
+        record = parse_json(line.decode("utf-8", "replace"), where, _AGAIN)
+        records.append(check_record(record, where, _AGAIN, needed=("step",)))
+    return records
+
+
+def read_last_stats(folder: Path) -> dict[str, Any]:
+    """Read the statistics of the last step: the training's, overlaid by those of the held-out views."""
+    merged: dict[str, Any] = {}
+    for kind in ("train", "val"):
+        numbered = _numbered(folder / "stats", rf"{kind}_step(\d+)\.json")
+        if numbered:
+            merged |= read_stats(numbered[-1][1])
+    return merged
+
+
+def read_stats(path: Path) -> dict[str, Any]:
+    """Read one file of statistics.
+
+    Raises:
+        PopError: it is damaged; names the entry.
+    """
+    fix = "write it again with 'pop eval'"
+    return check_record(read_json(path, fix), str(path), fix)
+
+
+def headline(stats: Mapping[str, Any]) -> list[Tile]:
+    """Choose the numbers at the top of the page."""
+    tiles: list[Tile] = []
+    for key, label, form, unit in (("psnr", "PSNR", "{:.2f}", "dB"), ("ssim", "SSIM", "{:.4f}", "")):
+        if stats.get(key) is not None:
+            tiles.append(Tile(label, form.format(stats[key]), unit, "mean of the held-out views"))
+    if stats.get("lpips") is not None:
+        tiles.append(Tile("LPIPS", f"{stats['lpips']:.4f}", "", str(stats.get("lpips_net", ""))))
+    elif "lpips" in stats:
+        tiles.append(Tile("LPIPS", "–", "", str(stats.get("lpips_reason", "not measured"))))
+    if stats.get("num_GS") is not None:
+        n = int(stats["num_GS"])
+        left = stats.get("num_GS_above_floor")
+        tiles.append(Tile("Gaussians", f"{n:,}", "", "" if left is None else f"{int(left):,} with opacity ≥ 1/255"))
+        as_ply = f"as PLY {n * BYTES_PLY / MIB:.1f} ({BYTES_PLY} B)"
+        tiles.append(Tile("Size", f"{n * BYTES_CKPT / MIB:.1f}", "MiB", f"{BYTES_CKPT} B each; {as_ply}"))
+    if stats.get("n_blended") is not None:
+        traversed = "" if stats.get("n_traversed") is None else f"{stats['n_traversed']:.1f} traversed"
+        tiles.append(Tile("Gaussians per pixel", f"{stats['n_blended']:.1f}", "blended", traversed))
+    return tiles + _cost_tiles(stats)
+
+
+def _cost_tiles(stats: Mapping[str, Any]) -> list[Tile]:
+    tiles: list[Tile] = []
+    seconds, steps = stats.get("seconds"), stats.get("step")
+    if seconds:
+        value, unit = (f"{seconds:.0f}", "s") if seconds < 600 else (f"{seconds / 60:.1f}", "min")
+        note = "" if steps is None else f"{(steps + 1) / seconds:.1f} iterations a second"
+        tiles.append(Tile("Training", value, unit, note))
+    if stats.get("memory_bytes"):
+        tiles.append(Tile("Peak memory", f"{stats['memory_bytes'] / 2**30:.1f}", "GiB", "of the whole process"))
+    return tiles
+
+
+def _machine(stats: Mapping[str, Any]) -> str:
+    versions = stats.get("versions") or {}
+    torch = f"torch {versions['torch']}" if "torch" in versions else ""
+    threads = threads_of(stats) if "threads" in stats else ""
+    return ", ".join(filter(None, [str(stats.get("machine") or ""), threads, torch]))
+
+
+def _schedule_note(config: TrainConfig) -> str:
+    steps = f"{config.max_steps:,} iterations"
+    given = config.given
+    if given is None or given.scaler == 1.0:
+        return steps
+    return f"{steps} (preset {given.preset}, the paper's schedule times {given.scaler:g})"
+
+
+def _views_note(stats: Mapping[str, Any]) -> str:
+    return f"{stats['views']} held-out views" if "views" in stats else ""
+
+
+def _curves(records: Sequence[Mapping[str, Any]], folder: Path) -> dict[str, tuple[list[float], list[float]]]:
+    curves: dict[str, tuple[list[float], list[float]]] = {}
+    window = max(1, round(len(records) * _SMOOTH))
+    for name, key, smooth in (
+        ("num_gaussians", "num_gaussians", False),
+        ("psnr_train", "psnr", True),
+        ("loss", "loss", True),
+        ("n_blended", "n_blended", True),
+        ("n_traversed", "n_traversed", True),
+    ):
+        points = [(float(r["step"]), float(r[key])) for r in records if r.get(key) is not None]
+        if points:
+            steps, values = (list(column) for column in zip(*points, strict=True))
+            curves[name] = steps, running_mean(values, window) if smooth else values
+    measured = [
+        (step, read_stats(path).get("psnr")) for step, path in _numbered(folder / "stats", r"val_step(\d+)\.json")
+    ]
+    held_out = [(float(step + 1), float(psnr)) for step, psnr in measured if psnr is not None]
+    if held_out:
+        curves["psnr_val"] = [step for step, _ in held_out], [psnr for _, psnr in held_out]
+    return {name: thin_out(*curve) for name, curve in curves.items()}
+
+
+def running_mean(values: Sequence[float], window: int) -> list[float]:
+    """Average each value with those before it, `window` in all (fewer at the start), without what is not finite."""
+    out: list[float] = []
+    for i in range(len(values)):
+        part = [v for v in values[max(0, i + 1 - window) : i + 1] if math.isfinite(v)]
+        out.append(sum(part) / len(part) if part else math.nan)
+    return out
+
+
+def thin_out(steps: list[float], values: list[float], most: int = 400) -> tuple[list[float], list[float]]:
+    """Keep at most about `most` points of a curve, evenly, the first and the last among them."""
+    if len(steps) <= most:
+        return steps, values
+    kept = np.unique(np.round(np.linspace(0, len(steps) - 1, most)).astype(int))
+    return [steps[i] for i in kept], [values[i] for i in kept]
+
+
+def _windows(config: TrainConfig) -> list[Window]:
+    plan = config.strategy
+    windows = [Window("density control", plan.refine_start_iter, plan.refine_stop_iter, "var(--density)")]
+    if plan.blur_stop_iter >= plan.blur_start_iter:
+        windows.append(Window("blur densification", plan.blur_start_iter, plan.blur_stop_iter, "var(--blur)"))
+    if plan.lambda_pop > 0.0:
+        windows.append(Window("POP loss", plan.pop_start_iter, plan.pop_stop_iter, "var(--pop)"))
+    return [
+        Window(w.name, w.start, min(w.stop, config.max_steps), w.color) for w in windows if w.start < config.max_steps
+    ]
+
+
+def _histograms(folder: Path, max_steps: int) -> Iterator[Histogram]:
+    numbered = _numbered(folder / "report_data", r"opacity_step(-?\d+)\.npz")
+    for place, (step, path) in enumerate(numbered):
+        counts = read_arrays(path, _COUNTS, _AGAIN)["counts"]
+        if len(counts) % 2:
+            raise PopError(f"{path}: counts has {len(counts)} bins, which no run writes; {_AGAIN}")
+        last = place == len(numbered) - 1 and step + 1 >= max_steps
+        title = "start" if step < 0 else "end" if last else f"iteration {step + 1:,}"
+        # two of the file's bins make one bar: 50 bars are readable, and 0.1 and 0.9 stay bin edges
+        yield Histogram(title, counts.reshape(-1, 2).sum(axis=1))
+
+
+def _views(folder: Path) -> Iterator[ReportView]:
+    for path in _last_view_files(folder):
+        a = read_arrays(path, _VIEW, _AGAIN)
+        yield ReportView(str(a["name"]), a["render"], a["photo"], float(a["psnr"]), float(a["ssim"]))
+
+
+def _dominant(folder: Path) -> tuple[str, np.ndarray, np.ndarray] | None:
+    for path in _last_view_files(folder):
+        a = read_arrays(path, _VIEW, _AGAIN)
+        if "dominant_ids" in a:
+            return str(a["name"]), a["dominant_ids"], a["render"]
+    return None
+
+
+def _last_view_files(folder: Path) -> list[Path]:
+    pattern = re.compile(r"val_step(\d+)_(\d+)\.npz")
+    data = folder / "report_data"
+    found = [(m, p) for p in data.iterdir() if (m := pattern.fullmatch(p.name))] if data.is_dir() else []
+    last = max((int(m[1]) for m, _ in found), default=-1)
+    return [path for _, path in sorted((int(m[2]), path) for m, path in found if int(m[1]) == last)]
+
+
+def _numbered(folder: Path, pattern: str) -> list[tuple[int, Path]]:
+    if not folder.is_dir():
+        return []
+    found = ((re.fullmatch(pattern, path.name), path) for path in folder.iterdir())
+    return sorted((int(match[1]), path) for match, path in found if match)
+
+
+def _settings(config: TrainConfig) -> dict[str, Any]:
+    given = config.given
+    if given is None:
+        return config.flat()
+    return {
+        "preset": given.preset,
+        "steps_scaler": given.scaler,
+        "scale_lambda_pop": given.scale_lambda_pop,
+    } | config.flat()

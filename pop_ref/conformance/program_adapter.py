@@ -1,0 +1,199 @@
+"""A program in any language as a backend: laws make scenes, the program answers over its standard input and output.
+
+The kit starts the program once and sends one request after the other; the program ends when its input does. A request
+is a line of words in ASCII, `verb key=value ...`, and then arrays, little-endian float64 in C order with nothing
+between. An answer is a line, `ok ...` or `error TEXT`, and then the arrays that it names, in the same form; what is
+written to standard error is shown where the program fails.
+
+    hello protocol=1
+        -> ok name=NAME dtype=float32|float64 profile=PROFILE offers=WORD,WORD,...
+    render N= n_sh= width= height= tile_size= sh_degree= antialiased=0|1 CONSTANTS want=NAME,NAME,...
+    and means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, n_sh, 3], viewmat [4, 4], K [3, 3],
+    background [3]
+        -> ok NAME NAME ... and these arrays; at least those that are wanted
+    gradients, the same, and v_image [H, W, 3], v_T_final [H, W]
+        -> ok v_NAME v_NAME ... and these arrays
+
+PROFILE is one of `pop_ref.PROFILES`, whose constants every scene then has, or `any`, and CONSTANTS are the fields of
+`Profile` with 0 and 1 for false and true. Offered are arrays, by the names of `SHAPES` (integers cross as float64,
+too), and what `ABILITIES` lists. `image` and `T_final` belong together, as do `v_means`, `v_quats`, `v_scales`,
+`v_opacities` and `v_sh`. What is not offered is skipped by name; an answer that is malformed, late or missing breaks
+the law that asked, and the program is started again for the next one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+from typing import Any, Final
+
+import numpy as np
+
+from pop_ref.conformance.adapter import Adapter, View
+from pop_ref.conformance.capabilities import (
+    ANTIALIASING,
+    DETERMINISTIC,
+    DOMINANCE,
+    DOMINANT_COUNTS,
+    DOMINANT_WEIGHTS,
+    GRADIENTS,
+    RENDER,
+    ROWWISE,
+    SCALE,
+)
+from pop_ref.conformance.program_pipe import Pipe, ProgramError
+from pop_ref.conformance.scene_files import scene_arrays
+from pop_ref.conformance.scenes import Scene
+from pop_ref.constants import PROFILES, profile_named
+
+PROTOCOL: Final = 1
+# what a render may answer, and its shape in the letters of the protocol
+OF_A_VIEW: Final = {
+    "image": "H W 3",
+    "T_final": "H W",
+    "dominant_ids": "H W",
+    "dominant_weights": "H W",
+    "dominant_counts": "N",
+    "n_blended": "H W",
+    "n_traversed": "H W",
+    "radii": "N 2",
+    "means2d": "N 2",
+    "depths": "N",
+    "conics": "N 3",
+}
+OF_GRADIENTS: Final = {
+    "v_means": "N 3",
+    "v_quats": "N 4",
+    "v_scales": "N 3",
+    "v_opacities": "N",
+    "v_sh": "N n_sh 3",
+    "v_viewmat": "4 4",
+    "v_background": "3",
+    "v_means2d": "N 2",
+    "v_means2d_abs": "N 2",
+}
+SHAPES: Final = {**OF_A_VIEW, **OF_GRADIENTS}
+INTEGERS: Final = frozenset({"dominant_ids", "dominant_counts", "n_blended", "n_traversed", "radii"})
+ABILITIES: Final = {
+    "antialiased": ANTIALIASING,
+    "deterministic": DETERMINISTIC,
+    "rowwise": ROWWISE,
+    "thousands": SCALE,
+}
+_TOGETHER: Final = (("image", "T_final"), ("v_means", "v_quats", "v_scales", "v_opacities", "v_sh"))
+
+
+class ProgramAdapter(Adapter):
+    """A program that answers the protocol of this module.
+
+    Args:
+        command: the program and its arguments, as a shell splits them.
+        timeout: seconds that an answer may take.
+
+    Raises:
+        ProgramError: it cannot be started, or does not greet as it must.
+    """
+
+    def __init__(self, command: str, timeout: float = 60.0) -> None:
+        self._pipe = Pipe(shlex.split(command), timeout)
+        words = self._greeting()
+        self.name = words["name"]
+        self.dtype = {"float32": np.float32, "float64": np.float64}[words["dtype"]]
+        self.profile = None if words["profile"] == "any" else profile_named(words["profile"])
+        self.offers = tuple(words["offers"].split(","))
+        self.able = tuple(ABILITIES[word] for word in self.offers if word in ABILITIES)
+
+    def _greeting(self) -> dict[str, str]:
+        answer = self._pipe.ask(f"hello protocol={PROTOCOL}")
+        words: dict[str, str] = {}
+        for word in answer.split():
+            key, _, words[key] = word.partition("=")
+        expected = "name=NAME dtype=float32|float64 profile=PROFILE offers=WORD,..."
+        wrong = [key for key in ("name", "dtype", "profile", "offers") if not words.get(key)]
+        if wrong:
+            raise ProgramError(f"{self._pipe} greets with 'ok {answer}', without {wrong[0]}; it must say ok {expected}")
+        allowed = {"dtype": ("float32", "float64"), "profile": (*PROFILES, "any")}
+        for key, values in allowed.items():
+            if words[key] not in values:
+                raise ProgramError(
+                    f"{self._pipe} greets with {key}={words[key]}; it must be one of {', '.join(values)}"
+                )
+        offers = words["offers"].split(",")
+        unknown = [word for word in offers if word not in SHAPES and word not in ABILITIES]
+        if unknown:
+            known = ", ".join((*SHAPES, *ABILITIES))
+            raise ProgramError(f"{self._pipe} offers {unknown[0]!r}; what may be offered is {known}")
+        for group in _TOGETHER:
+            lacks = [name for name in group if name not in offers]
+            if lacks and len(lacks) < len(group):
+                raise ProgramError(f"{self._pipe} offers no {lacks[0]}; {', '.join(group)} belong together")
+        return words
+
+    def has(self, need: str) -> bool:
+        """Tell whether the program offers it."""
+        arrays = {
+            RENDER: "image",
+            GRADIENTS: "v_means",
+            DOMINANCE: "dominant_ids",
+            DOMINANT_WEIGHTS: "dominant_weights",
+            DOMINANT_COUNTS: "dominant_counts",
+        }
+        if need == SCALE:
+            return SCALE in self.able
+        return arrays[need] in self.offers if need in arrays else super().has(need)
+
+    def render(self, scene: Scene) -> View:
+        """Draw a scene and ask for everything that is offered."""
+        return View(**self._ask("render", scene, [name for name in OF_A_VIEW if name in self.offers]))
+
+    def plainly(self, scene: Scene) -> View:
+        """Draw a scene and ask for nothing but the image."""
+        return View(**self._ask("render", scene, ["image", "T_final"]))
+
+    def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
+        """Ask for the cotangents that are offered."""
+        wanted = [name for name in OF_GRADIENTS if name in self.offers]
+        found = self._ask("gradients", scene, wanted, v_image, v_T_final)
+        return {name.removeprefix("v_"): value for name, value in found.items()}
+
+    def _ask(self, verb: str, scene: Scene, wanted: list[str], *cotangents: Any) -> dict[str, np.ndarray]:
+        n, n_sh, _ = scene.gaussians.sh.shape
+        words = {
+            "N": n,
+            "n_sh": n_sh,
+            "width": scene.camera.width,
+            "height": scene.camera.height,
+            "tile_size": scene.tile_size or scene.profile.tile_size,
+            "sh_degree": round(np.sqrt(n_sh)) - 1 if scene.sh_degree is None else scene.sh_degree,
+            "antialiased": int(scene.antialiased),
+        }
+        constants = {k: v for k, v in dataclasses.asdict(scene.profile).items() if k not in ("name", "tile_size")}
+        words |= {key: int(value) if isinstance(value, bool) else value for key, value in constants.items()}
+        line = " ".join((verb, *(f"{key}={value}" for key, value in words.items()), f"want={','.join(wanted)}"))
+        answer = self._pipe.ask(line, [*scene_arrays(scene).values(), *cotangents])
+        return self._arrays(answer.split(), wanted, OF_A_VIEW if verb == "render" else OF_GRADIENTS, words)
+
+    def _arrays(
+        self, names: list[str], wanted: list[str], known: dict[str, str], words: dict[str, Any]
+    ) -> dict[str, np.ndarray]:
+        sizes = {"N": words["N"], "n_sh": words["n_sh"], "H": words["height"], "W": words["width"]}
+        strange = [name for name in names if name not in known or names.count(name) > 1]
+        lacks = [name for name in wanted if name not in names]
+        if strange or lacks:
+            what = f"names {strange[0]!r}, unknown or twice" if strange else f"lacks {lacks[0]}, which was asked for"
+            self._pipe.stop()
+            raise ProgramError(f"{self._pipe} answers 'ok {' '.join(names)}', which {what}")
+        found: dict[str, np.ndarray] = {}
+        for name in names:
+            shape = tuple(int(sizes.get(axis, axis)) for axis in known[name].split())
+            value = self._pipe.read_array(name, shape)
+            if name in INTEGERS:
+                whole = np.where(np.isfinite(value), value, 0.5)
+                if np.any(whole != np.round(whole)):
+                    self._pipe.stop()
+                    raise ProgramError(f"{self._pipe} answers {name} that are not whole numbers")
+                value = whole.astype(np.int64)
+            if name in wanted:
+                found[name] = value
+        self._pipe.done()
+        return found

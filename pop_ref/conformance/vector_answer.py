@@ -1,0 +1,179 @@
+"""What a port does with the portable vectors, done by any backend of the kit: read the inputs, write the outputs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pop_ref.conformance import vector_training as training
+from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.calls import Call, Frame
+from pop_ref.conformance.capabilities import (
+    CAMERAS,
+    CHANNELS,
+    COLORS,
+    DEPTH,
+    DOMINANCE,
+    GRADIENTS,
+    RENDER,
+    SCALE,
+    SIGNATURE,
+)
+from pop_ref.conformance.scene_files import scene_from
+from pop_ref.conformance.scenes import Scene
+from pop_ref.constants import Profile
+from pop_ref.density import DensityConfig, rows_from_params
+from pop_ref.records import Camera, Gaussians
+
+Arrays = dict[str, np.ndarray]
+LARGE = 100
+
+
+def answer(folder: Path, results: Path, backend: Any) -> list[str]:
+    """Answer every vector of a folder as far as a backend can; return the names of those that it could not.
+
+    Args:
+        folder: that `vectors.export` wrote.
+        results: is made.
+        backend: an adapter.
+    """
+    results.mkdir(parents=True)
+    index, unanswered = json.loads((folder / "index.json").read_text(encoding="utf-8")), []
+    for name, vector in index["vectors"].items():
+        with np.load(folder / vector["file"]) as stored:
+            arrays = dict(stored)
+        outputs = answered(backend, vector["kind"], arrays, vector["options"])
+        if outputs:
+            given: dict[str, Any] = outputs
+            np.savez(results / f"{name}.npz", **given)
+        else:
+            unanswered.append(name)
+    return unanswered
+
+
+def answered(backend: Any, kind: str, arrays: Arrays, options: dict[str, Any]) -> Arrays:
+    """Return a backend's outputs for one vector; none where it lacks what the vector is about."""
+    answers = {
+        "render": _image,
+        "large": _image,
+        "call": _call,
+        "call_plain": _call,
+        "loss": _loss,
+        "pop": _pop,
+        "adam": _adam,
+        "density": _density,
+    }
+    return answers[kind](backend, arrays, options)
+
+
+def _image(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
+    scene = scene_from(arrays, options)
+    able = backend.has(RENDER) and (len(scene.gaussians) < LARGE or backend.has(SCALE))
+    if not able or not _same(backend.sees(scene), scene):
+        return {}
+    view = backend.render(scene)
+    found = {"image": view.image, "T_final": view.T_final, "n_blended": view.n_blended, "radii": view.radii}
+    found |= {name: getattr(view, name) for name in ("means2d", "depths", "conics")}
+    if backend.has(DOMINANCE):
+        found["dominant_ids"] = view.dominant_ids
+    if isinstance(backend, OracleAdapter):
+        splats = backend.full_render(scene).splats
+        found |= {"colors": splats.colors, "effective_opacities": splats.opacities}
+    if "depths" not in arrays:
+        # a large vector asks for the image alone
+        found = {name: found.get(name) for name in ("image", "T_final", "n_blended", "dominant_ids")}
+    if backend.has(GRADIENTS):
+        v = backend.gradients(scene, arrays["v_image"], arrays["v_T_final"])
+        found |= {f"v_{name}": value for name, value in v.items()}
+    return {name: np.asarray(value) for name, value in found.items() if value is not None}
+
+
+def _same(seen: Scene, scene: Scene) -> bool:
+    # a backend of one profile, or without a principal point, reads another scene than the vector holds
+    return seen.profile == scene.profile and np.array_equal(seen.gaussians.means, scene.gaussians.means)
+
+
+def _call(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
+    plain = "colors" in arrays
+    needs = [SIGNATURE, CAMERAS, *([COLORS, CHANNELS] if plain else [])]
+    needs += [DEPTH] if options["render_mode"] != "RGB" else []
+    if not all(backend.has(need) for need in needs):
+        return {}
+    n = len(arrays["means"])
+    sh = np.zeros((n, 1, 3)) if plain else arrays["sh"]
+    gaussians = Gaussians(arrays["means"], arrays["quats"], arrays["scales"], arrays["opacities"], sh)
+    frames = []
+    profile = Profile(**options["profile"])
+    for c in range(len(arrays["viewmats"])):
+        camera = Camera(arrays["viewmats"][c], arrays["Ks"][c], options["width"], options["height"])
+        scene = Scene(gaussians, camera, arrays["backgrounds"][c], profile, options["tile_size"])
+        frames.append(Frame(scene, arrays["colors"] if plain else None))
+    call = Call((tuple(frames),), render_mode=options["render_mode"])
+    cotangents = (arrays["v_images"][None], arrays["v_alphas"][None]) if backend.has(GRADIENTS) else ()
+    called = backend.call(call, *cotangents)
+    found = {"images": called.images[0], "alphas": called.alphas[0]}
+    names = {name: name for name in ("means", "quats", "scales", "opacities", "viewmats", "backgrounds")}
+    names["colors"] = "colors" if plain else "sh"
+    return found | {f"v_{names[name]}": value for name, value in called.gradients.items() if name in names}
+
+
+def _loss(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
+    name, found = options["loss"], {}
+    arguments = training.loss_arguments(options, arrays["mask"])
+    if backend.has(name):
+        found["loss"] = np.asarray(backend.stage(name)(arrays["picture"], arrays["target"], *arguments))
+    if backend.has(f"{name}_vjp"):
+        pull = backend.stage(f"{name}_vjp")
+        found["v_picture"] = pull(arrays["picture"], arrays["target"], options["v_loss"], *arguments)
+    return found
+
+
+def _pop(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
+    found = {}
+    important = arrays["dominant_counts"] > 0
+    if backend.has("importance_mask"):
+        important = backend.stage("importance_mask")(arrays["dominant_counts"])
+        found["important"] = np.asarray(important).astype(np.int64)
+    if backend.has("pop_loss"):
+        found["pop_loss"] = np.asarray(backend.stage("pop_loss")(arrays["opacities"], important))
+    if backend.has("pop_loss_vjp"):
+        found["v_opacities"] = backend.stage("pop_loss_vjp")(arrays["opacities"], important, options["v_loss"])
+    return found
+
+
+def _adam(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
+    if not backend.has("adam_step"):
+        return {}
+    # the name of a parameter that every trainer knows
+    given = [{"means": arrays[name]} for name in ("param", "grad", "m", "v")]
+    after = backend.stage("adam_step")(*given, options["step"], {"means": options["lr"]})
+    return {name: value["means"] for name, value in zip(("new_param", "new_m", "new_v"), after, strict=True)}
+
+
+def _density(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
+    if not backend.has("densify_and_prune"):
+        return {}
+    params, statistics = training.density_inputs(arrays)
+    config = DensityConfig(**options["config"])
+    split = arrays["split"].astype(bool)
+    rows, _ = backend.stage("densify_and_prune")(
+        rows_from_params(params),
+        statistics,
+        options["scene_scale"],
+        options["step"],
+        lambda n: arrays["normals"][:, split][:, :n],
+        config,
+    )
+    found = training.density_rows(dict(rows.params))
+    if backend.has("grow_masks"):
+        scales = np.exp(arrays["log_scales"])
+        masks = backend.stage("grow_masks")(statistics, scales, options["scene_scale"], options["step"], config)
+        found |= {
+            name: np.asarray(mask).astype(np.int64) for name, mask in zip(("cloned", "split"), masks, strict=True)
+        }
+    # another number of rows is an answer, too: it is as wrong as can be
+    return {name: value if value.shape == arrays[name].shape else np.full(arrays[name].shape, np.nan)
+            for name, value in found.items()}  # fmt: skip

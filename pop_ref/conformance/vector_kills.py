@@ -1,0 +1,78 @@
+"""What the portable vectors alone would have noticed: `python -m pop_ref.conformance.vector_kills FILE`.
+
+Every mutant answers the vectors as a port would; it is killed where an array fails, or where it raises. The laws see
+more: they draw scenes, compare a rasterizer with itself, and judge stages that no vector is about.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pop_ref.conformance.backends import SHIPPED, shipped
+from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM
+from pop_ref.conformance.mutants.trial import alive
+from pop_ref.conformance.vector_answer import answer
+from pop_ref.conformance.vector_check import check
+from pop_ref.conformance.vectors import export
+
+
+def first_failure(folder: Path, results: Path, backend: Any) -> str | None:
+    """Return the first vector and array at which a backend fails, or what it raises; None where it passes.
+
+    Args:
+        folder: that `vectors.export` wrote.
+        results: is made.
+        backend: an adapter.
+    """
+    try:
+        answer(folder, results, backend)
+        failed = check(folder, results, np.dtype(backend.dtype).name).failed
+    except Exception as error:
+        return f"raises {type(error).__name__}"
+    return f"{failed[0].vector}: {failed[0].array}" if failed else None
+
+
+def kills(told: Callable[[str, str | None], None] = lambda name, found: None) -> dict[str, dict[str, str | None]]:
+    """Return by family and mutant what fails first, None for who survives; sound backends are a family, too.
+
+    Args:
+        told: is given every name and result as it comes.
+    """
+    families = {"stages of the oracle": MUTANTS, "the program that trains": PROGRAM, "whole rasterizers": BLACK_BOXES}
+    found: dict[str, dict[str, str | None]] = {family: {} for family in (*families, "sound")}
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch) / "vectors"
+        export(folder)
+        trials: list[tuple[str, str, Callable[[], AbstractContextManager[Any]]]] = []
+        for family, mutants in families.items():
+            trials += [(family, mutant.name, partial(alive, mutant)) for mutant in mutants]
+        for number, (family, name, living) in enumerate(trials):
+            with living() as backend:
+                found[family][name] = first_failure(folder, Path(scratch) / str(number), backend)
+            told(name, found[family][name])
+        for name in SHIPPED:
+            found["sound"][name] = first_failure(folder, Path(scratch) / name, shipped(name))
+    return found
+
+
+def main(words: list[str]) -> int:
+    """Write the results."""
+    if len(words) != 1:
+        print("usage: python -m pop_ref.conformance.vector_kills FILE")
+        return 2
+    found = kills(lambda name, first: print(f"{name}: {first or 'survives'}", flush=True))
+    Path(words[0]).write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,144 @@
+"""Draw a counterexample with NumPy alone: what a student's function gives in orange, what it should give in blue.
+
+Covariances are drawn as ellipses, rotations as the axes that they turn, pictures as pictures, and all other numbers as
+bars beside each other, each pair to its own scale.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+
+from pop_ref.conformance.scenes import Scene
+from pop_ref.learn.judge import Verdict
+from pop_ref.learn.mistakes import numbers
+from pop_ref.learn.student import Call
+from pop_ref.render import render
+
+SIDE: Final = 240
+_FINER: Final = 3
+_PAPER, _RULE = np.array([0.99, 0.985, 0.975]), np.array([0.8, 0.79, 0.77])
+YOURS: Final = np.array([0.82, 0.38, 0.16])
+ORACLES: Final = np.array([0.15, 0.39, 0.79])
+_MOST_BARS: Final = 16
+
+_AS_ELLIPSES: Final = ("covars_from_quats_scales", "covars_cam_from_covars", "project_covars", "low_pass")
+_AS_AXES: Final = ("rotmats_from_quats",)
+
+
+def drawn_counterexample(verdict: Verdict) -> np.ndarray | None:
+    """Draw what broke a law.
+
+    Args:
+        verdict: of a stage that has not passed.
+
+    Returns:
+        A picture [H, W, 3] in [0, 1]: the scene, if one was drawn, and the two results; None where there is nothing
+        to draw.
+    """
+    panels = [_scene(value) for value in (verdict.drawn or {}).values() if isinstance(value, Scene)][:1]
+    if verdict.call is not None:
+        panels += _results(verdict.call)
+    if not panels:
+        return None
+    gap = np.broadcast_to(_PAPER, (SIDE, 12, 3))
+    return np.concatenate([part for panel in panels for part in (panel, gap)][:-1], axis=1)
+
+
+def _results(call: Call) -> list[np.ndarray]:
+    found, expected = call.found[0], call.expected[0]
+    if call.function in _AS_ELLIPSES or call.function in _AS_AXES:
+        ours, theirs = np.asarray(found, dtype=float), np.asarray(expected, dtype=float)
+        if ours.shape == theirs.shape and np.all(np.isfinite(ours)):
+            both = ((theirs, ORACLES), (ours, YOURS))
+            return [_ellipses(both) if call.function in _AS_ELLIPSES else _axes(both)]
+    pictures = [_image(value) for value in (found, expected)]
+    if all(picture is not None for picture in pictures):
+        return [picture for picture in pictures if picture is not None]
+    a, b = numbers(call.found), numbers(call.expected)
+    return [_bars(a, b)] if len(a) and len(b) else []
+
+
+def _canvas() -> np.ndarray:
+    return np.tile(_PAPER, (SIDE * _FINER, SIDE * _FINER, 1))
+
+
+def _smooth(canvas: np.ndarray) -> np.ndarray:
+    return canvas.reshape(SIDE, _FINER, SIDE, _FINER, 3).mean(axis=(1, 3))
+
+
+def _grid(reach: float) -> tuple[np.ndarray, np.ndarray]:
+    at = reach * (2.0 * (np.arange(SIDE * _FINER) + 0.5) / (SIDE * _FINER) - 1.0)
+    return np.meshgrid(at, at)
+
+
+def _ellipses(both: tuple[tuple[np.ndarray, np.ndarray], ...]) -> np.ndarray:
+    """Draw ellipses of one standard deviation about one centre, seen along z where they are in space."""
+    every = np.concatenate([covars[:, :2, :2] for covars, _ in both])
+    largest = float(np.sqrt(max(np.max(np.abs(every)), 1e-12)))
+    x, y = _grid(1.3 * largest)
+    canvas = _canvas()
+    canvas[(np.abs(x) < 0.004 * largest) | (np.abs(y) < 0.004 * largest)] = _RULE
+    for covars, color in both:
+        for covar in covars[:3, :2, :2]:
+            # a flat one is drawn as thin as a line
+            inverse = np.linalg.pinv(0.5 * (covar + covar.T) + 1e-4 * largest**2 * np.eye(2))
+            q = inverse[0, 0] * x * x + (inverse[0, 1] + inverse[1, 0]) * x * y + inverse[1, 1] * y * y
+            # the distance from the outline, to first order
+            slope = np.hypot(inverse[0, 0] * x + inverse[0, 1] * y, inverse[0, 1] * x + inverse[1, 1] * y)
+            canvas[np.abs(q - 1.0) < 0.03 * largest * np.maximum(slope, 1e-12)] = color
+    return _smooth(canvas)
+
+
+def _axes(both: tuple[tuple[np.ndarray, np.ndarray], ...]) -> np.ndarray:
+    """Draw where a rotation takes the axes x (longest), y and z, seen along z."""
+    x, y = _grid(1.2)
+    canvas = _canvas()
+    canvas[(np.abs(x) < 0.005) | (np.abs(y) < 0.005)] = _RULE
+    for rotmats, color in both:
+        for k, length in enumerate((1.0, 0.75, 0.5)):
+            end = length * rotmats[0, :2, k]
+            along = np.clip((x * end[0] + y * end[1]) / max(end @ end, 1e-12), 0.0, 1.0)
+            canvas[np.hypot(x - along * end[0], y - along * end[1]) < 0.015] = color
+            canvas[np.hypot(x - end[0], y - end[1]) < 0.035] = color
+    return _smooth(canvas)
+
+
+def _bars(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Draw pairs of numbers as pairs of bars; those that differ first, each pair to the larger of its two."""
+    n = min(len(found), len(expected))
+    a, b = (np.nan_to_num(each[:n], posinf=1e300, neginf=-1e300) for each in (found, expected))
+    order = np.argsort(-np.abs(a - b), kind="stable")[:_MOST_BARS]
+    size = np.maximum(np.maximum(np.abs(a), np.abs(b)), 1e-300)[order]
+    canvas, middle = _canvas(), SIDE * _FINER // 2
+    canvas[middle - 1 : middle + 2] = _RULE
+    wide = SIDE * _FINER / len(order)
+    for k in range(len(order)):
+        for value, offset, color in ((a[order[k]], 0.1, YOURS), (b[order[k]], 0.5, ORACLES)):
+            left, right = int((k + offset) * wide), int((k + offset + 0.38) * wide)
+            top = middle - round(0.9 * middle * float(value / size[k]))
+            canvas[min(top, middle) : max(top, middle) + 1, left:right] = color
+    return _smooth(canvas)
+
+
+def _image(value: Any) -> np.ndarray | None:
+    if not isinstance(value, np.ndarray) or value.ndim != 3 or min(value.shape[:2]) < 5:
+        return None
+    return _enlarged(np.broadcast_to(value[..., :3], (*value.shape[:2], 3)))
+
+
+def _scene(scene: Scene) -> np.ndarray:
+    background = scene.background
+    view = render(scene.gaussians, scene.camera, background)
+    return _enlarged(np.broadcast_to(view.image[..., :3], (*view.image.shape[:2], 3)))
+
+
+def _enlarged(image: np.ndarray) -> np.ndarray:
+    """Fit a picture into a square panel, pixels as squares."""
+    height, width = image.shape[:2]
+    times = max(1, SIDE // max(height, width))
+    large = np.clip(np.nan_to_num(image), 0.0, 1.0).repeat(times, axis=0).repeat(times, axis=1)[:SIDE, :SIDE]
+    panel = np.tile(_PAPER, (SIDE, SIDE, 1))
+    panel[: large.shape[0], : large.shape[1]] = large
+    return panel

@@ -1,0 +1,112 @@
+"""Widgets for the pages: pictures that answer to a finger, a mouse or the arrow keys, with no network and no framework.
+
+Each is one plain script beside this file. Its mathematics stands apart in `math/`, one file a stage and its functions
+named as the oracle's; a test runs those against the oracle. The constants are those of the profile `paper`.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from functools import cache
+from html import escape
+from pathlib import Path
+from typing import Final
+
+from pop_ref.constants import PAPER
+
+FOLDER: Final = Path(__file__).resolve().parent
+
+
+@dataclass(frozen=True)
+class Widget:
+    """What a widget is called, what to try with it, the stages whose mathematics it needs, and its recorded data."""
+
+    title: str
+    prompt: str
+    stages: tuple[str, ...] = ()
+    data: str | None = None
+
+
+WIDGETS: Final = {
+    "splat2d": Widget(
+        "One splat on the screen",
+        "drag the splat over the pixels, then take its opacity down to 0.02: where does the orange edge go?",
+        ("alpha", "footprint"),
+    ),
+    "stack": Widget(
+        "A stack of splats at one pixel",
+        "put a wall in the middle, then bring it to the front: who still has a weight, and who a gradient?",
+        ("alpha", "pixel"),
+    ),
+    "orbit": Widget(
+        "A Gaussian in space and its ellipse",
+        "walk around it by dragging, then come as near as 2 world units: when does the ellipse leave the points?",
+        ("covariance", "projection"),
+    ),
+    "harmonics": Widget(
+        "Sixteen harmonics",
+        "set all to zero, raise one slider at a time, and turn the globe: which are even, which odd?",
+        ("harmonics",),
+    ),
+    "scrubber": Widget(
+        "Two trainings, without and with the prior",
+        "play both, and watch the middle of the histograms empty on one side only.",
+        data="scrubber.json",
+    ),
+}
+
+
+def html(name: str) -> str:
+    """Write a widget as markup for a page: style, script and data in one piece, nothing loaded from anywhere.
+
+    Where scripts do not run it stays hidden, and one line says so. A page may hold several, each of them once.
+
+    Args:
+        name: one of `WIDGETS`.
+
+    Returns:
+        Elements for the body of a page. Colours are the page's own variables, where it has them.
+
+    Raises:
+        ValueError: there is no widget of that name.
+    """
+    if name not in WIDGETS:
+        raise ValueError(f"there is no widget {name!r}; use one of {', '.join(WIDGETS)}")
+    widget = WIDGETS[name]
+    title = escape(widget.title)
+    return (
+        f'<div class="pop-widget" data-widget="{name}" role="group" aria-label="{title}" hidden>'
+        f'<h4>{title}</h4><p class="pw-try"><b>Try this:</b> {escape(widget.prompt)}</p></div>'
+        f'<noscript><p class="pop-widget-off">({title}: this one moves where JavaScript is allowed.)</p></noscript>'
+        f"<style>{_text('widgets.css')}</style><script>{_script(name, widget)}</script>"
+    )
+
+
+def mathematics(*stages: str) -> str:
+    """Read the pure functions of stages, with the constants that they use in front."""
+    constants = {
+        key: value for key, value in asdict(PAPER).items() if isinstance(value, float)
+    }
+    return "\n".join(
+        [
+            f"const PAPER = {json.dumps(constants)};",
+            *(_text(f"math/{stage}.js") for stage in stages),
+        ]
+    )
+
+
+def _script(name: str, widget: Widget) -> str:
+    data = f"const RECORDING = {_text(widget.data)};" if widget.data else ""
+    # whatever a page holds more than once is started once
+    start = (
+        f"for (const root of document.querySelectorAll('.pop-widget[data-widget=\"{name}\"][hidden]')) "
+        f"{{ root.hidden = false; {name}(root); }}"
+    )
+    parts = (mathematics(*widget.stages), _text("kit.js"), data, _text(f"{name}.js"), start)
+    return "(() => {\n" + "\n".join(part for part in parts if part) + "\n})();"
+
+
+@cache
+def _text(name: str) -> str:
+    return (FOLDER / name).read_text(encoding="utf-8")

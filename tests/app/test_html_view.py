@@ -1,0 +1,227 @@
+"""The page that shows a splat: a browser without a network draws what `pop render` draws."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pop_fast.api.registry import get_backend
+from pop_fast.io.formats import load_splat_file, save_as
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
+from pop_fast.train.views import ViewTensors, render_view
+from pop_fast.view.html import PageCamera, cameras_of, page_of
+from pop_fast.view.html.cameras import camera_of_points, view_distances
+from tests.app.browser import Browser, browser
+from tests.app.clouds import many
+from tests.app.conftest import Pop
+from tests.app.tiny import look_at, tiny_capture
+
+WIDTH, HEIGHT = 200, 150
+# of the rendered SPZ that the page holds; half floats and the card's exp differ by less than a step of 255 almost
+# everywhere, and by some steps where alpha lies at the floor of 1/255 (measured: 55 to 59 dB)
+DRAWN_ALIKE = 50.0
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with browser(tmp_path_factory.mktemp("browser")) as opened:
+        yield opened
+
+
+def a_view(position: tuple[float, float, float] = (0.5, -1.0, -6.0)) -> ViewTensors:
+    K = torch.tensor([[180.0, 0.0, 93.0], [0.0, 170.0, 80.0], [0.0, 0.0, 1.0]])
+    viewmat = torch.from_numpy(look_at(np.array(position))).float()
+    return ViewTensors("a view", torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8), None, viewmat[None], K[None])
+
+
+def camera_of(view: ViewTensors) -> PageCamera:
+    return PageCamera(view.name, view.viewmat[0].double().numpy(), view.K[0].double().numpy(), WIDTH, HEIGHT)
+
+
+def shown(tab: Browser, page: Path, camera: int = 0) -> np.ndarray:
+    tab.open(page, WIDTH, HEIGHT, f"#camera={camera}&bare")
+    tab.wait_for(f"document.getElementById('view')?.dataset.drawn === '{camera}'")
+    return tab.screenshot()
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(10.0 * np.log10(255.0**2 / max(((a.astype(float) - b) ** 2).mean(), 1e-9)))
+
+
+def rendered(params: dict[str, torch.Tensor], view: ViewTensors, config: TrainConfig, degree: int) -> np.ndarray:
+    with torch.no_grad():
+        image = render_view(get_backend("fast"), params, view, config, degree).image
+    return (image.clamp(0.0, 1.0) * 255.0).round().numpy()
+
+
+@pytest.mark.parametrize(
+    ("bands", "antialiased", "background", "profile"),
+    [
+        (15, False, (0.0, 0.0, 0.0), "paper"),
+        (8, True, (1.0, 0.5, 0.25), "paper"),
+        (3, False, (0.2, 0.2, 0.2), "gsplat_1_6"),
+        (0, False, (0.0, 0.0, 0.0), "paper"),
+    ],
+)
+def test_a_browser_draws_what_is_rendered(
+    tab: Browser, tmp_path: Path, bands: int, antialiased: bool, background: tuple, profile: str
+) -> None:
+    params, degree = many(1500, bands), (0, 3, 8, 15).index(bands)
+    config = TrainConfig(antialiased=antialiased, background=background, profile=profile)
+    views = [a_view(), a_view((3.0, 1.0, 4.0))]
+    page = tmp_path / "x.html"
+    page.write_bytes(page_of(params, [camera_of(view) for view in views], config, degree, "x"))
+    save_as(tmp_path / "x.spz", "spz", params, antialiased)
+    held, _ = load_splat_file(tmp_path / "x.spz")
+    for index, view in enumerate(views):
+        picture = shown(tab, page, index)
+        drawn = rendered(held, view, config, degree)
+        # not one colour, and the two views differ
+        assert drawn.std() > 10.0
+        assert psnr(picture, drawn) > DRAWN_ALIKE
+    assert psnr(picture, rendered(held, views[0], config, degree)) < 25.0
+    assert tab.errors == []
+
+
+def test_a_page_of_a_result_starts_at_a_training_camera_and_asks_for_nothing(
+    tab: Browser, pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path
+) -> None:
+    outcome = pop("export", shared_result, "--out", tmp_path / "x.html")
+    assert outcome.status == 0, outcome.err
+    tab.requests.clear()
+    tab.open(tmp_path / "x.html", 40, 32, "#bare")
+    tab.wait_for("document.getElementById('view')?.dataset.drawn === '0'")
+    picture = tab.screenshot()
+    assert all(url.startswith(("file:", "blob:", "about:", "data:")) for url in tab.requests)
+    files = {url.partition("#")[0] for url in tab.requests if url.startswith("file:")}
+    assert files == {(tmp_path / "x.html").as_uri()}
+    splat = load_splat(shared_result)
+    capture, config = open_capture(splat, CaptureOptions())
+    first = ViewTensors.of(capture.train_views(config.test_every)[0])
+    # beside what the browser changes, what SPZ loses
+    assert psnr(picture, rendered(splat.params, first, config, splat.sh_degree)) > 40.0
+
+
+def test_the_page_refers_to_no_other_file() -> None:
+    page = page_of(many(5), [], TrainConfig(), 3, "x").decode()
+    assert not re.findall(r"""(?:src|href)\s*=|url\(|@import|fetch\(|XMLHttpRequest|WebSocket|import\(""", page)
+    assert "connect-src" not in page
+    assert "default-src 'none'" in page
+
+
+def test_mouse_wheel_and_keys_move_the_camera(tab: Browser, tmp_path: Path) -> None:
+    page = tmp_path / "x.html"
+    page.write_bytes(
+        page_of(many(300), [camera_of(a_view()), camera_of(a_view((3.0, 1.0, 4.0)))], TrainConfig(), 3, "x")
+    )
+    start = shown(tab, page)
+
+    def after(expression: str | None = None) -> np.ndarray:
+        if expression:
+            tab.value(expression)
+        # two frames of the browser: one that sorts, one that draws in the new order
+        for _ in range(3):
+            tab.value("delete document.getElementById('view').dataset.drawn; window.dispatchEvent(new Event('resize'))")
+            tab.wait_for("document.getElementById('view').dataset.drawn")
+        return tab.screenshot()
+
+    def key(name: str) -> str:
+        return f"window.dispatchEvent(new KeyboardEvent('keydown', {{key: '{name}'}}))"
+
+    turned = after(key("ArrowLeft"))
+    assert psnr(turned, start) < 30.0
+    nearer = after(key("+"))
+    assert psnr(nearer, turned) < 35.0
+    back = after(key("r"))
+    assert psnr(back, start) > 60.0
+    other = after(key("n"))
+    assert psnr(other, start) < 25.0
+    assert psnr(after(key("p")), start) > 60.0
+    for kind, x, buttons in (("mousePressed", 60, 1), ("mouseMoved", 120, 1), ("mouseReleased", 120, 0)):
+        tab.call("Input.dispatchMouseEvent", type=kind, x=x, y=70, button="left", buttons=buttons, clickCount=1)
+    dragged = after()
+    assert psnr(dragged, start) < 30.0
+    tab.call("Input.dispatchMouseEvent", type="mouseWheel", x=60, y=70, deltaX=0, deltaY=-300)
+    assert psnr(after(), dragged) < 35.0
+
+
+def test_two_fingers_zoom(tab: Browser, tmp_path: Path) -> None:
+    page = tmp_path / "x.html"
+    page.write_bytes(page_of(many(300), [camera_of(a_view())], TrainConfig(), 3, "x"))
+    start = shown(tab, page)
+
+    def touch(kind: str, *points: tuple[int, int]) -> None:
+        fingers = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
+        tab.call("Input.dispatchTouchEvent", type=kind, touchPoints=fingers)
+
+    tab.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
+    touch("touchStart", (90, 75), (110, 75))
+    for step in (5, 15, 30):
+        touch("touchMove", (90 - step, 75), (110 + step, 75))
+    touch("touchEnd")
+    tab.call("Emulation.setTouchEmulationEnabled", enabled=False)
+    tab.wait_for("document.getElementById('view').dataset.drawn")
+    assert psnr(tab.screenshot(), start) < 30.0
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (400, 780)])
+def test_the_buttons_fit_into_the_window(tab: Browser, tmp_path: Path, width: int, height: int) -> None:
+    page = tmp_path / "x.html"
+    page.write_bytes(page_of(many(300), [], TrainConfig(), 3, "a title that is rather long"))
+    tab.open(page, width, height)
+    tab.wait_for("document.getElementById('view')?.dataset.drawn === '0'")
+    assert tab.value("document.documentElement.scrollWidth <= innerWidth && document.body.scrollHeight <= innerHeight")
+    boxes = tab.value(
+        "JSON.stringify([...document.querySelectorAll('#panel > *, #panel button')]"
+        ".map(e => e.getBoundingClientRect()).map(b => [b.left, b.top, b.right, b.bottom]))"
+    )
+    for left, top, right, bottom in json.loads(boxes):
+        assert 0 <= left <= right <= width
+        assert 0 <= top <= bottom <= height
+
+
+def test_an_empty_splat_and_a_lone_one_have_pages(tab: Browser, tmp_path: Path) -> None:
+    for n in (0, 1):
+        page = tmp_path / f"{n}.html"
+        page.write_bytes(page_of(many(n), [], TrainConfig(background=(0.0, 1.0, 0.0)), 3, "x"))
+        assert shown(tab, page)[0, 0].tolist() == [0, 255, 0]
+
+
+def test_views_turn_about_the_point_that_all_cameras_look_at() -> None:
+    cameras = [camera_of(a_view(place)) for place in ((0.0, -1.0, -6.0), (5.0, -1.0, 0.0), (0.0, 2.0, 3.0))]
+    distances = view_distances(cameras, many(200)["means"])
+    np.testing.assert_allclose(distances, [np.linalg.norm(camera.eye) for camera in cameras], rtol=1e-6)
+
+
+def test_cameras_that_look_the_same_way_turn_about_the_median_gaussian() -> None:
+    cameras = []
+    for x in (0.0, 0.5):
+        viewmat = np.eye(4)
+        viewmat[:3, 3] = [x, 0.0, 7.0]
+        cameras.append(PageCamera("x", viewmat, np.eye(3), 10, 10))
+    for distance in view_distances(cameras, many(2000)["means"]):
+        assert distance == pytest.approx(7.0, abs=0.2)
+
+
+def test_a_splat_without_cameras_is_seen_from_the_front() -> None:
+    means = many(500)["means"] + torch.tensor([4.0, 0.0, 0.0])
+    camera = camera_of_points(means)
+    seen = means.double().numpy() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    pixels = seen[:, :2] / seen[:, 2:] * camera.K[0, 0] + camera.K[:2, 2]
+    inside = (seen[:, 2] > 0) & (pixels >= 0).all(1) & (pixels <= [camera.width, camera.height]).all(1)
+    assert inside.mean() > 0.7
+
+
+def test_a_large_capture_gives_sixty_cameras_evenly() -> None:
+    views = tiny_capture(n_views=200).views
+    cameras = cameras_of(views)
+    assert len(cameras) == 60
+    assert cameras[0].name == views[0].name
+    assert cameras[-1].name == views[-1].name

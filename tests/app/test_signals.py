@@ -1,0 +1,132 @@
+"""Ctrl-C, SIGTERM, SIGHUP and SIGKILL, at a program that is at work in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pop_fast.train import checkpoint as ckpt
+from tests.app.captures import write_photograph
+from tests.app.conftest import TRAIN
+from tests.app.damage import contents
+
+ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+_POP = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from pop_fast.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.fixture
+def photographs(tmp_path: Path) -> Path:
+    """Photographs of noise that overlap: thousands of features each, minutes of matching."""
+    wall = np.random.default_rng(0).integers(0, 256, (900, 3000, 3), dtype=np.uint8)
+    for i in range(24):
+        write_photograph(tmp_path / "in" / f"{i:02d}.png", wall[:, 80 * i : 80 * i + 1100])
+    return tmp_path / "in"
+
+
+def start(tmp_path: Path, *words: object) -> subprocess.Popen[str]:
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(scratch), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", _POP, *map(str, words)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen(command, env=environment, text=True, cwd=ROOT, **pipes)
+
+
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str] | None = None) -> None:
+    end = time.monotonic() + 90.0
+    while not condition():
+        assert process is None or process.poll() is None, process.communicate()
+        assert time.monotonic() < end, "it does not come to that"
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize(
+    ("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -signal.SIGKILL)]
+)
+def test_the_search_for_cameras_is_left_at_once_and_leaves_nothing(
+    photographs: Path, tmp_path: Path, number: signal.Signals, status: int
+) -> None:
+    before = contents(photographs)
+    process = start(tmp_path, "sfm", photographs)
+    # while features are found, in one call of COLMAP that takes longer than the test waits
+    wait_until(lambda: any((tmp_path / "scratch").glob("pop_sfm_*/database.db")), process)
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == status
+    if number != signal.SIGKILL:
+        assert err == "pop: interrupted\n"
+        assert contents(photographs) == before
+    # the other process notices that this one is gone, whatever ended it
+    wait_until(lambda: not any((tmp_path / "scratch").iterdir()))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_training_that_is_told_to_stop_writes_a_checkpoint(
+    shared_capture: Path, tmp_path: Path, number: signal.Signals
+) -> None:
+    folder = tmp_path / "r"
+    words = ("--max-steps", "100000", "--checkpoint-every", "0", *TRAIN)
+    process = start(tmp_path, "train", shared_capture, "--out", folder, *words)
+    wait_until(lambda: (folder / "cfg.json").exists(), process)
+    process.send_signal(number)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 130
+    ((step, _),) = ckpt.list_checkpoints(folder)
+    assert err == f"pop: stopped after step {step + 1:,}; the same command with --resume goes on\n"
+
+
+def test_a_hangup_that_is_ignored_stays_so(shared_capture: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "r"
+    ignoring = (
+        "import os, signal, sys; signal.signal(signal.SIGHUP, signal.SIG_IGN); os.execv(sys.argv[1], sys.argv[1:])"
+    )
+    command = [sys.executable, "-c", _POP, "train", str(shared_capture), "--out", str(folder), "--max-steps", "600"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(
+        [sys.executable, "-c", ignoring, *command, *TRAIN], env=environment, cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+    wait_until(lambda: (folder / "cfg.json").exists(), process)
+    process.send_signal(signal.SIGHUP)
+    out, _ = process.communicate(timeout=300)
+    assert process.returncode == 0
+    assert "report: " in out
+
+
+_LOADING = """
+import time
+from pathlib import Path
+from pop_fast.data import load
+from pop_fast.data.pinhole import require_colmap
+
+def slowly(*_, **__):
+    require_colmap()
+    Path(sys.argv[-1], "reading").touch()
+    time.sleep(300.0)
+
+load.load_capture = slowly
+"""
+
+
+def test_sigterm_while_a_capture_is_read_is_one_line(shared_capture: Path, tmp_path: Path) -> None:
+    script = _POP.replace("from pop_fast.cli import main", f"{_LOADING}from pop_fast.cli import main")
+    # pycolmap prints a stack trace of its own where it is let
+    words = ["train", str(shared_capture), "--out", f"{tmp_path}/r", "--images", str(tmp_path)]
+    process = subprocess.Popen([sys.executable, "-c", script, *words], stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    wait_until(lambda: (tmp_path / "reading").exists(), process)
+    process.terminate()
+    assert process.communicate(timeout=60)[1] == "pop: interrupted\n"
+    assert process.returncode == 143

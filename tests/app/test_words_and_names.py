@@ -1,0 +1,282 @@
+"""What people type, and how they call their files: none of it is taken for something else or reaches a terminal raw."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+import torch
+
+from pop_fast.cli import COMMANDS, main
+from pop_fast.cli.completion import bash, fish, options_of
+from pop_fast.cli.errors import describe
+from pop_fast.cli.printable import message, printable
+from pop_fast.cli.train import arguments, takes_hours
+from pop_fast.data import load_capture, run_sfm
+from pop_fast.stages.tiles import tile_lists
+from pop_fast.train import TrainConfig, choose
+from tests.app.captures import (
+    assert_one_line,
+    colmap_capture,
+    edit_transforms,
+    photograph,
+    transforms_capture,
+    write_photograph,
+)
+from tests.app.conftest import TRAIN, Pop
+from tests.app.damage import says
+from tests.app.interruptions import interrupt
+
+
+@pytest.mark.parametrize("name", ["a=b", "x y", "--", "-s"])
+def test_a_path_may_hold_an_equals_sign_or_a_space(pop: Pop, shared_capture: Path, tmp_path: Path, name: str) -> None:
+    data = Path(shutil.copytree(shared_capture, tmp_path / name / "data=1"))
+    outcome = pop("train", data, "--out", tmp_path / f"{name} out=1", *TRAIN, "--max-steps", "2")
+    assert outcome.status == 0, outcome.err
+    assert (tmp_path / f"{name} out=1" / "cfg.json").is_file()
+
+
+def test_iterations_are_steps() -> None:
+    assert arguments(["scene", "--iterations", "700"])[0].max_steps == 700
+    assert arguments(["scene", "--preset", "quick", "--iterations=700"])[0].max_steps == 700
+
+
+def test_a_photograph_whose_name_is_no_text_is_trained_on(pop: Pop, tmp_path: Path) -> None:
+    # a file name is bytes; Python carries the odd ones through a string
+    odd = os.fsdecode(b"view\xff.png")
+    root = transforms_capture(tmp_path / "scene", 9)
+    (root / "images" / "04.png").rename(root / "images" / odd)
+    edit_transforms(root, lambda listing: listing["frames"][4].update(file_path=f"images/{odd}"))
+    outcome = pop("train", root, "--out", tmp_path / "r", *TRAIN, "--max-steps", "3", "--test-every", "2")
+    assert outcome.status == 0, outcome.err
+    assert (tmp_path / "r" / "report.html").is_file()
+    assert "view" in (tmp_path / "r" / "stats" / "val_step0002.json").read_text()
+    assert (
+        pop("train", root, "--out", tmp_path / "r", *TRAIN, "--max-steps", "3", "--test-every", "2", "--resume").status
+        == 0
+    )
+
+
+def test_the_search_for_cameras_names_a_photograph_that_colmap_cannot_list(tmp_path: Path) -> None:
+    for i, name in enumerate((b"a\xff.png", b"b.png")):
+        (tmp_path / os.fsdecode(name)).write_bytes(b"")
+        write_photograph(tmp_path / "plain.png", photograph(i))
+        (tmp_path / "plain.png").rename(tmp_path / os.fsdecode(name))
+    assert_one_line(lambda: run_sfm(tmp_path), "not UTF-8", "rename the photograph")
+
+
+def test_escape_sequences_in_names_are_shown_and_not_obeyed(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
+    evil = tmp_path / "a\x1b[31m\r\u202eb"
+    outcome = pop("eval", evil)
+    says(outcome, r"a\x1b[31m", r"\u202eb")
+    shutil.copytree(shared_capture, evil)
+    outcome = pop("train", evil, "--out", tmp_path / "r", *TRAIN, "--max-steps", "2")
+    assert outcome.status == 0
+    assert "\x1b" not in outcome.out + outcome.err
+    assert r"a\x1b[31m" in outcome.out
+    assert "\x1b" not in pop("data", "check", evil).out
+
+
+def test_tabs_and_letters_of_all_languages_stay() -> None:
+    assert printable("Fotos\tgrün 写真 🎈") == "Fotos\tgrün 写真 🎈"
+    assert printable("\udcff") == "\\udcff"
+
+
+def test_a_message_is_no_longer_than_can_be_read() -> None:
+    long = "a" + "b" * 10_000 + "c"
+    short = message(long)
+    assert len(short) < 1_300
+    assert (short[0], short[-1]) == ("a", "c")
+    assert message("b" * 1_000) == "b" * 1_000
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--seed", "-1"), "seed is -1; it must be at least 0"),
+        (("--threads", "100000"), "threads is 100000; it must be at most 512"),
+        (("--sfm.matcher", "exhaustive", "--sfm.seed", "-1"), "seed is -1; it must be a whole number from 0"),
+    ],
+)
+def test_numbers_that_libraries_cannot_take_are_refused(
+    pop: Pop, shared_capture: Path, tmp_path: Path, words: tuple[str, ...], told: str
+) -> None:
+    outcome = pop("train", shared_capture, "--out", tmp_path / "r", *words)
+    assert outcome.status == 2
+    assert told in " ".join(outcome.err.replace("│", " ").split())
+    assert not (tmp_path / "r").exists()
+
+
+def test_a_camera_id_beyond_32_bits_is_named(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path, binary=False)
+    for name in ("cameras.txt", "images.txt"):
+        path = root / "sparse" / "0" / name
+        lines = path.read_text().splitlines()
+        changed = [line.replace("1 PINHOLE", f"{2**32} SIMPLE_RADIAL") for line in lines]
+        path.write_text("\n".join(changed) + "\n")
+    cameras = root / "sparse" / "0" / "cameras.txt"
+    cameras.write_text(f"{2**32} SIMPLE_RADIAL 40 30 36 20 15 0\n")
+    assert_one_line(lambda: load_capture(root), "cameras.txt", f"CAMERA_ID is {2**32}")
+
+
+def test_what_the_system_refuses_is_explained() -> None:
+    told = describe(RuntimeError("can't start new thread"))
+    assert told is not None
+    assert "ulimit -u" in told
+
+
+def test_renders_that_are_nested_beyond_reading_are_somebody_else_s(
+    pop: Pop, shared_result: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "views"
+    out.mkdir()
+    (out / "renders.json").write_text("[" * 200_000)
+    outcome = pop("render", shared_result, "--out", out, "--overwrite")
+    assert outcome.status == 2
+    assert "renders.json" in outcome.err
+
+
+def test_quiet_prints_nothing_and_no_progress_leaves_out_the_bars(
+    pop: Pop, shared_capture: Path, tmp_path: Path
+) -> None:
+    words = [*TRAIN, "--max-steps", "2"]
+    assert pop("train", shared_capture, "--out", tmp_path / "a", *words, "--quiet").out == ""
+    assert "PSNR" in pop("train", shared_capture, "--out", tmp_path / "b", *words).out
+
+
+def test_how_cameras_are_found_can_be_said_to_train(pop: Pop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for i in range(3):
+        write_photograph(tmp_path / "in" / f"{i}.png", photograph(i))
+    asked: dict[str, object] = {}
+
+    def placed(photos: Path, root: Path, **options: object) -> None:
+        asked.update(options)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pop_fast.data.load.run_sfm", placed)
+    words = ("--sfm.camera-model", "OPENCV", "--sfm.matcher", "sequential", "--sfm.max-size", "800")
+    assert pop("train", tmp_path / "in", "--out", tmp_path / "r", *words).status == 130
+    assert (asked["camera_model"], asked["matcher"], asked["max_size"]) == ("OPENCV", "sequential", 800)
+
+
+def test_an_unfinished_run_is_marked_beside_a_finished_one(
+    pop: Pop, shared_capture: Path, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("--eval-steps", "5", "--checkpoint-every", "5")
+    interrupt(monkeypatch, at=10)
+    assert pop("train", shared_capture, "--out", tmp_path / "r", *TRAIN, *words).status == 130
+    _, finished, unfinished = pop("compare", shared_result, tmp_path / "r").out.splitlines()
+    assert "5 of 30, unfinished" in unfinished
+    assert "unfinished" not in finished
+    assert " 1 threads" not in finished
+
+
+def test_which_folder_a_factor_reads_is_told(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path)
+    assert load_capture(root).notes == ()
+    assert load_capture(root, factor=2).notes == ("the photographs of images/ are shrunk by 2 here",)
+    for path in (root / "images").iterdir():
+        write_photograph(root / "images_2" / path.name, photograph(0, 20, 15))
+    (note,) = load_capture(root, factor=2).notes
+    assert note.startswith("the photographs of images_2/ are used, made smaller before")
+
+
+@pytest.mark.parametrize(
+    ("words", "hours"),
+    [
+        ((), True),
+        (("--preset", "quick"), False),
+        (("--max-steps", "500"), False),
+        (("--steps-scaler", "0.1"), False),
+        (("--backend", "cuda"), False),
+    ],
+)
+def test_the_paper_s_schedule_is_mentioned_where_nobody_asked_for_it_on_a_cpu(
+    words: tuple[str, ...], hours: bool
+) -> None:
+    config, _ = arguments(["scene", *words])
+    assert takes_hours(config) == hours
+
+
+def test_no_gpu_is_said_where_there_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cuda_ext.why_not", lambda: "the CUDA extension is not built; run `pop build-cuda`")
+    config = TrainConfig(result_dir=str(tmp_path))
+    monkeypatch.setattr(choose, "has_gpu", lambda: False)
+    assert choose.choose_backend(config)[1].endswith("there is no NVIDIA GPU here")
+    monkeypatch.setattr(choose, "has_gpu", lambda: True)
+    assert choose.choose_backend(config)[1].endswith("run `pop build-cuda`")
+
+
+def test_help_of_a_switch_that_is_on_reads_forwards(pop: Pop) -> None:
+    shown = " ".join(pop("train", "--help-all").out.replace("│", " ").split())
+    assert "--normalize, --no-normalize move the capture into gsplat's normalised world. (default: True)" in shown
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_bash_completes_commands_options_and_files(tmp_path: Path, pop: Pop) -> None:
+    (tmp_path / "pop.bash").write_text(pop("completion", "bash").out)
+    (tmp_path / "scene").mkdir()
+    script = 'source ./pop.bash; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _pop; echo "${COMPREPLY[@]}"'
+
+    def completed(*words: str) -> list[str]:
+        command = ["bash", "-c", script, "-", *words]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout.split()
+
+    assert completed("pop", "tra") == ["train"]
+    assert completed("pop", "data", "") == ["check"]
+    assert "--pop.lambda-pop" in completed("pop", "train", "--pop.l")
+    assert completed("pop", "eval", "sc") == ["scene"]
+    assert set(completed("pop", "")) == {name.split()[0] for name in COMMANDS}
+
+
+def test_every_option_of_every_command_is_completed() -> None:
+    words = {name: options_of(name) for name in COMMANDS}
+    assert {"--help", "--capture", "--json"} <= set(words["eval"])
+    assert "--max-steps" in words["train"]
+    assert all("--help" in options for options in words.values())
+    assert "-l max-steps" in fish(words)
+    assert "bashcompinit" in bash(words, zsh=True)
+
+
+def test_tiles_beyond_what_a_float_counts_are_listed_in_the_right_rows() -> None:
+    # one splat over 4,099 x 4,099 tiles of a pixel: past 2^24 of them a quotient in float32 is rounded
+    side = 4_099
+    lists = tile_lists(
+        torch.tensor([[side / 2.0, side / 2.0]]),
+        torch.tensor([[2.0 * side, 2.0 * side]]),
+        torch.tensor([1.0]),
+        side,
+        side,
+        1,
+    )
+    assert torch.equal(lists.offsets, torch.arange(side * side + 1))
+
+
+def test_the_package_gives_its_main_names_and_its_version(shared_capture: Path) -> None:
+    import pop_fast
+
+    for name in pop_fast.__all__:
+        assert getattr(pop_fast, name) is not None
+    assert pop_fast.__version__[0].isdigit()
+    with pytest.raises(AttributeError, match="no attribute 'rasterisation'"):
+        _ = pop_fast.rasterisation
+    assert callable(pop_fast.rasterization)
+    loaded = pop_fast.load_capture(shared_capture)
+    assert repr(loaded).startswith("Capture('toy', 8 views, ")
+    assert loaded._repr_html_().count("<img src=") == 8
+    assert loaded.views[0]._repr_html_().count("data:image/png;base64,") == 1
+
+
+def test_a_replaced_stream_is_no_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:
+    import io
+
+    monkeypatch.setattr("sys.stdout", io.StringIO())
+    assert main(["--version"]) == 0
+
+
+def test_numbers_of_a_run_stay_json(shared_result: Path) -> None:
+    assert json.loads((shared_result / "cfg.json").read_text())["resolved"]["progress"] is False

@@ -1,1 +1,0 @@
-from pop_ref.conformance.laws.test_footprint import *  # noqa: F403  the laws of one stage, over the host mirror

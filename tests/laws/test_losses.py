@@ -1,5 +1,0 @@
-"""The laws of `pop_ref.conformance.laws.test_losses`, over our own backends."""
-
-from __future__ import annotations
-
-from pop_ref.conformance.laws.test_losses import *  # noqa: F403

@@ -1,0 +1,59 @@
+"""A program that answers the kit's protocol and then misbehaves, in the way that its first argument names."""
+
+import struct
+import sys
+import time
+
+HELLO = "ok name=bad dtype=float32 profile=paper offers=image,T_final,dominant_ids"
+GREETINGS = {
+    "nameless": "ok dtype=float32 profile=paper offers=image,T_final",
+    "half": "ok name=bad dtype=float16 profile=paper offers=image,T_final",
+    "elsewhere": "ok name=bad dtype=float32 profile=mine offers=image,T_final",
+    "stranger": "ok name=bad dtype=float32 profile=paper offers=image,T_final,colour",
+    "lonely": "ok name=bad dtype=float32 profile=paper offers=image",
+    "silent": "",
+}
+
+
+def write(line: str, *numbers: float) -> None:
+    sys.stdout.buffer.write(line.encode() + b"\n" + struct.pack(f"<{len(numbers)}d", *numbers))
+    sys.stdout.buffer.flush()
+
+
+def main(mode: str) -> None:
+    while line := sys.stdin.buffer.readline().decode():
+        verb, *words = line.split()
+        if verb == "hello":
+            write(GREETINGS.get(mode, HELLO))
+            continue
+        given = dict(word.split("=") for word in words)
+        n, n_sh, pixels = int(given["N"]), int(given["n_sh"]), int(given["width"]) * int(given["height"])
+        sys.stdin.buffer.read(8 * (11 * n + 3 * n_sh * n + 16 + 9 + 3))
+        image, T, ids = [0.0] * 3 * pixels, [1.0] * pixels, [-1.0] * pixels
+        if mode == "ends":
+            sys.exit("out of memory, says the port")
+        if mode == "hangs":
+            time.sleep(1000)
+        if mode == "refuses":
+            write("error harmonics are not for me")
+        elif mode == "babbles":
+            write("image follows", *image)
+        elif mode == "has no end":
+            sys.stdout.buffer.write(b"ok" * 50000)
+            sys.stdout.buffer.flush()
+        elif mode == "stops halfway":
+            write("ok image T_final dominant_ids", *image[1:])
+            sys.exit(3)
+        elif mode == "forgets":
+            write("ok image", *image)
+        elif mode == "invents":
+            write("ok image T_final dominant_ids colour", *image, *T, *ids, *image)
+        elif mode == "splits":
+            write("ok image T_final dominant_ids", *image, *T, *[0.5] * pixels)
+        elif mode == "says more":
+            write("ok image T_final dominant_ids", *image, *T, *ids, 0.0)
+        else:
+            write("ok image T_final dominant_ids", *image, *T, *ids)
+
+
+main(" ".join(sys.argv[1:]))

@@ -1,0 +1,156 @@
+"""Programs in other languages are judged over their standard input and output, whatever they answer."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cuda_ext.compiler import find_compiler, no_compiler
+from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.assertions import assert_same_image
+from pop_ref.conformance.error_bounds import pixel_error_bounds
+from pop_ref.conformance.golden import golden_scene
+from pop_ref.conformance.program_adapter import ProgramAdapter
+from pop_ref.conformance.program_pipe import ProgramError
+from pop_ref.constants import PAPER
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+
+
+@pytest.fixture(scope="session")
+def port(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The port in C++, compiled."""
+    compiler = find_compiler()
+    if compiler is None:
+        pytest.skip(no_compiler())
+    headers = {
+        path.parent for name in ("mirror_render.h", "splatting.cuh") for path in ROOT.glob(f"cuda_ext/**/{name}")
+    }
+    made = tmp_path_factory.mktemp("port") / "port"
+    flags = [
+        "-std=c++17",
+        "-O1",
+        "-ffp-contract=off",
+        "-Wall",
+        "-Wextra",
+        "-Werror",
+        *(f"-I{path}" for path in headers),
+    ]
+    subprocess.run([*compiler, *flags, str(HERE / "port.cpp"), "-o", str(made)], check=True)
+    return made
+
+
+def bad(mode: str, timeout: float = 30.0) -> ProgramAdapter:
+    return ProgramAdapter(f"{sys.executable} -S -E {HERE / 'bad_port.py'} {mode}", timeout)
+
+
+def judged(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """Run the kit as its users do."""
+    environment = {**os.environ, "HYPOTHESIS_PROFILE": "dev", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--pyargs", "pop_ref.conformance"]
+    return subprocess.run(
+        [*command, *options], capture_output=True, text=True, cwd=folder, env=environment, check=False
+    )
+
+
+def test_a_port_in_cpp_obeys_the_laws_of_images_and_gradients(port: Path, tmp_path: Path) -> None:
+    stages = ("alpha", "compositing", "dominance", "gradients", "whole")
+    done = judged(tmp_path, "--program", str(port), *(word for stage in stages for word in ("--stage", stage)))
+    assert done.returncode == 0, done.stdout
+    passed = int(done.stdout.split(" passed")[0].split()[-1])
+    assert passed >= 60, done.stdout
+
+
+def test_a_port_says_how_large_its_error_is(port: Path) -> None:
+    backend = ProgramAdapter(str(port))
+    assert (backend.name, backend.dtype, backend.profile) == ("host", np.float32, None)
+    scene = backend.sees(golden_scene())
+    bounds, expected = pixel_error_bounds(scene, np.float32), OracleAdapter().render(scene)
+    for view in (backend.render(scene), backend.plainly(scene)):
+        assert_same_image("agreement.image", backend, view.image, expected.image, bounds, against_oracle=True)
+    assert backend.plainly(scene).dominant_ids is None
+
+
+def test_a_black_port_breaks_laws_and_is_skipped_by_name_for_what_it_lacks(tmp_path: Path) -> None:
+    command = f"{sys.executable} -S -E {HERE / 'bad_port.py'} black"
+    done = judged(tmp_path, "--program", command, "--stage", "compositing", "--stage", "gradients", "-rs")
+    assert done.returncode == 1
+    assert "bad has no gradients" in done.stdout
+    assert "failed" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("mode", "words"),
+    [
+        (
+            "ends",
+            "ended with status 1 before it had answered render, waiting for a line; it wrote to .* error: out of",
+        ),
+        ("refuses", "refuses the request render: harmonics are not for me"),
+        ("babbles", "answers 'image follows', which begins neither with ok nor with error"),
+        ("stops halfway", "ended with status 3 before it had answered render, waiting for the"),
+        ("forgets", "which lacks T_final, which was asked for"),
+        ("invents", "which names 'colour', unknown or twice"),
+        ("has no end", "bytes that hold no line"),
+        ("splits", "dominant_ids that are not whole numbers"),
+    ],
+)
+def test_what_a_program_does_wrong_is_said_and_it_is_started_again(mode: str, words: str) -> None:
+    backend = bad(mode)
+    for _ in range(2):
+        with pytest.raises(ProgramError, match=words):
+            backend.render(golden_scene())
+
+
+def test_bytes_beyond_an_answer_are_noticed() -> None:
+    backend = bad("says more")
+    with pytest.raises(ProgramError, match=r"8 bytes more than its answer announces|begins neither with ok"):
+        _twice(backend)
+
+
+def _twice(backend: ProgramAdapter) -> None:
+    # they may come after the answer has been read, and are then found before the next request
+    for _ in range(2):
+        backend.render(golden_scene())
+
+
+def test_an_answer_that_does_not_come_is_not_waited_for_twice() -> None:
+    backend = bad("hangs", timeout=2.0)
+    with pytest.raises(ProgramError, match="took longer than 2 s to answer render, waiting for a line"):
+        backend.render(golden_scene())
+    with pytest.raises(ProgramError, match="took longer than 1 s"):
+        backend.render(golden_scene())
+
+
+@pytest.mark.parametrize(
+    ("mode", "words"),
+    [
+        ("nameless", "without name; it must say ok name=NAME"),
+        ("half", "dtype=float16; it must be one of float32, float64"),
+        ("elsewhere", "profile=mine; it must be one of paper"),
+        ("stranger", "offers 'colour'; what may be offered is image, T_final"),
+        ("lonely", "offers no T_final; image, T_final belong together"),
+        ("silent", "answers '', which begins neither with ok nor with error"),
+    ],
+)
+def test_a_wrong_greeting_is_refused(mode: str, words: str) -> None:
+    with pytest.raises(ProgramError, match=words):
+        bad(mode)
+
+
+def test_a_program_that_is_not_there_is_a_usage_error(tmp_path: Path) -> None:
+    done = judged(tmp_path, "--program", "./no-such-port")
+    assert done.returncode == 4
+    assert "program ./no-such-port cannot be started" in done.stderr + done.stdout
+
+
+def test_a_sound_greeting_is_read() -> None:
+    backend = bad("sound")
+    assert (backend.name, backend.dtype, backend.profile) == ("bad", np.float32, PAPER)
+    assert [backend.has(need) for need in ("render", "dominance", "gradients")] == [True, True, False]

@@ -1,0 +1,230 @@
+"""The other forms of the chapters: slides that turn and fit, a printed book, and the command that writes them."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pop_ref.walkthrough import __main__ as command
+from pop_ref.walkthrough import browser
+from pop_ref.walkthrough.__main__ import main
+from pop_ref.walkthrough.cells import Chapter, chapter_number, read_chapter
+from pop_ref.walkthrough.pages import Outcome, run_chapter
+from pop_ref.walkthrough.printed import book
+from pop_ref.walkthrough.slides import LECTURE, MINUTES, deck
+from tests.walkthrough.chromium import WHY_NOT, Page, keep
+from tests.walkthrough.ran import CHAPTERS, ran
+
+in_browser = pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)
+
+TEXT = """# minutes: 5
+
+# %% [markdown]
+# # 1. Title
+#
+# What the reader will know. And more of it.
+#
+# ## A section
+#
+# The first sentence, with $a. B$ and POP paper, eq. 11, in it. The second. What leads on is this:
+#
+# $$x = y$$
+#
+# - one item
+# - another
+
+# %%
+import matplotlib.pyplot as plt
+
+from pop_ref.walkthrough.pages import picture
+
+fig, ax = plt.subplots()
+ax.plot([0, 1])
+picture(fig, "A line.")
+
+# %% [markdown]
+# ### Exercise 1: predict
+# What is two?
+
+# %% answer
+two = 2
+assert two == 2
+
+# %% [markdown]
+# ## Another section
+#
+# It has a widget and a label, D5.
+#
+# {{source: pop_ref.alpha.falloff}}
+#
+# {{source: pop_ref.pixel.composite_pixel}}
+#
+# {{widget: stack}}
+"""
+
+
+@pytest.fixture(scope="module")
+def small() -> tuple[Chapter, list[Outcome]]:
+    chapter = read_chapter(Path("chapter_01_small.py"), TEXT)
+    return chapter, run_chapter(chapter)
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Page]:
+    with Page() as opened:
+        yield opened
+
+
+def _faces(text: str) -> list[str]:
+    sections = re.findall(r'<section class="slide \w+".*?</section>', text, re.DOTALL)
+    return [section.partition("<aside>")[0] for section in sections]
+
+
+def test_a_slide_has_first_sentences_formulas_lists_and_pictures_and_the_notes_have_all(
+    small: tuple[Chapter, list[Outcome]],
+) -> None:
+    text = deck([small])
+    faces = _faces(text)
+    assert len(faces) == 5
+    assert "<h1>Title</h1>" in faces[0]
+    assert "What the reader will know. And more of it." in re.sub(r"<[^>]*>", "", faces[0])
+    assert "<h2>A section</h2>" in faces[1]
+    assert "The second." not in faces[1]
+    assert "eq. 11, in it. What leads on is this:" in faces[1]
+    assert "<li>another</li>" in faces[1]
+    assert "The second." in text
+    assert "<figcaption>A line.</figcaption>" in faces[2]
+    plain = re.sub(r"<[^>]*>", "", faces[3])
+    assert "pop_ref/alpha.py:\ndef falloff" in plain
+    # what is too long to be read from afar is named on the slide, and stands in its notes
+    assert "pop_ref/pixel.py:" in plain
+    assert "def composite_pixel" not in plain
+    assert "composite_pixel" in text
+    assert 'data-widget="stack"' in faces[4]
+    assert "What is two?" not in text
+    assert "label, D5." in text
+    assert not re.search(r'href="(?!#)', text)
+    # minute by minute, from the first to the last
+    minutes = [(int(a), int(b)) for a, b in re.findall(r"Minute (\d+) to (\d+)", text)]
+    assert minutes[0][0] == 0
+    assert minutes[-1][1] == MINUTES
+    assert all(b >= c - 1 and a < b for (a, b), (c, _) in itertools.pairwise(minutes))
+
+
+@in_browser
+def test_slides_turn_by_key_button_and_finger_and_show_notes(
+    page: Page, small: tuple[Chapter, list[Outcome]], tmp_path: Path
+) -> None:
+    file = tmp_path / "slides.html"
+    file.write_text(deck([small]), encoding="utf-8")
+    page.open(file, width=1280, height=720)
+    here = "[...document.querySelectorAll('.slide')].findIndex(each => getComputedStyle(each).display !== 'none')"
+    assert page.ask(here) == 0
+    for key, then in (("ArrowRight", 1), (" ", 2), ("End", 4), ("ArrowRight", 4), ("ArrowLeft", 3), ("Home", 0)):
+        page.press(key)
+        assert page.ask(here) == then, key
+    page.ask("document.querySelector('[data-go=\"1\"]').click()")
+    assert page.ask(here) == 1
+    assert page.ask("location.hash") == "#2"
+    notes = "getComputedStyle(document.querySelector('.slide.here aside')).display"
+    assert page.ask(notes) == "none"
+    page.press("n")
+    assert page.ask(notes) == "block"
+    page.open(file, width=400, height=700)
+    page.touch((300, 300), (100, 310))
+    assert page.ask(here) == 1
+    page.touch((100, 300), (300, 310))
+    assert page.ask(here) == 0
+    assert page.complaints == []
+
+
+@in_browser
+@pytest.mark.slow
+def test_every_slide_of_the_lecture_fits_its_screen(page: Page, tmp_path: Path) -> None:
+    told = [ran(path) for path in CHAPTERS if chapter_number(path) in LECTURE]
+    assert len(told) == len(LECTURE)
+    file = tmp_path / "slides.html"
+    file.write_text(deck(told), encoding="utf-8")
+    page.open(file, width=1280, height=720)
+    n = page.ask("document.querySelectorAll('.slide').length")
+    assert 30 <= n <= 80
+    for number in range(1, n + 1):
+        page.ask("new Promise(done => setTimeout(() => done(1), 120))")
+        face = "document.querySelector('.slide.here .face')"
+        assert page.ask(f"{face}.scrollHeight <= {face}.clientHeight + 1"), page.ask(f"{face}.textContent.slice(0, 80)")
+        inside = (
+            "each => each.getBoundingClientRect().bottom <= innerHeight + 1 && each.getBoundingClientRect().top >= -1"
+        )
+        assert page.ask(f"[...{face}.querySelectorAll('.body > *')].every({inside})"), page.ask(f"{face}.textContent")
+        keep(page.picture(".slide.here .face"), f"slide_{number:02}.png")
+        page.press("PageDown")
+    assert page.complaints == []
+
+
+def test_the_book_holds_every_chapter_and_no_id_twice(small: tuple[Chapter, list[Outcome]]) -> None:
+    chapter, outcomes = small
+    other = read_chapter(Path("chapter_02_other.py"), TEXT.replace("# # 1. Title", "# # 2. Other"))
+    text = book([(chapter, outcomes), (other, run_chapter(other))])
+    assert text.count("<article id=") == 2
+    assert '<a href="#chapter_02_other">2. Other</a>' in text
+    ids = re.findall(r'\bid="([^"]+)"', text)
+    assert {each for each in ids if ids.count(each) > 1} == set()
+    for used in re.findall(r'(?:href="#|url\(#)([^")]+)', text):
+        assert used in ids, used
+    assert not re.search(r'href="(?!#)', text)
+
+
+@in_browser
+def test_the_command_prints_a_book(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--pdf", str(tmp_path / "new" / "book.pdf"), "--only", "1"]) == 0
+    assert [path.name for path in tmp_path.rglob("*.*")] == ["book.pdf"]
+    whole = (tmp_path / "new" / "book.pdf").read_bytes()
+    assert whole.startswith(b"%PDF-")
+    assert len(re.findall(rb"/Type\s*/Page\b", whole)) >= 4
+    assert "book.pdf" in capsys.readouterr().out
+
+
+def test_without_a_browser_the_command_says_what_a_book_needs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CHROMIUM", "no-such-browser")
+    assert main(["--pdf", str(tmp_path / "book.pdf"), "--only", "1"]) == 2
+    assert capsys.readouterr().err.startswith("a PDF needs Chromium or Chrome: install it")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_browser_that_prints_nothing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CHROMIUM", "false")
+    with pytest.raises(browser.BrowserError, match="false printed nothing"):
+        browser.print_pdf(tmp_path / "page.html", tmp_path / "book.pdf")
+
+
+def test_all_forms_stand_beside_the_pages_and_the_contents_leads_to_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command, "chromium", lambda: None)
+    assert main([str(tmp_path), "--all", "--only", "1"]) == 0
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    links = re.findall(r'href="([^"]+)">(?:notebooks|slides|PDF)<', page)
+    assert links == ["notebooks/index.html", "slides.html"]
+    for link in links:
+        assert (tmp_path / link).is_file()
+    listed = (tmp_path / "notebooks" / "index.html").read_text(encoding="utf-8")
+    for link in re.findall(r'href="([^"]+)"', listed):
+        assert (tmp_path / "notebooks" / link).is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"), [([], "name the folder that the pages go to"), (["--all"], "--all needs the folder")]
+)
+def test_a_command_that_says_nothing_is_told_what_it_may_say(
+    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert told in capsys.readouterr().err

@@ -1,0 +1,130 @@
+"""The notebooks: they hold the chapter, run in Jupyter, and every picture appears; the first nine need no torch."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pop_ref.walkthrough.cells import Chapter, chapter_files, read_chapter
+from pop_ref.walkthrough.notebooks import notebook
+
+CHAPTERS = [read_chapter(path) for path in chapter_files()]
+# in a process of its own, as Jupyter has it
+EXECUTE = """
+import json, sys
+import nbclient, nbformat
+notebook = nbformat.read(sys.argv[1], as_version=4)
+nbformat.validate(notebook)
+nbclient.NotebookClient(notebook, timeout=600, kernel_name="python3").execute()
+print(json.dumps([output for cell in notebook.cells for output in cell.get("outputs", [])]))
+"""
+MISSING = [name for name in ("nbclient", "ipykernel") if importlib.util.find_spec(name) is None]
+runs = pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed")
+
+GOOD = """# minutes: 5
+
+# %% [markdown]
+# # 1. Title
+#
+# What the reader will know; see [the next](chapter_02_space_to_screen.py).
+#
+# {{widget: splat2d}}
+#
+# And on.
+
+# %%
+import matplotlib.pyplot as plt
+
+from pop_ref.walkthrough.pages import picture
+
+fig, ax = plt.subplots()
+ax.plot([0, 1])
+picture(fig, "A line with $y$.")
+x = 2
+x + 1
+
+# %% [markdown]
+# ### Exercise 1: predict
+# What is two?
+
+# %% answer
+# It is 2.
+print("two")
+assert x == 2
+"""
+
+
+def _small(text: str = GOOD) -> Chapter:
+    return read_chapter(Path("chapter_01_small.py"), text)
+
+
+def _outputs(chapter: Chapter, folder: Path, more: str = "") -> list[dict[str, Any]]:
+    written = json.loads(notebook(chapter))
+    if more:
+        empty = {"execution_count": None, "outputs": [], "metadata": {}, "id": "more"}
+        written["cells"].append({"cell_type": "code", "source": [more], **empty})
+    file = folder / "chapter.ipynb"
+    file.write_text(json.dumps(written), encoding="utf-8")
+    done = subprocess.run([sys.executable, "-c", EXECUTE, str(file)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def _pictures(outputs: list[dict[str, Any]]) -> int:
+    return sum("image/png" in output.get("data", {}) for output in outputs)
+
+
+def test_a_notebook_holds_the_chapter_and_folds_what_a_page_folds() -> None:
+    written = json.loads(notebook(_small()))
+    cells = [(c["cell_type"], c["metadata"].get("jupyter", {}).get("source_hidden", False)) for c in written["cells"]]
+    texts = ["".join(c["source"]) for c in written["cells"]]
+    assert cells[1:] == [
+        ("markdown", False),
+        ("code", True),
+        ("markdown", False),
+        ("code", True),
+        ("code", True),
+        ("code", False),
+        ("markdown", False),
+        ("markdown", False),
+        ("code", True),
+    ]
+    assert "(chapter_02_space_to_screen.ipynb)" in texts[1]
+    assert 'html("splat2d")' in texts[2]
+    assert texts[3] == "And on."
+    assert texts[6] == "x = 2\nx + 1;"
+    assert texts[8] == "<details><summary>Answer</summary>\n\nIt is 2.\n\n</details>"
+    assert texts[9] == 'print("two")\nassert x == 2'
+    assert len({c["id"] for c in written["cells"]}) == len(cells)
+    assert notebook(_small()) == notebook(_small())
+
+
+@runs
+def test_a_small_notebook_shows_its_picture_caption_widget_and_print_and_nothing_else(tmp_path: Path) -> None:
+    outputs = _outputs(_small(), tmp_path)
+    assert _pictures(outputs) == 1
+    data = [output["data"] for output in outputs if "data" in output]
+    assert ["text/html" in each for each in data] == [True, False, False]
+    assert data[2]["text/markdown"] == "A line with $y$."
+    assert [output["text"] for output in outputs if output["output_type"] == "stream"] == ["two\n"]
+    assert len(outputs) == 4
+
+
+# the first nine chapters are read without torch; the others are executed where all tests are
+@runs
+@pytest.mark.slow
+@pytest.mark.parametrize("chapter", CHAPTERS, ids=lambda chapter: chapter.path.stem)
+def test_every_picture_of_a_chapter_appears_in_its_notebook(chapter: Chapter, tmp_path: Path) -> None:
+    early = int(chapter.path.stem[8:10]) <= 9
+    more = "import sys\nassert 'torch' not in sys.modules" if early else ""
+    outputs = _outputs(chapter, tmp_path, more)
+    drawn = sum(cell.text.count("\npicture(") + cell.text.count("\nfilm(") for cell in chapter.cells)
+    assert _pictures(outputs) == drawn > 0
+    errors = [output for output in outputs if output["output_type"] == "error" or output.get("name") == "stderr"]
+    assert errors == []

@@ -1,0 +1,277 @@
+"""The widgets in a browser: they appear, answer to sliders, fingers and keys, fit a phone, and say no error."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from pop_ref.walkthrough.cells import FOLDER
+from pop_ref.walkthrough.widgets import FOLDER as WIDGET_FOLDER
+from pop_ref.walkthrough.widgets import WIDGETS, html, record
+from tests.walkthrough.chromium import WHY_NOT, Page, keep
+
+NAMES = list(WIDGETS)
+browser = pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Page]:
+    with Page() as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("widgets")
+    style = (FOLDER / "page.css").read_text(encoding="utf-8")
+    texts = {name: html(name) for name in NAMES} | {"all": "".join(html(name) for name in NAMES)}
+    for name, text in texts.items():
+        head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><style>{style}</style>'
+        whole = f"<!doctype html><html><head>{head}</head><body><main>{text}</main></body></html>"
+        (folder / f"{name}.html").write_text(whole, encoding="utf-8")
+    return {name: folder / f"{name}.html" for name in texts}
+
+
+# whatever sticks out of its widget, but for what is clipped
+BEYOND = """[...document.querySelectorAll('.pop-widget :is(dd, dt, output, button, h4, h5, p, canvas, input, text)')]
+    .filter(each => !each.closest('[clip-path]'))
+    .filter(each => {
+        const box = each.getBoundingClientRect(), room = each.closest('.pop-widget').getBoundingClientRect();
+        return box.width && (box.left < room.left - 1 || box.right > room.right + 1); })
+    .map(each => each.tagName + ' ' + each.textContent)"""
+
+
+def _image(png: bytes) -> np.ndarray:
+    return matplotlib.image.imread(io.BytesIO(png), format="png")[..., :3]
+
+
+def _settle(page: Page) -> None:
+    page.ask("new Promise(done => setTimeout(() => requestAnimationFrame(() => done(1)), 60))")
+
+
+def test_an_unknown_name_is_named() -> None:
+    with pytest.raises(ValueError, match="there is no widget 'splat3d'; use one of splat2d, stack"):
+        html("splat3d")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_markup_loads_nothing_and_stays_hidden_without_scripts(name: str) -> None:
+    text = html(name)
+    style = "".join(re.findall(r"<style>(.*?)</style>", text, re.DOTALL))
+    assert not re.search(r"@import|url\(", style)
+    assert not re.search(r"\b(fetch|XMLHttpRequest|import)\b|\bsrc=|https?://(?!www\.w3\.org/2000/svg)", text)
+    assert f'data-widget="{name}"' in text
+    assert " hidden>" in text
+    assert "<noscript>" in text
+    # what is about 200 lines is read; what is longer is not
+    assert len((WIDGET_FOLDER / f"{name}.js").read_text(encoding="utf-8").splitlines()) <= 260
+
+
+@browser
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+@pytest.mark.parametrize("width", [900, 400])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_widget_is_drawn_without_complaint_and_fits(
+    page: Page, files: dict[str, Path], name: str, width: int, dark: bool
+) -> None:
+    page.open(files[name], width=width, dark=dark)
+    _settle(page)
+    assert page.complaints == []
+    assert page.ask("document.documentElement.scrollWidth") == width
+    assert page.ask(BEYOND) == []
+    png = page.picture(".pop-widget")
+    keep(png, f"widget_{name}_{width}_{'dark' if dark else 'light'}.png")
+    image = _image(png)
+    ground = image[image.shape[0] // 2, 4]
+    assert (ground.mean() < 0.3) == dark
+    # something stands on the ground, in more than one colour
+    inked = np.abs(image - ground).max(axis=-1) > 0.2
+    assert 0.02 < inked.mean() < 0.9
+    assert np.ptp(image[inked], axis=-1).max() > 0.3
+
+
+@browser
+@pytest.mark.parametrize("name", NAMES)
+def test_every_slider_changes_the_picture(page: Page, files: dict[str, Path], name: str) -> None:
+    page.open(files[name])
+    _settle(page)
+    n_sliders = page.ask("document.querySelectorAll('input[type=range]').length")
+    assert n_sliders >= 1
+    for i in range(n_sliders):
+        page.open(files[name])
+        _settle(page)
+        drawn = "[...document.querySelectorAll('canvas')].map(c => c.toDataURL()).join() + " + (
+            "[...document.querySelectorAll('svg')].map(s => s.innerHTML).join()"
+        )
+        before = page.ask(drawn)
+        page.ask(f"document.querySelectorAll('input[type=range]')[{i}].focus()")
+        label = page.ask("document.activeElement.getAttribute('aria-label')")
+        told = page.ask("document.activeElement.getAttribute('aria-valuetext')")
+        for key in ("ArrowLeft", "ArrowLeft"):
+            page.press(key)
+        assert page.ask("document.activeElement.getAttribute('aria-valuetext')") != told, label
+        assert page.ask(drawn) != before, label
+    assert page.complaints == []
+
+
+@browser
+@pytest.mark.parametrize("name", NAMES)
+def test_what_can_be_reached_by_keyboard_has_a_name(page: Page, files: dict[str, Path], name: str) -> None:
+    page.open(files[name])
+    nameless = """[...document.querySelectorAll('.pop-widget :is(input, button, [tabindex])')]
+        .filter(each => !(each.getAttribute('aria-label') || each.textContent.trim())).map(each => each.outerHTML)"""
+    assert page.ask(nameless) == []
+    assert page.ask("document.querySelector('.pop-widget').getAttribute('aria-label')") == WIDGETS[name].title
+
+
+def _middle(page: Page, selector: str) -> tuple[float, float]:
+    box = f"document.querySelector({json.dumps(selector)}).getBoundingClientRect()"
+    x, y = page.ask(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box})")
+    return x, y
+
+
+def _reading(page: Page, label: str) -> str:
+    return page.ask(
+        f"[...document.querySelectorAll('dt')].find(d => d.textContent === {json.dumps(label)}).nextSibling.textContent"
+    )
+
+
+@browser
+def test_a_splat_is_dragged_by_mouse_finger_and_arrow_keys(page: Page, files: dict[str, Path]) -> None:
+    centre = "[aria-label^='centre of the splat']"
+    place = f"document.querySelector({json.dumps(centre)}).getAttribute('transform')"
+    page.open(files["splat2d"])
+    assert page.ask(place) == "translate(12.1 7.4)"
+    x, y = _middle(page, centre)
+    step = page.ask("document.querySelector('.pw-over').clientWidth") / 24
+    page.drag((x, y), (x + 3 * step, y + 2 * step))
+    numbers = [float(each) for each in re.findall(r"[\d.]+", page.ask(place))]
+    assert np.allclose(numbers, [15.1, 9.4], atol=0.1)
+    page.press("ArrowLeft")
+    assert np.allclose(float(re.findall(r"[\d.]+", page.ask(place))[0]), numbers[0] - 0.25)
+    page.open(files["splat2d"], width=400)
+    x, y = _middle(page, centre)
+    page.touch((x, y), (x - 40, y))
+    assert float(re.findall(r"[\d.]+", page.ask(place))[0]) < 11
+    assert page.complaints == []
+
+
+@browser
+def test_what_a_splat_shows_is_what_the_oracle_computes(page: Page, files: dict[str, Path]) -> None:
+    from pop_ref.alpha import alpha_from_sigma, sigma_at_pixel
+    from pop_ref.footprint import conics_from_covars2d, low_pass, radii_from_covars2d
+
+    page.open(files["splat2d"])
+    turn = np.radians(23)
+    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    covars2d = low_pass((R @ np.diag([3.4**2, 1.5**2]) @ R.T)[None], 0.3)
+    conic = conics_from_covars2d(covars2d)[0].tolist()
+    sigma = sigma_at_pixel([12.1, 7.4], conic, 17.5, 10.5)
+    assert _reading(page, "its exponent \u03c3") == f"{sigma:.3f}"
+    assert _reading(page, "its alpha") == f"{alpha_from_sigma(sigma, 0.8)[0]:.4f}"
+    radii = radii_from_covars2d(covars2d, np.array([0.8]))[0]
+    assert _reading(page, "extent") == f"{2 * radii[0]} \u00d7 {2 * radii[1]} px"
+    n = sum(
+        not alpha_from_sigma(sigma_at_pixel([12.1, 7.4], conic, x + 0.5, y + 0.5), 0.8)[1]
+        for x in range(24)
+        for y in range(16)
+    )
+    assert _reading(page, "pixels drawn") == f"{n} of 384"
+    # the canvas leaves the rest of them clear
+    clear = (
+        "(c => [...c.getContext('2d').getImageData(0, 0, 24, 16).data].filter((x, i) => i % 4 === 3 && x > 0).length)"
+    )
+    assert page.ask(f"{clear}(document.querySelector('canvas'))") == n
+
+
+@browser
+def test_splats_of_a_stack_change_places_and_a_wall_ends_the_pixel(page: Page, files: dict[str, Path]) -> None:
+    page.open(files["stack"])
+    order = """[...document.querySelectorAll('.pw-row')].sort((a, b) => a.style.order - b.style.order)
+        .map(row => row.querySelector('input').getAttribute('aria-label').replace('alpha of ', ''))"""
+    assert page.ask(order) == ["red", "yellow", "green", "blue", "violet"]
+    page.ask("document.querySelector('[aria-label=\"send red farther\"]').focus()")
+    page.press("Enter")
+    assert page.ask(order) == ["yellow", "red", "green", "blue", "violet"]
+    x, y = _middle(page, ".pw-row:nth-of-type(5) .pw-swatch")
+    page.drag((x, y), (x, y - 90))
+    assert page.ask(order).index("violet") < 4
+    page.ask("[...document.querySelectorAll('button')].find(b => b.textContent === 'two walls').click()")
+    shown = page.ask("document.querySelector('.pw-wide svg').textContent")
+    assert "stop" in shown
+    dim = "[...document.querySelectorAll('.pw-row')].map(row => row.dataset.dim)"
+    assert page.ask(dim) == ["false", "false", "true", "true", "true"]
+    assert page.complaints == []
+
+
+@browser
+def test_a_globe_turns_and_a_gaussian_is_walked_around(page: Page, files: dict[str, Path]) -> None:
+    for name, reading in (("harmonics", "view direction d"), ("orbit", "by EWA")):
+        page.open(files[name])
+        _settle(page)
+        before = _reading(page, reading)
+        page.ask("document.querySelector('[role=application]').focus()")
+        page.press("ArrowRight")
+        turned = _reading(page, reading)
+        assert turned != before
+        x, y = _middle(page, "[role=application]")
+        page.drag((x, y), (x + 60, y + 20))
+        assert _reading(page, reading) != turned
+        assert page.complaints == []
+
+
+@browser
+def test_a_recording_plays(page: Page, files: dict[str, Path]) -> None:
+    page.open(files["scrubber"])
+    _settle(page)
+    runs = json.loads(record.FILE.read_text(encoding="utf-8"))["runs"]
+    assert _reading(page, "PSNR") == f"{runs['without']['psnr'][-1]:.1f} dB"
+    page.ask("document.querySelector('button').click()")
+    page.ask("new Promise(done => setTimeout(() => done(1), 900))")
+    at = int(page.ask("document.querySelector('input').value"))
+    assert 1 <= at < len(record.FRAMES) - 1
+    assert page.complaints == []
+
+
+@browser
+def test_all_stand_on_one_page_and_none_without_scripts(page: Page, files: dict[str, Path]) -> None:
+    page.open(files["all"])
+    _settle(page)
+    assert page.complaints == []
+    assert page.ask("document.querySelectorAll('.pop-widget:not([hidden]) .pw-body').length") == len(NAMES)
+    ids = page.ask("[...document.querySelectorAll('[id]')].map(each => each.id)")
+    assert len(ids) == len(set(ids))
+    page.open(files["all"], scripts=False)
+    assert page.ask("document.querySelectorAll('.pop-widget[hidden]').length") == len(NAMES)
+    assert page.ask("document.body.innerText").count("where JavaScript is allowed") == len(NAMES)
+
+
+def test_the_recording_is_what_the_script_records() -> None:
+    told = json.loads(record.FILE.read_text(encoding="utf-8"))
+    assert told["steps"] == list(record.FRAMES)
+    pictures = _image(base64.b64decode(told["pictures"]))
+    assert pictures.shape == (2 * record.SIZE, (len(record.FRAMES) + 1) * record.SIZE, 3)
+    for row, (name, weight) in enumerate(record.LAMBDAS.items()):
+        run = told["runs"][name]
+        assert [sum(counts) for counts in run["opacities"]] == run["n"]
+        for column, frame in enumerate(record.frames(weight, last_step=30)):
+            # sums of many terms: another build of NumPy may add them in another order
+            assert abs(frame.psnr - run["psnr"][column]) < 0.02
+            assert frame.n == run["n"][column]
+            assert sum(abs(a - b) for a, b in zip(frame.opacities, run["opacities"][column], strict=True)) <= 6
+            place = (
+                slice(row * record.SIZE, (row + 1) * record.SIZE),
+                slice(column * record.SIZE, (column + 1) * record.SIZE),
+            )
+            assert np.abs(pictures[place] - frame.image).mean() < 0.01
+    # what the widget is there to show
+    between = {name: sum(run["opacities"][-1][1:14]) / run["n"][-1] for name, run in told["runs"].items()}
+    assert between["with"] < 0.75 * between["without"]
