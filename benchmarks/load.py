@@ -9,7 +9,7 @@ torch included. The bound is stated beforehand, as bytes of a pixel, of a Gaussi
     4K photographs       24 of 3840 x 2160, loaded at full size and trained on for three steps
     3M Gaussians         a PLY of them with all colour bands, loaded and rendered at 1920 x 1080
 
-Writes benchmarks/results/load.json, of which docs/results.md has the table; exit status 1 where a peak is above its
+Writes benchmarks/results/load.json, of which docs/reliability.md has the table; exit status 1 where a peak is above its
 bound. --scale makes fewer photographs and Gaussians.
 """
 

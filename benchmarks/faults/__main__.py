@@ -1,8 +1,9 @@
 """python -m benchmarks.faults [--minutes M] [--only PART] [--quick] [--seed N] [--out FILE]
 
-Runs the parts below, prints what failed, and writes benchmarks/results/faults.json, of which docs/results.md has the
-table. With --minutes the fuzzer and the kill loop share that time; without, they stop after their least. --quick tries
-a few places of those parts that have no test of their own, as the tests do. Exit status 1 where anything failed.
+Runs the parts below, prints what failed, and writes benchmarks/results/faults.json, of which docs/reliability.md has
+the tables; a part that is run alone replaces its own results. With --minutes the fuzzer and the kill loop share that
+time; without, they stop after their least. --quick tries a few places of those parts that have no test of their own, as
+the tests do. Exit status 1 where anything failed.
 
     fuzz        mutated files to every reader, in children with limits of memory and time
     kills       SIGKILL at random moments of a run; going on gives the same bits
@@ -26,7 +27,7 @@ from . import fuzz, runs, sanitizers
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from record import machine, write_json
+from record import machine, read_json, write_json
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "faults.json"
 PARTS = ("fuzz", "kills", "crashes", "writes", "flips", "sanitizers")
@@ -47,7 +48,7 @@ def main() -> int:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     found = {part: result for part in args.only or (QUICK if args.quick else PARTS) for result in [_run(part, args)]}
-    write_json(args.out, {"machine": machine(), **found})
+    write_json(args.out, {**read_json(args.out), "machine": machine(), **found})
     failed = [line for part, result in found.items() for line in _failures(part, result)]
     print("\n".join(failed) or "nothing failed")
     return 1 if failed else 0

@@ -21,7 +21,7 @@ from typing import BinaryIO
 
 from pop_fast.errors import PopError
 
-__all__ = ["file_atomically", "folder_atomically", "write_atomically"]
+__all__ = ["file_atomically", "folder_atomically", "is_left_behind", "write_atomically"]
 
 # of renameat2(2)
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
@@ -234,6 +234,15 @@ def _sweep(path: Path) -> None:
             os.replace(left, path)
         else:
             _remove(left)
+
+
+def is_left_behind(path: Path) -> bool:
+    """Tell by its name whether a file is what a writer that is no longer alive began; the next write removes it."""
+    parts = path.name.split(".")
+    if len(parts) < 4 or parts[0] or parts[-1] != "partial" or not parts[-2].isdigit():
+        return False
+    pid = int(parts[-2])
+    return pid == os.getpid() or not _alive(pid)
 
 
 def _remove(left: Path) -> None:

@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import write_atomically
+from pop_fast.io.atomic import is_left_behind, write_atomically
 from pop_fast.io.lock import FolderLock
 from pop_fast.io.read_back import read_json
 from pop_fast.train.config import TrainConfig
@@ -153,7 +153,7 @@ class ResultFolder:
             write_atomically(self.path / name, lambda file, text=text: file.write(text.encode()))
 
     def _is_used(self) -> bool:
-        return self.path.is_dir() and any(self.path.iterdir())
+        return self.path.is_dir() and not all(is_left_behind(found) for found in self.path.iterdir())
 
     def _set_aside(self) -> None:
         aside = self.path / _ASIDE

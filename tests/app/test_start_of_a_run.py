@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -249,3 +251,24 @@ def test_a_damaged_capture_json_is_named_on_resume(pop: Pop, shared_capture: Pat
     for text in ("", "[1]", '{"colour": 1}'):
         (result / "capture.json").write_text(text)
         says(pop("train", shared_capture, "--out", result, *TRAIN, "--resume"), "capture.json", "remove it", "--images")
+
+
+def test_what_a_run_left_that_was_killed_while_it_wrote_its_first_file_is_nobody_s(tmp_path):
+    # of a process that has ended
+    child = subprocess.Popen([sys.executable, "-c", ""])
+    child.wait()
+    left = tmp_path / f".cfg.json.{child.pid}.partial"
+    left.write_text("{")
+    for resume in (True, False):
+        ResultFolder(tmp_path).check(resume=resume, overwrite=False)
+    TrainingRun(tiny_config(tmp_path, max_steps=2), tiny_capture(), resume=True).run()
+    assert not left.exists()
+    assert (tmp_path / "cfg.json").is_file()
+
+
+@pytest.mark.parametrize("name", [f".cfg.json.{os.getppid()}.partial", "cfg.json.partial", ".cfg.json.x.partial"])
+def test_what_a_living_writer_or_somebody_else_has_there_is_kept(tmp_path, name):
+    (tmp_path / name).write_text("{")
+    with pytest.raises(PopError, match="exists and is not empty"):
+        ResultFolder(tmp_path).check(resume=False, overwrite=False)
+    assert (tmp_path / name).read_text() == "{"
