@@ -128,7 +128,7 @@ def _outcome(reader: Reader, path: Path) -> dict[str, Any]:
         line = message(str(error))
         if isinstance(error, PopError) and "\n" not in line and len(line) < LONGEST and path.name in line:
             return {"came": "refused"}
-        if not isinstance(error, PopError) and describe(error) is not None:
+        if isinstance(error, (MemoryError, OSError)) and describe(error) is not None:
             return {"came": "told"}
         frame = traceback.extract_tb(error.__traceback__)[-1]
         site = f"{type(error).__name__} at {os.path.basename(frame.filename)}:{frame.lineno}"

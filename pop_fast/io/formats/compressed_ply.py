@@ -145,8 +145,8 @@ def decode(data: bytes, path: Path) -> Cloud:
             f"{path}: has {len(chunks)} chunks for {n} vertices; {-(-n // _CHUNK)} are needed: {_WRITE_AGAIN}"
         )
     which = np.arange(n) // _CHUNK
-    colors = _COLOR_RANGES if "min_r" in (chunks.dtype.names or ()) else ()
-    if not set(_RANGES) <= set(chunks.dtype.names or ()) or not set(_WORDS) <= set(words.dtype.names or ()):
+    colors = _COLOR_RANGES if set(_COLOR_RANGES) & set(chunks.dtype.names or ()) else ()
+    if not {*_RANGES, *colors} <= set(chunks.dtype.names or ()) or not set(_WORDS) <= set(words.dtype.names or ()):
         raise PopError(f"{path}: element 'chunk' or 'vertex' lacks a property of compressed PLY; {_WRITE_AGAIN}")
 
     def spread(names: tuple[str, ...], shares: np.ndarray) -> np.ndarray:
