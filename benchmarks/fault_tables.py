@@ -32,7 +32,7 @@ def disturbed() -> str:
     rows = [["SIGKILL at random moments of `pop train`, then `--resume`", ended, "the same bits", _failed(kills)]]
     for part, what in (("crashes", "the process ends before"), ("writes", "the system refuses")):
         for job, of in found[part].items():
-            came = ", ".join(f"{of[key]} {key}" for key in ("ended", "told", "went on") if of.get(key))
+            came = ", ".join(f"{of[key]} {key}" for key in ("ended", "told", "continued") if of.get(key))
             place = f"{what} a change of the disk: {job}"
             rows.append([place, f"{of['tried']} of {of['points']} places", came, _failed(of)])
     came = f"{flips['refused']:,} refused, {flips['the same']:,} read as before"

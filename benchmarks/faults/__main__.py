@@ -6,7 +6,7 @@ time; without, they stop after their least. --quick tries a few places of those 
 the tests do. Exit status 1 where anything failed.
 
     fuzz        mutated files to every reader, in children with limits of memory and time
-    kills       SIGKILL at random moments of a run; going on gives the same bits
+    kills       SIGKILL at random moments of a run; continuing gives the same bits
     crashes     the process ends right before each rename, flush, new folder and removal
     writes      the system refuses each of them, or a write in its middle
     flips       single bits of a checkpoint

@@ -1,4 +1,4 @@
-"""A run that is killed, whose disk fails or whose checkpoints rot: it goes on to the same bits."""
+"""A run that is killed, whose disk fails or whose checkpoints rot: it continues to the same bits."""
 
 from __future__ import annotations
 
@@ -69,12 +69,12 @@ class Scene:
         TrainingRun(self.config(name), self.capture, resume=resume, overwrite=overwrite).run()
 
     def finish(self, name: str) -> str | None:
-        """Go on with a run until its end, in a child; say what is wrong with what it ends with, or None."""
+        """Continue a run until its end, in a child; say what is wrong with what it ends with, or None."""
         said = self.folder / "said"
         said.unlink(missing_ok=True)
         status = wait(start(lambda: self.train(name), said))
         if status != 0:
-            return f"going on ended with {status}: {said.read_text()[-300:]}"
+            return f"continuing ended with {status}: {said.read_text()[-300:]}"
         if not same(ended_with(self.folder / name), self.whole):
             return "the bits differ"
         left = [
@@ -180,7 +180,7 @@ def _at_points(
 
             status = wait(start(disturbed, said))
             text = said.read_text() if said.exists() else ""
-            statuses[{CRASHED: "ended", 0: "went on", TOLD: "told"}.get(status, "else")] += 1
+            statuses[{CRASHED: "ended", 0: "continued", TOLD: "told"}.get(status, "else")] += 1
             wrong = None if status in (CRASHED, 0, TOLD) else f"status {status}: {text[-300:]}"
             wrong = wrong or check()
             failures += [f"{job}, point {number}: {wrong}"] if wrong else []

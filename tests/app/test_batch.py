@@ -94,7 +94,7 @@ def test_density_control_sees_the_views_one_after_the_other(window: str, masked:
     assert len({tuple(row.tolist()) for row in blurred}) > 1
 
 
-def test_a_run_of_batches_draws_as_many_views_a_step_and_goes_on_to_the_same_bits(tmp_path: Path) -> None:
+def test_a_run_of_batches_draws_as_many_views_a_step_and_continues_to_the_same_bits(tmp_path: Path) -> None:
     capture = tiny_capture()
     whole = TrainingRun(tiny_config(tmp_path / "whole", batch_size=3), capture)
     whole.run()

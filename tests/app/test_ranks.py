@@ -81,7 +81,7 @@ def test_two_processes_train_to_the_bits_of_one(together: Path, tmp_path: Path, 
     )
 
 
-def test_one_process_goes_on_with_what_two_began(together: Path) -> None:
+def test_one_process_continues_what_two_began(together: Path) -> None:
     train(together / "left", "fast", "pop", resume=True)
     same(together / "left", together / "pop")
 
