@@ -49,6 +49,7 @@ _SHOWN: Final = frozenset(
     {
         *("data", "result_dir", "max_steps", "seed", "backend", "profile"),
         *("factor", "test_every", "antialiased", "background", "lpips_vgg", "lpips_alex"),
+        *("exposure", "random_background", "refine_cameras"),
     }
 )
 _DOCUMENTED: Final = (FinishOptions, LimitOptions, Given, TrainConfig)
@@ -377,7 +378,9 @@ def summary(stats: dict[str, Any]) -> str:
     """Say in one line how a run ended."""
     parts: list[str] = []
     if stats.get("psnr") is not None:
-        parts += [f"PSNR {stats['psnr']:.2f} dB", f"SSIM {stats['ssim']:.4f}"]
+        parts.append(f"PSNR {stats['psnr']:.2f} dB")
+        parts += [f"with colours fitted {stats['cc_psnr']:.2f} dB"] if "cc_psnr" in stats else []
+        parts += [f"SSIM {stats['ssim']:.4f}"]
     if stats.get("lpips") is not None:
         parts.append(f"LPIPS {stats['lpips']:.4f} ({stats['lpips_net']})")
     parts.append(f"{stats['num_GS']:,} Gaussians ({stats['num_GS_above_floor']:,} with opacity >= 1/255)")

@@ -153,6 +153,10 @@ def unsupported(config: TrainConfig) -> str | None:
                 f"backend 'cuda' trains with {method}.{name} = {supported!r} only, not {value!r}; "
                 f"use --backend fast, or leave {method}.{name} as it is"
             )
+    for name in ("exposure", "random_background", "refine_cameras"):
+        if getattr(config, name):
+            option = name.replace("_", "-")
+            return f"backend 'cuda' trains without {name}; use --backend fast, or leave out --{option}"
     return None
 
 

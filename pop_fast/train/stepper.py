@@ -15,6 +15,7 @@ from pop_fast.api.backend import Renderer
 from pop_fast.density.control import DensityControl
 from pop_fast.density.foreign import ForeignStrategy
 from pop_fast.density.protocol import State
+from pop_fast.train.appearance import Appearance
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.views import ViewTensors
 
@@ -63,6 +64,7 @@ class Task:
         order: the view of every step, `config.max_steps` of them.
         updates: whom Adam moves at which step.
         step: steps taken.
+        appearance: what is learned of the photographs.
     """
 
     config: TrainConfig
@@ -71,6 +73,7 @@ class Task:
     order: Sequence[int]
     updates: Updates
     step: int
+    appearance: Appearance
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from torch import Tensor
@@ -57,29 +58,32 @@ class TorchStepper:
         strategy, params, optimizers, state = self._task.strategy, self._params, self._optimizers, self._state
         index = self._task.order[step]
         rendered = self._render(index, step, phase)
-        objective = self._objective(rendered.image, index, phase)
+        image = self._task.appearance.exposed(rendered.image, index)
+        objective = self._objective(image, index, phase)
         term = strategy.regularizer(rendered.opacities, state, step, rendered.info)
         strategy.step_pre_backward(params, optimizers, state, step, rendered.info)
         loss = objective if term is None else objective + term
         loss.backward()
         self._require_finite(loss, index, step)
-        stats = self._measured(rendered, index, step, phase, objective, term)
+        stats = self._measured(replace(rendered, image=image), index, step, phase, objective, term)
         adam_step(params, optimizers, self._task.updates, step, state)
+        self._task.appearance.update(step)
         strategy.collect(params, state, step, rendered.info)
         self.step = step + 1
         return stats
 
     def _render(self, index: int, step: int, phase: Phase) -> Rendered:
-        config, strategy = self._task.config, self._task.strategy
+        config, strategy, appearance = self._task.config, self._task.strategy, self._task.appearance
         return render_view(
             self._backend,
             self._params,
-            self._task.views[index],
+            appearance.seen_from(self._task.views[index], index),
             config,
             phase.sh_degree,
             dominance=strategy.needs_dominance(step),
             counts=step % config.log_every == 0,
             absgrad=strategy.absgrad,
+            background=appearance.background(step),
         )
 
     def _require_finite(self, loss: Tensor, index: int, step: int) -> None:

@@ -34,6 +34,7 @@ from pop_fast.io.heartbeat import Heartbeat, duration
 from pop_fast.io.ply import Frame, save_ply
 from pop_fast.stages.activations import opacities_from_logits
 from pop_fast.train import checkpoint as ckpt
+from pop_fast.train.appearance import Appearance
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.effects import facts, find_warnings
@@ -61,6 +62,7 @@ class TrainingRun:
         config: the settings, step numbers as they are run.
         params: raw parameters.
         optimizers: one Adam a parameter.
+        appearance: exposures and cameras that are learned.
         strategy: the population's.
         state: the strategy's state.
         step: steps taken.
@@ -139,6 +141,7 @@ class TrainingRun:
             raise PopError(f"{capture.name}: has no view to train on; lower test_every or set it to 0")
         check_views(config, capture.name, self._train, self._test)
         self._nets = load_nets(config.lpips_vgg, config.lpips_alex, [(view.height, view.width) for view in self._test])
+        self.appearance = Appearance(config, self._train)
         self._capture = capture
         self._scene_scale = capture.scene_scale()
         self._order = ViewOrder(len(self._train), config.seed)
@@ -269,7 +272,8 @@ class TrainingRun:
     @cached_property
     def _passes(self) -> Passes:
         """What a change of the population sees of the training views."""
-        return Passes.of(self._engine.backend, self._train, self.config, self._engine.device)
+        views = self.appearance.seen(self._train)
+        return Passes.of(self._engine.backend, views, self.config, self._engine.device)
 
     @property
     def stepper(self) -> Stepper:
@@ -280,7 +284,7 @@ class TrainingRun:
             ahead = ViewOrder(len(self._train), self.config.seed)
             ahead.load_state_dict(self._order.state_dict())
             order = [0] * self.step + [ahead.next() for _ in range(self.step, self.config.max_steps)]
-            task = Task(self.config, self.strategy, self._train, order, self.updates, self.step)
+            task = Task(self.config, self.strategy, self._train, order, self.updates, self.step, self.appearance)
             self._stepper = self._engine.make_stepper(task)
             with words_for_memory():
                 self._stepper.rebind(self.params, self.optimizers, self.state)
@@ -321,6 +325,8 @@ class TrainingRun:
             self._results.write_opacities(step, self._opacities().numpy())
         if taken in config.eval_steps or last:
             self._evaluate(step)
+        if self.appearance.params and (taken in config.save_steps or last):
+            self._results.write_stats("appearance", step, self.appearance.by_view(self._train))
         if taken in config.save_steps or last:
             save_ply(
                 self._results.path / "ply" / f"point_cloud_{step}.ply",
@@ -374,6 +380,7 @@ class TrainingRun:
             "optimizers": _on_cpu(ckpt.pack_optimizers(self.optimizers)),
             "strategy": _on_cpu(ckpt.pack_strategy(self.state)),
             "view_order": self._order.state_dict(),
+            "appearance": self.appearance.state_dict(),
             "config": self.config.binding(),
             "capture": self._fingerprint(),
             "metrics_bytes": self._results.flush_metrics(),
@@ -394,6 +401,7 @@ class TrainingRun:
         ckpt.unpack_optimizers(self.optimizers, content["optimizers"])
         ckpt.unpack_strategy(self.state, content["strategy"])
         self._order.load_state_dict(content["view_order"])
+        self.appearance.load_state_dict(content["appearance"])
         self._results.open_metrics(content["metrics_bytes"])
         self._train_seconds = content["seconds"]["train"]
         self._started -= content["seconds"]["total"]
