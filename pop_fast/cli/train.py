@@ -69,7 +69,8 @@ _IGNORED: Final = frozenset({"--eval"})  # Inria: hold out every 8th view; here 
 class _Run(FinishOptions):
     """Fit a splat to a capture or a folder of photographs.
 
-    DATA is a folder with a COLMAP model (the largest in sparse), with transforms.json, or with photographs alone.
+    DATA is a folder with a COLMAP model (the largest in sparse), with transforms.json, with what Polycam, Metashape or
+    RealityCapture export, or with photographs alone.
 
     Attributes:
         resume: go on from the last checkpoint in the output folder, to the same bits as without the interruption; start
@@ -88,7 +89,7 @@ class _Run(FinishOptions):
     missing: Literal["error", "skip"] = "error"
     images: str | None = None
     ignore_masks: bool = False
-    source: Literal["auto", "colmap", "transforms", "photos"] = "auto"
+    source: Literal["auto", "colmap", "transforms", "polycam", "metashape", "realitycapture", "photos"] = "auto"
     sfm: SfmOptions = dataclasses.field(default_factory=SfmOptions)
     quiet: bool = False
 
