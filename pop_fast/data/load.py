@@ -21,7 +21,7 @@ from pop_fast.data.sfm_files import read_upright
 from pop_fast.data.sfm_options import SfmOptions
 from pop_fast.data.transforms import find_transforms, read_transforms
 from pop_fast.errors import CaptureError
-from pop_fast.io.images import find_image, unreadable_photographs
+from pop_fast.io.images import VIDEO_SUFFIXES, find_image, unreadable_photographs
 
 __all__ = ["beside_the_model", "load_capture", "turned_upright"]
 
@@ -75,6 +75,8 @@ def load_capture(
     root = Path(path)
     if not root.is_dir():
         what = "is a file, not a folder" if root.exists() else "no such folder"
+        if root.suffix.lower() in VIDEO_SUFFIXES and root.exists():
+            raise CaptureError(f"{root}: is a video; take photographs out of it first: pop frames {root}")
         raise CaptureError(f"{root}: {what}; give the folder that holds the photographs and their cameras")
     if factor < 1 or int(factor) != factor:
         raise CaptureError(f"factor is {factor}; it must be a whole number of at least 1")

@@ -25,8 +25,9 @@ from pop_fast.data.sfm_options import SfmOptions
 from pop_fast.data.sfm_search import Search, check_camera_model, find_cameras
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import folder_atomically
+from pop_fast.io.heif import HEIF_SUFFIXES
 from pop_fast.io.image_header import read_exif
-from pop_fast.io.images import list_images, read_image, unreadable_photographs
+from pop_fast.io.images import list_images, read_image, unreadable_photographs, write_png
 from pop_fast.io.jpeg import sound_jpegs
 
 __all__ = ["SfmResult", "photo_folder", "photographs", "run_sfm"]
@@ -167,13 +168,22 @@ class _Job:
 def _stage(photos: Path, names: list[Path], work: Path) -> list[str]:
     """Give photographs plain numbers for names, because COLMAP's lists of pairs cannot hold a space."""
     (work / "images").mkdir()
-    staged = [f"{i:06d}{name.suffix.lower()}" for i, name in enumerate(names)]
+    staged = [f"{i:06d}{_plain_suffix(name)}" for i, name in enumerate(names)]
     for name, plain in zip(names, staged, strict=True):
+        if name.suffix.lower() in HEIF_SUFFIXES:
+            # which COLMAP does not read
+            write_png(work / "images" / plain, read_image(photos / name)[:, :, :3])
+            continue
         try:
             (work / "images" / plain).symlink_to((photos / name).resolve())
         except OSError:  # where links need a privilege
             shutil.copyfile(photos / name, work / "images" / plain)
     return staged
+
+
+def _plain_suffix(name: Path) -> str:
+    suffix = name.suffix.lower()
+    return ".png" if suffix in HEIF_SUFFIXES else suffix
 
 
 def _sizes(photos: Path, names: list[Path], progress: Progress | None) -> set[tuple[int, int]]:

@@ -85,7 +85,15 @@ def realitycapture(capture: Capture, source: Path, folder: Path) -> Path:
         turned, pitch, roll = Rotation.from_matrix(pose[:3, :3]).as_euler("ZXY", degrees=True).tolist()
         film = 36.0 / max(view.width, view.height)
         middle = (view.K[:2, 2] - [view.width / 2, view.height / 2]) * film
-        numbers = [*pose[:3, 3].tolist(), -turned, pitch, roll, float(view.K[0, 0] * film), *middle.tolist(), *[0.0] * 6]
+        numbers = [
+            *pose[:3, 3].tolist(),
+            -turned,
+            pitch,
+            roll,
+            float(view.K[0, 0] * film),
+            *middle.tolist(),
+            *[0.0] * 6,
+        ]
         lines.append(",".join([view.name, *map(repr, numbers)]))
     (folder / "cameras.csv").write_text("\n".join(lines) + "\n")
     return folder
