@@ -116,6 +116,10 @@ def _about_camera(shown: Sequence[Shown]) -> Iterator[Finding]:
     named = ", ".join(f"{count} x {kind}" for kind, count in kinds.most_common(3))
     focal = ", ".join(f"{mm:g} mm" for mm, _ in lenses.most_common(4))
     text = f"{named or 'no camera named'}{f'; focal length {focal}' if focal else ''}"
+    without = [one.name for one in shown if not one.exif.focal]
+    if without:
+        fix = "where photographs were edited, use the originals: cameras are found more surely from a known lens"
+        yield Finding("warn", "EXIF", f"{len(without)} have no focal length, {_some(without)}; {fix}")
     if len(kinds) > 1 or len(lenses) > 1:
         yield Finding("warn", "EXIF", f"{text}: several lenses or zooms; one fixed lens is placed more surely")
     else:
@@ -144,7 +148,7 @@ def _about_exposure(shown: Sequence[Shown]) -> Iterator[Finding]:
             yield Finding("warn", "exposure", f"{len(names)} are over a quarter pure {what}, {_some(names)}")
     taken = [one.exif.exposure * one.exif.iso for one in shown if one.exif.exposure and one.exif.iso]
     stops = float(np.log2(max(taken) / min(taken))) if len(taken) == len(shown) else 0.0
-    fix = "lock the exposure: training takes one brightness for all"
+    fix = "lock the exposure, or train with --exposure: without it training takes one brightness for all"
     if stops > _STOPS:
         yield Finding("warn", "exposure", f"exposures differ by {stops:.1f} stops; {fix}")
     elif not dark and not bright:

@@ -18,7 +18,7 @@ from pop_fast.data.posed_images import PosedImage
 from pop_fast.errors import CaptureError
 from pop_fast.io.images import find_image
 
-__all__ = ["find_polycam", "read_polycam"]
+__all__ = ["find_polycam", "photographs_of_polycam", "read_polycam"]
 
 # cameras and the photographs that belong to them, the better ones first
 _FOLDERS: Final = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
@@ -32,6 +32,12 @@ def find_polycam(root: Path) -> Path | None:
             if (keyframes / images).is_dir() and folder.is_dir() and any(folder.glob("*.json")):
                 return folder
     return None
+
+
+def photographs_of_polycam(root: Path) -> Path | None:
+    """Find the photographs of an export, which lie among depth maps and other versions of themselves; None if none."""
+    cameras = find_polycam(root)
+    return None if cameras is None else cameras.parent / dict(_FOLDERS)[cameras.name]
 
 
 def read_polycam(folder: Path, root: Path) -> list[PosedImage]:

@@ -20,6 +20,7 @@ from typing import Any, Literal
 
 from pop_fast.data.capture import Progress
 from pop_fast.data.colmap import quiet_colmap
+from pop_fast.data.polycam import photographs_of_polycam
 from pop_fast.data.sfm_files import UPRIGHT, recognise_result, write_list
 from pop_fast.data.sfm_options import SfmOptions
 from pop_fast.data.sfm_search import Search, check_camera_model, find_cameras
@@ -58,7 +59,13 @@ def photo_folder(root: Path) -> Path:
 
 
 def photographs(folder: Path) -> list[Path]:
-    """List the photographs of a folder and its subfolders, sorted by relative name; `masks` holds none."""
+    """List the photographs of a folder and its subfolders, sorted by relative name; `masks` holds none.
+
+    Of a Polycam export only those that its cameras are of.
+    """
+    exported = photographs_of_polycam(folder)
+    if exported is not None:
+        return list_images(exported)
     return [path for path in list_images(folder) if path.relative_to(folder).parts[0] != "masks"]
 
 

@@ -6,9 +6,10 @@ not to be obeyed again.
 
 from __future__ import annotations
 
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -24,6 +25,10 @@ def can_read_heif() -> bool:
     return find_spec("pillow_heif") is not None
 
 
+def _pillow_heif() -> Any:
+    return import_module("pillow_heif")
+
+
 def is_heif(data: bytes) -> bool:
     """Tell by a file's first 12 bytes whether it is HEIF."""
     return data[4:8] == b"ftyp" and data[8:12] in _BRANDS
@@ -35,9 +40,7 @@ def heif_size(data: bytes) -> tuple[int, int]:
     Raises:
         ValueError: the file is damaged.
     """
-    import pillow_heif
-
-    width, height = pillow_heif.open_heif(data).size
+    width, height = _pillow_heif().open_heif(data).size
     return int(width), int(height)
 
 
@@ -47,9 +50,7 @@ def decode_heif(data: bytes) -> np.ndarray:
     Raises:
         ValueError: the file is damaged.
     """
-    import pillow_heif
-
-    picture = pillow_heif.open_heif(data, convert_hdr_to_8bit=True)
+    picture = _pillow_heif().open_heif(data, convert_hdr_to_8bit=True)
     # one channel is gray
     pixels = np.ascontiguousarray(np.asarray(picture))
     return np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels
@@ -57,10 +58,8 @@ def decode_heif(data: bytes) -> np.ndarray:
 
 def heif_exif(path: Path) -> bytes:
     """Return the TIFF block of a file's EXIF tags, empty where it has none or cannot be read."""
-    import pillow_heif
-
     try:
-        block = pillow_heif.open_heif(path.read_bytes()).info.get("exif") or b""
+        block = _pillow_heif().open_heif(path.read_bytes()).info.get("exif") or b""
     except (OSError, ValueError):
         return b""
     return block.removeprefix(b"Exif\0\0")

@@ -95,7 +95,12 @@ def test_exposures_and_lenses_that_differ_are_told(pop: Pop, tmp_path: Path, pic
         Image.fromarray(picture).save(tmp_path / f"{i}.jpg", exif=exif, quality=95)
     out = pop("data", "check", tmp_path).out
     assert "8 x Maker X; focal length 4 mm, 5 mm: several lenses" in out
-    assert "exposures differ by 2.0 stops; lock the exposure" in out
+    assert "exposures differ by 2.0 stops; lock the exposure, or train with --exposure" in out
+    assert "no focal length" not in out
+    write_photograph(tmp_path / "edited.jpg", photograph(1, 160, 120))
+    assert (
+        "1 have no focal length, first edited.jpg; where photographs were edited" in pop("data", "check", tmp_path).out
+    )
 
 
 def test_what_is_not_read_is_mentioned_among_what_is(pop: Pop, bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:

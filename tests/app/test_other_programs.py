@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from pop_fast.data import Capture, load_capture
+from pop_fast.data.sfm import photographs
 from pop_fast.errors import CaptureError
 from tests.app import exported
 from tests.app.conftest import Pop
@@ -64,6 +65,16 @@ def test_polycams_first_cameras_are_read_where_it_has_not_corrected_them(
 ) -> None:
     folder = write("polycam", original, shared_capture, tmp_path, kind="")
     same_cameras(load_capture(folder, normalize=False, points=20), original)
+
+
+def test_structure_from_motion_takes_a_polycam_exports_photographs_and_nothing_else(
+    original: Capture, shared_capture: Path, tmp_path: Path
+) -> None:
+    folder = write("polycam", original, shared_capture, tmp_path)
+    exported.photographs(shared_capture, folder / "keyframes" / "images")
+    assert [path.relative_to(folder).as_posix() for path in photographs(folder)] == [
+        f"keyframes/corrected_images/view_{i:03d}.png" for i in range(8)
+    ]
 
 
 def test_points_beside_an_export_are_read(original: Capture, shared_capture: Path, tmp_path: Path) -> None:
