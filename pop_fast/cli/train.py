@@ -324,7 +324,7 @@ def check_backend(config: TrainConfig) -> None:
 
     require_backend(config.backend)
     if config.backend == "cuda":
-        from pop_fast.train.fused_stepper import unsupported
+        from pop_fast.train.fused_settings import unsupported
 
         reason = unsupported(config)
         if reason is not None:

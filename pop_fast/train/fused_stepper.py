@@ -138,28 +138,6 @@ class FusedStepper:
                 target.copy_(self._state[key])
 
 
-def unsupported(config: TrainConfig) -> str | None:
-    """Return one sentence on a setting that fused steps do not know and what to do, or None."""
-    plan, method = config.strategy, config.method
-    known: dict[str, tuple[Any, Any]] = {
-        "absgrad": (plan.absgrad, False),
-        "key_for_gradient": (plan.key_for_gradient, "means2d"),
-        "refine_scale2d_stop_iter": (plan.refine_scale2d_stop_iter, 0),
-        "lambda_entropy": (plan.lambda_entropy, 0.0),
-    }
-    for name, (value, supported) in known.items():
-        if value != supported:
-            return (
-                f"backend 'cuda' trains with {method}.{name} = {supported!r} only, not {value!r}; "
-                f"use --backend fast, or leave {method}.{name} as it is"
-            )
-    for name in ("exposure", "random_background", "refine_cameras"):
-        if getattr(config, name):
-            option = name.replace("_", "-")
-            return f"backend 'cuda' trains without {name}; use --backend fast, or leave out --{option}"
-    return None
-
-
 def step_settings(config: TrainConfig, updates: Updates) -> StepSettings:
     """Return what stays the same over a run.
 

@@ -21,9 +21,10 @@ from pop_fast.stages import refinement
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.appearance import Appearance
+from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import engine_of, torch_engine
-from pop_fast.train.fused_stepper import unsupported
+from pop_fast.train.fused_settings import unsupported
 from pop_fast.train.metrics import psnr, psnr_after_correction
 from pop_fast.train.views import ViewTensors, render_view
 from pop_ref.losses import photometric_pop, photometric_pop_vjp
@@ -290,3 +291,11 @@ def test_what_no_run_can_have_learned_is_refused_and_named(case: str, finished: 
     with pytest.raises(PopError, match=named) as refused:
         run._restore(forged)
     assert str(forged) in str(refused.value)
+
+
+def test_the_line_about_the_backend_says_that_autograd_takes_the_steps(tmp_path: Path) -> None:
+    asked = replace(tiny_config(tmp_path), backend="compiled")
+    assert choose_backend(asked)[1] == "backend compiled, as asked for"
+    said = choose_backend(replace(asked, exposure=True))[1]
+    assert said == "backend compiled, as asked for; its fused step has no exposure, so autograd takes the steps"
+    assert choose_backend(replace(asked, backend="fast", exposure=True))[1] == "backend fast, as asked for"
