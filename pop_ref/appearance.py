@@ -105,7 +105,8 @@ def color_correct(image: Float64[np.ndarray, "P 3"], target: Float64[np.ndarray,
     """Fit each channel of a render to its photograph's, for measurements: `(c - b) / a` with `a t + b` nearest to c.
 
     The line is fitted by least squares over all pixels, from photograph t to render c, and then inverted; the result is
-    clamped to [0, 1]. A channel of the photograph that hardly varies, or a flat line, has the slope 1.
+    clamped to [0, 1]. A channel of the photograph that hardly varies, or a flat line, has the slope 1. What a render
+    gets wrong flattens the line, so that a poor one can be further from its photograph when it has been corrected.
 
     Source: gsplat's trainer, metric cc_psnr with `color_correct_method` "affine", after Mildenhall et al., multinerf.
     Departs: nothing.

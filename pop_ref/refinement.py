@@ -133,6 +133,41 @@ def refined_viewmat_vjp(
     return v_viewmat, np.concatenate([rotmat_from_vector_vjp(correction[:3], v_motion[:, :3]), v_motion[:, 3]])
 
 
+def without_common_motion(
+    corrections: Float64[np.ndarray, "V 6"], viewmats: Float64[np.ndarray, "V 4 4"]
+) -> Float64[np.ndarray, "V 6"]:
+    """Take out of the corrections what moves all cameras alike: `c - A x`, x least squares of `A x = c`.
+
+    A motion of the whole world by the small twist x = (w, u) is in camera i's axes `A_i x = (R w, t x R w + R u)`. When
+    all cameras move so and the Gaussians follow, every image stays: nothing in the loss holds such a motion back, but
+    held-out cameras, which have no correction, do not follow it.
+
+    Source: the adjoint of a rigid motion, Murray, Li and Sastry 1994, section 2.4.2.
+    Departs: gsplat lets the cameras drift. Exact to first order in the corrections, which are small.
+
+    Args:
+        corrections: rotation vectors and translations of the training cameras.
+        viewmats: their world -> camera matrices before correction, rigid.
+
+    Returns:
+        The corrections less the common motion.
+
+    Example:
+        >>> viewmats = np.stack([np.eye(4), np.eye(4)])
+        >>> together = np.tile([0.0, 0.0, 0.25, 0.5, 0.0, 0.0], (2, 1))
+        >>> np.abs(without_common_motion(together, viewmats)).max() < 1e-15
+        np.True_
+    """
+    A = np.zeros((6 * len(viewmats), 6))
+    for i, viewmat in enumerate(viewmats):
+        R, t = viewmat[:3, :3], viewmat[:3, 3]
+        A[6 * i : 6 * i + 3, :3] = R
+        A[6 * i + 3 : 6 * i + 6, :3] = _cross(t) @ R
+        A[6 * i + 3 : 6 * i + 6, 3:] = R
+    stacked = corrections.reshape(-1)
+    return (stacked - A @ np.linalg.lstsq(A, stacked, rcond=None)[0]).reshape(-1, 6)
+
+
 def _cross(vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
     x, y, z = (float(entry) for entry in vector)
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

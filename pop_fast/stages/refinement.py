@@ -45,6 +45,20 @@ def refined_viewmat_vjp(viewmat: Tensor, correction: Tensor, v_refined: Tensor) 
     return v_viewmat, torch.cat([rotmat_from_vector_vjp(correction[:3], v_motion[:, :3]), v_motion[:, 3]])
 
 
+def without_common_motion(corrections: Tensor, viewmats: Tensor) -> Tensor:
+    """See `pop_ref.refinement.without_common_motion`.
+
+    Optimizations: none; in double precision, so that nothing is lost where a few cameras hardly fix the motion.
+    """
+    R, t = viewmats[:, :3, :3].double(), viewmats[:, :3, 3].double()
+    A = R.new_zeros((len(viewmats), 6, 6))
+    A[:, :3, :3], A[:, 3:, 3:] = R, R
+    A[:, 3:, :3] = torch.linalg.cross(t[:, :, None].expand_as(R), R, dim=1)
+    stacked, wide = corrections.double().reshape(-1, 1), A.reshape(-1, 6)
+    common = torch.linalg.lstsq(wide, stacked, driver="gelsd").solution
+    return (stacked - wide @ common).view_as(corrections).to(corrections)
+
+
 class _Refined(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, viewmat: Tensor, correction: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from pop_fast.stages.appearance import background_at, centred_exposures, expose
-from pop_fast.stages.refinement import refined_viewmat
+from pop_fast.stages.refinement import refined_viewmat, without_common_motion
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.model import make_optimizers
 from pop_fast.train.views import ViewTensors
@@ -37,6 +37,7 @@ class Appearance:
         }
         self.params = {name: Parameter(value) for name, value in start.items() if value is not None}
         self._optimizers = make_optimizers(self.params)
+        self._viewmats = torch.cat([view.viewmat for view in views])
 
     def seen_from(self, view: ViewTensors, index: int) -> ViewTensors:
         """Return a training view with its corrected camera."""
@@ -58,13 +59,15 @@ class Appearance:
 
     @torch.no_grad()
     def update(self, step: int) -> None:
-        """Move by the gradients of a step, and forget these."""
+        """Move by the gradients of a step, less what the loss says nothing of, and forget the gradients."""
         rates, share = self._config.appearance_lr, step / self._config.max_steps
         for name, optimizer in self._optimizers.items():
             rate, decay = getattr(rates, name), getattr(rates, f"{name}_decay")
             optimizer.param_groups[0]["lr"] = rate * decay**share
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
+        if "cameras" in self.params:
+            self.params["cameras"].copy_(without_common_motion(self.params["cameras"], self._viewmats))
         if "exposures" in self.params:
             self.params["exposures"].copy_(centred_exposures(self.params["exposures"]))
 

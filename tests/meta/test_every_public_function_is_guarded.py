@@ -165,6 +165,7 @@ TESTS = {
     "appearance.color_correct": "test_appearance.test_correction_takes_back_gain_and_offset_by_channel",
     "appearance.background_at": "test_appearance.test_the_stream_is_splitmix64_by_its_published_numbers",
     "refinement.rotmat_from_vector": "test_refinement.test_a_rotation_is_the_exponential_of_its_generator",
+    "refinement.without_common_motion": "test_refinement.test_what_is_taken_out_is_orthogonal_to_what_is_left",
     "refinement.refined_viewmat": "test_refinement.test_a_corrected_camera_is_rigid_and_moves_points_in_its_own_axes",
     "ssim.gaussian_window": "test_losses.test_window_is_the_impulse_response_of_scipys_gaussian_filter",
     "ssim.ssim_map": "test_losses.test_ssim_of_equal_images_is_one_and_is_its_maximum",

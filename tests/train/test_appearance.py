@@ -57,6 +57,14 @@ def test_stages_have_the_values_of_the_oracle() -> None:
         np.testing.assert_array_equal(stages.background_at(step, seed), pop_ref.appearance.background_at(step, seed))
 
 
+def test_the_common_motion_that_is_taken_out_is_the_oracles() -> None:
+    viewmats = np.stack([view.viewmat for view in tiny_capture().views])
+    found = refinement.without_common_motion(tensor(CORRECTIONS), tensor(viewmats))
+    expected = pop_ref.refinement.without_common_motion(CORRECTIONS, viewmats)
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-15)
+    assert np.abs(expected - CORRECTIONS).max() > 1e-3
+
+
 @pytest.mark.parametrize("size", [0.0, 1e-3, 1.0])
 def test_corrections_of_cameras_and_their_gradients_are_the_oracles(size: float) -> None:
     viewmat, v_refined = tiny_capture().views[1].viewmat, np.vstack([RNG.normal(size=(3, 4)), np.zeros(4)])
@@ -201,26 +209,32 @@ def test_psnr_after_correction_forgets_gain_and_offset_and_what_a_mask_hides() -
     assert psnr_after_correction(image, target) < 30.0 < 90.0 < psnr_after_correction(image, target, mask)
 
 
-def test_a_camera_that_is_a_little_off_is_found_again(tmp_path: Path) -> None:
+def test_cameras_that_are_a_little_off_are_found_again(tmp_path: Path) -> None:
     params = initialize_params(tiny_capture(), 7, 0.8, 1.0)
     rates = {"appearance_lr": replace(TrainConfig().appearance_lr, cameras=3e-3)}
-    config = tiny_config(tmp_path, refine_cameras=True, max_steps=120, **rates)
-    true = ViewTensors.of(tiny_capture().views[1])
-    off = replace(true, viewmat=refinement.refined_viewmat(true.viewmat[0], torch.tensor(CORRECTIONS[0]).float())[None])
-    backend = get_backend("fast")
-    target = render_view(backend, params, true, config, 0).image
-    appearance = Appearance(config, [off])
+    config, backend = tiny_config(tmp_path, refine_cameras=True, max_steps=150, **rates), get_backend("fast")
+    true = [ViewTensors.of(view) for view in tiny_capture().views]
+    viewmats = torch.cat([view.viewmat for view in true])
+    # what moves all cameras alike cannot be found again
+    errors = refinement.without_common_motion(torch.tensor(CORRECTIONS).float(), viewmats)
+    off = [
+        replace(view, viewmat=refinement.refined_viewmat(view.viewmat[0], error)[None])
+        for view, error in zip(true, errors, strict=True)
+    ]
+    targets = [render_view(backend, params, view, config, 0).image for view in true]
+    appearance = Appearance(config, off)
     losses: list[float] = []
-    for step in range(120):
-        image = render_view(backend, params, appearance.seen_from(off, 0), config, 0).image
-        loss = ((image - target) ** 2).mean()
+    for step in range(150):
+        index = step % len(off)
+        image = render_view(backend, params, appearance.seen_from(off[index], index), config, 0).image
+        loss = ((image - targets[index]) ** 2).mean()
         loss.backward()
         losses.append(loss.item())
         appearance.update(step)
-    before = (off.viewmat - true.viewmat).abs().max()
-    after = (appearance.seen_from(off, 0).viewmat.detach() - true.viewmat).abs().max()
-    assert losses[-1] < 0.02 * losses[0]
-    assert after < 0.5 * before
+    assert sum(losses[-5:]) < 0.1 * sum(losses[:5])
+    after = torch.cat([view.viewmat for view in appearance.seen(off)])
+    before = torch.cat([view.viewmat for view in off])
+    assert (after - viewmats).square().mean() < 0.25 * (before - viewmats).square().mean()
 
 
 def test_passes_see_the_cameras_as_they_are_corrected(tmp_path: Path) -> None:
