@@ -8,6 +8,7 @@ Metashape's p1 and p2 are OpenCV's p2 and p1. A fisheye sensor is OpenCV's where
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -101,7 +102,7 @@ def read_metashape(path: Path, root: Path, images: str) -> tuple[list[PosedImage
             name = label if found is None else found.name
             shots.append(PosedImage(name, images, name, lens, viewmat))
     names = [shot.name for shot in shots]
-    twice = next((name for name in names if names.count(name) > 1), None)
+    twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
         raise CaptureError(f"{path}: two cameras have the label {twice}; export one chunk, with labels that differ")
     notes = [f"{len(unaligned)} cameras of {path.name} are not aligned and left out, first {unaligned[0]}"]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from pathlib import Path
 from typing import Any, Final
 
@@ -91,7 +92,7 @@ def _rows(path: Path) -> list[tuple[str, dict[str, Any]]]:
         raise CaptureError(f"{path}: has no column {absent[0]}; {_EXPORT}")
     named = [(Path(row["#name"].strip().replace("\\", "/")).as_posix(), row) for row in table]
     names = [name for name, _ in named]
-    twice = next((name for name in names if names.count(name) > 1), None)
+    twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
         raise CaptureError(f"{path}: lists {twice} twice; remove one of its rows")
     return named
