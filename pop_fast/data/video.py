@@ -17,15 +17,12 @@ import cv2
 import numpy as np
 
 from pop_fast.data.capture import Progress
+from pop_fast.data.photo_quality import look_the_same, sharpness, thumbnail
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import folder_atomically
 
-__all__ = ["Taken", "sharpness", "take_frames"]
+__all__ = ["Taken", "take_frames"]
 
-_SIDE: Final = 512
-_THUMB: Final = 24
-# mean difference of two thumbnails, of 255, under which nothing has moved
-_SAME: Final = 1.2
 _JPEG_QUALITY: Final = 97
 
 
@@ -51,18 +48,6 @@ class _Candidate:
     number: int
     image: np.ndarray
     sharpness: float
-
-
-def sharpness(image: np.ndarray) -> float:
-    """Return the variance of the Laplacian of a picture, gray and shrunk to sides of up to 512 px.
-
-    Args:
-        image: BGR. uint8 [H, W, 3]
-    """
-    gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    scale = _SIDE / max(gray.shape)
-    small = gray if scale >= 1.0 else cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return float(cv2.Laplacian(small, cv2.CV_32F).var())
 
 
 def take_frames(
@@ -102,8 +87,8 @@ def take_frames(
     last: np.ndarray | None = None
     with folder_atomically(out, overwrite, keeps=[path], recognise=lambda file: _is_ours(file, pattern)) as folder:
         for best in _sharpest(path, total, stretch, progress):
-            thumb = cv2.resize(best.image, (_THUMB, _THUMB), interpolation=cv2.INTER_AREA).astype(np.float32)
-            if last is not None and float(np.abs(thumb - last).mean()) < _SAME:
+            thumb = thumbnail(cv2.cvtColor(best.image, cv2.COLOR_BGR2GRAY))
+            if last is not None and look_the_same(thumb, last[None])[0]:
                 alike += 1
                 continue
             last = thumb
@@ -166,7 +151,7 @@ def _sharpest(path: Path, total: int, stretch: float, progress: Progress | None)
                     earliest = best.number + 0.5 * stretch
                 best, end = None, end + stretch
             if number >= earliest:
-                value = sharpness(image)
+                value = sharpness(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
                 if best is None or value > best.sharpness:
                     best = _Candidate(number, image, value)
         if best is not None:

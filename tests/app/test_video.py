@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from pop_fast.data import load_capture
-from pop_fast.data.video import sharpness, take_frames
+from pop_fast.data.photo_quality import sharpness
+from pop_fast.data.video import take_frames
 from pop_fast.errors import CaptureError, PopError
 from pop_fast.io.images import list_images, read_image
 from pop_fast.view.paths import VideoFile
@@ -53,9 +54,9 @@ def test_every_stretch_gives_a_sharp_frame_and_a_rest_gives_one(clip: Path, tmp_
 
 
 def test_sharpness_is_that_of_the_picture_shrunk_and_falls_with_blur() -> None:
-    sharp, soft = frame(2), frame(3)
+    sharp, soft = (cv2.cvtColor(frame(number), cv2.COLOR_RGB2GRAY) for number in (2, 3))
     assert sharpness(sharp) > 4.0 * sharpness(soft)
-    large = np.kron(sharp, np.ones((8, 8, 1), np.uint8))
+    large = np.kron(sharp, np.ones((8, 8), np.uint8))
     assert sharpness(large) == pytest.approx(sharpness(cv2.resize(large, (512, 384), interpolation=cv2.INTER_AREA)))
 
 
