@@ -41,6 +41,8 @@ STAGES = (
     Stage("importance mask and POP loss", "eqs. 7, 8", ("polarization",)),
     Stage("density control", "eqs. 3, 6", ("density", "density_config", "density_rows")),
     Stage("Adam and its schedules", "4.1", ("optimizer",), ("train/model.py", "train/schedule.py")),
+    Stage("exposure of photographs, random backgrounds", "–", ("appearance",), ("train/appearance.py",)),
+    Stage("corrections of cameras", "–", ("refinement",)),
     Stage("one training step", "eq. 9", ("training", "recipes"), ("train/torch_stepper.py",)),
     Stage(
         "sums of weights, pixels and distances over a view",
@@ -69,6 +71,8 @@ LAWS_ELSEWHERE = {
     "render": "pop_ref/conformance/laws/test_whole.py",
     "depth": "pop_ref/conformance/laws/test_signature_depth.py",
     "training": "tests/golden",
+    "appearance": "tests/oracle/test_appearance.py",
+    "refinement": "tests/oracle/test_refinement.py",
     "margins": "tests/thresholds",
 }
 

@@ -215,6 +215,23 @@ class UpdateRules:
     round_decay_every: int = 400
 
 
+@dataclass(frozen=True, kw_only=True)
+class AppearanceRates:
+    """Adam's learning rates of what belongs to photographs and not to the scene; each decays log-linearly.
+
+    Attributes:
+        exposures: of the entries of every exposure; Inria's.
+        exposures_decay: what that rate is multiplied by from the first step to the last.
+        cameras: of the corrections of cameras, rad and world units; gsplat's.
+        cameras_decay: likewise.
+    """
+
+    exposures: float = 1e-2
+    exposures_decay: float = 0.1
+    cameras: float = 1e-5
+    cameras_decay: float = 0.01
+
+
 POP: Final = DensityConfig()
 GSPLAT: Final = DensityConfig(blur_stop_iter=-1, reset_every=3000)
 # whose opacities move half as fast since October 2024

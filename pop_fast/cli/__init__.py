@@ -31,6 +31,7 @@ COMMANDS: Final = {
     "convert": "turn a splat's file into another format",
     "compare": "put several results side by side in one table",
     "report": "write report.html again from the files of a result",
+    "frames": "take sharp photographs out of a video",
     "sfm": "find the cameras of a folder of photographs (pycolmap)",
     "demo": "write the built-in demo capture, made from a seed",
     "data check": "look a capture over before training: sizes, pairing, masks, memory",

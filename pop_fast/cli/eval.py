@@ -117,6 +117,7 @@ def _lines(stats: dict[str, Any]) -> list[str]:
     lines = [
         f"views      {stats['views']}",
         f"PSNR       {stats['psnr']:.3f} dB",
+        *([f"cc PSNR    {stats['cc_psnr']:.3f} dB, colours fitted to each photograph"] if "cc_psnr" in stats else []),
         f"SSIM       {stats['ssim']:.4f}",
     ]
     for variant, value in stats["lpips_variants"].items():

@@ -52,6 +52,7 @@ _SHOWN: Final = frozenset(
     {
         *("data", "result_dir", "max_steps", "seed", "backend", "profile"),
         *("factor", "test_every", "antialiased", "background", "lpips_vgg", "lpips_alex"),
+        *("exposure", "random_background", "refine_cameras"),
     }
 )
 _DOCUMENTED: Final = (FinishOptions, LimitOptions, Given, TrainConfig)
@@ -71,7 +72,8 @@ _IGNORED: Final = frozenset({"--eval"})  # Inria: hold out every 8th view; here 
 class _Run(FinishOptions):
     """Fit a splat to a capture or a folder of photographs.
 
-    DATA is a folder with a COLMAP model (the largest in sparse), with transforms.json, or with photographs alone.
+    DATA is a folder with a COLMAP model (the largest in sparse), with transforms.json, with what Polycam, Metashape or
+    RealityCapture export, or with photographs alone.
 
     Attributes:
         resume: go on from the last checkpoint in the output folder, to the same bits as without the interruption; start
@@ -90,7 +92,7 @@ class _Run(FinishOptions):
     missing: Literal["error", "skip"] = "error"
     images: str | None = None
     ignore_masks: bool = False
-    source: Literal["auto", "colmap", "transforms", "photos"] = "auto"
+    source: Literal["auto", "colmap", "transforms", "polycam", "metashape", "realitycapture", "photos"] = "auto"
     sfm: SfmOptions = dataclasses.field(default_factory=SfmOptions)
     quiet: bool = False
 
@@ -352,7 +354,7 @@ def check_backend(config: TrainConfig) -> None:
 
     require_backend(config.backend)
     if config.backend == "cuda":
-        from pop_fast.train.fused_stepper import unsupported
+        from pop_fast.train.fused_settings import unsupported
 
         reason = unsupported(config)
         if reason is not None:
@@ -419,7 +421,9 @@ def summary(stats: dict[str, Any]) -> str:
     """Say in one line how a run ended."""
     parts: list[str] = []
     if stats.get("psnr") is not None:
-        parts += [f"PSNR {stats['psnr']:.2f} dB", f"SSIM {stats['ssim']:.4f}"]
+        parts.append(f"PSNR {stats['psnr']:.2f} dB")
+        parts += [f"with colours fitted {stats['cc_psnr']:.2f} dB"] if "cc_psnr" in stats else []
+        parts += [f"SSIM {stats['ssim']:.4f}"]
     if stats.get("lpips") is not None:
         parts.append(f"LPIPS {stats['lpips']:.4f} ({stats['lpips_net']})")
     parts.append(f"{stats['num_GS']:,} Gaussians ({stats['num_GS_above_floor']:,} with opacity >= 1/255)")

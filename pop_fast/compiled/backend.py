@@ -43,7 +43,7 @@ class CompiledBackend(TorchBackend):
     def make_engine(self, config: Any, own_strategy: bool) -> Any:
         """Return the native step where it knows all settings, else autograd over the compiled stages."""
         from pop_fast.train.engines import native_engine, torch_engine
-        from pop_fast.train.fused_stepper import unsupported
+        from pop_fast.train.fused_settings import unsupported
 
         if own_strategy and unsupported(config) is None:
             return native_engine(self)

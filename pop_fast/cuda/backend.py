@@ -52,7 +52,7 @@ class CudaBackend(DrawingBackend):
         """Return the fused step and nothing else; a setting that it does not know is refused."""
         from pop_fast.errors import PopError
         from pop_fast.train import engines
-        from pop_fast.train.fused_stepper import unsupported
+        from pop_fast.train.fused_settings import unsupported
 
         reason = unsupported(config)
         if not own_strategy:

@@ -34,6 +34,7 @@ class View:
         K: intrinsics in px. float64 [3, 3]
         mask: True where the photograph counts; None where all of it does. bool [H, W]
         split: the capture's own assignment, or None where every n-th file is held out.
+        had_alpha: the file has transparency, which was laid over a background.
     """
 
     name: str
@@ -42,6 +43,7 @@ class View:
     K: np.ndarray
     mask: np.ndarray | None = None
     split: Split | None = None
+    had_alpha: bool = False
 
     @property
     def width(self) -> int:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from pop_fast.data.colmap import find_model, read_model
+from pop_fast.data.exports import EXPORTS, find_export, read_export
 from pop_fast.data.finding import Finding, State
 from pop_fast.data.load import beside_the_model, turned_upright
 from pop_fast.data.photo_quality import Shown, about_number, measure
@@ -38,7 +39,7 @@ class Photo:
 
 
 def read_listing(root: Path, images: str | None = None) -> tuple[str, list[PosedImage], SparsePoints | None] | None:
-    """Read where photographs were taken from: a COLMAP model or transforms.json; what it is, its shots, its points.
+    """Read where photographs were taken from: a COLMAP model, transforms.json, an export; what, its shots, its points.
 
     Args:
         root: the capture's folder.
@@ -62,6 +63,10 @@ def read_listing(root: Path, images: str | None = None) -> tuple[str, list[Posed
     if lists:
         shots, cloud = read_transforms(lists)
         return " and ".join(path.name for path in lists), _in_folder(shots, images), cloud
+    export = find_export(root)
+    if export is not None:
+        shots, cloud, _ = read_export(*export, root, images)
+        return f"{EXPORTS[export[0]][0]} in {export[1].relative_to(root)}", shots, cloud
     folder = photo_folder(root)
     if not photographs(folder):
         hint = unreadable_photographs(folder) or "give the folder of a capture"

@@ -11,6 +11,7 @@ import numpy as np
 from pop_fast.data.capture import Capture, Progress, View
 from pop_fast.data.colmap import find_models, read_model
 from pop_fast.data.diagnostics import about_other_models, about_random_points, about_unplaced
+from pop_fast.data.exports import EXPORTS, find_export, read_export
 from pop_fast.data.normalize import normalizing_transform, transform_points, transform_viewmats
 from pop_fast.data.posed_images import PosedImage, SparsePoints
 from pop_fast.data.random_points import random_points
@@ -20,11 +21,11 @@ from pop_fast.data.sfm_files import read_upright
 from pop_fast.data.sfm_options import SfmOptions
 from pop_fast.data.transforms import find_transforms, read_transforms
 from pop_fast.errors import CaptureError
-from pop_fast.io.images import find_image, unreadable_photographs
+from pop_fast.io.images import VIDEO_SUFFIXES, find_image, unreadable_photographs
 
 __all__ = ["beside_the_model", "load_capture", "turned_upright"]
 
-Source = Literal["auto", "colmap", "transforms", "photos"]
+Source = Literal["auto", "colmap", "transforms", "polycam", "metashape", "realitycapture", "photos"]
 
 
 def load_capture(
@@ -46,8 +47,8 @@ def load_capture(
     """Load photographs, cameras and sparse points of a capture.
 
     `source="auto"` takes the first that is there: a COLMAP model (the largest in `sparse` and its subfolders, else in
-    `colmap/sparse`, else the folder itself), `transforms.json` or Blender's `transforms_train.json`, a bare folder of
-    photographs.
+    `colmap/sparse`, else the folder itself), `transforms.json` or Blender's `transforms_train.json`, the export of
+    Polycam, Metashape (XML) or RealityCapture (CSV), a bare folder of photographs.
 
     Args:
         path: the capture's folder.
@@ -74,6 +75,8 @@ def load_capture(
     root = Path(path)
     if not root.is_dir():
         what = "is a file, not a folder" if root.exists() else "no such folder"
+        if root.suffix.lower() in VIDEO_SUFFIXES and root.exists():
+            raise CaptureError(f"{root}: is a video; take photographs out of it first: pop frames {root}")
         raise CaptureError(f"{root}: {what}; give the folder that holds the photographs and their cameras")
     if factor < 1 or int(factor) != factor:
         raise CaptureError(f"factor is {factor}; it must be a whole number of at least 1")
@@ -82,7 +85,7 @@ def load_capture(
     if resize not in ("area", "bicubic"):
         raise CaptureError(f"resize is {resize!r}; it must be 'area' or 'bicubic'")
     options = PhotoOptions(int(factor), masks, missing, _background(background), images, resize)
-    listing, shots, cloud, made_from, notes = _read_listing(root, source, sfm, progress)
+    listing, shots, cloud, made_from, notes = _read_listing(root, source, images, sfm, progress)
     if len(shots) < 2:
         raise CaptureError(f"{listing}: has {len(shots)} view(s) with a known camera; a scene needs two or more")
     if made_from == "COLMAP model":
@@ -104,7 +107,7 @@ def _background(color: tuple[float, float, float]) -> tuple[float, float, float]
 
 
 def _read_listing(
-    root: Path, source: Source, sfm: bool | SfmOptions, progress: Progress | None
+    root: Path, source: Source, images: str | None, sfm: bool | SfmOptions, progress: Progress | None
 ) -> tuple[Path, list[PosedImage], SparsePoints | None, str, list[str]]:
     models = find_models(root) if source in ("auto", "colmap") else []
     if models:
@@ -112,12 +115,18 @@ def _read_listing(
     found = find_transforms(root) if source in ("auto", "transforms") else []
     if found:
         return found[0], *read_transforms(found), found[0].name, []
+    export = find_export(root, source)
+    if export is not None:
+        shots, cloud, notes = read_export(*export, root, images)
+        return export[1], shots, cloud, EXPORTS[export[0]][0], notes
     if source == "colmap":
         raise CaptureError(
             f"{root}: has no COLMAP model in sparse, sparse/0 or colmap/sparse/0; run pop sfm, or COLMAP"
         )
     if source == "transforms":
         raise CaptureError(f"{root}: has no transforms.json and no transforms_train.json; choose another --source")
+    if source in EXPORTS:
+        raise CaptureError(f"{root}: has no {EXPORTS[source][2]}; export it there, or choose another --source")
     model = _from_photos(root, sfm, progress)
     left = unreadable_photographs(photo_folder(root))
     return model, *read_model(model), "COLMAP model", [left] if left else []

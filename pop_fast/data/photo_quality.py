@@ -74,19 +74,43 @@ def measure(path: Path, image: np.ndarray, name: str) -> Shown:
     """Measure a photograph that was read. image: uint8 [H, W, 3 or 4]"""
     height, width = image.shape[:2]
     gray = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_RGB2GRAY)
-    scale = _SIDE / max(height, width)
-    small = gray if scale >= 1.0 else cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    small = _shrunk(gray)
     return Shown(
         name,
         (width, height),
         exif=read_exif(path),
         digest=hashlib.sha256(path.read_bytes()).hexdigest(),
-        sharpness=float(cv2.Laplacian(small, cv2.CV_32F).var()),
+        sharpness=sharpness(small),
         brightness=float(gray.mean()),
         dark=float((small < 4).mean()),
         bright=float((small > 251).mean()),
-        thumb=cv2.resize(gray, (_THUMB, _THUMB), interpolation=cv2.INTER_AREA).astype(np.float32),
+        thumb=thumbnail(gray),
     )
+
+
+def sharpness(gray: np.ndarray) -> float:
+    """Return the variance of the Laplacian of a gray picture, shrunk to sides of up to 512 px. uint8 [H, W]"""
+    return float(cv2.Laplacian(_shrunk(gray), cv2.CV_32F).var())
+
+
+def thumbnail(gray: np.ndarray) -> np.ndarray:
+    """Shrink a gray picture to what tells whether two look the same. float32 [24, 24]"""
+    return cv2.resize(gray, (_THUMB, _THUMB), interpolation=cv2.INTER_AREA).astype(np.float32)
+
+
+def look_the_same(thumb: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Tell which thumbnails look like another: they differ by no more than noise and compression make. bool [P]
+
+    Args:
+        thumb: float32 [24, 24]
+        others: float32 [P, 24, 24]
+    """
+    return np.abs(others - thumb).mean(axis=(1, 2)) < _SAME
+
+
+def _shrunk(gray: np.ndarray) -> np.ndarray:
+    scale = _SIDE / max(gray.shape)
+    return gray if scale >= 1.0 else cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
 
 def about_quality(shown: Sequence[Shown]) -> Iterator[Finding]:
@@ -116,6 +140,10 @@ def _about_camera(shown: Sequence[Shown]) -> Iterator[Finding]:
     named = ", ".join(f"{count} x {kind}" for kind, count in kinds.most_common(3))
     focal = ", ".join(f"{mm:g} mm" for mm, _ in lenses.most_common(4))
     text = f"{named or 'no camera named'}{f'; focal length {focal}' if focal else ''}"
+    without = [one.name for one in shown if not one.exif.focal]
+    if without:
+        fix = "where photographs were edited, use the originals: cameras are found more surely from a known lens"
+        yield Finding("warn", "EXIF", f"{len(without)} have no focal length, {_some(without)}; {fix}")
     if len(kinds) > 1 or len(lenses) > 1:
         yield Finding("warn", "EXIF", f"{text}: several lenses or zooms; one fixed lens is placed more surely")
     else:
@@ -144,7 +172,7 @@ def _about_exposure(shown: Sequence[Shown]) -> Iterator[Finding]:
             yield Finding("warn", "exposure", f"{len(names)} are over a quarter pure {what}, {_some(names)}")
     taken = [one.exif.exposure * one.exif.iso for one in shown if one.exif.exposure and one.exif.iso]
     stops = float(np.log2(max(taken) / min(taken))) if len(taken) == len(shown) else 0.0
-    fix = "lock the exposure: training takes one brightness for all"
+    fix = "lock the exposure, or train with --exposure: without it training takes one brightness for all"
     if stops > _STOPS:
         yield Finding("warn", "exposure", f"exposures differ by {stops:.1f} stops; {fix}")
     elif not dark and not bright:
@@ -160,10 +188,10 @@ def _about_copies(shown: Sequence[Shown]) -> Iterator[Finding]:
         yield Finding(
             "warn", "duplicates", f"{len(copies)} are the same file more than once, {_some(copies)}; keep one"
         )
-    thumbs = np.stack([one.thumb.ravel() for one in shown])
+    thumbs = np.stack([one.thumb for one in shown])
     alike: list[str] = []
     for i in range(len(shown) - 1):
-        near = np.abs(thumbs[i + 1 :] - thumbs[i]).mean(axis=1) < _SAME
+        near = look_the_same(thumbs[i], thumbs[i + 1 :])
         others = [shown[i + 1 + int(j)] for j in np.flatnonzero(near)]
         alike += [f"{shown[i].name} and {other.name}" for other in others if other.digest != shown[i].digest]
     if alike:

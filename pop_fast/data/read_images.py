@@ -167,7 +167,8 @@ def _read(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
     height, width = image.shape[:2]
     camera = photo.shot.camera or _camera_from_angle(photo.shot.angle_x or 1.0, width, height)
     _check_shape(photo.path, "the photograph", (width, height), "its camera", (camera.width, camera.height))
-    if image.shape[2] == 4:
+    had_alpha = image.shape[2] == 4
+    if had_alpha:
         image = _over(image, options.background)
     try:
         rectification = rectify(camera, width, height)
@@ -184,7 +185,8 @@ def _read(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
     if size != (width, height):
         image = _shrunk(image, size, options.resize)
         K[:2] *= np.array([size[0] / width, size[1] / height])[:, None]
-    return _upright(View(photo.shot.name, image, photo.shot.viewmat, K, mask, photo.shot.split), photo.shot.turns)
+    view = View(photo.shot.name, image, photo.shot.viewmat, K, mask, photo.shot.split, had_alpha)
+    return _upright(view, photo.shot.turns)
 
 
 def _check_header(photo: _Photo) -> None:

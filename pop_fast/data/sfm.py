@@ -20,13 +20,15 @@ from typing import Any, Literal
 
 from pop_fast.data.capture import Progress
 from pop_fast.data.colmap import quiet_colmap
+from pop_fast.data.polycam import photographs_of_polycam
 from pop_fast.data.sfm_files import UPRIGHT, recognise_result, write_list
 from pop_fast.data.sfm_options import SfmOptions
 from pop_fast.data.sfm_search import Search, check_camera_model, find_cameras
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import folder_atomically
+from pop_fast.io.heif import HEIF_SUFFIXES
 from pop_fast.io.image_header import read_exif
-from pop_fast.io.images import list_images, read_image, unreadable_photographs
+from pop_fast.io.images import list_images, read_image, unreadable_photographs, write_png
 from pop_fast.io.jpeg import sound_jpegs
 
 __all__ = ["SfmResult", "photo_folder", "photographs", "run_sfm"]
@@ -57,7 +59,13 @@ def photo_folder(root: Path) -> Path:
 
 
 def photographs(folder: Path) -> list[Path]:
-    """List the photographs of a folder and its subfolders, sorted by relative name; `masks` holds none."""
+    """List the photographs of a folder and its subfolders, sorted by relative name; `masks` holds none.
+
+    Of a Polycam export only those that its cameras are of.
+    """
+    exported = photographs_of_polycam(folder)
+    if exported is not None:
+        return list_images(exported)
     return [path for path in list_images(folder) if path.relative_to(folder).parts[0] != "masks"]
 
 
@@ -167,13 +175,22 @@ class _Job:
 def _stage(photos: Path, names: list[Path], work: Path) -> list[str]:
     """Give photographs plain numbers for names, because COLMAP's lists of pairs cannot hold a space."""
     (work / "images").mkdir()
-    staged = [f"{i:06d}{name.suffix.lower()}" for i, name in enumerate(names)]
+    staged = [f"{i:06d}{_plain_suffix(name)}" for i, name in enumerate(names)]
     for name, plain in zip(names, staged, strict=True):
+        if name.suffix.lower() in HEIF_SUFFIXES:
+            # which COLMAP does not read
+            write_png(work / "images" / plain, read_image(photos / name)[:, :, :3])
+            continue
         try:
             (work / "images" / plain).symlink_to((photos / name).resolve())
         except OSError:  # where links need a privilege
             shutil.copyfile(photos / name, work / "images" / plain)
     return staged
+
+
+def _plain_suffix(name: Path) -> str:
+    suffix = name.suffix.lower()
+    return ".png" if suffix in HEIF_SUFFIXES else suffix
 
 
 def _sizes(photos: Path, names: list[Path], progress: Progress | None) -> set[tuple[int, int]]:

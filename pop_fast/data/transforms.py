@@ -16,18 +16,16 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from pop_fast.data.capture import Split
+from pop_fast.data.fields import WIDEST, Numbers, brown_lens, shortened, viewmat_from_pose
 from pop_fast.data.pinhole import make_camera
 from pop_fast.data.posed_images import PosedImage, SparsePoints
-from pop_fast.data.rigid import nearest_rigid
 from pop_fast.errors import CaptureError
 from pop_fast.io.points import read_points
 
-__all__ = ["find_transforms", "read_transforms"]
+__all__ = ["find_transforms", "points_beside", "read_transforms"]
 
 _POINTS = ("sparse_pc.ply", "points3D.ply", "points3d.ply")
 _RADIAL = ("k1", "k2", "k3", "k4")
-# px; more than any photograph has, and less than what a corrupt number would ask for
-_WIDEST = 1_000_000
 # what is measured in pixels of the size w x h; without it, only a field of view can be used
 _IN_PIXELS = ("fl_x", "fl_y", "cx", "cy")
 _MODELS = ("OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE", "perspective")
@@ -63,14 +61,21 @@ def read_transforms(paths: list[Path]) -> tuple[list[PosedImage], SparsePoints |
         shots += _read_listing(path, listing, split)
         points = listing.get("ply_file_path")
         if points is not None and not isinstance(points, str):
-            raise CaptureError(f"{path}: ply_file_path is {_short(points)}; it must be the relative name of a PLY file")
+            raise CaptureError(
+                f"{path}: ply_file_path is {shortened(points)}; it must be the relative name of a PLY file"
+            )
         named = path.parent / points if points else named
     names = sorted(shot.name for shot in shots)
     twice = [a for a, b in itertools.pairwise(names) if a == b]
     if twice:
         raise CaptureError(f"{paths[0]}: frames lists {twice[0]} twice; remove one of them")
-    found = [named] if named else [f for f in (paths[0].parent / name for name in _POINTS) if f.is_file()]
-    return sorted(shots, key=lambda shot: shot.name), SparsePoints(*read_points(found[0])) if found else None
+    return sorted(shots, key=lambda shot: shot.name), points_beside(paths[0].parent, named)
+
+
+def points_beside(folder: Path, named: Path | None = None) -> SparsePoints | None:
+    """Read the points of a capture: those of the file that its list names, else of a file of a usual name, if any."""
+    found = [named] if named else [f for f in (folder / name for name in _POINTS) if f.is_file()]
+    return SparsePoints(*read_points(found[0])) if found else None
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -128,7 +133,9 @@ def _named_splits(path: Path, listing: dict[str, Any]) -> dict[str, Split]:
     for split in in_turn:
         names = listing.get(f"{split}_filenames")
         if names is not None and not isinstance(names, list):
-            raise CaptureError(f"{path}: {split}_filenames is {_short(names)}; it must be a list of file_path entries")
+            raise CaptureError(
+                f"{path}: {split}_filenames is {shortened(names)}; it must be a list of file_path entries"
+            )
         for name in names or []:
             name = Path(str(name)).as_posix()
             if name not in listed:
@@ -147,23 +154,15 @@ def _viewmat(where: str, frame: dict[str, Any]) -> np.ndarray:
         pose = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])
     if pose.shape != (4, 4):
         raise CaptureError(f"{field} has shape {list(pose.shape)}; it must be 4x4 numbers, camera to world")
-    try:
-        pose = nearest_rigid(pose)
-    except ValueError as error:
-        raise CaptureError(f"{field} {error}") from error
-    rotation = pose[:3, :3] * np.array([1.0, -1.0, -1.0])
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = rotation.T
-    viewmat[:3, 3] = -rotation.T @ pose[:3, 3]
-    return viewmat
+    return viewmat_from_pose(field, pose, opengl=True)
 
 
 def _camera(where: str, fields: dict[str, Any], camera_id: int) -> Any:
     """Build the camera of a frame: its own fields before the file's."""
-    number = _Numbers(where, fields)
+    number = Numbers(where, fields)
     width, height = int(number("w")), int(number("h"))
-    if not (1 <= width <= _WIDEST and 1 <= height <= _WIDEST):
-        raise CaptureError(f"{where}: w x h is {width} x {height}; both must be at least 1 and at most {_WIDEST}")
+    if not (1 <= width <= WIDEST and 1 <= height <= WIDEST):
+        raise CaptureError(f"{where}: w x h is {width} x {height}; both must be at least 1 and at most {WIDEST}")
     model = "OPENCV_FISHEYE" if fields.get("is_fisheye") else str(fields.get("camera_model", "OPENCV"))
     if model not in _MODELS:
         raise CaptureError(f"{where}: camera_model is {model!r}; use one of {', '.join(_MODELS)}, or a COLMAP model")
@@ -180,7 +179,7 @@ def _camera(where: str, fields: dict[str, Any], camera_id: int) -> Any:
 
 def _angle(where: str, fields: dict[str, Any]) -> float | None:
     """Read Blender's only intrinsic, the horizontal field of view in radians; None where a file says more."""
-    number = _Numbers(where, fields)
+    number = Numbers(where, fields)
     if "w" in fields or "h" in fields:
         return None
     measured = any(name in fields for name in _IN_PIXELS) or any(fields.get(k) for k in _RADIAL)
@@ -192,7 +191,7 @@ def _angle(where: str, fields: dict[str, Any]) -> float | None:
     return angle
 
 
-def _focal(number: _Numbers, focal: str, angle: str, size: float) -> float | None:
+def _focal(number: Numbers, focal: str, angle: str, size: float) -> float | None:
     if focal in number.fields:
         return number(focal)
     if angle in number.fields:
@@ -202,7 +201,7 @@ def _focal(number: _Numbers, focal: str, angle: str, size: float) -> float | Non
 
 
 def _lens(
-    where: str, model: str, number: _Numbers
+    where: str, model: str, number: Numbers
 ) -> tuple[Literal["PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"], list[float]]:
     if model.endswith("PINHOLE"):
         return "PINHOLE", []
@@ -213,31 +212,4 @@ def _lens(
         raise CaptureError(
             f"{where}: k4 is {k4}; OPENCV's fourth radial term is not supported, calibrate with k1 to k3"
         )
-    p1, p2 = number("p1", 0.0), number("p2", 0.0)
-    if k3:
-        return "FULL_OPENCV", [k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]
-    if k1 or k2 or p1 or p2:
-        return "OPENCV", [k1, k2, p1, p2]
-    return "PINHOLE", []
-
-
-class _Numbers:
-    """Look fields up as finite numbers, or say which is none."""
-
-    def __init__(self, where: str, fields: dict[str, Any]) -> None:
-        self.where, self.fields = where, fields
-
-    def __call__(self, name: str, default: float | None = None) -> float:
-        value = self.fields.get(name, default)
-        try:
-            number = math.nan if isinstance(value, bool | str) or value is None else float(value)
-        except (TypeError, OverflowError):
-            number = math.nan
-        if not math.isfinite(number):
-            raise CaptureError(f"{self.where}: {name} is {_short(value)}; it must be a finite number")
-        return number
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    return brown_lens((k1, k2, k3), (number("p1", 0.0), number("p2", 0.0)))

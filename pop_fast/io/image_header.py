@@ -1,7 +1,8 @@
 """What an image file says of itself before a pixel is decoded: its size, and its EXIF tags.
 
 A few kilobytes of header decide how much memory decoding takes, so the size is held against what is expected first.
-JPEG, PNG, WebP, BMP and TIFF are read; of any other or damaged file nothing is told, and the decoder judges it.
+JPEG, PNG, WebP, BMP and TIFF are read, and of HEIC the tags; of any other or damaged file nothing is told, and the
+decoder judges it.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
+
+from pop_fast.io.heif import can_read_heif, heif_exif, is_heif
 
 __all__ = ["LARGEST", "Exif", "read_exif", "read_size", "size_of"]
 
@@ -88,6 +91,9 @@ def read_exif(path: Path) -> Exif:
             data = file.read(_HEAD)
             if not data.startswith(b"\xff\xd8"):
                 data += file.read()
+        upright = is_heif(data)
+        if upright:
+            data = heif_exif(path) if can_read_heif() else b""
         at = _exif_at(data)
         if at is None:
             return Exif()
@@ -97,7 +103,8 @@ def read_exif(path: Path) -> Exif:
         return Exif()
     maker, model = (tags[key] if isinstance(tags.get(key), str) else "" for key in (_MAKE, _MODEL))
     camera = model if model.startswith(maker) else f"{maker} {model}".strip()
-    turned = tags.get(_ORIENTATION, 1)
+    # what libheif decodes has been turned already
+    turned = 1 if upright else tags.get(_ORIENTATION, 1)
     return Exif(
         int(turned) if turned in range(1, 9) else 1,
         camera or None,

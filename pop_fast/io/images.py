@@ -1,4 +1,4 @@
-"""Photographs and masks: found by name, checked to be complete, decoded with OpenCV as COLMAP does.
+"""Photographs and masks: found by name, checked to be complete, decoded with OpenCV as COLMAP does (HEIC by `heif`).
 
 EXIF orientation is ignored, because COLMAP ignores it: a model's width and height are those of the stored pixels.
 """
@@ -17,34 +17,43 @@ import numpy as np
 
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import write_atomically
+from pop_fast.io.heif import HEIF_SUFFIXES, INSTALL, can_read_heif, decode_heif, heif_size, is_heif
 from pop_fast.io.image_header import LARGEST, size_of
 
 __all__ = [
     "FIX",
     "IMAGE_SUFFIXES",
+    "VIDEO_SUFFIXES",
     "find_image",
     "inline_png",
     "list_images",
     "read_image",
     "read_mask",
+    "readable_suffixes",
     "unreadable_photographs",
     "write_png",
 ]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-# what telephones and cameras write and OpenCV cannot read: HEIF and raw formats
-_UNREADABLE = (".heic", ".heif", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
-_VIDEOS = (".mov", ".mp4", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp")
+# what cameras write and nothing here reads: HEIF without pillow-heif, and raw formats
+_UNREADABLE = (".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
+VIDEO_SUFFIXES = (".mov", ".mp4", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp")
 FIX = "copy it again from its source, or remove it from the capture"
+
+
+def readable_suffixes() -> tuple[str, ...]:
+    """Return the endings of files that hold photographs which can be read here."""
+    return (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) if can_read_heif() else IMAGE_SUFFIXES
 
 
 def list_images(folder: Path) -> list[Path]:
     """List the photographs of a folder and its subfolders, sorted by relative name; hidden files are left out."""
+    suffixes = readable_suffixes()
     return sorted(
         (
             path
             for path in folder.rglob("*")
-            if path.suffix.lower() in IMAGE_SUFFIXES
+            if path.suffix.lower() in suffixes
             and path.is_file()
             and not any(part.startswith(".") for part in path.relative_to(folder).parts)
         ),
@@ -60,21 +69,23 @@ def unreadable_photographs(folder: Path) -> str | None:
     files = [
         path for path in folder.rglob("*") if not any(part.startswith(".") for part in path.relative_to(folder).parts)
     ]
-    still = [path.suffix for path in files if path.suffix.lower() in _UNREADABLE and path.is_file()]
-    moving = [path for path in files if path.suffix.lower() in _VIDEOS and path.is_file()]
+    unreadable = _UNREADABLE if can_read_heif() else (*_UNREADABLE, *HEIF_SUFFIXES)
+    still = [path.suffix for path in files if path.suffix.lower() in unreadable and path.is_file()]
+    moving = [path for path in files if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()]
     told: list[str] = []
     if still:
         kind = max(set(still), key=still.count)
         what = f"{len(still)} files are" if len(still) > 1 else "1 file is"
+        install = f"{INSTALL}, or " if kind.lower() in HEIF_SUFFIXES else ""
         told.append(
-            f"{what} {kind[1:].upper()} or the like, which is not read: convert them to JPEG first, "
+            f"{what} {kind[1:].upper()} or the like, which is not read: {install}convert them to JPEG first, "
             f"for example with ImageMagick: magick mogrify -format jpg *{kind}"
         )
     if moving:
         what = f"{len(moving)} files are videos, which are" if len(moving) > 1 else "1 file is a video, which is"
         told.append(
-            f"{what} not read ({moving[0].name}): take sharp frames out first, "
-            f"for example with ffmpeg -i {moving[0].name} -vf fps=2 frame_%04d.jpg"
+            f"{what} no photographs ({moving[0].name}): take sharp frames out first, "
+            f"for example with pop frames {moving[0].name} --out photos"
         )
     return "; ".join(told) or None
 
@@ -96,11 +107,12 @@ def find_image(folder: Path, name: str) -> Path | None:
     if not exact.parent.is_dir():
         return None
     # nerfstudio and blender name frames with and without their extension
-    stems = {exact.stem, exact.name} if exact.suffix.lower() in IMAGE_SUFFIXES else {exact.name}
+    suffixes = readable_suffixes()
+    stems = {exact.stem, exact.name} if exact.suffix.lower() in suffixes else {exact.name}
     found = sorted(
         path
         for path in exact.parent.iterdir()
-        if path.stem in stems and path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
+        if path.stem in stems and path.suffix.lower() in suffixes and path.is_file()
     )
     if len(found) > 1:
         raise CaptureError(
@@ -187,12 +199,9 @@ def _decode(path: Path) -> np.ndarray:
         raise CaptureError(f"{path}: the file is absent; restore it, or remove it from the capture") from None
     except OSError as error:
         raise CaptureError(f"{path}: could not be read: {error.strerror}; check the file's permissions") from error
-    size = size_of(data)
-    if size is not None and size[0] * size[1] > LARGEST:
-        raise CaptureError(
-            f"{path}: is {size[0]}x{size[1]} px by its header; more than {LARGEST // 10**6} million pixels are not "
-            "decoded: make it smaller"
-        )
+    if is_heif(data):
+        return _decode_heif(path, data)
+    _check_size(path, size_of(data))
     defect = _defect(data)
     if defect:
         raise CaptureError(f"{path}: {defect}; {FIX}")
@@ -209,6 +218,28 @@ def _decode(path: Path) -> np.ndarray:
     if image.dtype != np.uint8:
         raise CaptureError(f"{path}: has samples of type {image.dtype}; save it with 8 or 16 bit per channel")
     return image
+
+
+def _check_size(path: Path, size: tuple[int, int] | None) -> None:
+    if size is not None and size[0] * size[1] > LARGEST:
+        raise CaptureError(
+            f"{path}: is {size[0]}x{size[1]} px by its header; more than {LARGEST // 10**6} million pixels are not "
+            "decoded: make it smaller"
+        )
+
+
+def _decode_heif(path: Path, data: bytes) -> np.ndarray:
+    """Decode as OpenCV would: BGR or BGRA, 8 bit."""
+    if not can_read_heif():
+        raise CaptureError(f"{path}: is HEIC, which needs pillow-heif: {INSTALL}, or convert it to JPEG")
+    try:
+        _check_size(path, heif_size(data))
+        image = decode_heif(data)
+    except CaptureError:
+        raise
+    except ValueError as error:
+        raise CaptureError(f"{path}: the HEIC file is truncated or corrupt ({error}); {FIX}") from error
+    return cv2.cvtColor(image, cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
 
 
 def _defect(data: bytes) -> str | None:

@@ -8,9 +8,12 @@ from itertools import takewhile
 from pathlib import Path, PureWindowsPath
 
 from pop_fast.errors import PopError
+from pop_fast.io.heif import HEIF_SUFFIXES
 from pop_fast.io.images import IMAGE_SUFFIXES
 
 __all__ = ["inside", "picture_names"]
+
+_PICTURES = (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
 
 
 def picture_names(views: Sequence[str], suffix: str = ".png") -> list[Path]:
@@ -33,9 +36,7 @@ def picture_names(views: Sequence[str], suffix: str = ".png") -> list[Path]:
         ['a/0.png', 'b/0.png', 'c/1.png']
     """
     whole = [Path(*parts) for parts in _inner_parts(views)]
-    plain = [
-        path.with_name((path.stem if path.suffix.lower() in IMAGE_SUFFIXES else path.name) + suffix) for path in whole
-    ]
+    plain = [path.with_name((path.stem if path.suffix.lower() in _PICTURES else path.name) + suffix) for path in whole]
     wanted = Counter(map(_key, plain))
     taken: set[str] = set()
     names: list[Path] = []

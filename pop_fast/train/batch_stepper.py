@@ -139,6 +139,13 @@ def check_batch(config: TrainConfig, own_strategy: bool, ranks: Ranks) -> None:
             f"batch_size is {size}; {ranks.size} processes share the views of a step evenly: "
             f"use --batch-size {ranks.size} or a multiple of it"
         )
+    learned = [name for name in ("exposure", "refine_cameras") if getattr(config, name)]
+    if size > 1 and learned:
+        option = learned[0].replace("_", "-")
+        raise PopError(
+            f"batch_size is {size}; what --{option} learns of a photograph needs steps of one view: "
+            f"leave out --batch-size, or --{option}"
+        )
     if size > 1 and not own_strategy:
         raise PopError(
             f"batch_size is {size}; it must be 1 with a strategy of somebody else, which looks at one render a step"

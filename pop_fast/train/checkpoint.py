@@ -180,10 +180,17 @@ def check_fits(
             )
     last, order = config.max_steps - 1, content["view_order"]["order"]
     odd = sorted(set(known) ^ content["strategy"].keys())
+    learned = {name: len(found["value"]) for name, found in content["appearance"].items()}
+    expected = {
+        **({"exposures": n_views} if config.exposure else {}),
+        **({"cameras": n_views} if config.refine_cameras else {}),
+    }
     if content["step"] > last:
         raise PopError(f"{path}: step is {content['step']}; it must be at most {last}, the run's last: {_DAMAGED}")
     if len(order) not in (0, n_views):
         raise PopError(f"{path}: view_order.order has {len(order)} views; it must have {n_views}: {_DAMAGED}")
+    if learned != expected:
+        raise PopError(f"{path}: appearance has the rows {learned}; it must have {expected}: {_DAMAGED}")
     if odd:
         what = "missing" if odd[0] in known else "unknown"
         raise PopError(f"{path}: strategy.{odd[0]} is {what}; it must hold {', '.join(known)}: {_DAMAGED}")

@@ -23,6 +23,8 @@ from pop_fast.train.model import KEYS, first_non_finite, first_unusable
 
 _TAILS: Final = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
 _FLOATS: Final = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+# one row a photograph: exposures, corrections of cameras
+_OF_PHOTOGRAPHS: Final = {"exposures": (3, 4), "cameras": (6,)}
 _MOMENTS: Final = ("step", "exp_avg", "exp_avg_sq")
 _LONGEST: Final = 40  # letters of a value that a message shows
 # a strategy's numbers with one row a Gaussian
@@ -95,10 +97,28 @@ def check_content(content: Mapping[str, Any]) -> dict[str, Any]:
         "optimizers": {key: _moments(packed[key], f"optimizers.{key}", splats[key], step + 1) for key in KEYS},
         "strategy": _strategy(content["strategy"], list(splats["shN"].shape), step + 1),
         "view_order": _view_order(content["view_order"]),
+        "appearance": _appearance(content.get("appearance", {}), step + 1),
         "seconds": {key: _number(value, f"seconds.{key}") for key, value in seconds.items()},
     }
-    tensors = {name: checked[name] for name in ("splats", "optimizers", "strategy", "view_order")}
+    tensors = {name: checked[name] for name in ("splats", "optimizers", "strategy", "view_order", "appearance")}
     _check_apart(tensors, "", {})
+    return checked
+
+
+def _appearance(packed: Any, taken: int) -> dict[str, dict[str, Tensor]]:
+    """Check what was learned of the photographs; files of older versions have none."""
+    checked: dict[str, dict[str, Tensor]] = {}
+    for key, found in _mapping(packed, "appearance").items():
+        if key not in _OF_PHOTOGRAPHS:
+            raise ValueError(f"appearance.{shown(key)} is unknown; it must hold {', '.join(_OF_PHOTOGRAPHS)}")
+        name = f"appearance.{key}"
+        moments = dict(_mapping(found, name, ("value", *_MOMENTS)))
+        value = _tensor(moments.pop("value"), f"{name}.value", torch.float32)
+        own = _own(value, [*value.shape[:1], *_OF_PHOTOGRAPHS[key]], f"{name}.value")
+        bad = first_non_finite({f"{name}.value": own})
+        if bad:
+            raise ValueError(f"{bad[0]}{bad[1]} is {bad[2]}; every entry must be finite")
+        checked[key] = {"value": own, **_moments(moments, name, own, taken)}
     return checked
 
 

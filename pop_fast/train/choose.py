@@ -10,6 +10,7 @@ from typing import Any
 
 from pop_fast.api.registry import get_backend
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.fused_settings import unsupported, unsupported_setting
 
 
 def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConfig, str]:
@@ -24,6 +25,12 @@ def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConf
     Returns:
         The settings with a backend's name, and one line that says which and why.
     """
+    chosen, why = _choose(config, resume)
+    name = unsupported_setting(chosen) if chosen.backend == "compiled" else None
+    return chosen, why if name is None else f"{why}; its fused step has no {name}, so autograd takes the steps"
+
+
+def _choose(config: TrainConfig, resume: bool) -> tuple[TrainConfig, str]:
     if config.backend != "auto":
         return config, f"backend {config.backend}, as asked for"
     begun = _begun_with(Path(config.result_dir)) if resume else None
@@ -33,8 +40,6 @@ def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConf
     if reason is not None and not has_gpu():
         reason = "there is no NVIDIA GPU here"
     if reason is None:
-        from pop_fast.train.fused_stepper import unsupported
-
         reason = unsupported(config)
     if reason is None:
         return replace(config, backend="cuda"), "backend cuda: a GPU and the build are here"

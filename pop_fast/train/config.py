@@ -16,7 +16,7 @@ from pop_fast.errors import PopError
 from pop_fast.train.jsonable import from_plain, to_plain
 from pop_fast.train.limits import check_values
 from pop_fast.train.presets import METHODS, MILESTONES, Given, defaults, laid_over, method_of
-from pop_ref.settings import LAMBDA_SSIM_3DGS, MAX_SH_DEGREE, LearningRates, Recipe
+from pop_ref.settings import LAMBDA_SSIM_3DGS, MAX_SH_DEGREE, AppearanceRates, LearningRates, Recipe
 
 __all__ = ["LearningRates", "TrainConfig", "first_difference"]
 
@@ -68,6 +68,12 @@ class TrainConfig:
         ssim_padding: "valid" as gsplat, or "same" as Inria (and method "3dgs").
         d_ssim_halved: (1 - SSIM) / 2 instead of 1 - SSIM.
         lr: learning rates.
+        exposure: learn an affine map of colours for every photograph, for captures whose exposure or white balance
+            changes; held-out views are then also measured after fitting their colours (cc_psnr), as gsplat's trainer.
+        random_background: lay another colour behind everything at every step, drawn from seed and step: what nothing
+            covers costs then. For photographs without alpha.
+        refine_cameras: learn a small rotation and translation of every training camera.
+        appearance_lr: learning rates of exposures and cameras.
         strategy: density control and the POP term; its type says which method this is.
         threads: threads of one operation; results are the same bits for the same number. 0 takes all cores.
         eval_steps: after so many steps the held-out views are measured; the last step always counts.
@@ -108,6 +114,10 @@ class TrainConfig:
     ssim_padding: Literal["valid", "same"] = Recipe.padding
     d_ssim_halved: bool = Recipe.d_ssim_halved
     lr: LearningRates = Recipe.lr
+    exposure: bool = False
+    random_background: bool = False
+    refine_cameras: bool = False
+    appearance_lr: AppearanceRates = field(default_factory=AppearanceRates)
     strategy: DensityControl = field(default_factory=POPStrategy)
     threads: int = 0
     eval_steps: tuple[int, ...] = MILESTONES

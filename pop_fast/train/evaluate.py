@@ -39,7 +39,7 @@ def evaluate(
         backend: what renders.
         params: raw parameters.
         views: held-out views.
-        config: background, profile and the like.
+        config: background, profile and the like; with `exposure` PSNR is also measured after fitting colours.
         sh_degree: highest active colour band.
         nets: LPIPS networks.
         folder: where pictures of the first `config.max_renders` views go; None keeps none.
@@ -57,9 +57,10 @@ def evaluate(
         rendered = render_view(backend, params, view, config, sh_degree, counts=True)
         seconds += time.perf_counter() - start
         per_pixel += gaussians_per_pixel(rendered.info)
-        metrics = measure(rendered.image, view.target(), view.mask, nets)
+        metrics = measure(rendered.image, view.target(), view.mask, nets, color_corrected=config.exposure)
         measured.append(metrics)
-        per_view[view.name] = {"psnr": metrics.psnr, "ssim": metrics.ssim, **metrics.lpips}
+        corrected = {} if metrics.cc_psnr is None else {"cc_psnr": metrics.cc_psnr}
+        per_view[view.name] = {"psnr": metrics.psnr, **corrected, "ssim": metrics.ssim, **metrics.lpips}
         if folder is not None and i < config.max_renders:
             _keep_pictures(folder, f"step{step}_{i:04d}", view, rendered, metrics)
     n = max(len(views), 1)

@@ -138,25 +138,6 @@ class FusedStepper:
                 target.copy_(self._state[key])
 
 
-def unsupported(config: TrainConfig) -> str | None:
-    """Return one sentence on a setting that fused steps do not know and what to do, or None."""
-    plan, method = config.strategy, config.method
-    known: dict[str, tuple[Any, Any]] = {
-        "batch_size": (config.batch_size, 1),
-        f"{method}.absgrad": (plan.absgrad, False),
-        f"{method}.key_for_gradient": (plan.key_for_gradient, "means2d"),
-        f"{method}.refine_scale2d_stop_iter": (plan.refine_scale2d_stop_iter, 0),
-        f"{method}.lambda_entropy": (plan.lambda_entropy, 0.0),
-    }
-    for name, (value, supported) in known.items():
-        if value != supported:
-            return (
-                f"backend 'cuda' trains with {name} = {supported!r} only, not {value!r}; "
-                f"use --backend fast, or leave {name} as it is"
-            )
-    return None
-
-
 def step_settings(config: TrainConfig, updates: Updates) -> StepSettings:
     """Return what stays the same over a run.
 

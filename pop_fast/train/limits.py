@@ -28,7 +28,13 @@ _AT_LEAST: Final = {
 # each takes memory of its own, and beyond what the system allows the libraries end the process
 _MOST_THREADS: Final = 512
 # numbers that are divided by, or of which a logarithm is taken
-_OVER_ZERO: Final = ("init_scale", "photometric_divisor", "lr.means_decay")
+_OVER_ZERO: Final = (
+    "init_scale",
+    "photometric_divisor",
+    "lr.means_decay",
+    "appearance_lr.exposures_decay",
+    "appearance_lr.cameras_decay",
+)
 # of the strategy, whose settings errors call by the method's name as the command line does
 _AT_LEAST_OF_STRATEGY: Final = {
     **dict.fromkeys(("refine_every", "sh_rest_every", "round_steps", "round_decay_every", "blur_stop_span"), 1),

@@ -79,7 +79,7 @@ class CaptureRecord:
     images: str | None = None
     missing: Literal["error", "skip"] = "error"
     masks: bool = True
-    source: Literal["auto", "colmap", "transforms", "photos"] = "auto"
+    source: Literal["auto", "colmap", "transforms", "polycam", "metashape", "realitycapture", "photos"] = "auto"
     world_transform: list[list[float]] = field(default_factory=lambda: np.eye(4).tolist())
 
 

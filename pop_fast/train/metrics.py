@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pop_fast.stages.appearance import color_correct
 from pop_fast.stages.losses import ssim
 from pop_fast.stages.ssim import WINDOW_SIZE
 from pop_fast.train.lpips import LPIPS, VARIANTS
@@ -21,11 +22,12 @@ ALPHA_FLOOR = 1.0 / 255.0
 
 @dataclass(frozen=True)
 class ViewMetrics:
-    """What was measured on one view; `lpips` by variant."""
+    """What was measured on one view; `lpips` by variant, `cc_psnr` after fitting colours, where that was asked for."""
 
     psnr: float
     ssim: float
     lpips: Mapping[str, float]
+    cc_psnr: float | None = None
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
@@ -41,16 +43,29 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     return -10.0 * math.log10(error) if error > 0.0 else math.inf
 
 
-def measure(image: Tensor, target: Tensor, mask: Tensor | None = None, nets: Sequence[LPIPS] = ()) -> ViewMetrics:
+def measure(
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    nets: Sequence[LPIPS] = (),
+    color_corrected: bool = False,
+) -> ViewMetrics:
     """Measure one view, as gsplat does: on floats clamped to [0, 1], SSIM over windows that lie inside.
 
     Masked pixels are left out of PSNR, and given the photograph's colour for SSIM and LPIPS, whose windows need
-    whole images.
+    whole images. With `color_corrected`, PSNR is measured again with each channel fitted to the photograph's.
     """
     image = image.clamp(0.0, 1.0)
     whole = image if mask is None else torch.where(mask[..., None], image, target)
     lpips = {variant: net(whole, target, variant) for net in nets for variant in VARIANTS[net.net]}
-    return ViewMetrics(psnr(image, target, mask), float(ssim(whole, target, padding="valid")), lpips)
+    corrected = psnr_after_correction(image, target, mask) if color_corrected else None
+    return ViewMetrics(psnr(image, target, mask), float(ssim(whole, target, padding="valid")), lpips, corrected)
+
+
+def psnr_after_correction(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Return PSNR after `color_correct` over the pixels that the mask keeps: gsplat's cc_psnr; arguments as `psnr`."""
+    kept = torch.ones(image.shape[:2], dtype=torch.bool) if mask is None else mask
+    return psnr(color_correct(image.clamp(0.0, 1.0)[kept], target[kept]), target[kept])
 
 
 def too_small(views: Sequence[ViewTensors]) -> str | None:
@@ -65,8 +80,10 @@ def average(views: Sequence[ViewMetrics], nets: Sequence[LPIPS]) -> dict[str, An
     """Average over views; `lpips` is gsplat's variant where AlexNet's weights were given, else 3DGS's, else null."""
     means = {name: _mean([view.lpips[name] for view in views]) for net in nets for name in VARIANTS[net.net]}
     chosen = next((name for name in ("alex_norm", "vgg_01") if name in means), None)
+    corrected = [view.cc_psnr for view in views if view.cc_psnr is not None]
     return {
         "psnr": _mean([view.psnr for view in views]),
+        **({"cc_psnr": _mean(corrected)} if corrected else {}),
         "ssim": _mean([view.ssim for view in views]),
         "lpips": means[chosen] if chosen else None,
         "lpips_net": chosen,

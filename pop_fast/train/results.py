@@ -8,6 +8,8 @@
     stats/train_step{step}.json     Gaussians, opacities, seconds, memory, machine, versions
     stats/val_step{step}.json       the same and PSNR, SSIM, LPIPS of the held-out views, and each view's own; of the
                                     last step also encodings: bytes in every file format, and the PSNR from there
+    stats/appearance_step{step}.json  what was learned of each training photograph, by name: exposure, and the camera
+                                    (viewmat, in the training frame); only with --exposure or --refine-cameras
     renders/val_step{step}_{i}.png        render | photograph | error
     renders/dominant_step{step}_{i}.png   every pixel in the colour of its dominant Gaussian
     report_data/opacity_step{step}.npz    counts [100] of opacities in equal bins of [0, 1]; step -1 is the start

@@ -15,6 +15,7 @@ from pop_fast.api.backend import Renderer
 from pop_fast.density.control import DensityControl
 from pop_fast.density.foreign import ForeignStrategy
 from pop_fast.density.protocol import State
+from pop_fast.train.appearance import Appearance
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.ranks import ALONE, Ranks
 from pop_fast.train.views import ViewTensors
@@ -64,6 +65,7 @@ class Task:
         order: the views of every step, `config.batch_size` of them a step.
         updates: whom Adam moves at which step.
         step: steps taken.
+        appearance: what is learned of the photographs.
         ranks: the processes that draw the views of a step.
     """
 
@@ -73,6 +75,7 @@ class Task:
     order: Sequence[int]
     updates: Updates
     step: int
+    appearance: Appearance
     ranks: Ranks = ALONE
 
 

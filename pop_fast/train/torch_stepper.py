@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from torch import Tensor
@@ -70,6 +70,7 @@ class TorchStepper:
         self._require_finite(look.loss, look.index, step)
         stats = self._measured(look, step, phase)
         adam_step(self._params, self._optimizers, self._task.updates, step, self._state)
+        self._task.appearance.update(step)
         self._task.strategy.collect(self._params, self._state, step, look.rendered.info)
         self.step = step + 1
         return stats
@@ -78,24 +79,26 @@ class TorchStepper:
         """Render a view, compare it with its photograph and go back to the gradients of the parameters."""
         strategy, params, optimizers, state = self._task.strategy, self._params, self._optimizers, self._state
         rendered = self._render(index, step, phase)
-        objective = self._objective(rendered.image, index, phase)
+        image = self._task.appearance.exposed(rendered.image, index)
+        objective = self._objective(image, index, phase)
         term = strategy.regularizer(rendered.opacities, state, step, rendered.info)
         strategy.step_pre_backward(params, optimizers, state, step, rendered.info)
         loss = objective if term is None else objective + term
         loss.backward()
-        return Look(index, rendered, objective, term, loss)
+        return Look(index, replace(rendered, image=image), objective, term, loss)
 
     def _render(self, index: int, step: int, phase: Phase) -> Rendered:
-        config, strategy = self._task.config, self._task.strategy
+        config, strategy, appearance = self._task.config, self._task.strategy, self._task.appearance
         return render_view(
             self._backend,
             self._params,
-            self._task.views[index],
+            appearance.seen_from(self._task.views[index], index),
             config,
             phase.sh_degree,
             dominance=strategy.needs_dominance(step),
             counts=step % config.log_every == 0,
             absgrad=strategy.absgrad,
+            background=appearance.background(step),
         )
 
     def _require_finite(self, loss: Tensor, index: int, step: int) -> None:

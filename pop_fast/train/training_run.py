@@ -34,6 +34,7 @@ from pop_fast.io.heartbeat import Heartbeat, duration
 from pop_fast.io.ply import Frame, save_ply
 from pop_fast.stages.activations import opacities_from_logits
 from pop_fast.train import checkpoint as ckpt
+from pop_fast.train.appearance import Appearance
 from pop_fast.train.batch_stepper import check_batch
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
@@ -64,6 +65,7 @@ class TrainingRun:
         config: the settings, step numbers as they are run.
         params: raw parameters.
         optimizers: one Adam a parameter.
+        appearance: exposures and cameras that are learned.
         strategy: the population's.
         state: the strategy's state.
         step: steps taken.
@@ -146,6 +148,7 @@ class TrainingRun:
             raise PopError(f"{capture.name}: has no view to train on; lower test_every or set it to 0")
         check_views(config, capture.name, self._train, self._test)
         self._nets = load_nets(config.lpips_vgg, config.lpips_alex, [(view.height, view.width) for view in self._test])
+        self.appearance = Appearance(config, self._train)
         self._capture = capture
         self._scene_scale = capture.scene_scale()
         self._order = ViewOrder(len(self._train), config.seed)
@@ -286,7 +289,8 @@ class TrainingRun:
     @cached_property
     def _passes(self) -> Passes:
         """What a change of the population sees of the training views."""
-        return Passes.of(self._engine.backend, self._train, self.config, self._engine.device)
+        views = self.appearance.seen(self._train)
+        return Passes.of(self._engine.backend, views, self.config, self._engine.device)
 
     @property
     def stepper(self) -> Stepper:
@@ -298,7 +302,16 @@ class TrainingRun:
             ahead.load_state_dict(self._order.state_dict())
             size = self.config.batch_size
             order = [0] * size * self.step + [ahead.next() for _ in range(size * (self.config.max_steps - self.step))]
-            task = Task(self.config, self.strategy, self._train, order, self.updates, self.step, self._ranks)
+            task = Task(
+                self.config,
+                self.strategy,
+                self._train,
+                order,
+                self.updates,
+                self.step,
+                self.appearance,
+                self._ranks,
+            )
             self._stepper = self._engine.make_stepper(task)
             with words_for_memory():
                 self._stepper.rebind(self.params, self.optimizers, self.state)
@@ -341,6 +354,8 @@ class TrainingRun:
             self._results.write_opacities(step, self._opacities().numpy())
         if taken in config.eval_steps or last:
             self._evaluate(step)
+        if self.appearance.params and (taken in config.save_steps or last):
+            self._results.write_stats("appearance", step, self.appearance.by_view(self._train))
         if taken in config.save_steps or last:
             path = self._results.path / "ply" / f"point_cloud_{step}.ply"
             save_ply(path, self._detached(), config.antialiased, frame=self._frame)
@@ -390,6 +405,7 @@ class TrainingRun:
             "optimizers": on_cpu(ckpt.pack_optimizers(self.optimizers)),
             "strategy": on_cpu(ckpt.pack_strategy(self.state)),
             "view_order": self._order.state_dict(),
+            "appearance": self.appearance.state_dict(),
             "config": self.config.binding(),
             "capture": self._fingerprint(),
             "metrics_bytes": self._results.flush_metrics(),
@@ -410,6 +426,7 @@ class TrainingRun:
         ckpt.unpack_optimizers(self.optimizers, content["optimizers"])
         ckpt.unpack_strategy(self.state, content["strategy"])
         self._order.load_state_dict(content["view_order"])
+        self.appearance.load_state_dict(content["appearance"])
         if self._ranks.writes:
             self._results.open_metrics(content["metrics_bytes"])
         self._train_seconds = content["seconds"]["train"]

@@ -24,6 +24,7 @@ class ViewTensors:
         mask: True where the photograph counts, or None. bool [H, W]
         viewmat: world -> camera, in the precision of the training. [1, 4, 4]
         K: intrinsics, px, likewise. [1, 3, 3]
+        had_alpha: the file's transparency has been laid over one background.
     """
 
     name: str
@@ -31,6 +32,7 @@ class ViewTensors:
     mask: Tensor | None
     viewmat: Tensor
     K: Tensor
+    had_alpha: bool = False
 
     @classmethod
     def of(cls, view: View, dtype: torch.dtype = torch.float32) -> ViewTensors:
@@ -41,6 +43,7 @@ class ViewTensors:
             mask=None if view.mask is None else torch.from_numpy(view.mask),
             viewmat=torch.from_numpy(view.viewmat).to(dtype)[None],
             K=torch.from_numpy(view.K).to(dtype)[None],
+            had_alpha=view.had_alpha,
         )
 
     @property
@@ -81,6 +84,7 @@ def render_view(
     dominance: bool = False,
     counts: bool = False,
     absgrad: bool = False,
+    background: Tensor | None = None,
 ) -> Rendered:
     """Render a view from raw parameters.
 
@@ -95,11 +99,13 @@ def render_view(
         dominance: dominant ids and counts will be read from `info`.
         counts: Gaussians per pixel will be read from `info`.
         absgrad: so will the gradient of the screen centres summed of absolute values.
+        background: colour behind everything in the place of the config's. [3]
     """
     opacities = opacities_from_logits(params["opacities"])
     bands = (sh_degree + 1) ** 2
     sh = params["sh0"] if bands == 1 else torch.cat([params["sh0"], params["shN"][:, : bands - 1]], dim=1)
-    background = torch.tensor([config.background]).to(opacities) if any(config.background) else None
+    if background is None and any(config.background):
+        background = torch.tensor(config.background)
     colors, _, info = backend.rasterization(
         means=params["means"],
         quats=params["quats"],
@@ -112,7 +118,7 @@ def render_view(
         height=view.height,
         sh_degree=sh_degree,
         packed=False,
-        backgrounds=background,
+        backgrounds=None if background is None else background.to(opacities)[None],
         absgrad=absgrad,
         rasterize_mode="antialiased" if config.antialiased else "classic",
         profile=config.profile,

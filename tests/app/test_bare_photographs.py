@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from pop_fast.data import load_capture, run_sfm, sfm
+from pop_fast.io import images
 from tests.app.captures import assert_one_line, make_model, photograph, ring, write_photograph
 from tests.app.damage import contents
 
@@ -102,9 +103,12 @@ def test_photographs_that_could_not_be_placed_are_told(tmp_path: Path) -> None:
     assert note.endswith("first 3.png")
 
 
-def test_photographs_in_a_format_that_is_not_read_are_named_with_the_way_to_convert_them(tmp_path: Path) -> None:
+def test_photographs_in_a_format_that_is_not_read_are_named_with_the_way_to_convert_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(images, "can_read_heif", lambda: False)
     for name in ("a.HEIC", "b.HEIC", "c.dng"):
         (tmp_path / name).write_bytes(b"no JPEG")
-    words = ("3 files are HEIC", "convert them to JPEG", "mogrify -format jpg *.HEIC")
+    words = ("3 files are HEIC", "pip install pillow-heif, or convert them to JPEG", "mogrify -format jpg *.HEIC")
     assert_one_line(lambda: load_capture(tmp_path, sfm=True), "has no photographs", *words)
     assert_one_line(lambda: run_sfm(tmp_path), "has 0 photograph(s)", *words)

@@ -36,7 +36,7 @@ def one_step(views: list[int], mask: Any = None, **plan: Any) -> tuple[Any, Any]
     initial["shN"] += 0.05
     run: Any = TrainingRun(config, tiny_capture(mask=mask), initial=initial)
     order = [0] * len(views) * STEP + views
-    task = Task(config, run.strategy, run._train, order, run.updates, STEP)
+    task = Task(config, run.strategy, run._train, order, run.updates, STEP, run.appearance)
     kind = TorchStepper if len(views) == 1 else BatchStepper
     stepper = kind(task, require_backend("fast"))
     stepper.rebind(run.params, run.optimizers, run.state)

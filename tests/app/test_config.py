@@ -25,6 +25,7 @@ from pop_fast.train.schedule import ViewOrder, active_sh_degree, updates_of
 from pop_ref.density import densifies_at
 from pop_ref.optimizer import learning_rates, update_numbers
 from pop_ref.recipes import BASELINES, RECIPES
+from pop_ref.settings import AppearanceRates
 
 
 def test_the_defaults_are_the_papers_schedule():
@@ -114,8 +115,12 @@ SCHEDULES = st.fixed_dictionaries(
         "scale_lambda_pop": st.booleans(),
     }
 )
-NAMES = [f.name for f in fields(TrainConfig) if f.name not in ("given", "lr", "strategy")]
+NAMES = [f.name for f in fields(TrainConfig) if f.name not in ("given", "lr", "appearance_lr", "strategy")]
 NAMES += [f"strategy.{f.name}" for f in fields(DensityControl)] + [f"lr.{f.name}" for f in fields(LearningRates)]
+NAMES += [f"appearance_lr.{f.name}" for f in fields(AppearanceRates)]
+
+
+NESTED = {"strategy": DensityControl, "lr": LearningRates, "appearance_lr": AppearanceRates}
 
 
 def value_of(config, name):
@@ -141,7 +146,7 @@ def another(value, hint):
 @given(plan=SCHEDULES, name=st.sampled_from(NAMES))
 def test_the_users_word_wins_over_every_default(plan, name):
     group, dot, inner = name.partition(".")
-    kind = {"strategy": DensityControl, "lr": LearningRates}[group] if dot else TrainConfig
+    kind = NESTED[group] if dot else TrainConfig
     base = TrainConfig.of(**plan)
     value = another(value_of(base, name), get_type_hints(kind)[inner if dot else name])
     config = TrainConfig.of(**plan, **{name: value})

@@ -14,6 +14,7 @@ from PIL.TiffImagePlugin import IFDRational
 from pop_fast.data import load_capture
 from pop_fast.demo.scene import make_scene
 from pop_fast.demo.tracer import render_view
+from pop_fast.io import images
 from tests.app.captures import colmap_capture, look_at, photograph, write_photograph
 from tests.app.conftest import Pop
 
@@ -94,15 +95,21 @@ def test_exposures_and_lenses_that_differ_are_told(pop: Pop, tmp_path: Path, pic
         Image.fromarray(picture).save(tmp_path / f"{i}.jpg", exif=exif, quality=95)
     out = pop("data", "check", tmp_path).out
     assert "8 x Maker X; focal length 4 mm, 5 mm: several lenses" in out
-    assert "exposures differ by 2.0 stops; lock the exposure" in out
+    assert "exposures differ by 2.0 stops; lock the exposure, or train with --exposure" in out
+    assert "no focal length" not in out
+    write_photograph(tmp_path / "edited.jpg", photograph(1, 160, 120))
+    assert (
+        "1 have no focal length, first edited.jpg; where photographs were edited" in pop("data", "check", tmp_path).out
+    )
 
 
-def test_what_is_not_read_is_mentioned_among_what_is(pop: Pop, bare: Path) -> None:
+def test_what_is_not_read_is_mentioned_among_what_is(pop: Pop, bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(images, "can_read_heif", lambda: False)
     (bare / "a.HEIC").write_bytes(b"no JPEG")
     (bare / "b.MOV").write_bytes(b"no JPEG")
     outcome = pop("data", "check", bare)
     assert outcome.status == 0
-    for words in ("1 file is HEIC", "mogrify -format jpg *.HEIC", "1 file is a video", "ffmpeg -i b.MOV"):
+    for words in ("1 file is HEIC", "mogrify -format jpg *.HEIC", "1 file is a video", "pop frames b.MOV"):
         assert words in outcome.out
 
 

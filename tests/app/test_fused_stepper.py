@@ -15,7 +15,8 @@ from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.engines import LONGEST_ON_GPU
-from pop_fast.train.fused_stepper import step_settings, unsupported
+from pop_fast.train.fused_settings import unsupported
+from pop_fast.train.fused_stepper import step_settings
 from pop_fast.train.phases import phase_at, segment_end
 from pop_fast.train.schedule import updates_of
 from tests.app.drift import Drift, drift_engine

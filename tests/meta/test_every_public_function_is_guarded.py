@@ -160,6 +160,13 @@ TESTS = {
     "density_config.densifies_at": CALENDAR,
     "density_config.resets_at": CALENDAR,
     "density_config.blurs_at": "test_density.test_split_only_blur_splits_small_ones_and_may_clone_them_as_well",
+    "appearance.expose": "test_appearance.test_an_exposure_mixes_channels_row_by_row",
+    "appearance.centred_exposures": "test_appearance.test_centred_exposures_have_the_identity_as_mean",
+    "appearance.color_correct": "test_appearance.test_correction_takes_back_gain_and_offset_by_channel",
+    "appearance.background_at": "test_appearance.test_the_stream_is_splitmix64_by_its_published_numbers",
+    "refinement.rotmat_from_vector": "test_refinement.test_a_rotation_is_the_exponential_of_its_generator",
+    "refinement.without_common_motion": "test_refinement.test_what_is_taken_out_is_orthogonal_to_what_is_left",
+    "refinement.refined_viewmat": "test_refinement.test_a_corrected_camera_is_rigid_and_moves_points_in_its_own_axes",
     "ssim.gaussian_window": "test_losses.test_window_is_the_impulse_response_of_scipys_gaussian_filter",
     "ssim.ssim_map": "test_losses.test_ssim_of_equal_images_is_one_and_is_its_maximum",
     "ssim.replace_left_out": "test_losses.test_l1_at_equality_has_the_mean_of_its_one_sided_slopes",
@@ -182,6 +189,7 @@ LADDER = (
     "training.control",
 )
 DOCTESTS = (
+    *("appearance.expose_vjp", "refinement.rotmat_from_vector_vjp", "refinement.refined_viewmat_vjp"),
     "depth.expected_depth",
     "depth.expected_depth_vjp",
     "depth.with_depth_channel",

@@ -1,0 +1,76 @@
+"""Exposure, colour correction and random backgrounds by what they must do, and against other implementations."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pop_ref.appearance import background_at, centred_exposures, color_correct, expose
+
+RNG = np.random.default_rng(11)
+IMAGE = RNG.uniform(-0.2, 1.3, (3, 4, 3))
+EXPOSURE = np.eye(3, 4) + RNG.normal(0.0, 0.3, (3, 4))
+
+
+def test_the_identity_leaves_every_bit_of_a_render() -> None:
+    np.testing.assert_array_equal(expose(IMAGE, np.eye(3, 4)), IMAGE)
+
+
+def test_exposures_compose_as_affine_maps_do() -> None:
+    second = np.eye(3, 4) + RNG.normal(0.0, 0.3, (3, 4))
+    last = [[0.0, 0.0, 0.0, 1.0]]
+    together = (np.vstack([second, last]) @ np.vstack([EXPOSURE, last]))[:3]
+    np.testing.assert_allclose(expose(expose(IMAGE, EXPOSURE), second), expose(IMAGE, together), rtol=0.0, atol=1e-14)
+
+
+def test_an_exposure_mixes_channels_row_by_row() -> None:
+    np.testing.assert_allclose(
+        expose(IMAGE, EXPOSURE), np.einsum("ij,hwj->hwi", EXPOSURE[:, :3], IMAGE) + EXPOSURE[:, 3], atol=1e-14
+    )
+
+
+def test_centred_exposures_have_the_identity_as_mean() -> None:
+    exposures = np.eye(3, 4) + RNG.normal(0.1, 0.3, (4, 3, 4))
+    centred = centred_exposures(exposures)
+    np.testing.assert_allclose(centred.mean(axis=0), np.eye(3, 4), atol=1e-15)
+    np.testing.assert_allclose(centred - centred[0], exposures - exposures[0], atol=1e-15)
+
+
+def test_correction_takes_back_gain_and_offset_by_channel() -> None:
+    target = RNG.uniform(0.0, 1.0, (40, 3))
+    image = target * [0.5, 0.75, 0.9] + [0.25, 0.1, 0.05]
+    np.testing.assert_allclose(color_correct(image, target), target, atol=1e-13)
+
+
+def test_correction_is_the_inverse_of_the_line_that_numpy_fits_from_photograph_to_render() -> None:
+    target, image = RNG.uniform(0.0, 1.0, (2, 60, 3))
+    image = 0.7 * target + 0.2 * image
+    for channel in range(3):
+        slope, offset = np.polyfit(target[:, channel], image[:, channel], 1)
+        expected = np.clip((image[:, channel] - offset) / slope, 0.0, 1.0)
+        np.testing.assert_allclose(color_correct(image, target)[:, channel], expected, atol=1e-12)
+
+
+def test_a_render_without_any_colour_of_its_photograph_keeps_a_slope_of_one() -> None:
+    target = np.linspace(0.0, 1.0, 9)[:, None].repeat(3, axis=1)
+    np.testing.assert_allclose(color_correct(np.full((9, 3), 0.5), target), np.zeros((9, 3)), atol=1e-12)
+
+
+@given(st.integers(0, 2**40), st.integers(0, 2**31 - 1))
+def test_a_background_lies_in_the_unit_cube_and_depends_on_nothing_but_step_and_seed(step: int, seed: int) -> None:
+    color = background_at(step, seed)
+    assert np.all((color >= 0.0) & (color < 1.0))
+    np.testing.assert_array_equal(color, background_at(step, seed))
+
+
+def test_the_stream_is_splitmix64_by_its_published_numbers() -> None:
+    # the first three numbers from state 0, whose mix is 0; Vigna's splitmix64.c prints these
+    words = [0xE220A8397B1DCDAF, 0x6E789E6AA1B965F4, 0x06C45D188009454F]
+    np.testing.assert_array_equal(background_at(0, 0), [(word >> 11) * 2.0**-53 for word in words])
+
+
+def test_backgrounds_of_many_steps_are_uniform() -> None:
+    colors = np.array([background_at(step, 3) for step in range(3000)])
+    np.testing.assert_allclose(colors.mean(axis=0), 0.5, atol=0.02)
+    np.testing.assert_allclose(np.cov(colors.T), np.eye(3) / 12.0, atol=5e-3)
