@@ -104,7 +104,7 @@ def run(argv: Sequence[str]) -> int:
         options = as_begun(folder, options)
         config, chosen = choose_backend(config, options.resume)
         check_backend(config)
-        return _train(config, options, chosen)
+        return _train(config, options, chosen, argv)
 
 
 @contextmanager
@@ -113,7 +113,8 @@ def _stdout_closed() -> Iterator[None]:
         yield
 
 
-def _train(config: TrainConfig, options: Any, chosen: str) -> int:
+def _train(config: TrainConfig, options: Any, chosen: str, argv: Sequence[str]) -> int:
+    from pop_fast.train.commands import COMMANDS_FILE, commands_text
     from pop_fast.train.load_result import RECORD, record_text
 
     folder, start = Path(config.result_dir), time.perf_counter()
@@ -130,7 +131,8 @@ def _train(config: TrainConfig, options: Any, chosen: str) -> int:
     if takes_hours(config):
         print(f"note: {config.max_steps:,} steps take hours on a CPU; --preset quick takes a tenth of the schedule")
     how = {"resume": options.resume, "overwrite": options.overwrite, "loading_seconds": loading}
-    beside = {RECORD: record_text(_record(capture, options))}
+    commands = commands_text(folder if options.resume else None, ["pop", "train", *argv])
+    beside = {RECORD: record_text(_record(capture, options)), COMMANDS_FILE: commands}
     # absolute, so that the result can be looked at from another folder too
     training = TrainingRun(replace(config, data=str(Path(config.data).absolute())), capture, beside=beside, **how)
     if options.resume:
