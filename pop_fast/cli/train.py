@@ -8,7 +8,7 @@ import sys
 import time
 import typing
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextlib import ExitStack, contextmanager, nullcontext, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
@@ -30,6 +30,8 @@ from pop_fast.train.presets import ALIASES, METHODS, Given
 if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train.load_result import CaptureRecord
+    from pop_fast.train.training_run import TrainingRun
+    from pop_fast.view.live.server import LiveViewer
 
 _EXAMPLES: Final = """
     pop train scene                          POP, the paper's 30,000 steps, results in out/scene_pop
@@ -41,6 +43,7 @@ _EXAMPLES: Final = """
     pop train scene --out out/a --resume     go on from the last checkpoint
     pop train scene --backend fast           on the CPU, also where a GPU is
     pop train scene --export sog html        also as a small file and as a page, in out/scene_pop/export
+    pop train scene --view                   watch it in the browser while it runs
     pop train scene --pop.lambda-pop 0.01    any setting, taken as it is; --help-all lists them all
 """
 
@@ -80,6 +83,9 @@ class _Run(FinishOptions):
         source: where cameras come from; "auto" takes the first that is there.
         sfm: how the cameras of bare photographs are found.
         quiet: print nothing but warnings and errors; --no-progress leaves out the bars alone.
+        view: show the training in the browser while it runs, as `pop view` does, to the same bits. Needs viser.
+        view_host: the address that the viewer listens on; 0.0.0.0 lets other machines see it, without a password.
+        view_port: its port; where it is taken, the next free one.
     """
 
     resume: bool = False
@@ -90,6 +96,9 @@ class _Run(FinishOptions):
     source: Literal["auto", "colmap", "transforms", "photos"] = "auto"
     sfm: SfmOptions = dataclasses.field(default_factory=SfmOptions)
     quiet: bool = False
+    view: bool = False
+    view_host: str = "127.0.0.1"
+    view_port: int = 8080
 
 
 def run(argv: Sequence[str]) -> int:
@@ -99,6 +108,7 @@ def run(argv: Sequence[str]) -> int:
 
     folder = Path(config.result_dir)
     options.check()
+    check_viewer(options)
     with _stdout_closed() if options.quiet else nullcontext():
         check_output(folder, options)
         options = as_begun(folder, options)
@@ -134,9 +144,18 @@ def _train(config: TrainConfig, options: Any, chosen: str, argv: Sequence[str]) 
     commands = commands_text(folder if options.resume else None, ["pop", "train", *argv])
     beside = {RECORD: record_text(_record(capture, options)), COMMANDS_FILE: commands}
     # absolute, so that the result can be looked at from another folder too
-    training = TrainingRun(replace(config, data=str(Path(config.data).absolute())), capture, beside=beside, **how)
-    if options.resume:
-        print(_resumption(folder))
+    absolute = replace(config, data=str(Path(config.data).absolute()))
+    with ExitStack() as showing:
+        watch = _Watch(capture, options, showing) if options.view else None
+        training = TrainingRun(absolute, capture, beside=beside, watch=watch, **how)
+        if options.resume:
+            print(_resumption(folder))
+        if watch is not None:
+            watch.start(training)
+        return _trained(training, folder, capture, options)
+
+
+def _trained(training: TrainingRun, folder: Path, capture: Capture, options: Any) -> int:
     try:
         stats = training.run()
     except KeyboardInterrupt:
@@ -144,6 +163,47 @@ def _train(config: TrainConfig, options: Any, chosen: str, argv: Sequence[str]) 
         return EXIT_INTERRUPTED
     print(summary(stats), flush=True)
     return finish(folder, capture, options) or report(folder)
+
+
+class _Watch:
+    """The viewer of a training; see `pop_fast.view.live.follow`."""
+
+    def __init__(self, capture: Capture, options: Any, showing: ExitStack) -> None:
+        self._capture, self._options, self._showing = capture, options, showing
+        self._viewer: LiveViewer | None = None
+
+    def start(self, run: TrainingRun) -> None:
+        """Start the server, and print where it is."""
+        from pop_fast.cli.view import announce, stands_of_capture
+        from pop_fast.view.live.follow import scene_of
+        from pop_fast.view.live.server import LiveViewer
+
+        capture, options = self._capture, self._options
+        stands = stands_of_capture(capture, run.config.test_every, run.params["means"])
+        scene = scene_of(run, capture.world_transform)
+        viewer = LiveViewer(scene, stands, capture.name, options.view_host, options.view_port)
+        self._viewer = self._showing.enter_context(viewer)
+        announce(viewer)
+
+    def __call__(self, run: TrainingRun) -> None:
+        from pop_fast.view.live.follow import follow
+
+        if self._viewer is not None:
+            follow(self._viewer, run, self._capture.world_transform)
+
+
+def check_viewer(options: Any) -> None:
+    """Refuse a viewer that cannot be before the minutes of loading, not after.
+
+    Raises:
+        PopError: viser is absent, or the port is none.
+    """
+    if options.view:
+        from pop_fast.cli.view import check_port
+        from pop_fast.view.live.server import require_viser
+
+        check_port(options.view_port)
+        require_viser()
 
 
 def takes_hours(config: TrainConfig) -> bool:

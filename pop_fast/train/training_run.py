@@ -10,11 +10,11 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -53,6 +53,11 @@ from pop_fast.train.signals import stop_requests
 from pop_fast.train.stepper import Engine, Stepper, Task
 from pop_fast.train.views import ViewTensors
 
+# sees a run between two steps
+Watch = Callable[["TrainingRun"], None]
+# steps at a time under a watch
+_WATCHED_STEPS: Final = 5
+
 
 class TrainingRun:
     """A run of one capture.
@@ -79,6 +84,7 @@ class TrainingRun:
         strategy: Strategy | None = None,
         initial: Mapping[str, Tensor] | None = None,
         engine: Engine | None = None,
+        watch: Watch | None = None,
     ) -> None:
         """Prepare a run; nothing is written yet.
 
@@ -93,6 +99,7 @@ class TrainingRun:
             initial: raw parameters to start from; None makes them from the capture's points. Their precision is that of
                 the training; a GPU trains in float32 only.
             engine: takes the steps; None takes the one for `config.backend`.
+            watch: is shown the run between steps, and changes nothing of it; with one, fewer steps are taken at a time.
 
         Raises:
             PopError: the capture cannot be trained on, weights are missing, or the backend is not available or does
@@ -110,6 +117,7 @@ class TrainingRun:
         )
         self.updates = self._updates()
         self.step = 0
+        self._watch = watch
         self._stepper: Stepper | None = None
         self._train_seconds = 0.0
         self._loading_seconds = loading_seconds
@@ -185,7 +193,7 @@ class TrainingRun:
         bars = tqdm(total=config.max_steps, initial=self.step, disable=None if config.progress else True)
         with bars as bar, Heartbeat(config.progress) as beat:
             while self.step < config.max_steps:
-                longest = self.stepper.longest
+                longest = self.stepper.longest if self._watch is None else min(self.stepper.longest, _WATCHED_STEPS)
                 segment = self.take_steps(segment_end(config, self.strategy, self.step, longest))
                 self._log(segment, bar)
                 beat.say(self._so_far())
@@ -195,6 +203,8 @@ class TrainingRun:
                     self._results.begin(self.config, self._beside, self._unwritten, self._overwrite)
                     self._unwritten = None
                 self._milestones(self.step - 1)
+                if self._watch is not None:
+                    self._watch(self)
                 if stop.is_set() and self.step < config.max_steps:
                     self._save()
                     raise KeyboardInterrupt
@@ -399,6 +409,19 @@ class TrainingRun:
         self._started -= content["seconds"]["total"]
         self.step = content["step"] + 1
         self._stepper = None
+
+    @property
+    def backend(self) -> Any:
+        """What measures and draws the run's Gaussians, wherever they lie."""
+        return self._engine.backend
+
+    @property
+    def sh_degree(self) -> int:
+        """The highest colour band that the last step drew."""
+        config = self.config
+        return active_sh_degree(
+            max(self.step - 1, 0), config.sh_interval, config.sh_degree, config.strategy.sh_start_iter
+        )
 
     @property
     def _frame(self) -> Frame:
