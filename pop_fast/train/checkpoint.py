@@ -238,3 +238,10 @@ def unpack_strategy(state: State, packed: Mapping[str, Any]) -> None:
             state[key].set_state(value)
         else:
             state[key] = value
+
+
+def on_cpu(content: Any) -> Any:
+    """Return nested dicts with their tensors on the CPU; those that are there already are not copied."""
+    if isinstance(content, Mapping):
+        return {key: on_cpu(value) for key, value in content.items()}
+    return content.cpu() if isinstance(content, Tensor) else content

@@ -53,10 +53,8 @@ from pop_fast.train.signals import stop_requests
 from pop_fast.train.stepper import Engine, Stepper, Task
 from pop_fast.train.views import ViewTensors
 
-# sees a run between two steps
 Watch = Callable[["TrainingRun"], None]
-# steps at a time under a watch
-_WATCHED_STEPS: Final = 5
+_WATCHED_STEPS: Final = 5  # at a time, between which a watch sees the run
 
 
 class TrainingRun:
@@ -193,7 +191,7 @@ class TrainingRun:
         bars = tqdm(total=config.max_steps, initial=self.step, disable=None if config.progress else True)
         with bars as bar, Heartbeat(config.progress) as beat:
             while self.step < config.max_steps:
-                longest = self.stepper.longest if self._watch is None else min(self.stepper.longest, _WATCHED_STEPS)
+                longest = min(self.stepper.longest, config.max_steps if self._watch is None else _WATCHED_STEPS)
                 segment = self.take_steps(segment_end(config, self.strategy, self.step, longest))
                 self._log(segment, bar)
                 beat.say(self._so_far())
@@ -263,11 +261,9 @@ class TrainingRun:
         """Let density control edit the population, if that is due."""
         if not self.strategy.changes_after(step):
             return None
-        config = self.config
-        degree = active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter)
         passes = self._passes if self.strategy.needs_passes(step) else None
         given = (self.params, self.optimizers, self.state, step, self.draws)
-        event = self.strategy.change(*given, passes=passes, sh_degree=degree)
+        event = self.strategy.change(*given, passes=passes, sh_degree=self.sh_degree(step))
         self.stepper.rebind(self.params, self.optimizers, self.state)
         return event
 
@@ -354,9 +350,9 @@ class TrainingRun:
             **self._facts(),
         }
         self._results.write_stats("train", step, {**stats, "ellipse_time": self._train_seconds})
-        degree = active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter)
         folder = self._results if step + 1 == config.max_steps else None
-        stats |= evaluate(self._engine.backend, self.params, self._test, config, degree, self._nets, folder, step)
+        given = (self._engine.backend, self.params, self._test, config, self.sh_degree(step), self._nets)
+        stats |= evaluate(*given, folder, step)
         stats["seconds_total"] = self._total_seconds
         self._results.write_stats("val", step, stats)
         return stats
@@ -381,8 +377,8 @@ class TrainingRun:
         content = {
             "step": self.step - 1,
             "splats": self._detached(),
-            "optimizers": _on_cpu(ckpt.pack_optimizers(self.optimizers)),
-            "strategy": _on_cpu(ckpt.pack_strategy(self.state)),
+            "optimizers": ckpt.on_cpu(ckpt.pack_optimizers(self.optimizers)),
+            "strategy": ckpt.on_cpu(ckpt.pack_strategy(self.state)),
             "view_order": self._order.state_dict(),
             "config": self.config.binding(),
             "capture": self._fingerprint(),
@@ -415,13 +411,10 @@ class TrainingRun:
         """What measures and draws the run's Gaussians, wherever they lie."""
         return self._engine.backend
 
-    @property
-    def sh_degree(self) -> int:
-        """The highest colour band that the last step drew."""
+    def sh_degree(self, step: int) -> int:
+        """Return the highest colour band that a step, from 0, draws."""
         config = self.config
-        return active_sh_degree(
-            max(self.step - 1, 0), config.sh_interval, config.sh_degree, config.strategy.sh_start_iter
-        )
+        return active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter)
 
     @property
     def _frame(self) -> Frame:
@@ -455,10 +448,3 @@ class TrainingRun:
                 f"{name}{index} is {value} after {self.step} steps; {self._what_is_left}: lower the learning rate of "
                 f"{name} and start again, or look at the photographs and masks of the capture"
             )
-
-
-def _on_cpu(content: Any) -> Any:
-    """Return nested dicts with their tensors on the CPU; those that are there already are not copied."""
-    if isinstance(content, Mapping):
-        return {key: _on_cpu(value) for key, value in content.items()}
-    return content.cpu() if isinstance(content, Tensor) else content

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 def scene_of(run: TrainingRun, world_transform: np.ndarray) -> SplatScene:
     """Return the Gaussians of a run as they are now; a later step changes what this draws."""
-    return SplatScene(run.params, run.config, run.sh_degree, run.backend, world_transform)
+    degree = run.sh_degree(max(run.step - 1, 0))
+    return SplatScene(run.params, run.config, degree, run.backend, world_transform)
 
 
 def follow(viewer: LiveViewer, run: TrainingRun, world_transform: np.ndarray) -> None:

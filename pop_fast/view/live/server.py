@@ -6,6 +6,7 @@ its steps. viser's threads only note what is wanted.
 
 from __future__ import annotations
 
+import importlib
 import io
 import threading
 import time
@@ -58,10 +59,10 @@ def require_viser() -> Any:
         PopError: it is absent or broken; says how to get it.
     """
     try:
-        import viser
+        # by name: type checkers run without it
+        return importlib.import_module("viser")
     except ImportError as error:
         raise PopError(f"the viewer needs viser, which cannot be imported ({error}); {_FIX}") from error
-    return viser
 
 
 class LiveViewer:
@@ -141,7 +142,8 @@ class LiveViewer:
 
     def close(self) -> None:
         """End the server."""
-        self._server.stop()
+        with redirect_stdout(io.StringIO()):
+            self._server.stop()
 
     def __enter__(self) -> LiveViewer:
         return self
