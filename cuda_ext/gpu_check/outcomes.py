@@ -16,24 +16,30 @@ SHOWN = 20  # failures that are told one by one
 _WORDS = 400  # characters of a failure's last lines
 
 
-def pytest_runtest_logreport(report: Any) -> None:
-    """Write down how a test ended; a test that passes has done so when its call has."""
-    if report.when == "call" or report.outcome != "passed":
-        _write(report.nodeid, report.outcome, report.duration, report.longreprtext)
-
-
-def pytest_collectreport(report: Any) -> None:
-    """Write down a file whose tests cannot be collected."""
-    if report.outcome == "failed":
-        _write(report.nodeid, "failed", 0.0, report.longreprtext)
-
-
-def _write(test: str, outcome: str, seconds: float, words: str) -> None:
+def pytest_configure(config: Any) -> None:
+    """Write where the environment says so; pytest-xdist's workers tell the process that started them."""
     path = os.environ.get(FILE)
-    # pytest-xdist's workers tell the process that started them
-    if path and "PYTEST_XDIST_WORKER" not in os.environ:
+    if path and not hasattr(config, "workerinput"):
+        config.pluginmanager.register(_Outcomes(Path(path)))
+
+
+class _Outcomes:
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        """Write down how a test ended; a test that passes has done so when its call has."""
+        if report.when == "call" or report.outcome != "passed":
+            self._write(report.nodeid, report.outcome, report.duration, report.longreprtext)
+
+    def pytest_collectreport(self, report: Any) -> None:
+        """Write down a file whose tests cannot be collected."""
+        if report.outcome == "failed":
+            self._write(report.nodeid, "failed", 0.0, report.longreprtext)
+
+    def _write(self, test: str, outcome: str, seconds: float, words: str) -> None:
         line = {"test": test, "outcome": outcome, "seconds": round(seconds, 2), "words": words[-_WORDS:]}
-        with open(path, "a", encoding="utf-8") as file:
+        with self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
 
 

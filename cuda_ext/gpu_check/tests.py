@@ -53,7 +53,7 @@ def smoke_stage(check: Check) -> dict[str, Any]:
 
 def laws_stage(check: Check) -> dict[str, Any]:
     """Hold every law of the kit, gradients and thresholds among them, to the CUDA backend."""
-    return _laws(check, "laws", "columns atomics")
+    return _laws(check, "laws", "pixel_parallel atomics")
 
 
 def laws_of_gaussian_parallel_stage(check: Check) -> dict[str, Any]:

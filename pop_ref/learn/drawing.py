@@ -73,15 +73,27 @@ def _grid(reach: float) -> tuple[np.ndarray, np.ndarray]:
     return np.meshgrid(at, at)
 
 
+def _flattened(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Project covariances [N, 3, 3] onto the planes in which they differ most; [N, 2, 2] stay as they are."""
+    if a.shape[-1] == 2:
+        return a, b
+    values, vectors = np.linalg.eigh((a - b) + np.swapaxes(a - b, 1, 2))
+    first = np.argsort(-np.abs(values), axis=1)[:, None, :2]
+    planes = np.take_along_axis(vectors, first, axis=2)
+    across = np.swapaxes(planes, 1, 2)
+    return across @ a @ planes, across @ b @ planes
+
+
 def _ellipses(both: tuple[tuple[np.ndarray, np.ndarray], ...]) -> np.ndarray:
-    """Draw ellipses of one standard deviation about one centre, seen along z where they are in space."""
-    every = np.concatenate([covars[:, :2, :2] for covars, _ in both])
+    """Draw ellipses of one standard deviation about one centre, seen where they differ most if they are in space."""
+    both = tuple(zip(_flattened(*(covars[:3] for covars, _ in both)), (color for _, color in both), strict=True))
+    every = np.concatenate([covars for covars, _ in both])
     largest = float(np.sqrt(max(np.max(np.abs(every)), 1e-12)))
     x, y = _grid(1.3 * largest)
     canvas = _canvas()
     canvas[(np.abs(x) < 0.004 * largest) | (np.abs(y) < 0.004 * largest)] = _RULE
     for covars, color in both:
-        for covar in covars[:3, :2, :2]:
+        for covar in covars:
             # a flat one is drawn as thin as a line
             inverse = np.linalg.pinv(0.5 * (covar + covar.T) + 1e-4 * largest**2 * np.eye(2))
             q = inverse[0, 0] * x * x + (inverse[0, 1] + inverse[1, 0]) * x * y + inverse[1, 1] * y * y

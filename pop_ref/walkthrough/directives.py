@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from pop_ref.walkthrough.cells import MINUTES, chapter_files
+from pop_ref.walkthrough.docstrings import without_docstring
 
 DIRECTIVE: Final = re.compile(r"^\{\{(\w+)(?:: ([^}]+))?\}\}$", re.MULTILINE)
 
@@ -86,18 +87,6 @@ def function_in(text: str, name: str, path: str) -> str:
         if isinstance(node, ast.FunctionDef) and node.name == name:
             return without_docstring(text, node)
     raise ValueError(f"{path}: there is no such function")
-
-
-def without_docstring(text: str, node: ast.FunctionDef) -> str:
-    """Return a function's lines but for its docstring."""
-    lines = text.split("\n")
-    told = node.body[0] if ast.get_docstring(node) is not None else None
-    first, last = node.lineno - 1, node.end_lineno or node.lineno
-    if told is None:
-        return "\n".join(lines[first:last])
-    return "\n".join(
-        [*lines[first : told.lineno - 1], *lines[told.end_lineno or told.lineno : last]]
-    )
 
 
 def _quoted(code: str, file: str) -> str:

@@ -107,7 +107,7 @@ def test_settings_that_the_device_does_not_know_are_refused_before_anything_is_r
 
 @pytest.mark.usefixtures("with_gpu")
 def test_a_run_on_a_gpu_from_the_command_line(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
-    outcome = pop("train", shared_capture, "--out", tmp_path / "r", *TRAIN)
+    outcome = pop("train", shared_capture, "--out", tmp_path / "r", *TRAIN, "--skip-sizes")
     assert outcome.status == 0, outcome.err
     assert "backend cuda: a GPU and the build are here" in outcome.out
     assert " s on drift, loading " in outcome.out
@@ -115,7 +115,7 @@ def test_a_run_on_a_gpu_from_the_command_line(pop: Pop, shared_capture: Path, tm
     stats = json.loads((tmp_path / "r" / "stats" / "val_step0029.json").read_text())
     assert stats["gpu"] == "drift"
     assert stats["stepper"] == "cuda"
-    again = pop("train", shared_capture, "--out", tmp_path / "r", *TRAIN, "--resume")
+    again = pop("train", shared_capture, "--out", tmp_path / "r", *TRAIN, "--resume", "--skip-sizes")
     assert again.status == 0, again.err
     assert "backend cuda, with which the run was begun" in again.out
 

@@ -41,6 +41,7 @@ def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 @pytest.fixture(autouse=True)
 def _without_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cuda_ext.why_not", lambda: NO_GPU)
+    monkeypatch.setattr("pop_fast.train.choose.has_gpu", lambda: True)
 
 
 def compiler(folder: Path, script: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,9 @@ import torch
 
 import cuda_ext
 from pop_fast.api import registry as backends
-from pop_fast.api.rasterize import rasterization
 from pop_fast.cli.explain import chosen_view
 from pop_fast.errors import PopError
+from pop_fast.stages.backend import FAST, TorchBackend
 from pop_fast.stages.losses import photometric_3dgs, photometric_pop
 from pop_fast.train.config import TrainConfig
 from pop_fast.view.explain import ExplainedView, explain_pixel, explain_view
@@ -114,13 +114,31 @@ def test_without_a_gpu_one_sentence_says_why_and_what_to_do(pop: Pop, shared_res
     assert not (tmp_path / "why.json").exists()
 
 
-def stand_in(change: Callable[[dict[str, Any]], dict[str, Any]]) -> Any:
-    """Make a backend that draws as pop_fast does, from arguments that it has spoilt."""
+Change = Callable[[dict[str, Any]], dict[str, Any]]
 
-    def draw(**given: Any) -> Any:
-        return rasterization(**(given | change(given)))
 
-    return backends._Registered("cuda", lambda: draw, lambda: None)
+@dataclass(frozen=True)
+class Spoilt(TorchBackend):
+    """Draws as pop_fast does, from arguments that it has spoilt."""
+
+    change: Change = field(kw_only=True)
+
+    def rasterization(self, **kwargs: Any) -> Any:
+        return FAST.rasterization(**(kwargs | self.change(kwargs)))
+
+
+@pytest.fixture
+def instead_of_cuda(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Change], None]]:
+    """Put a backend that spoils its arguments in place of "cuda"."""
+
+    def put(change: Change) -> None:
+        spoilt = Spoilt("cuda", "cpu", FAST.dtypes, speed=None, change=change)
+        monkeypatch.setattr("pop_fast.cuda.backend.CUDA", spoilt)
+        backends._loaded.cache_clear()
+
+    yield put
+    monkeypatch.undo()
+    backends._loaded.cache_clear()
 
 
 def fainter(gaussian: int, alpha: float, falloff: float) -> Callable[[dict[str, Any]], dict[str, Any]]:
@@ -135,12 +153,12 @@ def fainter(gaussian: int, alpha: float, falloff: float) -> Callable[[dict[str, 
 
 
 def test_a_backend_that_skips_a_splat_is_shown_with_the_decision_that_flipped(
-    scene: ExplainedView, monkeypatch: pytest.MonkeyPatch
+    scene: ExplainedView, instead_of_cuda: Callable[[Change], None]
 ) -> None:
     x, y = 16, 12
     row = explain_pixel(scene, x, y).blended[1]
     floor = PAPER.alpha_floor
-    monkeypatch.setitem(backends._BACKENDS, "cuda", stand_in(fainter(row.id, 0.999 * floor, row.falloff)))
+    instead_of_cuda(fainter(row.id, 0.999 * floor, row.falloff))
     found = difference(scene, "fast", "cuda", x, y)
     assert found.names == ("fast", "cuda")
     assert found.at == (x, y)
@@ -154,9 +172,9 @@ def test_a_backend_that_skips_a_splat_is_shown_with_the_decision_that_flipped(
 
 
 def test_a_backend_with_another_ceiling_parts_by_d6_and_the_worst_pixel_is_looked_up(
-    scene: ExplainedView, monkeypatch: pytest.MonkeyPatch
+    scene: ExplainedView, instead_of_cuda: Callable[[Change], None]
 ) -> None:
-    monkeypatch.setitem(backends._BACKENDS, "cuda", stand_in(lambda given: {"profile": "gsplat_1_6"}))
+    instead_of_cuda(lambda given: {"profile": "gsplat_1_6"})
     image, info = scene.rasterized(torch.float32, backends.get_backend("cuda"))
     sound, own = scene.rasterized(torch.float32, backends.get_backend("fast"))
     differs = (image - sound).abs().amax(dim=2) + (info["n_contrib"] != own["n_contrib"])[0]
@@ -170,7 +188,7 @@ def test_a_backend_with_another_ceiling_parts_by_d6_and_the_worst_pixel_is_looke
 
 
 def test_the_command_line_shows_where_two_backends_part(
-    pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pop: Pop, shared_result: Path, tmp_path: Path, instead_of_cuda: Callable[[Change], None]
 ) -> None:
     words = ("explain", shared_result, "--view", "3", "--pixel", "20,16")
     assert pop(*words, "--json", tmp_path / "own.json").status == 0
@@ -178,7 +196,7 @@ def test_the_command_line_shows_where_two_backends_part(
     # away from its centre a splat may be too faint at the pixel and still be visible elsewhere
     row = next(row for row in rows if row["status"] == "blended" and row["falloff"] < 0.5)
     faint = fainter(row["id"], 0.99 * PAPER.alpha_floor, row["falloff"])
-    monkeypatch.setitem(backends._BACKENDS, "cuda", stand_in(faint))
+    instead_of_cuda(faint)
     outcome = pop(*words, "--json", tmp_path / "why.json", "--diff", "fast", "cuda")
     assert outcome.status == 0, outcome.err
     assert f"D5 falls otherwise first, at Gaussian {row['id']}" in outcome.out

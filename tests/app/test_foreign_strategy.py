@@ -117,6 +117,7 @@ def test_our_own_strategies_follow_the_protocol_too(tmp_path):
         assert torch.equal(given.params[key], value), key
 
 
-def test_a_gpu_trains_with_the_strategies_of_this_package(tmp_path):
+def test_a_gpu_trains_with_the_strategies_of_this_package(tmp_path, monkeypatch):
+    monkeypatch.setattr("cuda_ext.why_not", lambda: None)
     with pytest.raises(PopError, match="strategies of this package only; use --backend fast"):
         TrainingRun(tiny_config(tmp_path, backend="cuda"), tiny_capture(), strategy=Jitter())

@@ -169,7 +169,10 @@ def test_a_full_gpu_says_what_to_lower(error, tmp_path, monkeypatch):
         (with_gsplat(absgrad=True), "gsplat.absgrad = False only, not True"),
     ],
 )
-def test_settings_that_the_device_does_not_know_are_refused_before_anything_starts(changes, words, tmp_path):
+def test_settings_that_the_device_does_not_know_are_refused_before_anything_starts(
+    changes, words, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("cuda_ext.why_not", lambda: None)
     with pytest.raises(PopError, match="use --backend fast") as error:
         TrainingRun(tiny_config(tmp_path / "new", backend="cuda", **changes), tiny_capture())
     assert words in str(error.value)

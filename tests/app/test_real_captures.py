@@ -85,7 +85,7 @@ def test_fox_is_loaded_from_its_listing_too_when_absent_photographs_may_be_skipp
     )
     capture = load_capture(root, missing="skip", **options)
     assert len(capture.views) == 50
-    assert capture.notes == ("17 of 67 listed images are absent and were skipped",)
+    assert capture.notes[0] == "17 of 67 listed images are absent and were skipped"
     assert "no points: 30000 random ones (seed 0)" in capture.source
 
 

@@ -97,7 +97,7 @@ def test_job_one_builds_and_gives_numbers(node, tmp_path):
     for case in bench.values():
         assert "failed" not in case
         assert case["pixel_parallel"]["step_ms"] > 0.0
-        assert case["columns_by_kernel"]["loads"]["contributing"] > 0
+        assert case["pixel_parallel_by_kernel"]["loads"]["contributing"] > 0
         # there are no kernels of a GPU to be profiled here, which is told and loses no time
         assert "profiler" in case["pixel_parallel"]["step_kernels"]["skipped"]
     assert bench["toy_pop_enlarged"]["width"] > bench["toy_pop"]["width"] == 40

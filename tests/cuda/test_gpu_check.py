@@ -205,7 +205,9 @@ def test_a_training_without_the_package_of_the_command_line_is_skipped(tmp_path,
 def test_rows_of_the_paper_are_trained_and_brought_back(tmp_path, monkeypatch):
     assert "no captures" in gpu_check_stages.reproduce_stage(check(tmp_path))["skipped"]
     monkeypatch.setattr(gpu_check_stages, "REPRODUCED", ("l1_div_100",))
-    found = gpu_check_stages.reproduce_stage(check(tmp_path, captures=(tmp_path / "demo",), rehearsal=True))
+    found = gpu_check_stages.reproduce_stage(
+        check(tmp_path, captures=(tmp_path / "demo",), rehearsal=True, seconds=600.0)
+    )
     assert found["status"] == 0, found["output"]
     assert found["rows"] == ["toy/l1_div_100/demo_42.json"]
 

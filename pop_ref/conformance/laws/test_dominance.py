@@ -115,10 +115,12 @@ def test_of_coincident_copies_only_the_first_in_memory_dominates(backend, opacit
 
 @law("dominance", RENDER, DOMINANCE, DOMINANT_WEIGHTS, PROFILES, more=st.integers(0, 2))
 def test_an_exact_tie_goes_to_the_front(backend, more):
-    # half the light, then all of the other half: both weigh exactly one half once ceiling and stop are out of the way
-    profile = dataclasses.replace(PAPER, name="open", alpha_ceiling=1.0, transmittance_stop=-1.0)
+    # the largest number below 1 as ceiling, half of it in front: what is left of the light rounds to one half, so that
+    # both weigh the same to the bit
+    ceiling = float(np.nextafter(np.ones(1, backend.dtype), 0.0, dtype=backend.dtype)[0])
+    profile = dataclasses.replace(PAPER, name="open", alpha_ceiling=ceiling, transmittance_stop=0.0)
     camera = Camera(np.eye(4), np.array([[8.0, 0, 0.5], [0, 8.0, 0.5], [0, 0, 1]]), 1, 1)
-    stack = [Record(0.5, 0.5, 4.0, opacity=1.0), Record(0.5, 0.5, 2.0, opacity=0.5)]
+    stack = [Record(0.5, 0.5, 4.0, opacity=1.0), Record(0.5, 0.5, 2.0, opacity=0.5 * ceiling)]
     behind = [Record(0.5, 0.5, 8.0 + k, opacity=1.0) for k in range(more)]
     seen = backend.sees(Scene(pack(stack + behind, camera), camera, np.zeros(3), profile))
     n = len(stack + behind)

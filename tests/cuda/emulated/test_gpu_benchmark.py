@@ -60,12 +60,12 @@ def test_every_number_of_the_benchmark_is_measured(bench, gpu, monkeypatch, tmp_
     assert (status, list(told["cases"])) == (0, ["tiny"])
     found = told["cases"]["tiny"]
     assert all(math.isfinite(number) for number in numbers(found))
-    loads = found["columns_by_kernel"]["loads"]
+    loads = found["pixel_parallel_by_kernel"]["loads"]
     assert 0 < loads["visible"] <= loads["gaussians"] == 40
     assert loads["pixels"] == 40 * 24
     assert 0 < loads["contributing"] <= loads["evaluated"] <= 128 * loads["instances"]
-    assert found["splats_by_kernel"]["loads"] == loads
-    timed = found["columns_by_kernel"]["kernels"]
+    assert found["gaussian_parallel_by_kernel"]["loads"] == loads
+    timed = found["pixel_parallel_by_kernel"]["kernels"]
     assert set(timed) == set(KERNELS)
     assert {name for name, entry in timed.items() if "floor_ms" in entry} == {
         *("project", "count_instances", "make_tile_lists", "blend_forward", "photometric"),
