@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
 import cv2
 import numpy as np
@@ -253,6 +255,32 @@ def test_a_port_that_cannot_be_is_refused(pop: Pop, shared_result: Path, port: i
     outcome = pop("view", shared_result, "--port", port)
     assert outcome.status == 2
     assert f"port is {port}; give --port" in outcome.err
+
+
+@pytest.mark.parametrize("lone", [False, True])
+def test_the_command_prints_its_address_serves_it_and_ends_with_ctrl_c(
+    pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lone: bool
+) -> None:
+    pytest.importorskip("viser", reason="pip install 'viser>=1.1'")
+    from pop_fast.view.live.server import LiveViewer
+
+    served: list[bytes] = []
+
+    def interrupted(viewer: LiveViewer) -> None:
+        served.append(urlopen(viewer.url).read())
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(LiveViewer, "wait", interrupted)
+    file = tmp_path / "a.ply"
+    if lone:
+        assert pop("export", shared_result, "--out", file).status == 0
+    outcome = pop("view", file if lone else shared_result, "--port", 18_432)
+    assert outcome.status == 0, outcome.err
+    assert re.fullmatch(
+        r"(note: no capture is known.*\n)?viewer: http://127\.0\.0\.1:\d+\nCtrl-C ends it\n", outcome.out
+    )
+    assert ("note: no capture" in outcome.out) is lone
+    assert b"<html" in served[0].lower()
 
 
 class Viewer:

@@ -19,6 +19,7 @@ from pop_fast.errors import PopError
 from pop_fast.train.gpu_proxy import renderer
 from pop_fast.train.load_result import load_splat
 from pop_fast.view.paths.video import frames_in
+from pop_fast.view.pictures import colormap_table
 from pop_fast.view.report import checks, write_report
 from pop_fast.view.report.checks import (
     Checks,
@@ -98,6 +99,7 @@ def test_neighbours_in_a_ring_of_twelve_are_thirty_degrees_apart() -> None:
         ("Photographs", {"neighbour_degrees": 25.0}, "look", "far apart"),
         ("Exposure", {}, "good", "-0.02 (a) to +0.03 stops (b)"),
         ("Exposure", {"stops": {"a": -0.2, "b": 0.2}}, "look", "standard deviation 0.20"),
+        ("Exposure", {"stops": {**{f"v{i}": 0.0 for i in range(40)}, "b": -0.4}}, "look", "-0.40 (b)"),
         ("Exposure", {"stops": {"a": -0.5, "b": 0.5}}, "bad", "29.60 dB instead of 29.50"),
         ("Floaters", {}, "good", "at most 0.20 % of a view"),
         ("Floaters", {"floaters": {"a": 0.0, "b": 0.015}}, "look", "worst b, 1.5 %"),
@@ -217,7 +219,11 @@ def test_depth_maps_share_a_range_that_outliers_do_not_set() -> None:
     picture = depth_picture(depth, near, far)
     assert np.ptp(picture[-1], axis=0).max() == 0  # NaN in grey
     assert picture[0, 0].sum() > picture[199, 4].sum()  # near is bright
-    assert depth_range([]) == (0.0, 1.0)
+    # equal ratios are equal steps
+    one, two, four = (depth_picture(np.array([[value]]), 1.0, 16.0)[0, 0].tolist() for value in (1.0, 4.0, 16.0))
+    table = colormap_table("viridis_r").tolist()
+    assert [one, two, four] == [table[0], table[128], table[255]]
+    assert depth_range([]) == (0.1, 1.0)
 
 
 def test_the_slider_uncovers_the_photograph_and_the_orbit_plays(shared_result: Path, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ _FELL: Final = 0.3  # dB between the best held-out measurement and the last
 _FEW: Final = 20
 _FAR_APART: Final = 15.0  # degrees between neighbouring cameras
 _DRIFT: Final = 0.15  # stops, standard deviation over the photographs
+_ONE_OFF: Final = 0.35  # stops, of a single photograph
 _FLOATERS: Final = 0.01  # of the pixels
 
 Kind = Literal["good", "look", "bad"]
@@ -124,7 +125,7 @@ def _exposure(checks: Checks) -> Iterator[Finding]:
     names, values = list(checks.stops), np.array(list(checks.stops.values()))
     spread, low, high = float(values.std()), int(values.argmin()), int(values.argmax())
     ends = f"{values[low]:+.2f} ({names[low]}) to {values[high]:+.2f} stops ({names[high]})"
-    if spread < _DRIFT:
+    if spread < _DRIFT and np.abs(values).max() < _ONE_OFF:
         text = f"Even: photographs differ from the splat by {ends}, standard deviation {spread:.2f}."
         yield Finding("good", "Exposure", text)
         return
@@ -134,7 +135,8 @@ def _exposure(checks: Checks) -> Iterator[Finding]:
             f" Scaling each held-out render to its photograph's brightness gives {checks.matched_psnr:.2f} dB instead "
             f"of {checks.held_out_psnr:.2f}."
         )
-    text = f"It drifts: photographs differ from the splat by {ends}, standard deviation {spread:.2f}.{gain}"
+    what = "It drifts" if spread >= _DRIFT else "Even, but for some"
+    text = f"{what}: photographs differ from the splat by {ends}, standard deviation {spread:.2f}.{gain}"
     yield Finding("bad" if spread > 2.0 * _DRIFT else "look", "Exposure", f"{text} Lock exposure and white balance.")
 
 

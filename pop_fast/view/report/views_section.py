@@ -31,7 +31,9 @@ def views_section(views: Sequence[ReportView], n_held_out: int | None) -> str:
     some = f" Pictures of {len(views)} of {n_held_out}." if n_held_out is not None and n_held_out > len(views) else ""
     legend = _bar("error", pictures.colorbar_css(), "0", f"{255 * top:.0f} of 255 and more")
     if any(view.depth is not None for view in views):
-        legend += _bar("depth", pictures.colorbar_css(DEPTH_COLORS), f"{near:.3g}", f"{far:.3g} units of the capture")
+        legend += _bar(
+            "depth", pictures.colorbar_css(DEPTH_COLORS), f"{near:.3g}", f"{far:.3g} units of the capture, logarithmic"
+        )
     return (
         "<h2>Held-out views, the worst first</h2><p>Photographs that training never saw: drag the line between "
         "photograph and render. Error is the mean over the channels of |render − photo|; depth is the mean of what a "
@@ -45,15 +47,26 @@ def depth_range(depths: Sequence[np.ndarray]) -> tuple[float, float]:
     known = [depth[np.isfinite(depth)][:: max(1, depth.size // 50_000)] for depth in depths]
     joined = np.concatenate(known) if known else np.zeros(0)
     if not len(joined):
-        return 0.0, 1.0
-    near, far = (float(np.quantile(joined, q)) for q in (0.01, 0.99))
-    return near, max(far, near + 1e-6 * abs(near) + 1e-12)
+        return 0.1, 1.0
+    near, far = (max(float(np.quantile(joined, q)), 1e-12) for q in (0.01, 0.99))
+    return near, max(far, near * (1.0 + 1e-6))
 
 
 def depth_picture(depth: np.ndarray, near: float, far: float) -> np.ndarray:
-    """Colour a depth map, near in yellow and far in violet, grey where it is not finite. uint8 [H, W, 3]"""
+    """Colour a depth map by its logarithm, near in yellow and far in violet, grey where it is not finite.
+
+    A garden has its background many times as far away as its table: evenly spaced colours would leave the table one.
+
+    Args:
+        depth: over 0, or NaN. [H, W]
+        near: yellow, over 0.
+        far: violet, over `near`.
+
+    Returns:
+        uint8 [H, W, 3]
+    """
     known = np.isfinite(depth)
-    level = np.clip((np.where(known, depth, near) - near) / (far - near), 0.0, 1.0)
+    level = np.log(np.clip(np.where(known, depth, near), near, far) / near) / np.log(far / near)
     picture = pictures.colormap_table(DEPTH_COLORS)[np.round(255.0 * level).astype(np.uint8)]
     picture[~known] = _NOTHING
     return picture
