@@ -170,6 +170,17 @@ def test_the_worst_views_come_first_and_have_pictures_whatever_was_kept(result: 
     assert all(view.depth is not None and np.nanmin(view.depth) > 0.0 for view in views)
 
 
+@pytest.mark.usefixtures("short_orbit")
+def test_a_run_that_was_stopped_is_shown_as_it_was_then(result: Path, shared_capture: Path) -> None:
+    for path in (result / "report_data").glob("val_*"):
+        path.unlink()
+    splat, capture = load_splat(result), load_capture(shared_capture)
+    found = write_checks(result, capture, splat.params, splat.config, splat.sh_degree, renderer("auto")[0], 19)
+    data = read_result(result)
+    assert [view.name for view in data.views] == [view.name for view in capture.test_views()]
+    assert f"{found.held_out_psnr:.2f} dB on average" in data.verdict[0].text
+
+
 def test_a_resumed_run_has_all_its_commands(pop: Pop, result: Path, shared_capture: Path) -> None:
     words = ("train", shared_capture, "--out", result, *TRAIN, "--resume", "--skip-sizes", "--skip-checks")
     assert pop(*words).status == 0

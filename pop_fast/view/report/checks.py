@@ -108,9 +108,11 @@ def write_checks(
     worst = sorted(held_out, key=lambda name: held_out[name])[: min(_WORST, config.max_renders)]
     for i, view in enumerate(test):
         layers = seen[view.name]
-        if i >= config.max_renders and view.name in worst:
-            _keep_picture(results, f"val_step{step}_{i:04d}", view, layers)
         if i < config.max_renders or view.name in worst:
+            stem = f"val_step{step}_{i:04d}"
+            # a run that was stopped has measured nothing at its last step
+            if not (folder / "report_data" / f"{stem}.npz").is_file():
+                _keep_picture(results, stem, view, layers)
             depth = np.where(layers.alpha >= _SEEN, layers.depth / capture.world_scale, np.nan).astype(np.float32)
             results.write_arrays(f"depth_step{step}_{i:04d}", name=view.name, depth=fit(depth, nearest=True))
     checks = Checks(

@@ -57,15 +57,16 @@ def verdict(
         checks: what was measured of the splat, or None where nothing was.
         held_out: steps and PSNR of the held-out views during the run, or None.
     """
-    found = list(_quality(stats))
+    # what was measured last: of a run that was stopped, statistics are of an earlier step
+    psnr = stats.get("psnr") if checks is None else checks.held_out_psnr
+    found = list(_quality(psnr))
     found += _course(held_out)
     if checks is not None:
         found += [*_overfitting(checks), *_photographs(checks), *_exposure(checks), *_floating(checks)]
     return found
 
 
-def _quality(stats: Mapping[str, Any]) -> Iterator[Finding]:
-    psnr = stats.get("psnr")
+def _quality(psnr: float | None) -> Iterator[Finding]:
     if psnr is None:
         return
     _, kind, words = next(grade for grade in _GRADES if psnr >= grade[0])
