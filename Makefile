@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 TORCH := $(shell sed -n 's/^\(torch==.*\)/\1/p' constraints.txt)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo walkthrough repro site test explore lint bench cuda sass emulate gpu-check docs-check clean
+.PHONY: help setup demo walkthrough repro site test test-fast explore lint bench cuda sass emulate gpu-check docs-check clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
@@ -46,6 +46,12 @@ site: demo walkthrough  ## build docs/, the walk-through and the demo's report a
 # a worker a core, each with one thread: two that take both cores wait for each other
 test: setup  ## run every test
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --dist worksteal
+
+# float64 of the torch path stands for that of the compiled one; what failed last comes first
+test-fast: setup  ## run in two minutes what a change most likely breaks: renderers, gradients, laws (5 examples), steps
+	OMP_NUM_THREADS=1 HYPOTHESIS_PROFILE=quick $(BIN)/python -m pytest -q -n logical --dist worksteal --failed-first \
+		-m "not slow" -k "not compiled64" tests/fast tests/gradients tests/golden tests/laws tests/oracle tests/thresholds \
+		tests/train tests/meta/test_architecture.py tests/meta/test_import_cycles.py
 
 explore: setup  ## run the tests that draw examples with fresh ones, once for each of SEEDS="1 2 3"
 	@broken=; for seed in $(or $(SEEDS),$$(date +%s)); do \

@@ -1,6 +1,6 @@
 """How many examples a law is tried on, and which: the Hypothesis profiles, registered in one place.
 
-`dev`, `ci` and `thorough` draw the same examples on every machine and every time: each test's draws follow from its own
+`quick`, `dev`, `ci` and `thorough` draw the same examples on every machine and every time: each test's draws follow from its own
 source. `explore` draws anew, from the seed given by pytest's `--hypothesis-seed`.
 
 Hypothesis also draws constants that it finds in the modules of the working folder which happen to be imported. With
@@ -14,7 +14,7 @@ from typing import Final
 
 from hypothesis import HealthCheck, settings
 
-EXAMPLES: Final = {"dev": 25, "ci": 50, "thorough": 500, "explore": 25}
+EXAMPLES: Final = {"quick": 5, "dev": 25, "ci": 50, "thorough": 500, "explore": 25}
 
 
 def load_profile(name: str) -> None:
