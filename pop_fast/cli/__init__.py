@@ -26,6 +26,7 @@ COMMANDS: Final = {
     "train": "fit a splat to a capture or a folder of photographs",
     "eval": "measure a result, a checkpoint or a PLY on the held-out views",
     "render": "write held-out views, or a camera path as pictures or a video",
+    "view": "show a splat in the browser, drawn by our own renderers (needs viser)",
     "explain": "say why a pixel looks as it does, and where two renderers part",
     "export": "write a result as PLY, SPZ, SOG, glTF, ..., a page that shows it, or an Inria-style folder",
     "convert": "turn a splat's file into another format",

@@ -29,6 +29,7 @@ _PACKAGES: Final = (
     ("tqdm", "tqdm", "progress", True),
     ("tyro", "tyro", "this command line", True),
     ("matplotlib", "matplotlib", "colours of the error maps", True),
+    ("viser", "viser", "pop view: pip install 'pop-splatting[viewer]'", False),
     ("hypothesis", "hypothesis", "the conformance kit: pip install 'pop-splatting[conformance]'", False),
 )
 

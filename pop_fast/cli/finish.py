@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from pop_fast.data import Capture
+    from pop_fast.train.config import TrainConfig
     from pop_fast.train.load_result import Splat
 
 VIEWER: Final = "viewer.html"
@@ -32,10 +33,12 @@ class FinishOptions(LimitOptions):
             limits below hold for these files, for the table of sizes and for the page; the checkpoint and the PLY stay
             whole.
         skip_sizes: do not measure what the splat weighs in every format.
+        skip_checks: do not render what only the report shows: depth, the orbit, floaters, exposure, overfitting.
     """
 
     export: tuple[FormatName, ...] = ()
     skip_sizes: bool = False
+    skip_checks: bool = False
 
 
 def finish(folder: Path, capture: Capture, options: Any) -> int:
@@ -89,6 +92,22 @@ def _finish(folder: Path, capture: Capture, options: FinishOptions) -> None:
     write_atomically(folder / VIEWER, lambda file: file.write(shown))
     if not options.skip_sizes:
         _sizes(folder, splat, capture, kept)
+    if not options.skip_checks:
+        checked(folder, splat, capture, splat.config)
+
+
+def checked(folder: Path, splat: Splat, capture: Capture, config: TrainConfig) -> None:
+    """Render and measure what the report shows besides the results; see `pop_fast.view.report.checks`."""
+    from pop_fast.io.heartbeat import Heartbeat
+    from pop_fast.train.environment import reproducible
+    from pop_fast.train.gpu_proxy import renderer
+    from pop_fast.view.report.checks import write_checks
+
+    backend, _ = renderer(config.backend)
+    with reproducible(config.threads), Heartbeat() as beat:
+        beat.say("rendering depth and the orbit for the report")
+        step = config.max_steps - 1 if splat.step is None else splat.step
+        write_checks(folder, capture, splat.params, config, splat.sh_degree, backend, step)
 
 
 def _limited(

@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final
 
 import tyro
 
@@ -27,6 +27,7 @@ _INDEX: Final = "renders.json"
 _EXAMPLES: Final = """
     pop render out/scene_pop --out views                     the held-out views, one PNG each
     pop render out/scene_pop --path orbit --video orbit.webm  a video around the scene
+    pop render out/scene_pop --path garden_path.json --video walk.webm   a path recorded in 'pop view'
     pop render a.ply --capture scene --path interpolate --frames 240 --out frames
 """
 
@@ -41,8 +42,9 @@ class Args(CaptureArguments):
     """Write one PNG a view into this new folder, and renders.json, which lists them."""
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write a video: .webm, .avi, or .mp4 where OpenCV can write H.264."""
-    path: Literal["views", "orbit", "ellipse", "interpolate"] = "views"
-    """"views" are the held-out views; the others are paths made from the training cameras."""
+    path: Annotated[str, tyro.conf.arg(metavar="{views,orbit,ellipse,interpolate}|FILE")] = "views"
+    """"views" are the held-out views; the next three are paths made from the training cameras, of which "orbit" goes as
+    far round as these stand; a file is a path that 'pop view' recorded."""
     frames: int = 120
     """Frames of a path."""
     fps: float = 30.0
@@ -63,6 +65,7 @@ def _render(args: Args) -> int:
     from pop_fast.io.names import picture_names
     from pop_fast.view.frames import check_one_size, planned_views, rendered, write_pictures, write_video
 
+    check_path(args.path)
     video = planned_video(args)
     splat = load_splat(args.splat)
     capture, config = open_with_bars(splat, args)
@@ -84,6 +87,25 @@ def _render(args: Args) -> int:
     targets = " and ".join(str(target) for target in (args.out, args.video) if target is not None)
     print(f"{written} views of {capture.name} -> {targets}")
     return 0
+
+
+def check_path(path: str) -> None:
+    """Check the path that was asked for before the long work begins.
+
+    Raises:
+        PopError: it is neither a name that is known nor a file that was recorded.
+    """
+    from pop_fast.view.live import read_path
+    from pop_fast.view.paths import PATHS
+
+    if path in ("views", *PATHS):
+        return
+    if not Path(path).is_file():
+        names = ", ".join(("views", *PATHS))
+        raise PopError(
+            f"path is '{path}', which is no file; give --path one of {names}, or a file that 'pop view' saved"
+        )
+    read_path(Path(path))
 
 
 def planned_video(args: Args) -> VideoFile | None:

@@ -10,20 +10,37 @@ from typing import Annotated
 import tyro
 
 from pop_fast.cli.arguments import parse
+from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
 
 
 @dataclass(frozen=True, kw_only=True)
-class Args:
-    """Write report.html into a result folder, from the files in it; also for a run that was stopped."""
+class Args(CaptureArguments):
+    """Write report.html into a result folder, from the files in it; also for a run that was stopped.
+
+    --check renders first what older and stopped runs lack, with the capture: depth, the orbit, floaters, exposure.
+    """
 
     result: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT")]
     """A folder that 'pop train' wrote."""
+    check: bool = False
+    """Render and measure what the report shows besides the results; needs the capture."""
 
 
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "report")
+    if args.check:
+        _check(args)
     from pop_fast.view.report import write_report
 
     print(write_report(args.result))
     return 0
+
+
+def _check(args: Args) -> None:
+    from pop_fast.cli.finish import checked
+    from pop_fast.train.load_result import load_splat
+
+    splat = load_splat(args.result)
+    capture, config = open_with_bars(splat, args)
+    checked(args.result, splat, capture, config)

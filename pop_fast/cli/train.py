@@ -8,7 +8,7 @@ import sys
 import time
 import typing
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextlib import ExitStack, contextmanager, nullcontext, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train.load_result import CaptureRecord
     from pop_fast.train.ranks import Ranks
+    from pop_fast.train.training_run import TrainingRun
+    from pop_fast.view.live.server import LiveViewer
 
 _EXAMPLES: Final = """
     pop train scene                          POP, the paper's 30,000 steps, results in out/scene_pop
@@ -44,6 +46,7 @@ _EXAMPLES: Final = """
                                              four processes, a view of each step for each
     pop train scene --backend fast           on the CPU, also where a GPU is
     pop train scene --export sog html        also as a small file and as a page, in out/scene_pop/export
+    pop train scene --view                   watch it in the browser while it runs
     pop train scene --pop.lambda-pop 0.01    any setting, taken as it is; --help-all lists them all
 """
 
@@ -85,6 +88,9 @@ class _Run(FinishOptions):
         source: where cameras come from; "auto" takes the first that is there.
         sfm: how the cameras of bare photographs are found.
         quiet: print nothing but warnings and errors; --no-progress leaves out the bars alone.
+        view: show the training in the browser while it runs, as `pop view` does, to the same bits. Needs viser.
+        view_host: the address that the viewer listens on; 0.0.0.0 lets other machines see it, without a password.
+        view_port: its port; where it is taken, the next free one.
     """
 
     resume: bool = False
@@ -95,6 +101,9 @@ class _Run(FinishOptions):
     source: Literal["auto", "colmap", "transforms", "polycam", "metashape", "realitycapture", "photos"] = "auto"
     sfm: SfmOptions = dataclasses.field(default_factory=SfmOptions)
     quiet: bool = False
+    view: bool = False
+    view_host: str = "127.0.0.1"
+    view_port: int = 8080
 
 
 def run(argv: Sequence[str]) -> int:
@@ -104,6 +113,7 @@ def run(argv: Sequence[str]) -> int:
 
     folder = Path(config.result_dir)
     options.check()
+    check_viewer(options)
     ranks = _ranks()
     with _stdout_closed() if options.quiet or not _writes(ranks) else nullcontext():
         if _writes(ranks):
@@ -111,7 +121,7 @@ def run(argv: Sequence[str]) -> int:
         options = as_begun(folder, options)
         config, chosen = choose_backend(config, options.resume)
         check_backend(config)
-        status = _train(config, options, chosen, ranks)
+        status = _train(config, options, chosen, argv, ranks)
     if ranks is not None:
         ranks.leave()
     return status
@@ -136,7 +146,8 @@ def _stdout_closed() -> Iterator[None]:
         yield
 
 
-def _train(config: TrainConfig, options: Any, chosen: str, ranks: Ranks | None) -> int:
+def _train(config: TrainConfig, options: Any, chosen: str, argv: Sequence[str], ranks: Ranks | None) -> int:
+    from pop_fast.train.commands import COMMANDS_FILE, commands_text
     from pop_fast.train.load_result import RECORD, record_text
 
     folder, start = Path(config.result_dir), time.perf_counter()
@@ -159,11 +170,21 @@ def _train(config: TrainConfig, options: Any, chosen: str, ranks: Ranks | None) 
         "loading_seconds": loading,
         "ranks": ranks or ALONE,
     }
-    beside = {RECORD: record_text(_record(capture, options))}
+    commands = commands_text(folder if options.resume else None, ["pop", "train", *argv])
+    beside = {RECORD: record_text(_record(capture, options)), COMMANDS_FILE: commands}
     # absolute, so that the result can be looked at from another folder too
-    training = TrainingRun(replace(config, data=str(Path(config.data).absolute())), capture, beside=beside, **how)
-    if options.resume:
-        print(_resumption(folder))
+    absolute = replace(config, data=str(Path(config.data).absolute()))
+    with ExitStack() as showing:
+        watch = _Watch(capture, options, showing) if options.view and _writes(ranks) else None
+        training = TrainingRun(absolute, capture, beside=beside, watch=watch, **how)
+        if options.resume:
+            print(_resumption(folder))
+        if watch is not None:
+            watch.start(training)
+        return _trained(training, folder, capture, options, ranks)
+
+
+def _trained(training: TrainingRun, folder: Path, capture: Capture, options: Any, ranks: Ranks | None) -> int:
     try:
         stats = training.run()
     except KeyboardInterrupt:
@@ -174,6 +195,47 @@ def _train(config: TrainConfig, options: Any, chosen: str, ranks: Ranks | None) 
         return 0
     print(summary(stats), flush=True)
     return finish(folder, capture, options) or report(folder)
+
+
+class _Watch:
+    """The viewer of a training; see `pop_fast.view.live.follow`."""
+
+    def __init__(self, capture: Capture, options: Any, showing: ExitStack) -> None:
+        self._capture, self._options, self._showing = capture, options, showing
+        self._viewer: LiveViewer | None = None
+
+    def start(self, run: TrainingRun) -> None:
+        """Start the server, and print where it is."""
+        from pop_fast.cli.view import announce, stands_of_capture
+        from pop_fast.view.live.follow import scene_of
+        from pop_fast.view.live.server import LiveViewer
+
+        capture, options = self._capture, self._options
+        stands = stands_of_capture(capture, run.config.test_every, run.params["means"])
+        scene = scene_of(run, capture.world_transform)
+        viewer = LiveViewer(scene, stands, capture.name, options.view_host, options.view_port)
+        self._viewer = self._showing.enter_context(viewer)
+        announce(viewer)
+
+    def __call__(self, run: TrainingRun) -> None:
+        from pop_fast.view.live.follow import follow
+
+        if self._viewer is not None:
+            follow(self._viewer, run, self._capture.world_transform)
+
+
+def check_viewer(options: Any) -> None:
+    """Refuse a viewer that cannot be before the minutes of loading, not after.
+
+    Raises:
+        PopError: viser is absent, or the port is none.
+    """
+    if options.view:
+        from pop_fast.cli.view import check_port
+        from pop_fast.view.live.server import require_viser
+
+        check_port(options.view_port)
+        require_viser()
 
 
 def takes_hours(config: TrainConfig) -> bool:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -59,6 +59,11 @@ class Frame:
 
     name: Literal["capture", "training"]
     transform: tuple[tuple[float, ...], ...] | None = None
+
+    @classmethod
+    def of_training(cls, transform: Any) -> Frame:
+        """Return the frame of a training that a similarity, an array [4, 4], moved, or that None left where it was."""
+        return cls("capture") if transform is None else cls("training", tuple(map(tuple, transform.tolist())))
 
 
 def save_ply(

@@ -12,6 +12,7 @@ from torch.optim import Adam, Optimizer
 
 from cuda_ext.train_settings import GROUPS, Updates
 from pop_fast.density.protocol import State
+from pop_fast.errors import PopError
 from pop_fast.stages.activations import scales_from_log_scales
 from pop_ref.settings import BETAS, EPS
 
@@ -100,3 +101,17 @@ def first_unusable(params: Mapping[str, Tensor]) -> tuple[str, list[int], float]
     That is one which is not finite, or a scale whose exponential is not.
     """
     return first_non_finite(params) or first_non_finite({"scales": scales_from_log_scales(params["scales"])})
+
+
+def require_usable(params: Mapping[str, Tensor], when: str) -> None:
+    """Check that raw parameters can be rendered.
+
+    Raises:
+        PopError: they cannot; names the first number, and says what to do.
+    """
+    if found := first_unusable(params):
+        name, index, value = found
+        raise PopError(
+            f"{name}{index} is {value} {when}: lower the learning rate of {name} and start again, "
+            "or look at the photographs and masks of the capture"
+        )

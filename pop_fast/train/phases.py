@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from cuda_ext.train_settings import Phase
+from cuda_ext.train_settings import Phase, Updates
 from pop_fast.density.control import DensityControl
 from pop_fast.density.foreign import ForeignStrategy
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.schedule import active_sh_degree
+from pop_fast.train.schedule import active_sh_degree, updates_of
 
 
 def phase_at(config: TrainConfig, strategy: DensityControl | ForeignStrategy, step: int) -> Phase:
@@ -56,3 +56,17 @@ def is_milestone(config: TrainConfig, taken: int) -> bool:
     due = config.checkpoint_every > 0 and taken % config.checkpoint_every == 0
     planned = (*config.eval_steps, *config.save_steps, config.strategy.blur_stop_iter, config.max_steps)
     return due or taken in planned
+
+
+def updates_of_strategy(config: TrainConfig, strategy: DensityControl | ForeignStrategy, scene_scale: float) -> Updates:
+    """List the rates and the numbers of all of Adam's updates of a run.
+
+    Args:
+        config: step numbers as they are run.
+        strategy: at whose changes Adam may skip or restart; of one that is not ours it is not known.
+        scene_scale: the unit of the means' rate, world units.
+    """
+    if isinstance(strategy, ForeignStrategy):
+        return updates_of(config.lr, scene_scale, config.max_steps)
+    edits = [step for step in range(config.max_steps) if strategy.is_refine_step(step)]
+    return updates_of(config.lr, scene_scale, config.max_steps, strategy, edits, strategy.adam_restarts)

@@ -2,6 +2,7 @@
 
     cfg.json                        the settings as given, and as they are run
     capture.json                    how `pop train` read the capture, and its training frame
+    commands.json                   the command that began the run, and those that resumed it, with their folders
     metrics.jsonl                   one record every `log_every` steps and at every change of the population
     ckpts/ckpt_{step}_rank0.pt      checkpoints; `step` counts from 0 here and below, so 30,000 steps end at 29999
     ply/point_cloud_{step}.ply      Gaussians in Inria's layout
@@ -14,6 +15,9 @@
     renders/dominant_step{step}_{i}.png   every pixel in the colour of its dominant Gaussian
     report_data/opacity_step{step}.npz    counts [100] of opacities in equal bins of [0, 1]; step -1 is the start
     report_data/val_step{step}_{i}.npz    name, render, photo (uint8 [H, W, 3]), dominant_ids (int32 [H, W]), psnr, ssim
+    report_data/depth_step{step}_{i}.npz  name, depth (float32 [H, W], units of the capture, NaN where nothing is)
+    report_data/checks_step{step}.json    overfitting, exposure, floaters: `pop_fast.view.report.checks.Checks`
+    videos/orbit_step{step}.webm    a turn about the scene
     viewer.html                     a page that shows the splat in a browser
     export/                         files that `pop train --export` asked for
 
@@ -46,7 +50,7 @@ from pop_fast.train.config import TrainConfig
 # cfg.json is the first to step aside and the first to be written anew: where it is, the new run has begun
 _OURS = (
     *("cfg.json", "metrics.jsonl", "ckpts", "ply", "stats", "renders", "report_data", "report.html", "capture.json"),
-    *("viewer.html", "export"),
+    *("viewer.html", "export", "commands.json", "videos"),
 )
 # holds what a new run replaces while that is being done
 _ASIDE = ".replaced"

@@ -96,6 +96,12 @@ class ViewOrder:
         self._position += 1
         return self._order[self._position - 1]
 
+    def ahead(self, count: int) -> list[int]:
+        """Return the views to come, without drawing them."""
+        copy = ViewOrder(self._n, 0)
+        copy.load_state_dict(self.state_dict())
+        return [copy.next() for _ in range(count)]
+
     def state_dict(self) -> dict[str, Any]:
         """Return all that decides the views to come."""
         return {"generator": self._generator.get_state(), "order": list(self._order), "position": self._position}

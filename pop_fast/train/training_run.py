@@ -10,11 +10,11 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -45,17 +45,20 @@ from pop_fast.train.evaluate import evaluate
 from pop_fast.train.gpu_proxy import words_for_memory
 from pop_fast.train.lpips import load_nets
 from pop_fast.train.metrics import population
-from pop_fast.train.model import KEYS, first_unusable, make_optimizers
-from pop_fast.train.phases import phase_at, segment_end
+from pop_fast.train.model import KEYS, make_optimizers, require_usable
+from pop_fast.train.phases import phase_at, segment_end, updates_of_strategy
 from pop_fast.train.placement import moved_to, on_cpu
 from pop_fast.train.preflight import check_start, check_views
 from pop_fast.train.ranks import ALONE, Ranks
 from pop_fast.train.records import Segment, record_of
 from pop_fast.train.results import ResultFolder
-from pop_fast.train.schedule import Updates, ViewOrder, active_sh_degree, updates_of
+from pop_fast.train.schedule import ViewOrder, active_sh_degree
 from pop_fast.train.signals import stop_requests
 from pop_fast.train.stepper import Engine, Stepper, Task
 from pop_fast.train.views import ViewTensors
+
+Watch = Callable[["TrainingRun"], None]
+_WATCHED_STEPS: Final = 5  # at a time, between which a watch sees the run
 
 
 class TrainingRun:
@@ -85,6 +88,7 @@ class TrainingRun:
         initial: Mapping[str, Tensor] | None = None,
         engine: Engine | None = None,
         ranks: Ranks = ALONE,
+        watch: Watch | None = None,
     ) -> None:
         """Prepare a run; nothing is written yet.
 
@@ -100,6 +104,7 @@ class TrainingRun:
                 the training; a GPU trains in float32 only.
             engine: takes the steps; None takes the one for `config.backend`.
             ranks: the processes that train together, of which this is one; the first one writes.
+            watch: is shown the run between steps, and changes nothing of it; with one, fewer steps are taken at a time.
 
         Raises:
             PopError: the capture cannot be trained on, weights are missing, or the backend is not available or does
@@ -117,8 +122,9 @@ class TrainingRun:
         self.state = self.strategy.initialize_state(
             self._scene_scale, seed=self.config.seed, count=len(self.params["means"])
         )
-        self.updates = self._updates()
+        self.updates = updates_of_strategy(self.config, self.strategy, self._scene_scale)
         self.step = 0
+        self._watch = watch
         self._stepper: Stepper | None = None
         self._train_seconds = 0.0
         self._loading_seconds = loading_seconds
@@ -127,13 +133,6 @@ class TrainingRun:
         self._unwritten: np.ndarray | None = None
         # the training PSNR of the last record, in words
         self._latest = ""
-
-    def _updates(self) -> Updates:
-        config, plan = self.config, self.strategy
-        if isinstance(plan, ForeignStrategy):
-            return updates_of(config.lr, self._scene_scale, config.max_steps)
-        edits = [step for step in range(config.max_steps) if plan.is_refine_step(step)]
-        return updates_of(config.lr, self._scene_scale, config.max_steps, plan, edits, plan.adam_restarts)
 
     def _prepare_capture(self, capture: Capture, initial: Mapping[str, Tensor] | None) -> None:
         config = self.config
@@ -201,7 +200,7 @@ class TrainingRun:
         bars = tqdm(total=config.max_steps, initial=self.step, disable=None if shown else True)
         with bars as bar, Heartbeat(shown) as beat:
             while self.step < config.max_steps:
-                longest = self.stepper.longest
+                longest = min(self.stepper.longest, config.max_steps if self._watch is None else _WATCHED_STEPS)
                 segment = self.take_steps(segment_end(config, self.strategy, self.step, longest))
                 self._log(segment, bar)
                 beat.say(self._so_far())
@@ -212,6 +211,8 @@ class TrainingRun:
                         self._results.begin(self.config, self._beside, self._unwritten, self._overwrite)
                     self._unwritten = None
                 self._milestones(self.step - 1)
+                if self._watch is not None:
+                    self._watch(self)
                 if self._ranks.any(stop.is_set()) and self.step < config.max_steps:
                     self._save()
                     raise KeyboardInterrupt
@@ -273,11 +274,9 @@ class TrainingRun:
         """Let density control edit the population, if that is due."""
         if not self.strategy.changes_after(step):
             return None
-        config = self.config
-        degree = active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter)
         passes = self._passes if self.strategy.needs_passes(step) else None
         given = (self.params, self.optimizers, self.state, step, self.draws)
-        event = self.strategy.change(*given, passes=passes, sh_degree=degree)
+        event = self.strategy.change(*given, passes=passes, sh_degree=self.sh_degree(step))
         self.stepper.rebind(self.params, self.optimizers, self.state)
         return event
 
@@ -297,21 +296,10 @@ class TrainingRun:
         """What takes the steps; it is made at the first use, for the rows as they are then."""
         if self._stepper is None:
             self._place()
+            config, size, done = self.config, self.config.batch_size, self.step
             # the views of steps that were taken are not known any more
-            ahead = ViewOrder(len(self._train), self.config.seed)
-            ahead.load_state_dict(self._order.state_dict())
-            size = self.config.batch_size
-            order = [0] * size * self.step + [ahead.next() for _ in range(size * (self.config.max_steps - self.step))]
-            task = Task(
-                self.config,
-                self.strategy,
-                self._train,
-                order,
-                self.updates,
-                self.step,
-                self.appearance,
-                self._ranks,
-            )
+            order = [0] * size * done + self._order.ahead(size * (config.max_steps - done))
+            task = Task(config, self.strategy, self._train, order, self.updates, done, self.appearance, self._ranks)
             self._stepper = self._engine.make_stepper(task)
             with words_for_memory():
                 self._stepper.rebind(self.params, self.optimizers, self.state)
@@ -358,7 +346,8 @@ class TrainingRun:
             self._results.write_stats("appearance", step, self.appearance.by_view(self._train))
         if taken in config.save_steps or last:
             path = self._results.path / "ply" / f"point_cloud_{step}.ply"
-            save_ply(path, self._detached(), config.antialiased, frame=self._frame)
+            frame = Frame.of_training(self._capture.world_transform if config.normalize else None)
+            save_ply(path, self._detached(), config.antialiased, frame=frame)
 
     def _evaluate(self, step: int) -> dict[str, Any]:
         self._require_finite()
@@ -371,9 +360,9 @@ class TrainingRun:
             **self._facts(),
         }
         self._results.write_stats("train", step, {**stats, "ellipse_time": self._train_seconds})
-        degree = active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter)
         folder = self._results if step + 1 == config.max_steps else None
-        stats |= evaluate(self._engine.backend, self.params, self._test, config, degree, self._nets, folder, step)
+        given = (self._engine.backend, self.params, self._test, config, self.sh_degree(step), self._nets)
+        stats |= evaluate(*given, folder, step)
         stats["seconds_total"] = self._total_seconds
         self._results.write_stats("val", step, stats)
         return stats
@@ -435,11 +424,14 @@ class TrainingRun:
         self._stepper = None
 
     @property
-    def _frame(self) -> Frame:
-        """The world of the run's Gaussians."""
-        if not self.config.normalize:
-            return Frame("capture")
-        return Frame("training", tuple(map(tuple, self._capture.world_transform.tolist())))
+    def backend(self) -> Any:
+        """What measures and draws the run's Gaussians, wherever they lie."""
+        return self._engine.backend
+
+    def sh_degree(self, step: int) -> int:
+        """Return the highest colour band that a step, from 0, draws."""
+        config = self.config
+        return active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter)
 
     @property
     def _total_seconds(self) -> float:
@@ -459,9 +451,4 @@ class TrainingRun:
         return "the latest checkpoint is kept" if self._unwritten is None else "nothing was written"
 
     def _require_finite(self) -> None:
-        if found := first_unusable(self._detached()):
-            name, index, value = found
-            raise PopError(
-                f"{name}{index} is {value} after {self.step} steps; {self._what_is_left}: lower the learning rate of "
-                f"{name} and start again, or look at the photographs and masks of the capture"
-            )
+        require_usable(self._detached(), f"after {self.step} steps; {self._what_is_left}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from pop_fast.train.environment import reproducible
 from pop_fast.train.gpu_proxy import renderer
 from pop_fast.train.load_result import Splat
 from pop_fast.train.views import ViewTensors, render_view
-from pop_fast.view.paths import VideoFile, camera_path
+from pop_fast.view.paths import PATHS, VideoFile, camera_path
 
 
 def check_one_size(video: VideoFile, views: Sequence[ViewTensors]) -> None:
@@ -44,23 +45,31 @@ def check_one_size(video: VideoFile, views: Sequence[ViewTensors]) -> None:
 def planned_views(capture: Capture, config: TrainConfig, path: str, frames: int) -> list[ViewTensors]:
     """Choose the cameras: the held-out views, or a path with the size and lens of the first training view.
 
+    Args:
+        capture: in the frame of the splat.
+        config: `test_every` is read.
+        path: "views", the name of a path, or a file that `pop view` recorded, whose angles of view are used.
+        frames: cameras of a path.
+
     Raises:
-        PopError: there is nothing to render, or too little to make the path of.
+        PopError: there is nothing to render, or too little to make the path of, or the file is no path.
     """
     if path == "views":
         views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
         if not views:
             raise PopError(f"{capture.name}: holds no view out; give --test-every 8, or --path orbit")
         return views
+    if frames < 1:
+        raise PopError(f"frames is {frames}; give --frames 1 or more")
     train = capture.train_views(config.test_every)
+    if path not in PATHS:
+        return _recorded(capture, Path(path), frames)
     needed = 2 if path == "interpolate" else 1
     if len(train) < needed:
         raise PopError(
             f"{capture.name}: --path {path} needs {needed} or more training views and there are {len(train)}; "
             f"hold fewer out with --test-every 0{', or take --path orbit' if train else ''}"
         )
-    if frames < 1:
-        raise PopError(f"frames is {frames}; give --frames 1 or more")
     lens = train[0]
     blank = torch.zeros((lens.height, lens.width, 3), dtype=torch.uint8)
     K = torch.from_numpy(lens.K).float()[None]
@@ -69,6 +78,16 @@ def planned_views(capture: Capture, config: TrainConfig, path: str, frames: int)
         ViewTensors(f"{path}_{i:04d}", blank, None, torch.from_numpy(viewmat).float()[None], K)
         for i, viewmat in enumerate(viewmats)
     ]
+
+
+def _recorded(capture: Capture, path: Path, frames: int) -> list[ViewTensors]:
+    """Make the cameras of a recorded path, in the size of the first photograph."""
+    from pop_fast.view.live import ViewState, read_path
+
+    lens = capture.views[0]
+    along = read_path(path).along(frames, capture.world_transform)
+    states = [ViewState(camera.viewmat, camera.fov_y, lens.width, lens.height) for camera in along]
+    return [replace(state.camera(), name=f"path_{i:04d}") for i, state in enumerate(states)]
 
 
 @torch.no_grad()

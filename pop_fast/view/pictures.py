@@ -12,11 +12,11 @@ COLORMAP: Final = "magma"
 _MAX_SIDE: Final = 640
 
 
-def colormap_table() -> np.ndarray:
-    """Give the error maps' colours: matplotlib's magma, perceptually uniform and readable in grey. uint8 [256, 3]"""
+def colormap_table(name: str = COLORMAP) -> np.ndarray:
+    """Give the colours of one of matplotlib's maps; magma, which is perceptually uniform, for errors. uint8 [256, 3]"""
     from matplotlib import colormaps
 
-    return np.round(colormaps[COLORMAP](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0).astype(np.uint8)
+    return np.round(colormaps[name](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0).astype(np.uint8)
 
 
 def error_magnitude(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
@@ -79,7 +79,7 @@ def data_uri(picture: np.ndarray, lossless: bool = False) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
 
 
-def colorbar_css() -> str:
-    """Give the error maps' colours as a CSS gradient from 0 to the top of the scale."""
-    stops = colormap_table()[np.linspace(0, 255, 12).astype(int)]
+def colorbar_css(name: str = COLORMAP) -> str:
+    """Give the colours of a map as a CSS gradient from the bottom to the top of the scale."""
+    stops = colormap_table(name)[np.linspace(0, 255, 12).astype(int)]
     return "linear-gradient(90deg," + ",".join(f"#{r:02x}{g:02x}{b:02x}" for r, g, b in stops) + ")"

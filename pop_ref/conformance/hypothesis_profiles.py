@@ -1,7 +1,7 @@
 """How many examples a law is tried on, and which: the Hypothesis profiles, registered in one place.
 
-`quick`, `dev`, `ci` and `thorough` draw the same examples on every machine and every time: each test's draws follow from
-its own source. `explore` draws anew, from the seed given by pytest's `--hypothesis-seed`.
+`quick`, `dev`, `ci` and `thorough` draw the same examples on every machine and every time: each test's draws follow
+from its own source. `explore` draws anew, from the seed given by pytest's `--hypothesis-seed`.
 
 Hypothesis also draws constants that it finds in the modules of the working folder which happen to be imported. With
 them the examples would depend on which tests were collected, on where the kit is installed, and on every number that is

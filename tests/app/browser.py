@@ -80,10 +80,14 @@ class Browser:
 
     def open(self, page: Path, width: int, height: int, fragment: str = "") -> None:
         """Show a page in a window of this size, px."""
+        self.show(f"{page.as_uri()}{fragment}", width, height)
+
+    def show(self, url: str, width: int, height: int) -> None:
+        """Show an address in a window of this size, px."""
         metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.call("Emulation.setDeviceMetricsOverride", **metrics)
         self.call("Page.navigate", url="about:blank")
-        self.call("Page.navigate", url=f"{page.as_uri()}{fragment}")
+        self.call("Page.navigate", url=url)
 
     def value(self, expression: str) -> Any:
         """Evaluate an expression in the page."""

@@ -63,6 +63,41 @@ def test_an_orbit_keeps_distance_height_and_gaze() -> None:
     assert np.all(gaze[:, 2] > 0.0)
 
 
+@pytest.mark.parametrize("width", [20.0, 100.0, 190.0])
+def test_an_orbit_of_a_capture_from_one_side_stays_on_that_side(width: float) -> None:
+    turn = np.radians(np.linspace(-width / 2, width / 2, 9) + 170.0)  # over the seam of the angle too
+    target = np.array([0.5, -0.25, 0.0])
+    centers = target + np.stack([3.0 * np.cos(turn), 3.0 * np.sin(turn), np.zeros(9)], axis=1)
+    path = orbit(look_at(centers, target, UP), 40)
+    offsets = camera_centers(path) - target
+    angles = np.degrees(np.arctan2(offsets[:, 1], offsets[:, 0])) % 360.0
+    assert angles.min() == pytest.approx(170.0 - width / 2, abs=1e-6)
+    assert angles.max() == pytest.approx(170.0 + width / 2, abs=1e-6)
+    assert angles[0] == pytest.approx(170.0)
+    steps = np.linalg.norm(np.diff(np.vstack([offsets, offsets[:1]]), axis=0), axis=1)
+    assert steps.max() < 3.0 * np.radians(width) / 2 * 2.0 * np.pi / 40
+
+
+def test_an_orbit_is_a_full_circle_where_cameras_stand_all_round() -> None:
+    for n in (3, 4, 12):
+        offsets = camera_centers(orbit(ring(n), 8)) - [0.5, -0.25, 0.0]
+        angles = np.sort(np.degrees(np.arctan2(offsets[:, 1], offsets[:, 0])) % 360.0)
+        np.testing.assert_allclose(np.diff(angles), 45.0)
+
+
+def test_a_single_camera_sways_and_does_not_fly_round() -> None:
+    path = orbit(ring(1), 16)
+    assert (path[:, 2, :3] @ ring(1)[0, 2, :3]).min() > np.cos(np.radians(6.0))
+
+
+def test_cameras_that_spread_are_given_a_focus_ahead_of_them() -> None:
+    outwards = look_at(camera_centers(ring())[:3], np.array([0.5, -0.25, 0.0]), UP)
+    outwards[:, :3, :] *= np.array([-1.0, 1.0, -1.0])[:, None]  # half a turn about their own y axes
+    focus = focus_point(outwards)
+    ahead = np.einsum("mj,mj->m", focus - camera_centers(outwards), outwards[:, 2, :3])
+    assert np.median(ahead) > 0.0
+
+
 def test_up_stays_up_along_closed_paths() -> None:
     for name in ("orbit", "ellipse"):
         assert mean_up(camera_path(name, ring(), 9)) @ UP > 0.5

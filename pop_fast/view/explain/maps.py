@@ -16,6 +16,9 @@ from pop_fast.view.explain.scene import TILE_SIZE, ExplainedView
 from pop_fast.view.pictures import error_magnitude, error_scale, id_colors
 from pop_ref.constants import PROFILES
 
+# scales end at this quantile, so that a few pixels do not set them
+_TOP = 0.995
+_LEAST_LIGHT = 0.01
 _NONE = (70, 70, 74)
 _UP, _DOWN = (255, 140, 60), (80, 140, 255)
 
@@ -71,9 +74,7 @@ def view_maps(scene: ExplainedView) -> list[Map]:
             "n_traversed", "Traversed", "list entries visited until the pixel ended", info["n_traversed"][0].numpy()
         ),
         _termination(scene),
-        scaled(
-            "T_final", "Light left", "T_final, the share of the background", info["final_T"][0].numpy(), "viridis", 1.0
-        ),
+        _light_left(info["final_T"][0].numpy()),
         scaled(
             "importance",
             "Important light",
@@ -116,7 +117,17 @@ def as_uint8(image: np.ndarray) -> np.ndarray:
 
 
 def _count(name: str, title: str, about: str, counts: np.ndarray) -> Map:
-    return scaled(name, title, f"{about}; {counts.mean():.1f} on average", counts, "viridis", max(int(counts.max()), 1))
+    top = max(int(np.quantile(counts, _TOP)), 1)
+    most = f", {int(counts.max()):,} at most" if counts.max() > top else ""
+    return scaled(name, title, f"{about}; {counts.mean():.1f} on average{most}", counts, "viridis", top)
+
+
+def _light_left(left: np.ndarray) -> Map:
+    # nearly all of a good splat is opaque: a scale up to 1 would show one colour
+    top = max(float(np.quantile(left, _TOP)), _LEAST_LIGHT)
+    share = float((left > _LEAST_LIGHT).mean())
+    about = f"T_final, the share of the background; over {_LEAST_LIGHT:g} in {share:.1%} of the pixels"
+    return scaled("T_final", "Light left", about, left, "viridis", top)
 
 
 def _shares(scene: ExplainedView) -> tuple[np.ndarray, np.ndarray]:

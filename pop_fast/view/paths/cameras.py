@@ -13,11 +13,18 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+# an orbit keeps out of a gap between cameras that is as wide as this and so many times wider than any other
+_WIDE_GAP: Final = np.pi / 2.0
+_STANDS_OUT: Final = 1.5
+_LEAST_SWAY: Final = np.radians(5.0)  # to either side of a single camera
 _SWAY: Final = 0.9  # the percentile that the ellipse keeps of the cameras' spread, so that one outlier does not set it
 
 
 def orbit(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
-    """Circle around the point the cameras look at, at their median distance and height.
+    """Turn about the point the cameras look at, at their median distance and height, as far round as cameras stand.
+
+    Where they stand all round it is a full circle. Else it goes from the middle of their arc to one end, to the other
+    and back, so that nothing is shown from where no photograph was taken.
 
     Args:
         viewmats: cameras of the capture, world -> camera. [M, 4, 4]
@@ -31,9 +38,31 @@ def orbit(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
     heights = offsets @ up
     radius = float(np.median(np.linalg.norm(offsets - heights[:, None] * up, axis=1)))
     a, b = _plane_axes(up, offsets)
-    turn = np.linspace(0.0, 2.0 * np.pi, n_frames, endpoint=False)[:, None]
-    centers = focus + radius * (np.cos(turn) * a + np.sin(turn) * b) + float(np.median(heights)) * up
+    turn = np.linspace(0.0, 2.0 * np.pi, n_frames, endpoint=False)
+    arc = camera_arc(np.arctan2(offsets @ b, offsets @ a))
+    angle = (turn if arc is None else arc[0] + arc[1] * np.sin(turn))[:, None]
+    centers = focus + radius * (np.cos(angle) * a + np.sin(angle) * b) + float(np.median(heights)) * up
     return look_at(centers, focus, up)
+
+
+def camera_arc(angles: np.ndarray) -> tuple[float, float] | None:
+    """Find the arc that cameras stand on: the circle without its largest gap.
+
+    Args:
+        angles: where they stand about the point they look at, radians. [M]
+
+    Returns:
+        The middle and half the width of the arc, radians; None where no gap stands out, for a full circle.
+    """
+    around = np.sort(np.mod(angles, 2.0 * np.pi))
+    gaps = np.diff(around, append=around[0] + 2.0 * np.pi)
+    widest = int(np.argmax(gaps))
+    others = np.delete(gaps, widest)
+    if gaps[widest] < _WIDE_GAP or (len(others) and gaps[widest] < _STANDS_OUT * others.max()):
+        return None
+    half = (2.0 * np.pi - gaps[widest]) / 2.0
+    start = around[(widest + 1) % len(around)]
+    return float(start + half), float(max(half, _LEAST_SWAY))
 
 
 def ellipse(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
@@ -111,15 +140,18 @@ def mean_up(viewmats: np.ndarray) -> np.ndarray:
 def focus_point(viewmats: np.ndarray) -> np.ndarray:
     """Give the point nearest to all optical axes: sum_i (I - d_i d_i^T)(x - c_i) = 0.
 
-    Parallel axes meet nowhere; then it is the point one mean camera distance ahead of the cameras' mean.
+    Parallel axes meet nowhere, and those that spread meet behind the cameras; then it is the point one mean camera
+    distance ahead of the cameras' mean.
     """
     centers, forward = camera_centers(viewmats), viewmats[:, 2, :3]
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     total = across.sum(axis=0)
-    if np.linalg.cond(total) > 1e6:
-        spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean())
-        return centers.mean(axis=0) + (spread or 1.0) * forward.mean(axis=0)
-    return np.linalg.solve(total, np.einsum("mij,mj->i", across, centers))
+    if np.linalg.cond(total) < 1e6:
+        focus = np.linalg.solve(total, np.einsum("mij,mj->i", across, centers))
+        if np.median(np.einsum("mj,mj->m", focus - centers, forward)) > 0.0:
+            return focus
+    spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean())
+    return centers.mean(axis=0) + (spread or 1.0) * forward.mean(axis=0)
 
 
 def look_at(centers: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -108,7 +109,8 @@ class VideoFile:
 
     def _open(self, size: tuple[int, int]) -> cv2.VideoWriter:
         codec = _CODECS[self.path.suffix.lower()]
-        writer = cv2.VideoWriter(str(self._part), cv2.VideoWriter.fourcc(*codec), self.fps, size)
+        with _no_standard_error():
+            writer = cv2.VideoWriter(str(self._part), cv2.VideoWriter.fourcc(*codec), self.fps, size)
         if writer.isOpened():
             return writer
         # an encoder that cannot write fails in the same way: this raises where the disk is at fault
@@ -136,6 +138,25 @@ def _quiet() -> Iterator[None]:
         yield
     finally:
         cv2.utils.logging.setLogLevel(level)
+
+
+@contextmanager
+def _no_standard_error() -> Iterator[None]:
+    """Close standard error to libraries: OpenCV prints there, past its log, that it chose the tag of WebM itself."""
+    sys.stderr.flush()
+    try:
+        kept = os.dup(2)
+    except OSError:  # there is none
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def frames_in(path: Path) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pop_fast.view.report.curves import Window
+from pop_fast.view.report.verdict import Finding
 
 
 @dataclass(frozen=True)
@@ -41,13 +42,17 @@ class Histogram:
 
 @dataclass(frozen=True)
 class ReportView:
-    """One held-out view: what was rendered, what was photographed, how far they are apart. uint8 RGB."""
+    """One held-out view: what was rendered, what was photographed, how far they are apart. uint8 RGB.
+
+    `depth` is in units of the capture, NaN where nothing is, perhaps smaller than the picture. [H', W']
+    """
 
     name: str
     render: np.ndarray
     photo: np.ndarray
     psnr: float | None = None
     ssim: float | None = None
+    depth: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -64,11 +69,17 @@ class ReportData:
         resets: iterations of opacity resets.
         histograms: opacities at the start, in the middle, at the end.
         dominant: a view's dominant ids and its render, when they were kept.
-        views: held-out views.
+        views: held-out views, the worst first.
+        n_held_out: how many held-out views were measured.
         config: setting -> value, in reading order.
         events: one mapping a density event or reset.
         files: a row a file format: name, size, bytes a Gaussian, share of the PLY's size, PSNR.
         viewer: the page that shows the splat.
+        verdict: how it went, in sentences.
+        checked: whether what the verdict needs was measured.
+        orbit: a video of a turn about the scene, and what it is called in the folder.
+        commands: what was typed, and in which folder.
+        links: files of the folder that are worth opening: name, path in the folder, size in bytes.
     """
 
     title: str
@@ -81,7 +92,13 @@ class ReportData:
     histograms: Sequence[Histogram] = field(default_factory=tuple)
     dominant: tuple[str, np.ndarray, np.ndarray] | None = None
     views: Sequence[ReportView] = field(default_factory=tuple)
+    n_held_out: int | None = None
     config: Mapping[str, Any] = field(default_factory=dict)
     events: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
     files: Sequence[Sequence[str]] = field(default_factory=tuple)
     viewer: str | None = None
+    verdict: Sequence[Finding] = field(default_factory=tuple)
+    checked: bool = False
+    orbit: tuple[str, bytes] | None = None
+    commands: Sequence[tuple[str, str]] = field(default_factory=tuple)
+    links: Sequence[tuple[str, str, int]] = field(default_factory=tuple)

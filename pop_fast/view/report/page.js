@@ -39,3 +39,14 @@ for (const figure of document.querySelectorAll("[data-chart]")) {
   svg.addEventListener("pointerdown", show);
   svg.addEventListener("pointerleave", hide);
 }
+// photograph against render: the line follows the slider
+for (const slider of document.querySelectorAll(".slider")) {
+  const input = slider.querySelector("input");
+  const move = () => slider.style.setProperty("--at", `${input.value}%`);
+  input.addEventListener("input", move);
+  // the browser may keep where it stood when the page is loaded again
+  move();
+}
+if (!matchMedia("(prefers-reduced-motion: reduce)").matches) {
+  for (const video of document.querySelectorAll("video.orbit")) video.play().catch(() => {});
+}

@@ -12,7 +12,9 @@ import numpy as np
 from pop_fast.view import pictures
 from pop_fast.view.report.curves import Chart, Series, draw, draw_histogram
 from pop_fast.view.report.files_section import sizes_section, viewer_section
-from pop_fast.view.report.model import Histogram, ReportData, ReportView, Tile
+from pop_fast.view.report.model import Histogram, ReportData, Tile
+from pop_fast.view.report.run_sections import command_section, open_section, orbit_section, verdict_section
+from pop_fast.view.report.views_section import views_section
 
 # (title, ((curve, legend, colour, dots), ...), log axis, axis from zero, unit)
 _CHARTS: Final = (
@@ -47,12 +49,16 @@ def page(data: ReportData) -> str:
         [
             f"<header><h1>{escape(data.title)}</h1><p>{escape(data.subtitle)}</p></header>",
             _tiles(data.headline),
+            verdict_section(data.verdict, data.checked),
+            views_section(data.views, data.n_held_out),
+            viewer_section(data.viewer),
+            orbit_section(data.orbit),
             _curves(data),
             _opacities(data.histograms),
             _dominance(data),
-            _views(data.views),
-            viewer_section(data.viewer),
             sizes_section(data.files),
+            open_section(data.links),
+            command_section(data.commands),
             _tables(data),
             "<footer>Written by <code>pop</code> from the files beside it; nothing comes from the network.</footer>",
         ]
@@ -122,7 +128,8 @@ def _opacities(histograms: Sequence[Histogram]) -> str:
     ]
     return (
         "<h2>Opacity</h2>"
-        "<p>Share of the Gaussians by opacity. Polarised means: near 1, or near 0 and about to be pruned.</p>"
+        "<p>Share of the Gaussians by opacity. Polarised means: near 1, or near 0, where <code>pop export "
+        "--min-opacity</code> or <code>--final-prune</code> leaves them out of a file.</p>"
         f'<div class="charts three">{"".join(drawn)}</div>'
     )
 
@@ -143,35 +150,6 @@ def _dominance(data: ReportData) -> str:
         f'<figcaption class="caption">{n_owners:,} Gaussians own {share:.1f} % of the pixels</figcaption></figure>'
         f'<figure><img alt="render of {escape(name)}" src="{pictures.data_uri(pictures.fit(render))}">'
         f'<figcaption class="caption">{escape(name)}</figcaption></figure></div></div>'
-    )
-
-
-def _views(views: Sequence[ReportView]) -> str:
-    if not views:
-        return ""
-    errors = [pictures.error_magnitude(view.render, view.photo) for view in views]
-    top = pictures.error_scale(errors)
-    rows = []
-    for view, error in zip(views, errors, strict=True):
-        numbers = [] if view.psnr is None else [f"PSNR {view.psnr:.2f} dB"]
-        numbers += [] if view.ssim is None else [f"SSIM {view.ssim:.4f}"]
-        shown = (
-            ("render", view.render),
-            ("photo", view.photo),
-            ("error", pictures.error_picture(error, top)),
-        )
-        triple = "".join(
-            f'<figure><img loading="lazy" alt="{what} of {escape(view.name)}" '
-            f'src="{pictures.data_uri(pictures.fit(picture))}"><figcaption class="caption">{what}</figcaption></figure>'
-            for what, picture in shown
-        )
-        head = f"<b>{escape(view.name)}</b>" + "".join(f'<span class="num">{text}</span>' for text in numbers)
-        rows.append(f'<div class="view"><p>{head}</p><div class="triple">{triple}</div></div>')
-    return (
-        "<h2>Held-out views</h2><p>Photographs that training never saw. Error is the mean over the channels of "
-        "|render − photo|, in one scale for all views.</p>"
-        f'<div class="bar">0<i style="background:{pictures.colorbar_css()}"></i>{top:.2f} and more (of 1)</div>'
-        f'<div class="views">{"".join(rows)}</div>'
     )
 
 

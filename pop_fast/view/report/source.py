@@ -12,12 +12,15 @@ import numpy as np
 
 from pop_fast.errors import PopError
 from pop_fast.io.read_back import check_record, parse_json, read_arrays, read_json
+from pop_fast.train.commands import read_commands, shell_line
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.results import read_config
+from pop_fast.view.report.checks import Checks, read_checks
 from pop_fast.view.report.compare import threads_of
 from pop_fast.view.report.curves import Window
 from pop_fast.view.report.files_section import checked_encodings, encoding_rows
 from pop_fast.view.report.model import Histogram, ReportData, ReportView, Tile
+from pop_fast.view.report.verdict import verdict
 
 MIB: Final = 2**20
 # float32 numbers of a Gaussian: as gsplat's checkpoints hold it, and as Inria's PLY does (with three zero normals)
@@ -34,6 +37,7 @@ _VIEW: Final = {
     "ssim": ("f", 0),
     "dominant_ids?": ("i", 2),
 }
+_DEPTH: Final = {"name": ("U", 0), "depth": ("f", 2)}
 _SMOOTH: Final = 0.03  # width of the running means, as a share of the records
 
 
@@ -48,24 +52,31 @@ def read_result(folder: Path) -> ReportData:
     stats = read_last_stats(folder)
     method = _METHODS.get(config.method, config.method)
     histograms = list(_histograms(folder, config.max_steps))
-    views = list(_views(folder))
+    views = _views(folder)
     dominant = _dominant(folder)
     events = [record for record in records if "cloned" in record or "reset" in record]
+    curves, checks = _curves(records, folder), _checks(folder)
     return ReportData(
         title=f"{Path(config.data).resolve().name} · {_METHODS.get(config.method, config.method).split(' (')[0]}",
         subtitle=" · ".join(filter(None, [method, _schedule_note(config), _views_note(stats), _machine(stats)])),
         headline=headline(stats),
-        curves=_curves(records, folder),
+        curves=curves,
         max_steps=config.max_steps,
         windows=_windows(config),
         resets=[int(record["step"]) for record in events if record.get("reset")],
         histograms=histograms,
         dominant=dominant,
         views=views,
+        n_held_out=stats.get("views"),
         config=_settings(config),
         events=[{key: event.get(key) for key in _EVENT_COLUMNS} for event in events],
         files=_files(stats, str(folder)),
         viewer=_viewer(folder),
+        verdict=verdict(stats, checks, curves.get("psnr_val")),
+        checked=checks is not None,
+        orbit=_orbit(folder),
+        commands=[(shell_line(entry["words"]), entry["folder"]) for entry in read_commands(folder)],
+        links=list(_links(folder)),
     )
 
 
@@ -79,10 +90,45 @@ def _files(stats: Mapping[str, Any], where: str) -> list[tuple[str, ...]]:
 
 def _viewer(folder: Path) -> str | None:
     path = folder / "viewer.html"
+    return _read(path).decode("utf-8", "replace") if path.is_file() else None
+
+
+def _checks(folder: Path) -> Checks | None:
+    numbered = _numbered(folder / "report_data", r"checks_step(\d+)\.json")
+    return read_checks(numbered[-1][1]) if numbered else None
+
+
+def _orbit(folder: Path) -> tuple[str, bytes] | None:
+    numbered = _numbered(folder / "videos", r"orbit_step(\d+)\.webm")
+    if not numbered:
+        return None
+    path = numbered[-1][1]
+    return path.relative_to(folder).as_posix(), _read(path)
+
+
+def _read(path: Path) -> bytes:
     try:
-        return path.read_text(encoding="utf-8", errors="replace") if path.is_file() else None
+        return path.read_bytes()
     except OSError as error:
         raise PopError(f"{path}: could not be read: {error.strerror}; remove it, or check its permissions") from error
+
+
+def _links(folder: Path) -> Iterator[tuple[str, str, int]]:
+    """List what is worth opening from the report: the viewer, the last PLY, exports, the orbit."""
+    plys = _numbered(folder / "ply", r"point_cloud_(\d+)\.ply")
+    films = _numbered(folder / "videos", r"orbit_step(\d+)\.webm")
+    exports = sorted((folder / "export").iterdir()) if (folder / "export").is_dir() else []
+    named = [
+        ("the splat in the browser", folder / "viewer.html"),
+        *(("the splat", path) for _, path in plys[-1:]),
+        *(("export", path) for path in exports),
+        *(("the orbit", path) for _, path in films[-1:]),
+        ("settings", folder / "cfg.json"),
+        ("records", folder / "metrics.jsonl"),
+    ]
+    for name, path in named:
+        if path.is_file():
+            yield name, path.relative_to(folder).as_posix(), path.stat().st_size
 
 
 def read_records(folder: Path) -> list[dict[str, Any]]:
@@ -237,10 +283,21 @@ def _histograms(folder: Path, max_steps: int) -> Iterator[Histogram]:
         yield Histogram(title, counts.reshape(-1, 2).sum(axis=1))
 
 
-def _views(folder: Path) -> Iterator[ReportView]:
+def _views(folder: Path) -> list[ReportView]:
+    """Read the held-out views, the worst first."""
+    depths = dict(_depths(folder))
+    views = []
     for path in _last_view_files(folder):
         a = read_arrays(path, _VIEW, _AGAIN)
-        yield ReportView(str(a["name"]), a["render"], a["photo"], float(a["psnr"]), float(a["ssim"]))
+        name = str(a["name"])
+        views.append(ReportView(name, a["render"], a["photo"], float(a["psnr"]), float(a["ssim"]), depths.get(name)))
+    return sorted(views, key=lambda view: (view.psnr is None, view.psnr))
+
+
+def _depths(folder: Path) -> Iterator[tuple[str, np.ndarray]]:
+    for path in _last_view_files(folder, "depth"):
+        a = read_arrays(path, _DEPTH, _AGAIN)
+        yield str(a["name"]), a["depth"]
 
 
 def _dominant(folder: Path) -> tuple[str, np.ndarray, np.ndarray] | None:
@@ -251,8 +308,8 @@ def _dominant(folder: Path) -> tuple[str, np.ndarray, np.ndarray] | None:
     return None
 
 
-def _last_view_files(folder: Path) -> list[Path]:
-    pattern = re.compile(r"val_step(\d+)_(\d+)\.npz")
+def _last_view_files(folder: Path, kind: str = "val") -> list[Path]:
+    pattern = re.compile(kind + r"_step(\d+)_(\d+)\.npz")
     data = folder / "report_data"
     found = [(m, p) for p in data.iterdir() if (m := pattern.fullmatch(p.name))] if data.is_dir() else []
     last = max((int(m[1]) for m, _ in found), default=-1)

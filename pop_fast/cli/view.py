@@ -1,0 +1,125 @@
+"""`pop view`: a splat in the browser, drawn by the package's own renderers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import tyro
+
+from pop_fast.cli.arguments import parse
+from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
+from pop_fast.errors import PopError
+from pop_fast.train.load_result import Splat, load_splat
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from pop_fast.data import Capture
+    from pop_fast.view.live.server import LiveViewer
+
+_EXAMPLES: Final = """
+    pop view out/scene_pop                        open the address that it prints
+    pop view a.ply --capture scene                a file, with the cameras of a capture
+    pop view out/scene_pop --port 9000 --host 0.0.0.0   for other machines too
+"""
+_PHOTO_SIDE: Final = 160
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args(CaptureArguments):
+    """Show a splat in the browser, until Ctrl-C: turn it, look from the training cameras, take pictures, record a path.
+
+    It is drawn here, by the same renderer that trained it, and sent to the browser as pictures. Needs viser.
+    """
+
+    splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|PLY")]
+    """What to show."""
+    host: str = "127.0.0.1"
+    """The address to listen on; 0.0.0.0 lets other machines see it, without a password."""
+    port: int = 8080
+    """The port; where it is taken, the next free one."""
+
+
+def run(argv: Sequence[str]) -> int:
+    """Run the subcommand."""
+    args = parse(Args, argv, "view", examples=_EXAMPLES)
+    from pop_fast.train.environment import reproducible
+    from pop_fast.view.live.server import require_viser
+
+    check_port(args.port)
+    require_viser()
+    splat = load_splat(args.splat)
+    with reproducible(splat.config.threads), make_viewer(args, splat) as viewer:
+        announce(viewer)
+        print("Ctrl-C ends it", flush=True)
+        try:
+            while True:
+                viewer.wait()
+                viewer.draw_due()
+        except KeyboardInterrupt:
+            return 0
+
+
+def make_viewer(args: Args, splat: Splat) -> LiveViewer:
+    """Start the viewer of a splat: with the cameras of its capture, or where none is known with one made up."""
+    from pop_fast.train.gpu_proxy import renderer
+    from pop_fast.view.html.cameras import camera_of_points
+    from pop_fast.view.live import SplatScene
+    from pop_fast.view.live.server import LiveViewer, stands_of
+
+    data = args.capture or splat.config.data
+    backend, note = renderer(splat.config.backend)
+    if note:
+        print(f"note: {note}")
+    if args.capture is None and (not data or not Path(data).is_dir()):
+        print("note: no capture is known, so there are no training cameras; give --capture DIR")
+        scene = SplatScene(splat.params, splat.config, splat.sh_degree, backend, transform_of(splat))
+        stands = stands_of([camera_of_points(splat.params["means"])], [None], splat.params["means"])
+    else:
+        capture, config = open_with_bars(splat, args)
+        scene = SplatScene(splat.params, config, splat.sh_degree, backend, capture.world_transform)
+        stands = stands_of_capture(capture, config.test_every, splat.params["means"])
+    path = splat.folder or splat.path
+    return LiveViewer(scene, stands, path.resolve().stem, args.host, args.port)
+
+
+def transform_of(splat: Splat) -> np.ndarray | None:
+    """Return how a lone file's world came from its capture's, as its header says; None where it does not."""
+    import numpy as np
+
+    known = splat.frame is not None and splat.frame.name == "training" and splat.frame.transform is not None
+    return np.array(splat.frame.transform) if known and splat.frame is not None else None
+
+
+def stands_of_capture(capture: Capture, test_every: int, means: Any) -> list[Any]:
+    """Make places to look from of the training views, at most sixty."""
+    from pop_fast.view.html.cameras import cameras_of
+    from pop_fast.view.live.server import stands_of
+    from pop_fast.view.pictures import fit
+
+    views = capture.train_views(test_every)
+    cameras, by_name = cameras_of(views), {view.name: view for view in views}
+    photos = [fit(by_name[camera.name].image, max_side=_PHOTO_SIDE) for camera in cameras]
+    return stands_of(cameras, photos, means.detach().cpu())
+
+
+def announce(viewer: LiveViewer) -> None:
+    """Print where the viewer is."""
+    from pop_fast.view.live.server import LOOPBACK
+
+    print(f"viewer: {viewer.url}", flush=True)
+    if viewer.host not in LOOPBACK:
+        print(f"note: whoever reaches {viewer.host}:{viewer.port} sees the splat and its photographs", flush=True)
+
+
+def check_port(port: int) -> None:
+    """Refuse what is no port.
+
+    Raises:
+        PopError: it is none.
+    """
+    if not 0 < port < 65536:
+        raise PopError(f"port is {port}; give --port a number from 1 to 65535")

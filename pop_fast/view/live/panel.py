@@ -1,0 +1,166 @@
+"""The panel of one browser: what it asks for, and the files that it is given."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+import cv2
+import numpy as np
+
+from pop_fast.view.live.recording import KeyCamera, path_of
+from pop_fast.view.live.state import MODES, Box, Mode, ViewState
+
+_LONGEST: Final = (480, 720, 960, 1280, 1920)
+_AXES: Final = ("x", "y", "z")
+
+
+class Panel:
+    """Controls beside the picture.
+
+    Args:
+        client: viser's handle of the browser.
+        names: of the places to look from.
+        title: in the names of files.
+        box: what holds nearly all Gaussians, in the capture's own frame.
+        world_transform: world = world_transform @ the capture's own frame. [4, 4]
+    """
+
+    def __init__(self, client: Any, names: Sequence[str], title: str, box: Box, world_transform: np.ndarray) -> None:
+        self._client, self._title, self._names = client, title, list(names)
+        self._world_transform = world_transform
+        self._changed: Callable[[], None] = lambda: None
+        self._stand: Callable[[int], None] = lambda index: None
+        self._frustums: Callable[[bool], None] = lambda shown: None
+        self._wanted = False
+        self._taken = 0
+        self._path: list[KeyCamera] = []
+        # what is shown at present, for the path; None before the first picture
+        self.now: ViewState | None = None
+        gui = client.gui
+        self._status = gui.add_markdown("drawing ...")
+        self._mode = gui.add_dropdown("show", MODES, initial_value=MODES[0])
+        self._opacity = gui.add_slider("opacity at least", 0.0, 1.0, 0.005, 0.0)
+        self._side = gui.add_dropdown("longest side, px", tuple(map(str, _LONGEST)), initial_value="960")
+        self._add_crop(gui, box)
+        self._add_cameras(gui)
+        self._add_files(gui)
+        for control in (self._mode, self._opacity, self._side, self._cropped, *self._ranges):
+            control.on_update(lambda event: self._update())
+
+    def on_change(self, call: Callable[[], None]) -> None:
+        """Call this when something else is to be shown."""
+        self._changed = call
+
+    def on_stand(self, call: Callable[[int], None]) -> None:
+        """Call this with the number of a place to look from."""
+        self._stand = call
+
+    def on_frustums(self, call: Callable[[bool], None]) -> None:
+        """Call this when training cameras are to be shown, or not."""
+        self._frustums = call
+
+    @property
+    def mode(self) -> Mode:
+        """What is to be drawn."""
+        return self._mode.value
+
+    @property
+    def min_opacity(self) -> float:
+        """Gaussians of less are left out."""
+        return float(self._opacity.value)
+
+    @property
+    def longest(self) -> int:
+        """The longer side of a sharp picture, px."""
+        return int(self._side.value)
+
+    @property
+    def crop(self) -> Box | None:
+        """The box outside of which Gaussians are left out, in the capture's own frame."""
+        if not self._cropped.value:
+            return None
+        (x0, x1), (y0, y1), (z0, z1) = (tuple(map(float, control.value)) for control in self._ranges)
+        return (x0, y0, z0, x1, y1, z1)
+
+    def say(self, text: str) -> None:
+        """Show a line above the controls."""
+        self._status.content = text
+
+    def take_screenshot(self) -> bool:
+        """Tell whether a screenshot was asked for since this was last called."""
+        wanted, self._wanted = self._wanted, False
+        return wanted
+
+    def send_screenshot(self, image: np.ndarray) -> None:
+        """Hand a picture to the browser as a PNG. uint8 [H, W, 3]"""
+        done, data = cv2.imencode(".png", np.ascontiguousarray(image[:, :, ::-1]))
+        assert done
+        self._taken += 1
+        self._send(f"{self._title}_{self._taken:03d}.png", data.tobytes())
+
+    def record(self) -> None:
+        """Add the camera that is shown to the path."""
+        if self.now is not None:
+            self._path.append(KeyCamera(self.now.viewmat, self.now.fov_y))
+        self._count()
+
+    def save_path(self) -> None:
+        """Hand the path to the browser."""
+        if self._path:
+            self._send(f"{self._title}_path.json", path_of(self._path, self._world_transform).text().encode())
+
+    def _send(self, name: str, data: bytes) -> None:
+        self._client.send_file_download(name, data, save_immediately=True)
+
+    def _add_crop(self, gui: Any, box: Box) -> None:
+        with gui.add_folder("Crop", expand_by_default=False):
+            self._cropped = gui.add_checkbox("leave out what is outside", False)
+            self._ranges = []
+            for k, axis in enumerate(_AXES):
+                low, high = round(box[k], 4), round(box[k + 3], 4)
+                step = max((high - low) / 200.0, 1e-4)
+                self._ranges.append(gui.add_multi_slider(axis, low, high, step, (low, high)))
+            self._crop_words = gui.add_markdown("")
+
+    def _add_cameras(self, gui: Any) -> None:
+        with gui.add_folder("Training cameras"):
+            choice = gui.add_dropdown("look from", tuple(self._names), initial_value=self._names[0])
+            step = gui.add_button_group("", ("previous", "next"))
+            shown = gui.add_checkbox("show cameras and photographs", False)
+        choice.on_update(lambda event: self._stand(self._names.index(choice.value)))
+
+        def move(event: Any) -> None:
+            by = 1 if step.value == "next" else -1
+            # which looks from there
+            choice.value = self._names[(self._names.index(choice.value) + by) % len(self._names)]
+
+        step.on_click(move)
+        shown.on_update(lambda event: self._frustums(shown.value))
+
+    def _add_files(self, gui: Any) -> None:
+        gui.add_button("Screenshot").on_click(lambda event: self._ask())
+        with gui.add_folder("Path"):
+            gui.add_button("Add this camera").on_click(lambda event: self.record())
+            gui.add_button("Remove the last").on_click(lambda event: self._forget())
+            gui.add_button("Save").on_click(lambda event: self.save_path())
+            self._path_words = gui.add_markdown("")
+        self._count()
+
+    def _ask(self) -> None:
+        self._wanted = True
+        self._changed()
+
+    def _forget(self) -> None:
+        del self._path[-1:]
+        self._count()
+
+    def _count(self) -> None:
+        n = len(self._path)
+        self._path_words.content = f"{n} camera{'' if n == 1 else 's'}; film it with `pop render RESULT --path FILE`"
+
+    def _update(self) -> None:
+        crop = self.crop
+        words = "" if crop is None else f"`--crop {' '.join(f'{value:.4g}' for value in crop)}`"
+        self._crop_words.content = words and f"the same in a file: {words} of `pop export`"
+        self._changed()

@@ -1,0 +1,262 @@
+"""The viewer's server: viser carries cameras from browsers to us, and our pictures back.
+
+Whoever owns the Gaussians calls `draw_due`, which draws on the calling thread: `pop view` in a loop, a training between
+its steps. viser's threads only note what is wanted.
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from pop_fast.errors import PopError
+from pop_fast.view.html.cameras import view_distances
+from pop_fast.view.live.draw import SplatScene
+from pop_fast.view.live.pace import Pace
+from pop_fast.view.live.panel import Panel
+from pop_fast.view.live.state import ViewState, pose_of_viewmat, viewmat_of_pose
+
+if TYPE_CHECKING:
+    from pop_fast.view.html.cameras import PageCamera
+
+LOOPBACK: Final = ("127.0.0.1", "localhost", "::1")
+_FIX: Final = "pip install 'viser>=1.1' (or pop-splatting[viewer])"
+
+
+@dataclass(frozen=True, eq=False)
+class Stand:
+    """A place to look from: a training camera, the distance to what it looks at, and its photograph, small."""
+
+    camera: PageCamera
+    distance: float
+    photo: np.ndarray | None = None
+
+
+def stands_of(cameras: Sequence[PageCamera], photos: Sequence[np.ndarray | None], means: Any) -> list[Stand]:
+    """Make places to look from of cameras and their photographs.
+
+    Args:
+        cameras: one or more.
+        photos: as many, uint8 [H, W, 3] or None.
+        means: centres of the Gaussians. [N, 3]
+    """
+    distances = view_distances(cameras, means)
+    return [Stand(*entry) for entry in zip(cameras, distances, photos, strict=True)]
+
+
+def require_viser() -> Any:
+    """Import viser.
+
+    Raises:
+        PopError: it is absent or broken; says how to get it.
+    """
+    try:
+        # by name: type checkers run without it
+        return importlib.import_module("viser")
+    except ImportError as error:
+        raise PopError(f"the viewer needs viser, which cannot be imported ({error}); {_FIX}") from error
+
+
+class LiveViewer:
+    """A viewer of one splat, for any number of browsers.
+
+    Args:
+        scene: what is shown first.
+        stands: where one can look from; the first is where a browser starts.
+        title: above the panel and in the names of files.
+        host: the address to listen on.
+        port: the next free one is taken where it is in use.
+
+    Raises:
+        PopError: viser is absent, or the address cannot be listened on.
+
+    Example:
+        with LiveViewer(scene, stands, "garden") as viewer:
+            print(viewer.url)
+            while True:
+                viewer.wait()
+                viewer.draw_due()
+    """
+
+    def __init__(
+        self, scene: SplatScene, stands: Sequence[Stand], title: str, host: str = "127.0.0.1", port: int = 8080
+    ) -> None:
+        viser = require_viser()
+        self._scene, self._stands, self._title = scene, list(stands), title
+        self.box = scene.extent()
+        self.note = ""
+        self._views: dict[int, _View] = {}
+        self._lock, self._wake = threading.Lock(), threading.Event()
+        try:
+            # it prints a box of its own, whatever `verbose` is
+            with redirect_stdout(io.StringIO()):
+                self._server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+        except (OSError, RuntimeError) as error:
+            raise PopError(f"the viewer cannot listen on {host}:{port} ({error}); give --host or --port") from error
+        self.host, self.port = host, int(self._server.get_port())
+        self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        upwards = -np.mean([stand.camera.viewmat[1, :3] for stand in self._stands], axis=0)
+        self._server.scene.set_up_direction(tuple(float(v) for v in upwards))
+        self._server.scene.world_axes.visible = False
+        start = self._server.initial_camera
+        position, look_at, up, fov = pose_at(self._stands[0])
+        start.position, start.look_at, start.up, start.fov = position, look_at, up, fov
+        self._server.on_client_connect(self._connected)
+        self._server.on_client_disconnect(self._disconnected)
+
+    @property
+    def url(self) -> str:
+        """The address to open."""
+        shown = "127.0.0.1" if self.host in ("0.0.0.0", "::", "") else self.host
+        return f"http://{f'[{shown}]' if ':' in shown else shown}:{self.port}"
+
+    @property
+    def watched(self) -> bool:
+        """Whether a browser is connected."""
+        return bool(self._views)
+
+    def show(self, scene: SplatScene, note: str = "") -> None:
+        """Show other Gaussians from now on, with a line about them."""
+        self._scene, self.note = scene, note
+        for view in self._present():
+            view.pace.renewed()
+
+    def wait(self, seconds: float = 1.0) -> None:
+        """Sleep until something may have to be drawn."""
+        now = time.monotonic()
+        awaited = [rest for view in self._present() if (rest := view.pace.rests_in(now)) is not None]
+        self._wake.wait(min([seconds, *awaited]))
+        self._wake.clear()
+
+    def draw_due(self) -> int:
+        """Draw what is due, at most one picture a browser; returns how many."""
+        return sum(view.draw(self._scene, self.note) for view in self._present())
+
+    def close(self) -> None:
+        """End the server."""
+        with redirect_stdout(io.StringIO()):
+            self._server.stop()
+
+    def __enter__(self) -> LiveViewer:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _present(self) -> list[_View]:
+        with self._lock:
+            return list(self._views.values())
+
+    def _connected(self, client: Any) -> None:
+        view = _View(client, self._stands, self._title, self.box, self._scene.world_transform, self._wake)
+        with self._lock:
+            self._views[client.client_id] = view
+        self._wake.set()
+
+    def _disconnected(self, client: Any) -> None:
+        with self._lock:
+            self._views.pop(client.client_id, None)
+
+
+def pose_at(stand: Stand) -> tuple[Any, Any, Any, float]:
+    """Return position, look-at point, up direction and vertical angle (radians) of a place to look from."""
+    camera = stand.camera
+    forward, up = camera.viewmat[2, :3], -camera.viewmat[1, :3]
+    fov = float(2.0 * np.arctan2(camera.height / 2.0, camera.K[1, 1]))
+    return camera.eye, camera.eye + stand.distance * forward, up, fov
+
+
+class _View:
+    """One browser."""
+
+    def __init__(
+        self, client: Any, stands: Sequence[Stand], title: str, box: Any, world_transform: Any, wake: threading.Event
+    ) -> None:
+        self._client, self._stands, self._wake = client, stands, wake
+        self.pace = Pace()
+        self._frustums: list[Any] = []
+        self.panel = Panel(client, [stand.camera.name for stand in stands], title, box, world_transform)
+        self.panel.on_change(self._changed)
+        self.panel.on_stand(self.look_from)
+        self.panel.on_frustums(self._show_frustums)
+        client.camera.on_update(self._moved)
+
+    def look_from(self, index: int) -> None:
+        """Move this browser's camera to a place to look from."""
+        position, look_at, up, fov = pose_at(self._stands[index])
+        camera = self._client.camera
+        with self._client.atomic():
+            camera.up_direction, camera.position, camera.look_at, camera.fov = up, position, look_at, fov
+        self._changed()
+
+    def draw(self, scene: SplatScene, note: str) -> int:
+        """Draw what is due; returns how many pictures."""
+        now, camera = time.monotonic(), self._client.camera
+        shot = self.panel.take_screenshot()
+        kind = self.pace.due(now)
+        if kind is None and not shot:
+            return 0
+        self.panel.now = self._state(camera, camera.image_width, camera.image_height)
+        if shot:
+            longest = max(max(stand.camera.width, stand.camera.height) for stand in self._stands)
+            scale = longest / max(camera.image_width, camera.image_height, 1)
+            size = (round(scale * camera.image_width), round(scale * camera.image_height))
+            self.panel.send_screenshot(scene.draw(self._state(camera, *size)).image)
+        if kind is None:
+            return 0
+        width, height = self.pace.size(kind, camera.image_width, camera.image_height, self.panel.longest)
+        self.pace.begin()
+        drawing = scene.draw(self._state(camera, width, height))
+        # JPEG would mix the colours of neighbouring Gaussians
+        form = "png" if self.panel.mode == "dominant" else "jpeg"
+        self._client.scene.set_background_image(drawing.image, format=form, jpeg_quality=90 if kind == "sharp" else 70)
+        self.panel.say(" · ".join(filter(None, [note, drawing.legend, f"{width} x {height}"])))
+        self.pace.drawn(kind, width * height, time.monotonic() - now, time.monotonic())
+        return 1
+
+    def _state(self, camera: Any, width: int, height: int) -> ViewState:
+        viewmat = viewmat_of_pose(camera.wxyz, camera.position)
+        panel = self.panel
+        return ViewState(
+            viewmat, float(camera.fov), max(width, 1), max(height, 1), panel.mode, panel.min_opacity, panel.crop
+        )
+
+    def _moved(self, camera: Any) -> None:
+        self.pace.moved(time.monotonic())
+        self._wake.set()
+
+    def _changed(self) -> None:
+        self.pace.changed()
+        self._wake.set()
+
+    def _show_frustums(self, shown: bool) -> None:
+        if shown and not self._frustums:
+            self._frustums = [self._frustum(i, stand) for i, stand in enumerate(self._stands)]
+        for frustum in self._frustums:
+            frustum.visible = shown
+
+    def _frustum(self, index: int, stand: Stand) -> Any:
+        camera = stand.camera
+        wxyz, position = pose_of_viewmat(camera.viewmat)
+        added = self._client.scene.add_camera_frustum(
+            f"/cameras/{index}",
+            fov=float(2.0 * np.arctan2(camera.height / 2.0, camera.K[1, 1])),
+            aspect=camera.width / camera.height,
+            scale=0.06 * stand.distance,
+            thickness=0.001 * stand.distance,
+            color=(255, 190, 70),
+            image=stand.photo,
+            format="jpeg",
+            wxyz=tuple(wxyz.tolist()),
+            position=tuple(position.tolist()),
+        )
+        added.on_click(lambda event: self.look_from(index))
+        return added

@@ -1,0 +1,264 @@
+"""What a report says about a finished splat, measured by rendering it: overfitting, exposure, floaters; depth, orbit.
+
+The numbers go to report_data/checks_step{step}.json, depth maps to report_data/depth_step{step}_{i}.npz in the order of
+the held-out views' pictures, the orbit to videos/orbit_step{step}.webm: a report is made of files alone.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pop_fast.data.capture import Capture, View
+from pop_fast.errors import PopError
+from pop_fast.io.atomic import write_atomically
+from pop_fast.io.read_back import read_json
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.metrics import measure, psnr
+from pop_fast.train.results import ResultFolder
+from pop_fast.train.views import ViewTensors
+from pop_fast.view.layers import Layers, render_layers
+from pop_fast.view.paths import VideoFile, camera_path
+from pop_fast.view.pictures import fit
+
+# training views that are rendered, evenly over the capture
+_MOST_TRAIN: Final = 12
+# of the worst held-out views there are pictures even where `max_renders` ends before them
+_WORST: Final = 3
+# nearer than this share of the distance of the nearest points, nothing was photographed
+_NEAR: Final = 0.5
+_NEAREST_POINTS: Final = 0.02  # quantile, as a few points are always wrong
+_FEWEST_POINTS: Final = 20
+# what covers a pixel by as much is seen
+_SEEN: Final = 0.1
+_ORBIT_SIDE: Final = 400
+_ORBIT_FRAMES: Final = 60
+_ORBIT_FPS: Final = 15.0
+# what is darker, or as near to white, has lost its brightness
+_DARK: Final = 0.08
+_MOST_PSNR: Final = 100.0  # dB, of equal images
+_FIX: Final = "write it again with 'pop report --check', or remove the file"
+# of display values to light: those of photographs are about a square root of it
+_GAMMA: Final = 2.2
+
+
+@dataclass(frozen=True)
+class Checks:
+    """What was measured.
+
+    Attributes:
+        photographs: training views there are.
+        train_psnr: mean over the training views that were rendered, dB.
+        train_measured: how many these are.
+        held_out_psnr: mean over the held-out views, dB; None where there are none.
+        matched_psnr: the same after each channel of each render was scaled to its photograph's brightness, dB.
+        neighbour_degrees: median over the training cameras of the angle to the nearest other one, seen from the point
+            that they look at.
+        stops: how much brighter each photograph is than its render, in stops of exposure, by view.
+        floaters: share of each held-out view's pixels (training views where none is held out) that Gaussians cover by a
+            tenth or more which are nearer than half the distance of the nearest points; empty without points.
+    """
+
+    photographs: int
+    train_psnr: float
+    train_measured: int
+    held_out_psnr: float | None = None
+    matched_psnr: float | None = None
+    neighbour_degrees: float | None = None
+    stops: Mapping[str, float] = field(default_factory=dict)
+    floaters: Mapping[str, float] = field(default_factory=dict)
+
+
+def write_checks(
+    folder: Path,
+    capture: Capture,
+    params: Mapping[str, Tensor],
+    config: TrainConfig,
+    sh_degree: int,
+    backend: Any,
+    step: int,
+) -> Checks:
+    """Measure a splat and write what a report shows of it.
+
+    Args:
+        folder: the result folder.
+        capture: in the frame of the splat.
+        params: raw parameters.
+        config: of the run.
+        sh_degree: highest active colour band.
+        backend: what renders.
+        step: the last step taken, from 0; it names the files.
+    """
+    results = ResultFolder(folder)
+
+    def looked(view: View, chosen: Mapping[str, Tensor] = params) -> Layers:
+        return render_layers(backend, chosen, ViewTensors.of(view), config, sh_degree)
+
+    train, test = capture.train_views(config.test_every), capture.test_views(config.test_every)
+    some = [train[i] for i in np.unique(np.linspace(0, len(train) - 1, min(len(train), _MOST_TRAIN)).astype(int))]
+    seen = {view.name: looked(view) for view in (*some, *test)}
+    held_out = {view.name: _psnr(view, seen[view.name].image) for view in test}
+    worst = sorted(held_out, key=lambda name: held_out[name])[: min(_WORST, config.max_renders)]
+    for i, view in enumerate(test):
+        layers = seen[view.name]
+        if i < config.max_renders or view.name in worst:
+            stem = f"val_step{step}_{i:04d}"
+            # a run that was stopped has measured nothing at its last step
+            if not (folder / "report_data" / f"{stem}.npz").is_file():
+                _keep_picture(results, stem, view, layers)
+            depth = np.where(layers.alpha >= _SEEN, layers.depth / capture.world_scale, np.nan).astype(np.float32)
+            results.write_arrays(f"depth_step{step}_{i:04d}", name=view.name, depth=fit(depth, nearest=True))
+    checks = Checks(
+        photographs=len(train),
+        train_psnr=float(np.mean([_psnr(view, seen[view.name].image) for view in some])),
+        train_measured=len(some),
+        held_out_psnr=_mean(list(held_out.values())),
+        matched_psnr=_mean([_psnr(view, _matched(view, seen[view.name].image)) for view in test]),
+        neighbour_degrees=neighbour_degrees(np.stack([view.viewmat for view in train])),
+        stops={view.name: stops_between(*_kept(view, seen[view.name].image)) for view in (*some, *test)},
+        # random points say nothing of where things are
+        floaters={} if "random ones" in capture.source else _floaters(capture, test or some, params, looked),
+    )
+    text = json.dumps(asdict(checks), indent=2) + "\n"
+    target = folder / "report_data" / f"checks_step{step}.json"
+    write_atomically(target, lambda file: file.write(text.encode()))
+    _film(folder / "videos" / f"orbit_step{step}.webm", train, looked)
+    return checks
+
+
+def _keep_picture(results: ResultFolder, stem: str, view: View, layers: Layers) -> None:
+    """Write what the report shows of a view that measurements kept no pictures of."""
+    tensors = ViewTensors.of(view)
+    found = measure(torch.from_numpy(layers.image), tensors.target(), tensors.mask)
+    render = np.round(np.clip(layers.image, 0.0, 1.0) * 255.0).astype(np.uint8)
+    results.write_arrays(stem, name=view.name, render=render, photo=view.image, psnr=found.psnr, ssim=found.ssim)
+
+
+def near_limit(view: View, points: np.ndarray) -> float | None:
+    """Give the camera z up to which nothing was photographed: half that of the nearest points in the picture.
+
+    Args:
+        view: the camera.
+        points: of the capture, world. [P, 3]
+
+    Returns:
+        The limit, world units; None where too few points are in the picture to tell.
+    """
+    seen = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    seen = seen[seen[:, 2] > 1e-6]
+    pixels = seen @ view.K.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    inside = ((pixels >= 0.0) & (pixels < [view.width, view.height])).all(axis=1)
+    if inside.sum() < _FEWEST_POINTS:
+        return None
+    return _NEAR * float(np.quantile(seen[inside, 2], _NEAREST_POINTS))
+
+
+def nearer_than(params: Mapping[str, Tensor], view: View, limit: float) -> dict[str, Tensor]:
+    """Select the Gaussians whose centres lie before a camera and nearer than a limit, world units."""
+    axis = torch.from_numpy(view.viewmat[2]).to(params["means"])
+    depths = params["means"].detach() @ axis[:3] + axis[3]
+    chosen = (depths > 0.0) & (depths < limit)
+    return {name: tensor.detach()[chosen] for name, tensor in params.items()}
+
+
+def stops_between(photo: np.ndarray, render: np.ndarray) -> float:
+    """Tell how much brighter a photograph is than a render, in stops: the median over pixels that are neither very dark
+    nor nearly white; 0 where there are none.
+
+    Args:
+        photo: in [0, 1]. [P, 3]
+        render: likewise. [P, 3]
+    """
+    theirs, ours = photo.mean(axis=1), render.mean(axis=1)
+    telling = (np.minimum(ours, theirs) > _DARK) & (np.maximum(ours, theirs) < 1.0 - _DARK)
+    return float(_GAMMA * np.median(np.log2(theirs[telling] / ours[telling]))) if telling.any() else 0.0
+
+
+def neighbour_degrees(viewmats: np.ndarray) -> float | None:
+    """Give the median angle from a camera to the nearest other one, seen from the point they look at. [M, 4, 4]"""
+    from pop_fast.view.paths.cameras import camera_centers, focus_point
+
+    if len(viewmats) < 2:
+        return None
+    offsets = camera_centers(viewmats) - focus_point(viewmats)
+    rays = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)
+    cosines = rays @ rays.T
+    np.fill_diagonal(cosines, -1.0)
+    return float(np.degrees(np.median(np.arccos(np.clip(cosines.max(axis=1), -1.0, 1.0)))))
+
+
+def _floaters(capture: Capture, views: Sequence[View], params: Mapping[str, Tensor], looked: Any) -> dict[str, float]:
+    shares: dict[str, float] = {}
+    for view in views:
+        limit = near_limit(view, capture.points)
+        if limit is None:
+            continue
+        near = nearer_than(params, view, limit)
+        shares[view.name] = float((looked(view, near).alpha >= _SEEN).mean()) if len(near["means"]) else 0.0
+    return shares
+
+
+def _psnr(view: View, image: np.ndarray) -> float:
+    tensors = ViewTensors.of(view)
+    return min(psnr(torch.from_numpy(image), tensors.target(), tensors.mask), _MOST_PSNR)
+
+
+def _kept(view: View, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the photograph's and the render's pixels where the mask keeps them, in [0, 1]. [P, 3] each"""
+    mask = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
+    return view.image[mask] / np.float32(255.0), image[mask]
+
+
+def _matched(view: View, image: np.ndarray) -> np.ndarray:
+    theirs, ours = _kept(view, image)
+    return image * ((ours * theirs).sum(0) / np.maximum((ours * ours).sum(0), 1e-12))
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if values else None
+
+
+def _film(path: Path, train: Sequence[View], looked: Any) -> None:
+    """Film the orbit, as large as fits the report."""
+    lens = train[0]
+    scale = min(1.0, _ORBIT_SIDE / max(lens.width, lens.height))
+    width, height = (max(2, 2 * round(scale * side / 2)) for side in (lens.width, lens.height))
+    K = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.K
+    blank = np.zeros((height, width, 3), np.uint8)
+    with VideoFile(path, _ORBIT_FPS) as video:
+        for i, viewmat in enumerate(camera_path("orbit", np.stack([v.viewmat for v in train]), _ORBIT_FRAMES)):
+            image = looked(View(f"orbit_{i}", blank, viewmat, K)).image
+            video.add(np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8))
+
+
+def read_checks(path: Path) -> Checks:
+    """Read checks_step{step}.json.
+
+    Raises:
+        PopError: it is damaged; names the entry.
+    """
+    entry = read_json(path, _FIX)
+    shares = {"stops", "floaters"}
+    for name, value in entry.items():
+        if name in shares:
+            right = isinstance(value, dict) and all(_is_number(number) for number in value.values())
+        else:
+            right = _is_number(value) or (value is None and name not in ("photographs", "train_psnr", "train_measured"))
+        if not right:
+            raise PopError(f"{path}: {name} is not what a run writes; {_FIX}")
+    try:
+        return Checks(**entry)
+    except TypeError as error:
+        raise PopError(f"{path}: is not what a run writes ({error}); {_FIX}") from error
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e150
