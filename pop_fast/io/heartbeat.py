@@ -8,7 +8,7 @@ import time
 from types import TracebackType
 from typing import Final
 
-__all__ = ["PERIOD", "Heartbeat", "duration"]
+__all__ = ["PERIOD", "Heartbeat", "duration", "so_far"]
 
 # seconds between two lines
 PERIOD: Final = 30.0
@@ -70,3 +70,17 @@ def duration(seconds: float) -> str:
     if whole < 3600:
         return f"{whole // 60} min {whole % 60} s"
     return f"{whole // 3600} h {whole % 3600 // 60} min"
+
+
+def so_far(step: int, of: int, n_gaussians: int, seconds: float, latest: str) -> str:
+    """Tell how far a training is.
+
+    Args:
+        step: steps taken, at least 1.
+        of: steps in all.
+        n_gaussians: how many there are.
+        seconds: that the steps took.
+        latest: what was measured last, in words that begin with a comma, or nothing.
+    """
+    told = f"step {step:,} of {of:,}, {n_gaussians:,} Gaussians{latest}"
+    return f"{told}, {step / max(seconds, 1e-9):.1f} steps a second, {duration(seconds * (of - step) / step)} left"

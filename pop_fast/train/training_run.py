@@ -30,7 +30,7 @@ from pop_fast.density.foreign import ForeignStrategy
 from pop_fast.density.passes import Passes
 from pop_fast.density.protocol import DensificationStep, Draws, Strategy
 from pop_fast.errors import PopError
-from pop_fast.io.heartbeat import Heartbeat, duration
+from pop_fast.io.heartbeat import Heartbeat, so_far
 from pop_fast.io.ply import Frame, save_ply
 from pop_fast.stages.activations import opacities_from_logits
 from pop_fast.train import checkpoint as ckpt
@@ -203,7 +203,9 @@ class TrainingRun:
                 longest = min(self.stepper.longest, config.max_steps if self._watch is None else _WATCHED_STEPS)
                 segment = self.take_steps(segment_end(config, self.strategy, self.step, longest))
                 self._log(segment, bar)
-                beat.say(self._so_far())
+                beat.say(
+                    so_far(self.step, config.max_steps, len(self.params["means"]), self._train_seconds, self._latest)
+                )
                 if self._unwritten is not None:
                     # a rate can be so high that the first step is the last; that is no reason to replace anything
                     self._require_finite()
@@ -220,12 +222,6 @@ class TrainingRun:
         if not self._ranks.writes:
             return {}
         return self._results.read_stats("val", last) or self._evaluate(last)
-
-    def _so_far(self) -> str:
-        seconds = self._train_seconds
-        left = seconds * (self.config.max_steps - self.step) / self.step
-        told = f"step {self.step:,} of {self.config.max_steps:,}, {len(self.params['means']):,} Gaussians"
-        return f"{told}{self._latest}, {self.step / max(seconds, 1e-9):.1f} steps a second, {duration(left)} left"
 
     def take_steps(self, last: int) -> Segment:
         """Take the steps up to `last`, and the densification step that is due after them.

@@ -17,7 +17,8 @@ from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
 from pop_fast.train.batch_stepper import BatchStepper
 from pop_fast.train.engines import engine_of, torch_engine
-from pop_fast.train.fused_stepper import FusedStepper, unsupported
+from pop_fast.train.fused_settings import unsupported
+from pop_fast.train.fused_stepper import FusedStepper
 from pop_fast.train.phases import phase_at
 from pop_fast.train.stepper import Task
 from pop_fast.train.torch_stepper import TorchStepper
