@@ -20,6 +20,7 @@ from pop_fast.cli.arguments import parse
 from pop_fast.cli.errors import describe
 from pop_fast.cli.finish import FinishOptions, finish
 from pop_fast.cli.limits import LimitOptions
+from pop_fast.cli.live_view import LiveView, check_viewer
 from pop_fast.cli.printable import printable
 from pop_fast.cli.said import PLAN, plan_of, said
 from pop_fast.data.sfm_options import SfmOptions
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from pop_fast.train.load_result import CaptureRecord
     from pop_fast.train.ranks import Ranks
     from pop_fast.train.training_run import TrainingRun
-    from pop_fast.view.live.server import LiveViewer
 
 _EXAMPLES: Final = """
     pop train scene                          POP, the paper's 30,000 steps, results in out/scene_pop
@@ -175,7 +175,7 @@ def _train(config: TrainConfig, options: Any, chosen: str, argv: Sequence[str], 
     # absolute, so that the result can be looked at from another folder too
     absolute = replace(config, data=str(Path(config.data).absolute()))
     with ExitStack() as showing:
-        watch = _Watch(capture, options, showing) if options.view and _writes(ranks) else None
+        watch = LiveView(capture, options, showing) if options.view and _writes(ranks) else None
         training = TrainingRun(absolute, capture, beside=beside, watch=watch, **how)
         if options.resume:
             print(_resumption(folder))
@@ -195,47 +195,6 @@ def _trained(training: TrainingRun, folder: Path, capture: Capture, options: Any
         return 0
     print(summary(stats), flush=True)
     return finish(folder, capture, options) or report(folder)
-
-
-class _Watch:
-    """The viewer of a training; see `pop_fast.view.live.follow`."""
-
-    def __init__(self, capture: Capture, options: Any, showing: ExitStack) -> None:
-        self._capture, self._options, self._showing = capture, options, showing
-        self._viewer: LiveViewer | None = None
-
-    def start(self, run: TrainingRun) -> None:
-        """Start the server, and print where it is."""
-        from pop_fast.cli.view import announce, stands_of_capture
-        from pop_fast.view.live.follow import scene_of
-        from pop_fast.view.live.server import LiveViewer
-
-        capture, options = self._capture, self._options
-        stands = stands_of_capture(capture, run.config.test_every, run.params["means"])
-        scene = scene_of(run, capture.world_transform)
-        viewer = LiveViewer(scene, stands, capture.name, options.view_host, options.view_port)
-        self._viewer = self._showing.enter_context(viewer)
-        announce(viewer)
-
-    def __call__(self, run: TrainingRun) -> None:
-        from pop_fast.view.live.follow import follow
-
-        if self._viewer is not None:
-            follow(self._viewer, run, self._capture.world_transform)
-
-
-def check_viewer(options: Any) -> None:
-    """Refuse a viewer that cannot be before the minutes of loading, not after.
-
-    Raises:
-        PopError: viser is absent, or the port is none.
-    """
-    if options.view:
-        from pop_fast.cli.view import check_port
-        from pop_fast.view.live.server import require_viser
-
-        check_port(options.view_port)
-        require_viser()
 
 
 def takes_hours(config: TrainConfig) -> bool:
