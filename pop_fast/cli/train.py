@@ -164,19 +164,14 @@ def _train(config: TrainConfig, options: Any, chosen: str, argv: Sequence[str], 
     print(chosen)
     if takes_hours(config):
         print(f"note: {config.max_steps:,} steps take hours on a CPU; --preset quick takes a tenth of the schedule")
-    how = {
-        "resume": options.resume,
-        "overwrite": options.overwrite,
-        "loading_seconds": loading,
-        "ranks": ranks or ALONE,
-    }
+    how = {"resume": options.resume, "overwrite": options.overwrite, "loading_seconds": loading}
     commands = commands_text(folder if options.resume else None, ["pop", "train", *argv])
     beside = {RECORD: record_text(_record(capture, options)), COMMANDS_FILE: commands}
     # absolute, so that the result can be looked at from another folder too
     absolute = replace(config, data=str(Path(config.data).absolute()))
     with ExitStack() as showing:
         watch = LiveView(capture, options, showing) if options.view and _writes(ranks) else None
-        training = TrainingRun(absolute, capture, beside=beside, watch=watch, **how)
+        training = TrainingRun(absolute, capture, beside=beside, ranks=ranks or ALONE, watch=watch, **how)
         if options.resume:
             print(_resumption(folder))
         if watch is not None:
