@@ -10,7 +10,6 @@ from pop_fast.errors import PopError
 
 # a page that is larger than this is linked, not put into the report
 _LARGEST: Final = 16 * 2**20
-HEADS: Final = ("format", "MB", "B/Gaussian", "of the PLY", "held-out PSNR")
 _KINDS: Final[Mapping[str, tuple[type, ...]]] = {
     "format": (str,),
     "bytes": (int,),
@@ -39,8 +38,14 @@ def checked_encodings(entries: Any, where: str, fix: str) -> list[dict[str, Any]
     return entries
 
 
+def encoding_heads(encodings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    """Return the heads of a table of encodings; few of many held-out views are rendered, and the last head says so."""
+    views = max((entry["views"] for entry in encodings), default=0)
+    return "format", "MB", "B/Gaussian", "of the PLY", f"PSNR of {views} held-out view{'' if views == 1 else 's'}"
+
+
 def encoding_rows(encodings: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """Return the cells of a table of encodings, under `HEADS`.
+    """Return the cells of a table of encodings, under `encoding_heads`.
 
     Args:
         encodings: entries of the statistics, as `pop_fast.train.encodings.Encoding` makes them.
@@ -76,11 +81,12 @@ def viewer_section(page: str | None) -> str:
     )
 
 
-def sizes_section(rows: Sequence[Sequence[str]]) -> str:
-    """Tell what the splat weighs in every format, and what it then is worth."""
-    if not rows:
+def sizes_section(table: Sequence[Sequence[str]]) -> str:
+    """Tell what the splat weighs in every format, and what it then is worth, from heads and rows."""
+    if not table:
         return ""
-    head = "".join(f"<th{'' if k == 0 else ' class=n'}>{name}</th>" for k, name in enumerate(HEADS))
+    heads, *rows = table
+    head = "".join(f"<th{'' if k == 0 else ' class=n'}>{name}</th>" for k, name in enumerate(heads))
     body = "".join(
         "<tr>"
         + "".join(f"<td{'' if k == 0 else ' class=n'}>{escape(cell)}</td>" for k, cell in enumerate(row))

@@ -18,7 +18,7 @@ from pop_fast.train.results import read_config
 from pop_fast.view.report.checks import Checks, read_checks
 from pop_fast.view.report.compare import threads_of
 from pop_fast.view.report.curves import Window
-from pop_fast.view.report.files_section import checked_encodings, encoding_rows
+from pop_fast.view.report.files_section import checked_encodings, encoding_heads, encoding_rows
 from pop_fast.view.report.model import Histogram, ReportData, ReportView, Tile
 from pop_fast.view.report.verdict import verdict
 
@@ -85,7 +85,7 @@ _EVENT_COLUMNS: Final = ("step", "cloned", "split", "pruned", "reset", "num_gaus
 
 def _files(stats: Mapping[str, Any], where: str) -> list[tuple[str, ...]]:
     entries = checked_encodings(stats.get("encodings") or [], where, "train again with --resume, which measures them")
-    return encoding_rows(entries)
+    return [encoding_heads(entries), *encoding_rows(entries)] if entries else []
 
 
 def _viewer(folder: Path) -> str | None:
