@@ -110,7 +110,8 @@ def train_one(check: Check, path: Path, limit: float, backend: str = "cuda") -> 
     """Train on one capture, or go on with the training of an earlier call at the same commit."""
     folder = check.work / f"{path.name}_{backend}_{check.steps_scaler:g}_{check.commit[:12]}"
     words = ["train", str(path), "--out", str(folder), "--backend", backend]
-    words += ["--steps-scaler", str(check.steps_scaler), "--no-progress", "--max-renders", "1", "--skip-sizes"]
+    words += ["--steps-scaler", str(check.steps_scaler), "--no-progress", "--max-renders", "1"]
+    words += ["--skip-sizes", "--skip-checks"]
     words += ["--resume"] if (folder / "cfg.json").exists() else []
     found = check.run(check.python("-c", _TRAIN, *words), limit)
     stats = sorted((folder / "stats").glob("val_step*.json"), key=lambda file: int(file.stem.split("step")[1]))
