@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from pop_ref.conformance.capabilities import STAGES
+from pop_ref.conformance.capabilities import SIGNATURE, STAGES
 
 LAWS = "pop_ref.conformance.laws"
 FAILURES = "conformance_failures"
@@ -113,10 +113,19 @@ def parametrize_backends(metafunc: pytest.Metafunc, backends: list[Any]) -> None
     cases = []
     for backend in backends:
         lacks = missing(backend, stated.needs) if stated else []
-        reason = getattr(backend, "reason", f"{backend.name} has no {', '.join(lacks)}")
+
+        reason = getattr(backend, "reason", None) or f"{backend.name} has no {', '.join(_in_words(backend, lacks))}"
         marks = [pytest.mark.skip(reason=reason)] if lacks or hasattr(backend, "reason") else []
         cases.append(pytest.param(backend, id=backend.name, marks=marks))
     metafunc.parametrize("backend", cases)
+
+
+def _in_words(backend: Any, lacks: list[str]) -> list[str]:
+    """Return what a backend lacks, each with the words in which it refused where it was asked."""
+    from pop_ref.conformance.views import ASKED
+
+    refused = {need: backend.why_not(need) for need in lacks if need in ASKED and backend.has(SIGNATURE)}
+    return [f"{need} ({words.splitlines()[0]})" if (words := refused.get(need)) else need for need in lacks]
 
 
 def _chosen_backends(config: pytest.Config) -> list[Any]:
