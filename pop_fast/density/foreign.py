@@ -69,7 +69,7 @@ class ForeignStrategy:
         self.strategy.step_pre_backward(params, optimizers, state, step, info)
 
     def collect(self, params: Params, state: State, step: int, info: Info, packed: bool = False) -> None:
-        """Keep what the step's render told for `change`, in which the strategy itself collects."""
+        """Keep what the step's render returned for `change`, in which the strategy itself collects."""
         self._info = info
 
     def change(

@@ -22,7 +22,7 @@ from pop_ref.conformance.capabilities import SIGNATURE, STAGES
 LAWS = "pop_ref.conformance.laws"
 FAILURES = "conformance_failures"
 # the lines of a failure's report that say what differs first (`failure_report`)
-TOLD = re.compile(
+DIFFERENCES = re.compile(
     r"^E +((?:first|nearest|no) (?:stage|pixel|Gaussian|gradient|decision)\b.*|saved as .*)$", re.MULTILINE
 )
 
@@ -213,16 +213,16 @@ class _Recorder:
         named: Any = dict(report.user_properties).get("law")
         if named is None or not (report.when == "call" or report.skipped or report.failed):
             return
-        detail, told = "", ()
+        detail, differences = "", ()
         if report.skipped and isinstance(report.longrepr, tuple):
             detail = str(report.longrepr[2]).removeprefix("Skipped: ")
         elif report.failed:
             crash = getattr(report.longrepr, "reprcrash", None)
             detail = str(crash.message if crash else report.longrepr).splitlines()[0]
-            told = tuple(TOLD.findall(report.longreprtext))
+            differences = tuple(DIFFERENCES.findall(report.longreprtext))
         backend, stage, law = named
         cpu: Any = dict(report.user_properties).get("cpu", 0.0)
-        self.card.entries.append(Entry(backend, stage, law, report.outcome, detail, report.duration, told, cpu))
+        self.card.entries.append(Entry(backend, stage, law, report.outcome, detail, report.duration, differences, cpu))
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item: pytest.Item) -> Generator[None, Any, Any]:

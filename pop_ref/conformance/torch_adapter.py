@@ -221,19 +221,19 @@ class TorchAdapter(Adapter):
         image, alphas, meta = drawn
         H, W, N = scene.camera.height, scene.camera.width, len(scene.gaussians)
         T_final = meta.get("final_T")
-        told: dict[str, Any] = {}
+        shown: dict[str, Any] = {}
         # reading what was not asked for may draw anew
         if dominance or "dominance" not in self._instruments:
-            told |= {name: (meta.get(name), (H, W)) for name in ("dominant_ids", "dominant_weights")}
-            told["dominant_counts"] = (meta.get("dominant_counts"), (N,))
+            shown |= {name: (meta.get(name), (H, W)) for name in ("dominant_ids", "dominant_weights")}
+            shown["dominant_counts"] = (meta.get("dominant_counts"), (N,))
         if counts or "counts" not in self._instruments:
-            told |= {"n_blended": (meta.get("n_contrib"), (H, W)), "n_traversed": (meta.get("n_traversed"), (H, W))}
+            shown |= {"n_blended": (meta.get("n_contrib"), (H, W)), "n_traversed": (meta.get("n_traversed"), (H, W))}
         shapes = {"radii": (N, 2), "means2d": (N, 2), "depths": (N,), "conics": (N, 3)}
-        told |= {name: (meta.get(name), shape) for name, shape in shapes.items()}
+        shown |= {name: (meta.get(name), shape) for name, shape in shapes.items()}
         return View(
             image=self._array(image).reshape(H, W, -1),
             T_final=self._array(T_final if T_final is not None else 1.0 - alphas).reshape(H, W),
-            **{name: None if x is None else self._array(x).reshape(shape) for name, (x, shape) in told.items()},
+            **{name: None if x is None else self._array(x).reshape(shape) for name, (x, shape) in shown.items()},
         )
 
     def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
@@ -306,8 +306,8 @@ class TorchAdapter(Adapter):
                 of_screen = {"means2d": self._grad_of(means2d)}
                 of_screen |= {} if absolute is None else {"means2d_abs": self._array(absolute)}
                 gradients |= {name: unpacked(call, value, meta) for name, value in of_screen.items()}
-        told = {name: self._array(meta[name]) for name in meta if meta[name] is not None}
-        return Called(self._array(images), self._array(alphas), told, gradients)
+        shown = {name: self._array(meta[name]) for name in meta if meta[name] is not None}
+        return Called(self._array(images), self._array(alphas), shown, gradients)
 
     def _asked_by(self, call: Call) -> dict[str, Any]:
         """Return the arguments of a call that are not at gsplat's defaults, and the profile for who takes one."""
