@@ -1,12 +1,12 @@
 """Taming-3DGS: growth to a budget, by sampling from a score of nine terms.
 
-Source: Mallick et al. 2024 and its code. Every 500 steps the Gaussians may grow in number, along a
-parabola from the first number to the budget (`pop_ref.taming`). Ten training views score each Gaussian by the view's
-loss times nine terms; of those that 3DGS would clone or split, as many as the parabola has room for are drawn by score. Of those that 3DGS would prune,
-only who is drawn too goes, half as many as there are, by the inverse of the score; the last densification step prunes
-all. The bands beyond the first move each 16 steps by the sum of their gradients, opacities not at all after step
-15,000, where the code hands Adam a tensor that it does not train. Everything else is 3DGS of 2024, with twice its rate
-for these bands.
+Source: Mallick et al. 2024 and its code. Every 500 steps the Gaussians may grow in number, along a parabola from the
+first number to the budget (`pop_ref.taming`). Ten training views score each Gaussian by the view's loss times nine
+terms; of those that 3DGS would clone or split, as many as the parabola has room for are drawn by score. Of those that
+3DGS would prune, only who is drawn too goes, half as many as there are, by the inverse of the score; the last
+densification step prunes all. The bands beyond the first move each 16 steps by the sum of their gradients, opacities
+not at all after step 15,000, where the code hands Adam a tensor that it does not train. Everything else is 3DGS of
+2024, with twice its rate for these bands.
 """
 
 from __future__ import annotations
