@@ -8,6 +8,8 @@ Nothing is typed by hand: the outputs are those of one run, each no longer than 
 
 from __future__ import annotations
 
+import base64
+import json
 import os
 import re
 import shutil
@@ -16,11 +18,13 @@ import subprocess
 import sys
 import tempfile
 import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+from websockets.sync.client import connect
 
 from paper_repro.cli import COMMANDS as REPRO_COMMANDS
 from pop_fast.cli import COMMANDS as OF_POP
@@ -44,7 +48,7 @@ class Run:
         words: what is typed.
         picture: draws the picture's PNG from the folder that everything runs in; None where text is all.
         caption: of the picture.
-        seconds: after which Ctrl-C is sent, for a command that waits for it.
+        seconds: until it is ended, for a command that serves until then.
     """
 
     of: str
@@ -54,20 +58,50 @@ class Run:
     seconds: float | None = None
 
 
-def shot(page: str, width: int = WIDEST, height: int = 700) -> Picture:
-    """Return what photographs a page in a browser; `page` is an address or a file of the folder."""
+def shot(page: str, width: int = WIDEST, height: int = 700, seconds: float = 4.0) -> Picture:
+    """Return what photographs a page in a browser.
+
+    Args:
+        page: an address, or a file of the folder.
+        width, height: of the window, px.
+        seconds: that the page is given to draw itself.
+    """
 
     def take(folder: Path, png: Path) -> None:
         program = chromium()
         if program is None:
             raise SystemExit("the pictures of pages need Chromium: apt install chromium, or set CHROMIUM")
         address = page if "://" in page else (folder / page).resolve().as_uri()
-        with tempfile.TemporaryDirectory() as profile:
-            gl = [option for option in OPTIONS if option != "--disable-gpu"] + ["--enable-unsafe-swiftshader"]
-            words = [program, *gl, f"--user-data-dir={profile}", f"--window-size={width},{height}", "--timeout=20000"]
-            subprocess.run([*words, f"--screenshot={png}", address], check=True, capture_output=True, timeout=120)
+        options = [option for option in OPTIONS if option != "--disable-gpu"]
+        options += ["--enable-unsafe-swiftshader", f"--window-size={width},{height}", "--remote-debugging-port=0"]
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+            browser = subprocess.Popen(
+                [program, *options, f"--user-data-dir={profile}", address], stderr=subprocess.DEVNULL
+            )
+            try:
+                png.write_bytes(_photographed(Path(profile), seconds))
+            finally:
+                browser.terminate()
+                browser.wait()
 
     return take
+
+
+def _photographed(profile: Path, seconds: float) -> bytes:
+    """Ask the browser of a profile for a PNG of its page, by the DevTools protocol."""
+    port = profile / "DevToolsActivePort"
+    for _ in range(100):
+        if port.exists():
+            break
+        time.sleep(0.2)
+    time.sleep(seconds)
+    with urllib.request.urlopen(f"http://127.0.0.1:{port.read_text().split()[0]}/json/list") as answer:
+        page = next(target for target in json.load(answer) if target["type"] == "page")
+    with connect(page["webSocketDebuggerUrl"], max_size=None) as wire:
+        wire.send(json.dumps({"id": 1, "method": "Page.captureScreenshot"}))
+        while (message := json.loads(wire.recv())).get("id") != 1:
+            pass
+    return base64.b64decode(message["result"]["data"])
 
 
 def tiles(pattern: str, count: int = 4) -> Picture:
@@ -97,7 +131,7 @@ RUNS = (
     Run("eval", "pop eval out/pop"),
     Run("render", "pop render out/pop --out views", tiles("views/*.png", 3), "held-out views"),
     Run("render", "pop render out/pop --path orbit --video orbit.webm"),
-    Run("view", "pop view out/pop --port 8099", shot("http://127.0.0.1:8099", 1100, 650), "in the browser", 60.0),
+    Run("view", "pop view out/pop --port 8099", shot("http://127.0.0.1:8099", 1100, 650, 20.0), "in the browser", 60.0),
     Run(
         "explain",
         "pop explain out/pop --view 3 --pixel 80,60 --html why.html",
@@ -143,7 +177,7 @@ def ran(run: Run, folder: Path) -> str:
     if run.seconds is not None:
         time.sleep(run.seconds / 4)
         drawn(run, folder)
-        os.killpg(process.pid, signal.SIGINT)
+        os.killpg(process.pid, signal.SIGTERM)
     return process.communicate()[0]
 
 

@@ -112,6 +112,38 @@ def _tile_above_the_image(sound: Rasterization, given: dict[str, Any]) -> Any:
     return images, alphas, {**meta, "isect_ids": (tile << 40) | (image << 32) | (keys & 0xFFFFFFFF)}
 
 
+def _expected_depth_of_a_constant_opacity(sound: Rasterization, given: dict[str, Any]) -> Any:
+    if not given["render_mode"].endswith("ED"):
+        return sound(**given)
+    images, alphas, meta = sound(**given | {"render_mode": given["render_mode"].replace("ED", "D")})
+    # an image of its own, as a tensor that shares storage with what autograd keeps must not be written to
+    images = images.clone()
+    images[..., -1:] = images[..., -1:] / alphas.detach().clamp_min(1e-10)
+    return images, alphas, meta
+
+
+def _tiles_counted_in_a_byte(sound: Rasterization, given: dict[str, Any]) -> Any:
+    images, alphas, meta = sound(**given)
+    return images, alphas, {**meta, "tiles_per_gauss": meta["tiles_per_gauss"] & 255}
+
+
+def _dominant_packed_rows(sound: Rasterization, given: dict[str, Any]) -> Any:
+    images, alphas, meta = sound(**given)
+    if not given["packed"]:
+        return images, alphas, meta
+    ids, n = meta["dominant_ids"], given["means"].shape[-2]
+    rows = ids.new_zeros((meta["n_cameras"], n))
+    for camera in range(meta["n_cameras"]):
+        present = meta["gaussian_ids"][meta["camera_ids"] == camera]
+        rows[camera, present] = ids.new_tensor(range(len(present)))
+    wrong = rows.gather(1, ids.clamp_min(0).flatten(-2).reshape(meta["n_cameras"], -1)).reshape(ids.shape)
+    return images, alphas, {**meta, "dominant_ids": wrong.where(ids >= 0, ids)}
+
+
+def _just_below_the_far_plane(given: dict[str, Any]) -> float:
+    return float(given["far_plane"]) * (1.0 - 2.0**-20)
+
+
 def _accumulated_for_expected(given: dict[str, Any]) -> str:
     return given["render_mode"].replace("ED", "D")
 
@@ -179,6 +211,30 @@ BLACK_BOXES: Final = (
         "the expected depth is the accumulated one: nobody divides by the opacity",
         _with(render_mode=_accumulated_for_expected),
         "test_signature_depth:the_expected_depth_is_the_accumulated_one_over_the_opacity",
+    ),
+    BlackBox(
+        "expected_depth_of_a_constant_opacity",
+        "the opacity by which the expected depth is divided has no gradient",
+        _expected_depth_of_a_constant_opacity,
+        "test_signature_depth:the_expected_depth_is_the_accumulated_one_over_the_opacity",
+    ),
+    BlackBox(
+        "tiles_counted_in_a_byte",
+        "a splat that lies over more than 255 tiles begins to count them from 0 again",
+        _tiles_counted_in_a_byte,
+        "test_signature_meta:a_splat_over_hundreds_of_tiles_counts_all_of_them",
+    ),
+    BlackBox(
+        "dominant_packed_rows",
+        "dominant ids of packed rows are row numbers, not Gaussians",
+        _dominant_packed_rows,
+        "test_signature_meta:dominant_ids_are_of_gaussians_and_not_of_packed_rows",
+    ),
+    BlackBox(
+        "far_plane_exclusive",
+        "a centre on the far plane is culled",
+        _with(far_plane=_just_below_the_far_plane),
+        f"{ARGUMENTS}:a_centre_on_the_far_plane_is_drawn_and_one_on_the_near_plane_as_the_profile_says",
     ),
     BlackBox(
         "covariances_counted_once",
