@@ -23,10 +23,20 @@ KEPT: Final = 192
 # Gaussians of the largest scene that is remembered
 LARGEST: Final = 256
 
+# the answers of every function that keeps some
+_ALL: Final[list[OrderedDict[Hashable, Any]]] = []
+
+
+def forget() -> None:
+    """Forget every answer; whoever breaks the oracle itself must, before and after."""
+    for kept in _ALL:
+        kept.clear()
+
 
 def remembered(answer: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function of a scene and of arrays or plain values that keeps its latest answers, which are read only."""
     kept: OrderedDict[Hashable, Any] = OrderedDict()
+    _ALL.append(kept)
 
     @functools.wraps(answer)
     def asked(scene: Scene, *more: Any) -> Any:

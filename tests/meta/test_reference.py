@@ -6,7 +6,7 @@ import numpy as np
 
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.corners import corners
-from pop_ref.conformance.reference import KEPT, LARGEST, Reference, remembered
+from pop_ref.conformance.reference import KEPT, LARGEST, Reference, forget, remembered
 from pop_ref.conformance.scenes import Scene, cotangents
 from pop_ref.conformance.strategies import wide_scene
 from pop_ref.constants import GSPLAT_1_6
@@ -65,6 +65,9 @@ def test_the_oldest_answers_and_large_scenes_are_forgotten() -> None:
     for number in (*range(KEPT + 1), 0):
         answer(scene, number)
     assert asked == [*range(KEPT + 1), 0]
+    forget()
+    answer(scene, 0)
+    assert asked[-2:] == [0, 0]
     many = wide_scene(0)
     times = -(-(LARGEST + 1) // len(many.gaussians))
     large = many.rows(np.tile(np.arange(len(many.gaussians)), times))
