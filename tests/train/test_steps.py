@@ -18,7 +18,7 @@ from tests.train.scene import RECIPE, SHORT, STEPS, capture
 
 EVERYTHING = {"gradient clone", "gradient split", "blur clone", "blur split", "faint", "too big", "reset"}
 # steps in which a decision was so close to its threshold that the oracle cannot say what is right; measured: 0 of 90
-MOST_IN_DOUBT = 2
+MOST_IN_DOUBT = 1
 
 
 def run_of(recipe: Any, folder: Path, engine: Any, dtype: torch.dtype = torch.float32) -> TrainingRun:
