@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import pkgutil
 from collections.abc import Iterable
@@ -36,6 +37,15 @@ def judge_own_backends(metafunc: pytest.Metafunc) -> None:
     What trains counts among those; every other stage is the same code there, so that its laws have nothing to judge.
     """
     stated = getattr(metafunc.function, "law", None)
-    compiled: list[Any] = [shipped_or_absent(name) for name in ("compiled64", "compiled32")]
+    everywhere, compiled = own_backends()
     concerned = [b for b in compiled if isinstance(b, Absent) or not (stated and missing(b, stated.needs))]
-    parametrize_backends(metafunc, [*map(shipped, SHIPPED), *concerned])
+    parametrize_backends(metafunc, [*everywhere, *concerned])
+
+
+@functools.cache
+def own_backends() -> tuple[list[Any], list[Any]]:
+    """Return the adapters of what is judged everywhere, and of the compiled stages.
+
+    An adapter asks its program once what it offers; made anew for each law, it would ask for each.
+    """
+    return [shipped(name) for name in SHIPPED], [shipped_or_absent(name) for name in ("compiled64", "compiled32")]

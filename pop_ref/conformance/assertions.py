@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from pop_ref.conformance import tolerances
-from pop_ref.conformance.adapter import OracleAdapter
-from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bounds
+from pop_ref.conformance.error_bounds import PixelErrorBounds
+from pop_ref.conformance.reference import error_bounds_of
 from pop_ref.conformance.scenes import Scene
 from pop_ref.margins import margins
 
@@ -72,12 +72,11 @@ def with_error_bounds(backend: Any, scene: Scene) -> tuple[Scene, PixelErrorBoun
     # not at the top: portable vectors are made and checked without Hypothesis
     from hypothesis import assume
 
-    seen, lists = backend.sees(scene), None
+    seen = backend.sees(scene)
     if seen.profile.extent == "square":
         # here extents and tile lists are part of the meaning; where rounding decides them, nothing is said
         assume(not extent_near_threshold(seen, backend.dtype))
-        lists = OracleAdapter().full_render(seen).tile_lists
-    error_bounds = pixel_error_bounds(seen, backend.dtype, lists)
+    error_bounds = error_bounds_of(seen, backend.dtype)
     assume(error_bounds.worst_condition() * error_bounds.reach < WORST_CONDITION)
     return seen, error_bounds
 

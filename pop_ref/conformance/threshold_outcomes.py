@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from pop_ref.conformance import tolerances
-from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.assertions import assert_same_bits, assert_same_image, assert_same_transmittance
 from pop_ref.conformance.error_bounds import Layer, PixelErrorBounds
+from pop_ref.conformance.reference import Reference
 from pop_ref.conformance.scenes import Scene
 from pop_ref.pixel import Pixel, SplatRows, composite_pixel
 
@@ -86,7 +86,7 @@ def assert_one_of_the_oracles_outcomes(
         error_bounds: of the scene.
         drawn: the backend's view of it, if it is not to be drawn by `render`.
     """
-    expected, view = OracleAdapter().render(scene), backend.render(scene) if drawn is None else drawn
+    expected, view = Reference().render(scene), backend.render(scene) if drawn is None else drawn
     assert_same_image("agreement.image", backend, view.image, expected.image, error_bounds, against_oracle=True)
     assert_same_transmittance(
         "agreement.T_final", backend, view.T_final, expected.T_final, error_bounds, against_oracle=True

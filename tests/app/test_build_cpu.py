@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
+import sys
 from pathlib import Path
 
 import pytest
@@ -25,9 +26,49 @@ NO_GPU = "there is no GPU in this test"
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="there is no C++ compiler")
 
 
+# a compiler that remembers: ten seconds for each of a dozen builds of the same sources would show nothing more
+REMEMBERING = """#!{python} -IS
+import hashlib, os, shutil, subprocess, sys
+
+words = sys.argv[1:]
+at = words.index("-o") + 1
+units = [word for word in words if word.endswith(".cpp")]
+folder = os.path.dirname(units[0])
+asked = [word for word in words if word not in units and word != words[at]]
+key = hashlib.sha256(repr((asked, list(map(os.path.basename, units)))).encode())
+for name in sorted(os.listdir(folder)):
+    if name.endswith((".h", ".cpp")):
+        key.update(name.encode())
+        key.update(open(os.path.join(folder, name), "rb").read())
+kept = os.path.join({kept!r}, key.hexdigest())
+if not os.path.exists(kept):
+    status = subprocess.run([*{real!r}, *words]).returncode
+    if status:
+        sys.exit(status)
+    beside = kept + "." + str(os.getpid())
+    shutil.copyfile(words[at], beside)
+    os.replace(beside, kept)
+shutil.copyfile(kept, words[at])
+"""
+
+
+@pytest.fixture(scope="session")
+def remembering(tmp_path_factory: pytest.TempPathFactory) -> str | None:
+    """Return a command that compiles as the compiler of this machine, the same sources once; None without one."""
+    real, folder = find_compiler(), tmp_path_factory.mktemp("remembered")
+    if real is None:
+        return None
+    program = folder / "remembering"
+    program.write_text(REMEMBERING.format(python=sys.executable, kept=str(folder), real=real))
+    program.chmod(0o755)
+    return str(program)
+
+
 @pytest.fixture
-def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, remembering: str | None) -> Path:
     """A package whose blend was never compiled."""
+    if remembering is not None:
+        monkeypatch.setenv("CXX", remembering)
     for name in building.SOURCES:
         (tmp_path / name).write_bytes((building.HERE / name).read_bytes())
     monkeypatch.setattr(building, "HERE", tmp_path)
@@ -120,22 +161,16 @@ def test_a_library_that_no_longer_loads_is_compiled_again(fresh: Path, pop: Pop)
 
 @needs_compiler
 def test_the_compiler_that_is_asked_for_is_the_one_that_runs(
-    fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch
+    fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch, remembering: str
 ) -> None:
     monkeypatch.setenv("CXX", "clang++-of-tomorrow")
     outcome = pop("build-cpu")
     assert outcome.status == 2
     assert "CXX is 'clang++-of-tomorrow', which is not on this machine" in outcome.err
-    monkeypatch.setenv("CXX", f"env {(find_compiler_without_cxx() or ['g++'])[0]}")
+    monkeypatch.setenv("CXX", f"env {remembering}")
     outcome = pop("build-cpu", "--verbose")
     assert outcome.status == 0, outcome.err
     assert outcome.out.split()[0].endswith("/env")
-
-
-def find_compiler_without_cxx() -> list[str] | None:
-    with pytest.MonkeyPatch.context() as without:
-        without.delenv("CXX", raising=False)
-        return find_compiler()
 
 
 def test_a_compiler_that_does_not_run_is_named(fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,6 +187,7 @@ def test_a_compiler_that_does_not_run_is_named(fresh: Path, pop: Pop, monkeypatc
 def test_without_a_compiler_it_says_which_to_install(
     fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.delenv("CXX", raising=False)
     monkeypatch.setattr(building, "find_compiler", lambda: None)
     outcome = pop("build-cpu")
     assert outcome.status == 2

@@ -99,6 +99,7 @@ def test_a_process_whose_fellow_has_ended_says_so(together: Path) -> None:
 
 def test_pop_train_is_one_command_for_two_processes(shared_capture: Path, tmp_path: Path) -> None:
     settings = ["--steps-scaler", "0.0003", "--no-progress", "--backend", "fast", "--batch-size", "2", "--threads", "1"]
+    settings += ["--skip-sizes", "--skip-checks", "--max-renders", "1"]
     first, second = launched(["-m", "pop_fast.cli", "train", shared_capture, "--out", tmp_path / "two", *settings])
     assert (first.status, second.status) == (0, 0), (first.err, second.err)
     assert "Gaussians" in first.out

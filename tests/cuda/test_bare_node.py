@@ -6,6 +6,7 @@ The kernels are emulated and the cases tiny (`--rehearse`); everything else is w
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,7 @@ from tests.cuda.bare_node import (
     make_bare_node,
     stand_in_gsplat,
 )
+from tests.cuda.emulated.conftest import FOLDER
 
 ROOT = Path(__file__).resolve().parents[2]
 WHEELS = ("plyfile", "tyro", "typeguard", "docstring_parser", "typing_extensions")
@@ -44,6 +46,9 @@ def node(tmp_path_factory) -> tuple[Path, Path]:
     assert pop(words) == 0
     tree = copy_of_the_tree(ROOT, tmp / "tree")
     assert not (tree / ".git").exists()
+    # what is compiled of the same sources with the same flags is taken as it is; were the copy another, it would not be
+    compiled = emulate.build(FOLDER).parent
+    shutil.copytree(compiled, tree / "tests" / "cuda" / "emulated" / "build" / compiled.name)
     python = make_bare_node(tmp / "python")
     packed = tree / "out" / "gpu_pack"
     options = ["--no-wheels", "--runs", str(run), "--captures", str(capture), "--pixels", "1000"]

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 import pop_ref
+from pop_ref.conformance.reference import forget
 from pop_ref.magnitudes import Rounded
 
 NUDGE = 1.0 + 2.0**-10
@@ -101,8 +102,10 @@ def broken(function: Callable[..., Any]) -> Iterator[None]:
     ]
     for module, name in places:
         setattr(module, name, wrong)
+    forget()
     try:
         yield
     finally:
         for module, name in places:
             setattr(module, name, function)
+        forget()

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -21,6 +24,11 @@ from pop_ref.conformance.corpus_answers import (
 QUICK = ("fifty", "slanted", "hundreds_in_a_tile", "many_tiles", "fifty_of_inria", "hundreds_of_inria")
 
 
+@functools.cache
+def drawn_of(name: str) -> Any:
+    return OracleAdapter().full_render(corpus_scene(name))
+
+
 @pytest.mark.parametrize("name", QUICK)
 def test_the_answers_are_the_oracles(name: str) -> None:
     kept, again = answers(name), answer(name)
@@ -38,7 +46,7 @@ def test_the_answers_are_the_oracles(name: str) -> None:
 @pytest.mark.parametrize("name", sorted(set(PLANS) - set(QUICK)))
 def test_the_images_and_two_windows_of_the_answers_are_the_oracles(name: str) -> None:
     kept, scene = answers(name), corpus_scene(name)
-    drawn = OracleAdapter().full_render(scene)
+    drawn = drawn_of(name)
     seen = np.concatenate([drawn.image, drawn.T_final[..., None]], axis=2)
     np.testing.assert_allclose(seen[picked_pixels(scene)], kept["pixels"], rtol=1e-10)
     np.testing.assert_allclose(weighted_blocks(seen, kept["unambiguous"]), kept["blocks"], rtol=1e-10)
@@ -52,7 +60,7 @@ def test_the_images_and_two_windows_of_the_answers_are_the_oracles(name: str) ->
 def test_the_corpus_has_long_lists_many_tiles_many_entries_and_cut_tiles() -> None:
     longest, tiles, entries, blended = [], [], [], []
     for name, plan in PLANS.items():
-        drawn = OracleAdapter().full_render(corpus_scene(name))
+        drawn = drawn_of(name)
         lengths = [len(ids) for ids in drawn.tile_lists]
         longest.append(max(lengths))
         blended.append(int(drawn.n_blended.max()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,8 @@ from tests.train.oracle_steps import Judged, config_of, judged_step
 from tests.train.scene import RECIPE, SHORT, STEPS, capture
 
 EVERYTHING = {"gradient clone", "gradient split", "blur clone", "blur split", "faint", "too big", "reset"}
-# steps in which a decision was so close to its threshold that the oracle cannot say what is right; measured: 0 of 300
-MOST_IN_DOUBT = 5
+# steps in which a decision was so close to its threshold that the oracle cannot say what is right; measured: 0 of 90
+MOST_IN_DOUBT = 1
 
 
 def run_of(recipe: Any, folder: Path, engine: Any, dtype: torch.dtype = torch.float32) -> TrainingRun:
@@ -25,8 +26,13 @@ def run_of(recipe: Any, folder: Path, engine: Any, dtype: torch.dtype = torch.fl
     return TrainingRun(config_of(recipe, folder / "run", seed=7), capture(), engine=engine, initial=initial)
 
 
+def each_judged(run: TrainingRun, recipe: Any, steps: int) -> Iterator[Judged]:
+    scale = capture().scene_scale()
+    return (judged_step(run, recipe, scale) for _ in range(steps))
+
+
 def judged(run: TrainingRun, recipe: Any, steps: int) -> list[Judged]:
-    return [judged_step(run, recipe, capture().scene_scale()) for _ in range(steps)]
+    return list(each_judged(run, recipe, steps))
 
 
 def agree(steps: list[Judged]) -> None:
@@ -49,12 +55,12 @@ def test_ten_steps_in_double_precision_are_the_oracles_to_the_last_digits(tmp_pa
 
 
 @pytest.mark.slow
-def test_three_hundred_steps_through_every_kind_of_event_are_the_oracles(engine: Any, tmp_path: Path) -> None:
+def test_ninety_steps_through_every_kind_of_event_are_the_oracles(engine: Any, tmp_path: Path) -> None:
     steps = judged(run_of(RECIPE, tmp_path, engine), RECIPE, STEPS)
     agree(steps)
     assert set().union(*(step.happened for step in steps)) == EVERYTHING
     # before the first reset, while the loss is the same
-    assert sum(step.loss for step in steps[64:68]) < 0.8 * sum(step.loss for step in steps[:4])
+    assert sum(step.loss for step in steps[24:28]) < 0.8 * sum(step.loss for step in steps[:4])
 
 
 WRONG = {
@@ -70,5 +76,5 @@ WRONG = {
 @pytest.mark.parametrize("what", WRONG)
 def test_a_run_with_another_setting_is_found_out(what: str, tmp_path: Path) -> None:
     run = run_of(replace(SHORT, **WRONG[what]), tmp_path, torch_engine("fast"))
-    steps = judged(run, SHORT, 10)
-    assert any(step.differences and not step.doubtful for step in steps)
+    # the first step that is found out is enough
+    assert any(step.differences and not step.doubtful for step in each_judged(run, SHORT, 10))
