@@ -28,7 +28,7 @@ def notebook(chapter: Chapter) -> str:
     """Write a chapter as a notebook that has not been run, in nbformat 4.5.
 
     Imports, drawing, checks, fixtures and answers are code cells of their own whose source is folded; what they show
-    stays in sight.
+    stays in sight. Each code cell's metadata names the line of the chapter's file at which its chapter's cell begins.
 
     Args:
         chapter: as `read_chapter` gave it.
@@ -45,7 +45,11 @@ def notebook(chapter: Chapter) -> str:
     )
     cells = [_prose(about)]
     for cell in chapter.cells:
-        cells += _told(cell) if cell.kind == "prose" else _done(cell)
+        made = _told(cell) if cell.kind == "prose" else _done(cell)
+        for each in made:
+            if each["cell_type"] == "code":
+                each["metadata"] |= {"chapter_line": cell.line}
+        cells += made
     for i, each in enumerate(cells):
         each["id"] = f"cell-{i}"
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
@@ -106,7 +110,7 @@ def _prose(text: str) -> dict[str, Any]:
 
 
 def _code(text: str, folded: bool) -> dict[str, Any]:
-    metadata = {"jupyter": {"source_hidden": True}} if folded else {}
+    metadata: dict[str, Any] = {"jupyter": {"source_hidden": True}} if folded else {}
     empty = {"execution_count": None, "outputs": []}
     return {
         "cell_type": "code",
