@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from pop_ref.walkthrough.cells import FOLDER, Cell, Chapter
 from pop_ref.walkthrough.directives import expanded
-from pop_ref.walkthrough.folding import parts, said_and_done
+from pop_ref.walkthrough.folding import names_in, parts, said_and_done
 
 _WIDGET: Final = re.compile(r"^\{\{widget: (\w+)\}\}$", re.MULTILINE)
 _LINK: Final = re.compile(r"\]\((chapter_\w+)\.py\)")
@@ -45,7 +45,7 @@ def notebook(chapter: Chapter) -> str:
     )
     cells = [_prose(about)]
     for cell in chapter.cells:
-        made = _told(cell) if cell.kind == "prose" else _done(cell)
+        made = _told(cell) if cell.kind == "prose" else _done(chapter, cell)
         for each in made:
             if each["cell_type"] == "code":
                 each["metadata"] |= {"chapter_line": cell.line}
@@ -95,14 +95,15 @@ def _told(cell: Cell) -> list[dict[str, Any]]:
     return cells
 
 
-def _done(cell: Cell) -> list[dict[str, Any]]:
+def _done(chapter: Chapter, cell: Cell) -> list[dict[str, Any]]:
     if cell.kind == "answer":
         said, code = said_and_done(cell.text)
         told = f"<details><summary>Answer</summary>\n\n{expanded(said)}\n\n</details>"
         return [*([_prose(told)] if said else []), _code(code, folded=True)]
     if cell.kind == "setup":
         return [_code(cell.text, folded=True)]
-    return [_code(part.text, folded=part.role != "plain") for part in parts(cell.text)]
+    cut = parts(cell.text, names_in(chapter.code_after(cell)))
+    return [_code(part.text, folded=part.role != "plain") for part in cut]
 
 
 def _prose(text: str) -> dict[str, Any]:
