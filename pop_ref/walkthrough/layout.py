@@ -235,7 +235,9 @@ def _figure(chapter: Chapter, cell: Cell, name: str, picture: Picture) -> str:
         shown = f'<img src="data:image/png;base64,{data}" {size} alt="{escape(picture.caption)}">'
     else:
         shown = _inline_svg(picture.svg, name, picture.caption)
-    return f'<figure><div class="wide">{shown}</div><figcaption>{caption}</figcaption></figure>'
+    # on a phone a picture is at least so wide that its letters can be read
+    least = f'style="--least:{picture.width * 80:.0f}px"'
+    return f'<figure><div class="wide" {least}>{shown}</div><figcaption>{caption}</figcaption></figure>'
 
 
 def _inline_svg(svg: str, name: str, caption: str) -> str:
