@@ -351,8 +351,8 @@ for panel, (name, each) in zip(panels, runs.items(), strict=False):
     for kind, rows in KINDS.items():
         lines = panel.plot(each[0][1][:, rows], color=shades[kind], lw=1.0)
         lines[0].set_label(kind)
-    panel.set(title=f"opacities: {name}", xlabel="step", ylim=(-0.02, 1.02))
-panels[0].legend(loc="upper left")
+    panel.set(title=f"opacities: {name}", xlabel="step", ylim=(-0.02, 1.25))
+panels[0].legend(loc="upper left", ncols=3)
 for (name, each), shade in zip(runs.items(), (INK, SECOND, ACCENT), strict=True):
     panels[3].plot(
         np.mean([run[0] for run in each], axis=0), color=shade, lw=1.2, label=name
