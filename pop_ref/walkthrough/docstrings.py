@@ -7,7 +7,7 @@ import re
 from typing import Final
 
 # in characters
-PAGE: Final = 88
+PAGE: Final = 96
 _SIGNATURE: Final = re.compile(r"^def (\w+)\(\s*(.*?),?\s*\)( -> [^\n]*)?:\n", re.DOTALL)
 # what the oracle's files call an ambiguity of the papers
 _AMBIGUITY: Final = re.compile(r"(?m)^( *#.*?) \(A\d+\)")

@@ -19,6 +19,7 @@ from pygments.lexers.python import PythonLexer
 from pop_ref.walkthrough import widgets
 from pop_ref.walkthrough.cells import FOLDER, Cell, Chapter, ChapterError
 from pop_ref.walkthrough.directives import expanded
+from pop_ref.walkthrough.docstrings import PAGE
 from pop_ref.walkthrough.folding import names_in, parts, said_and_done
 from pop_ref.walkthrough.glossary import GLOSSARY_PAGE, glossary
 from pop_ref.walkthrough.pages import Outcome, Picture
@@ -54,13 +55,11 @@ _MATHML: Final = "{http://www.w3.org/1998/Math/MathML}"
 ElementTree.register_namespace("", _MATHML[1:-1])
 
 
-# labels of decisions and kinks in prose; what code quotes is left alone
-# what is longer than a page is wide, in characters
-_LONG: Final = 88
 # a comma behind a formula stays on its line
 _PUNCTUATED: Final = re.compile(
     r'<span class="math inline">((?:(?!</math>).)*</math>)</span>([,.;:)?]+)', re.DOTALL
 )
+# labels of decisions and kinks in prose; what code quotes is left alone
 _LABEL: Final = re.compile(r"(<(pre|code|a|math|h\d)\b.*?</\2>)|\b([DB][1-8])\b", re.DOTALL)
 _WIDGET: Final = re.compile(r"<p>\{\{widget: (\w+)\}\}</p>")
 
@@ -201,7 +200,7 @@ def _asked(name: str, tier: str, answer: str) -> str:
 
 def _printed(text: str) -> str:
     # a table of long lines scrolls, since it cannot be read when its lines are broken
-    long = max(map(len, text.split("\n"))) > _LONG
+    long = max(map(len, text.split("\n"))) > PAGE
     return f'<pre class="printed{" long" if long else ""}">{escape(text)}</pre>'
 
 
