@@ -105,7 +105,7 @@ COURSE: Final = (
     ),
     Stage(
         "compositing",
-        "one pixel from front to back, its gradient from back to front, and who dominates it",
+        "one pixel from front to back, its gradient from back to front, and what dominates it",
         "4",
         {
             "pixel": ("stops", *_with_transposes("composite_pixel")),

@@ -13,6 +13,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from pop_ref.optimizer import BETAS, EPS
+
 Oracle = dict[str, Callable[..., Any]]
 
 
@@ -81,6 +83,44 @@ def _transposed_covars(o: Oracle, quats: Any, scales: Any) -> Any:
     return o["covars_from_quats_scales"](inverse, scales)
 
 
+def _without_length(o: Oracle, quats: Any) -> Any:
+    w, x, y, z = quats.T
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def _positive_first_harmonics(o: Oracle, dirs: Any, degree: int) -> Any:
+    signs = np.ones((degree + 1) ** 2)
+    signs[1:4:2] = -1.0
+    return signs * o["sh_basis"](dirs, degree)
+
+
+def _colors(half: float, unit: bool) -> Callable[..., Any]:
+    """Make `colors_from_sh` without the half, or with directions as they are given."""
+
+    def made(o: Oracle, sh: Any, dirs: Any, degree: int) -> Any:
+        basis = o["sh_basis"](dirs / np.linalg.norm(dirs, axis=1, keepdims=True) if unit else dirs, degree)
+        sums = [row @ each[: basis.shape[1]] for row, each in zip(basis, sh, strict=True)]
+        return np.maximum(np.array(sums) + half, 0.0)
+
+    return made
+
+
+def _adam_from_zero(o: Oracle, params: Any, grads: Any, m: Any, v: Any, step: Any, lr: Any,
+                    betas: Any = BETAS, eps: float = EPS) -> Any:  # fmt: skip
+    """Make `adam_step` without the divisions by 1 - beta^t."""
+    params, m, v = dict(params), dict(m), dict(v)
+    for name, g in grads.items():
+        m[name] = betas[0] * m[name] + (1.0 - betas[0]) * g
+        v[name] = betas[1] * v[name] + (1.0 - betas[1]) * g * g
+        params[name] = params[name] - lr[name] * m[name] / (np.sqrt(v[name]) + eps)
+    return params, m, v
+
+
 def _pixel(o: Oracle, ids: Any, rows: Any, px: float, py: float, background: Any, *profile: Any) -> Any:
     return o["composite_pixel"](ids, rows, px, py, [0.0] * len(background), *profile)
 
@@ -105,6 +145,13 @@ MISTAKES: Final = (
         "The identity is (1, 0, 0, 0).",
     ),
     Mistake(
+        "rotmats_from_quats",
+        _without_length,
+        "Your quaternion is used as it is given; it must be divided by its length first, since only then is it a"
+        " rotation.",
+        "Training moves its four numbers freely, so that its length is anything; unit_quats_from_quats divides.",
+    ),
+    Mistake(
         "covars_from_quats_scales",
         _transposed_covars,
         f"Your rotation is transposed: the covariance is R^T S S R and not R S S R^T. {_TRANSPOSED}",
@@ -115,6 +162,24 @@ MISTAKES: Final = (
         lambda o, quats, scales: o["covars_from_quats_scales"](quats, np.sqrt(scales)),
         "Your scales enter once; a covariance holds squares, because scales are standard deviations.",
         "With M = R diag(s) the covariance is M M^T, in which every scale stands twice.",
+    ),
+    Mistake(
+        "sh_basis",
+        _positive_first_harmonics,
+        "Two of your harmonics of degree 1 have the wrong sign: they are (-y, z, -x) times a constant.",
+        "The signs are a convention, and every file of splats follows it.",
+    ),
+    Mistake(
+        "colors_from_sh",
+        _colors(half=0.0, unit=True),
+        "The half is missing: a Gaussian whose coefficients are 0 is grey, not black.",
+        "c = max(sum_k Y_k h_k + 0.5, 0).",
+    ),
+    Mistake(
+        "colors_from_sh",
+        _colors(half=0.5, unit=False),
+        "Your direction is used as it is given; the harmonics ask for one of length 1.",
+        "Divide each direction by its length before sh_basis.",
     ),
     Mistake(
         "sigma_at_pixel",
@@ -215,6 +280,18 @@ MISTAKES: Final = (
         lambda o, logits, v: v.copy(),
         "The sigmoid's slope is missing.",
         "o = 1 / (1 + exp(-x)) has the derivative o (1 - o).",
+    ),
+    Mistake(
+        "adam_step",
+        _adam_from_zero,
+        "The two running means are not corrected: both start at 0, so that the first steps have the wrong length.",
+        "Divide m by 1 - beta1^t and v by 1 - beta2^t before the quotient; keep m and v themselves as they are.",
+    ),
+    Mistake(
+        "prune_rows",
+        lambda o, rows, mask: o["prune_rows"](rows, ~mask),
+        "You keep the rows that are to be removed: the mask selects what goes.",
+        "rows[~mask] are the survivors, in every parameter and both moments.",
     ),
     Mistake(
         "l2_vjp",

@@ -85,6 +85,8 @@ def read_work(folder: Path) -> Work:
         ValueError: the folder has no stubs, or a file is not Python; the message names file and line.
     """
     if not any((folder / stage.file).exists() for stage in COURSE):
+        if any(Path(stage.file).exists() for stage in COURSE):
+            raise ValueError(f"{folder} has no stubs; you are in a folder that has some: write . for it, at the end")
         raise ValueError(f"{folder} has no stubs; 'pop learn start {folder}' writes them")
     written = {}
     for stage in COURSE:

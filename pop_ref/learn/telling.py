@@ -26,15 +26,19 @@ def told(stage: Stage, verdict: Verdict) -> str:
         lines += [
             f"hint: {verdict.hint}",
             "",
-            f"{verdict.n_held} laws hold; the first that does not: {verdict.broken}.",
+            f"{_held(verdict)}; the first that does not: {verdict.broken}.",
         ]
     elif not verdict.unwritten:
-        lines += [f"{stage.name}: passed. {verdict.n_held} laws hold."]
+        lines += [f"{stage.name}: passed. {_held(verdict)}."]
     elif verdict.n_held:
-        lines += [f"{stage.name}: right so far. {verdict.n_held} laws hold."]
+        lines += [f"{stage.name}: right so far. {_held(verdict)}."]
     if verdict.unwritten:
         lines += [f"still to write in {stage.file}: {', '.join(verdict.unwritten)}"]
     return "\n".join(textwrap.fill(line, 100) if line[:1].strip() else line for line in lines)
+
+
+def _held(verdict: Verdict) -> str:
+    return "1 law holds" if verdict.n_held == 1 else f"{verdict.n_held} laws hold"
 
 
 def _counterexample(verdict: Verdict) -> Iterator[str]:

@@ -77,6 +77,14 @@ class Chapter:
             if cell.kind == "prose" and (found := _EXERCISE.match(cell.text))
         ]
 
+    def code_after(self, cell: Cell) -> list[str]:
+        """List the code of all later cells."""
+        return [
+            each.text
+            for each in self.cells
+            if each.kind != "prose" and each.line > cell.line
+        ]
+
     @property
     def n_exercises(self) -> int:
         """Count the exercises, each of which has an answer."""

@@ -66,18 +66,20 @@ def seen_by(k, where):
 fig, (left, right) = axes(2, height=2.9)
 at, depths = seen_by(UNSEEN, points)
 order = np.argsort(-depths)
-left.scatter(*at[order].T, s=7, c=tints[order], lw=0)
+# so many dots are kept as an image
+left.scatter(*at[order].T, s=7, c=tints[order], lw=0, rasterized=True)
 left.set(
     xlim=(0, WIDTH),
     ylim=(HEIGHT, 0),
     aspect="equal",
     title="the points, from the side put aside",
 )
-right.scatter(*points[:, :2].T, s=4, c=tints, lw=0)
+right.scatter(*points[:, :2].T, s=4, c=tints, lw=0, rasterized=True)
 places = np.array([-camera[0][:3, :3].T @ camera[0][:3, 3] for camera in cameras])
 right.plot(*places[seen, :2].T, "^", color=ACCENT, ms=5)
 right.plot(*places[UNSEEN, :2], "^", color=SECOND, ms=7)
 right.set(aspect="equal", title="and from above, with the cameras")
+right.set(xlim=(-1.6, 1.6), ylim=(-1.3, 1.3))
 for panel in (left, right):
     panel.set(xticks=[], yticks=[])
     panel.grid(False)
@@ -168,15 +170,8 @@ for step in range(STEPS + 1):
     image, tape = splat.render(params, cameras[k], background)
     loss, v_image = splat.l2(image, photographs[k])
     gradients, _ = splat.render_vjp(params, tape, v_image)
-    slower = 0.2 ** (step / STEPS)
-    splat.adam_step(
-        params,
-        gradients,
-        m,
-        v,
-        step + 1,
-        {name: slower * rate for name, rate in rates.items()},
-    )
+    now = {name: 0.2 ** (step / STEPS) * rate for name, rate in rates.items()}
+    splat.adam_step(params, gradients, m, v, step + 1, now)
 print(*labels[::5], sep="\n")
 assert curve[-1][1] > curve[0][1] + 1.5
 film(
@@ -271,7 +266,7 @@ picture(
 # ## What to know before, and how long it takes
 #
 # Vectors, matrices, eigenvalues, and the chain rule; Python and a little NumPy. Nothing about graphics or learning.
-# Chapters 0 to 9b run on NumPy alone, 10 and 11 need torch.
+# Chapters 0 to 9b and 12 run on NumPy alone, 10 and 11 need torch.
 #
 # {{chapters}}
 #

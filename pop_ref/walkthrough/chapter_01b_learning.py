@@ -105,12 +105,8 @@ def descent(rate: float) -> Callable:
 
 
 just_right, too_large = walk(descent(0.019), 60), walk(descent(0.0202), 60)
-print(
-    "after 60 steps: rate 0.019  ",
-    just_right[-1].round(3),
-    " rate 0.0202  ",
-    too_large[-1].round(3),
-)
+print("after 60 steps at rate 0.019: ", just_right[-1].round(3))
+print("after 60 steps at rate 0.0202:", too_large[-1].round(3))
 assert valley(just_right[-1]) < valley(just_right[0])
 assert abs(too_large[-1, 0]) > 1.0
 
@@ -149,7 +145,7 @@ def adam(rate: float) -> Callable:
 
 
 with_adam = walk(adam(0.1), 60)
-print("after 60 steps: Adam        ", with_adam[-1].round(3))
+print("after 60 steps of Adam:       ", with_adam[-1].round(3))
 assert valley(with_adam[-1]) < valley(just_right[-1])
 assert np.allclose(np.abs(with_adam[1] - with_adam[0]), 0.1)
 
@@ -209,7 +205,7 @@ assert np.isclose(first_step(1e-10, 1e-8), 1 / 101)
 fig, ax = axes(1, width=5.0, height=2.5)
 for (eps, length), shade in zip(steps.items(), (ACCENT, SECOND), strict=True):
     ax.semilogx(sizes, length, ".-", color=shade, label=rf"$\epsilon$ = {eps:g}")
-ax.set(xlabel="size of the gradient", ylabel="Adam's first step, in learning rates")
+ax.set(xlabel="size of the gradient", ylabel="first step / learning rate")
 ax.legend(loc="center right")
 picture(fig, "To Adam a gradient has a sign and hardly a size, down to about $\\epsilon$.")
 
@@ -252,6 +248,7 @@ assert np.isclose(v_logit[0], -0.15)
 # the same by a small difference
 h = 1e-6
 above, below = ((opacities_from_logits(logit + d) - wish) ** 2 for d in (h, -h))
+print("by a difference", (above - below) / (2 * h))
 assert np.isclose((above - below)[0] / (2 * h), v_logit[0])
 
 # %% [markdown]
@@ -290,7 +287,7 @@ frames, labels, losses = [], [], []
 for step in range(1, 91):
     image = drawn(params)
     losses.append(l2(image, target))
-    if step % 6 == 1:
+    if step % 6 == 1 or step == 90:
         frames.append(np.concatenate([image, target], axis=1))
         labels.append(f"step {step - 1}")
     v_image = l2_vjp(image, target, 1.0)
@@ -300,12 +297,8 @@ for step in range(1, 91):
     grads = params_vjp(params, gradients, np.zeros(1))
     params, m, v = adam_step(params, grads, m, v, step, rates)
 print(f"loss {losses[0]:.4f} at first, {losses[-1]:.6f} after 90 steps")
-print(
-    "opacity",
-    opacities_from_logits(params["opacities"]).round(2),
-    " widths",
-    np.exp(params["scales"]).round(2),
-)
+print("opacity", opacities_from_logits(params["opacities"]).round(2))
+print("widths ", np.exp(params["scales"]).round(2))
 assert losses[-1] < 0.02 * losses[0]
 film(frames, labels, "Left the splat that learns, right its target.", enlarged=12)
 

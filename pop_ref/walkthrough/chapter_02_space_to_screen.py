@@ -111,10 +111,18 @@ for axis in range(3):
     nudge = step * np.eye(3)[axis]
     ahead = project_means(means_cam + nudge, K, width, height)
     behind = project_means(means_cam - nudge, K, width, height)
-    assert np.allclose((ahead - behind) / (2 * step), J[:, :, axis], atol=1e-5)
+    column = (ahead - behind) / (2 * step)
+    print(
+        "along",
+        "xyz"[axis],
+        "by a difference",
+        column[0].round(4),
+        " in J",
+        J[0, :, axis].round(4),
+    )
+    assert np.allclose(column, J[:, :, axis], atol=1e-5)
 
 means2d = project_means(means_cam, K, width, height)
-print("J of the first:", J[0].round(2).tolist())
 covars2d = project_covars(covars_cam, J)
 assert np.allclose(covars2d[0], J[0] @ covars_cam[0] @ J[0].T)
 

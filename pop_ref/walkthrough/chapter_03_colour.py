@@ -111,7 +111,7 @@ assert np.allclose(Y.T @ (weights[:, None] * Y), np.eye(16), atol=1e-12)
 # %% [markdown]
 # The first harmonic is $Y_0 = 1/\sqrt{4\pi} \approx 0.2821$ everywhere, so $h_0$ alone sets the mean colour: $c = 1/2 +
 # Y_0 h_0$. Only the direction of $d$ counts, not its length. And a negative sum is cut to 0, while nothing is cut at 1:
-# the renderer works with linear light, and a picture is clipped only when it is shown.
+# a picture is clipped only when it is shown.
 
 # %%
 assert round(1 / math.sqrt(4 * math.pi), 4) == 0.2821
@@ -121,6 +121,7 @@ rng = np.random.default_rng(3)
 sh = 0.3 * rng.normal(size=(1, 16, 3))
 d = np.array([[0.3, -1.0, 2.0]])
 by_hand = 0.5 + sh_basis(d / np.linalg.norm(d), 3)[0] @ sh[0]
+print("by hand", by_hand.round(3), " by the oracle", colors_from_sh(sh, d, 3)[0].round(3))
 assert np.allclose(colors_from_sh(sh, d, 3)[0], np.maximum(by_hand, 0))
 assert np.allclose(colors_from_sh(sh, d, 3), colors_from_sh(sh, 10 * d, 3))
 bright = colors_from_sh(np.full((1, 1, 3), 9.0), d, 0)

@@ -46,12 +46,8 @@ views = {
 }
 for view in views.values():
     assert np.allclose(view.image, views[16].image, rtol=0, atol=1e-14)
-print(
-    "tiles of 16 px:",
-    grid_size(80, 48, 16),
-    " entries in all lists:",
-    sum(map(len, views[16].tile_lists)),
-)
+print("tiles of 16 px:", grid_size(80, 48, 16))
+print("entries in all lists:", sum(map(len, views[16].tile_lists)))
 
 # %% [markdown]
 # ## From a splat to its tiles
@@ -68,9 +64,7 @@ print(
 covar2d = np.array([[[90.0, 60.0], [60.0, 55.0]]])
 centre, radii = np.array([[43.0, 25.0]]), radii_from_covars2d(covar2d, np.array([0.9]))
 x0, y0, x1, y1 = tile_rects(centre, radii, 80, 48, 16)[0].tolist()
-print(
-    f"radii {radii[0]}, tiles {x0}..{x1 - 1} across and {y0}..{y1 - 1} down: {(x1 - x0) * (y1 - y0)} tiles"
-)
+print(f"radii {radii[0]}; tiles {x0} to {x1 - 1} across and {y0} to {y1 - 1} down")
 
 
 def reaches(tile_x: int, tile_y: int) -> bool:
@@ -86,7 +80,7 @@ def reaches(tile_x: int, tile_y: int) -> bool:
 
 touched = {(x, y) for y in range(y0, y1) for x in range(x0, x1)}
 needed = {(x, y) for y in range(3) for x in range(5) if reaches(x, y)}
-print(f"{len(needed)} of them are needed")
+print(f"{len(touched)} tiles, {len(needed)} of them needed")
 assert needed < touched
 
 fig, ax = axes(1, width=5.4, height=3.3)
@@ -174,7 +168,7 @@ mine = sorted_lists(splats, 80, 48, 16)
 theirs = tile_lists(splats.means2d, splats.radii, splats.depths, 80, 48, 16)
 assert mine == theirs
 print(
-    f"{sum(map(len, mine))} entries of {np.sum(splats.visible)} splats in {len(mine)} lists, as the oracle has them"
+    f"{sum(map(len, mine))} entries of {np.sum(splats.visible)} splats in {len(mine)} lists"
 )
 
 # %% [markdown]
@@ -215,9 +209,8 @@ angles = np.linspace(-0.1, 0.1, 81)
 reds = np.array([crossing(angle)[0][0] for angle in angles])
 first = np.array([crossing(angle)[1].argmin() for angle in angles])
 jump = np.abs(np.diff(reds)).max()
-print(
-    f"largest change between two angles {jump:.2f}, everywhere else under {np.sort(np.abs(np.diff(reds)))[-2]:.3f}"
-)
+elsewhere = np.sort(np.abs(np.diff(reds)))[-2]
+print(f"largest change between two angles {jump:.2f}, elsewhere at most {elsewhere:.4f}")
 assert np.abs(np.diff(reds)).argmax() == np.abs(np.diff(first)).argmax()
 assert jump > 0.2
 

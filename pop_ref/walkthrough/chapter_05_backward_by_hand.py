@@ -79,7 +79,8 @@ assert v_alphas_of(three, 0.0).tolist() == [1 / 8, -1 / 8, 1 / 4]
 # \qquad \frac{\partial L}{\partial c_i} = T_i \alpha_i\, g .$$
 #
 # So one scalar, walked from back to front, is all that the backward pass of a pixel carries, however many channels it
-# has. In the oracle it is called `behind`, and $q_i$ is `worth`; the last lines belong to the next section:
+# has. In the oracle $q_i$ is `color_dot_grad` and the scalar `suffix_dot_grad`, the same product of all that lies
+# behind. It starts with the background; the last lines belong to the next section:
 #
 # {{source: pop_ref.pixel.composite_pixel_vjp}}
 
@@ -129,6 +130,7 @@ picture(
 
 # %%
 S = np.array([np.sum((T * alphas * q)[i + 1 :]) for i in range(n)]) + pixel.T_final * 0.3
+print("by the sum", (T * q - S / (1.0 - alphas)).round(3))
 np.testing.assert_allclose(T * q - S / (1.0 - alphas), v_alphas, rtol=1e-12)
 
 # %% [markdown]
@@ -154,9 +156,9 @@ assert (four[3], four[0]) == (1 / 8, 0.0)
 # \quad \frac{\partial L}{\partial \mu} = \frac{\partial L}{\partial \sigma}\, Q d,
 # \quad \frac{\partial L}{\partial Q} = \frac{\partial L}{\partial \sigma} \tfrac12 d d^\top .$$
 #
-# What POP says about leakage (eq. 10) is already here: the gradient of the centre has $\alpha$, and so $o$, as a
-# factor. Two decisions cut the chain: a splat under the floor 1/255 is skipped (D5), and one at the ceiling 0.999
-# passes nothing, because the clamped alpha does not move (kink B3).
+# Note that the gradient of the centre has $\alpha$, and so $o$, as a factor: a faint splat is moved only a little (POP
+# paper, eq. 10; chapter 8 comes back to it). Two decisions cut the chain: a splat under the floor 1/255 is skipped
+# (D5), and one at the ceiling 0.999 passes nothing, because the clamped alpha does not move (kink B3).
 #
 # {{source: pop_ref.alpha.alpha_from_sigma_vjp}}
 #
@@ -171,6 +173,7 @@ assert sigma == 0.5 * d @ Q @ d == 1.75
 v_sigma, v_opacity = alpha_from_sigma_vjp(sigma, 0.5, v_alpha=1.0)
 np.testing.assert_allclose([v_opacity, v_sigma], [np.exp(-1.75), -0.5 * np.exp(-1.75)])
 v_mean2d, v_conic = sigma_at_pixel_vjp(mean2d, conic, 0.5, 0.5, v_sigma)
+print("v_mean2d", np.round(v_mean2d, 4), " by the formula", (v_sigma * Q @ d).round(4))
 np.testing.assert_allclose(v_mean2d, v_sigma * Q @ d)
 # the off-diagonal stands once in the conic and twice in Q
 np.testing.assert_allclose(
@@ -357,7 +360,7 @@ forward = difference(u, 1e-5)
 print(f"<v, J u> = {forward:.9f}   <J^T v, u> = {by_hand @ u:.9f}")
 assert abs(forward - by_hand @ u) < 1e-7 * scale
 
-# the test has teeth: two entries that are swapped are seen
+# the test can fail: two entries that are swapped are seen
 swapped = by_hand.copy()
 swapped[[7, 8]] = swapped[[8, 7]]
 assert abs(forward - swapped @ u) > 1e-4 * scale
@@ -365,9 +368,9 @@ assert abs(forward - swapped @ u) > 1e-4 * scale
 # %% [markdown]
 # ### Exercise 2: code
 #
-# `render_vjp` also returns `means2d`, the gradient with respect to the projected centres, which density control reads
-# (eq. 3). Move the principal point of `K`: all splats shift together on the screen. Check that the loss changes by the
-# sum of those gradients.
+# `render_vjp` also returns `means2d`, the gradient with respect to the projected centres, which *density control*
+# reads, the rules that add and remove Gaussians (POP paper, eq. 3; chapter 9). Move the principal point of `K`: all
+# splats shift together on the screen. Check that the loss changes by the sum of those gradients.
 
 
 # %% answer

@@ -24,8 +24,11 @@
 #
 # The way forwards, from chapter 2 (3DGS, eq. 6 and eq. 5), and the way back, below:
 #
-# $$q, s \;\to\; M = R\,\mathrm{diag}(s) \;\to\; \Sigma = M M^\top \;\to\; \Sigma_{\mathrm{cam}} \;\to\;
-# \Sigma^{2D} = J \Sigma_{\mathrm{cam}} J^\top \;\to\; Q = (\Sigma^{2D} + 0.3\, I)^{-1}$$
+# $$q, s \;\to\; M = R\,\mathrm{diag}(s) \;\to\; \Sigma = M M^\top \;\to\;
+# \Sigma_{\mathrm{cam}} = W \Sigma W^\top$$
+#
+# $$\Sigma_{\mathrm{cam}} \;\to\; \Sigma^{2D} = J \Sigma_{\mathrm{cam}} J^\top \;\to\;
+# Q = (\Sigma^{2D} + 0.3\, I)^{-1}$$
 
 # %% setup
 import math
@@ -104,16 +107,12 @@ v_splats = composite_vjp(
 )
 v_means2d, v_conics, v_colors = v_splats.v_means2d, v_splats.v_conics, v_splats.v_colors
 assert np.allclose(conics, view.splats.conics)
-print(
-    "arriving at Gaussian 0: v_means2d",
-    v_means2d[0].round(5),
-    " v_conics",
-    v_conics[0].round(5),
-)
+print("arriving at Gaussian 0: v_means2d", v_means2d[0].round(5))
+print("                        v_conics ", v_conics[0].round(5))
 
 
 def slope(function, x: np.ndarray, v: np.ndarray, h: float = 1e-6) -> np.ndarray:
-    """Differentiate the product of v with a function's result with respect to each entry of x, by differences."""
+    """Differentiate <v, function(x)> with respect to each entry of x, by differences."""
     found = np.zeros_like(x)
     for at in np.ndindex(x.shape):
         step = np.zeros_like(x)

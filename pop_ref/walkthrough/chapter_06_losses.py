@@ -124,7 +124,7 @@ for loss, best in ((l1, 0.2), (l2, 0.28)):
 # ## SSIM looks at windows
 #
 # *SSIM*, the structural similarity, compares means, variances and the covariance under a Gaussian window of 11 x 11 px
-# (Wang et al. 2004, eq. 13; the D-SSIM of eqs. 2 and 9 is $1 - \mathrm{SSIM}$ in the code that everyone runs):
+# (Wang et al. 2004, eq. 13; the D-SSIM of eqs. 2 and 9 is $1 - \mathrm{SSIM}$ in the programs of 3DGS and gsplat):
 #
 # $$S = \frac{(2 \mu_x \mu_y + C_1)(2 \sigma_{xy} + C_2)}{(\mu_x^2 + \mu_y^2 + C_1)(\sigma_x^2 + \sigma_y^2 + C_2)} .$$
 #
@@ -223,7 +223,7 @@ for ax in panels:
     ax.set(xticks=[], yticks=[])
 picture(
     fig,
-    "The paper's figure 3 in small, each map scaled to its own maximum: blobs of haze, and who pulls at them.",
+    "The paper's figure 3 in small, each map scaled to its own maximum: blobs of haze, and the pull of each loss.",
 )
 
 # %% [markdown]
@@ -313,8 +313,9 @@ picture(
 # stays below L2 at every step and within a factor of three in the second half. With the 0.2 of the 3DGS objective (eq.
 # 2) it would be twenty times larger, and drown L2. Hence the small $\lambda_{\mathrm{SSIM}}$ of eq. 9.
 #
-# The fading has a price. Density control grows a Gaussian when its gradient exceeds a fixed threshold (eq. 3), and
-# under L2 fewer do. [The next chapter](chapter_07_dominance.py) shows what POP adds.
+# The fading has a price. Density control, the rules that add and remove Gaussians (chapter 9), grows a Gaussian when
+# its gradient exceeds a fixed threshold (eq. 3), and under L2 fewer do. [The next chapter](chapter_07_dominance.py)
+# shows what POP adds.
 
 # %%
 assert np.allclose(size_l1, 1.0)
@@ -345,9 +346,9 @@ assert (rest_error(l1, 0.5), rest_error(lambda *both: 0.1 * l1(*both), 0.5)) == 
 
 # %% [markdown]
 # ### Exercise 4: code
-# The quality of a held-out view is told as *PSNR*, $-10 \log_{10} L_2$ in decibels (dB). Write it. What does the same
-# error of a tenth give everywhere, and what does halving every error gain? What happens if only one pixel in a hundred
-# is wrong, by 1?
+# A *held-out* view is one that was put aside and not trained on, as in chapter 0. Its quality is told as *PSNR*, $-10
+# \log_{10} L_2$ in decibels (dB). Write it. What does the same error of a tenth give everywhere, and what does halving
+# every error gain? What happens if only one pixel in a hundred is wrong, by 1?
 
 
 # %% answer

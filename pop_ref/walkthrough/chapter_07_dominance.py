@@ -109,14 +109,8 @@ scene = Gaussians(
 # %%
 overview = view = render(scene, camera)
 counts = view.dominant_counts
-print(
-    "the largest counts:",
-    np.sort(counts)[::-1][:8],
-    " winners:",
-    np.sum(counts > 0),
-    "of",
-    len(counts),
-)
+print("the largest counts:", np.sort(counts)[::-1][:8])
+print("winners:", np.sum(counts > 0), "of", len(counts))
 assert counts.sum() == np.sum(view.n_blended > 0)
 assert np.array_equal(view.dominant_ids < 0, view.n_blended == 0)
 assert np.all(counts[:few] > counts[few:].max())
@@ -187,10 +181,11 @@ for width, height in ((980, 545), (1557, 1038)):
 # %% [markdown]
 # ### Exercise 2: derive
 #
-# A densification step follows a hundred views. Three readings of "cumulative" are possible: test the count of the last
-# view, flag a Gaussian if *any* view's count passes the threshold, or test the *sum* over the views. A Gaussian wins
-# one pixel in each of 100 views of 980 x 545 px, but for the fiftieth, where it wins twelve. Is it in the set under
-# each reading? How many winners must a covered scene have at least, once all have escaped the sum?
+# Gaussians are added after every hundred views. The paper calls the count "cumulative", and three readings of that are
+# possible: test the count of the last view, flag a Gaussian if *any* view's count passes the threshold, or test the
+# *sum* over the views. A Gaussian wins one pixel in each of 100 views of 980 x 545 px, but for the fiftieth, where it
+# wins twelve. Is it in the set under each reading? How many winners must a covered scene have at least, once all have
+# escaped the sum?
 
 # %% answer
 # The last view: 1 < 11, no. Any view: 12 > 10.68, yes. Sum: 111 > 10.68, yes; the counts now sum to $100\,HW$, so at
@@ -319,7 +314,8 @@ for column, event in enumerate((0, 3, 6, 9)):
 for ax in panels:
     ax.set(xticks=[], yticks=[])
 picture(
-    fig, "Before events 1, 4, 7 and 10: the render above, and who wins which pixel below."
+    fig,
+    "Before events 1, 4, 7 and 10: the render above, and which Gaussian wins which pixel below.",
 )
 
 # %% [markdown]

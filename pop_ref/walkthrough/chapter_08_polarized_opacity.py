@@ -168,12 +168,8 @@ np.testing.assert_allclose(
     pop_loss_vjp(opacities, important, 1.0), [-1 / 2, -1 / 2, 1 / 3, 1 / 3, 1 / 3]
 )
 assert pop_loss(np.array([1.0, 1.0, 0.0]), np.array([True, True, False])) == 0.0
-print(
-    "loss",
-    round(pop_loss(opacities, important), 3),
-    " gradient",
-    pop_loss_vjp(opacities, important, 1.0).round(3),
-)
+print("loss    ", round(pop_loss(opacities, important), 3))
+print("gradient", pop_loss_vjp(opacities, important, 1.0).round(3))
 assert POP.prune_opa == 0.005
 
 # %% [markdown]
@@ -371,9 +367,8 @@ assert np.any(with_prior[-1].opacities[faint] > 0.2)
 error_without, blended_without = measured(without[POP_STEPS])
 error_with, blended_with = measured(with_prior[POP_STEPS])
 print(f"blended per pixel: {blended_without:.1f} without, {blended_with:.1f} with")
-print(
-    f"at a pole: {at_poles(without[POP_STEPS]):.0%} without, {at_poles(with_prior[POP_STEPS]):.0%} with"
-)
+shares = [at_poles(run[POP_STEPS]) for run in (without, with_prior)]
+print(f"at a pole: {shares[0]:.0%} without, {shares[1]:.0%} with")
 assert np.allclose([blended_without, blended_with], [13.5, 9.6], atol=0.05)
 
 fig, (left, right) = axes(2, height=2.8)

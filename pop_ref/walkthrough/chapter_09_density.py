@@ -100,11 +100,11 @@ print("pull: too short {:.4f}, too wide {:.4f}, right {:.4f}, faint {:.4f}".form
 # %% [markdown]
 # ## One event
 #
-# Every 100 steps the window closes and the population is edited. Selected and small: **clone**, a copy on top of the
-# original. Selected and large: **split**, two children drawn from the parent's own distribution, 1.6 times smaller, in
-# its place. Small means that the largest scale is at most 0.01 of the scene's. Then **prune**: what has an opacity
-# under 0.005 is removed, and late in the training what is far too large. (A child's place is drawn at random; here two
-# draws are picked that make a clear picture.)
+# The average is taken over a *window* of 100 steps. When it closes, Gaussians are added and removed. Selected and
+# small: **clone**, a copy on top of the original. Selected and large: **split**, two children drawn from the parent's
+# own distribution, 1.6 times smaller, in its place. Small means that the largest scale is at most 0.01 of the scene's.
+# Then **prune**: what has an opacity under 0.005 is removed, and late in the training what is far too large. (A child's
+# place is drawn at random; here two draws are picked that make a clear picture.)
 #
 # {{source: pop_ref.density.grow_masks}}
 #
@@ -167,7 +167,7 @@ picture(
 # $m$, a running mean of the gradient, and $v$, one of its square (Kingma and Ba 2015). A row operation moves all three
 # together. Survivors keep their bits; newcomers start with zero moments; Adam's step counter belongs to the tensor and
 # runs on. Where $m$ and $v$ are not moved along, every Gaussian after the first removed row continues with the momentum
-# of another: a bug that has happened, and one of the bugs that are hunted in [chapter 12](chapter_12_break_it.py).
+# of another: a bug that has happened (exercise 5; more of them in [chapter 12](chapter_12_break_it.py)).
 
 # %%
 for before, now in ((rows.params, after.params), (rows.m, after.m), (rows.v, after.v)):
@@ -345,14 +345,14 @@ assert ends["prior"]["wall"] > 0.9 > 0.02 > ends["prior"]["hidden"]
 assert ends["prior"]["haze"] > ends["neither"]["haze"]
 
 # %%
-fig, panels = axes(4, height=2.5)
+fig, panels = axes(2, 2, height=4.6)
 shades = {"wall": ACCENT, "hidden": SECOND, "haze": THIRD}
 for panel, (name, each) in zip(panels, runs.items(), strict=False):
     for kind, rows in KINDS.items():
         lines = panel.plot(each[0][1][:, rows], color=shades[kind], lw=1.0)
         lines[0].set_label(kind)
-    panel.set(title=f"opacities: {name}", xlabel="step", ylim=(-0.02, 1.02))
-panels[2].legend(loc="center right")
+    panel.set(title=f"opacities: {name}", xlabel="step", ylim=(-0.02, 1.25))
+panels[0].legend(loc="upper left", ncols=3)
 for (name, each), shade in zip(runs.items(), (INK, SECOND, ACCENT), strict=True):
     panels[3].plot(
         np.mean([run[0] for run in each], axis=0), color=shade, lw=1.2, label=name

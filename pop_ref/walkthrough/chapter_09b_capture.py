@@ -13,8 +13,9 @@
 # the lens maps directions to pixels, and the *pose*, which tells where the camera stood and how it was turned:
 #
 # $$K = \begin{pmatrix} f_x & 0 & c_x \\ 0 & f_y & c_y \\ 0 & 0 & 1 \end{pmatrix}, \qquad
-# \text{viewmat} = \begin{pmatrix} W & t \\ 0 & 1 \end{pmatrix}, \qquad
-# p = W \mu + t, \quad u = \left( f_x \frac{x}{z} + c_x, \; f_y \frac{y}{z} + c_y \right)$$
+# \text{viewmat} = \begin{pmatrix} W & t \\ 0 & 1 \end{pmatrix}$$
+#
+# $$p = W \mu + t, \quad u = \left( f_x \frac{x}{z} + c_x, \; f_y \frac{y}{z} + c_y \right)$$
 #
 # (the projection of chapter 2; POP paper, eq. 1, begins after it). The pose takes the world to the camera; the camera
 # itself stands at $o = -W^\top t$. The focal length in pixels and the angle of view say the same thing: $f_x =
@@ -53,9 +54,8 @@ view = capture.views[0]
 W, t = view.viewmat[:3, :3], view.viewmat[:3, 3]
 center = -W.T @ t
 angle = 2 * np.degrees(np.arctan(view.width / 2 / view.K[0, 0]))
-print(
-    f"fx {view.K[0, 0]:.1f} px, so the view is {angle:.0f} degrees wide; it stands at {center.round(2)}"
-)
+print(f"fx {view.K[0, 0]:.1f} px, so the view is {angle:.0f} degrees wide")
+print(f"the camera stands at {center.round(2)}")
 assert np.allclose(center, view.camera_center)
 assert np.allclose(W @ W.T, np.eye(3))
 assert np.isclose(np.linalg.det(W), 1.0)
@@ -64,12 +64,8 @@ assert np.isclose(np.linalg.det(W), 1.0)
 flip = np.diag([1.0, -1.0, -1.0, 1.0])
 for_blender = np.linalg.inv(view.viewmat) @ flip
 assert np.allclose(np.linalg.inv(for_blender @ flip), view.viewmat)
-print(
-    "forwards in the world:",
-    W[2].round(2),
-    " the same by OpenGL's third column:",
-    -for_blender[:3, 2].round(2),
-)
+print("forwards in the world:          ", W[2].round(2))
+print("minus OpenGL's third column:    ", -for_blender[:3, 2].round(2))
 
 # %% [markdown]
 # ## What COLMAP does
@@ -86,7 +82,7 @@ print(
 #
 # The heart of it fits in a few lines. A feature at pixel $u$ says that the point lies on a ray, $u \times (K p) = 0$ in
 # homogeneous coordinates: two linear equations for its three coordinates. Two photographs give four equations; ten give
-# twenty, and least squares take care of their errors.
+# twenty, and least squares take care of their errors. Below, each feature is half a pixel off.
 
 
 # %%
@@ -116,9 +112,7 @@ for n_views in (2, 4, 12):
         seen = [pixels_of(view, truth)[0][0] + rng.normal(0.0, 0.5, 2) for view in chosen]
         off.append(np.linalg.norm(triangulated(chosen, seen) - truth[0]))
     errors[n_views] = float(np.median(off))
-    print(
-        f"{n_views:2} photographs, features half a pixel off: the point is off by {errors[n_views]:.4f}"
-    )
+    print(f"{n_views:2} photographs: the point is off by {errors[n_views]:.4f}")
 assert errors[12] < errors[4] < errors[2]
 
 # %% [markdown]
@@ -138,11 +132,8 @@ assert errors[12] < errors[4] < errors[2]
 print(*files)
 at, depths = pixels_of(view, capture.points)
 inside = (depths > 0) & np.all((at > 0) & (at < [view.width, view.height]), axis=1)
-print(
-    f"{len(capture.points)} points; {inside.sum()} in photograph 0, at depths {depths[inside].min():.1f} to",
-    end=" ",
-)
-print(f"{depths[inside].max():.1f}")
+print(f"{len(capture.points)} points, {inside.sum()} of them in photograph 0,", end=" ")
+print(f"at depths {depths[inside].min():.1f} to {depths[inside].max():.1f}")
 
 fig, (left, right) = axes(2, height=2.9, width_ratios=[1.25, 1])
 show_image(left, view.image / 255.0, "photograph 0 and the points")
@@ -227,9 +218,8 @@ picture(
     "The first Gaussians with a quarter of these widths, with them, and with three times as much.",
 )
 for factor, each in drawn.items():
-    print(
-        f"widths x {factor:<4g}  light left {each.T_final.mean():.2f}, blended per pixel {each.n_blended.mean():.0f}"
-    )
+    light, blended = each.T_final.mean(), each.n_blended.mean()
+    print(f"widths x {factor:<4g}  light left {light:.2f}, blended per pixel {blended:.0f}")
 light = [each.T_final.mean() for each in drawn.values()]
 assert light == sorted(light, reverse=True)
 

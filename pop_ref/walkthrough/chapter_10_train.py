@@ -18,7 +18,7 @@
 # prior adds to the opacities; which Gaussians are important is read off this very render (7). The image's gradient goes
 # **back** to the Gaussians (5, 5b) and to the raw parameters (1b). The entropy term belongs to another method and is
 # off. `update` is **Adam** (1b). Then **density control** (9): the screen gradients, which Gaussians are visible, and
-# the dominant counts are added to the window's statistics, and where the calendar says so, `control` clones, splits and
+# the dominant counts are added to the window's statistics, and where the schedule says so, `control` clones, splits and
 # prunes. "Windows" and "waiting" serve options of other methods.
 #
 # This is what is minimised, and where eq. 9 stands:
@@ -113,7 +113,7 @@ picture(
 )
 
 # %% [markdown]
-# Forty steps by the function above, each with a random one of the eight training views:
+# Thirty steps by the function above, each with a random one of the eight training views:
 
 # %%
 n_points = len(capture.points)
@@ -129,32 +129,29 @@ recipe = replace(
 )
 state, losses = start(first), []
 draws = np.random.default_rng(1)
-for _ in range(40):
+
+
+def normals(n):
+    """Draw where the two children of n split Gaussians go, as `train_step` asks."""
+    return draws.standard_normal((2, n, 3))
+
+
+for _ in range(30):
     each = capture.train_views(test_every=5)[draws.integers(8)]
     seen_from = Camera(each.viewmat, each.K, SIZE, SIZE)
-    state, loss = train_step(
-        state,
-        seen_from,
-        each.image / 255.0,
-        capture.scene_scale(),
-        lambda n: draws.standard_normal((2, n, 3)),
-        recipe,
-    )
+    photo, scale = each.image / 255.0, capture.scene_scale()
+    state, loss = train_step(state, seen_from, photo, scale, normals, recipe)
     losses.append(loss)
-print(
-    "mean loss of steps 1-10:",
-    np.mean(losses[:10]).round(4),
-    " of steps 31-40:",
-    np.mean(losses[30:]).round(4),
-)
-assert np.mean(losses[30:]) < 0.6 * np.mean(losses[:10])
-assert state.step == 40
+print("mean loss of the first ten steps:", np.mean(losses[:10]).round(4))
+print("and of the last ten:             ", np.mean(losses[20:]).round(4))
+assert np.mean(losses[20:]) < 0.6 * np.mean(losses[:10])
+assert state.step == 30
 
 # %% [markdown]
 # ## A training
 #
 # The program takes the same steps, only faster. A run is decided by one frozen value, `TrainConfig`; its defaults are
-# the paper's, 30,000 steps. Ours has 200, so the calendar shrinks with it: the population changes every 20 steps up to
+# the paper's, 30,000 steps. Ours has 200, so the schedule shrinks with it: the population changes every 20 steps up to
 # step 150, the blur rule (POP paper, eq. 6) is on from 30 to 60, the prior (eq. 8) until 150. The prior has 150 steps
 # instead of 15,000, so it must push harder: its weight is 0.02 and not 0.001. The objective is the paper's,
 #
@@ -313,7 +310,7 @@ show_image(
 wheel = np.random.default_rng(0).uniform(0.15, 1.0, (1000, 3))
 owner = kept["dominant_ids"]
 show_image(
-    panels[3], np.where(owner[..., None] < 0, 0.0, wheel[owner]), "who owns each pixel"
+    panels[3], np.where(owner[..., None] < 0, 0.0, wheel[owner]), "dominant Gaussians"
 )
 for panel in panels:
     panel.set(xticks=[], yticks=[])
@@ -327,7 +324,7 @@ assert kept["name"] == "00.png"
 # %% [markdown]
 # ## The report
 #
-# `report.html` shows all of this and more on one page: the headline numbers, these curves with the calendar, opacities
+# `report.html` shows all of this and more on one page: the headline numbers, these curves with the schedule, opacities
 # at three moments, dominance maps, held-out views beside their photographs, every setting, and every change of the
 # population. It is one file that loads nothing, so open it with any browser. `pop train` writes it at the end,
 # `pop report FOLDER` writes it again, also for a run that was stopped, and `pop compare A B` puts two side by side. The
@@ -356,7 +353,7 @@ with redirect_stdout(io.StringIO()) as said:
     asked = ["--out", out, "--preset", "quick", "--max-steps", "500"]
     trained = command(["train", scene, *asked])
 assert (made, trained) == (0, 0)
-print(*[line for line in said.getvalue().splitlines() if "PSNR" in line], sep="\n")
+print(*[line for line in said.getvalue().splitlines() if line.startswith("PSNR")], sep="\n")
 held_out = sorted((home / "demo" / "report_data").glob("val_step*_0000.npz"))[-1]
 kept = np.load(held_out)
 render, photo = (kept[key] / 255.0 for key in ("render", "photo"))

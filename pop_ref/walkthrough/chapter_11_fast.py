@@ -29,7 +29,7 @@ from pop_ref.records import Splats
 from pop_ref.tiles import tile_lists
 from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
-from pop_ref.walkthrough.style import SECOND, axes, show_image
+from pop_ref.walkthrough.style import DIVERGING, SECOND, axes, show_image
 
 TILE = 16
 
@@ -106,7 +106,7 @@ fig, panels = axes(7, height=1.5)
 names = ("$1$", "$x$", "$y$", "$x^2$", "$xy$", "$y^2$")
 for panel, row, name in zip(panels, P, names, strict=False):
     most = np.abs(row).max()
-    show_image(panel, row.reshape(TILE, TILE), name, vmin=-most, vmax=most, cmap="RdBu_r")
+    show_image(panel, row.reshape(TILE, TILE), name, vmin=-most, vmax=most, cmap=DIVERGING)
 show_image(panels[6], alpha[6].reshape(TILE, TILE), "alpha of one", vmin=0, vmax=1)
 for panel in panels:
     panel.set(xticks=[], yticks=[])
@@ -163,12 +163,12 @@ panels[0].set(xlabel="pixel, early stoppers first", ylabel="place in the list")
 panels[0].set_title("weights, log10")
 panels[0].grid(False)
 fig.colorbar(shade, ax=panels[0], pad=0.02)
-show_image(panels[1], image.reshape(TILE, TILE, 3), "image = colours × weights")
+show_image(panels[1], image.reshape(TILE, TILE, 3), "the tile")
 panels[1].set(xticks=[0, 8, 16], yticks=[0, 8, 16])
 picture(
     fig,
     "Left: the weight matrix; blank is zero, because of the floor or because the pixel has stopped. The line is how "
-    "far the oracle looked. Right: the tile.",
+    "far the oracle looked. Right: colours times weights, the image of the tile.",
 )
 
 # %% [markdown]
@@ -227,11 +227,8 @@ v_b = -(u * dv - v * sx + sxy)
 v_conics = np.stack([v_a, v_b, v_c], axis=1)
 assert np.allclose(v_means2d, wanted.v_means2d, rtol=1e-9, atol=1e-11)
 assert np.allclose(v_conics, wanted.v_conics, rtol=1e-9, atol=1e-11)
-print(
-    f"largest gradient of a centre {np.abs(v_means2d).max():.3f}; off the oracle's by",
-    end=" ",
-)
-print(f"{np.abs(v_means2d - wanted.v_means2d).max():.0e}")
+print(f"largest gradient of a centre {np.abs(v_means2d).max():.3f}", end="; ")
+print(f"off the oracle's by {np.abs(v_means2d - wanted.v_means2d).max():.0e}")
 
 # %% [markdown]
 # ## The real one

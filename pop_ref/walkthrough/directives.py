@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from pop_ref.walkthrough.cells import MINUTES, chapter_files
-from pop_ref.walkthrough.docstrings import without_docstring
+from pop_ref.walkthrough.docstrings import as_wide_as_a_page, without_docstring
 
 DIRECTIVE: Final = re.compile(r"^\{\{(\w+)(?:: ([^}]+))?\}\}$", re.MULTILINE)
 
@@ -90,4 +90,4 @@ def function_in(text: str, name: str, path: str) -> str:
 
 
 def _quoted(code: str, file: str) -> str:
-    return f"`{file}`:\n\n```python\n{code}\n```"
+    return f"`{file}`:\n\n```python\n{as_wide_as_a_page(code)}\n```"

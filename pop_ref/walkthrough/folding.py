@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -20,15 +21,17 @@ class Part:
     role: Role
 
 
-def parts(code: str) -> list[Part]:
+def parts(code: str, used_later: Collection[str] | None = None) -> list[Part]:
     """Cut a cell by what its statements are there for.
 
     Drawing begins with the statement that makes axes and ends with the one that calls `picture` or `film`; a function
     that makes axes, or takes them as `ax`, is drawing by itself. Outside of drawing, imports are imports, and an
-    assertion, or a loop that does nothing but assert, is a check. Comments right above a statement belong to it.
+    assertion, or a loop that does nothing but assert, is a check, and so is an assignment of what only checks look at.
+    Comments right above a statement belong to it.
 
     Args:
         code: a cell that Python can parse.
+        used_later: names that later cells look at, by default any.
 
     Returns:
         The parts in order; together they are the code, but for blank lines between them.
@@ -36,6 +39,8 @@ def parts(code: str) -> list[Part]:
     lines = code.split("\n")
     body = ast.parse(code).body
     roles = _roles(body)
+    if used_later is not None:
+        roles = _with_what_only_checks_need(body, roles, set(used_later))
     cut: list[tuple[int, int, Role]] = []
     for i, (node, role) in enumerate(zip(body, roles, strict=True)):
         first, last = _with_comments(lines, node.lineno - 1), node.end_lineno or node.lineno
@@ -51,6 +56,11 @@ def parts(code: str) -> list[Part]:
         Part("\n".join(lines[first:last]).strip("\n"), role) for first, last, role in cut
     ]
     return found or [Part(code, "plain")]
+
+
+def names_in(codes: Sequence[str]) -> set[str]:
+    """Collect the names that cells look at."""
+    return set().union(*(_looked_at(ast.parse(code)) for code in codes))
 
 
 def said_and_done(code: str) -> tuple[str, str]:
@@ -83,6 +93,36 @@ def _role(node: ast.stmt) -> Role:
     if isinstance(node, ast.Import | ast.ImportFrom):
         return "imports"
     return "checks" if _only_asserts(node) else "plain"
+
+
+def _with_what_only_checks_need(
+    body: list[ast.stmt], roles: list[Role], needed: set[str]
+) -> list[Role]:
+    found, checked = list(roles), set[str]()
+    for i in reversed(range(len(body))):
+        targets = _assigned(body[i])
+        if roles[i] == "plain" and targets & checked and not targets & needed:
+            found[i] = "checks"
+        (checked if found[i] == "checks" else needed).update(_looked_at(body[i]))
+    return found
+
+
+def _assigned(node: ast.stmt) -> set[str]:
+    """Return what an assignment binds, and nothing where it also changes something."""
+    if not isinstance(node, ast.Assign):
+        return set()
+    places = [each for target in node.targets for each in ast.walk(target)]
+    if any(isinstance(each, ast.Subscript | ast.Attribute) for each in places):
+        return set()
+    return {each.id for each in places if isinstance(each, ast.Name)}
+
+
+def _looked_at(node: ast.AST) -> set[str]:
+    return {
+        each.id
+        for each in ast.walk(node)
+        if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Load)
+    }
 
 
 def _only_asserts(node: ast.stmt) -> bool:

@@ -87,6 +87,7 @@ TERMS: Final = (
         "vector-Jacobian product: takes the cotangent of a function's result to that of its input",
     ),
     Term("Jacobian", "1b", "the matrix of a function's first derivatives"),
+    Term("density control", "5", "the rules that add and remove Gaussians in training"),
     Term("near plane", "2", "the depth in front of which nothing is drawn"),
     Term(
         "spherical harmonics",
@@ -175,7 +176,10 @@ def shapes(names: tuple[str, ...]) -> str:
     Raises:
         ValueError: the notation has no such symbol.
     """
-    return ", ".join(f"{name} {symbol_named(name).shape}".rstrip() for name in names)
+    return ", ".join(
+        "gradients" if name == "v_x" else f"{name} {symbol_named(name).shape}".rstrip()
+        for name in names
+    )
 
 
 def glossary() -> str:

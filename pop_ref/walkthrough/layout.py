@@ -19,7 +19,8 @@ from pygments.lexers.python import PythonLexer
 from pop_ref.walkthrough import widgets
 from pop_ref.walkthrough.cells import FOLDER, Cell, Chapter, ChapterError
 from pop_ref.walkthrough.directives import expanded
-from pop_ref.walkthrough.folding import parts, said_and_done
+from pop_ref.walkthrough.docstrings import PAGE
+from pop_ref.walkthrough.folding import names_in, parts, said_and_done
 from pop_ref.walkthrough.glossary import GLOSSARY_PAGE, glossary
 from pop_ref.walkthrough.pages import Outcome, Picture
 from pop_ref.walkthrough.style import VARIABLES
@@ -31,7 +32,11 @@ LEAD: Final = (
     "runs, and each of its exercises has an answer that runs."
 )
 
-
+BY_DOING: Final = (
+    "To learn by doing, <code>pop learn start mine</code> writes twelve files for you to fill in and judges them; the "
+    "whole method in 300 lines of NumPy is <code>pop_ref/learn/splat.py</code>, and <code>python -m "
+    "pop_ref.learn.splat</code> trains a small scene with it in a minute."
+)
 _NAMES: Final = (
     "argmax",
     "argmin",
@@ -50,6 +55,10 @@ _MATHML: Final = "{http://www.w3.org/1998/Math/MathML}"
 ElementTree.register_namespace("", _MATHML[1:-1])
 
 
+# a comma behind a formula stays on its line
+_PUNCTUATED: Final = re.compile(
+    r'<span class="math inline">((?:(?!</math>).)*</math>)</span>([,.;:)?]+)', re.DOTALL
+)
 # labels of decisions and kinks in prose; what code quotes is left alone
 _LABEL: Final = re.compile(r"(<(pre|code|a|math|h\d)\b.*?</\2>)|\b([DB][1-8])\b", re.DOTALL)
 _WIDGET: Final = re.compile(r"<p>\{\{widget: (\w+)\}\}</p>")
@@ -106,7 +115,7 @@ def index_page(chapters: Sequence[Chapter], beside: Mapping[str, str] | None = N
         for chapter in chapters
     ]
     hours = sum(chapter.minutes for chapter in chapters) / 60.0
-    about = f'{LEAD} All of it takes about {hours:.0f} hours. <a href="{GLOSSARY_PAGE}">Glossary</a>'
+    about = f'{LEAD} All of it takes about {hours:.0f} hours. {BY_DOING} <a href="{GLOSSARY_PAGE}">Glossary</a>'
     for name, place in (beside or {}).items():
         about += (
             f' · <a href="{place}{"/index.html" if name == "notebooks" else ""}">{name}</a>'
@@ -153,7 +162,7 @@ def _cell(chapter: Chapter, name: str, outcome: Outcome, tier: str) -> str:
     said, code = said_and_done(cell.text) if cell.kind == "answer" else ("", cell.text)
     shown = [_prose(chapter, Cell("prose", said, cell.line))] if said else []
     by_role: dict[str, list[str]] = {"plain": [], "imports": [], "checks": [], "draws": []}
-    for part in parts(code):
+    for part in parts(code, names_in(chapter.code_after(cell))):
         by_role[part.role].append(part.text)
     plain, imports, checks, drawing = ("\n\n".join(by_role[role]) for role in by_role)
     if imports:
@@ -165,7 +174,7 @@ def _cell(chapter: Chapter, name: str, outcome: Outcome, tier: str) -> str:
             else _code(plain)
         )
     if outcome.printed.strip():
-        shown.append(f'<pre class="printed">{escape(outcome.printed.rstrip())}</pre>')
+        shown.append(_printed(outcome.printed.rstrip()))
     for i, each in enumerate(outcome.pictures):
         shown.append(_figure(chapter, cell, f"{name}-{i}", each))
     # how a picture is drawn, and what is checked, are footnotes
@@ -187,6 +196,12 @@ def _asked(name: str, tier: str, answer: str) -> str:
         f'<input id="{name}-guess" autocomplete="off"><span role="status"></span></p>'
     )
     return f'<div class="asked">{box}{_folded("Answer", answer)}</div>'
+
+
+def _printed(text: str) -> str:
+    # a table of long lines scrolls, since it cannot be read when its lines are broken
+    long = max(map(len, text.split("\n"))) > PAGE
+    return f'<pre class="printed{" long" if long else ""}">{escape(text)}</pre>'
 
 
 def _aside(title: str, code: str) -> str:
@@ -219,7 +234,9 @@ def _figure(chapter: Chapter, cell: Cell, name: str, picture: Picture) -> str:
         shown = f'<img src="data:image/png;base64,{data}" {size} alt="{escape(picture.caption)}">'
     else:
         shown = _inline_svg(picture.svg, name, picture.caption)
-    return f'<figure><div class="wide">{shown}</div><figcaption>{caption}</figcaption></figure>'
+    # on a phone a picture is at least so wide that its letters can be read
+    least = f'style="--least:{picture.width * 80:.0f}px"'
+    return f'<figure><div class="wide" {least}>{shown}</div><figcaption>{caption}</figcaption></figure>'
 
 
 def _inline_svg(svg: str, name: str, caption: str) -> str:
@@ -294,6 +311,7 @@ def _prose(chapter: Chapter, cell: Cell) -> str:
         raise ChapterError(chapter.path, cell.line, str(error)) from error
     try:
         rendered = _LABEL.sub(_label, _MARKDOWN.render(text))
+        rendered = _PUNCTUATED.sub(r'<span class="math inline stays">\1\2</span>', rendered)
         return _WIDGET.sub(lambda found: widgets.html(found[1]), rendered)
     except Exception as error:
         raise ChapterError(

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from pop_ref.walkthrough.cells import FOLDER, Cell, Chapter
 from pop_ref.walkthrough.directives import expanded
-from pop_ref.walkthrough.folding import parts, said_and_done
+from pop_ref.walkthrough.folding import names_in, parts, said_and_done
 
 _WIDGET: Final = re.compile(r"^\{\{widget: (\w+)\}\}$", re.MULTILINE)
 _LINK: Final = re.compile(r"\]\((chapter_\w+)\.py\)")
@@ -28,7 +28,7 @@ def notebook(chapter: Chapter) -> str:
     """Write a chapter as a notebook that has not been run, in nbformat 4.5.
 
     Imports, drawing, checks, fixtures and answers are code cells of their own whose source is folded; what they show
-    stays in sight.
+    stays in sight. Each code cell's metadata names the line of the chapter's file at which its chapter's cell begins.
 
     Args:
         chapter: as `read_chapter` gave it.
@@ -45,7 +45,11 @@ def notebook(chapter: Chapter) -> str:
     )
     cells = [_prose(about)]
     for cell in chapter.cells:
-        cells += _told(cell) if cell.kind == "prose" else _done(cell)
+        made = _told(cell) if cell.kind == "prose" else _done(chapter, cell)
+        for each in made:
+            if each["cell_type"] == "code":
+                each["metadata"] |= {"chapter_line": cell.line}
+        cells += made
     for i, each in enumerate(cells):
         each["id"] = f"cell-{i}"
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
@@ -91,14 +95,15 @@ def _told(cell: Cell) -> list[dict[str, Any]]:
     return cells
 
 
-def _done(cell: Cell) -> list[dict[str, Any]]:
+def _done(chapter: Chapter, cell: Cell) -> list[dict[str, Any]]:
     if cell.kind == "answer":
         said, code = said_and_done(cell.text)
         told = f"<details><summary>Answer</summary>\n\n{expanded(said)}\n\n</details>"
         return [*([_prose(told)] if said else []), _code(code, folded=True)]
     if cell.kind == "setup":
         return [_code(cell.text, folded=True)]
-    return [_code(part.text, folded=part.role != "plain") for part in parts(cell.text)]
+    cut = parts(cell.text, names_in(chapter.code_after(cell)))
+    return [_code(part.text, folded=part.role != "plain") for part in cut]
 
 
 def _prose(text: str) -> dict[str, Any]:
@@ -106,7 +111,7 @@ def _prose(text: str) -> dict[str, Any]:
 
 
 def _code(text: str, folded: bool) -> dict[str, Any]:
-    metadata = {"jupyter": {"source_hidden": True}} if folded else {}
+    metadata: dict[str, Any] = {"jupyter": {"source_hidden": True}} if folded else {}
     empty = {"execution_count": None, "outputs": []}
     return {
         "cell_type": "code",

@@ -16,6 +16,7 @@ from pop_ref.notation import AXES, SYMBOLS
 from pop_ref.walkthrough import widgets
 from pop_ref.walkthrough.__main__ import main
 from pop_ref.walkthrough.cells import TIERS, ChapterError, read_chapter
+from pop_ref.walkthrough.docstrings import as_wide_as_a_page
 from pop_ref.walkthrough.folding import Part, parts, said_and_done
 from pop_ref.walkthrough.glossary import GLOSSARY_PAGE, TERMS, Term
 from pop_ref.walkthrough.layout import chapter_page, index_page
@@ -215,6 +216,38 @@ def test_a_cell_is_cut_by_what_its_statements_are_for() -> None:
     assert parts(f"x = 1\n{checks}") == [Part("x = 1", "plain"), Part(checks, "checks")]
     assert parts("for y in z:\n    total += y") == [Part("for y in z:\n    total += y", "plain")]
     assert parts("film(images, labels, 'A film.')") == [Part("film(images, labels, 'A film.')", "draws")]
+
+
+def test_what_only_checks_look_at_is_folded_with_them() -> None:
+    code = "y = f(x)\nz = g(y)\nassert z == 1"
+    assert parts(code, set()) == [Part(code, "checks")]
+    assert parts(code, {"z"}) == [Part("y = f(x)\nz = g(y)", "plain"), Part("assert z == 1", "checks")]
+    assert parts(code, {"y"}) == [Part("y = f(x)", "plain"), Part("z = g(y)\nassert z == 1", "checks")]
+    # what is printed, and what changes something, stays in sight
+    assert [part.role for part in parts(f"{code}\nprint(z)", set())] == ["plain", "checks", "plain"]
+    assert parts("y[0] = 1\nassert y", set())[0] == Part("y[0] = 1", "plain")
+    page = _whole(GOOD.replace("print(Pair", "n = 7\nassert n == 7\nprint(Pair"))
+    assert page.index("What was checked") < page.index('<span class="n">n</span>')
+
+
+def test_a_signature_is_broken_where_it_is_wider_than_a_page() -> None:
+    short = "def f(x: int) -> int:\n    # why (A27)\n    return x"
+    assert as_wide_as_a_page(short) == "def f(x: int) -> int:\n    # why\n    return x"
+    given = ", ".join(f'{name * 12}: Float64[np.ndarray, "N 3"]' for name in "abc")
+    wide = f"def f({given}) -> tuple[int, int]:\n    return 1, 2"
+    for each in (wide, wide.replace("f(", "f(\n    ").replace(") ->", "\n) ->")):
+        lines = as_wide_as_a_page(each).split("\n")
+        assert lines[1] == '    aaaaaaaaaaaa: Float64[np.ndarray, "N 3"],'
+        assert lines[4:] == [") -> tuple[int, int]:", "    return 1, 2"]
+
+
+def test_a_printed_table_of_long_lines_is_not_broken() -> None:
+    assert '<pre class="printed long">' in _whole(GOOD.replace("print(Pair(1.0).x)", "print('x' * 100)"))
+    assert '<pre class="printed">' in _whole(GOOD)
+
+
+def test_a_comma_behind_a_formula_stays_with_it() -> None:
+    assert re.search(r'<span class="math inline stays"><math [^>]*>.*?</math>\.</span>', _whole(GOOD), re.DOTALL)
 
 
 def test_the_comment_that_opens_an_answer_is_prose() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import time
 from pathlib import Path
 
@@ -29,6 +30,9 @@ def write(folder: Path, name: str, *changes: tuple[str, str]) -> Path:
     future = "from __future__ import annotations\n"
     modules = [(ORACLE / f"{module}.py").read_text(encoding="utf-8") for module in BY_NAME[name].functions]
     text = future + "\n\n".join(module.replace(future, "") for module in modules)
+    for module in BY_NAME[name].functions:
+        # what one module imports from another of the stage would hide what stands in this file
+        text = re.sub(rf"from pop_ref\.{module} import (\([^)]*\)|.*)\n", "", text)
     for old, new in changes:
         assert text.count(old) == 1, old
         text = text.replace(old, new)
@@ -116,6 +120,36 @@ WRONG = {
         ("    return covars2d + eps2d * np.eye(2)", "    covars2d += eps2d * np.eye(2)\n    return covars2d"),
         "in place",
     ),
+    "a quaternion of any length": (
+        "covariance",
+        (
+            "rotmats = np.zeros((len(quats), 3, 3))\n    for i, (w, x, y, z) in enumerate(unit_quats_from_quats(quats)",
+            "rotmats = np.zeros((len(quats), 3, 3))\n    for i, (w, x, y, z) in enumerate((quats)",
+        ),
+        "divided by its length",
+    ),
+    "positive harmonics of degree 1": (
+        "harmonics",
+        ("-_C1 * y,\n        _C1 * z,\n        -_C1 * x,", "_C1 * y,\n        _C1 * z,\n        _C1 * x,"),
+        "degree 1 have the wrong sign",
+    ),
+    "no half in a colour": ("harmonics", ("@ sh[i, :n_sh] + 0.5, 0.0)", "@ sh[i, :n_sh], 0.0)"), "half is missing"),
+    "no correction in Adam": (
+        "optimizer",
+        (
+            "/ np.sqrt(1.0 - beta2**t) + eps\n        new_params[name] = params[name] - lr[name] / (1.0 - beta1**t) *",
+            "+ eps\n        new_params[name] = params[name] - lr[name] *",
+        ),
+        "not corrected",
+    ),
+    "the rows that should go": (
+        "density",
+        (
+            "return _keep_and_append(rows, ~mask, {name: array[:0]",
+            "return _keep_and_append(rows, mask, {name: array[:0]",
+        ),
+        "keep the rows",
+    ),
     "an error": ("alpha", ("    return math.exp(-sigma)\n", "    return math.exp(-sigma) / 0\n"), "ZeroDivisionError"),
 }
 
@@ -202,6 +236,12 @@ def test_a_function_finds_the_students_own_and_the_oracles_where_there_is_none(m
         assert borrowed.module("alpha").alpha_from_sigma(0.0, 0.5) == (0.25, -1.0)
         assert borrowed.module("pixel").alpha_from_sigma(0.0, 0.5) == (0.25, -1.0)
         assert borrowed.oracle["falloff"](0.0) == 1.0
+
+
+def test_who_stands_inside_the_folder_is_told_how_to_name_it(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(mine)
+    with pytest.raises(ValueError, match=r"mine has no stubs; you are in a folder that has some: write \. for it"):
+        read_work(Path("mine"))
 
 
 def test_the_map_turns_green_with_a_pass_and_back_with_a_change(mine: Path) -> None:

@@ -2,29 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pop_ref.walkthrough.cells import Chapter, chapter_files, read_chapter
+from pop_ref.walkthrough.cells import Chapter, chapter_number, read_chapter
 from pop_ref.walkthrough.notebooks import notebook
+from tests.walkthrough.ran import CHAPTERS, MISSING, executed, run_of
 
-CHAPTERS = [read_chapter(path) for path in chapter_files()]
-# in a process of its own, as Jupyter has it
-EXECUTE = """
-import json, sys
-import nbclient, nbformat
-notebook = nbformat.read(sys.argv[1], as_version=4)
-nbformat.validate(notebook)
-nbclient.NotebookClient(notebook, timeout=600, kernel_name="python3").execute()
-print(json.dumps([output for cell in notebook.cells for output in cell.get("outputs", [])]))
-"""
-MISSING = [name for name in ("nbclient", "ipykernel") if importlib.util.find_spec(name) is None]
 runs = pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed")
 
 GOOD = """# minutes: 5
@@ -64,18 +51,6 @@ def _small(text: str = GOOD) -> Chapter:
     return read_chapter(Path("chapter_01_small.py"), text)
 
 
-def _outputs(chapter: Chapter, folder: Path, more: str = "") -> list[dict[str, Any]]:
-    written = json.loads(notebook(chapter))
-    if more:
-        empty = {"execution_count": None, "outputs": [], "metadata": {}, "id": "more"}
-        written["cells"].append({"cell_type": "code", "source": [more], **empty})
-    file = folder / "chapter.ipynb"
-    file.write_text(json.dumps(written), encoding="utf-8")
-    done = subprocess.run([sys.executable, "-c", EXECUTE, str(file)], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-3000:]
-    return json.loads(done.stdout.splitlines()[-1])
-
-
 def _pictures(outputs: list[dict[str, Any]]) -> int:
     return sum("image/png" in output.get("data", {}) for output in outputs)
 
@@ -106,8 +81,8 @@ def test_a_notebook_holds_the_chapter_and_folds_what_a_page_folds() -> None:
 
 
 @runs
-def test_a_small_notebook_shows_its_picture_caption_widget_and_print_and_nothing_else(tmp_path: Path) -> None:
-    outputs = _outputs(_small(), tmp_path)
+def test_a_small_notebook_shows_its_picture_caption_widget_and_print_and_nothing_else() -> None:
+    outputs = [output for cell in executed(notebook(_small())) for output in cell["outputs"]]
     assert _pictures(outputs) == 1
     data = [output["data"] for output in outputs if "data" in output]
     assert ["text/html" in each for each in data] == [True, False, False]
@@ -116,15 +91,17 @@ def test_a_small_notebook_shows_its_picture_caption_widget_and_print_and_nothing
     assert len(outputs) == 4
 
 
-# the first nine chapters are read without torch; the others are executed where all tests are
+# the first nine chapters are read without torch; from the last on, so that two workers seldom wait for one chapter
 @runs
 @pytest.mark.slow
-@pytest.mark.parametrize("chapter", CHAPTERS, ids=lambda chapter: chapter.path.stem)
-def test_every_picture_of_a_chapter_appears_in_its_notebook(chapter: Chapter, tmp_path: Path) -> None:
-    early = int(chapter.path.stem[8:10]) <= 9
-    more = "import sys\nassert 'torch' not in sys.modules" if early else ""
-    outputs = _outputs(chapter, tmp_path, more)
+@pytest.mark.parametrize("path", CHAPTERS[::-1], ids=lambda path: path.stem)
+def test_every_picture_of_a_chapter_appears_in_its_notebook(path: Path) -> None:
+    chapter, run = read_chapter(path), run_of(path)
+    assert run.outputs is not None
+    if int(chapter_number(path).rstrip("b")) <= 9:
+        assert "pop_ref" in run.modules
+        assert "torch" not in run.modules
+    outputs = [output for each in run.outputs for output in each]
     drawn = sum(cell.text.count("\npicture(") + cell.text.count("\nfilm(") for cell in chapter.cells)
     assert _pictures(outputs) == drawn > 0
-    errors = [output for output in outputs if output["output_type"] == "error" or output.get("name") == "stderr"]
-    assert errors == []
+    assert [output for output in outputs if output["output_type"] == "error" or output.get("name") == "stderr"] == []

@@ -36,7 +36,7 @@ WIDGETS: Final = {
     ),
     "stack": Widget(
         "A stack of splats at one pixel",
-        "put a wall in the middle, then bring it to the front: who still has a weight, and who a gradient?",
+        "put a wall in the middle, then bring it to the front: which splats still have a weight, and which a gradient?",
         ("alpha", "pixel"),
     ),
     "orbit": Widget(

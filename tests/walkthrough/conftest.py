@@ -1,0 +1,18 @@
+"""A folder in which the workers of a session share what the chapters did."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from tests.walkthrough import ran
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _shared_runs(tmp_path_factory: pytest.TempPathFactory) -> None:
+    base = tmp_path_factory.getbasetemp()
+    # a worker of xdist has a folder of its own in that of the session
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "chapters-that-ran"
+    folder.mkdir(exist_ok=True)
+    ran.shared = folder
