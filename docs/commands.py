@@ -28,7 +28,6 @@ from websockets.sync.client import connect
 
 from paper_repro.cli import COMMANDS as REPRO_COMMANDS
 from pop_fast.cli import COMMANDS as OF_POP
-from pop_ref.walkthrough.browser import OPTIONS, chromium
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
@@ -36,6 +35,14 @@ PAGE, PICTURES = DOCS / "commands.md", DOCS / "commands"
 OF_REPRO = {name: about for name, (_, about) in REPRO_COMMANDS.items()}
 LONGEST = 30  # lines of an output
 WIDEST = 900  # px of a picture
+# WebGL without a GPU, and inside a container
+HEADLESS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--enable-unsafe-swiftshader",
+    "--disable-dev-shm-usage",
+    "--hide-scrollbars",
+)
 Picture = Callable[[Path, Path], None]
 
 
@@ -68,12 +75,11 @@ def shot(page: str, width: int = WIDEST, height: int = 700, seconds: float = 4.0
     """
 
     def take(folder: Path, png: Path) -> None:
-        program = chromium()
+        program = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
         if program is None:
             raise SystemExit("the pictures of pages need Chromium: apt install chromium, or set CHROMIUM")
         address = page if "://" in page else (folder / page).resolve().as_uri()
-        options = [option for option in OPTIONS if option != "--disable-gpu"]
-        options += ["--enable-unsafe-swiftshader", f"--window-size={width},{height}", "--remote-debugging-port=0"]
+        options = [*HEADLESS, f"--window-size={width},{height}", "--remote-debugging-port=0"]
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
             browser = subprocess.Popen(
                 [program, *options, f"--user-data-dir={profile}", address], stderr=subprocess.DEVNULL
