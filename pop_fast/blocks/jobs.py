@@ -52,12 +52,13 @@ def profile_folder(name: str) -> Path:
     return found.absolute()
 
 
-def run_in_turn(folder: Path, job: Job, say: Callable[[str], None] = print) -> int:
+def run_in_turn(folder: Path, job: Job, quiet: bool = False, say: Callable[[str], None] = print) -> int:
     """Train the blocks that are not trained yet, one after the other, and merge them.
 
     Args:
         folder: the run's, whose capture is divided.
         job: what was asked for.
+        quiet: what they print is not shown; warnings and errors are.
         say: is told what begins.
 
     Returns:
@@ -68,13 +69,15 @@ def run_in_turn(folder: Path, job: Job, say: Callable[[str], None] = print) -> i
             continue
         say(f"block {name}, {index} of {len(job.names)}" if name else f"merging {len(job.names)} blocks")
         words = ["train", str(folder), name] if name else ["merge", str(folder)]
-        status = _run([sys.executable, "-m", "pop_fast.cli", "blocks", *words])
+        status = _run([sys.executable, "-m", "pop_fast.cli", "blocks", *words], quiet)
         if status != 0:
             return status
     return 0
 
 
-def run_workflow(folder: Path, job: Job, jobs: int, threads: int, backend: str, profile: Path | None) -> int:
+def run_workflow(
+    folder: Path, job: Job, jobs: int, threads: int, backend: str, profile: Path | None, quiet: bool = False
+) -> int:
     """Run the workflow by Snakemake.
 
     Args:
@@ -84,11 +87,13 @@ def run_workflow(folder: Path, job: Job, jobs: int, threads: int, backend: str, 
         threads: of a training.
         backend: what trains; "cuda" asks for a GPU each.
         profile: a profile's folder, by which it runs on a cluster; None stays here.
+        quiet: what it prints is not shown; warnings and errors are.
 
     Returns:
         The exit status: Snakemake's, or 130 after Ctrl-C or SIGTERM.
     """
-    return _run(workflow_words(folder, job, jobs, threads, backend, profile))
+    more = ["--quiet", "all"] if quiet else []
+    return _run(workflow_words(folder, job, jobs, threads, backend, profile, *more), quiet)
 
 
 def workflow_words(
@@ -111,11 +116,11 @@ def workflow_words(
     return [*command, *where, *more, "--config", *(f"{name}={value}" for name, value in settings.items())]
 
 
-def _run(words: Sequence[str]) -> int:
-    """Run a process and wait; of the first Ctrl-C, SIGTERM or SIGHUP it and its children hear once, as in a terminal."""
+def _run(words: Sequence[str], quiet: bool) -> int:
+    """Run a process and wait; the first Ctrl-C, SIGTERM or SIGHUP is passed on once to it and its children."""
     alone = os.name == "posix"
     with stop_requests() as stop:
-        process = subprocess.Popen(words, start_new_session=alone)
+        process = subprocess.Popen(words, start_new_session=alone, stdout=subprocess.DEVNULL if quiet else None)
         try:
             while process.poll() is None:
                 if stop.wait(_PAUSE):

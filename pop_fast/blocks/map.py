@@ -44,7 +44,8 @@ def write_map(path: Path, capture: Capture, plan: Plan) -> None:
         axes.plot(*_outline(wider), "--", color=color, linewidth=1.0)
         axes.plot(*_outline(core), "-", color="black", linewidth=1.2)
         text = f"{block.name}\n{len(block.views)} views, {len(block.points):,} points"
-        axes.text(*core.mean(axis=1), text, ha="center", va="center", fontsize=8, bbox={"fc": "white", "alpha": 0.7})
+        across, along = core.mean(axis=1)
+        axes.text(across, along, text, ha="center", va="center", fontsize=8, bbox={"fc": "white", "alpha": 0.7})
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="first axis of the ground", ylabel="second axis")
     axes.set_title(
         f"{capture.name} in {plan.job.blocks}: points, cameras (triangles), cores, margins (dashed)", fontsize=9

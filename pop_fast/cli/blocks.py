@@ -92,13 +92,14 @@ def _train(folder: Path, config: TrainConfig, block: str, argv: Sequence[str]) -
     record = read_record(folder)
     own = config_of(folder, config, block)
     # what a user's own training of the block's folder would be, without what the merged result has instead
-    _, options = arguments([own.data, "--out", own.result_dir, "--resume", "--skip-sizes", "--skip-checks"])
+    place = Path(own.result_dir)
+    again = ["--resume"] if (place / "cfg.json").is_file() else []
+    _, options = arguments([own.data, "--out", own.result_dir, "--skip-sizes", "--skip-checks", *again])
     if record is not None:
         options = replace(options, images=record.images, ignore_masks=not record.masks)
-    place = Path(own.result_dir)
     check_output(place, options)
     options = as_begun(place, options)
-    own, chosen = choose_backend(own, resume=True)
+    own, chosen = choose_backend(own, options.resume)
     check_backend(own)
     status = train_capture(own, options, chosen, ["blocks", *argv])
     if status in (0, EXIT_INCOMPLETE):

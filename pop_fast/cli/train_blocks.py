@@ -49,8 +49,8 @@ def check_blocks(config: TrainConfig, options: Any) -> None:
     if config.exposure or config.refine_cameras:
         name = "--exposure" if config.exposure else "--refine-cameras"
         raise PopError(
-            f"{name} learns of each photograph in every block that it trains, and blocks would not agree on it, so that "
-            "they would not fit together; leave it out with --blocks"
+            f"{name} learns of a photograph in every block that it trains, and blocks would not agree on it and so not "
+            "fit together; leave it out with --blocks"
         )
     for name in _NEED_ALL:
         if getattr(options, name) is not None:
@@ -128,10 +128,11 @@ def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequen
             print(f"all blocks of {folder} are trained and merged")
             return 0
         if options.blocks_profile is None and not has_snakemake():
-            status = run_in_turn(folder, job, lambda line: print(line, flush=True))
+            status = run_in_turn(folder, job, options.quiet, lambda line: print(line, flush=True))
         else:
             profile = None if options.blocks_profile is None else profile_folder(options.blocks_profile)
-            status = run_workflow(folder, job, options.blocks_jobs, config.threads, config.backend, profile)
+            how = (options.blocks_jobs, config.threads, config.backend, profile, options.quiet)
+            status = run_workflow(folder, job, *how)
     finally:
         lock.release()
     if status == EXIT_INTERRUPTED:
