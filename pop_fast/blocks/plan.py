@@ -42,10 +42,11 @@ from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.read_back import read_json
 
-__all__ = ["FOLDER", "Block", "Job", "Plan", "make_plan", "read_job", "read_plan", "write_job", "write_plan"]
+__all__ = ["FOLDER", "JOB", "Block", "Job", "Plan", "job_text", "make_plan", "read_job", "read_plan", "write_plan"]
 
 FOLDER: Final = "blocks"
-_JOB, _PLAN = "job.json", "plan.json"
+JOB: Final = f"{FOLDER}/job.json"
+_PLAN = "plan.json"
 _FIX: Final = "start 'pop train --blocks' again with --overwrite"
 
 
@@ -173,9 +174,9 @@ def _evenly(indices: np.ndarray, most: int) -> np.ndarray:
     return indices[np.linspace(0, len(indices) - 1, most).round().astype(np.int64)]
 
 
-def write_job(folder: Path, job: Job) -> None:
-    """Write what was asked for into a result folder."""
-    _write_json(folder / FOLDER / _JOB, asdict(job))
+def job_text(job: Job) -> str:
+    """Return what job.json holds."""
+    return json.dumps(asdict(job), indent=2) + "\n"
 
 
 def read_job(folder: Path) -> Job | None:
@@ -184,7 +185,7 @@ def read_job(folder: Path) -> Job | None:
     Raises:
         PopError: job.json is damaged.
     """
-    path = folder / FOLDER / _JOB
+    path = folder / JOB
     if not path.is_file():
         return None
     content = read_json(path, _FIX)

@@ -190,20 +190,19 @@ def _begin(folder: Path, config: TrainConfig, options: Any, job: Job, division: 
     """Write what a run has from its start, in place of earlier results."""
     import numpy as np
 
-    from pop_fast.blocks.plan import write_job
+    from pop_fast.blocks.plan import JOB, job_text
     from pop_fast.cli.result_folder import record_of
     from pop_fast.train.commands import COMMANDS_FILE, commands_text
     from pop_fast.train.load_result import RECORD, record_text
     from pop_fast.train.results import ResultFolder
 
     record = record_text(record_of(division.capture, options))
-    beside = {RECORD: record, COMMANDS_FILE: commands_text(None, ["pop", "train", *argv])}
+    beside = {RECORD: record, COMMANDS_FILE: commands_text(None, ["pop", "train", *argv]), JOB: job_text(job)}
     first = np.full(len(division.capture.points), config.init_opacity)
     results = ResultFolder(folder)
     try:
         results.check(options.resume, options.overwrite)
         results.begin(config, beside, first, options.overwrite)
-        write_job(folder, job)
     finally:
         results.close()
 

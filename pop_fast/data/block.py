@@ -21,8 +21,9 @@ from pop_fast.data.posed_images import Listing, PosedImage, SparsePoints
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import write_atomically
 
-__all__ = ["find_block", "read_block", "write_block"]
+__all__ = ["BLOCK", "find_block", "read_block", "write_block"]
 
+BLOCK: Final = "block"  # what a list of a block says that it is made from
 _LIST, _POINTS = "block.json", "points.npz"
 _FIX: Final = "remove the folder with all blocks, and start 'pop train --blocks' again with --overwrite"
 
@@ -78,7 +79,7 @@ def read_block(folder: Path) -> Listing:
         raise CaptureError(f"{points}: is not what 'pop train --blocks' writes ({error!r}); {_FIX}") from error
     if not root.is_dir():
         raise CaptureError(f"{path}: is a block of {root}, which is not there; put the capture back, or {_FIX}")
-    return Listing(root, path, shots, cloud, "block", transform=transform)
+    return Listing(root, path, shots, cloud, BLOCK, transform=transform)
 
 
 def _entry(shot: PosedImage) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from pop_fast.data.block import find_block, read_block
+from pop_fast.data.block import BLOCK, find_block, read_block
 from pop_fast.data.capture import Capture, Progress, View, held_out
 from pop_fast.data.colmap import find_models, read_model
 from pop_fast.data.diagnostics import about_other_models, about_random_points, about_unplaced
@@ -89,8 +89,9 @@ def load_capture(
         raise CaptureError(f"missing is {missing!r}; it must be 'error' or 'skip'")
     if resize not in ("area", "bicubic"):
         raise CaptureError(f"resize is {resize!r}; it must be 'area' or 'bicubic'")
-    options = PhotoOptions(int(factor), masks, missing, _background(background), images, resize)
+    shown = _background(background)
     listing = list_capture(path, source, images, sfm, progress) if listing is None else listing
+    options = PhotoOptions(int(factor), masks, missing, shown, images, resize, part=listing.made_from == BLOCK)
 
     def wanted(shots: Sequence[PosedImage]) -> list[bool]:
         if photographs == "none":

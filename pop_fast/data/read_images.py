@@ -35,7 +35,11 @@ __all__ = ["PhotoOptions", "read_views"]
 
 @dataclass(frozen=True)
 class PhotoOptions:
-    """How photographs are read; see `pop_fast.data.load_capture`."""
+    """How photographs are read; see `pop_fast.data.load_capture`.
+
+    Attributes:
+        part: the list is a part of what its folder holds, so that masks may be there and none of them be its own.
+    """
 
     factor: int = 1
     masks: bool = True
@@ -43,6 +47,7 @@ class PhotoOptions:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     images: str | None = None
     resize: Literal["area", "bicubic"] = "area"
+    part: bool = False
 
 
 @dataclass(frozen=True)
@@ -125,7 +130,7 @@ def _locate(
             f"{listing}: lists {len(shots)} images, {len(absent)} of them absent, first {absent[0]}; "
             "restore them or pass --missing skip"
         )
-    if masks and not any(photo.mask for photo in photos):
+    if masks and not options.part and not any(photo.mask for photo in photos):
         raise CaptureError(f"{masks}: holds no mask named as a photograph (<name>.png or <name>.jpg.png); rename them")
     notes = [f"{len(absent)} of {len(shots)} listed images are absent and were skipped"] if absent else []
     notes += _about_folders(root, shots, options)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +19,13 @@ import torch
 from pop_fast.blocks import jobs
 from pop_fast.blocks.plan import read_plan
 from pop_fast.cli import main
-from pop_fast.data.load import load_capture
+from pop_fast.data.block import write_block
+from pop_fast.data.load import list_capture, load_capture
 from pop_fast.errors import PopError
 from pop_fast.train.checkpoint import load_splats
 from pop_fast.train.results import ResultFolder
 from pop_fast.train.views import ViewTensors
-from tests.app.captures import assert_one_line
+from tests.app.captures import assert_one_line, write_photograph
 from tests.app.conftest import TRAIN, Pop
 from tests.app.interruptions import interrupt
 
@@ -294,6 +296,19 @@ def test_cameras_alone_and_held_out_photographs_alone_are_those_of_the_whole(sha
                 assert view.image.strides[:2] == (0, 0)
                 with pytest.raises(PopError, match="was not read"):
                     ViewTensors.of(view)
+
+
+def test_a_block_none_of_whose_photographs_has_a_mask_is_read_and_one_with_masks_keeps_them(capture, tmp_path):
+    listing = list_capture(capture)
+    names = [shot.name for shot in listing.shots]
+    write_photograph(capture / "masks" / f"{Path(names[1]).stem}.png", np.full((32, 40), 255, np.uint8))
+    whole = load_capture(capture)
+    assert [view.mask is not None for view in whole.views] == [name == names[1] for name in names]
+    for chosen, masked in ((names[:3], [False, True, False]), (names[3:], [False] * 5)):
+        shots = [replace(shot, split="train") for shot in listing.shots if shot.name in chosen]
+        write_block(tmp_path / "block", replace(listing, shots=shots, transform=whole.world_transform))
+        assert [view.mask is not None for view in load_capture(tmp_path / "block").views] == masked
+        assert all(view.mask is None for view in load_capture(tmp_path / "block", masks=False).views)
 
 
 @pytest.mark.processes
