@@ -3,7 +3,7 @@
 python -m benchmarks.blocks CAPTURE --work FOLDER [--blocks 2x2] [--factor 2] [--preset quick] [--threads 1]
 
 Both are `pop train` of the same settings, so that each block takes as many steps as the whole, and both are measured on
-the held-out views of the whole capture. Memory is the peak of each training's process. What was interrupted goes on
+the held-out views of the whole capture. Memory is the peak of each training's process. What was interrupted is resumed
 when the command is given again; processor times add up in FOLDER. Writes benchmarks/results/blocks.json, of which
 docs/using.md has the table.
 """
@@ -26,7 +26,7 @@ GIB = 2**30
 
 
 def run(words: Sequence[str], folder: Path, note: Path) -> dict[str, float]:
-    """Run `pop train`, or go on with it, and return the seconds that it has taken up to now: of clock and processor.
+    """Run `pop train`, or resume it, and return the seconds that it has taken up to now: of clock and processor.
 
     Args:
         words: after `pop train`.

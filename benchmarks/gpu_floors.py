@@ -76,8 +76,8 @@ def _clock_hz() -> float:
     if tool is None:
         return 1e9
     query = [tool, "--query-gpu=clocks.max.sm", "--format=csv,noheader,nounits"]
-    told = subprocess.run(query, capture_output=True, text=True, check=False).stdout.split()
-    return 1e6 * float(told[0]) if told else 1e9
+    printed = subprocess.run(query, capture_output=True, text=True, check=False).stdout.split()
+    return 1e6 * float(printed[0]) if printed else 1e9
 
 
 def instructions_a_pair(kernel: str, arch: str = "sm_90") -> float:

@@ -127,7 +127,7 @@ class Record:
         self.result, self._write = result, write
 
     def part(self, name: str, measured: Callable[[], Any], keep: bool = True) -> Any:
-        """Measure a part, or make what is not kept; what it raises is told under `failed`, and None returned."""
+        """Measure a part, or make what is not kept; what it raises is recorded under `failed`, and None returned."""
         try:
             found = measured()
             if keep:
@@ -135,8 +135,8 @@ class Record:
         # a benchmark that ends the process takes the other parts with it no more than one that raises
         except (Exception, SystemExit) as error:
             found = None
-            told = "".join(traceback.format_exception_only(error)).strip()
-            self.result.setdefault("failed", {})[name] = told[:1000]
+            message = "".join(traceback.format_exception_only(error)).strip()
+            self.result.setdefault("failed", {})[name] = message[:1000]
         self._write()
         return found
 
@@ -170,9 +170,9 @@ def measure(case: GpuCase, scene: dict[str, Tensor], card: Card, record: Record)
 
 def shares(result: dict[str, Any]) -> dict[str, float]:
     """Say what dominant Gaussians and bits that repeat cost."""
-    ours, told = result["pixel_parallel"], result["with_dominance"]
+    ours, with_dominance = result["pixel_parallel"], result["with_dominance"]
     return {
-        "dominance_share": told["forward_ms"] / ours["forward_ms"] - 1.0,
+        "dominance_share": with_dominance["forward_ms"] / ours["forward_ms"] - 1.0,
         "deterministic_costs_ms": ours["step_ms"] - result["pixel_parallel_atomic"]["step_ms"],
     }
 

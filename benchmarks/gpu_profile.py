@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import torch
 
-LARGEST: Final = 12  # kernels that are told by name
+LARGEST: Final = 12  # kernels that are listed by name
 # waits that the benchmark itself puts before a step
 _OURS = ("spin_kernel", "sleep")
 

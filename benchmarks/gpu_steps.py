@@ -73,17 +73,17 @@ def step_kernels(scene: dict[str, Tensor], photograph: Tensor, steps: int, **set
 
 
 def step_loads(trainer: FusedTrainer) -> Loads:
-    """Count what the trainer's last step had to do; it must have told dominant Gaussians and counts."""
-    ((size, told),) = trainer.render_stats().items()
+    """Count what the trainer's last step had to do; it must have returned dominant Gaussians and counts."""
+    ((size, stats),) = trainer.render_stats().items()
     width, height = size
-    tiles = torch.nn.functional.pad(told["n_traversed"], (0, -width % 16, 0, -height % 8)).view(-(-height // 8), 8, -1)
+    tiles = torch.nn.functional.pad(stats["n_traversed"], (0, -width % 16, 0, -height % 8)).view(-(-height // 8), 8, -1)
     longest = tiles.view(tiles.shape[0], 8, -1, 16).amax((1, 3))
     return Loads(
         trainer.n,
         int((trainer.radii > 0).all(1).sum()),
         trainer.n_instances,
         int(longest.long().sum()) * 16 * 8,
-        int(told["n_blended"].long().sum()),
+        int(stats["n_blended"].long().sum()),
         width * height,
     )
 

@@ -63,9 +63,9 @@ def differences(folder: Path = RUNS) -> str:
             lines.append(
                 _difference(capture, steps, pop["psnr"] - control["psnr"], pop["ssim"] - control["ssim"], share)
             )
-    told = paper()
+    published = paper()
     for dataset, number in (("Mip-NeRF 360", 1), ("Tanks & Temples", 2), ("Deep Blending", 1)):
-        ours, base = (told.table(number).row(row).values[dataset] for row in ("pop", "gsplat"))
+        ours, base = (published.table(number).row(row).values[dataset] for row in ("pop", "gsplat"))
         share = ours["num_gaussians_k"] / base["num_gaussians_k"]
         found = (ours["psnr"] - base["psnr"], ours["ssim"] - base["ssim"], share)
         lines.append(_difference(dataset, "30,000 steps, the paper's", *found))

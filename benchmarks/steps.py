@@ -1,7 +1,7 @@
 """Training steps of POP by every engine, in turns, and where those of the native step go.
 
 All are taken as a user's run takes them, by a `TrainingRun` that asks its stepper for segments; the POP term,
-dominance and the statistics of density control are on, and the population stays as it is.
+dominance and the statistics of density control are on, and the Gaussians stay as they are.
 """
 
 from __future__ import annotations

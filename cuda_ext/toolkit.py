@@ -54,7 +54,7 @@ def nvcc_version(nvcc: str) -> tuple[int, int]:
 
 
 def link_flags(nvcc: str) -> list[str]:
-    """Return what nvcc must be told to find its own runtime: the wheels keep it in lib, nvcc looks into lib64."""
+    """Return the options by which nvcc finds its own runtime: the wheels keep it in lib, nvcc looks into lib64."""
     root = Path(nvcc).resolve().parent.parent
     here, usual = root / "lib" / "libcudart_static.a", root / "lib64" / "libcudart_static.a"
     return [f"-L{here.parent}"] if here.exists() and not usual.exists() else []

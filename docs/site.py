@@ -63,7 +63,7 @@ def content(path: str) -> str:
     """Make the Markdown of a file's page: itself, its source, or the names in a folder."""
     file = ROOT / path
     if not file.exists():
-        raise FileNotFoundError(f"{path}: a page links to it and it does not exist; mend the link")
+        raise FileNotFoundError(f"{path}: a page links to it and it does not exist; correct the link")
     if file.is_dir():
         names = "\n".join(f"- `{child.name}`" for child in sorted(file.iterdir()) if child.name[0] not in "._")
         return f"# {path}\n\n{names}\n"

@@ -43,9 +43,9 @@ _SLACK: Final = 1.2
 
 def claims(scale: str, results: Iterable[Result]) -> tuple[Claim, ...]:
     """Judge every claim by the results of one scale."""
-    found, told = groups(r for r in results if r.scale == scale), paper()
+    found, published = groups(r for r in results if r.scale == scale), paper()
     return tuple(
-        make(found, told)
+        make(found, published)
         for make in (
             *(halves_the_count, blur_multiplies, no_worse_than_reset, window, decay_after_the_window),
             *(fewer_per_pixel, l2_beats_scaled_l1, compact_against_gsplat),
@@ -53,7 +53,7 @@ def claims(scale: str, results: Iterable[Result]) -> tuple[Claim, ...]:
     )
 
 
-def halves_the_count(found: Groups, told: Paper) -> Claim:
+def halves_the_count(found: Groups, published: Paper) -> Claim:
     """C-half: POP leaves half or less of the Gaussians of L2 and blur."""
 
     def ask(pop: Group, blur: Group) -> tuple[str, bool | None]:
@@ -61,7 +61,7 @@ def halves_the_count(found: Groups, told: Paper) -> Claim:
         text = f"{pop.n:,.0f} of {blur.n:,.0f}, {share:.1%}; PSNR {pop.psnr - blur.psnr:+.2f} dB"
         return text, _at_most(share, 0.5, _ratio_error(pop, blur))
 
-    ratios = _percents(paper_ratios(told, "pop", "l2_blur"))
+    ratios = _percents(paper_ratios(published, "pop", "l2_blur"))
     return claim(
         "half",
         "POP cuts the number of Gaussians by half or more against L2 with the blur rule",
@@ -71,9 +71,9 @@ def halves_the_count(found: Groups, told: Paper) -> Claim:
     )
 
 
-def blur_multiplies(found: Groups, told: Paper) -> Claim:
+def blur_multiplies(found: Groups, published: Paper) -> Claim:
     """C-blur: the blur rule multiplies N, with POP and without."""
-    without, with_pop = paper_ratios(told, "l2_blur", "l2"), paper_ratios(told, "pop", "l2_pop")
+    without, with_pop = paper_ratios(published, "l2_blur", "l2"), paper_ratios(published, "pop", "l2_pop")
     least = (min(without), min(with_pop))
 
     def ask(blur: Group, l2: Group, pop: Group, l2_pop: Group) -> tuple[str, bool | None]:
@@ -91,7 +91,7 @@ def blur_multiplies(found: Groups, told: Paper) -> Claim:
     )
 
 
-def no_worse_than_reset(found: Groups, told: Paper) -> Claim:
+def no_worse_than_reset(found: Groups, published: Paper) -> Claim:
     """C-reset: POP is no worse than opacity resets in PSNR."""
 
     def ask(pop: Group, reset: Group) -> tuple[str, bool | None]:
@@ -99,21 +99,21 @@ def no_worse_than_reset(found: Groups, told: Paper) -> Claim:
         share = pop.n / reset.n
         return f"{change:+.2f} dB{_noise(error)} with {share:.1%} of its Gaussians", at_least(change, 0.0, error)
 
-    changes = [told.ablation("pop", d, "psnr") - told.ablation("reset", d, "psnr") for d in DATASETS]
+    changes = [published.ablation("pop", d, "psnr") - published.ablation("reset", d, "psnr") for d in DATASETS]
     return claim(
         "reset",
         "POP is no worse than opacity reset in PSNR",
         ", ".join(f"{c:+.2f}" for c in changes)
-        + f" dB with {_percents(paper_ratios(told, 'pop', 'reset'))} of its Gaussians",
+        + f" dB with {_percents(paper_ratios(published, 'pop', 'reset'))} of its Gaussians",
         "PSNR(pop) is at least PSNR(reset)",
         _by_scene(found, ("pop", "reset"), ask),
     )
 
 
-def window(found: Groups, told: Paper) -> Claim:
+def window(found: Groups, published: Paper) -> Claim:
     """C-window: 3k-7k is the trade-off: less is too little, more costs Gaussians and brings less."""
     names = ("blur_3k_4k", "pop", "blur_3k_11k", "blur_3k_15k")
-    low = min(paper_ratios(told, "blur_3k_15k", "pop"))
+    low = min(paper_ratios(published, "blur_3k_15k", "pop"))
 
     def ask(short: Group, pop: Group, longer: Group, longest: Group) -> tuple[str, bool | None]:
         gain, change = pop.psnr - short.psnr, longest.psnr - pop.psnr
@@ -123,22 +123,22 @@ def window(found: Groups, told: Paper) -> Claim:
         return text + f" for x {growth:.2f} of N", gain > 0.0 and gain > change and growth >= low
 
     def line(d: str) -> str:
-        psnr = [told.ablation(row, d, "psnr") for row in names]
+        psnr = [published.ablation(row, d, "psnr") for row in names]
         return f"{psnr[1] - psnr[0]:+.2f} then {psnr[3] - psnr[1]:+.2f} dB"
 
     return claim(
         "window",
         "the window 3k-7k of the blur rule is the trade-off: 3k-4k grows too little, 3k-15k costs two to three times "
         "the Gaussians for a PSNR that changes little",
-        f"{', '.join(map(line, DATASETS))}; x {_list(paper_ratios(told, 'blur_3k_15k', 'pop'))} of N at 3k-15k",
+        f"{', '.join(map(line, DATASETS))}; x {_list(paper_ratios(published, 'blur_3k_15k', 'pop'))} of N at 3k-15k",
         f"PSNR gains from 4k to 7k, and more than from 7k to 15k, which takes at least x {low:.2f} of N",
         _by_scene(found, names, ask),
     )
 
 
-def decay_after_the_window(found: Groups, told: Paper) -> Claim:
+def decay_after_the_window(found: Groups, published: Paper) -> Claim:
     """C-decay: N peaks when the window closes and POP takes it down from there until density control ends."""
-    implied, rates = implied_shares(told), implied_rates(told)
+    implied, rates = implied_shares(published), implied_rates(published)
     bound = min(rates) / _SLACK
 
     def ask(pop: Group) -> tuple[str, bool | None]:
@@ -164,7 +164,7 @@ def decay_after_the_window(found: Groups, told: Paper) -> Claim:
     )
 
 
-def fewer_per_pixel(found: Groups, told: Paper) -> Claim:
+def fewer_per_pixel(found: Groups, published: Paper) -> Claim:
     """C-pixel: POP has fewer Gaussians per pixel than 3DGS."""
 
     def ask(pop: Group, base: Group) -> tuple[str, bool | None]:
@@ -184,7 +184,7 @@ def fewer_per_pixel(found: Groups, told: Paper) -> Claim:
     )
 
 
-def l2_beats_scaled_l1(found: Groups, told: Paper) -> Claim:
+def l2_beats_scaled_l1(found: Groups, published: Paper) -> Claim:
     """C-l2: L2 has a higher PSNR than L1 / n at as many Gaussians."""
 
     def evidence() -> Iterator[Evidence]:
@@ -204,12 +204,12 @@ def l2_beats_scaled_l1(found: Groups, told: Paper) -> Claim:
     )
 
 
-def compact_against_gsplat(found: Groups, told: Paper) -> Claim:
+def compact_against_gsplat(found: Groups, published: Paper) -> Claim:
     """C-compact: POP keeps 4 to 15 % of gsplat's Gaussians."""
     tables = {"Mip-NeRF 360": 1, "Tanks & Temples": 2, "Deep Blending": 1}
 
     def printed(row: str, dataset: str, metric: str) -> float:
-        return told.table(tables[dataset]).value(row, dataset, metric)
+        return published.table(tables[dataset]).value(row, dataset, metric)
 
     shares = [printed("pop", d, "num_gaussians_k") / printed("gsplat", d, "num_gaussians_k") for d in DATASETS]
     changes = [printed("pop", d, "psnr") - printed("gsplat", d, "psnr") for d in DATASETS]
@@ -238,9 +238,9 @@ def markdown(judged: Sequence[Claim], scale: str) -> str:
     verdicts = [[c.says, c.paper, c.verdict, c.where] for c in judged]
     parts.append(grid(["claim", "in the paper", "verdict", "where"], verdicts))
     for c in judged:
-        told = [[e.scene, e.says, _word(e.holds), ", ".join(e.runs)] for e in c.evidence]
+        rows = [[e.scene, e.says, _word(e.holds), ", ".join(e.runs)] for e in c.evidence]
         body = (
-            grid(["scene", "found", "holds", "runs"], told) if told else "Not decided: no scene has the runs it needs."
+            grid(["scene", "found", "holds", "runs"], rows) if rows else "Not decided: no scene has the runs it needs."
         )
         parts.append(f"### {c.id}: {c.says}\n\nAsked: {c.holds_if}. In the paper: {c.paper}.\n\n{body}")
     return "\n\n".join(parts) + "\n"

@@ -33,7 +33,7 @@ class Found:
     Attributes:
         scene: the scene.
         status: "ok", "missing" (not there) or "refused" (there, and not as the protocol has it).
-        reason: what is wrong and how to mend it; empty for nothing.
+        reason: what is wrong and how to fix it; empty for nothing.
         folder: where it is.
         n_images: photographs with a known camera.
         sizes: their widths and heights, px, the most frequent first.

@@ -116,8 +116,8 @@ class Claim:
         """Say on which scenes it holds, and on which it does not."""
         yes = [e.scene for e in self.evidence if e.holds]
         no = [e.scene for e in self.evidence if e.holds is False]
-        told = ([f"on {', '.join(yes)}"] if yes else []) + ([f"not on {', '.join(no)}"] if no else [])
-        return "; ".join(told) or "no runs decide"
+        parts = ([f"on {', '.join(yes)}"] if yes else []) + ([f"not on {', '.join(no)}"] if no else [])
+        return "; ".join(parts) or "no runs decide"
 
 
 def claim(id: str, says: str, paper: str, holds_if: str, evidence: Iterable[Evidence]) -> Claim:
@@ -189,20 +189,22 @@ def decay(run: Result) -> Decay | None:
     return Decay(closing, left / closing, round(ends) - round(closes))
 
 
-def paper_ratios(told: Paper, row: str, base: str) -> tuple[float, ...]:
+def paper_ratios(published: Paper, row: str, base: str) -> tuple[float, ...]:
     """Give N of a row over N of another in the paper's ablations, by data set."""
-    return tuple(told.ablation(row, d, "num_gaussians_k") / told.ablation(base, d, "num_gaussians_k") for d in DATASETS)
+    return tuple(
+        published.ablation(row, d, "num_gaussians_k") / published.ablation(base, d, "num_gaussians_k") for d in DATASETS
+    )
 
 
-def implied_shares(told: Paper) -> tuple[float, ...]:
+def implied_shares(published: Paper) -> tuple[float, ...]:
     """Give what the paper's tables imply to be left at step 15,000 of N(7,000), by data set.
 
     A window that lasts until density control ends shows the count at which the blur rule saturates; a shorter one
     reaches about as much, and POP takes it down from there.
     """
-    return paper_ratios(told, "pop", "blur_3k_15k")
+    return paper_ratios(published, "pop", "blur_3k_15k")
 
 
-def implied_rates(told: Paper) -> tuple[float, ...]:
+def implied_rates(published: Paper) -> tuple[float, ...]:
     """Give the rates of decay per 1,000 steps that `implied_shares` comes to, by data set."""
-    return tuple(Decay(1.0, share, DENSITY_STOP - BLUR_STOP).rate for share in implied_shares(told))
+    return tuple(Decay(1.0, share, DENSITY_STOP - BLUR_STOP).rate for share in implied_shares(published))

@@ -75,10 +75,10 @@ def experiments(results: Iterable[Result]) -> tuple[Answer, ...]:
     return _longer_schedules(found), _pruned_harder(found), _growth(found)
 
 
-def markdown(told: Sequence[Answer]) -> str:
+def markdown(found: Sequence[Answer]) -> str:
     """Render answers: the question, what is said, the numbers."""
     parts = []
-    for answer in told:
+    for answer in found:
         parts.append(f"### {answer.id}: {answer.asks}\n\n{answer.says}")
         if answer.lines:
             parts.append(grid(answer.head, answer.lines))

@@ -76,8 +76,8 @@ def files(results: Iterable[Result], folder: Path = HERE) -> dict[Path, str]:
     found = list(results)
     protocol = _read(folder / "protocol.md")
     protocol = with_part(protocol, "ambiguities", _ambiguities())
-    told = (*readings.answers(found), *readings.experiments(found))
-    protocol = with_part(protocol, "readings", readings.markdown(told))
+    answered = (*readings.answers(found), *readings.experiments(found))
+    protocol = with_part(protocol, "readings", readings.markdown(answered))
     return {
         folder / "README.md": with_part(_read(folder / "README.md"), "status", status_table(found)),
         folder / "protocol.md": protocol,
@@ -123,12 +123,12 @@ def _commits(used: Iterable[Result]) -> str:
 
 def _progress(rows: Sequence[str], datasets: Sequence[str], used: Sequence[Result]) -> str:
     """Say for each scale how many of its pairs of row and scene have a run; the data sets are the paper's scale's."""
-    told = []
+    counts = []
     for scale in _telling():
         scenes = SCENES_OF.get(scale) or [s for d in datasets for s in paper().datasets[d]]
         done = {(r.row, r.scene) for r in used if r.scale == scale and r.scene in scenes}
-        told.append(f"{scale}: {len(done)} of {len(rows) * len(scenes)}" if done else f"{scale}: not run")
-    return "; ".join(told)
+        counts.append(f"{scale}: {len(done)} of {len(rows) * len(scenes)}" if done else f"{scale}: not run")
+    return "; ".join(counts)
 
 
 def _ambiguities() -> str:

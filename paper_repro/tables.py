@@ -133,22 +133,22 @@ def table(number: int, scale: str, results: Iterable[Result], absent: Iterable[s
     Raises:
         PopError: there is no such table or scale.
     """
-    told = paper()
-    printed, found = told.table(number), _of_scale(scale, results)
+    published = paper()
+    printed, found = published.table(number), _of_scale(scale, results)
     # the paper's own method is "Ours" in its main tables
     rows = {line.row: line.name.replace("Ours", "POP (Ours)") for line in printed.rows}
     found = [r for r in found if r.row in rows]
-    metrics = tuple(told.metrics[m] for m in printed.metrics)
-    groups = _groups(scale, found, {name: told.datasets[name] for name in printed.datasets})
+    metrics = tuple(published.metrics[m] for m in printed.metrics)
+    groups = _groups(scale, found, {name: published.datasets[name] for name in printed.datasets})
     blocks = []
     for title, scenes in groups.items():
-        make = _Maker(told, printed, scale, title, scenes, frozenset(absent))
+        make = _Maker(published, printed, scale, title, scenes, frozenset(absent))
         lines = [make.line(row, name, found) for row, name in rows.items()]
         # places among values of different LPIPS networks would mean nothing
-        mixed = scale == "paper" and len({told.lpips[title, row] for row in rows}) > 1
+        mixed = scale == "paper" and len({published.lpips[title, row] for row in rows}) > 1
         ranked = [m for m in metrics if m.id != "lpips" or not mixed]
         blocks.append(Block(_titled(title, scale, found), _placed(lines, ranked, printed.marked)))
-    remarks = {n.id: n.why for n in told.not_comparable if _touches(n, printed)} if scale == "paper" else {}
+    remarks = {n.id: n.why for n in published.not_comparable if _touches(n, printed)} if scale == "paper" else {}
     ratios = None if scale == "paper" else _ratios(printed, groups, found)
     return Table(
         f"table {number}", scale, printed.title, _header(scale, found), metrics, tuple(blocks), ratios, remarks
@@ -161,13 +161,13 @@ def beyond(scale: str, results: Iterable[Result], absent: Iterable[str] = ()) ->
     Raises:
         PopError: there is no such scale.
     """
-    told = paper()
+    published = paper()
     found = [r for r in _of_scale(scale, results) if r.row in BEYOND]
-    metrics = tuple(told.metrics.values())
-    groups = _groups(scale, found, told.datasets)
+    metrics = tuple(published.metrics.values())
+    groups = _groups(scale, found, published.datasets)
     blocks = []
     for title, scenes in groups.items():
-        make = _Maker(told, None, scale, title, scenes, frozenset(absent))
+        make = _Maker(published, None, scale, title, scenes, frozenset(absent))
         lines = [make.line(row, name, found) for row, name in BEYOND.items()]
         blocks.append(Block(_titled(title, scale, found), _placed(lines, metrics, 1)))
     return Table("beyond", scale, "Beyond the paper", _header(scale, found), metrics, tuple(blocks), None, {})
@@ -214,7 +214,7 @@ _GET: Final[Mapping[str, Callable[[Result], float]]] = {
 class _Maker:
     """Makes the lines of one block."""
 
-    told: Paper
+    published: Paper
     printed: PaperTable | None
     scale: str
     title: str
@@ -225,7 +225,7 @@ class _Maker:
         mine = [r for r in found if r.row == row and r.scene in self.scenes]
         present = {r.scene for r in mine}
         missing = tuple(scene for scene in self.scenes if scene not in present)
-        metrics = self.told.metrics if self.printed is None else self.printed.metrics
+        metrics = self.published.metrics if self.printed is None else self.printed.metrics
         cells = {metric: self._cell(row, metric, mine, missing) for metric in metrics}
         seeds = [{r.seed for r in mine if r.scene == scene} for scene in present]
         shared = len(set.intersection(*seeds)) if seeds else 0
@@ -269,13 +269,15 @@ class _Maker:
         if self.scale != "paper":
             return OTHER_DATA
         blocking = [
-            n for n in self.told.not_comparable if n.blocked and n.holds(self.printed.number, self.title, row, metric)
+            n
+            for n in self.published.not_comparable
+            if n.blocked and n.holds(self.printed.number, self.title, row, metric)
         ]
         if blocking:
             return f"not comparable: {blocking[0].why} ({blocking[0].id})"
-        if metric == "lpips" and self.told.lpips[self.title, row] == "unknown":
+        if metric == "lpips" and self.published.lpips[self.title, row] == "unknown":
             return "not comparable: which LPIPS the paper's number is, is not known (C1)"
-        gpu = str(self.told.stated["gpu"].value)
+        gpu = str(self.published.stated["gpu"].value)
         strangers = sorted({r.machine for r in mine if gpu not in r.machine})
         if metric == "time_s" and strangers:
             return f"not comparable: trained on {', '.join(strangers)}, the paper on {gpu} (C5)"
@@ -286,7 +288,7 @@ class _Maker:
     def _value(self, row: str, metric: str, result: Result) -> float | None:
         if metric != "lpips":
             return _GET[metric](result)
-        variant = self.told.lpips.get((self.title, row), "alex_norm")
+        variant = self.published.lpips.get((self.title, row), "alex_norm")
         return result.lpips["alex_norm" if variant == "unknown" else variant]
 
     def _digits(self, metric: str) -> int:

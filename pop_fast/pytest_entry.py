@@ -1,4 +1,4 @@
-"""The conformance kit's door: pytest loads this in every session, and it lets the kit in where a session asks for it.
+"""The conformance kit's entry point, which pytest loads in every session; the kit itself only where one asks for it.
 
 Options that the kit adds have plain names ("--profile", "--device"), which other plugins may use in sessions of their
 own; so none is added before `pop_ref.conformance` stands among the words. The module stands in this package because

@@ -1,6 +1,6 @@
-"""Adaptive density control: what is counted, who is selected, and the event that edits the population.
+"""Adaptive density control: what is counted, who is selected, and the densification step that edits the Gaussians.
 
-Between two events each view adds to the window's statistics. At an event
+Between two densification steps each view adds to the window's statistics. At a densification step
 
     grad set   average view-space gradient > tau_Den              (eq. 3)
     blur set   dominates more than theta H W pixels of a view     (eq. 6), inside the blur window only
@@ -35,7 +35,7 @@ __all__ += ["grow_masks", "blur_is_over", "without_blur_that_does_not_pay", "pru
 
 @dataclass(frozen=True)
 class Statistics:
-    """What the views since the last event have shown.
+    """What the views since the last densification step have shown.
 
     Attributes:
         grad_sum: sum of view-space gradient norms, NDC units. [N]
@@ -202,7 +202,7 @@ def grow_masks(
         statistics: the window.
         scales: standard deviations, activated, world units.
         scene_scale: world units.
-        step: of the event, from 0.
+        step: of the densification step, from 0.
         config: thresholds and readings.
 
     Returns:
@@ -297,7 +297,7 @@ def prune_mask(
         opacities: activated.
         scales: standard deviations, activated, world units.
         scene_scale: world units.
-        step: of the event, from 0.
+        step: of the densification step, from 0.
         config: thresholds.
 
     Returns:
@@ -321,24 +321,24 @@ def densify_and_prune(
     normals: Callable[[int], np.ndarray],
     config: DensityConfig = POP,
 ) -> tuple[Rows, Statistics]:
-    """Hold one event: clone, split, prune, forget.
+    """Hold one densification step: clone, split, prune, forget.
 
-    Copies are appended first and are never split in the same event; then split parents make way for their children;
-    then the grown population is pruned, newcomers included. N' = N + clones + splits - prunes.
+    Copies are appended first and are never split in the same step; then split parents make way for their children;
+    then the grown set of Gaussians is pruned, newcomers included. N' = N + clones + splits - prunes.
 
     Source: POP paper sections 3.1 and 3.3.
     Departs: nothing; the order is gsplat's.
 
     Args:
-        rows: the population.
+        rows: the Gaussians.
         statistics: the window that ends here.
         scene_scale: world units.
-        step: of the event, from 0.
+        step: of the densification step, from 0.
         normals: given n, standard normal draws [2, n, 3] for n split parents.
         config: thresholds and readings.
 
     Returns:
-        The new population; statistics of an empty window (A3).
+        The new Gaussians; statistics of an empty window (A3).
 
     Example:
         >>> rows = rows_from_params({"means": np.zeros((2, 3)), "scales": np.zeros((2, 3)),

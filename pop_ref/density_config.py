@@ -1,6 +1,6 @@
-"""When the events of density control happen.
+"""When the densification steps of density control happen.
 
-Steps count from 0 as in gsplat: the event of step s follows the Adam update of step s. The numbers are in
+Steps count from 0 as in gsplat: the densification step of step s follows the Adam update of step s. The numbers are in
 `settings.DensityConfig`, which is re-exported here.
 """
 
@@ -12,7 +12,7 @@ __all__ = ["GSPLAT", "POP", "DensityConfig", "blurs_at", "densifies_at", "resets
 
 
 def densifies_at(step: int, config: DensityConfig) -> bool:
-    """Tell whether the population is grown and pruned after this step (A17).
+    """Tell whether the Gaussians are grown and pruned after this step (A17).
 
     `refine_start_iter < step < refine_stop_iter`, and step is a multiple of `refine_every`: 600, 700 ... 14900; but not
     within `pause_refine_after_reset` steps of a reset.
@@ -25,7 +25,7 @@ def densifies_at(step: int, config: DensityConfig) -> bool:
         config: the schedule.
 
     Returns:
-        True at an event.
+        True at a densification step.
 
     Example:
         >>> [step for step in range(0, 900, 50) if densifies_at(step, POP)]
@@ -37,7 +37,7 @@ def densifies_at(step: int, config: DensityConfig) -> bool:
 
 
 def blurs_at(step: int, config: DensityConfig) -> bool:
-    """Tell whether the blur rule takes part in an event of this step: both ends of its window included (A19).
+    """Tell whether the blur rule takes part in densification after this step: both ends of its window included (A19).
 
     Source: POP paper section 4.1 (between 3K and 7K iterations).
     Departs: nothing.

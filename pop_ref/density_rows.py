@@ -1,6 +1,7 @@
 """Row operations of density control: clone, split, prune, reset, with Adam's moments carried along.
 
-A population is a dictionary of arrays that share their first axis; Adam's moments m and v have its keys and shapes.
+Gaussians in training: a dictionary of arrays that share their first axis; Adam's moments m and v have its keys and
+shapes.
 Every operation is one gather of surviving rows followed by appended rows, the same for each key: a row stays one row.
 
     clone   all rows, then copies of the selected ones in their order
@@ -55,7 +56,7 @@ class Rows:
 
 
 def rows_from_params(params: Mapping[str, np.ndarray]) -> Rows:
-    """Start a population: these parameters, and zero moments.
+    """Start from Gaussians: these parameters, and zero moments.
 
     Source: Kingma and Ba 2015, algorithm 1 (m_0 = v_0 = 0).
     Departs: nothing.
@@ -64,7 +65,7 @@ def rows_from_params(params: Mapping[str, np.ndarray]) -> Rows:
         params: raw parameters, one row a Gaussian.
 
     Returns:
-        The population.
+        The Gaussians.
 
     Raises:
         ValueError: the arrays differ in length.
@@ -84,7 +85,7 @@ def clone_rows(rows: Rows, mask: Bool[np.ndarray, " N"]) -> Rows:
     Departs: Kerbl et al. move the copy along the gradient; every code appends it in place, and so does this.
 
     Args:
-        rows: the population.
+        rows: the Gaussians.
         mask: True where a row is cloned.
 
     Returns:
@@ -115,7 +116,7 @@ def split_rows(
     Departs: nothing; the draws are an argument so that the operation is pure.
 
     Args:
-        rows: the population.
+        rows: the Gaussians.
         mask: True where a row is split.
         normals: eps, standard normal draws: first and second child of each selected row, in row order.
         revised_opacity: gsplat's option of that name.
@@ -157,7 +158,7 @@ def prune_rows(rows: Rows, mask: Bool[np.ndarray, " N"]) -> Rows:
     Departs: nothing.
 
     Args:
-        rows: the population.
+        rows: the Gaussians.
         mask: True where a row is removed.
 
     Returns:
@@ -178,11 +179,11 @@ def reset_opacities(rows: Rows, ceiling: float = POP.reset_opa) -> Rows:
     Departs: the paper writes o -> 0; every code takes the minimum with 0.01.
 
     Args:
-        rows: the population.
+        rows: the Gaussians.
         ceiling: the largest opacity afterwards, in (0, 1).
 
     Returns:
-        The population with new opacities; their m and v are 0, all other values keep their bits.
+        The Gaussians with new opacities; their m and v are 0, all other values keep their bits.
 
     Example:
         >>> rows = reset_opacities(rows_from_params({"opacities": np.array([0.0, -9.0])}), 0.25)

@@ -202,7 +202,7 @@ def learning_rates(
 def is_updated(name: str, step: int, recipe: Recipe) -> bool:
     """Tell whether Adam moves a parameter at a step.
 
-    Source: Inria's training loop (a step that edits the population moves nothing); taming-3dgs (bands beyond the first
+    Source: Inria's training loop (a step that edits the Gaussians moves nothing); taming-3dgs (bands beyond the first
         move each 16 steps, opacities not after 15,000).
     Departs: nothing.
 

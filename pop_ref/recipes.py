@@ -1,7 +1,7 @@
 """What a training minimises and when: POP, the rows of the paper's ablation tables, and two baselines, by name.
 
 "3DGS" is Inria's code since October 2024, with whose counts the paper's row of that name agrees: renderer, loss, SSIM
-padding, selection at the threshold, opacity rate, and no update in a step that edits the population. "3DGS 2023" is the
+padding, selection at the threshold, opacity rate, and no update in a step that edits the Gaussians. "3DGS 2023" is the
 code before, whose opacities move twice as fast; other methods are built on it. Steps count from 0 in all. "gsplat" is
 the default strategy of gsplat 1.5.
 

@@ -1,4 +1,4 @@
-"""The values that pass between stages: frozen, validated at the door, printed as code that makes them again.
+"""The values that pass between stages: frozen, validated when made, printed as code that makes them again.
 
 All arrays are float64 (ids and extents int64). Shapes are in `notation`.
 """

@@ -42,9 +42,9 @@ class DensityConfig:
         prune_too_big: prune Gaussians that grow excessively large (A16: kept although the reset is gone).
         prune_scale3d: excessively large is above this share of the scene's scale (A16).
         prune_too_big_after: ... and only at steps after this one (A16: not tied to `reset_every`).
-        refine_start_iter: events happen at steps after it.
-        refine_stop_iter: events happen at steps before it (A17: pruning too ends there).
-        refine_every: an event each so many steps (A17: pruning happens with each).
+        refine_start_iter: densification steps happen at steps after it.
+        refine_stop_iter: densification steps happen at steps before it (A17: pruning too ends there).
+        refine_every: a densification step each so many steps (A17: pruning happens with each).
         theta_blur: share of a view's pixels above which a Gaussian is blurred (eq. 6; A18: of each view's own size).
         blur_min_pixels: and above at least so many pixels. The paper has no such bound and needs none: its smallest
             images (980 x 545) make theta_blur 10.7 pixels. In an image of 130,000 pixels theta_blur is 2.6, and nearly
@@ -54,7 +54,7 @@ class DensityConfig:
         blur_stop_gain: the blur window also ends where growth no longer pays: where twice as many Gaussians have not
             divided the loss by two to the power of this (`density.blur_is_over`); 0 leaves that out. The paper calls
             its fixed window its first limitation.
-        blur_stop_span: events whose windows are averaged for that, before and after.
+        blur_stop_span: densification steps whose windows are averaged for that, before and after.
         blur_window: "own_view" tests the densification step's own view only, "any_view" tests each view since the last
             one by itself and keeps the flag, "sum" adds the counts of those views up and tests the sum (A2).
         blur_rule: "by_scale" clones small blurred Gaussians and splits large ones, "split" splits all (A14).
@@ -62,7 +62,7 @@ class DensityConfig:
         reset_every: reset opacities each so many steps before `refine_stop_iter`; 0 never (A22, A29).
         reset_at_zero: reset at step 0 as well, as gsplat up to 1.5.2 does (A25).
         reset_opa: the ceiling of a reset; gsplat couples it to `prune_opa`, as twice that.
-        pause_refine_after_reset: steps after a reset in which no event happens (gsplat's name; 0, as in its default).
+        pause_refine_after_reset: steps after a reset without densification (gsplat's name; 0, as in its default).
         final_prune_iter: step after which opacities under `final_prune_opa` are pruned once more; -1 never.
         final_prune_opa: the opacity that survives that.
     """
@@ -120,7 +120,7 @@ class PopTerm:
         lambda_pop: weight of the POP term; 0 leaves it out.
         pop_start_iter: first step with the POP term (A13: from the start).
         pop_stop_iter: first step without it.
-        pop_views: "current" takes importance from the current view, "window" from all views since the last event (A1).
+        pop_views: "current" takes importance from the current view, "window" from all since densification (A1).
         pop_over: "all" averages over all Gaussians, "visible" over those the view shows (A12).
         lambda_entropy: weight of the mean binary entropy of all opacities, a rival of the POP term that does not ask
             who is important; on at the same steps.
@@ -243,7 +243,7 @@ class Recipe(Photometric, PopTerm):
     """What a training minimises, and its schedule; the defaults are POP's.
 
     Attributes:
-        density: of the population.
+        density: of the Gaussians.
         lr: learning rates.
         max_steps: length of the training, over which the positions' learning rate decays.
         sh_interval: steps between two raises of the harmonics' degree.

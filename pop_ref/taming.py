@@ -203,7 +203,7 @@ def taming_scores(
     sh_degree: int | None = None,
     profile: Profile = INRIA,
 ) -> Float64[np.ndarray, " N"]:
-    """Score a population by a few views: render each, weigh its pixels, sum what each Gaussian adds, add the scores.
+    """Score Gaussians by a few views: render each, weigh its pixels, sum what each Gaussian adds, add the scores.
 
     Source: Mallick et al. 2024 (Taming-3DGS).
     Departs: nothing.
@@ -254,7 +254,7 @@ def quotas(budget: int, n: int, n_clone: int, n_split: int) -> tuple[int, int]:
     With `more = min(A, N + n_clone + n_split) - N`: `floor(more n_clone / (n_clone + n_split))`, and so for splits.
 
     Source: Mallick et al. 2024 (Taming-3DGS), and its code.
-    Departs: a population over its budget grows by none; the code asks for a negative number.
+    Departs: over the budget none is grown; the code asks for a negative number.
 
     Args:
         budget: A, as `budget_at` gives it.

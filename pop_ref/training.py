@@ -1,6 +1,6 @@
 """Training, one step at a time: render -> loss -> gradient -> Adam -> density control.
 
-The order is gsplat's since 1.5: Adam moves first, then density control edits the population. Dominant counts come from
+The order is gsplat's since 1.5: Adam moves first, then density control edits the Gaussians. Dominant counts come from
 the forward pass that made the loss (A27), so importance and blur cost no second render.
 
 What is minimised and when is a `recipes.Recipe`.
@@ -100,7 +100,7 @@ def train_step(
     """Take one step with one view.
 
     Source: POP paper, section 3; Kerbl et al. 2023, algorithm 1.
-    Departs: Inria edits the population before Adam and so loses that step's update; gsplat edits it after. Here it is
+    Departs: Inria edits the Gaussians before Adam and so loses that step's update; gsplat edits it after. Here it is
         edited after, and `UpdateRules.edits_replace_update` leaves the update out.
 
     Args:
@@ -144,7 +144,7 @@ def train_step(
             windows = (*windows, (len(rows), loss_sum / statistics.n_views))
         density, loss_sum = without_blur_that_does_not_pay(density, windows), 0.0
     rows, statistics = control(rows, statistics, scene_scale, step, normals, density)
-    # rows that wait are not those of a population that has been edited
+    # rows that wait are not those of Gaussians that have been edited
     waiting = {} if densifies_at(step, recipe.density) else waiting
     return Training(rows, statistics, step + 1, waiting, loss_sum, windows), loss
 
@@ -158,14 +158,14 @@ def update(
     Departs: nothing.
 
     Args:
-        rows: the population.
+        rows: the Gaussians.
         grads: gradients of this step's loss.
         state: before the step: its number, and the gradients that wait.
         scene_scale: world units.
         recipe: rates and rules.
 
     Returns:
-        The population after the update; the gradients that wait from now on.
+        The Gaussians after the update; the gradients that wait from now on.
 
     Example:
         >>> from pop_ref.settings import UpdateRules
@@ -298,7 +298,7 @@ def control(
     normals: Callable[[int], np.ndarray],
     config: DensityConfig,
 ) -> tuple[Rows, Statistics]:
-    """Edit the population if this step is one for it: an event, a reset, both, or neither.
+    """Edit the Gaussians if this step is one for it: densification, a reset, both, or neither.
 
     Source: POP paper sections 3.1 and 4.1.
     Departs: nothing.
@@ -312,7 +312,7 @@ def control(
         config: of density control.
 
     Returns:
-        The population and the window for the next step.
+        The Gaussians and the window for the next step.
 
     Example:
         >>> rows = rows_from_params({"opacities": np.array([9.0])})

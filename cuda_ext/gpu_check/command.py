@@ -7,7 +7,7 @@
 What has to be there: Python 3.11 or newer with torch for CUDA, NumPy, nanobind, hypothesis and pytest, cmake, nvcc.
 Results go to the folder named first, else to $OUT, else to out/gpu_check/results: one JSON file a job, and beside it
 what its stages wrote while they ran. Nothing need survive between the jobs: each builds first, and keeps what it finds
-built. A stage that fails or runs out of time is told with the reason, and the next one runs.
+built. A stage that fails or runs out of time is reported with the reason, and the next one runs.
 
 What travels is made beforehand, where there is a network, by --pack FOLDER, and read by --packed FOLDER:
     scenes/NAME.npz    trained Gaussians and their cameras, of every folder under --runs
@@ -45,18 +45,18 @@ COMMIT = "POP_COMMIT"
 
 def commit_of(packed: Path | None) -> str:
     """Return the commit: what the environment says, git, or what was packed; else "unknown"."""
-    told = os.environ.get(COMMIT, "")
-    if not told and (ROOT / ".git").exists():
-        told = first_line(["git", "rev-parse", "HEAD"]) or ""
-    if not told and packed is not None:
-        told = str(read_json(packed / "manifest.json").get("commit", ""))
-    return told or "unknown"
+    commit = os.environ.get(COMMIT, "")
+    if not commit and (ROOT / ".git").exists():
+        commit = first_line(["git", "rev-parse", "HEAD"]) or ""
+    if not commit and packed is not None:
+        commit = str(read_json(packed / "manifest.json").get("commit", ""))
+    return commit or "unknown"
 
 
 def environment(commit: str) -> dict[str, Any]:
     """Describe the machine, the driver, the versions and the commit."""
     query = ["nvidia-smi", "--query-gpu=name,driver_version,memory.total,clocks.max.sm", "--format=csv,noheader"]
-    told: dict[str, Any] = {
+    found: dict[str, Any] = {
         "gpu": first_line(query),
         "cpu": platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
@@ -64,14 +64,14 @@ def environment(commit: str) -> dict[str, Any]:
         "commit": commit,
     }
     if (ROOT / ".git").exists():
-        told["dirty"] = first_line(["git", "status", "--porcelain"]) is not None
+        found["dirty"] = first_line(["git", "status", "--porcelain"]) is not None
     try:
         from importlib.metadata import version
 
-        told["torch"] = version("torch")
+        found["torch"] = version("torch")
     except ImportError:
-        told["torch"] = None
-    return told
+        found["torch"] = None
+    return found
 
 
 def run_stages(names: list[str], limit: float, check: Check, report: dict[str, Any], path: Path) -> list[str]:

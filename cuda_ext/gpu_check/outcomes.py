@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 FILE = "POP_OUTCOMES"
-SHOWN = 20  # failures that are told one by one
+SHOWN = 20  # failures that are listed one by one
 _WORDS = 400  # characters of a failure's last lines
 
 

@@ -25,8 +25,8 @@ _TRAIN = "from pop_fast.cli import main; raise SystemExit(main())"
 _COMPILE = "import time; t = time.time(); from gsplat.cuda._backend import _C; print(round(time.time() - t), 's');"
 _COMPILE += "assert _C is not None, 'gsplat found no CUDA toolkit'"
 # what a training run is judged by
-_TOLD = ("step", "seconds", "seconds_loading", "seconds_total", "num_GS", "num_GS_above_floor", "psnr", "ssim", "views")
-_TOLD += ("gpu", "gpu_memory_bytes", "instance_buffers_grown")
+_KEPT = ("step", "seconds", "seconds_loading", "seconds_total", "num_GS", "num_GS_above_floor", "psnr", "ssim", "views")
+_KEPT += ("gpu", "gpu_memory_bytes", "instance_buffers_grown")
 
 
 def wheels_stage(check: Check) -> dict[str, Any]:
@@ -121,9 +121,9 @@ def train_one(check: Check, path: Path, limit: float, backend: str = "cuda") -> 
         found["status"] = 1
     if not stats:
         return found
-    told = read_json(stats[-1])
-    result = {name: told.get(name) for name in _TOLD}
-    return {**result, **found, "seconds_training": told.get("seconds")}
+    last = read_json(stats[-1])
+    result = {name: last.get(name) for name in _KEPT}
+    return {**result, **found, "seconds_training": last.get("seconds")}
 
 
 def _start_gsplat(check: Check) -> None:

@@ -116,13 +116,13 @@ def _pytest(
     """Run tests of the GPU's folder, or of the emulator's twin of it, and add up how they ended."""
     folder = ROOT / "tests" / "cuda" / ("emulated" if check.rehearsal else "gpu")
     chosen = [str(folder / (_emulated(test) if check.rehearsal else test)) for test in tests]
-    told = check.out / f"{name}.jsonl"
-    told.unlink(missing_ok=True)
+    lines = check.out / f"{name}.jsonl"
+    lines.unlink(missing_ok=True)
     words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "cuda_ext.gpu_check.outcomes"]
-    over = {"OMP_NUM_THREADS": "1" if check.rehearsal else "4", FILE: str(told), **over}
+    over = {"OMP_NUM_THREADS": "1" if check.rehearsal else "4", FILE: str(lines), **over}
     # interrupted, pytest says what it has seen so far
     found = check.run([*before, *words, *options, *chosen], limit or check.seconds, over, signal.SIGINT)
-    found["tests"] = outcomes(told)
+    found["tests"] = outcomes(lines)
     # without a GPU everything is skipped, which is no pass
     return found | {"status": found["status"] or int(found["tests"]["passed"] == 0)}
 

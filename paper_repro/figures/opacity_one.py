@@ -1,7 +1,7 @@
 """The run behind figure 3: a finished 3DGS model, trained on under its own loss with every opacity pushed to 1.
 
 The paper's prior pushes up what is important and down what is not. Without that distinction, (1 - o) on all Gaussians,
-there is what the figure shows. The population stays as it is, and centres move at the rate that the training ended
+there is what the figure shows. The Gaussians stay as they are, and centres move at the rate that the training ended
 with, so that nothing but the push is new.
 """
 
@@ -37,7 +37,7 @@ _FOLDER: Final = "figure_3"
 
 @dataclass(frozen=True)
 class OpacityOne:
-    """A strategy by gsplat's protocol that leaves the population alone and pulls every opacity to 1.
+    """A strategy by gsplat's protocol that leaves the Gaussians alone and pulls every opacity to 1.
 
     Attributes:
         weight: of the mean of 1 - o in the loss.
@@ -58,7 +58,7 @@ class OpacityOne:
     def step_post_backward(
         self, params: Any, optimizers: Any, state: Any, step: int, info: Any, packed: bool = False
     ) -> None:
-        """See `pop_fast.density.Strategy`; the population stays."""
+        """See `pop_fast.density.Strategy`; the Gaussians stay."""
 
     def regularizer(self, opacities: Tensor, state: Any, step: int, info: Any) -> Tensor:
         """Return the term that is added to the loss."""

@@ -12,5 +12,5 @@ if TYPE_CHECKING:
 
 __all__ = ["backend_names", "get_backend", "rasterization"]
 
-# which backends there are is told without torch
+# the names of backends are known without torch
 __getattr__ = given_by(__name__, {"rasterize": ("rasterization",), "registry": ("backend_names", "get_backend")})

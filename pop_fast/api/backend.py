@@ -155,7 +155,7 @@ class Backend(Renderer, Protocol):
 
         Args:
             config: the settings, a `pop_fast.train.config.TrainConfig`.
-            own_strategy: whether the population's strategy is one of this package.
+            own_strategy: whether the density strategy is one of this package.
 
         Raises:
             PopError: the backend cannot take the steps of these settings.

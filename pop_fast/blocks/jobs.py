@@ -2,7 +2,7 @@
 
 Either way a part is a process of its own, `pop blocks train OUT i_j` or `pop blocks merge OUT`, so that its memory is
 given back when it ends. One that is finished has left its marker and is not done again; a block that was interrupted
-goes on from its last checkpoint.
+resumes from its last checkpoint.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def run_in_turn(folder: Path, job: Job, quiet: bool = False, say: Callable[[str]
         folder: the run's, whose capture is divided.
         job: what was asked for.
         quiet: what they print is not shown; warnings and errors are.
-        say: is told what begins.
+        say: is called with a line on what begins.
 
     Returns:
         The exit status of the first part that failed, or 0; 130 after Ctrl-C or SIGTERM.

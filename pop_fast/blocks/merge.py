@@ -103,7 +103,7 @@ def _write_splat(results: ResultFolder, config: TrainConfig, capture: Capture, p
     step = config.max_steps - 1
     frame = Frame.of_training(capture.world_transform if config.normalize else None)
     save_ply(results.path / "ply" / f"point_cloud_{step}.ply", params, config.antialiased, frame=frame)
-    # gsplat's keys alone: what steps would go on from are the blocks' own checkpoints
+    # gsplat's keys alone: training is resumed from the blocks' own checkpoints
     save_checkpoint(checkpoint_path(results.path, step), {"step": step, "splats": params})
     results.write_opacities(step, params["opacities"].sigmoid().numpy())
 

@@ -12,7 +12,7 @@ A block's Gaussians are those of its core. To train them it gets
 What a view sees is judged by its picture's edges alone: the sparse points stand for surfaces, and what hides them is
 not looked for. Each held-out view belongs to the block whose core it stands in, and the whole is measured on all.
 
-The folder of a run in blocks, besides a result's own files, which describe the merged splat:
+The folder of a run in blocks has a result's own files, which describe the merged splat, and:
 
     blocks/job.json         what was asked for
     blocks/plan.json        borders, and the numbers of every block

@@ -54,7 +54,7 @@ def divide_capture(
         record: how the capture is read.
         job: what was asked for.
         sfm: how the cameras of bare photographs are found.
-        progress: is told (stage, done, total).
+        progress: is called with (stage, done, total).
 
     Raises:
         PopError: the capture cannot be read, or not be divided as asked for.

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pop_fast.train.load_result import CaptureRecord
 
 _EXAMPLES: Final = """
-    pop blocks train out/city 0_1          train one block, or go on with it
+    pop blocks train out/city 0_1          train one block, or resume it
     pop blocks merge out/city              put the trained blocks together, and measure the whole
     pop blocks partition out/city          divide the capture again, as the run was begun
 """

@@ -71,7 +71,7 @@ def options_of(command: str) -> list[str]:
 
 
 def bash(words: dict[str, list[str]], zsh: bool = False) -> str:
-    """Write the script for bash, which zsh runs too when it is told to."""
+    """Write the script for bash, which zsh runs too when asked to."""
     first = dict.fromkeys(name.split()[0] for name in words)
     options = {word: [o for name, found in words.items() if name.split()[0] == word for o in found] for word in first}
     cases = "\n".join(f'      {name}) words="{" ".join(found)}" ;;' for name, found in options.items())

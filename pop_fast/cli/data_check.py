@@ -52,8 +52,8 @@ def run(argv: Sequence[str]) -> int:
     if hidden and not args.all:
         print(f"and {hidden} more of the same kinds; --all prints them")
     bad = sum(finding.state == "bad" for finding in findings)
-    told = f"{bad} problem{'s stand' if bad != 1 else ' stands'} against training"
-    print(told if bad else "ready to train")
+    verdict = f"{bad} problem{'s stand' if bad != 1 else ' stands'} against training"
+    print(verdict if bad else "ready to train")
     return 1 if bad else 0
 
 
@@ -70,7 +70,10 @@ def look_over(root: Path, images: str | None = None) -> list[Finding]:
         folder = photo_folder(root)
         files = photographs(folder)
         shown, damage = _each(files, lambda path: measure_file(path, path.relative_to(folder).as_posix()), lambda p: p)
-        findings = [*check_dataset.about_bare(root, shown), *(Finding("bad", "photographs", told) for told in damage)]
+        findings = [
+            *check_dataset.about_bare(root, shown),
+            *(Finding("bad", "photographs", problem) for problem in damage),
+        ]
         return [*findings, *about_quality(shown)]
     made_from, shots, cloud = listing
     findings = [Finding("ok" if len(shots) > 1 else "bad", "poses", f"{len(shots)} views from the {made_from}")]
@@ -80,7 +83,7 @@ def look_over(root: Path, images: str | None = None) -> list[Finding]:
         shots, lambda shot: check_dataset.read_photo(shot, paths[id(shot)]), lambda shot: paths[id(shot)]
     )
     findings += check_dataset.about_photos(photos, root)
-    findings += [Finding("bad", "photographs", told) for told in damage]
+    findings += [Finding("bad", "photographs", problem) for problem in damage]
     findings += about_quality([photo.shown for photo in photos if photo.shown is not None])
     findings += check_dataset.about_masks(photos, root)
     findings += check_dataset.about_points(shots, cloud)

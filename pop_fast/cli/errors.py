@@ -1,4 +1,4 @@
-"""Which exceptions are the user's to mend, and the one line that says how."""
+"""Which exceptions are the user's to correct, and the one line that says how."""
 
 from __future__ import annotations
 

@@ -18,8 +18,8 @@ _SWITCH_INTERVAL: Final = 2e-4
 def importing(*modules: str) -> Iterator[None]:
     """Import modules in a thread of their own while the block runs; they are there, or have failed, when it ends.
 
-    What fails is not said here: whoever imports such a module afterwards is told. The block must have imported all that
-    it needs, as two threads do not import one package at a time.
+    A failure is not reported here: whoever imports such a module afterwards meets it. The block must have imported all
+    that it needs, as two threads do not import one package at a time.
 
     Args:
         modules: their names.

@@ -136,12 +136,12 @@ def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequen
     finally:
         lock.release()
     if status == EXIT_INTERRUPTED:
-        print("pop: stopped; the same command with --resume goes on", file=sys.stderr)
+        print("pop: stopped; the same command with --resume continues", file=sys.stderr)
     return status
 
 
 def _begun(folder: Path, config: TrainConfig, job: Job) -> Job | None:
-    """Read what a run that is gone on with was begun with, or None where nothing is there.
+    """Read what a run that is resumed was begun with, or None where nothing is there.
 
     Raises:
         PopError: it is another run: names what differs.

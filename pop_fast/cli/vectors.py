@@ -80,7 +80,7 @@ def _check(args: Check) -> int:
         print(f"{array:<{width}}{len(verdicts) - len(failed)} of {len(verdicts)} vectors pass")
         for verdict in failed:
             off = f"off by {verdict.worst:.3g} {verdict.unit}, allowed {verdict.allowed:.3g}"
-            print(f"  {verdict.vector}: {off}; {verdict.told}")
+            print(f"  {verdict.vector}: {off}; {verdict.where}")
     for title, names in (("not there", found.absent), ("no result for", found.missing), ("unknown", found.strange)):
         if names:
             more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""

@@ -1,6 +1,6 @@
 """The compiled library through ctypes: the layouts of what its functions are given, and how they are called.
 
-Whether the library loads can be told without torch; calling it takes torch's tensors.
+Whether the library loads can be found out without torch; calling it takes torch's tensors.
 """
 
 from __future__ import annotations

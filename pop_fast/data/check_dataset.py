@@ -224,7 +224,7 @@ def about_reprojection(root: Path) -> Iterator[Finding]:
         reconstruction = require_colmap().Reconstruction(model)
         observations = int(reconstruction.compute_num_observations())
         if observations == 0:
-            yield Finding("ok", "reprojection", "the model has no tracks, so its error cannot be told")
+            yield Finding("ok", "reprojection", "the model has no tracks, so its error is unknown")
             return
         reconstruction.update_point_3d_errors()
         error = float(reconstruction.compute_mean_reprojection_error())

@@ -26,9 +26,9 @@ def about_other_models(root: Path, models: Sequence[tuple[Path, int]]) -> list[s
     """
     if len(models) < 2:
         return []
-    told = [f"{path.relative_to(root)} ({count if count >= 0 else 'unreadable'})" for path, count in models]
+    listed = [f"{path.relative_to(root)} ({count if count >= 0 else 'unreadable'})" for path, count in models]
     return [
-        f"of {len(models)} COLMAP models the one with the most images is used, {told[0]}, not {', '.join(told[1:])}"
+        f"of {len(models)} COLMAP models the one with the most images is used, {listed[0]}, not {', '.join(listed[1:])}"
     ]
 
 

@@ -28,7 +28,7 @@ __all__ = ["find_realitycapture", "read_realitycapture"]
 _POSE: Final = ("x", "y", "alt", "heading", "pitch", "roll")
 _NEEDED: Final = ("#name", *_POSE, "f")
 _EXPORT: Final = 'export "Internal/External camera parameters" as CSV again'
-# mm, the longer side that focal lengths are told for
+# mm, the longer side that focal lengths refer to
 _FILM: Final = 36.0
 
 

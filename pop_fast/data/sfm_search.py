@@ -192,7 +192,7 @@ def _search(job: Search, tell: Callable[[str, int, int], None]) -> Any:
 
 
 def _extract(job: Search, tell: Progress) -> None:
-    """Find features, a few photographs at a time, so that progress can be told."""
+    """Find features, a few photographs at a time, so that progress can be reported."""
     pycolmap = require_colmap()
     n = len(job.names)
     # listed first and in order, because the threads that find features would number photographs as they finish

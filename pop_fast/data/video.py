@@ -122,9 +122,9 @@ def _frame_count(path: Path) -> int:
     """Count by the file's header, or one by one where that tells nothing."""
     video = _open(path)
     try:
-        told = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-        if told > 0:
-            return told
+        n_frames = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        if n_frames > 0:
+            return n_frames
         counted = 0
         while video.grab():
             counted += 1

@@ -1,4 +1,4 @@
-"""Population strategies, compatible with gsplat's protocol: how the number of Gaussians grows and shrinks."""
+"""Density strategies, compatible with gsplat's protocol: how the number of Gaussians grows and shrinks."""
 
 from __future__ import annotations
 

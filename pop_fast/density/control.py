@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from pop_fast.density.protocol import (
+    DensificationContext,
     DensificationStep,
     Draws,
     Info,
     Optimizers,
     Params,
-    Population,
     State,
     check_layout,
 )
@@ -79,7 +79,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
 
         Args:
             scene_scale: the unit of `grow_scale3d` and `prune_scale3d`, world units.
-            seed: seeds the random numbers that changes of the population take.
+            seed: seeds the random numbers that changes of the Gaussians take.
             count: of the first Gaussians, which some methods measure their budget by.
         """
         from pop_fast.density import densify
@@ -130,7 +130,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         return self.collects(step) and self.pop_views == "window"
 
     def changes_after(self, step: int) -> bool:
-        """Tell whether the population is edited after this step."""
+        """Tell whether the Gaussians are edited after this step."""
         return self.is_refine_step(step) or self.is_reset_step(step) or step == self.final_prune_iter
 
     def regularizer(self, opacities: Tensor, state: State, step: int, info: Info) -> Tensor | None:
@@ -157,7 +157,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         return self.is_refine_step(step) and blurs_at(step, self)
 
     def is_refine_step(self, step: int) -> bool:
-        """Tell whether the population changes after this step."""
+        """Tell whether the Gaussians change after this step."""
         paused = self.reset_every > 0 and step % self.reset_every < self.pause_refine_after_reset
         return self.refine_start_iter < step < self.refine_stop_iter and step % self.refine_every == 0 and not paused
 
@@ -179,7 +179,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         """Collect statistics; at a refine step grow, prune and start a new window; at a reset step reset.
 
         Returns:
-            What happened to the population, or None where this is no step at which it changes.
+            What happened to the Gaussians, or None where this is no step at which they change.
 
         Warns:
             UserWarning: the loss of this step should have had the term of `regularizer`, which nobody has asked for.
@@ -243,38 +243,38 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
 
         draws = draws or densify.draws_of(state["generator"])
         with torch.no_grad():
-            return self.edit(Population(params, optimizers, state, step, draws, passes, sh_degree))
+            return self.edit(DensificationContext(params, optimizers, state, step, draws, passes, sh_degree))
 
-    def edit(self, of: Population) -> DensificationStep:
-        """Do what is due after a step after which the population changes: refine, reset, prune for the last time."""
-        event = self.refine(of) if self.is_refine_step(of.step) else DensificationStep()
-        return self.prune_finally(of, self.reset(of, event))
+    def edit(self, of: DensificationContext) -> DensificationStep:
+        """Do what is due after a step after which the Gaussians change: refine, reset, prune for the last time."""
+        done = self.refine(of) if self.is_refine_step(of.step) else DensificationStep()
+        return self.prune_finally(of, self.reset(of, done))
 
-    def refine(self, of: Population) -> DensificationStep:
+    def refine(self, of: DensificationContext) -> DensificationStep:
         """Clone, split and prune by the window's statistics."""
         from pop_fast.density import densify
 
         return densify.refine(self, of, *densify.who_grows(self, of), lambda: densify.who_goes(self, of))
 
-    def prune_finally(self, of: Population, event: DensificationStep) -> DensificationStep:
-        """Prune faint Gaussians once more if it is time, and say so in the event."""
+    def prune_finally(self, of: DensificationContext, done: DensificationStep) -> DensificationStep:
+        """Prune faint Gaussians once more if it is time, and say so in what was done."""
         if of.step != self.final_prune_iter:
-            return event
+            return done
         import torch
 
         from pop_fast.density import densify
 
         faint = torch.sigmoid(of.params["opacities"].flatten()) < self.final_prune_opa
-        return replace(event, pruned=event.pruned + densify.prune(of, faint))
+        return replace(done, pruned=done.pruned + densify.prune(of, faint))
 
-    def reset(self, of: Population, event: DensificationStep) -> DensificationStep:
-        """Reset opacities if it is time, and say so in the event."""
+    def reset(self, of: DensificationContext, done: DensificationStep) -> DensificationStep:
+        """Reset opacities if it is time, and say so in what was done."""
         if not self.is_reset_step(of.step):
-            return event
+            return done
         from pop_fast.density import densify
 
         densify.reset(self, of)
-        return replace(event, reset=True)
+        return replace(done, reset=True)
 
 
 def _scaled(step: Any, factor: float) -> Any:

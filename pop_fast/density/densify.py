@@ -1,4 +1,4 @@
-"""What density control collects of each view, and how it changes the population: `DensityControl` says when."""
+"""What density control collects of each view, and how it changes the Gaussians: `DensityControl` says when."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pop_fast.density import rows
 from pop_fast.density.info import dominant_counts, visible_from_radii, visible_in
-from pop_fast.density.protocol import DensificationStep, Draws, Info, Params, Population, State
+from pop_fast.density.protocol import DensificationContext, DensificationStep, Draws, Info, Params, State
 from pop_fast.stages.density import SPLIT_CHILDREN, Statistics, blur_is_over, blur_set, grow_masks, prune_mask
 from pop_fast.stages.polarization import importance_mask, opacity_entropy, pop_loss
 
@@ -114,32 +114,32 @@ def draws_of(generator: torch.Generator) -> Draws:
 
 
 def refine(
-    plan: DensityControl, of: Population, clones: Tensor, splits: Tensor, prunes: Callable[[], Tensor]
+    plan: DensityControl, of: DensificationContext, clones: Tensor, splits: Tensor, prunes: Callable[[], Tensor]
 ) -> DensificationStep:
     """Clone, split, prune, and start a new window.
 
     Args:
         plan: the strategy.
-        of: the population.
+        of: the Gaussians, and what a step may ask for.
         clones: who is cloned. [N] bool
         splits: who is split. [N] bool
-        prunes: asked of the grown population who of it is pruned. -> bool
+        prunes: asked of the grown set of Gaussians who of it is pruned. -> bool
     """
     n_clones, n_splits = int(clones.sum()), int(splits.sum())
     if n_clones:
         rows.clone(of.params, of.optimizers, of.state, clones)
     if n_splits:
-        # a clone of this event is never split in it
+        # a clone of this densification step is never split in it
         padded = torch.cat([splits, splits.new_zeros(n_clones)])
         rows.split(of.params, of.optimizers, of.state, padded, of.draws.normals(n_splits), plan.revised_opacity)
-    event = DensificationStep(n_clones, n_splits, prune(of, prunes()))
+    done = DensificationStep(n_clones, n_splits, prune(of, prunes()))
     clear(of.state)
     if plan.verbose:
-        print(f"step {of.step}: {event}, {len(of)} Gaussians")
-    return event
+        print(f"step {of.step}: {done}, {len(of)} Gaussians")
+    return done
 
 
-def prune(of: Population, mask: Tensor) -> int:
+def prune(of: DensificationContext, mask: Tensor) -> int:
     """Remove the selected Gaussians and return how many they were."""
     n_pruned = int(mask.sum())
     if n_pruned:
@@ -147,7 +147,7 @@ def prune(of: Population, mask: Tensor) -> int:
     return n_pruned
 
 
-def who_grows(plan: DensityControl, of: Population) -> tuple[Tensor, Tensor]:
+def who_grows(plan: DensityControl, of: DensificationContext) -> tuple[Tensor, Tensor]:
     """Return who is cloned and who is split; see `pop_ref.density.grow_masks`. [N] bool each"""
     state = of.state
     if plan.blur_stop_gain > 0.0 and plan.is_blur_step(of.step):
@@ -158,7 +158,7 @@ def who_grows(plan: DensityControl, of: Population) -> tuple[Tensor, Tensor]:
     return masks
 
 
-def _without_blur_that_does_not_pay(plan: DensityControl, of: Population) -> DensityControl:
+def _without_blur_that_does_not_pay(plan: DensityControl, of: DensificationContext) -> DensityControl:
     """Note the window that ends; see `pop_ref.density.without_blur_that_does_not_pay`."""
     state = of.state
     if not state["loss_sum"] > 0.0:
@@ -182,7 +182,7 @@ def window(state: State) -> Statistics:
     )
 
 
-def who_goes(plan: DensityControl, of: Population) -> Tensor:
+def who_goes(plan: DensityControl, of: DensificationContext) -> Tensor:
     """Return who is too faint or too big; see `pop_ref.density.prune_mask`. [N] bool"""
     opacities, state = torch.sigmoid(of.params["opacities"].flatten()), of.state
     mask = prune_mask(opacities, torch.exp(of.params["scales"]), state["scene_scale"], of.step, plan)
@@ -191,7 +191,7 @@ def who_goes(plan: DensityControl, of: Population) -> Tensor:
     return mask
 
 
-def reset(plan: DensityControl, of: Population) -> None:
+def reset(plan: DensityControl, of: DensificationContext) -> None:
     """Lower all opacities to the ceiling of a reset."""
     rows.reset_opacities(of.params, of.optimizers, ceiling=plan.reset_opa)
 
@@ -201,7 +201,7 @@ def clear(state: State) -> None:
     state["grad2d"].zero_()
     state["count"].zero_()
     state["views"], state["loss_sum"] = 0, 0.0
-    # rows that wait are not those of a population that has been edited
+    # rows that wait are not those of Gaussians that have been edited
     state["blurred"] = state["dominant_sum"] = state["sh_rest_sum"] = None
     if state["radii"] is not None:
         state["radii"].zero_()

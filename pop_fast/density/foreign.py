@@ -17,7 +17,7 @@ class ForeignStrategy:
     """A strategy that collects and changes in one call, `step_post_backward`, as gsplat's do.
 
     Where it draws random numbers with torch's global generator, they come from one in `state` that is saved with it, so
-    that a run that is resumed goes on to the same bits. When it changes the population is not known beforehand; a
+    that a run that is resumed goes on to the same bits. When it changes the Gaussians is not known beforehand; a
     `DensificationStep` that it returns goes into the records.
 
     Args:
@@ -52,7 +52,7 @@ class ForeignStrategy:
         return asked is not None and asked(step)
 
     def changes_after(self, step: int) -> bool:
-        """Tell whether the population may change after this step: always."""
+        """Tell whether the Gaussians may change after this step: always."""
         return True
 
     def needs_passes(self, step: int) -> bool:
@@ -69,7 +69,7 @@ class ForeignStrategy:
         self.strategy.step_pre_backward(params, optimizers, state, step, info)
 
     def collect(self, params: Params, state: State, step: int, info: Info, packed: bool = False) -> None:
-        """Keep what the step's render told for `change`, in which the strategy itself collects."""
+        """Keep what the step's render returned for `change`, in which the strategy itself collects."""
         self._info = info
 
     def change(

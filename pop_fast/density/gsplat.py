@@ -16,7 +16,7 @@ class GsplatStrategy(DensityControl):
     """Growth by gradient alone, and opacity reset at steps 3000, 6000, 9000 and 12000.
 
     The defaults are those of gsplat before 1.5.3, without its reset at step 0 (1.5.3 itself never resets, by a slip of
-    operator precedence that was mended later).
+    operator precedence that was fixed later).
     """
 
     reset_every: int = _GSPLAT.density.reset_every
@@ -26,7 +26,7 @@ class GsplatStrategy(DensityControl):
 
 @dataclass(frozen=True, kw_only=True)
 class InriaStrategy(GsplatStrategy):
-    """The same as Inria's code has it: a gradient at the threshold grows, and a step that edits the population moves
+    """The same as Inria's code has it: a gradient at the threshold grows, and a step that edits the Gaussians moves
     nothing."""
 
     inclusive: bool = RECIPES["3DGS"].density.inclusive

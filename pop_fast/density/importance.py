@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 
 from pop_fast.density import densify
-from pop_fast.density.protocol import Population
+from pop_fast.density.protocol import DensificationContext
 from pop_fast.stages.selection import lowest_share
 
 
-def summed_over_views(of: Population, score: Callable[[int], Tensor]) -> Tensor:
+def summed_over_views(of: DensificationContext, score: Callable[[int], Tensor]) -> Tensor:
     """Add up what a score gives for every training view, in float64.
 
     Args:
-        of: the population.
+        of: the Gaussians, and what a step may ask for.
         score: of a view by its index, any shape.
     """
     total = score(0).to(torch.float64)
@@ -28,6 +28,6 @@ def summed_over_views(of: Population, score: Callable[[int], Tensor]) -> Tensor:
     return total
 
 
-def prune_lowest(of: Population, scores: Tensor, share: float) -> int:
+def prune_lowest(of: DensificationContext, scores: Tensor, share: float) -> int:
     """Remove the share of Gaussians with the lowest scores, and return how many those were."""
     return densify.prune(of, lowest_share(scores, share).to(of.params["means"].device))

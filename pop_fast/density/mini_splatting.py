@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Final, Literal
 
 from pop_fast.density.gsplat import InriaStrategy
-from pop_fast.density.protocol import DensificationStep, Population
+from pop_fast.density.protocol import DensificationContext, DensificationStep
 from pop_ref.recipes import BASELINES, Recipe
 
 _MINI: Final[Recipe] = BASELINES["Mini-Splatting"]
@@ -74,10 +74,10 @@ class MiniSplattingStrategy(InriaStrategy):
         return step in self.adam_restarts
 
     def changes_after(self, step: int) -> bool:
-        """Tell whether the population is edited after this step."""
+        """Tell whether the Gaussians are edited after this step."""
         return super().changes_after(step) or self.needs_passes(step)
 
-    def edit(self, of: Population) -> DensificationStep:
+    def edit(self, of: DensificationContext) -> DensificationStep:
         """Do what is due after this step."""
         if of.step in self.adam_restarts:
             from pop_fast.density import mini_splatting_steps as events

@@ -1,4 +1,4 @@
-"""What Mini-Splatting does to the population beside 3DGS's clone, split and prune."""
+"""What Mini-Splatting does to the Gaussians beside 3DGS's clone, split and prune."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pop_fast.data.initialize import SH_C0
 from pop_fast.density import densify, rows
-from pop_fast.density.protocol import DensificationStep, Params, Population
+from pop_fast.density.protocol import DensificationContext, DensificationStep, Params
 from pop_fast.stages.mini_splatting import nearest_log_scales, samples_per_view, view_importance
 from pop_fast.stages.selection import least_mass, sample_without_replacement
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pop_fast.density.mini_splatting import MiniSplattingStrategy
 
 
-def set_anew_from_depth(plan: MiniSplattingStrategy, of: Population) -> DensificationStep:
+def set_anew_from_depth(plan: MiniSplattingStrategy, of: DensificationContext) -> DensificationStep:
     """Replace all Gaussians by points of the training views, with their pixels' colours."""
     points, colors = [], []
     for index in range(of.views.n_views):
@@ -29,7 +29,7 @@ def set_anew_from_depth(plan: MiniSplattingStrategy, of: Population) -> Densific
     return _begin_anew(plan, of, torch.cat(points), sh0)
 
 
-def _points_of_view(plan: MiniSplattingStrategy, of: Population, index: int) -> tuple[Tensor, Tensor]:
+def _points_of_view(plan: MiniSplattingStrategy, of: DensificationContext, index: int) -> tuple[Tensor, Tensor]:
     """Draw pixels by their opacity, and return their points and their photograph's colours. [M, 3] each"""
     views = of.views
     points, ids, T_final = views.dominant_points(of.params, index, of.sh_degree)
@@ -44,7 +44,7 @@ def _points_of_view(plan: MiniSplattingStrategy, of: Population, index: int) -> 
     return points.reshape(-1, 3)[drawn], photo[drawn].to(points.dtype) / 255.0
 
 
-def importance(plan: MiniSplattingStrategy, of: Population) -> Tensor:
+def importance(plan: MiniSplattingStrategy, of: DensificationContext) -> Tensor:
     """Sum the importance of every Gaussian over the training views; 0 where none is dominated at any pixel. [N]"""
     n = len(of)
     total, dominant_sum = torch.zeros(n, dtype=torch.float64), torch.zeros(n, dtype=torch.int64)
@@ -55,7 +55,7 @@ def importance(plan: MiniSplattingStrategy, of: Population) -> Tensor:
     return torch.where(dominant_sum > 0, total, 0.0)
 
 
-def draw_by_importance(plan: MiniSplattingStrategy, of: Population) -> DensificationStep:
+def draw_by_importance(plan: MiniSplattingStrategy, of: DensificationContext) -> DensificationStep:
     """Let a share of the Gaussians, drawn by importance, keep place and colour and begin anew; the others go."""
     weights = importance(plan, of)
     wanted = int(plan.sampling_factor * int((weights > 0.0).sum()))
@@ -64,7 +64,7 @@ def draw_by_importance(plan: MiniSplattingStrategy, of: Population) -> Densifica
     return _begin_anew(plan, of, of.params["means"].detach()[drawn], of.params["sh0"].detach()[drawn])
 
 
-def prune(plan: MiniSplattingStrategy, of: Population) -> DensificationStep:
+def prune(plan: MiniSplattingStrategy, of: DensificationContext) -> DensificationStep:
     """Remove the least important Gaussians, and start Adam anew."""
     mask = least_mass(importance(plan, of), plan.prune_mass)
     pruned = densify.prune(of, mask.to(of.params["means"].device))
@@ -72,7 +72,9 @@ def prune(plan: MiniSplattingStrategy, of: Population) -> DensificationStep:
     return DensificationStep(pruned=pruned)
 
 
-def _begin_anew(plan: MiniSplattingStrategy, of: Population, points: Tensor, sh0: Tensor) -> DensificationStep:
+def _begin_anew(
+    plan: MiniSplattingStrategy, of: DensificationContext, points: Tensor, sh0: Tensor
+) -> DensificationStep:
     densify.forget(of.state)
     rows.replace_rows(of.params, of.optimizers, of.state, _rows(of.params, points, sh0, plan.reinit_opacity))
     return DensificationStep(replaced=len(points))

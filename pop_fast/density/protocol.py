@@ -1,4 +1,4 @@
-"""The protocol that every population strategy follows; it is gsplat's, so that a strategy serves both trainers.
+"""The protocol that every density strategy follows; it is gsplat's, so that a strategy serves both trainers.
 
 A trainer holds a dict of raw parameters (`means`, `scales` in log, `quats`, `opacities` in logit, `sh0`, `shN`) and one
 optimizer per key. Every step it calls, in this order,
@@ -9,7 +9,7 @@ optimizer per key. Every step it calls, in this order,
     strategy.step_post_backward(params, optimizers, state, step, info)
 
 `info` is the dict that `rasterization()` returns last. `step` counts from 0. A strategy is a dataclass of settings;
-everything that changes lives in `state`. What a step did to the population is returned, as a `DensificationStep`;
+everything that changes lives in `state`. What a step did to the Gaussians is returned, as a `DensificationStep`;
 gsplat's own strategies return nothing.
 """
 
@@ -35,7 +35,7 @@ Info: TypeAlias = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Draws:
-    """Where a change of the population takes its random numbers from.
+    """Where a change of the Gaussians takes its random numbers from.
 
     Attributes:
         normals: given n, standard normal draws for the children of n split parents, on the CPU. -> [2, n, 3]
@@ -47,7 +47,7 @@ class Draws:
 
 
 @dataclass(frozen=True)
-class Population:
+class DensificationContext:
     """The Gaussians at a step after which they may change, and what a change may ask for.
 
     Attributes:
@@ -79,13 +79,13 @@ class Population:
             ValueError: the trainer has none.
         """
         if self.passes is None:
-            raise ValueError("this strategy looks at the training views when it changes the population; give it passes")
+            raise ValueError("this strategy looks at the training views when it changes the Gaussians; give it passes")
         return self.passes
 
 
 @dataclass(frozen=True)
 class DensificationStep:
-    """What density control did to the population after a step.
+    """What density control did to the Gaussians after a step.
 
     Attributes:
         cloned: Gaussians that were copied.
@@ -127,7 +127,7 @@ class Strategy(Protocol):
     def step_post_backward(
         self, params: Params, optimizers: Optimizers, state: State, step: int, info: Info, packed: bool = False
     ) -> Any:
-        """Collect statistics and, when it is time, change the population; may return a `DensificationStep`."""
+        """Collect statistics and, when it is time, change the Gaussians; may return a `DensificationStep`."""
         ...
 
 

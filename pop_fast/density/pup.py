@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from pop_fast.density.gsplat import InriaStrategy
-from pop_fast.density.protocol import DensificationStep, Population
+from pop_fast.density.protocol import DensificationContext, DensificationStep
 from pop_ref.recipes import BASELINES, Recipe
 
 _PUP: Final[Recipe] = BASELINES["PUP-3DGS"]
@@ -42,10 +42,10 @@ class PupStrategy(InriaStrategy):
         return step in self.adam_restarts
 
     def changes_after(self, step: int) -> bool:
-        """Tell whether the population is edited after this step."""
+        """Tell whether the Gaussians are edited after this step."""
         return super().changes_after(step) or self.needs_passes(step)
 
-    def edit(self, of: Population) -> DensificationStep:
+    def edit(self, of: DensificationContext) -> DensificationStep:
         """Refine and reset as 3DGS; at the beginning of a round prune and start Adam anew."""
         if of.step not in self.adam_restarts:
             return super().edit(of)

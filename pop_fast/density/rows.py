@@ -1,4 +1,4 @@
-"""Edits of the population that carry the optimizers' moments and the statistics with their rows.
+"""Edits of the Gaussians that carry the optimizers' moments and the statistics with their rows.
 
 Every edit is one call of `edit_rows`: keep some rows, append others. Rows that are kept keep their bits and their
 order, in every parameter, in every moment and in every per-Gaussian tensor of the state. Rows that are appended start

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from pop_fast.density.gsplat import InriaStrategy
-from pop_fast.density.protocol import DensificationStep, Population
+from pop_fast.density.protocol import DensificationContext, DensificationStep
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,17 +42,17 @@ class SpeedySplatStrategy(InriaStrategy):
         return self.prune_share_at(step) > 0.0
 
     def changes_after(self, step: int) -> bool:
-        """Tell whether the population is edited after this step."""
+        """Tell whether the Gaussians are edited after this step."""
         return super().changes_after(step) or self.needs_passes(step)
 
-    def edit(self, of: Population) -> DensificationStep:
+    def edit(self, of: DensificationContext) -> DensificationStep:
         """Refine, prune by sensitivity, reset: in this order."""
-        event = self.refine(of) if self.is_refine_step(of.step) else DensificationStep()
+        done = self.refine(of) if self.is_refine_step(of.step) else DensificationStep()
         share = self.prune_share_at(of.step)
         if share > 0.0:
             from pop_fast.density.importance import prune_lowest, summed_over_views
 
             views = of.views
             scores = summed_over_views(of, lambda index: views.sensitivities(of.params, index, of.sh_degree))
-            event = replace(event, pruned=event.pruned + prune_lowest(of, scores, share))
-        return self.reset(of, event)
+            done = replace(done, pruned=done.pruned + prune_lowest(of, scores, share))
+        return self.reset(of, done)

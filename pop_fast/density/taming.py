@@ -1,12 +1,12 @@
 """Taming-3DGS: growth to a budget, by sampling from a score of nine terms.
 
-Source: Mallick et al. 2024 and its code. Every 500 steps the population may grow along a parabola from its first number
-to the budget (`pop_ref.taming`). Ten training views score each Gaussian by the view's loss times nine terms; of those
-that 3DGS would clone or split, as many as the parabola has room for are drawn by score. Of those that 3DGS would prune,
-only who is drawn too goes, half as many as there are, by the inverse of the score; the last densification step prunes
-all. The bands beyond the first move each 16 steps by the sum of their gradients, opacities not at all after step
-15,000, where the code hands Adam a tensor that it does not train. Everything else is 3DGS of 2024, with twice its rate
-for these bands.
+Source: Mallick et al. 2024 and its code. Every 500 steps the Gaussians may grow in number, along a parabola from the
+first number to the budget (`pop_ref.taming`). Ten training views score each Gaussian by the view's loss times nine
+terms; of those that 3DGS would clone or split, as many as the parabola has room for are drawn by score. Of those that
+3DGS would prune, only who is drawn too goes, half as many as there are, by the inverse of the score; the last
+densification step prunes all. The bands beyond the first move each 16 steps by the sum of their gradients, opacities
+not at all after step 15,000, where the code hands Adam a tensor that it does not train. Everything else is 3DGS of
+2024, with twice its rate for these bands.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from pop_fast.density.gsplat import InriaStrategy
-from pop_fast.density.protocol import DensificationStep, Population
+from pop_fast.density.protocol import DensificationContext, DensificationStep
 from pop_ref.recipes import BASELINES, Recipe
 
 _TAMING: Final[Recipe] = BASELINES["Taming-3DGS"]
@@ -57,7 +57,7 @@ class TamingStrategy(InriaStrategy):
         """Return which step of the parabola this is, from 1."""
         return (step - self.refine_start_iter) // self.refine_every
 
-    def refine(self, of: Population) -> DensificationStep:
+    def refine(self, of: DensificationContext) -> DensificationStep:
         """Clone, split and prune who is drawn."""
         from pop_fast.density import taming_steps
 

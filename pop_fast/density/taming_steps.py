@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.density import densify
-from pop_fast.density.protocol import DensificationStep, Population
+from pop_fast.density.protocol import DensificationContext, DensificationStep
 from pop_fast.stages.density import average_grads
 from pop_fast.stages.losses import photometric_3dgs
 from pop_fast.stages.selection import sample_without_replacement
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pop_fast.density.taming import TamingStrategy
 
 
-def refine(plan: TamingStrategy, of: Population) -> DensificationStep:
+def refine(plan: TamingStrategy, of: DensificationContext) -> DensificationStep:
     """Clone, split and prune, each by sampling."""
     scores, event = scores_of(plan, of), plan.event_at(of.step)
     clones, splits = densify.who_grows(plan, of)
@@ -36,8 +36,8 @@ def refine(plan: TamingStrategy, of: Population) -> DensificationStep:
     return densify.refine(plan, of, clones, splits, who_goes)
 
 
-def scores_of(plan: TamingStrategy, of: Population) -> Tensor:
-    """Score the population by a few training views. [N] float64, on the CPU"""
+def scores_of(plan: TamingStrategy, of: DensificationContext) -> Tensor:
+    """Score the Gaussians by a few training views. [N] float64, on the CPU"""
     views, params = of.views, of.params
     order = torch.argsort(of.draws.uniforms(views.n_views))[: plan.score_views].tolist()
     grads = average_grads(densify.window(of.state), plan)
@@ -52,7 +52,7 @@ def scores_of(plan: TamingStrategy, of: Population) -> Tensor:
     return total
 
 
-def _drawn(candidates: Tensor, scores: Tensor, wanted: int, of: Population) -> Tensor:
+def _drawn(candidates: Tensor, scores: Tensor, wanted: int, of: DensificationContext) -> Tensor:
     """Draw so many candidates by score. [N] bool"""
     weights = torch.where(candidates.cpu(), scores, 0.0)
     wanted = min(wanted, int((weights > 0.0).sum()))
@@ -61,7 +61,7 @@ def _drawn(candidates: Tensor, scores: Tensor, wanted: int, of: Population) -> T
     return mask.to(candidates.device)
 
 
-def _drawn_to_go(mask: Tensor, weights: Tensor, of: Population) -> Tensor:
+def _drawn_to_go(mask: Tensor, weights: Tensor, of: DensificationContext) -> Tensor:
     """Draw half as many as may go, by the weights of the first rows; the others, which are new, stay. [N] bool"""
     of_all = weights.new_zeros(len(mask))
     of_all[: len(weights)] = weights[: len(mask)]

@@ -82,5 +82,5 @@ def so_far(step: int, of: int, n_gaussians: int, seconds: float, latest: str) ->
         seconds: that the steps took.
         latest: what was measured last, in words that begin with a comma, or nothing.
     """
-    told = f"step {step:,} of {of:,}, {n_gaussians:,} Gaussians{latest}"
-    return f"{told}, {step / max(seconds, 1e-9):.1f} steps a second, {duration(seconds * (of - step) / step)} left"
+    line = f"step {step:,} of {of:,}, {n_gaussians:,} Gaussians{latest}"
+    return f"{line}, {step / max(seconds, 1e-9):.1f} steps a second, {duration(seconds * (of - step) / step)} left"

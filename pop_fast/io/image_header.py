@@ -1,7 +1,7 @@
 """What an image file says of itself before a pixel is decoded: its size, and its EXIF tags.
 
 A few kilobytes of header decide how much memory decoding takes, so the size is held against what is expected first.
-JPEG, PNG, WebP, BMP and TIFF are read, and of HEIC the tags; of any other or damaged file nothing is told, and the
+JPEG, PNG, WebP, BMP and TIFF are read, and of HEIC the tags; of any other or damaged file nothing is returned, and the
 decoder judges it.
 """
 

@@ -72,22 +72,22 @@ def unreadable_photographs(folder: Path) -> str | None:
     unreadable = _UNREADABLE if can_read_heif() else (*_UNREADABLE, *HEIF_SUFFIXES)
     still = [path.suffix for path in files if path.suffix.lower() in unreadable and path.is_file()]
     moving = [path for path in files if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()]
-    told: list[str] = []
+    changes: list[str] = []
     if still:
         kind = max(set(still), key=still.count)
         what = f"{len(still)} files are" if len(still) > 1 else "1 file is"
         install = f"{INSTALL}, or " if kind.lower() in HEIF_SUFFIXES else ""
-        told.append(
+        changes.append(
             f"{what} {kind[1:].upper()} or the like, which is not read: {install}convert them to JPEG first, "
             f"for example with ImageMagick: magick mogrify -format jpg *{kind}"
         )
     if moving:
         what = f"{len(moving)} files are videos, which are" if len(moving) > 1 else "1 file is a video, which is"
-        told.append(
+        changes.append(
             f"{what} no photographs ({moving[0].name}): take sharp frames out first, "
             f"for example with pop frames {moving[0].name} --out photos"
         )
-    return "; ".join(told) or None
+    return "; ".join(changes) or None
 
 
 def find_image(folder: Path, name: str) -> Path | None:

@@ -1,7 +1,7 @@
 """A program of its own: decode JPEG files in turn, each announced by a NUL and its number on standard error.
 
 OpenCV hands nothing over when libjpeg finds damage in the coded pixels: libjpeg itself prints a line on standard error,
-which belongs to the whole process. In a process where nothing else happens, the line can be told to its file.
+which belongs to the whole process. In a process where nothing else happens, the line can be assigned to its file.
 """
 
 from __future__ import annotations

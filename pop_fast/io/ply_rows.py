@@ -97,7 +97,7 @@ def read_vertices(path: Path) -> np.ndarray:
     Raises:
         PopError: as `read_header`; or the file has no vertices as element, or fewer rows than its header says.
     """
-    # a file that is no splat is told by its beginning
+    # a file that is no splat is recognised by its beginning
     _vertex_elements(read_header(path), path)
     try:
         data = path.read_bytes()

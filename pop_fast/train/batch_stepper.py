@@ -127,7 +127,7 @@ def check_batch(config: TrainConfig, own_strategy: bool, ranks: Ranks) -> None:
 
     Args:
         config: `batch_size` is read.
-        own_strategy: whether the population's strategy is one of this package.
+        own_strategy: whether the density strategy is one of this package.
         ranks: the processes that draw them.
 
     Raises:

@@ -44,7 +44,7 @@ def facts(config: TrainConfig, views: Sequence[ViewTensors]) -> dict[str, Any]:
 
 
 def find_warnings(config: TrainConfig, views: Sequence[ViewTensors]) -> Iterator[str]:
-    """Say, in one sentence each, what will not do as it is set, and which option mends it.
+    """Say, in one sentence each, what will not do as it is set, and which option fixes it.
 
     Args:
         config: the settings.
@@ -58,7 +58,7 @@ def find_warnings(config: TrainConfig, views: Sequence[ViewTensors]) -> Iterator
         yield (
             f"theta_blur is {pixels:.1f} pixels of {smallest.name} ({smallest.width} x {smallest.height}), where the "
             "paper's smallest images make it 10.7: nearly every Gaussian that is seen will count as blur and grow; "
-            f"--{config.method}.blur-min-pixels {ENOUGH_PIXELS} mends it"
+            f"--{config.method}.blur-min-pixels {ENOUGH_PIXELS} fixes it"
         )
     if profile_named(config.profile).principal_point == "centred":
         away = {view.name: _off_centre(view) for view in views}

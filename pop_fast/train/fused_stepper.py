@@ -1,6 +1,6 @@
 """Training steps by something that takes a whole step by itself: the fused step on a GPU, or one like it.
 
-What it is told are rows, the photographs and `StepSettings`; it holds the statistics of density control in its own
+It is given rows, the photographs and `StepSettings`; it holds the statistics of density control in its own
 arrays, which are copied into the strategy's state after every segment, in the strategy's own types.
 """
 

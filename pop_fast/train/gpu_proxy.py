@@ -1,4 +1,4 @@
-"""A backend on a GPU behind the door of one on the CPU, and which backend measures and draws what was trained."""
+"""A backend on a GPU with the interface of one on the CPU, and which backend measures and draws what was trained."""
 
 from __future__ import annotations
 

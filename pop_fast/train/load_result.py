@@ -161,7 +161,7 @@ def open_capture(
     Args:
         splat: what is looked at.
         options: which photographs and cameras.
-        progress: is told (stage, done, total).
+        progress: is called with (stage, done, total).
         photographs: which are read; see `pop_fast.data.load_capture`.
 
     Raises:
@@ -184,8 +184,8 @@ def open_capture(
     if frame is not None:
         changes["normalize"] = frame == "training"
     elif splat.path.suffix.lower() != ".pt":
-        told = "says nothing of its world, and is taken to be in pop's training frame"
-        print(f"note: {splat.path}: {told}; that of another program needs --own-frame", file=sys.stderr)
+        origin = "says nothing of its world, and is taken to be in pop's training frame"
+        print(f"note: {splat.path}: {origin}; that of another program needs --own-frame", file=sys.stderr)
     config = replace(splat.config, **changes)
     capture = load_capture(
         data,

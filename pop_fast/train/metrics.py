@@ -1,4 +1,4 @@
-"""How good a render is (PSNR, SSIM and, with weights at hand, LPIPS), and what to count of a population."""
+"""How good a render is (PSNR, SSIM and, with weights at hand, LPIPS), and what to count of its Gaussians."""
 
 from __future__ import annotations
 

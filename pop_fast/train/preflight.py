@@ -33,7 +33,7 @@ def check_views(config: TrainConfig, name: str, train: Sequence[ViewTensors], te
             checks.cameras(view.viewmat, view.K, view.width, view.height, 1, ())
             checks.values()
         except ValueError as error:
-            raise PopError(f"{name}: camera of {view.name}: {error}; mend it, or leave the view out") from error
+            raise PopError(f"{name}: camera of {view.name}: {error}; correct it, or leave the view out") from error
     transparent = next((view.name for view in train if view.had_alpha), None)
     if config.random_background and transparent is not None:
         raise PopError(

@@ -23,7 +23,7 @@ __all__ = ["ALONE", "Ranks", "TorchRanks", "join"]
 T = TypeVar("T")
 
 # what torchrun, and other launchers after it, tell a process of itself
-_TOLD: Final = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+_VARIABLES: Final = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 # rank 0 may load photographs, find cameras or measure held-out views for hours while the others wait
 _PATIENCE: Final = timedelta(days=2)
 
@@ -163,7 +163,7 @@ def join() -> Ranks:
     Raises:
         PopError: what the launcher says is damaged, or the others cannot be reached.
     """
-    if not all(os.environ.get(name) for name in _TOLD) or os.environ["WORLD_SIZE"] == "1":
+    if not all(os.environ.get(name) for name in _VARIABLES) or os.environ["WORLD_SIZE"] == "1":
         return ALONE
     import torch.distributed as group
 
@@ -173,6 +173,6 @@ def join() -> Ranks:
     try:
         group.init_process_group("cpu:gloo,cuda:nccl" if by_gpu else "gloo", timeout=_PATIENCE)
     except (RuntimeError, ValueError) as error:
-        told = ", ".join(f"{name}={os.environ[name]}" for name in _TOLD)
-        raise PopError(f"cannot meet the other processes ({told}): {error}; start them with torchrun") from error
+        given = ", ".join(f"{name}={os.environ[name]}" for name in _VARIABLES)
+        raise PopError(f"cannot meet the other processes ({given}): {error}; start them with torchrun") from error
     return TorchRanks()

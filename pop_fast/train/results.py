@@ -3,7 +3,7 @@
     cfg.json                        the settings as given, and as they are run
     capture.json                    how `pop train` read the capture, and its training frame
     commands.json                   the command that began the run, and those that resumed it, with their folders
-    metrics.jsonl                   one record every `log_every` steps and at every change of the population
+    metrics.jsonl                   one record every `log_every` steps and at every change of the Gaussians
     ckpts/ckpt_{step}_rank0.pt      checkpoints; `step` counts from 0 here and below, so 30,000 steps end at 29999
     ply/point_cloud_{step}.ply      Gaussians in Inria's layout
     stats/train_step{step}.json     Gaussians, opacities, seconds, memory, machine, versions
@@ -24,7 +24,7 @@
 
 A record of metrics.jsonl holds: step, view (or the names of a batch), loss, l1 or l2 (the pixel-wise term), d_ssim,
 pop (weighted, absent when off), psnr (of the training view), num_gaussians, n_blended and n_traversed (per pixel; not
-in runs on a GPU), sh_degree, lr_means, it_per_s, seconds (training alone); after a change of the population also
+in runs on a GPU), sh_degree, lr_means, it_per_s, seconds (training alone); after a change of the Gaussians also
 cloned, split, pruned, and reset when opacities were. Statistics of runs on a GPU also hold gpu, gpu_memory_bytes and
 instance_buffers_grown.
 """
@@ -261,7 +261,7 @@ def read_config(folder: Path) -> TrainConfig:
     try:
         return TrainConfig.from_json(path.read_text(encoding="utf-8"))
     except (PopError, UnicodeDecodeError) as error:
-        raise PopError(f"{path}: {error}; mend the file, copy it again or train again") from error
+        raise PopError(f"{path}: {error}; repair the file, copy it again or train again") from error
 
 
 def _remove(path: Path) -> None:

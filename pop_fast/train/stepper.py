@@ -38,7 +38,7 @@ class Stepper(Protocol):
     step: int
 
     def rebind(self, params: dict[str, Parameter], optimizers: Mapping[str, Adam], state: State) -> None:
-        """Go on with these rows, moments and statistics: at the beginning, and after the population has changed."""
+        """Go on with these rows, moments and statistics: at the beginning, and after the Gaussians have changed."""
         ...
 
     def steps(self, first: int, last: int, phase: Phase) -> list[StepStats]:
@@ -60,7 +60,7 @@ class Task:
 
     Attributes:
         config: step numbers as they are run.
-        strategy: the population's.
+        strategy: the one of density control.
         views: to train on.
         order: the views of every step, `config.batch_size` of them a step.
         updates: whom Adam moves at which step.

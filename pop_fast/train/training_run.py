@@ -69,7 +69,7 @@ class TrainingRun:
         params: raw parameters.
         optimizers: one Adam a parameter.
         appearance: exposures and cameras that are learned.
-        strategy: the population's.
+        strategy: the one of density control.
         state: the strategy's state.
         step: steps taken.
         updates: whom Adam moves at which step.
@@ -99,7 +99,7 @@ class TrainingRun:
             overwrite: replace the results of an earlier run in `config.result_dir`, once the first step has been taken.
             loading_seconds: how long reading the capture took, for the statistics.
             beside: texts to write beside cfg.json, by file name.
-            strategy: decides over the population in the place of the config's, by gsplat's protocol; on the CPU.
+            strategy: decides over the Gaussians in the place of the config's, by gsplat's protocol; on the CPU.
             initial: raw parameters to start from; None makes them from the capture's points. Their precision is that of
                 the training; a GPU trains in float32 only.
             engine: takes the steps; None takes the one for `config.backend`.
@@ -232,7 +232,7 @@ class TrainingRun:
             last: how many steps will have been taken, over `step`.
 
         Returns:
-            What the steps measured and what became of the population.
+            What the steps measured and what became of the Gaussians.
 
         Raises:
             PopError: a number is no longer finite; names it.
@@ -267,7 +267,7 @@ class TrainingRun:
         return stats
 
     def _change(self, step: int) -> DensificationStep | None:
-        """Let density control edit the population, if that is due."""
+        """Let density control edit the Gaussians, if that is due."""
         if not self.strategy.changes_after(step):
             return None
         passes = self._passes if self.strategy.needs_passes(step) else None
@@ -278,12 +278,12 @@ class TrainingRun:
 
     @cached_property
     def draws(self) -> Draws:
-        """What changes of the population are decided by, the same numbers whatever takes the steps."""
+        """What changes of the Gaussians are decided by, the same numbers whatever takes the steps."""
         return draws_of(self.state["generator"])
 
     @cached_property
     def _passes(self) -> Passes:
-        """What a change of the population sees of the training views."""
+        """What a change of the Gaussians sees of the training views."""
         views = self.appearance.seen(self._train)
         return Passes.of(self._engine.backend, views, self.config, self._engine.device)
 

@@ -35,9 +35,9 @@ def check_one_size(video: VideoFile, views: Sequence[ViewTensors]) -> None:
     sizes = {tuple(side // 2 for side in view.photo.shape[:2]): view for view in reversed(views)}
     if len(sizes) > 1:
         some = list(sizes.values())[:2]
-        told = ", ".join(f"{view.name} is {view.photo.shape[1]} x {view.photo.shape[0]} px" for view in some)
+        listed = ", ".join(f"{view.name} is {view.photo.shape[1]} x {view.photo.shape[0]} px" for view in some)
         raise PopError(
-            f"{video.path}: the views have {len(sizes)} sizes ({told}) and a video has one; "
+            f"{video.path}: the views have {len(sizes)} sizes ({listed}) and a video has one; "
             "write pictures with --out DIR, or film a path with --path orbit"
         )
 

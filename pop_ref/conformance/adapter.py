@@ -32,7 +32,7 @@ from pop_ref.conformance.capabilities import (
     same_constants,
 )
 from pop_ref.conformance.scenes import Scene, rounded_to
-from pop_ref.conformance.views import ASKED, offers
+from pop_ref.conformance.views import ASKED, refusal
 from pop_ref.constants import PAPER, Profile
 from pop_ref.records import Splats
 from pop_ref.splatting import project, project_vjp
@@ -143,15 +143,22 @@ class Adapter:
         if need == SIGNATURE:
             return callable(getattr(self, "call", None))
         if need in ASKED:
-            return self.has(SIGNATURE) and self._offers(need)
+            return self.has(SIGNATURE) and self.why_not(need) is None
         if need == SCALE:
             return self.has(RENDER)
         return need in self.able or need in capabilities_of(self.profile) or callable(getattr(self, need, None))
 
-    def _offers(self, need: str) -> bool:
-        known: dict[str, bool] = self.__dict__.setdefault("_known_offers", {})
+    def why_not(self, need: str) -> str | None:
+        """Return in what words the rasterizer refuses an argument of gsplat's signature; None if it does not.
+
+        It is asked once.
+
+        Args:
+            need: a capability of `views.ASKED`.
+        """
+        known: dict[str, str | None] = self.__dict__.setdefault("_known_refusals", {})
         if need not in known:
-            known[need] = offers(self, need)
+            known[need] = refusal(self, need)
         return known[need]
 
     def _tells(self, need: str) -> bool:

@@ -34,8 +34,10 @@ sides, the nearest decision with its margin, and a scene to paste, which is also
 
 A rasterizer is asked once for every argument of gsplat's signature: several cameras, batches, packed rows, depth modes,
 plain colours of any number of channels, colours of each camera, covariances, radius_clip, planes, no background,
-sparse_grad. What it refuses with NotImplementedError, TypeError or ValueError is skipped by name; what it accepts is
-compared with what the oracle draws of every frame alone. One that only draws has no gradients to judge.
+sparse_grad. What it refuses is skipped by name and in its own words: an argument that its signature lacks,
+NotImplementedError, a ValueError, TypeError or AssertionError that Python code raises by a statement, a RuntimeError
+that says "unsupported" or "not implemented". Any other error is a defect, which the laws of that argument report. What
+it accepts is compared with what the oracle draws of every frame alone. One that only draws has no gradients to judge.
 
 What is drawn where nothing but an image is asked for may be other code than what also counts. A rasterizer with the
 arguments `dominance` and `counts` is judged as training asks it, and a law holds every choice of the two together.

@@ -17,12 +17,12 @@ from typing import Any
 
 import pytest
 
-from pop_ref.conformance.capabilities import STAGES
+from pop_ref.conformance.capabilities import SIGNATURE, STAGES
 
 LAWS = "pop_ref.conformance.laws"
 FAILURES = "conformance_failures"
 # the lines of a failure's report that say what differs first (`failure_report`)
-TOLD = re.compile(
+DIFFERENCES = re.compile(
     r"^E +((?:first|nearest|no) (?:stage|pixel|Gaussian|gradient|decision)\b.*|saved as .*)$", re.MULTILINE
 )
 
@@ -113,10 +113,19 @@ def parametrize_backends(metafunc: pytest.Metafunc, backends: list[Any]) -> None
     cases = []
     for backend in backends:
         lacks = missing(backend, stated.needs) if stated else []
-        reason = getattr(backend, "reason", f"{backend.name} has no {', '.join(lacks)}")
+
+        reason = getattr(backend, "reason", None) or f"{backend.name} has no {', '.join(_in_words(backend, lacks))}"
         marks = [pytest.mark.skip(reason=reason)] if lacks or hasattr(backend, "reason") else []
         cases.append(pytest.param(backend, id=backend.name, marks=marks))
     metafunc.parametrize("backend", cases)
+
+
+def _in_words(backend: Any, lacks: list[str]) -> list[str]:
+    """Return what a backend lacks, each with the words in which it refused where it was asked."""
+    from pop_ref.conformance.views import ASKED
+
+    refused = {need: backend.why_not(need) for need in lacks if need in ASKED and backend.has(SIGNATURE)}
+    return [f"{need} ({words.splitlines()[0]})" if (words := refused.get(need)) else need for need in lacks]
 
 
 def _chosen_backends(config: pytest.Config) -> list[Any]:
@@ -204,16 +213,16 @@ class _Recorder:
         named: Any = dict(report.user_properties).get("law")
         if named is None or not (report.when == "call" or report.skipped or report.failed):
             return
-        detail, told = "", ()
+        detail, differences = "", ()
         if report.skipped and isinstance(report.longrepr, tuple):
             detail = str(report.longrepr[2]).removeprefix("Skipped: ")
         elif report.failed:
             crash = getattr(report.longrepr, "reprcrash", None)
             detail = str(crash.message if crash else report.longrepr).splitlines()[0]
-            told = tuple(TOLD.findall(report.longreprtext))
+            differences = tuple(DIFFERENCES.findall(report.longreprtext))
         backend, stage, law = named
         cpu: Any = dict(report.user_properties).get("cpu", 0.0)
-        self.card.entries.append(Entry(backend, stage, law, report.outcome, detail, report.duration, told, cpu))
+        self.card.entries.append(Entry(backend, stage, law, report.outcome, detail, report.duration, differences, cpu))
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item: pytest.Item) -> Generator[None, Any, Any]:

@@ -75,7 +75,7 @@ class Scene:
         return f"Scene({', '.join(shown)})"
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
-        # Hypothesis prints dataclasses by field unless told otherwise; a scene must paste
+        # Hypothesis prints dataclasses by field unless asked otherwise; a scene must paste
         printer.text(repr(self))
 
     def but(self, **changes: Any) -> Scene:

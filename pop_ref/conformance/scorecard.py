@@ -23,7 +23,7 @@ class Entry:
         outcome: passed, failed or skipped.
         detail: the first line of the failure, or why it was skipped.
         seconds: how long it took.
-        told: of a failure, what differs first and where, a line each.
+        differences: of a failure, what differs first and where, a line each.
         cpu: seconds of this process; a program that is judged has its own beside.
     """
 
@@ -33,7 +33,7 @@ class Entry:
     outcome: str
     detail: str
     seconds: float
-    told: tuple[str, ...] = ()
+    differences: tuple[str, ...] = ()
     cpu: float = 0.0
 
 

@@ -62,10 +62,10 @@ def _broken(entries: list[Entry]) -> list[str]:
     failed = [entry for entry in entries if entry.outcome == "failed"]
     parts = ["<h3>Broken</h3>"] if failed else []
     for entry in failed:
-        told = "".join(f"<li>{escape(line)}" for line in entry.told)
+        lines = "".join(f"<li>{escape(line)}" for line in entry.differences)
         parts.append(
             f"<article><b>{_sentence(entry.law)}</b> <small>{entry.stage}</small>"
-            f"<p>{escape(entry.detail)}</p><ul>{told}</ul></article>"
+            f"<p>{escape(entry.detail)}</p><ul>{lines}</ul></article>"
         )
     return parts
 

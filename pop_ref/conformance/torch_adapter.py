@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from types import ModuleType, SimpleNamespace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from hypothesis import reject
@@ -32,6 +32,9 @@ from pop_ref.conformance.capabilities import (
 from pop_ref.conformance.cases import BY_NAME, Case
 from pop_ref.conformance.scenes import Scene
 from pop_ref.constants import PAPER, Profile
+
+# arguments at the values by which a rasterizer that lacks them draws
+NEUTRAL: Final = {"packed": False, "near_plane": 0.01, "eps2d": 0.3}
 
 
 class TorchAdapter(Adapter):
@@ -83,7 +86,9 @@ class TorchAdapter(Adapter):
         self.profile = None if takes_any else profile
         self.able = (*(ANTIALIASING,) * ("rasterize_mode" in parameters), *(DETERMINISTIC,) * deterministic)
         self._whole_signature = whole_signature
-        self._takes_absgrad = "absgrad" in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+        self._takes_anything = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+        self._parameters = frozenset(parameters)
+        self._takes_absgrad = "absgrad" in parameters or self._takes_anything
         self._instruments = tuple(name for name in ("dominance", "counts") if name in parameters)
         self._has_gradients: bool | None = None if rasterization else False
         self._chosen = tuple(name for name in ("absgrad", *self._instruments) if name in parameters)
@@ -216,19 +221,19 @@ class TorchAdapter(Adapter):
         image, alphas, meta = drawn
         H, W, N = scene.camera.height, scene.camera.width, len(scene.gaussians)
         T_final = meta.get("final_T")
-        told: dict[str, Any] = {}
+        shown: dict[str, Any] = {}
         # reading what was not asked for may draw anew
         if dominance or "dominance" not in self._instruments:
-            told |= {name: (meta.get(name), (H, W)) for name in ("dominant_ids", "dominant_weights")}
-            told["dominant_counts"] = (meta.get("dominant_counts"), (N,))
+            shown |= {name: (meta.get(name), (H, W)) for name in ("dominant_ids", "dominant_weights")}
+            shown["dominant_counts"] = (meta.get("dominant_counts"), (N,))
         if counts or "counts" not in self._instruments:
-            told |= {"n_blended": (meta.get("n_contrib"), (H, W)), "n_traversed": (meta.get("n_traversed"), (H, W))}
+            shown |= {"n_blended": (meta.get("n_contrib"), (H, W)), "n_traversed": (meta.get("n_traversed"), (H, W))}
         shapes = {"radii": (N, 2), "means2d": (N, 2), "depths": (N,), "conics": (N, 3)}
-        told |= {name: (meta.get(name), shape) for name, shape in shapes.items()}
+        shown |= {name: (meta.get(name), shape) for name, shape in shapes.items()}
         return View(
             image=self._array(image).reshape(H, W, -1),
             T_final=self._array(T_final if T_final is not None else 1.0 - alphas).reshape(H, W),
-            **{name: None if x is None else self._array(x).reshape(shape) for name, (x, shape) in told.items()},
+            **{name: None if x is None else self._array(x).reshape(shape) for name, (x, shape) in shown.items()},
         )
 
     def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
@@ -280,9 +285,11 @@ class TorchAdapter(Adapter):
             width=scene.camera.width,
             height=scene.camera.height,
             sh_degree=call.sh_degree,
-            packed=call.packed,
-            tile_size=scene.profile.tile_size if scene.tile_size is None else scene.tile_size,
-            **self._asked_by(call),
+            **self._taken(
+                packed=call.packed,
+                tile_size=scene.profile.tile_size if scene.tile_size is None else scene.tile_size,
+                **self._asked_by(call),
+            ),
             **(self._absgrad if pulls else {}),
         )
         B, C, H, W = len(call.frames), len(call.frames[0]), scene.camera.height, scene.camera.width
@@ -299,8 +306,8 @@ class TorchAdapter(Adapter):
                 of_screen = {"means2d": self._grad_of(means2d)}
                 of_screen |= {} if absolute is None else {"means2d_abs": self._array(absolute)}
                 gradients |= {name: unpacked(call, value, meta) for name, value in of_screen.items()}
-        told = {name: self._array(meta[name]) for name in meta if meta[name] is not None}
-        return Called(self._array(images), self._array(alphas), told, gradients)
+        shown = {name: self._array(meta[name]) for name in meta if meta[name] is not None}
+        return Called(self._array(images), self._array(alphas), shown, gradients)
 
     def _asked_by(self, call: Call) -> dict[str, Any]:
         """Return the arguments of a call that are not at gsplat's defaults, and the profile for who takes one."""
@@ -310,6 +317,19 @@ class TorchAdapter(Adapter):
         asked |= {"radius_clip": call.radius_clip} if call.radius_clip else {}
         asked |= {"sparse_grad": True} if call.sparse_grad else {}
         return asked | ({"profile": scene.profile} if self._takes_profile else {})
+
+    def _taken(self, **options: Any) -> dict[str, Any]:
+        """Return the options without those that the rasterizer's signature lacks and that change nothing in an image.
+
+        The side of a tile is how a rasterizer works, not what it draws; where it does (square extents, D3), its
+        profile has it.
+        """
+        unknown = set() if self._takes_anything else options.keys() - self._parameters
+        return {
+            name: value
+            for name, value in options.items()
+            if name not in unknown or (name != "tile_size" and value != NEUTRAL.get(name))
+        }
 
     def _leaves(self, scene: Scene, grad: bool) -> dict[str, Any]:
         g, c = scene.gaussians, scene.camera
@@ -344,13 +364,15 @@ class TorchAdapter(Adapter):
             self._tensor(scene.camera.K[None]),
             scene.camera.width,
             scene.camera.height,
-            near_plane=scene.profile.near_plane,
-            eps2d=scene.profile.eps2d,
             sh_degree=n_bands if scene.sh_degree is None else scene.sh_degree,
-            packed=False,
-            tile_size=scene.profile.tile_size if scene.tile_size is None else scene.tile_size,
             backgrounds=leaves["background"],
-            **options,
+            **self._taken(
+                near_plane=scene.profile.near_plane,
+                eps2d=scene.profile.eps2d,
+                packed=False,
+                tile_size=scene.profile.tile_size if scene.tile_size is None else scene.tile_size,
+                **options,
+            ),
         )
 
     def _tensor(self, value: Any, own: ModuleType | None = None) -> Any:

@@ -1,7 +1,7 @@
 """Density control and Adam of a torch trainer as stage functions: what its strategy, its row operations and its
 optimizers do when it trains, under the oracle's names.
 
-A population is taken into the trainer's own form, parameters with one optimizer each whose moments are set, and back.
+Gaussians are taken into the trainer's own form, parameters with one optimizer each whose moments are set, and back.
 torch and the trainer are imported when the stages are made, never when the kit is.
 """
 

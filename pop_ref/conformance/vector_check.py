@@ -25,7 +25,7 @@ class Verdict:
         vector, array: names.
         worst: the largest difference over its error bound; for integers the number of wrong entries.
         allowed: the largest that passes.
-        told: where the worst entry is, with both values.
+        where: where the worst entry is, with both values.
         unit: what `worst` and `allowed` count.
     """
 
@@ -33,7 +33,7 @@ class Verdict:
     array: str
     worst: float
     allowed: float
-    told: str = ""
+    where: str = ""
     unit: str = "of its error_bound"
 
     @property
@@ -201,8 +201,8 @@ def _judge(
     if worst <= allowed:
         return Verdict(vector, array, worst, allowed, unit=unit)
     at = tuple(int(i) for i in np.unravel_index(np.argmax(wrong), wrong.shape))
-    told = f"at {list(at)}{' of its sums' if 'reduce' in rule else ''}: got {result[at]}, expected {expected[at]}"
-    return Verdict(vector, array, worst, allowed, told, unit)
+    where = f"at {list(at)}{' of its sums' if 'reduce' in rule else ''}: got {result[at]}, expected {expected[at]}"
+    return Verdict(vector, array, worst, allowed, where, unit)
 
 
 def _reduced(how: str, values: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -41,11 +41,11 @@ def first_failure(folder: Path, results: Path, backend: Any) -> str | None:
     return f"{failed[0].vector}: {failed[0].array}" if failed else None
 
 
-def kills(told: Callable[[str, str | None], None] = lambda name, found: None) -> dict[str, dict[str, str | None]]:
+def kills(report: Callable[[str, str | None], None] = lambda name, found: None) -> dict[str, dict[str, str | None]]:
     """Return by family and mutant what fails first, None for who survives; sound backends are a family, too.
 
     Args:
-        told: is given every name and result as it comes.
+        report: is given every name and result as it comes.
     """
     families = {"stages of the oracle": MUTANTS, "the program that trains": PROGRAM, "whole rasterizers": BLACK_BOXES}
     found: dict[str, dict[str, str | None]] = {family: {} for family in (*families, "sound")}
@@ -58,7 +58,7 @@ def kills(told: Callable[[str, str | None], None] = lambda name, found: None) ->
         for number, (family, name, living) in enumerate(trials):
             with living() as backend:
                 found[family][name] = first_failure(folder, Path(scratch) / str(number), backend)
-            told(name, found[family][name])
+            report(name, found[family][name])
         for name in SHIPPED:
             found["sound"][name] = first_failure(folder, Path(scratch) / name, shipped(name))
     return found

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dis
+import re
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -97,6 +99,9 @@ def _call(backend: Any, entries: int = 1, count: int = 1, **options: Any) -> Cal
     return Call(rows, camera_colors=of_frames.get("camera_colors", False), **options)
 
 
+# what a rasterizer's signature may lack, and be none the worse in what it has
+ARGUMENTS: Final = ("near_plane", "far_plane", "radius_clip", "eps2d", "sh_degree", "packed", "tile_size",
+                    "backgrounds", "render_mode", "sparse_grad", "absgrad", "rasterize_mode", "covars")  # fmt: skip
 # by capability, a call that needs it and nothing else
 ASKED: Final[dict[str, Callable[[Any], Call]]] = {
     capabilities.CAMERAS: lambda backend: _call(backend, count=2),
@@ -114,8 +119,11 @@ ASKED: Final[dict[str, Callable[[Any], Call]]] = {
 }
 
 
-def offers(backend: Any, capability: str) -> bool:
-    """Ask a backend once for a call that needs a capability; what it refuses, it does not offer.
+def refusal(backend: Any, capability: str) -> str | None:
+    """Ask a backend for a call that needs a capability, and return in what words it refuses; None if it does not.
+
+    A refusal is an error that somebody raised on purpose about an argument. Any other error is a defect: the capability
+    counts as offered, so that its laws run into the error and report it.
 
     Args:
         backend: has a method `call`.
@@ -123,6 +131,26 @@ def offers(backend: Any, capability: str) -> bool:
     """
     try:
         backend.call(ASKED[capability](backend))
-    except (NotImplementedError, TypeError, ValueError):
-        return False
-    return True
+    except Exception as error:
+        return f"{type(error).__name__}: {error}" if _on_purpose(error) else None
+    return None
+
+
+def _on_purpose(error: Exception) -> bool:
+    text = str(error)
+    if isinstance(error, NotImplementedError):
+        return True
+    if isinstance(error, TypeError) and "unexpected keyword argument" in text:
+        return any(f"'{name}'" in text for name in ARGUMENTS)
+    # compiled code cannot raise NotImplementedError through every binding, so its words decide
+    if isinstance(error, RuntimeError):
+        return re.search(r"unsupported|not supported|not implemented|only supports?", text, re.IGNORECASE) is not None
+    return isinstance(error, (TypeError, ValueError, AssertionError)) and _was_raised(error)
+
+
+def _was_raised(error: Exception) -> bool:
+    """Tell whether Python code raised an error by a statement, as no failing operation of an array does."""
+    at = error.__traceback__
+    while at is not None and at.tb_next is not None:
+        at = at.tb_next
+    return at is not None and at.tb_frame.f_code.co_code[at.tb_lasti] == dis.opmap["RAISE_VARARGS"]

@@ -1,4 +1,4 @@
-"""Small populations with optimizers, and what a rasterizer would say about them."""
+"""A few Gaussians with optimizers, and what a rasterizer would say about them."""
 
 from __future__ import annotations
 

@@ -116,12 +116,12 @@ def test_an_unknown_setting_in_cfg_json_is_named(pop: Pop, result: Path) -> None
 @pytest.mark.parametrize("command", ["eval", "compare", "report"])
 def test_a_damaged_cfg_json_is_named_by_its_path(pop: Pop, result: Path, command: str, text: str) -> None:
     (result / "cfg.json").write_text(text)
-    says(pop(command, result), str(result / "cfg.json"), "mend the file")
+    says(pop(command, result), str(result / "cfg.json"), "repair the file")
 
 
 def test_a_cfg_json_in_another_encoding_is_named(pop: Pop, result: Path) -> None:
     (result / "cfg.json").write_bytes("{}".encode("utf-16"))
-    says(pop("eval", result), str(result / "cfg.json"), "mend the file")
+    says(pop("eval", result), str(result / "cfg.json"), "repair the file")
 
 
 def test_a_capture_that_is_no_longer_there_is_asked_for(pop: Pop, capture: Path, result: Path) -> None:

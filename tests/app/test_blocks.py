@@ -164,7 +164,7 @@ def test_a_block_that_was_interrupted_goes_on_to_the_same_bits(
         interrupt(patch, at=11)
         stopped = pop(*words)
     assert stopped.status == 130
-    assert "with --resume goes on" in stopped.err
+    assert "with --resume continues" in stopped.err
     assert not (folder / "blocks" / "0_0" / "trained").exists()
     assert pop("eval", folder).err.count("\n") == 1
     gone_on = pop(*words, "--resume")
@@ -312,7 +312,7 @@ def test_a_block_none_of_whose_photographs_has_a_mask_is_read_and_one_with_masks
 
 
 @pytest.mark.processes
-def test_parts_are_processes_of_their_own_and_hear_of_ctrl_c(shared_capture, tmp_path):
+def test_parts_are_processes_of_their_own_and_are_stopped_by_sigterm(shared_capture, tmp_path):
     folder = tmp_path / "out"
     long = ("--checkpoint-every", "100", "--max-steps", "200000", "--eval-steps", "--save-steps")
     command = [sys.executable, "-m", "pop_fast.cli", "train", str(shared_capture), "--out", str(folder), *BLOCKS, *long]
@@ -325,6 +325,6 @@ def test_parts_are_processes_of_their_own_and_hear_of_ctrl_c(shared_capture, tmp
         out, err = process.communicate(timeout=60.0)
     assert process.returncode == 130, err
     assert "stopped after step" in err
-    assert "the same command with --resume goes on" in err
+    assert "the same command with --resume continues" in err
     assert "block 0_0, 1 of 2" in out
     assert not (folder / "blocks" / "1_0" / "result").exists()

@@ -34,7 +34,7 @@ def test_small_images_need_a_least_number_of_pixels():
     (warning,) = said_of(480, 270)
     assert "theta_blur is 2.6 pixels of a.jpg (480 x 270)" in warning
     assert "--pop.blur-min-pixels 10" in warning
-    # what it names mends it; quick has it; and where nothing grows by blur there is nothing to mend
+    # what it names fixes it; quick has it; and where nothing grows by blur there is nothing to fix
     assert said_of(480, 270, **{"pop.blur_min_pixels": 10}) == []
     assert said_of(480, 270, preset="quick") == []
     assert said_of(480, 270, **{"pop.blur_stop_iter": -1}) == []

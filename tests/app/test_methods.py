@@ -1,4 +1,4 @@
-"""The paper's other methods as runs: when what happens, what the events do to the population, on every CPU engine."""
+"""The paper's other methods as runs: when what happens, what the events do to the Gaussians, on every CPU engine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is measured: PSNR, SSIM, counts of the population, and averages."""
+"""What is measured: PSNR, SSIM, counts of the Gaussians, and averages."""
 
 from __future__ import annotations
 

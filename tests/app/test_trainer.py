@@ -36,7 +36,7 @@ def finished(request, tmp_path_factory):
 
 
 def test_training_brings_renders_nearer_to_the_photographs(tmp_path):
-    # a fixed population: with one that changes every fourth step, thirty steps show mostly that
+    # fixed Gaussians: with one that changes every fourth step, thirty steps show mostly that
     config = tiny_config(tmp_path, max_steps=60, strategy=POPStrategy(refine_stop_iter=0))
     TrainingRun(config, tiny_capture()).run()
     psnr = [record["psnr"] for record in records(tmp_path)]

@@ -24,7 +24,7 @@ FUNCTIONS = public_functions()
 
 STEP = "gradients:a_step_along_any_direction_changes_the_image_as_the_gradient_says"
 FLOOR_MARGIN = "test_margins.test_d5_is_near_where_alpha_is_next_to_the_floor"
-CALENDAR = "test_density.test_calendar_has_144_events_41_with_blur_and_4_resets"
+SCHEDULE = "test_density.test_schedule_has_144_densification_steps_41_with_blur_and_4_resets"
 VISIBLE = "density:the_density_statistic_averages_ndc_gradients_over_the_views_that_showed_the_gaussian"
 OUTCOME = "thresholds:at_a_depth_tie_the_order_is_one_of_the_two_and_by_index_where_the_tie_is_exact"
 IMPORTANCE = "mini_splatting:importance_is_weight_indoors_and_weight_a_pixel_for_who_dominates_outdoors"
@@ -65,7 +65,7 @@ LAWS = {
     "density.grow_masks": "density:the_small_are_cloned_and_the_large_are_split_by_gradient_or_blur",
     "density.prune_mask": "density:the_faint_are_pruned_and_later_the_far_too_large",
     "density.densify_and_prune": "density:an_event_adds_clones_and_splits_and_takes_prunes_away",
-    "density_rows.rows_from_params": "density:a_new_population_has_zero_moments",
+    "density_rows.rows_from_params": "density:new_gaussians_have_zero_moments",
     "density_rows.clone_rows": "density:clones_are_exact_copies_at_the_end_with_fresh_moments",
     "density_rows.split_rows": "density:a_split_replaces_each_parent_by_two_smaller_children_drawn_from_it",
     "density_rows.prune_rows": "density:survivors_of_pruning_keep_their_order_bits_and_moments",
@@ -157,8 +157,8 @@ TESTS = {
     "taming.taming_scores": "test_taming.test_scores_of_a_population_add_over_views_that_are_rendered_and_weighed",
     "fisher.screen_moments": "test_fisher.test_the_view_direction_counts_and_channels_do_not_leak_into_each_other",
     "fisher.fisher_blocks": "test_fisher.test_the_view_direction_counts_and_channels_do_not_leak_into_each_other",
-    "density_config.densifies_at": CALENDAR,
-    "density_config.resets_at": CALENDAR,
+    "density_config.densifies_at": SCHEDULE,
+    "density_config.resets_at": SCHEDULE,
     "density_config.blurs_at": "test_density.test_split_only_blur_splits_small_ones_and_may_clone_them_as_well",
     "appearance.expose": "test_appearance.test_an_exposure_mixes_channels_row_by_row",
     "appearance.centred_exposures": "test_appearance.test_centred_exposures_have_the_identity_as_mean",

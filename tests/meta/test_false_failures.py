@@ -12,7 +12,15 @@ import torch
 
 from pop_fast.api.rasterize import rasterization as fast
 from pop_ref.conformance.adapter import Adapter, OracleAdapter, View, stage_function
-from pop_ref.conformance.capabilities import DETERMINISTIC, DOMINANCE, DOMINANT_WEIGHTS, GRADIENTS, HOMOGENEOUS, RENDER
+from pop_ref.conformance.capabilities import (
+    DETERMINISTIC,
+    DOMINANCE,
+    DOMINANT_WEIGHTS,
+    GRADIENTS,
+    HOMOGENEOUS,
+    PACKED,
+    RENDER,
+)
 from pop_ref.conformance.failure_report import failure_report
 from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.law import missing
@@ -72,6 +80,69 @@ def test_dominant_ids_are_judged_without_weights_and_counts() -> None:
     judged = [path for path, s in LAWS.items() if DOMINANCE in s.needs and not missing(backend, s.needs)]
     assert len(judged) >= 6
     assert {path: broken for path in judged if (broken := obeys(LAWS[path], backend, 10))} == {}
+
+
+def _refuses_packed(error: Callable[[], Any]) -> Callable[..., Any]:
+    def rasterization(*args: Any, packed: bool = True, **options: Any) -> Any:
+        return error() if packed else sound(*args, packed=False, **options)
+
+    return rasterization
+
+
+def _raises(error: Exception) -> Any:
+    raise error
+
+
+def _asserts() -> None:
+    allowed = False
+    assert allowed, "packed rows come later"
+
+
+def without_packed(means: Any, quats: Any, scales: Any, opacities: Any, colors: Any, viewmats: Any, Ks: Any,
+                   width: int, height: int, sh_degree: int | None = None, backgrounds: Any = None) -> Any:  # fmt: skip
+    return sound(means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree=sh_degree,
+                 backgrounds=backgrounds)  # fmt: skip
+
+
+REFUSALS: dict[str, Callable[..., Any]] = {
+    "not implemented": _refuses_packed(lambda: _raises(NotImplementedError("packed"))),
+    "a ValueError by a statement": _refuses_packed(lambda: _raises(ValueError("packed=True is not for me"))),
+    "an assertion": _refuses_packed(_asserts),
+    "words of compiled code": _refuses_packed(lambda: _raises(RuntimeError("packed mode is not supported"))),
+    "no such argument": without_packed,
+}
+DEFECTS: dict[str, Callable[..., Any]] = {
+    "an operation on types that have none": _refuses_packed(lambda: {} | ()),  # type: ignore[operator]
+    "arrays that do not fit": _refuses_packed(lambda: np.zeros(2) + np.zeros(3)),
+    "a key that is not there": _refuses_packed(lambda: {}["packed"]),
+    "an argument of something inside": _refuses_packed(lambda: dict.fromkeys(values=())),  # type: ignore[call-arg]
+    "a kernel that fails": _refuses_packed(lambda: _raises(RuntimeError("illegal memory access"))),
+}
+PACKED_LAW = "test_signature_cameras:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same"
+
+
+@pytest.mark.parametrize("words", REFUSALS)
+def test_what_is_refused_on_purpose_is_skipped_in_the_words_of_the_refusal(words: str) -> None:
+    backend = TorchAdapter("refusing", REFUSALS[words], dtype="float32")
+    assert missing(backend, law_named(PACKED_LAW).needs) == [PACKED]
+    assert "packed" in str(backend.why_not(PACKED))
+
+
+def test_a_rasterizer_with_fewer_arguments_than_gsplats_is_judged_by_those_it_has() -> None:
+    backend = TorchAdapter("short", without_packed, dtype="float32")
+    for path in (
+        "test_agreement:images_are_the_oracles",
+        "test_signature_cameras:several_cameras_in_one_call_see_what_each_sees_alone",
+    ):
+        assert not missing(backend, law_named(path).needs)
+        assert obeys(law_named(path), backend, 5) is None
+
+
+@pytest.mark.parametrize("defect", DEFECTS)
+def test_an_error_that_nobody_raised_on_purpose_is_a_defect_that_a_law_reports(defect: str) -> None:
+    backend = TorchAdapter("crashing", DEFECTS[defect], dtype="float32")
+    assert not missing(backend, law_named(PACKED_LAW).needs)
+    assert obeys(law_named(PACKED_LAW), backend, 5) is not None
 
 
 class _Unordered(torch.autograd.Function):

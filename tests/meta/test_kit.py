@@ -184,7 +184,7 @@ def test_the_kit_runs_from_the_command_line_and_writes_a_scorecard(tmp_path: Pat
 
 
 def test_a_session_that_judges_nothing_is_left_alone(tmp_path: Path) -> None:
-    # pytest loads the kit's door in every session; options of the kit's names may then be somebody else's
+    # pytest loads the kit's entry point in every session; options of the kit's names may then be somebody else's
     (tmp_path / "conftest.py").write_text("def pytest_addoption(parser): parser.addoption('--profile')\n")
     (tmp_path / "test_mine.py").write_text(
         "import sys\ndef test_mine(request):\n    assert request.config.getoption('--profile') == 'cpu'\n"

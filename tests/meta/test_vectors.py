@@ -107,7 +107,7 @@ def test_one_wrong_pixel_of_thousands_is_found_by_the_sums(folder: Path, tmp_pat
     np.savez(path, **arrays)
     (failed,) = check(folder, tmp_path / "results").failed
     assert (failed.vector, failed.array) == ("large_five_thousand", "image")
-    assert f"at [{101 // 8 * 25 + 77 // 8}, 2] of its sums" in failed.told
+    assert f"at [{101 // 8 * 25 + 77 // 8}, 2] of its sums" in failed.where
 
 
 def test_masks_leave_most_of_every_vector_to_be_compared(folder: Path) -> None:

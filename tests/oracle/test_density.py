@@ -1,4 +1,4 @@
-"""Density control: the statistic's units, who is selected under every reading, the calendar, one whole event."""
+"""Density control: the statistic's units, who is selected under every reading, the schedule, one whole step."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ def test_pruning_takes_faint_ones_always_and_huge_ones_after_step_3000() -> None
     assert prune_mask(opacities, scales, 1.0, 9000, replace(POP, prune_too_big=False)).tolist() == [True, *[False] * 3]
 
 
-def test_calendar_has_144_events_41_with_blur_and_4_resets() -> None:
+def test_schedule_has_144_densification_steps_41_with_blur_and_4_resets() -> None:
     events = [s for s in STEPS if densifies_at(s, POP)]
     assert (len(events), events[0], events[-1]) == (144, 600, 14_900)
     blurred = [s for s in events if blurs_at(s, POP)]

@@ -1,4 +1,4 @@
-"""Every setting of a recipe is seen in a training step: the loss and the next population are those found by hand.
+"""Every setting of a recipe is seen in a training step: the loss and the next Gaussians are those found by hand.
 
 By hand means: from `losses`, `polarization` and `render` with the setting's value written out here, never through
 `training.objective`.

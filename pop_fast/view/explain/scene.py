@@ -81,7 +81,7 @@ class ExplainedView:
 
 
 def settings_of(view: View, config: TrainConfig, dtype: torch.dtype) -> dict[str, Any]:
-    """Collect what `rasterization` is told about the camera, with dominance and counts."""
+    """Collect what `rasterization` is given of the camera, with dominance and counts."""
     return {
         "viewmats": torch.from_numpy(view.viewmat).to(dtype)[None],
         "Ks": torch.from_numpy(view.K).to(dtype)[None],

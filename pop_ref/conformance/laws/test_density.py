@@ -112,7 +112,7 @@ def test_a_reset_lowers_opacities_to_the_ceiling_and_forgets_their_moments_only(
 
 
 @law("density", "rows_from_params", n=st.integers(1, 4))
-def test_a_new_population_has_zero_moments(backend, n):
+def test_new_gaussians_have_zero_moments(backend, n):
     params = tagged_rows(n).params
     rows = backend.stage("rows_from_params")(dict(params))
     for name, array in params.items():
@@ -213,9 +213,7 @@ def test_the_faint_are_pruned_and_later_the_far_too_large(backend, opacity, scen
 
 
 @law("density", "densifies_at", "resets_at", step=st.integers(0, 170).map(lambda k: 100 * k), later=st.integers(-1, 1))
-def test_the_population_changes_every_hundred_steps_and_opacities_are_reset_where_that_is_asked_for(
-    backend, step, later
-):
+def test_the_gaussians_change_every_hundred_steps_and_opacities_are_reset_where_that_is_asked_for(backend, step, later):
     at = max(step + later, 0)
     due = at % 100 == 0 and 500 < at < 15_000
     for reset_every, at_zero, pause in ((0, False, 0), (0, True, 0), (3000, False, 0), (3000, True, 300)):

@@ -185,7 +185,7 @@ BASELINES: Final = (
     ),
     Mutant(
         "negative_quota",
-        "a population over its budget asks for a negative number of children (Taming-3DGS)",
+        "a number over the budget asks for a negative number of children (Taming-3DGS)",
         "taming.py",
         "more = max(min(budget, n + n_candidates) - n, 0)",
         "more = min(budget, n + n_candidates) - n",

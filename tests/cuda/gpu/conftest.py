@@ -15,7 +15,7 @@ import cuda_ext  # noqa: E402  asserts must be rewritten first
 from pop_ref.conformance.plugin import parametrize_backends  # noqa: E402
 
 FOLDER = Path(__file__).parent
-TOLD = ("means2d", "radii", "depths", "conics", "opacities", "final_T")
+OF_META = ("means2d", "radii", "depths", "conics", "opacities", "final_T")
 DOMINANCE = ("dominant_ids", "dominant_weights", "dominant_counts")
 
 
@@ -30,7 +30,7 @@ def rasterizer(backward: str, deterministic: bool = True) -> Any:
         settings = {"profile": profile, "rasterize_mode": rasterize_mode, "dominance": dominance, **options}
         image, alphas, meta = rasterization(*args, backward=backward, deterministic=deterministic, **settings)
         visits = ("n_traversed",) if options.get("tile_size", 16) % 16 == 0 else ()
-        return image, alphas, {key: meta[key] for key in (*TOLD, *DOMINANCE, "n_contrib", *visits)}
+        return image, alphas, {key: meta[key] for key in (*OF_META, *DOMINANCE, "n_contrib", *visits)}
 
     return draw
 

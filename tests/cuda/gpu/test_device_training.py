@@ -55,7 +55,7 @@ def records(folder):
 @pytest.mark.parametrize("case", CASES)
 def test_steps_are_the_cpus_under_every_setting(engine, case, tmp_path):
     changes, edit = CASES[case]
-    # a population that stays, and rates at which rounding does not grow
+    # Gaussians that stay, and rates at which rounding does not grow
     strategy = POPStrategy(**{**STILL, "pop_stop_iter": 6, **changes.get("strategy", {})})
     settings = {"max_steps": 8, "log_every": 1, "checkpoint_every": 0, **changes, "strategy": strategy}
     capture = edit(tiny_capture())

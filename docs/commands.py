@@ -1,0 +1,248 @@
+"""docs/commands.md: every command, run on the demo capture, with what it printed and the pictures that it made.
+
+python docs/commands.py --write     run all of them (about ten minutes on two cores) and write the page and its pictures
+python docs/commands.py --check     exit with 1 where the page does not have every command, each with its summary
+
+Nothing is typed by hand: the outputs are those of one run, each no longer than a screen.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+
+from paper_repro.cli import COMMANDS as REPRO_COMMANDS
+from pop_fast.cli import COMMANDS as OF_POP
+from pop_ref.walkthrough.browser import OPTIONS, chromium
+
+DOCS = Path(__file__).resolve().parent
+ROOT = DOCS.parent
+PAGE, PICTURES = DOCS / "commands.md", DOCS / "commands"
+OF_REPRO = {name: about for name, (_, about) in REPRO_COMMANDS.items()}
+LONGEST = 30  # lines of an output
+WIDEST = 900  # px of a picture
+Picture = Callable[[Path, Path], None]
+
+
+@dataclass(frozen=True)
+class Run:
+    """A command line, and a picture that it leaves.
+
+    Attributes:
+        of: the command's name, as the list of commands has it.
+        words: what is typed.
+        picture: draws the picture's PNG from the folder that everything runs in; None where text is all.
+        caption: of the picture.
+        seconds: after which Ctrl-C is sent, for a command that waits for it.
+    """
+
+    of: str
+    words: str
+    picture: Picture | None = None
+    caption: str = ""
+    seconds: float | None = None
+
+
+def shot(page: str, width: int = WIDEST, height: int = 700) -> Picture:
+    """Return what photographs a page in a browser; `page` is an address or a file of the folder."""
+
+    def take(folder: Path, png: Path) -> None:
+        program = chromium()
+        if program is None:
+            raise SystemExit("the pictures of pages need Chromium: apt install chromium, or set CHROMIUM")
+        address = page if "://" in page else (folder / page).resolve().as_uri()
+        with tempfile.TemporaryDirectory() as profile:
+            gl = [option for option in OPTIONS if option != "--disable-gpu"] + ["--enable-unsafe-swiftshader"]
+            words = [program, *gl, f"--user-data-dir={profile}", f"--window-size={width},{height}", "--timeout=20000"]
+            subprocess.run([*words, f"--screenshot={png}", address], check=True, capture_output=True, timeout=120)
+
+    return take
+
+
+def tiles(pattern: str, count: int = 4) -> Picture:
+    """Return what puts the first few pictures of a glob next to one another."""
+
+    def join(folder: Path, png: Path) -> None:
+        found = [cv2.imread(str(path)) for path in sorted(folder.glob(pattern))[:count]]
+        row = cv2.hconcat([image for image in found if image is not None])
+        scale = min(1.0, WIDEST / row.shape[1])
+        cv2.imwrite(str(png), cv2.resize(row, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+
+    return join
+
+
+RUNS = (
+    Run("doctor", "pop doctor"),
+    Run("build-cpu", "pop build-cpu"),
+    Run("build-cuda", "pop build-cuda --help"),
+    Run("demo", "pop demo scene", tiles("scene/images/*.png"), "four of its photographs"),
+    Run("data check", "pop data check scene"),
+    Run("data check", "pop data check photos"),
+    Run("sfm", "pop sfm photos"),
+    Run(
+        "train", "pop train scene --preset quick --out out/pop", shot("out/pop/report.html", height=1100), "report.html"
+    ),
+    Run("train", "pop train scene --preset quick --method gsplat --out out/gsplat --skip-checks"),
+    Run(
+        "train",
+        "pop train scene --preset quick --max-steps 500 --blocks 2x1 --out out/blocks",
+        tiles("out/blocks/blocks/map.png", 1),
+        "blocks/map.png",
+    ),
+    Run("blocks", "pop blocks merge out/blocks"),
+    Run("eval", "pop eval out/pop"),
+    Run("render", "pop render out/pop --out views", tiles("views/*.png", 3), "held-out views"),
+    Run("render", "pop render out/pop --path orbit --video orbit.webm"),
+    Run("view", "pop view out/pop --port 8099", shot("http://127.0.0.1:8099", 1100, 650), "in the browser", 60.0),
+    Run(
+        "explain",
+        "pop explain out/pop --view 3 --pixel 80,60 --html why.html",
+        shot("why.html", height=1000),
+        "why.html",
+    ),
+    Run("compare", "pop compare out/pop out/gsplat"),
+    Run("report", "pop report out/pop"),
+    Run("export", "pop export out/pop --out mine.ply --drop-invisible"),
+    Run("export", "pop export out/pop --to spz --final-prune 0.003"),
+    Run("export", "pop export out/pop --to html", shot("pop.html", 700, 525), "pop.html, drawn by WebGL"),
+    Run("convert", "pop convert mine.ply mine.sog"),
+    Run("frames", "pop frames orbit.webm --count 12 --out frames", tiles("frames/*.jpg", 4), "four of the frames"),
+    Run("learn", "pop learn start mine"),
+    Run("learn", "pop learn check alpha mine"),
+    Run("learn", "pop learn map mine", tiles("mine/picture.png", 1), "the picture as it stands"),
+    Run("vectors", "pop vectors export vectors"),
+    Run("vectors", "pop vectors check vectors vectors"),
+    Run("completion", "pop completion bash | head -12"),
+)
+REPRO = (
+    Run("run", "pop-repro run pop demo --scale toy --out results --work work"),
+    Run("queue", "pop-repro queue --scale toy --rows pop gsplat l2_blur --out results --work work"),
+    Run("status", "pop-repro status --scale dev"),
+    Run("table", "pop-repro table 4 --scale toy --results results --out tables"),
+    Run(
+        "figure",
+        "pop-repro figure 7 --scale toy --results results --work work --out figures",
+        tiles("figures/*.png", 1),
+    ),
+    Run("claims", "pop-repro claims --scale dev"),
+    Run("data check", "pop-repro data check --data ."),
+)
+
+
+def ran(run: Run, folder: Path) -> str:
+    """Run a command line in the folder and return what it printed, errors too."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "110", "PATH": _path()}
+    process = subprocess.Popen(
+        run.words, shell=True, cwd=folder, env=environment, text=True, stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+    )  # fmt: skip
+    if run.seconds is not None:
+        time.sleep(run.seconds / 4)
+        drawn(run, folder)
+        os.killpg(process.pid, signal.SIGINT)
+    return process.communicate()[0]
+
+
+def _path() -> str:
+    return f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+
+
+def drawn(run: Run, folder: Path) -> Path | None:
+    """Draw a run's picture, once; return where it is."""
+    if run.picture is None:
+        return None
+    name = re.sub(r"\W+", "_", run.words.split(" --")[0].removeprefix("pop").strip()) + ".png"
+    png = PICTURES / name.removeprefix("_")
+    if not png.exists():
+        png.parent.mkdir(exist_ok=True)
+        run.picture(folder, png)
+    return png
+
+
+def shown(text: str, folder: Path) -> str:
+    """Return an output as the page has it: no path of this machine, no more than a screen."""
+    for path, name in (
+        (folder, "."),
+        (folder.resolve(), "."),
+        (Path(sys.prefix), ".venv"),
+        (ROOT, "pop-splatting"),
+        (Path.home(), "~"),
+    ):
+        text = text.replace(str(path), name)
+    lines = [line.rstrip() for line in text.rstrip().splitlines()]
+    if len(lines) > LONGEST:
+        half = LONGEST // 2
+        lines = [*lines[:half], f"... {len(lines) - 2 * half} lines more ...", *lines[-half:]]
+    return "\n".join(lines)
+
+
+def sections(folder: Path, runs: tuple[Run, ...], program: str, commands: dict[str, str]) -> Iterator[str]:
+    """Run everything in order, and give a section for every command."""
+    before = ""
+    for run in runs:
+        if run.of != before:
+            yield f"## {program} {run.of}\n\n{commands[run.of].capitalize()}."
+            before = run.of
+        print(run.words, file=sys.stderr, flush=True)
+        yield f"```console\n$ {run.words}\n{shown(ran(run, folder), folder)}\n```"
+        png = drawn(run, folder)
+        if png is not None:
+            yield f"![{run.caption or run.of}]({PICTURES.name}/{png.name})"
+
+
+def page() -> str:
+    """Run every command, and make the page of it."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        shutil.rmtree(PICTURES, ignore_errors=True)
+        subprocess.run(f"{sys.executable} -m pop_fast.cli demo bare && mv bare/images photos", shell=True, cwd=folder,
+                       check=True, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True)  # fmt: skip
+        parts = [*sections(folder, RUNS, "pop", OF_POP), *sections(folder, REPRO, "pop-repro", OF_REPRO)]
+    return "\n\n".join([_HEAD, *parts]) + "\n"
+
+
+_HEAD = """# Every command
+
+One run of each on the demo capture, with what it printed; `pop COMMAND --help` has its options. What to do in which
+order is in [the guide](guide.md). `photos` holds the demo's photographs alone, without their cameras.
+`python docs/commands.py --write` makes this page."""
+
+
+def lacking(text: str) -> list[str]:
+    """Return the commands that a page does not show with their summaries."""
+    wanted = {"pop": OF_POP, "pop-repro": OF_REPRO}
+    return [
+        f"{program} {name}"
+        for program, commands in wanted.items()
+        for name, summary in commands.items()
+        if f"## {program} {name}\n\n{summary.capitalize()}.\n\n```console\n$ {program} {name}" not in text
+    ]
+
+
+def main() -> int:
+    """Print, write or check the page."""
+    if "--check" in sys.argv:
+        missing = lacking(PAGE.read_text(encoding="utf-8"))
+        print("\n".join(missing) or f"{PAGE.name} has every command")
+        return int(bool(missing))
+    made = page()
+    if "--write" in sys.argv:
+        PAGE.write_text(made, encoding="utf-8")
+    else:
+        print(made, end="")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
