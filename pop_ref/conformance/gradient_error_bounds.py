@@ -59,6 +59,7 @@ def gradient_error_bounds(
     v_T_final: np.ndarray,
     plain: int = 0,
     with_depth: bool = False,
+    e_cotangents: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> dict[str, np.ndarray]:
     """Return the error bound of every gradient by name, in units of eps.
 
@@ -69,9 +70,15 @@ def gradient_error_bounds(
         v_T_final: cotangent of the remaining transmittance. [H, W]
         plain: how many of the first channels are plain colours; with none, they are of harmonics.
         with_depth: whether the last channel is depth.
+        e_cotangents: the error bounds of the two cotangents themselves, in units of eps; None where they are exact.
     """
-    found = sums_over_pixels(scene, error_bounds, v_image, v_T_final)
-    return error_bounds_of_sums(scene, error_bounds.screen, *found, plain, with_depth)
+    rows, background = sums_over_pixels(scene, error_bounds, v_image, v_T_final)
+    if e_cotangents is not None:
+        # what is off in a cotangent is off by as much as the same cotangent would weigh
+        off, behind = sums_over_pixels(scene, error_bounds, *e_cotangents)
+        rows = {name: Bound(bound.m, bound.e + off[name].m) for name, bound in rows.items()}
+        background = background + behind
+    return error_bounds_of_sums(scene, error_bounds.screen, rows, background, plain, with_depth)
 
 
 def sums_over_pixels(

@@ -41,6 +41,9 @@ class Expected:
         sure = self.error_bounds.smooth
         # dyadic, of either sign, nowhere zero, and others for every frame
         self.v_image = (np.mod(k * 5.0 + 3.0 + 7.0 * number, 16.0) - 7.5) / 8.0 * sure[..., None]
+        if call.render_mode.endswith("ED"):
+            # a pixel that shows almost nothing has an expected depth whose gradient is nearly all rounding
+            self.v_image[..., -1] = np.round(64.0 * self.v_image[..., -1] * self._opacity**2) / 64.0
         self.v_T_final = (np.mod(np.arange(H * W).reshape(H, W) * 3.0 + number, 8.0) - 3.5) / 8.0 * sure
 
     @property
@@ -64,15 +67,12 @@ class Expected:
         found = {name: getattr(g, name) for name in ("means", "quats", "scales", "opacities", "means2d", "means2d_abs")}
         found |= {"viewmats": g.viewmat, "backgrounds": g.background}
         found["colors"] = g.sh if g.colors is None else g.colors
-        v_image, v_T = np.abs(self.v_image), np.abs(self.v_T_final)
+        v_image, v_T, e_cotangents = np.abs(self.v_image), np.abs(self.v_T_final), None
         if mode.endswith("ED"):
-            # the cotangents of the quotient's two parts, with what rounding of the opacity does to them
-            share = 1.0 + (self.error_bounds.T_final + 1.0) / self._opacity
-            v_depth = v_image[..., -1] / self._opacity * share
-            v_T = v_T + v_depth * np.abs(self.render.image[..., -1]) * share
-            v_image = np.concatenate((v_image[..., :-1], v_depth[..., None]), axis=2)
+            v_image, v_T, e_cotangents = self._quotients_cotangents(v_image, v_T)
         plain = 0 if colors is None or not mode.startswith("RGB") else colors.shape[1]
-        bounds = gradient_error_bounds(self.scene, self.error_bounds, v_image, v_T, plain, mode != "RGB")
+        given = (v_image, v_T, plain, mode != "RGB", e_cotangents)
+        bounds = gradient_error_bounds(self.scene, self.error_bounds, *given)
         bounds |= {"viewmats": bounds["viewmat"], "backgrounds": bounds["background"][: len(g.background)]}
         bounds["colors"] = bounds["sh"] if colors is None else bounds["colors"]
         for name in ("backgrounds", "colors"):
@@ -80,6 +80,21 @@ class Expected:
             if bounds[name].size == 0 or not mode.startswith("RGB"):
                 bounds[name] = np.zeros(found[name].shape)
         return found, bounds
+
+    def _quotients_cotangents(
+        self, v_image: np.ndarray, v_T: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """Return the sizes of the cotangents of accumulated depth and transmittance, and the error bounds of both.
+
+        Of E = D / A with A = 1 - T: dE/dD = 1 / A, which is off by as large a share as A is, and dE/dT = E / A.
+        """
+        depth, e_depth = np.abs(self.render.image[..., -1]), self.image_error_bounds[..., -1]
+        v_depth = v_image[..., -1] / self._opacity
+        e_v_depth = v_depth * ((self.error_bounds.T_final + 1.0) / self._opacity + 1.0)
+        e_image = np.zeros_like(v_image)
+        e_image[..., -1] = e_v_depth
+        e_T = e_v_depth * depth + v_depth * (e_depth + depth)
+        return np.concatenate((v_image[..., :-1], v_depth[..., None]), axis=2), v_T + v_depth * depth, (e_image, e_T)
 
 
 def _frame_error_bounds(call: Call, frame: Frame, scene: Scene, dtype: Any) -> PixelErrorBounds:

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from pop_ref.conformance.calls import Call
+from pop_ref.conformance.calls import Call, Frame
 from pop_ref.conformance.capabilities import (
     CAMERAS,
     CHANNELS,
@@ -68,6 +68,17 @@ def test_the_near_and_the_far_plane_are_where_the_call_says(backend):
         depths = expectations(backend, call)[0][0].render.splats.depths
         assert all(np.min(np.abs(depths - plane)) > 2.0**-8 for plane in planes.values()), "a depth is at a plane"
         assert_call_is_the_oracles(backend, call)
+
+
+@law("signature", *JUDGED, PLANES)
+def test_a_centre_on_the_far_plane_is_drawn_and_one_on_the_near_plane_as_the_profile_says(backend):
+    (frame,) = frames(backend, 5)
+    one = {"means": [[0.0, 0.0, 3.0]], "scales": [[0.5, 0.5, 0.5]], "opacities": [0.75], "viewmat": np.eye(4)}
+    scene = backend.sees(frame.scene.rows([0]).but(**{name: np.array(value) for name, value in one.items()}))
+    assert scene.gaussians.means[0, 2] == 3.0
+    for plane, drawn in (("far_plane", True), ("near_plane", not scene.profile.near_inclusive)):
+        called = backend.call(Call(((Frame(scene, None),),), planes={plane: 3.0}))
+        assert (called.alphas.max() > 0.25) == drawn, f"depth 3 at {plane}=3 is {'culled' if drawn else 'drawn'}"
 
 
 @law("signature", *JUDGED, PLANES)
