@@ -134,6 +134,13 @@ RUNS = (
         "train", "pop train scene --preset quick --out out/pop", shot("out/pop/report.html", height=1100), "report.html"
     ),
     Run("train", "pop train scene --preset quick --method gsplat --out out/gsplat --skip-checks"),
+    Run(
+        "train",
+        "pop train scene --preset quick --max-steps 500 --blocks 2x1 --out out/blocks",
+        tiles("out/blocks/blocks/map.png", 1),
+        "blocks/map.png",
+    ),
+    Run("blocks", "pop blocks merge out/blocks"),
     Run("eval", "pop eval out/pop"),
     Run("render", "pop render out/pop --out views", tiles("views/*.png", 3), "held-out views"),
     Run("render", "pop render out/pop --path orbit --video orbit.webm"),

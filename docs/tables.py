@@ -138,6 +138,11 @@ def _of_faults(name: str) -> Callable[[], str]:
     return lambda: str(runpy.run_path(str(ROOT / "benchmarks" / "fault_tables.py"))[name]())
 
 
+def blocks() -> str:
+    """Make the table of a capture whole and in blocks, as benchmarks/blocks.py does."""
+    return str(runpy.run_path(str(ROOT / "benchmarks" / "blocks.py"))["table"]())
+
+
 def scorecards() -> str:
     """Make the table of what the kit found: rows are stages, cells say laws passed, failed and skipped."""
     columns = [card(file)["summary"][backend] for file, backend in JUDGED.values()]
@@ -312,6 +317,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "results": results,
     "differences": differences,
     **{name: _of_faults(name) for name in ("fuzzed", "disturbed", "loads")},
+    "blocks": blocks,
     "recipes": recipes,
     "reproduction": reproduction,
     "kit": kit,

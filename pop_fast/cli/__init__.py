@@ -36,6 +36,7 @@ COMMANDS: Final = {
     "sfm": "find the cameras of a folder of photographs (pycolmap)",
     "demo": "write the built-in demo capture, made from a seed",
     "data check": "look a capture over before training: sizes, pairing, masks, memory",
+    "blocks": "do one part of a training in blocks: partition, train a block, merge",
     "build-cpu": "compile the CPU kernels: about three times the speed (needs a C++ compiler)",
     "build-cuda": "compile the CUDA extension (needs nvcc)",
     "learn": "build your own splatting in NumPy, judged stage by stage",

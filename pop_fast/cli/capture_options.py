@@ -12,6 +12,7 @@ from pop_fast.train.load_result import CaptureOptions, Splat, open_capture
 
 if TYPE_CHECKING:
     from pop_fast.data import Capture
+    from pop_fast.data.load import Photographs
     from pop_fast.train.config import TrainConfig
 
 
@@ -23,9 +24,11 @@ class CaptureArguments(CaptureOptions):
     """The capture; by default the one it was trained on."""
 
 
-def open_with_bars(splat: Splat, options: CaptureOptions) -> tuple[Capture, TrainConfig]:
+def open_with_bars(
+    splat: Splat, options: CaptureOptions, photographs: Photographs = "all"
+) -> tuple[Capture, TrainConfig]:
     """Load the capture that a splat shows under progress bars; see `pop_fast.train.load_result.open_capture`."""
     from pop_fast.cli.progress import bars
 
     with bars() as progress:
-        return open_capture(splat, options, progress)
+        return open_capture(splat, options, progress, photographs)

@@ -56,7 +56,7 @@ def run(argv: Sequence[str]) -> int:
 
     splat = load_splat(args.splat)
     nets = _nets(args, splat.config)
-    capture, config = open_with_bars(splat, args)
+    capture, config = open_with_bars(splat, args, "held out")
     views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
     if not views:
         raise PopError(f"{capture.name}: holds no view out; give --test-every 8 or another number over 0")

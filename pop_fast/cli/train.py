@@ -17,12 +17,15 @@ import tyro
 
 from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED
 from pop_fast.cli.arguments import parse
+from pop_fast.cli.blocks_options import BlocksOptions
 from pop_fast.cli.errors import describe
 from pop_fast.cli.finish import FinishOptions, finish
 from pop_fast.cli.limits import LimitOptions
 from pop_fast.cli.live_view import LiveView, check_viewer
 from pop_fast.cli.printable import printable
+from pop_fast.cli.result_folder import as_begun, check_output, record_of, resumption, stopped
 from pop_fast.cli.said import PLAN, plan_of, said
+from pop_fast.cli.train_blocks import check_blocks, train_in_blocks
 from pop_fast.data.sfm_options import SfmOptions
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
@@ -30,7 +33,6 @@ from pop_fast.train.presets import ALIASES, METHODS, Given
 
 if TYPE_CHECKING:
     from pop_fast.data import Capture
-    from pop_fast.train.load_result import CaptureRecord
     from pop_fast.train.ranks import Ranks
     from pop_fast.train.training_run import TrainingRun
 
@@ -47,6 +49,7 @@ _EXAMPLES: Final = """
     pop train scene --backend fast           on the CPU, also where a GPU is
     pop train scene --export sog html        also as a small file and as a page, in out/scene_pop/export
     pop train scene --view                   watch it in the browser while it runs
+    pop train city --blocks 3x2              in blocks of the ground, for a capture larger than memory
     pop train scene --pop.lambda-pop 0.01    any setting, taken as it is; --help-all lists them all
 """
 
@@ -58,7 +61,7 @@ _SHOWN: Final = frozenset(
         *("exposure", "random_background", "refine_cameras"),
     }
 )
-_DOCUMENTED: Final = (FinishOptions, LimitOptions, Given, TrainConfig)
+_DOCUMENTED: Final = (BlocksOptions, FinishOptions, LimitOptions, Given, TrainConfig)
 # words of other trainers' command lines: Inria's, gsplat's
 _ALIASES: Final = {
     **dict.fromkeys(("-s", "--source-path", "--data-dir", "--data"), "DATA"),
@@ -72,7 +75,7 @@ _IGNORED: Final = frozenset({"--eval"})  # Inria: hold out every 8th view; here 
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Run(FinishOptions):
+class _Run(BlocksOptions, FinishOptions):
     """Fit a splat to a capture or a folder of photographs.
 
     DATA is a folder with a COLMAP model (the largest in sparse), with transforms.json, with what Polycam, Metashape or
@@ -114,6 +117,7 @@ def run(argv: Sequence[str]) -> int:
     folder = Path(config.result_dir)
     options.check()
     check_viewer(options)
+    check_blocks(config, options)
     ranks = _ranks()
     with _stdout_closed() if options.quiet or not _writes(ranks) else nullcontext():
         if _writes(ranks):
@@ -121,7 +125,9 @@ def run(argv: Sequence[str]) -> int:
         options = as_begun(folder, options)
         config, chosen = choose_backend(config, options.resume)
         check_backend(config)
-        status = _train(config, options, chosen, argv, ranks)
+        if options.blocks is not None:
+            return train_in_blocks(config, options, chosen, argv)
+        status = train_capture(config, options, chosen, argv, ranks)
     if ranks is not None:
         ranks.leave()
     return status
@@ -146,7 +152,21 @@ def _stdout_closed() -> Iterator[None]:
         yield
 
 
-def _train(config: TrainConfig, options: Any, chosen: str, argv: Sequence[str], ranks: Ranks | None) -> int:
+def train_capture(
+    config: TrainConfig, options: Any, chosen: str, argv: Sequence[str], ranks: Ranks | None = None
+) -> int:
+    """Train on a capture, finish the result and report on it.
+
+    Args:
+        config: the settings.
+        options: what `arguments` returns beside them.
+        chosen: a line on the backend.
+        argv: the words after `pop train`, for commands.json.
+        ranks: the processes that train together.
+
+    Returns:
+        The exit status.
+    """
     from pop_fast.train.commands import COMMANDS_FILE, commands_text
     from pop_fast.train.load_result import RECORD, record_text
 
@@ -166,14 +186,14 @@ def _train(config: TrainConfig, options: Any, chosen: str, argv: Sequence[str], 
         print(f"note: {config.max_steps:,} steps take hours on a CPU; --preset quick takes a tenth of the schedule")
     how = {"resume": options.resume, "overwrite": options.overwrite, "loading_seconds": loading}
     commands = commands_text(folder if options.resume else None, ["pop", "train", *argv])
-    beside = {RECORD: record_text(_record(capture, options)), COMMANDS_FILE: commands}
+    beside = {RECORD: record_text(record_of(capture, options)), COMMANDS_FILE: commands}
     # absolute, so that the result can be looked at from another folder too
     absolute = replace(config, data=str(Path(config.data).absolute()))
     with ExitStack() as showing:
         watch = LiveView(capture, options, showing) if options.view and _writes(ranks) else None
         training = TrainingRun(absolute, capture, beside=beside, ranks=ranks or ALONE, watch=watch, **how)
         if options.resume:
-            print(_resumption(folder))
+            print(resumption(folder))
         if watch is not None:
             watch.start(training)
         return _trained(training, folder, capture, options, ranks)
@@ -184,7 +204,7 @@ def _trained(training: TrainingRun, folder: Path, capture: Capture, options: Any
         stats = training.run()
     except KeyboardInterrupt:
         if _writes(ranks):
-            print(f"pop: {_stopped(folder, training.step)}", file=sys.stderr)
+            print(f"pop: {stopped(folder, training.step)}", file=sys.stderr)
         return EXIT_INTERRUPTED
     if not _writes(ranks):
         return 0
@@ -197,22 +217,6 @@ def takes_hours(config: TrainConfig) -> bool:
     given = config.given
     said = given is None or given.steps_scaler is not None or "max_steps" in given.settings
     return not said and config.preset == "paper" and config.backend != "cuda"
-
-
-def _stopped(folder: Path, step: int) -> str:
-    """Say where a run stopped and from which checkpoint it goes on: after a second Ctrl-C that is not the last step."""
-    from pop_fast.train.checkpoint import list_checkpoints
-
-    if step == 0:
-        return "stopped before the first step; nothing was written"
-    kept = [number + 1 for number, _ in list_checkpoints(folder)]
-    if not kept:
-        return (
-            f"stopped after step {step:,}, before a checkpoint was written; the same command with --resume starts anew"
-        )
-    if kept[-1] == step:
-        return f"stopped after step {step:,}; the same command with --resume goes on"
-    return f"stopped after step {step:,}; the same command with --resume goes on from step {kept[-1]:,}"
 
 
 def report(folder: Path) -> int:
@@ -315,51 +319,6 @@ def _arguments_type(base: TrainConfig, plan: dict[str, Any], short: bool) -> typ
     )
 
 
-def check_output(folder: Path, options: Any) -> None:
-    """Refuse an output folder that cannot be written to before the minutes of loading, not after.
-
-    Raises:
-        PopError: as `ResultFolder.check`, or both --resume and --overwrite were given.
-    """
-    if options.resume and options.overwrite:
-        raise PopError("--resume and --overwrite exclude each other; choose one")
-    from pop_fast.train.results import ResultFolder
-
-    if ResultFolder(folder).check(options.resume, options.overwrite):
-        print(f"note: {folder}: an --overwrite was cut short; the results that it had set aside are back")
-
-
-def as_begun(folder: Path, options: Any) -> Any:
-    """Read the capture of a run that is gone on with as it was read before, where the command does not say.
-
-    Args:
-        folder: the result folder.
-        options: a `_Run`; without `resume` it is returned as it is.
-
-    Raises:
-        PopError: capture.json is damaged.
-    """
-    from pop_fast.train.load_result import read_record
-
-    record = read_record(folder) if options.resume else None
-    if record is None:
-        return options
-    return replace(
-        options,
-        images=options.images or record.images,
-        missing=record.missing if options.missing == _Run.missing else options.missing,
-        ignore_masks=options.ignore_masks or not record.masks,
-        source=record.source if options.source == _Run.source else options.source,
-    )
-
-
-def _resumption(folder: Path) -> str:
-    from pop_fast.train.checkpoint import list_checkpoints
-
-    found = list_checkpoints(folder)
-    return f"going on from step {found[-1][0] + 1:,}" if found else f"nothing to resume in {folder}: starting anew"
-
-
 def check_backend(config: TrainConfig) -> None:
     """Refuse a backend that cannot run here, or not with these settings, before the minutes of loading, not after.
 
@@ -415,18 +374,6 @@ def open_capture(config: TrainConfig, options: Any) -> Capture:
             sfm=options.sfm,
             seed=config.seed,
         )
-
-
-def _record(capture: Capture, options: Any) -> CaptureRecord:
-    from pop_fast.train.load_result import CaptureRecord
-
-    return CaptureRecord(
-        images=options.images,
-        missing=options.missing,
-        masks=not options.ignore_masks,
-        source=options.source,
-        world_transform=capture.world_transform.tolist(),
-    )
 
 
 def _plan(config: TrainConfig) -> str:

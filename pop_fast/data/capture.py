@@ -8,7 +8,7 @@ they are stored.
 from __future__ import annotations
 
 import html
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from pop_fast.errors import CaptureError
 
-__all__ = ["Capture", "Progress", "Split", "View"]
+__all__ = ["Capture", "Progress", "Split", "View", "held_out"]
 
 Split = Literal["train", "val", "test"]
 # called from the main thread with (what is being done, how many are done, of how many)
@@ -35,6 +35,7 @@ class View:
         mask: True where the photograph counts; None where all of it does. bool [H, W]
         split: the capture's own assignment, or None where every n-th file is held out.
         had_alpha: the file has transparency, which was laid over a background.
+        was_read: False where only the camera was asked for; `image` then has the right size and no content.
     """
 
     name: str
@@ -44,6 +45,7 @@ class View:
     mask: np.ndarray | None = None
     split: Split | None = None
     had_alpha: bool = False
+    was_read: bool = True
 
     @property
     def width(self) -> int:
@@ -145,11 +147,22 @@ class Capture:
         Args:
             test_every: 8 in the paper; 0 holds nothing out.
         """
-        if self._has_split:
-            held_out = "test" if any(view.split == "test" for view in self.views) else "val"
-            return tuple(view for view in self.views if view.split == held_out)
-        return tuple(view for i, view in enumerate(self.views) if test_every > 0 and i % test_every == 0)
+        chosen = held_out([view.split for view in self.views], test_every)
+        return tuple(view for view, out in zip(self.views, chosen, strict=True) if out)
 
     @property
     def _has_split(self) -> bool:
         return any(view.split is not None for view in self.views)
+
+
+def held_out(splits: Sequence[Split | None], test_every: int) -> list[bool]:
+    """Tell which views are held out; see `Capture.test_views`.
+
+    Args:
+        splits: the capture's own assignment of each view, in the order of their names.
+        test_every: as `Capture.test_views`.
+    """
+    if any(split is not None for split in splits):
+        chosen = "test" if "test" in splits else "val"
+        return [split == chosen for split in splits]
+    return [test_every > 0 and i % test_every == 0 for i in range(len(splits))]

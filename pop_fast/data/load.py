@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from pop_fast.data.capture import Capture, Progress, View
+from pop_fast.data.block import BLOCK, find_block, read_block
+from pop_fast.data.capture import Capture, Progress, View, held_out
 from pop_fast.data.colmap import find_models, read_model
 from pop_fast.data.diagnostics import about_other_models, about_random_points, about_unplaced
 from pop_fast.data.exports import EXPORTS, find_export, read_export
 from pop_fast.data.normalize import normalizing_transform, transform_points, transform_viewmats
-from pop_fast.data.posed_images import PosedImage, SparsePoints
+from pop_fast.data.posed_images import Listing, PosedImage, SparsePoints
 from pop_fast.data.random_points import random_points
 from pop_fast.data.read_images import PhotoOptions, read_views
 from pop_fast.data.sfm import photo_folder, photographs, run_sfm
@@ -23,8 +25,9 @@ from pop_fast.data.transforms import find_transforms, read_transforms
 from pop_fast.errors import CaptureError
 from pop_fast.io.images import VIDEO_SUFFIXES, find_image, unreadable_photographs
 
-__all__ = ["beside_the_model", "load_capture", "turned_upright"]
+__all__ = ["Photographs", "beside_the_model", "list_capture", "load_capture", "turned_upright"]
 
+Photographs = Literal["all", "held out", "none"]
 Source = Literal["auto", "colmap", "transforms", "polycam", "metashape", "realitycapture", "photos"]
 
 
@@ -43,12 +46,16 @@ def load_capture(
     sfm: bool | SfmOptions = False,
     points: int = 30_000,
     seed: int = 0,
+    photographs: Photographs = "all",
+    test_every: int = 8,
+    listing: Listing | None = None,
 ) -> Capture:
     """Load photographs, cameras and sparse points of a capture.
 
-    `source="auto"` takes the first that is there: a COLMAP model (the largest in `sparse` and its subfolders, else in
-    `colmap/sparse`, else the folder itself), `transforms.json` or Blender's `transforms_train.json`, the export of
-    Polycam, Metashape (XML) or RealityCapture (CSV), a bare folder of photographs.
+    `source="auto"` takes the first that is there: a block of a larger capture (`block.json`), a COLMAP model (the
+    largest in `sparse` and its subfolders, else in `colmap/sparse`, else the folder itself), `transforms.json` or
+    Blender's `transforms_train.json`, the export of Polycam, Metashape (XML) or RealityCapture (CSV), a bare folder of
+    photographs.
 
     Args:
         path: the capture's folder.
@@ -68,6 +75,53 @@ def load_capture(
             `<path>/sparse/0`.
         points: how many random points to make where the capture brings none.
         seed: of the random points.
+        photographs: which are read: of the other views only the cameras are, and they take no memory. What is not
+            "all" has no points where the capture brings none.
+        test_every: which are held out; see `Capture.test_views`.
+        listing: what `list_capture` has read of it, where that was done before.
+
+    Raises:
+        CaptureError: one line that names the file, the field and the fix.
+    """
+    if factor < 1 or int(factor) != factor:
+        raise CaptureError(f"factor is {factor}; it must be a whole number of at least 1")
+    if missing not in ("error", "skip"):
+        raise CaptureError(f"missing is {missing!r}; it must be 'error' or 'skip'")
+    if resize not in ("area", "bicubic"):
+        raise CaptureError(f"resize is {resize!r}; it must be 'area' or 'bicubic'")
+    shown = _background(background)
+    listing = list_capture(path, source, images, sfm, progress) if listing is None else listing
+    options = PhotoOptions(int(factor), masks, missing, shown, images, resize, part=listing.made_from == BLOCK)
+
+    def wanted(shots: Sequence[PosedImage]) -> list[bool]:
+        if photographs == "none":
+            return [False] * len(shots)
+        in_order = sorted(shots, key=lambda shot: shot.name)
+        out = held_out([shot.split for shot in in_order], test_every)
+        names = {shot.name for shot, chosen in zip(in_order, out, strict=True) if chosen}
+        return [shot.name in names for shot in shots]
+
+    views, more = read_views(
+        listing.root, listing.path, listing.shots, options, progress, None if photographs == "all" else wanted
+    )
+    if len(views) < 2:
+        count = len(listing.shots)
+        raise CaptureError(
+            f"{listing.path}: {len(views)} view(s) are left of {count}; a scene needs two or more: restore them"
+        )
+    whole = photographs == "all"
+    listing = replace(listing, notes=[*listing.notes, *more])
+    return _assemble(Path(path), listing, views, normalize, points if whole else 0, seed)
+
+
+def list_capture(
+    path: str | Path,
+    source: Source = "auto",
+    images: str | None = None,
+    sfm: bool | SfmOptions = False,
+    progress: Progress | None = None,
+) -> Listing:
+    """Read what a capture lists, and none of its photographs; see `load_capture`.
 
     Raises:
         CaptureError: one line that names the file, the field and the fix.
@@ -78,26 +132,15 @@ def load_capture(
         if root.suffix.lower() in VIDEO_SUFFIXES and root.exists():
             raise CaptureError(f"{root}: is a video; take photographs out of it first: pop frames {root}")
         raise CaptureError(f"{root}: {what}; give the folder that holds the photographs and their cameras")
-    if factor < 1 or int(factor) != factor:
-        raise CaptureError(f"factor is {factor}; it must be a whole number of at least 1")
-    if missing not in ("error", "skip"):
-        raise CaptureError(f"missing is {missing!r}; it must be 'error' or 'skip'")
-    if resize not in ("area", "bicubic"):
-        raise CaptureError(f"resize is {resize!r}; it must be 'area' or 'bicubic'")
-    options = PhotoOptions(int(factor), masks, missing, _background(background), images, resize)
-    listing, shots, cloud, made_from, notes = _read_listing(root, source, images, sfm, progress)
+    listing = _read_listing(root, source, images, sfm, progress)
+    shots = listing.shots
     if len(shots) < 2:
-        raise CaptureError(f"{listing}: has {len(shots)} view(s) with a known camera; a scene needs two or more")
-    if made_from == "COLMAP model":
-        shots = turned_upright(root, beside_the_model(root, shots, images), listing)
-        notes += about_unplaced(root / (images or shots[0].folder), shots)
-    views, more = read_views(root, listing, shots, options, progress)
-    notes += more
-    if len(views) < 2:
-        raise CaptureError(
-            f"{listing}: {len(views)} view(s) are left of {len(shots)}; a scene needs two or more: restore them"
-        )
-    return _assemble(root, listing, views, cloud, made_from, notes, normalize, points, seed)
+        raise CaptureError(f"{listing.path}: has {len(shots)} view(s) with a known camera; a scene needs two or more")
+    if listing.made_from == "COLMAP model":
+        shots = turned_upright(root, beside_the_model(root, shots, images), listing.path)
+        notes = listing.notes + about_unplaced(root / (images or shots[0].folder), shots)
+        listing = replace(listing, shots=shots, notes=notes)
+    return listing
 
 
 def _background(color: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -108,17 +151,19 @@ def _background(color: tuple[float, float, float]) -> tuple[float, float, float]
 
 def _read_listing(
     root: Path, source: Source, images: str | None, sfm: bool | SfmOptions, progress: Progress | None
-) -> tuple[Path, list[PosedImage], SparsePoints | None, str, list[str]]:
+) -> Listing:
+    if source == "auto" and find_block(root):
+        return read_block(root)
     models = find_models(root) if source in ("auto", "colmap") else []
     if models:
-        return models[0][0], *read_model(models[0][0]), "COLMAP model", about_other_models(root, models)
+        return Listing(root, models[0][0], *read_model(models[0][0]), "COLMAP model", about_other_models(root, models))
     found = find_transforms(root) if source in ("auto", "transforms") else []
     if found:
-        return found[0], *read_transforms(found), found[0].name, []
+        return Listing(root, found[0], *read_transforms(found), found[0].name, [])
     export = find_export(root, source)
     if export is not None:
         shots, cloud, notes = read_export(*export, root, images)
-        return export[1], shots, cloud, EXPORTS[export[0]][0], notes
+        return Listing(root, export[1], shots, cloud, EXPORTS[export[0]][0], notes)
     if source == "colmap":
         raise CaptureError(
             f"{root}: has no COLMAP model in sparse, sparse/0 or colmap/sparse/0; run pop sfm, or COLMAP"
@@ -129,7 +174,7 @@ def _read_listing(
         raise CaptureError(f"{root}: has no {EXPORTS[source][2]}; export it there, or choose another --source")
     model = _from_photos(root, sfm, progress)
     left = unreadable_photographs(photo_folder(root))
-    return model, *read_model(model), "COLMAP model", [left] if left else []
+    return Listing(root, model, *read_model(model), "COLMAP model", [left] if left else [])
 
 
 def beside_the_model(root: Path, shots: list[PosedImage], images: str | None) -> list[PosedImage]:
@@ -163,32 +208,28 @@ def _from_photos(root: Path, sfm: bool | SfmOptions, progress: Progress | None) 
     return root / "sparse" / "0"
 
 
-def _assemble(
-    root: Path,
-    listing: Path,
-    views: list[View],
-    cloud: SparsePoints | None,
-    made_from: str,
-    notes: list[str],
-    normalize: bool,
-    points: int,
-    seed: int,
-) -> Capture:
+def _assemble(root: Path, listing: Listing, views: list[View], normalize: bool, points: int, seed: int) -> Capture:
+    cloud, made_from, notes = listing.cloud, listing.made_from, listing.notes
     try:
         transform = np.eye(4)
         if normalize:
             viewmats = np.stack([view.viewmat for view in views])
-            transform = normalizing_transform(viewmats, cloud.xyz if cloud else None)
+            transform = listing.transform
+            if transform is None:
+                transform = normalizing_transform(viewmats, cloud.xyz if cloud else None)
             moved = transform_viewmats(transform, viewmats)
             views = [replace(view, viewmat=viewmat) for view, viewmat in zip(views, moved, strict=True)]
         if cloud:
             cloud = SparsePoints(transform_points(transform, cloud.xyz), cloud.rgb)
             source = f"{made_from}: {len(views)} views, {len(cloud)} points"
+        elif points == 0:
+            cloud = SparsePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+            source = f"{made_from}: {len(views)} views, no points"
         else:
             cloud = random_points(views, points, seed)
             notes = notes + about_random_points(views, len(cloud), points)
             source = f"{made_from}: {len(views)} views, no points: {len(cloud)} random ones (seed {seed})"
     except CaptureError as error:
-        raise CaptureError(f"{listing}: {error}") from error
+        raise CaptureError(f"{listing.path}: {error}") from error
     name = root.resolve().name
     return Capture(name, tuple(views), cloud.xyz, cloud.rgb, source, transform, tuple(notes))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from pop_fast.data.capture import Split
 
-__all__ = ["SparsePoints", "PosedImage"]
+__all__ = ["Listing", "PosedImage", "SparsePoints"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,3 +55,26 @@ class SparsePoints:
 
     def __len__(self) -> int:
         return len(self.xyz)
+
+
+@dataclass(frozen=True, eq=False)
+class Listing:
+    """What a capture lists, its photographs not read.
+
+    Attributes:
+        root: the folder that the photographs' folders are in.
+        path: the file or model that lists them, for messages.
+        shots: where each was taken.
+        cloud: sparse points; None where there are none.
+        made_from: what kind of list it is.
+        notes: one line each.
+        transform: the training frame, where that is decided already; None normalizes. float64 [4, 4]
+    """
+
+    root: Path
+    path: Path
+    shots: list[PosedImage]
+    cloud: SparsePoints | None
+    made_from: str
+    notes: list[str] = field(default_factory=list)
+    transform: np.ndarray | None = None

@@ -10,7 +10,7 @@ from pop_fast.data.capture import View
 from pop_fast.data.posed_images import SparsePoints
 from pop_fast.errors import CaptureError
 
-__all__ = ["random_points"]
+__all__ = ["in_picture", "random_points"]
 
 _ROUNDS = 20
 
@@ -52,9 +52,14 @@ def _times_seen(points: np.ndarray, views: Sequence[View]) -> np.ndarray:
     """Count for every point the views that have it in front of them and inside the image. int64 [P]"""
     seen = np.zeros(len(points), np.int64)
     for view in views:
-        x, y, z = (points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]).T
-        # the image's edges as planes through the camera: no division, so points at z = 0 are harmless
-        u = view.K[0, 0] * x + view.K[0, 2] * z
-        v = view.K[1, 1] * y + view.K[1, 2] * z
-        seen += (z > 0.0) & (u >= 0.0) & (u < view.width * z) & (v >= 0.0) & (v < view.height * z)
+        seen += in_picture(points, view)
     return seen
+
+
+def in_picture(points: np.ndarray, view: View) -> np.ndarray:
+    """Tell which points a view has in front of it and inside its image, whatever may stand before them. bool [P]"""
+    x, y, z = (points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]).T
+    # the image's edges as planes through the camera: no division, so points at z = 0 are harmless
+    u = view.K[0, 0] * x + view.K[0, 2] * z
+    v = view.K[1, 1] * y + view.K[1, 2] * z
+    return (z > 0.0) & (u >= 0.0) & (u < view.width * z) & (v >= 0.0) & (v < view.height * z)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -35,7 +35,11 @@ __all__ = ["PhotoOptions", "read_views"]
 
 @dataclass(frozen=True)
 class PhotoOptions:
-    """How photographs are read; see `pop_fast.data.load_capture`."""
+    """How photographs are read; see `pop_fast.data.load_capture`.
+
+    Attributes:
+        part: the list is a part of what its folder holds, so that masks may be there and none of them be its own.
+    """
 
     factor: int = 1
     masks: bool = True
@@ -43,6 +47,7 @@ class PhotoOptions:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     images: str | None = None
     resize: Literal["area", "bicubic"] = "area"
+    part: bool = False
 
 
 @dataclass(frozen=True)
@@ -53,8 +58,16 @@ class _Photo:
     shrink: int
 
 
+Wanted = Callable[[Sequence[PosedImage]], Sequence[bool]]
+
+
 def read_views(
-    root: Path, listing: Path, shots: Sequence[PosedImage], options: PhotoOptions, progress: Progress | None
+    root: Path,
+    listing: Path,
+    shots: Sequence[PosedImage],
+    options: PhotoOptions,
+    progress: Progress | None,
+    wanted: Wanted | None = None,
 ) -> tuple[list[View], list[str]]:
     """Read all photographs of a list, several at a time.
 
@@ -64,6 +77,8 @@ def read_views(
         shots: what is listed.
         options: how to read them.
         progress: called after every photograph.
+        wanted: tells of the shots that have a photograph whose is read; of the others only the cameras are taken, so
+            that they need no memory. None reads all.
 
     Returns:
         Views in the order of the shots, and notes.
@@ -74,13 +89,19 @@ def read_views(
     photos, notes = _locate(root, listing, shots, options)
     rectify = _rectifier()
     views: list[View] = []
-    with sound_jpegs([photo.path for photo in photos]), ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-        jobs = [pool.submit(_read, photo, options, rectify) for photo in photos]
+    chosen = [True] * len(photos) if wanted is None else wanted([photo.shot for photo in photos])
+    read = [photo.path for photo, out in zip(photos, chosen, strict=True) if out]
+    what = "reading photographs" if read else "reading cameras"
+    with sound_jpegs(read), ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        jobs = [
+            pool.submit(_read if out else _camera_alone, photo, options, rectify)
+            for photo, out in zip(photos, chosen, strict=True)
+        ]
         try:
             for job in jobs:
                 views.append(job.result())
                 if progress is not None:
-                    progress("reading photographs", len(views), len(jobs))
+                    progress(what, len(views), len(jobs))
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
@@ -109,7 +130,7 @@ def _locate(
             f"{listing}: lists {len(shots)} images, {len(absent)} of them absent, first {absent[0]}; "
             "restore them or pass --missing skip"
         )
-    if masks and not any(photo.mask for photo in photos):
+    if masks and not options.part and not any(photo.mask for photo in photos):
         raise CaptureError(f"{masks}: holds no mask named as a photograph (<name>.png or <name>.jpg.png); rename them")
     notes = [f"{len(absent)} of {len(shots)} listed images are absent and were skipped"] if absent else []
     notes += _about_folders(root, shots, options)
@@ -165,28 +186,52 @@ def _read(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
     _check_header(photo)
     image = read_image(photo.path)
     height, width = image.shape[:2]
-    camera = photo.shot.camera or _camera_from_angle(photo.shot.angle_x or 1.0, width, height)
-    _check_shape(photo.path, "the photograph", (width, height), "its camera", (camera.width, camera.height))
+    rectification, size, K = _placed(photo, (width, height), rectify)
     had_alpha = image.shape[2] == 4
     if had_alpha:
         image = _over(image, options.background)
+    image = rectification.image(image)
+    mask = None
+    if photo.mask is not None:
+        mask = _read_mask(photo.mask, (width, height), rectification, size, photo.shot.turns)
+    if size != (width, height):
+        image = _shrunk(image, size, options.resize)
+    view = View(photo.shot.name, image, photo.shot.viewmat, K, mask, photo.shot.split, had_alpha)
+    return _upright(view, photo.shot.turns)
+
+
+def _placed(photo: _Photo, stored: tuple[int, int], rectify: Any) -> tuple[Undistortion, tuple[int, int], np.ndarray]:
+    """Find how a photograph of a stored size is undistorted, the size that it is used in, and K of that."""
+    width, height = stored
+    camera = photo.shot.camera or _camera_from_angle(photo.shot.angle_x or 1.0, width, height)
+    _check_shape(photo.path, "the photograph", stored, "its camera", (camera.width, camera.height))
     try:
         rectification = rectify(camera, width, height)
     except ValueError as error:
         raise CaptureError(f"{photo.path}: its camera {camera.camera_id} {error}") from error
-    image = rectification.image(image)
     size = (round(width / photo.shrink), round(height / photo.shrink))
     if min(size) < 1:
         raise CaptureError(f"{photo.path}: is {width}x{height} px, too small for factor {photo.shrink}; lower it")
-    mask = None
-    if photo.mask is not None:
-        mask = _read_mask(photo.mask, (width, height), rectification, size, photo.shot.turns)
     K = rectification.K.copy()
-    if size != (width, height):
-        image = _shrunk(image, size, options.resize)
+    if size != stored:
         K[:2] *= np.array([size[0] / width, size[1] / height])[:, None]
-    view = View(photo.shot.name, image, photo.shot.viewmat, K, mask, photo.shot.split, had_alpha)
-    return _upright(view, photo.shot.turns)
+    return rectification, size, K
+
+
+def _camera_alone(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
+    """Make the view of a photograph whose header alone is read: its camera, and an image that takes no memory."""
+    del options  # they say how pixels are read
+    stored = read_size(photo.path)
+    if stored is None:
+        height, width = read_image(photo.path).shape[:2]
+        stored = (width, height)
+    _, (width, height), K = _placed(photo, stored, rectify)
+    view = _upright(View(photo.shot.name, _blank(width, height), photo.shot.viewmat, K), photo.shot.turns)
+    return replace(view, image=_blank(view.width, view.height), split=photo.shot.split, was_read=False)
+
+
+def _blank(width: int, height: int) -> np.ndarray:
+    return np.broadcast_to(np.zeros(3, np.uint8), (height, width, 3))
 
 
 def _check_header(photo: _Photo) -> None:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from pop_fast.data import Capture
     from pop_fast.data.capture import Progress
+    from pop_fast.data.load import Photographs
     from pop_fast.io.ply import Frame
 
 RECORD = "capture.json"
@@ -153,7 +154,7 @@ def _from_folder(folder: Path) -> Splat:
 
 
 def open_capture(
-    splat: Splat, options: CaptureOptions, progress: Progress | None = None
+    splat: Splat, options: CaptureOptions, progress: Progress | None = None, photographs: Photographs = "all"
 ) -> tuple[Capture, TrainConfig]:
     """Load the capture that a splat shows, and give the settings to look at it with.
 
@@ -161,6 +162,7 @@ def open_capture(
         splat: what is looked at.
         options: which photographs and cameras.
         progress: is called with (stage, done, total).
+        photographs: which are read; see `pop_fast.data.load_capture`.
 
     Raises:
         PopError: no capture is known, or it cannot be read.
@@ -197,6 +199,8 @@ def open_capture(
         images=options.images or record.images,
         resize=config.resize,
         seed=config.seed,
+        photographs=photographs,
+        test_every=config.test_every,
     )
     if config.normalize:
         _check_same_frame(splat, capture)

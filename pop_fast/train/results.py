@@ -20,6 +20,7 @@
     videos/orbit_step{step}.webm    a turn about the scene
     viewer.html                     a page that shows the splat in a browser
     export/                         files that `pop train --export` asked for
+    blocks/                         of a training in blocks: `pop_fast.blocks.plan` says what
 
 A record of metrics.jsonl holds: step, view (or the names of a batch), loss, l1 or l2 (the pixel-wise term), d_ssim,
 pop (weighted, absent when off), psnr (of the training view), num_gaussians, n_blended and n_traversed (per pixel; not
@@ -50,7 +51,7 @@ from pop_fast.train.config import TrainConfig
 # cfg.json is the first to step aside and the first to be written anew: where it is, the new run has begun
 _OURS = (
     *("cfg.json", "metrics.jsonl", "ckpts", "ply", "stats", "renders", "report_data", "report.html", "capture.json"),
-    *("viewer.html", "export", "commands.json", "videos"),
+    *("viewer.html", "export", "commands.json", "videos", "blocks"),
 )
 # holds what a new run replaces while that is being done
 _ASIDE = ".replaced"

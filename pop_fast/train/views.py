@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.data.capture import View
+from pop_fast.errors import PopError
 from pop_fast.stages.activations import opacities_from_logits, scales_from_log_scales
 from pop_fast.train.config import TrainConfig
 
@@ -36,7 +37,13 @@ class ViewTensors:
 
     @classmethod
     def of(cls, view: View, dtype: torch.dtype = torch.float32) -> ViewTensors:
-        """Take over a view of a capture, its camera in a precision."""
+        """Take over a view of a capture, its camera in a precision.
+
+        Raises:
+            PopError: only the view's camera was read.
+        """
+        if not view.was_read:
+            raise PopError(f"{view.name}: its photograph was not read; load the capture with photographs='all'")
         return cls(
             name=view.name,
             photo=torch.from_numpy(view.image),

@@ -1,0 +1,147 @@
+"""A capture trained whole, and in blocks that are merged: what that costs in quality, and what it saves in memory.
+
+python -m benchmarks.blocks CAPTURE --work FOLDER [--blocks 2x2] [--factor 2] [--preset quick] [--threads 1]
+
+Both are `pop train` of the same settings, so that each block takes as many steps as the whole, and both are measured on
+the held-out views of the whole capture. Memory is the peak of each training's process. What was interrupted is resumed
+when the command is given again; processor times add up in FOLDER. Writes benchmarks/results/blocks.json, of which
+docs/using.md has the table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+RESULTS = HERE / "results" / "blocks.json"
+GIB = 2**30
+
+
+def run(words: Sequence[str], folder: Path, note: Path) -> dict[str, float]:
+    """Run `pop train`, or resume it, and return the seconds that it has taken up to now: of clock and processor.
+
+    Args:
+        words: after `pop train`.
+        folder: of results.
+        note: where the seconds of earlier calls stand.
+    """
+    spent = json.loads(note.read_text()) if note.exists() else {"clock": 0.0, "processor": 0.0}
+    again = ["--resume"] if (folder / "cfg.json").is_file() else []
+    start = time.perf_counter()
+    child = subprocess.Popen(
+        [sys.executable, "-m", "pop_fast.cli", "train", *words, "--out", str(folder), *again], cwd=HERE.parent
+    )
+    # of the process and of those that it waited for
+    _, status, used = os.wait4(child.pid, 0)
+    spent = {
+        "clock": spent["clock"] + time.perf_counter() - start,
+        "processor": spent["processor"] + used.ru_utime + used.ru_stime,
+    }
+    note.parent.mkdir(parents=True, exist_ok=True)
+    note.write_text(json.dumps(spent))
+    if status != 0:
+        raise SystemExit(f"pop train {' '.join(words)}: ended with {os.waitstatus_to_exitcode(status)}")
+    return spent
+
+
+def stats_of(folder: Path) -> dict[str, Any]:
+    """Read the statistics of a run's last step."""
+    last = max((folder / "stats").glob("val_step*.json"), key=lambda path: (len(path.name), path.name))
+    return json.loads(last.read_text(encoding="utf-8"))
+
+
+def numbers(stats: dict[str, Any]) -> dict[str, Any]:
+    """Choose what is compared."""
+    chosen = {name: stats[name] for name in ("psnr", "ssim")}
+    return {**chosen, "gaussians": stats["num_GS"], "peak_gib": stats["memory_bytes"] / GIB}
+
+
+def main(words: list[str], say: Callable[[str], None] = print) -> int:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--blocks", default="2x2")
+    parser.add_argument("--factor", default="2")
+    parser.add_argument("--preset", default="quick")
+    parser.add_argument("--threads", default="1")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    args = parser.parse_args(words)
+    settings = [str(args.capture), "--factor", args.factor, "--preset", args.preset, "--threads", args.threads]
+    work = args.work.absolute()
+    settings += ["--skip-sizes", "--skip-checks"]
+    whole, blocks = work / "whole", work / "blocks"
+    spent = {
+        "whole": run(settings, whole, work / "whole.json"),
+        "merged": run([*settings, "--blocks", args.blocks], blocks, work / "blocks.json"),
+    }
+    write(args, whole, blocks, spent)
+    say(table(args.out))
+    return 0
+
+
+def write(args: argparse.Namespace, whole: Path, blocks: Path, spent: dict[str, dict[str, float]]) -> None:
+    """Write what both runs came to."""
+    sys.path.insert(0, str(HERE))
+    from record import machine, write_json
+
+    merged, one = stats_of(blocks), stats_of(whole)
+    parts = [
+        {
+            **{key: part[key] for key in ("name", "training_views", "held_out_views", "points", "background_points")},
+            **numbers(part),
+            "kept": part["kept"],
+            "seconds": part["seconds"],
+        }
+        for part in merged["blocks"]
+    ]
+    result = {
+        "machine": machine(),
+        "capture": args.capture.resolve().name,
+        "grid": args.blocks,
+        "factor": int(args.factor),
+        "preset": args.preset,
+        "steps": one["step"] + 1,
+        "held_out_views": one["views"],
+        "whole": {**numbers(one), "seconds": one["seconds"], "spent": spent["whole"]},
+        "merged": {**numbers(merged), "merge_gib": merged["memory_bytes_merging"] / GIB, "spent": spent["merged"]},
+        "blocks": parts,
+    }
+    write_json(args.out, result)
+
+
+def table(path: Path = RESULTS) -> str:
+    """Make the table of docs/using.md."""
+    found = json.loads(path.read_text(encoding="utf-8"))
+    whole, merged = found["whole"], found["merged"]
+    views = f"{found['held_out_views']} of the whole"
+    rows = [["the whole", "all", f"{whole['gaussians']:,}", "", *_measured(whole, views)]]
+    for part in found["blocks"]:
+        counts = [f"{part[name]:,}" for name in ("training_views", "gaussians", "kept")]
+        rows.append([f"block {part['name']}", *counts, *_measured(part, f"{part['held_out_views']} in its core")])
+    merging = {**merged, "peak_gib": merged["merge_gib"]}
+    rows.append([f"**{found['grid']}, merged**", "", f"{merged['gaussians']:,}", "", *_measured(merging, views)])
+    head = ["", "training views", "Gaussians", "kept", "held-out views", "PSNR", "SSIM", "peak memory"]
+    return _table(head, ["---", "---:", "---:", "---:", "---", "---:", "---:", "---:"], rows)
+
+
+def _measured(row: dict[str, Any], views: str) -> list[str]:
+    if row["psnr"] is None:
+        return [views, "", "", f"{row['peak_gib']:.2f} GiB"]
+    return [views, f"{row['psnr']:.2f} dB", f"{row['ssim']:.4f}", f"{row['peak_gib']:.2f} GiB"]
+
+
+def _table(head: Sequence[str], rule: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule, *rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,141 @@
+"""Run the parts of a run in blocks: by Snakemake where it is installed, else one after the other.
+
+Either way a part is a process of its own, `pop blocks train OUT i_j` or `pop blocks merge OUT`, so that its memory is
+given back when it ends. One that is finished has left its marker and is not done again; a block that was interrupted
+resumes from its last checkpoint.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+from pop_fast.blocks.plan import FOLDER, Job
+from pop_fast.blocks.run import marker_of
+from pop_fast.errors import PopError
+from pop_fast.train.signals import stop_requests
+
+__all__ = ["SNAKEFILE", "has_snakemake", "profile_folder", "run_in_turn", "run_workflow", "workflow_words"]
+
+SNAKEFILE: Final = Path(__file__).with_name("Snakefile")
+_INSTALL: Final = "pip install 'pop-splatting[blocks]' brings it"
+# s between looks at a process and at whether to stop
+_PAUSE: Final = 0.1
+
+
+def has_snakemake() -> bool:
+    """Tell whether Snakemake is installed."""
+    return importlib.util.find_spec("snakemake") is not None
+
+
+def profile_folder(name: str) -> Path:
+    """Find a Snakemake profile: a folder, or one of those that come with the program.
+
+    Raises:
+        PopError: there is none, or Snakemake is not installed.
+    """
+    if not has_snakemake():
+        raise PopError(f"--blocks-profile {name} needs Snakemake; {_INSTALL}")
+    own = SNAKEFILE.parent / "profiles"
+    shipped = {path.name: path for path in sorted(own.iterdir()) if path.name != "default"}
+    found = shipped.get(name, Path(name))
+    if not (found / "config.yaml").is_file():
+        raise PopError(
+            f"--blocks-profile {name}: is neither one of {', '.join(shipped)} nor a folder with a config.yaml"
+        )
+    return found.absolute()
+
+
+def run_in_turn(folder: Path, job: Job, quiet: bool = False, say: Callable[[str], None] = print) -> int:
+    """Train the blocks that are not trained yet, one after the other, and merge them.
+
+    Args:
+        folder: the run's, whose capture is divided.
+        job: what was asked for.
+        quiet: what they print is not shown; warnings and errors are.
+        say: is called with a line on what begins.
+
+    Returns:
+        The exit status of the first part that failed, or 0; 130 after Ctrl-C or SIGTERM.
+    """
+    for index, name in enumerate((*job.names, None), start=1):
+        if marker_of(folder, name).is_file():
+            continue
+        say(f"block {name}, {index} of {len(job.names)}" if name else f"merging {len(job.names)} blocks")
+        words = ["train", str(folder), name] if name else ["merge", str(folder)]
+        status = _run([sys.executable, "-m", "pop_fast.cli", "blocks", *words], quiet)
+        if status != 0:
+            return status
+    return 0
+
+
+def run_workflow(
+    folder: Path, job: Job, jobs: int, threads: int, backend: str, profile: Path | None, quiet: bool = False
+) -> int:
+    """Run the workflow by Snakemake.
+
+    Args:
+        folder: the run's.
+        job: what was asked for.
+        jobs: how many blocks are trained at a time on this machine.
+        threads: of a training.
+        backend: what trains; "cuda" asks for a GPU each.
+        profile: a profile's folder, by which it runs on a cluster; None stays here.
+        quiet: what it prints is not shown; warnings and errors are.
+
+    Returns:
+        The exit status: Snakemake's, or 130 after Ctrl-C or SIGTERM.
+    """
+    more = ["--quiet", "all"] if quiet else []
+    return _run(workflow_words(folder, job, jobs, threads, backend, profile, *more), quiet)
+
+
+def workflow_words(
+    folder: Path, job: Job, jobs: int, threads: int, backend: str, profile: Path | None, *more: str
+) -> list[str]:
+    """Return the command that runs the workflow; see `run_workflow`.
+
+    Args:
+        folder, job, jobs, threads, backend, profile: as `run_workflow`.
+        more: further words for Snakemake.
+    """
+    place = folder.absolute()
+    each = threads or os.cpu_count() or 1
+    many = min(jobs, len(job.names))
+    # a machine is taken to have one GPU; the folder is locked by who calls this
+    here = ["--cores", str(each * many), "--resources", "gpu=1", "--nolock"]
+    where = here if profile is None else ["--profile", str(profile), "--nolock"]
+    command = [sys.executable, "-m", "snakemake", "-s", str(SNAKEFILE), "--directory", str(place / FOLDER)]
+    settings = {"folder": place, "threads": each, "gpus": int(backend == "cuda")}
+    return [*command, *where, *more, "--config", *(f"{name}={value}" for name, value in settings.items())]
+
+
+def _run(words: Sequence[str], quiet: bool) -> int:
+    """Run a process and wait; the first Ctrl-C, SIGTERM or SIGHUP is passed on once to it and its children."""
+    alone = os.name == "posix"
+    with stop_requests() as stop:
+        process = subprocess.Popen(words, start_new_session=alone, stdout=subprocess.DEVNULL if quiet else None)
+        try:
+            while process.poll() is None:
+                if stop.wait(_PAUSE):
+                    _interrupt(process, alone)
+                    process.wait()
+                    return 128 + signal.SIGINT
+        except BaseException:
+            process.kill()
+            process.wait()
+            raise
+    return process.returncode if process.returncode >= 0 else 128 - process.returncode
+
+
+def _interrupt(process: subprocess.Popen[bytes], alone: bool) -> None:
+    if alone:
+        os.killpg(process.pid, signal.SIGINT)
+    else:
+        process.terminate()

@@ -1,0 +1,231 @@
+"""`pop train --blocks`: divide a capture, train its blocks, merge them."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pop_fast.cli import EXIT_INTERRUPTED
+from pop_fast.cli.blocks_options import BlocksOptions
+from pop_fast.cli.finish import FinishOptions, table_lines
+from pop_fast.cli.printable import printable
+from pop_fast.errors import PopError
+
+if TYPE_CHECKING:
+    from pop_fast.blocks.plan import Job
+    from pop_fast.blocks.run import Division
+    from pop_fast.train.config import TrainConfig
+
+# of what is written at the end, what looks at all training photographs, which the merge does not hold
+_NEED_ALL = ("final_prune", "max_gaussians", "target_mb")
+
+
+def check_blocks(config: TrainConfig, options: Any) -> None:
+    """Refuse what cannot be trained in blocks, before anything is loaded.
+
+    Args:
+        config: the settings.
+        options: those of `pop train`.
+
+    Raises:
+        PopError: names the option, the reason and what to do.
+    """
+    if options.blocks is None:
+        _check_without(config, options)
+        return
+    from pop_fast.blocks.jobs import has_snakemake, profile_folder
+
+    _job(options)
+    if "WORLD_SIZE" in os.environ:
+        raise PopError("--blocks starts processes of its own, one a block; start it without torchrun")
+    if options.view:
+        raise PopError(
+            "--view shows one training, and --blocks trains several; leave it out, and see the result with pop view"
+        )
+    if config.exposure or config.refine_cameras:
+        name = "--exposure" if config.exposure else "--refine-cameras"
+        raise PopError(
+            f"{name} learns of a photograph in every block that it trains, and blocks would not agree on it and so not "
+            "fit together; leave it out with --blocks"
+        )
+    for name in _NEED_ALL:
+        if getattr(options, name) is not None:
+            option = "--" + name.replace("_", "-")
+            raise PopError(
+                f"{option} looks at all training photographs, which are not in memory when blocks are merged; leave it "
+                f"out with --blocks, and say it to pop export {config.result_dir}"
+            )
+    if options.blocks_profile is not None:
+        profile_folder(options.blocks_profile)
+    if options.blocks_jobs < 1:
+        raise PopError(f"--blocks-jobs is {options.blocks_jobs}; it must be 1 or more")
+    if options.blocks_jobs > 1 and not has_snakemake():
+        raise PopError(
+            "--blocks-jobs over 1 needs Snakemake, which trains blocks at the same time; pip install "
+            "'pop-splatting[blocks]' brings it, or leave the option out: they are trained one after the other"
+        )
+
+
+def _check_without(config: TrainConfig, options: Any) -> None:
+    for field in fields(BlocksOptions):
+        if getattr(options, field.name) != field.default:
+            option = "--" + field.name.replace("_", "-")
+            raise PopError(f"{option} says how blocks are trained, and there are none; say --blocks 2x2 too")
+    if options.resume:
+        from pop_fast.blocks.plan import read_job
+
+        begun = read_job(Path(config.result_dir))
+        if begun is not None:
+            raise PopError(f"{config.result_dir}: was begun in blocks; resume it with --blocks {begun.blocks}")
+
+
+def _job(options: Any) -> Job:
+    from pop_fast.blocks.plan import Job
+
+    finishing = {field.name: getattr(options, field.name) for field in fields(FinishOptions)}
+    return Job(blocks=options.blocks, margin=options.blocks_margin, share=options.blocks_share, finish=finishing)
+
+
+def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequence[str]) -> int:
+    """Divide the capture where that is not done yet, train the blocks that are not trained yet, and merge them.
+
+    Args:
+        config: the settings; every block is trained with them.
+        options: those of `pop train`.
+        chosen: a line on the backend.
+        argv: the words after `pop train`, for commands.json.
+
+    Returns:
+        The exit status.
+    """
+    from pop_fast.blocks.jobs import has_snakemake, profile_folder, run_in_turn, run_workflow
+    from pop_fast.blocks.plan import FOLDER, read_plan
+    from pop_fast.blocks.run import marker_of
+    from pop_fast.io.lock import FolderLock
+
+    folder, job = Path(config.result_dir), _job(options)
+    config = replace(config, data=str(Path(config.data).absolute()))
+    begun = _begun(folder, config, job) if options.resume else None
+    lock = FolderLock(folder / FOLDER)
+    if begun is not None:
+        lock.take()
+    if begun is None or read_plan(folder) is None:
+        division = _divided(config, options, job)
+        print(printable(f"{config.method} in blocks {job.blocks}, {config.max_steps:,} steps each -> {folder}"))
+        print(chosen)
+        if begun is None:
+            _begin(folder, config, options, job, division, argv)
+            lock.take()
+        division.write(folder)
+    try:
+        for line in plan_lines(folder):
+            print(line, flush=True)
+        if marker_of(folder, None).is_file():
+            print(f"all blocks of {folder} are trained and merged")
+            return 0
+        if options.blocks_profile is None and not has_snakemake():
+            status = run_in_turn(folder, job, options.quiet, lambda line: print(line, flush=True))
+        else:
+            profile = None if options.blocks_profile is None else profile_folder(options.blocks_profile)
+            how = (options.blocks_jobs, config.threads, config.backend, profile, options.quiet)
+            status = run_workflow(folder, job, *how)
+    finally:
+        lock.release()
+    if status == EXIT_INTERRUPTED:
+        print("pop: stopped; the same command with --resume continues", file=sys.stderr)
+    return status
+
+
+def _begun(folder: Path, config: TrainConfig, job: Job) -> Job | None:
+    """Read what a run that is resumed was begun with, or None where nothing is there.
+
+    Raises:
+        PopError: it is another run: names what differs.
+    """
+    from pop_fast.blocks.plan import read_job
+    from pop_fast.train.config import first_difference
+    from pop_fast.train.results import read_config
+
+    before = read_job(folder)
+    if before is None:
+        if (folder / "cfg.json").is_file():
+            raise PopError(f"{folder}: was begun without blocks; resume it without --blocks, or choose another folder")
+        return None
+    found = first_difference(
+        {**config.binding(), **_dividing(job)}, {**read_config(folder).binding(), **_dividing(before)}
+    )
+    if found:
+        name, ours, theirs = found
+        raise PopError(
+            f"{folder}: was begun with {name} = {theirs}, but this run has {name} = {ours}; use the same settings, or "
+            "another result folder"
+        )
+    return before
+
+
+def _dividing(job: Job) -> dict[str, Any]:
+    return {f"blocks.{name}": value for name, value in asdict(job).items() if name != "finish"}
+
+
+def _divided(config: TrainConfig, options: Any, job: Job) -> Division:
+    from pop_fast.blocks.run import divide_capture
+    from pop_fast.cli.progress import bars
+    from pop_fast.train.load_result import CaptureRecord
+
+    how = {"images": options.images, "missing": options.missing, "source": options.source}
+    record = CaptureRecord(**how, masks=not options.ignore_masks)
+    with bars(config.progress) as progress:
+        division = divide_capture(config, record, job, options.sfm, progress)
+    for note in division.capture.notes:
+        print(f"note: {printable(note)}")
+    print(printable(f"{division.capture.name}: {division.capture.source}"))
+    return division
+
+
+def _begin(folder: Path, config: TrainConfig, options: Any, job: Job, division: Division, argv: Sequence[str]) -> None:
+    """Write what a run has from its start, in place of earlier results."""
+    import numpy as np
+
+    from pop_fast.blocks.plan import JOB, job_text
+    from pop_fast.cli.result_folder import record_of
+    from pop_fast.train.commands import COMMANDS_FILE, commands_text
+    from pop_fast.train.load_result import RECORD, record_text
+    from pop_fast.train.results import ResultFolder
+
+    record = record_text(record_of(division.capture, options))
+    beside = {RECORD: record, COMMANDS_FILE: commands_text(None, ["pop", "train", *argv]), JOB: job_text(job)}
+    first = np.full(len(division.capture.points), config.init_opacity)
+    results = ResultFolder(folder)
+    try:
+        results.check(options.resume, options.overwrite)
+        results.begin(config, beside, first, options.overwrite)
+    finally:
+        results.close()
+
+
+def plan_lines(folder: Path) -> list[str]:
+    """Lay out how a capture is divided, as a table."""
+    from pop_fast.blocks.plan import FOLDER, read_plan
+
+    plan = read_plan(folder)
+    if plan is None:
+        return []
+    rows = [["block", "training views", "in its core", "held out", "points", "behind them"]]
+    names = ("training_views", "in_its_core", "held_out_views", "points", "background_points")
+    rows += [[entry["name"], *(f"{entry[name]:,}" for name in names)] for entry in plan[1]]
+    return [*table_lines(rows), f"seen from above: {folder / FOLDER / 'map.png'}"]
+
+
+def merged_lines(stats: dict[str, Any]) -> list[str]:
+    """Lay out what every block came to, as a table."""
+    rows = [["block", "Gaussians", "kept", "PSNR", "time", "memory"]]
+    for block in stats["blocks"]:
+        psnr = "-" if block["psnr"] is None else f"{block['psnr']:.2f} dB"
+        memory = f"{block['memory_bytes'] / 2**30:.2f} GiB"
+        counts = (f"{block['num_GS']:,}", f"{block['kept']:,}")
+        rows.append([block["name"], *counts, psnr, f"{block['seconds_total']:.0f} s", memory])
+    return table_lines(rows)

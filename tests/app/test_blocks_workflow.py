@@ -1,0 +1,85 @@
+"""The Snakemake workflow of a run in blocks: what it would do, that it does it, and that the Slurm profile is read."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from pop_fast.blocks import jobs
+from pop_fast.blocks.plan import read_job
+from pop_fast.cli import main
+from tests.app.conftest import TRAIN, Pop
+
+pytestmark = pytest.mark.skipif(
+    not jobs.has_snakemake(), reason="snakemake is not installed; pip install 'pop-splatting[blocks]' brings it"
+)
+BLOCKS = ("--blocks", "2x1", *TRAIN, "--skip-sizes", "--threads", "1")
+
+
+@pytest.fixture(scope="module")
+def begun(shared_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose capture is divided, and whose blocks are not trained."""
+    folder = tmp_path_factory.mktemp("workflow") / "toy"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jobs, "_run", lambda words, quiet: 0)
+        assert main(["train", str(shared_capture), "--out", str(folder), *BLOCKS]) == 0
+    return folder
+
+
+def dry_run(folder: Path, tmp_path: Path, *words: str, profile: Path | None = None) -> dict[str, int]:
+    """Ask the workflow what it would do, and read the table of jobs that it prints."""
+    job = read_job(folder)
+    assert job is not None
+    command = jobs.workflow_words(folder, job, 1, 1, "compiled", profile, "-n", *words)
+    environment = {**os.environ, "HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return {name: int(count) for name, count in re.findall(r"^(\w+) +(\d+)$", done.stdout + done.stderr, re.MULTILINE)}
+
+
+TRAININGS = {"block_0_0": 1, "block_1_0": 1}
+
+
+def test_there_is_one_job_for_each_block_and_then_the_merge(begun, tmp_path):
+    assert dry_run(begun, tmp_path) == {"all": 1, **TRAININGS, "merge": 1, "total": 4}
+
+
+def test_a_capture_that_is_not_divided_is_divided_first(begun, tmp_path):
+    folder = Path(shutil.copytree(begun, tmp_path / "copy"))
+    (folder / "blocks" / "plan.json").unlink()
+    assert dry_run(folder, tmp_path) == {"all": 1, "partition": 1, **TRAININGS, "merge": 1, "total": 5}
+
+
+def test_a_block_that_is_trained_is_left_alone(begun, tmp_path):
+    folder = Path(shutil.copytree(begun, tmp_path / "copy"))
+    (folder / "blocks" / "0_0" / "trained").touch()
+    assert dry_run(folder, tmp_path) == {"all": 1, "block_1_0": 1, "merge": 1, "total": 3}
+
+
+def test_the_slurm_profile_is_read(begun, tmp_path):
+    pytest.importorskip("snakemake_executor_plugin_slurm", reason="snakemake-executor-plugin-slurm is not installed")
+    planned = dry_run(begun, tmp_path, profile=jobs.profile_folder("slurm"))
+    assert planned == {"all": 1, **TRAININGS, "merge": 1, "total": 4}
+
+
+def test_a_profile_that_is_none_is_refused(pop: Pop, shared_capture, tmp_path):
+    outcome = pop("train", shared_capture, "--out", tmp_path / "out", *BLOCKS, "--blocks-profile", "nowhere")
+    assert outcome.status == 2
+    assert "is neither one of slurm nor a folder with a config.yaml" in outcome.err
+
+
+@pytest.mark.slow
+def test_the_workflow_trains_and_merges(pop: Pop, shared_capture, begun, tmp_path):
+    folder = Path(shutil.copytree(begun, tmp_path / "copy"))
+    trained = pop("train", shared_capture, "--out", folder, *BLOCKS, "--blocks-jobs", "2", "--resume")
+    assert trained.status == 0, trained.err
+    assert (folder / "blocks" / "merged").is_file()
+    assert (folder / "stats" / "val_step0029.json").is_file()
+    again = pop("train", shared_capture, "--out", folder, *BLOCKS, "--resume")
+    assert again.status == 0
+    assert "are trained and merged" in again.out
