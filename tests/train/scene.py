@@ -1,4 +1,4 @@
-"""Four small photographs, and a schedule of ninety steps in which everything happens that a training knows."""
+"""Four small photographs, and a schedule of 300 steps in which everything happens that a training knows."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from pop_fast.data.capture import Capture, View
 from pop_ref.settings import DensityConfig, LearningRates, Recipe
 from tests.app.tiny import look_at
 
-WIDTH, HEIGHT, N_POINTS, STEPS = 18, 12, 14, 90
+WIDTH, HEIGHT, N_POINTS, STEPS = 18, 12, 14, 300
 
 DENSITY = DensityConfig(
-    grow_grad2d=0.011,
-    grow_scale3d=0.17,
-    prune_opa=0.08,
-    prune_scale3d=0.28,
-    prune_too_big_after=25,
-    refine_start_iter=5,
-    refine_stop_iter=82,
-    refine_every=7,
-    theta_blur=0.05,
-    blur_start_iter=33,
-    blur_stop_iter=62,
-    reset_every=32,
+    grow_grad2d=0.012,
+    grow_scale3d=0.12,
+    prune_opa=0.06,
+    prune_scale3d=0.26,
+    prune_too_big_after=60,
+    refine_start_iter=10,
+    refine_stop_iter=260,
+    refine_every=12,
+    theta_blur=0.07,
+    blur_start_iter=96,
+    blur_stop_iter=180,
+    reset_every=70,
     reset_opa=0.2,
 )
 RECIPE = Recipe(
     density=DENSITY,
-    lr=LearningRates(means=7.2e-3, scales=3.6e-2, quats=7.2e-3, opacities=9e-2, sh0=5.4e-2, sh_rest=3.6e-3),
+    lr=LearningRates(means=4e-3, scales=2e-2, quats=4e-3, opacities=5e-2, sh0=3e-2, sh_rest=2e-3),
     lambda_pop=5e-3,
-    pop_start_iter=8,
-    pop_stop_iter=70,
-    l2_stop_iter=80,
+    pop_start_iter=20,
+    pop_stop_iter=220,
+    l2_stop_iter=256,
     max_steps=STEPS,
-    sh_interval=13,
+    sh_interval=40,
 )
 # the same in ten steps
 SHORT = replace(

@@ -12,7 +12,7 @@ from tests.train.test_ten_losses import agree as climbed
 from tests.train.test_ten_losses import climb
 
 
-@pytest.mark.parametrize(("recipe", "steps"), [(SHORT, 10), (RECIPE, STEPS)], ids=["ten", "ninety"])
+@pytest.mark.parametrize(("recipe", "steps"), [(SHORT, 10), (RECIPE, STEPS)], ids=["ten", "three-hundred"])
 def test_every_step_is_the_oracles(engine, recipe, steps, tmp_path):
     found = judged(run_of(recipe, tmp_path, engine), recipe, steps)
     agree(found)
