@@ -17,7 +17,7 @@ from tests.train.oracle_steps import Judged, config_of, judged_step
 from tests.train.scene import RECIPE, SHORT, STEPS, capture
 
 EVERYTHING = {"gradient clone", "gradient split", "blur clone", "blur split", "faint", "too big", "reset"}
-# steps in which a decision was too close to its threshold for the oracle to say what is right; measured: at most 1 of 300
+# steps in which a decision was too close to its threshold for the oracle to judge; measured: at most 1 of 300
 MOST_IN_DOUBT = 1
 
 
