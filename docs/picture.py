@@ -1,5 +1,7 @@
 """Draw docs/demo.png from a finished demo run: one held-out view before training, after it, and as it was photographed.
 
+The same render and photograph, without a word, are kept for chapter 0 of the walk-through.
+
 make demo && python docs/picture.py out/demo
 """
 
@@ -25,6 +27,7 @@ mpl.use("Agg")
 from matplotlib import pyplot as plt
 
 TARGET = Path(__file__).resolve().parent / "demo.png"
+OF_CHAPTER = TARGET.parents[1] / "pop_ref" / "walkthrough" / "trained.png"
 
 
 def before(result: Path, view: int) -> np.ndarray:
@@ -39,10 +42,23 @@ def before(result: Path, view: int) -> np.ndarray:
     return made.image.clamp(0.0, 1.0).numpy()
 
 
+def data_of(result: Path, view: int) -> Path:
+    """Find the maps of a held-out view after the last step."""
+    return sorted((result / "report_data").glob(f"val_step*_{view:04d}.npz"))[-1]
+
+
+def side_by_side(result: Path, view: int = 0) -> bytes:
+    """Put the render of a held-out view to the left of its photograph; PNG."""
+    with np.load(data_of(result, view)) as kept:
+        both = np.hstack([kept["render"], kept["photo"]])
+    buffer = io.BytesIO()
+    Image.fromarray(both).save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()
+
+
 def draw(result: Path, view: int = 0) -> bytes:
     """Compose the picture of one held-out view of a result folder; PNG with 256 colours."""
-    path = sorted((result / "report_data").glob(f"val_step*_{view:04d}.npz"))[-1]
-    with np.load(path) as kept:
+    with np.load(data_of(result, view)) as kept:
         photo, render, ids = kept["photo"], kept["render"], kept["dominant_ids"]
         psnr = float(kept["psnr"])
     parts = (
@@ -69,5 +85,6 @@ def draw(result: Path, view: int = 0) -> bytes:
 
 
 if __name__ == "__main__":
-    TARGET.write_bytes(draw(Path(sys.argv[1]), *map(int, sys.argv[2:3])))
-    print(f"{TARGET}: {TARGET.stat().st_size / 1000:.0f} kB")
+    for target, made in ((TARGET, draw), (OF_CHAPTER, side_by_side)):
+        target.write_bytes(made(Path(sys.argv[1]), *map(int, sys.argv[2:3])))
+        print(f"{target}: {target.stat().st_size / 1000:.0f} kB")
