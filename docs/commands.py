@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+from PIL import Image
 from websockets.sync.client import connect
 
 from paper_repro.cli import COMMANDS as REPRO_COMMANDS
@@ -180,6 +181,11 @@ REPRO = (
 )
 
 
+def sentence(summary: str) -> str:
+    """Make a sentence of a command's summary."""
+    return f"{summary[0].upper()}{summary[1:]}."
+
+
 def ran(run: Run, folder: Path) -> str:
     """Run a command line in the folder and return what it printed, errors too."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "110", "PATH": _path()}
@@ -202,11 +208,13 @@ def drawn(run: Run, folder: Path) -> Path | None:
     """Draw a run's picture, once; return where it is."""
     if run.picture is None:
         return None
-    name = re.sub(r"\W+", "_", run.words.split(" --")[0].removeprefix("pop").strip()) + ".png"
-    png = PICTURES / name.removeprefix("_")
+    png = PICTURES / (re.sub(r"\W+", "_", f"{run.of} {run.caption}").strip("_") + ".png")
     if not png.exists():
         png.parent.mkdir(exist_ok=True)
         run.picture(folder, png)
+        with Image.open(png) as taken:
+            # 256 colours are a third of the bytes
+            taken.convert("RGB").quantize(256, dither=Image.Dither.FLOYDSTEINBERG).save(png, "PNG", optimize=True)
     return png
 
 
@@ -232,7 +240,7 @@ def sections(folder: Path, runs: tuple[Run, ...], program: str, commands: dict[s
     before = ""
     for run in runs:
         if run.of != before:
-            yield f"## {program} {run.of}\n\n{commands[run.of].capitalize()}."
+            yield f"## {program} {run.of}\n\n{sentence(commands[run.of])}"
             before = run.of
         print(run.words, file=sys.stderr, flush=True)
         yield f"```console\n$ {run.words}\n{shown(ran(run, folder), folder)}\n```"
@@ -266,7 +274,7 @@ def lacking(text: str) -> list[str]:
         f"{program} {name}"
         for program, commands in wanted.items()
         for name, summary in commands.items()
-        if f"## {program} {name}\n\n{summary.capitalize()}.\n\n```console\n$ {program} {name}" not in text
+        if f"## {program} {name}\n\n{sentence(summary)}\n\n```console\n$ {program} {name}" not in text
     ]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import socket
 import sys
 import time
 from dataclasses import replace
@@ -259,7 +260,12 @@ def test_a_port_that_cannot_be_is_refused(pop: Pop, shared_result: Path, port: i
 
 @pytest.mark.parametrize("lone", [False, True])
 def test_the_command_prints_its_address_serves_it_and_ends_with_ctrl_c(
-    pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lone: bool
+    pop: Pop,
+    shared_result: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    lone: bool,
 ) -> None:
     pytest.importorskip("viser", reason="pip install 'viser>=1.1'")
     from pop_fast.view.live.server import LiveViewer
@@ -267,6 +273,8 @@ def test_the_command_prints_its_address_serves_it_and_ends_with_ctrl_c(
     served: list[bytes] = []
 
     def interrupted(viewer: LiveViewer) -> None:
+        # as browsers do that open connections ahead
+        socket.create_connection((viewer.host, viewer.port)).close()
         served.append(urlopen(viewer.url).read())
         raise KeyboardInterrupt
 
@@ -281,6 +289,7 @@ def test_the_command_prints_its_address_serves_it_and_ends_with_ctrl_c(
     )
     assert ("note: no capture" in outcome.out) is lone
     assert b"<html" in served[0].lower()
+    assert not [record for record in caplog.records if record.name.startswith("websockets")]
 
 
 class Viewer:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import io
+import logging
 import threading
 import time
 from collections.abc import Sequence
@@ -95,6 +96,8 @@ class LiveViewer:
         self.note = ""
         self._views: dict[int, _View] = {}
         self._lock, self._wake = threading.Lock(), threading.Event()
+        # browsers open connections ahead and drop them, which is logged as an error with a traceback
+        logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
         try:
             # it prints a box of its own, whatever `verbose` is
             with redirect_stdout(io.StringIO()):
