@@ -57,8 +57,8 @@ def test_the_images_and_two_windows_of_the_answers_are_the_oracles(name: str) ->
             assert np.array_equal(getattr(error_bounds, key), kept[key][place])
 
 
-def test_the_corpus_has_long_lists_many_tiles_many_entries_and_cut_tiles() -> None:
-    longest, tiles, entries, blended = [], [], [], []
+def test_the_corpus_has_long_lists_wide_splats_many_tiles_many_entries_and_cut_tiles() -> None:
+    longest, tiles, entries, blended, widest = [], [], [], [], []
     for name, plan in PLANS.items():
         drawn = drawn_of(name)
         lengths = [len(ids) for ids in drawn.tile_lists]
@@ -66,6 +66,7 @@ def test_the_corpus_has_long_lists_many_tiles_many_entries_and_cut_tiles() -> No
         blended.append(int(drawn.n_blended.max()))
         tiles.append(len(lengths))
         entries.append(sum(lengths))
+        widest.append(int(np.bincount(np.concatenate([np.array(ids, dtype=int) for ids in drawn.tile_lists])).max()))
         assert answers(name)["unambiguous"].mean() > 0.5
         assert 50 <= plan.n <= 5000
     for length in (8, 32, 256, 1024):
@@ -73,6 +74,7 @@ def test_the_corpus_has_long_lists_many_tiles_many_entries_and_cut_tiles() -> No
         assert any(length < each <= 8 * length for each in longest)
     assert max(blended) > 1024
     assert max(tiles) > 256
+    assert max(widest) > 256
     assert max(entries) > 2**16
     assert any(plan.width % plan.tile_size and plan.height % plan.tile_size for plan in PLANS.values())
     assert {(33, 17), (200, 120)} <= {(plan.width, plan.height) for plan in PLANS.values()}
