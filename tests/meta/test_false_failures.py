@@ -131,7 +131,7 @@ def test_what_is_refused_on_purpose_is_skipped_in_the_words_of_the_refusal(words
 def test_a_rasterizer_with_fewer_arguments_than_gsplats_is_judged_by_those_it_has() -> None:
     backend = TorchAdapter("short", without_packed, dtype="float32")
     for path in (
-        "test_agreement:images_are_the_oracles",
+        "test_agreement:the_image_is_one_of_the_oracles_outcomes",
         "test_signature_cameras:several_cameras_in_one_call_see_what_each_sees_alone",
     ):
         assert not missing(backend, law_named(path).needs)
