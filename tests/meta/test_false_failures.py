@@ -101,7 +101,7 @@ def _asserts() -> None:
 def without_packed(means: Any, quats: Any, scales: Any, opacities: Any, colors: Any, viewmats: Any, Ks: Any,
                    width: int, height: int, sh_degree: int | None = None, backgrounds: Any = None) -> Any:  # fmt: skip
     return sound(means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree=sh_degree,
-                 backgrounds=backgrounds)  # fmt: skip
+                 backgrounds=backgrounds, packed=False)  # fmt: skip
 
 
 REFUSALS: dict[str, Callable[..., Any]] = {
