@@ -1,11 +1,12 @@
-"""A capture trained whole, and in blocks that are merged: what that costs in quality, and what it saves in memory.
+"""A capture trained whole, in blocks that are merged, and on in rounds: quality, memory and processor time.
 
-python -m benchmarks.blocks CAPTURE --work FOLDER [--blocks 2x2] [--factor 2] [--preset quick] [--threads 1]
+python -m benchmarks.blocks CAPTURE --work FOLDER [--blocks 2x2] [--rounds 3] [--factor 2] [--preset quick] [--threads 1]
 
-Both are `pop train` of the same settings, so that each block takes as many steps as the whole, and both are measured on
+All are `pop train` of the same settings, so that each block takes as many steps as the whole, and all are measured on
 the held-out views of the whole capture. Memory is the peak of each training's process. What was interrupted is resumed
-when the command is given again; processor times add up in FOLDER. Writes benchmarks/results/blocks.json, of which
-docs/using.md has the table.
+when the command is given again, and what is finished is kept; processor times add up in FOLDER. The rounds are added to
+the merged blocks, and so pay for two more merges. Writes benchmarks/results/blocks.json, of which docs/using.md has the
+table.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ def run(words: Sequence[str], folder: Path, note: Path) -> dict[str, float]:
         note: where the seconds of earlier calls stand.
     """
     spent = json.loads(note.read_text()) if note.exists() else {"clock": 0.0, "processor": 0.0}
+    if spent.get("done"):
+        return spent
     again = ["--resume"] if (folder / "cfg.json").is_file() else []
     start = time.perf_counter()
     child = subprocess.Popen(
@@ -46,7 +49,7 @@ def run(words: Sequence[str], folder: Path, note: Path) -> dict[str, float]:
         "processor": spent["processor"] + used.ru_utime + used.ru_stime,
     }
     note.parent.mkdir(parents=True, exist_ok=True)
-    note.write_text(json.dumps(spent))
+    note.write_text(json.dumps({**spent, "done": 1.0} if status == 0 else spent))
     if status != 0:
         raise SystemExit(f"pop train {' '.join(words)}: ended with {os.waitstatus_to_exitcode(status)}")
     return spent
@@ -70,6 +73,7 @@ def main(words: list[str], say: Callable[[str], None] = print) -> int:
     parser.add_argument("capture", type=Path)
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--blocks", default="2x2")
+    parser.add_argument("--rounds", default="3")
     parser.add_argument("--factor", default="2")
     parser.add_argument("--preset", default="quick")
     parser.add_argument("--threads", default="1")
@@ -79,9 +83,11 @@ def main(words: list[str], say: Callable[[str], None] = print) -> int:
     work = args.work.absolute()
     settings += ["--skip-sizes", "--skip-checks"]
     whole, blocks = work / "whole", work / "blocks"
+    in_blocks = [*settings, "--blocks", args.blocks, "--blocks-rounds"]
     spent = {
         "whole": run(settings, whole, work / "whole.json"),
-        "merged": run([*settings, "--blocks", args.blocks], blocks, work / "blocks.json"),
+        "merged": run([*in_blocks, "0"], blocks, work / "blocks.json"),
+        "rounds": run([*in_blocks, args.rounds], blocks, work / "rounds.json"),
     }
     write(args, whole, blocks, spent)
     say(table(args.out))
@@ -103,6 +109,8 @@ def write(args: argparse.Namespace, whole: Path, blocks: Path, spent: dict[str, 
         }
         for part in merged["blocks"]
     ]
+    found, job = merged["rounds"], json.loads((blocks / "blocks" / "job.json").read_text(encoding="utf-8"))
+    times = {name: {key: value for key, value in each.items() if key != "done"} for name, each in spent.items()}
     result = {
         "machine": machine(),
         "capture": args.capture.resolve().name,
@@ -111,9 +119,21 @@ def write(args: argparse.Namespace, whole: Path, blocks: Path, spent: dict[str, 
         "preset": args.preset,
         "steps": one["step"] + 1,
         "held_out_views": one["views"],
-        "whole": {**numbers(one), "seconds": one["seconds"], "spent": spent["whole"]},
-        "merged": {**numbers(merged), "merge_gib": merged["memory_bytes_merging"] / GIB, "spent": spent["merged"]},
+        "whole": {**numbers(one), "seconds": one["seconds"], "spent": times["whole"]},
+        "merged": {**numbers(found[0]), "merge_gib": merged["memory_bytes_merging"] / GIB, "spent": times["merged"]},
         "blocks": parts,
+        "round_steps": job["round_steps"],
+        "rounds": [
+            {
+                **numbers(each),
+                "blocks": [
+                    {**{key: part[key] for key in ("name", "own", "fixed", "seconds")}, **numbers(part)}
+                    for part in each["blocks"]
+                ],
+            }
+            for each in found[1:]
+        ],
+        "rounds_spent": times["rounds"],
     }
     write_json(args.out, result)
 
@@ -129,6 +149,8 @@ def table(path: Path = RESULTS) -> str:
         rows.append([f"block {part['name']}", *counts, *_measured(part, f"{part['held_out_views']} in its core")])
     merging = {**merged, "peak_gib": merged["merge_gib"]}
     rows.append([f"**{found['grid']}, merged**", "", f"{merged['gaussians']:,}", "", *_measured(merging, views)])
+    for number, each in enumerate(found["rounds"], start=1):
+        rows.append([f"**after round {number}**", "", f"{each['gaussians']:,}", "", *_measured(each, views)])
     head = ["", "training views", "Gaussians", "kept", "held-out views", "PSNR", "SSIM", "peak memory"]
     return _table(head, ["---", "---:", "---:", "---:", "---", "---:", "---:", "---:"], rows)
 

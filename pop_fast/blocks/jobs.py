@@ -1,8 +1,8 @@
 """Run the parts of a run in blocks: by Snakemake where it is installed, else one after the other.
 
-Either way a part is a process of its own, `pop blocks train OUT i_j` or `pop blocks merge OUT`, so that its memory is
-given back when it ends. One that is finished has left its marker and is not done again; a block that was interrupted
-resumes from its last checkpoint.
+Either way a part (see `pop_fast.blocks.parts`) is a process of its own, `pop blocks train OUT i_j` or `pop blocks merge
+OUT`, so that its memory is given back when it ends. One that is finished has left its marker and is not done again; a
+block that was interrupted resumes from its last checkpoint.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
+from pop_fast.blocks.parts import Part, parts_of
 from pop_fast.blocks.plan import FOLDER, Job
-from pop_fast.blocks.run import marker_of
 from pop_fast.errors import PopError
 from pop_fast.train.signals import stop_requests
 
@@ -53,7 +53,7 @@ def profile_folder(name: str) -> Path:
 
 
 def run_in_turn(folder: Path, job: Job, quiet: bool = False, say: Callable[[str], None] = print) -> int:
-    """Train the blocks that are not trained yet, one after the other, and merge them.
+    """Do the parts that are not done yet, one after the other: train the blocks, merge them, and so in every round.
 
     Args:
         folder: the run's, whose capture is divided.
@@ -64,15 +64,22 @@ def run_in_turn(folder: Path, job: Job, quiet: bool = False, say: Callable[[str]
     Returns:
         The exit status of the first part that failed, or 0; 130 after Ctrl-C or SIGTERM.
     """
-    for index, name in enumerate((*job.names, None), start=1):
-        if marker_of(folder, name).is_file():
+    for part in parts_of(job):
+        if part.marker(folder).is_file():
             continue
-        say(f"block {name}, {index} of {len(job.names)}" if name else f"merging {len(job.names)} blocks")
-        words = ["train", str(folder), name] if name else ["merge", str(folder)]
-        status = _run([sys.executable, "-m", "pop_fast.cli", "blocks", *words], quiet)
+        say(_begins(part, job))
+        status = _run([sys.executable, "-m", "pop_fast.cli", "blocks", *part.words(folder)], quiet)
         if status != 0:
             return status
     return 0
+
+
+def _begins(part: Part, job: Job) -> str:
+    count = len(job.names)
+    of_round = f"round {part.round} of {job.rounds}: " if part.round else ""
+    if part.block is None:
+        return f"{of_round}merging {count} blocks"
+    return f"{of_round}block {part.block}, {job.names.index(part.block) + 1} of {count}"
 
 
 def run_workflow(

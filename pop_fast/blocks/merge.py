@@ -1,7 +1,12 @@
-"""Put trained blocks together: of each the Gaussians whose centre lies in its core, and of no other."""
+"""Put trained blocks together: of each the Gaussians of its core, and of no other.
+
+After the trainings by themselves, these are the Gaussians whose centre lies in the core; after a round, those that the
+block has trained. What the last merge makes is the run's result; what another makes is what the next round starts from.
+"""
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,10 +16,14 @@ import torch
 from torch import Tensor
 
 from pop_fast.blocks.partition import Partition
-from pop_fast.blocks.plan import FOLDER, read_plan
+from pop_fast.blocks.parts import Part, core_of, result_of, round_folder
+from pop_fast.blocks.plan import read_plan
+from pop_fast.blocks.start import own_of
 from pop_fast.data.capture import Capture
 from pop_fast.errors import PopError
+from pop_fast.io.atomic import write_atomically
 from pop_fast.io.ply import Frame, save_ply
+from pop_fast.io.read_back import read_json
 from pop_fast.train.checkpoint import checkpoint_path, save_checkpoint
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.environment import peak_memory_bytes, reproducible, run_facts
@@ -28,15 +37,10 @@ from pop_fast.train.results import ResultFolder
 from pop_fast.train.schedule import active_sh_degree
 from pop_fast.train.views import ViewTensors
 
-__all__ = ["kept_of", "merge", "result_of"]
+__all__ = ["kept_of", "merge"]
 
 # what a block's statistics say of the settings, which are those of all
 _SETTINGS: Final = ("method", "preset", "seed", "lambda_pop", "blur_min_pixels", "blur_events", "stepper")
-
-
-def result_of(folder: Path, name: str) -> Path:
-    """Return the result folder of a block of the run in `folder`."""
-    return folder / FOLDER / name / "result"
 
 
 def kept_of(partition: Partition, number: int, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -53,27 +57,56 @@ def kept_of(partition: Partition, number: int, params: Mapping[str, Tensor]) -> 
     return {key: value[kept] for key, value in params.items()}
 
 
-def merge(folder: Path, config: TrainConfig, capture: Capture) -> dict[str, Any]:
-    """Merge the trained blocks of a run: write checkpoint, PLY, pictures and statistics, as a training does at its end.
+def merge(folder: Path, config: TrainConfig, capture: Capture, part: Part) -> dict[str, Any]:
+    """Merge the trained blocks of a round.
 
-    One block is in memory at a time, and of the capture the held-out photographs.
+    The last merge writes checkpoint, PLY, pictures and statistics, as a training does at its end; one that a round
+    follows writes the Gaussians of every core for it, and what they measure. One block is in memory at a time, the
+    merged Gaussians, and of the capture the held-out photographs.
 
     Args:
         folder: the run's.
         config: its settings.
         capture: the whole, of which the held-out photographs have been read.
+        part: which merge.
 
     Returns:
-        The statistics, as in stats/val_step{step}.json; `blocks` has each block's own.
+        The statistics: of the last merge as in stats/val_step{step}.json, `blocks` with each block's own training and,
+        where there are rounds, `rounds` with what each of them came to; of another one its entry of `rounds`.
 
     Raises:
         PopError: the capture is not divided, or a block is not trained to its end.
     """
-    start, step = time.perf_counter(), config.max_steps - 1
+    start = time.perf_counter()
     plan = read_plan(folder)
     if plan is None:
         raise PopError(f"{folder}: its capture is not divided yet; run pop blocks partition {folder}")
     partition, entries = plan
+    gathered = _trained(folder, config, partition, entries) if part.round == 0 else _refined(folder, entries, part)
+    params, rows = gathered
+    if len(params["means"]) == 0:
+        raise PopError(f"{folder}: no block has a Gaussian in its core, so that nothing is left; look at the blocks")
+    results = ResultFolder(folder)
+    results.hold()
+    try:
+        if not part.last:
+            return _hand_on(folder, config, capture, params, rows, part, partition)
+        before = [_read_round(folder, number) for number in range(part.round)]
+        _write_splat(results, config, capture, params)
+        stats = _measured(results, config, capture, params, rows, before)
+    finally:
+        results.close()
+    stats["seconds_merging"] = time.perf_counter() - start
+    results.write_stats("val", config.max_steps - 1, stats)
+    return stats
+
+
+Gathered = tuple[dict[str, Tensor], list[dict[str, Any]]]
+
+
+def _trained(folder: Path, config: TrainConfig, partition: Partition, entries: Sequence[Mapping[str, Any]]) -> Gathered:
+    """Gather what blocks that were trained by themselves have in their cores, and each one's numbers."""
+    step = config.max_steps - 1
     parts: list[dict[str, Tensor]] = []
     rows: list[dict[str, Any]] = []
     for number, entry in enumerate(entries):
@@ -83,20 +116,75 @@ def merge(folder: Path, config: TrainConfig, capture: Capture) -> dict[str, Any]
             raise PopError(f"{result}: is not trained to its end; run pop blocks train {folder} {entry['name']}")
         parts.append(kept_of(partition, number, splat.params))
         rows.append({**entry, "kept": len(parts[-1]["means"]), **_numbers(result, step)})
+    return _joined(parts), rows
+
+
+def _refined(folder: Path, entries: Sequence[Mapping[str, Any]], part: Part) -> Gathered:
+    """Gather the Gaussians that blocks trained in a round, and each one's numbers."""
+    parts: list[dict[str, Tensor]] = []
+    rows: list[dict[str, Any]] = []
+    for entry in entries:
+        name = entry["name"]
+        result, counts = result_of(folder, name, part.round), own_of(folder, name, part.round)
+        if counts["own"] == 0:
+            continue
+        splat = load_splat(result)
+        last = splat.config.max_steps - 1
+        if splat.step != last:
+            again = f"pop blocks train {folder} {name} --round {part.round}"
+            raise PopError(f"{result}: is not trained to its end; run {again}")
+        parts.append({key: value[: counts["own"]].clone() for key, value in splat.params.items()})
+        rows.append({"name": name, **counts, **_numbers(result, last)})
+    return _joined(parts), rows
+
+
+def _joined(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     params = {key: torch.cat([part[key] for part in parts]) for key in KEYS}
     parts.clear()
-    if len(params["means"]) == 0:
-        raise PopError(f"{folder}: no block has a Gaussian in its core, so that nothing is left; look at the blocks")
-    results = ResultFolder(folder)
-    results.hold()
-    try:
-        _write_splat(results, config, capture, params)
-        stats = _measured(results, config, capture, params, rows)
-    finally:
-        results.close()
-    stats["seconds_merging"] = time.perf_counter() - start
-    results.write_stats("val", step, stats)
+    return params
+
+
+def _hand_on(
+    folder: Path,
+    config: TrainConfig,
+    capture: Capture,
+    params: dict[str, Tensor],
+    rows: Sequence[Mapping[str, Any]],
+    part: Part,
+    partition: Partition,
+) -> dict[str, Any]:
+    """Write what the next round starts from, and what it measures."""
+    for number, name in enumerate(partition.names):
+        content = {"step": config.max_steps - 1, "splats": kept_of(partition, number, params)}
+        save_checkpoint(core_of(folder, name, part.round), content)
+    stats = _of_round(part.round, _evaluated(config, capture, params), params, rows)
+    text = json.dumps(stats, indent=2) + "\n"
+    write_atomically(_stats_path(folder, part.round), lambda file: file.write(text.encode()))
     return stats
+
+
+def _of_round(
+    number: int, measured: Mapping[str, Any], params: Mapping[str, Tensor], rows: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    return {
+        "round": number,
+        **{name: measured.get(name) for name in ("psnr", "ssim")},
+        "num_GS": len(params["means"]),
+        **{name: sum(row[name] for row in rows) for name in ("seconds", "seconds_total")},
+        "memory_bytes": max(row["memory_bytes"] for row in rows),
+        "blocks": list(rows),
+    }
+
+
+def _stats_path(folder: Path, number: int) -> Path:
+    return round_folder(folder, number) / "stats.json"
+
+
+def _read_round(folder: Path, number: int) -> dict[str, Any]:
+    path, fix = _stats_path(folder, number), f"run pop blocks merge {folder} --round {number}"
+    if not path.is_file():
+        raise PopError(f"{path}: is absent; {fix}")
+    return read_json(path, fix)
 
 
 def _write_splat(results: ResultFolder, config: TrainConfig, capture: Capture, params: dict[str, Tensor]) -> None:
@@ -114,11 +202,12 @@ def _measured(
     capture: Capture,
     params: dict[str, Tensor],
     rows: Sequence[Mapping[str, Any]],
+    before: list[dict[str, Any]],
 ) -> dict[str, Any]:
+    """Return what the last merge measures, with what the rounds before it came to."""
     step = config.max_steps - 1
-    views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
-    nets = load_nets(config.lpips_vgg, config.lpips_alex, [(view.height, view.width) for view in views])
-    trained = [results_stats(result_of(results.path, row["name"]), step) for row in rows]
+    first = before[0]["blocks"] if before else rows
+    trained = [_results_stats(result_of(results.path, row["name"]), step) for row in first]
     stats: dict[str, Any] = {
         "step": step,
         **{name: trained[0][name] for name in _SETTINGS if name in trained[0]},
@@ -128,26 +217,40 @@ def _measured(
     pixels = [value for found in trained for value in found.get("theta_blur_pixels", ())]
     if pixels:
         stats["theta_blur_pixels"] = [min(pixels), max(pixels)]
-    # as long as all blocks took, one after the other
-    seconds, total = (sum(found[name] for found in trained) for name in ("seconds", "seconds_total"))
+    # as long as all blocks took in all rounds, one after the other
+    counted = [*trained, *(row for found in before[1:] for row in found["blocks"]), *(rows if before else ())]
+    seconds, total = (sum(found[name] for found in counted) for name in ("seconds", "seconds_total"))
     stats |= run_facts(config.backend, seconds, total)
     stats["seconds_loading"] = sum(found["seconds_loading"] for found in trained)
     results.write_stats("train", step, {**stats, "ellipse_time": seconds})
-    backend, _ = renderer(config.backend)
-    degree = active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter)
-    with reproducible(config.threads):
-        stats |= evaluate(backend, params, views, config, degree, nets, results, step)
-    peak = max([peak_memory_bytes(), *(found["memory_bytes"] for found in trained)])
+    stats |= _evaluated(config, capture, params, results)
+    peak = max([peak_memory_bytes(), *(found["memory_bytes"] for found in counted)])
+    rounds = [*before, _of_round(len(before), stats, params, rows)] if before else []
     return {
         **stats,
         "memory_bytes": peak,
         "mem": peak / 2**30,
         "memory_bytes_merging": peak_memory_bytes(),
-        "blocks": rows,
+        "blocks": list(first),
+        **({"rounds": rounds} if rounds else {}),
     }
 
 
-def results_stats(result: Path, step: int) -> dict[str, Any]:
+def _evaluated(
+    config: TrainConfig, capture: Capture, params: dict[str, Tensor], results: ResultFolder | None = None
+) -> dict[str, Any]:
+    """Measure the held-out views; into a result folder go pictures of them, and then LPIPS is measured too."""
+    step = config.max_steps - 1
+    views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
+    sizes = [(view.height, view.width) for view in views]
+    nets = () if results is None else load_nets(config.lpips_vgg, config.lpips_alex, sizes)
+    backend, _ = renderer(config.backend)
+    degree = active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter)
+    with reproducible(config.threads):
+        return evaluate(backend, params, views, config, degree, nets, results, step)
+
+
+def _results_stats(result: Path, step: int) -> dict[str, Any]:
     """Read the statistics of a block's last step: the training's, and the held-out views' where there are some.
 
     Raises:
@@ -161,6 +264,6 @@ def results_stats(result: Path, step: int) -> dict[str, Any]:
 
 
 def _numbers(result: Path, step: int) -> dict[str, Any]:
-    stats = results_stats(result, step)
+    stats = _results_stats(result, step)
     names = ("num_GS", "psnr", "ssim", "seconds", "seconds_total", "memory_bytes")
     return {name: stats.get(name) for name in names}

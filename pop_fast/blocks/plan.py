@@ -20,7 +20,19 @@ The folder of a run in blocks has a result's own files, which describe the merge
     blocks/i_j/             one block: the list of its photographs and its points (see `pop_fast.data.block`)
     blocks/i_j/result/      its training, an ordinary result folder
     blocks/i_j/trained      is there when its training is finished
-    blocks/merged           is there when the blocks are merged
+    blocks/merged           is there when the blocks are merged for the last time
+
+and of every round r, from 0, that another one follows:
+
+    blocks/round_r/i_j.pt      the merged Gaussians of a core, which the next round starts from
+    blocks/round_r/stats.json  what they measure
+    blocks/round_r/merged      is there when these are
+
+and of every round from 1 (see `pop_fast.blocks.start`):
+
+    blocks/round_r/i_j/start.json  how many Gaussians the block trained, and how many it held fixed
+    blocks/round_r/i_j/result/     its training: the first rows are those that it trained
+    blocks/round_r/i_j/trained     is there when that is finished
 """
 
 from __future__ import annotations
@@ -42,12 +54,30 @@ from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.read_back import read_json
 
-__all__ = ["FOLDER", "JOB", "Block", "Job", "Plan", "job_text", "make_plan", "read_job", "read_plan", "write_plan"]
+__all__ = [
+    "DEFAULT_ROUNDS",
+    "FOLDER",
+    "JOB",
+    "ROUND_SHARE",
+    "Block",
+    "Job",
+    "Plan",
+    "job_text",
+    "make_plan",
+    "read_job",
+    "read_plan",
+    "write_plan",
+]
 
 FOLDER: Final = "blocks"
 JOB: Final = f"{FOLDER}/job.json"
 _PLAN = "plan.json"
 _FIX: Final = "start 'pop train --blocks' again with --overwrite"
+# rounds of a run where nobody says how many, and the steps of one as a share of a block's training
+DEFAULT_ROUNDS: Final = 1
+ROUND_SHARE: Final = 0.1
+# more parts than a workflow shows, and surely a slip
+_MOST_ROUNDS: Final = 100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,12 +88,16 @@ class Job:
         blocks: the grid, as "2x2".
         margin: what a block is trained on beyond its core, as a share of the core's size on either axis.
         share: of the sparse points in a view's picture, those in a core must be so many for the view to train it.
+        rounds: how often the merged Gaussians are trained on, every block those of its core.
+        round_steps: of a block in each round; 0 where there is none.
         finish: what is written when the blocks are merged, as `FinishOptions` has it.
     """
 
     blocks: str
     margin: float = 0.2
     share: float = 0.25
+    rounds: int = 0
+    round_steps: int = 0
     finish: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -74,6 +108,10 @@ class Job:
             raise PopError(
                 f"--blocks-share is {self.share}; it must be over 0 and at most 1, a share of a view's points"
             )
+        if not 0 <= self.rounds <= _MOST_ROUNDS:
+            raise PopError(f"--blocks-rounds is {self.rounds}; it must be from 0 to {_MOST_ROUNDS}")
+        if self.rounds > 0 and self.round_steps < 1:
+            raise PopError(f"--blocks-round-steps is {self.round_steps}; it must be 1 or more")
 
     @property
     def names(self) -> list[str]:

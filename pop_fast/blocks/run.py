@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from pop_fast.blocks.map import write_map
-from pop_fast.blocks.merge import merge, result_of
+from pop_fast.blocks.merge import merge
+from pop_fast.blocks.parts import Part, result_of
 from pop_fast.blocks.plan import FOLDER, Job, Plan, make_plan, write_plan
 from pop_fast.data.capture import Capture, Progress
 from pop_fast.data.load import Photographs, list_capture, load_capture
@@ -18,8 +19,9 @@ from pop_fast.data.posed_images import Listing
 from pop_fast.data.sfm_options import SfmOptions
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import CaptureRecord
+from pop_fast.train.refining import refining
 
-__all__ = ["Division", "config_of", "divide_capture", "marker_of", "merge_capture"]
+__all__ = ["Division", "config_of", "divide_capture", "merge_capture", "round_config"]
 
 
 class Division:
@@ -65,15 +67,15 @@ def divide_capture(
 
 
 def merge_capture(
-    folder: Path, config: TrainConfig, record: CaptureRecord, progress: Progress | None = None
+    folder: Path, config: TrainConfig, record: CaptureRecord, part: Part, progress: Progress | None = None
 ) -> tuple[Capture, dict[str, Any]]:
-    """Merge the trained blocks of a run and measure the held-out views of the whole capture; see `merge`.
+    """Merge the blocks of a round and measure the held-out views of the whole capture; see `merge`.
 
     Returns:
         The capture, whose held-out photographs alone have been read, and the statistics.
     """
     capture = _load(config, record, "held out", progress)
-    return capture, merge(folder, config, capture)
+    return capture, merge(folder, config, capture, part)
 
 
 def config_of(folder: Path, config: TrainConfig, name: str) -> TrainConfig:
@@ -81,9 +83,21 @@ def config_of(folder: Path, config: TrainConfig, name: str) -> TrainConfig:
     return replace(config, data=str(folder / FOLDER / name), result_dir=str(result_of(folder, name)))
 
 
-def marker_of(folder: Path, name: str | None) -> Path:
-    """Return the file that says that a block is trained, or, of no block, that all are merged."""
-    return folder / FOLDER / (f"{name}/trained" if name else "merged")
+def round_config(folder: Path, config: TrainConfig, part: Part, steps: int) -> TrainConfig:
+    """Return the settings of a block's training in a round from 1: they go on where those of the run have ended.
+
+    Args:
+        folder: the run's.
+        config: its settings.
+        part: which block, in which round; each round draws another order of views.
+        steps: of the round.
+    """
+    if part.block is None:
+        raise ValueError("a merge is no training")
+    result = str(result_of(folder, part.block, part.round))
+    return replace(
+        refining(config_of(folder, config, part.block), steps), result_dir=result, seed=config.seed + part.round
+    )
 
 
 def _load(

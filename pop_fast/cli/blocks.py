@@ -3,27 +3,32 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import tyro
 
-from pop_fast.cli import EXIT_INCOMPLETE
+from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED
 from pop_fast.cli.arguments import parse
-from pop_fast.cli.train_blocks import merged_lines, plan_lines
+from pop_fast.cli.train_blocks import merged_lines, plan_lines, round_lines
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 
 if TYPE_CHECKING:
+    from pop_fast.blocks.parts import Part
     from pop_fast.blocks.plan import Job
     from pop_fast.train.config import TrainConfig
     from pop_fast.train.load_result import CaptureRecord
 
 _EXAMPLES: Final = """
     pop blocks train out/city 0_1          train one block, or resume it
-    pop blocks merge out/city              put the trained blocks together, and measure the whole
+    pop blocks merge out/city --round 0    put the trained blocks together, for the round that follows
+    pop blocks train out/city 0_1 --round 1
+                                           train what the block has in its core, among all others as they are
+    pop blocks merge out/city              the last merge: the result of the run, and the report
     pop blocks partition out/city          divide the capture again, as the run was begun
 """
 
@@ -37,11 +42,14 @@ class Args:
         part: divide the capture, train a block, or merge all.
         result: the result folder.
         block: which block to train, as 0_1.
+        round: of which round: 0 trains each block by itself, those after begin with the merged blocks of the round
+            before. (default: train in round 0, merge the last one)
     """
 
     part: Annotated[Literal["partition", "train", "merge"], tyro.conf.Positional]
     result: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT")]
     block: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="BLOCK")] = None
+    round: Annotated[int | None, tyro.conf.arg(help_behavior_hint="")] = None
 
 
 def run(argv: Sequence[str]) -> int:
@@ -56,15 +64,36 @@ def run(argv: Sequence[str]) -> int:
     if job is None:
         raise PopError(f"{args.result}: is no run in blocks; start one with pop train DATA --blocks 2x2 --out DIR")
     config, record = read_config(folder), read_record(folder) or CaptureRecord()
-    if args.part == "train":
-        if args.block not in job.names:
-            raise PopError(f"{args.result}: has no block {args.block}; its blocks are {', '.join(job.names)}")
-        return _train(folder, config, args.block, argv)
-    if args.block is not None:
+    if args.part != "train" and args.block is not None:
         raise PopError(f"pop blocks {args.part} is of all blocks; leave {args.block} out")
     if args.part == "partition":
+        if args.round is not None:
+            raise PopError("pop blocks partition is of all rounds; leave --round out")
         return _partition(folder, config, record, job)
-    return _merge(folder, config, record, job)
+    part = _part(args, job)
+    if part.block is None:
+        return _merge(folder, config, record, job, part)
+    return _train_round(folder, config, job, part) if part.round else _train(folder, config, part.block, argv)
+
+
+def _part(args: Args, job: Job) -> Part:
+    """Find which part of the run is asked for.
+
+    Raises:
+        PopError: it has no such block or round.
+    """
+    from pop_fast.blocks.parts import parts_of
+
+    if args.part == "train" and args.block not in job.names:
+        raise PopError(f"{args.result}: has no block {args.block}; its blocks are {', '.join(job.names)}")
+    number = (0 if args.part == "train" else job.rounds) if args.round is None else args.round
+    found = [part for part in parts_of(job) if (part.round, part.block) == (number, args.block)]
+    if not found:
+        raise PopError(
+            f"{args.result}: has no round {number}, but rounds 0 to {job.rounds}; for more of them start pop train "
+            "with --blocks-rounds and --resume"
+        )
+    return found[0]
 
 
 def _partition(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job) -> int:
@@ -80,25 +109,16 @@ def _partition(folder: Path, config: TrainConfig, record: CaptureRecord, job: Jo
 
 
 def _train(folder: Path, config: TrainConfig, block: str, argv: Sequence[str]) -> int:
+    from pop_fast.blocks.parts import marker_of
     from pop_fast.blocks.plan import read_plan
-    from pop_fast.blocks.run import config_of, marker_of
-    from pop_fast.cli.result_folder import as_begun, check_output
-    from pop_fast.cli.train import arguments, check_backend, train_capture
+    from pop_fast.blocks.run import config_of
+    from pop_fast.cli.train import check_backend, train_capture
     from pop_fast.train.choose import choose_backend
-    from pop_fast.train.load_result import read_record
 
     if read_plan(folder) is None:
         raise PopError(f"{folder}: its capture is not divided yet; run pop blocks partition {folder}")
-    record = read_record(folder)
     own = config_of(folder, config, block)
-    # what a user's own training of the block's folder would be, without what the merged result has instead
-    place = Path(own.result_dir)
-    again = ["--resume"] if (place / "cfg.json").is_file() else []
-    _, options = arguments([own.data, "--out", own.result_dir, "--skip-sizes", "--skip-checks", *again])
-    if record is not None:
-        options = replace(options, images=record.images, ignore_masks=not record.masks)
-    check_output(place, options)
-    options = as_begun(place, options)
+    options = _options(folder, own)
     own, chosen = choose_backend(own, options.resume)
     check_backend(own)
     status = train_capture(own, options, chosen, ["blocks", *argv])
@@ -109,8 +129,71 @@ def _train(folder: Path, config: TrainConfig, block: str, argv: Sequence[str]) -
     return status
 
 
-def _merge(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job) -> int:
-    from pop_fast.blocks.run import marker_of, merge_capture
+def _options(folder: Path, own: TrainConfig) -> Any:
+    """Return the options of `pop train` that a block's training is done with.
+
+    They are those of a user's own training of the block's folder, without what the merged result has instead.
+
+    Args:
+        folder: the run's.
+        own: the settings of the training.
+    """
+    from pop_fast.cli.result_folder import as_begun, check_output
+    from pop_fast.cli.train import arguments
+    from pop_fast.train.load_result import read_record
+
+    record, place = read_record(folder), Path(own.result_dir)
+    again = ["--resume"] if (place / "cfg.json").is_file() else []
+    _, options = arguments([own.data, "--out", own.result_dir, "--skip-sizes", "--skip-checks", *again])
+    if record is not None:
+        options = replace(options, images=record.images, ignore_masks=not record.masks)
+    check_output(place, options)
+    return as_begun(place, options)
+
+
+def _train_round(folder: Path, config: TrainConfig, job: Job, part: Part) -> int:
+    """Train what a block has in its core, in a round from 1, among what its views see of the other cores."""
+    from pop_fast.blocks.parts import marker_of
+    from pop_fast.blocks.run import round_config
+    from pop_fast.blocks.start import check_merged, read_start, write_counts
+    from pop_fast.cli.printable import printable
+    from pop_fast.cli.result_folder import record_of, resumption, stopped
+    from pop_fast.cli.train import check_backend, open_capture, summary
+    from pop_fast.train.choose import choose_backend
+    from pop_fast.train.load_result import RECORD, record_text
+
+    assert part.block is not None
+    check_merged(folder, part.round)
+    own = round_config(folder, config, part, job.round_steps)
+    options, place, begun = _options(folder, own), Path(own.result_dir), time.perf_counter()
+    own, chosen = choose_backend(own, options.resume)
+    check_backend(own)
+    capture = open_capture(own, options)
+    start = read_start(folder, part.block, part.round, own, capture.views)
+    write_counts(folder, part.block, part.round, start)
+    seen = len(start.params["means"]) - start.own
+    print(printable(f"{part.block}, round {part.round}: {start.own:,} Gaussians, {own.max_steps:,} steps -> {place}"))
+    print(f"{seen:,} of the {start.merged - start.own:,} others are seen by its views, and held fixed")
+    if start.own > 0:
+        from pop_fast.blocks.refine import prepare
+
+        print(chosen)
+        beside = {RECORD: record_text(record_of(capture, options))}
+        loading = time.perf_counter() - begun
+        training = prepare(own, capture, start, resume=options.resume, loading_seconds=loading, beside=beside)
+        if options.resume:
+            print(resumption(place))
+        try:
+            print(summary(training.run()), flush=True)
+        except KeyboardInterrupt:
+            print(f"pop: {stopped(place, training.step)}", file=sys.stderr)
+            return EXIT_INTERRUPTED
+    write_atomically(marker_of(folder, part.block, part.round), lambda file: file.write(b""))
+    return 0
+
+
+def _merge(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job, part: Part) -> int:
+    from pop_fast.blocks.run import merge_capture
     from pop_fast.cli.finish import FinishOptions, finish
     from pop_fast.cli.progress import bars
     from pop_fast.cli.train import report, summary
@@ -120,12 +203,17 @@ def _merge(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job) -
     except TypeError as error:
         raise PopError(f"{folder}/blocks/job.json: finish is not what 'pop train' writes ({error})") from error
     with bars(config.progress) as progress:
-        capture, stats = merge_capture(folder, config, record, progress)
+        capture, stats = merge_capture(folder, config, record, part, progress)
+    if not part.last:
+        for line in round_lines([stats]):
+            print(line, flush=True)
+        write_atomically(part.marker(folder), lambda file: file.write(b""))
+        return 0
     for line in merged_lines(stats):
         print(line)
     print(summary(stats), flush=True)
     status = finish(folder, capture, options) or report(folder)
     if status == 0:
-        write_atomically(marker_of(folder, None), lambda file: file.write(b""))
+        write_atomically(part.marker(folder), lambda file: file.write(b""))
         print(f"pop report {folder} --check adds what looks at all photographs", file=sys.stderr)
     return status

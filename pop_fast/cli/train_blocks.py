@@ -39,7 +39,7 @@ def check_blocks(config: TrainConfig, options: Any) -> None:
         return
     from pop_fast.blocks.jobs import has_snakemake, profile_folder
 
-    _job(options)
+    _job(config, options)
     if "WORLD_SIZE" in os.environ:
         raise PopError("--blocks starts processes of its own, one a block; start it without torchrun")
     if options.view:
@@ -83,15 +83,31 @@ def _check_without(config: TrainConfig, options: Any) -> None:
             raise PopError(f"{config.result_dir}: was begun in blocks; resume it with --blocks {begun.blocks}")
 
 
-def _job(options: Any) -> Job:
-    from pop_fast.blocks.plan import Job
+def _job(config: TrainConfig, options: Any) -> Job:
+    """Gather what is asked for; what is not said of rounds is as a run that is resumed was begun.
 
+    Raises:
+        PopError: an option is out of range, or job.json is damaged.
+    """
+    from pop_fast.blocks.plan import DEFAULT_ROUNDS, ROUND_SHARE, Job, read_job
+
+    begun = read_job(Path(config.result_dir)) if options.resume else None
+    rounds, steps = options.blocks_rounds, options.blocks_round_steps
+    if rounds is None:
+        rounds = DEFAULT_ROUNDS if begun is None else begun.rounds
+    if steps is not None and rounds == 0:
+        raise PopError(f"--blocks-round-steps is {steps}, and there are no rounds; say --blocks-rounds 1 too")
+    if steps is None:
+        steps = (
+            begun.round_steps if begun is not None and begun.rounds else max(round(config.max_steps * ROUND_SHARE), 1)
+        )
     finishing = {field.name: getattr(options, field.name) for field in fields(FinishOptions)}
-    return Job(blocks=options.blocks, margin=options.blocks_margin, share=options.blocks_share, finish=finishing)
+    dividing = {"blocks": options.blocks, "margin": options.blocks_margin, "share": options.blocks_share}
+    return Job(**dividing, rounds=rounds, round_steps=steps if rounds else 0, finish=finishing)
 
 
 def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequence[str]) -> int:
-    """Divide the capture where that is not done yet, train the blocks that are not trained yet, and merge them.
+    """Divide the capture where that is not done yet, and do the parts of the run that are not done yet.
 
     Args:
         config: the settings; every block is trained with them.
@@ -103,19 +119,24 @@ def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequen
         The exit status.
     """
     from pop_fast.blocks.jobs import has_snakemake, profile_folder, run_in_turn, run_workflow
+    from pop_fast.blocks.parts import marker_of
     from pop_fast.blocks.plan import FOLDER, read_plan
-    from pop_fast.blocks.run import marker_of
     from pop_fast.io.lock import FolderLock
 
-    folder, job = Path(config.result_dir), _job(options)
+    folder, job = Path(config.result_dir), _job(config, options)
     config = replace(config, data=str(Path(config.data).absolute()))
     begun = _begun(folder, config, job) if options.resume else None
     lock = FolderLock(folder / FOLDER)
     if begun is not None:
         lock.take()
+        _extend(folder, begun, job)
     if begun is None or read_plan(folder) is None:
         division = _divided(config, options, job)
-        print(printable(f"{config.method} in blocks {job.blocks}, {config.max_steps:,} steps each -> {folder}"))
+        print(
+            printable(
+                f"{config.method} in blocks {job.blocks}, {config.max_steps:,} steps each{_rounds_of(job)} -> {folder}"
+            )
+        )
         print(chosen)
         if begun is None:
             _begin(folder, config, options, job, division, argv)
@@ -124,7 +145,7 @@ def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequen
     try:
         for line in plan_lines(folder):
             print(line, flush=True)
-        if marker_of(folder, None).is_file():
+        if marker_of(folder, None, None).is_file():
             print(f"all blocks of {folder} are trained and merged")
             return 0
         if options.blocks_profile is None and not has_snakemake():
@@ -155,9 +176,8 @@ def _begun(folder: Path, config: TrainConfig, job: Job) -> Job | None:
         if (folder / "cfg.json").is_file():
             raise PopError(f"{folder}: was begun without blocks; resume it without --blocks, or choose another folder")
         return None
-    found = first_difference(
-        {**config.binding(), **_dividing(job)}, {**read_config(folder).binding(), **_dividing(before)}
-    )
+    theirs = {**read_config(folder).binding(), **_dividing(before)}
+    found = first_difference({**config.binding(), **_dividing(_no_longer(job, before))}, theirs)
     if found:
         name, ours, theirs = found
         raise PopError(
@@ -165,6 +185,31 @@ def _begun(folder: Path, config: TrainConfig, job: Job) -> Job | None:
             "another result folder"
         )
     return before
+
+
+def _no_longer(job: Job, before: Job) -> Job:
+    """Return a job with the rounds of the one before it where it has more: rounds can be added to a run."""
+    if job.rounds <= before.rounds:
+        return job
+    return replace(job, rounds=before.rounds, round_steps=job.round_steps if before.rounds else 0)
+
+
+def _extend(folder: Path, before: Job, job: Job) -> None:
+    """Let a run have more rounds than it was begun with; its merge is then the last one no more."""
+    from pop_fast.blocks.parts import marker_of
+    from pop_fast.blocks.plan import JOB, job_text
+    from pop_fast.io.atomic import write_atomically
+
+    if job.rounds > before.rounds:
+        marker_of(folder, None, None).unlink(missing_ok=True)
+        more = replace(before, rounds=job.rounds, round_steps=job.round_steps)
+        write_atomically(folder / JOB, lambda file: file.write(job_text(more).encode()))
+
+
+def _rounds_of(job: Job) -> str:
+    if job.rounds == 0:
+        return ""
+    return f", then {job.rounds} round{'s' if job.rounds > 1 else ''} of {job.round_steps:,}"
 
 
 def _dividing(job: Job) -> dict[str, Any]:
@@ -228,4 +273,17 @@ def merged_lines(stats: dict[str, Any]) -> list[str]:
         memory = f"{block['memory_bytes'] / 2**30:.2f} GiB"
         counts = (f"{block['num_GS']:,}", f"{block['kept']:,}")
         rows.append([block["name"], *counts, psnr, f"{block['seconds_total']:.0f} s", memory])
+    return [*table_lines(rows), *round_lines(stats.get("rounds", ()))]
+
+
+def round_lines(rounds: Sequence[dict[str, Any]]) -> list[str]:
+    """Lay out what the merged blocks measured after every round, as a table; no lines where there are no rounds."""
+    if not rounds:
+        return []
+    rows = [["merged after", "Gaussians", "PSNR", "SSIM", "time", "memory"]]
+    for found in rounds:
+        measured = ["-", "-"] if found["psnr"] is None else [f"{found['psnr']:.2f} dB", f"{found['ssim']:.4f}"]
+        memory = f"{found['memory_bytes'] / 2**30:.2f} GiB"
+        name = f"round {found['round']}"
+        rows.append([name, f"{found['num_GS']:,}", *measured, f"{found['seconds_total']:.0f} s", memory])
     return table_lines(rows)
