@@ -1,6 +1,7 @@
-"""A capture trained whole, in blocks that are merged, and on in rounds: quality, memory and processor time.
+r"""A capture trained whole, in blocks that are merged, and on in rounds: quality, memory and processor time.
 
-python -m benchmarks.blocks CAPTURE --work FOLDER [--blocks 2x2] [--rounds 3] [--factor 2] [--preset quick] [--threads 1]
+python -m benchmarks.blocks CAPTURE --work FOLDER [--blocks 2x2] [--rounds 3] [--factor 2] [--preset quick] \
+    [--threads 1]
 
 All are `pop train` of the same settings, so that each block takes as many steps as the whole, and all are measured on
 the held-out views of the whole capture. Memory is the peak of each training's process. What was interrupted is resumed
