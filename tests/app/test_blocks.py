@@ -29,7 +29,7 @@ from tests.app.captures import assert_one_line, write_photograph
 from tests.app.conftest import TRAIN, Pop
 from tests.app.interruptions import interrupt
 
-BLOCKS = ("--blocks", "2x1", *TRAIN, "--skip-sizes", "--threads", "1")
+BLOCKS = ("--blocks", "2x1", "--blocks-rounds", "0", *TRAIN, "--skip-sizes", "--threads", "1")
 NAMES = ("0_0", "1_0")
 LAST = "ckpts/ckpt_29_rank0.pt"
 
