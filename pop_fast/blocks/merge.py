@@ -1,7 +1,7 @@
 """Put trained blocks together: of each the Gaussians of its core, and of no other.
 
-After the trainings by themselves, these are the Gaussians whose centre lies in the core. In a round every block corrects
-what its photographs still show as if no other did. Where a view shows two cores both do, and together they would
+After the trainings by themselves, these are the Gaussians whose centre lies in the core. In a round a block corrects
+what its photographs still show as if no other block did. Where a view shows two cores both do, and together they would
 correct it twice: so a merge takes a share (`TAKEN`) of what a round has changed. What the last merge makes is the run's
 result; what another one makes is what the next round starts from.
 """
