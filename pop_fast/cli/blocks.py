@@ -24,12 +24,11 @@ if TYPE_CHECKING:
     from pop_fast.train.load_result import CaptureRecord
 
 _EXAMPLES: Final = """
-    pop blocks train out/city 0_1          train one block, or resume it
-    pop blocks merge out/city --round 0    put the trained blocks together, for the round that follows
-    pop blocks train out/city 0_1 --round 1
-                                           train what the block has in its core, among all others as they are
-    pop blocks merge out/city              the last merge: the result of the run, and the report
-    pop blocks partition out/city          divide the capture again, as the run was begun
+    pop blocks train out/city 0_1            train one block, or resume it
+    pop blocks merge out/city --round 0      put the trained blocks together, for the round that follows
+    pop blocks train out/city 0_1 --round 1  train what the block has in its core, among all others as they are
+    pop blocks merge out/city                the last merge: the result of the run, measured, and its report
+    pop blocks partition out/city            divide the capture again, as the run was begun
 """
 
 

@@ -117,10 +117,12 @@ def test_a_profile_that_is_none_is_refused(pop: Pop, shared_capture, tmp_path):
 @pytest.mark.slow
 def test_the_workflow_trains_and_merges(pop: Pop, shared_capture, begun, tmp_path):
     folder = Path(shutil.copytree(begun, tmp_path / "copy"))
-    trained = pop("train", shared_capture, "--out", folder, *BLOCKS, "--blocks-jobs", "2", "--resume")
+    trained = pop(
+        "train", shared_capture, "--out", folder, *BLOCKS, "--blocks-rounds", "1", "--blocks-jobs", "2", "--resume"
+    )
     assert trained.status == 0, trained.err
     assert (folder / "blocks" / "merged").is_file()
-    assert (folder / "stats" / "val_step0029.json").is_file()
-    again = pop("train", shared_capture, "--out", folder, *BLOCKS, "--resume")
+    assert len(json.loads((folder / "stats" / "val_step0029.json").read_text())["rounds"]) == 2
+    again = pop("train", shared_capture, "--out", folder, *BLOCKS, "--blocks-rounds", "1", "--resume")
     assert again.status == 0
     assert "are trained and merged" in again.out
