@@ -11,7 +11,7 @@ from typing import Any
 
 from pop_fast.blocks.map import write_map
 from pop_fast.blocks.merge import merge
-from pop_fast.blocks.parts import Part, result_of
+from pop_fast.blocks.parts import Part, block_folder, result_of
 from pop_fast.blocks.plan import FOLDER, Job, Plan, make_plan, write_plan
 from pop_fast.data.capture import Capture, Progress
 from pop_fast.data.load import Photographs, list_capture, load_capture
@@ -94,10 +94,9 @@ def round_config(folder: Path, config: TrainConfig, part: Part, steps: int) -> T
     """
     if part.block is None:
         raise ValueError("a merge is no training")
-    result = str(result_of(folder, part.block, part.round))
-    return replace(
-        refining(config_of(folder, config, part.block), steps), result_dir=result, seed=config.seed + part.round
-    )
+    place = block_folder(folder, part.block, part.round)
+    where = {"data": str(place), "result_dir": str(result_of(folder, part.block, part.round))}
+    return replace(refining(config, steps), **where, seed=config.seed + part.round)
 
 
 def _load(

@@ -28,7 +28,7 @@ from pop_fast.train.config import TrainConfig
 from pop_fast.train.model import KEYS
 from pop_ref.constants import profile_named
 
-__all__ = ["Start", "check_merged", "own_of", "read_start", "shown_in", "write_counts"]
+__all__ = ["Start", "check_merged", "own_of", "read_core", "read_start", "shown_in", "write_counts"]
 
 # Gaussians that are projected at a time: some 20 MB
 _AT_A_TIME = 65_536
@@ -76,7 +76,20 @@ def check_merged(folder: Path, number: int) -> list[str]:
     return plan[0].names
 
 
-def read_start(folder: Path, name: str, number: int, config: TrainConfig, views: Sequence[View]) -> Start:
+def read_core(folder: Path, name: str, number: int) -> dict[str, Tensor]:
+    """Read the merged Gaussians of a block's core that a round starts from.
+
+    Args:
+        folder: the run's.
+        name: of the block.
+        number: of the round, from 1.
+    """
+    return load_splats(core_of(folder, name, number - 1))[0]
+
+
+def read_start(
+    folder: Path, name: str, number: int, config: TrainConfig, views: Sequence[View], own: dict[str, Tensor]
+) -> Start:
     """Read what a block starts from in a round.
 
     Args:
@@ -85,16 +98,15 @@ def read_start(folder: Path, name: str, number: int, config: TrainConfig, views:
         number: of the round, from 1.
         config: profile and antialiasing are read.
         views: of the block, to train on and held out.
+        own: the Gaussians of its core.
 
     Raises:
         PopError: the capture is not divided, or the blocks of the round before are not merged.
     """
-    before, names = number - 1, check_merged(folder, number)
-    own, _ = load_splats(core_of(folder, name, before))
     parts, merged = [own], len(own["means"])
-    for other in names:
+    for other in check_merged(folder, number):
         if other != name:
-            params, _ = load_splats(core_of(folder, other, before))
+            params = read_core(folder, other, number)
             merged += len(params["means"])
             shown = shown_in(views, params, config)
             parts.append({key: value[shown] for key, value in params.items()})

@@ -72,7 +72,9 @@ def run(argv: Sequence[str]) -> int:
     part = _part(args, job)
     if part.block is None:
         return _merge(folder, config, record, job, part)
-    return _train_round(folder, config, job, part) if part.round else _train(folder, config, part.block, argv)
+    if part.round:
+        return _train_round(folder, config, record, job, part)
+    return _train(folder, config, part.block, argv)
 
 
 def _part(args: Args, job: Job) -> Part:
@@ -150,11 +152,12 @@ def _options(folder: Path, own: TrainConfig) -> Any:
     return as_begun(place, options)
 
 
-def _train_round(folder: Path, config: TrainConfig, job: Job, part: Part) -> int:
+def _train_round(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job, part: Part) -> int:
     """Train what a block has in its core, in a round from 1, among what its views see of the other cores."""
     from pop_fast.blocks.parts import marker_of
+    from pop_fast.blocks.round_views import write_round_block
     from pop_fast.blocks.run import round_config
-    from pop_fast.blocks.start import check_merged, read_start, write_counts
+    from pop_fast.blocks.start import check_merged, read_core, read_start, write_counts
     from pop_fast.cli.printable import printable
     from pop_fast.cli.result_folder import record_of, resumption, stopped
     from pop_fast.cli.train import check_backend, open_capture, summary
@@ -162,13 +165,15 @@ def _train_round(folder: Path, config: TrainConfig, job: Job, part: Part) -> int
     from pop_fast.train.load_result import RECORD, record_text
 
     assert part.block is not None
-    check_merged(folder, part.round)
+    begun, names = time.perf_counter(), check_merged(folder, part.round)
+    core = read_core(folder, part.block, part.round)
+    write_round_block(folder, config, record, names, part.block, part.round, core["means"].numpy())
     own = round_config(folder, config, part, job.round_steps)
-    options, place, begun = _options(folder, own), Path(own.result_dir), time.perf_counter()
+    options, place = _options(folder, own), Path(own.result_dir)
     own, chosen = choose_backend(own, options.resume)
     check_backend(own)
     capture = open_capture(own, options)
-    start = read_start(folder, part.block, part.round, own, capture.views)
+    start = read_start(folder, part.block, part.round, own, capture.views, core)
     write_counts(folder, part.block, part.round, start)
     seen = len(start.params["means"]) - start.own
     print(printable(f"{part.block}, round {part.round}: {start.own:,} Gaussians, {own.max_steps:,} steps -> {place}"))
