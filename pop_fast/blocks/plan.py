@@ -28,8 +28,9 @@ and of every round r, from 0, that another one follows:
     blocks/round_r/stats.json  what they measure
     blocks/round_r/merged      is there when these are
 
-and of every round from 1 (see `pop_fast.blocks.start`):
+and of every round from 1 (see `pop_fast.blocks.round_views` and `pop_fast.blocks.start`):
 
+    blocks/round_r/i_j/block.json  the views that the block drew (with points.npz, as above)
     blocks/round_r/i_j/start.json  how many Gaussians the block trained, and how many it held fixed
     blocks/round_r/i_j/result/     its training: the first rows are those that it trained
     blocks/round_r/i_j/trained     is there when that is finished

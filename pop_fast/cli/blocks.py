@@ -175,9 +175,11 @@ def _train_round(folder: Path, config: TrainConfig, record: CaptureRecord, job: 
     capture = open_capture(own, options)
     start = read_start(folder, part.block, part.round, own, capture.views, core)
     write_counts(folder, part.block, part.round, start)
-    seen = len(start.params["means"]) - start.own
-    print(printable(f"{part.block}, round {part.round}: {start.own:,} Gaussians, {own.max_steps:,} steps -> {place}"))
-    print(f"{seen:,} of the {start.merged - start.own:,} others are seen by its views, and held fixed")
+    views, seen = len(capture.train_views()), len(start.params["means"]) - start.own
+    print(printable(f"{part.block}, round {part.round}: {views} views, {own.max_steps:,} steps -> {place}"))
+    print(
+        f"{start.own:,} Gaussians are trained; {seen:,} of the {start.merged - start.own:,} others show and are fixed"
+    )
     if start.own > 0:
         from pop_fast.blocks.refine import prepare
 

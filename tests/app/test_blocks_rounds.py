@@ -7,21 +7,24 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from pop_fast.api.registry import get_backend
 from pop_fast.blocks import jobs
 from pop_fast.blocks.merge import TAKEN
-from pop_fast.blocks.parts import parts_of
+from pop_fast.blocks.parts import block_folder, parts_of
 from pop_fast.blocks.plan import Job, read_job, read_plan
+from pop_fast.blocks.round_views import write_round_block
 from pop_fast.cli import main
 from pop_fast.data.load import load_capture
+from pop_fast.data.random_points import in_picture
 from pop_fast.train.checkpoint import load_splats, save_checkpoint
 from pop_fast.train.evaluate import evaluate
-from pop_fast.train.load_result import load_splat
+from pop_fast.train.load_result import CaptureRecord, load_splat, read_record
 from pop_fast.train.model import KEYS
-from pop_fast.train.results import ResultFolder
+from pop_fast.train.results import ResultFolder, read_config
 from pop_fast.train.views import ViewTensors
 from tests.app.conftest import TRAIN, Pop
 from tests.app.interruptions import interrupt
@@ -76,6 +79,10 @@ def merged(folder: Path, number: int) -> dict[str, torch.Tensor]:
     return {key: torch.cat([part[key] for part in parts]) for key in KEYS}
 
 
+def place(folder: Path, number: int, name: str) -> Path:
+    return block_folder(folder, name, number)
+
+
 def same(first: Path, second: Path) -> bool:
     ours, theirs = load_splat(first).params, load_splat(second).params
     return all(torch.equal(ours[key], theirs[key]) for key in KEYS)
@@ -98,6 +105,40 @@ def test_a_block_trains_its_core_and_holds_what_its_views_see_of_the_others(shar
         given = {tuple(row) for row in around["means"].tolist()}
         assert {tuple(row) for row in fixed["means"].tolist()} <= given
         assert (after["means"][:own] != before["means"]).any()
+
+
+def test_a_round_draws_as_many_views_as_the_block_has_from_all_that_show_its_core(shared_rounds):
+    views = {number: {name: load_capture(place(shared_rounds, number, name)) for name in NAMES} for number in range(3)}
+    training = {view.name for view in views[0]["0_0"].train_views()} | {
+        view.name for view in views[0]["1_0"].train_views()
+    }
+    drawn = []
+    for number in (1, 2):
+        for name in NAMES:
+            own, found = views[0][name], views[number][name]
+            assert len(found.train_views()) == len(own.train_views())
+            assert {view.name for view in found.train_views()} <= training
+            assert [view.name for view in found.test_views()] == [view.name for view in own.test_views()]
+            points = core(shared_rounds, number - 1, name)["means"].double().numpy()
+            assert all(in_picture(points, view).any() for view in found.train_views())
+        drawn.append({view.name for view in views[number]["1_0"].train_views()})
+    own_views = {view.name for view in views[0]["1_0"].train_views()}
+    assert len(own_views) == 3
+    assert drawn[0] != drawn[1]
+    assert not drawn[0] | drawn[1] <= own_views
+
+
+def test_views_that_show_nothing_of_a_core_are_not_drawn(shared_rounds, tmp_path):
+    folder = Path(shutil.copytree(shared_rounds, tmp_path / "copy"))
+    config, record = read_config(folder), read_record(folder) or CaptureRecord()
+    every = load_capture(place(folder, 0, "0_0")).train_views()
+    assert len(every) == 7
+    # in the middle of one view's picture, a hair before its lens: out of the others' pictures
+    alone = (every[2].camera_center + 1e-3 * every[2].viewmat[2, :3]).astype(np.float32)[None]
+    showing = {view.name for view in every if in_picture(alone.astype(np.float64), view).any()}
+    assert showing < {view.name for view in every}
+    write_round_block(folder, config, record, list(NAMES), "0_0", 7, alone)
+    assert {view.name for view in load_capture(place(folder, 7, "0_0"), photographs="none").train_views()} == showing
 
 
 def test_the_merge_takes_a_share_of_what_every_block_has_changed(shared_rounds):
