@@ -87,9 +87,7 @@ def read_core(folder: Path, name: str, number: int) -> dict[str, Tensor]:
     return load_splats(core_of(folder, name, number - 1))[0]
 
 
-def read_start(
-    folder: Path, name: str, number: int, config: TrainConfig, views: Sequence[View], own: dict[str, Tensor]
-) -> Start:
+def read_start(folder: Path, name: str, number: int, config: TrainConfig, views: Sequence[View]) -> Start:
     """Read what a block starts from in a round.
 
     Args:
@@ -98,13 +96,13 @@ def read_start(
         number: of the round, from 1.
         config: profile and antialiasing are read.
         views: of the block, to train on and held out.
-        own: the Gaussians of its core.
 
     Raises:
         PopError: the capture is not divided, or the blocks of the round before are not merged.
     """
+    names, own = check_merged(folder, number), read_core(folder, name, number)
     parts, merged = [own], len(own["means"])
-    for other in check_merged(folder, number):
+    for other in names:
         if other != name:
             params = read_core(folder, other, number)
             merged += len(params["means"])

@@ -166,14 +166,14 @@ def _train_round(folder: Path, config: TrainConfig, record: CaptureRecord, job: 
 
     assert part.block is not None
     begun, names = time.perf_counter(), check_merged(folder, part.round)
-    core = read_core(folder, part.block, part.round)
-    write_round_block(folder, config, record, names, part.block, part.round, core["means"].numpy())
+    centers = read_core(folder, part.block, part.round)["means"].numpy()
+    write_round_block(folder, config, record, names, part.block, part.round, centers)
     own = round_config(folder, config, part, job.round_steps)
     options, place = _options(folder, own), Path(own.result_dir)
     own, chosen = choose_backend(own, options.resume)
     check_backend(own)
     capture = open_capture(own, options)
-    start = read_start(folder, part.block, part.round, own, capture.views, core)
+    start = read_start(folder, part.block, part.round, own, capture.views)
     write_counts(folder, part.block, part.round, start)
     views, seen = len(capture.train_views()), len(start.params["means"]) - start.own
     print(printable(f"{part.block}, round {part.round}: {views} views, {own.max_steps:,} steps -> {place}"))
