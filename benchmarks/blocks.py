@@ -6,7 +6,8 @@ python -m benchmarks.blocks CAPTURE --work FOLDER [--blocks 2x2] [--rounds 3] [-
 All are `pop train` of the same settings, so that each block takes as many steps as the whole, and all are measured on
 the held-out views of the whole capture. Memory is the peak of each training's process. What was interrupted is resumed
 when the command is given again, and what is finished is kept; processor times add up in FOLDER. The rounds are added to
-the merged blocks, and so pay for two more merges. Writes benchmarks/results/blocks.json, of which docs/using.md has the
+the merged blocks, and so pay for two more merges. Because they are also more training, the whole is trained on by as
+many steps too, on the Gaussians that it has, as they are. Writes benchmarks/results/blocks.json, of which docs/using.md has the
 table.
 """
 
@@ -19,6 +20,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +58,26 @@ def run(words: Sequence[str], folder: Path, note: Path) -> dict[str, float]:
     return spent
 
 
+def train_on(whole: Path, steps: int, folder: Path) -> dict[str, Any]:
+    """Train the whole on, without density control, as a round trains its blocks, and return what that measures.
+
+    Args:
+        whole: the result folder of its training.
+        steps: how many more.
+        folder: of results; what is there already is read.
+    """
+    from pop_fast.train import TrainingRun
+    from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
+    from pop_fast.train.refining import refining
+
+    if not (folder / "stats").is_dir():
+        splat = load_splat(whole)
+        capture, config = open_capture(splat, CaptureOptions())
+        after = replace(refining(config, steps), result_dir=str(folder), seed=config.seed + 1)
+        TrainingRun(after, capture, initial=splat.params, overwrite=True).run()
+    return stats_of(folder)
+
+
 def stats_of(folder: Path) -> dict[str, Any]:
     """Read the statistics of a run's last step."""
     last = max((folder / "stats").glob("val_step*.json"), key=lambda path: (len(path.name), path.name))
@@ -90,13 +112,17 @@ def main(words: list[str], say: Callable[[str], None] = print) -> int:
         "merged": run([*in_blocks, "0"], blocks, work / "blocks.json"),
         "rounds": run([*in_blocks, args.rounds], blocks, work / "rounds.json"),
     }
-    write(args, whole, blocks, spent)
+    rounds = stats_of(blocks)["rounds"][1:]
+    more = len(rounds) * json.loads((blocks / "blocks" / "job.json").read_text(encoding="utf-8"))["round_steps"]
+    write(args, whole, blocks, spent, train_on(whole, more, work / "longer"))
     say(table(args.out))
     return 0
 
 
-def write(args: argparse.Namespace, whole: Path, blocks: Path, spent: dict[str, dict[str, float]]) -> None:
-    """Write what both runs came to."""
+def write(
+    args: argparse.Namespace, whole: Path, blocks: Path, spent: dict[str, dict[str, float]], longer: dict[str, Any]
+) -> None:
+    """Write what the runs came to."""
     sys.path.insert(0, str(HERE))
     from record import machine, write_json
 
@@ -123,6 +149,7 @@ def write(args: argparse.Namespace, whole: Path, blocks: Path, spent: dict[str, 
         "whole": {**numbers(one), "seconds": one["seconds"], "spent": times["whole"]},
         "merged": {**numbers(found[0]), "merge_gib": merged["memory_bytes_merging"] / GIB, "spent": times["merged"]},
         "blocks": parts,
+        "whole_trained_on": {"steps": longer["step"] + 1, **numbers(longer)},
         "round_steps": job["round_steps"],
         "rounds": [
             {
@@ -150,6 +177,8 @@ def table(path: Path = RESULTS) -> str:
         rows.append([f"block {part['name']}", *counts, *_measured(part, f"{part['held_out_views']} in its core")])
     merging = {**merged, "peak_gib": merged["merge_gib"]}
     rows.append([f"**{found['grid']}, merged**", "", f"{merged['gaussians']:,}", "", *_measured(merging, views)])
+    on = found["whole_trained_on"]
+    rows.insert(1, [f"the whole, {on['steps']} steps more", "all", f"{on['gaussians']:,}", "", *_measured(on, views)])
     for number, each in enumerate(found["rounds"], start=1):
         rows.append([f"**after round {number}**", "", f"{each['gaussians']:,}", "", *_measured(each, views)])
     head = ["", "training views", "Gaussians", "kept", "held-out views", "PSNR", "SSIM", "peak memory"]
