@@ -7,8 +7,8 @@ All are `pop train` of the same settings, so that each block takes as many steps
 the held-out views of the whole capture. Memory is the peak of each training's process. What was interrupted is resumed
 when the command is given again, and what is finished is kept; processor times add up in FOLDER. The rounds are added to
 the merged blocks, and so pay for two more merges. Because they are also more training, the whole is trained on by as
-many steps too, on the Gaussians that it has, as they are. Writes benchmarks/results/blocks.json, of which docs/using.md has the
-table.
+many steps too, on the Gaussians that it has, as they are. Writes benchmarks/results/blocks.json, of which docs/using.md
+has the table.
 """
 
 from __future__ import annotations
