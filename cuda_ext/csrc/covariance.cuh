@@ -62,8 +62,10 @@ POP_HD void covar_from_quat_scale_vjp(Vec4<Real> quat, Vec3<Real> scale, Mat3<Re
     // a turn by t about an axis a takes the unit quaternion u to u + u (0, a) t / 2
     const Vec4<Real> u = unit_quat_from_quat(quat);
     const Real factor = Real(2) / quat_norm(quat);
-    v_quat = {-factor * (u.x * turn_x + u.y * turn_y + u.z * turn_z), factor * (u.w * turn_x + u.y * turn_z - u.z * turn_y),
-              factor * (u.w * turn_y + u.z * turn_x - u.x * turn_z), factor * (u.w * turn_z + u.x * turn_y - u.y * turn_x)};
+    v_quat = {-factor * (u.x * turn_x + u.y * turn_y + u.z * turn_z),
+              factor * (u.w * turn_x + u.y * turn_z - u.z * turn_y),
+              factor * (u.w * turn_y + u.z * turn_x - u.x * turn_z),
+              factor * (u.w * turn_z + u.x * turn_y - u.y * turn_x)};
 }
 
 }  // namespace pop

@@ -81,7 +81,8 @@ template <class Real>
 POP_HD SplatRow<Real> splat_in_front(Vec3<Real> mean_cam, const Mat3<Real>& covar, Real opacity,
                                      const Camera<Real>& camera, const Profile<Real>& profile,
                                      const ProjectOptions<Real>& options) {
-    return splat_on_screen(screen_gaussian(mean_cam, covar, opacity, camera, profile, options), camera, profile, options);
+    const ScreenGaussian<Real> g = screen_gaussian(mean_cam, covar, opacity, camera, profile, options);
+    return splat_on_screen(g, camera, profile, options);
 }
 
 template <class Real>

@@ -66,9 +66,10 @@ template <bool ANTIALIASED>
 #pragma GCC ivdep
   for (int64_t l = 0; l < ROW_BLOCK; l++) {
     const GaussianRow<float> g = rows.gaussian(l);
-    const ScreenGaussian<float> seen = screen_gaussian(mean_cam_from_mean(g.mean, camera),
-                                                       covar_from_quat_scale(g.quat, g.scale), g.opacity, camera, profile,
-                                                       ProjectOptions<float>{ANTIALIASED, 0.0f});
+    const Vec3<float> mean_cam = mean_cam_from_mean(g.mean, camera);
+    const Mat3<float> covar = covar_from_quat_scale(g.quat, g.scale);
+    const ProjectOptions<float> options = {ANTIALIASED, 0.0f};
+    const ScreenGaussian<float> seen = screen_gaussian(mean_cam, covar, g.opacity, camera, profile, options);
     rows.means2d[0][l] = seen.mean2d.x;
     rows.means2d[1][l] = seen.mean2d.y;
     rows.depths[0][l] = seen.depth;
@@ -105,7 +106,8 @@ template <int DEGREE, bool ANTIALIASED>
                                             rows.v_effective[0][l],
                                             0.0f};
     ViewmatVjp<float> unused = {};
-    const GaussianVjp<float> v = project_one_vjp(g, camera, profile, ProjectOptions<float>{ANTIALIASED, 0.0f}, v_splat, v_dir, unused);
+    const ProjectOptions<float> options = {ANTIALIASED, 0.0f};
+    const GaussianVjp<float> v = project_one_vjp(g, camera, profile, options, v_splat, v_dir, unused);
     put_column(v.v_mean, l, rows.v_means);
     rows.v_quats[0][l] = v.v_quat.w;
     rows.v_quats[1][l] = v.v_quat.x;
