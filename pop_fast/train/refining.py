@@ -18,8 +18,6 @@ __all__ = ["at_rest", "refining"]
 
 # what the positions' rate begins at, over its last value
 _MEANS_AGAIN: Final = 10.0
-# a step that no run takes
-_LATER: Final = 2**31 - 1
 # settings of every method that time a change of the Gaussians or of the schedule, and what each is when there is none
 _NEVER: Final[dict[str, Any]] = {
     "refine_stop_iter": 0,
@@ -33,8 +31,8 @@ _NEVER: Final[dict[str, Any]] = {
     "rounds_start_iter": 0,
     "prune_shares": (),
     "reinit_iters": (),
-    "sample_iter": _LATER,
-    "prune_iter": _LATER,
+    "sample_iter": -1,
+    "prune_iter": -1,
     "soft_prune_iters": (),
     "hard_prune_iters": (),
 }

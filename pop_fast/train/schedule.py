@@ -29,10 +29,11 @@ def updates_of(
         scene_scale: the unit of the means' rate, world units.
         max_steps: length of the run, over which the means' rate decays.
         rules: whom Adam moves when; None moves all at every step.
-        edits: steps after which Gaussians are added or removed.
-        restarts: steps after which Adam begins anew.
+        edits: steps after which Gaussians are added or removed; those outside the run are left out.
+        restarts: steps after which Adam begins anew, likewise.
     """
     rules = rules or UpdateRules()
+    edits, restarts = ([step for step in given if 0 <= step < max_steps] for given in (edits, restarts))
     steps = torch.arange(max_steps, dtype=torch.float64)
     base = {**lr.by_parameter(), "means": lr.means * scene_scale}
     rates = torch.tensor([base[name] for name in GROUPS], dtype=torch.float64).repeat(max_steps, 1)
@@ -40,12 +41,12 @@ def updates_of(
     rates[:, GROUPS.index("means")] = base["means"] * lr.means_decay ** _share(steps, max_steps, rules)
     moved = torch.ones((max_steps, len(GROUPS)), dtype=torch.bool)
     if rules.edits_replace_update:
-        moved[[step for step in (*edits, *restarts) if step < max_steps]] = False
+        moved[[*edits, *restarts]] = False
     if rules.opacities_stop_iter >= 0:
         moved[rules.opacities_stop_iter :, GROUPS.index("opacities")] = False
     moved[:, GROUPS.index("shN")] &= (steps + 1) % rules.sh_rest_every == 0
     numbers = moved.cumsum(0)
-    for step in sorted(step for step in restarts if step < max_steps):
+    for step in sorted(restarts):
         numbers[step + 1 :] -= numbers[step].clone()
     return Updates(rates, (numbers * moved).to(torch.int32), rules.sh_rest_every)
 

@@ -100,8 +100,8 @@ class TrainingRun:
             loading_seconds: how long reading the capture took, for the statistics.
             beside: texts to write beside cfg.json, by file name.
             strategy: decides over the Gaussians in the place of the config's, by gsplat's protocol; on the CPU.
-            initial: raw parameters to start from; None makes them from the capture's points. Their precision is that of
-                the training; a GPU trains in float32 only.
+            initial: raw parameters to start from, which are copied; None makes them from the capture's points. Their
+                precision is that of the training; a GPU trains in float32 only.
             engine: takes the steps; None takes the one for `config.backend`.
             ranks: the processes that train together, of which this is one; the first one writes.
             watch: is shown the run between steps, and changes nothing of it; with one, fewer steps are taken at a time.
@@ -139,7 +139,7 @@ class TrainingRun:
         if initial is None:
             initial = initialize_params(capture, config.seed, config.init_opacity, config.init_scale)
         check_start(capture.name, initial)
-        self.params = {key: Parameter(initial[key].contiguous()) for key in KEYS}
+        self.params = {key: Parameter(initial[key].clone(memory_format=torch.contiguous_format)) for key in KEYS}
         dtype = self.params["means"].dtype
         self._train = [ViewTensors.of(view, dtype) for view in capture.train_views(config.test_every)]
         self._test = [ViewTensors.of(view, dtype) for view in capture.test_views(config.test_every)]

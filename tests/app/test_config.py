@@ -25,7 +25,7 @@ from pop_fast.train.schedule import ViewOrder, active_sh_degree, updates_of
 from pop_ref.density import densifies_at
 from pop_ref.optimizer import learning_rates, update_numbers
 from pop_ref.recipes import BASELINES, RECIPES
-from pop_ref.settings import AppearanceRates
+from pop_ref.settings import AppearanceRates, UpdateRules
 
 
 def test_the_defaults_are_the_papers_schedule():
@@ -223,6 +223,14 @@ def test_a_run_moves_whom_the_oracle_moves_when_and_as_far(recipe):
         assert found.rates[step].tolist() == pytest.approx([wanted[name] for name in GROUPS], rel=1e-14)
         numbers = update_numbers(GROUPS, step, short)
         assert found.numbers[step].tolist() == [numbers.get(name, 0) for name in GROUPS]
+
+
+def test_restarts_outside_the_run_change_no_update():
+    rules = UpdateRules(edits_replace_update=True)
+    some = updates_of(LearningRates(), 1.0, 12, rules, [3], [7])
+    more = updates_of(LearningRates(), 1.0, 12, rules, [-1, 3, 40], [-1, 7, 12])
+    assert some.numbers.equal(more.numbers)
+    assert some.numbers[:, 0].tolist() == [1, 2, 3, 0, 4, 5, 6, 0, 1, 2, 3, 4]
 
 
 def test_colour_bands_open_one_every_interval():

@@ -11,6 +11,7 @@ import torch
 
 from cuda_ext.train_settings import Phase
 from pop_fast.api.registry import get_backend
+from pop_fast.data.initialize import initialize_params
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.io.ply import load_ply
@@ -43,7 +44,16 @@ def test_training_brings_renders_nearer_to_the_photographs(tmp_path):
     assert np.mean(psnr[-4:]) > np.mean(psnr[:4]) + 2.0
 
 
-def test_the_population_changes_when_the_schedule_says(finished):
+def test_what_a_run_starts_from_stays_the_callers(tmp_path):
+    given = initialize_params(tiny_capture(), 1)
+    before = {key: value.clone() for key, value in given.items()}
+    run = TrainingRun(tiny_config(tmp_path), tiny_capture(), initial=given)
+    run.take_steps(2)
+    assert all(torch.equal(given[key], before[key]) for key in KEYS)
+    assert not torch.equal(run.params["means"], before["means"])
+
+
+def test_the_number_of_gaussians_changes_when_the_schedule_says(finished):
     trainer, _, folder = finished
     events = [record for record in records(folder) if "cloned" in record]
     changes = [record["step"] for record in events if not record.get("reset") or record["step"] % 4 == 0]
