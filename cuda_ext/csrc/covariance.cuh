@@ -47,16 +47,23 @@ POP_HD Mat3<Real> covar_from_quat_scale(Vec4<Real> quat, Vec3<Real> scale) {
     return times(M, transposed(M));
 }
 
+// In the Gaussian's own axes: with S' = R^T (v_covar + v_covar^T) R the gradient with respect to a turn about axis x is
+// S'_yz (s_y^2 - s_z^2). Taken by way of R, terms of the size of s^2 would cancel to that, and for round Gaussians to
+// nothing but rounding.
 template <class Real>
 POP_HD void covar_from_quat_scale_vjp(Vec4<Real> quat, Vec3<Real> scale, Mat3<Real> v_covar, Vec4<Real>& v_quat,
                                       Vec3<Real>& v_scale) {
     const Mat3<Real> R = rotmat_from_quat(quat);
-    const Mat3<Real> v_M = times(sum(v_covar, transposed(v_covar)), columns_scaled(R, scale));
-    const Mat3<Real> v_R = columns_scaled(v_M, scale);
-    v_scale.x = R.m[0][0] * v_M.m[0][0] + R.m[1][0] * v_M.m[1][0] + R.m[2][0] * v_M.m[2][0];
-    v_scale.y = R.m[0][1] * v_M.m[0][1] + R.m[1][1] * v_M.m[1][1] + R.m[2][1] * v_M.m[2][1];
-    v_scale.z = R.m[0][2] * v_M.m[0][2] + R.m[1][2] * v_M.m[1][2] + R.m[2][2] * v_M.m[2][2];
-    v_quat = rotmat_from_quat_vjp(quat, v_R);
+    const Mat3<Real> own = times(transposed(R), times(sum(v_covar, transposed(v_covar)), R));
+    v_scale = {own.m[0][0] * scale.x, own.m[1][1] * scale.y, own.m[2][2] * scale.z};
+    const Real turn_x = own.m[1][2] * ((scale.y - scale.z) * (scale.y + scale.z));
+    const Real turn_y = own.m[0][2] * ((scale.z - scale.x) * (scale.z + scale.x));
+    const Real turn_z = own.m[0][1] * ((scale.x - scale.y) * (scale.x + scale.y));
+    // a turn by t about an axis a takes the unit quaternion u to u + u (0, a) t / 2
+    const Vec4<Real> u = unit_quat_from_quat(quat);
+    const Real factor = Real(2) / quat_norm(quat);
+    v_quat = {-factor * (u.x * turn_x + u.y * turn_y + u.z * turn_z), factor * (u.w * turn_x + u.y * turn_z - u.z * turn_y),
+              factor * (u.w * turn_y + u.z * turn_x - u.x * turn_z), factor * (u.w * turn_z + u.x * turn_y - u.y * turn_x)};
 }
 
 }  // namespace pop

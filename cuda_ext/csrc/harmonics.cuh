@@ -115,30 +115,47 @@ POP_HD Vec3<Real> unclamped_color(const Row& sh, const Real basis[MAX_BASIS], in
 
 // B2: clamped at 0
 template <class Real, class Row>
-POP_HD Vec3<Real> color_from_sh(const Row& sh, Vec3<Real> dir, int degree) {
-    Real basis[MAX_BASIS];
-    basis_one(unit_dir(dir), degree, basis);
-    const Vec3<Real> unclamped = unclamped_color(sh, basis, (degree + 1) * (degree + 1));
+POP_HD Vec3<Real> color_from_basis(const Row& sh, const Real basis[MAX_BASIS], int n_sh) {
+    const Vec3<Real> unclamped = unclamped_color(sh, basis, n_sh);
     return {max_of(unclamped.x, Real(0)), max_of(unclamped.y, Real(0)), max_of(unclamped.z, Real(0))};
 }
 
-// basis and v_sum are left to the caller: v_sh_k = basis_k v_sum is an outer product that need not be stored
 template <class Real, class Row>
-POP_HD Vec3<Real> color_from_sh_vjp(const Row& sh, Vec3<Real> dir, int degree, Vec3<Real> v_color,
-                                    Real basis[MAX_BASIS], Vec3<Real>& v_sum) {
-    const Vec3<Real> u = unit_dir(dir);
-    const int n_sh = (degree + 1) * (degree + 1);
-    basis_one(u, degree, basis);
+POP_HD Vec3<Real> color_from_sh(const Row& sh, Vec3<Real> dir, int degree) {
+    Real basis[MAX_BASIS];
+    basis_one(unit_dir(dir), degree, basis);
+    return color_from_basis(sh, basis, (degree + 1) * (degree + 1));
+}
+
+// v_sum is left to the caller: v_sh_k = basis_k v_sum is an outer product that need not be stored
+template <class Real, class Row>
+POP_HD void color_from_basis_vjp(const Row& sh, const Real basis[MAX_BASIS], int n_sh, Vec3<Real> v_color,
+                                 Vec3<Real>& v_sum, Real v_basis[MAX_BASIS]) {
     const Vec3<Real> unclamped = unclamped_color(sh, basis, n_sh);
     // B2: a channel under 0 passes nothing; at exactly 0 the derivative from above is used
     v_sum = {unclamped.x >= Real(0) ? v_color.x : Real(0), unclamped.y >= Real(0) ? v_color.y : Real(0),
              unclamped.z >= Real(0) ? v_color.z : Real(0)};
-    Real v_basis[MAX_BASIS];
     POP_UNROLL
     for (int k = 0; k < MAX_BASIS; ++k) v_basis[k] = k < n_sh ? dot(sh.at(k), v_sum) : Real(0);
+}
+
+// the transpose of basis_one(unit_dir(dir)), of which u is the direction
+template <class Real>
+POP_HD Vec3<Real> basis_of_dir_vjp(Vec3<Real> dir, Vec3<Real> u, int degree, const Real v_basis[MAX_BASIS]) {
     const Vec3<Real> v_u = basis_one_vjp(u, degree, v_basis);
     const Real along = dot(u, v_u), norm = dir_norm(dir);
     return {(v_u.x - u.x * along) / norm, (v_u.y - u.y * along) / norm, (v_u.z - u.z * along) / norm};
+}
+
+// basis and v_sum are left to the caller, as above
+template <class Real, class Row>
+POP_HD Vec3<Real> color_from_sh_vjp(const Row& sh, Vec3<Real> dir, int degree, Vec3<Real> v_color,
+                                    Real basis[MAX_BASIS], Vec3<Real>& v_sum) {
+    const Vec3<Real> u = unit_dir(dir);
+    Real v_basis[MAX_BASIS];
+    basis_one(u, degree, basis);
+    color_from_basis_vjp(sh, basis, (degree + 1) * (degree + 1), v_color, v_sum, v_basis);
+    return basis_of_dir_vjp(dir, u, degree, v_basis);
 }
 
 }  // namespace pop

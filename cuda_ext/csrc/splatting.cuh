@@ -47,20 +47,41 @@ POP_HD SplatRow<Real> culled(Real depth) {
     return {{zero, zero}, depth, {zero, zero, zero}, zero, {0, 0}};
 }
 
+// A Gaussian on the screen, before its extent tells whether any pixel sees it.
+template <class Real>
+struct ScreenGaussian {
+    Vec2<Real> mean2d;
+    Real depth;
+    Mat2<Real> covar2d;  // after the low-pass
+    Real opacity;        // effective
+};
+
+// For a Gaussian in front of the camera (D1).
+template <class Real>
+POP_HD ScreenGaussian<Real> screen_gaussian(Vec3<Real> mean_cam, const Mat3<Real>& covar, Real opacity,
+                                            const Camera<Real>& camera, const Profile<Real>& profile,
+                                            const ProjectOptions<Real>& options) {
+    const Mat3<Real> covar_cam = covar_cam_from_covar(covar, camera);
+    const Mat2<Real> covar2d = project_covar(covar_cam, projection_jacobian(mean_cam, camera, profile));
+    const Real effective_opacity = options.antialiased ? opacity * compensation(covar2d, profile.eps2d) : opacity;
+    return {project_mean(mean_cam, camera), mean_cam.z, low_pass(covar2d, profile.eps2d), effective_opacity};
+}
+
+template <class Real>
+POP_HD SplatRow<Real> splat_on_screen(const ScreenGaussian<Real>& g, const Camera<Real>& camera,
+                                      const Profile<Real>& profile, const ProjectOptions<Real>& options) {
+    const Radii radii = radii_from_covar2d(g.covar2d, g.opacity, profile);
+    const bool clipped = Real(radii.x) <= options.radius_clip && Real(radii.y) <= options.radius_clip;
+    if (clipped || !on_screen(g.mean2d, radii, camera.width, camera.height, profile)) return culled(g.depth);  // D2
+    return {g.mean2d, g.depth, conic_from_covar2d(g.covar2d), g.opacity, radii};
+}
+
 // For a Gaussian in front of the camera (D1).
 template <class Real>
 POP_HD SplatRow<Real> splat_in_front(Vec3<Real> mean_cam, const Mat3<Real>& covar, Real opacity,
                                      const Camera<Real>& camera, const Profile<Real>& profile,
                                      const ProjectOptions<Real>& options) {
-    const Mat3<Real> covar_cam = covar_cam_from_covar(covar, camera);
-    const Mat2<Real> covar2d = project_covar(covar_cam, projection_jacobian(mean_cam, camera, profile));
-    const Mat2<Real> blurred = low_pass(covar2d, profile.eps2d);
-    const Real effective_opacity = options.antialiased ? opacity * compensation(covar2d, profile.eps2d) : opacity;
-    const Vec2<Real> mean2d = project_mean(mean_cam, camera);
-    const Radii radii = radii_from_covar2d(blurred, effective_opacity, profile);
-    const bool clipped = Real(radii.x) <= options.radius_clip && Real(radii.y) <= options.radius_clip;
-    if (clipped || !on_screen(mean2d, radii, camera.width, camera.height, profile)) return culled(mean_cam.z);  // D2
-    return {mean2d, mean_cam.z, conic_from_covar2d(blurred), effective_opacity, radii};
+    return splat_on_screen(screen_gaussian(mean_cam, covar, opacity, camera, profile, options), camera, profile, options);
 }
 
 template <class Real>

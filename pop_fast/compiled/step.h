@@ -22,6 +22,7 @@
 #include "cuda_ext/csrc/splatting.cuh"
 #include "forward.h"
 #include "pool.h"
+#include "row_block.h"
 #include "ssim.h"
 
 namespace pop {
@@ -70,7 +71,7 @@ struct Seen {
 
 constexpr int COLUMNS = 9;          // of an entry's row: six moments, colours
 constexpr int64_t ROWS = 256;       // Gaussians in a part
-constexpr int64_t ROW_BLOCK = 64;   // whose gradients are held at once
+static_assert(ROWS % ROW_BLOCK == 0);
 constexpr int SHORT = 14;           // floats of a row besides the bands beyond the first
 
 inline int64_t parts_of(int64_t n, int64_t part) { return (n + part - 1) / part; }
@@ -81,6 +82,7 @@ struct Worker {
   Transpose<float> transpose;
   Products<float> products;
   Blur<float> blur;
+  RowBlock block = {};
   std::vector<float> gradients;  // of ROW_BLOCK Gaussians, parameter by parameter
   Worker(const Pixels<float> &pixels, int64_t stride, int64_t n_rest)
       : canvas(pixels, 3), transpose(pixels, 3), products(stride), blur(stride),
@@ -119,6 +121,12 @@ struct StepCounts {
   int64_t pairs;    // of a walked entry and a pixel of a strip in which some pixel had not stopped
   int64_t marked;   // of a walked entry and such a strip which it may reach by its parabola: blended
   int64_t reached;  // of these, those where it changed a pixel: transposed
+};
+
+// What has come of a part's Gaussians so far.
+struct Part {
+  uint64_t *keys;                       // of the visible ones
+  int64_t visible = 0, slot = 0, bad = -1;  // slots given out; the first row that is not finite, or -1
 };
 
 class Stepper : public Plan {
@@ -168,8 +176,9 @@ private:
   void begin();
   void make_workers();
   Work see();
-  template <int DEGREE> void see_rows(int64_t first, int64_t last);
-  template <int DEGREE> bool see_row(int64_t i, Seen &to);
+  template <int DEGREE> void see_rows(Worker &own, int64_t first, int64_t last);
+  template <int DEGREE> void see_block(RowBlock &block, int64_t first, int64_t last, Part &part);
+  template <int DEGREE> bool see_row(const RowBlock &block, int64_t i, int64_t l, Seen &to);
   void reach_tiles(Seen &of) const;
   template <class F> void each_tile(const Seen &of, F f) const;
   bool all_finite() const;
@@ -190,7 +199,8 @@ private:
   Work update();
   float *gradients_of(Worker &own, StepGroup group) const;
   template <int DEGREE> void update_block(Worker &own, int64_t first, int64_t last, double *pop_sum);
-  template <int DEGREE> void gradient_of_row(int64_t i, int64_t row, Worker &own);
+  template <int DEGREE> void transpose_block(Worker &own, int64_t first, int64_t last);
+  template <int DEGREE> Vec3<float> transpose_entries(int64_t i, int64_t l, RowBlock &block);
   void add_up_rest(const float *gradient, int64_t first, int64_t n);
   void adam(StepGroup group, const float *gradient, int64_t first, int64_t n);
   void finish();

@@ -37,7 +37,9 @@ Work Stepper::see() {
   keys.get(given->n);
   Work work = {given->n, ROWS, {}};
   with_degree(given->degree, [&](auto degree) {
-    work.f = [this](int, int64_t first, int64_t last) { see_rows<decltype(degree)::value>(first, last); };
+    work.f = [this](int thread, int64_t first, int64_t last) {
+      see_rows<decltype(degree)::value>(*workers[size_t(thread)], first, last);
+    };
   });
   return work;
 }
@@ -52,35 +54,45 @@ bool Stepper::all_finite() const {
 }
 
 // The visible ones' keys begin where the part's Gaussians do.
-template <int DEGREE> void Stepper::see_rows(int64_t first, int64_t last) {
+template <int DEGREE> void Stepper::see_rows(Worker &own, int64_t first, int64_t last) {
+  Part part = {keys.get(given->n) + first};
+  for (int64_t block = first; block < last; block += ROW_BLOCK)
+    see_block<DEGREE>(own.block, block, std::min(last, block + ROW_BLOCK), part);
+  part_visible[first / ROWS] = part.bad < 0 ? part.visible : -part.bad - 1;
+  part_slots[first / ROWS] = part.slot;
+}
+
+template <int DEGREE> void Stepper::see_block(RowBlock &block, int64_t first, int64_t last, Part &part) {
   Seen *const all = seen.get(given->n);
   int32_t *const count = counts.get(given->n);
-  uint64_t *const key = keys.get(given->n) + first;
-  int64_t visible = 0, slot = 0, bad = -1;
+  for (int64_t i = first; i < last; i++) {
+    if (part.bad < 0 && !finite_row(*given, i)) part.bad = i;
+    load_row(*given, i, i - first, block);
+  }
+  // the step ends with this part
+  if (part.bad >= 0) return;
+  if (options.antialiased) project_rows<true>(block, camera, profile);
+  else project_rows<false>(block, camera, profile);
+  basis_rows<DEGREE>(block, camera);
   for (int64_t i = first; i < last; i++) {
     Seen &row = all[i];
     row.n = -1;
     count[i] = 0;
-    if (!finite_row(*given, i)) {
-      if (bad < 0) bad = i;
-      continue;
-    }
-    if (!see_row<DEGREE>(i, row)) continue;
-    row.first = int32_t(slot);
-    slot += row.n;
-    if (row.n > 0) key[visible++] = uint64_t(ordered_bits(row.depth)) << 32 | uint64_t(i);
+    if (!see_row<DEGREE>(block, i, i - first, row)) continue;
+    row.first = int32_t(part.slot);
+    part.slot += row.n;
+    if (row.n > 0) part.keys[part.visible++] = uint64_t(ordered_bits(row.depth)) << 32 | uint64_t(i);
   }
-  part_visible[first / ROWS] = bad < 0 ? visible : -bad - 1;
-  part_slots[first / ROWS] = slot;
 }
 
-template <int DEGREE> [[gnu::flatten]] bool Stepper::see_row(int64_t i, Seen &to) {
-  const GaussianRow<float> g = gaussian_of(*given, i);
-  const SplatRow<float> splat = project_one(g, camera, profile, options);
+template <int DEGREE> [[gnu::flatten]] bool Stepper::see_row(const RowBlock &block, int64_t i, int64_t l, Seen &to) {
+  if (!in_front(block.depths[0][l], profile)) return false;
+  const SplatRow<float> splat = splat_on_screen(block.on_screen(l), camera, profile, options);
   if (splat.radii.x <= 0) return false;
   const float mean2d[2] = {splat.mean2d.x, splat.mean2d.y}, conic[3] = {splat.conic.xx, splat.conic.xy, splat.conic.yy};
-  float color[3];
-  put(color, color_from_sh(harmonics_of(*given, i), view_dir(g.mean, camera), DEGREE));
+  float color[3], basis[MAX_BASIS];
+  take_column(block.basis, l, basis);
+  put(color, color_from_basis(harmonics_of(*given, i), basis, (DEGREE + 1) * (DEGREE + 1)));
   blend.splats[i] = splat_of(mean2d, conic, splat.opacity, color, 3);
   const TileGrid grid = grid_of(int(given->width), int(given->height), STEP_TILE, STEP_TILE);
   const TileRect rect = tile_rect(splat.mean2d, splat.radii, grid, profile);

@@ -25,6 +25,14 @@ inline GaussianRow<float> gaussian_of(const StepGiven &given, int64_t i) {
           opacity_from_logit(given.params[OPACITIES][i])};
 }
 
+inline void load_row(const StepGiven &given, int64_t i, int64_t l, RowBlock &to) {
+  const GaussianRow<float> g = gaussian_of(given, i);
+  put_column(g.mean, l, to.means);
+  put_column<4>({g.quat.w, g.quat.x, g.quat.y, g.quat.z}, l, to.quats);
+  put_column(g.scale, l, to.scales);
+  to.opacities[0][l] = g.opacity;
+}
+
 inline ShRow<float> harmonics_of(const StepGiven &given, int64_t i) {
   return {given.params[SH0] + 3 * i, given.params[SHN] + 3 * given.n_rest * i};
 }

@@ -59,8 +59,8 @@ template <int DEGREE> void Stepper::update_block(Worker &own, int64_t first, int
   const StepGiven &g = *given;
   std::fill(own.gradients.begin(), own.gradients.end(), 0.0f);
   float *const v_logits = gradients_of(own, OPACITIES);
+  transpose_block<DEGREE>(own, first, last);
   for (int64_t i = first; i < last; i++) {
-    if (seen[i].n >= 0) gradient_of_row<DEGREE>(i, i - first, own);
     if (blend.dominant_counts) {
       const int32_t count = blend.dominant_counts[i];
       if (g.lambda_pop != 0.0) {
@@ -87,7 +87,39 @@ template <int DEGREE> void Stepper::update_block(Worker &own, int64_t first, int
   for (int64_t i = first; i < last && active > 0; i++) adam(SHN, gradients_of(own, SHN) + row * (i - first), row * i, active);
 }
 
-template <int DEGREE> [[gnu::flatten]] void Stepper::gradient_of_row(int64_t i, int64_t row, Worker &own) {
+template <int DEGREE> void Stepper::transpose_block(Worker &own, int64_t first, int64_t last) {
+  const StepGiven &g = *given;
+  RowBlock &block = own.block;
+  Vec3<float> v_sums[ROW_BLOCK];
+  for (int64_t i = first; i < last; i++)
+    if (seen[i].n >= 0) load_row(g, i, i - first, block);
+  basis_rows<DEGREE>(block, camera);
+  for (int64_t i = first; i < last; i++)
+    if (seen[i].n >= 0) v_sums[i - first] = transpose_entries<DEGREE>(i, i - first, block);
+  if (options.antialiased) project_rows_vjp<DEGREE, true>(block, camera, profile);
+  else project_rows_vjp<DEGREE, false>(block, camera, profile);
+  for (int64_t i = first; i < last; i++) {
+    if (seen[i].n < 0) continue;
+    const int64_t l = i - first;
+    const Vec3<float> v_sum = v_sums[l];
+    for (int k = 0; k < 3; k++) {
+      gradients_of(own, MEANS)[3 * l + k] = block.v_means[k][l];
+      gradients_of(own, SCALES)[3 * l + k] = block.scales[k][l] * block.v_scales[k][l];
+    }
+    for (int k = 0; k < 4; k++) gradients_of(own, QUATS)[4 * l + k] = block.v_quats[k][l];
+    gradients_of(own, OPACITIES)[l] = opacity_from_logit_vjp(g.params[OPACITIES][i], block.v_opacities[0][l]);
+    const auto put_band = [&](float *to, int k) {
+      const float basis = block.basis[k][l];
+      put(to, {basis * v_sum.x, basis * v_sum.y, basis * v_sum.z});
+    };
+    put_band(gradients_of(own, SH0) + 3 * l, 0);
+    float *const v_rest = gradients_of(own, SHN) + 3 * g.n_rest * l;
+    for (int k = 1; k < (DEGREE + 1) * (DEGREE + 1); k++) put_band(v_rest + 3 * (k - 1), k);
+  }
+}
+
+// Add up a Gaussian's entries: what its splat's and basis's gradients are; return that of the colour before the clamp.
+template <int DEGREE> [[gnu::flatten]] Vec3<float> Stepper::transpose_entries(int64_t i, int64_t l, RowBlock &block) {
   const StepGiven &g = *given;
   const Seen &of = seen[i];
   double sums[COLUMNS] = {};
@@ -95,37 +127,22 @@ template <int DEGREE> [[gnu::flatten]] void Stepper::gradient_of_row(int64_t i, 
   for (int32_t k = 0; k < of.n; k++, entry += COLUMNS)
     for (int j = 0; j < COLUMNS; j++) sums[j] += double(entry[j]);
   const double a = of.a, b = of.b, c = of.c;
-  const SplatCotangents<float> v_splat = {
-      {float(-(a * sums[1] + b * sums[2])), float(-(b * sums[1] + c * sums[2]))},
-      0.0f,
-      {float(-0.5 * sums[3]), float(-sums[4]), float(-0.5 * sums[5])},
-      of.opacity == 0.0f ? 0.0f : float(sums[0] / double(of.opacity)),
-      0.0f};
+  const Vec2<float> v_mean2d = {float(-(a * sums[1] + b * sums[2])), float(-(b * sums[1] + c * sums[2]))};
+  block.v_means2d[0][l] = v_mean2d.x;
+  block.v_means2d[1][l] = v_mean2d.y;
+  put_column({float(-0.5 * sums[3]), float(-sums[4]), float(-0.5 * sums[5])}, l, block.v_conics);
+  block.v_effective[0][l] = of.opacity == 0.0f ? 0.0f : float(sums[0] / double(of.opacity));
   if (g.grad_sum) {
-    g.grad_sum[i] += densification_gradient(v_splat.v_mean2d, int(g.width), int(g.height));
+    g.grad_sum[i] += densification_gradient(v_mean2d, int(g.width), int(g.height));
     g.n_visible[i]++;
   }
-  const GaussianRow<float> gaussian = gaussian_of(g, i);
-  float basis[MAX_BASIS];
+  float basis[MAX_BASIS], v_basis[MAX_BASIS];
   Vec3<float> v_sum;
+  take_column(block.basis, l, basis);
   const Vec3<float> v_color = {float(sums[6]), float(sums[7]), float(sums[8])};
-  const Vec3<float> v_dir = color_from_sh_vjp(harmonics_of(g, i), view_dir(gaussian.mean, camera), DEGREE,
-                                              v_color, basis, v_sum);
-  ViewmatVjp<float> unused = {};
-  const GaussianVjp<float> v = project_one_vjp(gaussian, camera, profile, options, v_splat, v_dir, unused);
-  put(gradients_of(own, MEANS) + 3 * row, v.v_mean);
-  put(gradients_of(own, SCALES) + 3 * row,
-      {gaussian.scale.x * v.v_scale.x, gaussian.scale.y * v.v_scale.y, gaussian.scale.z * v.v_scale.z});
-  float *const v_quat = gradients_of(own, QUATS) + 4 * row;
-  v_quat[0] = v.v_quat.w;
-  v_quat[1] = v.v_quat.x;
-  v_quat[2] = v.v_quat.y;
-  v_quat[3] = v.v_quat.z;
-  gradients_of(own, OPACITIES)[row] = opacity_from_logit_vjp(g.params[OPACITIES][i], v.v_opacity);
-  put(gradients_of(own, SH0) + 3 * row, {basis[0] * v_sum.x, basis[0] * v_sum.y, basis[0] * v_sum.z});
-  float *const v_rest = gradients_of(own, SHN) + 3 * g.n_rest * row;
-  for (int64_t k = 0; k < (DEGREE + 1) * (DEGREE + 1) - 1; k++)
-    put(v_rest + 3 * k, {basis[k + 1] * v_sum.x, basis[k + 1] * v_sum.y, basis[k + 1] * v_sum.z});
+  color_from_basis_vjp(harmonics_of(g, i), basis, (DEGREE + 1) * (DEGREE + 1), v_color, v_sum, v_basis);
+  put_column(v_basis, l, block.v_basis);
+  return v_sum;
 }
 
 // Gradients of the bands beyond the first join those that wait; with an update due all are spent.

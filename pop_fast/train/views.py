@@ -108,34 +108,48 @@ def render_view(
         absgrad: so will the gradient of the screen centres summed of absolute values.
         background: colour behind everything in the place of the config's. [3]
     """
+    given = rasterization_arguments(params, view, config, sh_degree, background)
+    colors, _, info = backend.rasterization(**given, absgrad=absgrad, dominance=dominance, counts=counts)
+    opacities = given["opacities"]
+    if dominance and view.mask is not None:
+        info["dominant_counts"] = _counts_inside(info["dominant_ids"], view.mask, len(opacities))
+        info["kept_pixels"] = view.kept_pixels
+    return Rendered(colors[0], opacities, info)
+
+
+def rasterization_arguments(
+    params: Mapping[str, Tensor],
+    view: ViewTensors,
+    config: TrainConfig,
+    sh_degree: int,
+    background: Tensor | None = None,
+) -> dict[str, Any]:
+    """Return what `rasterization()` is given for a view of raw parameters.
+
+    Args:
+        params, view, config, sh_degree, background: as of `render_view`.
+    """
     opacities = opacities_from_logits(params["opacities"])
     bands = (sh_degree + 1) ** 2
     sh = params["sh0"] if bands == 1 else torch.cat([params["sh0"], params["shN"][:, : bands - 1]], dim=1)
     if background is None and any(config.background):
         background = torch.tensor(config.background)
-    colors, _, info = backend.rasterization(
-        means=params["means"],
-        quats=params["quats"],
-        scales=scales_from_log_scales(params["scales"]),
-        opacities=opacities,
-        colors=sh,
-        viewmats=view.viewmat,
-        Ks=view.K,
-        width=view.width,
-        height=view.height,
-        sh_degree=sh_degree,
-        packed=False,
-        backgrounds=None if background is None else background.to(opacities)[None],
-        absgrad=absgrad,
-        rasterize_mode="antialiased" if config.antialiased else "classic",
-        profile=config.profile,
-        dominance=dominance,
-        counts=counts,
-    )
-    if dominance and view.mask is not None:
-        info["dominant_counts"] = _counts_inside(info["dominant_ids"], view.mask, len(opacities))
-        info["kept_pixels"] = view.kept_pixels
-    return Rendered(colors[0], opacities, info)
+    return {
+        "means": params["means"],
+        "quats": params["quats"],
+        "scales": scales_from_log_scales(params["scales"]),
+        "opacities": opacities,
+        "colors": sh,
+        "viewmats": view.viewmat,
+        "Ks": view.K,
+        "width": view.width,
+        "height": view.height,
+        "sh_degree": sh_degree,
+        "packed": False,
+        "backgrounds": None if background is None else background.to(opacities)[None],
+        "rasterize_mode": "antialiased" if config.antialiased else "classic",
+        "profile": config.profile,
+    }
 
 
 def _counts_inside(dominant_ids: Tensor, mask: Tensor, n: int) -> Tensor:

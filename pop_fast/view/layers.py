@@ -10,9 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pop_fast.stages.activations import opacities_from_logits, scales_from_log_scales
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.views import ViewTensors
+from pop_fast.train.views import ViewTensors, rasterization_arguments
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,27 +50,8 @@ def render_layers(
         sh_degree: highest active colour band.
         dominance: also find the dominant Gaussians.
     """
-    opacities = opacities_from_logits(params["opacities"])
-    sh = torch.cat([params["sh0"], params["shN"]], dim=1)[:, : (sh_degree + 1) ** 2]
-    background = torch.tensor([config.background]).to(opacities) if any(config.background) else None
-    drawn, alphas, info = backend.rasterization(
-        means=params["means"],
-        quats=params["quats"],
-        scales=scales_from_log_scales(params["scales"]),
-        opacities=opacities,
-        colors=sh,
-        viewmats=view.viewmat,
-        Ks=view.K,
-        width=view.width,
-        height=view.height,
-        sh_degree=sh_degree,
-        packed=False,
-        backgrounds=background,
-        render_mode="RGB+ED",
-        rasterize_mode="antialiased" if config.antialiased else "classic",
-        profile=config.profile,
-        dominance=dominance,
-    )
+    given = rasterization_arguments(params, view, config, sh_degree)
+    drawn, alphas, info = backend.rasterization(**given, render_mode="RGB+ED", dominance=dominance)
     found = drawn[0].cpu().numpy()
     ids = info["dominant_ids"][0].cpu().numpy() if dominance else None
     return Layers(found[..., :3], alphas[0, ..., 0].cpu().numpy(), found[..., 3], ids)

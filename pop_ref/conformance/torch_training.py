@@ -243,9 +243,10 @@ class Trainer:
         return self._rows(params, optimizers)
 
     def _strategy(self, config: DensityConfig) -> Any:
-        """Return the trainer's strategy under these settings."""
-        shared = {f.name for f in fields(self._Strategy)} & {f.name for f in fields(DensityConfig)}
-        return self._Strategy(**{name: getattr(config, name) for name in shared})
+        """Return the trainer's strategy under these settings, without a prior: there is no loss to add it to."""
+        names = {f.name for f in fields(self._Strategy)}
+        shared = {name: getattr(config, name) for name in names & {f.name for f in fields(DensityConfig)}}
+        return self._Strategy(**shared, **({"lambda_pop": 0.0} if "lambda_pop" in names else {}))
 
     def _state(self, strategy: Any, statistics: Statistics, scene_scale: float) -> dict[str, Any]:
         """Return the strategy's state with these statistics."""
