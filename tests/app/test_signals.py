@@ -41,7 +41,9 @@ def start(tmp_path: Path, *words: object) -> subprocess.Popen[str]:
     scratch = tmp_path / "scratch"
     scratch.mkdir()
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(scratch), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", _POP, *map(str, words)]
+    # whoever runs the tests without a terminal may have hangups ignored, which children inherit
+    heeding = "import signal; signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
+    command = [sys.executable, "-c", heeding + _POP, *map(str, words)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     return subprocess.Popen(command, env=environment, text=True, cwd=ROOT, **pipes)
 

@@ -70,7 +70,7 @@ def test_a_chapter_runs_and_holds_what_a_chapter_must(path: Path) -> None:
     assert set(chapter.tiers) == set(TIERS if chapter.number != "0" else TIERS[:2])
     assert chapter.tiers.count("find the bug") == (chapter.number != "0")
     assert 10 <= chapter.minutes <= 60
-    assert 1 <= sum(len(outcome.pictures) for outcome in outcomes) <= 6
+    assert 1 <= sum(len(outcome.pictures) for outcome in outcomes) <= 7
     assert sum(len(outcome.printed.splitlines()) for outcome in outcomes) <= 130
     told = [cell.text for cell in chapter.cells if cell.kind == "prose"]
     assert any("eq." in text or "algorithm" in text or "section" in text for text in told), "no formula has a source"
