@@ -161,6 +161,35 @@ def background_at(step: int, seed: int) -> Float64[np.ndarray, "3"]:
     return np.array([(word >> 11) * 2.0**-53 for word in words])
 
 
+def over_background(
+    photo: Float64[np.ndarray, "H W 3"],
+    alpha: Float64[np.ndarray, "H W"],
+    was: Float64[np.ndarray, "3"],
+    now: Float64[np.ndarray, "3"],
+) -> Float64[np.ndarray, "H W 3"]:
+    """Lay a photograph with transparency over another background: `I + (1 - alpha) (now - was)`.
+
+    Where a render's background changes from step to step, so must that of the photographs that it is compared with.
+
+    Source: Porter and Duff 1984, the operator "over": I = alpha c + (1 - alpha) was.
+    Departs: nothing; the colour c is not asked for, which is unknown where alpha is 0.
+
+    Args:
+        photo: laid over `was`.
+        alpha: its opacity, in [0, 1].
+        was: the background that it lies over.
+        now: the one that it is to lie over.
+
+    Returns:
+        alpha c + (1 - alpha) now.
+
+    Example:
+        >>> over_background(np.full((1, 1, 3), 0.5), np.array([[0.75]]), np.zeros(3), np.array([1.0, 0.5, 0.0]))
+        array([[[0.75 , 0.625, 0.5  ]]])
+    """
+    return photo + (1.0 - alpha)[:, :, None] * (now - was)
+
+
 def _mixed(word: int) -> int:
     word &= _WORD
     word = ((word ^ (word >> 30)) * _MIX[0]) & _WORD

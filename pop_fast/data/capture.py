@@ -34,7 +34,8 @@ class View:
         K: intrinsics in px. float64 [3, 3]
         mask: True where the photograph counts; None where all of it does. bool [H, W]
         split: the capture's own assignment, or None where every n-th file is held out.
-        had_alpha: the file has transparency, which was laid over a background.
+        alpha: opacity of a photograph with transparency, which `image` has laid over the background, of 255; None
+            where the file has none. uint8 [H, W]
         was_read: False where only the camera was asked for; `image` then has the right size and no content.
     """
 
@@ -44,7 +45,7 @@ class View:
     K: np.ndarray
     mask: np.ndarray | None = None
     split: Split | None = None
-    had_alpha: bool = False
+    alpha: np.ndarray | None = None
     was_read: bool = True
 
     @property

@@ -187,16 +187,18 @@ def _read(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
     image = read_image(photo.path)
     height, width = image.shape[:2]
     rectification, size, K = _placed(photo, (width, height), rectify)
-    had_alpha = image.shape[2] == 4
-    if had_alpha:
-        image = _over(image, options.background)
+    alpha = None
+    if image.shape[2] == 4:
+        image, alpha = _over(image, options.background), np.ascontiguousarray(image[:, :, 3])
+        alpha = rectification.image(alpha)
     image = rectification.image(image)
     mask = None
     if photo.mask is not None:
         mask = _read_mask(photo.mask, (width, height), rectification, size, photo.shot.turns)
     if size != (width, height):
         image = _shrunk(image, size, options.resize)
-    view = View(photo.shot.name, image, photo.shot.viewmat, K, mask, photo.shot.split, had_alpha)
+        alpha = None if alpha is None else _shrunk(alpha, size, options.resize)
+    view = View(photo.shot.name, image, photo.shot.viewmat, K, mask, photo.shot.split, alpha)
     return _upright(view, photo.shot.turns)
 
 
@@ -255,8 +257,9 @@ def _upright(view: View, turns: int) -> View:
         K = view.K
         turned = np.array([[K[1, 1], 0.0, view.height - K[1, 2]], [0.0, K[0, 0], K[0, 2]], [0.0, 0.0, 1.0]])
         x, y, *rest = view.viewmat
-        image, mask = (None if a is None else np.ascontiguousarray(np.rot90(a, -1)) for a in (view.image, view.mask))
-        view = replace(view, image=image, mask=mask, K=turned, viewmat=np.stack([-y, x, *rest]))
+        pixels = {name: getattr(view, name) for name in ("image", "mask", "alpha")}
+        upright = {name: None if a is None else np.ascontiguousarray(np.rot90(a, -1)) for name, a in pixels.items()}
+        view = replace(view, **upright, K=turned, viewmat=np.stack([-y, x, *rest]))
     return view
 
 

@@ -50,6 +50,14 @@ def background_at(step: int, seed: int) -> Tensor:
     return torch.tensor([(word >> 11) * 2.0**-53 for word in words], dtype=torch.float64)
 
 
+def over_background(photo: Tensor, alpha: Tensor, was: Tensor, now: Tensor) -> Tensor:
+    """See `pop_ref.appearance.over_background`.
+
+    Optimizations: none.
+    """
+    return photo + (1.0 - alpha)[:, :, None] * (now - was)
+
+
 def _mixed(word: int) -> int:
     word &= _WORD
     word = ((word ^ (word >> 30)) * _MIX[0]) & _WORD

@@ -58,6 +58,14 @@ class Appearance:
         return background_at(step, self._config.seed) if self._config.random_background else None
 
     @torch.no_grad()
+    def behind_photo(self, index: int, step: int) -> Tensor | None:
+        """Return what a transparent photograph is laid over at a step, in the photograph's colours [3], or None."""
+        background = self.background(step)
+        if background is None:
+            return None
+        return self.exposed(background.to(self._viewmats)[None, None], index)[0, 0]
+
+    @torch.no_grad()
     def update(self, step: int) -> None:
         """Move by the gradients of a step, less what the loss says nothing of, and forget the gradients."""
         rates, share = self._config.appearance_lr, step / self._config.max_steps

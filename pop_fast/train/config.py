@@ -71,7 +71,7 @@ class TrainConfig:
         exposure: learn an affine map of colours for every photograph, for captures whose exposure or white balance
             changes; held-out views are then also measured after fitting their colours (cc_psnr), as gsplat's trainer.
         random_background: lay another colour behind everything at every step, drawn from seed and step: what nothing
-            covers costs then. For photographs without alpha.
+            covers costs then. A photograph with alpha is laid over the same one.
         refine_cameras: learn a small rotation and translation of every training camera.
         appearance_lr: learning rates of exposures and cameras.
         strategy: density control and the POP term; its type says which method this is.

@@ -19,7 +19,7 @@ def check_views(config: TrainConfig, name: str, train: Sequence[ViewTensors], te
     """Check the cameras of all views, and that each photograph can be compared as the settings ask.
 
     Args:
-        config: `ssim_padding`, `random_background` and `background` are read.
+        config: `ssim_padding` is read.
         name: the capture's.
         train: views to train on.
         test: held-out views, which are always measured by whole windows.
@@ -34,12 +34,6 @@ def check_views(config: TrainConfig, name: str, train: Sequence[ViewTensors], te
             checks.values()
         except ValueError as error:
             raise PopError(f"{name}: camera of {view.name}: {error}; correct it, or leave the view out") from error
-    transparent = next((view.name for view in train if view.had_alpha), None)
-    if config.random_background and transparent is not None:
-        raise PopError(
-            f"{name}: {transparent} has transparency, which was laid over the background {list(config.background)}; "
-            "train it without --random-background, or with photographs that have no alpha"
-        )
     in_loss = too_small(train) if config.ssim_padding == "valid" else None
     measured = too_small(test)
     if in_loss or measured:

@@ -23,10 +23,14 @@ from pop_fast.train.views import Rendered, render_view
 
 @dataclass(frozen=True)
 class Look:
-    """A view after its backward pass: its index, render, photometric loss, prior or None, and their sum."""
+    """A view after its backward pass: its index, render, photometric loss, prior or None, and their sum.
+
+    `behind` is what its photograph was laid over if that is transparent; None where that is the settings' background.
+    """
 
     index: int
     rendered: Rendered
+    behind: Tensor | None
     objective: Tensor
     term: Tensor | None
     loss: Tensor
@@ -80,12 +84,13 @@ class TorchStepper:
         strategy, params, optimizers, state = self._task.strategy, self._params, self._optimizers, self._state
         rendered = self._render(index, step, phase)
         image = self._task.appearance.exposed(rendered.image, index)
-        objective = self._objective(image, index, phase)
+        behind = self._task.appearance.behind_photo(index, step)
+        objective = self._objective(image, index, phase, behind)
         term = strategy.regularizer(rendered.opacities, state, step, rendered.info)
         strategy.step_pre_backward(params, optimizers, state, step, rendered.info)
         loss = objective if term is None else objective + term
         loss.backward()
-        return Look(index, replace(rendered, image=image), objective, term, loss)
+        return Look(index, replace(rendered, image=image), behind, objective, term, loss)
 
     def _render(self, index: int, step: int, phase: Phase) -> Rendered:
         config, strategy, appearance = self._task.config, self._task.strategy, self._task.appearance
@@ -111,5 +116,6 @@ class TorchStepper:
         if step % self._task.config.log_every != 0 and not self._task.strategy.changes_after(step):
             return StepStats(math.nan, math.nan, photometric, math.nan, pop)
         rendered = look.rendered
-        pixelwise, structural, square = self._objective.measure(rendered.image.detach(), look.index, phase.l1)
+        image = rendered.image.detach()
+        pixelwise, structural, square = self._objective.measure(image, look.index, phase.l1, look.behind)
         return StepStats(pixelwise, structural, photometric, square, pop, *gaussians_per_pixel(rendered.info))

@@ -12,6 +12,7 @@ from torch import Tensor
 from pop_fast.data.capture import View
 from pop_fast.errors import PopError
 from pop_fast.stages.activations import opacities_from_logits, scales_from_log_scales
+from pop_fast.stages.appearance import over_background
 from pop_fast.train.config import TrainConfig
 
 
@@ -25,7 +26,8 @@ class ViewTensors:
         mask: True where the photograph counts, or None. bool [H, W]
         viewmat: world -> camera, in the precision of the training. [1, 4, 4]
         K: intrinsics, px, likewise. [1, 3, 3]
-        had_alpha: the file's transparency has been laid over one background.
+        alpha: opacity of a photograph with transparency, which `photo` has laid over the settings' background, of 255;
+            None where it has none. uint8 [H, W]
     """
 
     name: str
@@ -33,7 +35,7 @@ class ViewTensors:
     mask: Tensor | None
     viewmat: Tensor
     K: Tensor
-    had_alpha: bool = False
+    alpha: Tensor | None = None
 
     @classmethod
     def of(cls, view: View, dtype: torch.dtype = torch.float32) -> ViewTensors:
@@ -50,7 +52,7 @@ class ViewTensors:
             mask=None if view.mask is None else torch.from_numpy(view.mask),
             viewmat=torch.from_numpy(view.viewmat).to(dtype)[None],
             K=torch.from_numpy(view.K).to(dtype)[None],
-            had_alpha=view.had_alpha,
+            alpha=None if view.alpha is None else torch.from_numpy(view.alpha),
         )
 
     @property
@@ -71,6 +73,16 @@ class ViewTensors:
     def target(self) -> Tensor:
         """Return the photograph as floats in [0, 1]. [H, W, 3]"""
         return self.photo.to(self.viewmat.dtype).div_(255.0)
+
+    def target_over(self, background: Tensor, was: Tensor) -> Tensor:
+        """Return the photograph over a background [3] that it was not laid over (`was` [3]) when it was read. [H, W, 3]
+
+        One without transparency is as it is over any.
+        """
+        if self.alpha is None:
+            return self.target()
+        alpha = self.alpha.to(self.viewmat.dtype).div_(255.0)
+        return over_background(self.target(), alpha, was.to(alpha), background.to(alpha))
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pop_fast.data import Capture, load_capture
+from pop_fast.data.read_images import _upright
 from pop_fast.io.images import read_image
-from tests.app.captures import HEIGHT, WIDTH, assert_one_line, colmap_capture, photograph, write_photograph
+from tests.app.captures import HEIGHT, WIDTH, assert_one_line, camera, colmap_capture, photograph, write_photograph
 
 
 def raw(root: Path, **options) -> Capture:
@@ -70,6 +71,21 @@ def test_transparency_is_composited_over_the_background_and_is_no_mask(tmp_path:
         want = alpha * rgba[:, :, :3] + (1.0 - alpha) * 255.0 * np.array(background)
         assert view.mask is None
         assert np.abs(view.image - want).max() <= 0.5 + 1e-3
+        np.testing.assert_array_equal(view.alpha, rgba[:, :, 3])
+    assert raw(root).views[1].alpha is None
+
+
+def test_transparency_is_undistorted_shrunk_and_turned_with_its_photograph(tmp_path: Path) -> None:
+    """A photograph that is as bright as it is opaque, over black, is its own opacity."""
+    root = colmap_capture(tmp_path, cameras=[camera("SIMPLE_RADIAL", (40.0, 20.0, 15.0, 0.1))])
+    opaque = photograph(5)[:, :, :1]
+    write_photograph(root / "images" / "00.png", np.concatenate([np.full_like(opaque, 255)] * 3 + [opaque], axis=2))
+    for factor in (1, 2):
+        view = raw(root, factor=factor).views[0]
+        assert view.alpha.shape == view.image.shape[:2]
+        np.testing.assert_array_equal(view.image[:, :, 0], view.alpha)
+    turned = _upright(view, 1)
+    np.testing.assert_array_equal(turned.image[:, :, 0], turned.alpha)
 
 
 def test_gray_and_sixteen_bit_photographs_become_eight_bit_rgb(tmp_path: Path) -> None:

@@ -163,6 +163,7 @@ TESTS = {
     "appearance.expose": "test_appearance.test_an_exposure_mixes_channels_row_by_row",
     "appearance.centred_exposures": "test_appearance.test_centred_exposures_have_the_identity_as_mean",
     "appearance.color_correct": "test_appearance.test_correction_takes_back_gain_and_offset_by_channel",
+    "appearance.over_background": "test_appearance.test_a_photograph_over_another_background_is_as_if_laid_over_it",
     "appearance.background_at": "test_appearance.test_the_stream_is_splitmix64_by_its_published_numbers",
     "refinement.rotmat_from_vector": "test_refinement.test_a_rotation_is_the_exponential_of_its_generator",
     "refinement.without_common_motion": "test_refinement.test_what_is_taken_out_is_orthogonal_to_what_is_left",

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pop_ref.appearance import background_at, centred_exposures, color_correct, expose
+from pop_ref.appearance import background_at, centred_exposures, color_correct, expose, over_background
 
 RNG = np.random.default_rng(11)
 IMAGE = RNG.uniform(-0.2, 1.3, (3, 4, 3))
@@ -74,3 +74,15 @@ def test_backgrounds_of_many_steps_are_uniform() -> None:
     colors = np.array([background_at(step, 3) for step in range(3000)])
     np.testing.assert_allclose(colors.mean(axis=0), 0.5, atol=0.02)
     np.testing.assert_allclose(np.cov(colors.T), np.eye(3) / 12.0, atol=5e-3)
+
+
+def test_a_photograph_over_another_background_is_as_if_laid_over_it() -> None:
+    alpha = RNG.uniform(0.0, 1.0, (3, 4))
+    alpha[0, :2] = 0.0, 1.0
+    was, now = RNG.uniform(0.0, 1.0, (2, 3))
+
+    def over(background: np.ndarray) -> np.ndarray:
+        return alpha[:, :, None] * IMAGE + (1.0 - alpha)[:, :, None] * background
+
+    np.testing.assert_allclose(over_background(over(was), alpha, was, now), over(now), rtol=0.0, atol=1e-15)
+    np.testing.assert_array_equal(over_background(over(was), alpha, was, now)[0, 1], IMAGE[0, 1])

@@ -26,6 +26,7 @@ from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import engine_of, torch_engine
 from pop_fast.train.fused_settings import unsupported
 from pop_fast.train.metrics import psnr, psnr_after_correction
+from pop_fast.train.phases import phase_at
 from pop_fast.train.views import ViewTensors, render_view
 from pop_ref.losses import photometric_pop, photometric_pop_vjp
 from pop_ref.records import Camera
@@ -93,22 +94,27 @@ def learned(run: TrainingRun) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("backend", ["fast", "compiled"])
-def test_the_gradients_of_a_step_are_the_oracles(tmp_path: Path, backend: str) -> None:
+@pytest.mark.parametrize("transparent", [False, True])
+def test_the_gradients_of_a_step_are_the_oracles(tmp_path: Path, backend: str, transparent: bool) -> None:
     reason = get_backend(backend).why_not()
     if reason is not None:
         pytest.skip(reason)
     # l2 and half the light, with a hole in the scene: the background counts
     config = tiny_config(tmp_path / "run", l2_stop_iter=None, **ALL)
-    initial = initialize_params(tiny_capture(), 7, 0.5, 0.5, torch.float64)
+    capture = tiny_capture()
+    if transparent:
+        alpha = RNG.integers(0, 256, (24, 32), dtype=np.uint8)
+        capture = replace(capture, views=tuple(replace(view, alpha=alpha) for view in capture.views))
+    initial = initialize_params(capture, 7, 0.5, 0.5, torch.float64)
     start = {key: value.numpy().copy() for key, value in initial.items()}
-    run = TrainingRun(config, tiny_capture(), initial=initial, engine=torch_engine(backend))
+    run = TrainingRun(config, capture, initial=initial, engine=torch_engine(backend))
     with torch.no_grad():
         run.appearance.params["exposures"].copy_(tensor(EXPOSURES[:4]))
         run.appearance.params["cameras"].copy_(tensor(CORRECTIONS[:4]))
     index = run.stepper._task.order[0]
     found = learned(run)
 
-    view = tiny_capture().train_views(5)[index]
+    view = capture.train_views(5)[index]
     gaussians = gaussians_from_params(start)
     exposure, correction = EXPOSURES[index], CORRECTIONS[index]
     viewmat = pop_ref.refinement.refined_viewmat(view.viewmat, correction)
@@ -117,7 +123,11 @@ def test_the_gradients_of_a_step_are_the_oracles(tmp_path: Path, backend: str) -
     image = render(gaussians, camera, background, sh_degree=0).image
     assert np.any(np.abs(image - render(gaussians, camera, sh_degree=0).image) > 0.05), "the background does not show"
     exposed = pop_ref.appearance.expose(image, exposure)
-    given = (exposed, view.image / 255.0)
+    target = view.image / 255.0
+    if view.alpha is not None:
+        behind = pop_ref.appearance.expose(background[None, None], exposure)[0, 0]
+        target = pop_ref.appearance.over_background(target, view.alpha / 255.0, np.zeros(3), behind)
+    given = (exposed, target)
     assert photometric_pop(*given) > 0.0
     v_exposed = photometric_pop_vjp(*given, 1.0)
     v_exposed = v_exposed[0] if isinstance(v_exposed, tuple) else v_exposed
@@ -249,11 +259,38 @@ def test_passes_see_the_cameras_as_they_are_corrected(tmp_path: Path) -> None:
     assert not torch.equal(seen[2].viewmat, views[2].viewmat)
 
 
-def test_a_random_background_refuses_photographs_with_transparency(tmp_path: Path) -> None:
+@pytest.mark.parametrize("exposure", [False, True])
+def test_what_shows_nothing_costs_nothing_before_any_background(tmp_path: Path, exposure: bool) -> None:
+    """Photographs that are transparent throughout ask for an empty scene, whatever lies behind it and however dark."""
     capture = tiny_capture()
-    capture = replace(capture, views=tuple(replace(view, had_alpha=True) for view in capture.views))
-    with pytest.raises(PopError, match=r"tiny: 01\.png has transparency.*without --random-background"):
-        TrainingRun(tiny_config(tmp_path / "run", random_background=True), capture)
+    blank = np.zeros_like(capture.views[0].image)
+    clear = [replace(view, image=blank, alpha=blank[..., 0]) for view in capture.views]
+    initial = initialize_params(capture, 7, 0.5, 0.5, torch.float64)
+    initial["opacities"].fill_(-30.0)
+    config = tiny_config(tmp_path / "run", random_background=True, exposure=exposure)
+    run = TrainingRun(config, replace(capture, views=tuple(clear)), initial=initial, engine=torch_engine("fast"))
+    if exposure:
+        with torch.no_grad():
+            run.appearance.params["exposures"].copy_(tensor(EXPOSURES[:4]))
+    (stats,) = run.stepper.steps(0, 1, phase_at(config, config.strategy, 0))
+    assert stats.objective < 1e-9
+    assert (
+        run.stepper._objective(tensor(np.zeros((24, 32, 3))), 0, phase_at(config, config.strategy, 0), torch.ones(3))
+        > 0.1
+    )
+
+
+def test_transparency_matters_to_a_random_background_alone(tmp_path: Path) -> None:
+    def losses(name: str, alpha: np.ndarray | None, **settings: Any) -> list[float]:
+        capture = tiny_capture()
+        capture = replace(capture, views=tuple(replace(view, alpha=alpha) for view in capture.views))
+        config = tiny_config(tmp_path / name, **settings)
+        steps = TrainingRun(config, capture).stepper.steps(0, 2, phase_at(config, config.strategy, 0))
+        return [step.objective for step in steps]
+
+    half = np.full((24, 32), 128, np.uint8)
+    assert losses("a", half) == losses("b", None)
+    assert losses("c", half, random_background=True) != losses("d", None, random_background=True)
 
 
 @pytest.mark.parametrize("name", sorted(ALL))
