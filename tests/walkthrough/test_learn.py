@@ -198,9 +198,10 @@ def test_a_counterexample_is_drawn_with_what_came_out_and_what_should(
     assert image.shape[0] == SIDE
     assert image.min() >= 0.0
     assert image.max() <= 1.0
+    # a short line at least: how small the counterexample is made, and what it shows, depends on the time that it takes
     yours, oracles = _colored(image, YOURS), _colored(image, ORACLES)
-    assert yours > 100, "what the student's function gives is seen"
-    assert oracles > 100, "and what it should give"
+    assert yours > 30, "what the student's function gives is seen"
+    assert oracles > 30, "and what it should give"
     assert main(["learn", "check", stage, str(mine)]) == 1
     picture = mine / f"counterexample_{stage}.png"
     assert str(picture) in capsys.readouterr().out
