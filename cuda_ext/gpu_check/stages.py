@@ -99,7 +99,7 @@ def reproduce_stage(check: Check) -> dict[str, Any]:
     results = check.out / "paper_repro"
     words = ["-m", "paper_repro", "queue", "--scale", "toy" if check.rehearsal else "full", "--data", str(folder)]
     words += ["--out", str(results), "--work", str(check.work / "paper_repro"), "--threads", "0"]
-    words += ["--backend", "fast" if check.rehearsal else "cuda", "--rows", *REPRODUCED]
+    words += ["--backend", "auto" if check.rehearsal else "cuda", "--rows", *REPRODUCED]
     found = check.run(check.python(*words), check.seconds)
     if found["status"] == 130:
         found |= {"status": 0, "note": "the time was up; the rows that were finished are under `rows`"}

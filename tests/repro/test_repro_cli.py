@@ -103,9 +103,9 @@ def test_a_queue_lists_what_is_missing_cheapest_first(capsys, tmp_path):
 
 @pytest.fixture(scope="module")
 def queued(tmp_path_factory):
-    """A queue of three toy rows that is stopped by SIGTERM in the first, then called again to the end."""
+    """A queue of two toy rows that is stopped by SIGTERM in the first, then called again to the end."""
     folder = tmp_path_factory.mktemp("queue")
-    words = ["--scale", "toy", "--rows", "l2_pop", "l1_div_100", "pop", "--out", "results", "--work", "work"]
+    words = ["--scale", "toy", "--rows", "l2_pop", "l1_div_100", "--out", "results", "--work", "work"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     command = [sys.executable, "-m", "paper_repro", "queue", *words, "--checkpoint-every", "50"]
     said = []
@@ -129,7 +129,7 @@ def queued(tmp_path_factory):
 def test_a_queue_stops_at_sigterm_with_a_checkpoint(queued):
     _, ((text, status), _), left = queued
     assert status == 130
-    assert "0 of 3 rows are done; 3 to go" in text
+    assert "0 of 2 rows are done; 2 to go" in text
     assert text.splitlines()[-1] == "stopped; the same command goes on"
     assert left
 
@@ -137,21 +137,21 @@ def test_a_queue_stops_at_sigterm_with_a_checkpoint(queued):
 def test_a_queue_that_is_called_again_goes_on_to_the_end(queued):
     folder, (_, (text, status)), _ = queued
     assert status == 0, text
-    assert [result.row for result in read_all("toy", folder / "results")] == ["l1_div_100", "l2_pop", "pop"]
+    assert [result.row for result in read_all("toy", folder / "results")] == ["l1_div_100", "l2_pop"]
     assert "with which the run was begun" in text
-    assert text.splitlines()[-1] == "3 rows trained"
+    assert text.splitlines()[-1] == "2 rows trained"
 
 
 def test_status_counts_what_is_done_and_begun(queued, capsys, tmp_path):
     folder = queued[0]
     where = ["--results", folder / "results", "--work", tmp_path]
-    text = call("status", "--scale", "toy", "--rows", "pop", "l2", "l2_pop", *where, capsys=capsys)
-    assert text.split("\n")[1:4] == ["pop     done", "l2      to do", "l2_pop  done"]
+    text = call("status", "--scale", "toy", "--rows", "l1_div_100", "l2", "l2_pop", *where, capsys=capsys)
+    assert text.split("\n")[1:4] == ["l2          to do", "l2_pop      done", "l1_div_100  done"]
     assert "2 of 3 done" in text
     checkpoint = tmp_path / "toy" / "l2" / "demo_42" / "ckpts" / "ckpt_149_rank0.pt"
     checkpoint.parent.mkdir(parents=True)
     checkpoint.touch()
-    text = call("status", "--scale", "toy", "--rows", "pop", "l2", "--seeds", "2", *where, capsys=capsys)
+    text = call("status", "--scale", "toy", "--rows", "l2_pop", "l2", "--seeds", "2", *where, capsys=capsys)
     assert "1 done, to do" in text
     assert "step 150, to do" in text
 

@@ -14,7 +14,7 @@ from typing import Any, Self
 
 from pop_ref.walkthrough.browser import OPTIONS, chromium
 
-# where pictures are kept to be looked at; without it they are taken and judged only
+# where pictures are kept to be looked at
 SCREENSHOTS = os.environ.get("POP_SCREENSHOTS")
 
 WHY_NOT = "" if chromium() else "there is no Chromium here (apt install chromium)"

@@ -16,7 +16,7 @@ from pop_ref.walkthrough.cells import Chapter, chapter_number, read_chapter
 from pop_ref.walkthrough.pages import Outcome, run_chapter
 from pop_ref.walkthrough.printed import book
 from pop_ref.walkthrough.slides import LECTURE, MINUTES, deck
-from tests.walkthrough.chromium import WHY_NOT, Page, keep
+from tests.walkthrough.chromium import SCREENSHOTS, WHY_NOT, Page, keep
 from tests.walkthrough.ran import CHAPTERS, ran
 
 in_browser = pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)
@@ -160,7 +160,8 @@ def test_every_slide_of_the_lecture_fits_its_screen(page: Page, tmp_path: Path) 
             "each => each.getBoundingClientRect().bottom <= innerHeight + 1 && each.getBoundingClientRect().top >= -1"
         )
         assert page.ask(f"[...{face}.querySelectorAll('.body > *')].every({inside})"), page.ask(f"{face}.textContent")
-        keep(page.picture(".slide.here .face"), f"slide_{number:02}.png")
+        if SCREENSHOTS or number == 1:
+            keep(page.picture(".slide.here .face"), f"slide_{number:02}.png")
         page.press("PageDown")
     assert page.complaints == []
 

@@ -9,7 +9,7 @@ import pytest
 
 from pop_ref.walkthrough.cells import read_chapter
 from pop_ref.walkthrough.layout import chapter_page, index_page
-from tests.walkthrough.chromium import WHY_NOT, Page, keep
+from tests.walkthrough.chromium import SCREENSHOTS, WHY_NOT, Page, keep
 from tests.walkthrough.ran import CHAPTERS, ran
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)]
@@ -40,7 +40,9 @@ def _looked_at(page: Page, file: Path) -> None:
         assert (sum(int(each) for each in paper[4:-1].split(",")) < 300) == dark
         # an ink that would vanish on this paper
         assert page.ask("getComputedStyle(document.body).color") != paper
-        keep(page.picture("body"), f"{file.stem}_{width}_{'dark' if dark else 'light'}.png")
+        # of a whole page it takes seconds
+        if SCREENSHOTS or (width, dark) == LOOKS[0]:
+            keep(page.picture("body"), f"{file.stem}_{width}_{'dark' if dark else 'light'}.png")
 
 
 @pytest.mark.parametrize("path", CHAPTERS, ids=lambda path: path.stem)
