@@ -22,7 +22,7 @@ def available() -> bool:
 
 def why_not() -> str | None:
     """Return one sentence on why backend "cuda" cannot run here and what to do, or None where it can."""
-    # a machine that could run it once goes on to; asking anew would cost at every render
+    # a machine that could run it once continues to; asking anew would cost at every render
     if not _could_run:
         reason = _why_not()
         if reason is not None:

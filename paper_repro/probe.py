@@ -39,7 +39,7 @@ VIEWS: Final = 3
 class ProbedRun(TrainingRun):
     """A run that renders `VIEWS` training views before every `every`-th step, and writes what they say to probe.json.
 
-    What was probed before a run was stopped is taken up where the run itself goes on.
+    What was probed before a run was stopped is taken up where the run itself continues.
     """
 
     def __init__(self, config: TrainConfig, capture: Capture, *, every: int, **more: Any) -> None:
@@ -91,7 +91,7 @@ class ProbedRun(TrainingRun):
         return {"num_gaussians": len(self.params["means"]), **sums}
 
     def _read(self) -> dict[int, Mapping[str, float]]:
-        """Take up what was probed before the step that the run goes on from."""
+        """Take up what was probed before the step that the run continues from."""
         if not self._path.is_file():
             return {}
         found = read_json(self._path, "train the row again in an empty folder")

@@ -90,7 +90,7 @@ def is_finished(job: Job, folder: Path) -> bool:
 
 
 def train_row(job: Job, options: Options) -> Path:
-    """Train a job, or go on with it, and write its result; where it has one, nothing is done.
+    """Train a job, or continue with it, and write its result; where it has one, nothing is done.
 
     Returns:
         The result's file.

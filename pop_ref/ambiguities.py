@@ -91,7 +91,7 @@ AMBIGUITIES: Final = (
     Ambiguity(
         "A8",
         "H",
-        "Does gradient densification go on beside the blur rule?",
+        "Does gradient densification continue next to the blur rule?",
         "yes: the union is grown",
         _CONFIG,
         ("DensityConfig.grow_on_gradient_in_blur_window = False", "DensityConfig.grow_on_gradient = False"),

@@ -138,7 +138,7 @@ def background_at(step: int, seed: int) -> Float64[np.ndarray, "3"]:
     """Draw the background of a training step, each channel uniform in [0, 1): three numbers of a stream.
 
     The stream is SplitMix64 from the state mix(seed). Any step's colour is found without those before it, so a run that
-    goes on after an interruption needs nothing but its seed.
+    continues after an interruption needs nothing but its seed.
 
     Source: gsplat's trainer (`random_bkgd`) draws uniformly; Steele, Lea and Flood 2014 for the stream.
     Departs: gsplat draws from torch's global generator.

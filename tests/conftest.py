@@ -72,7 +72,7 @@ def pytest_configure() -> None:
 
 @pytest.fixture(autouse=True)
 def _threads_of_torch() -> Iterator[None]:
-    """Leave to the next test as many threads as there were: results record them, and a run goes on with its own."""
+    """Leave to the next test as many threads as there were: results record them, and a run continues with its own."""
     torch = sys.modules.get("torch")
     before = None if torch is None else torch.get_num_threads()
     yield

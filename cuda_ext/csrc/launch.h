@@ -169,7 +169,7 @@ void project(const GaussianArrays& gaussians, const ViewArrays& view, const Proj
 void pack_records(int n, int channels, const SplatArrays& splats, float alpha_floor, float* records,
                   cudaStream_t stream);
 size_t tile_workspace(int n, int capacity, int n_tiles);
-// Sorts by depth and counts; make_tile_lists goes on from there. state->n_instances is written by the first where the
+// Sorts by depth and counts; make_tile_lists continues from there. state->n_instances is written by the first where the
 // lists have no capacity yet, else by the second; it stops at INT_MAX.
 void count_instances(const TileLists& lists, const SplatArrays& splats, const Profile<float>& profile,
                      DeviceState* state, cudaStream_t stream);

@@ -30,7 +30,7 @@ _KEPT += ("gpu", "gpu_memory_bytes", "instance_buffers_grown")
 
 
 def wheels_stage(check: Check) -> dict[str, Any]:
-    """Install the wheels that were brought along into a scratch folder; go on without what is absent."""
+    """Install the wheels that were brought along into a scratch folder; continue without what is absent."""
     wheels = sorted(map(str, (check.packed / "wheels").glob("*.whl"))) if check.packed else []
     if not wheels:
         return skipped("no wheels were brought along (--packed FOLDER, made by --pack)")
@@ -107,7 +107,7 @@ def reproduce_stage(check: Check) -> dict[str, Any]:
 
 
 def train_one(check: Check, path: Path, limit: float, backend: str = "cuda") -> dict[str, Any]:
-    """Train on one capture, or go on with the training of an earlier call at the same commit."""
+    """Train on one capture, or continue with the training of an earlier call at the same commit."""
     folder = check.work / f"{path.name}_{backend}_{check.steps_scaler:g}_{check.commit[:12]}"
     words = ["train", str(path), "--out", str(folder), "--backend", backend]
     words += ["--steps-scaler", str(check.steps_scaler), "--no-progress", "--max-renders", "1"]
@@ -116,7 +116,7 @@ def train_one(check: Check, path: Path, limit: float, backend: str = "cuda") -> 
     found = check.run(check.python("-c", _TRAIN, *words), limit)
     stats = sorted((folder / "stats").glob("val_step*.json"), key=lambda file: int(file.stem.split("step")[1]))
     if found["status"] == 130:
-        found |= {"status": 124, "note": "the time was up; where the folder survives, the next call goes on"}
+        found |= {"status": 124, "note": "the time was up; where the folder survives, the next call continues"}
     elif found["status"] == 0 and not stats:
         found["status"] = 1
     if not stats:

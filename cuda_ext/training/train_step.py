@@ -3,7 +3,7 @@
 `FusedTrainer.run(until)` replays begin -> project -> list -> blend -> loss -> blend back -> update -> end. The device
 holds the step counter, picks the view, makes the learning rates and keeps what every step tells, so that one graph
 serves all steps of a kind. When instances do not fit, the device raises a flag and does nothing from that step on; the
-host sees the flag two steps late, grows the buffers and goes on from the device's counter: nothing is cut or lost.
+host sees the flag two steps late, grows the buffers and continues from the device's counter: nothing is cut or lost.
 Everything is asked of the tensors' device, whatever device is current.
 """
 
@@ -155,7 +155,7 @@ class FusedTrainer:
         return self._rows
 
     def _recover(self) -> int:
-        """Handle what halted the device, and return the step to go on from."""
+        """Handle what halted the device, and return the step to continue from."""
         state = self._shared.state
         # waits for all that was asked of the GPU: copies on their way, and graphs that use what goes now
         flags = state.tolist()

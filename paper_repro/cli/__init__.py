@@ -23,7 +23,7 @@ EXIT_INTERRUPTED: Final = 130
 
 # each with its module and what it does
 COMMANDS: Final = {
-    "run": ("training", "train one row on one scene, or go on with it"),
+    "run": ("training", "train one row on one scene, or continue with it"),
     "queue": ("training", "train every row of a scale that is missing, the cheapest first"),
     "status": ("showing", "say which rows of a scale are done"),
     "table": ("showing", "make one of the paper's tables from the results"),
@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 0
     except KeyboardInterrupt:
-        print("pop-repro: stopped; the same command goes on from the last checkpoint", file=sys.stderr)
+        print("pop-repro: stopped; the same command continues from the last checkpoint", file=sys.stderr)
         return EXIT_INTERRUPTED
     except BrokenPipeError:
         # the reader has gone, as in `pop-repro status | head`: what is still buffered has nowhere to go

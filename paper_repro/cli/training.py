@@ -15,12 +15,12 @@ __all__ = ["queue", "run"]
 _SEED: Final = 42
 _RUN: Final = """
     pop-repro run pop demo --scale toy                    in seconds, on a capture that the program makes
-    pop-repro run pop fox --scale dev --data DATA         the same command goes on after a stop
+    pop-repro run pop fox --scale dev --data DATA         the same command continues after a stop
     pop-repro run l2_blur bonsai_800 --scale full --data DATA --threads 2
 """
 _QUEUE: Final = """
     pop-repro queue --scale toy                           every row in minutes
-    pop-repro queue --scale dev --data DATA --nice 10     days; Ctrl-C or SIGTERM stops it, the same command goes on
+    pop-repro queue --scale dev --data DATA --nice 10     days; Ctrl-C or SIGTERM stops it, the same command continues
     pop-repro queue --scale dev --data DATA --rows pop gsplat 3dgs --scenes fox bear_512 --seeds 3
     pop-repro queue --scale dev --data DATA --list        what is missing, in order, without training
 """
@@ -71,7 +71,7 @@ def queue(words: Sequence[str]) -> int:
         if some:
             print(f"{what}: {', '.join(f'{job.row.name} {job.scene.name} {job.seed}' for job in some)}")
     if outcome.stopped:
-        print("stopped; the same command goes on")
+        print("stopped; the same command continues")
         return EXIT_INTERRUPTED
     return EXIT_INCOMPLETE if any(left.values()) else 0
 

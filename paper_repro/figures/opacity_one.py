@@ -85,7 +85,7 @@ class Pushed:
 
 
 def pushed(asked: Asked) -> Pushed:
-    """Train what the figure shows, or go on with it, or take it where it is finished.
+    """Train what the figure shows, or continue with it, or take it where it is finished.
 
     Raises:
         PopError: no scene of the scale is there, or as `train_row`.

@@ -30,7 +30,7 @@ def prepare(
         config: its settings, of `pop_fast.train.refining`, with a backend's name.
         capture: the block's photographs.
         start: what it begins with.
-        resume: go on from the latest checkpoint of `config.result_dir`, or start where there is none.
+        resume: continue from the latest checkpoint of `config.result_dir`, or start where there is none.
         loading_seconds: how long reading took, for the statistics.
         beside: texts to write beside cfg.json, by file name.
     """

@@ -84,7 +84,7 @@ def config_of(folder: Path, config: TrainConfig, name: str) -> TrainConfig:
 
 
 def round_config(folder: Path, config: TrainConfig, part: Part, steps: int) -> TrainConfig:
-    """Return the settings of a block's training in a round from 1: they go on where those of the run have ended.
+    """Return the settings of a block's training in a round from 1: they continue where those of the run have ended.
 
     Args:
         folder: the run's.

@@ -69,11 +69,11 @@ def resumption(folder: Path) -> str:
     from pop_fast.train.checkpoint import list_checkpoints
 
     found = list_checkpoints(folder)
-    return f"going on from step {found[-1][0] + 1:,}" if found else f"nothing to resume in {folder}: starting anew"
+    return f"continuing from step {found[-1][0] + 1:,}" if found else f"nothing to resume in {folder}: starting anew"
 
 
 def stopped(folder: Path, step: int) -> str:
-    """Say where a run stopped and from which checkpoint it goes on: after a second Ctrl-C that is not the last step."""
+    """Say where a run stopped and from which checkpoint it continues; a second Ctrl-C leaves an earlier one."""
     from pop_fast.train.checkpoint import list_checkpoints
 
     if step == 0:
@@ -84,5 +84,5 @@ def stopped(folder: Path, step: int) -> str:
             f"stopped after step {step:,}, before a checkpoint was written; the same command with --resume starts anew"
         )
     if kept[-1] == step:
-        return f"stopped after step {step:,}; the same command with --resume goes on"
-    return f"stopped after step {step:,}; the same command with --resume goes on from step {kept[-1]:,}"
+        return f"stopped after step {step:,}; the same command with --resume continues"
+    return f"stopped after step {step:,}; the same command with --resume continues from step {kept[-1]:,}"

@@ -43,7 +43,7 @@ _EXAMPLES: Final = """
     pop train scene --method gsplat          the control: gsplat's default strategy, with opacity reset
     pop train scene --method 3dgs            Inria's constants, learning rates, SSIM and rasterizer
     pop train scene --method taming          or pup, mini-splatting, speedy-splat: the paper's other methods
-    pop train scene --out out/a --resume     go on from the last checkpoint
+    pop train scene --out out/a --resume     continue from the last checkpoint
     torchrun --nproc-per-node 4 --no-python pop train scene --batch-size 4
                                              four processes, a view of each step for each
     pop train scene --backend fast           on the CPU, also where a GPU is
@@ -82,8 +82,8 @@ class _Run(BlocksOptions, FinishOptions):
     RealityCapture export, or with photographs alone.
 
     Attributes:
-        resume: go on from the last checkpoint in the output folder, to the same bits as without the interruption; start
-            where there is none.
+        resume: continue from the last checkpoint in the output folder, to the same bits as without the interruption;
+            start where there is none.
         overwrite: replace the results in the output folder, once the first step has been taken.
         missing: what to do about photographs that are listed but absent.
         images: read the photographs from this folder of the capture.

@@ -20,7 +20,7 @@ def why_not() -> str | None:
     from pop_fast.compiled.build import library_path
 
     path = library_path()
-    # what is loaded stays, also when an update has removed its file under a training that goes on
+    # what is loaded stays, also when an update has removed its file under a training that continues
     if str(path) in _loaded:
         return None
     if not path.exists():

@@ -40,7 +40,7 @@ template <class Real> struct Blend {
   const int64_t *first_chunks;                        // chunks of all tiles before this one. [tiles]
   int64_t n, channels, tiles_x, tiles_y, tile_size, width, height, threads;
   int64_t pixel_stride, channel_stride;  // of image and v_image: [H, W, D] has D and 1, [D, H, W] has 1 and H W
-  double alpha_floor, alpha_ceiling, stop;  // alpha > floor is blended, T > stop goes on: strictness is folded in
+  double alpha_floor, alpha_ceiling, stop;  // alpha > floor is blended, T > stop continues: strictness is folded in
   int64_t ceiling_passes;                   // B3: whether the gradient goes through the ceiling
   Splat *splats;                            // the forward pass makes them, and the transpose takes them. [N]
   Real *lights;                             // T before every chunk, for the transpose. [chunks, strips, lanes]

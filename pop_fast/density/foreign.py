@@ -17,7 +17,7 @@ class ForeignStrategy:
     """A strategy that collects and changes in one call, `step_post_backward`, as gsplat's do.
 
     Where it draws random numbers with torch's global generator, they come from one in `state` that is saved with it, so
-    that a run that is resumed goes on to the same bits. When it changes the Gaussians is not known beforehand; a
+    that a run that is resumed continues to the same bits. When it changes the Gaussians is not known beforehand; a
     `DensificationStep` that it returns goes into the records.
 
     Args:

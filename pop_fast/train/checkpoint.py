@@ -1,4 +1,4 @@
-"""Checkpoints: all that a run needs to go on with the same bits, in one file that is written whole or not at all.
+"""Checkpoints: all that a run needs to continue with the same bits, in one file that is written whole or not at all.
 
 The file is a dict that `torch.load(weights_only=True)` reads, so loading one cannot run code. `splats` and `step` are
 gsplat's keys: its trainer evaluates these files as they are. What is read is checked first, bit by bit against its
@@ -30,7 +30,7 @@ from pop_fast.train.config import TrainConfig, first_difference
 
 FORMAT = 1
 _NAME = re.compile(r"ckpt_(\d+)_rank0\.pt")
-_DAMAGED = "remove the file to go on from the one before it"
+_DAMAGED = "remove the file to continue from the one before it"
 _NEEDED = (
     "format",
     "step",
@@ -95,7 +95,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
             can have written; names the entry and what to do.
     """
     earlier = earlier_checkpoint(path)
-    instead = f"to go on from {earlier.name}" if earlier else "and train again, or copy it again if you have another"
+    instead = f"to continue from {earlier.name}" if earlier else "and train again, or copy it again if you have another"
     fix = f"remove it {instead}"
     content = read_torch_file(path, fix)
     missing = [key for key in _NEEDED if not isinstance(content, dict) or key not in content]

@@ -1,4 +1,4 @@
-"""What a checkpoint must hold before a run goes on from it: every shape, type and range that the steps rely on.
+"""What a checkpoint must hold before a run continues from it: every shape, type and range that the steps rely on.
 
 torch's fused Adam takes the addresses of a parameter and its moments but the length of the first alone: with a moment
 of another shape it writes where it must not. So nothing of a file reaches a run unchecked. A file can also hold tensors
@@ -6,7 +6,7 @@ that are views of one another, or one number that claims to be a billion.
 
 What is refused is what no run can have written. Parameters and first moments are finite, because a run that loses that
 stops before it saves. Second moments and sums of gradients are at least 0, and may be infinite: the square of a large
-gradient overflows while the parameter that it is for goes on.
+gradient overflows while the parameter that it is for continues.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def check_splats(splats: Any, kind: torch.dtype | None = None) -> dict[str, Tens
 
 
 def check_content(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Check all that a run goes on from, except what only the run knows: its settings, its capture, its strategy.
+    """Check all that a run continues from, except what only the run knows: its settings, its capture, its strategy.
 
     Args:
         content: of a checkpoint, with every key that one must have.

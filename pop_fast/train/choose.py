@@ -20,7 +20,7 @@ def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConf
 
     Args:
         config: the settings as given.
-        resume: go on with the run in `config.result_dir`, if there is one.
+        resume: continue with the run in `config.result_dir`, if there is one.
 
     Returns:
         The settings with a backend's name, and one line that says which and why.

@@ -1,4 +1,4 @@
-"""Settings of a training that goes on where another one has ended, on the Gaussians that there are.
+"""Settings of a training that continues where another one has ended, on the Gaussians that there are.
 
 Objective, colour bands and rates are those of the last step. The number of Gaussians stays: density control is at rest,
 whatever the method. The rate of the positions begins at ten times its last value and decays to that again, because what
@@ -45,7 +45,7 @@ def at_rest(strategy: DensityControl) -> DensityControl:
 
 
 def refining(config: TrainConfig, steps: int) -> TrainConfig:
-    """Return the settings of a training that goes on after the last step of another one.
+    """Return the settings of a training that continues after the last step of another one.
 
     Args:
         config: of that training.

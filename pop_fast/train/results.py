@@ -73,7 +73,7 @@ class ResultFolder:
         """Refuse a folder that a run may not write to; nothing is written or removed yet.
 
         Args:
-            resume: the run goes on with what is there.
+            resume: the run continues with what is there.
             overwrite: the run replaces what is there, when it begins.
 
         Returns:

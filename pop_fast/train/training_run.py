@@ -95,7 +95,7 @@ class TrainingRun:
         Args:
             config: the settings.
             capture: the photographs and cameras.
-            resume: go on from the latest checkpoint of `config.result_dir`, or start where there is none.
+            resume: continue from the latest checkpoint of `config.result_dir`, or start where there is none.
             overwrite: replace the results of an earlier run in `config.result_dir`, once the first step has been taken.
             loading_seconds: how long reading the capture took, for the statistics.
             beside: texts to write beside cfg.json, by file name.

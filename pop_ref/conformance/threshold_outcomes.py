@@ -1,7 +1,7 @@
 """Near a threshold: the outcomes that the oracle has when each decision near its threshold is taken either way.
 
 At a pixel whose decisions are all clear of rounding there is one outcome. Elsewhere every such splat is blended or
-skipped (D1, D2, D5), the pixel ends before such a splat or goes on (D7), and neighbours in depth swap
+skipped (D1, D2, D5), the pixel ends before such a splat or continues (D7), and neighbours in depth swap
 (D4); each combination is a list of splats, and the oracle's own blending of that list is an outcome. A backend must
 equal one of them.
 """

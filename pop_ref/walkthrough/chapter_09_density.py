@@ -496,6 +496,6 @@ assert haze["all at 0.5"] > ends["prior"]["haze"]
 
 # %% answer
 # The moments are cut to the right length instead of gathered by the same rows, so each Gaussian after a removed one
-# goes on with the momentum of its predecessor. After every densification step they
+# continues with the momentum of its predecessor. After every densification step they
 # move in wrong directions for some hundred steps.
 print(caught("moments_left_behind"))

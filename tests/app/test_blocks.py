@@ -169,7 +169,7 @@ def test_a_block_that_was_interrupted_goes_on_to_the_same_bits(
     assert pop("eval", folder).err.count("\n") == 1
     gone_on = pop(*words, "--resume")
     assert gone_on.status == 0, gone_on.err
-    assert "going on from step" in gone_on.out
+    assert "continuing from step" in gone_on.out
     for key, value in splats(shared_blocks).items():
         assert torch.equal(splats(folder)[key], value)
 

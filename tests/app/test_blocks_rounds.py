@@ -225,7 +225,7 @@ def test_a_round_that_was_interrupted_goes_on_to_the_same_bits(
     assert not (folder / "blocks" / "round_1" / "0_0" / "trained").exists()
     gone_on = pop(*words, *ROUNDS, "--resume")
     assert gone_on.status == 0, gone_on.err
-    assert gone_on.out.count("going on from step 5") == 1
+    assert gone_on.out.count("continuing from step 5") == 1
     assert same(folder, shared_rounds)
 
 

@@ -138,7 +138,7 @@ def test_ctrl_c_says_how_to_go_on_and_exits_with_130(
     interrupt(monkeypatch, at=10)
     outcome = pop("train", shared_capture, "--out", tmp_path / "r", *TRAIN)
     assert outcome.status == 130
-    assert outcome.err.strip() == "pop: stopped after step 10; the same command with --resume goes on from step 7"
+    assert outcome.err.strip() == "pop: stopped after step 10; the same command with --resume continues from step 7"
     interrupt(monkeypatch, at=0)
     outcome = pop("train", shared_capture, "--out", tmp_path / "s", *TRAIN)
     assert outcome.status == 130

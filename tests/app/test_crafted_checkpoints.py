@@ -68,7 +68,7 @@ def test_what_no_run_can_have_written_is_refused_and_named(case: str, forged: Pa
     if "metrics.jsonl" not in message:
         assert message.startswith(f"{latest(forged)}: ")
     if not message.endswith("reads format 1") and "metrics.jsonl" not in message:
-        assert "go on from" in message
+        assert "continue from" in message
     assert contents(forged) == before
 
 
@@ -95,7 +95,7 @@ def test_what_is_no_dict_is_refused(content: Any, tmp_path: Path) -> None:
 
 def test_a_checkpoint_under_another_ones_name_is_refused(forged: Path) -> None:
     latest(forged).write_bytes(ckpt.checkpoint_path(forged, 4).read_bytes())
-    with pytest.raises(PopError, match=r"step is 4; it must be 9, as the file's name says; remove it to go on from"):
+    with pytest.raises(PopError, match=r"step is 4; it must be 9, as the file's name says; remove it to continue from"):
         ckpt.load_checkpoint(latest(forged))
 
 
@@ -130,7 +130,7 @@ def test_what_a_run_can_come_to_is_accepted(forged: Path) -> None:
 
 def test_going_on_from_the_checkpoint_before_ends_in_the_same_bits(forged: Path, stopped: Path, tmp_path: Path) -> None:
     forge(forged, FORGED["m of another shape"][0])
-    with pytest.raises(PopError, match=r"remove it to go on from ckpt_4_rank0\.pt"):
+    with pytest.raises(PopError, match=r"remove it to continue from ckpt_4_rank0\.pt"):
         ckpt.load_checkpoint(latest(forged))
     latest(forged).unlink()
     on_cpu(forged).run()

@@ -1,4 +1,4 @@
-"""A run that was stopped, by whatever, goes on to the same bits as one that was not."""
+"""A run that was stopped, by whatever, continues to the same bits as one that was not."""
 
 from __future__ import annotations
 

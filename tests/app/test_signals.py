@@ -88,7 +88,7 @@ def test_training_that_is_told_to_stop_writes_a_checkpoint(
     _, err = process.communicate(timeout=120)
     assert process.returncode == 130
     ((step, _),) = ckpt.list_checkpoints(folder)
-    assert err == f"pop: stopped after step {step + 1:,}; the same command with --resume goes on\n"
+    assert err == f"pop: stopped after step {step + 1:,}; the same command with --resume continues\n"
 
 
 def test_a_hangup_that_is_ignored_stays_so(shared_capture: Path, tmp_path: Path) -> None:

@@ -200,7 +200,7 @@ def test_results_that_a_kill_left_aside_come_back_with_a_note(pop: Pop, shared_c
     again = pop("train", shared_capture, "--out", result, *TRAIN, "--resume")
     assert again.status == 0, again.err
     assert "an --overwrite was cut short; the results that it had set aside are back" in again.out
-    assert "going on from step 30" in again.out
+    assert "continuing from step 30" in again.out
     assert {path: data for path, data in contents(result).items() if path.suffix in (".pt", ".ply")} == {
         path: data for path, data in before.items() if path.suffix in (".pt", ".ply")
     }
@@ -237,14 +237,14 @@ def test_a_run_that_is_cut_off_can_be_looked_at_and_gone_on_with_in_few_words(
     interrupt(monkeypatch, at=-1)
     again = pop(*words, "--resume")
     assert again.status == 0, again.err
-    assert "going on from step 7\n" in again.out
+    assert "continuing from step 7\n" in again.out
 
 
 def test_resuming_where_no_run_is_says_that_it_starts(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
     outcome = pop("train", shared_capture, "--out", tmp_path / "r", *TRAIN, "--resume")
     assert outcome.status == 0, outcome.err
     assert f"nothing to resume in {tmp_path / 'r'}: starting anew\n" in outcome.out
-    assert "going on" not in outcome.out
+    assert "continuing" not in outcome.out
 
 
 def test_a_damaged_capture_json_is_named_on_resume(pop: Pop, shared_capture: Path, result: Path) -> None:

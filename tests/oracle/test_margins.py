@@ -258,7 +258,7 @@ def test_rounded_numbers_inherit_errors_as_their_derivatives_say() -> None:
 
 
 def test_d4_touches_the_pixels_that_see_both_splats_and_not_those_that_stopped_before() -> None:
-    # an inexact tie behind one opaque splat (the pixel goes on) and behind two (it stops)
+    # an inexact tie behind one opaque splat (the pixel continues) and behind two (it stops)
     tied = [[0.0, 0.1, 4.1], [0.1, 0.0, 4.1]]
     rolled = camera().viewmat.copy()
     rolled[:3, :3] = [[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]]

@@ -118,7 +118,7 @@ def test_curves_in_the_table_are_the_means_of_the_results(written):
         assert float(line["value"]) == sum(counts) / 2
         assert line["runs"].split() == [r.run for r in of_row]
         assert line["scenes"] == "fox bear_512"
-    # PUP-3DGS goes on when the others have ended
+    # PUP-3DGS continues when the others have ended
     assert max(step for row, step in found if row == "pup") == 13_332
     assert max(step for row, step in found if row == "gsplat") == 9_999
 

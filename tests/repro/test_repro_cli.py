@@ -1,4 +1,4 @@
-"""`pop-repro`: help that is quick, errors that name the fix, a queue that stops cleanly and goes on."""
+"""`pop-repro`: help that is quick, errors that name the fix, a queue that stops cleanly and continues."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def test_a_queue_stops_at_sigterm_with_a_checkpoint(queued):
     _, ((text, status), _), left = queued
     assert status == 130
     assert "0 of 2 rows are done; 2 to go" in text
-    assert text.splitlines()[-1] == "stopped; the same command goes on"
+    assert text.splitlines()[-1] == "stopped; the same command continues"
     assert left
 
 

@@ -249,7 +249,7 @@ def test_sigterm_leaves_a_checkpoint_and_the_same_command_goes_on(made, tmp_path
     _, said = process.communicate(timeout=120)
     assert (process.returncode, said) == (
         130,
-        "pop-repro: stopped; the same command goes on from the last checkpoint\n",
+        "pop-repro: stopped; the same command continues from the last checkpoint\n",
     )
     assert list((job.work(how.work) / "ckpts").iterdir())
     assert not job.result(how.results).exists()

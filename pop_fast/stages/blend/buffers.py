@@ -23,7 +23,7 @@ _pool = _Pool()
 def acquire(numel: int, dtype: torch.dtype) -> Tensor:
     """Return a flat buffer of at least `numel` uninitialised numbers, used before if one is free.
 
-    Lengths are powers of two, so that scenes whose sizes change from step to step go on sharing a few kinds of buffers.
+    Lengths are powers of two, so that scenes whose sizes change from step to step share a few kinds of buffers.
     """
     length = 1 << max(numel - 1, 0).bit_length()
     free = _pool.free.get((dtype, length))

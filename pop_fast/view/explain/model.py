@@ -18,7 +18,7 @@ class Row:
     Attributes:
         rank: place in the list, from 0 at the front.
         id: the Gaussian.
-        status: "blended", "skipped" (too faint here, the walk goes on), "stopped" (it would have taken T to the stop:
+        status: "blended", "skipped" (too faint here, the walk continues), "stopped" (it would have taken T to the stop:
             not blended, the walk ends) or "hidden" (behind the end of the walk, never visited).
         reason: the decision behind the status, with its label, operand and threshold; empty for plain blending.
         depth: camera z, world units.

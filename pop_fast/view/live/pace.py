@@ -10,7 +10,7 @@ _REST: Final = 0.25
 # seconds that a picture may take while the camera moves
 _QUICK: Final = 0.12
 _LEAST_SIDE: Final = 96
-# of the time at most, so that a training goes on under a viewer
+# of the time at most, so that a training continues under a viewer
 _SHARE: Final = 0.2
 _LEAST_PAUSE: Final = 2.0
 

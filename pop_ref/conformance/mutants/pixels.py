@@ -73,7 +73,7 @@ PIXELS: Final = (
     ),
     Mutant(
         "stop_forgotten",
-        "the terminating splat is skipped but the pixel goes on: fainter splats behind it are still blended",
+        "the terminating splat is skipped but the pixel continues: fainter splats behind it are still blended",
         "pixel.py",
         "        if stops(next_T, profile):\n            break\n",
         "        if stops(next_T, profile):\n            continue\n",

@@ -25,7 +25,7 @@ ASKED = "test_gradients:asking_for_dominance_and_counts_changes_neither_image_no
 _LINES: Final = (
     (
         "moments_of_the_next_row",
-        "an edit gathers the moments one row off: every survivor goes on with its neighbour's momentum",
+        "an edit gathers the moments one row off: every survivor continues with its neighbour's momentum",
         "density/rows.py",
         "moments[name] = edited(value, None",
         "moments[name] = edited(value.roll(1, 0), None",
