@@ -1,7 +1,7 @@
 """Draw a counterexample with NumPy alone: what a student's function gives in orange, what it should give in blue.
 
-Covariances are drawn as ellipses, rotations as the axes that they turn, pictures as pictures, and all other numbers as
-bars beside each other, each pair to its own scale.
+Covariances are drawn as ellipses, rotations as the axes that they turn, the blue ones thinner and on top; pictures
+as pictures, and all other numbers as bars side by side, each pair to its own scale.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def _results(call: Call) -> list[np.ndarray]:
     if call.function in _AS_ELLIPSES or call.function in _AS_AXES:
         ours, theirs = np.asarray(found, dtype=float), np.asarray(expected, dtype=float)
         if ours.shape == theirs.shape and np.all(np.isfinite(ours)):
-            both = ((theirs, ORACLES), (ours, YOURS))
+            both = ((ours, YOURS), (theirs, ORACLES))
             return [_ellipses(both) if call.function in _AS_ELLIPSES else _axes(both)]
     pictures = [_image(value) for value in (found, expected)]
     if all(picture is not None for picture in pictures):
@@ -85,35 +85,38 @@ def _flattened(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ellipses(both: tuple[tuple[np.ndarray, np.ndarray], ...]) -> np.ndarray:
-    """Draw ellipses of one standard deviation about one centre, seen where they differ most if they are in space."""
+    """Draw ellipses of one standard deviation about one centre, seen where they differ most if they are in space.
+
+    The second kind is a thinner line on top of the first, so that both are seen where they coincide.
+    """
     both = tuple(zip(_flattened(*(covars[:3] for covars, _ in both)), (color for _, color in both), strict=True))
     every = np.concatenate([covars for covars, _ in both])
     largest = float(np.sqrt(max(np.max(np.abs(every)), 1e-12)))
     x, y = _grid(1.3 * largest)
     canvas = _canvas()
     canvas[(np.abs(x) < 0.004 * largest) | (np.abs(y) < 0.004 * largest)] = _RULE
-    for covars, color in both:
+    for (covars, color), width in zip(both, (0.045, 0.02), strict=True):
         for covar in covars:
             # a flat one is drawn as thin as a line
             inverse = np.linalg.pinv(0.5 * (covar + covar.T) + 1e-4 * largest**2 * np.eye(2))
             q = inverse[0, 0] * x * x + (inverse[0, 1] + inverse[1, 0]) * x * y + inverse[1, 1] * y * y
             # the distance from the outline, to first order
             slope = np.hypot(inverse[0, 0] * x + inverse[0, 1] * y, inverse[0, 1] * x + inverse[1, 1] * y)
-            canvas[np.abs(q - 1.0) < 0.03 * largest * np.maximum(slope, 1e-12)] = color
+            canvas[np.abs(q - 1.0) < width * largest * np.maximum(slope, 1e-12)] = color
     return _smooth(canvas)
 
 
 def _axes(both: tuple[tuple[np.ndarray, np.ndarray], ...]) -> np.ndarray:
-    """Draw where a rotation takes the axes x (longest), y and z, seen along z."""
+    """Draw where a rotation takes the axes x (longest), y and z, seen along z; the second one's are thinner."""
     x, y = _grid(1.2)
     canvas = _canvas()
     canvas[(np.abs(x) < 0.005) | (np.abs(y) < 0.005)] = _RULE
-    for rotmats, color in both:
+    for (rotmats, color), width in zip(both, (0.03, 0.014), strict=True):
         for k, length in enumerate((1.0, 0.75, 0.5)):
             end = length * rotmats[0, :2, k]
             along = np.clip((x * end[0] + y * end[1]) / max(end @ end, 1e-12), 0.0, 1.0)
-            canvas[np.hypot(x - along * end[0], y - along * end[1]) < 0.015] = color
-            canvas[np.hypot(x - end[0], y - end[1]) < 0.035] = color
+            canvas[np.hypot(x - along * end[0], y - along * end[1]) < width] = color
+            canvas[np.hypot(x - end[0], y - end[1]) < 2.5 * width] = color
     return _smooth(canvas)
 
 
