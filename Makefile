@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+WORKERS ?= $(shell $(PYTHON) -c "import os; print((os.cpu_count() or 1) + 1)")
 TORCH := $(shell sed -n 's/^\(torch==.*\)/\1/p' constraints.txt)
 
 .DEFAULT_GOAL := help
@@ -43,13 +44,16 @@ site: demo walkthrough  ## build docs/, the walk-through and the demo's report a
 	mkdir -p out/site/demo && cp out/demo/report.html out/site/demo/
 	@echo "open out/site/index.html"
 
-# a worker a core, each with one thread: two that take both cores wait for each other
+# workers with one thread each: two that take both cores wait for each other. One more than there are cores, since some
+# tests wait for browsers and for processes of their own; those are many, and read what the first of them compiled
+TESTS := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+
 test: setup  ## run every test
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --dist worksteal
+	$(TESTS)
 
 # float64 of the torch path stands for that of the compiled one; what failed last comes first
 test-fast: setup  ## run in two minutes what a change most likely breaks: renderers, gradients, laws (5 examples), steps
-	OMP_NUM_THREADS=1 HYPOTHESIS_PROFILE=quick $(BIN)/python -m pytest -q -n logical --dist worksteal --failed-first \
+	HYPOTHESIS_PROFILE=quick $(TESTS) -q --failed-first \
 		-m "not slow" -k "not compiled64" tests/fast tests/gradients tests/golden tests/laws tests/oracle tests/thresholds \
 		tests/train tests/meta/test_architecture.py tests/meta/test_import_cycles.py
 

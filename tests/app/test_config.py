@@ -200,21 +200,21 @@ def test_a_label_cannot_be_carried_by_settings_that_do_not_follow_it():
 def test_a_run_moves_whom_the_oracle_moves_when_and_as_far(recipe):
     rules = replace(
         recipe.updates,
-        sh_start_iter=recipe.updates.sh_start_iter // 100,
-        opacities_stop_iter=recipe.updates.opacities_stop_iter // 100,
-        means_rewind_iter=recipe.updates.means_rewind_iter // 100,
-        means_rewind_to=recipe.updates.means_rewind_to // 100,
-        rounds_start_iter=recipe.updates.rounds_start_iter // 100,
-        round_steps=50,
+        sh_start_iter=recipe.updates.sh_start_iter // 200,
+        opacities_stop_iter=recipe.updates.opacities_stop_iter // 200,
+        means_rewind_iter=recipe.updates.means_rewind_iter // 200,
+        means_rewind_to=recipe.updates.means_rewind_to // 200,
+        rounds_start_iter=recipe.updates.rounds_start_iter // 200,
+        round_steps=25,
         round_decay_every=4,
     )
-    density = replace(recipe.density, refine_start_iter=5, refine_stop_iter=150, refine_every=7)
+    density = replace(recipe.density, refine_start_iter=5, refine_stop_iter=75, refine_every=7)
     short = replace(
         recipe,
         density=density,
         updates=rules,
-        max_steps=recipe.max_steps // 100,
-        adam_restarts=tuple(step // 100 for step in recipe.adam_restarts),
+        max_steps=recipe.max_steps // 200,
+        adam_restarts=tuple(step // 200 for step in recipe.adam_restarts),
     )
     edits = [step for step in range(short.max_steps) if densifies_at(step, density)]
     found = updates_of(short.lr, 2.5, short.max_steps, rules, edits, short.adam_restarts)

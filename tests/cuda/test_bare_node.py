@@ -41,7 +41,7 @@ def node(tmp_path_factory) -> tuple[Path, Path]:
     """Return the node's Python and its copy of the tree, with what travels in out/gpu_pack."""
     tmp = tmp_path_factory.mktemp("node")
     capture, run = tmp / "toy", tmp / "toy_pop"
-    assert pop(["demo", str(capture), "--views", "8", "--width", "40", "--height", "32"]) == 0
+    assert pop(["demo", str(capture), "--views", "8", "--width", "28", "--height", "24"]) == 0
     words = ["train", str(capture), "--out", str(run), "--max-steps", "3", "--backend", "fast", "--quiet"]
     assert pop(words) == 0
     tree = copy_of_the_tree(ROOT, tmp / "tree")
@@ -105,7 +105,7 @@ def test_job_one_builds_and_gives_numbers(node, tmp_path):
         assert case["pixel_parallel_by_kernel"]["loads"]["contributing"] > 0
         # there are no kernels of a GPU to be profiled here, which is told and loses no time
         assert "profiler" in case["pixel_parallel"]["step_kernels"]["skipped"]
-    assert bench["toy_pop_enlarged"]["width"] > bench["toy_pop"]["width"] == 40
+    assert bench["toy_pop_enlarged"]["width"] > bench["toy_pop"]["width"] == 28
     assert all(set(case["ratios"]) == {"forward", "forward_backward", "step"} for case in beside.values())
     assert stages["gsplat"]["results"]["gsplat"] == "stand-in"
 
