@@ -12,6 +12,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
@@ -130,10 +131,11 @@ def _run(words: Sequence[str], quiet: bool) -> int:
         process = subprocess.Popen(words, start_new_session=alone, stdout=subprocess.DEVNULL if quiet else None)
         try:
             while process.poll() is None:
-                if stop.wait(_PAUSE):
+                if stop.asked:
                     _interrupt(process, alone)
                     process.wait()
                     return 128 + signal.SIGINT
+                time.sleep(_PAUSE)
         except BaseException:
             process.kill()
             process.wait()

@@ -9,14 +9,25 @@ from collections.abc import Iterator
 from types import FrameType
 
 
+class StopRequest:
+    """Whether somebody has asked for an end.
+
+    Without a lock, unlike `threading.Event`: a handler runs in the middle of whatever the main thread is doing, and
+    would wait for ever for a lock that this thread itself holds, as it does within `Event.wait`.
+    """
+
+    def __init__(self) -> None:
+        self.asked = False
+
+
 @contextlib.contextmanager
-def stop_requests() -> Iterator[threading.Event]:
-    """Turn the first Ctrl-C, SIGTERM or SIGHUP (the terminal is gone) into an event that a loop looks at between steps.
+def stop_requests() -> Iterator[StopRequest]:
+    """Turn the first Ctrl-C, SIGTERM or SIGHUP (the terminal is gone) into a word that a loop looks at between steps.
 
     The second one is obeyed at once. SIGHUP stays ignored where it is, as under nohup. Outside the main thread, where
-    Python delivers no signals, the event is never set.
+    Python delivers no signals, nobody ever asks.
     """
-    stop = threading.Event()
+    stop = StopRequest()
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
@@ -30,7 +41,7 @@ def stop_requests() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
     def request(number: int, frame: FrameType | None) -> None:
-        stop.set()
+        stop.asked = True
         restore()
 
     for number in before:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import sys
-import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -53,7 +52,7 @@ from pop_fast.train.ranks import ALONE, Ranks
 from pop_fast.train.records import Segment, record_of
 from pop_fast.train.results import ResultFolder
 from pop_fast.train.schedule import ViewOrder, active_sh_degree
-from pop_fast.train.signals import stop_requests
+from pop_fast.train.signals import StopRequest, stop_requests
 from pop_fast.train.stepper import Engine, Stepper, Task
 from pop_fast.train.views import ViewTensors
 
@@ -194,7 +193,7 @@ class TrainingRun:
         self._stepper = self.stepper
         self._loading_seconds += time.perf_counter() - start
 
-    def _loop(self, stop: threading.Event) -> dict[str, Any]:
+    def _loop(self, stop: StopRequest) -> dict[str, Any]:
         config = self.config
         shown = config.progress and self._ranks.writes
         bars = tqdm(total=config.max_steps, initial=self.step, disable=None if shown else True)
@@ -215,7 +214,7 @@ class TrainingRun:
                 self._milestones(self.step - 1)
                 if self._watch is not None:
                     self._watch(self)
-                if self._ranks.any(stop.is_set()) and self.step < config.max_steps:
+                if self._ranks.any(stop.asked) and self.step < config.max_steps:
                     self._save()
                     raise KeyboardInterrupt
         last = config.max_steps - 1

@@ -105,7 +105,7 @@ rng = np.random.default_rng(0)
 # points that lie closer together than this add little here
 picked = []
 for i in rng.permutation(len(points)):
-    if all(np.sum((points[i] - points[j]) ** 2) > 0.018**2 for j in picked):
+    if np.all(np.sum((points[i] - points[picked]) ** 2, axis=1) > 0.018**2):
         picked.append(i)
 to_others = np.sum((points[picked][:, None] - points[picked]) ** 2, axis=2)
 apart = np.sqrt(np.mean(np.sort(to_others, axis=1)[:, 1:4], axis=1))

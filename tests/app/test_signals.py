@@ -15,6 +15,7 @@ import pytest
 
 from pop_fast.train import checkpoint as ckpt
 from tests.app.captures import write_photograph
+from tests.app.children import in_a_child
 from tests.app.conftest import TRAIN
 from tests.app.damage import contents
 
@@ -132,3 +133,41 @@ def test_sigterm_while_a_capture_is_read_is_one_line(shared_capture: Path, tmp_p
     process.terminate()
     assert process.communicate(timeout=60)[1] == "pop: interrupted\n"
     assert process.returncode == 143
+
+
+# the handler runs between any two lines of what the main thread is doing: here at each line of the wait in turn
+_AT_EVERY_LINE = """
+import signal, sys
+from pop_fast.blocks import jobs
+
+jobs._PAUSE = 0.01
+SLEEPER = [sys.executable, "-IS", "-c", "import time; time.sleep(100.0)"]
+
+def status_after_a_signal_at(line):
+    seen = 0
+
+    def trace(frame, event, argument):
+        nonlocal seen
+        caller = frame
+        while caller is not None and caller.f_code is not jobs._run.__code__:
+            caller = caller.f_back
+        if event == "line" and caller is not None and "process" in caller.f_locals:
+            seen += 1
+            if seen == line:
+                signal.raise_signal(signal.SIGTERM)
+        return trace
+
+    sys.settrace(trace)
+    try:
+        return jobs._run(SLEEPER, True)
+    finally:
+        sys.settrace(None)
+
+print(*[status_after_a_signal_at(line) for line in range(1, 61)])
+"""
+
+
+def test_a_request_to_stop_is_heard_at_every_line_of_waiting_for_a_process() -> None:
+    outcome = in_a_child(_AT_EVERY_LINE, seconds=120.0)
+    assert outcome.status == 0, outcome.err
+    assert outcome.out.split() == ["130"] * 60
