@@ -21,13 +21,16 @@ SHAPES_CHECKED = tuple(
         *("contributions", "sensitivity", "fisher", "chord", "selection", "taming", "mini_splatting", "tight_tiles"),
     )
 )
-# nor these: called for every pixel, window or basis value by functions that are checked, they were four fifths of all
-# checks, and each took several times what it checked
+# nor these: called for every pixel, window, basis value or step so far by functions that are checked, they were four
+# fifths of all checks, and each took several times what it checked
 INNERMOST = (
     *("dominance.dominant_id", "footprint._det", "footprint._inverse", "footprint._reach", "harmonics._basis_one"),
     *("harmonics._basis_gradient_one", "harmonics._n_sh", "harmonics._enough", "margins._Book.touch"),
     *("margins._Book.note", "projection._offset_vjp", "ssim._compare_window", "ssim.gaussian_window"),
-    "tiles.tile_span",
+    *("tiles.tile_span", "tiles.grid_size", "optimizer.is_updated", "projection._intrinsics", "splatting._scatter"),
+    *("margins._note_pixel", "harmonics._unit", "loss_magnitudes._operated", "chord._depth_on_ray"),
+    *("chord.chord_midpoint", "chord._ray_direction", "fisher._moments_of", "activations.unit_quats_from_quats"),
+    "covariance.rotmats_from_quats",
 )
 CHECKERS = ("beartype", "jaxtyping")
 

@@ -89,15 +89,19 @@ class Page:
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
         self.call("Emulation.setDeviceMetricsOverride", **size)
         self.call("Emulation.setTouchEmulationEnabled", enabled=width < 600)
-        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-        self.call("Emulation.setEmulatedMedia", features=[scheme])
+        self._prefer(dark)
         loader = self.call("Page.navigate", url=path.as_uri())["loaderId"]
         while (told := self._next()).get("method") != "Page.lifecycleEvent" or (
             told["params"]["name"] != "load" or told["params"]["loaderId"] != loader
         ):
             pass
         if scripts:
-            self.ask("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))")
+            self._wait_for_frames()
+
+    def switch(self, dark: bool) -> None:
+        """Let the reader prefer dark pages, or light ones, from now on, and wait until the page is drawn so."""
+        self._prefer(dark)
+        self._wait_for_frames()
 
     def ask(self, expression: str) -> Any:
         """Evaluate JavaScript in the page and return its value; a promise is waited for."""
@@ -144,6 +148,13 @@ class Page:
         box = self.ask(f"{script}(document.querySelector({json.dumps(selector)}).getBoundingClientRect())")
         shot = self.call("Page.captureScreenshot", clip={**box, "scale": 1}, captureBeyondViewport=True)
         return base64.b64decode(shot["data"])
+
+    def _prefer(self, dark: bool) -> None:
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.call("Emulation.setEmulatedMedia", features=[scheme])
+
+    def _wait_for_frames(self) -> None:
+        self.ask("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))")
 
     def _next(self) -> dict[str, Any]:
         while b"\0" not in self._rest:

@@ -14,7 +14,8 @@ from tests.walkthrough.ran import CHAPTERS, ran
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)]
 
-LOOKS = [(900, False), (900, True), (400, False), (400, True)]
+# how a page is opened; it is then looked at with the other preference too
+OPENED = [(900, False), (400, True)]
 # what is wider than its own box and neither scrolls nor is cut off there
 STICKS_OUT = """[...document.querySelectorAll('main *')].filter(each => {
     const box = each.getBoundingClientRect();
@@ -30,19 +31,25 @@ def page() -> Iterator[Page]:
 
 
 def _looked_at(page: Page, file: Path) -> None:
-    for width, dark in LOOKS:
+    for width, dark in OPENED:
         page.open(file, width=width, dark=dark)
-        page.ask("new Promise(done => setTimeout(() => done(1), 100))")
-        assert page.complaints == []
-        assert page.ask("document.documentElement.scrollWidth") <= width, page.ask(STICKS_OUT)
-        assert page.ask(STICKS_OUT) == []
-        paper = page.ask("getComputedStyle(document.body).backgroundColor")
-        assert (sum(int(each) for each in paper[4:-1].split(",")) < 300) == dark
-        # an ink that would vanish on this paper
-        assert page.ask("getComputedStyle(document.body).color") != paper
-        # of a whole page it takes seconds
-        if SCREENSHOTS or (width, dark) == LOOKS[0]:
-            keep(page.picture("body"), f"{file.stem}_{width}_{'dark' if dark else 'light'}.png")
+        _is_sound(page, file.stem, width, dark)
+        page.switch(dark=not dark)
+        _is_sound(page, file.stem, width, not dark)
+
+
+def _is_sound(page: Page, name: str, width: int, dark: bool) -> None:
+    page.ask("new Promise(done => setTimeout(() => done(1), 100))")
+    assert page.complaints == []
+    assert page.ask("document.documentElement.scrollWidth") <= width, page.ask(STICKS_OUT)
+    assert page.ask(STICKS_OUT) == []
+    paper = page.ask("getComputedStyle(document.body).backgroundColor")
+    assert (sum(int(each) for each in paper[4:-1].split(",")) < 300) == dark
+    # an ink that would vanish on this paper
+    assert page.ask("getComputedStyle(document.body).color") != paper
+    # of a whole page it takes seconds
+    if SCREENSHOTS or name == "index":
+        keep(page.picture("body"), f"{name}_{width}_{'dark' if dark else 'light'}.png")
 
 
 @pytest.mark.parametrize("path", CHAPTERS, ids=lambda path: path.stem)
