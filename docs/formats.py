@@ -7,12 +7,15 @@ python docs/formats.py --check    exit with 1 when the file holds something else
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
+from typing import Any
 
 from pop_fast.io.formats import FORMATS, Format
 
 PAGE = Path(__file__).resolve().parent / "FORMATS.md"
+SIZES = PAGE.parents[1] / "benchmarks" / "results" / "sizes.json"
 _FIELDS = ("centre", "scale", "rotation", "opacity", "colour", "view dependence")
 
 
@@ -61,7 +64,33 @@ as they are.
 Scores (`--score`) are Speedy-Splat's sensitivity, blending weights or dominated pixels, summed over the training views,
 or a guess from opacity and size where no capture is known. `pop train` takes the same options, for the files that
 `--export` names.
+
+## Measured
+
+{_measured(json.loads(SIZES.read_text(encoding="utf-8")))}
 """
+
+
+def _measured(sizes: dict[str, Any]) -> str:
+    captures, each = sizes["captures"], sizes["ply_bytes"]
+    shares = sorted({row["final_prune"] for found in captures.values() for row in found["rows"]})
+    head = ["capture", "format", *(f"`--final-prune {share:g}`" if share else "whole" for share in shares)]
+    rows, sources = [], []
+    for name, found in captures.items():
+        whole = found["gaussians"] * each
+        sources.append(f"{name}, {found['gaussians']:,} Gaussians, {whole / 1e6:.2f} MB as PLY, {found['psnr']:.2f} dB")
+        cells = {
+            (row["format"], row["final_prune"]): f"{row['bytes'] / 1e6:.2f} MB, 1/{whole / row['bytes']:.1f}, "
+            f"{row['psnr'] - found['psnr']:+.2f} dB"
+            for row in found["rows"]
+        }
+        formats = dict.fromkeys(row["format"] for row in found["rows"])
+        rows += [[name, f"`{format}`", *(cells[format, share] for share in shares)] for format in formats]
+    return f"""Bytes, their share of the whole splat's PLY, and the change of the held-out PSNR. POP, `--preset quick`:
+{"; ".join(sources)}. Every file is written by `pop export` and measured by `pop eval`
+(`benchmarks/sizes.py`).
+
+{_table(head, rows)}"""
 
 
 def _described(format: Format) -> str:

@@ -5,8 +5,8 @@ padding, selection at the threshold, opacity rate, and no update in a step that 
 code before, whose opacities move twice as fast; other methods are built on it. Steps count from 0 in all. "gsplat" is
 the default strategy of gsplat 1.5.
 
-`BASELINES` is what the other methods of the paper's tables minimise, with which renderer, rates and rules; the events
-that only they have are described where they are defined (`selection`, `taming`, `mini_splatting`, ...).
+`BASELINES` is what the other methods of the paper's tables minimise, with which renderer, rates and rules; the steps of
+density control that only they have are described where they are defined (`selection`, `taming`, `mini_splatting`, ...).
 
 `L1_DIVIDED[n]` is "L1 div = n" of the paper's comparison of L1 and L2, `0.99 L1 / n + 0.01 D-SSIM`, otherwise as "L2":
 no blur, no POP, no reset (A28).

@@ -1,6 +1,6 @@
 """Taming-3DGS: how many Gaussians there may be when, and which of the candidates grow.
 
-A training may hold A(x) Gaussians after its x-th event, a parabola that starts steeply and ends level at the target.
+A training may hold A(x) Gaussians after its x-th densification step, a parabola that starts steeply and ends level.
 The candidates that fill it are drawn with a probability proportional to a score, nine terms summed over a few views:
 each term is a quantity divided by its median and weighed, so that terms of different units can be added.
 """
@@ -30,15 +30,15 @@ EDGE: Final = 50.0
 _LUMA: Final = (19595, 38470, 7471)
 
 
-def budget_at(event: int, n_events: int, start: int, target: int) -> int:
-    """Say how many Gaussians there may be after an event: `floor(S + (B - S) (1 - (1 - x / n)^2))`.
+def budget_at(nth: int, n: int, start: int, target: int) -> int:
+    """Say how many Gaussians there may be after a densification step: `floor(S + (B - S) (1 - (1 - x / n)^2))`.
 
     Source: Mallick et al. 2024 (Taming-3DGS), the budget's parabola.
     Departs: nothing; computed in integers.
 
     Args:
-        event: x, from 0 (before the first) to n_events.
-        n_events: n, (15000 - 500) // interval in the code.
+        nth: x, which densification step it is, from 0 (before the first) to n.
+        n: densification steps in all, (15000 - 500) // interval in the code.
         start: S, Gaussians at the start.
         target: B, Gaussians at the end.
 
@@ -46,15 +46,15 @@ def budget_at(event: int, n_events: int, start: int, target: int) -> int:
         A(x), from S at 0 to B at n.
 
     Raises:
-        ValueError: the event lies outside 0 to n_events, or there are none.
+        ValueError: nth lies outside 0 to n, or there are none.
 
     Example:
         >>> [budget_at(x, 4, 1000, 2600) for x in range(5)]
         [1000, 1700, 2200, 2500, 2600]
     """
-    if n_events < 1 or not 0 <= event <= n_events:
-        raise ValueError(f"event is {event} of {n_events}; it must be in 0 to n_events, and n_events >= 1")
-    return start + (target - start) * (2 * n_events * event - event * event) // (n_events * n_events)
+    if n < 1 or not 0 <= nth <= n:
+        raise ValueError(f"nth is {nth} of {n}; it must be in 0 to n, and n >= 1")
+    return start + (target - start) * (2 * n * nth - nth * nth) // (n * n)
 
 
 def edge_map(photo: np.ndarray) -> Float64[np.ndarray, "H W"]:

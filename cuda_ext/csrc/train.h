@@ -72,7 +72,7 @@ struct UpdateArrays {
     int* dominant_sum;
     uint8_t* blurred;
     const float* blur_pixels;    // [views]: of state->view, a count above it blurs; read where blurred is asked for
-    bool blur_own_view;          // the flag is this view's alone; else it stays up until the next event (A2)
+    bool blur_own_view;          // the flag is this view's alone; else it stays up until the next densification step (A2)
 };
 
 // who takes part in the POP term, on which side, and what their terms come to

@@ -66,7 +66,7 @@ def steps_stage(check: Check) -> dict[str, Any]:
 
     And hold single kernels, rows of every place and size, and other readings of the paper, to the CPU.
     """
-    few = ("-k", "anew or twice or (events and pop)") if check.rehearsal else ()
+    few = ("-k", "anew or twice or (densification and pop)") if check.rehearsal else ()
     return _pytest(check, "steps", STEPS, *few)
 
 

@@ -1,11 +1,11 @@
 """How many instances the tile lists of each image size have room for, from what every view was last seen to need.
 
 Sorts and ranges run over the room, not over what is in it, because a captured step cannot ask how much that is. So the
-room follows the need: it grows when a step finds too little, and at every density event, when buffers are made anew in
-any case, it is brought back to `GROWTH` times the need. The need of a size is the most that one of its views had when
-last drawn: the heaviest view counts also where the last window passed it by, and a phase of large splats is forgotten
-once every view has been drawn again. A room that is not far off is kept, so that a need that varies a little neither
-moves memory about nor overflows at once.
+room follows the need: it grows when a step finds too little, and is brought back to `GROWTH` times the need at every
+densification step, when buffers are made anew in any case. The need of a size is the most that one of its views had
+when last drawn: the heaviest view counts also where the last window passed it by, and a phase of large splats is
+forgotten once every view has been drawn again. A room that is not far off is kept, so that a need that varies a little
+neither moves memory about nor overflows at once.
 """
 
 from __future__ import annotations

@@ -25,8 +25,8 @@ def captured(launch: Callable[[], None], device: torch.device) -> Callable[[], N
     graph = torch.cuda.CUDAGraph()
     # torch's default stream cannot be captured, and what it has still to do need not be finished: nothing runs here
     aside.wait_stream(here)
-    # not `torch.cuda.graph`: it waits for the GPU and empties torch's cache of memory, and the next density event would
-    # have to ask the driver for all of it again
+    # not `torch.cuda.graph`: it waits for the GPU and empties torch's cache of memory, and the next densification step
+    # would have to ask the driver for all of it again
     try:
         with torch.cuda.stream(aside), _no_collection():
             # "global" would let a call of another thread, a progress bar's for one, end the capture

@@ -84,7 +84,7 @@ class Shared:
 
 @dataclass(frozen=True)
 class DensificationContext:
-    """Gaussians between two density events, and what a step makes of each.
+    """Gaussians between two densification steps, and what a step makes of each.
 
     Attributes:
         params, m, v: raw parameters and Adam's moments.

@@ -35,7 +35,7 @@ class _Kind:
 
 
 class FusedTrainer:
-    """Owns the device's side of training between two density events.
+    """Owns the device's side of training between two densification steps.
 
     Args:
         params: raw float32 CUDA tensors by gsplat's keys; updated in place.
@@ -69,7 +69,7 @@ class FusedTrainer:
         self.rebind(params, m, v)
 
     def rebind(self, params: Mapping[str, Tensor], m: Mapping[str, Tensor], v: Mapping[str, Tensor]) -> None:
-        """Take new rows after a density event: buffers, statistics and graphs start anew."""
+        """Take new rows after a densification step: buffers, statistics and graphs start anew."""
         # what the old number of Gaussians needed goes first, so that old and new need not fit side by side
         self._kinds: dict[tuple[Size, Phase], _Kind] = {}
         self._frames: dict[Size, Frame] = {}
@@ -182,7 +182,7 @@ class FusedTrainer:
         if not self.settings.replay:
             kind.program.launch()
             return
-        # with many sizes most kinds come once between two density events, and a capture takes longer than a step
+        # with many sizes most kinds come once between two densification steps, and a capture takes longer than a step
         if kind.replay is None:
             kind.replay = captured(kind.program.launch, self.device)
         kind.replay()

@@ -178,7 +178,7 @@ class NativeTrainer:
         self.rebind(params, m, v)
 
     def rebind(self, params: Mapping[str, Tensor], m: Mapping[str, Tensor], v: Mapping[str, Tensor]) -> None:
-        """Take new rows after a density event; statistics start from nothing.
+        """Take new rows after a densification step; statistics start from nothing.
 
         Raises:
             ValueError: a tensor is not float32, not contiguous, or not on the CPU.

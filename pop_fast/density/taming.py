@@ -49,11 +49,11 @@ class TamingStrategy(InriaStrategy):
         return self.is_refine_step(step)
 
     @property
-    def n_events(self) -> int:
+    def n_densifications(self) -> int:
         """Return in how many steps of the parabola the budget is reached."""
         return (self.refine_stop_iter - self.refine_start_iter) // self.refine_every
 
-    def event_at(self, step: int) -> int:
+    def densification_at(self, step: int) -> int:
         """Return which step of the parabola this is, from 1."""
         return (step - self.refine_start_iter) // self.refine_every
 

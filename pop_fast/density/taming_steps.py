@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 def refine(plan: TamingStrategy, of: DensificationContext) -> DensificationStep:
     """Clone, split and prune, each by sampling."""
-    scores, event = scores_of(plan, of), plan.event_at(of.step)
+    scores, nth = scores_of(plan, of), plan.densification_at(of.step)
     clones, splits = densify.who_grows(plan, of)
-    budget = budget_at(event, plan.n_events, of.state["first_count"], plan.target(of.state["first_count"]))
+    budget = budget_at(nth, plan.n_densifications, of.state["first_count"], plan.target(of.state["first_count"]))
     n_clone, n_split = quotas(budget, len(of), int(clones.sum()), int(splits.sum()))
     clones, splits = _drawn(clones, scores, n_clone, of), _drawn(splits, scores, n_split, of)
     # after the split its parents' rows are gone
@@ -31,7 +31,7 @@ def refine(plan: TamingStrategy, of: DensificationContext) -> DensificationStep:
 
     def who_goes() -> Tensor:
         mask = densify.who_goes(plan, of)
-        return mask if event > plan.sampled_prunes else mask & _drawn_to_go(mask, weights, of)
+        return mask if nth > plan.sampled_prunes else mask & _drawn_to_go(mask, weights, of)
 
     return densify.refine(plan, of, clones, splits, who_goes)
 

@@ -24,15 +24,15 @@ VIEW, ERROR, EDGE = 50.0, 50.0, 50.0
 _LUMA = (19595, 38470, 7471)
 
 
-def budget_at(event: int, n_events: int, start: int, target: int) -> int:
+def budget_at(nth: int, n: int, start: int, target: int) -> int:
     """See `pop_ref.taming.budget_at`. Optimizations: none.
 
     Raises:
-        ValueError: the event lies outside 0 to n_events, or there are none.
+        ValueError: nth lies outside 0 to n, or there are none.
     """
-    if n_events < 1 or not 0 <= event <= n_events:
-        raise ValueError(f"event is {event} of {n_events}; it must be in 0 to n_events, and n_events >= 1")
-    return start + (target - start) * (2 * n_events * event - event * event) // (n_events * n_events)
+    if n < 1 or not 0 <= nth <= n:
+        raise ValueError(f"nth is {nth} of {n}; it must be in 0 to n, and n >= 1")
+    return start + (target - start) * (2 * n * nth - nth * nth) // (n * n)
 
 
 def edge_map(photo: Tensor) -> Tensor:

@@ -20,9 +20,9 @@ class Segment:
         phase: what they did.
         views: name of the photograph of each step.
         stats: of each step.
-        event: what density control did after the last, None where nothing was due.
+        densification: what density control did after the last, None where nothing was due.
         before: Gaussians that were trained.
-        after: Gaussians after the event.
+        after: Gaussians after that.
         seconds: that all of it took.
     """
 
@@ -30,7 +30,7 @@ class Segment:
     phase: Phase
     views: list[str]
     stats: list[StepStats]
-    event: DensificationStep | None
+    densification: DensificationStep | None
     before: int
     after: int
     seconds: float
@@ -39,7 +39,7 @@ class Segment:
 def record_of(
     segment: Segment, step: int, config: TrainConfig, lr_means: float, seconds_before: float
 ) -> dict[str, Any] | None:
-    """Make the record of a step, or None where none is due: every `log_every` steps there is one, and at every event.
+    """Make the record of a step, or None where none is due: every `log_every` steps there is one, and at every change.
 
     What the engine has not measured is left out.
 
@@ -52,8 +52,8 @@ def record_of(
     """
     place = step - segment.first
     stats, last = segment.stats[place], place + 1 == len(segment.stats)
-    event = segment.event if last else None
-    if step % config.log_every != 0 and event is None:
+    densification = segment.densification if last else None
+    if step % config.log_every != 0 and densification is None:
         return None
     halved = 0.5 if config.d_ssim_halved else 1.0
     measured = {
@@ -69,10 +69,10 @@ def record_of(
         "loss": stats.objective + stats.pop,
         **{name: value for name, value in measured.items() if not math.isnan(value)},
         **({"pop": stats.pop} if segment.phase.pop or stats.pop != 0.0 else {}),
-        "num_gaussians": segment.before if event is None else segment.after,
+        "num_gaussians": segment.before if densification is None else segment.after,
         "sh_degree": segment.phase.sh_degree,
         "lr_means": lr_means,
         "it_per_s": len(segment.stats) / segment.seconds,
         "seconds": seconds_before + segment.seconds * (place + 1) / len(segment.stats),
-        **({} if event is None else event.record()),
+        **({} if densification is None else densification.record()),
     }

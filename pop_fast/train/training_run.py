@@ -243,9 +243,9 @@ class TrainingRun:
         views = [", ".join(self._train[self._order.next()].name for _ in range(size)) for _ in range(first, last)]
         with words_for_memory():
             stats = self._measured(stepper, first, last, phase)
-            event = self._change(last - 1)
+            densification = self._change(last - 1)
         after, seconds = len(self.params["means"]), time.perf_counter() - start
-        return Segment(first, phase, views, stats, event, before, after, seconds)
+        return Segment(first, phase, views, stats, densification, before, after, seconds)
 
     def _measured(self, stepper: Stepper, first: int, last: int, phase: Phase) -> list[StepStats]:
         try:
@@ -272,9 +272,9 @@ class TrainingRun:
             return None
         passes = self._passes if self.strategy.needs_passes(step) else None
         given = (self.params, self.optimizers, self.state, step, self.draws)
-        event = self.strategy.change(*given, passes=passes, sh_degree=self.sh_degree(step))
+        densification = self.strategy.change(*given, passes=passes, sh_degree=self.sh_degree(step))
         self.stepper.rebind(self.params, self.optimizers, self.state)
-        return event
+        return densification
 
     @cached_property
     def draws(self) -> Draws:

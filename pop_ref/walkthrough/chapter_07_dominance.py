@@ -285,8 +285,8 @@ rows = rows_from_params(
 )
 # %%
 history, steps = [], itertools.count(1)
-for event in range(10):
-    for _ in range(6 if event else 20):
+for number in range(10):
+    for _ in range(6 if number else 20):
         gaussians = gaussians_from_params(rows.params)
         v_image = l2_vjp(render(gaussians, camera).image, target, 1.0)
         gradients = render_vjp(gaussians, camera, v_image)
@@ -307,27 +307,27 @@ for event in range(10):
 fig, panels = axes(5, 2, height=2.9)
 show_image(panels[4], target, "photograph")
 panels[9].axis("off")
-for column, event in enumerate((0, 3, 6, 9)):
-    n, view = history[event]
+for column, number in enumerate((0, 3, 6, 9)):
+    n, view = history[number]
     show_image(panels[column], view.image, f"{n} Gaussians")
     show_winners(panels[column + 5], view.dominant_ids, "")
 for ax in panels:
     ax.set(xticks=[], yticks=[])
 picture(
     fig,
-    "Before events 1, 4, 7 and 10: the render above, and which Gaussian wins which pixel below.",
+    "Before densification steps 1, 4, 7 and 10: the render above, and which Gaussian wins which pixel below.",
 )
 
 # %% [markdown]
-# At first all are too large and the number doubles; a split opens holes, which the training between two events
-# closes. As the counts come down growth slows to under a tenth per event, at a little over $2/\theta$ Gaussians. No
+# At first all are too large and the number doubles; a split opens holes, which the training between two steps
+# closes. As the counts come down growth slows to under a tenth per step, at a little over $2/\theta$ Gaussians. No
 # budget was set and no gradient asked: the threshold is the budget. In the paper the rule is active from step 3,000 to
 # 7,000 only, beside the gradient rule.
 
 # %%
 sizes = [n for n, _ in history]
 largest = [int(view.dominant_counts.max()) for _, view in history]
-print("Gaussians before each event:", sizes)
+print("Gaussians before each densification step:", sizes)
 print("largest count:              ", largest)
 assert sizes[:2] == [4, 8]
 assert sizes[-1] < 1.1 * sizes[-2]

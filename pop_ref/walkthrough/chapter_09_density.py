@@ -98,7 +98,7 @@ assert (pull > config.grow_grad2d).tolist() == [True, True, False, False]
 print("pull: too short {:.4f}, too wide {:.4f}, right {:.4f}, faint {:.4f}".format(*pull))
 
 # %% [markdown]
-# ## One event
+# ## One densification step
 #
 # The average is taken over a *window* of 100 steps. When it closes, Gaussians are added and removed. Selected and
 # small: **clone**, a copy on top of the original. Selected and large: **split**, two children drawn from the parent's
@@ -126,8 +126,8 @@ clone, split = density.grow_masks(window, scales, SCENE_SCALE, STEP, config)
 assert clone.tolist() == [True, False, False, False]
 assert split.tolist() == [False, True, False, False]
 draws = np.array([[[-0.6, -0.8, 0.0]], [[0.6, 0.8, 0.0]]])
-event = (window, SCENE_SCALE, STEP, lambda n: draws, config)
-after, _ = density.densify_and_prune(rows, *event)
+arguments = (window, SCENE_SCALE, STEP, lambda n: draws, config)
+after, _ = density.densify_and_prune(rows, *arguments)
 # one clone more, two children for one parent, one pruned
 assert len(after) == 4 + 1 + 1 - 1
 
@@ -414,8 +414,8 @@ assert abs(per_half_image - 1.0) < 0.06
 # %% [markdown]
 # ### Exercise 2: derive
 #
-# An event finds 1,000 Gaussians. It selects 200 as pulled hard, 60 of which are large, and then prunes 90. How many are
-# there afterwards? How many rows of Adam's moments are zero?
+# A densification step finds 1,000 Gaussians. It selects 200 as pulled hard, 60 of which are large, and then prunes 90.
+# How many are there afterwards? How many rows of Adam's moments are zero?
 
 # %% answer
 # A clone adds one row; a split removes the parent and adds two children, so it adds one, too: $1000 + 140 + 60 - 90 =
@@ -496,5 +496,6 @@ assert haze["all at 0.5"] > ends["prior"]["haze"]
 
 # %% answer
 # The moments are cut to the right length instead of gathered by the same rows, so each Gaussian after a removed one
-# goes on with the momentum of its predecessor. For some hundred steps they move in wrong directions, after every event.
+# goes on with the momentum of its predecessor. After every densification step they
+# move in wrong directions for some hundred steps.
 print(caught("moments_left_behind"))

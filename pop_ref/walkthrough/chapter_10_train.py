@@ -442,7 +442,7 @@ for name in ("prior", "none"):
 
 # %% [markdown]
 # ### Exercise 4: find the bug
-# This function collects what density control looks at between two events. One count is wrong.
+# This function collects what density control looks at between two densification steps. One count is wrong.
 #
 # {{bug: hidden_views_counted}}
 

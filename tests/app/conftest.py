@@ -26,7 +26,7 @@ class Outcome:
 
 
 Pop = Callable[..., Outcome]
-# a capture of 8 photographs; 30 steps with a change of the Gaussians and all other events in them
+# a capture of 8 photographs; 30 steps with a change of the Gaussians and all else that density control does
 TRAIN_AND_CHECK = ("--steps-scaler", "0.001", "--no-progress", "--pop.grow-grad2d", "1e-6")
 # without the renders of the report, which take longer than all of the rest
 TRAIN = (*TRAIN_AND_CHECK, "--skip-checks")

@@ -63,6 +63,6 @@ def moments(optimizers, params, key):
     return state["exp_avg"], state["exp_avg_sq"], state["step"]
 
 
-def run_event(strategy, params, optimizers, info, step: int, is_packed: bool = False, scene_scale: float = 1.0):
+def densified_at(strategy, params, optimizers, info, step: int, is_packed: bool = False, scene_scale: float = 1.0):
     state = strategy.initialize_state(scene_scale, seed=3)
     return strategy.step_post_backward(params, optimizers, state, step, info, packed=is_packed)

@@ -30,7 +30,7 @@ VIEWS = [2, 0, 3]
 
 
 def one_step(views: list[int], mask: Any = None, **plan: Any) -> tuple[Any, Any]:
-    """Take one step at STEP of these views, in float64, without an event; return the run and its measurements."""
+    """Take one step at STEP of these views, without density control; return the run and its measurements."""
     config = tiny_config("unused", batch_size=len(views), strategy=strategy(**plan), log_every=1)
     start = TrainingRun(config, tiny_capture(mask=mask))
     initial = {key: value.detach().double() for key, value in start.params.items()}

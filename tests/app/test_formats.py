@@ -50,7 +50,8 @@ def bounds_of(name: str, was: Cloud) -> dict[str, Any]:
         bits = min(20, int(np.floor(np.log2((2**23 - 1) / max(np.abs(was.means).max(initial=0.0), 1e-6)))))
         turn = 0.28 if name == "spz" else 14.0
         same = {"log_scales": 1 / 32, "opacities": BYTE, "sh0": 0.5 / 0.15 / 255.0, "rest": 0.25}
-        return {"means": 0.5 / 2.0**bits, "degrees": turn, **same}
+        smallest = np.exp(was.log_scales.astype(np.float64)).min(axis=1, keepdims=True, initial=np.inf)
+        return {"means": np.maximum(0.5 / 2.0**bits, smallest / 16.0), "degrees": turn, **same}
     if name == "compressed-ply":
         half = 0.5 / np.array([2047.0, 1023.0, 2047.0])
         return {
@@ -139,6 +140,29 @@ def test_a_codebook_is_near_what_it_is_fitted_to(values: list[float]) -> None:
     assert (np.diff(codes) >= 0.0).all()
     span = float(np.ptp(numbers)) if len(values) else 0.0
     assert not len(values) or np.abs(codes[nearest(codes, numbers)] - numbers).max() <= span / 256.0 + 1e-4
+
+
+def test_a_codebook_is_nearest_where_the_weights_are() -> None:
+    numbers = np.concatenate([np.linspace(-8.0, 0.0, 5000), np.linspace(0.0, 1.0, 50)]).astype(np.float32)
+    weights = np.repeat([0.001, 1.0], [5000, 50])
+    error = {}
+    for name, given_weights in (("even", None), ("weighted", weights)):
+        codes = codebook(numbers, given_weights)
+        error[name] = float((weights * (codes[nearest(codes, numbers)] - numbers) ** 2).sum())
+    assert error["weighted"] < 0.5 * error["even"]
+
+
+def test_a_centre_is_rounded_beside_what_its_gaussian_measures() -> None:
+    params = many(4000)
+    was, now, data = decoded("spz", params)
+    error = np.abs(was.means - now.means).max(axis=1) / np.exp(was.log_scales.min(axis=1))
+    assert 0.05 < error.max() <= 1.0 / 16.0 + 1e-3
+    params["scales"] -= 3.0
+    assert len(decoded("spz", params)[2]) > len(data)
+    # so far that few bits are left below one
+    params["means"] *= 2.0**20 / params["means"].abs().max()
+    was, now, _ = decoded("spz", params)
+    assert np.abs(was.means - now.means).max() <= 0.125 + 1e-6
 
 
 def test_a_palette_gives_every_row_its_nearest_within_its_group() -> None:

@@ -105,7 +105,7 @@ def test_a_polite_stop_ends_with_the_segment_and_writes_a_checkpoint(tmp_path, m
     assert [number for number, _ in ckpt.list_checkpoints(tmp_path)] == [8]
 
 
-def test_the_device_is_left_alone_between_events(tmp_path):
+def test_the_device_is_left_alone_between_densification_steps(tmp_path):
     trainer = drifting(tmp_path, checkpoint_every=0, sh_interval=100)
     trainer.run()
     runs = trainer.stepper.fused.runs

@@ -1,4 +1,4 @@
-"""The paper's other methods as runs: when what happens, what the events do to the Gaussians, on every CPU engine."""
+"""The paper's other methods as runs: when what happens, what density control does, on every CPU engine."""
 
 from __future__ import annotations
 
@@ -71,12 +71,12 @@ def test_mini_splatting_replaces_all_at_5000_and_10000_and_densifies_at_neither(
 
 def test_taming_grows_28_times_along_a_parabola_that_ends_at_the_budget() -> None:
     plan = plan_of("taming")
-    events = steps(plan.is_refine_step)
-    assert events == list(range(1_000, 15_000, 500))
-    assert len(events) == 28
-    assert [plan.event_at(step) for step in events] == list(range(1, 29))
-    assert plan.n_events == 29
-    assert taming.budget_at(29, plan.n_events, 1000, plan.target(1000)) == 2000
+    densified = steps(plan.is_refine_step)
+    assert densified == list(range(1_000, 15_000, 500))
+    assert len(densified) == 28
+    assert [plan.densification_at(step) for step in densified] == list(range(1, 29))
+    assert plan.n_densifications == 29
+    assert taming.budget_at(29, plan.n_densifications, 1000, plan.target(1000)) == 2000
 
 
 def test_pup_prunes_at_the_beginning_of_two_rounds_after_the_training() -> None:
@@ -87,7 +87,7 @@ def test_pup_prunes_at_the_beginning_of_two_rounds_after_the_training() -> None:
 
 
 @pytest.mark.parametrize("method", sorted(set(METHODS) - {"gsplat"}))
-def test_a_third_of_the_schedule_has_every_event(method: str) -> None:
+def test_a_third_of_the_schedule_has_all_density_control(method: str) -> None:
     whole, third = TrainConfig.of(method=method), TrainConfig.of(method=method, steps_scaler=1 / 3)
     assert third.max_steps == pytest.approx(whole.max_steps / 3, abs=1)
     found, wanted = (steps(c.strategy.needs_passes, c.max_steps) for c in (third, whole))
@@ -98,7 +98,7 @@ def test_a_third_of_the_schedule_has_every_event(method: str) -> None:
 
 
 def tiny_method(folder: Any, method: str, **changes: Any) -> TrainConfig:
-    """Thirty steps of a method, with every event that it has."""
+    """Thirty steps of a method, with all its density control."""
     own: dict[str, dict[str, Any]] = {
         "pup": {"rounds_start_iter": 20, "round_steps": 5, "round_decay_every": 2, "prune_shares": (0.5, 0.25)},
         "mini-splatting": {
@@ -192,24 +192,24 @@ def arrays_of(run: TrainingRun) -> dict[str, np.ndarray]:
     return {key: value.detach().numpy().copy() for key, value in run.params.items()}
 
 
-def hold_event(run: TrainingRun, step: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], Any]:
-    """Hold the event after a step by itself, and return the parameters before and after it."""
+def hold_change(run: TrainingRun, step: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], Any]:
+    """Hold density control after a step by itself, and return the parameters before and after it."""
     before = arrays_of(run)
-    event = run._change(step)
-    return before, arrays_of(run), event
+    change = run._change(step)
+    return before, arrays_of(run), change
 
 
 def test_speedy_splat_removes_who_the_oracle_says(tmp_path: Any) -> None:
     run, _ = in_double(tmp_path, "speedy-splat")
     stopped_before(run, 25)
-    before, after, event = hold_event(run, 25)
+    before, after, change = hold_change(run, 25)
     gaussians, profile, scores = gaussians_from_params(before), METHODS["speedy-splat"].recipe.profile, 0.0
     for camera, _ in cameras_of(run):
         drawn = render(gaussians, camera, profile=profile)
         size = (camera.width, camera.height, profile.tile_size)
         scores = scores + sensitivities(drawn.splats, drawn.tile_lists, *size, None, profile)
     gone = selection.lowest_share(scores, 0.3)
-    assert 0 < event.pruned == gone.sum() < len(gone)
+    assert 0 < change.pruned == gone.sum() < len(gone)
     for key in KEYS:
         np.testing.assert_array_equal(after[key], before[key][~gone])
 
@@ -217,7 +217,7 @@ def test_speedy_splat_removes_who_the_oracle_says(tmp_path: Any) -> None:
 def test_pup_removes_who_the_oracle_says_and_forgets_all_moments(tmp_path: Any) -> None:
     run, _ = in_double(tmp_path, "pup")
     stopped_before(run, 20)
-    before, after, event = hold_event(run, 20)
+    before, after, change = hold_change(run, 20)
     gaussians, profile = gaussians_from_params(before), METHODS["pup"].recipe.profile
     blocks = np.zeros((len(gaussians), 6, 6))
     for whole, _ in cameras_of(run):
@@ -229,7 +229,7 @@ def test_pup_removes_who_the_oracle_says_and_forgets_all_moments(tmp_path: Any) 
         moments = fisher.screen_moments(drawn.splats, drawn.tile_lists, *size, None, profile)
         blocks += fisher.fisher_blocks(gaussians, camera, moments, None, profile)
     gone = selection.lowest_share(fisher.log_det_scores(blocks), 0.5)
-    assert 0 < event.pruned == gone.sum() < len(gone)
+    assert 0 < change.pruned == gone.sum() < len(gone)
     for key in KEYS:
         np.testing.assert_array_equal(after[key], before[key][~gone])
         moments = run.optimizers[key].state[run.params[key]]
@@ -240,7 +240,7 @@ def test_mini_splatting_sets_points_where_the_oracle_does(tmp_path: Any) -> None
     run, recorded = in_double(tmp_path, "mini-splatting")
     stopped_before(run, 7)
     recorded.drawn.clear()
-    before, after, event = hold_event(run, 7)
+    before, after, change = hold_change(run, 7)
     gaussians, profile = gaussians_from_params(before), METHODS["mini-splatting"].recipe.profile
     views, points, colors = cameras_of(run), [], []
     for (camera, photo), uniforms in zip(views, recorded.drawn, strict=True):
@@ -251,14 +251,14 @@ def test_mini_splatting_sets_points_where_the_oracle_does(tmp_path: Any) -> None
         chosen = selection.sample_without_replacement(weights, min(wanted, int(np.sum(weights > 0))), uniforms)
         points.append(found.points.reshape(-1, 3)[chosen])
         colors.append(photo.reshape(-1, 3)[chosen] / 255.0)
-    assert event.replaced == len(after["means"]) == sum(map(len, points)) > 100
+    assert change.replaced == len(after["means"]) == sum(map(len, points)) > 100
     np.testing.assert_allclose(after["means"], np.concatenate(points), atol=1e-9)
     rgb = after["sh0"][:, 0] * 0.28209479177387814 + 0.5
     np.testing.assert_allclose(rgb, np.concatenate(colors), atol=1e-12)
     np.testing.assert_allclose(after["scales"], mini_splatting.nearest_log_scales(after["means"]), atol=1e-9)
     np.testing.assert_allclose(after["opacities"], np.log(0.1 / 0.9), rtol=1e-12)
     assert not after["shN"].any()
-    np.testing.assert_array_equal(after["quats"], np.tile([1.0, 0.0, 0.0, 0.0], (event.replaced, 1)))
+    np.testing.assert_array_equal(after["quats"], np.tile([1.0, 0.0, 0.0, 0.0], (change.replaced, 1)))
 
 
 @pytest.mark.parametrize("importance", ["indoor", "outdoor"])
@@ -277,18 +277,18 @@ def test_mini_splatting_draws_and_prunes_by_the_oracles_importance(importance: s
 
     stopped_before(run, 18)
     recorded.drawn.clear()
-    before, after, event = hold_event(run, 18)
+    before, after, change = hold_change(run, 18)
     weights = oracles(before, 1)
     wanted = int(0.5 * np.sum(weights > 0))
     chosen = selection.sample_without_replacement(weights, wanted, recorded.drawn[0])
-    assert event.replaced == wanted > 20
+    assert change.replaced == wanted > 20
     np.testing.assert_array_equal(after["means"], before["means"][chosen])
     np.testing.assert_array_equal(after["sh0"], before["sh0"][chosen])
     run.step = 19
     stopped_before(run, 24)
-    before, after, event = hold_event(run, 24)
+    before, after, change = hold_change(run, 24)
     gone = selection.least_mass(oracles(before, 2), 0.05)
-    assert 0 < event.pruned == gone.sum() < len(gone)
+    assert 0 < change.pruned == gone.sum() < len(gone)
     np.testing.assert_array_equal(after["means"], before["means"][~gone])
 
 
@@ -298,23 +298,23 @@ def test_taming_grows_and_prunes_who_the_oracle_draws(misaligned: bool, tmp_path
     plan = run.strategy = replace(run.strategy, misaligned_prune_weights=misaligned, grow_grad2d=1e-4, prune_opa=0.6)
     stopped_before(run, 16)
     recorded.drawn.clear()
-    # statistics of the window belong to the step before the event
+    # statistics of the window belong to the step before it
     state, draws = state_of(run), recorded.drawn
-    before, after, event = hold_event(run, 16)
+    before, after, change = hold_change(run, 16)
     views, gaussians = cameras_of(run), gaussians_from_params(before)
     chosen = [views[i] for i in np.argsort(draws[0], kind="stable")[:3]]
     grads = average_grads(state.statistics, plan)
     scores = taming.taming_scores(gaussians, chosen, grads, None, 2, METHODS["taming"].recipe.profile)
     small = gaussians.scales.max(1) <= plan.grow_scale3d * run.state["scene_scale"]
     candidates = grads >= plan.grow_grad2d
-    budget = taming.budget_at(plan.event_at(16), plan.n_events, 60, plan.target(60))
+    budget = taming.budget_at(plan.densification_at(16), plan.n_densifications, 60, plan.target(60))
     quotas = taming.quotas(budget, len(grads), int((candidates & small).sum()), int((candidates & ~small).sum()))
     sampled = []
     for mask, quota, uniforms in zip((candidates & small, candidates & ~small), quotas, draws[1:3], strict=True):
         weights = np.where(mask, scores, 0.0)
         sampled.append(selection.sample_without_replacement(weights, min(quota, int(np.sum(weights > 0))), uniforms))
-    assert (event.cloned, event.split) == tuple(map(len, sampled))
-    assert event.cloned + event.split > 0
+    assert (change.cloned, change.split) == tuple(map(len, sampled))
+    assert change.cloned + change.split > 0
     kept = np.setdiff1d(np.arange(len(grads)), sampled[1])
     inverse = 1.0 / (1e-6 + scores)
     chances = np.zeros(len(draws[3]))
@@ -325,7 +325,7 @@ def test_taming_grows_and_prunes_who_the_oracle_draws(misaligned: bool, tmp_path
     faint = 1.0 / (1.0 + np.exp(-grown)) < plan.prune_opa
     drawn = selection.sample_without_replacement(chances, int(faint.sum()) // 2, draws[3])
     gone = faint & np.isin(np.arange(len(grown)), drawn)
-    assert event.pruned == gone.sum() > 0
+    assert change.pruned == gone.sum() > 0
     np.testing.assert_array_equal(after["opacities"], grown[~gone])
 
 

@@ -111,9 +111,9 @@ def test_every_held_out_view_is_shown_as_render_photo_and_error(html: str) -> No
     assert f"dominant Gaussians of {VIEWS[0]}" in alts
 
 
-def test_events_and_settings_are_in_the_record(html: str) -> None:
+def test_densification_steps_and_settings_are_in_the_record(html: str) -> None:
     text = unescape(re.sub(r"<[^>]+>", " ", html))
-    assert "Density events (2)" in text
+    assert "Densification steps (2)" in text
     assert "pop.theta_blur" in text
 
 

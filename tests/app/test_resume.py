@@ -75,7 +75,7 @@ def uninterrupted(request, tmp_path_factory):
 
 def test_stopping_anywhere_and_going_on_changes_nothing(uninterrupted, tmp_path):
     method, reference = uninterrupted
-    # before the first checkpoint, on one, right after an event, between two, in the last segment
+    # before the first checkpoint, on one, right after a densification step, between two, in the last segment
     for place, stop_after in enumerate((3, 10, 13, 17, 29)):
         run_to(tmp_path, stop_after, resume=place > 0, method=method)
     run_to(tmp_path, resume=True, method=method)

@@ -11,7 +11,7 @@ from pop_fast.density import GsplatStrategy, InriaStrategy, POPStrategy, Strateg
 from pop_fast.density.control import SHORTEST_REFINE_EVERY
 from pop_ref.recipes import RECIPES
 from pop_ref.settings import PopTerm
-from tests.app.populations import make, make_info, run_event
+from tests.app.populations import densified_at, make, make_info
 
 
 @pytest.mark.parametrize("strategy", [POPStrategy(), GsplatStrategy()])
@@ -101,7 +101,7 @@ def test_missing_dominant_counts_are_explained():
     with pytest.raises(ValueError, match=r"dominant_counts.*pop_fast\.rasterization"):
         strategy.regularizer(torch.tensor([0.5, 0.5]), strategy.initialize_state(), 0, info)
     params, optimizers = make(2)
-    run_event(GsplatStrategy(), params, optimizers, info, 600)
+    densified_at(GsplatStrategy(), params, optimizers, info, 600)
 
 
 def test_sanity_checks_name_the_key():

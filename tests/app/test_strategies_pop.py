@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pop_fast.density import DensificationStep, GsplatStrategy, POPStrategy
-from tests.app.populations import HEIGHT, WIDTH, make, make_info, packed, run_event
+from tests.app.populations import HEIGHT, WIDTH, densified_at, make, make_info, packed
 
 
 def test_a_gaussian_that_dominates_enough_pixels_of_one_view_grows_in_the_blur_window_only():
@@ -18,7 +18,7 @@ def test_a_gaussian_that_dominates_enough_pixels_of_one_view_grows_in_the_blur_w
     for step, counts, n in ((3000, [20, 21], 3), (7000, [20, 21], 3), (2900, [21, 21], 2), (7100, [21, 21], 2)):
         params, optimizers = make(2)
         info = make_info(2, counts=torch.tensor(counts), width=width, height=height)
-        run_event(POPStrategy(theta_blur=threshold), params, optimizers, info, step)
+        densified_at(POPStrategy(theta_blur=threshold), params, optimizers, info, step)
         assert len(params["means"]) == n, step
 
 
@@ -26,7 +26,7 @@ def test_a_threshold_in_pixels_bounds_the_blur_rule_from_below():
     for least, counts, n in ((0.0, [0, 1], 3), (11.0, [11, 12], 3), (11.0, [1, 11], 2)):
         params, optimizers = make(2)
         info = make_info(2, counts=torch.tensor(counts), width=240, height=135)
-        run_event(POPStrategy(blur_min_pixels=least), params, optimizers, info, 3000)
+        densified_at(POPStrategy(blur_min_pixels=least), params, optimizers, info, 3000)
         assert len(params["means"]) == n
 
 
@@ -49,11 +49,11 @@ def test_the_share_of_a_masked_view_is_of_the_pixels_that_it_keeps(window):
     for pixels, n in ((kept // 2, 3), (kept // 2 + 1, 4)):
         params, optimizers = make(3)
         info = {**make_info(3, counts=[pixels, 0, 0]), "kept_pixels": kept}
-        run_event(POPStrategy(theta_blur=0.5, blur_window=window), params, optimizers, info, 3000)
+        densified_at(POPStrategy(theta_blur=0.5, blur_window=window), params, optimizers, info, 3000)
         assert len(params["means"]) == n
 
 
-def test_blur_flags_are_forgotten_after_an_event():
+def test_blur_flags_are_forgotten_after_a_densification_step():
     params, optimizers = make(1)
     strategy = POPStrategy()
     state = strategy.initialize_state()
@@ -64,11 +64,11 @@ def test_blur_flags_are_forgotten_after_an_event():
 
 
 def test_blur_clones_small_and_splits_large_or_splits_all():
-    for rule, event in (("by_scale", DensificationStep(1, 1)), ("split", DensificationStep(0, 2))):
+    for rule, change in (("by_scale", DensificationStep(1, 1)), ("split", DensificationStep(0, 2))):
         params, optimizers = make(2)
         params["scales"].data[1] = math.log(0.05)
         info = make_info(2, counts=torch.tensor([99, 99]))
-        assert run_event(POPStrategy(blur_rule=rule), params, optimizers, info, 3000) == event
+        assert densified_at(POPStrategy(blur_rule=rule), params, optimizers, info, 3000) == change
 
 
 def test_growth_by_gradient_can_be_switched_off_altogether_or_in_the_blur_window():
@@ -79,13 +79,13 @@ def test_growth_by_gradient_can_be_switched_off_altogether_or_in_the_blur_window
         (POPStrategy(grow_on_gradient_in_blur_window=False), 3000, 1),
     ):
         params, optimizers = make(1)
-        run_event(strategy, params, optimizers, make_info(1, grads), step)
+        densified_at(strategy, params, optimizers, make_info(1, grads), step)
         assert len(params["means"]) == n
 
 
 def test_nothing_happens_from_step_15000():
     params, optimizers = make(2)
-    assert run_event(POPStrategy(), params, optimizers, make_info(2, torch.ones(2, 2)), 15_000) is None
+    assert densified_at(POPStrategy(), params, optimizers, make_info(2, torch.ones(2, 2)), 15_000) is None
     assert len(params["means"]) == 2
 
 

@@ -55,12 +55,12 @@ def test_what_a_run_starts_from_stays_the_callers(tmp_path):
 
 def test_the_number_of_gaussians_changes_when_the_schedule_says(finished):
     trainer, _, folder = finished
-    events = [record for record in records(folder) if "cloned" in record]
-    changes = [record["step"] for record in events if not record.get("reset") or record["step"] % 4 == 0]
+    changed = [record for record in records(folder) if "cloned" in record]
+    changes = [record["step"] for record in changed if not record.get("reset") or record["step"] % 4 == 0]
     assert changes == [4, 8, 12, 16, 20]
-    resets = [record["step"] for record in events if record.get("reset")]
+    resets = [record["step"] for record in changed if record.get("reset")]
     assert resets == ([] if trainer.config.method == "pop" else [12])
-    assert sum(record["cloned"] + record["split"] for record in events) > 0
+    assert sum(record["cloned"] + record["split"] for record in changed) > 0
 
 
 def test_numbers_of_gaussians_add_up(finished):
@@ -87,7 +87,7 @@ def test_the_loss_is_the_sum_of_its_terms(finished):
         assert record["loss"] == pytest.approx(total, rel=1e-5)
 
 
-def test_a_record_is_written_every_other_step_and_at_events(finished):
+def test_a_record_is_written_every_other_step_and_at_changes(finished):
     _, _, folder = finished
     assert [record["step"] for record in records(folder)] == list(range(0, 30, 2))
     needed = {"view", "n_blended", "n_traversed", "sh_degree", "lr_means", "it_per_s", "seconds", "num_gaussians"}

@@ -1,7 +1,7 @@
 """Ten steps of training on three 16 x 16 views, fixed for good; run as a module to print the ladder.
 
 The photographs are formulas, not renders, and the schedule is squeezed so that ten steps pass through everything: the
-harmonics gain a band, two events clone, split, prune and use the blur rule, the POP term starts and ends.
+harmonics gain a band, two densification steps clone, split, prune and use the blur rule, the POP term starts and ends.
 """
 
 from __future__ import annotations

@@ -204,9 +204,9 @@ def test_pruning_takes_faint_ones_always_and_huge_ones_after_step_3000() -> None
 
 
 def test_schedule_has_144_densification_steps_41_with_blur_and_4_resets() -> None:
-    events = [s for s in STEPS if densifies_at(s, POP)]
-    assert (len(events), events[0], events[-1]) == (144, 600, 14_900)
-    blurred = [s for s in events if blurs_at(s, POP)]
+    densified = [s for s in STEPS if densifies_at(s, POP)]
+    assert (len(densified), densified[0], densified[-1]) == (144, 600, 14_900)
+    blurred = [s for s in densified if blurs_at(s, POP)]
     assert (len(blurred), blurred[0], blurred[-1]) == (41, 3000, 7000)
     assert [s for s in STEPS if resets_at(s, POP)] == []
     assert [s for s in STEPS if resets_at(s, GSPLAT)] == [3000, 6000, 9000, 12_000]
@@ -257,7 +257,9 @@ masks_st = st.integers(0, 7).flatmap(
 
 
 @given(masks_st)
-def test_an_event_changes_the_number_by_clones_plus_splits_minus_prunes(members: list[tuple[bool, bool, bool]]) -> None:
+def test_a_densification_changes_the_number_by_clones_plus_splits_minus_prunes(
+    members: list[tuple[bool, bool, bool]],
+) -> None:
     n = len(members)
     high, small, faint = (np.array([row[k] for row in members], dtype=bool) for k in range(3))
     rows = population(n)
@@ -276,7 +278,7 @@ def test_an_event_changes_the_number_by_clones_plus_splits_minus_prunes(members:
     assert s.n_views == 0
 
 
-def test_order_after_an_event_is_survivors_copies_first_children_second_children() -> None:
+def test_order_after_a_densification_is_survivors_copies_first_children_second_children() -> None:
     rows = population(5)
     scales = np.log(np.array([SMALL, LARGE, SMALL, LARGE, LARGE])[:, None] * np.ones((5, 3)))
     rows = replace(rows, params={**rows.params, "scales": scales})

@@ -36,10 +36,10 @@ def test_the_budget_is_the_parabola_rounded_down(n: int, data, start: int, targe
     assert taming.budget_at(x, n, start, target) == math.floor(parabola)
 
 
-def test_an_event_outside_the_schedule_is_told() -> None:
-    for event, n in ((-1, 4), (5, 4), (0, 0)):
-        with pytest.raises(ValueError, match=f"event is {event} of {n}"):
-            taming.budget_at(event, n, 10, 20)
+def test_a_densification_outside_the_schedule_is_told() -> None:
+    for nth, n in ((-1, 4), (5, 4), (0, 0)):
+        with pytest.raises(ValueError, match=f"nth is {nth} of {n}"):
+            taming.budget_at(nth, n, 10, 20)
 
 
 @pytest.mark.parametrize("shape", [(7, 9), (3, 3), (2, 5), (1, 1), (12, 3)])

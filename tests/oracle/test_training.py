@@ -87,7 +87,7 @@ def test_a_key_that_is_not_trained_goes_with_its_row() -> None:
     assert np.array_equal(state.rows.params["tags"], np.arange(10.0))
     assert not np.array_equal(state.rows.params["means"], PARAMS["means"])
     assert set(state.rows.params) == set(state.rows.m) == set(state.rows.v) == set(params)
-    # and through events that clone, split and prune
+    # and through densification steps that clone, split and prune
     tagged, _ = trained(params, 10, ten_losses.RECIPE)
     plain, _ = trained(PARAMS, 10, ten_losses.RECIPE)
     assert len(tagged.rows) == len(plain.rows) != 10
@@ -176,7 +176,7 @@ def test_recipes_are_the_rows_of_the_ablation_tables() -> None:
     assert [name for name, recipe in RECIPES.items() if recipe.pixelwise == "l1"] == ["3DGS", "3DGS 2023", "gsplat"]
 
 
-def test_an_event_and_a_reset_of_one_step_happen_in_that_order() -> None:
+def test_a_densification_and_a_reset_of_one_step_happen_in_that_order() -> None:
     rows = start(PARAMS).rows
     config = replace(density.GSPLAT, reset_every=600, prune_opa=0.02)
     after, _ = control(rows, density.zero_statistics(len(rows)), 1.0, 600, ten_losses.draws, config)

@@ -37,7 +37,7 @@ NAMED: dict[str, Recipe] = {
         for end in (4, 11, 15)
     },
 }
-# rows of other methods, whose own events are their strategies'
+# rows of other methods, whose own steps of density control are their strategies'
 OTHERS: dict[str, Recipe] = {
     "pup": BASELINES["PUP-3DGS"],
     "mini_splatting": BASELINES["Mini-Splatting"],

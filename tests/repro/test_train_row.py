@@ -83,7 +83,7 @@ def test_a_result_lies_in_its_place_and_holds_what_was_asked_for(made):
     assert str(how.data) not in path.read_text()
 
 
-def test_a_curve_has_every_event_and_the_held_out_views_of_every_fifteenth(made):
+def test_a_curve_has_every_densification_step_and_the_held_out_views_of_every_fifteenth(made):
     curve = read(made[1]).curve
     steps = [point["step"] for point in curve]
     assert steps == sorted(set(steps))
@@ -91,10 +91,10 @@ def test_a_curve_has_every_event_and_the_held_out_views_of_every_fifteenth(made)
     measured = [point for point in curve if point.get("psnr_test") is not None]
     assert [point["step"] for point in measured] == [20 * i - 1 for i in range(1, 16)]
     assert all(point["n_blended"] > 0.0 and point["n_traversed"] >= point["n_blended"] for point in measured)
-    # the counts add up: what an event cloned, split and pruned is the difference to the point before it
-    events = [(before, now) for before, now in pairwise(curve) if "cloned" in now]
-    assert len(events) == 14
-    for before, now in events:
+    # the counts add up: what a densification step cloned, split and pruned is the difference to the point before it
+    changes = [(before, now) for before, now in pairwise(curve) if "cloned" in now]
+    assert len(changes) == 14
+    for before, now in changes:
         change = now["cloned"] + now["split"] - now["pruned"]
         assert now["num_gaussians"] == before["num_gaussians"] + change
     last, result = curve[-1], read(made[1])

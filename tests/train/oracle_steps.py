@@ -1,8 +1,8 @@
 """One step of a training run, judged by the oracle's step from the same state, and what rounding may do to it.
 
 Before each step the run's parameters, moments and statistics are taken as the oracle's state, in float64. Both take the
-step; losses, parameters, moments, statistics and events are compared. A trajectory is so judged at every place that it
-comes to, though float32 and float64 would go apart at the first decision that rounding turns.
+step; losses, parameters, moments, statistics and density control are compared. A trajectory is so judged at every place
+that it comes to, though float32 and float64 would go apart at the first decision that rounding turns.
 
 A tolerance is eps times a magnitude. The kit's running error analysis (`conformance.gradient_error_bounds`) bounds what
 rounding costs in each gradient; of that bound, which adds the worst of every operation, engines need a small share
@@ -86,7 +86,7 @@ class Judged:
 
     Attributes:
         step: its number.
-        event: what density control did, or None.
+        densification: what density control did, or None.
         loss: the run's.
         differences: what is not the oracle's within rounding; empty where all is.
         doubtful: whether a decision of this step was so close that rounding could turn it.
@@ -95,7 +95,7 @@ class Judged:
     """
 
     step: int
-    event: Any
+    densification: Any
     loss: float
     differences: list[str]
     doubtful: bool
@@ -152,7 +152,7 @@ def judged_step(run: TrainingRun, recipe: Recipe, scene_scale: float) -> Judged:
     drawn: list[np.ndarray] = []
 
     def normals(n: int) -> np.ndarray:
-        # the first call draws; a second, of another variant of the event, is given the same numbers
+        # the first call draws; a second, of another variant of the densification step, is given the same numbers
         if not drawn:
             drawn.append(standard_normals(generator, n).double().numpy())
         return np.resize(drawn[0], (2, n, 3))
@@ -173,7 +173,9 @@ def judged_step(run: TrainingRun, recipe: Recipe, scene_scale: float) -> Judged:
     doubtful = bool(differences) and (
         work.doubtful() or near_threshold(moved, work, before.step, scene_scale, normals, recipe.density)
     )
-    return Judged(before.step, segment.event, found, differences, doubtful, reasons(moved, scene_scale, recipe.density))
+    return Judged(
+        before.step, segment.densification, found, differences, doubtful, reasons(moved, scene_scale, recipe.density)
+    )
 
 
 @dataclass
@@ -337,7 +339,7 @@ def compared_statistics(
         collected.append(("dominant_sum", found.dominant_sum))
     out = [f"{name}: {value} instead of {getattr(wanted, name)}" for name, value in collected
            if not np.array_equal(value, getattr(wanted, name))]  # fmt: skip
-    # after an event all is zero, whatever the number of rows has become
+    # after a densification step all is zero, whatever the number of rows has become
     allowed = error + 1e-6 * wanted.grad_sum if len(error) == len(found.grad_sum) else np.zeros(len(found.grad_sum))
     if np.any(np.abs(found.grad_sum - wanted.grad_sum) > allowed):
         out.append(f"grad_sum: {found.grad_sum} instead of {wanted.grad_sum}")

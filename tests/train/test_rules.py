@@ -1,4 +1,4 @@
-"""What methods change of an update and of an event: against the oracle in float64, and to the bit on every engine."""
+"""What methods change of an update and of density control: against the oracle in float64, and on every engine."""
 
 from __future__ import annotations
 
@@ -85,8 +85,8 @@ def test_each_engine_moves_whom_the_rules_move_and_nobody_else(engine: Any, tmp_
     idle = 0
     for step in range(10):
         before = {key: run.params[key].detach().clone() for key in KEYS}
-        event = run.take_steps(step + 1).event
-        if event is not None:
+        densification = run.take_steps(step + 1).densification
+        if densification is not None:
             continue
         for key in KEYS:
             moved = not torch.equal(before[key], run.params[key].detach())

@@ -42,10 +42,10 @@ def agree(steps: list[Judged]) -> None:
     assert len(wrong) <= MOST_IN_DOUBT, "\n".join(wrong)
 
 
-def test_ten_steps_with_an_event_of_every_kind_in_reach_are_the_oracles(engine: Any, tmp_path: Path) -> None:
+def test_ten_steps_with_all_density_control_in_reach_are_the_oracles(engine: Any, tmp_path: Path) -> None:
     steps = judged(run_of(SHORT, tmp_path, engine), SHORT, 10)
     agree(steps)
-    assert [step.step for step in steps if step.event is not None] == [3, 4, 6, 8]
+    assert [step.step for step in steps if step.densification is not None] == [3, 4, 6, 8]
 
 
 def test_ten_steps_in_double_precision_are_the_oracles_to_the_last_digits(tmp_path: Path) -> None:
@@ -55,7 +55,7 @@ def test_ten_steps_in_double_precision_are_the_oracles_to_the_last_digits(tmp_pa
 
 
 @pytest.mark.slow
-def test_three_hundred_steps_through_every_kind_of_event_are_the_oracles(engine: Any, tmp_path: Path) -> None:
+def test_three_hundred_steps_with_all_density_control_are_the_oracles(engine: Any, tmp_path: Path) -> None:
     steps = judged(run_of(RECIPE, tmp_path, engine), RECIPE, STEPS)
     agree(steps)
     assert set().union(*(step.happened for step in steps)) == EVERYTHING

@@ -1,4 +1,4 @@
-"""Splatting in one file is the oracle's: images, gradients, an event of density control, Adam's steps."""
+"""Splatting in one file is the oracle's: images, gradients, a densification step, Adam's steps."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_images_gradients_and_dominant_counts_are_the_oracles(seed: int) -> None
         assert np.max(np.abs(found - value)) < 1e-9 * np.max(np.abs(value)), name
 
 
-def test_an_event_of_density_control_is_the_oracles() -> None:
+def test_a_densification_step_is_the_oracles() -> None:
     rng = np.random.default_rng(3)
     params = _scene(3, 40)
     params["scales"] = rng.uniform(-5.0, -1.0, (40, 3))

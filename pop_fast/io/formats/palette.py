@@ -16,27 +16,32 @@ _SAMPLE: Final = 2**18
 _BLOCK: Final = 2**23
 
 
-def codebook(values: np.ndarray) -> np.ndarray:
+def codebook(values: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
     """Choose 256 numbers near which values lie: Lloyd's algorithm in one dimension, from between quantiles and a grid.
 
     Args:
         values: [M]
+        weights: how much the square of each one's error counts, 0 or more; all the same where absent. [M]
 
     Returns:
         Rising. float32 [256]
     """
     if len(values) == 0:
         return np.zeros(_CODES, np.float32)
-    rising = np.sort(values.astype(np.float64))
-    sample = rising[np.linspace(0, len(rising) - 1, min(len(rising), _SAMPLE)).round().astype(np.int64)]
+    order = np.argsort(values, kind="stable")
+    order = order[np.linspace(0, len(order) - 1, min(len(order), _SAMPLE)).round().astype(np.int64)]
+    sample = values[order].astype(np.float64)
+    mass = np.ones(len(sample)) if weights is None else weights[order] / max(float(weights.max()), 1e-300) + 1e-9
+    below = np.cumsum(mass) - 0.5 * mass
     # between the two: of quantiles alone, few would be far out, and of a grid alone, few where most values are
     shares = np.linspace(0.0, 1.0, _CODES)
-    codes = 0.5 * (np.quantile(sample, shares) + sample[0] + shares * (sample[-1] - sample[0]))
+    quantiles = np.interp(below[0] + shares * (below[-1] - below[0]), below, sample)
+    codes = 0.5 * (quantiles + sample[0] + shares * (sample[-1] - sample[0]))
     for _ in range(6 * _ROUNDS):
         which = nearest(codes, sample)
-        counts = np.bincount(which, minlength=_CODES)
-        sums = np.bincount(which, sample, _CODES)
-        codes = np.sort(np.where(counts > 0, sums / np.maximum(counts, 1), codes))
+        counts = np.bincount(which, mass, _CODES)
+        sums = np.bincount(which, mass * sample, _CODES)
+        codes = np.sort(np.where(counts > 0.0, sums / np.maximum(counts, 1e-300), codes))
     # six digits, which are written as a few characters
     return np.array([float(f"{code:.6g}") for code in codes], np.float32)
 

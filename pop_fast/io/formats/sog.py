@@ -60,7 +60,9 @@ def encode(cloud: Cloud) -> bytes:
     fixed = np.rint((means - low) / np.where(high > low, high - low, 1.0) * 65535.0).astype(np.uint16)
     largest, three = drop_largest(cloud.quats)
     rotations = to_bytes(255.0 * (three / math.sqrt(2.0) + 0.5))
-    scales, colors = codebook(cloud.log_scales.ravel()), codebook(cloud.sh0.ravel())
+    # what is large and opaque is few among the scales, and most of the picture
+    scales = codebook(cloud.log_scales.ravel(), np.repeat(cloud.visibility**2, 3))
+    colors = codebook(cloud.sh0.ravel())
     rgba = np.concatenate([nearest(colors, cloud.sh0), np.rint(255.0 * cloud.opacities)[:, None]], axis=1)
     meta: dict[str, Any] = {
         "version": 2,

@@ -26,9 +26,13 @@ _HEADER: Final = struct.Struct("<IIIBBBB")
 _ANTIALIASED: Final = 1
 # a centre's largest fixed-point number
 _LARGEST: Final = 2**23 - 1
+# of a centre; the fewest are those of large Gaussians, if it is not too far for as many
 _MOST_FRACTION_BITS: Final = 20
+_LEAST_FRACTION_BITS: Final = 5
 # colours are bytes over a range wider than [0, 1]
 _COLOR: Final = 0.15 * 255.0
+# of a Gaussian's smallest scale, what its centre is a multiple of at most
+_CENTRE_STEP: Final = 1.0 / 8.0
 # steps of the coefficients of a Gaussian of typical visibility, and the widest, of 128 in [0, 1]
 _SH_STEP: Final = 2.5
 _WIDEST_STEP: Final = 64
@@ -40,8 +44,8 @@ _WRITE_AGAIN: Final = "copy or write the file again"
 def encode(cloud: Cloud, version: int = 3, sh_step: float = _SH_STEP) -> bytes:
     """Write SPZ; the order of the Gaussians is kept.
 
-    Every coefficient has a byte, of which gzip makes the less the rounder they are: the colours of Gaussians that are
-    hardly seen are rounded more than those of the others.
+    gzip makes the less of the bytes the rounder their numbers are: centres are rounded to an eighth of the Gaussian's
+    smallest scale, and the colours of Gaussians that are hardly seen more than those of the others.
 
     Args:
         cloud: what to write.
@@ -58,9 +62,8 @@ def encode(cloud: Cloud, version: int = 3, sh_step: float = _SH_STEP) -> bytes:
     bits = _fraction_bits(turned.means)
     flags = _ANTIALIASED if cloud.antialiased else 0
     header = _HEADER.pack(MAGIC, version, len(cloud), cloud.degree, bits, flags, 0)
-    fixed = np.rint(turned.means.astype(np.float64) * 2.0**bits).astype("<i4").reshape(-1, 1)
     columns = [
-        fixed.view(np.uint8).reshape(-1, 4)[:, :3],
+        _centres(turned, bits).astype("<i4").reshape(-1, 1).view(np.uint8).reshape(-1, 4)[:, :3],
         to_bytes(255.0 * cloud.opacities),
         to_bytes(_COLOR * cloud.sh0.astype(np.float64) + 127.5),
         to_bytes(16.0 * (cloud.log_scales.astype(np.float64) + 10.0)),
@@ -77,6 +80,13 @@ def _fraction_bits(means: np.ndarray) -> int:
     if bits < 0:
         raise PopError(f"a centre is {far:.3g} from the origin; SPZ holds up to {_LARGEST}: crop, or choose SOG or PLY")
     return bits
+
+
+def _centres(cloud: Cloud, bits: int) -> np.ndarray:
+    """Return fixed-point centres, rounded to powers of two that are small beside the Gaussians. float64 [N, 3]"""
+    smallest = cloud.log_scales.min(axis=1, keepdims=True).astype(np.float64) / np.log(2.0)
+    step = 2.0 ** np.clip(np.floor(smallest + np.log2(_CENTRE_STEP)), -bits, max(-bits, -_LEAST_FRACTION_BITS))
+    return np.clip(np.rint(cloud.means / step) * step * 2.0**bits, -_LARGEST, _LARGEST)
 
 
 def _rotations(quats: np.ndarray, version: int) -> np.ndarray:

@@ -48,12 +48,13 @@ def _by_place(cloud: Cloud) -> np.ndarray:
 
 _BYTE_OPACITY: Final = "half of 1/255"
 _SPZ_LOSSES: Final = {
-    "centre": "half of 2^-b units; b is the largest up to 20 that the farthest centre leaves",
+    "centre": "half of 2^-b units, or 1/16 of its smallest scale where that is more; b is the largest up to 20 that "
+    "the farthest centre leaves",
     "scale": "factor within 3.2 %, between 4.5e-5 and 380 units",
     "rotation": "0.28° (10 bits a component)",
     "opacity": _BYTE_OPACITY,
     "colour": "half of 1/136 (degree 0), cut off at -0.44 and 1.44",
-    "view dependence": "coefficients in [-1, 1], within 1/100 of a Gaussian that is well seen, coarser the less it is, "
+    "view dependence": "coefficients in [-1, 1], within 1/75 of a Gaussian that is well seen, coarser the less it is, "
     "down to 1/4",
 }
 
@@ -99,7 +100,7 @@ FORMATS: Final[Mapping[str, Format]] = {
             size=("17, then WebP", "19 and a palette, then WebP"),
             losses={
                 "centre": "half of 1/65535 of the scene's extent in sign(x) log(1 + abs(x))",
-                "scale": "nearest of 256 numbers that are fitted to the splat",
+                "scale": "nearest of 256 numbers that are fitted to the splat, to what is large and opaque the most",
                 "rotation": "1.1° (8 bits a component)",
                 "opacity": _BYTE_OPACITY,
                 "colour": "nearest of 256 numbers that are fitted to the splat (degree 0); lost where the opacity is 0",

@@ -72,7 +72,7 @@ class ReportData:
         views: held-out views, the worst first.
         n_held_out: how many held-out views were measured.
         config: setting -> value, in reading order.
-        events: one mapping a density event or reset.
+        changes: one mapping a densification step or reset.
         files: a row a file format: name, size, bytes a Gaussian, share of the PLY's size, PSNR.
         viewer: the page that shows the splat.
         verdict: how it went, in sentences.
@@ -94,7 +94,7 @@ class ReportData:
     views: Sequence[ReportView] = field(default_factory=tuple)
     n_held_out: int | None = None
     config: Mapping[str, Any] = field(default_factory=dict)
-    events: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
+    changes: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
     files: Sequence[Sequence[str]] = field(default_factory=tuple)
     viewer: str | None = None
     verdict: Sequence[Finding] = field(default_factory=tuple)

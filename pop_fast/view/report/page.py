@@ -155,9 +155,9 @@ def _dominance(data: ReportData) -> str:
 
 def _tables(data: ReportData) -> str:
     parts = []
-    if data.events:
-        columns = list(dict.fromkeys(key for event in data.events for key in event))
-        parts.append(_table(f"Density events ({len(data.events)})", columns, data.events))
+    if data.changes:
+        columns = list(dict.fromkeys(key for change in data.changes for key in change))
+        parts.append(_table(f"Densification steps ({len(data.changes)})", columns, data.changes))
     if data.config:
         rows = [{"setting": key, "value": value} for key, value in data.config.items()]
         parts.append(_table("Settings", ["setting", "value"], rows))

@@ -54,7 +54,7 @@ def read_result(folder: Path) -> ReportData:
     histograms = list(_histograms(folder, config.max_steps))
     views = _views(folder)
     dominant = _dominant(folder)
-    events = [record for record in records if "cloned" in record or "reset" in record]
+    changes = [record for record in records if "cloned" in record or "reset" in record]
     curves, checks = _curves(records, folder), _checks(folder)
     return ReportData(
         title=f"{Path(config.data).resolve().name} · {_METHODS.get(config.method, config.method).split(' (')[0]}",
@@ -63,13 +63,13 @@ def read_result(folder: Path) -> ReportData:
         curves=curves,
         max_steps=config.max_steps,
         windows=_windows(config),
-        resets=[int(record["step"]) for record in events if record.get("reset")],
+        resets=[int(record["step"]) for record in changes if record.get("reset")],
         histograms=histograms,
         dominant=dominant,
         views=views,
         n_held_out=stats.get("views"),
         config=_settings(config),
-        events=[{key: event.get(key) for key in _EVENT_COLUMNS} for event in events],
+        changes=[{key: change.get(key) for key in _CHANGE_COLUMNS} for change in changes],
         files=_files(stats, str(folder)),
         viewer=_viewer(folder),
         verdict=verdict(stats, checks, curves.get("psnr_val")),
@@ -80,7 +80,7 @@ def read_result(folder: Path) -> ReportData:
     )
 
 
-_EVENT_COLUMNS: Final = ("step", "cloned", "split", "pruned", "reset", "num_gaussians")
+_CHANGE_COLUMNS: Final = ("step", "cloned", "split", "pruned", "reset", "num_gaussians")
 
 
 def _files(stats: Mapping[str, Any], where: str) -> list[tuple[str, ...]]:

@@ -239,7 +239,7 @@ def test_blur_ends_for_good_at_the_first_growth_that_has_not_paid(backend, windo
 
 
 @law("density", "densify_and_prune", choices=choices, scene_scale=scene_scales)
-def test_an_event_adds_clones_and_splits_and_takes_prunes_away(backend, choices, scene_scale):
+def test_a_densification_adds_clones_and_splits_and_takes_prunes_away(backend, choices, scene_scale):
     n = len(choices)
     masks = masks_of(choices)
     rows = tagged_rows(n)

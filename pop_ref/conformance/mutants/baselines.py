@@ -147,8 +147,8 @@ BASELINES: Final = (
         "budget_opens_upwards",
         "the parabola starts level and ends steeply",
         "taming.py",
-        "(2 * n_events * event - event * event)",
-        "(event * event)",
+        "(2 * n * nth - nth * nth)",
+        "(nth * nth)",
         "test_taming:the_budget_is_a_parabola_from_the_start_to_the_target",
     ),
     Mutant(

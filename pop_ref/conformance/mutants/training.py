@@ -97,7 +97,7 @@ TRAINING: Final = (
     ),
     Mutant(
         "blur_comes_back",
-        "blur that has ceased to pay is tried again at the next event",
+        "blur that has ceased to pay is tried again at the next densification step",
         "density.py",
         "for end in range(2 * span, len(windows) + 1):",
         "for end in range(max(2 * span, len(windows)), len(windows) + 1):",
@@ -153,7 +153,7 @@ TRAINING: Final = (
     ),
     Mutant(
         "blur_flag_forgets",
-        "the blur flag of earlier views is overwritten: only the event's own view counts (A2)",
+        "the blur flag of earlier views is overwritten: only the own view of the densification step counts (A2)",
         "density.py",
         "blurred = blurred | statistics.blurred",
         "blurred = blurred",

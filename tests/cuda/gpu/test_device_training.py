@@ -72,16 +72,16 @@ def test_steps_are_the_cpus_under_every_setting(engine, case, tmp_path):
 
 
 @pytest.mark.parametrize("method", ["pop", "gsplat"])
-def test_events_come_when_the_cpus_come_and_change_about_as_many(engine, method, tmp_path):
+def test_densification_steps_come_when_the_cpus_come_and_change_about_as_many(engine, method, tmp_path):
     TrainingRun(tiny_config(tmp_path / "cpu", method=method), tiny_capture()).run()
     TrainingRun(tiny_config(tmp_path / "gpu", method=method), tiny_capture(), engine=engine).run()
     ours, theirs = ([r for r in records(tmp_path / name) if "cloned" in r] for name in ("gpu", "cpu"))
-    assert [event["step"] for event in ours] == [event["step"] for event in theirs]
+    assert [change["step"] for change in ours] == [change["step"] for change in theirs]
     first, wanted = ours[0], theirs[0]
     for key in ("cloned", "split", "pruned", "num_gaussians"):
         assert abs(first[key] - wanted[key]) <= 2, key
     assert ours[-1]["num_gaussians"] == pytest.approx(theirs[-1]["num_gaussians"], rel=0.2)
-    assert [event.get("reset") for event in ours] == [event.get("reset") for event in theirs]
+    assert [change.get("reset") for change in ours] == [change.get("reset") for change in theirs]
 
 
 @pytest.mark.parametrize("method", ["pop", "gsplat"])

@@ -1,4 +1,4 @@
-"""What an event does: rows, moments and statistics stay together, and the oracle agrees."""
+"""What a densification step does: rows, moments and statistics stay together, and the oracle agrees."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pop_fast.density import DensificationStep, GsplatStrategy, POPStrategy
 from pop_ref import density as oracle
 from pop_ref.density_rows import Rows as OracleRows
-from tests.app.populations import HEIGHT, KEYS, WIDTH, make, make_info, moments, packed, run_event
+from tests.app.populations import HEIGHT, KEYS, WIDTH, densified_at, make, make_info, moments, packed
 
 
 def test_small_gaussians_are_cloned_with_their_bits_and_large_ones_split_in_two():
@@ -22,9 +22,9 @@ def test_small_gaussians_are_cloned_with_their_bits_and_large_ones_split_in_two(
     before = {key: value.detach().clone() for key, value in params.items()}
     first, second, steps = (x.clone() for x in moments(optimizers, params, "means"))
     grads = torch.tensor([[0.0, 0], [1.0, 0], [1.0, 0], [0.0, 0]])
-    event = run_event(POPStrategy(), params, optimizers, make_info(4, grads), step=600)
-    assert event == DensificationStep(cloned=1, split=1, pruned=0)
-    assert event.record() == {"cloned": 1, "split": 1, "pruned": 0}
+    change = densified_at(POPStrategy(), params, optimizers, make_info(4, grads), step=600)
+    assert change == DensificationStep(cloned=1, split=1, pruned=0)
+    assert change.record() == {"cloned": 1, "split": 1, "pruned": 0}
     # survivors 0, 1, 3; the clone of 1; two children of 2
     assert len(params["means"]) == 6
     for key in KEYS:
@@ -49,7 +49,7 @@ def test_a_parameter_dict_with_a_frozen_extra_is_edited_too():
     strategy.check_sanity(params, optimizers)
     params["opacities"].data[1] = -6.0
     grads = torch.tensor([[1.0, 0], [0.0, 0], [0.0, 0], [1.0, 0]])
-    run_event(strategy, params, optimizers, make_info(4, grads), step=600)
+    densified_at(strategy, params, optimizers, make_info(4, grads), step=600)
     assert params["tags"].tolist() == [0.0, 2.0, 3.0, 0.0, 3.0]
     assert not params["tags"].requires_grad
 
@@ -57,7 +57,7 @@ def test_a_parameter_dict_with_a_frozen_extra_is_edited_too():
 def test_optimizers_step_on_after_an_event():
     params, optimizers = make(4)
     grads = torch.ones(4, 2)
-    run_event(POPStrategy(), params, optimizers, make_info(4, grads), step=600)
+    densified_at(POPStrategy(), params, optimizers, make_info(4, grads), step=600)
     before = params["means"].detach().clone()
     params["means"].grad = torch.ones_like(params["means"])
     optimizers["means"].step()
@@ -69,11 +69,11 @@ def test_transparent_gaussians_are_pruned_and_oversized_ones_only_after_step_300
         params, optimizers = make(3)
         params["opacities"].data[0] = -6.0
         params["scales"].data[1] = math.log(0.2)
-        run_event(POPStrategy(blur_stop_iter=-1), params, optimizers, make_info(3), step)
+        densified_at(POPStrategy(blur_stop_iter=-1), params, optimizers, make_info(3), step)
         assert len(params["means"]) == survivors, step
     params, optimizers = make(3)
     params["scales"].data[1] = math.log(0.2)
-    run_event(POPStrategy(prune_too_big=False), params, optimizers, make_info(3), 3100)
+    densified_at(POPStrategy(prune_too_big=False), params, optimizers, make_info(3), 3100)
     assert len(params["means"]) == 3
 
 
@@ -82,7 +82,7 @@ def test_transparent_gaussians_are_pruned_and_oversized_ones_only_after_step_300
 def test_a_reset_lowers_opacities_to_its_ceiling_and_forgets_their_moments_only(ceiling: float, prune_opa: float):
     params, optimizers = make(3)
     other = [x.clone() for x in moments(optimizers, params, "scales")]
-    run_event(GsplatStrategy(reset_opa=ceiling, prune_opa=prune_opa), params, optimizers, make_info(3), 3000)
+    densified_at(GsplatStrategy(reset_opa=ceiling, prune_opa=prune_opa), params, optimizers, make_info(3), 3000)
     assert torch.allclose(torch.sigmoid(params["opacities"]), torch.tensor(ceiling))
     # the ceiling is the oracle's, and like there no multiple of the pruning threshold
     config = oracle.DensityConfig(reset_every=3000, prune_opa=prune_opa)
@@ -97,7 +97,7 @@ def test_a_reset_lowers_opacities_to_its_ceiling_and_forgets_their_moments_only(
 def test_a_reset_does_not_raise_opacities():
     params, optimizers = make(2, opacities=0.006)
     before = params["opacities"].detach().clone()
-    run_event(GsplatStrategy(), params, optimizers, make_info(2), 3000)
+    densified_at(GsplatStrategy(), params, optimizers, make_info(2), 3000)
     assert torch.equal(params["opacities"], before)
 
 
@@ -112,11 +112,11 @@ def test_the_gradient_is_measured_in_half_images_and_averaged_over_visible_views
         if step < 3:
             grads[0] = 0.0
         info = make_info(2, grads, visible)
-        event = strategy.step_post_backward(params, optimizers, state, step, info)
-        assert (event is None) == (step < 3)
+        change = strategy.step_post_backward(params, optimizers, state, step, info)
+        assert (change is None) == (step < 3)
     # 0 was seen three times and moved once; 1 was seen once and moved
-    assert event is not None
-    assert event.cloned == 1
+    assert change is not None
+    assert change.cloned == 1
     assert torch.equal(params["means"][2], params["means"][1])
     assert not state["grad2d"].any()
     assert not state["count"].any()
@@ -127,7 +127,7 @@ def test_inclusive_selects_a_gradient_at_the_threshold():
         params, optimizers = make(1)
         grads = torch.tensor([[2.0**-10, 0.0]])
         strategy = GsplatStrategy(inclusive=inclusive, grow_grad2d=2.0**-10 * WIDTH / 2)
-        run_event(strategy, params, optimizers, make_info(1, grads), 600)
+        densified_at(strategy, params, optimizers, make_info(1, grads), 600)
         assert len(params["means"]) == n
 
 
@@ -135,7 +135,7 @@ def test_absgrad_reads_the_absolute_gradient():
     params, optimizers = make(1)
     info = make_info(1)
     info["means2d"].absgrad = torch.ones(1, 1, 2)
-    run_event(POPStrategy(absgrad=True), params, optimizers, info, 600)
+    densified_at(POPStrategy(absgrad=True), params, optimizers, info, 600)
     assert len(params["means"]) == 2
 
 
@@ -153,10 +153,10 @@ def test_packed_and_unpacked_infos_give_the_same_bits(strategy):
             counts = torch.randint(0, 2, (2, 20), generator=g) * visible
             info = make_info(20, grads, visible, counts, cameras=2)
             info["radii"] = torch.randint(1, 9, (2, 20, 2), generator=g).int() * visible[..., None].int()
-            event = strategy.step_post_backward(
+            change = strategy.step_post_backward(
                 params, optimizers, state, step, packed(info) if is_packed else info, packed=is_packed
             )
-        results.append((params, event))
+        results.append((params, change))
     assert results[0][1] == results[1][1]
     assert results[0][1].cloned > 0
     for key in KEYS:
@@ -167,7 +167,7 @@ def test_extents_on_screen_split_and_prune_where_they_are_asked_for():
     params, optimizers = make(3)
     info = make_info(3)
     info["radii"] = torch.tensor([[[1, 1], [4, 1], [1, 20]]]).int()
-    run_event(GsplatStrategy(refine_scale2d_stop_iter=15_000), params, optimizers, info, 3100)
+    densified_at(GsplatStrategy(refine_scale2d_stop_iter=15_000), params, optimizers, info, 3100)
     # 0 stays, 1 (4/64 > 0.05) is split, 2 (20/64) is split, and its children inherit an extent that is pruned
     assert len(params["means"]) == 3
 
@@ -224,7 +224,7 @@ def test_an_event_equals_the_oracles_row_for_row(rows, step, blur_rule, inclusiv
     )
     want, _ = oracle.densify_and_prune(OracleRows(double, m, v), statistics, 1.0, step, normals, config)
 
-    run_event(strategy, params, optimizers, make_info(n, grads, visible, torch.from_numpy(dominant)), step)
+    densified_at(strategy, params, optimizers, make_info(n, grads, visible, torch.from_numpy(dominant)), step)
     assert len(params["means"]) == len(want)
     for key in KEYS:
         np.testing.assert_allclose(params[key].detach().numpy(), want.params[key], rtol=2e-6, atol=2e-6)
