@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import functools
-import importlib
 import importlib.util
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 
-# not the innermost loops, where the check costs more than the work, and not the dataclasses, which check themselves
+# not `alpha` and `pixel`, where to count calls costs as much as the work
 SHAPES_CHECKED = tuple(
     f"pop_ref.{module}"
     for module in (
@@ -21,42 +21,42 @@ SHAPES_CHECKED = tuple(
         *("contributions", "sensitivity", "fisher", "chord", "selection", "taming", "mini_splatting", "tight_tiles"),
     )
 )
-# nor these: called for every pixel, window, basis value or step so far by functions that are checked, they were four
-# fifths of all checks, and each took several times what it checked
-INNERMOST = (
-    *("dominance.dominant_id", "footprint._det", "footprint._inverse", "footprint._reach", "harmonics._basis_one"),
-    *("harmonics._basis_gradient_one", "harmonics._n_sh", "harmonics._enough", "margins._Book.touch"),
-    *("margins._Book.note", "projection._offset_vjp", "ssim._compare_window", "ssim.gaussian_window"),
-    *("tiles.tile_span", "tiles.grid_size", "optimizer.is_updated", "projection._intrinsics", "splatting._scatter"),
-    *("margins._note_pixel", "harmonics._unit", "loss_magnitudes._operated", "chord._depth_on_ray"),
-    *("chord.chord_midpoint", "chord._ray_direction", "fisher._moments_of", "activations.unit_quats_from_quats"),
-    "covariance.rotmats_from_quats",
-)
+# of a function's calls in a test the first ones are checked, and then one in so many: what is called for every pixel is
+# called in the same way, and each check took several times what it checked
+CHECKED_FIRST, CHECKED_THEN = 4, 16
 CHECKERS = ("beartype", "jaxtyping")
+_calls: list[list[int]] = []
 
 
-def _leave_innermost_unchecked() -> None:
-    """Take the checks off again; nothing else can be left out of a module that is checked."""
-    for path in INNERMOST:
-        module, *owners, name = path.split(".")
-        owner = functools.reduce(getattr, owners, importlib.import_module(f"pop_ref.{module}"))
-        checked = getattr(owner, name)
-        # what was imported before the hook came, as where the kit is called from here, is checked nowhere
-        plain = getattr(checked, "__wrapped__", checked)
-        # also where another module has imported it already
-        others = [each for key, each in sys.modules.items() if key.startswith("pop_ref")]
-        for each in (owner, *others):
-            if vars(each).get(name) is checked:
-                setattr(each, name, plain)
+def _sampled(check: Callable[..., Any], **options: Any) -> Callable[[Any], Any]:
+    """Make the decorator that jaxtyping's import hook puts on all functions and dataclasses of a module."""
+
+    def decorate(plain: Any) -> Any:
+        checked = check(**options)(plain)
+        if isinstance(plain, type):
+            return checked
+        calls = [0]
+        _calls.append(calls)
+
+        @functools.wraps(plain)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            n = calls[0]
+            calls[0] = n + 1
+            return (checked if n < CHECKED_FIRST or n % CHECKED_THEN == 0 else plain)(*args, **kwargs)
+
+        return call
+
+    return decorate
 
 
 # a bare GPU node has neither: there the tests run unchecked, and the summary says so
 UNCHECKED = [name for name in CHECKERS if importlib.util.find_spec(name) is None]
 if not UNCHECKED:
-    from jaxtyping import install_import_hook
+    import jaxtyping
 
-    install_import_hook(SHAPES_CHECKED, "beartype.beartype")
-    _leave_innermost_unchecked()
+    # the modules that the hook changes look the decorator up by this name
+    jaxtyping.jaxtyped = functools.partial(_sampled, jaxtyping.jaxtyped)
+    jaxtyping.install_import_hook(SHAPES_CHECKED, "beartype.beartype")
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
@@ -71,6 +71,12 @@ def pytest_configure() -> None:
     from pop_ref.conformance.hypothesis_profiles import load_profile
 
     load_profile(os.environ.get("HYPOTHESIS_PROFILE", "dev"))
+
+
+@pytest.fixture(autouse=True)
+def _shapes_are_checked_anew() -> None:
+    for calls in _calls:
+        calls[0] = 0
 
 
 @pytest.fixture(autouse=True)
