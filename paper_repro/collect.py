@@ -122,6 +122,7 @@ def collect(job: Job, folder: Path) -> Result:
             "load": stats["seconds_loading"],
             "train": stats["seconds"],
             "evaluate": max(stats["seconds_total"] - before["seconds_total"], 0.0),
+            **({"cpu": stats["seconds_cpu"]} if "seconds_cpu" in stats else {}),
         },
         num_gaussians=n,
         checkpoint_mib=n * size / 2**20,

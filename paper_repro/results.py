@@ -58,13 +58,14 @@ class Result:
         commit: the git commit that ran, or None outside a clone.
         config_hash: of the configuration.
         data_hash: of the capture's files.
-        machine: the processor, and the GPU where one was used.
+        machine: the processor, and after ", " the GPU where one was used.
         engine: the engine that trained.
         threads: CPU threads.
         versions: of Python and the packages that compute.
         protocol: split, images, size, metrics, timing, and the bytes of a Gaussian in a checkpoint.
         schedule: the settings as they were run, by dotted name.
-        seconds: wall time of "load", "train" and "evaluate".
+        seconds: by the clock, of "load", "train" and "evaluate"; "cpu" is the processor time of "train" over all
+            threads, where a CPU trained and it was counted.
         num_gaussians: at the end.
         checkpoint_mib: size of the parameters in float32, MiB.
         psnr: dB, mean over the held-out views.
@@ -109,6 +110,19 @@ class Result:
     opacity_histogram: tuple[int, ...]
     curve: tuple[Mapping[str, Any], ...]
     per_view: Mapping[str, Mapping[str, float]]
+
+    @property
+    def training_seconds(self) -> float:
+        """What the training takes of a machine that does nothing else, as far as it is known, s.
+
+        Processor time a thread where it was counted: the clock goes on through pauses and the work of others.
+        """
+        return self.seconds["cpu"] / self.threads if "cpu" in self.seconds else self.seconds["train"]
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether that can be compared: a CPU's by the clock cannot, since it may have done other work."""
+        return "cpu" in self.seconds or ", " in self.machine
 
     def at(self, step: int, key: str = "num_gaussians") -> float | None:
         """Give a value of the curve at a step, linearly between the logged ones; None outside of them."""
@@ -293,8 +307,9 @@ def _protocol(take: _Fields) -> dict[str, Any]:
 
 
 def _seconds(take: _Fields) -> dict[str, float]:
-    _known(take.found, _PHASES, take.where)
-    return {phase: take.number(phase, 0.0) for phase in _PHASES}
+    counted = [*_PHASES, *(["cpu"] if "cpu" in take.found else [])]
+    _known(take.found, counted, take.where)
+    return {phase: take.number(phase, 0.0) for phase in counted}
 
 
 def _lpips(take: _Fields) -> dict[str, float | None]:

@@ -38,6 +38,7 @@ OTHER_DATA: Final = "other data"
 NOT_RUN: Final = "not run"
 NO_DATA: Final = "no data"
 NO_WEIGHTS: Final = "no weights"
+BY_THE_CLOCK: Final = " (clock)"
 NOT_IN_PAPER: Final = "not in the paper"
 SEE_MAIN: Final = "see tables 1 and 2"
 
@@ -54,6 +55,7 @@ class Cell:
         difference: ours less the paper's, or why there is none.
         place: of ours among the best of its column, 0 without.
         paper_place: as the paper colours it.
+        is_ranked: whether ours may have a place.
     """
 
     value: float | None
@@ -63,6 +65,7 @@ class Cell:
     difference: str
     place: int = 0
     paper_place: int = 0
+    is_ranked: bool = True
 
 
 @dataclass(frozen=True)
@@ -203,7 +206,7 @@ def _touches(said: NotComparable, printed: PaperTable) -> bool:
 
 _GET: Final[Mapping[str, Callable[[Result], float]]] = {
     "num_gaussians_k": lambda r: r.num_gaussians / 1000.0,
-    "time_s": lambda r: r.seconds["train"],
+    "time_s": lambda r: r.training_seconds,
     "ckpt_mb": lambda r: r.checkpoint_mib,
     "psnr": lambda r: r.psnr,
     "ssim": lambda r: r.ssim,
@@ -244,13 +247,16 @@ class _Maker:
         mean, spread = _mean_and_spread(mine, known)
         digits = self._digits(metric)
         ours = f"{mean:,.{digits}f}" + (f" ± {spread:.{digits}f}" if spread is not None else "")
+        by_the_clock = metric == "time_s" and not all(r.is_timed for r in mine)
+        if by_the_clock:
+            ours += BY_THE_CLOCK
         if missing:
             ours += f" ({len(self.scenes) - len(missing)} of {len(self.scenes)} scenes)"
         against = self._against(row, metric, mine, missing)
         if against is None and printed is not None:
             # rounded first, so that no difference is "-0"
             against = f"{round(mean - printed, digits) + 0.0:+,.{digits}f}"
-        return Cell(mean, spread, ours, shown, against or shown, 0, place)
+        return Cell(mean, spread, ours, shown, against or shown, 0, place, not by_the_clock)
 
     def _printed(self, row: str, metric: str) -> tuple[float | None, str, int]:
         """Give the paper's number of a cell, how it is shown, and its colour."""
@@ -316,7 +322,8 @@ def _placed(lines: Sequence[Line], metrics: Sequence[Metric], upto: int) -> tupl
     for metric in metrics:
         # a mean over fewer scenes is another quantity
         whole = [line for line in lines if not line.missing]
-        values = {line.row: v for line in whole if (v := line.cells[metric.id].value) is not None}
+        cells = {line.row: line.cells[metric.id] for line in whole}
+        values = {row: c.value for row, c in cells.items() if c.value is not None and c.is_ranked}
         if len(values) < 2:
             continue
         for row, place in places(values, metric, upto).items():
@@ -356,7 +363,10 @@ def _header(scale: str, found: Sequence[Result]) -> tuple[str, ...]:
     machines = sorted({f"{r.machine}, {r.engine}, {r.threads} threads" for r in found})
     lpips = "the variant that the paper's cell seems to hold (protocol.md, C1)" if scale == "paper" else "alex_norm"
     about += f" LPIPS is {lpips}."
-    return first, about, f"Seconds are of training alone, on {'; '.join(machines)}."
+    clock = "(clock) is by the clock of a processor that may have had other work, so that it has no place. "
+    timing = "" if all(r.is_timed for r in found) else clock
+    cpu = ", those of a CPU its processor time a thread" if any("cpu" in r.seconds for r in found) else ""
+    return first, about, f"Seconds are of training alone{cpu}. {timing}Machines: {'; '.join(machines)}."
 
 
 def _ratios(printed: PaperTable, groups: Mapping[str, tuple[str, ...]], found: Sequence[Result]) -> Block:

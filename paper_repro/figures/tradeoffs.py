@@ -57,7 +57,8 @@ def psnr_against_time(asked: Asked) -> Drawn:
     ]
     machines = sorted({f"{r.machine}, {r.engine}, {_threads(r)}" for r in chosen.all})
     where = machines[0] if len(machines) == 1 else f"{len(machines)} machines, so that times do not compare"
-    note = foot(asked, chosen, f"Area of a marker: number of Gaussians, written at it. Time on {where}.")
+    clock = "" if all(r.is_timed for r in chosen.all) else ", by the clock though there may have been other work"
+    note = foot(asked, chosen, f"Area of a marker: number of Gaussians, written at it. Time on {where}{clock}.")
     sheet = Sheet(note, 2.3)
     axes = sheet.panel(Margins(right=0.1))
     _plane(axes, points, "training time (s)", 0.16)
@@ -104,7 +105,7 @@ def psnr_against_count(asked: Asked) -> Drawn:
 def _means(chosen: Chosen, row: str) -> tuple[float, float, float]:
     """Average seconds of training, PSNR and Gaussians."""
     get: tuple[Callable[[Result], float], ...] = (
-        lambda r: r.seconds["train"],
+        lambda r: r.training_seconds,
         lambda r: r.psnr,
         lambda r: float(r.num_gaussians),
     )
@@ -212,7 +213,7 @@ def _table(chosen: Chosen) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
     for row, by_scene in found.items():
         for scene in chosen.scenes:
             for r in by_scene[scene]:
-                rows.append((row, scene, r.seed, r.run, r.seconds["train"], r.psnr, r.num_gaussians, r.machine))
+                rows.append((row, scene, r.seed, r.run, r.training_seconds, r.psnr, r.num_gaussians, r.machine))
         seconds, psnr, n = _means(chosen, row)
         rows.append((row, "mean", "", "", seconds, psnr, n, ""))
     return ("row", "scene", "seed", "run", "seconds", "psnr", "num_gaussians", "machine"), rows

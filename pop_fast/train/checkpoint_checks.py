@@ -87,7 +87,9 @@ def check_content(content: Mapping[str, Any]) -> dict[str, Any]:
     step = _whole(content["step"], "step")
     splats = check_splats(content["splats"], torch.float32)
     packed = _mapping(content["optimizers"], "optimizers", KEYS)
-    seconds = _mapping(content["seconds"], "seconds", ("train", "total"))
+    # files of older versions do not have processor time
+    seconds = {"cpu": None, **_mapping(content["seconds"], "seconds")}
+    _mapping(seconds, "seconds", ("train", "total", "cpu"))
     _check_words(_mapping(content["config"], "config"), content["capture"])
     _whole(content["metrics_bytes"], "metrics_bytes")
     _whole(content["threads"], "threads", least=1)
@@ -98,7 +100,10 @@ def check_content(content: Mapping[str, Any]) -> dict[str, Any]:
         "strategy": _strategy(content["strategy"], list(splats["shN"].shape), step + 1),
         "view_order": _view_order(content["view_order"]),
         "appearance": _appearance(content.get("appearance", {}), step + 1),
-        "seconds": {key: _number(value, f"seconds.{key}") for key, value in seconds.items()},
+        "seconds": {
+            key: None if key == "cpu" and value is None else _number(value, f"seconds.{key}")
+            for key, value in seconds.items()
+        },
     }
     tensors = {name: checked[name] for name in ("splats", "optimizers", "strategy", "view_order", "appearance")}
     _check_apart(tensors, "", {})

@@ -23,7 +23,8 @@ class Segment:
         densification: what density control did after the last, None where nothing was due.
         before: Gaussians that were trained.
         after: Gaussians after that.
-        seconds: that all of it took.
+        seconds: that all of it took, by the clock.
+        seconds_cpu: of processor time, over all threads.
     """
 
     first: int
@@ -34,6 +35,7 @@ class Segment:
     before: int
     after: int
     seconds: float
+    seconds_cpu: float
 
 
 def record_of(

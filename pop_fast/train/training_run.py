@@ -126,6 +126,8 @@ class TrainingRun:
         self._watch = watch
         self._stepper: Stepper | None = None
         self._train_seconds = 0.0
+        # None where a part of the run did not count it
+        self._cpu_seconds: float | None = 0.0
         self._loading_seconds = loading_seconds
         self._started = 0.0
         # the first Gaussians' opacities while the folder is still as it was found
@@ -236,15 +238,18 @@ class TrainingRun:
         Raises:
             PopError: a number is no longer finite; names it.
         """
-        start, first, before = time.perf_counter(), self.step, len(self.params["means"])
+        start, start_cpu = time.perf_counter(), time.process_time()
+        first, before = self.step, len(self.params["means"])
         phase, stepper = phase_at(self.config, self.strategy, first), self.stepper
         size = self.config.batch_size
         views = [", ".join(self._train[self._order.next()].name for _ in range(size)) for _ in range(first, last)]
         with words_for_memory():
             stats = self._measured(stepper, first, last, phase)
             densification = self._change(last - 1)
-        after, seconds = len(self.params["means"]), time.perf_counter() - start
-        return Segment(first, phase, views, stats, densification, before, after, seconds)
+        seconds, seconds_cpu = time.perf_counter() - start, time.process_time() - start_cpu
+        return Segment(
+            first, phase, views, stats, densification, before, len(self.params["means"]), seconds, seconds_cpu
+        )
 
     def _measured(self, stepper: Stepper, first: int, last: int, phase: Phase) -> list[StepStats]:
         try:
@@ -316,6 +321,8 @@ class TrainingRun:
                 self._latest = f", PSNR {record['psnr']:.2f}"
                 bar.set_postfix_str(f"PSNR {record['psnr']:.2f}, N {record['num_gaussians']:,}", refresh=False)
         self._train_seconds += segment.seconds
+        if self._cpu_seconds is not None:
+            self._cpu_seconds += segment.seconds_cpu
         bar.update(self.step - segment.first)
 
     def _milestones(self, step: int) -> None:
@@ -373,9 +380,16 @@ class TrainingRun:
             **run_facts(engine.backend.name, self._train_seconds, self._total_seconds),
             "stepper": stepper.name,
             "seconds_loading": self._loading_seconds,
+            **self._cpu_facts(),
             **engine.facts(),
             **stepper.facts(),
         }
+
+    def _cpu_facts(self) -> dict[str, float]:
+        """Give the processor time of a training on the processor, which pauses and other work do not lengthen."""
+        if self._cpu_seconds is None or self._engine.device.type != "cpu":
+            return {}
+        return {"seconds_cpu": self._cpu_seconds}
 
     def _save(self) -> None:
         """Write a checkpoint, if this is the process that writes and all hold the same."""
@@ -393,7 +407,7 @@ class TrainingRun:
             "config": self.config.binding(),
             "capture": self._fingerprint(),
             "metrics_bytes": self._results.flush_metrics(),
-            "seconds": {"train": self._train_seconds, "total": self._total_seconds},
+            "seconds": {"train": self._train_seconds, "total": self._total_seconds, "cpu": self._cpu_seconds},
             "threads": torch.get_num_threads(),
             "versions": versions(),
         }
@@ -414,6 +428,7 @@ class TrainingRun:
         if self._ranks.writes:
             self._results.open_metrics(content["metrics_bytes"])
         self._train_seconds = content["seconds"]["train"]
+        self._cpu_seconds = content["seconds"]["cpu"]
         self._started -= content["seconds"]["total"]
         self.step = content["step"] + 1
         self._stepper = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from dataclasses import replace
 
@@ -185,3 +186,19 @@ def test_metrics_that_the_checkpoint_vouches_for_must_be_there(stopped, tmp_path
     (tmp_path / "metrics.jsonl").write_text("{}\n")
     with pytest.raises(PopError, match=r"metrics\.jsonl: has 3 bytes, fewer than"):
         resume(tmp_path)
+
+
+def test_processor_time_goes_on_from_a_checkpoint_and_is_not_told_where_a_part_was_not_counted(stopped, tmp_path):
+    written = []
+    for name in ("counted", "older"):
+        folder = shutil.copytree(stopped, tmp_path / name)
+        [(_, path)] = ckpt.list_checkpoints(folder)[-1:]
+        content = torch.load(path, weights_only=True)
+        before = content["seconds"]["cpu"]
+        assert before > 0.0
+        if name == "older":
+            del content["seconds"]["cpu"]
+            ckpt.save_checkpoint(path, content)
+        written.append(TrainingRun(tiny_config(folder), tiny_capture(), resume=True).run())
+    assert written[0]["seconds_cpu"] > before
+    assert "seconds_cpu" not in written[1]

@@ -238,6 +238,8 @@ def test_times_of_different_machines_are_said_not_to_compare():
     runs = [result("pop"), result("gsplat", machine="another")]
     assert "2 machines, so that times do not compare" in texts(drawn("1", runs)).replace("\n", " ")
     assert "Time on a machine, native, 1 thread." in texts(drawn("1", runs[:1])).replace("\n", " ")
+    untimed = [result("pop", seconds={"load": 1.0, "train": 9.0, "evaluate": 1.0})]
+    assert "1 thread, by the clock though" in texts(drawn("1", untimed)).replace("\n", " ")
 
 
 def test_at_the_papers_scale_a_figure_is_of_the_papers_scenes():

@@ -64,6 +64,7 @@ DAMAGE = [
     (_set("protocol/width", 0), "protocol: width is 0; it must be a whole number of at least 1"),
     (_set("protocol/extra", 0), "protocol: extra is not a field"),
     (_set("seconds/train", -1.0), "seconds: train is -1.0"),
+    (_set("seconds/cpu", -1.0), "seconds: cpu is -1.0"),
     (_set("lpips/vgg_01", "none"), "lpips: vgg_01"),
     (_set("lpips_reason", None), "lpips_reason is null; it must be a text, since a variant"),
     (_set("opacity_below_0.1", 1.5), "opacity_below_0.1 is 1.5; it must be a finite number from 0 to 1"),

@@ -183,6 +183,21 @@ def test_the_base_of_every_ratio_is_in_its_table() -> None:
     assert set(REFERENCES) == {1, 2, 3, 4, 5}
 
 
+def test_seconds_are_of_the_processor_and_those_by_the_clock_have_no_place() -> None:
+    clock = {"load": 1.0, "train": 50.0, "evaluate": 2.0}
+    found = [
+        result("gsplat", seconds={**clock, "cpu": 240.0}, threads=2),
+        result("pop", seconds={**clock, "cpu": 200.0}, threads=2),
+        result("3dgs", seconds=clock),
+        result("taming", seconds=clock, machine="a machine, a GPU"),
+    ]
+    made = table(1, "dev", found)
+    cells = {row: line_of(made, 0, row).cells["time_s"] for row in ("gsplat", "pop", "3dgs", "taming")}
+    assert [cell.ours for cell in cells.values()] == ["120", "100", "50 (clock)", "50"]
+    assert [cell.place for cell in cells.values()] == [3, 2, 0, 1]
+    assert "(clock) is by the clock of a processor that may have had other work" in markdown(made)
+
+
 def test_the_best_three_are_marked_and_ties_alike() -> None:
     made = table(1, "dev", DEV)
     assert {r: line_of(made, 0, r).cells["psnr"].place for r in ("3dgs", "gsplat", "pop", "mini_splatting")} == {

@@ -76,7 +76,9 @@ def test_a_result_lies_in_its_place_and_holds_what_was_asked_for(made):
     assert (result.protocol["width"], result.protocol["height"], result.protocol["resize"]) == (96, 72, "none")
     assert result.schedule["pop.blur_stop_iter"] == 70
     assert not {"data", "result_dir", "seed", "backend"} & set(result.schedule)
-    assert all(result.seconds[phase] > 0.0 for phase in ("load", "train", "evaluate"))
+    assert all(result.seconds[phase] > 0.0 for phase in ("load", "train", "evaluate", "cpu"))
+    # one thread takes no more of the processor than the clock shows, but for the grain of the two
+    assert result.training_seconds == result.seconds["cpu"] < result.seconds["train"] + 1.0
     assert result.checkpoint_mib == pytest.approx(result.num_gaussians * 236 / 2**20, rel=1e-12)
     assert result.lpips == {"vgg_01": None, "alex_norm": None, "alex_01": None}
     assert result.psnr == pytest.approx(sum(view["psnr"] for view in result.per_view.values()) / 3, rel=1e-12)
