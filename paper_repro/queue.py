@@ -19,6 +19,8 @@ from pathlib import Path
 from types import FrameType
 
 from paper_repro.jobs import Job, NotTrainableError
+from paper_repro.results import RESULTS
+from paper_repro.status import everything, stale_files
 from paper_repro.train_row import BusyError
 
 __all__ = ["Outcome", "run_queue"]
@@ -69,7 +71,7 @@ def run_queue(jobs: Sequence[Job], results: Path, words: Sequence[str], threads:
         results: the folder of results.
         words: further words of `pop-repro run`: --data and the like.
         threads: CPU threads of a training.
-        commit: commit each result in git when it is there.
+        commit: commit each result in git when it is there, with the pages that are made from the package's results.
 
     Returns:
         What became of them; a failed row does not keep the next ones from being trained.
@@ -115,11 +117,24 @@ def _words_of(job: Job) -> list[str]:
 
 
 def _commit(job: Job, results: Path) -> None:
-    path = job.result(results)
-    git = ["git", "-C", str(path.parent)]
+    path = job.result(results).resolve()
+    paths = [str(each) for each in (path, *(_pages(path.parent) if results.resolve() == RESULTS else []))]
     message = f"Result: {job.row.name} on {job.scene.name}, {job.scale.name} scale, seed {job.seed}"
-    for command in (["add", "--", path.name], ["commit", "--quiet", "-m", message, "--", path.name]):
-        done = subprocess.run([*git, *command], capture_output=True, text=True, check=False)
+    for command in (["add"], ["commit", "--quiet", "-m", message]):
+        done = _git(path.parent, *command, "--", *paths)
         if done.returncode != 0:
             print(f"pop-repro: git {command[0]} {path.name} failed: {done.stderr.strip()}", file=sys.stderr)
             return
+
+
+def _pages(folder: Path) -> list[Path]:
+    """Write what is made from the package's results, but for pages that somebody edits just now; give what changed."""
+    stale = stale_files(everything())
+    unedited = [path for path in stale if not _git(folder, "status", "--porcelain", "--", str(path)).stdout]
+    for path in unedited:
+        path.write_text(stale[path], encoding="utf-8")
+    return unedited
+
+
+def _git(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["git", "-C", str(folder), *words], capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""What is reproduced so far: the status table of README.md, claims.md, and the generated parts of protocol.md.
+"""What is reproduced so far: the status table of README.md and docs/paper.md, claims.md, and what protocol.md says.
 
 python -m paper_repro.status            print the status table
 python -m paper_repro.status --write    write all of them, from the results that are there
@@ -23,7 +23,7 @@ from paper_repro.tables import BEYOND, SCENES_OF
 from pop_fast.errors import PopError
 from pop_ref.ambiguities import AMBIGUITIES
 
-__all__ = ["HERE", "files", "status_table", "with_part"]
+__all__ = ["HERE", "everything", "files", "stale_files", "status_table", "with_part"]
 
 HERE: Final = Path(__file__).resolve().parent
 _MADE: Final = "<!-- made by python -m paper_repro.status --write -->"
@@ -78,11 +78,29 @@ def files(results: Iterable[Result], folder: Path = HERE) -> dict[Path, str]:
     protocol = with_part(protocol, "ambiguities", _ambiguities())
     answered = (*readings.answers(found), *readings.experiments(found))
     protocol = with_part(protocol, "readings", readings.markdown(answered))
-    return {
-        folder / "README.md": with_part(_read(folder / "README.md"), "status", status_table(found)),
+    table = status_table(found)
+    made = {
+        folder / "README.md": with_part(_read(folder / "README.md"), "status", table),
         folder / "protocol.md": protocol,
         folder / "claims.md": _claims(found),
     }
+    # only a clone has it
+    page = folder.parent / "docs" / "paper.md"
+    return {**made, page: with_part(_read(page), "reproduction", table)} if page.is_file() else made
+
+
+def stale_files(results: Iterable[Result]) -> dict[Path, str]:
+    """Give those of the generated files that hold something else, with the text that they should have.
+
+    Raises:
+        PopError: as `files`.
+    """
+    return {path: text for path, text in files(results).items() if not path.is_file() or _read(path) != text}
+
+
+def everything() -> list[Result]:
+    """Read the results of all scales that the package holds."""
+    return [r for scale in SCALES for r in read_all(scale, RESULTS)]
 
 
 def with_part(text: str, name: str, part: str) -> str:
@@ -151,12 +169,12 @@ def _claims(found: Sequence[Result]) -> str:
 
 def main(words: Sequence[str]) -> int:
     """Run the script."""
-    found = [r for scale in SCALES for r in read_all(scale, RESULTS)]
+    found = everything()
     if "--write" not in words and "--check" not in words:
         print(status_table(found))
         return 0
-    stale = [(path, text) for path, text in files(found).items() if not path.is_file() or _read(path) != text]
-    for path, text in stale:
+    stale = stale_files(found)
+    for path, text in stale.items():
         if "--write" in words:
             path.write_text(text, encoding="utf-8")
         else:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import sys
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cached_property
@@ -54,6 +53,7 @@ from pop_fast.train.results import ResultFolder
 from pop_fast.train.schedule import ViewOrder, active_sh_degree
 from pop_fast.train.signals import StopRequest, stop_requests
 from pop_fast.train.stepper import Engine, Stepper, Task
+from pop_fast.train.times import Stopwatch, Times
 from pop_fast.train.views import ViewTensors
 
 Watch = Callable[["TrainingRun"], None]
@@ -125,11 +125,7 @@ class TrainingRun:
         self.step = 0
         self._watch = watch
         self._stepper: Stepper | None = None
-        self._train_seconds = 0.0
-        # None where a part of the run did not count it
-        self._cpu_seconds: float | None = 0.0
-        self._loading_seconds = loading_seconds
-        self._started = 0.0
+        self._times = Times(loading_seconds)
         # the first Gaussians' opacities while the folder is still as it was found
         self._unwritten: np.ndarray | None = None
         # the training PSNR of the last record, in words
@@ -170,7 +166,7 @@ class TrainingRun:
         if self._ranks.writes and not isinstance(self.strategy, ForeignStrategy):
             for warning in find_warnings(self.config, self._train):
                 print(f"warning: {warning}", file=sys.stderr, flush=True)
-        self._started = time.perf_counter()
+        self._times.start()
         with reproducible(self.config.threads), stop_requests() as stop:
             try:
                 self._begin()
@@ -191,9 +187,8 @@ class TrainingRun:
                 self._results.write_settings(self.config, self._beside)
         else:
             self._unwritten = self._opacities().numpy()
-        start = time.perf_counter()
-        self._stepper = self.stepper
-        self._loading_seconds += time.perf_counter() - start
+        with self._times.is_loading():
+            self._stepper = self.stepper
 
     def _loop(self, stop: StopRequest) -> dict[str, Any]:
         config = self.config
@@ -205,7 +200,7 @@ class TrainingRun:
                 segment = self.take_steps(segment_end(config, self.strategy, self.step, longest))
                 self._log(segment, bar)
                 beat.say(
-                    so_far(self.step, config.max_steps, len(self.params["means"]), self._train_seconds, self._latest)
+                    so_far(self.step, config.max_steps, len(self.params["means"]), self._times.train, self._latest)
                 )
                 if self._unwritten is not None:
                     # a rate can be so high that the first step is the last; that is no reason to replace anything
@@ -238,7 +233,7 @@ class TrainingRun:
         Raises:
             PopError: a number is no longer finite; names it.
         """
-        start, start_cpu = time.perf_counter(), time.process_time()
+        took = Stopwatch()
         first, before = self.step, len(self.params["means"])
         phase, stepper = phase_at(self.config, self.strategy, first), self.stepper
         size = self.config.batch_size
@@ -246,10 +241,8 @@ class TrainingRun:
         with words_for_memory():
             stats = self._measured(stepper, first, last, phase)
             densification = self._change(last - 1)
-        seconds, seconds_cpu = time.perf_counter() - start, time.process_time() - start_cpu
-        return Segment(
-            first, phase, views, stats, densification, before, len(self.params["means"]), seconds, seconds_cpu
-        )
+        after = len(self.params["means"])
+        return Segment(first, phase, views, stats, densification, before, after, *took.read())
 
     def _measured(self, stepper: Stepper, first: int, last: int, phase: Phase) -> list[StepStats]:
         try:
@@ -315,14 +308,12 @@ class TrainingRun:
         """Write the records of a segment."""
         for step in range(segment.first, self.step):
             lr_means = float(self.updates.rates[step, KEYS.index("means")])
-            record = record_of(segment, step, self.config, lr_means, self._train_seconds)
+            record = record_of(segment, step, self.config, lr_means, self._times.train)
             if record is not None and self._ranks.writes:
                 self._results.log(record)
                 self._latest = f", PSNR {record['psnr']:.2f}"
                 bar.set_postfix_str(f"PSNR {record['psnr']:.2f}, N {record['num_gaussians']:,}", refresh=False)
-        self._train_seconds += segment.seconds
-        if self._cpu_seconds is not None:
-            self._cpu_seconds += segment.seconds_cpu
+        self._times.add(segment.seconds, segment.seconds_cpu)
         bar.update(self.step - segment.first)
 
     def _milestones(self, step: int) -> None:
@@ -361,11 +352,11 @@ class TrainingRun:
             **population(self._opacities()),
             **self._facts(),
         }
-        self._results.write_stats("train", step, {**stats, "ellipse_time": self._train_seconds})
+        self._results.write_stats("train", step, {**stats, "ellipse_time": self._times.train})
         folder = self._results if step + 1 == config.max_steps else None
         given = (self._engine.backend, self.params, self._test, config, self.sh_degree(step), self._nets)
         stats |= evaluate(*given, folder, step)
-        stats["seconds_total"] = self._total_seconds
+        stats["seconds_total"] = self._times.total
         self._results.write_stats("val", step, stats)
         return stats
 
@@ -377,19 +368,12 @@ class TrainingRun:
     def _facts(self) -> dict[str, Any]:
         stepper, engine = self.stepper, self._engine
         return {
-            **run_facts(engine.backend.name, self._train_seconds, self._total_seconds),
+            **run_facts(engine.backend.name, self._times.train, self._times.total),
             "stepper": stepper.name,
-            "seconds_loading": self._loading_seconds,
-            **self._cpu_facts(),
+            **self._times.facts(on_cpu=engine.device.type == "cpu"),
             **engine.facts(),
             **stepper.facts(),
         }
-
-    def _cpu_facts(self) -> dict[str, float]:
-        """Give the processor time of a training on the processor, which pauses and other work do not lengthen."""
-        if self._cpu_seconds is None or self._engine.device.type != "cpu":
-            return {}
-        return {"seconds_cpu": self._cpu_seconds}
 
     def _save(self) -> None:
         """Write a checkpoint, if this is the process that writes and all hold the same."""
@@ -407,7 +391,7 @@ class TrainingRun:
             "config": self.config.binding(),
             "capture": self._fingerprint(),
             "metrics_bytes": self._results.flush_metrics(),
-            "seconds": {"train": self._train_seconds, "total": self._total_seconds, "cpu": self._cpu_seconds},
+            "seconds": self._times.state_dict(),
             "threads": torch.get_num_threads(),
             "versions": versions(),
         }
@@ -427,9 +411,7 @@ class TrainingRun:
         self.appearance.load_state_dict(content["appearance"])
         if self._ranks.writes:
             self._results.open_metrics(content["metrics_bytes"])
-        self._train_seconds = content["seconds"]["train"]
-        self._cpu_seconds = content["seconds"]["cpu"]
-        self._started -= content["seconds"]["total"]
+        self._times.load_state_dict(content["seconds"])
         self.step = content["step"] + 1
         self._stepper = None
 
@@ -442,10 +424,6 @@ class TrainingRun:
         """Return the highest colour band that a step, from 0, draws."""
         config = self.config
         return active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter)
-
-    @property
-    def _total_seconds(self) -> float:
-        return time.perf_counter() - self._started
 
     def _fingerprint(self) -> dict[str, str]:
         return ckpt.capture_fingerprint(self._capture, self.config.test_every)

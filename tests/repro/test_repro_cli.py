@@ -12,7 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from paper_repro import queue as repro_queue
 from paper_repro.cli import COMMANDS, main
+from paper_repro.jobs import job_named
 from paper_repro.results import read_all
 from paper_repro.rows import ROWS
 
@@ -169,20 +171,54 @@ def test_claims_are_judged(queued, capsys):
     assert "claim" in call("claims", "--scale", "toy", "--results", queued[0] / "results", capsys=capsys)
 
 
-def test_results_are_committed_where_that_is_asked_for(tmp_path):
+def git(folder, *words):
+    return subprocess.run(["git", *words], cwd=folder, capture_output=True, text=True, check=True).stdout
+
+
+def new_repository(folder):
     for words in (["init", "-q"], ["config", "user.name", "a"], ["config", "user.email", "a@b"]):
-        subprocess.run(["git", *words], cwd=tmp_path, check=True)
+        git(folder, *words)
+
+
+def test_results_are_committed_where_that_is_asked_for(tmp_path):
+    new_repository(tmp_path)
     (tmp_path / "other.txt").write_text("not to be committed")
-    subprocess.run(["git", "add", "other.txt"], cwd=tmp_path, check=True)
+    git(tmp_path, "add", "other.txt")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     words = ["--scale", "toy", "--rows", "l1_div_100", "--out", "results", "--work", "work", "--commit"]
     command = [sys.executable, "-m", "paper_repro", "queue", *words]
     subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True)
-    shown = subprocess.run(
-        ["git", "show", "--stat", "--format=%s"], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    assert shown.stdout.startswith("Result: l1_div_100 on demo, toy scale, seed 42\n")
-    assert "demo_42.json" in shown.stdout
-    assert "other.txt" not in shown.stdout
+    shown = git(tmp_path, "show", "--stat", "--format=%s")
+    assert shown.startswith("Result: l1_div_100 on demo, toy scale, seed 42\n")
+    assert "demo_42.json" in shown
+    assert "other.txt" not in shown
     result = json.loads((tmp_path / "results" / "toy" / "l1_div_100" / "demo_42.json").read_text())
     assert result["psnr"] > 0.0
+
+
+def test_pages_made_from_the_packages_results_are_committed_with_them_unless_somebody_edits_them(tmp_path, monkeypatch):
+    new_repository(tmp_path)
+    job = job_named("pop", "demo", "toy", 42)
+    results, pages = tmp_path / "results", [tmp_path / name for name in ("claims.md", "protocol.md")]
+    for page in pages:
+        page.write_text("old")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-q", "-m", "pages")
+    pages[1].write_text("being edited")
+    path = job.result(results)
+    path.parent.mkdir(parents=True)
+    path.write_text("{}")
+    monkeypatch.setattr(repro_queue, "RESULTS", results)
+    monkeypatch.setattr(repro_queue, "stale_files", lambda found: dict.fromkeys(pages, "new"))
+    repro_queue._commit(job, results)
+    assert set(git(tmp_path, "show", "--format=", "--name-only").split()) == {
+        "claims.md", "results/toy/pop/demo_42.json",
+    }  # fmt: skip
+    assert [page.read_text() for page in pages] == ["new", "being edited"]
+    # elsewhere than in the package's own folder nothing but the result
+    pages[0].write_text("old")
+    git(tmp_path, "commit", "-q", "-m", "old again", "--", "claims.md")
+    path.write_text("{ }")
+    monkeypatch.setattr(repro_queue, "RESULTS", tmp_path)
+    repro_queue._commit(job, results)
+    assert git(tmp_path, "show", "--format=", "--name-only").split() == ["results/toy/pop/demo_42.json"]
