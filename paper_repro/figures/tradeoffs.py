@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 from paper_repro.figures.data import Asked, Chosen, choose, mean_of
 from paper_repro.figures.foot import foot
+from paper_repro.figures.names import Marker, along, places
 from paper_repro.figures.sheet import Drawn, Margins, Sheet
 from paper_repro.figures.style import color_of, count, darker, log_ticks, name_of
 from paper_repro.paper import paper
@@ -29,9 +29,6 @@ _STAR: Final = "l2"
 _LARGEST: Final = 330.0
 # and of the smallest in which its middle is marked
 _WITH_MIDDLE: Final = 16.0
-# where a name may stand: directions from the marker, the best first
-_SIDES: Final = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1))
-_GAP, _FAR = 2.0, 9.0
 
 
 @dataclass(frozen=True)
@@ -121,8 +118,8 @@ def _plane(axes: Axes, points: Sequence[_Point], label: str, room: float) -> Non
     """Settle the axes around points, with some room for their names."""
     xs, ys = [p.x for p in points], [p.y for p in points]
     stretch = max((max(xs) / min(xs)) ** room, 1.08)
-    # names stand to the right where they can
-    low, high = min(xs) / stretch, max(xs) * stretch**2.0
+    # names stand beside their markers where they can
+    low, high = min(xs) / stretch**2.0, max(xs) * stretch**2.0
     axes.set_xscale("log")
     axes.set_xlim(low, high)
     log_ticks(axes.xaxis, low, high)
@@ -133,11 +130,8 @@ def _plane(axes: Axes, points: Sequence[_Point], label: str, room: float) -> Non
     axes.set_ylabel("PSNR (dB)")
 
 
-Box = tuple[float, float, float, float]
-
-
 def _name(axes: Axes, points: Sequence[_Point], joined: Sequence[str] = ()) -> None:
-    """Write each point's name where it covers least of markers, of other names and of what is outside the axes.
+    """Write each point's name beside its marker.
 
     Args:
         axes: whose limits and place are settled.
@@ -147,64 +141,38 @@ def _name(axes: Axes, points: Sequence[_Point], joined: Sequence[str] = ()) -> N
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextToPath
 
-    to_points = 72.0 / axes.figure.dpi
-    size = 6.4
+    to_points, size = 72.0 / axes.figure.dpi, 6.4
     measure, font = TextToPath(), FontProperties(size=size)
     x0, y0 = axes.transAxes.transform((0.0, 0.0)) * to_points
     x1, y1 = axes.transAxes.transform((1.0, 1.0)) * to_points
-    frame: Box = (float(x0) + 1.0, float(y0) + 1.0, float(x1), float(y1))
     at = {p.row: [float(v) * to_points for v in axes.transData.transform((p.x, p.y))] for p in points}
-    radius = {p.row: (p.area / 3.1416) ** 0.5 for p in points}
-    boxes = {p.row: _around(at[p.row], radius[p.row] + _GAP) for p in points}
-    taken = _along([at[row] for row in joined])
-    for point in sorted(points, key=lambda p: p.y):
+    markers = []
+    for point in points:
         lines = point.text.split("\n")
         width = max(measure.get_text_width_height_descent(line, font, ismath=False)[0] for line in lines)
-        height = len(lines) * size * 1.15
         x, y = at[point.row]
-        best: tuple[float, Box] | None = None
-        for step, gap in enumerate((_GAP, _FAR)):
-            for rank, (right, up) in enumerate(_SIDES):
-                off = radius[point.row] * (0.75 if right and up else 1.0) + gap
-                cx, cy = x + right * (off + width / 2.0), y + up * (off + height / 2.0)
-                box = (cx - width / 2.0, cy - height / 2.0, cx + width / 2.0, cy + height / 2.0)
-                others = [other for row, other in boxes.items() if row != point.row]
-                covered = sum(_overlap(box, other) for other in (*others, *taken))
-                outside = width * height - _overlap(box, frame)
-                cost = covered + 2.0 * outside + rank + 12.0 * step
-                if best is None or cost < best[0]:
-                    best = (cost, box)
-        assert best is not None
-        box = best[1]
-        taken.append(box)
+        markers.append(Marker(x, y, (point.area / 3.1416) ** 0.5, width, len(lines) * size * 1.15))
+    # the axis itself is a line that names keep off
+    frame = (float(x0) + 3.0, float(y0) + 1.0, float(x1), float(y1))
+    found = places(markers, frame, along([at[row] for row in joined]))
+    for point, marker, place in zip(points, markers, found, strict=True):
+        left, bottom, right, top = place.box
+        color = darker(color_of(point.row))
+        if place.is_joined:
+            nearest = (min(max(marker.x, left), right), min(max(marker.y, bottom), top))
+            ends = [[v / to_points for v in end] for end in ((marker.x, marker.y), nearest)]
+            axes.plot(*axes.transData.inverted().transform(ends).T, color=color, linewidth=0.5, zorder=1)
         axes.annotate(
             point.text,
-            ((box[0] + box[2]) / 2.0, (box[1] + box[3]) / 2.0),
+            ((left + right) / 2.0, (bottom + top) / 2.0),
             xycoords="figure points",
             ha="center",
             va="center",
             size=size,
             linespacing=1.05,
-            color=darker(color_of(point.row)),
+            color=color,
             zorder=5,
         )
-
-
-def _around(at: Sequence[float], half: float) -> Box:
-    return (at[0] - half, at[1] - half, at[0] + half, at[1] + half)
-
-
-def _along(line: Sequence[Sequence[float]]) -> list[Box]:
-    """Cover a line with small boxes."""
-    boxes = []
-    for (x0, y0), (x1, y1) in pairwise(line):
-        n = int(max(abs(x1 - x0), abs(y1 - y0)) / 2.0) + 1
-        boxes += [_around((x0 + (x1 - x0) * i / n, y0 + (y1 - y0) * i / n), 1.0) for i in range(n + 1)]
-    return boxes
-
-
-def _overlap(a: Box, b: Box) -> float:
-    return max(min(a[2], b[2]) - max(a[0], b[0]), 0.0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0.0)
 
 
 def _table(chosen: Chosen) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
