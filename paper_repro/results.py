@@ -124,6 +124,11 @@ class Result:
         """Whether that can be compared: a CPU's by the clock cannot, since it may have done other work."""
         return "cpu" in self.seconds or ", " in self.machine
 
+    @property
+    def trained_on(self) -> str:
+        """Say of the training time what it is a time of: machine, engine, threads."""
+        return f"{self.machine}, {self.engine}, {self.threads} thread{'' if self.threads == 1 else 's'}"
+
     def at(self, step: int, key: str = "num_gaussians") -> float | None:
         """Give a value of the curve at a step, linearly between the logged ones; None outside of them."""
         known = [(int(p["step"]), float(p[key])) for p in self.curve if p.get(key) is not None]

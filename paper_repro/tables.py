@@ -360,7 +360,7 @@ def _header(scale: str, found: Sequence[Result]) -> tuple[str, ...]:
         )
     if not found:
         return first, "No run of this table is finished."
-    machines = sorted({f"{r.machine}, {r.engine}, {r.threads} threads" for r in found})
+    machines = sorted({r.trained_on for r in found})
     lpips = "the variant that the paper's cell seems to hold (protocol.md, C1)" if scale == "paper" else "alex_norm"
     about += f" LPIPS is {lpips}."
     clock = "(clock) is by the clock of a processor that may have had other work, so that it has no place. "

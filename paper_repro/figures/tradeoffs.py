@@ -52,7 +52,7 @@ def psnr_against_time(asked: Asked) -> Drawn:
         _Point(row, seconds, psnr, n, _LARGEST * n / largest, f"{name_of(row)}\n{count(n)}")
         for row, (seconds, psnr, n) in means.items()
     ]
-    machines = sorted({f"{r.machine}, {r.engine}, {_threads(r)}" for r in chosen.all})
+    machines = sorted({r.trained_on for r in chosen.all})
     where = machines[0] if len(machines) == 1 else f"{len(machines)} machines, so that times do not compare"
     clock = "" if all(r.is_timed for r in chosen.all) else ", by the clock though there may have been other work"
     note = foot(asked, chosen, f"Area of a marker: number of Gaussians, written at it. Time on {where}{clock}.")
@@ -108,10 +108,6 @@ def _means(chosen: Chosen, row: str) -> tuple[float, float, float]:
     )
     seconds, psnr, n = (mean_of(chosen.runs[row], chosen.scenes, one) for one in get)
     return seconds, psnr, n
-
-
-def _threads(result: Result) -> str:
-    return "1 thread" if result.threads == 1 else f"{result.threads} threads"
 
 
 def _plane(axes: Axes, points: Sequence[_Point], label: str, room: float) -> None:
