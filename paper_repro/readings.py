@@ -171,7 +171,7 @@ def _line(scale: str, scene: str, row: str, rows: Mapping[str, Group]) -> tuple[
 def _longer_schedules(results: Sequence[Result]) -> Answer:
     """E2: what POP does to N and PSNR on schedules of several lengths, by its weight."""
     lines: list[tuple[str, ...]] = []
-    lengths: dict[float, set[float]] = {}
+    lengths: dict[tuple[str, float], set[float]] = {}
     for scale in _telling(results):
         for scene, rows in groups(r for r in results if r.scale == scale).items():
             if "pop" not in rows or "l2_blur" not in rows:
@@ -180,16 +180,17 @@ def _longer_schedules(results: Sequence[Result]) -> Answer:
             steps, weight = setting(pop.runs[0], "max_steps"), setting(pop.runs[0], "lambda_pop")
             if steps is None or weight is None:
                 continue
-            lengths.setdefault(weight, set()).add(steps)
+            lengths.setdefault((scene, weight), set()).add(steps)
             shown = f"{steps:,.0f}", f"{weight:g}", f"{pop.n / blur.n:.1%}", f"{pop.psnr - blur.psnr:+.2f} dB"
             lines.append((scale, scene, *shown, ", ".join((*pop.ids, *blur.ids))))
     head = ("scale", "scene", "steps", "weight", "N(pop) / N(l2_blur)", "PSNR", "runs")
-    several = [weight for weight, steps in lengths.items() if len(steps) > 1]
+    several = sorted({scene for (scene, _), steps in lengths.items() if len(steps) > 1})
     if not several:
-        says = "Not decided: one weight has to be run on two lengths of the schedule."
+        says = "Not decided: one weight has to be run on two lengths of the schedule of one scene."
     else:
-        says = "One weight on several lengths of the schedule, below." + (
-            "" if len(lengths) > 1 else " No row divides the weight by the scaler, so that rule is not judged here."
+        weights = {weight for _, weight in lengths}
+        says = f"One weight on several lengths of the schedule of {', '.join(several)}, below." + (
+            "" if len(weights) > 1 else " No row divides the weight by the scaler, so that rule is not judged here."
         )
     return Answer(
         "E2", "does the weight of the POP term have to grow when the schedule shrinks?", says, head, tuple(lines)
