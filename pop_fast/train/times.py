@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 __all__ = ["Stopwatch", "Times"]
 
@@ -67,7 +68,7 @@ class Times:
         """Give what a checkpoint keeps."""
         return {"train": self.train, "total": self.total, "cpu": self.cpu}
 
-    def load_state_dict(self, state: Mapping[str, float | None]) -> None:
-        """Go on from a checkpoint, as `pop_fast.train.checkpoint_checks` has let it pass."""
-        self.train, self.cpu = float(state["train"] or 0.0), state["cpu"]
-        self._started -= float(state["total"] or 0.0)
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from a checkpoint that `pop_fast.train.checkpoint_checks` has let pass."""
+        self.train, self.cpu = state["train"], state["cpu"]
+        self._started -= state["total"]
