@@ -88,10 +88,12 @@ class Job:
             NotTrainableError: the program has no such method or option; names row and words.
         """
         from pop_fast.train import TrainConfig
+        from pop_ref.constants import GSPLAT_1_5, profile_named
 
         scaler = self.scale.steps_scaler
         whole = _whole(self)
         plain = self.scale.reset_every is None or whole.strategy.reset_every == 0
+        drawable = self.scene.centred or profile_named(whole.profile).principal_point == "used"
         said = {
             "log_every": self.scale.log_every,
             "checkpoint_every": self.scale.checkpoint_every,
@@ -102,6 +104,7 @@ class Job:
             **self.scale.of_methods.get(whole.method, {}),
             **_scaled(whole, scaler),
             **({} if plain else {"strategy.reset_every": self.scale.reset_every}),
+            **({} if drawable else {"profile": GSPLAT_1_5.name}),
             "seed": self.seed,
             "factor": self.factor,
             "progress": False,

@@ -165,6 +165,22 @@ def test_rows_with_options_by_scene_have_them_for_every_scene(name):
     assert len(set(said.values())) > 1
 
 
+def test_inrias_rasterizer_draws_no_scene_whose_principal_point_lies_far_off():
+    profiles = {
+        (row, scene): job_named(row, scene, "dev").config().profile
+        for row in ("pop", "3dgs", "speedy_splat")
+        for scene in ("fox", "bear_512")
+    }
+    assert profiles == {
+        ("pop", "fox"): "paper",
+        ("pop", "bear_512"): "paper",
+        ("3dgs", "fox"): "inria",
+        ("3dgs", "bear_512"): "gsplat_1_5",
+        ("speedy_splat", "fox"): "speedy_splat",
+        ("speedy_splat", "bear_512"): "gsplat_1_5",
+    }
+
+
 def test_jobs_come_cheapest_first_and_names_are_checked():
     jobs = jobs_of("dev", seeds=(42, 43))
     assert [job.cost for job in jobs] == sorted(job.cost for job in jobs)
