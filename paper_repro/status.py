@@ -31,20 +31,9 @@ _WRITE: Final = "run 'python -m paper_repro.status --write'"
 
 
 def status_table(results: Iterable[Result]) -> str:
-    """Make the status table: every claim by the best scale that decides it, every table by the cells that are run."""
+    """Make the status table: every claim by all scales that decide it, every table by the cells that are run."""
     found = list(results)
-    by_scale = {scale: claims(scale, found) for scale in _telling()}
-    rows = []
-    for i, claim in enumerate(by_scale["paper"]):
-        judged = [(scale, by_scale[scale][i]) for scale in _telling() if by_scale[scale][i].verdict != "not decided"]
-        scale, best = judged[0] if judged else ("", claim)
-        ours = (
-            f"{best.verdict} at scale {scale}, {best.where}"
-            if judged
-            else "not decided: the runs it needs are not there"
-        )
-        command = f"`pop-repro claims --scale {scale or 'dev'}`"
-        rows.append([claim.says, claim.paper, ours, command, _commits(_runs_of(best, found))])
+    rows = [_claim_row(by_scale, found) for by_scale in zip(*(claims(s, found) for s in _telling()), strict=True)]
     for table in paper().tables:
         lines = [line.row for line in table.rows]
         what = f"table {table.number}: {table.title}"
@@ -129,9 +118,15 @@ def _telling() -> list[str]:
     return [scale for scale in reversed(SCALES) if scale != "toy"]
 
 
-def _runs_of(claim: Claim, found: Sequence[Result]) -> list[Result]:
-    used = {run for e in claim.evidence for run in e.runs}
-    return [r for r in found if r.run in used]
+def _claim_row(by_scale: Sequence[Claim], found: Sequence[Result]) -> list[str]:
+    """Say of one claim what each scale decides: a verdict of one scale alone would hide that another disagrees."""
+    judged = [(s, c) for s, c in zip(_telling(), by_scale, strict=True) if c.verdict != "not decided"]
+    ours = "; ".join(f"{c.verdict} at scale {scale}, {c.where}" for scale, c in judged)
+    command = f"`pop-repro claims --scale {judged[0][0] if judged else 'dev'}`"
+    runs = {run for _, c in judged for e in c.evidence for run in e.runs}
+    used = [r for r in found if r.run in runs]
+    first = by_scale[0]
+    return [first.says, first.paper, ours or "not decided: the runs it needs are not there", command, _commits(used)]
 
 
 def _commits(used: Iterable[Result]) -> str:

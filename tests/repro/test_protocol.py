@@ -73,6 +73,13 @@ def test_a_new_result_changes_what_is_made_from_it() -> None:
     assert "holds at scale dev" in made["README.md"]
 
 
+def test_every_scale_that_decides_a_claim_is_told() -> None:
+    told = [result("pop", n=80), result("l2_blur", n=100)]
+    full = [result(row, n=n, scale="full", scene="bonsai_800") for row, n in (("pop", 40), ("l2_blur", 100))]
+    half = next(line for line in status_table([*told, *full]).splitlines() if line.startswith("| POP cuts"))
+    assert "| holds at scale full, on bonsai_800; does not hold at scale dev, not on fox |" in half
+
+
 def test_marks_that_are_absent_are_told() -> None:
     assert with_part("a <!-- x:begin -->old<!-- x:end --> b", "x", "new") == (
         "a <!-- x:begin -->\nnew\n<!-- x:end --> b"
