@@ -43,6 +43,9 @@ _PROTOCOL: Final = {
     "timing": str,
     "checkpoint_bytes_per_gaussian": int,
 }
+# and of one that began where another run had ended: that run's id
+_BASE: Final = "base"
+_RUN: Final = (r"[0-9a-f]{12}", "twelve hex digits")
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,8 @@ class Result:
         engine: the engine that trained.
         threads: CPU threads.
         versions: of Python and the packages that compute.
-        protocol: split, images, size, metrics, timing, and the bytes of a Gaussian in a checkpoint.
+        protocol: split, images, size, metrics, timing, and the bytes of a Gaussian in a checkpoint; "base" is the id of
+            the run that this one began from, whose time is in its own.
         schedule: the settings as they were run, by dotted name.
         seconds: by the clock, of "load", "train" and "evaluate"; "cpu" is the processor time of "train" over all
             threads, where a CPU trained and it was counted.
@@ -277,7 +281,7 @@ def _parse(found: Mapping[str, Any], where: str) -> Result:
         row=take.text("row", name, lower),
         scene=take.text("scene", name, lower),
         seed=take.whole("seed", 0),
-        run=take.text("run", r"[0-9a-f]{12}", "twelve hex digits"),
+        run=take.text("run", *_RUN),
         commit=take.text("commit", r"[0-9a-f]{7,40}(?:-dirty)?", "a git commit or null", or_none=True),
         config_hash=take.text("config_hash", r"[0-9a-f]{12,64}", "a hash in hex digits"),
         data_hash=take.text("data_hash", r"[0-9a-f]{12,64}", "a hash in hex digits"),
@@ -305,7 +309,9 @@ def _parse(found: Mapping[str, Any], where: str) -> Result:
 
 
 def _protocol(take: _Fields) -> dict[str, Any]:
-    _known(take.found, _PROTOCOL, take.where)
+    _known(take.found, [*_PROTOCOL, *([_BASE] if _BASE in take.found else [])], take.where)
+    if _BASE in take.found:
+        take.text(_BASE, *_RUN)
     for name, kind in _PROTOCOL.items():
         _ = take.text(name) if kind is str else take.whole(name, 1)
     return dict(take.found)

@@ -48,6 +48,7 @@ class Row:
         cost: time of a training over that of POP, for the order of a queue; from the paper's table where it has one.
         bytes_per_gaussian: of the file whose size the paper's table gives.
         scenes: further options by dataset or scene; the scene's own come last.
+        base: the row whose finished training it begins from, or None.
     """
 
     name: str
@@ -61,6 +62,7 @@ class Row:
     cost: float
     bytes_per_gaussian: int
     scenes: Mapping[str, tuple[str, ...]]
+    base: str | None = None
 
     def options_for(self, scene: Scene) -> tuple[str, ...]:
         """Return its options on a scene: its own, the dataset's, the scene's."""
@@ -84,7 +86,7 @@ def load_row(name: str, folder: Path = CONFIGS) -> Row:
     for field in [*wanted, *found]:
         if field not in wanted:
             raise PopError(f"{path}: {field} is not a field of a row; the fields are {', '.join(wanted)}")
-        if field not in found and field != "scenes":
+        if field not in found and field not in ("scenes", "base"):
             raise PopError(f"{path}: has no {field}")
     return _checked(name, path, {"scenes": {}, **found})
 
@@ -128,6 +130,8 @@ def _checked(name: str, path: Path, found: Mapping[str, Any]) -> Row:
     for field, inner in (("paper", lambda value: isinstance(value, str)), ("scenes", _is_texts)):
         if not isinstance(found[field], dict) or not all(map(inner, found[field].values())):
             raise fail(field, "a table of texts" if field == "paper" else "a table of lists of texts")
+    if found.get("base") is not None and found["base"] not in ROWS:
+        raise fail("base", f"one of {', '.join(ROWS)}")
     strange = next((key for key in found["scenes"] if key not in (*DATASETS, *SCENES)), None)
     if strange is not None:
         raise PopError(f"{path}: scenes.{strange} is neither a dataset nor a scene")
@@ -148,6 +152,7 @@ def _checked(name: str, path: Path, found: Mapping[str, Any]) -> Row:
         cost=float(cost),
         bytes_per_gaussian=size,
         scenes={key: tuple(value) for key, value in found["scenes"].items()},
+        base=found.get("base"),
     )
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from paper_repro import results
+from paper_repro.base import begin_from_base, keep_for_others, remove_what_was_kept
 from paper_repro.jobs import WORK, Job
 from paper_repro.scenes import Scene, find_folder
 from pop_fast.errors import PopError
@@ -113,7 +114,7 @@ def train_row(job: Job, options: Options) -> Path:
             from paper_repro.collect import collect
 
             path = results.write(collect(job, work), options.results)
-        _remove_bulk(work, options)
+        _remove_bulk(job, options)
     return path
 
 
@@ -186,24 +187,22 @@ def _train(job: Job, options: Options, config: TrainConfig) -> None:
     from paper_repro.collect import BESIDE, spacing, state_of_data
     from paper_repro.data_check import check_capture
     from pop_fast.cli.train import check_backend
-    from pop_fast.train.checkpoint import list_checkpoints
     from pop_fast.train.choose import choose_backend
 
     # asked before the hours of training, in which the clone may move on
     program = commit()
     config, chosen = choose_backend(config, True)
     check_backend(config)
-    if not list_checkpoints(Path(config.result_dir)):
-        # what a finished row has left, whose result was removed since
-        shutil.rmtree(config.result_dir, ignore_errors=True)
     capture, seconds = load_capture_of(job, config)
     check_capture(job, config, capture)
+    base = _begin(job, options, config, capture)
     from paper_repro.probe import ProbedRun
     from pop_fast.train.environment import keep_freed_memory
 
     keep_freed_memory()
     print(f"{job}: {capture.source}; {config.max_steps:,} steps; {chosen}", flush=True)
-    beside = {BESIDE: json.dumps({"commit": program, **state_of_data(job, config, capture)}, indent=2) + "\n"}
+    said = {"commit": program, **state_of_data(job, config, capture), **({} if base is None else {"base": base})}
+    beside = {BESIDE: json.dumps(said, indent=2) + "\n"}
     more = {"resume": True, "loading_seconds": seconds, "beside": beside}
     ProbedRun(config, capture, every=max(config.log_every, spacing(config.max_steps)), **more).run()
 
@@ -218,7 +217,26 @@ def load_capture_of(job: Job, config: TrainConfig) -> tuple[Capture, float]:
     return capture, time.perf_counter() - start
 
 
-def _remove_bulk(work: Path, options: Options) -> None:
-    for name, kept in ((_CHECKPOINTS, options.keep_checkpoints), (_PLY, options.keep_ply)):
-        if not kept:
-            shutil.rmtree(work / name, ignore_errors=True)
+def _begin(job: Job, options: Options, config: TrainConfig, capture: Capture) -> str | None:
+    """Prepare the result folder of a training, and return the run id of what it begins or began from."""
+    from paper_repro.collect import BESIDE
+    from pop_fast.io.read_back import read_json
+    from pop_fast.train.checkpoint import list_checkpoints
+
+    folder = Path(config.result_dir)
+    if list_checkpoints(folder):
+        return read_json(folder / BESIDE, "train the row again in an empty folder").get("base")
+    # what a finished row has left, whose result was removed since
+    shutil.rmtree(folder, ignore_errors=True)
+    return begin_from_base(job, options.results, options.work, config, capture)
+
+
+def _remove_bulk(job: Job, options: Options) -> None:
+    """Remove what a finished row does not need, but for what others begin from."""
+    places, work = (options.results, options.work), job.work(options.work)
+    if not options.keep_checkpoints:
+        keep_for_others(job, *places)
+        shutil.rmtree(work / _CHECKPOINTS, ignore_errors=True)
+    if not options.keep_ply:
+        shutil.rmtree(work / _PLY, ignore_errors=True)
+    remove_what_was_kept(job, *places)

@@ -204,6 +204,7 @@ WRONG = {
     "cost = 0": "cost is 0; it must be a number above 0",
     "bytes_per_gaussian = 240": "bytes_per_gaussian is 240; it must be 236 or 248",
     'method = "pop"\nwings = 2': "wings is not a field of a row",
+    'method = "pop"\nbase = "paup"': "base is 'paup'; it must be one of 3dgs",
     'description = ""': "description is ''; it must be a text",
 }
 

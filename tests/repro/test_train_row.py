@@ -144,6 +144,52 @@ def test_a_row_that_was_interrupted_ends_with_the_same_result(made, tmp_path, mo
     assert values(again) == values(read(made[1]))
 
 
+def test_a_row_begins_where_its_base_has_ended(tmp_path, monkeypatch):
+    job, of_base = (toy(row, steps_scaler=0.004) for row in ("pup", "3dgs_2023"))
+    alone = read(train_row(job, options(tmp_path / "alone")))
+    assert "base" not in alone.protocol
+    how = options(tmp_path / "after")
+    base = read(train_row(of_base, how))
+    kept = of_base.work(how.work) / "base" / "ckpt_119_rank0.pt"
+    assert kept.is_file()
+    assert not (of_base.work(how.work) / "ckpts").exists()
+
+    steps, take = [], TrainingRun.take_steps
+    monkeypatch.setattr(TrainingRun, "take_steps", lambda run, last: steps.append(run.step) or take(run, last))
+    with monkeypatch.context() as patch:
+        interrupt(patch, at=140)
+        with pytest.raises(KeyboardInterrupt):
+            train_row(job, how)
+    after = read(train_row(job, how))
+    assert min(steps) == 120
+    # another row begins there too
+    assert kept.is_file()
+
+    assert after.protocol["base"] == base.run
+    assert after.seconds["cpu"] > base.seconds["cpu"]
+    differ = {name for name, value in values(after).items() if value != values(alone)[name]}
+    # held-out views are measured at every fifteenth of the base's steps and of one's own
+    assert differ <= {"protocol", "curve"}
+    counts, others = ({p["step"]: p["num_gaussians"] for p in result.curve} for result in (after, alone))
+    both = counts.keys() & others.keys()
+    assert len(both) >= 16
+    assert all(counts[step] == others[step] for step in both)
+
+    write(replace(after, row="pup_star"), how.results)
+    module._remove_bulk(job, how)
+    assert not kept.parent.exists()
+
+
+@pytest.mark.parametrize("change", [{"threads": 2}, {"log_every": 7}], ids=["threads", "settings"])
+def test_a_base_of_another_kind_is_not_begun_from(change, tmp_path):
+    how, job = options(tmp_path, keep_checkpoints=True), toy("pup", steps_scaler=0.001)
+    train_row(toy("3dgs_2023", steps_scaler=0.001), how)
+    assert "base" not in read(train_row(job, replace(how, **change))).protocol
+    job.result(how.results).unlink()
+    shutil.rmtree(job.work(how.work))
+    assert "base" in read(train_row(job, how)).protocol
+
+
 def test_what_was_asked_to_be_kept_is_kept(made, tmp_path):
     how = options(tmp_path, keep_ply=True, keep_checkpoints=True)
     job = toy("l1_div_10", steps_scaler=0.002)

@@ -48,6 +48,7 @@ def test_there_is_one_rule_for_each_row_scene_and_seed_and_one_for_each_table_an
     jobs = [job for job in jobs_of(scale, seeds=(42, 43)) if trainable(job)]
     # a rule is there for every job; all of those that a table or a figure stands on are planned
     needed = {f"train_{job.row.name}_{job.scene.name}_{job.seed}" for job in jobs if job.row.tables or job.row.figures}
+    needed |= {f"train_{job.row.base}_{job.scene.name}_{job.seed}" for job in jobs if job.row.base is not None}
     figures = {f"figure_{figure}" for job in jobs for figure in job.row.figures} | {"figure_3"}
     tables = {f"table_{table.number}" for table in paper().tables}
     assert set(planned) == needed | figures | tables | {"all", "total"}
