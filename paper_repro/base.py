@@ -1,12 +1,14 @@
-"""Begin a row where the finished training of another ends: PUP-3DGS prunes a finished 3DGS, which is trained once.
+"""Begin a row where it parts from another: the steps that two rows share are trained once.
 
-The file of a row names its base. Where that has a result for the same scene, scale and seed, and its last checkpoint is
-still there, the row begins from it, at the step and with the bits that it would have come to alone. Otherwise it takes
-those steps itself.
+PUP-3DGS prunes a finished 3DGS, and both rows of Mini-Splatting are the same until they sample. The file of a row names
+its base. Where that has a result for the same scene, scale and seed, and its checkpoint of the step at which they part
+is still there, the row begins from it, with the bits that it would have come to alone. Otherwise it takes those steps
+itself.
 """
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,13 +23,16 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
 
-__all__ = ["base_of", "begin_from_base", "keep_for_others", "remove_what_was_kept"]
+__all__ = ["base_of", "begin_from_base", "keep_for_others", "remove_what_was_kept", "steps_for_others"]
 
-# settings that do nothing before the first round
-_OF_ROUNDS: Final = frozenset({"method", "max_steps", "rounds_start_iter", "prune_shares", "score_divisor"})
+# the settings in which a row may differ from its base, and for each the setting that says after which step it acts
+_ACTS_AFTER: Final = {
+    **dict.fromkeys(("method", "max_steps", "prune_shares", "rounds_start_iter", "score_divisor"), "rounds_start_iter"),
+    "sampling_factor": "sample_iter",
+}
 # what a result is collected from, beside what the checkpoint holds
-_RECORDS: Final = ("cfg.json", "metrics.jsonl", BESIDE, PROBE, "stats", "report_data")
-# of the result folder of a base: its last checkpoint, until no row needs that any more
+_RECORDS: Final = ("cfg.json", "metrics.jsonl", BESIDE, PROBE, "stats/*", "report_data/opacity_*")
+# of the result folder of a base: its checkpoints that rows begin from, until none needs them any more
 _KEPT: Final = "base"
 
 
@@ -36,31 +41,37 @@ def base_of(job: Job) -> Job | None:
     return None if job.row.base is None else Job(load_row(job.row.base), job.scene, job.scale, job.seed)
 
 
+def steps_for_others(job: Job) -> tuple[int, ...]:
+    """Return how many steps a job has taken where other rows begin from it, in rising order."""
+    return tuple(sorted({_shared_steps(job, other) for other in _followers(job)} - {0}))
+
+
 def keep_for_others(job: Job, folder: Path, work: Path) -> None:
-    """Put a finished job's last checkpoint where it stays, if rows that begin from it have no result yet.
+    """Put those checkpoints of a finished job where they stay that rows without a result begin from.
 
     Args:
         job: that is finished.
         folder: of results.
         work: of checkpoints.
     """
-    from pop_fast.train.checkpoint import list_checkpoints
+    from pop_fast.train.checkpoint import checkpoint_path
 
     of_job = job.work(work)
-    found = list_checkpoints(of_job)
-    if found and _is_awaited(job, folder):
-        found[-1][1].replace(_in(of_job / _KEPT) / found[-1][1].name)
+    for steps in {_shared_steps(job, other) for other in _followers(job) if not other.result(folder).is_file()}:
+        path = checkpoint_path(of_job, steps - 1)
+        if path.is_file():
+            path.replace(_ready(of_job / _KEPT / path.name))
 
 
 def remove_what_was_kept(job: Job, folder: Path, work: Path) -> None:
-    """Remove the checkpoint that `keep_for_others` left of a job's base, if this job was the last to need it."""
+    """Remove what `keep_for_others` left of a job's base, if this job was the last to need it."""
     base = base_of(job)
-    if base is not None and not _is_awaited(base, folder):
+    if base is not None and all(other.result(folder).is_file() for other in _followers(base)):
         shutil.rmtree(base.work(work) / _KEPT, ignore_errors=True)
 
 
 def begin_from_base(job: Job, folder: Path, work: Path, config: TrainConfig, capture: Capture) -> str | None:
-    """Make a job's result folder from its base's: the records, and the last checkpoint as one of the job's own.
+    """Make a job's result folder from its base's: the records, and the checkpoint as one of the job's own.
 
     Args:
         job: whose result folder is not there.
@@ -70,55 +81,65 @@ def begin_from_base(job: Job, folder: Path, work: Path, config: TrainConfig, cap
         capture: that it trains on.
 
     Returns:
-        The run id of the base, or None where nothing was made: the job has no base, that is not finished or has no
-        checkpoint any more, or was trained with other settings, threads or photographs.
+        The run id of the base, or None where nothing was made: the job has no base, that is not finished or does not
+        have the checkpoint, or was trained with other settings, threads or photographs.
 
     Raises:
         PopError: the base's result or checkpoint is damaged.
     """
+    import torch
+
     from pop_fast.train.checkpoint import capture_fingerprint, checkpoint_path, load_checkpoint, save_checkpoint
 
-    base, first = base_of(job), getattr(config.strategy, "rounds_start_iter", 0)
+    base = base_of(job)
     if base is None or not base.result(folder).is_file():
         return None
-    of_base, ours = base.work(work), job.work(work)
-    usual = checkpoint_path(of_base, first - 1)
+    steps, of_base, ours = _shared_steps(base, job), base.work(work), job.work(work)
+    usual = checkpoint_path(of_base, steps - 1)
     path = next((path for path in (of_base / _KEPT / usual.name, usual) if path.is_file()), None)
     if path is None:
         return None
     content = load_checkpoint(path)
-    if not _fits(content, config) or content["capture"] != capture_fingerprint(capture, config.test_every):
+    if (
+        _shared(content["config"], config.binding()) != steps
+        or content["threads"] != (config.threads or torch.get_num_threads())
+        or content["capture"] != capture_fingerprint(capture, config.test_every)
+    ):
         return None
     # a folder without its checkpoint would be taken for that of a run which has none yet
     made = ours.with_suffix(".begun")
     shutil.rmtree(made, ignore_errors=True)
-    for name in _RECORDS:
-        copy = shutil.copytree if (of_base / name).is_dir() else shutil.copy2
-        copy(of_base / name, _in(made) / name)
-    save_checkpoint(checkpoint_path(made, first - 1), {**content, "config": config.binding()})
+    for record in (found for pattern in _RECORDS for found in of_base.glob(pattern) if _step_of(found) < steps):
+        shutil.copy2(record, _ready(made / record.relative_to(of_base)))
+    save_checkpoint(checkpoint_path(made, steps - 1), {**content, "config": config.binding()})
     made.rename(ours)
     return results.read(base.result(folder)).run
 
 
-def _is_awaited(job: Job, folder: Path) -> bool:
-    others = (Job(row, job.scene, job.scale, job.seed) for row in load_rows() if row.base == job.row.name)
-    return any(not other.result(folder).is_file() for other in others)
+def _followers(job: Job) -> list[Job]:
+    return [Job(row, job.scene, job.scale, job.seed) for row in load_rows() if row.base == job.row.name]
 
 
-def _in(folder: Path) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+def _shared_steps(job: Job, other: Job) -> int:
+    return _shared(job.config().binding(), other.config().binding())
 
 
-def _fits(content: Mapping[str, Any], config: TrainConfig) -> bool:
-    """Tell whether a run of other settings has taken the same steps to a checkpoint."""
-    import torch
+def _shared(first: Mapping[str, Any], second: Mapping[str, Any]) -> int:
+    """Return after how many steps settings of two runs first make a difference; 0 where that is not known."""
+    one, two = ({name.removeprefix(f"{s['method']}."): value for name, value in s.items()} for s in (first, second))
+    differ = {name for name in {*one, *two} if one.get(name) != two.get(name)}
+    if not differ or not differ <= _ACTS_AFTER.keys():
+        return 0
+    both = {**one, **two}
+    return min(both.get(_ACTS_AFTER[name], 0) for name in differ)
 
-    ours, theirs = _plain(config.binding(), config.method), _plain(content["config"], content["config"]["method"])
-    differ = {name for name in {*ours, *theirs} if ours.get(name) != theirs.get(name)}
-    return differ <= _OF_ROUNDS and content["threads"] == (config.threads or torch.get_num_threads())
+
+def _step_of(record: Path) -> int:
+    """Return the step that a record is of; 0 for those of the whole run, which are cut where it continues."""
+    found = re.search(r"_step(\d+)", record.name)
+    return int(found[1]) if found else 0
 
 
-def _plain(settings: Mapping[str, Any], method: str) -> dict[str, Any]:
-    """Name the settings of a method without it."""
-    return {name.removeprefix(f"{method}."): value for name, value in settings.items()}
+def _ready(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path

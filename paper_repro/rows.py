@@ -48,7 +48,7 @@ class Row:
         cost: time of a training over that of POP, for the order of a queue; from the paper's table where it has one.
         bytes_per_gaussian: of the file whose size the paper's table gives.
         scenes: further options by dataset or scene; the scene's own come last.
-        base: the row whose finished training it begins from, or None.
+        base: the row from whose training it begins, where that is finished, or None; see `paper_repro.base`.
     """
 
     name: str

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from paper_repro import results
-from paper_repro.base import begin_from_base, keep_for_others, remove_what_was_kept
+from paper_repro.base import begin_from_base, keep_for_others, remove_what_was_kept, steps_for_others
 from paper_repro.jobs import WORK, Job
 from paper_repro.scenes import Scene, find_folder
 from pop_fast.errors import PopError
@@ -179,6 +179,8 @@ def _config(job: Job, options: Options, work: Path) -> TrainConfig:
     said: dict[str, Any] = {"threads": options.threads, "backend": options.backend}
     every = {"checkpoint_every": options.checkpoint_every, "log_every": options.log_every}
     said |= {name: value for name, value in every.items() if value is not None}
+    # a checkpoint of such a step is not removed for the next one
+    said["save_steps"] = steps_for_others(job)
     said |= {"lpips_vgg": options.lpips_vgg, "lpips_alex": options.lpips_alex, "progress": not options.quiet}
     return job.config(data=str(capture_folder(job.scene, options).absolute()), result_dir=str(work), **said)
 

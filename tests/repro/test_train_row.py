@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import atexit
 import json
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
-from dataclasses import fields, replace
-from functools import cache
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,36 +15,15 @@ import pytest
 
 from paper_repro import train_row as module
 from paper_repro.collect import collect, first_change
-from paper_repro.jobs import Job, NotTrainableError, job_named
-from paper_repro.results import Result, path_of, read, write
-from paper_repro.scenes import SCENES
-from paper_repro.train_row import BusyError, Options, capture_folder, commit, is_finished, only_one, train_row
+from paper_repro.jobs import NotTrainableError
+from paper_repro.results import path_of, read, write
+from paper_repro.train_row import BusyError, Options, commit, is_finished, only_one, train_row
 from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
 from tests.app.interruptions import interrupt
+from tests.repro.trained import options, toy, values
 
 ROOT = Path(__file__).parents[2]
-# measured in seconds, so not the same twice
-TIMES = {"seconds"}
-
-
-@cache
-def demo() -> Path:
-    """Make the demo capture once for this module."""
-    folder = Path(tempfile.mkdtemp())
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return capture_folder(SCENES["demo"], Options(data=folder, work=folder))
-
-
-def options(folder: Path, **more) -> Options:
-    how = Options(**{"data": folder, "results": folder / "results", "work": folder / "work", "quiet": True, **more})
-    shutil.copytree(demo(), how.work / "demo", dirs_exist_ok=True)
-    return how
-
-
-def toy(row: str, **scale) -> Job:
-    job = job_named(row, "demo", "toy")
-    return replace(job, scale=replace(job.scale, **scale))
 
 
 @pytest.fixture(scope="module")
@@ -56,13 +31,6 @@ def made(tmp_path_factory):
     """The options and the result of POP at toy scale, trained without an interruption."""
     folder = tmp_path_factory.mktemp("made")
     return options(folder), train_row(toy("pop"), options(folder))
-
-
-def values(result: Result) -> dict:
-    """What must be the same in two trainings of one row: everything but times."""
-    found = {field.name: getattr(result, field.name) for field in fields(Result) if field.name not in TIMES}
-    found["curve"] = [{key: value for key, value in point.items() if key not in TIMES} for point in result.curve]
-    return found
 
 
 def test_a_result_lies_in_its_place_and_holds_what_was_asked_for(made):
@@ -142,52 +110,6 @@ def test_a_row_that_was_interrupted_ends_with_the_same_result(made, tmp_path, mo
     assert (toy("pop").work(how.work) / "ckpts" / "ckpt_99_rank0.pt").is_file()
     again = read(train_row(toy("pop"), how))
     assert values(again) == values(read(made[1]))
-
-
-def test_a_row_begins_where_its_base_has_ended(tmp_path, monkeypatch):
-    job, of_base = (toy(row, steps_scaler=0.004) for row in ("pup", "3dgs_2023"))
-    alone = read(train_row(job, options(tmp_path / "alone")))
-    assert "base" not in alone.protocol
-    how = options(tmp_path / "after")
-    base = read(train_row(of_base, how))
-    kept = of_base.work(how.work) / "base" / "ckpt_119_rank0.pt"
-    assert kept.is_file()
-    assert not (of_base.work(how.work) / "ckpts").exists()
-
-    steps, take = [], TrainingRun.take_steps
-    monkeypatch.setattr(TrainingRun, "take_steps", lambda run, last: steps.append(run.step) or take(run, last))
-    with monkeypatch.context() as patch:
-        interrupt(patch, at=140)
-        with pytest.raises(KeyboardInterrupt):
-            train_row(job, how)
-    after = read(train_row(job, how))
-    assert min(steps) == 120
-    # another row begins there too
-    assert kept.is_file()
-
-    assert after.protocol["base"] == base.run
-    assert after.seconds["cpu"] > base.seconds["cpu"]
-    differ = {name for name, value in values(after).items() if value != values(alone)[name]}
-    # held-out views are measured at every fifteenth of the base's steps and of one's own
-    assert differ <= {"protocol", "curve"}
-    counts, others = ({p["step"]: p["num_gaussians"] for p in result.curve} for result in (after, alone))
-    both = counts.keys() & others.keys()
-    assert len(both) >= 16
-    assert all(counts[step] == others[step] for step in both)
-
-    write(replace(after, row="pup_star"), how.results)
-    module._remove_bulk(job, how)
-    assert not kept.parent.exists()
-
-
-@pytest.mark.parametrize("change", [{"threads": 2}, {"log_every": 7}], ids=["threads", "settings"])
-def test_a_base_of_another_kind_is_not_begun_from(change, tmp_path):
-    how, job = options(tmp_path, keep_checkpoints=True), toy("pup", steps_scaler=0.001)
-    train_row(toy("3dgs_2023", steps_scaler=0.001), how)
-    assert "base" not in read(train_row(job, replace(how, **change))).protocol
-    job.result(how.results).unlink()
-    shutil.rmtree(job.work(how.work))
-    assert "base" in read(train_row(job, how)).protocol
 
 
 def test_what_was_asked_to_be_kept_is_kept(made, tmp_path):
