@@ -242,6 +242,20 @@ def test_times_of_different_machines_are_said_not_to_compare():
     assert "1 thread, by the clock though" in texts(drawn("1", untimed)).replace("\n", " ")
 
 
+def test_captures_whose_times_are_by_the_clock_are_left_out_where_another_has_every_row():
+    clock = {"seconds": {"load": 1.0, "train": 9.0, "evaluate": 1.0}}
+    fox, bear = [result("pop"), result("gsplat", **clock)], [result(row, "bear_512") for row in ("pop", "gsplat")]
+    made = drawn("1", [*fox, *bear])
+    assert {line["scene"] for line in lines(made)} == {"bear_512", "mean"}
+    said = texts(made).replace("\n", " ")
+    assert "Without fox: time there is by the clock. Capture bear_512" in said
+    assert "by the clock though" not in said
+    # not where that would leave a row out
+    made = drawn("1", [*fox, bear[0]])
+    assert {line["scene"] for line in lines(made)} == {"fox", "mean"}
+    assert "by the clock though" in texts(made).replace("\n", " ")
+
+
 def test_at_the_papers_scale_a_figure_is_of_the_papers_scenes():
     runs = [result(row, scene, scale="paper") for row in ("pop", "gsplat") for scene in ("train", "truck", "bonsai")]
     made = drawn("1", runs, scale="paper")
