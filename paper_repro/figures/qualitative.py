@@ -65,16 +65,19 @@ def renders_and_photographs(asked: Asked) -> Drawn:
             f"--work, or train them with pop-repro run {_ROWS[0]} {scenes[0]} --scale {asked.scale}"
         )
     shown = tuple(view.scene for view in views)
+    not_run = tuple(scene for scene in scenes if any((row, scene) not in runs for row in _ROWS))
+    elsewhere = [scene for scene in scenes if scene not in (*shown, *not_run)]
     chosen = Chosen(
         {row: {scene: (runs[row, scene],) for scene in shown} for row in _ROWS},
         shown,
         (),
-        tuple(scene for scene in scenes if scene not in shown),
+        not_run,
     )
     note = foot(
         *(asked, chosen),
         "The first held-out view of each capture, PSNR of this view alone. Box: where the two renders differ most, "
         "whichever is better; enlarged beside it.",
+        *([f"The work folder has no renders of {', '.join(elsewhere)}."] if elsewhere else []),
         averaged=False,
     )
     return Drawn(_drawn(views, note), *_table(views, runs))

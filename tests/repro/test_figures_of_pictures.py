@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -53,6 +54,16 @@ def test_the_grid_of_renders_boxes_the_place_where_they_differ(renders):
         assert line["psnr"] == (30.0 if line["row"] == "pop" else 20.5)
     said = texts(made).replace("\n", " ")
     assert "30.00 dB" in said
+    assert "Not every row was run on garden_512 and bonsai_800." in said
+
+
+def test_a_scene_that_was_trained_elsewhere_is_not_said_not_to_be_run(renders):
+    folder, places = renders
+    shutil.rmtree(folder / "dev" / "pop" / "bear_512_42")
+    runs = [result(row, scene) for row in ("pop", "3dgs") for scene in places]
+    with style.look():
+        said = texts(qualitative.renders_and_photographs(asked("5", runs, folder))).replace("\n", " ")
+    assert "The work folder has no renders of bear_512." in said
     assert "Not every row was run on garden_512 and bonsai_800." in said
 
 
