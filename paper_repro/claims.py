@@ -298,5 +298,5 @@ def _against_sweep(l2: Group, sweep: Sequence[Group]) -> tuple[str, bool | None]
     (x0, y0), (x1, y1) = next((a, b) for a, b in pairwise(points) if a[0] <= at <= b[0])
     expected = y0 if x1 == x0 else y0 + (y1 - y0) * (at - x0) / (x1 - x0)
     change, error = l2.psnr - expected, l2.error(lambda r: r.psnr)
-    text = f"{l2.psnr:.2f} dB at {l2.n:,.0f} Gaussians, L1 / n there {expected:.2f} dB: {change:+.2f} dB"
+    text = f"{l2.psnr:.2f} dB at {l2.n:,.0f} Gaussians, L1 / n there {expected:.2f} dB: {change:+.2f} dB{_noise(error)}"
     return text, None if abs(change) < error else change > 0.0
