@@ -43,7 +43,7 @@ _PROTOCOL: Final = {
     "timing": str,
     "checkpoint_bytes_per_gaussian": int,
 }
-# and of one that began where another run had ended: that run's id
+# and of one that took its first steps from another run: that run's id
 _BASE: Final = "base"
 _RUN: Final = (r"[0-9a-f]{12}", "twelve hex digits")
 
@@ -66,7 +66,7 @@ class Result:
         threads: CPU threads.
         versions: of Python and the packages that compute.
         protocol: split, images, size, metrics, timing, and the bytes of a Gaussian in a checkpoint; "base" is the id of
-            the run that this one began from, whose time is in its own.
+            the run that its first steps are from, whose time is in its own.
         schedule: the settings as they were run, by dotted name.
         seconds: by the clock, of "load", "train" and "evaluate"; "cpu" is the processor time of "train" over all
             threads, where a CPU trained and it was counted.

@@ -62,6 +62,7 @@ DAMAGE = [
     (_set("run", "12345"), "run is .*twelve hex digits"),
     (_set("commit", "main"), "commit is .*a git commit or null"),
     (_set("protocol/width", 0), "protocol: width is 0; it must be a whole number of at least 1"),
+    (_set("protocol/base", "pup"), 'protocol: base is "pup"; it must be twelve hex digits'),
     (_set("protocol/extra", 0), "protocol: extra is not a field"),
     (_set("seconds/train", -1.0), "seconds: train is -1.0"),
     (_set("seconds/cpu", -1.0), "seconds: cpu is -1.0"),
