@@ -7,6 +7,7 @@ A default is the method's recipe (`pop_ref.recipes`), with the schedule multipli
     refine start and stop, blur, POP                yes
     refine_every, reset_every                       up only: a shorter schedule has fewer changes and fewer resets, as
                                                     far apart as ever (see `DensityControl.scaled`)
+    prune_too_big_after                             up only, as the reset interval that it stands for
     sh_interval, eval_steps, save_steps             yes
     lambda_pop                                      no, unless `scale_lambda_pop` asks for it
     learning rates, other weights, thresholds       no: Adam's step does not depend on the length of a run
@@ -168,8 +169,7 @@ def defaults(given: Given) -> dict[str, Any]:
     if given.scale_lambda_pop:
         strategy = replace(strategy, lambda_pop=strategy.lambda_pop / by)
     if given.preset == "quick":
-        # what a big Gaussian covered, a sky above all, does not grow back in so few steps: see benchmarks/NOTES.md
-        strategy = replace(strategy, prune_too_big=False, blur_min_pixels=QUICK_BLUR_MIN_PIXELS)
+        strategy = replace(strategy, blur_min_pixels=QUICK_BLUR_MIN_PIXELS)
 
     def scaled(step: int) -> int:
         return max(round(step * by), 1)
