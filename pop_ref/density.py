@@ -288,7 +288,7 @@ def prune_mask(
     step: int,
     config: DensityConfig = POP,
 ) -> Bool[np.ndarray, " N"]:
-    """Decide which rows are removed: `o < prune_opa`, or, with `prune_too_big`, `max scale > prune_scale3d * scene_scale` (A16).
+    """Decide which rows go: `o < prune_opa`, or, with `prune_too_big`, `max scale > prune_scale3d * scene_scale` (A16).
 
     Source: POP paper section 3.1 (opacity below a threshold, or excessively large).
     Departs: the paper's sentence describes 3DGS; POP, which has no resets, leaves large Gaussians, as gsplat does

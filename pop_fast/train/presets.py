@@ -211,8 +211,15 @@ def _options(recipe: Recipe, method: str) -> list[str]:
     chosen = [] if method == Given.method else ["--method", method]
     for name, ours, theirs in [*(pair for pair in pairs if pair[0] != "lr"), *rates]:
         if ours != theirs:
-            chosen += [f"--{name.replace('_', '-')}", f"{ours:g}" if isinstance(ours, float) else str(ours)]
+            chosen += _words(name, ours)
     return chosen
+
+
+def _words(name: str, value: Any) -> list[str]:
+    group, dot, rest = name.replace("_", "-").rpartition(".")
+    if isinstance(value, bool):
+        return [f"--{group}{dot}{'' if value else 'no-'}{rest}"]
+    return [f"--{group}{dot}{rest}", f"{value:g}" if isinstance(value, float) else str(value)]
 
 
 def laid_over(plain: dict[str, Any], given: Given) -> dict[str, Any]:
