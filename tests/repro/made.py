@@ -35,7 +35,7 @@ PLAIN = Result(
         "timing": "training loop",
         "checkpoint_bytes_per_gaussian": 236,
     },
-    schedule={"max_steps": 10_000, "pop.blur_start_iter": 1000, "pop.blur_stop_iter": 2333},
+    schedule={"method": "pop", "max_steps": 30_000, "pop.blur_start_iter": 3000, "pop.blur_stop_iter": 7000},
     seconds={"load": 1.0, "train": 100.0, "evaluate": 2.0, "cpu": 100.0},
     num_gaussians=1000,
     checkpoint_mib=1000 * 236 / 2**20,
