@@ -48,6 +48,8 @@ __all__ = [
 ALPHA: Final = 0.05
 # with more seeds than these a difference is smaller than what anyone would train for
 MOST_SEEDS: Final = 99
+# a noise floor with one degree of freedom has intervals of ratios that no float holds
+_LARGEST: Final = 700.0
 
 
 @dataclass(frozen=True)
@@ -220,14 +222,14 @@ class Comparison:
     def _value(self, half: float) -> str:
         told = half < inf
         if self.shown_as in ("share", "factor"):
-            form: Callable[[float], str] = (
-                (lambda v: f"{exp(v):.1%}") if self.shown_as == "share" else (lambda v: f"x {exp(v):.2f}")
-            )
-            # a pooled spread with one degree of freedom has intervals that no float holds
-            ends = (self.value - half, min(self.value + half, 700.0))
-            return form(self.value) + (f" ({form(ends[0])} to {form(ends[1])})" if told else " (no interval)")
+            ends = (self.value - half, min(self.value + half, _LARGEST))
+            interval = f"({self._ratio(ends[0])} to {self._ratio(ends[1])})" if told else "(no interval)"
+            return f"{self._ratio(self.value)} {interval}"
         form, unit = ("+.2f", " dB") if self.shown_as == "dB" else ("+.4g", "")
         return f"{self.value:{form}}" + (f" ± {half:.2g}{unit}" if told else f"{unit} (no interval)")
+
+    def _ratio(self, value: float) -> str:
+        return f"{exp(value):.1%}" if self.shown_as == "share" else f"x {exp(value):.2f}"
 
 
 def compare(

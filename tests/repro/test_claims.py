@@ -218,7 +218,7 @@ def test_growth_is_that_of_table_4_a_densification_step(counts: tuple[int, ...],
 def test_gaussians_per_pixel_need_both_counts() -> None:
     base = two("3dgs", n_blended=50.0, n_traversed=400.0)
 
-    def verdict(**counts: float | None) -> str:
+    def verdict(**counts: Any) -> str:
         return judged("pixel", [*base, *two("pop", **counts)]).verdict
 
     assert verdict(n_blended=40.0, n_traversed=300.0) == "holds"
