@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from dataclasses import replace
+from enum import Enum
 from functools import partial
 from typing import Any
 
@@ -23,13 +24,28 @@ from pop_ref.constants import PAPER
 
 WIDTH, HEIGHT, N = 21, 18, 24
 
+
+class RollingShutterType(Enum):
+    """gsplat 1.5.3's enumeration of that name (`gsplat/cuda/_wrapper.py`), which a caller of gsplat passes."""
+
+    ROLLING_TOP_TO_BOTTOM = 0
+    ROLLING_LEFT_TO_RIGHT = 1
+    ROLLING_BOTTOM_TO_TOP = 2
+    ROLLING_RIGHT_TO_LEFT = 3
+    GLOBAL = 4
+
+
 # fmt: off
-GSPLAT_1_5_3 = [
-    "means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height", "near_plane", "far_plane",
-    "radius_clip", "eps2d", "sh_degree", "packed", "tile_size", "backgrounds", "render_mode", "sparse_grad", "absgrad",
-    "rasterize_mode", "channel_chunk", "distributed", "camera_model", "segmented", "covars", "with_ut", "with_eval3d",
-    "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs", "rolling_shutter", "viewmats_rs",
-]
+# names and defaults as `gsplat/rendering.py` of the wheel 1.5.3 spells them; `...` where there is none
+GSPLAT_1_5_3: dict[str, Any] = {
+    "means": ..., "quats": ..., "scales": ..., "opacities": ..., "colors": ..., "viewmats": ..., "Ks": ...,
+    "width": ..., "height": ..., "near_plane": 0.01, "far_plane": 1e10, "radius_clip": 0.0, "eps2d": 0.3,
+    "sh_degree": None, "packed": True, "tile_size": 16, "backgrounds": None, "render_mode": "RGB",
+    "sparse_grad": False, "absgrad": False, "rasterize_mode": "classic", "channel_chunk": 32, "distributed": False,
+    "camera_model": "pinhole", "segmented": False, "covars": None, "with_ut": False, "with_eval3d": False,
+    "radial_coeffs": None, "tangential_coeffs": None, "thin_prism_coeffs": None, "ftheta_coeffs": None,
+    "rolling_shutter": RollingShutterType.GLOBAL, "viewmats_rs": None,
+}
 GSPLAT_META = {
     "means2d", "radii", "depths", "conics", "opacities", "camera_ids", "gaussian_ids", "batch_ids", "tile_width",
     "tile_height", "tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets", "width", "height", "tile_size",
@@ -62,8 +78,25 @@ def cameras(count: int = 1, dtype: torch.dtype = torch.float64) -> dict[str, Ten
 
 def test_the_signature_begins_with_gsplat_1_5_3s() -> None:
     parameters = inspect.signature(program).parameters
-    assert list(parameters)[: len(GSPLAT_1_5_3)] == GSPLAT_1_5_3
+    assert list(parameters)[: len(GSPLAT_1_5_3)] == list(GSPLAT_1_5_3)
     assert all(p.kind is p.KEYWORD_ONLY for name, p in parameters.items() if name not in GSPLAT_1_5_3)
+    for name, default in GSPLAT_1_5_3.items():
+        ours = parameters[name].default
+        # of the one default that is of a type of gsplat's, ours is None
+        assert ours == (parameters[name].empty if default is ... else None if name == "rolling_shutter" else default)
+
+
+@pytest.mark.parametrize("backend", ["fast", "compiled", "ref"])
+def test_every_default_of_gsplat_1_5_3_is_accepted_where_it_is_passed(backend: str) -> None:
+    if (reason := get_backend(backend).why_not()) is not None:
+        pytest.skip(reason)
+    defaults = {name: default for name, default in GSPLAT_1_5_3.items() if default is not ...}
+    plain = program(**scene(), **cameras(), backend=backend)
+    assert plain[0].std() > 0.0
+    for given in (defaults, *({name: default} for name, default in defaults.items()), {"tile_size": None}):
+        image, alphas, _ = program(**scene(), **cameras(), **given, backend=backend)
+        assert torch.equal(image, plain[0])
+        assert torch.equal(alphas, plain[1])
 
 
 def test_meta_holds_gsplats_keys_unpacked_and_packed() -> None:
@@ -244,6 +277,15 @@ WRONG = {
     "width is 0": {"width": lambda _: 0},
     "height is 0": {"height": lambda _: 0},
     "colors has shape": {"colors": lambda t: t[:-1]},
+    "means is missing; it must be a torch.Tensor": {"means": lambda _: None},
+    "opacities is missing": {"opacities": lambda _: None},
+    "colors is missing": {"colors": lambda _: None},
+    "quats is missing": {"quats": lambda _: None},
+    "viewmats is missing": {"viewmats": lambda _: None},
+    "Ks is of type ndarray; it must be a torch.Tensor": {"Ks": lambda t: t.numpy()},
+    "width is None; it must be a whole number": {"width": lambda _: None},
+    "height is 2.5; it must be a whole number": {"height": lambda _: 2.5},
+    "tile_size is '16'; it must be a whole number": {"tile_size": lambda _: "16"},
 }
 
 
@@ -252,7 +294,7 @@ def test_wrong_input_is_named_with_its_index(message: str) -> None:
     given = {**scene(), **cameras()}
     (name, change), *_ = WRONG[message].items()
     with pytest.raises(ValueError, match=re.escape(message)):
-        rasterization(**{**given, name: change(given[name])})
+        rasterization(**{**given, name: change(given.get(name))})
 
 
 @pytest.mark.parametrize(
@@ -266,6 +308,7 @@ def test_wrong_input_is_named_with_its_index(message: str) -> None:
         {"with_eval3d": True},
         {"radial_coeffs": torch.zeros(1, 6)},
         {"rolling_shutter": 1},
+        {"rolling_shutter": RollingShutterType.ROLLING_LEFT_TO_RIGHT},
         {"viewmats_rs": torch.eye(4)[None]},
     ],
 )
