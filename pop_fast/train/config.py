@@ -16,6 +16,7 @@ from pop_fast.errors import PopError
 from pop_fast.train.jsonable import from_plain, to_plain
 from pop_fast.train.limits import check_values
 from pop_fast.train.presets import METHODS, MILESTONES, Given, defaults, laid_over, method_of
+from pop_ref.constants import PAPER
 from pop_ref.settings import LAMBDA_SSIM_3DGS, MAX_SH_DEGREE, AppearanceRates, LearningRates, Recipe
 
 __all__ = ["LearningRates", "TrainConfig", "first_difference"]
@@ -44,8 +45,8 @@ class TrainConfig:
             Rates and step numbers stay as they are. Backend "cuda" takes one view a step.
         seed: of the view order, the initial rotations and the split noise.
         backend: what renders and trains: "fast" (CPU), "compiled" (CPU, with kernels in C++), "cuda", "ref" (the
-            oracle, slow), or "auto": "cuda" where a GPU and the build are there, else "compiled" where that was
-            compiled, else "fast".
+            oracle, slow), one that another package registers, or "auto": "cuda" where a GPU and the build are there,
+            else "compiled" where that was compiled, else "fast".
         profile: the rasterizer's constants: "paper", "gsplat_1_5", "gsplat_1_6", "inria" (that of method "3dgs" and of
             those built on it) or "speedy_splat".
         antialiased: render with opacity compensation (Mip-Splatting) instead of classically.
@@ -95,8 +96,8 @@ class TrainConfig:
     max_steps: int = Recipe.max_steps
     batch_size: int = 1
     seed: int = 42
-    backend: Literal["auto", "fast", "compiled", "cuda", "ref"] = "auto"
-    profile: Literal["paper", "gsplat_1_5", "gsplat_1_6", "inria", "speedy_splat"] = "paper"
+    backend: str = "auto"
+    profile: str = PAPER.name
     antialiased: bool = False
     factor: int = 1
     resize: Literal["area", "bicubic"] = "area"

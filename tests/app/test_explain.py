@@ -22,7 +22,7 @@ from pop_fast.view.explain.flips import first_flip
 from pop_fast.view.explain.maps import termination_depths
 from pop_fast.view.explain.table import WIDTH, table
 from pop_fast.view.explain.walk import candidates, oracle_splats, walk
-from pop_ref.constants import PAPER, Profile
+from pop_ref.constants import PAPER, PROFILES, Profile
 from pop_ref.records import Splats
 from tests.app.conftest import Pop
 from tests.app.tiny import tiny_capture
@@ -249,6 +249,13 @@ def test_one_command_writes_table_json_page_and_maps(pop: Pop, shared_result: Pa
     assert legend["pop_pull.png"]["scale"] == {"colors": "coolwarm", "low": -1.0, "top": 1.0}
 
 
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_pixel_is_explained_in_every_profile(pop: Pop, shared_result: Path, profile: str) -> None:
+    outcome = pop("explain", shared_result, "--view", "3", "--pixel", "20,16", "--profile", profile)
+    assert outcome.status == 0, outcome.err
+    assert f"profile {profile}" in outcome.out
+
+
 @pytest.mark.parametrize(
     ("words", "part"),
     [
@@ -260,8 +267,12 @@ def test_one_command_writes_table_json_page_and_maps(pop: Pop, shared_result: Pa
         (["--view", "cat.jpg", "--pixel", "1,1"], "view 'cat.jpg' is no view of toy; give a file name"),
         (["--view", "0", "--pixel", "1,1", "--capture", "nowhere"], "nowhere: no such folder"),
         (["--view", "0", "--pixel", "1,1", "--diff", "paper", "mine"], "'mine', which is neither a profile"),
+        (
+            ["--view", "0", "--pixel", "1,1", "--profile", "mine"],
+            "profile is 'mine'; it must be one of paper, gsplat_1_5",
+        ),
     ],
-    ids=["x", "y", "no numbers", "no pixel", "view", "name", "capture", "diff"],
+    ids=["x", "y", "no numbers", "no pixel", "view", "name", "capture", "diff", "profile"],
 )
 def test_bad_words_are_answered_by_one_line_that_names_field_and_fix(
     pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], part: str

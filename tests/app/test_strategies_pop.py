@@ -150,8 +150,17 @@ def documented_loop(steps: int, strategy: POPStrategy, learning_rate: float = 0.
     optimizers = {key: torch.optim.SGD([value], lr=learning_rate) for key, value in params.items()}
     K = torch.tensor([[20.0, 0.0, 12.0], [0.0, 20.0, 8.0], [0.0, 0.0, 1.0]])
     views = [(torch.eye(4), K, torch.full((16, 24, 3), 0.5))] * steps
-    names = {"params": params, "optimizers": optimizers, "strategy": strategy, "views": views, "width": 24}
-    exec(textwrap.dedent(block), {**names, "height": 16, "scene_scale": 1.0, "torch": torch, "rasterization": rasterization})
+    names: dict[str, object] = {
+        "params": params,
+        "optimizers": optimizers,
+        "strategy": strategy,
+        "views": views,
+        "width": 24,
+    }
+    exec(
+        textwrap.dedent(block),
+        {**names, "height": 16, "scene_scale": 1.0, "torch": torch, "rasterization": rasterization},
+    )
     return {key: value.detach() for key, value in params.items()}
 
 
