@@ -11,7 +11,7 @@ from cuda_ext.arrays import fill, pointer, stream_of
 from cuda_ext.render.lists import splat_struct
 from cuda_ext.train_settings import GROUPS, Phase
 from cuda_ext.training.resident import MARGIN
-from cuda_ext.training.step_buffers import RowBuffers, Frame, Shared
+from cuda_ext.training.step_buffers import Frame, RowBuffers, Shared
 
 
 class StepProgram:

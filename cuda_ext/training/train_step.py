@@ -20,7 +20,7 @@ from cuda_ext.render.capacity import Capacity, Size
 from cuda_ext.train_settings import Phase, Statistics, StepSettings, StepStats
 from cuda_ext.training.graphs import Watch, captured
 from cuda_ext.training.resident import ResidentViews
-from cuda_ext.training.step_buffers import RowBuffers, Frame, Shared
+from cuda_ext.training.step_buffers import Frame, RowBuffers, Shared
 from cuda_ext.training.step_program import StepProgram
 
 LATE = 2  # steps between an overflow and its notice
