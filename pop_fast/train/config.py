@@ -76,7 +76,8 @@ class TrainConfig:
         refine_cameras: learn a small rotation and translation of every training camera.
         appearance_lr: learning rates of exposures and cameras.
         strategy: density control and the POP term; its type says which method this is.
-        threads: threads of one operation; results are the same bits for the same number. 0 takes all cores.
+        threads: threads of one operation; results are the same bits for the same number, those of the native step
+            (backend "compiled") for any. 0 takes all cores.
         eval_steps: after so many steps the held-out views are measured; the last step always counts.
         save_steps: after so many steps a PLY and a checkpoint are kept; the last step always counts.
         checkpoint_every: steps between the checkpoints a run resumes from; 0 writes none of these.
