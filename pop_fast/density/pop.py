@@ -35,5 +35,6 @@ class POPStrategy(DensityControl):
                 optimizer.zero_grad()
             strategy.step_post_backward(params, optimizers, state, step, info, packed=False)
 
-    The defaults are those of `pop_ref.settings`; with `reset_every=3000, lambda_pop=0.0` it is the paper's row "Reset".
+    The defaults are those of `pop_ref.settings`; with `reset_every=3000, prune_too_big=True, lambda_pop=0.0` it is the
+    paper's row "Reset".
     """
