@@ -12,7 +12,7 @@ from paper_repro.record import BINS, Result, run_id, settings_hash
 _SCHEDULE = {"max_steps": 10_000, "factor": 4, "pop.blur_start_iter": 1000, "pop.blur_stop_iter": 2333}
 _VIEWS = {f"{letter}.png": {"psnr": 30.0, "ssim": 0.9} for letter in "abcdefg"}
 PLAIN = Result(
-    scale="dev",
+    scale="small",
     row="pop",
     scene="fox",
     seed=42,

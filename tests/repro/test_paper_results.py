@@ -26,10 +26,10 @@ def test_a_result_is_read_as_it_was_written(tmp_path: Path) -> None:
         curve=curve({0: 1000, 9_999: 1000}, **STEPS), lpips={"vgg_01": 0.2, "alex_norm": None, "alex_01": None}
     )
     path = write(told, tmp_path)
-    assert path == tmp_path / "dev" / "pop.jsonl"
+    assert path == tmp_path / "small" / "pop.jsonl"
     assert read(path) == (told,)
-    assert find("dev", "pop", "fox", 42, tmp_path) == told
-    assert find("dev", "pop", "fox", 43, tmp_path) is None
+    assert find("small", "pop", "fox", 42, tmp_path) == told
+    assert find("small", "pop", "fox", 43, tmp_path) is None
     assert path.read_text(encoding="utf-8").count("\n") == 1
 
 
@@ -37,9 +37,9 @@ def test_results_of_one_scale_are_found_in_order(tmp_path: Path) -> None:
     told = [result("pop", "fox", 43), result("l2", "fox"), result("pop", "bonsai_800"), result("pop", "fox", 7)]
     for one in (*told, replace(PLAIN, scale="toy")):
         write(one, tmp_path)
-    assert read_all("dev", tmp_path) == (told[1], told[2], told[3], told[0])
-    assert sorted(path.name for path in (tmp_path / "dev").iterdir()) == ["l2.jsonl", "pop.jsonl"]
-    assert kept("dev", "pop", tmp_path) == {("fox", 7), ("fox", 43), ("bonsai_800", 42)}
+    assert read_all("small", tmp_path) == (told[1], told[2], told[3], told[0])
+    assert sorted(path.name for path in (tmp_path / "small").iterdir()) == ["l2.jsonl", "pop.jsonl"]
+    assert kept("small", "pop", tmp_path) == {("fox", 7), ("fox", 43), ("bonsai_800", 42)}
     assert read_all("full", tmp_path) == ()
     with pytest.raises(PopError, match="scale is 'big'; it must be one of toy, "):
         read_all("big", tmp_path)
@@ -63,7 +63,7 @@ def test_processes_that_write_at_once_lose_no_line(tmp_path: Path) -> None:
     )
     processes = [subprocess.Popen([sys.executable, "-c", script, str(tmp_path), str(i)], cwd=ROOT) for i in range(4)]
     assert [process.wait() for process in processes] == [0] * 4
-    assert [each.seed for each in read_all("dev", tmp_path)] == list(range(40))
+    assert [each.seed for each in read_all("small", tmp_path)] == list(range(40))
 
 
 def test_lines_that_git_has_merged_are_read_in_order_and_two_of_one_run_are_refused(tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ DAMAGE = [
     (_set("num_gaussians", 999), "opacity_histogram .* whose sum is num_gaussians, 999"),
     (_set("scale", "huge"), r"is of pop at scale huge; its place is huge/pop\.jsonl"),
     (_set("row", "POP Ours"), "must begin with schema 2"),
-    (_set("row", "l2"), r"is of l2 at scale dev; its place is dev/l2\.jsonl"),
+    (_set("row", "l2"), r"is of l2 at scale small; its place is small/l2\.jsonl"),
     (_set("run", "12345"), "run is .*twelve hex digits"),
     (_set("commit", "main"), "commit is .*a git commit or null"),
     (_set("cpu", ""), "cpu is .*a text"),
@@ -159,7 +159,7 @@ def test_a_result_that_was_damaged_or_edited_is_told_by_file_line_and_field(
     change(found)
     path.write_text(f"{first}\n{json.dumps(found, separators=(',', ':'))}\n", encoding="utf-8")
     with pytest.raises(PopError, match=message) as error:
-        read_all("dev", tmp_path)
+        read_all("small", tmp_path)
     assert str(error.value).startswith(f"{path}: line 2")
 
 
