@@ -20,7 +20,8 @@ from paper_repro.paper import paper
 from paper_repro.readings import READINGS, answers, experiments
 from paper_repro.results import Result
 from paper_repro.rows import ROWS, load_row
-from tests.repro.made import PLAIN, curve, result
+from tests.repro.made import WHOLE, curve
+from tests.repro.made import whole as result
 
 SCHEDULE = {
     "max_steps": 10_000,
@@ -205,7 +206,7 @@ def test_growth_is_that_of_table_4_a_densification_step(counts: tuple[int, ...],
         [
             r
             for row, n in zip(rows, counts, strict=True)
-            for r in two(row, n=1000 * n, schedule={**PLAIN.schedule, "pop.blur_stop_iter": WINDOWS[row]})
+            for r in two(row, n=1000 * n, schedule={**WHOLE, "pop.blur_stop_iter": WINDOWS[row]})
         ],
     )
     assert told.verdict == verdict
@@ -308,7 +309,7 @@ def test_the_papers_own_numbers_bear_its_claims_out() -> None:
             for r in two(
                 row, n=round(1000 * v["num_gaussians_k"]), psnr=v["psnr"], ssim=v["ssim"],
                 seconds={"load": 1.0, "evaluate": 1.0, "train": 1.0, "cpu": v["time_s"]},
-                schedule={**PLAIN.schedule, "pop.blur_stop_iter": WINDOWS.get(row, 7_000)},
+                schedule={**WHOLE, "pop.blur_stop_iter": WINDOWS.get(row, 7_000)},
             )
         ]  # fmt: skip
         for id in asked:
@@ -320,7 +321,7 @@ def test_the_papers_own_numbers_bear_its_claims_out() -> None:
 
 def test_what_bears_on_a_comparison_besides_the_method_stands_beside_it() -> None:
     pop = {
-        **PLAIN.schedule, "pop.theta_blur": 2e-5, "pop.blur_min_pixels": 10.0, "pop.reset_every": 0,
+        **WHOLE, "pop.theta_blur": 2e-5, "pop.blur_min_pixels": 10.0, "pop.reset_every": 0,
         "pop.refine_stop_iter": 15_000,
     }  # fmt: skip
     reset = {**pop, "pop.reset_every": 3000}

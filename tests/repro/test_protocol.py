@@ -15,7 +15,7 @@ from paper_repro.results import RESULTS, SCALES, Result, read_all
 from paper_repro.status import HERE, files, status_table, with_part
 from pop_fast.errors import PopError
 from pop_ref.ambiguities import AMBIGUITIES
-from tests.repro.made import result
+from tests.repro.made import whole as result
 
 PROTOCOL = (HERE / "protocol.md").read_text(encoding="utf-8")
 FOUND = [r for scale in SCALES for r in read_all(scale, RESULTS)]
