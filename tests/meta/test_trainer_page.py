@@ -1,4 +1,4 @@
-"""docs/trainer.md: its code is run as it stands, and its prior is the oracle's. CITATION.cff and the workflows agree."""
+"""docs/trainer.md: its code runs, its prior is the oracle's. CITATION.cff and the workflows agree with the project."""
 
 from __future__ import annotations
 
