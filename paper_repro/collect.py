@@ -9,13 +9,12 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
 from paper_repro.jobs import Job
 from paper_repro.results import BINS, LPIPS_VARIANTS, Result
 from pop_fast.errors import PopError
-from pop_fast.io.read_back import read_json
+from pop_fast.io.read_back import read_arrays, read_json
 from pop_fast.train.results import ResultFolder, read_config
+from pop_fast.view.report.source import read_records
 
 if TYPE_CHECKING:
     from pop_fast.data import Capture
@@ -27,6 +26,7 @@ __all__ = ["BESIDE", "PROBE", "collect", "first_change", "settings_hash", "spaci
 BESIDE: Final = "row.json"
 # what `ProbedRun` leaves there
 PROBE: Final = "probe.json"
+_AGAIN: Final = "train the row again in an empty folder"
 # where things lie, who takes the steps and how often something is written: no part of what was trained
 _APART: Final = frozenset(
     {
@@ -87,12 +87,21 @@ def collect(job: Job, folder: Path) -> Result:
         folder: its result folder.
 
     Raises:
-        PopError: something of a finished training is absent; names the file.
+        PopError: something of a finished training is absent or damaged; names the file or the folder.
     """
+    try:
+        return _collected(job, folder)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        if isinstance(error, PopError):
+            raise
+        raise PopError(f"{folder}: its records are not what a finished training leaves ({error!r}); {_AGAIN}") from error
+
+
+def _collected(job: Job, folder: Path) -> Result:
     config = read_config(folder)
     last = config.max_steps - 1
     stats, before = _stats(folder, "val", last), _stats(folder, "train", last)
-    said = read_json(folder / BESIDE, "train the row again in an empty folder")
+    said = read_json(folder / BESIDE, _AGAIN)
     data_hash, commit = said.pop("data_hash"), said.pop("commit")
     config_hash = settings_hash(config)
     n, size = stats["num_GS"], job.row.bytes_per_gaussian
@@ -178,22 +187,19 @@ def _lpips_reason(stats: Mapping[str, Any]) -> str | None:
 def _histogram(folder: Path, last: int) -> tuple[int, ...]:
     path = folder / "report_data" / f"opacity_step{last}.npz"
     if not path.is_file():
-        raise PopError(f"{path}: is absent; train the row again in an empty folder")
-    with np.load(path) as found:
-        return tuple(int(count) for count in found["counts"].reshape(BINS, -1).sum(axis=1))
-
-
-def _records(folder: Path) -> list[dict[str, Any]]:
-    lines = (folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
-    return [json.loads(line) for line in lines]
+        raise PopError(f"{path}: is absent; {_AGAIN}")
+    counts = read_arrays(path, {"counts": ("iu", 1)}, _AGAIN)["counts"]
+    if len(counts) % BINS:
+        raise PopError(f"{path}: counts has {len(counts)} bins, which no run writes; {_AGAIN}")
+    return tuple(int(count) for count in counts.reshape(BINS, -1).sum(axis=1))
 
 
 def _curve(folder: Path, max_steps: int) -> tuple[dict[str, Any], ...]:
     """Make the curve of the records of single training views, of the measurements of all held-out views, and of what a
     few training views say all along."""
-    points = {point["step"]: point for point in _thinned(_records(folder), max_steps)}
+    points = {point["step"]: point for point in _thinned(read_records(folder), max_steps)}
     for path in sorted((folder / "stats").glob("val_step*.json")):
-        stats = read_json(path, "train the row again in an empty folder")
+        stats = read_json(path, _AGAIN)
         # at a step that has a record too, what that says of its training view stays
         record = points.get(stats["step"], {})
         points[stats["step"]] = {**_measured(stats), **{name: v for name, v in record.items() if v is not None}}
@@ -205,7 +211,7 @@ def _curve(folder: Path, max_steps: int) -> tuple[dict[str, Any], ...]:
 
 def _probed(folder: Path) -> dict[int, dict[str, Any]]:
     path = folder / PROBE
-    found = read_json(path, "train the row again in an empty folder") if path.is_file() else {}
+    found = read_json(path, _AGAIN) if path.is_file() else {}
     return {int(step): point for step, point in found.items()}
 
 
