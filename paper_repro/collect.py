@@ -94,7 +94,9 @@ def collect(job: Job, folder: Path) -> Result:
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         if isinstance(error, PopError):
             raise
-        raise PopError(f"{folder}: its records are not what a finished training leaves ({error!r}); {_AGAIN}") from error
+        raise PopError(
+            f"{folder}: its records are not what a finished training leaves ({error!r}); {_AGAIN}"
+        ) from error
 
 
 def _collected(job: Job, folder: Path) -> Result:

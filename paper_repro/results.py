@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from itertools import pairwise
@@ -173,7 +174,7 @@ def read(path: str | Path) -> Result:
         found = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise PopError(f"{path}: cannot be read ({error.strerror}); make it with pop-repro run") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise PopError(f"{path}: is not JSON ({error}); run this row again") from None
     if not isinstance(found, dict):
         raise PopError(f"{path}: is {type(found).__name__}, not an object; run this row again")
@@ -255,7 +256,8 @@ class _Fields:
 
 
 def _finite(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    # a whole number may be too large for a float
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def _known(found: Mapping[str, Any], names: Iterable[str], where: str) -> None:

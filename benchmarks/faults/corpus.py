@@ -191,7 +191,9 @@ def _write_exports(folder: Path) -> None:
     shutil.copytree(folder / "colmap" / "images", keyframes / "images")
     (keyframes / "cameras").mkdir()
     for view in range(VIEWS):
-        pose = {f"t_{i}{j}": float(i == j) + (0.1 * view if (i, j) == (0, 3) else 0.0) for i in range(3) for j in range(4)}
+        pose = {
+            f"t_{i}{j}": float(i == j) + (0.1 * view if (i, j) == (0, 3) else 0.0) for i in range(3) for j in range(4)
+        }
         lens = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "fy": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2}
         (keyframes / "cameras" / f"{view}.json").write_text(json.dumps({**lens, **pose}))
     shutil.copytree(folder / "colmap", folder / "upright")
@@ -208,7 +210,9 @@ def _metashape() -> str:
         f'<camera id="{view}" sensor_id="0" label="{view}.png"><transform>{pose}</transform></camera>'
         for view, pose in enumerate(poses)
     ]
-    frame = "<transform><rotation>1 0 0 0 1 0 0 0 1</rotation><translation>0 0 0</translation><scale>1</scale></transform>"
+    frame = (
+        "<transform><rotation>1 0 0 0 1 0 0 0 1</rotation><translation>0 0 0</translation><scale>1</scale></transform>"
+    )
     return (
         f'<document version="1.5"><chunk><sensors>{sensor}</sensors><cameras>{"".join(cameras)}</cameras>{frame}'
         "</chunk></document>\n"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -24,9 +25,11 @@ from pop_fast.blocks.plan import read_job, read_plan
 from pop_fast.blocks.start import own_of
 from pop_fast.cli.data_check import look_over
 from pop_fast.cli.render import listed_in
+from pop_fast.data.block import read_block
 from pop_fast.data.load import load_capture
 from pop_fast.data.sfm_files import recognise_result
 from pop_fast.data.video import take_frames
+from pop_fast.errors import CaptureError
 from pop_fast.io.formats import load_splat_file
 from pop_fast.io.heif import can_read_heif
 from pop_fast.io.image_header import read_exif, read_size
@@ -88,6 +91,15 @@ def _photograph(path: Path) -> Any:
 
 def _capture(folder: Path) -> Any:
     return load_capture(str(folder))
+
+
+def _block(folder: Path) -> Any:
+    place = folder / "blocks" / "0_0"
+    listing = read_block(place)
+    with suppress(CaptureError):
+        # what it says of a photograph or a mask that is listed names that file
+        load_capture(str(place))
+    return listing
 
 
 def _sfm_list(folder: Path) -> Any:
@@ -214,8 +226,8 @@ _RUNS = {
     "cfg_args": Reader("records/cfg_args", "", _exported, "text", refuses=False),
 }
 _BLOCKS = {
-    "block.json": Reader("blocked", "blocks/0_0/block.json", lambda folder: _capture(folder / "blocks/0_0"), "text"),
-    "points of a block": Reader("blocked", "blocks/0_0/points.npz", lambda folder: _capture(folder / "blocks/0_0"), "zip"),
+    "block.json": Reader("blocked", "blocks/0_0/block.json", _block, "text"),
+    "points of a block": Reader("blocked", "blocks/0_0/points.npz", _block, "zip"),
     "job.json": Reader("blocked", "blocks/job.json", read_job, "text"),
     "plan.json": Reader("blocked", "blocks/plan.json", read_plan, "text"),
     "start.json": Reader("blocked", "blocks/round_1/0_0/start.json", lambda folder: own_of(folder, "0_0", 1), "text"),
@@ -229,7 +241,9 @@ _COLLECTED = (
     ("report_data/opacity_step3.npz", "zip"),
 )
 _PAPER = {
-    "result of a row": Reader("records/dev", "pop/fox_42.json", lambda dev: results.read_all("dev", dev.parent), "text"),
+    "result of a row": Reader(
+        "records/dev", "pop/fox_42.json", lambda dev: results.read_all("dev", dev.parent), "text"
+    ),
     "row": Reader("records/pop.toml", "", _row, "text"),
     "paper.toml": Reader("records/paper.toml", "", paper.load, "text"),
     **{
