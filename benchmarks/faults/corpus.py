@@ -204,7 +204,8 @@ def _write_exports(folder: Path) -> None:
 def _metashape() -> str:
     lens = f"<f>{FOCAL}</f><cx>0</cx><cy>0</cy><k1>0.01</k1>"
     size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
-    sensor = f'<sensor id="0" type="frame">{size}<calibration type="frame" class="adjusted">{size}{lens}</calibration></sensor>'
+    lens = f'<calibration type="frame" class="adjusted">{size}{lens}</calibration>'
+    sensor = f'<sensor id="0" type="frame">{size}{lens}</sensor>'
     poses = [f"1 0 0 {0.1 * view} 0 1 0 0 0 0 1 0 0 0 0 1" for view in range(VIEWS)]
     cameras = [
         f'<camera id="{view}" sensor_id="0" label="{view}.png"><transform>{pose}</transform></camera>'
@@ -263,12 +264,12 @@ def _write_records(result: Path, folder: Path) -> None:
     )
     torch.save({"lin0.model.1.weight": torch.ones(1, 64, 1, 1)}, folder / "lpips.pt")
     repro = HERE.parents[2] / "paper_repro"
-    place = folder / "dev" / "pop"
+    place = folder / "full" / "pop_size_prune"
     place.mkdir(parents=True)
-    found = json.loads((repro / "results" / "dev" / "pop" / "fox_42.json").read_text())
+    found = json.loads((repro / "results" / "full" / "pop_size_prune" / "bonsai_800_42.json").read_text())
     # short: a few points of the curve say what all do
     found["curve"] = found["curve"][:3]
-    (place / "fox_42.json").write_text(json.dumps(found, indent=1))
+    (place / "bonsai_800_42.json").write_text(json.dumps(found, indent=1))
     shutil.copy(repro / "configs" / "pop.toml", folder / "pop.toml")
     shutil.copy(repro / "paper.toml", folder / "paper.toml")
 

@@ -212,10 +212,10 @@ def _outcome(reader: Reader, path: Path) -> tuple[str, ...]:
     except Exception as error:
         # as the command line prints it
         line = message(str(error) if isinstance(error, PopError) else describe(error) or str(error))
-        if isinstance(error, OSError) and describe(error) is not None:
+        if isinstance(error, OSError) and describe(error) is not None and path.name in line:
             return ("told",)
         known = isinstance(error, PopError) or (isinstance(error, ValueError) and describe(error) is not None)
-        if known and "\n" not in line and len(line) < LONGEST and path.name in line:
+        if known and "\n" not in line and len(line) < LONGEST and any(name in line for name in (path.name, HERE.name)):
             return ("refused",)
         frames = traceback.extract_tb(error.__traceback__)
         # our own line says more than the library's that it called

@@ -242,7 +242,7 @@ _COLLECTED = (
 )
 _PAPER = {
     "result of a row": Reader(
-        "records/dev", "pop/fox_42.json", lambda dev: results.read_all("dev", dev.parent), "text"
+        "records/full", "pop_size_prune/bonsai_800_42.json", lambda full: results.read_all("full", full.parent), "text"
     ),
     "row": Reader("records/pop.toml", "", _row, "text"),
     "paper.toml": Reader("records/paper.toml", "", paper.load, "text"),
