@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
 
-__all__ = ["BESIDE", "PROBE", "collect", "first_change", "settings_hash", "spacing", "state_of_data"]
+__all__ = ["BESIDE", "PROBE", "collect", "first_change", "read_probe", "settings_hash", "spacing", "state_of_data"]
 
 # what `train_row` leaves in the result folder about the capture and the program, from before the first step
 BESIDE: Final = "row.json"
@@ -205,15 +205,22 @@ def _curve(folder: Path, max_steps: int) -> tuple[dict[str, Any], ...]:
         # at a step that has a record too, what that says of its training view stays
         record = points.get(stats["step"], {})
         points[stats["step"]] = {**_measured(stats), **{name: v for name, v in record.items() if v is not None}}
-    for step, probed in _probed(folder).items():
+    for step, probed in read_probe(folder).items():
         point = {**dict.fromkeys(_ALWAYS), "step": step, **probed, **points.get(step, {})}
         points[step] = {name: _short(value) for name, value in point.items()}
     return tuple(points[step] for step in sorted(points))
 
 
-def _probed(folder: Path) -> dict[int, dict[str, Any]]:
+def read_probe(folder: Path) -> dict[int, dict[str, Any]]:
+    """Read what `ProbedRun` has measured in a result folder, by step; nothing where it has not.
+
+    Raises:
+        PopError: the file is damaged.
+    """
     path = folder / PROBE
     found = read_json(path, _AGAIN) if path.is_file() else {}
+    if not all(step.isascii() and step.isdecimal() and isinstance(point, dict) for step, point in found.items()):
+        raise PopError(f"{path}: must hold an object for each step; {_AGAIN}")
     return {int(step): point for step, point in found.items()}
 
 

@@ -37,6 +37,7 @@ from pop_ref.conformance.vectors import export
 HERE = Path(__file__).resolve().parent / "corpus"
 WIDTH, HEIGHT, FOCAL, VIEWS, POINTS = 24, 16, 20.0, 3, 12
 
+_COLUMNS = ("x", "y", "z", "red", "green", "blue")
 _PROTOCOL = {"split": "every 3rd by name", "test_views": 1, "images": "images", "factor": 1, "width": WIDTH}
 _PROTOCOL |= {"height": HEIGHT, "resize": "area"}
 
@@ -196,6 +197,14 @@ def _write_exports(folder: Path) -> None:
         }
         lens = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "fy": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2}
         (keyframes / "cameras" / f"{view}.json").write_text(json.dumps({**lens, **pose}))
+    # without points, thousands would be made at random for every input
+    points = "".join(f"{x} {y} {z} 200 100 50\n" for x, y, z in _points())
+    columns = "".join(
+        f"property {kind} {name}\n" for kind, name in zip(("float",) * 3 + ("uchar",) * 3, _COLUMNS, strict=True)
+    )
+    for name in ("metashape", "realitycapture", "polycam", "transforms"):
+        head = f"ply\nformat ascii 1.0\nelement vertex {POINTS}\n{columns}end_header\n"
+        (folder / name / "points3D.ply").write_text(head + points)
     shutil.copytree(folder / "colmap", folder / "upright")
     (folder / "upright" / "sparse" / UPRIGHT).write_text(json.dumps({"1.png": 2}))
     write_list(folder / "upright" / "sparse", folder / "upright" / "sparse", "sparse/")
@@ -233,6 +242,9 @@ def _write_blocks(folder: Path) -> None:
     (place / "blocks" / "job.json").write_text(job_text(job))
     for path in place.rglob("block.json"):
         path.write_text(path.read_text().replace(str(capture.absolute()), "benchmarks/faults/corpus/colmap"))
+    row = {"name": "0_0", "num_GS": 12, "seconds": 1.0, "seconds_total": 2.0, "memory_bytes": 10**8}
+    (place / "blocks" / "round_0").mkdir()
+    (place / "blocks" / "round_0" / "stats.json").write_text(json.dumps({"round": 0, "psnr": 20.0, "blocks": [row]}))
     merged = place / "blocks" / "round_1" / "0_0"
     merged.mkdir(parents=True)
     (merged / "start.json").write_text(json.dumps({"own": 3, "fixed": 2, "merged": 5}))

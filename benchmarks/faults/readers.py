@@ -21,8 +21,10 @@ from cuda_ext.gpu_check.outcomes import outcomes
 from paper_repro import paper, results, rows
 from paper_repro.collect import collect
 from paper_repro.jobs import job_named
+from pop_fast.blocks.merge import read_round
 from pop_fast.blocks.plan import read_job, read_plan
 from pop_fast.blocks.start import own_of
+from pop_fast.cli import compare
 from pop_fast.cli.data_check import look_over
 from pop_fast.cli.render import listed_in
 from pop_fast.data.block import read_block
@@ -221,6 +223,7 @@ _RUNS = {
             ("report_data/depth_step3_0000.npz", "zip"),
         )
     },
+    "compare": Reader("result", "stats/val_step0003.json", lambda folder: compare.run([str(folder)]), "text"),
     "camera path": Reader("records/path.json", "", _path, "text"),
     "renders.json": Reader("records/renders.json", "", _listed, "text", refuses=False),
     "cfg_args": Reader("records/cfg_args", "", _exported, "text", refuses=False),
@@ -230,6 +233,9 @@ _BLOCKS = {
     "points of a block": Reader("blocked", "blocks/0_0/points.npz", _block, "zip"),
     "job.json": Reader("blocked", "blocks/job.json", read_job, "text"),
     "plan.json": Reader("blocked", "blocks/plan.json", read_plan, "text"),
+    "stats.json of a round": Reader(
+        "blocked", "blocks/round_0/stats.json", lambda folder: read_round(folder, 0), "text"
+    ),
     "start.json": Reader("blocked", "blocks/round_1/0_0/start.json", lambda folder: own_of(folder, "0_0", 1), "text"),
 }
 _COLLECTED = (
