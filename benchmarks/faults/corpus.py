@@ -276,12 +276,11 @@ def _write_records(result: Path, folder: Path) -> None:
     )
     torch.save({"lin0.model.1.weight": torch.ones(1, 64, 1, 1)}, folder / "lpips.pt")
     repro = HERE.parents[2] / "paper_repro"
-    place = folder / "full" / "pop_size_prune"
-    place.mkdir(parents=True)
-    found = json.loads((repro / "results" / "full" / "pop_size_prune" / "bonsai_800_42.json").read_text())
+    (folder / "full").mkdir()
+    found = json.loads((repro / "results" / "full" / "pop_size_prune.jsonl").read_text().splitlines()[0])
     # short: a few points of the curve say what all do
-    found["curve"] = found["curve"][:3]
-    (place / "bonsai_800_42.json").write_text(json.dumps(found, indent=1))
+    found["curve"] = [{name: [*column[:1], *column[-2:]] for name, column in table.items()} for table in found["curve"]]
+    (folder / "full" / "pop_size_prune.jsonl").write_text(json.dumps(found, separators=(",", ":")) + "\n")
     shutil.copy(repro / "configs" / "pop.toml", folder / "pop.toml")
     shutil.copy(repro / "paper.toml", folder / "paper.toml")
 

@@ -157,7 +157,7 @@ def _row(path: Path) -> Any:
 
 
 def _collected(folder: Path) -> Any:
-    return results.write(collect(job_named("pop", "demo", "toy"), folder), folder / "results")
+    return results.write(collect(job_named("pop", "demo", "toy"), folder, {}), folder / "results")
 
 
 def _port(folder: Path) -> Any:
@@ -247,8 +247,8 @@ _COLLECTED = (
     ("report_data/opacity_step3.npz", "zip"),
 )
 _PAPER = {
-    "result of a row": Reader(
-        "records/full", "pop_size_prune/bonsai_800_42.json", lambda full: results.read_all("full", full.parent), "text"
+    "results of a row": Reader(
+        "records/full", "pop_size_prune.jsonl", lambda full: results.read_all("full", full.parent), "text"
     ),
     "row": Reader("records/pop.toml", "", _row, "text"),
     "paper.toml": Reader("records/paper.toml", "", paper.load, "text"),
