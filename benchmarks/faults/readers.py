@@ -186,8 +186,9 @@ _CAPTURES = {
     },
     **{
         f"data check: {name}": Reader("tracked", name, lambda folder: look_over(folder))
-        for name in ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin", "images/0.png")
+        for name in ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin")
     },
+    "data check: images/0.png": Reader("tracked", "images/0.png", lambda folder: look_over(folder), refuses=False),
     "transforms.json": Reader("transforms", "transforms.json", _capture, "text"),
     "Metashape": Reader("metashape", "cameras.xml", _capture, "text"),
     "RealityCapture": Reader("realitycapture", "cameras.csv", _capture, "text"),
