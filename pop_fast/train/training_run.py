@@ -112,7 +112,7 @@ class TrainingRun:
         check_batch(config, strategy is None, ranks)
         self._ranks = ranks
         self._engine = engine_of(choose_backend(config, resume)[0], strategy is None) if engine is None else engine
-        self.config = replace(config, backend=self._engine.name)
+        self.config = replace(config, backend=self._engine.name).in_world(capture.world_scale)
         self._resume, self._overwrite, self._beside = resume, overwrite, beside or {}
         self._prepare_capture(capture, initial)
         self.optimizers = make_optimizers(self.params)
