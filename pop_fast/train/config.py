@@ -29,6 +29,8 @@ _FREE: Final = frozenset(
         *("max_renders", "progress", "lpips_vgg", "lpips_alex", "target_cache_mb"),
     }
 )
+# settings of density control that are gone, with the value at which they did nothing: results with it still open
+_GONE: Final = {"blur_stop_gain": 0.0, "blur_stop_span": 5}
 # the two parts of cfg.json
 _GIVEN, _RESOLVED = "given", "resolved"
 
@@ -188,7 +190,10 @@ class TrainConfig:
     @classmethod
     def _from_values(cls, values: dict[str, Any], method: str) -> Self:
         rest = {name: value for name, value in values.items() if name != "strategy"}
-        strategy = from_plain(METHODS[method].strategy, values.get("strategy", {}), f"config.{method}")
+        own = values.get("strategy", {})
+        if isinstance(own, dict):
+            own = {name: value for name, value in own.items() if name not in _GONE or value != _GONE[name]}
+        strategy = from_plain(METHODS[method].strategy, own, f"config.{method}")
         return replace(from_plain(cls, rest, "config", skipped=("given", "strategy")), strategy=strategy)
 
     @property

@@ -255,8 +255,6 @@ class TrainingRun:
             self._require_finite()
             raise PopError(f"{error}; {self._what_is_left}") from error
         self.step = last
-        if "loss_sum" in self.state and phase.statistics:
-            self.state["loss_sum"] += self.config.batch_size * sum(found.objective + found.pop for found in stats)
         for step, found in enumerate(stats, first):
             if not math.isfinite(found.objective + found.pop):
                 self._require_finite()

@@ -363,7 +363,7 @@ def test_mini_splatting_splits_who_was_blurred_in_any_view_since_the_last_densif
         ),
         ("taming", {"sh_rest_every": 0}, "taming.sh_rest_every is 0; it must be at least 1"),
         ("taming", {"budget_multiplier": -2.0}, "taming.budget_multiplier is -2.0; it must be >= 0 and finite"),
-        ("pop", {"blur_stop_span": 0}, "pop.blur_stop_span is 0; it must be at least 1"),
+        ("pop", {"refine_every": 0}, "pop.refine_every is 0; it must be at least 1"),
     ],
 )
 def test_a_setting_that_cannot_be_is_named_as_the_command_line_names_it(
