@@ -92,7 +92,9 @@ class Job:
 
         scaler = self.scale.steps_scaler
         whole = _whole(self)
-        plain = self.scale.reset_every is None or whole.strategy.reset_every == 0
+        every = self.scale.reset_every
+        resets = {} if every is None or whole.strategy.reset_every == 0 else {"strategy.reset_every": every}
+        sizes = {} if every is None or not whole.strategy.prune_too_big else {"strategy.prune_too_big_after": every}
         drawable = self.scene.centred or profile_named(whole.profile).principal_point == "used"
         said = {
             "log_every": self.scale.log_every,
@@ -103,7 +105,8 @@ class Job:
             **self.scale.settings,
             **self.scale.of_methods.get(whole.method, {}),
             **_scaled(whole, scaler),
-            **({} if plain else {"strategy.reset_every": self.scale.reset_every}),
+            **resets,
+            **sizes,
             **({} if drawable else {"profile": GSPLAT_1_5.name}),
             "seed": self.seed,
             "factor": self.factor,

@@ -21,7 +21,7 @@ from pop_fast.io.atomic import write_atomically
 __all__ = ["BINS", "LPIPS_VARIANTS", "RESULTS", "SCALES", "SCHEMA", "Result", "path_of", "read", "read_all", "write"]
 
 SCHEMA: Final = 1
-SCALES: Final = ("toy", "dev", "full", "paper")
+SCALES: Final = ("toy", "small", "no_floor", "full", "paper")
 LPIPS_VARIANTS: Final = ("vgg_01", "alex_norm", "alex_01")
 BINS: Final = 50  # of the opacity histogram over [0, 1]
 RESULTS: Final = Path(__file__).resolve().parent / "results"
@@ -53,7 +53,7 @@ class Result:
     """What one finished run says of itself.
 
     Attributes:
-        scale: "toy", "dev", "full" or "paper".
+        scale: "toy", "small", "no_floor", "full" or "paper".
         row: the configuration, by the name of its file in `configs`.
         scene: the capture, by its name here ("fox", "bonsai_800", "kitchen", ...).
         seed: of every random number of the run.

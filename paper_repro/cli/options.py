@@ -18,7 +18,7 @@ WORK: Final = Path(__file__).resolve().parents[1] / "work"
 def add_scale(parser: argparse.ArgumentParser) -> None:
     """Add --scale."""
     about = "; ".join(f"{scale.name}: {scale.about}" for scale in SCALES.values())
-    parser.add_argument("--scale", choices=SCALES, default="dev", help=f"{about} (default: %(default)s)")
+    parser.add_argument("--scale", choices=SCALES, default="small", help=f"{about} (default: %(default)s)")
 
 
 def add_results(parser: argparse.ArgumentParser) -> None:

@@ -14,21 +14,21 @@ __all__ = ["claims", "figure", "status", "table"]
 
 _SEED: Final = 42
 _STATUS: Final = """
-    pop-repro status --scale dev
+    pop-repro status --scale small
     pop-repro status --scale paper --rows pop gsplat --seeds 3
 """
 _TABLE: Final = """
-    pop-repro table 1 --scale dev                         to read, as Markdown
-    pop-repro table 1 --scale dev --out out               table_1.md, table_1.tex and table_1.csv
-    pop-repro table beyond --scale dev                    what goes beyond the paper
+    pop-repro table 1 --scale small                         to read, as Markdown
+    pop-repro table 1 --scale small --out out               table_1.md, table_1.tex and table_1.csv
+    pop-repro table beyond --scale small                    what goes beyond the paper
 """
 _FIGURE: Final = """
-    pop-repro figure 7 --scale dev --out out              figure_7.svg, figure_7.png and the numbers in figure_7.csv
-    pop-repro figure 5 --scale dev --work WORK            of the renders that finished rows keep in their work folder
-    pop-repro figure 3 --scale dev --data DATA            trains 1,000 steps, on the CPU, from a 3DGS model
+    pop-repro figure 7 --scale small --out out              figure_7.svg, figure_7.png and the numbers in figure_7.csv
+    pop-repro figure 5 --scale small --work WORK            of the renders that finished rows keep in their work folder
+    pop-repro figure 3 --scale small --data DATA            trains 1,000 steps, on the CPU, from a 3DGS model
 """
 _CLAIMS: Final = """
-    pop-repro claims --scale dev                          each claim, its verdict, and the numbers behind it
+    pop-repro claims --scale small                          each claim, its verdict, and the numbers behind it
 """
 
 

@@ -15,14 +15,14 @@ __all__ = ["queue", "run"]
 _SEED: Final = 42
 _RUN: Final = """
     pop-repro run pop demo --scale toy                    in seconds, on a capture that the program makes
-    pop-repro run pop fox --scale dev --data DATA         the same command continues after a stop
+    pop-repro run pop fox --scale small --data DATA         the same command continues after a stop
     pop-repro run l2_blur bonsai_800 --scale full --data DATA --threads 2
 """
 _QUEUE: Final = """
     pop-repro queue --scale toy                           every row in minutes
-    pop-repro queue --scale dev --data DATA --nice 10     days; Ctrl-C or SIGTERM stops it, the same command continues
-    pop-repro queue --scale dev --data DATA --rows pop gsplat 3dgs --scenes fox bear_512 --seeds 3
-    pop-repro queue --scale dev --data DATA --list        what is missing, in order, without training
+    pop-repro queue --scale small --data DATA --nice 10     days; Ctrl-C or SIGTERM stops it, the same command continues
+    pop-repro queue --scale small --data DATA --rows pop gsplat 3dgs --scenes fox bear_512 --seeds 3
+    pop-repro queue --scale small --data DATA --list        what is missing, in order, without training
 """
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from paper_repro.results import BINS, Result
 
 PLAIN = Result(
-    scale="dev",
+    scale="small",
     row="pop",
     scene="fox",
     seed=42,

@@ -82,7 +82,7 @@ def test_a_base_of_another_kind_is_not_begun_from(change, tmp_path):
     assert "base" in read(train_row(job, how)).protocol
 
 
-@pytest.mark.parametrize("scale", ["toy", "dev", "full", "paper"])
+@pytest.mark.parametrize("scale", ["toy", "small", "full", "paper"])
 def test_every_row_that_names_a_base_shares_steps_with_it_on_every_scene(scale):
     named = [row for row in load_rows() if row.base is not None]
     assert {row.name for row in named} == {"pup", "pup_star", "mini_splatting_star"}

@@ -73,7 +73,7 @@ def written(tmp_path_factory):
     for one in full():
         write(one, folder / "results")
     for figure in OF_RESULTS:
-        words = ["figure", figure, "--scale", "dev", "--results", folder / "results", "--out", folder / "out"]
+        words = ["figure", figure, "--scale", "small", "--results", folder / "results", "--out", folder / "out"]
         assert main([str(word) for word in words]) == 0
     return folder
 
@@ -200,11 +200,11 @@ def test_seeds_count_the_same_in_the_histogram():
 
 @pytest.mark.parametrize("figure", OF_RESULTS)
 def test_a_figure_without_results_says_what_was_not_run(figure, tmp_path, capsys):
-    words = ["figure", figure, "--scale", "dev", "--results", str(tmp_path), "--out", str(tmp_path / "out")]
+    words = ["figure", figure, "--scale", "small", "--results", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main(words) == 1
     said = capsys.readouterr().err
-    assert f"figure {figure} at scale dev is not drawn: not run are " in said
-    assert "pop-repro queue --scale dev --data DATA --rows " in said
+    assert f"figure {figure} at scale small is not drawn: not run are " in said
+    assert "pop-repro queue --scale small --data DATA --rows " in said
     assert not (tmp_path / "out").exists()
 
 
@@ -226,8 +226,8 @@ def test_the_note_says_captures_steps_seeds_and_whether_it_is_the_protocol():
     chosen = choose(asked("7", runs), ["pop"], ["fox"])
     said = foot(asked("7", runs), chosen)
     assert said.replace("\N{NO-BREAK SPACE}", " ") == (
-        "Capture fox (270 × 480); 10,000 steps; mean over seeds 42 and 43. Scale dev, not the paper's protocol: real "
-        "photographs for a CPU: 10,000 steps, small images, theta_blur at least 10 pixels."
+        "Capture fox (270 × 480); 10,000 steps; mean over seeds 42 and 43. Scale small, not the paper's protocol: real "
+        "photographs for a CPU: the whole schedule, small images, theta_blur at least 10 pixels."
     )
     ours = [result("pop", "bicycle", scale="paper", schedule=STEPS)]
     said = foot(asked("7", ours, scale="paper"), choose(asked("7", ours, scale="paper"), ["pop"], ["bicycle", "room"]))
@@ -337,7 +337,7 @@ def test_a_logarithmic_axis_has_a_few_marks(low, high):
 
 def test_an_unknown_figure_is_refused_before_anything_is_read(tmp_path):
     with pytest.raises(PopError, match="figure is '8'; it must be one of 1, 2, 3, 4a, 4b, 5, 6a, 6b, 7"):
-        figures.draw("8", "dev", tmp_path, tmp_path)
+        figures.draw("8", "small", tmp_path, tmp_path)
 
 
 def test_rows_name_the_figures_that_show_them():

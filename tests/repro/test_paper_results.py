@@ -19,7 +19,7 @@ def test_a_result_is_read_as_it_was_written(tmp_path: Path) -> None:
     steps = curve({0: 1000, 100: 1100}, psnr=[None, 20.5], n_blended=[None, 3.5])
     told = result(curve=steps, lpips={"vgg_01": 0.2, "alex_norm": None, "alex_01": None})
     path = write(told, tmp_path)
-    assert path == tmp_path / "dev" / "pop" / "fox_42.json"
+    assert path == tmp_path / "small" / "pop" / "fox_42.json"
     assert read(path) == told
     assert path.read_text(encoding="utf-8").count("\n") == 2 + 29 + 3  # braces, fields and schema, points of the curve
 
@@ -28,9 +28,9 @@ def test_results_of_one_scale_are_found_in_order(tmp_path: Path) -> None:
     told = [result("pop", "fox", 43), result("l2", "fox"), result("pop", "bonsai_800"), result("pop", "fox", 7)]
     for one in (*told, replace(PLAIN, scale="toy")):
         write(one, tmp_path)
-    assert read_all("dev", tmp_path) == (told[1], told[2], told[3], told[0])
+    assert read_all("small", tmp_path) == (told[1], told[2], told[3], told[0])
     assert read_all("full", tmp_path) == ()
-    with pytest.raises(PopError, match="scale is 'big'; it must be one of toy, dev, full, paper"):
+    with pytest.raises(PopError, match="scale is 'big'; it must be one of toy, small, no_floor, full, paper"):
         read_all("big", tmp_path)
 
 
@@ -73,7 +73,7 @@ DAMAGE = [
     (_set("curve/1/psnr", "x"), r"curve\[1\]: psnr is .*a finite number or null"),
     (_set("curve", [{"step": 0}]), r"curve\[0\]: num_gaussians is absent"),
     (_set("per_view/a.png", {"psnr": 30.0}), "per_view: a.png: ssim is absent"),
-    (_set("seed", 43), "its place is dev/pop/fox_43.json"),
+    (_set("seed", 43), "its place is small/pop/fox_43.json"),
 ]
 
 

@@ -61,7 +61,7 @@ def test_help_is_quick_and_loads_nothing_heavy(command):
         (["rum"], "'rum' is not a subcommand; did you mean 'pop-repro run'?"),
         (["xyz"], "'xyz' is not a subcommand; see 'pop-repro --help'"),
         (["run", "pops", "fox"], "row is 'pops'; it must be one of 3dgs, 3dgs_2023"),
-        (["run", "pop", "garden", "--scale", "dev"], "scale 'dev' has no garden; its scenes are fox, "),
+        (["run", "pop", "garden", "--scale", "small"], "scale 'small' has no garden; its scenes are fox, "),
         (["run", "pop", "fox", "--scale", "tiny"], "argument --scale: invalid choice: 'tiny'"),
         (
             ["run", "pop", "fox", "--data", "nowhere", "--out", "results"],
@@ -95,12 +95,12 @@ def test_data_check_names_what_is_absent_and_its_source(capsys, tmp_path):
 
 
 def test_a_queue_lists_what_is_missing_cheapest_first(capsys, tmp_path):
-    words = ["queue", "--scale", "dev", "--out", tmp_path, "--list"]
+    words = ["queue", "--scale", "small", "--out", tmp_path, "--list"]
     lines = call(*words, "--seeds", "2", capsys=capsys).splitlines()
     assert len(lines) == 2 * 4 * len(ROWS)
     assert lines[0].split()[1] in ("bear_512", "garden_512")
     chosen = call(*words, "--rows", "gsplat", "pop", "--scenes", "fox", capsys=capsys).splitlines()
-    assert chosen == ["pop fox --scale dev --seed 42", "gsplat fox --scale dev --seed 42"]
+    assert chosen == ["pop fox --scale small --seed 42", "gsplat fox --scale small --seed 42"]
 
 
 @pytest.fixture(scope="module")

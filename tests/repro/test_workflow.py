@@ -42,7 +42,7 @@ def rules(printed: str) -> dict[str, int]:
     return {name: int(count) for name, count in re.findall(r"^(\w+) +(\d+)$", printed, re.MULTILINE)}
 
 
-@pytest.mark.parametrize("scale", ["toy", "dev", "paper"])
+@pytest.mark.parametrize("scale", ["toy", "small", "paper"])
 def test_there_is_one_rule_for_each_row_scene_and_seed_and_one_for_each_table_and_figure(tmp_path, scale):
     planned = rules(workflow(tmp_path, "-n", scale=scale, seeds=2))
     jobs = [job for job in jobs_of(scale, seeds=(42, 43)) if trainable(job)]
@@ -65,7 +65,7 @@ def test_the_cheapest_row_has_the_highest_priority_and_a_gpu_is_asked_for_at_the
     ranked = sorted(priority, key=lambda name: -priority[name])
     assert ranked == [f"train_{job.row.name}_{job.scene.name}_{job.seed}" for job in jobs]
     assert printed.count("gpu=1") == len(jobs)
-    assert "gpu=1" not in workflow(tmp_path, "-n", "rows", scale="dev")
+    assert "gpu=1" not in workflow(tmp_path, "-n", "rows", scale="small")
 
 
 def test_the_slurm_profile_is_read(tmp_path):
