@@ -167,8 +167,8 @@ RUNS = (
     Run("completion", "pop completion bash | head -12"),
 )
 REPRO = (
-    Run("run", "pop-repro run pop demo --scale toy --out results --work work"),
-    Run("queue", "pop-repro queue --scale toy --rows pop gsplat l2_blur --out results --work work"),
+    Run("run", "pop-repro run pop demo --scale toy --results results --work work"),
+    Run("queue", "pop-repro queue --scale toy --rows pop gsplat l2_blur --results results --work work"),
     Run("status", "pop-repro status --scale small"),
     Run("table", "pop-repro table 4 --scale toy --results results --out tables"),
     Run(

@@ -14,6 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from paper_repro import results
 from paper_repro.rows import ROWS, Row, load_row
 from paper_repro.scales import Scale, scale_named
 from paper_repro.scenes import Scene, scene_named
@@ -66,9 +67,25 @@ class Job:
         width, height = self.scene.size
         return self.row.cost * width * height / self.factor**2 * self.scale.steps_scaler
 
-    def result(self, folder: Path) -> Path:
-        """Return the place of its result in a folder of results."""
-        return folder / self.scale.name / self.row.name / f"{self.scene.name}_{self.seed}.json"
+    def file(self, folder: Path) -> Path:
+        """Return the file of its row's results in a folder of results."""
+        return results.path_of(self.scale.name, self.row.name, folder)
+
+    def is_done(self, folder: Path) -> bool:
+        """Tell whether it has a result in a folder of results.
+
+        Raises:
+            PopError: the file of the row's results is damaged.
+        """
+        return (self.scene.name, self.seed) in results.kept(self.scale.name, self.row.name, folder)
+
+    def result(self, folder: Path) -> results.Result | None:
+        """Read its result in a folder of results; None where there is none.
+
+        Raises:
+            PopError: the result is damaged, or does not agree with itself.
+        """
+        return results.find(self.scale.name, self.row.name, self.scene.name, self.seed, folder)
 
     def work(self, folder: Path) -> Path:
         """Return the place of its checkpoints in a work folder."""

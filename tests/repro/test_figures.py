@@ -19,7 +19,8 @@ from paper_repro.figures.data import NoDataError, choose, curve_of
 from paper_repro.figures.foot import foot
 from paper_repro.figures.sheet import save
 from paper_repro.paper import paper
-from paper_repro.results import BINS, Result, write
+from paper_repro.record import BINS
+from paper_repro.results import Result, write
 from paper_repro.rows import load_rows
 from pop_fast.errors import PopError
 from tests.repro.drawing import asked, drawn, lines, texts
@@ -47,7 +48,7 @@ def full() -> list[Result]:
     found = []
     for i, row in enumerate(load_rows()):
         for j, scene in enumerate(("fox", "bear_512")):
-            n = 1000 * (i + 1) + 100 * j
+            n = 1200 * (i + 1) + 120 * j
             points = logged(
                 *(n // 3, 13_333 if row.name == "pup" else 10_000),
                 grad_l1=1.0,

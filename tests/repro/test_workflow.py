@@ -78,14 +78,14 @@ def test_rows_are_trained_and_finished_ones_are_left_alone(tmp_path):
     workflow(tmp_path, "-j", "1", "rows", scale="toy", rows="l1_div_100,l2_pop")
     found = read_all("toy", tmp_path / "results")
     assert [result.row for result in found] == ["l1_div_100", "l2_pop"]
-    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "results").rglob("*.json")}
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "results").rglob("*.jsonl")}
     assert "Nothing to be done" in workflow(tmp_path, "-j", "1", "rows", scale="toy", rows="l1_div_100,l2_pop")
     # another machine has no memory of this one's runs, and its settings are other words
     (tmp_path / ".snakemake").rename(tmp_path / "forgotten")
     assert "Nothing to be done" in workflow(
         tmp_path, "-j", "1", "rows", scale="toy", rows="l1_div_100,l2_pop", threads=2
     )
-    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "results").rglob("*.json")} == before
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "results").rglob("*.jsonl")} == before
 
 
 def test_tables_are_made_of_what_is_there(tmp_path):
