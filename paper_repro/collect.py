@@ -119,7 +119,8 @@ def collect(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
         data_hash=data_hash,
         machine=", ".join(stats[name] for name in ("machine", "gpu") if name in stats),
         cpu=processor_kind(),
-        engine=stats["stepper"],
+        # a step by autograd is as a backend draws it
+        engine=f"torch ({stats['backend']})" if stats["stepper"] == "torch" else stats["stepper"],
         threads=stats["threads"],
         versions=stats["versions"],
         protocol={

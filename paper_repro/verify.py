@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -74,7 +75,7 @@ def verify(job: Job, options: Options, steps: int | None = None) -> Verdict:
 
     Args:
         job: that has a result.
-        options: the data, the results and the work folder, and the backend.
+        options: the data, the results and the work folder, and the backend; "auto" is that of the result.
         steps: after so many the training is stopped; None trains all.
 
     Raises:
@@ -85,10 +86,11 @@ def verify(job: Job, options: Options, steps: int | None = None) -> Verdict:
     if result is None:
         raise PopError(f"{job.file(options.results)}: has no result of {job.scene.name}, seed {job.seed}, to verify")
     _require_commit(result, _ROOT)
-    place = job.work(options.work / "verify").with_name(f"{job.scene.name}_{job.seed}_{result.commit}")
+    # git is run from elsewhere
+    place = job.work(options.work.absolute() / "verify").with_name(f"{job.scene.name}_{job.seed}_{result.commit}")
     _check_out(str(result.commit), place / "clone")
     taken = _train(job, result, options, place, steps)
-    verdict = _compare(result, job.work(place / "work"), taken)
+    verdict = _compare(result, job.work(place / "work"), taken, other_kind(result, options.backend))
     shutil.rmtree(place)
     return verdict
 
@@ -101,12 +103,19 @@ def history(root: Path = _ROOT) -> frozenset[str] | None:
     return frozenset(_git(root, "rev-list", "HEAD").stdout.split())
 
 
-def other_kind(result: Result) -> tuple[str, ...]:
-    """Name in what this machine is of another kind than the one that trained a result; empty on the same kind."""
+def other_kind(result: Result, backend: str = "auto") -> tuple[str, ...]:
+    """Name in what this machine is of another kind than the one that trained a result; empty on the same kind.
+
+    Args:
+        result: that was trained.
+        backend: that trains here; "auto" is that of the result.
+    """
     from pop_fast.train.environment import versions
 
-    here = {"processor": machine_name(), "kind of processor": processor_kind(), **versions()}
-    there = {"processor": result.machine, "kind of processor": result.cpu, **result.versions}
+    was = _backend_of(result)
+    engine = {"backend": was if backend == "auto" else backend}
+    here = {"processor": machine_name(), "kind of processor": processor_kind(), **engine, **versions()}
+    there = {"processor": result.machine, "kind of processor": result.cpu, "backend": was, **result.versions}
     return tuple(
         f"{name} is {here[name]} and was {there[name]}"
         for name in here
@@ -155,7 +164,7 @@ def _train(job: Job, result: Result, options: Options, place: Path, steps: int |
         "results": str(place / "results"),
         "work": str(place / "work"),
         "threads": result.threads,
-        "backend": options.backend,
+        "backend": options.backend if options.backend != "auto" else _backend_of(result),
     }
     command = [sys.executable, "-P", "-c", _TRAIN, json.dumps(asked)]
     clone, work = place / "clone", job.work(place / "work")
@@ -204,12 +213,11 @@ def _steps_taken(work: Path) -> int:
     return int(json.loads(lines[-1])["step"]) + 1 if lines else 0
 
 
-def _compare(result: Result, work: Path, taken: int) -> Verdict:
+def _compare(result: Result, work: Path, taken: int, kind: tuple[str, ...]) -> Verdict:
     last = int(result.schedule["max_steps"])
     finished = (work / "stats" / f"val_step{last - 1:04d}.json").is_file()
     # of the last step that was logged some may not have been written
     now = {point["step"]: point for point in curve_of(work, last) if finished or point["step"] < taken - 1}
-    kind = other_kind(result)
     equal = _within if kind else _equal
     common = [(point, now[point["step"]]) for point in result.curve if point["step"] in now]
     if not common:
@@ -256,6 +264,12 @@ def _within(name: str, now: float, then: float) -> bool:
     if name not in TOLERANCES:
         return True
     return abs(now - then) <= TOLERANCES[name] * (max(then, 1) if name == "num_gaussians" else 1.0)
+
+
+def _backend_of(result: Result) -> str:
+    """Return the backend that takes the steps as a result's engine did."""
+    by_autograd = re.fullmatch(r"torch \((.+)\)", result.engine)
+    return by_autograd[1] if by_autograd else {"native": "compiled", "cuda": "cuda"}.get(result.engine, "auto")
 
 
 def _environment(clone: Path, threads: int) -> Mapping[str, str]:

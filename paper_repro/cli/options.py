@@ -35,9 +35,8 @@ def add_data(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, default=Path(root), metavar="DIR", help=note)
 
 
-def add_backend(parser: argparse.ArgumentParser) -> None:
+def add_backend(parser: argparse.ArgumentParser, note: str) -> None:
     """Add --backend."""
-    note = "what takes the steps, as for pop train (default: %(default)s)"
     parser.add_argument("--backend", choices=("auto", "fast", "compiled", "cuda", "ref"), default="auto", help=note)
 
 
@@ -51,7 +50,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     note = "the folder of splats and renders of finished rows, to be published (default: published in --work)"
     parser.add_argument("--published", type=Path, metavar="DIR", help=note)
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="CPU threads, 0 for all cores (default: 1)")
-    add_backend(parser)
+    add_backend(parser, "what takes the steps, as for pop train (default: %(default)s)")
     note = "steps that a kill can cost (default: the scale's, 500 or so)"
     parser.add_argument("--checkpoint-every", type=int, metavar="STEPS", help=note)
     note = "steps between two points of the curves (default: the scale's, 100 or so)"

@@ -32,7 +32,7 @@ def verify(words: Sequence[str]) -> int:
     add_results(parser)
     note = "the folder that the commit is cloned and trained in (default: %(default)s)"
     parser.add_argument("--work", type=Path, default=WORK, metavar="DIR", help=note)
-    add_backend(parser)
+    add_backend(parser, "what takes the steps (default: what took those of the result)")
     args = parser.parse_args(words)
     from paper_repro.jobs import job_named
     from paper_repro.results import existing_folder

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +35,8 @@ def trained(tmp_path_factory):
 
 
 def verify(folder: Path, work: Path, *words: str) -> int:
-    where = ["--results", str(folder / "results"), "--work", str(work)]
+    # a relative folder, since git and the training are run in others
+    where = ["--results", str(folder / "results"), "--work", os.path.relpath(work)]
     return main(["verify", "pop", "demo", "--scale", "toy", *where, *words])
 
 
