@@ -16,6 +16,7 @@ from pop_fast.errors import PopError
 from pop_fast.train.jsonable import from_plain, to_plain
 from pop_fast.train.limits import check_values
 from pop_fast.train.presets import METHODS, MILESTONES, Given, defaults, laid_over, method_of
+from pop_ref.constants import PAPER
 from pop_ref.settings import LAMBDA_SSIM_3DGS, MAX_SH_DEGREE, AppearanceRates, LearningRates, Recipe
 
 __all__ = ["LearningRates", "TrainConfig", "first_difference"]
@@ -44,8 +45,8 @@ class TrainConfig:
             Rates and step numbers stay as they are. Backend "cuda" takes one view a step.
         seed: of the view order, the initial rotations and the split noise.
         backend: what renders and trains: "fast" (CPU), "compiled" (CPU, with kernels in C++), "cuda", "ref" (the
-            oracle, slow), or "auto": "cuda" where a GPU and the build are there, else "compiled" where that was
-            compiled, else "fast".
+            oracle, slow), one that another package registers, or "auto": "cuda" where a GPU and the build are there,
+            else "compiled" where that was compiled, else "fast".
         profile: the rasterizer's constants: "paper", "gsplat_1_5", "gsplat_1_6", "inria" (that of method "3dgs" and of
             those built on it) or "speedy_splat".
         antialiased: render with opacity compensation (Mip-Splatting) instead of classically.
@@ -75,7 +76,8 @@ class TrainConfig:
         refine_cameras: learn a small rotation and translation of every training camera.
         appearance_lr: learning rates of exposures and cameras.
         strategy: density control and the POP term; its type says which method this is.
-        threads: threads of one operation; results are the same bits for the same number. 0 takes all cores.
+        threads: threads of one operation; results are the same bits for the same number, those of the native step
+            (backend "compiled") for any. 0 takes all cores.
         eval_steps: after so many steps the held-out views are measured; the last step always counts.
         save_steps: after so many steps a PLY and a checkpoint are kept; the last step always counts.
         checkpoint_every: steps between the checkpoints a run resumes from; 0 writes none of these.
@@ -95,8 +97,8 @@ class TrainConfig:
     max_steps: int = Recipe.max_steps
     batch_size: int = 1
     seed: int = 42
-    backend: Literal["auto", "fast", "compiled", "cuda", "ref"] = "auto"
-    profile: Literal["paper", "gsplat_1_5", "gsplat_1_6", "inria", "speedy_splat"] = "paper"
+    backend: str = "auto"
+    profile: str = PAPER.name
     antialiased: bool = False
     factor: int = 1
     resize: Literal["area", "bicubic"] = "area"

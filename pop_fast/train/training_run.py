@@ -1,7 +1,8 @@
 """A training run: schedule, densification steps, records, measurements and checkpoints; a `Stepper` takes its steps.
 
 Everything random comes from generators that are seeded by the config and saved in checkpoints; the same config,
-capture, engine, machine and number of threads give the same bits, whether a run was interrupted or not.
+capture, engine, machine and number of threads give the same bits, whether a run was interrupted or not; those of the
+native step do not depend on the number of threads either.
 """
 
 from __future__ import annotations
@@ -401,7 +402,8 @@ class TrainingRun:
 
     def _restore(self, path: Path) -> None:
         content = ckpt.load_checkpoint(path)
-        threads, n_views = torch.get_num_threads(), len(self._train)
+        threads = torch.get_num_threads() if self._engine.depends_on_threads else None
+        n_views = len(self._train)
         ckpt.check_fits(path, content, self.config, self._fingerprint(), threads, n_views, self.state.keys())
         self.params = {key: Parameter(content["splats"][key]) for key in KEYS}
         self.optimizers = make_optimizers(self.params)
