@@ -22,6 +22,7 @@ from paper_repro.jobs import Job, NotTrainableError
 from paper_repro.results import RESULTS
 from paper_repro.status import everything, stale_files
 from paper_repro.train_row import BusyError
+from pop_fast.children import module_command
 
 __all__ = ["Outcome", "run_queue"]
 
@@ -88,7 +89,7 @@ def run_queue(jobs: Sequence[Job], results: Path, words: Sequence[str], threads:
                 continue
             print(f"[{number}/{len(missing)}] {job}", flush=True)
             start = time.monotonic()
-            status = child.run([sys.executable, "-m", "paper_repro", "run", *_words_of(job), *words], threads)
+            status = child.run(module_command("paper_repro", "run", *_words_of(job), *words), threads)
             kinds = {0: outcome.done, BusyError.status: outcome.busy, NotTrainableError.status: outcome.impossible}
             if child.stop and status != 0:
                 break
