@@ -17,7 +17,7 @@ from typing import Final
 
 from pop_fast.errors import PopError
 
-__all__ = ["DATASETS", "SCENES", "Dataset", "Scene", "find_folder", "scene_named"]
+__all__ = ["DATASETS", "MADE", "SCENES", "Dataset", "Scene", "find_folder", "scene_named"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,8 +162,14 @@ _ALL: Final = (
         *("demo", "demo", 24, (96, 72), "pop-repro makes it"),
         "a ray-traced still life, made by the program; for tests, its numbers say nothing about a method",
     ),
+    _further(
+        *("still_life", "still_life", 60, (320, 240), "pop-repro makes it"),
+        "the same as `pop demo` writes it; to be shown, its numbers say nothing about a method",
+    ),
 )
 SCENES: Final = {scene.name: scene for scene in _ALL}
+# those that the program makes itself
+MADE: Final = ("demo", "still_life")
 
 
 def scene_named(name: str) -> Scene:

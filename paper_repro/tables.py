@@ -22,6 +22,7 @@ __all__ = ["BEYOND", "REFERENCES", "SCENES_OF", "Block", "Cell", "Line", "Table"
 # what a scale is meant to train; results of further scenes are shown too
 SCENES_OF: Final = {
     "toy": ("demo",),
+    "shown": ("still_life",),
     "small": ("fox", "bear_512", "garden_512", "bonsai_800"),
     "no_floor": ("fox",),
     "full": ("bonsai_800",),
@@ -352,6 +353,7 @@ def _header(scale: str, found: Sequence[Result]) -> tuple[str, ...]:
     else:
         names = ", ".join(dict.fromkeys((*SCENES_OF[scale], *sorted({r.scene for r in found}))))
         what = {"toy": "a test of the program on a made-up scene, its numbers say nothing about a method",
+                "shown": "a made-up scene, its numbers say nothing about a method",
                 "small": "other photographs, small",
                 "no_floor": "other photographs, theta_blur without a floor",
                 "full": "other photographs, on the whole schedule"}[scale]  # fmt: skip
