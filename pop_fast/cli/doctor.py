@@ -26,6 +26,7 @@ _PACKAGES: Final = (
     ("opencv-contrib-python-headless", "cv2", "images, undistortion, video", True),
     ("pycolmap", "pycolmap", "COLMAP models, structure from motion", True),
     ("plyfile", "plyfile", "PLY files", True),
+    ("zstandard", "zstandard", "SPZ version 4", True),
     ("tqdm", "tqdm", "progress", True),
     ("tyro", "tyro", "this command line", True),
     ("matplotlib", "matplotlib", "colours of the error maps", True),
