@@ -44,14 +44,14 @@ def status_table(results: Iterable[Result]) -> str:
                 what,
                 cells,
                 _progress(lines, table.datasets, used),
-                f"`pop-repro table {table.number} --scale dev`",
+                f"`pop-repro table {table.number} --scale small`",
                 _commits(used),
             ]
         )
     used = [r for r in found if r.row in BEYOND and r.row != "pop"]
     progress = _progress([row for row in BEYOND if row != "pop"], DATASETS, used)
     rows.append(
-        ["beyond the paper", "not in the paper", progress, "`pop-repro table beyond --scale dev`", _commits(used)]
+        ["beyond the paper", "not in the paper", progress, "`pop-repro table beyond --scale small`", _commits(used)]
     )
     return grid(["claim or table", "paper", "ours", "command", "commits"], rows)
 
@@ -122,7 +122,7 @@ def _claim_row(by_scale: Sequence[Claim], found: Sequence[Result]) -> list[str]:
     """Say of one claim what each scale decides: a verdict of one scale alone would hide that another disagrees."""
     judged = [(s, c) for s, c in zip(_telling(), by_scale, strict=True) if c.verdict != "not decided"]
     ours = "; ".join(f"{c.verdict} at scale {scale}, {c.where}" for scale, c in judged)
-    command = f"`pop-repro claims --scale {judged[0][0] if judged else 'dev'}`"
+    command = f"`pop-repro claims --scale {judged[0][0] if judged else 'small'}`"
     runs = {run for _, c in judged for e in c.evidence for run in e.runs}
     used = [r for r in found if r.run in runs]
     first = by_scale[0]

@@ -288,10 +288,11 @@ def prune_mask(
     step: int,
     config: DensityConfig = POP,
 ) -> Bool[np.ndarray, " N"]:
-    """Decide who is removed: `o < prune_opa`, or after step 3000 `max scale > prune_scale3d * scene_scale` (A16).
+    """Decide which rows go: `o < prune_opa`, or, with `prune_too_big`, `max scale > prune_scale3d * scene_scale` (A16).
 
     Source: POP paper section 3.1 (opacity below a threshold, or excessively large).
-    Departs: Inria also has a 20 px rule on the screen extent, which never fires there; it is left out.
+    Departs: the paper's sentence describes 3DGS; POP, which has no resets, leaves large Gaussians, as gsplat does
+    without resets (A16). Inria also has a 20 px rule on the screen extent, which never fires there; it is left out.
 
     Args:
         opacities: activated.

@@ -39,9 +39,11 @@ class DensityConfig:
         grow_on_gradient: use the gradient rule, eq. 3 (A8: beside the blur rule).
         grow_on_gradient_in_blur_window: ... also inside the blur window, where else the blur rule works alone (A8).
         grow_scale3d: a Gaussian is small if its largest scale is at most this share of the scene's (A14).
-        prune_too_big: prune Gaussians that grow excessively large (A16: kept although the reset is gone).
+        prune_too_big: prune Gaussians that grow excessively large (A16: off in POP, on where opacities are reset;
+            gsplat and Inria's code apply this rule only after the first reset interval).
         prune_scale3d: excessively large is above this share of the scene's scale (A16).
-        prune_too_big_after: ... and only at steps after this one (A16: not tied to `reset_every`).
+        prune_too_big_after: ... and only at steps after this one, which is the reset interval in gsplat and in Inria's
+            code (A16).
         refine_start_iter: densification steps happen at steps after it.
         refine_stop_iter: densification steps happen at steps before it (A17: pruning too ends there).
         refine_every: a densification step each so many steps (A17: pruning happens with each).
@@ -74,7 +76,7 @@ class DensityConfig:
     grow_on_gradient: bool = True
     grow_on_gradient_in_blur_window: bool = True
     grow_scale3d: float = 0.01
-    prune_too_big: bool = True
+    prune_too_big: bool = False
     prune_scale3d: float = 0.1
     prune_too_big_after: int = 3000
     refine_start_iter: int = 500
@@ -233,7 +235,7 @@ class AppearanceRates:
 
 
 POP: Final = DensityConfig()
-GSPLAT: Final = DensityConfig(blur_stop_iter=-1, reset_every=3000)
+GSPLAT: Final = DensityConfig(blur_stop_iter=-1, reset_every=3000, prune_too_big=True)
 # whose opacities move half as fast since October 2024
 INRIA_RATES: Final = LearningRates(opacities=0.025)
 

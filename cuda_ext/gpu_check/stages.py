@@ -98,7 +98,7 @@ def reproduce_stage(check: Check) -> dict[str, Any]:
         return skipped("no captures were given (--captures DIR ...) or brought along")
     results = check.out / "paper_repro"
     words = ["-m", "paper_repro", "queue", "--scale", "toy" if check.rehearsal else "full", "--data", str(folder)]
-    words += ["--out", str(results), "--work", str(check.work / "paper_repro"), "--threads", "0"]
+    words += ["--results", str(results), "--work", str(check.work / "paper_repro"), "--threads", "0"]
     words += ["--backend", "auto" if check.rehearsal else "cuda", "--rows", *REPRODUCED]
     found = check.run(check.python(*words), check.seconds)
     if found["status"] == 130:

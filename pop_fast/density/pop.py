@@ -18,5 +18,6 @@ class POPStrategy(DensityControl):
 
         loss = loss + strategy.regularizer(torch.sigmoid(params["opacities"]), state, step, info)
 
-    The defaults are those of `pop_ref.settings`; with `reset_every=3000, lambda_pop=0.0` it is the paper's row "Reset".
+    The defaults are those of `pop_ref.settings`; with `reset_every=3000, prune_too_big=True, lambda_pop=0.0` it is the
+    paper's row "Reset".
     """

@@ -33,7 +33,7 @@ SCHEDULE = {
 }
 
 
-def judged(id: str, results: list[Result], scale: str = "dev") -> Claim:
+def judged(id: str, results: list[Result], scale: str = "small") -> Claim:
     """Judge one claim."""
     return next(claim for claim in claims(scale, results) if claim.id == id)
 
@@ -62,7 +62,7 @@ def test_a_claim_is_told_scene_by_scene() -> None:
 
 
 def test_without_runs_nothing_is_decided() -> None:
-    for claim in claims("dev", [result("pop"), replace(result("l2_blur"), scale="toy")]):
+    for claim in claims("small", [result("pop"), replace(result("l2_blur"), scale="toy")]):
         assert claim.verdict == "not decided"
         assert claim.where == "no runs decide"
         assert not claim.evidence or claim.id == "decay"
@@ -185,7 +185,7 @@ def test_the_papers_own_numbers_bear_its_claims_out() -> None:
 def test_a_toy_is_said_to_tell_nothing_and_other_data_to_be_a_yardstick() -> None:
     runs = [result("pop", n=40), result("l2_blur", n=100)]
     assert "Nothing here says anything of a method" in markdown(claims("toy", runs), "toy")
-    text = markdown(claims("dev", runs), "dev")
+    text = markdown(claims("small", runs), "small")
     assert "NOT the paper's protocol" in text
     assert f"| fox | 40 of 100, 40.0%; PSNR +0.00 dB | yes | {runs[0].run}, {runs[1].run} |" in text
     assert "NOT the paper's" not in markdown(claims("paper", []), "paper")
@@ -198,8 +198,8 @@ def test_the_reading_whose_decay_is_the_papers_speaks_for_itself() -> None:
     default = answers([with_curve("pop", 1000, right), with_curve("pop_visible", 1000, wrong)])
     other = answers([with_curve("pop", 1000, wrong), with_curve("pop_visible", 1000, right)])
     a12 = [next(a for a in told if a.id == "A12") for told in (default, other)]
-    assert "is `pop`, the default, on fox (dev)" in a12[0].says
-    assert "is `pop_visible`, not the default, on fox (dev)" in a12[1].says
+    assert "is `pop`, the default, on fox (small)" in a12[0].says
+    assert "is `pop_visible`, not the default, on fox (small)" in a12[1].says
     assert [line[2] for line in a12[0].lines] == ["pop", "pop_visible"]
     assert [a.id for a in default] == [r.id for r in READINGS] == ["A2", "A2, added up", "A12", "A16"]
 
@@ -227,7 +227,7 @@ def test_a_longer_schedule_at_one_weight_answers_in_part() -> None:
     assert apart.says.startswith("Not decided")
     assert [line[:5] for line in apart.lines] == [
         ("full", "bonsai_800", "30,000", "0.001", "40.0%"),
-        ("dev", "fox", "10,000", "0.001", "50.0%"),
+        ("small", "fox", "10,000", "0.001", "50.0%"),
     ]
     both = experiments([*(replace(r, scene="bonsai_800") for r in dev), *full])[0]
     assert both.says == (
@@ -239,7 +239,7 @@ def test_a_longer_schedule_at_one_weight_answers_in_part() -> None:
 def test_pruning_harder_is_told_beside_pop_and_gsplat() -> None:
     pop, pruned = result("pop", n=100, psnr=30.0), result("final_prune", n=70, psnr=29.9)
     told = experiments([pop, pruned, result("gsplat", n=200)])[1]
-    assert told.lines[0][:6] == ("dev", "fox", "final_prune", "70.0%", "-0.10 dB", "35.0%")
+    assert told.lines[0][:6] == ("small", "fox", "final_prune", "70.0%", "-0.10 dB", "35.0%")
     assert experiments([pruned])[1].says.startswith("Not decided")
 
 

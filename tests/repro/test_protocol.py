@@ -64,20 +64,20 @@ def test_a_new_result_changes_what_is_made_from_it() -> None:
     told = [result("pop", n=40, commit="abcdef1"), result("l2_blur", n=100, commit="abcdef1")]
     lines = status_table(told).splitlines()
     half = next(line for line in lines if line.startswith("| POP cuts"))
-    assert "holds at scale dev, on fox" in half
+    assert "holds at scale small, on fox" in half
     assert half.endswith("| abcdef1 |")
-    assert any("dev: 2 of 16" in line for line in lines if line.startswith("| table 3"))
+    assert any("small: 2 of 16" in line for line in lines if line.startswith("| table 3"))
     assert len(lines) == 2 + 8 + 5 + 1
     made = {path.name: text for path, text in files(told).items()}
     assert "40 of 100, 40.0%" in made["claims.md"]
-    assert "holds at scale dev" in made["README.md"]
+    assert "holds at scale small" in made["README.md"]
 
 
 def test_every_scale_that_decides_a_claim_is_told() -> None:
     told = [result("pop", n=80), result("l2_blur", n=100)]
     full = [result(row, n=n, scale="full", scene="bonsai_800") for row, n in (("pop", 40), ("l2_blur", 100))]
     half = next(line for line in status_table([*told, *full]).splitlines() if line.startswith("| POP cuts"))
-    assert "| holds at scale full, on bonsai_800; does not hold at scale dev, not on fox |" in half
+    assert "| holds at scale full, on bonsai_800; does not hold at scale small, not on fox |" in half
 
 
 def test_marks_that_are_absent_are_told() -> None:
