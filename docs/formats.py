@@ -53,9 +53,9 @@ as they are.
   have y up, so that the scene is half a turn about x or z from there. Readers here turn it back.
 - Every file but `.splat` says which world the splat is in, the capture's own or the frame that it was trained in, and
   how the one came from the other: PLY and compressed PLY in a comment, SOG in `asset` of its `meta.json`, glTF in
-  `extras` of its `asset`, SPZ in an extension of the type 0x504F0001, which other readers skip. A file that says nothing
-  is taken to be in the capture's own world, as every export is where `--frame training` does not ask for the other; one
-  that gsplat's trainer wrote needs `--training-frame`.
+  `extras` of its `asset`, SPZ in an extension of the type 0x504F0001, which other readers skip. A file that says
+  nothing is taken to be in the capture's own world, as every export is where `--frame training` does not ask for the
+  other; one that gsplat's trainer wrote needs `--training-frame`.
 - SPZ is read in versions 2 to 4, also with coordinates that it says to be others (half turns of the usual ones); SOG in
   version 2; glTF as one `.glb` with a splat that no node moves; KSPLAT in version 0.1, all of its compression levels.
 - `html` holds SPZ, and loses what that loses. It draws as the training's rasterizer does, to degree 3, but ends no

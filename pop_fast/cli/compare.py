@@ -61,7 +61,7 @@ def _stats(path: Path, args: Args) -> dict[str, Any]:
     if path.is_file():
         return _measured(path, args)
     config = read_config(path)
-    stats = read_last_stats(path) or {"capture": Path(config.data).name, "method": config.strategy.name}
+    stats = read_last_stats(path) or {"capture": Path(config.data).name, "method": config.method}
     return {**stats, "max_steps": config.max_steps}
 
 

@@ -110,8 +110,8 @@ def decode(data: bytes, path: Path) -> Cloud:
     parts = [_rows(data, section, ends, bands, path) for section in sections]
     if not parts:
         raise PopError(f"{path}: has no section; {_WRITE_AGAIN}")
-    fields = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return Cloud(**fields).checked(path)
+    means, log_scales, quats, logits, sh0, rest = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return Cloud(means, log_scales, quats, logits, sh0, rest).checked(path)
 
 
 def _sections(data: bytes, count: int, level: int, path: Path) -> list[_Section]:
@@ -135,8 +135,8 @@ def _sections(data: bytes, count: int, level: int, path: Path) -> list[_Section]
     return found
 
 
-def _rows(data: bytes, section: _Section, ends: tuple[float, float], bands: int, path: Path) -> dict[str, np.ndarray]:
-    """Return the fields of a cloud of a section's Gaussians, with so many coefficients a channel."""
+def _rows(data: bytes, section: _Section, ends: tuple[float, float], bands: int, path: Path) -> tuple[np.ndarray, ...]:
+    """Return the columns of a `Cloud` of a section's Gaussians, with so many coefficients a channel."""
     n = section.used
     rows = np.frombuffer(data, section.row, n, section.rows_at)
     bad = np.flatnonzero(~(rows["scale"] >= 0.0).all(axis=1))
@@ -154,14 +154,14 @@ def _rows(data: bytes, section: _Section, ends: tuple[float, float], bands: int,
         of_degree = sh[:, 3 * first : 3 * after].reshape(n, 3, after - first)
         rest[:, first:after] = of_degree.transpose(0, 2, 1)
     scales = np.maximum(rows["scale"].astype(np.float64), _SMALLEST_SCALE)
-    return {
-        "means": centres.astype(np.float32),
-        "log_scales": np.log(scales).astype(np.float32),
-        "quats": rows["quat"].astype(np.float32),
-        "logits": logits_of_bytes(rows["rgba"][:, 3]),
-        "sh0": ((rows["rgba"][:, :3] / 255.0 - 0.5) / SH_C0).astype(np.float32),
-        "rest": rest,
-    }
+    return (
+        centres.astype(np.float32),
+        np.log(scales).astype(np.float32),
+        rows["quat"].astype(np.float32),
+        logits_of_bytes(rows["rgba"][:, 3]),
+        ((rows["rgba"][:, :3] / 255.0 - 0.5) / SH_C0).astype(np.float32),
+        rest,
+    )
 
 
 def _bucket_centres(data: bytes, section: _Section, path: Path) -> np.ndarray:

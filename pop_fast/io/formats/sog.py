@@ -255,7 +255,7 @@ def _pixels(data: bytes, name: str, least: int, path: Path) -> np.ndarray:
 
 def _size(data: bytes) -> tuple[int, int]:
     """Return the width and the height that a WebP file states, 0 where it is none."""
-    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 30:
+    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 32:
         return 0, 0
     kind = data[12:16]
     if kind == b"VP8L" and data[20] == 0x2F:
