@@ -155,8 +155,10 @@ def collect(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
 def first_change(result: Result, config: TrainConfig) -> str | None:
     """Say which setting of a finished result the row has otherwise now, or None; settings that are new do not count."""
     now = _settings(config)
+    # None is the profile's: what that comes to in the world of a capture is known when the capture is read
+    free = {"near_plane"} if config.near_plane is None else set[str]()
     for name, value in result.schedule.items():
-        if name in now and now[name] != value:
+        if name not in free and name in now and now[name] != value:
             return f"{name} = {value}, and the row has {now[name]} now"
     return None
 

@@ -25,7 +25,7 @@ ROWS: Final = (
     *("taming", "speedy_splat", "pop"),
     *("l2", "l2_blur", "l2_pop", "reset", "blur_3k_4k", "blur_3k_11k", "blur_3k_15k"),
     *("l2_without_ssim", *(f"l1_div_{n}" for n in (1, 2, 5, 10, 20, 50, 100))),
-    *("adaptive_blur", "final_prune", "opacity_entropy"),
+    *("final_prune", "opacity_entropy"),
     *("pop_visible", "pop_any_view", "l2_blur_any_view", "pop_sum", "pop_size_prune", "pop_prune_002"),
 )
 # floats of one Gaussian in the files whose size the tables give: gsplat's checkpoint, and Inria's PLY with its normals

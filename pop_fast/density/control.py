@@ -12,6 +12,7 @@ what works on tensors stands in `densify`, which is imported when there are some
 from __future__ import annotations
 
 import warnings
+from collections.abc import MutableMapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
@@ -148,7 +149,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
             return None
         from pop_fast.density import densify
 
-        if isinstance(info, dict):
+        if isinstance(info, MutableMapping):
             info[_REGULARIZED] = True
         return densify.regularizer(self, opacities, state, info)
 
@@ -189,7 +190,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         if self.regularizes(step) and _REGULARIZED not in info:
             warnings.warn(
                 f"{type(self).__name__} trains without its prior on opacities: add strategy.regularizer(torch.sigmoid("
-                "params['opacities']), state, step, info) to the loss, or set lambda_pop=0",
+                "params['opacities']), state, step, info), where it is not None, to the loss, or set lambda_pop=0",
                 stacklevel=2,
             )
         self.collect(params, state, step, info, packed)

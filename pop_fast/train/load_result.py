@@ -205,7 +205,7 @@ def open_capture(
     if said is None:
         taken = "says nothing of its world, and is taken to be in the capture's own"
         print(f"note: {splat.path}: {taken}; that of gsplat's trainer needs --training-frame", file=sys.stderr)
-    config = replace(splat.config, **changes)
+    config = _in_frame(replace(splat.config, **changes), splat)
     capture = load_capture(
         data,
         factor=config.factor,
@@ -224,6 +224,15 @@ def open_capture(
     if config.normalize:
         _check_same_frame(splat, capture)
     return capture, config
+
+
+def _in_frame(config: TrainConfig, splat: Splat) -> TrainConfig:
+    """Give the near plane of the frame that a splat is looked at in, where that is not the one it was trained in."""
+    record = read_record(splat.folder)
+    if config.near_plane is None or record is None or config.normalize or not splat.config.normalize:
+        return config
+    scale = np.cbrt(np.linalg.det(np.array(record.world_transform)[:3, :3]))
+    return replace(config, near_plane=config.near_plane / float(scale))
 
 
 def frame_of_splat(splat: Splat, options: CaptureOptions) -> Literal["capture", "training"] | None:
