@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 
 from pop_fast.errors import PopError
+from pop_fast.io.budget import check_members, check_memory
 from pop_fast.io.formats.cloud import COEFFICIENTS, Cloud, logits_of_bytes, to_bytes
 from pop_fast.io.formats.palette import codebook, nearest, row_palette
 from pop_fast.io.formats.smallest_three import drop_largest, restore_largest
@@ -36,6 +37,8 @@ _LARGEST_PALETTE: Final = 65536
 _SHARED_BY: Final = 2
 _LOSSLESS: Final = (cv2.IMWRITE_WEBP_QUALITY, 101)
 _LARGEST_META: Final = 2**20
+# bytes of a Gaussian while it is decoded, at most
+_IN_MEMORY: Final = 700
 _WRITE_AGAIN: Final = "copy or write the file again"
 
 
@@ -135,7 +138,9 @@ def decode(data: bytes, path: Path) -> Cloud:
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            return _read(lambda name: _unzipped(archive, name, path), path)
+            check_members(path, archive, len(data), _WRITE_AGAIN)
+            held = sum(member.file_size for member in archive.infolist())
+            return _read(lambda name: _unzipped(archive, name, path), held, path)
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
         raise PopError(f"{path}: is no readable ZIP file ({error}); {_WRITE_AGAIN}") from error
 
@@ -149,7 +154,11 @@ def decode_folder(path: Path) -> Cloud:
     Raises:
         PopError: as `decode`, or a file is absent.
     """
-    return _read(lambda name: _file(path.parent, name, path), path)
+    try:
+        held = sum(image.stat().st_size for image in path.parent.glob("*.webp"))
+    except OSError as error:
+        raise PopError(f"{path}: could not be read: {error.strerror}; check its permissions") from error
+    return _read(lambda name: _file(path.parent, name, path), held, path)
 
 
 def _unzipped(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
@@ -175,17 +184,17 @@ def _file(folder: Path, name: str, path: Path) -> bytes:
         raise PopError(f"{folder / name}: could not be read: {error.strerror}; check its permissions") from error
 
 
-def _read(read: Callable[[str], bytes], path: Path) -> Cloud:
-    """Read the parts, each by its name."""
+def _read(read: Callable[[str], bytes], held: int, path: Path) -> Cloud:
+    """Read the parts, each by its name; together they have so many bytes."""
     try:
-        return _decoded(read, path)
+        return _decoded(read, held, path)
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError, RecursionError) as error:
         if isinstance(error, PopError):
             raise
         raise PopError(f"{path}: {META} is not that of SOG version 2 ({error!r}); {_WRITE_AGAIN}") from error
 
 
-def _decoded(read: Callable[[str], bytes], path: Path) -> Cloud:
+def _decoded(read: Callable[[str], bytes], held: int, path: Path) -> Cloud:
     meta = json.loads(read(META))
     if meta.get("version") != 2:
         raise PopError(
@@ -194,6 +203,7 @@ def _decoded(read: Callable[[str], bytes], path: Path) -> Cloud:
     n = meta["count"]
     if not isinstance(n, int) or n < 0:
         raise PopError(f"{path}: {META}.count is {n}; it must be a number of Gaussians: {_WRITE_AGAIN}")
+    check_memory(path, n * _IN_MEMORY, held, f"{META}.count of {n}", _WRITE_AGAIN)
 
     def pixels(entry: str, index: int, least: int = n) -> np.ndarray:
         name = str(meta[entry]["files"][index])

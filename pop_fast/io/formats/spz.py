@@ -25,6 +25,7 @@ from typing import Final
 import numpy as np
 
 from pop_fast.errors import PopError
+from pop_fast.io.budget import check_memory
 from pop_fast.io.formats.cloud import COEFFICIENTS, Cloud, logits_of_bytes, to_bytes
 from pop_fast.io.formats.smallest_three import drop_largest, restore_largest
 from pop_fast.io.frame import KEY, Frame
@@ -61,6 +62,8 @@ _SH_STEP: Final = 2.5
 _WIDEST_STEP: Final = 64
 # what deflate can expand a byte to, at most; Zstandard can do more, and splats come nowhere near
 _EXPANSION: Final = 1032
+# bytes of a Gaussian while it is decoded, at most
+_IN_MEMORY: Final = 700
 _WRITE_AGAIN: Final = "copy or write the file again"
 
 
@@ -294,6 +297,7 @@ def _checked_head(first: bytes, versions: Sequence[int], length: int, path: Path
         raise PopError(f"{path}: holds levels of detail (flag 0x80), not one splat; write it without them")
     if head.n * sum(head.widths) > _EXPANSION * length:
         raise PopError(f"{path}: numPoints is {head.n}, more than {length} bytes can hold; {_WRITE_AGAIN}")
+    check_memory(path, head.n * _IN_MEMORY, length, f"its numPoints of {head.n}", _WRITE_AGAIN)
     return head
 
 
