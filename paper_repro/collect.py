@@ -9,26 +9,29 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
 from paper_repro.jobs import Job
 from paper_repro.published import file_hash, ply_of
 from paper_repro.record import BINS, LPIPS_VARIANTS, Result, run_id, settings_hash
 from pop_fast.errors import PopError
-from pop_fast.io.read_back import read_json
+from pop_fast.io.read_back import read_arrays, read_json
 from pop_fast.machine import processor_kind
 from pop_fast.train.results import ResultFolder, read_config
+from pop_fast.view.report.source import read_records
 
 if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
 
-__all__ = ["BESIDE", "PROBE", "collect", "first_change", "spacing", "state_of_data"]
+__all__ = [
+    *("BESIDE", "PROBE", "collect", "curve_of", "digits", "final_stats", "first_change", "read_probe", "spacing"),
+    "state_of_data",
+]
 
 # what `train_row` leaves in the result folder about the capture and the program, from before the first step
 BESIDE: Final = "row.json"
 # what `ProbedRun` leaves there
 PROBE: Final = "probe.json"
+_AGAIN: Final = "train the row again in an empty folder"
 # where things lie, who takes the steps and how often something is written: no part of what was trained
 _APART: Final = frozenset(
     {
@@ -44,8 +47,8 @@ _COLUMNS: Final = (
     *("l1", "l2", "d_ssim", "pop", "cloned", "split", "pruned"),
 )
 _PROBED: Final = ("grad_", "probe_")
-# significant ones of a number in a curve, of others four; a PSNR has three after the point
-_DIGITS: Final = {"psnr": 5, "psnr_test": 5, "seconds": 5}
+# a PSNR of five digits has three after the point
+_PRECISE: Final = ("psnr", "psnr_test", "seconds")
 _SSIM: Final = "11 x 11 Gaussian window, sigma 1.5, windows inside the image, floats clamped to [0, 1]"
 _LPIPS: Final = {
     "vgg_01": "vgg_01: VGG16, images in [0, 1]",
@@ -95,12 +98,23 @@ def collect(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
         files: what `paper_repro.published` has made of it, by name, with hashes.
 
     Raises:
-        PopError: something of a finished training is absent; names the file.
+        PopError: something of a finished training is absent or damaged; names the file or the folder.
     """
+    try:
+        return _collected(job, folder, files)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        if isinstance(error, PopError):
+            raise
+        raise PopError(
+            f"{folder}: its records are not what a finished training leaves ({error!r}); {_AGAIN}"
+        ) from error
+
+
+def _collected(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
     config = read_config(folder)
     last = config.max_steps - 1
-    stats, before = _stats(folder, "val", last), _stats(folder, "train", last)
-    said = read_json(folder / BESIDE, "train the row again in an empty folder")
+    stats, before = final_stats(folder, last), final_stats(folder, last, "train")
+    said = read_json(folder / BESIDE, _AGAIN)
     data_hash, commit = said.pop("data_hash"), said.pop("commit")
     settings = _settings(config)
     config_hash = settings_hash(settings)
@@ -117,7 +131,8 @@ def collect(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
         data_hash=data_hash,
         machine=", ".join(stats[name] for name in ("machine", "gpu") if name in stats),
         cpu=processor_kind(),
-        engine=stats["stepper"],
+        # a step by autograd is as a backend draws it
+        engine=f"torch ({stats['backend']})" if stats["stepper"] == "torch" else stats["stepper"],
         threads=stats["threads"],
         versions=stats["versions"],
         protocol={
@@ -145,7 +160,7 @@ def collect(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
         opacity_below_01=stats["opacity_below_0.1"],
         opacity_above_09=stats["opacity_above_0.9"],
         opacity_histogram=_histogram(folder, last),
-        curve=_curve(folder, config.max_steps),
+        curve=curve_of(folder, config.max_steps),
         per_view={name: {key: view[key] for key in ("psnr", "ssim")} for name, view in stats["per_view"].items()},
         ply_hash=file_hash(ply_of(folder, last)),
         files=files,
@@ -167,7 +182,17 @@ def _settings(config: TrainConfig) -> dict[str, Any]:
     return {name: value for name, value in config.flat().items() if name not in _APART}
 
 
-def _stats(folder: Path, kind: str, step: int) -> dict[str, Any]:
+def final_stats(folder: Path, step: int, kind: str = "val") -> dict[str, Any]:
+    """Read what a finished training has measured after its last step.
+
+    Args:
+        folder: its result folder.
+        step: the last, counted from 0.
+        kind: "val" for everything, "train" for what was known before the held-out views were measured.
+
+    Raises:
+        PopError: it is not finished; names the file.
+    """
     results = ResultFolder(folder)
     found = results.read_stats(kind, step)
     if found is None:
@@ -187,33 +212,43 @@ def _lpips_reason(stats: Mapping[str, Any]) -> str | None:
 def _histogram(folder: Path, last: int) -> tuple[int, ...]:
     path = folder / "report_data" / f"opacity_step{last}.npz"
     if not path.is_file():
-        raise PopError(f"{path}: is absent; train the row again in an empty folder")
-    with np.load(path) as found:
-        return tuple(int(count) for count in found["counts"].reshape(BINS, -1).sum(axis=1))
+        raise PopError(f"{path}: is absent; {_AGAIN}")
+    counts = read_arrays(path, {"counts": ("iu", 1)}, _AGAIN)["counts"]
+    if len(counts) % BINS:
+        raise PopError(f"{path}: counts has {len(counts)} bins, which no run writes; {_AGAIN}")
+    return tuple(int(count) for count in counts.reshape(BINS, -1).sum(axis=1))
 
 
-def _records(folder: Path) -> list[dict[str, Any]]:
-    lines = (folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
-    return [json.loads(line) for line in lines]
+def curve_of(folder: Path, max_steps: int) -> tuple[dict[str, Any], ...]:
+    """Make the curve of a training, as far as it has come.
 
+    It has the records of single training views, the measurements of all held-out views, and what a few training views
+    say all along.
 
-def _curve(folder: Path, max_steps: int) -> tuple[dict[str, Any], ...]:
-    """Make the curve of the records of single training views, of the measurements of all held-out views, and of what a
-    few training views say all along."""
-    points = {record["step"]: dict(record) for record in _thinned(_records(folder), max_steps)}
+    Raises:
+        PopError: a record is damaged.
+    """
+    points = {record["step"]: dict(record) for record in _thinned(read_records(folder), max_steps)}
     for path in sorted((folder / "stats").glob("val_step*.json")):
-        stats = read_json(path, "train the row again in an empty folder")
+        stats = read_json(path, _AGAIN)
         # at a step that has a record too, what that says of its training view stays
         measured = {**stats, "num_gaussians": stats["num_GS"], "psnr": None, "psnr_test": stats["psnr"]}
         points[stats["step"]] = measured | _known(points.get(stats["step"], {}))
-    for step, probed in _probed(folder).items():
+    for step, probed in read_probe(folder).items():
         points[step] = {"step": step, **probed} | _known(points.get(step, {}))
     return tuple(_point(points[step]) for step in sorted(points))
 
 
-def _probed(folder: Path) -> dict[int, dict[str, Any]]:
+def read_probe(folder: Path) -> dict[int, dict[str, Any]]:
+    """Read what `ProbedRun` has measured in a result folder, by step; nothing where it has not.
+
+    Raises:
+        PopError: the file is damaged.
+    """
     path = folder / PROBE
-    found = read_json(path, "train the row again in an empty folder") if path.is_file() else {}
+    found = read_json(path, _AGAIN) if path.is_file() else {}
+    if not all(step.isascii() and step.isdecimal() and isinstance(point, dict) for step, point in found.items()):
+        raise PopError(f"{path}: must hold an object for each step; {_AGAIN}")
     return {int(step): point for step, point in found.items()}
 
 
@@ -235,12 +270,17 @@ def _known(point: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in point.items() if value is not None}
 
 
+def digits(name: str) -> int:
+    """Return how many significant digits a column of a curve keeps."""
+    return 5 if name in _PRECISE else 4
+
+
 def _point(found: Mapping[str, Any]) -> dict[str, Any]:
     """Take what a curve holds, in one order, rounded to what a figure shows; what JSON cannot hold is left out."""
     more = sorted(name for name in found if name.startswith(_PROBED))
     values = {name: found[name] for name in (*_COLUMNS, *more) if found.get(name) is not None}
     return {
-        name: float(f"{value:.{_DIGITS.get(name, 4)}g}") if isinstance(value, float) else value
+        name: float(f"{value:.{digits(name)}g}") if isinstance(value, float) else value
         for name, value in values.items()
         if math.isfinite(value)
     }

@@ -80,7 +80,7 @@ def load_row(name: str, folder: Path = CONFIGS) -> Row:
         raise PopError(f"row is '{name}'; it must be one of {', '.join(ROWS)}")
     try:
         found = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise PopError(f"{path}: is not TOML: {error}") from error
     wanted = [field.name for field in fields(Row) if field.name != "name"]
     for field in [*wanted, *found]:

@@ -25,7 +25,6 @@ import argparse
 import os
 import platform
 import subprocess
-import sys
 import tempfile
 import time
 import traceback
@@ -37,6 +36,7 @@ from cuda_ext.gpu_check.budget import SHORTEST, Budget
 from cuda_ext.gpu_check.shared import Check
 from cuda_ext.gpu_check.stages import JOBS, SHARES, STAGES
 from cuda_ext.gpu_check.tools import ROOT, first_line, python_path, read_json, write_json
+from pop_fast.children import python_command
 
 PLACE = ROOT / "out" / "gpu_check"
 PACKED = ROOT / "out" / "gpu_pack"
@@ -72,6 +72,13 @@ def environment(commit: str) -> dict[str, Any]:
     except ImportError:
         found["torch"] = None
     return found
+
+
+def begun_report(path: Path) -> dict[str, Any]:
+    """Return the report that earlier calls of a job have left, and an empty one where it is absent or damaged."""
+    report = read_json(path)
+    stages = report.get("stages")
+    return {**report, "stages": dict(stages) if isinstance(stages, dict) else {}}
 
 
 def run_stages(names: list[str], limit: float, check: Check, report: dict[str, Any], path: Path) -> list[str]:
@@ -126,7 +133,8 @@ def _pack(folder: Path, args: argparse.Namespace) -> int:
     words = [str(ROOT / "benchmarks" / "gpu_pack.py"), str(folder), "--pixels", str(args.pixels)]
     words += ["--runs", *map(str, args.runs), "--captures", *map(str, args.captures)]
     words += ["--no-wheels"] if args.no_wheels else []
-    done = subprocess.run([sys.executable, *words], env={**os.environ, "PYTHONPATH": python_path(ROOT)}, check=False)
+    path = python_path(ROOT, ROOT / "benchmarks")
+    done = subprocess.run(python_command(*words), env={**os.environ, "PYTHONPATH": path}, check=False)
     return done.returncode
 
 
@@ -160,7 +168,7 @@ def main(argv: list[str] | None = None) -> int:
         raise SystemExit(f"gpu_check: {packed}: no such folder; make it with --pack, or leave --packed out")
     commit = commit_of(packed)
     path = out / f"gpu_check_{args.job}.json"
-    report: dict[str, Any] = {"stages": {}, **read_json(path)}
+    report = begun_report(path)
     report |= {"job": args.job, "complete": False, "rehearsal": args.rehearse, "limit_s": args.limit_s}
     report["environment"] = environment(commit)
     check = Check(

@@ -110,11 +110,14 @@ def test_the_course_adds_the_kit_and_what_the_kit_needs_and_is_used_by_its_comma
     assert course
     for path in course:
         assert not _foreign(path, {"numpy", "pop_ref", "hypothesis"}), _name(path)
-    # by the script that records two trainings of its toy for a page, and by the chapter that shows a whole training
+    # by the script that records two trainings of its toy for a page, by the chapter that shows a whole training, and by
+    # the fuzzer, which damages a student's files
     users = (
         "pop_fast/cli/learn.py",
         "pop_ref/walkthrough/widgets/record.py",
         "pop_ref/walkthrough/chapter_00_one_picture.py",
+        "benchmarks/faults/corpus.py",
+        "benchmarks/faults/readers.py",
     )
     for path in FILES:
         if path not in course and "tests" not in path.parts and _name(path) not in users:
@@ -246,6 +249,48 @@ def test_a_run_begins_without_what_it_does_not_need(script: str, heavy: tuple[st
     check = f"import sys; loaded = [m for m in {heavy!r} if m in sys.modules]; assert not loaded, loaded"
     done = subprocess.run([sys.executable, "-c", f"{script}\n{check}"], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
+
+
+# where Python's path is read and no Python is started with it
+NAMES_THE_PYTHON = {
+    "cuda_ext/build.py": 2,  # CMake's own Python, which is told -P; a program beside it
+    "docs/commands.py": 1,  # the folder of its programs
+    "pop_fast/io/jpeg.py": 1,  # whether there is one
+}
+STARTS_PYTHON = re.compile(r"^python[\d.]*$")
+
+
+def _starts_python(tree: ast.Module) -> Iterator[int]:
+    """List the lines of a module that start a Python: by `sys.executable`, by its name, or without a command."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and node.attr in ("executable", "_base_executable"):
+            yield node.lineno
+        if isinstance(node, ast.List | ast.Tuple) and node.elts and isinstance(first := node.elts[0], ast.Constant):
+            yield from [node.lineno] * bool(STARTS_PYTHON.search(str(first.value)))
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names = [alias.name for alias in node.names] + [getattr(node, "module", None) or ""]
+            if any(name.split(".")[0] == "multiprocessing" or name == "ProcessPoolExecutor" for name in names):
+                yield node.lineno
+
+
+def test_one_place_makes_the_commands_of_child_pythons() -> None:
+    for path in FILES:
+        if path.parts[len(ROOT.parts)] == "tests" or _name(path) == "pop_fast/children.py":
+            continue
+        lines = list(_starts_python(_tree(path)))
+        fix = "take python_command or module_command of pop_fast.children, which leave the current folder out"
+        assert len(lines) == NAMES_THE_PYTHON.get(_name(path), 0), f"{_name(path)} starts a Python at {lines}: {fix}"
+    for workflow in (ROOT / "pop_fast/blocks/Snakefile", ROOT / "paper_repro/Snakefile"):
+        text = workflow.read_text(encoding="utf-8")
+        assert "os.environ.update(SAFE_PATH)" in text
+        assert "sys.executable" not in text
+
+
+@pytest.mark.parametrize(
+    "line", ["run([sys.executable, '-m', 'x'])", "run(['python3', '-m', 'x'])", "from multiprocessing import Pool"]
+)
+def test_a_python_that_is_started_elsewhere_is_seen(line: str) -> None:
+    assert list(_starts_python(ast.parse(line)))
 
 
 def _too_long(path: Path) -> Iterator[str]:
