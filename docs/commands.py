@@ -174,6 +174,7 @@ RUNS = (
 REPRO = (
     Run("run", "pop-repro run pop demo --scale toy --results results --work work"),
     Run("queue", "pop-repro queue --scale toy --rows pop gsplat l2_blur --results results --work work"),
+    Run("verify", "pop-repro verify pop demo --scale toy --results results --work work --steps 100"),
     Run("status", "pop-repro status --scale small"),
     Run("table", "pop-repro table 4 --scale toy --results results --out tables"),
     Run(

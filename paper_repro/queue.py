@@ -94,12 +94,22 @@ def run_queue(jobs: Sequence[Job], results: Path, words: Sequence[str], threads:
             if child.stop and status != 0:
                 break
             kinds.get(status, outcome.failed).append(job)
-            if status == 0:
+            if status != 0:
+                print(f"[{number}/{len(missing)}] {job} {_why(status)}", flush=True)
+            else:
                 print(f"[{number}/{len(missing)}] done after {(time.monotonic() - start) / 60:.1f} min", flush=True)
                 if commit:
                     _commit(job, results)
         outcome.stopped = child.stop
     return outcome
+
+
+def _why(status: int) -> str:
+    """Say what became of a row, at once: the queue's own end may be days away."""
+    if status < 0:
+        return f"was killed by {signal.Signals(-status).name}; the queue, called again, continues with it"
+    told = {BusyError.status: "is left to another process", NotTrainableError.status: "cannot be trained"}
+    return told.get(status, f"failed with status {status}; its last lines say why")
 
 
 @contextmanager
