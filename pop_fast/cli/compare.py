@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Annotated, Final
 
 import tyro
 
+from pop_fast.cli import EXIT_INCOMPLETE
 from pop_fast.cli.arguments import parse
 from pop_fast.errors import PopError
 
@@ -34,17 +36,23 @@ def run(argv: Sequence[str]) -> int:
         raise PopError("nothing to compare; name one or more result folders")
     from pop_fast.view.report.compare import markdown, plain, row
 
-    rows = [row(_stats(folder)) for folder in args.results]
+    found = {folder: _stats(folder) for folder in args.results}
+    rows = [row(stats) for stats in found.values() if stats is not None]
+    without = [str(folder) for folder, stats in found.items() if stats is None]
+    fix = "train to the first evaluation, or run pop eval"
+    if not rows:
+        raise PopError(f"{', '.join(without)}: nothing has been measured yet; {fix}")
     print(markdown(rows) if args.markdown else plain(rows))
-    return 0
+    for folder in without:
+        print(f"pop: {folder}: left out, as nothing has been measured yet; {fix}", file=sys.stderr)
+    return EXIT_INCOMPLETE if without else 0
 
 
-def _stats(folder: Path) -> dict[str, object]:
+def _stats(folder: Path) -> dict[str, object] | None:
+    """Read the statistics of a run; None where it has none yet."""
     from pop_fast.train.results import read_config
     from pop_fast.view.report.source import read_last_stats
 
     planned = read_config(folder).max_steps
     stats = read_last_stats(folder)
-    if not stats:
-        raise PopError(f"{folder}: has no statistics yet; train to the first evaluation, or run pop eval {folder}")
-    return {**stats, "max_steps": planned}
+    return {**stats, "max_steps": planned} if stats else None

@@ -125,6 +125,7 @@ def run(argv: Sequence[str]) -> int:
         options = as_begun(folder, options)
         config, chosen = choose_backend(config, options.resume)
         check_backend(config)
+        check_early(config, options, ranks)
         if options.blocks is not None:
             return train_in_blocks(config, options, chosen, argv)
         status = train_capture(config, options, chosen, argv, ranks)
@@ -172,12 +173,16 @@ def train_capture(
 
     folder, start = Path(config.result_dir), time.perf_counter()
     capture = _open_in_turn(config, options, ranks)
-    loading = time.perf_counter() - start
+    searching = capture.sfm_seconds or 0.0
+    loading = time.perf_counter() - start - searching
+    from pop_fast.io.heartbeat import duration
     from pop_fast.train.environment import keep_freed_memory
     from pop_fast.train.ranks import ALONE
     from pop_fast.train.training_run import TrainingRun
 
     keep_freed_memory()
+    if capture.sfm_seconds is not None:
+        print(f"cameras found in {duration(searching)}")
     for note in capture.notes:
         print(f"note: {printable(note)}")
     print(printable(f"{capture.name}: {capture.source}; {_plan(config)}"))
@@ -185,6 +190,7 @@ def train_capture(
     if takes_hours(config):
         print(f"note: {config.max_steps:,} steps take hours on a CPU; --preset quick takes a tenth of the schedule")
     how = {"resume": options.resume, "overwrite": options.overwrite, "loading_seconds": loading}
+    how["sfm_seconds"] = searching
     commands = commands_text(folder if options.resume else None, ["pop", "train", *argv])
     beside = {RECORD: record_text(record_of(capture, options)), COMMANDS_FILE: commands}
     # absolute, so that the result can be looked at from another folder too
@@ -336,6 +342,30 @@ def check_backend(config: TrainConfig) -> None:
             raise PopError(reason)
 
 
+def check_early(config: TrainConfig, options: Any, ranks: Ranks | None) -> None:
+    """Refuse what would end a run after its photographs were read, before their cameras are searched for.
+
+    Raises:
+        PopError: names the option, and the photograph or file.
+    """
+    for name, files in (("--lpips-vgg", config.lpips_vgg), ("--lpips-alex", config.lpips_alex)):
+        for file in files:
+            if not Path(file).is_file():
+                raise PopError(f"{file}: there is no such file of LPIPS weights; give {name} another, or leave it out")
+    if ranks is not None or config.batch_size > 1:
+        from pop_fast.train.batch_stepper import check_batch
+        from pop_fast.train.ranks import ALONE
+
+        check_batch(config, True, ranks or ALONE)
+    if not Path(config.data).is_dir() or config.factor == 1:
+        return
+    from pop_fast.data.load import check_factor, find_listing
+
+    # what a model lists is refused as its first photograph is read
+    if options.source == "photos" or find_listing(Path(config.data), options.source, options.images) is None:
+        check_factor(Path(config.data), config.factor)
+
+
 def _open_in_turn(config: TrainConfig, options: Any, ranks: Ranks | None) -> Capture:
     """Load the capture, the process that writes first: it may find cameras, and keep them for the others to read."""
     if ranks is None:
@@ -391,5 +421,6 @@ def summary(stats: dict[str, Any]) -> str:
         parts.append(f"LPIPS {stats['lpips']:.4f} ({stats['lpips_net']})")
     parts.append(f"{stats['num_GS']:,} Gaussians ({stats['num_GS_above_floor']:,} with opacity >= 1/255)")
     loading = f", loading {stats['seconds_loading']:.0f} s" if "seconds_loading" in stats else ""
+    loading += f", finding cameras {stats['seconds_sfm']:.0f} s" if "seconds_sfm" in stats else ""
     parts.append(f"{stats['seconds']:.0f} s on {stats.get('gpu', 'the CPU')}{loading}")
     return ", ".join(parts)
