@@ -14,8 +14,7 @@ from pop_fast.cli.arguments import parse
 from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
 from pop_fast.cli.limits import FormatName, LimitOptions, Shown, limited
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import check_file as check_place
-from pop_fast.io.atomic import check_folder
+from pop_fast.io.atomic import check_folder, check_place
 from pop_fast.train.load_result import Splat, frame_of_splat, load_splat, read_record
 
 if TYPE_CHECKING:

@@ -24,6 +24,7 @@ from pop_fast.errors import PopError
 __all__ = [
     "check_file",
     "check_folder",
+    "check_place",
     "file_atomically",
     "folder_atomically",
     "is_left_behind",
@@ -58,7 +59,7 @@ def check_file(path: str | os.PathLike[str]) -> None:
     path = Path(path)
     if path.is_dir():
         raise PopError(f"{path}: {_REASONS[errno.EISDIR]}")
-    _check_place(path)
+    check_place(path)
 
 
 def check_folder(
@@ -74,12 +75,16 @@ def check_folder(
     """
     path = Path(path)
     path = path.resolve() if path.is_symlink() or path.name in ("", "..") else path
-    _check_place(path)
+    check_place(path)
     _check_replaceable(path, overwrite, (), recognise)
 
 
-def _check_place(path: Path) -> None:
-    """Raise PopError where nothing can be put at `path`, as its nearest folder that exists does not allow it."""
+def check_place(path: Path) -> None:
+    """Refuse a place in which nothing new can be made, as the nearest folder over it that exists does not allow it.
+
+    Raises:
+        PopError: a part of the path is a file, or that folder may not be written to.
+    """
     parent = next((parent for parent in path.absolute().parents if parent.exists()), None)
     if parent is not None and not parent.is_dir():
         raise PopError(f"{path}: could not be written: {_REASONS[errno.ENOTDIR]}")

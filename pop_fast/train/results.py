@@ -45,7 +45,7 @@ from typing import Any
 import numpy as np
 
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import is_left_behind, write_atomically
+from pop_fast.io.atomic import check_place, is_left_behind, write_atomically
 from pop_fast.io.lock import FolderLock
 from pop_fast.io.read_back import read_json
 from pop_fast.train.config import TrainConfig
@@ -87,6 +87,8 @@ class ResultFolder:
         """
         if self.path.exists() and not self.path.is_dir():
             raise PopError(f"{self.path}: is a file; choose another result folder")
+        if not self.path.exists():
+            check_place(self.path)
         if self._lock.held:
             return self._check(resume, overwrite)
         self.hold()

@@ -97,8 +97,7 @@ class TrainingRun:
             capture: the photographs and cameras.
             resume: continue from the latest checkpoint of `config.result_dir`, or start where there is none.
             overwrite: replace the results of an earlier run in `config.result_dir`, once the first step has been taken.
-            loading_seconds: how long reading the capture took, for the statistics.
-            sfm_seconds: how long its cameras were searched for before, likewise.
+            loading_seconds, sfm_seconds: how long reading and the search for cameras took, for the statistics.
             beside: texts to write beside cfg.json, by file name.
             strategy: decides over the Gaussians in the place of the config's, by gsplat's protocol; on the CPU.
             initial: raw parameters to start from, which are copied; None makes them from the capture's points. Their
@@ -194,6 +193,9 @@ class TrainingRun:
             self._unwritten = self._opacities().numpy()
         with self._times.is_loading():
             self._stepper = self.stepper
+        due = found and writes and self.step in self.config.eval_steps
+        if due and not self._results.read_stats("val", self.step - 1):  # as somebody had asked for an end meanwhile
+            self._evaluate(self.step - 1)
 
     def _loop(self) -> dict[str, Any]:
         config = self.config
@@ -201,42 +203,28 @@ class TrainingRun:
         bars = tqdm(total=config.max_steps, initial=self.step, disable=None if shown else True)
         with bars as bar, Heartbeat(shown) as beat:
             beat.say(f"step {self.step:,} of {config.max_steps:,}")
-            self._make_up()
             while self.step < config.max_steps:
                 longest = min(self.stepper.longest, config.max_steps if self._watch is None else _WATCHED_STEPS)
                 segment = self.take_steps(segment_end(config, self.strategy, self.step, longest))
                 if segment.stats:
                     self._log(segment, bar)
-                    beat.say(
-                        so_far(self.step, config.max_steps, len(self.params["means"]), self._times.train, self._latest)
-                    )
-                    self._after_steps()
+                    n, seconds = len(self.params["means"]), self._times.train
+                    beat.say(so_far(self.step, config.max_steps, n, seconds, self._latest))
+                    if self._unwritten is not None:
+                        # a rate can be so high that the first step is the last; that is no reason to replace anything
+                        self._require_finite()
+                        if self._ranks.writes:
+                            self._results.begin(self.config, self._beside, self._unwritten, self._overwrite)
+                        self._unwritten = None
+                    self._milestones(self.step - 1)
+                    if self._watch is not None:
+                        self._watch(self)
                 if self._ranks.any(self._stop.asked) and self.step < config.max_steps:
                     if self._unwritten is None:
                         self._save()
                     raise KeyboardInterrupt
         last = config.max_steps - 1
-        if not self._ranks.writes:
-            return {}
-        return self._results.read_stats("val", last) or self._evaluate(last)
-
-    def _after_steps(self) -> None:
-        """Begin to write with the first steps, and do what is due after these."""
-        if self._unwritten is not None:
-            # a rate can be so high that the first step is the last; that is no reason to replace anything
-            self._require_finite()
-            if self._ranks.writes:
-                self._results.begin(self.config, self._beside, self._unwritten, self._overwrite)
-            self._unwritten = None
-        self._milestones(self.step - 1)
-        if self._watch is not None:
-            self._watch(self)
-
-    def _make_up(self) -> None:
-        """Measure what is due after the steps of a checkpoint that was written because somebody asked for an end."""
-        step = self.step - 1
-        if self.step in self.config.eval_steps and self._ranks.writes and not self._results.read_stats("val", step):
-            self._evaluate(step)
+        return (self._results.read_stats("val", last) or self._evaluate(last)) if self._ranks.writes else {}
 
     def take_steps(self, last: int) -> Segment:
         """Take the steps up to `last`, and the densification step that is due after them.
@@ -307,9 +295,12 @@ class TrainingRun:
 
     @property
     def stepper(self) -> Stepper:
-        """What takes the steps; it is made at the first use, for the rows as they are then."""
+        """What takes the steps; it is made at the first use, for the rows as they are then, on the engine's device."""
         if self._stepper is None:
-            self._place()
+            if self._engine.device.type != "cpu":
+                with words_for_memory():
+                    given = (self.params, self.optimizers, self.state)
+                    self.params, self.optimizers = moved_to(self._engine.device, *given)
             config, size, done = self.config, self.config.batch_size, self.step
             # the views of steps that were taken are not known any more
             order = [0] * size * done + self._order.ahead(size * (config.max_steps - done))
@@ -318,12 +309,6 @@ class TrainingRun:
             with words_for_memory():
                 self._stepper.rebind(self.params, self.optimizers, self.state)
         return self._stepper
-
-    def _place(self) -> None:
-        """Move parameters, moments and statistics to the engine's device."""
-        if self._engine.device.type != "cpu":
-            with words_for_memory():
-                self.params, self.optimizers = moved_to(self._engine.device, self.params, self.optimizers, self.state)
 
     def _log(self, segment: Segment, bar: tqdm) -> None:
         """Write the records of a segment."""
@@ -370,10 +355,10 @@ class TrainingRun:
 
     def _evaluate(self, step: int) -> dict[str, Any]:
         self._require_finite()
-        config = self.config
+        config, strategy = self.config, self.strategy
         stats = {
             "step": step,
-            **self._of_settings(),
+            **({"method": strategy.name} if isinstance(strategy, ForeignStrategy) else facts(config, self._train)),
             "capture": self._capture.name,
             **population(self._opacities()),
             **self._facts(),
@@ -386,11 +371,6 @@ class TrainingRun:
         stats["seconds_total"] = self._times.total
         self._results.write_stats("val", step, stats)
         return stats
-
-    def _of_settings(self) -> dict[str, Any]:
-        if isinstance(self.strategy, ForeignStrategy):
-            return {"method": self.strategy.name}
-        return facts(self.config, self._train)
 
     def _facts(self) -> dict[str, Any]:
         stepper, engine = self.stepper, self._engine

@@ -100,7 +100,7 @@ def test_photographs_that_could_not_be_placed_are_told(tmp_path: Path) -> None:
     fill(tmp_path, tuple(f"{i}.png" for i in range(5)))
     (note,) = load_capture(tmp_path, sfm=True).notes
     assert note.startswith("3 of 5 photographs in")
-    assert note.endswith("first 3.png")
+    assert note.endswith("has no camera for 3.png, 4.png")
 
 
 def test_photographs_in_a_format_that_is_not_read_are_named_with_the_way_to_convert_them(

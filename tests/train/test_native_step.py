@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -121,6 +123,39 @@ def test_the_bits_depend_neither_on_threads_nor_on_how_many_steps_are_asked_for_
     for stats, params in found[1:]:
         assert stats == found[0][0]
         assert all(torch.equal(params[key], found[0][1][key]) for key in params)
+
+
+def test_a_step_that_is_left_changes_nothing_and_is_taken_by_whoever_goes_on(tmp_path: Path) -> None:
+    last, settings = 24, {**SETTINGS["blur of summed counts"], "sh_interval": 100}
+
+    def state(run: TrainingRun) -> list[torch.Tensor]:
+        kept = [param.detach().clone() for param in run.params.values()]
+        kept += [value.clone() for of in run.optimizers.values() for value in of.state_dict()["state"][0].values()]
+        return [*kept, *(run.state[name].clone() for name in ("grad2d", "count", "dominant_sum", "blurred"))]
+
+    whole = run_of(tmp_path, native_engine(), settings)
+    states, seconds = {}, time.perf_counter()
+    for step in range(last):
+        whole.take_steps(step + 1)
+        states[step + 1] = state(whole)
+    seconds = time.perf_counter() - seconds
+    stopped = set()
+    for trial in range(12):
+        run = run_of(tmp_path, native_engine(), settings)
+        run.take_steps(1)
+        timer = threading.Timer(seconds * trial / 16, run._stop.ask)
+        timer.start()
+        taken_until = run.take_steps(last).stats
+        timer.join()
+        assert run.step == 1 + len(taken_until)
+        assert all(map(torch.equal, state(run), states[run.step]))
+        stopped.add(run.step)
+        if run.step < last:
+            assert run.take_steps(last).stats == []
+            run._stop._flag.value = 0
+            run.take_steps(last)
+        assert all(map(torch.equal, state(run), states[last]))
+    assert len(stopped) > 1, "nothing was left half way"
 
 
 def test_memory_for_photographs_changes_no_bit(tmp_path: Path) -> None:
