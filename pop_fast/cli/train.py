@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import sys
 import time
@@ -61,6 +62,8 @@ _SHOWN: Final = frozenset(
         *("exposure", "random_background", "refine_cameras"),
     }
 )
+# whose options the help lists after all others, in this order; those of limits belong to exports too
+_LATER: Final = (FinishOptions, LimitOptions, BlocksOptions)
 _DOCUMENTED: Final = (BlocksOptions, FinishOptions, LimitOptions, Given, TrainConfig)
 # words of other trainers' command lines: Inria's, gsplat's
 _ALIASES: Final = {
@@ -69,6 +72,15 @@ _ALIASES: Final = {
     "--data-factor": "--factor",
     "--iterations": "--max-steps",
 }
+_SMALLER: Final = (
+    "--factor 2 (4, 8) trains on photographs shrunk by so much; --sfm.max-size is only how large they are while "
+    "cameras are searched for"
+)
+# of which the nearest option by its letters is another thing
+_ELSEWHERE: Final = dict.fromkeys(("--max-size", "--resolution", "-r", "--downscale", "--downscale-factor"), _SMALLER)
+# px of a photograph from which a step takes seconds on a CPU, and the side that other trainers shrink such ones to
+_LARGE: Final = 3_000_000
+_USUAL_SIDE: Final = 1600
 # what trains, and takes longest to import
 _TRAINING: Final = ("pop_fast.train.training_run", "pop_fast.compiled.native_step")
 _IGNORED: Final = frozenset({"--eval"})  # Inria: hold out every 8th view; here the default (--test-every 0 holds none)
@@ -187,6 +199,9 @@ def train_capture(
         print(f"note: {printable(note)}")
     print(printable(f"{capture.name}: {capture.source}; {_plan(config)}"))
     print(chosen)
+    large = about_large(capture, config)
+    if large is not None:
+        print(f"note: {large}")
     if takes_hours(config):
         print(f"note: {config.max_steps:,} steps take hours on a CPU; --preset quick takes a tenth of the schedule")
     how = {"resume": options.resume, "overwrite": options.overwrite, "loading_seconds": loading}
@@ -216,6 +231,20 @@ def _trained(training: TrainingRun, folder: Path, capture: Capture, options: Any
         return 0
     print(summary(stats), flush=True)
     return finish(folder, capture, options) or report(folder)
+
+
+def about_large(capture: Capture, config: TrainConfig) -> str | None:
+    """Say what photographs of full size cost on a CPU, before the first step; None where they are not that large."""
+    pixels = sum(view.width * view.height for view in capture.views) / len(capture.views)
+    if config.backend == "cuda" or pixels < _LARGE:
+        return None
+    view = max(capture.views, key=lambda view: view.width * view.height)
+    shrink = math.ceil(max(view.width, view.height) / _USUAL_SIDE)
+    return (
+        f"the photographs are up to {view.width}x{view.height} px, and every step draws one: seconds a step on a CPU "
+        f"(the time left is told after the first ones); --factor {config.factor * shrink} takes about "
+        f"1/{shrink**2} of the time, at {round(view.width / shrink)}x{round(view.height / shrink)} px"
+    )
 
 
 def takes_hours(config: TrainConfig) -> bool:
@@ -281,6 +310,8 @@ def rename_aliases(argv: Sequence[str]) -> list[str]:
         word = word.replace("--adc.", "--gsplat.", 1) if word.startswith("--adc.") else word
         name, equals, value = word.partition("=")
         name = name.replace("_", "-") if name.startswith("--") else name
+        if name in _ELSEWHERE:
+            raise PopError(f"{name} is no option of pop train; {_ELSEWHERE[name]}")
         target = _ALIASES.get(name)
         if name in _IGNORED:
             continue
@@ -319,10 +350,15 @@ def _arguments_type(base: TrainConfig, plan: dict[str, Any], short: bool) -> typ
         elif short and field.name not in _SHOWN:
             kind = Annotated[kind, tyro.conf.Suppress]
         columns.append((field.name, kind, default))
+    # the settings first: in order of inheritance the help would open with the limits of an export
+    surrounding = typing.get_type_hints(_Run, include_extras=True)
+    own = {field.name: field for field in dataclasses.fields(_Run)}
+    later = {field.name: place for place, kind in enumerate(_LATER) for field in dataclasses.fields(kind)}
+    for name in sorted(own, key=lambda name: later.get(name, -1)):
+        columns.append((name, surrounding[name], own[name]))
     documented = str(_Run.__doc__) + "".join((kind.__doc__ or "").partition("Attributes:")[2] for kind in _DOCUMENTED)
-    return dataclasses.make_dataclass(
-        "TrainArguments", columns, bases=(_Run,), frozen=True, kw_only=True, namespace={"__doc__": documented}
-    )
+    methods = {"__doc__": documented, "check": _Run.check, "any": _Run.any}
+    return dataclasses.make_dataclass("TrainArguments", columns, frozen=True, kw_only=True, namespace=methods)
 
 
 def check_backend(config: TrainConfig) -> None:

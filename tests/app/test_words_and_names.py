@@ -180,6 +180,10 @@ def test_which_folder_a_factor_reads_is_told(tmp_path: Path) -> None:
     assert load_capture(root).notes == ()
     assert load_capture(root, factor=2).notes == ("the photographs of images/ are shrunk by 2 here",)
     for path in (root / "images").iterdir():
+        path.rename(root / path.name)
+    (root / "images").rmdir()
+    assert load_capture(root, factor=2).notes == ("the photographs are shrunk by 2 here",)
+    for path in (root / "images").iterdir():
         write_photograph(root / "images_2" / path.name, photograph(0, 20, 15))
     (note,) = load_capture(root, factor=2).notes
     assert note.startswith("the photographs of images_2/ are used, made smaller before")
