@@ -36,9 +36,9 @@ def run(argv: Sequence[str]) -> int:
         raise PopError("nothing to compare; name one or more result folders")
     from pop_fast.view.report.compare import markdown, plain, row
 
-    found = {folder: _stats(folder) for folder in args.results}
-    rows = [row(stats) for stats in found.values() if stats is not None]
-    without = [str(folder) for folder, stats in found.items() if stats is None]
+    found = [(folder, _stats(folder)) for folder in args.results]
+    rows = [row(stats) for _, stats in found if stats is not None]
+    without = [str(folder) for folder, stats in found if stats is None]
     fix = "train to the first evaluation, or run pop eval"
     if not rows:
         raise PopError(f"{', '.join(without)}: nothing has been measured yet; {fix}")

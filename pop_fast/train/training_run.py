@@ -202,7 +202,7 @@ class TrainingRun:
         shown = config.progress and self._ranks.writes
         bars = tqdm(total=config.max_steps, initial=self.step, disable=None if shown else True)
         with bars as bar, Heartbeat(shown) as beat:
-            beat.say(f"step {self.step:,} of {config.max_steps:,}")
+            beat.say(f"step {self.step:,} of {config.max_steps:,}, {len(self.params['means']):,} Gaussians")
             while self.step < config.max_steps:
                 longest = min(self.stepper.longest, config.max_steps if self._watch is None else _WATCHED_STEPS)
                 segment = self.take_steps(segment_end(config, self.strategy, self.step, longest))

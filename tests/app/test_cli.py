@@ -18,6 +18,7 @@ from pop_fast.cli import COMMANDS, main, train
 from pop_fast.cli.errors import describe
 from pop_fast.cli.train import arguments, rename_aliases
 from pop_fast.data.capture import Capture, View
+from pop_fast.data.sfm import SfmResult
 from pop_fast.errors import PopError
 from pop_fast.train import TrainConfig
 from tests.app.conftest import TRAIN, Pop
@@ -126,9 +127,10 @@ def test_a_bare_folder_of_photographs_is_placed_then_trained_on_and_the_end_is_t
 ) -> None:
     (capture / "sparse").rename(tmp_path / "sparse")
 
-    def placed(photos: Path, root: Path, **_: Any) -> None:
+    def placed(photos: Path, root: Path, **_: Any) -> SfmResult:
         assert photos == capture / "images"
         (tmp_path / "sparse").rename(root / "sparse")
+        return SfmResult(root, 8, 8, 100, 0.5)
 
     monkeypatch.setattr("pop_fast.data.load.run_sfm", placed)
     outcome = pop("train", capture, "--out", tmp_path / "r", *TRAIN)

@@ -175,14 +175,18 @@ def test_an_unfinished_run_is_marked_beside_a_finished_one(
     assert " 1 threads" not in finished
 
 
-def test_which_folder_a_factor_reads_is_told(tmp_path: Path) -> None:
+def test_photographs_beside_their_model_have_no_folder_to_name(tmp_path: Path) -> None:
     root = colmap_capture(tmp_path)
-    assert load_capture(root).notes == ()
-    assert load_capture(root, factor=2).notes == ("the photographs of images/ are shrunk by 2 here",)
     for path in (root / "images").iterdir():
         path.rename(root / path.name)
     (root / "images").rmdir()
     assert load_capture(root, factor=2).notes == ("the photographs are shrunk by 2 here",)
+
+
+def test_which_folder_a_factor_reads_is_told(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path)
+    assert load_capture(root).notes == ()
+    assert load_capture(root, factor=2).notes == ("the photographs of images/ are shrunk by 2 here",)
     for path in (root / "images").iterdir():
         write_photograph(root / "images_2" / path.name, photograph(0, 20, 15))
     (note,) = load_capture(root, factor=2).notes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import threading
 import time
@@ -17,11 +18,11 @@ from pop_fast.api.registry import get_backend
 from pop_fast.data.initialize import initialize_params
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.train import TrainingRun
+from pop_fast.train import TrainingRun, engines, fused_stepper
 from pop_fast.train.engines import engine_of, native_engine, torch_engine
 from pop_fast.train.model import KEYS
 from pop_fast.train.stepper import Engine
-from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config
+from tests.app.tiny import HEIGHT, WIDTH, last_checkpoint, tiny_capture, tiny_config
 
 REASON = get_backend("compiled").why_not()
 pytestmark = pytest.mark.skipif(REASON is not None, reason=REASON or "")
@@ -156,6 +157,28 @@ def test_a_step_that_is_left_changes_nothing_and_is_taken_by_whoever_goes_on(tmp
             run.take_steps(last)
         assert all(map(torch.equal, state(run), states[last]))
     assert len(stopped) > 1, "nothing was left half way"
+
+
+@pytest.mark.parametrize("gain", [0.0, 1e-6])
+def test_how_many_steps_are_taken_at_a_time_changes_no_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float
+) -> None:
+    found: list[dict[str, Any]] = []
+    for seconds, most in ((0.0, 20), (math.inf, 3), (math.inf, 20)):
+        monkeypatch.setattr(fused_stepper, "BLOCK_SECONDS", seconds)
+        monkeypatch.setattr(engines, "MOST_ON_CPU", most)
+        config = tiny_config(tmp_path / f"{seconds}_{most}", backend="compiled", checkpoint_every=0, save_steps=())
+        # the sums of the last window are among what is kept
+        window = {"refine_every": 13, "refine_stop_iter": 60, "blur_stop_iter": 50}
+        config = replace(config, strategy=replace(config.strategy, blur_stop_gain=gain, **window))
+        run = TrainingRun(config, tiny_capture())
+        run.run()
+        found.append(last_checkpoint(Path(config.result_dir), "seconds", "metrics_bytes"))
+    assert found[0][".strategy.loss_sum"] > 0.0
+    for other in found[1:]:
+        for name, value in found[0].items():
+            same = torch.equal(value, other[name]) if isinstance(value, torch.Tensor) else value == other[name]
+            assert same, name
 
 
 def test_memory_for_photographs_changes_no_bit(tmp_path: Path) -> None:
