@@ -31,7 +31,7 @@ walkthrough: setup  ## run the chapters and write pages, notebooks, slides and (
 	$(BIN)/python -m pop_ref.walkthrough out/walkthrough --all
 
 repro: setup  ## train every row of the paper at toy scale (minutes), leave its tables and figures in out/repro
-	$(BIN)/pop-repro queue --scale toy --out out/repro/results --work out/repro/work
+	$(BIN)/pop-repro queue --scale toy --results out/repro/results --work out/repro/work
 	for table in 1 2 3 4 5 beyond; do \
 		$(BIN)/pop-repro table $$table --scale toy --results out/repro/results --out out/repro || exit 1; done
 	for figure in 1 2 3 4a 4b 5 6a 6b 7; do $(BIN)/pop-repro figure $$figure --scale toy --results out/repro/results \

@@ -167,16 +167,16 @@ RUNS = (
     Run("completion", "pop completion bash | head -12"),
 )
 REPRO = (
-    Run("run", "pop-repro run pop demo --scale toy --out results --work work"),
-    Run("queue", "pop-repro queue --scale toy --rows pop gsplat l2_blur --out results --work work"),
-    Run("status", "pop-repro status --scale dev"),
+    Run("run", "pop-repro run pop demo --scale toy --results results --work work"),
+    Run("queue", "pop-repro queue --scale toy --rows pop gsplat l2_blur --results results --work work"),
+    Run("status", "pop-repro status --scale small"),
     Run("table", "pop-repro table 4 --scale toy --results results --out tables"),
     Run(
         "figure",
         "pop-repro figure 7 --scale toy --results results --work work --out figures",
         tiles("figures/*.png", 1),
     ),
-    Run("claims", "pop-repro claims --scale dev"),
+    Run("claims", "pop-repro claims --scale small"),
     Run("data check", "pop-repro data check --data ."),
 )
 

@@ -14,7 +14,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from paper_repro import results
 from paper_repro.collect import BESIDE, PROBE
 from paper_repro.jobs import Job
 from paper_repro.rows import load_row, load_rows
@@ -57,7 +56,7 @@ def keep_for_others(job: Job, folder: Path, work: Path) -> None:
     from pop_fast.train.checkpoint import checkpoint_path
 
     of_job = job.work(work)
-    for steps in {_shared_steps(job, other) for other in _followers(job) if not other.result(folder).is_file()}:
+    for steps in {_shared_steps(job, other) for other in _followers(job) if not other.is_done(folder)}:
         path = checkpoint_path(of_job, steps - 1)
         if path.is_file():
             path.replace(_ready(of_job / _KEPT / path.name))
@@ -66,7 +65,7 @@ def keep_for_others(job: Job, folder: Path, work: Path) -> None:
 def remove_what_was_kept(job: Job, folder: Path, work: Path) -> None:
     """Remove what `keep_for_others` left of a job's base, if this job was the last to need it."""
     base = base_of(job)
-    if base is not None and all(other.result(folder).is_file() for other in _followers(base)):
+    if base is not None and all(other.is_done(folder) for other in _followers(base)):
         shutil.rmtree(base.work(work) / _KEPT, ignore_errors=True)
 
 
@@ -92,14 +91,15 @@ def begin_from_base(job: Job, folder: Path, work: Path, config: TrainConfig, cap
     from pop_fast.train.checkpoint import capture_fingerprint, checkpoint_path, load_checkpoint, save_checkpoint
 
     base = base_of(job)
-    if base is None or not base.result(folder).is_file():
+    result = None if base is None else base.result(folder)
+    if base is None or result is None:
         return None
     steps, of_base, ours = _shared_steps(base, job), base.work(work), job.work(work)
     usual = checkpoint_path(of_base, steps - 1)
     path = next((path for path in (of_base / _KEPT / usual.name, usual) if path.is_file()), None)
     if path is None:
         return None
-    content = load_checkpoint(path)
+    content, config = load_checkpoint(path), config.in_world(capture.world_scale)
     if (
         _shared(content["config"], config.binding()) != steps
         or content["threads"] != (config.threads or torch.get_num_threads())
@@ -113,7 +113,7 @@ def begin_from_base(job: Job, folder: Path, work: Path, config: TrainConfig, cap
         shutil.copy2(record, _ready(made / record.relative_to(of_base)))
     save_checkpoint(checkpoint_path(made, steps - 1), {**content, "config": config.binding()})
     made.rename(ours)
-    return results.read(base.result(folder)).run
+    return result.run
 
 
 def _followers(job: Job) -> list[Job]:

@@ -9,24 +9,26 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
 from paper_repro.jobs import Job
-from paper_repro.results import BINS, LPIPS_VARIANTS, Result
+from paper_repro.published import file_hash, ply_of
+from paper_repro.record import BINS, LPIPS_VARIANTS, Result, run_id, settings_hash
 from pop_fast.errors import PopError
-from pop_fast.io.read_back import read_json
+from pop_fast.io.read_back import read_arrays, read_json
+from pop_fast.machine import processor_kind
 from pop_fast.train.results import ResultFolder, read_config
+from pop_fast.view.report.source import read_records
 
 if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
 
-__all__ = ["BESIDE", "PROBE", "collect", "first_change", "settings_hash", "spacing", "state_of_data"]
+__all__ = ["BESIDE", "PROBE", "collect", "first_change", "read_probe", "spacing", "state_of_data"]
 
 # what `train_row` leaves in the result folder about the capture and the program, from before the first step
 BESIDE: Final = "row.json"
 # what `ProbedRun` leaves there
 PROBE: Final = "probe.json"
+_AGAIN: Final = "train the row again in an empty folder"
 # where things lie, who takes the steps and how often something is written: no part of what was trained
 _APART: Final = frozenset(
     {
@@ -36,9 +38,14 @@ _APART: Final = frozenset(
 )
 # as many points as a curve of the whole schedule has with one each 100 steps
 _POINTS: Final = 300
-# of a record: what every point of a curve has, and what it may have besides
-_ALWAYS: Final = ("step", "num_gaussians", "psnr", "seconds", "n_blended", "n_traversed")
-_SOMETIMES: Final = ("l1", "l2", "d_ssim", "pop", "cloned", "split", "pruned")
+# what the points of a curve have, where it was measured
+_COLUMNS: Final = (
+    *("step", "num_gaussians", "psnr", "psnr_test", "seconds", "n_blended", "n_traversed"),
+    *("l1", "l2", "d_ssim", "pop", "cloned", "split", "pruned"),
+)
+_PROBED: Final = ("grad_", "probe_")
+# significant ones of a number in a curve, of others four; a PSNR has three after the point
+_DIGITS: Final = {"psnr": 5, "psnr_test": 5, "seconds": 5}
 _SSIM: Final = "11 x 11 Gaussian window, sigma 1.5, windows inside the image, floats clamped to [0, 1]"
 _LPIPS: Final = {
     "vgg_01": "vgg_01: VGG16, images in [0, 1]",
@@ -79,22 +86,35 @@ def state_of_data(job: Job, config: TrainConfig, capture: Capture) -> dict[str, 
     }
 
 
-def collect(job: Job, folder: Path) -> Result:
+def collect(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
     """Gather a finished training.
 
     Args:
         job: what was trained.
         folder: its result folder.
+        files: what `paper_repro.published` has made of it, by name, with hashes.
 
     Raises:
-        PopError: something of a finished training is absent; names the file.
+        PopError: something of a finished training is absent or damaged; names the file or the folder.
     """
+    try:
+        return _collected(job, folder, files)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        if isinstance(error, PopError):
+            raise
+        raise PopError(
+            f"{folder}: its records are not what a finished training leaves ({error!r}); {_AGAIN}"
+        ) from error
+
+
+def _collected(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
     config = read_config(folder)
     last = config.max_steps - 1
     stats, before = _stats(folder, "val", last), _stats(folder, "train", last)
-    said = read_json(folder / BESIDE, "train the row again in an empty folder")
+    said = read_json(folder / BESIDE, _AGAIN)
     data_hash, commit = said.pop("data_hash"), said.pop("commit")
-    config_hash = settings_hash(config)
+    settings = _settings(config)
+    config_hash = settings_hash(settings)
     n, size = stats["num_GS"], job.row.bytes_per_gaussian
     variants = stats["lpips_variants"]
     return Result(
@@ -102,11 +122,12 @@ def collect(job: Job, folder: Path) -> Result:
         row=job.row.name,
         scene=job.scene.name,
         seed=job.seed,
-        run=hashlib.sha256(f"{config_hash} {data_hash} {job.seed}".encode()).hexdigest()[:12],
+        run=run_id(config_hash, data_hash, job.seed),
         commit=commit,
         config_hash=config_hash,
         data_hash=data_hash,
         machine=", ".join(stats[name] for name in ("machine", "gpu") if name in stats),
+        cpu=processor_kind(),
         engine=stats["stepper"],
         threads=stats["threads"],
         versions=stats["versions"],
@@ -117,7 +138,7 @@ def collect(job: Job, folder: Path) -> Result:
             "timing": _TIMING,
             "checkpoint_bytes_per_gaussian": size,
         },
-        schedule=_settings(config),
+        schedule=settings,
         seconds={
             "load": stats["seconds_loading"],
             "train": stats["seconds"],
@@ -137,19 +158,18 @@ def collect(job: Job, folder: Path) -> Result:
         opacity_histogram=_histogram(folder, last),
         curve=_curve(folder, config.max_steps),
         per_view={name: {key: view[key] for key in ("psnr", "ssim")} for name, view in stats["per_view"].items()},
+        ply_hash=file_hash(ply_of(folder, last)),
+        files=files,
     )
-
-
-def settings_hash(config: TrainConfig) -> str:
-    """Hash what was trained: all settings but the seed, the engine and where things lie."""
-    return hashlib.sha256(json.dumps(_settings(config), sort_keys=True).encode()).hexdigest()
 
 
 def first_change(result: Result, config: TrainConfig) -> str | None:
     """Say which setting of a finished result the row has otherwise now, or None; settings that are new do not count."""
     now = _settings(config)
+    # None is the profile's: what that comes to in the world of a capture is known when the capture is read
+    free = {"near_plane"} if config.near_plane is None else set[str]()
     for name, value in result.schedule.items():
-        if name in now and now[name] != value:
+        if name not in free and name in now and now[name] != value:
             return f"{name} = {value}, and the row has {now[name]} now"
     return None
 
@@ -178,34 +198,37 @@ def _lpips_reason(stats: Mapping[str, Any]) -> str | None:
 def _histogram(folder: Path, last: int) -> tuple[int, ...]:
     path = folder / "report_data" / f"opacity_step{last}.npz"
     if not path.is_file():
-        raise PopError(f"{path}: is absent; train the row again in an empty folder")
-    with np.load(path) as found:
-        return tuple(int(count) for count in found["counts"].reshape(BINS, -1).sum(axis=1))
-
-
-def _records(folder: Path) -> list[dict[str, Any]]:
-    lines = (folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
-    return [json.loads(line) for line in lines]
+        raise PopError(f"{path}: is absent; {_AGAIN}")
+    counts = read_arrays(path, {"counts": ("iu", 1)}, _AGAIN)["counts"]
+    if len(counts) % BINS:
+        raise PopError(f"{path}: counts has {len(counts)} bins, which no run writes; {_AGAIN}")
+    return tuple(int(count) for count in counts.reshape(BINS, -1).sum(axis=1))
 
 
 def _curve(folder: Path, max_steps: int) -> tuple[dict[str, Any], ...]:
     """Make the curve of the records of single training views, of the measurements of all held-out views, and of what a
     few training views say all along."""
-    points = {point["step"]: point for point in _thinned(_records(folder), max_steps)}
+    points = {record["step"]: dict(record) for record in _thinned(read_records(folder), max_steps)}
     for path in sorted((folder / "stats").glob("val_step*.json")):
-        stats = read_json(path, "train the row again in an empty folder")
+        stats = read_json(path, _AGAIN)
         # at a step that has a record too, what that says of its training view stays
-        record = points.get(stats["step"], {})
-        points[stats["step"]] = {**_measured(stats), **{name: v for name, v in record.items() if v is not None}}
-    for step, probed in _probed(folder).items():
-        point = {**dict.fromkeys(_ALWAYS), "step": step, **probed, **points.get(step, {})}
-        points[step] = {name: _short(value) for name, value in point.items()}
-    return tuple(points[step] for step in sorted(points))
+        measured = {**stats, "num_gaussians": stats["num_GS"], "psnr": None, "psnr_test": stats["psnr"]}
+        points[stats["step"]] = measured | _known(points.get(stats["step"], {}))
+    for step, probed in read_probe(folder).items():
+        points[step] = {"step": step, **probed} | _known(points.get(step, {}))
+    return tuple(_point(points[step]) for step in sorted(points))
 
 
-def _probed(folder: Path) -> dict[int, dict[str, Any]]:
+def read_probe(folder: Path) -> dict[int, dict[str, Any]]:
+    """Read what `ProbedRun` has measured in a result folder, by step; nothing where it has not.
+
+    Raises:
+        PopError: the file is damaged.
+    """
     path = folder / PROBE
-    found = read_json(path, "train the row again in an empty folder") if path.is_file() else {}
+    found = read_json(path, _AGAIN) if path.is_file() else {}
+    if not all(step.isascii() and step.isdecimal() and isinstance(point, dict) for step, point in found.items()):
+        raise PopError(f"{path}: must hold an object for each step; {_AGAIN}")
     return {int(step): point for step, point in found.items()}
 
 
@@ -214,27 +237,25 @@ def spacing(max_steps: int) -> int:
     return max(max_steps // _POINTS, 1)
 
 
-def _thinned(records: Iterable[Mapping[str, Any]], max_steps: int) -> list[dict[str, Any]]:
+def _thinned(records: Iterable[Mapping[str, Any]], max_steps: int) -> list[Mapping[str, Any]]:
     """Keep about `_POINTS` of the records, the first among them."""
-    kept: list[dict[str, Any]] = []
+    kept: list[Mapping[str, Any]] = []
     for record in records:
         if not kept or record["step"] >= kept[-1]["step"] + spacing(max_steps):
-            kept.append(_point(record))
+            kept.append(record)
     return kept
 
 
-def _point(record: Mapping[str, Any]) -> dict[str, Any]:
-    more = [name for name in record if name in _SOMETIMES or name.startswith("grad_")]
-    return {name: _short(record.get(name)) for name in (*_ALWAYS, *more)}
+def _known(point: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in point.items() if value is not None}
 
 
-def _measured(stats: Mapping[str, Any]) -> dict[str, Any]:
-    found = {**stats, "num_gaussians": stats["num_GS"], "psnr": None, "psnr_test": stats["psnr"]}
-    return {name: _short(found.get(name)) for name in (*_ALWAYS, "psnr_test")}
-
-
-def _short(value: Any) -> Any:
-    """Round to what a figure shows; what JSON cannot hold is None."""
-    if not isinstance(value, float):
-        return value
-    return float(f"{value:.6g}") if math.isfinite(value) else None
+def _point(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Take what a curve holds, in one order, rounded to what a figure shows; what JSON cannot hold is left out."""
+    more = sorted(name for name in found if name.startswith(_PROBED))
+    values = {name: found[name] for name in (*_COLUMNS, *more) if found.get(name) is not None}
+    return {
+        name: float(f"{value:.{_DIGITS.get(name, 4)}g}") if isinstance(value, float) else value
+        for name, value in values.items()
+        if math.isfinite(value)
+    }

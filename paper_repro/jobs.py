@@ -14,6 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from paper_repro import results
 from paper_repro.rows import ROWS, Row, load_row
 from paper_repro.scales import Scale, scale_named
 from paper_repro.scenes import Scene, scene_named
@@ -66,9 +67,25 @@ class Job:
         width, height = self.scene.size
         return self.row.cost * width * height / self.factor**2 * self.scale.steps_scaler
 
-    def result(self, folder: Path) -> Path:
-        """Return the place of its result in a folder of results."""
-        return folder / self.scale.name / self.row.name / f"{self.scene.name}_{self.seed}.json"
+    def file(self, folder: Path) -> Path:
+        """Return the file of its row's results in a folder of results."""
+        return results.path_of(self.scale.name, self.row.name, folder)
+
+    def is_done(self, folder: Path) -> bool:
+        """Tell whether it has a result in a folder of results.
+
+        Raises:
+            PopError: the file of the row's results is damaged.
+        """
+        return (self.scene.name, self.seed) in results.kept(self.scale.name, self.row.name, folder)
+
+    def result(self, folder: Path) -> results.Result | None:
+        """Read its result in a folder of results; None where there is none.
+
+        Raises:
+            PopError: the result is damaged, or does not agree with itself.
+        """
+        return results.find(self.scale.name, self.row.name, self.scene.name, self.seed, folder)
 
     def work(self, folder: Path) -> Path:
         """Return the place of its checkpoints in a work folder."""
@@ -92,7 +109,9 @@ class Job:
 
         scaler = self.scale.steps_scaler
         whole = _whole(self)
-        plain = self.scale.reset_every is None or whole.strategy.reset_every == 0
+        every = self.scale.reset_every
+        resets = {} if every is None or whole.strategy.reset_every == 0 else {"strategy.reset_every": every}
+        sizes = {} if every is None or not whole.strategy.prune_too_big else {"strategy.prune_too_big_after": every}
         drawable = self.scene.centred or profile_named(whole.profile).principal_point == "used"
         said = {
             "log_every": self.scale.log_every,
@@ -103,7 +122,8 @@ class Job:
             **self.scale.settings,
             **self.scale.of_methods.get(whole.method, {}),
             **_scaled(whole, scaler),
-            **({} if plain else {"strategy.reset_every": self.scale.reset_every}),
+            **resets,
+            **sizes,
             **({} if drawable else {"profile": GSPLAT_1_5.name}),
             "seed": self.seed,
             "factor": self.factor,

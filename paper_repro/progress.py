@@ -14,7 +14,7 @@ __all__ = ["progress", "state"]
 
 def state(job: Job, results: Path, work: Path) -> str:
     """Say how far a job is: "done", "step 1,500", "to do" or "not in this version"."""
-    if job.result(results).is_file():
+    if job.is_done(results):
         return "done"
     from pop_fast.train.checkpoint import list_checkpoints
 

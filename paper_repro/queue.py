@@ -76,13 +76,13 @@ def run_queue(jobs: Sequence[Job], results: Path, words: Sequence[str], threads:
     Returns:
         What became of them; a failed row does not keep the next ones from being trained.
     """
-    outcome, missing = Outcome(), [job for job in jobs if not job.result(results).is_file()]
+    outcome, missing = Outcome(), [job for job in jobs if not job.is_done(results)]
     print(f"{len(jobs) - len(missing)} of {len(jobs)} rows are done; {len(missing)} to go", flush=True)
     with _stoppable() as child:
         for number, job in enumerate(missing, 1):
             if child.stop:
                 break
-            if job.result(results).is_file():
+            if job.is_done(results):
                 # another queue was there first
                 outcome.done.append(job)
                 continue
@@ -117,7 +117,7 @@ def _words_of(job: Job) -> list[str]:
 
 
 def _commit(job: Job, results: Path) -> None:
-    path = job.result(results).resolve()
+    path = job.file(results).resolve()
     paths = [str(each) for each in (path, *(_pages(path.parent) if results.resolve() == RESULTS else []))]
     message = f"Result: {job.row.name} on {job.scene.name}, {job.scale.name} scale, seed {job.seed}"
     for command in (["add"], ["commit", "--quiet", "-m", message]):

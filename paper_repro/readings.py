@@ -54,7 +54,7 @@ READINGS: Final = (
     Reading("A2", "over what is a dominant count cumulative in the blur rule?", ("pop", "pop_any_view")),
     Reading("A2, added up", "or are the counts of several views added up?", ("pop", "pop_sum")),
     Reading("A12", "does the POP term sum over all Gaussians or over visible ones?", ("pop", "pop_visible")),
-    Reading("A16", "are oversized Gaussians pruned although there is no reset?", ("pop", "pop_no_size_prune")),
+    Reading("A16", "are oversized Gaussians pruned although there is no reset?", ("pop", "pop_size_prune")),
 )
 _HEAD: Final = ("scale", "scene", "row", "N as the window closes", "left", "rate", "N", "of L2+Blur's", "PSNR", "runs")
 # L2+Blur under two readings of A2, the default first

@@ -24,8 +24,9 @@ class Scale:
         settings: what else differs from the method's own values, in the names of `pop_fast.train.TrainConfig`; those
             of density control under "strategy.".
         of_methods: what else differs for one method alone, likewise.
-        reset_every: steps between two resets, for the rows that have resets; None leaves them as the scaled schedule
-            has them, no closer than 3,000 steps.
+        reset_every: steps between two resets, for the rows that have resets, and the step after which large Gaussians
+            are pruned, for the rows that prune them; None leaves both as the scaled schedule has them, no sooner than
+            3,000 steps.
         log_every: steps between two points of the curves.
         checkpoint_every: steps that a kill can cost.
     """
@@ -47,7 +48,7 @@ _FLOOR: Final = {"strategy.blur_min_pixels": 10.0}
 # Mini-Splatting's 3.5 million points are one to three of a hundred pixels of the paper's views; so many are these
 _POINTS: Final = {
     scale: {"mini-splatting": {"strategy.reinit_points": count}}
-    for scale, count in (("toy", 3_000), ("dev", 200_000), ("full", 1_000_000))
+    for scale, count in (("toy", 3_000), ("small", 200_000), ("full", 1_000_000))
 }
 
 _ALL: Final = (
@@ -64,12 +65,17 @@ _ALL: Final = (
         checkpoint_every=100,
     ),
     Scale(
-        name="dev",
-        about="real photographs for a CPU: 10,000 steps, small images, theta_blur at least 10 pixels",
+        name="small",
+        about="real photographs for a CPU: the whole schedule, small images, theta_blur at least 10 pixels",
         factors={"fox": 4, "bear_512": 2, "garden_512": 2, "bonsai_800": 2},
-        steps_scaler=0.333333,
         settings=_FLOOR,
-        of_methods=_POINTS["dev"],
+        of_methods=_POINTS["small"],
+    ),
+    Scale(
+        name="no_floor",
+        about="fox at half its size and the whole schedule, where theta_blur is 10.4 pixels by itself",
+        factors={"fox": 2},
+        of_methods=_POINTS["small"],
     ),
     Scale(
         name="full",

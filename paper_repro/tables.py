@@ -22,7 +22,8 @@ __all__ = ["BEYOND", "REFERENCES", "SCENES_OF", "Block", "Cell", "Line", "Table"
 # what a scale is meant to train; results of further scenes are shown too
 SCENES_OF: Final = {
     "toy": ("demo",),
-    "dev": ("fox", "bear_512", "garden_512", "bonsai_800"),
+    "small": ("fox", "bear_512", "garden_512", "bonsai_800"),
+    "no_floor": ("fox",),
     "full": ("bonsai_800",),
 }
 # the line that the others of its table are compared with where the data is not the paper's
@@ -30,7 +31,6 @@ REFERENCES: Final = {1: "gsplat", 2: "gsplat", 3: "l2_blur", 4: "pop", 5: "reset
 # lines of the table of what goes beyond the paper, which has none of their numbers, with the method itself first
 BEYOND: Final = {
     "pop": "POP, the paper's method",
-    "adaptive_blur": "POP, adaptive blur window",
     "final_prune": "POP, final prune",
     "opacity_entropy": "opacity-entropy prior instead of POP",
 }
@@ -352,7 +352,8 @@ def _header(scale: str, found: Sequence[Result]) -> tuple[str, ...]:
     else:
         names = ", ".join(dict.fromkeys((*SCENES_OF[scale], *sorted({r.scene for r in found}))))
         what = {"toy": "a test of the program on a made-up scene, its numbers say nothing about a method",
-                "dev": "other photographs, small, on a third of the schedule",
+                "small": "other photographs, small",
+                "no_floor": "other photographs, theta_blur without a floor",
                 "full": "other photographs, on the whole schedule"}[scale]  # fmt: skip
         first = (
             f"NOT the paper's protocol: scale {scale}, {what} ({names}). No number here may be compared with a number "

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from paper_repro import results
 from paper_repro.base import begin_from_base, keep_for_others, remove_what_was_kept, steps_for_others
 from paper_repro.jobs import WORK, Job
+from paper_repro.results import Result
 from paper_repro.scenes import Scene, find_folder
 from pop_fast.errors import PopError
 
@@ -23,8 +24,13 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
 
-__all__ = ["BusyError", "Options", "capture_folder", "commit", "is_finished", "load_capture_of", "train_row"]
+__all__ = [
+    *("PUBLISHED", "BusyError", "Options", "capture_folder", "commit", "finished", "load_capture_of", "only_one"),
+    "train_row",
+]
 
+# of a work folder: what finished rows leave to be published
+PUBLISHED: Final = "published"
 _DEMO_SEED: Final = 0
 # of a result folder: what takes space and a finished row does not need
 _CHECKPOINTS, _PLY = "ckpts", "ply"
@@ -54,6 +60,8 @@ class Options:
         log_every: steps between two points of the curve; None takes the scale's.
         lpips_vgg: weights of LPIPS on VGG16.
         lpips_alex: weights of LPIPS on AlexNet.
+        published: the folder of what finished rows leave to be published; None takes "published" in the work folder.
+        again: train a row that is finished again, and replace its result.
         keep_ply: keep the Gaussians in the work folder.
         keep_checkpoints: keep the checkpoints too.
         quiet: no progress bar.
@@ -68,54 +76,63 @@ class Options:
     log_every: int | None = None
     lpips_vgg: tuple[str, ...] = ()
     lpips_alex: tuple[str, ...] = ()
+    published: Path | None = None
+    again: bool = False
     keep_ply: bool = False
     keep_checkpoints: bool = False
     quiet: bool = False
 
 
-def is_finished(job: Job, folder: Path) -> bool:
-    """Tell whether a job has its result.
+def finished(job: Job, folder: Path) -> Result | None:
+    """Return the result of a job; None where it has none.
 
     Raises:
         PopError: it has one that is damaged, or that was trained with settings that are no longer the row's.
     """
-    path = job.result(folder)
-    if not path.is_file():
-        return False
-    from paper_repro.collect import first_change
+    result = job.result(folder)
+    if result is not None:
+        from paper_repro.collect import first_change
 
-    change = first_change(results.read(path), job.config())
-    if change is not None:
-        raise PopError(f"{path}: was trained with {change}; remove the file to train the row again")
-    return True
+        change = first_change(result, job.config())
+        if change is not None:
+            raise PopError(
+                f"{job.file(folder)}: {job.scene.name}, seed {job.seed} was trained with {change}; train it again "
+                "with --again"
+            )
+    return result
 
 
-def train_row(job: Job, options: Options) -> Path:
+def train_row(job: Job, options: Options) -> Result:
     """Train a job, or continue with it, and write its result; where it has one, nothing is done.
 
     Returns:
-        The result's file.
+        The result.
 
     Raises:
         PopError: the program lacks the method, the scene is absent or is not what it must be, or as `TrainingRun`.
         BusyError: another process trains it.
         KeyboardInterrupt: after Ctrl-C or SIGTERM, when a checkpoint has been written.
     """
-    path, work = job.result(options.results), job.work(options.work)
-    if is_finished(job, options.results):
-        return path
+    work = job.work(options.work)
+    before = None if options.again else finished(job, options.results)
+    if before is not None:
+        return before
     # a row that cannot be trained is said before anything is made
     job.config()
     config = _config(job, options, work)
     with only_one(work.with_suffix(".lock"), f"{job}: another process trains it"):
         # that process may have finished it meanwhile
-        if not path.is_file():
+        result = None if options.again else job.result(options.results)
+        if result is None:
             _train(job, options, config)
             from paper_repro.collect import collect
+            from paper_repro.published import publish
 
-            path = results.write(collect(job, work), options.results)
+            published = options.published or options.work / PUBLISHED
+            result = collect(job, work, publish(job, work, published, config.max_steps - 1))
+            results.write(result, options.results)
         _remove_bulk(job, options)
-    return path
+    return result
 
 
 def capture_folder(scene: Scene, options: Options) -> Path:
@@ -226,9 +243,10 @@ def _begin(job: Job, options: Options, config: TrainConfig, capture: Capture) ->
     from pop_fast.train.checkpoint import list_checkpoints
 
     folder = Path(config.result_dir)
-    if list_checkpoints(folder):
+    taken = max((step + 1 for step, _ in list_checkpoints(folder)), default=0)
+    if 0 < taken < config.max_steps or (taken and not options.again):
         return read_json(folder / BESIDE, "train the row again in an empty folder").get("base")
-    # what a finished row has left, whose result was removed since
+    # what a finished row has left, whose result was removed since or is to be replaced
     shutil.rmtree(folder, ignore_errors=True)
     return begin_from_base(job, options.results, options.work, config, capture)
 

@@ -39,9 +39,11 @@ class DensityConfig:
         grow_on_gradient: use the gradient rule, eq. 3 (A8: beside the blur rule).
         grow_on_gradient_in_blur_window: ... also inside the blur window, where else the blur rule works alone (A8).
         grow_scale3d: a Gaussian is small if its largest scale is at most this share of the scene's (A14).
-        prune_too_big: prune Gaussians that grow excessively large (A16: kept although the reset is gone).
+        prune_too_big: prune Gaussians that grow excessively large (A16: off in POP, on where opacities are reset;
+            gsplat and Inria's code apply this rule only after the first reset interval).
         prune_scale3d: excessively large is above this share of the scene's scale (A16).
-        prune_too_big_after: ... and only at steps after this one (A16: not tied to `reset_every`).
+        prune_too_big_after: ... and only at steps after this one, which is the reset interval in gsplat and in Inria's
+            code (A16).
         refine_start_iter: densification steps happen at steps after it.
         refine_stop_iter: densification steps happen at steps before it (A17: pruning too ends there).
         refine_every: a densification step each so many steps (A17: pruning happens with each).
@@ -51,10 +53,6 @@ class DensityConfig:
             every Gaussian that can be seen would grow until it cannot.
         blur_start_iter: first step of the blur window, inclusive.
         blur_stop_iter: last step of the blur window, inclusive (A19); under `blur_start_iter` there is none.
-        blur_stop_gain: the blur window also ends where growth no longer pays: where twice as many Gaussians have not
-            divided the loss by two to the power of this (`density.blur_is_over`); 0 leaves that out. The paper calls
-            its fixed window its first limitation.
-        blur_stop_span: densification steps whose windows are averaged for that, before and after.
         blur_window: "own_view" tests the densification step's own view only, "any_view" tests each view since the last
             one by itself and keeps the flag, "sum" adds the counts of those views up and tests the sum (A2).
         blur_rule: "by_scale" clones small blurred Gaussians and splits large ones, "split" splits all (A14).
@@ -74,7 +72,7 @@ class DensityConfig:
     grow_on_gradient: bool = True
     grow_on_gradient_in_blur_window: bool = True
     grow_scale3d: float = 0.01
-    prune_too_big: bool = True
+    prune_too_big: bool = False
     prune_scale3d: float = 0.1
     prune_too_big_after: int = 3000
     refine_start_iter: int = 500
@@ -84,8 +82,6 @@ class DensityConfig:
     blur_min_pixels: float = 0.0
     blur_start_iter: int = 3000
     blur_stop_iter: int = 7000
-    blur_stop_gain: float = 0.0
-    blur_stop_span: int = 5
     blur_window: Literal["any_view", "sum", "own_view"] = "own_view"
     blur_rule: Literal["by_scale", "split"] = "by_scale"
     revised_opacity: bool = False
@@ -233,7 +229,7 @@ class AppearanceRates:
 
 
 POP: Final = DensityConfig()
-GSPLAT: Final = DensityConfig(blur_stop_iter=-1, reset_every=3000)
+GSPLAT: Final = DensityConfig(blur_stop_iter=-1, reset_every=3000, prune_too_big=True)
 # whose opacities move half as fast since October 2024
 INRIA_RATES: Final = LearningRates(opacities=0.025)
 

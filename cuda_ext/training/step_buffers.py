@@ -83,7 +83,7 @@ class Shared:
 
 
 @dataclass(frozen=True)
-class DensificationContext:
+class RowBuffers:
     """Gaussians between two densification steps, and what a step makes of each.
 
     Attributes:
@@ -107,7 +107,7 @@ class DensificationContext:
     pop_sums: Tensor
 
     @classmethod
-    def make(cls, params: Rows, m: Rows, v: Rows, waits: bool) -> DensificationContext:
+    def make(cls, params: Rows, m: Rows, v: Rows, waits: bool) -> RowBuffers:
         """Allocate what belongs to the rows; statistics start from nothing, and so do gradients where they wait."""
         kernels, n, device = load(), len(params["means"]), params["means"].device
         shapes = {"means2d": (n, 2), "depths": (n,), "conics": (n, 3), "opacities": (n,)}

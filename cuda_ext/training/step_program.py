@@ -11,7 +11,7 @@ from cuda_ext.arrays import fill, pointer, stream_of
 from cuda_ext.render.lists import splat_struct
 from cuda_ext.train_settings import GROUPS, Phase
 from cuda_ext.training.resident import MARGIN
-from cuda_ext.training.step_buffers import DensificationContext, Frame, Shared
+from cuda_ext.training.step_buffers import Frame, RowBuffers, Shared
 
 
 class StepProgram:
@@ -27,7 +27,7 @@ class StepProgram:
         phase: what the steps do.
     """
 
-    def __init__(self, shared: Shared, rows: DensificationContext, frame: Frame, phase: Phase) -> None:
+    def __init__(self, shared: Shared, rows: RowBuffers, frame: Frame, phase: Phase) -> None:
         self._shared, self._rows, self._frame, self._phase = shared, rows, frame, phase
         kernels, (width, height) = load(), frame.size
         render = shared.render(frame.size, phase.sh_degree)
@@ -71,7 +71,7 @@ def _schedule(shared: Shared) -> Any:
     return made
 
 
-def _gaussians(rows: DensificationContext) -> Any:
+def _gaussians(rows: RowBuffers) -> Any:
     p = rows.params
     own = {k: p[k] for k in ("means", "quats", "scales", "opacities")}
     made = fill(load().Gaussians(), n=len(rows), raw=True, **own, sh_first=p["sh0"], sh_rest=p["shN"])
@@ -94,7 +94,7 @@ def _loss(shared: Shared, frame: Frame) -> Any:
     return fill(made, width=frame.size[0], height=frame.size[1])
 
 
-def _blends(shared: Shared, rows: DensificationContext, frame: Frame, phase: Phase) -> tuple[Any, Any]:
+def _blends(shared: Shared, rows: RowBuffers, frame: Frame, phase: Phase) -> tuple[Any, Any]:
     kernels, deterministic = load(), shared.settings.deterministic
     passed = {key: frame.work.get(key) for key in ("T_final", "last", "checkpoints")}
     drawn = {"channels": 3, "records": rows.records, "background": shared.background, "image": frame.image, **passed}
@@ -107,7 +107,7 @@ def _blends(shared: Shared, rows: DensificationContext, frame: Frame, phase: Pha
     return forward, backward
 
 
-def _pop_term(shared: Shared, rows: DensificationContext, frame: Frame, phase: Phase) -> Any:
+def _pop_term(shared: Shared, rows: RowBuffers, frame: Frame, phase: Phase) -> Any:
     s = shared.settings
     before: Tensor | None = rows.statistics.dominant_sum if s.pop_views == "window" else None
     shown: Tensor | None = rows.splats["radii"] if s.pop_over == "visible" else None
@@ -117,7 +117,7 @@ def _pop_term(shared: Shared, rows: DensificationContext, frame: Frame, phase: P
     return fill(made, radii=shown, logits=rows.params["opacities"], sides=rows.pop_sides, sums=rows.pop_sums)
 
 
-def _update(shared: Shared, rows: DensificationContext, frame: Frame, phase: Phase) -> Any:
+def _update(shared: Shared, rows: RowBuffers, frame: Frame, phase: Phase) -> Any:
     s, found = shared.settings, rows.statistics
     made = fill(load().UpdateArrays(), n=len(rows), n_rest=rows.params["shN"].shape[1], sums=rows.sums)
     counts = frame.render_stats["dominant_counts"] if phase.dominance else None
@@ -136,7 +136,7 @@ def _update(shared: Shared, rows: DensificationContext, frame: Frame, phase: Pha
     return made
 
 
-def _record(shared: Shared, rows: DensificationContext, phase: Phase) -> Any:
+def _record(shared: Shared, rows: RowBuffers, phase: Phase) -> Any:
     sums = rows.pop_sums if phase.pop else None
     made = fill(load().StepRecord(), values=shared.values, history=shared.history, pop_sums=sums)
     return fill(made, n=len(rows), lambda_pop=shared.settings.lambda_pop)

@@ -20,7 +20,7 @@ from cuda_ext.render.capacity import Capacity, Size
 from cuda_ext.train_settings import Phase, Statistics, StepSettings, StepStats
 from cuda_ext.training.graphs import Watch, captured
 from cuda_ext.training.resident import ResidentViews
-from cuda_ext.training.step_buffers import DensificationContext, Frame, Shared
+from cuda_ext.training.step_buffers import Frame, RowBuffers, Shared
 from cuda_ext.training.step_program import StepProgram
 
 LATE = 2  # steps between an overflow and its notice
@@ -76,7 +76,7 @@ class FusedTrainer:
         self._rows = None
         self._capacity.settle(len(params["means"]))
         with torch.cuda.device_of(params["means"]):
-            self._rows = DensificationContext.make(params, m, v, self.settings.updates.sh_rest_every > 1)
+            self._rows = RowBuffers.make(params, m, v, self.settings.updates.sh_rest_every > 1)
 
     def run(self, until: int, phase: Phase) -> None:
         """Take steps until the counter stands at `until`, all of one phase.
@@ -150,7 +150,7 @@ class FusedTrainer:
         return {size: frame.lists.capacity for size, frame in self._frames.items()}
 
     @property
-    def _population(self) -> DensificationContext:
+    def _population(self) -> RowBuffers:
         assert self._rows is not None
         return self._rows
 

@@ -42,8 +42,8 @@ commands:
 start here:
   pop-repro run pop demo --scale toy                    one row in seconds, without data
   pop-repro data check --data DATA                      what of the paper's scenes is there
-  pop-repro queue --scale dev --data DATA --nice 10     days of training, stopped and gone on with at any time
-  pop-repro table 1 --scale dev                         the paper's first table from the results
+  pop-repro queue --scale small --data DATA --nice 10     days of training, stopped and gone on with at any time
+  pop-repro table 1 --scale small                         the paper's first table from the results
   snakemake -s {snakefile} -n        the same as a workflow, for a cluster or a cloud
 
 'pop-repro COMMAND --help' explains one. --debug (or POP_DEBUG=1) shows the traceback of an error."""

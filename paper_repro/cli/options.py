@@ -18,13 +18,13 @@ WORK: Final = Path(__file__).resolve().parents[1] / "work"
 def add_scale(parser: argparse.ArgumentParser) -> None:
     """Add --scale."""
     about = "; ".join(f"{scale.name}: {scale.about}" for scale in SCALES.values())
-    parser.add_argument("--scale", choices=SCALES, default="dev", help=f"{about} (default: %(default)s)")
+    parser.add_argument("--scale", choices=SCALES, default="small", help=f"{about} (default: %(default)s)")
 
 
 def add_results(parser: argparse.ArgumentParser) -> None:
     """Add --results."""
     parser.add_argument(
-        "--results", type=Path, default=RESULTS, metavar="DIR", help="the results (default: %(default)s)"
+        "--results", type=Path, default=RESULTS, metavar="DIR", help="the folder of results (default: %(default)s)"
     )
 
 
@@ -39,10 +39,11 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     """Add what says how rows are trained, and changes nothing of what they are."""
     add_scale(parser)
     add_data(parser)
-    note = "the folder of results (default: %(default)s)"
-    parser.add_argument("--out", type=Path, default=RESULTS, metavar="DIR", help=note)
+    add_results(parser)
     note = "the folder of checkpoints; of a finished row it can be removed (default: %(default)s)"
     parser.add_argument("--work", type=Path, default=WORK, metavar="DIR", help=note)
+    note = "the folder of splats and renders of finished rows, to be published (default: published in --work)"
+    parser.add_argument("--published", type=Path, metavar="DIR", help=note)
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="CPU threads, 0 for all cores (default: 1)")
     note = "what takes the steps, as for pop train (default: %(default)s)"
     parser.add_argument("--backend", choices=("auto", "fast", "compiled", "cuda", "ref"), default="auto", help=note)
@@ -62,11 +63,12 @@ def training_words(args: argparse.Namespace) -> list[str]:
     words = [
         "--data",
         str(args.data.absolute()),
-        "--out",
-        str(args.out.absolute()),
+        "--results",
+        str(args.results.absolute()),
         "--work",
         str(args.work.absolute()),
     ]
+    words += [] if args.published is None else ["--published", str(args.published.absolute())]
     words += ["--threads", str(args.threads), "--backend", args.backend]
     for name in ("checkpoint_every", "log_every"):
         value = getattr(args, name)

@@ -14,21 +14,21 @@ __all__ = ["claims", "figure", "status", "table"]
 
 _SEED: Final = 42
 _STATUS: Final = """
-    pop-repro status --scale dev
+    pop-repro status --scale small
     pop-repro status --scale paper --rows pop gsplat --seeds 3
 """
 _TABLE: Final = """
-    pop-repro table 1 --scale dev                         to read, as Markdown
-    pop-repro table 1 --scale dev --out out               table_1.md, table_1.tex and table_1.csv
-    pop-repro table beyond --scale dev                    what goes beyond the paper
+    pop-repro table 1 --scale small                         to read, as Markdown
+    pop-repro table 1 --scale small --out out               table_1.md, table_1.tex and table_1.csv
+    pop-repro table beyond --scale small                    what goes beyond the paper
 """
 _FIGURE: Final = """
-    pop-repro figure 7 --scale dev --out out              figure_7.svg, figure_7.png and the numbers in figure_7.csv
-    pop-repro figure 5 --scale dev --work WORK            of the renders that finished rows keep in their work folder
-    pop-repro figure 3 --scale dev --data DATA            trains 1,000 steps, on the CPU, from a 3DGS model
+    pop-repro figure 7 --scale small --out out              figure_7.svg, figure_7.png and the numbers in figure_7.csv
+    pop-repro figure 5 --scale small --work WORK            of the renders that finished rows keep in their work folder
+    pop-repro figure 3 --scale small --data DATA            trains 1,000 steps, on the CPU, from a 3DGS model
 """
 _CLAIMS: Final = """
-    pop-repro claims --scale dev                          each claim, its verdict, and the numbers behind it
+    pop-repro claims --scale small                          each claim, its verdict, its intervals, what would decide it
 """
 
 
@@ -44,10 +44,11 @@ def status(words: Sequence[str]) -> int:
     args = parser.parse_args(words)
     from paper_repro.jobs import jobs_of
     from paper_repro.progress import progress
+    from paper_repro.results import existing_folder
     from paper_repro.rows import ROWS
 
     jobs = jobs_of(args.scale, args.rows or ROWS, args.scenes, range(_SEED, _SEED + args.seeds))
-    print("\n".join(progress(jobs, args.results, args.work)))
+    print("\n".join(progress(jobs, existing_folder(args.results), args.work)))
     return 0
 
 
@@ -62,12 +63,12 @@ def table(words: Sequence[str]) -> int:
     parser.add_argument("--out", type=Path, metavar="DIR", help=note)
     args = parser.parse_args(words)
     from paper_repro import tables
-    from paper_repro.results import read_all
+    from paper_repro.results import existing_folder, read_all
     from paper_repro.table_csv import csv_text
     from paper_repro.table_latex import latex
     from paper_repro.table_markdown import markdown
 
-    results, absent = read_all(args.scale, args.results), _absent(args.scale, args.data)
+    results, absent = read_all(args.scale, existing_folder(args.results)), _absent(args.scale, args.data)
     made = (
         tables.beyond(args.scale, results, absent)
         if args.number == "beyond"
@@ -96,7 +97,9 @@ def figure(words: Sequence[str]) -> int:
     )
     parser.add_argument("--out", type=Path, default=Path("out"), metavar="DIR", help="where to write (default: out)")
     args = parser.parse_args(words)
-    for path in draw(args.id, args.scale, args.results, args.out, args.work, args.data):
+    from paper_repro.results import existing_folder
+
+    for path in draw(args.id, args.scale, existing_folder(args.results), args.out, args.work, args.data):
         print(path)
     return 0
 
@@ -106,16 +109,16 @@ def claims(words: Sequence[str]) -> int:
     parser = parser_of("claims", _CLAIMS)
     add_scale(parser)
     add_results(parser)
-    parser.add_argument("--out", type=Path, metavar="FILE", help="write there instead of printing")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write claims.md there instead of printing")
     args = parser.parse_args(words)
-    from paper_repro import claims as judging
-    from paper_repro.results import read_all
+    from paper_repro.claims_page import markdown
+    from paper_repro.results import existing_folder, read_all
 
-    text = judging.markdown(judging.claims(args.scale, read_all(args.scale, args.results)), args.scale)
+    text = markdown(args.scale, read_all(args.scale, existing_folder(args.results)))
     if args.out is None:
         print(text)
     else:
-        _write(args.out, text)
+        _write(args.out / "claims.md", text)
     return 0
 
 

@@ -15,30 +15,40 @@ __all__ = ["queue", "run"]
 _SEED: Final = 42
 _RUN: Final = """
     pop-repro run pop demo --scale toy                    in seconds, on a capture that the program makes
-    pop-repro run pop fox --scale dev --data DATA         the same command continues after a stop
+    pop-repro run pop fox --scale small --data DATA         the same command continues after a stop
     pop-repro run l2_blur bonsai_800 --scale full --data DATA --threads 2
 """
 _QUEUE: Final = """
     pop-repro queue --scale toy                           every row in minutes
-    pop-repro queue --scale dev --data DATA --nice 10     days; Ctrl-C or SIGTERM stops it, the same command continues
-    pop-repro queue --scale dev --data DATA --rows pop gsplat 3dgs --scenes fox bear_512 --seeds 3
-    pop-repro queue --scale dev --data DATA --list        what is missing, in order, without training
+    pop-repro queue --scale small --data DATA --nice 10     days; Ctrl-C or SIGTERM stops it, the same command continues
+    pop-repro queue --scale small --data DATA --rows pop gsplat 3dgs --scenes fox bear_512 --seeds 3
+    pop-repro queue --scale small --data DATA --list        what is missing, in order, without training
 """
 
 
 def run(words: Sequence[str]) -> int:
-    """Train one row and print where its result is."""
+    """Train one row and print the file that has its result."""
     parser = parser_of("run", _RUN)
     parser.add_argument("row", metavar="ROW", help="a file of configs: pop, gsplat, 3dgs, l2_blur, ...")
     parser.add_argument("scene", metavar="SCENE", help="one of the scale's: fox, bonsai_800, garden, ...")
     parser.add_argument("--seed", type=int, default=_SEED, help="of every random number (default: %(default)s)")
+    parser.add_argument("--again", action="store_true", help="train a finished row again, and replace its result")
     add_training(parser)
     args = parser.parse_args(words)
     from paper_repro.jobs import job_named
-    from paper_repro.train_row import Options, train_row
+    from paper_repro.train_row import Options, finished, train_row
 
     job = job_named(args.row, args.scene, args.scale, args.seed)
-    print(train_row(job, Options(results=args.out, **_options(args))))
+    before = None if args.again else finished(job, args.results)
+    if before is None:
+        train_row(job, Options(again=args.again, **_options(args)))
+    else:
+        at = "" if before.commit is None else f" at commit {before.commit[:7]}"
+        print(
+            f"{job} is finished: {before.psnr:.2f} dB with {before.num_gaussians:,} Gaussians, trained{at}; "
+            "--again trains it again"
+        )
+    print(job.file(args.results))
     return 0
 
 
@@ -60,11 +70,11 @@ def queue(words: Sequence[str]) -> int:
     seeds = range(_SEED, _SEED + args.seeds)
     jobs = jobs_of(args.scale, args.rows or ROWS, args.scenes, seeds)
     if args.list:
-        print("\n".join(str(job) for job in jobs if not job.result(args.out).is_file()))
+        print("\n".join(str(job) for job in jobs if not job.is_done(args.results)))
         return 0
     if args.nice:
         os.nice(args.nice)
-    outcome = run_queue(jobs, args.out, training_words(args), args.threads, args.commit)
+    outcome = run_queue(jobs, args.results, training_words(args), args.threads, args.commit)
     left = {"failed": outcome.failed, "not in this version": outcome.impossible, "trained elsewhere": outcome.busy}
     print(f"{len(outcome.done)} rows trained")
     for what, some in left.items():
@@ -77,7 +87,10 @@ def queue(words: Sequence[str]) -> int:
 
 
 def _options(args: argparse.Namespace) -> dict[str, Any]:
-    names = ("data", "work", "threads", "backend", "checkpoint_every", "log_every", "keep_ply", "keep_checkpoints")
+    names = (
+        *("data", "results", "work", "published", "threads", "backend", "checkpoint_every", "log_every"),
+        *("keep_ply", "keep_checkpoints"),
+    )
     return {
         **{name: getattr(args, name) for name in names},
         **{name: tuple(getattr(args, name)) for name in ("lpips_vgg", "lpips_alex")},

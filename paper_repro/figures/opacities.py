@@ -12,7 +12,7 @@ from paper_repro.figures.foot import foot
 from paper_repro.figures.sheet import Drawn, Margins, Sheet
 from paper_repro.figures.style import GREY, color_of, count, darker
 from paper_repro.paper import paper
-from paper_repro.results import BINS
+from paper_repro.record import BINS
 
 __all__ = ["opacity_histogram", "share_above", "share_below"]
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from paper_repro.figures.data import Asked
 from paper_repro.jobs import Job, job_named
-from paper_repro.results import Result, read
+from paper_repro.results import Result
 from paper_repro.scenes import SCENES, find_folder
 from paper_repro.train_row import Options, capture_folder, load_capture_of, train_row
 from pop_fast.errors import PopError
@@ -129,7 +129,7 @@ def _base(asked: Asked, job: Job) -> tuple[Result, Path]:
                 return result, kept[-1]
     work = asked.work / _FOLDER
     print(f"figure 3: the Gaussians of {job} were not kept (--keep-ply), so they are trained for it", flush=True)
-    result = read(train_row(job, Options(data=asked.data, results=work / "results", work=work, keep_ply=True)))
+    result = train_row(job, Options(data=asked.data, results=work / "results", work=work, keep_ply=True))
     kept = sorted((job.work(work) / "ply").glob("point_cloud_*.ply"))
     if not kept:
         raise PopError(f"{job.work(work)}: its Gaussians are gone; remove {work} to train them again")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from numbers import Integral
 from typing import Any, Final
 
 import torch
@@ -259,6 +260,18 @@ class Checks:
             self._rules.append(_Rule(name, tensor, quick, bad, words))
 
 
+def check_given(**tensors: Any) -> None:
+    """Raise for what must be given and is no tensor.
+
+    Raises:
+        ValueError: names the argument.
+    """
+    for name, value in tensors.items():
+        if not isinstance(value, Tensor):
+            problem = "is missing" if value is None else f"is of type {type(value).__name__}"
+            raise ValueError(f"{name} {problem}; it must be a torch.Tensor")
+
+
 def check_sizes(width: int, height: int, tile_size: int) -> None:
     """Raise for an image or a tile that is none.
 
@@ -266,8 +279,8 @@ def check_sizes(width: int, height: int, tile_size: int) -> None:
         ValueError: names the size.
     """
     for name, value in {"width": width, "height": height, "tile_size": tile_size}.items():
-        if value < 1:
-            raise ValueError(f"{name} is {value}; it must be >= 1")
+        if not isinstance(value, Integral) or value < 1:
+            raise ValueError(f"{name} is {value!r}; it must be a whole number >= 1")
     if tile_size > LARGEST_TILE:
         raise ValueError(f"tile_size is {tile_size}; it must be <= {LARGEST_TILE}")
 

@@ -13,6 +13,7 @@ from pop_fast.api.checks import (
     RENDER_MODES,
     Checks,
     check_choice,
+    check_given,
     check_sizes,
     check_supported,
     resolved_profile,
@@ -41,7 +42,7 @@ def rasterization(
     eps2d: float = 0.3,
     sh_degree: int | None = None,
     packed: bool = True,
-    tile_size: int = 16,
+    tile_size: int | None = 16,
     backgrounds: Tensor | None = None,
     render_mode: Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"] = "RGB",
     sparse_grad: bool = False,
@@ -86,7 +87,7 @@ def rasterization(
         eps2d: low-pass, px^2; at gsplat's default the profile's own value is used.
         sh_degree: bands to evaluate, or None when `colors` are colours.
         packed: whether meta holds rows of visible (camera, Gaussian) pairs only.
-        tile_size: px, up to 4096; the image does not depend on it, except in profile "inria".
+        tile_size: px, up to 4096, None for 16; the image does not depend on it, except in profile "inria".
         backgrounds: colours behind everything, without depth. [..., C, D]
         render_mode: colours, depth (D), expected depth (ED), or colours and then depth as the last channel.
         sparse_grad: only False.
@@ -103,7 +104,7 @@ def rasterization(
         tangential_coeffs: only None.
         thin_prism_coeffs: only None.
         ftheta_coeffs: only None.
-        rolling_shutter: only None.
+        rolling_shutter: only None, or gsplat's `RollingShutterType.GLOBAL`.
         viewmats_rs: only None.
         profile: constants and strictness: "paper", "gsplat_1_5", "gsplat_1_6", "inria", or a `Profile`.
         dominance: compute the dominance keys of meta in the same pass; else they cost one more when first read.
@@ -123,6 +124,7 @@ def rasterization(
         NotImplementedError: an argument is not supported.
         PopError: the backend is unknown, cannot run here, or does not offer an argument; says why and what to do.
     """
+    check_given(means=means, opacities=opacities, colors=colors, viewmats=viewmats, Ks=Ks)
     drawing = _backend_for(backend, means)
     given = {
         "sparse_grad": sparse_grad,
@@ -135,7 +137,8 @@ def rasterization(
         "tangential_coeffs": tangential_coeffs,
         "thin_prism_coeffs": thin_prism_coeffs,
         "ftheta_coeffs": ftheta_coeffs,
-        "rolling_shutter": rolling_shutter,
+        # gsplat's default is a member of an enumeration of its own, which need not be imported to be recognized
+        "rolling_shutter": None if getattr(rolling_shutter, "name", None) == "GLOBAL" else rolling_shutter,
         "viewmats_rs": viewmats_rs,
         "covars": covars,
         "radius_clip": radius_clip,
@@ -146,6 +149,8 @@ def rasterization(
     if not radius_clip >= 0.0:
         raise ValueError(f"radius_clip is {radius_clip}; it must be >= 0 px")
     chosen = resolved_profile(profile, near_plane, far_plane, eps2d)
+    # what gsplat's main branch means by None
+    tile_size = 16 if tile_size is None else tile_size
     check_sizes(width, height, tile_size)
     checks = Checks(drawing, means.dtype)
     batch = checks.gaussians(means, quats, scales, opacities, covars)

@@ -25,6 +25,11 @@ OWN: Final = {
 }
 
 
+def is_own(name: str) -> bool:
+    """Tell whether a backend is one of this package, which needs no look at what is installed."""
+    return name in OWN
+
+
 def backend_names() -> tuple[str, ...]:
     """Return the names that `get_backend` knows."""
     return (*OWN, *(name for name in _foreign() if name not in OWN))

@@ -16,6 +16,7 @@ from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import check_file, check_folder, folder_atomically, write_atomically
 from pop_fast.train.load_result import load_splat
+from pop_ref.constants import PROFILES
 
 if TYPE_CHECKING:
     from pop_fast.data import Capture, View
@@ -38,7 +39,7 @@ class Args(CaptureArguments):
     """A view of the capture: its place by file name, from 0, or the name itself."""
     pixel: Annotated[str | None, tyro.conf.arg(metavar="X,Y")] = None
     """The pixel: column and row, from 0 at the upper left. Only maps alone need none."""
-    profile: Literal["paper", "gsplat_1_5", "gsplat_1_6", "inria"] | None = None
+    profile: Annotated[str | None, tyro.conf.arg(metavar=f"{{{','.join(PROFILES)}}}")] = None
     """The rasterizer's constants; by default as in training."""
     objective: Literal["run", "pop", "3dgs"] = "run"
     """The loss that is differentiated: the run's own (POP's for a lone file), paper eq. 9, or eq. 2."""
@@ -85,7 +86,9 @@ def _explain(args: Args, at: tuple[int, int] | None) -> int:
     view = chosen_view(capture, args.view)
     if at is not None:
         check_inside(view, *at)
-    config = with_objective(config.but(profile=args.profile) if args.profile else config, args.objective)
+    if args.profile is not None:
+        config = config.but(profile=args.profile, near_plane=None).in_world(capture.world_scale)
+    config = with_objective(config, args.objective)
     with reproducible(config.threads):
         scene = explain_view(splat.params, view, config, splat.sh_degree, splat.step)
         parting = None if args.diff is None or at is None else difference(scene, *args.diff, *at)

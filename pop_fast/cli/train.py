@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import tyro
 
+from pop_fast.api.registry import backend_names
 from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.blocks_options import BlocksOptions
@@ -31,6 +32,7 @@ from pop_fast.data.sfm_options import SfmOptions
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.presets import ALIASES, METHODS, Given
+from pop_ref.constants import PROFILES
 
 if TYPE_CHECKING:
     from pop_fast.data import Capture
@@ -339,6 +341,10 @@ def _arguments_type(base: TrainConfig, plan: dict[str, Any], short: bool) -> typ
             continue
         kind: Any = hints[field.name]
         default: Any = dataclasses.field(default_factory=lambda name=field.name: getattr(base, name))
+        if field.name == "backend":
+            kind = Literal[("auto", *backend_names())]
+        if field.name == "profile":
+            kind = Literal[tuple(PROFILES)]
         if field.name == "strategy":
             kind = Annotated[type(base.strategy), tyro.conf.arg(name=base.method)]
         if field.name == "data":

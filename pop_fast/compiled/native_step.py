@@ -24,6 +24,8 @@ from pop_fast.train.signals import StopRequest, heard
 
 # steps that are taken before Python is asked again: Ctrl-C, a progress bar
 LONGEST: Final = 10
+# of (Gaussian, tile) pairs of a step, which are numbered with 32 bits
+MOST_ENTRIES: Final = 2**31 - 1
 # what the step measures, the first of `StepStats`
 N_VALUES: Final = 5
 PARTS: Final = ("see", "list", "blend", "compare", "gather", "transpose", "update")
@@ -54,6 +56,7 @@ class StepGiven(ctypes.Structure):
         *_fields(_REAL, "blur_pixels"),
         *_fields(_REAL * len(GROUPS), "lr"),
         *_fields(_REAL, "beta1", "beta2", "eps"),
+        *_fields(_WHOLE, "most_entries"),
         *_fields(_WHOLE * len(GROUPS), "updates"),
         *_fields(_POINTER, "sh_rest_sum"),
         *_fields(_POINTER, "grad_sum", "n_visible", "dominant_sum", "blurred"),
@@ -227,7 +230,7 @@ class NativeTrainer:
 
         Raises:
             ValueError: a Gaussian is no longer finite; the message names its row and step.
-            MemoryError: there is not enough.
+            MemoryError: there is not enough, or the Gaussians reach more tiles than can be numbered.
         """
         self._history = {}
         self._set_phase(phase)
@@ -257,6 +260,7 @@ class NativeTrainer:
         given.pop_visible, given.pop_window = settings.pop_over == "visible", settings.pop_views == "window"
         given.blur_own_view = settings.blur_window == "own_view"
         (given.beta1, given.beta2), given.eps = settings.betas, settings.eps
+        given.most_entries = MOST_ENTRIES
         given.seconds = self._seconds.data_ptr()
         given.bad_row = self._bad_row.data_ptr()
 
@@ -294,6 +298,11 @@ class NativeTrainer:
         self.step += taken
         if int(self._bad_row) >= 0:
             raise ValueError(f"step {self.step}: Gaussian {int(self._bad_row)} has a value that is not finite")
+        if taken < n and not self._asked:
+            raise MemoryError(
+                f"step {self.step}: the Gaussians reach more than {MOST_ENTRIES:,} tiles altogether; "
+                "train on smaller photographs (--factor), or bound the number of Gaussians"
+            )
 
     def _set_step(self, step: int, view: _Target) -> None:
         given, settings = self._given, self.settings

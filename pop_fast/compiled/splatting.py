@@ -50,7 +50,18 @@ def colors_of_view(sh: Tensor, means: Tensor, viewmat: Tensor, degree: int, visi
         viewmat: world -> camera. [4, 4]
         degree: bands to use.
         visible: rows to evaluate, ascending. [V] int64
+
+    Raises:
+        ValueError: `visible` is no list of rows.
     """
+    if visible.dtype != torch.int64 or visible.dim() != 1:
+        shape = list(visible.shape)
+        raise ValueError(
+            f"visible is a tensor of {visible.dtype} and shape {shape}; it must hold the numbers of the rows to "
+            "evaluate, torch.int64 [V]; of a mask these are mask.nonzero().squeeze(1)"
+        )
+    if len(visible) and not (int(visible.min()) >= 0 and int(visible.max()) < len(sh)):
+        raise ValueError(f"visible names row {int(visible.min())} to {int(visible.max())}; there are {len(sh)}")
     return _Colors.apply(sh, means, viewmat, degree, visible)
 
 

@@ -28,7 +28,7 @@ bool Stepper::next(Work &work) {
     work = see();
     return true;
   case 1:
-    if (!all_finite()) return false;
+    if (!all_finite() || !few_enough()) return false;
     sort_by_depth();
     work = count_entries();
     return true;
@@ -173,7 +173,8 @@ void *pop_stepper_open(int64_t threads) {
 
 void pop_stepper_close(void *stepper) { delete static_cast<pop::Stepper *>(stepper); }
 
-// how many steps were taken: fewer where a row is not finite or *stop is not 0 any more; -1 where there is no memory
+// how many steps were taken: fewer where a row is not finite, lists are too long or *stop is not 0 any more; -1 where there
+// is no memory
 int64_t pop_stepper_steps(void *stepper, const pop::StepGiven *first, int64_t n, const int32_t *stop) {
   try {
     return static_cast<pop::Stepper *>(stepper)->steps(first, n, stop);

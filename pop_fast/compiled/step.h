@@ -52,6 +52,7 @@ struct StepGiven {
   int64_t dominance, pop_window, pop_visible, blur_own_view;  // dominance: counts are made
   double blur_pixels;                             // a view's count above it blurs
   double lr[GROUPS], beta1, beta2, eps;
+  int64_t most_entries;                           // of all lists; a step that has more is not taken
   int64_t updates[GROUPS];                        // number of the update, from 1; 0 where a group is not moved
   float *sh_rest_sum;                             // gradients that wait for an update, null where none do. [N, n_rest, 3]
   float *grad_sum;                                // statistics of density control, each null where not asked for. [N]
@@ -188,6 +189,7 @@ private:
   void reach_tiles(Seen &of) const;
   template <class F> void each_tile(const Seen &of, F f) const;
   bool all_finite() const;
+  bool few_enough() const;
   void sort_by_depth();
   int64_t list_part() const;
   template <class F> void each_entry(int64_t first, int64_t last, F f) const;

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <numeric>
 #include <utility>
 
 #include "lists.h"
@@ -51,6 +52,11 @@ bool Stepper::all_finite() const {
       return false;
     }
   return true;
+}
+
+// Slots are kept as numbers of 32 bits.
+bool Stepper::few_enough() const {
+  return std::accumulate(part_slots.begin(), part_slots.end(), int64_t(0)) <= given->most_entries;
 }
 
 // The visible ones' keys begin where the part's Gaussians do.

@@ -12,6 +12,7 @@ what works on tensors stands in `densify`, which is imported when there are some
 from __future__ import annotations
 
 import warnings
+from collections.abc import MutableMapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
@@ -35,8 +36,9 @@ if TYPE_CHECKING:
 # in a view's `info`: its prior has been asked for
 _REGULARIZED = "pop_regularized"
 _NEEDED = ("means", "scales", "quats", "opacities")
-# steps between a reset and what it has to be recovered from by; see `DensityControl.scaled`
-_RECOVERY = ("reset_every", "pause_refine_after_reset")
+# steps between a reset and what has to recover from it, and the first one's step, after which large Gaussians are
+# pruned (A16); see `DensityControl.scaled`
+_RECOVERY = ("reset_every", "pause_refine_after_reset", "prune_too_big_after")
 # a shrunk schedule keeps at least so many steps between changes. They are not a share of the schedule: in them a window
 # collects enough views to average over, a fresh clone (which starts on top of its source, with no moments) moves away
 # from it, and the opacity of what is not needed falls under `prune_opa`. With 20 steps instead, on the fox capture at
@@ -58,7 +60,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
 
     # settings that are step numbers, or several of them: what `scaled` multiplies
     scaled_steps: ClassVar[tuple[str, ...]] = (
-        *("prune_too_big_after", "refine_start_iter", "refine_stop_iter", "blur_start_iter", "blur_stop_iter"),
+        *("refine_start_iter", "refine_stop_iter", "blur_start_iter", "blur_stop_iter"),
         *("pop_start_iter", "pop_stop_iter", "refine_scale2d_stop_iter", "sh_start_iter", "opacities_stop_iter"),
         *("means_rewind_iter", "means_rewind_to", "rounds_start_iter", "round_steps", "round_decay_every"),
         "final_prune_iter",
@@ -91,7 +93,8 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
 
         Every step number is multiplied. `refine_every` is too, but not to under `SHORTEST_REFINE_EVERY` or what it is,
         whichever is less: a shorter schedule has fewer changes, not more hasty ones. Resets come no faster either: what
-        one takes away has to be regrown in steps, and those do not get shorter with the schedule.
+        one takes away has to be regrown in steps, and those do not get shorter with the schedule. Large Gaussians are
+        pruned only after the first reset, as in gsplat, so that step is no sooner either.
         """
         changed: dict[str, Any] = {name: _scaled(getattr(self, name), factor) for name in self.scaled_steps}
         changed |= {name: max(_scaled(getattr(self, name), factor), getattr(self, name)) for name in _RECOVERY}
@@ -146,7 +149,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
             return None
         from pop_fast.density import densify
 
-        if isinstance(info, dict):
+        if isinstance(info, MutableMapping):
             info[_REGULARIZED] = True
         return densify.regularizer(self, opacities, state, info)
 
@@ -187,7 +190,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         if self.regularizes(step) and _REGULARIZED not in info:
             warnings.warn(
                 f"{type(self).__name__} trains without its prior on opacities: add strategy.regularizer(torch.sigmoid("
-                "params['opacities']), state, step, info) to the loss, or set lambda_pop=0",
+                "params['opacities']), state, step, info), where it is not None, to the loss, or set lambda_pop=0",
                 stacklevel=2,
             )
         self.collect(params, state, step, info, packed)

@@ -20,6 +20,7 @@ class GsplatStrategy(DensityControl):
     """
 
     reset_every: int = _GSPLAT.density.reset_every
+    prune_too_big: bool = _GSPLAT.density.prune_too_big
     blur_stop_iter: int = _GSPLAT.density.blur_stop_iter
     lambda_pop: float = _GSPLAT.lambda_pop
 

@@ -1,4 +1,4 @@
-"""Blend splats into an image, differentiably. Meaning: `pop_ref.compositing`; the arithmetic is in `blender`."""
+"""Blend splats into an image, differentiably, by `pop_fast.stages.blend.blend`. Meaning: `pop_ref.compositing`."""
 
 from __future__ import annotations
 
@@ -56,7 +56,8 @@ def composite(
 ) -> Composite:
     """Blend every tile's list front to back, over black. See `pop_ref.compositing.composite`.
 
-    Optimizations: see `blender`; what is kept for the transpose is the light of every pixel before every eighth entry.
+    Optimizations: see `pop_fast.stages.blend.blend`; what is kept for the transpose is the light of every pixel
+    before every eighth entry.
 
     Args:
         means2d: screen centres, px. [N, 2]

@@ -145,7 +145,7 @@ def check_fits(
     content: Mapping[str, Any],
     config: TrainConfig,
     fingerprint: Mapping[str, str],
-    threads: int,
+    threads: int | None,
     n_views: int,
     known: Collection[str],
 ) -> None:
@@ -156,15 +156,16 @@ def check_fits(
         content: what it holds, checked.
         config: the run's settings.
         fingerprint: of the run's capture.
-        threads: of one operation.
+        threads: of one operation; None where the bits of the steps do not depend on it.
         n_views: how many the run trains on.
         known: what the state of the run's strategy holds.
 
     Raises:
         PopError: it belongs to other settings or another capture, or cannot be of this run; names what differs.
     """
-    ours = {**config.binding(), "threads": threads}
-    found = first_difference(ours, {**content["config"], "threads": content["threads"]})
+    theirs = {**content["config"], "threads": content["threads"]}
+    ours = {**config.binding(), "threads": content["threads"] if threads is None else threads}
+    found = first_difference(ours, theirs)
     if found:
         name, ours, theirs = found
         raise PopError(

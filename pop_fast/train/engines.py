@@ -72,6 +72,7 @@ def native_engine(backend: str | Backend = "compiled") -> Engine:
     return replace(
         torch_engine(backend),
         make_stepper=lambda task: FusedStepper(task, "native", MOST_ON_CPU, _native_trainer(task)),
+        depends_on_threads=False,
     )
 
 

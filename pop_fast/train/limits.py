@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from typing import Any, Final
 
+from pop_fast.api.registry import backend_names, is_own
 from pop_fast.errors import PopError
+from pop_ref.constants import PROFILES
 
 _AT_LEAST: Final = {
     "max_steps": 1,
@@ -37,7 +39,7 @@ _OVER_ZERO: Final = (
 )
 # of the strategy, whose settings errors call by the method's name as the command line does
 _AT_LEAST_OF_STRATEGY: Final = {
-    **dict.fromkeys(("refine_every", "sh_rest_every", "round_steps", "round_decay_every", "blur_stop_span"), 1),
+    **dict.fromkeys(("refine_every", "sh_rest_every", "round_steps", "round_decay_every"), 1),
     **dict.fromkeys(("score_views", "score_divisor", "reinit_points", "max_gaussians"), 1),
     **dict.fromkeys(("reset_every", "pause_refine_after_reset", "final_count", "sampled_prunes"), 0),
 }
@@ -59,6 +61,7 @@ def check_values(config: Any) -> None:
         PopError: a setting is out of range or, being a number, not finite.
     """
     values, method = dict(_flat(config)), config.method
+    _check_names(values)
     own = {name: value for name, value in values.items() if name.startswith(f"{method}.")}
     shares = ("lambda_ssim", *(name for name in own if name.removeprefix(f"{method}.") in _SHARES_OF_STRATEGY))
     known = {f"{method}.{name}": least for name, least in _AT_LEAST_OF_STRATEGY.items()}
@@ -80,6 +83,18 @@ def check_values(config: Any) -> None:
     for name in (*_OVER_ZERO, *shares, *(name for name, value in values.items() if isinstance(value, float))):
         for value in values[name] if isinstance(values[name], tuple) else (values[name],):
             _check_number(name, value, name in shares)
+
+
+def _check_names(values: dict[str, Any]) -> None:
+    """Check what is one of a table, to which other packages may add."""
+    if values["profile"] not in PROFILES:
+        raise PopError(f"profile is {values['profile']!r}; it must be one of {', '.join(PROFILES)}")
+    name = values["backend"]
+    if name != "auto" and not is_own(name) and name not in backend_names():
+        known = ", ".join(("auto", *backend_names()))
+        raise PopError(
+            f"backend is {name!r}; it must be one of {known}; one of another package is known where that is installed"
+        )
 
 
 def _check_number(name: str, value: float, is_share: bool) -> None:

@@ -7,6 +7,7 @@ A default is the method's recipe (`pop_ref.recipes`), with the schedule multipli
     refine start and stop, blur, POP                yes
     refine_every, reset_every                       up only: a shorter schedule has fewer changes and fewer resets, as
                                                     far apart as ever (see `DensityControl.scaled`)
+    prune_too_big_after                             up only, as the reset interval that it stands for
     sh_interval, eval_steps, save_steps             yes
     lambda_pop                                      no, unless `scale_lambda_pop` asks for it
     learning rates, other weights, thresholds       no: Adam's step does not depend on the length of a run
@@ -168,8 +169,7 @@ def defaults(given: Given) -> dict[str, Any]:
     if given.scale_lambda_pop:
         strategy = replace(strategy, lambda_pop=strategy.lambda_pop / by)
     if given.preset == "quick":
-        # what a big Gaussian covered, a sky above all, does not grow back in so few steps: see benchmarks/NOTES.md
-        strategy = replace(strategy, prune_too_big=False, blur_min_pixels=QUICK_BLUR_MIN_PIXELS)
+        strategy = replace(strategy, blur_min_pixels=QUICK_BLUR_MIN_PIXELS)
 
     def scaled(step: int) -> int:
         return max(round(step * by), 1)
@@ -211,8 +211,15 @@ def _options(recipe: Recipe, method: str) -> list[str]:
     chosen = [] if method == Given.method else ["--method", method]
     for name, ours, theirs in [*(pair for pair in pairs if pair[0] != "lr"), *rates]:
         if ours != theirs:
-            chosen += [f"--{name.replace('_', '-')}", f"{ours:g}" if isinstance(ours, float) else str(ours)]
+            chosen += _words(name, ours)
     return chosen
+
+
+def _words(name: str, value: Any) -> list[str]:
+    group, dot, rest = name.replace("_", "-").rpartition(".")
+    if isinstance(value, bool):
+        return [f"--{group}{dot}{'' if value else 'no-'}{rest}"]
+    return [f"--{group}{dot}{rest}", f"{value:g}" if isinstance(value, float) else str(value)]
 
 
 def laid_over(plain: dict[str, Any], given: Given) -> dict[str, Any]:

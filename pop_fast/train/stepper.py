@@ -103,6 +103,7 @@ class Engine:
         backend: renders there for measurements, from and to the CPU.
         make_stepper: makes what takes the steps.
         facts: goes into the statistics of a run.
+        depends_on_threads: whether another number of threads may round otherwise; if not, a run goes on with any.
     """
 
     name: str
@@ -110,3 +111,4 @@ class Engine:
     backend: Renderer
     make_stepper: Callable[[Task], Stepper]
     facts: Callable[[], dict[str, Any]] = dict
+    depends_on_threads: bool = True

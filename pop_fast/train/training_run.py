@@ -1,7 +1,8 @@
 """A training run: schedule, densification steps, records, measurements and checkpoints; a `Stepper` takes its steps.
 
 Everything random comes from generators that are seeded by the config and saved in checkpoints; the same config,
-capture, engine, machine and number of threads give the same bits, whether a run was interrupted or not.
+capture, engine, machine and number of threads give the same bits, whether a run was interrupted or not; those of the
+native step do not depend on the number of threads either.
 """
 
 from __future__ import annotations
@@ -113,7 +114,7 @@ class TrainingRun:
         check_batch(config, strategy is None, ranks)
         self._ranks = ranks
         self._engine = engine_of(choose_backend(config, resume)[0], strategy is None) if engine is None else engine
-        self.config = replace(config, backend=self._engine.name)
+        self.config = replace(config, backend=self._engine.name).in_world(capture.world_scale)
         self._resume, self._overwrite, self._beside = resume, overwrite, beside or {}
         self._prepare_capture(capture, initial)
         self.optimizers = make_optimizers(self.params)
@@ -264,9 +265,6 @@ class TrainingRun:
             raise PopError(f"{error}; {self._what_is_left}") from error
         self.step = stepper.step
         for step, found in enumerate(stats, first):
-            if "loss_sum" in self.state and phase.statistics:
-                # one by one, so that it does not depend on how many steps are taken at a time
-                self.state["loss_sum"] += self.config.batch_size * (found.objective + found.pop)
             if not math.isfinite(found.objective + found.pop):
                 self._require_finite()
                 raise PopError(f"the loss of step {step} is {found.objective + found.pop}; {self._what_is_left}")
@@ -408,7 +406,8 @@ class TrainingRun:
 
     def _restore(self, path: Path) -> None:
         content = ckpt.load_checkpoint(path)
-        threads, n_views = torch.get_num_threads(), len(self._train)
+        threads = torch.get_num_threads() if self._engine.depends_on_threads else None
+        n_views = len(self._train)
         ckpt.check_fits(path, content, self.config, self._fingerprint(), threads, n_views, self.state.keys())
         self.params = {key: Parameter(content["splats"][key]) for key in KEYS}
         self.optimizers = make_optimizers(self.params)

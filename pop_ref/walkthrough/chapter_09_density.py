@@ -103,8 +103,9 @@ print("pull: too short {:.4f}, too wide {:.4f}, right {:.4f}, faint {:.4f}".form
 # The average is taken over a *window* of 100 steps. When it closes, Gaussians are added and removed. Selected and
 # small: **clone**, a copy on top of the original. Selected and large: **split**, two children drawn from the parent's
 # own distribution, 1.6 times smaller, in its place. Small means that the largest scale is at most 0.01 of the scene's.
-# Then **prune**: what has an opacity under 0.005 is removed, and late in the training what is far too large. (A child's
-# place is drawn at random; here two draws are picked that make a clear picture.)
+# Then **prune**: what has an opacity under 0.005 is removed; 3DGS also removes what is far too large, once opacities
+# have been reset, and POP, which has no resets, does not. (A child's place is drawn at random; here two draws are
+# picked that make a clear picture.)
 #
 # {{source: pop_ref.density.grow_masks}}
 #

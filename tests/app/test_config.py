@@ -72,7 +72,7 @@ def test_quick_is_a_tenth_of_the_schedule_with_the_papers_weights():
     assert (plan.lambda_pop, plan.blur_min_pixels, plan.prune_too_big) == (0.001, 10.0, False)
     assert quick.lr == LearningRates()
     control = TrainConfig.of(preset="quick", method="gsplat").strategy
-    assert (control.refine_stop_iter, control.reset_every, control.prune_too_big) == (1500, 3000, False)
+    assert (control.refine_stop_iter, control.reset_every, control.prune_too_big_after) == (1500, 3000, 3000)
     assert TrainConfig.of(preset="quick", steps_scaler=0.5).max_steps == 15_000
     assert TrainConfig.of(preset="quick", scale_lambda_pop=True).strategy.lambda_pop == pytest.approx(0.01)
 
@@ -83,9 +83,11 @@ def test_eleven_pixels_are_blur_in_quick_and_ten_are_not():
     assert blur_set(counts, 270, 480, plan.theta_blur, plan.blur_min_pixels).tolist() == [False, True]
 
 
-def test_a_shrunk_paper_schedule_still_prunes_by_size():
+@pytest.mark.parametrize("preset", ["paper", "quick"])
+def test_large_gaussians_are_pruned_by_every_method_but_pop_and_after_a_reset_interval(preset):
     for method in METHODS:
-        assert TrainConfig.of(method=method, steps_scaler=0.1).strategy.prune_too_big
+        plan = TrainConfig.of(method=method, preset=preset).strategy
+        assert (plan.prune_too_big, plan.prune_too_big_after) == (method != "pop", 3000)
 
 
 @pytest.mark.parametrize(
@@ -343,7 +345,7 @@ def test_a_resumed_run_must_share_what_reaches_the_bits_and_only_that():
 
 
 def test_two_ways_to_say_the_same_schedule_are_the_same_run():
-    spelled_out = TrainConfig.of(steps_scaler=0.1, **{"pop.blur_min_pixels": 10.0, "pop.prune_too_big": False})
+    spelled_out = TrainConfig.of(steps_scaler=0.1, **{"pop.blur_min_pixels": 10.0})
     assert TrainConfig.of(preset="quick").digest() == spelled_out.digest()
     assert TrainConfig.of(preset="quick").digest() != TrainConfig.of(steps_scaler=0.1).digest()
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+import pop_fast
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.stages.losses import photometric_pop
@@ -22,8 +23,9 @@ from pop_fast.view.explain.flips import first_flip
 from pop_fast.view.explain.maps import termination_depths
 from pop_fast.view.explain.table import WIDTH, table
 from pop_fast.view.explain.walk import candidates, oracle_splats, walk
-from pop_ref.constants import PAPER, Profile
+from pop_ref.constants import PAPER, PROFILES, Profile
 from pop_ref.records import Splats
+from tests.app.browser import browser
 from tests.app.conftest import Pop
 from tests.app.tiny import tiny_capture
 
@@ -249,6 +251,38 @@ def test_one_command_writes_table_json_page_and_maps(pop: Pop, shared_result: Pa
     assert legend["pop_pull.png"]["scale"] == {"colors": "coolwarm", "low": -1.0, "top": 1.0}
 
 
+def test_the_page_runs_its_own_script_and_no_other(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
+    outcome = pop("explain", shared_result, "--view", "3", "--pixel", "20,16", "--html", tmp_path / "why.html")
+    assert outcome.status == 0, outcome.err
+    html = (tmp_path / "why.html").read_text()
+    assert html.index("Content-Security-Policy") < html.index("<title>")
+    # as a name in a capture that was not escaped would do it
+    smuggled = "<script>window.smuggled = 1</script><img src=x onerror='window.smuggled = 1'>"
+    (tmp_path / "why.html").write_text(html.replace("<header>", f"<header>{smuggled}", 1))
+    with browser(tmp_path / "browser") as tab:
+        tab.open(tmp_path / "why.html", 1000, 800)
+        tab.wait_for("document.readyState === 'complete'")
+        tab.value("document.getElementById('all').click()")
+        tab.wait_for("document.body.classList.contains('all')")
+        assert tab.value("window.smuggled ?? 0") == 0
+        assert tab.value("getComputedStyle(document.querySelector('.swatch')).backgroundColor").startswith("rgb")
+        assert tab.value("document.querySelector('figure img').naturalWidth") > 0
+
+
+def test_no_page_makes_html_of_text() -> None:
+    scripts = sorted((Path(pop_fast.__file__).parent / "view").rglob("*.js"))
+    assert len(scripts) >= 4
+    for script in scripts:
+        assert not re.search(r"innerHTML|outerHTML|AdjacentHTML|document\.write|eval\(", script.read_text()), script
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_pixel_is_explained_in_every_profile(pop: Pop, shared_result: Path, profile: str) -> None:
+    outcome = pop("explain", shared_result, "--view", "3", "--pixel", "20,16", "--profile", profile)
+    assert outcome.status == 0, outcome.err
+    assert f"profile {profile}" in outcome.out
+
+
 @pytest.mark.parametrize(
     ("words", "part"),
     [
@@ -260,8 +294,12 @@ def test_one_command_writes_table_json_page_and_maps(pop: Pop, shared_result: Pa
         (["--view", "cat.jpg", "--pixel", "1,1"], "view 'cat.jpg' is no view of toy; give a file name"),
         (["--view", "0", "--pixel", "1,1", "--capture", "nowhere"], "nowhere: no such folder"),
         (["--view", "0", "--pixel", "1,1", "--diff", "paper", "mine"], "'mine', which is neither a profile"),
+        (
+            ["--view", "0", "--pixel", "1,1", "--profile", "mine"],
+            "profile is 'mine'; it must be one of paper, gsplat_1_5",
+        ),
     ],
-    ids=["x", "y", "no numbers", "no pixel", "view", "name", "capture", "diff"],
+    ids=["x", "y", "no numbers", "no pixel", "view", "name", "capture", "diff", "profile"],
 )
 def test_bad_words_are_answered_by_one_line_that_names_field_and_fix(
     pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], part: str

@@ -31,14 +31,14 @@ def tried(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 @pytest.mark.parametrize("reader", READERS)
 def test_a_damaged_file_is_read_or_refused_in_a_line(tried: dict[str, Any], reader: str) -> None:
     found = tried["fuzz"]["readers"][reader]
-    assert sum(found.values()) == 15 + len(kept(reader))
+    assert sum(found.values()) == 10 + len(kept(reader))
     failures = {key: value for key, value in tried["fuzz"]["failures"].items() if key.startswith(f"{reader}: ")}
     assert found["escaped"] + found["crashed"] + found["hung"] == 0, failures
-    assert found["refused"] > 0
+    assert found["refused"] > 0 or not READERS[reader].refuses
 
 
 def test_inputs_that_once_broke_something_are_kept() -> None:
-    assert sum(len(kept(reader)) for reader in READERS) >= 3
+    assert sum(len(kept(reader)) for reader in READERS) >= 60
 
 
 @pytest.mark.parametrize("job", ["train", "train --overwrite", "write a PLY"])
@@ -107,7 +107,7 @@ def test_the_fuzzer_notices_what_readers_must_not_do() -> None:
         "a fault": {"escaped": 2},
         "aborts": {"crashed": 2},
         "hangs": {"hung": 2},
-        "takes all memory": {"told": 2},
+        "takes all memory": {"escaped": 2},
         "ends": {"crashed": 2},
     }
 

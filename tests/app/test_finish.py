@@ -156,5 +156,14 @@ def test_the_report_shows_the_splat_in_a_frame(result: Path, tmp_path: Path) -> 
     assert picture.std() > 10.0
 
 
+def test_a_viewer_whose_script_is_not_of_this_version_is_linked(pop: Pop, result: Path) -> None:
+    viewer = result / "viewer.html"
+    viewer.write_text(viewer.read_text().replace("</script></body>", "window.other = 1</script></body>"))
+    # the same text and more is another script
+    assert pop("report", result).status == 0
+    assert 'in <a href="viewer.html">viewer.html</a>' in (result / "report.html").read_text()
+    assert "<iframe" not in (result / "report.html").read_text()
+
+
 def test_a_table_has_its_first_column_to_the_left() -> None:
     assert table_lines([("a", "bb"), ("ccc", "d")]) == ["a    bb", "ccc   d"]

@@ -53,7 +53,6 @@ def test_a_scaled_schedule_keeps_its_shape_and_a_window_worth_averaging():
     quick = POPStrategy().scaled(0.1)
     assert (quick.refine_start_iter, quick.refine_stop_iter, quick.refine_every) == (50, 1500, SHORTEST_REFINE_EVERY)
     assert (quick.blur_start_iter, quick.blur_stop_iter, quick.pop_stop_iter) == (300, 700, 1500)
-    assert quick.prune_too_big_after == 300
     assert quick.lambda_pop == POPStrategy().lambda_pop
     assert POPStrategy().scaled(1.0) == POPStrategy()
     assert POPStrategy(refine_every=10).scaled(0.1).refine_every == 10
@@ -64,6 +63,7 @@ def test_resets_keep_the_steps_that_are_needed_to_recover_from_them():
     for factor in (0.01, 0.1, 1.0):
         scaled = control.scaled(factor)
         assert (scaled.reset_every, scaled.pause_refine_after_reset) == (3000, 200)
+        assert scaled.prune_too_big_after == 3000
         assert scaled.blur_stop_iter == -1
     assert (control.scaled(2.0).reset_every, control.scaled(2.0).pause_refine_after_reset) == (6000, 400)
     assert not any(GsplatStrategy().scaled(0.1).is_reset_step(step) for step in range(3000))

@@ -69,11 +69,11 @@ def test_transparent_gaussians_are_pruned_and_oversized_ones_only_after_step_300
         params, optimizers = make(3)
         params["opacities"].data[0] = -6.0
         params["scales"].data[1] = math.log(0.2)
-        densified_at(POPStrategy(blur_stop_iter=-1), params, optimizers, make_info(3), step)
+        densified_at(POPStrategy(blur_stop_iter=-1, prune_too_big=True), params, optimizers, make_info(3), step)
         assert len(params["means"]) == survivors, step
     params, optimizers = make(3)
     params["scales"].data[1] = math.log(0.2)
-    densified_at(POPStrategy(prune_too_big=False), params, optimizers, make_info(3), 3100)
+    densified_at(POPStrategy(), params, optimizers, make_info(3), 3100)
     assert len(params["means"]) == 3
 
 

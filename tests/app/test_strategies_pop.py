@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import textwrap
 import warnings
 
 import pytest
 import torch
 
+from pop_fast.api.rasterize import rasterization
 from pop_fast.density import DensificationStep, GsplatStrategy, POPStrategy
 from tests.app.populations import HEIGHT, WIDTH, densified_at, make, make_info, packed
 
@@ -138,3 +140,42 @@ def test_a_trainer_that_leaves_out_the_prior_is_warned() -> None:
         # nothing is missed where there is no prior
         strategy.step_post_backward(params, optimizers, state, strategy.pop_stop_iter, make_info(2))
         GsplatStrategy().step_post_backward(params, optimizers, GsplatStrategy().initialize_state(), 1, make_info(2))
+
+
+def documented_loop(steps: int, strategy: POPStrategy, learning_rate: float = 0.01) -> dict[str, torch.Tensor]:
+    """Run the loop that the docstring shows another trainer, with `rasterization`; return the parameters."""
+    block = (POPStrategy.__doc__ or "").split("where there is one:")[1].split("The defaults are")[0]
+    params, _ = make(12, scale=0.3)
+    params["means"].data[:, 2] += 4.0
+    optimizers = {key: torch.optim.SGD([value], lr=learning_rate) for key, value in params.items()}
+    K = torch.tensor([[20.0, 0.0, 12.0], [0.0, 20.0, 8.0], [0.0, 0.0, 1.0]])
+    views = [(torch.eye(4), K, torch.full((16, 24, 3), 0.5))] * steps
+    names: dict[str, object] = {
+        "params": params,
+        "optimizers": optimizers,
+        "strategy": strategy,
+        "views": views,
+        "width": 24,
+    }
+    exec(
+        textwrap.dedent(block),
+        {**names, "height": 16, "scene_scale": 1.0, "torch": torch, "rasterization": rasterization},
+    )
+    return {key: value.detach() for key, value in params.items()}
+
+
+def test_the_loop_that_the_docstring_shows_trains_with_the_prior_and_is_not_warned() -> None:
+    # the last steps have no prior
+    strategy = POPStrategy(pop_stop_iter=4, refine_start_iter=2, refine_every=3, lambda_pop=0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(documented_loop(6, strategy)["means"]) > 0
+        without, with_prior = (documented_loop(1, POPStrategy(lambda_pop=weight)) for weight in (0.0, 0.5))
+    moved = (with_prior["opacities"] - without["opacities"]) / 0.01
+    # o = 0.5, whose slope is 1/4: up where a pixel is won, down elsewhere, each by its share
+    up, down = moved > 0.0, moved < 0.0
+    assert up.any()
+    assert down.any()
+    torch.testing.assert_close(moved[up].sum().item(), 0.5 * 0.25, rtol=1e-3, atol=0.0)
+    torch.testing.assert_close(moved[down].sum().item(), -0.5 * 0.25, rtol=1e-3, atol=0.0)
+    assert all(torch.equal(with_prior[key], without[key]) for key in without if key != "opacities")

@@ -69,7 +69,13 @@ def last_checkpoint(folder: Path, *without: str) -> dict[str, Any]:
 
 def tiny_config(folder: Path | str, method: str = "pop", **changes: Any) -> TrainConfig:
     """Thirty steps, at high rates, with all density control: growth, blur, pruning, resets, all colour bands."""
-    steps = {"refine_start_iter": 3, "refine_stop_iter": 24, "refine_every": 4, "prune_too_big_after": 8}
+    steps = {
+        "refine_start_iter": 3,
+        "refine_stop_iter": 24,
+        "refine_every": 4,
+        "prune_too_big": True,
+        "prune_too_big_after": 8,
+    }
     grow = {"grow_grad2d": 3e-3, "grow_scale3d": 0.05}
     strategies = {
         "pop": POPStrategy(**steps, **grow, blur_start_iter=8, blur_stop_iter=16, theta_blur=0.02, pop_stop_iter=24),

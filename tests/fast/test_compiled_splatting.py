@@ -94,3 +94,28 @@ def test_gradients_of_unseen_gaussians_are_zero(shown: list[int]) -> None:
     assert v_sh.flatten(1).any(1).nonzero().squeeze(1).tolist() == shown
     assert set(v_means.any(1).nonzero().squeeze(1).tolist()) <= set(shown)
     assert bool(v_means.isfinite().all())
+
+
+MASK = torch.tensor([True, False, True])
+
+
+@pytest.mark.parametrize(
+    ("visible", "words"),
+    [
+        (
+            MASK,
+            r"is a tensor of torch.bool and shape \[3\]; .* of a mask these are mask.nonzero\(\).squeeze\(1\)",
+        ),
+        (MASK.nonzero(), r"shape \[2, 1\]; it must hold the numbers of the rows to evaluate, torch.int64 \[V\]"),
+        (torch.tensor([0, 2], dtype=torch.int32), "visible is a tensor of torch.int32"),
+        (torch.tensor([0, 3]), "visible names row 0 to 3; there are 3"),
+        (torch.tensor([-1, 2]), "visible names row -1 to 2; there are 3"),
+    ],
+    ids=["mask", "columns", "int32", "beyond", "negative"],
+)
+def test_rows_that_are_none_are_refused_before_they_are_read(visible: Tensor, words: str) -> None:
+    sh, means = torch.ones(3, 4, 3), torch.ones(3, 3)
+    with pytest.raises(ValueError, match=words):
+        in_cpp.colors_of_view(sh, means, torch.eye(4), 1, visible)
+    shown = in_cpp.colors_of_view(sh, means, torch.eye(4), 1, MASK.nonzero().squeeze(1))
+    assert (shown != 0.0).any(1).tolist() == MASK.tolist()

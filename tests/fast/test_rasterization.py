@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import re
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -19,17 +18,11 @@ from pop_fast.api.registry import backend_names, fastest_backend, get_backend
 from pop_fast.errors import PopError
 from pop_fast.stages.backend import FAST
 from pop_fast.stages.blend import buffers
-from pop_ref.constants import PAPER
 
 WIDTH, HEIGHT, N = 21, 18, 24
 
+
 # fmt: off
-GSPLAT_1_5_3 = [
-    "means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height", "near_plane", "far_plane",
-    "radius_clip", "eps2d", "sh_degree", "packed", "tile_size", "backgrounds", "render_mode", "sparse_grad", "absgrad",
-    "rasterize_mode", "channel_chunk", "distributed", "camera_model", "segmented", "covars", "with_ut", "with_eval3d",
-    "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs", "rolling_shutter", "viewmats_rs",
-]
 GSPLAT_META = {
     "means2d", "radii", "depths", "conics", "opacities", "camera_ids", "gaussian_ids", "batch_ids", "tile_width",
     "tile_height", "tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets", "width", "height", "tile_size",
@@ -58,12 +51,6 @@ def cameras(count: int = 1, dtype: torch.dtype = torch.float64) -> dict[str, Ten
     viewmats[:, 0, 3] = torch.arange(count, dtype=dtype) * 0.25
     K = torch.tensor([[20.0, 0.0, 10.25], [0.0, 20.0, 9.5], [0.0, 0.0, 1.0]], dtype=dtype)
     return {"viewmats": viewmats, "Ks": K.repeat(count, 1, 1), "width": WIDTH, "height": HEIGHT}
-
-
-def test_the_signature_begins_with_gsplat_1_5_3s() -> None:
-    parameters = inspect.signature(program).parameters
-    assert list(parameters)[: len(GSPLAT_1_5_3)] == GSPLAT_1_5_3
-    assert all(p.kind is p.KEYWORD_ONLY for name, p in parameters.items() if name not in GSPLAT_1_5_3)
 
 
 def test_meta_holds_gsplats_keys_unpacked_and_packed() -> None:
@@ -228,52 +215,6 @@ def test_an_empty_scene_is_the_background() -> None:
         assert (meta["dominant_ids"] == -1).all()
 
 
-WRONG = {
-    "means[3, 1] is nan": {
-        "means": lambda t: t.index_put((torch.tensor(3), torch.tensor(1)), torch.tensor(np.nan).double())
-    },
-    "scales[2, 0] is -1.0": {
-        "scales": lambda t: t.index_put((torch.tensor(2), torch.tensor(0)), torch.tensor(-1.0).double())
-    },
-    "quats[4] is [0.0, 0.0, 0.0, 0.0]": {"quats": lambda t: t.index_fill(0, torch.tensor([4]), 0.0)},
-    "opacities[0] is 1.5": {"opacities": lambda t: t.index_fill(0, torch.tensor([0]), 1.5)},
-    "quats has shape": {"quats": lambda t: t[:, :3]},
-    "scales has dtype": {"scales": lambda t: t.float()},
-    "Ks[0] is": {"Ks": lambda t: torch.zeros_like(t)},
-    "viewmats[0] is": {"viewmats": lambda t: t * 2.0},
-    "width is 0": {"width": lambda _: 0},
-    "height is 0": {"height": lambda _: 0},
-    "colors has shape": {"colors": lambda t: t[:-1]},
-}
-
-
-@pytest.mark.parametrize("message", WRONG)
-def test_wrong_input_is_named_with_its_index(message: str) -> None:
-    given = {**scene(), **cameras()}
-    (name, change), *_ = WRONG[message].items()
-    with pytest.raises(ValueError, match=re.escape(message)):
-        rasterization(**{**given, name: change(given[name])})
-
-
-@pytest.mark.parametrize(
-    "argument",
-    [
-        {"sparse_grad": True},
-        {"distributed": True},
-        {"camera_model": "fisheye"},
-        {"segmented": True},
-        {"with_ut": True},
-        {"with_eval3d": True},
-        {"radial_coeffs": torch.zeros(1, 6)},
-        {"rolling_shutter": 1},
-        {"viewmats_rs": torch.eye(4)[None]},
-    ],
-)
-def test_unsupported_arguments_raise_by_name(argument: dict[str, object]) -> None:
-    with pytest.raises(NotImplementedError, match=next(iter(argument))):
-        rasterization(**scene(), **cameras(), **argument)
-
-
 def test_the_oracle_and_the_fast_path_are_both_backends() -> None:
     assert {"fast", "ref"} <= set(backend_names())
     given = scene(6, n=6)
@@ -360,34 +301,6 @@ def test_what_the_oracle_does_not_offer_is_said_in_one_line(argument: dict[str, 
     assert "\n" not in str(caught.value)
     with pytest.raises(TypeError, match="unexpected keyword argument 'colour'"):
         get_backend("ref").rasterization(**harmonics(), colour=1)
-
-
-@pytest.mark.parametrize("backend", ["fast", "compiled", "ref"])
-@pytest.mark.parametrize(
-    ("argument", "said"),
-    [
-        ({"near_plane": float("nan")}, "near_plane is nan; it must be a number"),
-        ({"near_plane": -1.0}, "near_plane is -1.0; it must be finite and >= 0"),
-        ({"near_plane": float("inf")}, "near_plane is inf; it must be finite and >= 0"),
-        ({"far_plane": -1.0}, "far_plane is -1.0; it must be beyond near_plane, which is 0.01"),
-        ({"far_plane": float("nan")}, "far_plane is nan; it must be a number"),
-        ({"near_plane": 5.0, "far_plane": 4.0}, "far_plane is 4.0; it must be beyond near_plane, which is 5.0"),
-        ({"eps2d": float("nan")}, "eps2d is nan; it must be a number"),
-        ({"eps2d": -0.3}, "eps2d is -0.3; it must be finite and >= 0 px^2"),
-        ({"radius_clip": float("nan")}, "radius_clip is nan; it must be >= 0 px"),
-        ({"radius_clip": -1.0}, "radius_clip is -1.0; it must be >= 0 px"),
-        ({"profile": 3}, "profile is 3; it must be a name or a pop_ref.constants.Profile"),
-        ({"profile": replace(PAPER, alpha_floor=2.0)}, "alpha_floor is 2.0; it must be in (0, 1)"),
-        ({"profile": replace(PAPER, alpha_ceiling=1.0)}, "alpha_ceiling is 1.0; it must be between alpha_floor and 1"),
-    ],
-)
-def test_numbers_with_which_nothing_can_be_drawn_raise(backend: str, argument: dict[str, Any], said: str) -> None:
-    if (reason := get_backend(backend).why_not()) is not None:
-        pytest.skip(reason)
-    expected = NotImplementedError if backend == "ref" and "radius_clip" in argument else ValueError
-    match = "radius_clip=" if expected is NotImplementedError else re.escape(said)
-    with pytest.raises(expected, match=match):
-        program(**scene(), **cameras(), **argument, backend=backend)
 
 
 @pytest.mark.parametrize("packed", [False, True])

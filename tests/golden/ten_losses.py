@@ -29,6 +29,7 @@ RECIPE: Recipe = replace(
         grow_grad2d=0.008,
         grow_scale3d=0.2,
         prune_scale3d=0.3,
+        prune_too_big=True,
         prune_too_big_after=5,
         prune_opa=0.02,
         refine_start_iter=1,

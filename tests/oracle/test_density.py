@@ -198,9 +198,9 @@ def test_split_only_blur_splits_small_ones_and_may_clone_them_as_well() -> None:
 
 def test_pruning_takes_faint_ones_always_and_huge_ones_after_step_3000() -> None:
     opacities, scales = np.array([0.0, 0.005, 1.0, 1.0]), np.array([[SMALL] * 3, [SMALL] * 3, [0, 0, HUGE], [0.1] * 3])
-    assert prune_mask(opacities, scales, 1.0, 3000).tolist() == [True, False, False, False]
-    assert prune_mask(opacities, scales, 1.0, 3001).tolist() == [True, False, True, False]
-    assert prune_mask(opacities, scales, 1.0, 9000, replace(POP, prune_too_big=False)).tolist() == [True, *[False] * 3]
+    assert prune_mask(opacities, scales, 1.0, 3000, GSPLAT).tolist() == [True, False, False, False]
+    assert prune_mask(opacities, scales, 1.0, 3001, GSPLAT).tolist() == [True, False, True, False]
+    assert prune_mask(opacities, scales, 1.0, 9000, POP).tolist() == [True, *[False] * 3]
 
 
 def test_schedule_has_144_densification_steps_41_with_blur_and_4_resets() -> None:

@@ -10,7 +10,7 @@ from paper_repro.figures.sheet import Drawn
 from paper_repro.results import Result
 
 
-def asked(figure: str, results: list[Result], folder: Path = Path("nowhere"), scale: str = "dev") -> Asked:
+def asked(figure: str, results: list[Result], folder: Path = Path("nowhere"), scale: str = "small") -> Asked:
     return Asked(figure, scale, [r for r in results if r.scale == scale], folder, folder)
 
 

@@ -7,18 +7,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from paper_repro.results import BINS, Result
+from paper_repro.record import BINS, Result, run_id, settings_hash
 
+_SCHEDULE = {"max_steps": 10_000, "factor": 4, "pop.blur_start_iter": 1000, "pop.blur_stop_iter": 2333}
+# the paper's, on which every claim can be decided
+WHOLE = {"method": "pop", "max_steps": 30_000, "pop.blur_start_iter": 3000, "pop.blur_stop_iter": 7000}
+_VIEWS = {f"{letter}.png": {"psnr": 30.0, "ssim": 0.9} for letter in "abcdefg"}
 PLAIN = Result(
-    scale="dev",
+    scale="small",
     row="pop",
     scene="fox",
     seed=42,
-    run="0123456789ab",
+    run=run_id(settings_hash(_SCHEDULE), "d" * 64, 42),
     commit="25d084e",
-    config_hash="c" * 64,
+    config_hash=settings_hash(_SCHEDULE),
     data_hash="d" * 64,
     machine="a machine",
+    cpu="a kind",
     engine="native",
     threads=1,
     versions={"python": "3.11.0"},
@@ -35,7 +40,7 @@ PLAIN = Result(
         "timing": "training loop",
         "checkpoint_bytes_per_gaussian": 236,
     },
-    schedule={"max_steps": 10_000, "pop.blur_start_iter": 1000, "pop.blur_stop_iter": 2333},
+    schedule=_SCHEDULE,
     seconds={"load": 1.0, "train": 100.0, "evaluate": 2.0, "cpu": 100.0},
     num_gaussians=1000,
     checkpoint_mib=1000 * 236 / 2**20,
@@ -45,26 +50,47 @@ PLAIN = Result(
     lpips_reason="no weights were given (lpips_vgg, lpips_alex)",
     n_blended=20.0,
     n_traversed=100.0,
-    opacity_below_01=0.25,
-    opacity_above_09=0.5,
+    opacity_below_01=1.0,
+    opacity_above_09=0.0,
     opacity_histogram=(1000, *[0] * (BINS - 1)),
     curve=(),
-    per_view={"a.png": {"psnr": 30.0, "ssim": 0.9}},
+    per_view=_VIEWS,
+    ply_hash="e" * 64,
+    files={"splat.spz": "f" * 64},
 )
 
 
 def result(row: str = "pop", scene: str = "fox", seed: int = 42, n: int = 1000, **changes: Any) -> Result:
-    """Make a result; `n` sets everything that follows from the number of Gaussians, and the run id from the rest."""
-    size = n * changes.get("protocol", PLAIN.protocol)["checkpoint_bytes_per_gaussian"] / 2**20
-    run = hashlib.sha256(f"{row} {scene} {seed} {n}".encode()).hexdigest()[:12]
-    told = {"run": run, "checkpoint_mib": size, "opacity_histogram": (n, *[0] * (BINS - 1)), **changes}
-    return replace(PLAIN, row=row, scene=scene, seed=seed, num_gaussians=n, **told)
+    """Make a result that agrees with itself: what follows from its row, scene, seed, `n` and the changes is set so."""
+    protocol = changes.get("protocol", PLAIN.protocol)
+    told = {
+        "num_gaussians": n,
+        "checkpoint_mib": n * protocol["checkpoint_bytes_per_gaussian"] / 2**20,
+        "opacity_histogram": (n, *[0] * (BINS - 1)),
+        "data_hash": hashlib.sha256(f"{row} {scene} {n}".encode()).hexdigest(),
+        **changes,
+        "schedule": {"factor": protocol["factor"], **changes.get("schedule", _SCHEDULE)},
+    }
+    config_hash, counts = settings_hash(told["schedule"]), told["opacity_histogram"]
+    agreeing = {
+        "config_hash": config_hash,
+        "run": run_id(config_hash, told["data_hash"], seed),
+        "opacity_below_01": sum(counts[:5]) / max(sum(counts), 1),
+        "opacity_above_09": sum(counts[-5:]) / max(sum(counts), 1),
+        "per_view": {name: {"psnr": told.get("psnr", 30.0), "ssim": told.get("ssim", 0.9)} for name in _VIEWS},
+    }
+    return replace(PLAIN, row=row, scene=scene, seed=seed, **{**agreeing, **told})
+
+
+def whole(row: str = "pop", scene: str = "fox", seed: int = 42, n: int = 1000, **changes: Any) -> Result:
+    """Make a result of the paper's whole schedule."""
+    return result(row, scene, seed, n, **{"schedule": WHOLE, **changes})
 
 
 def curve(counts: Mapping[int, int], **more: Sequence[float | None]) -> tuple[Mapping[str, Any], ...]:
     """Make a curve from the number of Gaussians by step, and other columns in the same order."""
     columns = {name: list(values) for name, values in more.items()}
     return tuple(
-        {"step": step, "num_gaussians": n, **{name: values[i] for name, values in columns.items()}}
+        {"step": step, "num_gaussians": n, **{c: values[i] for c, values in columns.items() if values[i] is not None}}
         for i, (step, n) in enumerate(counts.items())
     )

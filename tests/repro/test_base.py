@@ -10,7 +10,7 @@ import pytest
 from paper_repro import train_row as module
 from paper_repro.base import base_of, steps_for_others
 from paper_repro.jobs import jobs_of
-from paper_repro.results import read, write
+from paper_repro.results import write
 from paper_repro.rows import load_rows
 from paper_repro.train_row import train_row
 from pop_fast.train import TrainingRun
@@ -29,10 +29,10 @@ def test_a_row_that_begins_from_its_base_comes_to_what_it_comes_to_alone(
     row, base, shared, stop, tmp_path, monkeypatch
 ):
     job, of_base = toy(row, **SHORT), toy(base, **SHORT)
-    alone = read(train_row(job, options(tmp_path / "alone")))
+    alone = train_row(job, options(tmp_path / "alone"))
     assert "base" not in alone.protocol
     how = options(tmp_path / "after")
-    first = read(train_row(of_base, how))
+    first = train_row(of_base, how)
     kept = of_base.work(how.work) / "base" / f"ckpt_{shared - 1}_rank0.pt"
     assert [path.name for path in kept.parent.iterdir()] == [kept.name]
     assert not (of_base.work(how.work) / "ckpts").exists()
@@ -44,7 +44,7 @@ def test_a_row_that_begins_from_its_base_comes_to_what_it_comes_to_alone(
         with pytest.raises(KeyboardInterrupt):
             train_row(job, how)
     assert kept.is_file()
-    after = read(train_row(job, how))
+    after = train_row(job, how)
     assert min(steps) == shared
 
     assert after.protocol == {**alone.protocol, "base": first.run}
@@ -65,7 +65,7 @@ def test_a_checkpoint_stays_as_long_as_a_row_waits_for_it(tmp_path):
     of_base = base_of(job)
     train_row(of_base, how)
     kept = of_base.work(how.work) / "base"
-    done = read(train_row(job, how))
+    done = train_row(job, how)
     assert kept.is_dir()
     write(replace(done, row="pup_star"), how.results)
     module._remove_bulk(job, how)
@@ -76,13 +76,13 @@ def test_a_checkpoint_stays_as_long_as_a_row_waits_for_it(tmp_path):
 def test_a_base_of_another_kind_is_not_begun_from(change, tmp_path):
     how, job = options(tmp_path, keep_checkpoints=True), toy("pup", steps_scaler=0.001)
     train_row(base_of(job), how)
-    assert "base" not in read(train_row(job, replace(how, **change))).protocol
-    job.result(how.results).unlink()
+    assert "base" not in train_row(job, replace(how, **change)).protocol
+    job.file(how.results).unlink()
     shutil.rmtree(job.work(how.work))
-    assert "base" in read(train_row(job, how)).protocol
+    assert "base" in train_row(job, how).protocol
 
 
-@pytest.mark.parametrize("scale", ["toy", "dev", "full", "paper"])
+@pytest.mark.parametrize("scale", ["toy", "small", "full", "paper"])
 def test_every_row_that_names_a_base_shares_steps_with_it_on_every_scene(scale):
     named = [row for row in load_rows() if row.base is not None]
     assert {row.name for row in named} == {"pup", "pup_star", "mini_splatting_star"}

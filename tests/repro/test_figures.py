@@ -19,7 +19,8 @@ from paper_repro.figures.data import NoDataError, choose, curve_of
 from paper_repro.figures.foot import foot
 from paper_repro.figures.sheet import save
 from paper_repro.paper import paper
-from paper_repro.results import BINS, Result, write
+from paper_repro.record import BINS
+from paper_repro.results import Result, write
 from paper_repro.rows import load_rows
 from pop_fast.errors import PopError
 from tests.repro.drawing import asked, drawn, lines, texts
@@ -47,7 +48,7 @@ def full() -> list[Result]:
     found = []
     for i, row in enumerate(load_rows()):
         for j, scene in enumerate(("fox", "bear_512")):
-            n = 1000 * (i + 1) + 100 * j
+            n = 1200 * (i + 1) + 120 * j
             points = logged(
                 *(n // 3, 13_333 if row.name == "pup" else 10_000),
                 grad_l1=1.0,
@@ -73,7 +74,7 @@ def written(tmp_path_factory):
     for one in full():
         write(one, folder / "results")
     for figure in OF_RESULTS:
-        words = ["figure", figure, "--scale", "dev", "--results", folder / "results", "--out", folder / "out"]
+        words = ["figure", figure, "--scale", "small", "--results", folder / "results", "--out", folder / "out"]
         assert main([str(word) for word in words]) == 0
     return folder
 
@@ -200,11 +201,11 @@ def test_seeds_count_the_same_in_the_histogram():
 
 @pytest.mark.parametrize("figure", OF_RESULTS)
 def test_a_figure_without_results_says_what_was_not_run(figure, tmp_path, capsys):
-    words = ["figure", figure, "--scale", "dev", "--results", str(tmp_path), "--out", str(tmp_path / "out")]
+    words = ["figure", figure, "--scale", "small", "--results", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main(words) == 1
     said = capsys.readouterr().err
-    assert f"figure {figure} at scale dev is not drawn: not run are " in said
-    assert "pop-repro queue --scale dev --data DATA --rows " in said
+    assert f"figure {figure} at scale small is not drawn: not run are " in said
+    assert "pop-repro queue --scale small --data DATA --rows " in said
     assert not (tmp_path / "out").exists()
 
 
@@ -226,8 +227,8 @@ def test_the_note_says_captures_steps_seeds_and_whether_it_is_the_protocol():
     chosen = choose(asked("7", runs), ["pop"], ["fox"])
     said = foot(asked("7", runs), chosen)
     assert said.replace("\N{NO-BREAK SPACE}", " ") == (
-        "Capture fox (270 × 480); 10,000 steps; mean over seeds 42 and 43. Scale dev, not the paper's protocol: real "
-        "photographs for a CPU: 10,000 steps, small images, theta_blur at least 10 pixels."
+        "Capture fox (270 × 480); 10,000 steps; mean over seeds 42 and 43. Scale small, not the paper's protocol: real "
+        "photographs for a CPU: the whole schedule, small images, theta_blur at least 10 pixels."
     )
     ours = [result("pop", "bicycle", scale="paper", schedule=STEPS)]
     said = foot(asked("7", ours, scale="paper"), choose(asked("7", ours, scale="paper"), ["pop"], ["bicycle", "room"]))
@@ -337,7 +338,7 @@ def test_a_logarithmic_axis_has_a_few_marks(low, high):
 
 def test_an_unknown_figure_is_refused_before_anything_is_read(tmp_path):
     with pytest.raises(PopError, match="figure is '8'; it must be one of 1, 2, 3, 4a, 4b, 5, 6a, 6b, 7"):
-        figures.draw("8", "dev", tmp_path, tmp_path)
+        figures.draw("8", "small", tmp_path, tmp_path)
 
 
 def test_rows_name_the_figures_that_show_them():

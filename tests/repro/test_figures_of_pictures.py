@@ -21,7 +21,7 @@ from tests.repro.made import result
 
 def keep(folder: Path, row: str, scene: str, render: np.ndarray, photo: np.ndarray, psnr: float) -> None:
     """Leave what a run keeps of its first held-out view."""
-    kept = folder / "dev" / row / f"{scene}_42" / "report_data"
+    kept = folder / "small" / row / f"{scene}_42" / "report_data"
     kept.mkdir(parents=True)
     np.savez(kept / "val_step9999_0000.npz", name="0001.jpg", render=render, photo=photo, psnr=psnr)
 
@@ -59,7 +59,7 @@ def test_the_grid_of_renders_boxes_the_place_where_they_differ(renders):
 
 def test_a_scene_that_was_trained_elsewhere_is_not_said_not_to_be_run(renders):
     folder, places = renders
-    shutil.rmtree(folder / "dev" / "pop" / "bear_512_42")
+    shutil.rmtree(folder / "small" / "pop" / "bear_512_42")
     runs = [result(row, scene) for row in ("pop", "3dgs") for scene in places]
     with style.look():
         said = texts(qualitative.renders_and_photographs(asked("5", runs, folder))).replace("\n", " ")

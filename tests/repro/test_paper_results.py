@@ -1,8 +1,10 @@
-"""A result survives its file, and a damaged file is told by its name and the name of the field."""
+"""A result survives its file, and one that is damaged or does not agree with itself is told by file, line and field."""
 
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,28 +12,68 @@ from typing import Any
 
 import pytest
 
-from paper_repro.results import RESULTS, SCALES, read, read_all, write
+from paper_repro.record import to_line
+from paper_repro.results import RESULTS, SCALES, existing_folder, find, kept, read, read_all, write
 from pop_fast.errors import PopError
 from tests.repro.made import PLAIN, curve, result
 
+ROOT = Path(__file__).parents[2]
+STEPS = {"psnr": [None, 20.5], "n_blended": [None, 3.5]}
+
 
 def test_a_result_is_read_as_it_was_written(tmp_path: Path) -> None:
-    steps = curve({0: 1000, 100: 1100}, psnr=[None, 20.5], n_blended=[None, 3.5])
-    told = result(curve=steps, lpips={"vgg_01": 0.2, "alex_norm": None, "alex_01": None})
+    told = result(
+        curve=curve({0: 1000, 9_999: 1000}, **STEPS), lpips={"vgg_01": 0.2, "alex_norm": None, "alex_01": None}
+    )
     path = write(told, tmp_path)
-    assert path == tmp_path / "dev" / "pop" / "fox_42.json"
-    assert read(path) == told
-    assert path.read_text(encoding="utf-8").count("\n") == 2 + 29 + 3  # braces, fields and schema, points of the curve
+    assert path == tmp_path / "small" / "pop.jsonl"
+    assert read(path) == (told,)
+    assert find("small", "pop", "fox", 42, tmp_path) == told
+    assert find("small", "pop", "fox", 43, tmp_path) is None
+    assert path.read_text(encoding="utf-8").count("\n") == 1
 
 
 def test_results_of_one_scale_are_found_in_order(tmp_path: Path) -> None:
     told = [result("pop", "fox", 43), result("l2", "fox"), result("pop", "bonsai_800"), result("pop", "fox", 7)]
     for one in (*told, replace(PLAIN, scale="toy")):
         write(one, tmp_path)
-    assert read_all("dev", tmp_path) == (told[1], told[2], told[3], told[0])
+    assert read_all("small", tmp_path) == (told[1], told[2], told[3], told[0])
+    assert sorted(path.name for path in (tmp_path / "small").iterdir()) == ["l2.jsonl", "pop.jsonl"]
+    assert kept("small", "pop", tmp_path) == {("fox", 7), ("fox", 43), ("bonsai_800", 42)}
     assert read_all("full", tmp_path) == ()
-    with pytest.raises(PopError, match="scale is 'big'; it must be one of toy, dev, full, paper"):
+    with pytest.raises(PopError, match="scale is 'big'; it must be one of toy, "):
         read_all("big", tmp_path)
+
+
+def test_a_result_takes_the_place_of_an_older_one_and_leaves_the_others_as_they_are(tmp_path: Path) -> None:
+    path = write(result("pop", "bonsai_800"), tmp_path)
+    write(result("pop", "fox"), tmp_path)
+    other = path.read_text(encoding="utf-8").splitlines()[0]
+    newer = result("pop", "fox", psnr=31.0)
+    write(newer, tmp_path)
+    assert read(path) == (result("pop", "bonsai_800"), newer)
+    assert path.read_text(encoding="utf-8").splitlines()[0] == other
+
+
+def test_processes_that_write_at_once_lose_no_line(tmp_path: Path) -> None:
+    script = (
+        "import sys; from pathlib import Path\n"
+        "from paper_repro.results import write; from tests.repro.made import result\n"
+        "for seed in range(int(sys.argv[2]), 40, 4): write(result('pop', 'fox', seed), Path(sys.argv[1]))"
+    )
+    processes = [subprocess.Popen([sys.executable, "-c", script, str(tmp_path), str(i)], cwd=ROOT) for i in range(4)]
+    assert [process.wait() for process in processes] == [0] * 4
+    assert [each.seed for each in read_all("small", tmp_path)] == list(range(40))
+
+
+def test_lines_that_git_has_merged_are_read_in_order_and_two_of_one_run_are_refused(tmp_path: Path) -> None:
+    path = write(result("pop", "fox"), tmp_path)
+    first, second = path.read_text(encoding="utf-8"), to_line(result("pop", "bear_512"))
+    path.write_text(f"{first}{second}\n", encoding="utf-8")
+    assert [each.scene for each in read(path)] == ["bear_512", "fox"]
+    path.write_text(f"{first}{second}\n{first}", encoding="utf-8")
+    with pytest.raises(PopError, match=r"pop\.jsonl: lines 1 and 3 are both of fox, seed 42; remove one"):
+        read(path)
 
 
 def _set(field: str, value: Any) -> Callable[[dict[str, Any]], None]:
@@ -49,7 +91,7 @@ def _drop(field: str) -> Callable[[dict[str, Any]], None]:
 
 
 DAMAGE = [
-    (_set("schema", 2), "schema must be 1"),
+    (_set("schema", 3), "must begin with schema 2, scale, row, scene and seed"),
     (_drop("psnr"), "psnr is absent"),
     (_set("psnrr", 1.0), "psnrr is not a field of a result"),
     (_set("psnr", "30"), 'psnr is "30"; it must be a finite number'),
@@ -57,10 +99,12 @@ DAMAGE = [
     (_set("num_gaussians", 3.5), "num_gaussians is 3.5; it must be a whole number"),
     (_set("num_gaussians", True), "num_gaussians is true"),
     (_set("num_gaussians", 999), "opacity_histogram .* whose sum is num_gaussians, 999"),
-    (_set("scale", "huge"), 'scale is "huge"; it must be one of'),
-    (_set("row", "POP Ours"), "row is .*lower-case"),
+    (_set("scale", "huge"), r"is of pop at scale huge; its place is huge/pop\.jsonl"),
+    (_set("row", "POP Ours"), "must begin with schema 2"),
+    (_set("row", "l2"), r"is of l2 at scale small; its place is small/l2\.jsonl"),
     (_set("run", "12345"), "run is .*twelve hex digits"),
     (_set("commit", "main"), "commit is .*a git commit or null"),
+    (_set("cpu", ""), "cpu is .*a text"),
     (_set("protocol/width", 0), "protocol: width is 0; it must be a whole number of at least 1"),
     (_set("protocol/base", "pup"), 'protocol: base is "pup"; it must be twelve hex digits'),
     (_set("protocol/extra", 0), "protocol: extra is not a field"),
@@ -69,43 +113,82 @@ DAMAGE = [
     (_set("lpips/vgg_01", "none"), "lpips: vgg_01"),
     (_set("lpips_reason", None), "lpips_reason is null; it must be a text, since a variant"),
     (_set("opacity_below_0.1", 1.5), "opacity_below_0.1 is 1.5; it must be a finite number from 0 to 1"),
-    (_set("curve/1/step", 0), r"curve\[1\]: step is 0; it must be a whole number of at least 1"),
-    (_set("curve/1/psnr", "x"), r"curve\[1\]: psnr is .*a finite number or null"),
-    (_set("curve", [{"step": 0}]), r"curve\[0\]: num_gaussians is absent"),
+    (_set("curve", {}), r"curve is \{\}; it must be a list of tables"),
+    (_set("curve/0/step", [0, 1]), r"curve\[0\] must be an object of lists of one length"),
+    (_set("curve/1/step", [0]), r"curve\[1\]: step is 0; it must be a whole number of at least 1"),
+    (_set("curve/1/psnr", ["x"]), r"curve\[1\]: psnr is .*a finite number"),
+    (_set("curve", [{"step": [0]}]), r"curve\[0\]: num_gaussians is absent"),
     (_set("per_view/a.png", {"psnr": 30.0}), "per_view: a.png: ssim is absent"),
-    (_set("seed", 43), "its place is dev/pop/fox_43.json"),
+    (_set("ply_hash", "0"), "ply_hash is .*a SHA-256 in hex digits"),
+    (_set("files/splat.spz", "0"), "files: splat.spz is .*a SHA-256 in hex digits"),
+    (_set("seed", -1), "must begin with schema 2"),
+]
+# what was edited by hand and is still of the right type: it does not agree with the rest of the result
+DISAGREEING = [
+    (_set("psnr", 31.0), r"psnr is 31\.0; it must be 30\.0, by per_view"),
+    (_set("ssim", 0.95), r"ssim is 0\.95; it must be 0\.9"),
+    (_set("per_view/a.png/psnr", 30.5), r"psnr is 30\.0; it must be 30\.07"),
+    (_set("schedule/pop.lambda_pop", 0.001), "config_hash is .*the hash of the settings in schedule"),
+    (_set("schedule/max_steps", 30_000), "config_hash is .*the hash of the settings in schedule"),
+    (_set("run", "0123456789ab"), "run is .*what config_hash, data_hash and seed give"),
+    (_set("config_hash", "0" * 64), "config_hash is .*the hash of the settings in schedule"),
+    (_set("data_hash", "0" * 64), "run is .*what config_hash, data_hash and seed give"),
+    (_set("seed", 43), "run is .*what config_hash, data_hash and seed give"),
+    (_set("checkpoint_mib", 0.1), r"checkpoint_mib is 0\.1; it must be 0\.2250.*, 1000 Gaussians of 236 bytes"),
+    (_set("protocol/checkpoint_bytes_per_gaussian", 248), "checkpoint_mib is .*1000 Gaussians of 248 bytes"),
+    (_set("protocol/test_views", 6), "protocol: test_views is 6; it must be 7, by per_view"),
+    (_set("protocol/factor", 2), "protocol: factor is 2; it must be 4, by schedule"),
+    (_set("opacity_below_0.1", 0.9), r"opacity_below_0\.1 is 0\.9; it must be 1\.0, by opacity_histogram"),
+    (_set("opacity_above_0.9", 0.1), r"opacity_above_0\.9 is 0\.1; it must be 0\.0, by opacity_histogram"),
+    (_set("curve/1/step", [9_998]), "curve is .*one that ends at step 9999, of schedule, with 1000 Gaussians"),
+    (_set("curve/1/num_gaussians", [999]), "curve is .*one that ends at step 9999, of schedule, with 1000 Gaussians"),
 ]
 
 
-@pytest.mark.parametrize(("change", "message"), DAMAGE, ids=[message[:30] for _, message in DAMAGE])
-def test_a_damaged_result_is_told_by_file_and_field(
+@pytest.mark.parametrize(
+    ("change", "message"), [*DAMAGE, *DISAGREEING], ids=[message[:40] for _, message in [*DAMAGE, *DISAGREEING]]
+)
+def test_a_result_that_was_damaged_or_edited_is_told_by_file_line_and_field(
     change: Callable[[dict[str, Any]], None], message: str, tmp_path: Path
 ) -> None:
-    path = write(result(curve=curve({0: 1000, 100: 1100}, psnr=[None, 20.5])), tmp_path)
-    found = json.loads(path.read_text(encoding="utf-8"))
+    settings = {**PLAIN.schedule, "pop.lambda_pop": 0.01}
+    write(result(scene="bear_512"), tmp_path)
+    path = write(result(curve=curve({0: 1000, 9_999: 1000}, **STEPS), schedule=settings), tmp_path)
+    first, second = path.read_text(encoding="utf-8").splitlines()
+    found = json.loads(second)
     change(found)
-    path.write_text(json.dumps(found), encoding="utf-8")
+    path.write_text(f"{first}\n{json.dumps(found, separators=(',', ':'))}\n", encoding="utf-8")
     with pytest.raises(PopError, match=message) as error:
-        read(path)
-    assert str(path) in str(error.value)
+        read_all("small", tmp_path)
+    assert str(error.value).startswith(f"{path}: line 2")
 
 
-def test_a_file_that_is_no_result_is_told_by_name(tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
-    with pytest.raises(PopError, match=r"a\.json: cannot be read"):
-        read(path)
-    path.write_text("{", encoding="utf-8")
-    with pytest.raises(PopError, match=r"a\.json: is not JSON"):
-        read(path)
-    path.write_text("[]", encoding="utf-8")
-    with pytest.raises(PopError, match=r"a\.json: is list, not an object"):
+def test_a_line_that_is_no_result_is_told_by_file_and_line(tmp_path: Path) -> None:
+    path = write(PLAIN, tmp_path)
+    line = path.read_text(encoding="utf-8")
+    for text in ("{\n", "[]\n", json.dumps(json.loads(line)) + "\n"):
+        path.write_text(line + text, encoding="utf-8")
+        with pytest.raises(PopError, match=r"pop\.jsonl: line 2: must begin with schema 2, .*; remove the line"):
+            read(path)
+        with pytest.raises(PopError, match=r"pop\.jsonl: line 2: must begin"):
+            write(PLAIN, tmp_path)
+        assert path.read_text(encoding="utf-8") == line + text
+    path.write_text(line.replace('"psnr"', "psnr"), encoding="utf-8")
+    with pytest.raises(PopError, match=r"pop\.jsonl: line 1: is not JSON"):
         read(path)
 
 
 def test_what_cannot_be_read_is_not_written(tmp_path: Path) -> None:
-    with pytest.raises(PopError, match="psnr"):
-        write(replace(PLAIN, psnr=float("inf")), tmp_path)
-    assert not list(tmp_path.rglob("*.json"))
+    for strange in (replace(PLAIN, psnr=float("inf")), replace(PLAIN, psnr=31.0), replace(PLAIN, seed=43)):
+        with pytest.raises(PopError, match=r"psnr|run"):
+            write(strange, tmp_path)
+    assert not list(tmp_path.rglob("*.jsonl"))
+
+
+def test_a_folder_of_results_that_is_not_there_is_refused_where_it_is_read(tmp_path: Path) -> None:
+    assert existing_folder(tmp_path) == tmp_path
+    with pytest.raises(PopError, match="typo: no such folder; name the one that holds the results with --results"):
+        existing_folder(tmp_path / "typo")
 
 
 def test_a_curve_is_read_between_its_points() -> None:
@@ -118,7 +201,8 @@ def test_a_curve_is_read_between_its_points() -> None:
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_every_committed_result_can_be_read(scale: str) -> None:
+def test_every_committed_result_can_be_read_and_is_in_the_one_form(scale: str) -> None:
     found = read_all(scale, RESULTS)
-    assert len(found) == len(list((RESULTS / scale).rglob("*.json")))
-    assert len({(r.row, r.scene, r.seed) for r in found}) == len(found)
+    lines = sum(path.read_text(encoding="utf-8").count("\n") for path in (RESULTS / scale).glob("*.jsonl"))
+    assert len({(r.row, r.scene, r.seed) for r in found}) == len(found) == lines
+    assert not list((RESULTS / scale).rglob("*.json"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -61,10 +60,10 @@ def test_help_is_quick_and_loads_nothing_heavy(command):
         (["rum"], "'rum' is not a subcommand; did you mean 'pop-repro run'?"),
         (["xyz"], "'xyz' is not a subcommand; see 'pop-repro --help'"),
         (["run", "pops", "fox"], "row is 'pops'; it must be one of 3dgs, 3dgs_2023"),
-        (["run", "pop", "garden", "--scale", "dev"], "scale 'dev' has no garden; its scenes are fox, "),
+        (["run", "pop", "garden", "--scale", "small"], "scale 'small' has no garden; its scenes are fox, "),
         (["run", "pop", "fox", "--scale", "tiny"], "argument --scale: invalid choice: 'tiny'"),
         (
-            ["run", "pop", "fox", "--data", "nowhere", "--out", "results"],
+            ["run", "pop", "fox", "--data", "nowhere", "--results", "results"],
             "nowhere: no such folder; name the one that holds the scenes with",
         ),
         (["run", "pop"], "the following arguments are required: SCENE"),
@@ -84,7 +83,7 @@ def test_a_row_that_this_version_lacks_has_its_own_status(capsys, tmp_path, monk
     from pop_fast.train import presets
 
     monkeypatch.setattr(presets, "METHODS", {"pop": presets.METHODS["pop"]})
-    words = ["run", "gsplat", "demo", "--scale", "toy", "--work", tmp_path, "--out", tmp_path]
+    words = ["run", "gsplat", "demo", "--scale", "toy", "--work", tmp_path, "--results", tmp_path]
     assert "has no method 'gsplat'; it has pop" in call(*words, status=69, capsys=capsys)
 
 
@@ -95,19 +94,19 @@ def test_data_check_names_what_is_absent_and_its_source(capsys, tmp_path):
 
 
 def test_a_queue_lists_what_is_missing_cheapest_first(capsys, tmp_path):
-    words = ["queue", "--scale", "dev", "--out", tmp_path, "--list"]
+    words = ["queue", "--scale", "small", "--results", tmp_path, "--list"]
     lines = call(*words, "--seeds", "2", capsys=capsys).splitlines()
     assert len(lines) == 2 * 4 * len(ROWS)
     assert lines[0].split()[1] in ("bear_512", "garden_512")
     chosen = call(*words, "--rows", "gsplat", "pop", "--scenes", "fox", capsys=capsys).splitlines()
-    assert chosen == ["pop fox --scale dev --seed 42", "gsplat fox --scale dev --seed 42"]
+    assert chosen == ["pop fox --scale small --seed 42", "gsplat fox --scale small --seed 42"]
 
 
 @pytest.fixture(scope="module")
 def queued(tmp_path_factory):
     """A queue of two toy rows that is stopped by SIGTERM in the first, then called again to the end."""
     folder = tmp_path_factory.mktemp("queue")
-    words = ["--scale", "toy", "--rows", "l2_pop", "l1_div_100", "--out", "results", "--work", "work"]
+    words = ["--scale", "toy", "--rows", "l2_pop", "l1_div_100", "--results", "results", "--work", "work"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     command = [sys.executable, "-m", "paper_repro", "queue", *words, "--checkpoint-every", "50"]
     said = []
@@ -185,15 +184,14 @@ def test_results_are_committed_where_that_is_asked_for(tmp_path):
     (tmp_path / "other.txt").write_text("not to be committed")
     git(tmp_path, "add", "other.txt")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    words = ["--scale", "toy", "--rows", "l1_div_100", "--out", "results", "--work", "work", "--commit"]
+    words = ["--scale", "toy", "--rows", "l1_div_100", "--results", "results", "--work", "work", "--commit"]
     command = [sys.executable, "-m", "paper_repro", "queue", *words]
     subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True)
     shown = git(tmp_path, "show", "--stat", "--format=%s")
     assert shown.startswith("Result: l1_div_100 on demo, toy scale, seed 42\n")
-    assert "demo_42.json" in shown
+    assert "results/toy/l1_div_100.jsonl" in shown
     assert "other.txt" not in shown
-    result = json.loads((tmp_path / "results" / "toy" / "l1_div_100" / "demo_42.json").read_text())
-    assert result["psnr"] > 0.0
+    assert [result.row for result in read_all("toy", tmp_path / "results")] == ["l1_div_100"]
 
 
 def test_pages_made_from_the_packages_results_are_committed_with_them_unless_somebody_edits_them(tmp_path, monkeypatch):
@@ -205,14 +203,14 @@ def test_pages_made_from_the_packages_results_are_committed_with_them_unless_som
     git(tmp_path, "add", ".")
     git(tmp_path, "commit", "-q", "-m", "pages")
     pages[1].write_text("being edited")
-    path = job.result(results)
+    path = job.file(results)
     path.parent.mkdir(parents=True)
     path.write_text("{}")
     monkeypatch.setattr(repro_queue, "RESULTS", results)
     monkeypatch.setattr(repro_queue, "stale_files", lambda found: dict.fromkeys(pages, "new"))
     repro_queue._commit(job, results)
     assert set(git(tmp_path, "show", "--format=", "--name-only").split()) == {
-        "claims.md", "results/toy/pop/demo_42.json",
+        "claims.md", "results/toy/pop.jsonl",
     }  # fmt: skip
     assert [page.read_text() for page in pages] == ["new", "being edited"]
     # elsewhere than in the package's own folder nothing but the result
@@ -221,4 +219,4 @@ def test_pages_made_from_the_packages_results_are_committed_with_them_unless_som
     path.write_text("{ }")
     monkeypatch.setattr(repro_queue, "RESULTS", tmp_path)
     repro_queue._commit(job, results)
-    assert git(tmp_path, "show", "--format=", "--name-only").split() == ["results/toy/pop/demo_42.json"]
+    assert git(tmp_path, "show", "--format=", "--name-only").split() == ["results/toy/pop.jsonl"]

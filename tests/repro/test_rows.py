@@ -50,7 +50,7 @@ READINGS = {
     "pop_any_view": ("blur_window", "any_view"),
     "pop_prune_002": ("prune_opa", 0.02),
     "pop_sum": ("blur_window", "sum"),
-    "pop_no_size_prune": ("prune_too_big", False),
+    "pop_size_prune": ("prune_too_big", True),
 }
 
 
@@ -105,25 +105,34 @@ def test_no_two_rows_train_the_same():
 
 
 def test_step_numbers_of_options_are_shortened_with_the_schedule():
-    blur = job_named("blur_3k_4k", "fox", "dev").config().strategy
-    assert (blur.blur_start_iter, blur.blur_stop_iter, blur.refine_stop_iter) == (1000, 1333, 5000)
+    blur = job_named("blur_3k_4k", "demo", "toy").config().strategy
+    assert (blur.blur_start_iter, blur.blur_stop_iter, blur.refine_stop_iter) == (30, 40, 150)
     # a share, a weight and a factor are no step numbers
-    l1 = job_named("l1_div_5", "fox", "dev").config()
-    assert (l1.photometric_divisor, l1.max_steps, l1.strategy.lambda_pop) == (5.0, 10_000, 0.0)
-    # never stays never, and resets come no faster
-    assert job_named("l2", "fox", "dev").config().strategy.blur_stop_iter == -1
-    assert job_named("reset", "fox", "dev").config().strategy.reset_every == 3000
-    assert job_named("reset", "demo", "toy").config().strategy.reset_every == 30
-    assert job_named("pop", "demo", "toy").config().strategy.reset_every == 0
+    l1 = job_named("l1_div_5", "demo", "toy").config()
+    assert (l1.photometric_divisor, l1.max_steps, l1.strategy.lambda_pop) == (5.0, 300, 0.0)
+    # never stays never
+    assert job_named("l2", "demo", "toy").config().strategy.blur_stop_iter == -1
+    reset, pop = (job_named(row, "demo", "toy").config().strategy for row in ("reset", "pop"))
+    assert (reset.reset_every, reset.prune_too_big_after, reset.prune_too_big) == (30, 30, True)
+    assert (pop.reset_every, pop.prune_too_big) == (0, False)
+
+
+@pytest.mark.parametrize("scale", ["small", "no_floor", "full", "paper"])
+def test_the_scales_that_judge_have_the_whole_schedule(scale):
+    scene = next(iter(SCALES[scale].factors))
+    reset, whole = job_named("reset", scene, scale).config(), job_named("reset", "garden", "paper").config()
+    assert SCALES[scale].steps_scaler == 1.0
+    assert replace(reset.strategy, blur_min_pixels=0.0) == whole.strategy
+    assert (reset.max_steps, reset.sh_interval) == (whole.max_steps, whole.sh_interval)
 
 
 def test_a_small_scale_keeps_theta_blur_at_ten_pixels_and_the_papers_does_not():
-    for scale, floor in (("toy", 10.0), ("dev", 10.0), ("full", 10.0), ("paper", 0.0)):
+    for scale, floor in (("toy", 10.0), ("small", 10.0), ("full", 10.0), ("no_floor", 0.0), ("paper", 0.0)):
         scene = next(iter(SCALES[scale].factors))
         assert job_named("pop", scene, scale).config().strategy.blur_min_pixels == floor
 
 
-@pytest.mark.parametrize("scale", ["toy", "dev", "full"])
+@pytest.mark.parametrize("scale", ["toy", "small", "full"])
 def test_a_small_scale_sets_fewer_points_anew_than_its_views_have_pixels(scale):
     for scene, factor in SCALES[scale].factors.items():
         (width, height), views = SCENES[scene].size, SCENES[scene].n_images
@@ -139,11 +148,11 @@ def test_rows_of_a_method_that_is_not_there_say_so(monkeypatch):
     monkeypatch.setattr(presets, "METHODS", without)
     assert "no method 'gsplat'" in str(missing_method(load_row("gsplat")))
     with pytest.raises(NotTrainableError, match="row gsplat: this version of pop has no method 'gsplat'; it has pop"):
-        job_named("gsplat", "fox", "dev").config()
+        job_named("gsplat", "fox", "small").config()
 
 
 def test_rows_of_an_option_that_is_not_there_say_so(capsys):
-    job = job_named("pop", "fox", "dev")
+    job = job_named("pop", "fox", "small")
     strange = replace(job, row=replace(job.row, options=("--pop.wings", "2")))
     with pytest.raises(NotTrainableError, match=r"row pop: this version of pop train does not take .*--pop\.wings 2"):
         strange.config()
@@ -167,7 +176,7 @@ def test_rows_with_options_by_scene_have_them_for_every_scene(name):
 
 def test_inrias_rasterizer_draws_no_scene_whose_principal_point_lies_far_off():
     profiles = {
-        (row, scene): job_named(row, scene, "dev").config().profile
+        (row, scene): job_named(row, scene, "small").config().profile
         for row in ("pop", "3dgs", "speedy_splat")
         for scene in ("fox", "bear_512")
     }
@@ -182,18 +191,18 @@ def test_inrias_rasterizer_draws_no_scene_whose_principal_point_lies_far_off():
 
 
 def test_jobs_come_cheapest_first_and_names_are_checked():
-    jobs = jobs_of("dev", seeds=(42, 43))
+    jobs = jobs_of("small", seeds=(42, 43))
     assert [job.cost for job in jobs] == sorted(job.cost for job in jobs)
-    assert len(jobs) == len(set(map(str, jobs))) == 2 * len(ROWS) * len(SCALES["dev"].factors)
-    small, large = (job_named("pop", scene, "dev").cost for scene in ("bear_512", "fox"))
+    assert len(jobs) == len(set(map(str, jobs))) == 2 * len(ROWS) * len(SCALES["small"].factors)
+    small, large = (job_named("pop", scene, "small").cost for scene in ("bear_512", "fox"))
     assert small < large < job_named("pop", "bonsai_800", "full").cost
     with pytest.raises(PopError, match="row is 'pops'; it must be one of 3dgs, "):
-        job_named("pops", "fox", "dev")
+        job_named("pops", "fox", "small")
     with pytest.raises(PopError, match="scene is 'foxes'; it must be one of "):
-        job_named("pop", "foxes", "dev")
-    with pytest.raises(PopError, match="scale 'dev' has no garden; its scenes are fox, "):
-        job_named("pop", "garden", "dev")
-    with pytest.raises(PopError, match="scale is 'tiny'; it must be one of toy, dev, full, paper"):
+        job_named("pop", "foxes", "small")
+    with pytest.raises(PopError, match="scale 'small' has no garden; its scenes are fox, "):
+        job_named("pop", "garden", "small")
+    with pytest.raises(PopError, match="scale is 'tiny'; it must be one of toy, small, no_floor, full, paper"):
         job_named("pop", "fox", "tiny")
 
 

@@ -53,7 +53,7 @@ TANKS = [
 
 
 def test_a_cell_is_the_mean_over_seeds_with_their_spread() -> None:
-    line = line_of(table(1, "dev", DEV), 0, "pop")
+    line = line_of(table(1, "small", DEV), 0, "pop")
     assert (line.seeds, len(line.runs), line.missing) == (2, 2, ())
     assert line.cells["num_gaussians_k"].ours == "51.0 ± 1.4"
     assert line.cells["psnr"].ours == "31.10 ± 0.14"
@@ -62,7 +62,7 @@ def test_a_cell_is_the_mean_over_seeds_with_their_spread() -> None:
 
 
 def test_one_seed_has_no_spread_and_says_how_many_it_is() -> None:
-    made = table(1, "dev", DEV)
+    made = table(1, "small", DEV)
     assert line_of(made, 0, "gsplat").cells["psnr"].ours == "31.40"
     assert line_of(made, 0, "gsplat").cells["psnr"].spread is None
     assert f"n = 1: {DEV[2].run}" in markdown(made)
@@ -145,7 +145,7 @@ def test_other_data_never_stands_beside_a_number_of_the_paper(number: int, scale
 
 
 def test_ratios_stand_beside_the_papers_own() -> None:
-    ratios = table(1, "dev", DEV).ratios
+    ratios = table(1, "small", DEV).ratios
     assert ratios is not None
     assert ratios.columns == (
         "fox",
@@ -158,7 +158,7 @@ def test_ratios_stand_beside_the_papers_own() -> None:
     assert ratios.relative is not None
     assert ratios.relative["pop"] == ["51.0%, -0.30 dB", *["not run"] * 3, "8.5%, -0.65 dB", "3.9%, -0.95 dB"]
     assert ratios.relative["taming"][:2] == ["not run", "not run"]
-    blur = table(3, "dev", DEV).ratios
+    blur = table(3, "small", DEV).ratios
     assert blur is not None
     assert blur.relative is not None
     assert blur.relative["pop"] == [
@@ -172,7 +172,7 @@ def test_ratios_stand_beside_the_papers_own() -> None:
 
 
 def test_a_ratio_without_its_base_says_so() -> None:
-    ratios = table(1, "dev", DEV[:1]).ratios
+    ratios = table(1, "small", DEV[:1]).ratios
     assert ratios is not None
     assert ratios.relative is not None
     assert ratios.relative["pop"][0] == "gsplat not run"
@@ -191,7 +191,7 @@ def test_seconds_are_of_the_processor_and_those_by_the_clock_have_no_place() -> 
         result("3dgs", seconds=clock),
         result("taming", seconds=clock, machine="a machine, a GPU"),
     ]
-    made = table(1, "dev", found)
+    made = table(1, "small", found)
     cells = {row: line_of(made, 0, row).cells["time_s"] for row in ("gsplat", "pop", "3dgs", "taming")}
     assert [cell.ours for cell in cells.values()] == ["120", "100", "50 (clock)", "50"]
     assert [cell.place for cell in cells.values()] == [3, 2, 0, 1]
@@ -199,7 +199,7 @@ def test_seconds_are_of_the_processor_and_those_by_the_clock_have_no_place() -> 
 
 
 def test_the_best_three_are_marked_and_ties_alike() -> None:
-    made = table(1, "dev", DEV)
+    made = table(1, "small", DEV)
     assert {r: line_of(made, 0, r).cells["psnr"].place for r in ("3dgs", "gsplat", "pop", "mini_splatting")} == {
         "3dgs": 1, "gsplat": 2, "pop": 3, "mini_splatting": 0,
     }  # fmt: skip
@@ -217,7 +217,7 @@ def test_the_best_three_are_marked_and_ties_alike() -> None:
 
 
 def test_ablations_mark_the_best_alone_as_in_the_paper() -> None:
-    made = table(3, "dev", [result("l2", n=10), result("l2_blur", n=30), result("l2_pop", n=20)])
+    made = table(3, "small", [result("l2", n=10), result("l2_blur", n=30), result("l2_pop", n=20)])
     places = {line.row: line.cells["num_gaussians_k"].place for line in made.blocks[0].lines}
     assert places == {"l2": 1, "l2_blur": 0, "l2_pop": 0, "pop": 0}
 
@@ -232,7 +232,7 @@ def test_absent_data_is_told_from_what_was_not_run() -> None:
 
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("number", [1, 2, 3, 4, 5, 0])
-@pytest.mark.parametrize("results", [[], DEV, [*TANKS, on_paper("pup", "bicycle")]], ids=["none", "dev", "paper"])
+@pytest.mark.parametrize("results", [[], DEV, [*TANKS, on_paper("pup", "bicycle")]], ids=["none", "small", "paper"])
 def test_no_cell_is_blank_and_every_line_has_all_columns(results: list[Result], number: int, scale: str) -> None:
     made = table(number, scale, results) if number else beyond(scale, results)
     rows = list(csv.DictReader(io.StringIO(csv_text(made))))
@@ -261,7 +261,7 @@ def test_the_colours_are_those_of_the_paper() -> None:
 
 
 def test_what_goes_beyond_the_paper_has_a_table_of_its_own() -> None:
-    made = beyond("dev", [*DEV, result("final_prune", n=30_000)])
+    made = beyond("small", [*DEV, result("final_prune", n=30_000)])
     assert [line.row for line in made.blocks[0].lines] == list(BEYOND)
     assert line_of(made, 0, "final_prune").cells["psnr"].paper == "not in the paper"
     assert line_of(made, 0, "final_prune").cells["ckpt_mb"].ours == "6.8"
@@ -282,7 +282,7 @@ def test_a_setting_is_found_by_the_end_of_its_name() -> None:
 
 def test_unknown_names_are_refused() -> None:
     with pytest.raises(PopError, match="table is 7"):
-        table(7, "dev", [])
+        table(7, "small", [])
     with pytest.raises(PopError, match="scale is 'x'"):
         table(1, "x", [])
     with pytest.raises(PopError, match="scale is 'x'"):
@@ -300,4 +300,4 @@ def test_the_scenes_of_a_scale_are_those_that_the_runner_trains() -> None:
 def test_results_that_were_written_make_the_same_table(tmp_path: Path) -> None:
     for one in DEV:
         write(one, tmp_path)
-    assert csv_text(table(1, "dev", read_all("dev", tmp_path))) == csv_text(table(1, "dev", DEV))
+    assert csv_text(table(1, "small", read_all("small", tmp_path))) == csv_text(table(1, "small", DEV))

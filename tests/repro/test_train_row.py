@@ -16,8 +16,9 @@ import pytest
 from paper_repro import train_row as module
 from paper_repro.collect import collect, first_change
 from paper_repro.jobs import NotTrainableError
-from paper_repro.results import path_of, read, write
-from paper_repro.train_row import BusyError, Options, commit, is_finished, only_one, train_row
+from paper_repro.record import run_id, settings_hash
+from paper_repro.results import read, write
+from paper_repro.train_row import BusyError, Options, commit, finished, only_one, train_row
 from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
 from tests.app.interruptions import interrupt
@@ -34,10 +35,8 @@ def made(tmp_path_factory):
 
 
 def test_a_result_lies_in_its_place_and_holds_what_was_asked_for(made):
-    how, path = made
-    assert path == how.results / "toy" / "pop" / "demo_42.json"
-    result = read(path)
-    assert path_of(result, how.results) == path
+    how, result = made
+    assert read(how.results / "toy" / "pop.jsonl") == (result,)
     assert (result.scale, result.row, result.scene, result.seed) == ("toy", "pop", "demo", 42)
     assert (result.threads, result.commit) == (1, commit())
     assert result.protocol["test_views"] == len(result.per_view) == 3
@@ -50,11 +49,11 @@ def test_a_result_lies_in_its_place_and_holds_what_was_asked_for(made):
     assert result.checkpoint_mib == pytest.approx(result.num_gaussians * 236 / 2**20, rel=1e-12)
     assert result.lpips == {"vgg_01": None, "alex_norm": None, "alex_01": None}
     assert result.psnr == pytest.approx(sum(view["psnr"] for view in result.per_view.values()) / 3, rel=1e-12)
-    assert str(how.data) not in path.read_text()
+    assert str(how.data) not in toy("pop").file(how.results).read_text()
 
 
 def test_a_curve_has_every_densification_step_and_the_held_out_views_of_every_fifteenth(made):
-    curve = read(made[1]).curve
+    curve = made[1].curve
     steps = [point["step"] for point in curve]
     assert steps == sorted(set(steps))
     assert set(range(0, 300, 10)) <= set(steps)
@@ -67,7 +66,7 @@ def test_a_curve_has_every_densification_step_and_the_held_out_views_of_every_fi
     for before, now in changes:
         change = now["cloned"] + now["split"] - now["pruned"]
         assert now["num_gaussians"] == before["num_gaussians"] + change
-    last, result = curve[-1], read(made[1])
+    last, result = curve[-1], made[1]
     assert (last["step"], last["num_gaussians"], last["psnr_test"]) == (
         *(299, result.num_gaussians),
         pytest.approx(result.psnr, rel=1e-5),
@@ -75,7 +74,7 @@ def test_a_curve_has_every_densification_step_and_the_held_out_views_of_every_fi
 
 
 def test_a_curve_has_what_a_few_training_views_say_all_along(made):
-    points = {point["step"]: point for point in read(made[1]).curve}
+    points = {point["step"]: point for point in made[1].curve}
     probed = [step for step, point in points.items() if point.get("grad_l2") is not None]
     assert probed == list(range(0, 300, 10))
     for step in probed:
@@ -89,15 +88,15 @@ def test_a_curve_has_what_a_few_training_views_say_all_along(made):
 
 
 def test_a_finished_row_is_not_trained_again_and_leaves_no_bulk(made, monkeypatch):
-    how, path = made
+    how, result = made
     work = toy("pop").work(how.work)
     assert not (work / "ckpts").exists()
     assert not (work / "ply").exists()
     assert (work / "metrics.jsonl").is_file()
-    text = path.read_bytes()
+    text = toy("pop").file(how.results).read_bytes()
     monkeypatch.setattr(TrainingRun, "__init__", lambda *_, **__: pytest.fail("trained again"))
-    assert train_row(toy("pop"), how) == path
-    assert path.read_bytes() == text
+    assert train_row(toy("pop"), how) == result
+    assert toy("pop").file(how.results).read_bytes() == text
 
 
 def test_a_row_that_was_interrupted_ends_with_the_same_result(made, tmp_path, monkeypatch):
@@ -106,16 +105,16 @@ def test_a_row_that_was_interrupted_ends_with_the_same_result(made, tmp_path, mo
         interrupt(patch, at=150)
         with pytest.raises(KeyboardInterrupt):
             train_row(toy("pop"), how)
-    assert not toy("pop").result(how.results).exists()
+    assert not toy("pop").is_done(how.results)
     assert (toy("pop").work(how.work) / "ckpts" / "ckpt_99_rank0.pt").is_file()
-    again = read(train_row(toy("pop"), how))
-    assert values(again) == values(read(made[1]))
+    again = train_row(toy("pop"), how)
+    assert values(again) == values(made[1])
 
 
 def test_what_was_asked_to_be_kept_is_kept(made, tmp_path):
     how = options(tmp_path, keep_ply=True, keep_checkpoints=True)
     job = toy("l1_div_10", steps_scaler=0.002)
-    result = read(train_row(job, how))
+    result = train_row(job, how)
     assert [path.name for path in (job.work(how.work) / "ply").iterdir()] == ["point_cloud_59.ply"]
     assert list((job.work(how.work) / "ckpts").iterdir())
     # a divisor is no step number, and a run of 60 steps has not become one of 300
@@ -125,38 +124,41 @@ def test_what_was_asked_to_be_kept_is_kept(made, tmp_path):
 @pytest.mark.parametrize("row", ["3dgs", "gsplat", "reset", "l1_div_10"])
 def test_rows_of_other_methods_and_losses_are_trained(row, tmp_path, made):
     job = toy(row, steps_scaler=0.003)
-    result = read(train_row(job, options(tmp_path)))
+    result = train_row(job, options(tmp_path))
     assert result.schedule["method"] == job.row.method
     assert {point["step"] for point in result.curve} >= {0, 89}
-    assert result.run != read(made[1]).run
-    assert result.data_hash == read(made[1]).data_hash
+    assert result.run != made[1].run
+    assert result.data_hash == made[1].data_hash
     loss = "l2" if row == "reset" else "l1"
     assert result.curve[0][loss] > 0.0
 
 
 def test_a_run_is_known_by_settings_data_and_seed_and_not_by_how_it_ran(tmp_path):
     job = toy("pop", steps_scaler=0.001)
-    one, other = (read(train_row(job, options(tmp_path / name))) for name in ("a", "b"))
+    one, other = (train_row(job, options(tmp_path / name)) for name in ("a", "b"))
     assert (one.run, one.config_hash, one.data_hash) == (other.run, other.config_hash, other.data_hash)
-    threads = read(train_row(job, options(tmp_path / "c", threads=2, checkpoint_every=7, log_every=5)))
+    threads = train_row(job, options(tmp_path / "c", threads=2, checkpoint_every=7, log_every=5))
     assert (threads.run, threads.threads) == (one.run, 2)
-    logged = [{point["step"] for point in result.curve if point["psnr"] is not None} for result in (one, threads)]
+    logged = [{point["step"] for point in result.curve if "psnr" in point} for result in (one, threads)]
     assert logged == [{0, 10, 20}, {0, 5, 10, 15, 20, 25}]
-    seed = read(train_row(replace(job, seed=43), options(tmp_path / "d")))
+    seed = train_row(replace(job, seed=43), options(tmp_path / "d"))
     assert (seed.config_hash, seed.seed) == (one.config_hash, 43)
     assert seed.run != one.run
 
 
 def test_a_result_whose_row_has_changed_is_refused_and_new_settings_are_not(made, tmp_path):
-    result, job = read(made[1]), toy("pop")
-    assert is_finished(job, made[0].results)
+    result, job = made[1], toy("pop")
+    assert finished(job, made[0].results) == result
     older = replace(result, schedule={name: v for name, v in result.schedule.items() if name != "pop.absgrad"})
     assert first_change(older, job.config()) is None
-    other = replace(result, schedule={**result.schedule, "pop.theta_blur": 3e-5})
+    settings = {**result.schedule, "pop.theta_blur": 3e-5}
+    hashed = settings_hash(settings)
+    other = replace(result, schedule=settings, config_hash=hashed, run=run_id(hashed, result.data_hash, result.seed))
     path = write(other, tmp_path / "results")
-    with pytest.raises(PopError, match=r"was trained with pop\.theta_blur = 3e-05, and the row has 2e-05 now; remove"):
+    told = r"pop\.jsonl: demo, seed 42 was trained with pop\.theta_blur = 3e-05, and the row has 2e-05 now; .* --again"
+    with pytest.raises(PopError, match=told):
         train_row(job, options(tmp_path))
-    assert path.is_file()
+    assert read(path) == (other,)
 
 
 def test_a_row_that_another_process_trains_is_left_to_it(made, tmp_path):
@@ -185,20 +187,19 @@ def test_an_unfinished_folder_is_not_collected(tmp_path, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             train_row(job, how)
     with pytest.raises(PopError, match=r"val_step0029\.json: is absent, so the training is not finished"):
-        collect(job, job.work(how.work))
+        collect(job, job.work(how.work), {})
 
 
 def test_what_an_earlier_training_left_does_not_reach_a_result(tmp_path):
     how, job = options(tmp_path), toy("pop", steps_scaler=0.001)
-    path = train_row(job, how)
-    first = values(read(path))
+    first = values(train_row(job, how))
     # measurements at steps that this training does not measure at
     stats = job.work(how.work) / "stats"
     (stats / "val_step0010.json").write_text(
         json.dumps({**json.loads((stats / "val_step0029.json").read_text()), "step": 10})
     )
-    path.unlink()
-    assert values(read(train_row(job, how))) == first
+    job.file(how.results).unlink()
+    assert values(train_row(job, how)) == first
 
 
 def _waiting_for(path: Path, process: subprocess.Popen, seconds: float = 120.0) -> None:
@@ -211,7 +212,7 @@ def _waiting_for(path: Path, process: subprocess.Popen, seconds: float = 120.0) 
 
 def test_sigterm_leaves_a_checkpoint_and_the_same_command_goes_on(made, tmp_path):
     how, job = options(tmp_path), toy("pop")
-    words = ["run", "pop", "demo", "--scale", "toy", "--out", str(how.results), "--work", str(how.work)]
+    words = ["run", "pop", "demo", "--scale", "toy", "--results", str(how.results), "--work", str(how.work)]
     command = [sys.executable, "-m", "paper_repro", *words]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=ROOT)
     _waiting_for(job.work(how.work) / "metrics.jsonl", process)
@@ -222,7 +223,7 @@ def test_sigterm_leaves_a_checkpoint_and_the_same_command_goes_on(made, tmp_path
         "pop-repro: stopped; the same command continues from the last checkpoint\n",
     )
     assert list((job.work(how.work) / "ckpts").iterdir())
-    assert not job.result(how.results).exists()
+    assert not job.is_done(how.results)
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True)
-    assert done.stdout.splitlines()[-1] == str(job.result(how.results))
-    assert values(read(job.result(how.results))) == values(read(made[1]))
+    assert done.stdout.splitlines()[-1] == str(job.file(how.results))
+    assert values(job.result(how.results)) == values(made[1])

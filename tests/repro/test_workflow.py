@@ -42,7 +42,7 @@ def rules(printed: str) -> dict[str, int]:
     return {name: int(count) for name, count in re.findall(r"^(\w+) +(\d+)$", printed, re.MULTILINE)}
 
 
-@pytest.mark.parametrize("scale", ["toy", "dev", "paper"])
+@pytest.mark.parametrize("scale", ["toy", "small", "paper"])
 def test_there_is_one_rule_for_each_row_scene_and_seed_and_one_for_each_table_and_figure(tmp_path, scale):
     planned = rules(workflow(tmp_path, "-n", scale=scale, seeds=2))
     jobs = [job for job in jobs_of(scale, seeds=(42, 43)) if trainable(job)]
@@ -65,7 +65,7 @@ def test_the_cheapest_row_has_the_highest_priority_and_a_gpu_is_asked_for_at_the
     ranked = sorted(priority, key=lambda name: -priority[name])
     assert ranked == [f"train_{job.row.name}_{job.scene.name}_{job.seed}" for job in jobs]
     assert printed.count("gpu=1") == len(jobs)
-    assert "gpu=1" not in workflow(tmp_path, "-n", "rows", scale="dev")
+    assert "gpu=1" not in workflow(tmp_path, "-n", "rows", scale="small")
 
 
 def test_the_slurm_profile_is_read(tmp_path):
@@ -78,14 +78,14 @@ def test_rows_are_trained_and_finished_ones_are_left_alone(tmp_path):
     workflow(tmp_path, "-j", "1", "rows", scale="toy", rows="l1_div_100,l2_pop")
     found = read_all("toy", tmp_path / "results")
     assert [result.row for result in found] == ["l1_div_100", "l2_pop"]
-    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "results").rglob("*.json")}
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "results").rglob("*.jsonl")}
     assert "Nothing to be done" in workflow(tmp_path, "-j", "1", "rows", scale="toy", rows="l1_div_100,l2_pop")
     # another machine has no memory of this one's runs, and its settings are other words
     (tmp_path / ".snakemake").rename(tmp_path / "forgotten")
     assert "Nothing to be done" in workflow(
         tmp_path, "-j", "1", "rows", scale="toy", rows="l1_div_100,l2_pop", threads=2
     )
-    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "results").rglob("*.json")} == before
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "results").rglob("*.jsonl")} == before
 
 
 def test_tables_are_made_of_what_is_there(tmp_path):

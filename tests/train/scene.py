@@ -17,6 +17,7 @@ DENSITY = DensityConfig(
     grow_scale3d=0.12,
     prune_opa=0.06,
     prune_scale3d=0.26,
+    prune_too_big=True,
     prune_too_big_after=60,
     refine_start_iter=10,
     refine_stop_iter=260,

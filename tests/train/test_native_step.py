@@ -14,14 +14,18 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.faults.runs import same
 from pop_fast.api.registry import get_backend
+from pop_fast.compiled import native_step
 from pop_fast.data.initialize import initialize_params
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun, engines, fused_stepper
+from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.engines import engine_of, native_engine, torch_engine
 from pop_fast.train.model import KEYS
 from pop_fast.train.stepper import Engine
+from tests.app.interruptions import interrupt
 from tests.app.tiny import HEIGHT, WIDTH, last_checkpoint, tiny_capture, tiny_config
 
 REASON = get_backend("compiled").why_not()
@@ -159,26 +163,69 @@ def test_a_step_that_is_left_changes_nothing_and_is_taken_by_whoever_goes_on(tmp
     assert len(stopped) > 1, "nothing was left half way"
 
 
-@pytest.mark.parametrize("gain", [0.0, 1e-6])
+@pytest.mark.parametrize("method", ["pop", "gsplat"])
 def test_how_many_steps_are_taken_at_a_time_changes_no_bit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found: list[dict[str, Any]] = []
     for seconds, most in ((0.0, 20), (math.inf, 3), (math.inf, 20)):
         monkeypatch.setattr(fused_stepper, "BLOCK_SECONDS", seconds)
         monkeypatch.setattr(engines, "MOST_ON_CPU", most)
-        config = tiny_config(tmp_path / f"{seconds}_{most}", backend="compiled", checkpoint_every=0, save_steps=())
+        folder = tmp_path / f"{seconds}_{most}"
+        config = tiny_config(folder, method, backend="compiled", checkpoint_every=0, save_steps=())
         # the sums of the last window are among what is kept
-        window = {"refine_every": 13, "refine_stop_iter": 60, "blur_stop_iter": 50}
-        config = replace(config, strategy=replace(config.strategy, blur_stop_gain=gain, **window))
-        run = TrainingRun(config, tiny_capture())
-        run.run()
-        found.append(last_checkpoint(Path(config.result_dir), "seconds", "metrics_bytes"))
-    assert found[0][".strategy.loss_sum"] > 0.0
+        config = replace(config, strategy=replace(config.strategy, refine_every=13, refine_stop_iter=60))
+        TrainingRun(config, tiny_capture()).run()
+        found.append(last_checkpoint(folder, "seconds", "metrics_bytes"))
+    assert found[0][".strategy.count"].any()
     for other in found[1:]:
         for name, value in found[0].items():
             same = torch.equal(value, other[name]) if isinstance(value, torch.Tensor) else value == other[name]
             assert same, name
+
+
+@pytest.mark.parametrize("method", ["pop", "gsplat"])
+def test_a_run_goes_on_with_another_number_of_threads_to_the_same_bits(
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # so many Gaussians that torch shares them out: those of the densification steps between the native ones too
+    rng, many = np.random.default_rng(0), 33_000
+    points, colors = rng.uniform(-1.0, 1.0, (many, 3)), rng.integers(0, 255, (many, 3), dtype=np.uint8)
+    capture = replace(tiny_capture(), points=points, points_rgb=colors)
+
+    def run(folder: str, threads: int, resume: bool = False) -> None:
+        settings = {"max_steps": 7, "eval_steps": (), "save_steps": (), "checkpoint_every": 3, "init_scale": 0.3}
+        config = tiny_config(tmp_path / folder, method, backend="compiled", threads=threads, **settings)
+        config = replace(config, strategy=replace(config.strategy, grow_grad2d=1e-6))
+        TrainingRun(config, capture, resume=resume).run()
+
+    run("whole", 1)
+    with monkeypatch.context() as patch:
+        interrupt(patch, at=4)
+        with pytest.raises(KeyboardInterrupt):
+            run("parts", 2)
+    run("parts", 3, resume=True)
+    whole, parts = (ckpt.load_checkpoint(ckpt.checkpoint_path(tmp_path / name, 6)) for name in ("whole", "parts"))
+    assert (whole["threads"], parts["threads"]) == (1, 3)
+    assert len(whole["splats"]["means"]) != many
+    for part in ("splats", "optimizers", "strategy"):
+        assert same(whole[part], parts[part]), part
+
+
+@pytest.mark.parametrize("most", [1_000_000, 10])
+def test_a_step_whose_lists_cannot_be_numbered_is_told_before_it_is_taken(
+    most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(native_step, "MOST_ENTRIES", most)
+    run = run_of(tmp_path, native_engine(), {})
+    before = {key: param.detach().clone() for key, param in run.params.items()}
+    if most > 10:
+        taken(run, 1)
+        assert not torch.equal(run.params["means"], before["means"])
+        return
+    with pytest.raises(MemoryError, match="step 0: the Gaussians reach more than 10 tiles altogether; train"):
+        taken(run, 1)
+    assert all(torch.equal(param, before[key]) for key, param in run.params.items())
 
 
 def test_memory_for_photographs_changes_no_bit(tmp_path: Path) -> None:

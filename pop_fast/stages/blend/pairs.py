@@ -1,4 +1,4 @@
-"""The (splat, pixel) pairs of a blend, a step of `blender` at a time, for sums over the pixels of every splat.
+"""The (splat, pixel) pairs of a blend, a step of `Blender` at a time, for sums over the pixels of every splat.
 
 A pass over a view asks of every splat for a sum over the pixels where it is blended. A tile-list entry holds one
 splat's pixels of one tile: the pass writes one row an entry, and the rows of a splat are added up in the order of the

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
-from importlib.resources import files
 
 import numpy as np
 
+from pop_fast.view.document import asset, document
 from pop_fast.view.explain.drawing import css_color, ellipse_of, light_bar, stage
 from pop_fast.view.explain.maps import Map, crop
 from pop_fast.view.explain.model import PixelExplanation, Row
@@ -41,18 +41,8 @@ def page(e: PixelExplanation, maps: Sequence[Map], differences: Sequence[str] = 
             "<footer>Written by <code>pop explain</code>; the numbers are the oracle's, in float64.</footer>",
         ]
     )
-    style = _asset("pop_fast.view.report", "page.css") + _asset("pop_fast.view.explain", "page.css")
-    title = escape(f"{e.view} ({e.x}, {e.y})")
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<title>{title}</title><style>{style}</style></head>"
-        f"<body><main>{body}</main><script>{_asset('pop_fast.view.explain', 'page.js')}</script></body></html>\n"
-    )
-
-
-def _asset(package: str, name: str) -> str:
-    return files(package).joinpath(name).read_text(encoding="utf-8")
+    style = asset("report", "page.css") + asset("explain", "page.css")
+    return document(f"{e.view} ({e.x}, {e.y})", style, body, asset("explain", "page.js"))
 
 
 def _subtitle(e: PixelExplanation) -> str:

@@ -7,6 +7,7 @@ from html import escape
 from typing import Any, Final
 
 from pop_fast.errors import PopError
+from pop_fast.view.document import asset
 
 # a page that is larger than this is linked, not put into the report
 _LARGEST: Final = 16 * 2**20
@@ -66,13 +67,27 @@ def encoding_rows(encodings: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...
     return rows
 
 
+def viewer_script() -> str:
+    """Return the script of the page that shows the splat."""
+    return asset("html", "viewer.js")
+
+
+def is_framed(page: str | None) -> bool:
+    """Tell whether the report shows that page in a frame: where it is not too large, and has this version's script.
+
+    A page that another version or another program has written is opened by itself: the report lets no script run but
+    those of this package.
+    """
+    return page is not None and len(page) <= _LARGEST and f"<script>{viewer_script()}</script></body>" in page
+
+
 def viewer_section(page: str | None) -> str:
     """Show the page that shows the splat, in a frame of its own; nothing where there is none."""
     if page is None:
         return ""
     about = "Drag, pinch or use the arrows; it starts at a training camera. The same page lies beside this report as "
     about += '<a href="viewer.html">viewer.html</a>.'
-    if len(page) > _LARGEST:
+    if not is_framed(page):
         return f'<h2>The splat</h2><p>{len(page) / 1e6:.0f} MB, in <a href="viewer.html">viewer.html</a>.</p>'
     return (
         f"<h2>The splat</h2><p>{about}</p>"

@@ -1,3 +1,10 @@
+// a line of text, as text whatever it holds, after a dot of a colour
+const line = (text, color) => {
+  const made = document.createElement("div");
+  if (color) made.append(Object.assign(document.createElement("i"), { style: `background:${color}` }));
+  made.append(text);
+  return made;
+};
 // a crosshair for each chart: the values at the iteration nearest to the pointer
 for (const figure of document.querySelectorAll("[data-chart]")) {
   const chart = JSON.parse(figure.dataset.chart);
@@ -21,14 +28,13 @@ for (const figure of document.querySelectorAll("[data-chart]")) {
     const step = longest.x[nearest(longest.x, wanted)];
     const at = left + ((width - left - right) * step) / chart.stop;
     cross.setAttribute("d", `M${at} ${top}V${height - bottom}`);
-    const rows = chart.series.filter((s) => s.x.length).map((s) => {
+    tip.replaceChildren(line(`iteration ${step}`));
+    for (const s of chart.series.filter((s) => s.x.length)) {
       const at = nearest(s.x, step);
-      const value = Math.abs(s.x[at] - step) < 0.02 * chart.stop ? s.y[at] : null;
-      if (value === null) return "";
-      const text = value.toLocaleString("en", { maximumSignificantDigits: 5 });
-      return `<div><i style="background:${s.c}"></i>${s.n} ${text}${chart.unit}</div>`;
-    });
-    tip.innerHTML = `<div>iteration ${step}</div>` + rows.join("");
+      if (Math.abs(s.x[at] - step) >= 0.02 * chart.stop || s.y[at] === null) continue;
+      const text = s.y[at].toLocaleString("en", { maximumSignificantDigits: 5 });
+      tip.append(line(`${s.n} ${text}${chart.unit}`, s.c));
+    }
     tip.hidden = false;
     const outer = figure.getBoundingClientRect();
     const x = box.left - outer.left + (at / width) * box.width;

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from html import escape
-from importlib.resources import files
 from typing import Any, Final
 
 import numpy as np
 
 from pop_fast.view import pictures
+from pop_fast.view.document import asset, document
 from pop_fast.view.report.curves import Chart, Series, draw, draw_histogram
-from pop_fast.view.report.files_section import sizes_section, viewer_section
+from pop_fast.view.report.files_section import is_framed, sizes_section, viewer_script, viewer_section
 from pop_fast.view.report.model import Histogram, ReportData, Tile
 from pop_fast.view.report.run_sections import command_section, open_section, orbit_section, verdict_section
 from pop_fast.view.report.views_section import views_section
@@ -63,17 +63,8 @@ def page(data: ReportData) -> str:
             "<footer>Written by <code>pop</code> from the files beside it; nothing comes from the network.</footer>",
         ]
     )
-    style, script = _asset("page.css"), _asset("page.js")
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<title>{escape(data.title)}</title><style>{style}</style></head>"
-        f"<body><main>{body}</main><script>{script}</script></body></html>\n"
-    )
-
-
-def _asset(name: str) -> str:
-    return files("pop_fast.view.report").joinpath(name).read_text(encoding="utf-8")
+    framed = viewer_script() if is_framed(data.viewer) else ""
+    return document(data.title, asset("report", "page.css"), body, asset("report", "page.js"), framed)
 
 
 def _tiles(headline: Sequence[Tile]) -> str:
