@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import os
 import sys
 import time
@@ -27,6 +26,7 @@ from pop_fast.cli.live_view import LiveView, check_viewer
 from pop_fast.cli.printable import printable
 from pop_fast.cli.result_folder import as_begun, check_output, record_of, resumption, stopped
 from pop_fast.cli.said import PLAN, plan_of, said
+from pop_fast.cli.told_early import about_large, check_early
 from pop_fast.cli.train_blocks import check_blocks, train_in_blocks
 from pop_fast.data.sfm_options import SfmOptions
 from pop_fast.errors import PopError
@@ -80,9 +80,6 @@ _SMALLER: Final = (
 )
 # of which the nearest option by its letters is another thing
 _ELSEWHERE: Final = dict.fromkeys(("--max-size", "--resolution", "-r", "--downscale", "--downscale-factor"), _SMALLER)
-# px of a photograph from which a step takes seconds on a CPU, and the side that other trainers shrink such ones to
-_LARGE: Final = 3_000_000
-_USUAL_SIDE: Final = 1600
 # what trains, and takes longest to import
 _TRAINING: Final = ("pop_fast.train.training_run", "pop_fast.compiled.native_step")
 _IGNORED: Final = frozenset({"--eval"})  # Inria: hold out every 8th view; here the default (--test-every 0 holds none)
@@ -139,7 +136,7 @@ def run(argv: Sequence[str]) -> int:
         options = as_begun(folder, options)
         config, chosen = choose_backend(config, options.resume)
         check_backend(config)
-        check_early(config, options, ranks)
+        check_early(config, options.source, options.images, ranks)
         if options.blocks is not None:
             return train_in_blocks(config, options, chosen, argv)
         status = train_capture(config, options, chosen, argv, ranks)
@@ -233,20 +230,6 @@ def _trained(training: TrainingRun, folder: Path, capture: Capture, options: Any
         return 0
     print(summary(stats), flush=True)
     return finish(folder, capture, options) or report(folder)
-
-
-def about_large(capture: Capture, config: TrainConfig) -> str | None:
-    """Say what photographs of full size cost on a CPU, before the first step; None where they are not that large."""
-    pixels = sum(view.width * view.height for view in capture.views) / len(capture.views)
-    if config.backend == "cuda" or pixels < _LARGE:
-        return None
-    view = max(capture.views, key=lambda view: view.width * view.height)
-    shrink = math.ceil(max(view.width, view.height) / _USUAL_SIDE)
-    return (
-        f"the photographs are up to {view.width}x{view.height} px, and every step draws one: seconds a step on a CPU "
-        f"(the time left is told after the first ones); --factor {config.factor * shrink} takes about "
-        f"1/{shrink**2} of the time, at {round(view.width / shrink)}x{round(view.height / shrink)} px"
-    )
 
 
 def takes_hours(config: TrainConfig) -> bool:
@@ -382,30 +365,6 @@ def check_backend(config: TrainConfig) -> None:
         reason = unsupported(config)
         if reason is not None:
             raise PopError(reason)
-
-
-def check_early(config: TrainConfig, options: Any, ranks: Ranks | None) -> None:
-    """Refuse what would end a run after its photographs were read, before their cameras are searched for.
-
-    Raises:
-        PopError: names the option, and the photograph or file.
-    """
-    for name, files in (("--lpips-vgg", config.lpips_vgg), ("--lpips-alex", config.lpips_alex)):
-        for file in files:
-            if not Path(file).is_file():
-                raise PopError(f"{file}: there is no such file of LPIPS weights; give {name} another, or leave it out")
-    if ranks is not None or config.batch_size > 1:
-        from pop_fast.train.batch_stepper import check_batch
-        from pop_fast.train.ranks import ALONE
-
-        check_batch(config, True, ranks or ALONE)
-    if not Path(config.data).is_dir() or config.factor == 1:
-        return
-    from pop_fast.data.load import check_factor, find_listing
-
-    # what a model lists is refused as its first photograph is read
-    if options.source == "photos" or find_listing(Path(config.data), options.source, options.images) is None:
-        check_factor(Path(config.data), config.factor)
 
 
 def _open_in_turn(config: TrainConfig, options: Any, ranks: Ranks | None) -> Capture:

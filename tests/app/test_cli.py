@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pop_fast.cli import COMMANDS, main, train
+from pop_fast.cli import COMMANDS, main
 from pop_fast.cli.errors import describe
+from pop_fast.cli.told_early import about_large
 from pop_fast.cli.train import arguments, rename_aliases
 from pop_fast.data.capture import Capture, View
 from pop_fast.data.sfm import SfmResult
@@ -220,12 +221,12 @@ def test_photographs_of_full_size_are_told_what_they_cost() -> None:
     image = np.broadcast_to(np.zeros(3, np.uint8), (3000, 4000, 3))
     view = View("a.jpg", image, np.eye(4), np.eye(3))
     large = Capture("large", (view, replace(view, name="b.jpg")), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "")
-    told = train.about_large(large, TrainConfig())
+    told = about_large(large, TrainConfig())
     assert told is not None
     assert "4000x3000 px" in told
     assert "--factor 3 takes about 1/9 of the time, at 1333x1000 px" in told
     small = replace(view, image=image[:1000, :1333])
-    assert train.about_large(replace(large, views=(small, replace(small, name="b.jpg"))), TrainConfig()) is None
+    assert about_large(replace(large, views=(small, replace(small, name="b.jpg"))), TrainConfig()) is None
 
 
 def test_compare_puts_results_side_by_side(pop: Pop, shared_result: Path) -> None:
