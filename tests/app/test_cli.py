@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -190,18 +189,6 @@ def test_eval_of_a_ply_needs_a_capture_and_agrees_with_the_checkpoint(
     measured = json.loads((tmp_path / "e.json").read_text())
     trained = json.loads((shared_result / "stats" / "val_step0029.json").read_text())
     assert measured["psnr"] == pytest.approx(trained["psnr"], abs=1e-3)
-
-
-def test_compare_leaves_out_a_run_that_has_measured_nothing_and_names_it(
-    pop: Pop, shared_result: Path, result: Path
-) -> None:
-    shutil.rmtree(result / "stats")
-    found = pop("compare", shared_result, result)
-    assert found.status == 1
-    assert len(found.out.splitlines()) == len(pop("compare", shared_result).out.splitlines())
-    assert str(result) in found.err
-    assert "pop eval" in found.err
-    assert pop("compare", result).status == 2
 
 
 def test_the_help_of_train_begins_with_what_is_trained_and_ends_with_blocks(pop: Pop) -> None:
