@@ -48,10 +48,8 @@ def hours_by_row(jobs: Sequence[Job]) -> list[str]:
     width = max(map(len, found))
     lines = [f"{name:<{width}}  {taken:6.1f} h" for name, taken in found.items()]
     gpu = paper().stated["gpu"].value
-    return [
-        *lines,
-        f"{sum(found.values()):.1f} hours of one {gpu} in all, by the paper's times, or by a row's cost where it has none",
-    ]
+    source = "by the paper's times, or by a row's cost where it prints none"
+    return [*lines, f"{sum(found.values()):.1f} hours of one {gpu} in all, {source}"]
 
 
 def lacking(jobs: Sequence[Job], data: Path, work: Path, backend: str) -> list[str]:
