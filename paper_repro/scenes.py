@@ -21,7 +21,15 @@ from typing import Any, Final
 from pop_fast.errors import PopError
 
 __all__ = [
-    *("DATASETS", "SCENES", "Dataset", "Scene", "find_folder", "load_scene", "load_scenes", "scene_named", "source_of"),
+    "DATASETS",
+    "SCENES",
+    "Dataset",
+    "Scene",
+    "find_folder",
+    "load_scene",
+    "load_scenes",
+    "scene_named",
+    "source_of",
 ]
 
 FOLDER: Final = Path(__file__).resolve().parent / "scenes"
