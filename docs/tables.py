@@ -19,8 +19,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from stages import ROOT, STAGES, files, functions, laws
 
-from paper_repro.results import SCALES, read_all
-from paper_repro.status import status_table
+from paper_repro.claims_page import outcome as outcome_of
+from paper_repro.status import everything, status_table
 from pop_fast.train.presets import options_for
 from pop_ref.conformance.capabilities import STAGES as LAW_STAGES
 from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM
@@ -115,7 +115,12 @@ RECIPE_NOTES = {
 
 def reproduction() -> str:
     """Make the table of the paper's claims and tables, as `paper_repro.status` does."""
-    return status_table([result for scale in SCALES for result in read_all(scale)])
+    return status_table(everything())
+
+
+def outcome() -> str:
+    """Tell what became of the paper's headline claims, a line each, as `paper_repro.status` does."""
+    return outcome_of(everything())
 
 
 def results() -> str:
@@ -320,6 +325,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "blocks": blocks,
     "recipes": recipes,
     "reproduction": reproduction,
+    "settled": outcome,
+    "outcome": outcome,
     "kit": kit,
     "teeth": teeth,
     "scorecards": scorecards,

@@ -99,7 +99,7 @@ def begin_from_base(job: Job, folder: Path, work: Path, config: TrainConfig, cap
     path = next((path for path in (of_base / _KEPT / usual.name, usual) if path.is_file()), None)
     if path is None:
         return None
-    content = load_checkpoint(path)
+    content, config = load_checkpoint(path), config.in_world(capture.world_scale)
     if (
         _shared(content["config"], config.binding()) != steps
         or content["threads"] != (config.threads or torch.get_num_threads())

@@ -9,26 +9,26 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
 from paper_repro.jobs import Job
 from paper_repro.published import file_hash, ply_of
 from paper_repro.record import BINS, LPIPS_VARIANTS, Result, run_id, settings_hash
 from pop_fast.errors import PopError
-from pop_fast.io.read_back import read_json
+from pop_fast.io.read_back import read_arrays, read_json
 from pop_fast.machine import processor_kind
 from pop_fast.train.results import ResultFolder, read_config
+from pop_fast.view.report.source import read_records
 
 if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
 
-__all__ = ["BESIDE", "PROBE", "collect", "first_change", "spacing", "state_of_data"]
+__all__ = ["BESIDE", "PROBE", "collect", "first_change", "read_probe", "spacing", "state_of_data"]
 
 # what `train_row` leaves in the result folder about the capture and the program, from before the first step
 BESIDE: Final = "row.json"
 # what `ProbedRun` leaves there
 PROBE: Final = "probe.json"
+_AGAIN: Final = "train the row again in an empty folder"
 # where things lie, who takes the steps and how often something is written: no part of what was trained
 _APART: Final = frozenset(
     {
@@ -95,12 +95,23 @@ def collect(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
         files: what `paper_repro.published` has made of it, by name, with hashes.
 
     Raises:
-        PopError: something of a finished training is absent; names the file.
+        PopError: something of a finished training is absent or damaged; names the file or the folder.
     """
+    try:
+        return _collected(job, folder, files)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        if isinstance(error, PopError):
+            raise
+        raise PopError(
+            f"{folder}: its records are not what a finished training leaves ({error!r}); {_AGAIN}"
+        ) from error
+
+
+def _collected(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
     config = read_config(folder)
     last = config.max_steps - 1
     stats, before = _stats(folder, "val", last), _stats(folder, "train", last)
-    said = read_json(folder / BESIDE, "train the row again in an empty folder")
+    said = read_json(folder / BESIDE, _AGAIN)
     data_hash, commit = said.pop("data_hash"), said.pop("commit")
     settings = _settings(config)
     config_hash = settings_hash(settings)
@@ -155,8 +166,10 @@ def collect(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
 def first_change(result: Result, config: TrainConfig) -> str | None:
     """Say which setting of a finished result the row has otherwise now, or None; settings that are new do not count."""
     now = _settings(config)
+    # None is the profile's: what that comes to in the world of a capture is known when the capture is read
+    free = {"near_plane"} if config.near_plane is None else set[str]()
     for name, value in result.schedule.items():
-        if name in now and now[name] != value:
+        if name not in free and name in now and now[name] != value:
             return f"{name} = {value}, and the row has {now[name]} now"
     return None
 
@@ -185,33 +198,37 @@ def _lpips_reason(stats: Mapping[str, Any]) -> str | None:
 def _histogram(folder: Path, last: int) -> tuple[int, ...]:
     path = folder / "report_data" / f"opacity_step{last}.npz"
     if not path.is_file():
-        raise PopError(f"{path}: is absent; train the row again in an empty folder")
-    with np.load(path) as found:
-        return tuple(int(count) for count in found["counts"].reshape(BINS, -1).sum(axis=1))
-
-
-def _records(folder: Path) -> list[dict[str, Any]]:
-    lines = (folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
-    return [json.loads(line) for line in lines]
+        raise PopError(f"{path}: is absent; {_AGAIN}")
+    counts = read_arrays(path, {"counts": ("iu", 1)}, _AGAIN)["counts"]
+    if len(counts) % BINS:
+        raise PopError(f"{path}: counts has {len(counts)} bins, which no run writes; {_AGAIN}")
+    return tuple(int(count) for count in counts.reshape(BINS, -1).sum(axis=1))
 
 
 def _curve(folder: Path, max_steps: int) -> tuple[dict[str, Any], ...]:
     """Make the curve of the records of single training views, of the measurements of all held-out views, and of what a
     few training views say all along."""
-    points = {record["step"]: dict(record) for record in _thinned(_records(folder), max_steps)}
+    points = {record["step"]: dict(record) for record in _thinned(read_records(folder), max_steps)}
     for path in sorted((folder / "stats").glob("val_step*.json")):
-        stats = read_json(path, "train the row again in an empty folder")
+        stats = read_json(path, _AGAIN)
         # at a step that has a record too, what that says of its training view stays
         measured = {**stats, "num_gaussians": stats["num_GS"], "psnr": None, "psnr_test": stats["psnr"]}
         points[stats["step"]] = measured | _known(points.get(stats["step"], {}))
-    for step, probed in _probed(folder).items():
+    for step, probed in read_probe(folder).items():
         points[step] = {"step": step, **probed} | _known(points.get(step, {}))
     return tuple(_point(points[step]) for step in sorted(points))
 
 
-def _probed(folder: Path) -> dict[int, dict[str, Any]]:
+def read_probe(folder: Path) -> dict[int, dict[str, Any]]:
+    """Read what `ProbedRun` has measured in a result folder, by step; nothing where it has not.
+
+    Raises:
+        PopError: the file is damaged.
+    """
     path = folder / PROBE
-    found = read_json(path, "train the row again in an empty folder") if path.is_file() else {}
+    found = read_json(path, _AGAIN) if path.is_file() else {}
+    if not all(step.isascii() and step.isdecimal() and isinstance(point, dict) for step, point in found.items()):
+        raise PopError(f"{path}: must hold an object for each step; {_AGAIN}")
     return {int(step): point for step, point in found.items()}
 
 

@@ -180,8 +180,17 @@ def load(path: Path) -> Paper:
         found = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise PopError(f"{path}: cannot be read ({error.strerror})") from None
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise PopError(f"{path}: is not TOML ({error})") from None
+    try:
+        return _of_toml(found, path)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        if isinstance(error, PopError):
+            raise
+        raise PopError(f"{path}: an entry is absent or not what paper.toml has there ({error!r})") from error
+
+
+def _of_toml(found: Mapping[str, Any], path: Path) -> Paper:
     tables = tuple(_table(table, path) for table in found["tables"])
     stated = [Stated(s["id"], _value(s["value"]), s["quote"], s["about"]) for s in found["stated"]]
     if len({s.id for s in stated}) != len(stated):

@@ -16,10 +16,9 @@ from typing import Any, Final
 import torch
 from torch import Tensor
 
-from paper_repro.collect import PROBE
+from paper_repro.collect import PROBE, read_probe
 from pop_fast.data import Capture
 from pop_fast.io.atomic import write_atomically
-from pop_fast.io.read_back import read_json
 from pop_fast.stages import losses
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import engine_of
@@ -92,10 +91,7 @@ class ProbedRun(TrainingRun):
 
     def _read(self) -> dict[int, Mapping[str, float]]:
         """Take up what was probed before the step that the run continues from."""
-        if not self._path.is_file():
-            return {}
-        found = read_json(self._path, "train the row again in an empty folder")
-        return {int(step): point for step, point in found.items() if int(step) < self.step}
+        return {step: point for step, point in read_probe(self._path.parent).items() if step < self.step}
 
     def _write(self) -> None:
         # nothing is written into a folder that the run itself has not begun

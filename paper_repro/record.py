@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 import re
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
@@ -175,7 +176,7 @@ def from_line(line: str, where: str) -> Result:
     """
     try:
         values = json.loads(line)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise PopError(f"{where}: is not JSON ({error}); {_AGAIN}") from None
     if not isinstance(values, dict):
         raise PopError(f"{where}: is {type(values).__name__}, not an object; {_AGAIN}")
@@ -264,7 +265,8 @@ class _Fields:
 
 
 def _finite(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    # a whole number may be too large for a float
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def _known(found: Mapping[str, Any], names: Iterable[str], where: str) -> None:

@@ -25,7 +25,7 @@ ROWS: Final = (
     *("taming", "speedy_splat", "pop"),
     *("l2", "l2_blur", "l2_pop", "reset", "blur_3k_4k", "blur_3k_11k", "blur_3k_15k"),
     *("l2_without_ssim", *(f"l1_div_{n}" for n in (1, 2, 5, 10, 20, 50, 100))),
-    *("adaptive_blur", "final_prune", "opacity_entropy"),
+    *("final_prune", "opacity_entropy"),
     *("pop_visible", "pop_any_view", "l2_blur_any_view", "pop_sum", "pop_size_prune", "pop_prune_002"),
 )
 # floats of one Gaussian in the files whose size the tables give: gsplat's checkpoint, and Inria's PLY with its normals
@@ -80,7 +80,7 @@ def load_row(name: str, folder: Path = CONFIGS) -> Row:
         raise PopError(f"row is '{name}'; it must be one of {', '.join(ROWS)}")
     try:
         found = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise PopError(f"{path}: is not TOML: {error}") from error
     wanted = [field.name for field in fields(Row) if field.name != "name"]
     for field in [*wanted, *found]:

@@ -14,8 +14,9 @@ from typing import Final
 
 from paper_repro import readings
 from paper_repro.claims import claims
-from paper_repro.claims import markdown as claims_markdown
-from paper_repro.evidence import DATASETS, Claim
+from paper_repro.claims_page import deciding, method, outcome, telling
+from paper_repro.claims_page import markdown as claims_markdown
+from paper_repro.evidence import DATASETS, JUDGE, Claim
 from paper_repro.paper import paper
 from paper_repro.results import RESULTS, SCALES, Result, read_all
 from paper_repro.table_markdown import grid
@@ -33,7 +34,7 @@ _WRITE: Final = "run 'python -m paper_repro.status --write'"
 def status_table(results: Iterable[Result]) -> str:
     """Make the status table: every claim by all scales that decide it, every table by the cells that are run."""
     found = list(results)
-    rows = [_claim_row(by_scale, found) for by_scale in zip(*(claims(s, found) for s in _telling()), strict=True)]
+    rows = [_claim_row(by_scale, found) for by_scale in zip(*(claims(s, found) for s in telling()), strict=True)]
     for table in paper().tables:
         lines = [line.row for line in table.rows]
         what = f"table {table.number}: {table.title}"
@@ -73,9 +74,13 @@ def files(results: Iterable[Result], folder: Path = HERE) -> dict[Path, str]:
         folder / "protocol.md": protocol,
         folder / "claims.md": _claims(found),
     }
-    # only a clone has it
-    page = folder.parent / "docs" / "paper.md"
-    return {**made, page: with_part(_read(page), "reproduction", table)} if page.is_file() else made
+    page, front = folder.parent / "docs" / "paper.md", folder.parent / "README.md"
+    # only a clone has them
+    if page.is_file():
+        told = outcome(found)
+        made[page] = with_part(with_part(_read(page), "reproduction", table), "settled", told)
+        made[front] = with_part(_read(front), "outcome", told)
+    return made
 
 
 def stale_files(results: Iterable[Result]) -> dict[Path, str]:
@@ -113,20 +118,16 @@ def _read(path: Path) -> str:
         raise PopError(f"{path}: cannot be read ({error.strerror})") from None
 
 
-def _telling() -> list[str]:
-    """List the scales that say something of a method, the most telling first."""
-    return [scale for scale in reversed(SCALES) if scale != "toy"]
-
-
 def _claim_row(by_scale: Sequence[Claim], found: Sequence[Result]) -> list[str]:
     """Say of one claim what each scale decides: a verdict of one scale alone would hide that another disagrees."""
-    judged = [(s, c) for s, c in zip(_telling(), by_scale, strict=True) if c.verdict != "not decided"]
-    ours = "; ".join(f"{c.verdict} at scale {scale}, {c.where}" for scale, c in judged)
-    command = f"`pop-repro claims --scale {judged[0][0] if judged else 'small'}`"
-    runs = {run for _, c in judged for e in c.evidence for run in e.runs}
+    named = list(zip(telling(), by_scale, strict=True))
+    judged = [(scale, c) for scale, c in named if c.verdict != "not decided"]
+    ours = "; ".join(f"{c.verdict} at scale {scale}: {c.line}" for scale, c in judged)
+    scale, told = deciding(named)
+    command = f"pop-repro claims --scale {scale}" if judged else next(iter(told.told.deciders), "none")
+    runs = {run for _, c in judged or [(scale, told)] for e in c.told.evidence for run in e.runs}
     used = [r for r in found if r.run in runs]
-    first = by_scale[0]
-    return [first.says, first.paper, ours or "not decided: the runs it needs are not there", command, _commits(used)]
+    return [told.says, told.paper, ours or f"not decided: {told.line}", f"`{command}`", _commits(used)]
 
 
 def _commits(used: Iterable[Result]) -> str:
@@ -137,7 +138,7 @@ def _commits(used: Iterable[Result]) -> str:
 def _progress(rows: Sequence[str], datasets: Sequence[str], used: Sequence[Result]) -> str:
     """Say for each scale how many of its pairs of row and scene have a run; the data sets are the paper's scale's."""
     counts = []
-    for scale in _telling():
+    for scale in telling():
         scenes = SCENES_OF.get(scale) or [s for d in datasets for s in paper().datasets[d]]
         done = {(r.row, r.scene) for r in used if r.scale == scale and r.scene in scenes}
         counts.append(f"{scale}: {len(done)} of {len(rows) * len(scenes)}" if done else f"{scale}: not run")
@@ -153,12 +154,11 @@ def _ambiguities() -> str:
 
 
 def _claims(found: Sequence[Result]) -> str:
-    about = "How each is judged: [claims.py](claims.py). What is compared with what: [protocol.md](protocol.md)."
-    parts = ["# The paper's claims", _MADE, about]
-    scales = [scale for scale in _telling() if any(r.scale == scale for r in found)]
-    parts += [claims_markdown(claims(scale, found), scale).strip() for scale in scales]
-    if not scales:
-        parts.append("No run is finished, so no claim is decided.")
+    about = "What is asked: [claims.py](claims.py). What is compared with what: [protocol.md](protocol.md)."
+    parts = ["# The paper's claims", _MADE, about, method()]
+    # the scale that is meant to decide says which runs it lacks even where it has none
+    scales = [scale for scale in telling() if scale == JUDGE or any(r.scale == scale for r in found)]
+    parts += [claims_markdown(scale, found).strip() for scale in scales]
     return "\n\n".join(parts) + "\n"
 
 

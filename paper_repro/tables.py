@@ -31,7 +31,6 @@ REFERENCES: Final = {1: "gsplat", 2: "gsplat", 3: "l2_blur", 4: "pop", 5: "reset
 # lines of the table of what goes beyond the paper, which has none of their numbers, with the method itself first
 BEYOND: Final = {
     "pop": "POP, the paper's method",
-    "adaptive_blur": "POP, adaptive blur window",
     "final_prune": "POP, final prune",
     "opacity_entropy": "opacity-entropy prior instead of POP",
 }

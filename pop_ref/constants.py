@@ -52,7 +52,7 @@ class Profile:
 
     Attributes:
         name: the profile's name.
-        near_plane: camera z in world units at or under which a Gaussian is culled (D1).
+        near_plane: camera z in world units at or under which a Gaussian is culled (D1); see `NEAR_IN_CAPTURE_UNITS`.
         near_inclusive: True culls `z <= near_plane`, False culls `z < near_plane` (D1).
         far_plane: camera z in world units beyond which a Gaussian is culled (D1).
         eps2d: low-pass, px^2 added to both diagonal entries of the screen covariance.
@@ -151,6 +151,10 @@ INRIA: Final = Profile(
 SPEEDY_SPLAT: Final = replace(INRIA, name="speedy_splat", extent="opacity_aware", extent_sigmas=3.33)
 
 PROFILES: Final = {p.name: p for p in (PAPER, GSPLAT_1_5, GSPLAT_1_6, INRIA, SPEEDY_SPLAT)}
+
+# profiles whose near plane is a length of the capture's own world: Inria's family trains in COLMAP's units. In a world
+# that was scaled it lies as many times farther (`TrainConfig.in_world`)
+NEAR_IN_CAPTURE_UNITS: Final = frozenset({INRIA.name, SPEEDY_SPLAT.name})
 
 
 def profile_named(name: str) -> Profile:

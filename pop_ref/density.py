@@ -16,9 +16,8 @@ Labels decided here: A2, A3, A4, A8, A14, A16, A18, A23; which reading is taken 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,7 +29,7 @@ from pop_ref.density_rows import Rows, clone_rows, prune_rows, reset_opacities, 
 __all__ = ["GSPLAT", "POP", "DensityConfig", "blurs_at", "densifies_at", "resets_at"]
 __all__ += ["Rows", "rows_from_params", "clone_rows", "split_rows", "prune_rows", "reset_opacities"]
 __all__ += ["Statistics", "zero_statistics", "accumulate", "average_grads", "blur_set"]
-__all__ += ["grow_masks", "blur_is_over", "without_blur_that_does_not_pay", "prune_mask", "densify_and_prune"]
+__all__ += ["grow_masks", "prune_mask", "densify_and_prune"]
 
 
 @dataclass(frozen=True)
@@ -224,61 +223,6 @@ def grow_masks(
     if config.blur_rule == "split":
         return by_grad & small, (by_grad & ~small) | by_blur
     return (by_grad | by_blur) & small, (by_grad | by_blur) & ~small
-
-
-def blur_is_over(windows: Sequence[tuple[int, float]], span: int, gain: float) -> bool:
-    """Tell whether growth by blur has ceased to pay: whether ln(loss before / after) < gain ln(N after / before) once.
-
-    Before and after are means over `span` windows each, one right after the other; the question is asked at the end of
-    each window from the second span on, and one No ends blur for good.
-
-    Source: ours. The POP paper's limitations name the fixed blur window as what should become adaptive.
-    Departs: the paper ends blur at step 7,000.
-
-    Args:
-        windows: of every window that ended while blur was on or could have been, the number of Gaussians that it had,
-            and its mean loss, > 0.
-        span: windows that are averaged.
-        gain: the exponent that growth has to reach.
-
-    Returns:
-        True from the first comparison on that growth has lost.
-
-    Example:
-        >>> halved = [(100, 4.0), (200, 2.0)]
-        >>> blur_is_over(halved, 1, 0.5), blur_is_over([*halved, (400, 1.9)], 1, 0.5)
-        (False, True)
-    """
-    for end in range(2 * span, len(windows) + 1):
-        before, after = windows[end - 2 * span : end - span], windows[end - span : end]
-        grown = math.log(sum(n for n, _ in after) / sum(n for n, _ in before))
-        won = math.log(sum(loss for _, loss in before) / sum(loss for _, loss in after))
-        if won < gain * grown:
-            return True
-    return False
-
-
-def without_blur_that_does_not_pay(config: DensityConfig, windows: Sequence[tuple[int, float]]) -> DensityConfig:
-    """Take the blur rule out of a configuration where `blur_stop_gain` asks for it.
-
-    Source: ours, see `blur_is_over`.
-    Departs: nothing.
-
-    Args:
-        config: of density control.
-        windows: as in `blur_is_over`.
-
-    Returns:
-        The configuration, without a blur window if blur is over.
-
-    Example:
-        >>> config = DensityConfig(blur_stop_gain=0.5, blur_stop_span=1)
-        >>> without_blur_that_does_not_pay(config, [(100, 4.0), (200, 3.9)]).blur_stop_iter
-        -1
-    """
-    if config.blur_stop_gain > 0.0 and blur_is_over(windows, config.blur_stop_span, config.blur_stop_gain):
-        return replace(config, blur_stop_iter=-1)
-    return config
 
 
 def prune_mask(

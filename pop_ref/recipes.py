@@ -61,7 +61,7 @@ BASELINES: Final = {
         updates=replace(_INRIA.updates, rounds_start_iter=30_000),
         adam_restarts=(30_000, 35_000),
     ),
-    # no reset; blur of a tenth of the pixels' share that POP takes, always a split; colours without bands until 15,000
+    # no reset; blur by ten times POP's share of any view's pixels, always a split; colours without bands until 15,000
     "Mini-Splatting": replace(
         _INRIA,
         density=replace(
@@ -70,6 +70,7 @@ BASELINES: Final = {
             theta_blur=2e-4,
             blur_start_iter=0,
             blur_stop_iter=15_000,
+            blur_window="any_view",
             blur_rule="split",
         ),
         updates=replace(_INRIA.updates, sh_start_iter=15_000, means_rewind_iter=15_000, means_rewind_to=5_000),

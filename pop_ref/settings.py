@@ -53,10 +53,6 @@ class DensityConfig:
             every Gaussian that can be seen would grow until it cannot.
         blur_start_iter: first step of the blur window, inclusive.
         blur_stop_iter: last step of the blur window, inclusive (A19); under `blur_start_iter` there is none.
-        blur_stop_gain: the blur window also ends where growth no longer pays: where twice as many Gaussians have not
-            divided the loss by two to the power of this (`density.blur_is_over`); 0 leaves that out. The paper calls
-            its fixed window its first limitation.
-        blur_stop_span: densification steps whose windows are averaged for that, before and after.
         blur_window: "own_view" tests the densification step's own view only, "any_view" tests each view since the last
             one by itself and keeps the flag, "sum" adds the counts of those views up and tests the sum (A2).
         blur_rule: "by_scale" clones small blurred Gaussians and splits large ones, "split" splits all (A14).
@@ -86,8 +82,6 @@ class DensityConfig:
     blur_min_pixels: float = 0.0
     blur_start_iter: int = 3000
     blur_stop_iter: int = 7000
-    blur_stop_gain: float = 0.0
-    blur_stop_span: int = 5
     blur_window: Literal["any_view", "sum", "own_view"] = "own_view"
     blur_rule: Literal["by_scale", "split"] = "by_scale"
     revised_opacity: bool = False

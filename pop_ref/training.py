@@ -29,14 +29,12 @@ from pop_ref.density import (
     Rows,
     Statistics,
     accumulate,
-    blurs_at,
     densifies_at,
     densify_and_prune,
     prune_rows,
     reset_opacities,
     resets_at,
     rows_from_params,
-    without_blur_that_does_not_pay,
     zero_statistics,
 )
 from pop_ref.optimizer import adam_step, learning_rates, sh_degree_at, update_numbers
@@ -56,8 +54,6 @@ class Training:
             is not trained, and goes with its row.
         statistics: of the current densification window.
         step: number of the next step, from 0.
-        loss_sum: of the window's losses.
-        windows: of each window that ended in the blur window, the Gaussians that it had and its mean loss.
         waiting: gradients that wait for their parameter's next update (`UpdateRules.sh_rest_every`); absent ones are 0.
     """
 
@@ -65,8 +61,6 @@ class Training:
     statistics: Statistics
     step: int = 0
     waiting: Mapping[str, np.ndarray] = field(default_factory=dict[str, np.ndarray])
-    loss_sum: float = 0.0
-    windows: tuple[tuple[int, float], ...] = ()
 
 
 def start(params: Mapping[str, np.ndarray]) -> Training:
@@ -137,16 +131,10 @@ def train_step(
     rows, waiting = update(rows, grads, state, scene_scale, recipe)
     seen = (gradients.means2d, view.splats.visible, view.dominant_counts, camera.width, camera.height)
     statistics = accumulate(state.statistics, *seen, recipe.density)
-    windows, density = state.windows, recipe.density
-    loss_sum = state.loss_sum + loss
-    if densifies_at(step, density):
-        if blurs_at(step, density):
-            windows = (*windows, (len(rows), loss_sum / statistics.n_views))
-        density, loss_sum = without_blur_that_does_not_pay(density, windows), 0.0
-    rows, statistics = control(rows, statistics, scene_scale, step, normals, density)
+    rows, statistics = control(rows, statistics, scene_scale, step, normals, recipe.density)
     # rows that wait are not those of Gaussians that have been edited
     waiting = {} if densifies_at(step, recipe.density) else waiting
-    return Training(rows, statistics, step + 1, waiting, loss_sum, windows), loss
+    return Training(rows, statistics, step + 1, waiting), loss
 
 
 def update(

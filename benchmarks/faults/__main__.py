@@ -1,10 +1,12 @@
-"""python -m benchmarks.faults [--minutes M] [--only PART] [--quick] [--seed N] [--out FILE]
+"""python -m benchmarks.faults [--minutes M] [--only PART] [--quick] [--seed N] [--save] [--out FILE]
 
 Runs the parts below, prints what failed, and writes benchmarks/results/faults.json, of which docs/reliability.md has
 the tables; a part that is run alone replaces its own results. With --minutes the fuzzer and the kill loop share that
-time; without, they stop after their least. --quick tries a few places of those parts that have no test of their own, as
-the tests do. Exit status 1 where anything failed. Runs are tried of every --kind: by the native step, on two ranks and
-in blocks; --kills says how often each is killed at least, --places at how many changes of the disk it is disturbed.
+time, or the one of them that runs has it; without, they stop after their least. --save keeps the files that broke a
+reader among the regressions of benchmarks/faults/corpus. Runs are tried of every --kind: by the native step, on two ranks
+and in blocks; --kills says how often each is killed at least, --places at how many changes of the disk it is disturbed.
+--quick tries a few places of those parts that have no test of their own, as the tests do. Exit status 1 where anything
+failed.
 
     fuzz        mutated files to every reader, in children with limits of memory and time
     kills       SIGKILL at random moments of a run; continuing gives the same bits
@@ -51,6 +53,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int)
     parser.add_argument("--places", type=int)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--save", action="store_true")
     parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
     # children that are forked must find no thread's locks taken
@@ -66,7 +69,8 @@ def main() -> int:
 def _run(part: str, args: argparse.Namespace) -> dict[str, Any]:
     print(f"{part} ...", flush=True)
     if part == "fuzz":
-        return fuzz.fuzz(15 if args.quick else 1_000, args.minutes / 2.0, args.seed, args.reader)
+        minutes = args.minutes if args.only == ["fuzz"] else args.minutes / 2.0
+        return fuzz.fuzz(10 if args.quick else 2_000, minutes, args.seed, args.reader, args.save)
     if part == "sanitizers":
         return sanitizers.sanitized(compile_first=not args.quick)
     reason = runs.why_not()

@@ -1,8 +1,9 @@
-"""Damaged input: every reader gives a result or a sentence, and never ends, hangs or surprises its process."""
+"""Damaged input: every reader gives a result or a sentence, and never ends, hangs, fills or surprises its process."""
 
 from __future__ import annotations
 
 import json
+import mmap
 import os
 import random
 import shutil
@@ -10,8 +11,11 @@ import signal
 import tempfile
 import time
 import traceback
+import warnings
 import zlib
 from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,67 +32,110 @@ from .readers import READERS, Reader
 
 # of one input: seconds, bytes over what importing takes, letters of a refusal
 SECONDS, MEMORY, LONGEST = 20, 2**30, 1_300
+# of a reader's turn, seconds: long beside the start of a child
+TURN = 4.0
 OUTCOMES = ("read", "refused", "told", "escaped", "crashed", "hung")
+FAILURES = OUTCOMES[3:]
 
 
-def fuzz(inputs: int, minutes: float, seed: int, only: str | None = None) -> dict[str, Any]:
+def fuzz(inputs: int, minutes: float, seed: int, only: str | None = None, save: bool = False) -> dict[str, Any]:
     """Give mutated files to all readers in turn.
 
+    After its least each reader gets the same time, so that cheap readers are given more inputs than dear ones. A
+    reader's inputs are numbered from 0; with the seed, a number names the same file everywhere.
+
     Args:
-        inputs: of each reader in a round.
-        minutes: for rounds after the first one.
-        seed: of the first round; every round has one more.
+        inputs: of each reader, at least.
+        minutes: in all; the least is done where it takes longer.
+        seed: decides all inputs.
         only: a reader's name, or None for all.
+        save: keep the smallest file of every failure among the regressions of its reader.
 
     Returns:
         By reader how often what came out, and every failure once by where it came from.
     """
-    end = time.monotonic() + 60.0 * minutes
-    counts: dict[str, Counter[str]] = {name: Counter() for name in READERS if only in (None, name)}
-    failures: dict[str, dict[str, Any]] = {}
-    first = seed
-    while seed == first or time.monotonic() < end:
-        for name in counts:
-            for line in _round(name, inputs, seed, regressions=seed == first):
-                counts[name][line["came"]] += 1
-                if line["came"] in ("escaped", "crashed", "hung"):
-                    key = f"{name}: {line['came']} {line.get('site', '')}"
-                    failures.setdefault(key, {**line, "times": 0})["times"] += 1
-        seed += 1
-    table = {name: {outcome: found[outcome] for outcome in OUTCOMES} for name, found in counts.items()}
+    begin = time.monotonic()
+    end = begin + 60.0 * minutes
+    turns = [_Turns(name, seed) for name in READERS if only in (None, name)]
+    for turn in turns:
+        turn.go_on(inputs)
+    while time.monotonic() < end:
+        for turn in turns:
+            turn.go_on(None, min(TURN, max(end - time.monotonic(), 0.0)))
+    failures = {key: value for turn in turns for key, value in turn.failures.items()}
+    if save:
+        _save(failures)
     return {
-        "first_seed": first,
-        "rounds": seed - first,
-        "inputs_a_round": inputs,
-        "readers": table,
+        "seed": seed,
+        "minutes": round((time.monotonic() - begin) / 60.0, 1),
+        "least": inputs,
+        "inputs": sum(sum(turn.counts.values()) for turn in turns),
+        "readers": {turn.name: {outcome: turn.counts[outcome] for outcome in OUTCOMES} for turn in turns},
         "failures": failures,
     }
 
 
-def _round(name: str, inputs: int, seed: int, regressions: bool) -> list[dict[str, Any]]:
-    """Read inputs in children, a new one after each that died, and list what came of each."""
-    lines: list[dict[str, Any]] = []
-    at = -len(kept(name)) if regressions else 0
-    with tempfile.TemporaryDirectory() as folder:
-        log, said = Path(folder) / "log", Path(folder) / "said"
-        while at < inputs:
-            log.write_text("")
-            pid = start(lambda at=at: _read_all(name, at, inputs, seed, Path(folder), log), said, MEMORY)
-            status = wait(pid)
-            found = [json.loads(line) for line in log.read_text().splitlines()]
-            lines += [line for line in found if "came" in line]
-            if status == 0 and found and found[-1] == {"end": inputs}:
-                break
-            at = found[-1].get("number", inputs) if found else at
+@dataclass
+class _Turns:
+    """What has come of a reader's inputs so far; the next is `at`, and those below 0 once broke something."""
+
+    name: str
+    seed: int
+    at: int = 0
+    counts: Counter[str] = field(default_factory=Counter)
+    failures: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.at = -len(kept(self.name))
+
+    def go_on(self, last: int | None, seconds: float = float("inf")) -> None:
+        """Read inputs in children, a new one after each that died, up to a number or for a time."""
+        until = time.monotonic() + seconds
+        with tempfile.TemporaryDirectory() as folder, mmap.mmap(-1, 8 * 8) as page:
+            while (last is None or self.at < last) and time.monotonic() < until:
+                log, said = Path(folder) / "log", Path(folder) / "said"
+                log.write_text("")
+                with memoryview(page) as raw, raw.cast("q") as notes:
+                    notes[:] = memoryview(bytes(8 * 8)).cast("q")
+                    notes[0] = self.at
+                    work = _Chunk(self.name, self.seed, self.at, last, until, Path(folder), log)
+                    status = wait(start(lambda work=work, notes=notes: work.read(notes), said, MEMORY))
+                    self._add(notes, status, log)
+
+    def _add(self, notes: memoryview, status: int, log: Path) -> None:
+        self.counts.update({outcome: notes[2 + k] for k, outcome in enumerate(OUTCOMES)})
+        for line in log.read_text().splitlines():
+            self._failed(**json.loads(line))
+        self.at = notes[0]
+        if not notes[1]:
             came = "hung" if status == -signal.SIGALRM else "crashed"
-            lines.append({"number": at, "seed": seed, "came": came, "site": f"status {status}"})
-            at += 1
-    return lines
+            self.counts[came] += 1
+            self._failed(self.at, came, f"status {status}")
+            self.at += 1
+
+    def _failed(self, number: int, came: str, site: str, message: str = "") -> None:
+        size = len(input_of(self.name, self.seed, number))
+        line = {"reader": self.name, "number": number, "seed": self.seed, "bytes": size, "message": message}
+        found = self.failures.setdefault(f"{self.name}: {came}: {site}", {**line, "times": 0})
+        # the smallest tells most
+        found |= {**(line if size < found["bytes"] else {}), "times": found["times"] + 1}
+
+
+def _save(failures: dict[str, dict[str, Any]]) -> None:
+    for key, found in failures.items():
+        folder, reader = _folder(found["reader"]), READERS[found["reader"]]
+        folder.mkdir(parents=True, exist_ok=True)
+        name = f"{zlib.crc32(key.encode()):08x}_{Path(reader.file or reader.root).name}"
+        (folder / name).write_bytes(input_of(found["reader"], found["seed"], found["number"]))
+
+
+def _folder(name: str) -> Path:
+    return HERE / "regressions" / name.replace("/", "_").replace(":", "")
 
 
 def kept(name: str) -> list[Path]:
     """List the inputs that once broke something in a reader."""
-    folder = HERE / "regressions" / name.replace("/", "_").replace(":", "")
+    folder = _folder(name)
     return sorted(folder.iterdir()) if folder.is_dir() else []
 
 
@@ -101,37 +148,80 @@ def input_of(name: str, seed: int, number: int) -> bytes:
     return mutated(data, reader.layer, random.Random(zlib.crc32(f"{name} {seed} {number}".encode())))
 
 
-def _read_all(name: str, first: int, last: int, seed: int, folder: Path, log: Path) -> None:
-    """In a child: read inputs one after the other; what is begun is noted before it is done."""
-    reader = READERS[name]
-    copy = folder / Path(reader.root).name
+def copied(reader: Reader, folder: Path) -> Path:
+    """Copy what a reader is given into a folder; return the copy."""
+    whole, copy = HERE / reader.root, folder / Path(reader.root).name
     if not copy.exists():
-        whole = HERE / reader.root
         shutil.copytree(whole, copy) if whole.is_dir() else shutil.copy(whole, copy)
-    target = copy / reader.file if reader.file else copy
-    with open(log, "a", encoding="utf-8") as notes:
-        for number in range(first, last):
-            target.write_bytes(input_of(name, seed, number))
-            print(json.dumps({"number": number}), file=notes, flush=True)
-            signal.alarm(SECONDS)
-            came = _outcome(reader, copy)
-            signal.alarm(0)
-            print(json.dumps({"number": number, "seed": seed, **came}), file=notes, flush=True)
-        print(json.dumps({"end": last}), file=notes, flush=True)
+    return copy
 
 
-def _outcome(reader: Reader, path: Path) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Chunk:
+    """Inputs that one child reads: from `first` to before `last`, or until a time on the clock."""
+
+    name: str
+    seed: int
+    first: int
+    last: int | None
+    until: float
+    folder: Path
+    log: Path
+
+    def read(self, notes: memoryview) -> None:
+        """In a child: read one after the other; what is begun is noted before it is done.
+
+        Args:
+            notes: shared with the parent: the number, whether the end was reached, and how often each outcome came.
+        """
+        warnings.simplefilter("ignore")
+        reader = READERS[self.name]
+        copy = copied(reader, self.folder)
+        target = copy / reader.file if reader.file else copy
+        with open(self.log, "a", encoding="utf-8") as log:
+            for number, data in self._inputs(reader):
+                notes[0] = number
+                target.write_bytes(data)
+                signal.alarm(SECONDS)
+                came, *more = _outcome(reader, copy)
+                signal.alarm(0)
+                notes[2 + OUTCOMES.index(came)] += 1
+                if more:
+                    site, words = more
+                    line = {"number": number, "came": came, "site": site, "message": words}
+                    print(json.dumps(line), file=log, flush=True)
+                notes[0] = number + 1
+        notes[1] = 1
+
+    def _inputs(self, reader: Reader) -> Iterator[tuple[int, bytes]]:
+        sound = (HERE / reader.root / reader.file).read_bytes()
+        number = self.first
+        while (self.last is None or number < self.last) and time.monotonic() < self.until:
+            if number < 0:
+                yield number, kept(self.name)[number].read_bytes()
+            else:
+                rng = random.Random(zlib.crc32(f"{self.name} {self.seed} {number}".encode()))
+                yield number, mutated(sound, reader.layer, rng)
+            number += 1
+
+
+def _outcome(reader: Reader, path: Path) -> tuple[str, ...]:
+    """Read, and return what came: its name, and for a failure where and what."""
     try:
         found = reader.read(path)
     except Exception as error:
         # as the command line prints it
-        line = message(str(error))
-        if isinstance(error, PopError) and "\n" not in line and len(line) < LONGEST and path.name in line:
-            return {"came": "refused"}
-        if isinstance(error, (MemoryError, OSError)) and describe(error) is not None:
-            return {"came": "told"}
-        frame = traceback.extract_tb(error.__traceback__)[-1]
+        line = message(str(error) if isinstance(error, PopError) else describe(error) or str(error))
+        if isinstance(error, OSError) and describe(error) is not None and path.name in line:
+            return ("told",)
+        known = isinstance(error, PopError) or (isinstance(error, ValueError) and describe(error) is not None)
+        if known and "\n" not in line and len(line) < LONGEST and any(name in line for name in (path.name, HERE.name)):
+            return ("refused",)
+        frames = traceback.extract_tb(error.__traceback__)
+        # our own line says more than the library's that it called
+        ours = [frame for frame in frames if "site-packages" not in frame.filename and "/lib/" not in frame.filename]
+        frame = (ours or frames)[-1]
         site = f"{type(error).__name__} at {os.path.basename(frame.filename)}:{frame.lineno}"
-        return {"came": "escaped", "site": site, "message": line[:200]}
+        return "escaped", site, line[:200]
     bad = [key for key, value in found.items() if not torch.isfinite(value).all()] if reader.finite else []
-    return {"came": "escaped", "site": f"not finite: {bad[0]}"} if bad else {"came": "read"}
+    return ("escaped", f"not finite: {bad[0]}", "") if bad else ("read",)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import random
+import re
 import struct
 import zipfile
 import zlib
@@ -30,6 +31,8 @@ _WORDS = (
     *("[]", "{}", '""', '"x"', "[[1]]", "\0", "\x1b[2J", "\ufffd", "é", "../../etc/passwd", "/", "", " ", "\n", "#"),
     *("OPENCV", "PINHOLE", "9" * 400, "[" * 3000, "x" * 5000, "0x10", "1_000", "١", "1,5"),
 )
+
+_EDGES = re.compile(r'[ \n\t,:\[\]{}"]')
 
 
 def mutated(data: bytes, layer: str, rng: random.Random) -> bytes:
@@ -144,7 +147,7 @@ def _sound_png(data: bytes) -> bytes:
 def _word(data: bytes, rng: random.Random) -> bytes:
     text = data.decode("utf-8", "surrogateescape")
     # what stands between white space, brackets, commas and quotes
-    edges = [0, *(k for k, letter in enumerate(text) if letter in ' \n\t,:[]{}"'), len(text)]
+    edges = [0, *(found.start() for found in _EDGES.finditer(text)), len(text)]
     place = rng.randrange(len(edges) - 1)
     start, end = edges[place], edges[place + 1]
     match rng.randrange(4):

@@ -1,23 +1,57 @@
-"""Every reader of the program, with the file of the corpus that is mutated for it."""
+"""Every reader of the program, with the file of the corpus that is mutated for it.
+
+A test (`tests/meta/test_readers.py`) runs all of them on the sound files and holds what they have opened to what the
+program's source opens: a new function that reads a file needs a reader here.
+"""
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 
+from cuda_ext.gpu_check.command import begun_report
+from cuda_ext.gpu_check.outcomes import outcomes
+from paper_repro import paper, results, rows
+from paper_repro.collect import collect
+from paper_repro.jobs import job_named
+from pop_fast.blocks.merge import read_round
+from pop_fast.blocks.plan import read_job, read_plan
+from pop_fast.blocks.start import own_of
+from pop_fast.cli import compare
+from pop_fast.cli.data_check import look_over
+from pop_fast.cli.render import listed_in
+from pop_fast.data.block import read_block
 from pop_fast.data.load import load_capture
+from pop_fast.data.sfm_files import recognise_result
+from pop_fast.data.video import take_frames
+from pop_fast.errors import CaptureError
 from pop_fast.io.formats import load_splat_file
+from pop_fast.io.heif import can_read_heif
 from pop_fast.io.image_header import read_exif, read_size
 from pop_fast.io.images import read_image, read_mask
 from pop_fast.io.points import read_points
+from pop_fast.train import TrainConfig
 from pop_fast.train import checkpoint as ckpt
-from pop_fast.train.load_result import read_record
+from pop_fast.train.choose import choose_backend
+from pop_fast.train.load_result import load_splat, read_record
+from pop_fast.train.lpips import LPIPS
 from pop_fast.train.results import read_config
+from pop_fast.view.inria import exported_to
+from pop_fast.view.live.recording import read_path
+from pop_fast.view.paths.video import frames_in
 from pop_fast.view.report.source import read_result
+from pop_ref.conformance import vector_check
+from pop_ref.conformance.scene_files import load_scene
+from pop_ref.learn.course import stage_named
+from pop_ref.learn.progress import asked_before, course_map, state
+from pop_ref.learn.student import borrowing, read_work
 
 
 @dataclass(frozen=True)
@@ -31,6 +65,7 @@ class Reader:
         layer: what lies around the content: "gzip", "zip" and "glb" are also taken off, and put on again with sound
             checksums and lengths.
         finite: whether all tensors that it returns must be.
+        refuses: whether it refuses anything; some do without what is damaged.
     """
 
     root: str
@@ -38,10 +73,15 @@ class Reader:
     read: Callable[[Path], Any]
     layer: Literal["plain", "gzip", "zip", "glb", "text"] = "plain"
     finite: bool = False
+    refuses: bool = True
 
 
 def _splat(path: Path) -> dict[str, torch.Tensor]:
     return load_splat_file(path)[0]
+
+
+def _splat_with_frame(path: Path) -> dict[str, torch.Tensor]:
+    return load_splat(path).params
 
 
 def _photograph(path: Path) -> Any:
@@ -55,6 +95,26 @@ def _capture(folder: Path) -> Any:
     return load_capture(str(folder))
 
 
+def _block(folder: Path) -> Any:
+    place = folder / "blocks" / "0_0"
+    listing = read_block(place)
+    with suppress(CaptureError):
+        # what it says of a photograph or a mask that is listed names that file
+        load_capture(str(place))
+    return listing
+
+
+def _sfm_list(folder: Path) -> Any:
+    ours = recognise_result(folder, folder / "sparse")
+    return [ours(path.relative_to(folder / "sparse")) for path in (folder / "sparse").rglob("*")]
+
+
+def _film(path: Path) -> Any:
+    frames_in(path)
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        return take_frames(path, Path(folder) / "frames", 3)
+
+
 def _checkpoint(folder: Path) -> Any:
     return ckpt.load_checkpoint(ckpt.checkpoint_path(folder, 3))
 
@@ -63,9 +123,50 @@ def _splats_of_checkpoint(folder: Path) -> dict[str, torch.Tensor]:
     return ckpt.load_splats(ckpt.checkpoint_path(folder, 3))[0]
 
 
+def _resumed(folder: Path) -> Any:
+    return choose_backend(TrainConfig.of(result_dir=str(folder), backend="auto"), resume=True)
+
+
+def _path(path: Path) -> Any:
+    # as `pop render --path FILE` uses it
+    return read_path(path).along(5, np.eye(4))
+
+
+def _exported(path: Path) -> bool:
+    return exported_to(path.parent)(Path("cameras.json"))
+
+
+def _listed(path: Path) -> bool:
+    return listed_in(path.parent)(Path("0.png"))
+
+
+def _course(folder: Path) -> Any:
+    work, stage = read_work(folder), stage_named("alpha")
+    asked_before(folder, stage)
+    return state(work, stage), course_map(work)
+
+
+def _submission(folder: Path) -> Any:
+    work, stage = read_work(folder), stage_named("alpha")
+    with borrowing(work, (stage,)) as borrowed:
+        return list(borrowed.installed)
+
+
+def _row(path: Path) -> Any:
+    return rows.load_row(path.stem, path.parent), rows.header_of(path.stem, path.parent)
+
+
+def _collected(folder: Path) -> Any:
+    return results.write(collect(job_named("pop", "demo", "toy"), folder, {}), folder / "results")
+
+
+def _port(folder: Path) -> Any:
+    return vector_check.check(folder, folder / "port").failed
+
+
 _CKPT = "ckpts/ckpt_3_rank0.pt"
-READERS: dict[str, Reader] = {
-    "PLY": Reader("splats/splat.ply", "", _splat, finite=True),
+_SPLATS = {
+    "PLY": Reader("splats/splat.ply", "", _splat_with_frame, finite=True),
     "points of a PLY": Reader("splats/splat.ply", "", read_points),
     "compressed PLY": Reader("splats/compressed-ply.compressed.ply", "", _splat, finite=True),
     "SPZ": Reader("splats/spz.spz", "", _splat, "gzip", finite=True),
@@ -73,8 +174,8 @@ READERS: dict[str, Reader] = {
     "splat": Reader("splats/splat.splat", "", _splat, finite=True),
     "glTF": Reader("splats/gltf.glb", "", _splat, "glb", finite=True),
     "glTF of SPZ": Reader("splats/gltf-spz.glb", "", _splat, "glb", finite=True),
-    "checkpoint": Reader("result", _CKPT, _checkpoint, "zip"),
-    "splats of a checkpoint": Reader("result", _CKPT, _splats_of_checkpoint, "zip", finite=True),
+}
+_CAPTURES = {
     **{
         f"COLMAP {name}.bin": Reader("colmap", f"sparse/0/{name}.bin", _capture)
         for name in ("cameras", "images", "points3D")
@@ -83,19 +184,90 @@ READERS: dict[str, Reader] = {
         f"COLMAP {name}.txt": Reader("colmap_text", f"sparse/0/{name}.txt", _capture, "text")
         for name in ("cameras", "images", "points3D")
     },
+    **{
+        f"data check: {name}": Reader("tracked", name, lambda folder: look_over(folder))
+        for name in ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin")
+    },
+    "data check: images/0.png": Reader("tracked", "images/0.png", lambda folder: look_over(folder), refuses=False),
     "transforms.json": Reader("transforms", "transforms.json", _capture, "text"),
+    "Metashape": Reader("metashape", "cameras.xml", _capture, "text"),
+    "RealityCapture": Reader("realitycapture", "cameras.csv", _capture, "text"),
+    "Polycam": Reader("polycam", "keyframes/cameras/1.json", _capture, "text"),
+    "upright.json": Reader("upright", "sparse/upright.json", _capture, "text"),
+    "sfm.sha256": Reader("upright", "sparse/sfm.sha256", _sfm_list, "text", refuses=False),
+}
+_PICTURES = {
     **{f"photograph.{kind}": Reader(f"photos/photo.{kind}", "", _photograph) for kind in ("png", "jpg", "webp", "tif")},
     "photograph.bmp": Reader("photos/photo.bmp", "", _photograph),
+    "photograph of 16 bit": Reader("photos/deep.png", "", _photograph),
+    "photograph with EXIF": Reader("photos/exif.jpg", "", _photograph),
+    **({"photograph.heic": Reader("photos/photo.heic", "", _photograph)} if can_read_heif() else {}),
     "mask": Reader("photos/photo.png", "", read_mask),
+    **{f"video.{kind}": Reader(f"films/film.{kind}", "", _film) for kind in ("avi", "mp4", "webm")},
+}
+_RUNS = {
+    "checkpoint": Reader("result", _CKPT, _checkpoint, "zip"),
+    "splats of a checkpoint": Reader("result", _CKPT, _splats_of_checkpoint, "zip", finite=True),
+    "weights of LPIPS": Reader("records/lpips.pt", "", lambda path: LPIPS("vgg", [path]), "zip"),
     "cfg.json": Reader("result", "cfg.json", read_config, "text"),
+    "cfg.json of a run to resume": Reader("result", "cfg.json", _resumed, "text", refuses=False),
     "capture.json": Reader("result", "capture.json", read_record, "text"),
     **{
         f"report: {name}": Reader("result", name, read_result, kind)  # type: ignore[arg-type]
         for name, kind in (
             ("metrics.jsonl", "text"),
+            ("commands.json", "text"),
             ("stats/val_step0003.json", "text"),
+            ("report_data/checks_step3.json", "text"),
             ("report_data/opacity_step-1.npz", "zip"),
             ("report_data/val_step3_0000.npz", "zip"),
+            ("report_data/depth_step3_0000.npz", "zip"),
         )
     },
+    "compare": Reader("result", "stats/val_step0003.json", lambda folder: compare.run([str(folder)]), "text"),
+    "camera path": Reader("records/path.json", "", _path, "text"),
+    "renders.json": Reader("records/renders.json", "", _listed, "text", refuses=False),
+    "cfg_args": Reader("records/cfg_args", "", _exported, "text", refuses=False),
 }
+_BLOCKS = {
+    "block.json": Reader("blocked", "blocks/0_0/block.json", _block, "text"),
+    "points of a block": Reader("blocked", "blocks/0_0/points.npz", _block, "zip"),
+    "job.json": Reader("blocked", "blocks/job.json", read_job, "text"),
+    "plan.json": Reader("blocked", "blocks/plan.json", read_plan, "text"),
+    "stats.json of a round": Reader(
+        "blocked", "blocks/round_0/stats.json", lambda folder: read_round(folder, 0), "text"
+    ),
+    "start.json": Reader("blocked", "blocks/round_1/0_0/start.json", lambda folder: own_of(folder, "0_0", 1), "text"),
+}
+_COLLECTED = (
+    ("row.json", "text"),
+    ("probe.json", "text"),
+    ("metrics.jsonl", "text"),
+    ("stats/train_step0003.json", "text"),
+    ("stats/val_step0003.json", "text"),
+    ("report_data/opacity_step3.npz", "zip"),
+)
+_PAPER = {
+    "results of a row": Reader(
+        "records/full", "pop_size_prune.jsonl", lambda full: results.read_all("full", full.parent), "text"
+    ),
+    "row": Reader("records/pop.toml", "", _row, "text"),
+    "paper.toml": Reader("records/paper.toml", "", paper.load, "text"),
+    **{
+        f"collected: {name}": Reader("result", name, _collected, kind)  # type: ignore[arg-type]
+        for name, kind in _COLLECTED
+    },
+}
+_KIT = {
+    "vectors: index.json": Reader("vectors", "index.json", _port, "text"),
+    "vectors: a vector": Reader("vectors", "pop_loss_some_important.npz", _port, "zip"),
+    "vectors: a result": Reader("vectors", "port/pop_loss_some_important.npz", _port, "zip"),
+    "vectors: a result as JSON": Reader("vectors", "port/loss_l1.json", _port, "text"),
+    "scene": Reader("scenes/scene.npz", "", load_scene, "zip"),
+    "learn: progress": Reader("course", ".progress.json", _course, "text"),
+    "learn: a submission": Reader("course", "alpha.py", _course, "text"),
+    "learn: a submission that is run": Reader("course", "alpha.py", _submission, "text"),
+    "GPU check: report": Reader("records/gpu_check_1.json", "", begun_report, "text", refuses=False),
+    "GPU check: outcomes": Reader("records/laws.jsonl", "", outcomes, "text", refuses=False),
+}
+READERS: dict[str, Reader] = {**_SPLATS, **_PICTURES, **_CAPTURES, **_RUNS, **_BLOCKS, **_PAPER, **_KIT}

@@ -13,6 +13,7 @@ import pop_fast.compiled
 from pop_fast import rasterization
 from pop_fast.compiled import build, library
 from pop_fast.compiled.backend import COMPILED
+from pop_fast.compiled.native_step import NativeTrainer
 from pop_fast.data.load import load_capture
 from pop_fast.stages.types import Camera, Gaussians
 from pop_fast.stages.view_pass import PassInput
@@ -67,10 +68,11 @@ def _train(capture: object, method: str, threads: int, steps: int) -> int:
     run = TrainingRun(config, capture)  # type: ignore[arg-type]
     while run.step < config.max_steps:
         run.take_steps(run.step + 1)
-    if run.stepper.name != "native":
+    fused = getattr(run.stepper, "fused", None)
+    if not isinstance(fused, NativeTrainer):
         raise SystemExit(f"{method} was not trained by the native step")
-    if not run.stepper.fused.counts()["entries"]:
-        raise SystemExit(f"{method}: the last step had nothing to do")
+    if method == "pop" and not fused.counts()["entries"]:
+        raise SystemExit("the last step had nothing to do")
     return run.step
 
 

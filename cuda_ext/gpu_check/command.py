@@ -74,6 +74,13 @@ def environment(commit: str) -> dict[str, Any]:
     return found
 
 
+def begun_report(path: Path) -> dict[str, Any]:
+    """Return the report that earlier calls of a job have left, and an empty one where it is absent or damaged."""
+    report = read_json(path)
+    stages = report.get("stages")
+    return {**report, "stages": dict(stages) if isinstance(stages, dict) else {}}
+
+
 def run_stages(names: list[str], limit: float, check: Check, report: dict[str, Any], path: Path) -> list[str]:
     """Run stages in order, each in its share of the time, and write down what each found; return those that failed."""
     # how long emulated kernels take says nothing: only the limit ends them
@@ -160,7 +167,7 @@ def main(argv: list[str] | None = None) -> int:
         raise SystemExit(f"gpu_check: {packed}: no such folder; make it with --pack, or leave --packed out")
     commit = commit_of(packed)
     path = out / f"gpu_check_{args.job}.json"
-    report: dict[str, Any] = {"stages": {}, **read_json(path)}
+    report = begun_report(path)
     report |= {"job": args.job, "complete": False, "rehearsal": args.rehearse, "limit_s": args.limit_s}
     report["environment"] = environment(commit)
     check = Check(

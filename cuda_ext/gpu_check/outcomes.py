@@ -44,16 +44,30 @@ class _Outcomes:
 
 
 def outcomes(path: Path) -> dict[str, Any]:
-    """Add up a file of outcomes: counts, the failures, the slowest tests, why tests were skipped."""
+    """Add up a file of outcomes: counts, the failures, the slowest tests, why tests were skipped.
+
+    A line that a kill has cut off, or that something else has damaged, is counted as `damaged` and left out.
+    """
     if not path.exists():
         return {"passed": 0, "failed": 0, "skipped": 0}
-    tests = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    lines = path.read_bytes().splitlines()
+    tests = [test for line in lines if (test := _outcome(line)) is not None]
     counts = Counter(test["outcome"] for test in tests)
     slowest = sorted(tests, key=lambda test: -test["seconds"])[:5]
     reasons = Counter(test["words"] for test in tests if test["outcome"] == "skipped")
     return {
         **{name: counts[name] for name in ("passed", "failed", "skipped")},
+        **({"damaged": len(lines) - len(tests)} if len(tests) < len(lines) else {}),
         "failures": [test for test in tests if test["outcome"] == "failed"][:SHOWN],
         "slowest": {test["test"]: test["seconds"] for test in slowest},
         "skipped_for": dict(reasons.most_common(5)),
     }
+
+
+def _outcome(line: bytes) -> dict[str, Any] | None:
+    try:
+        test = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    texts = isinstance(test, dict) and all(isinstance(test.get(key), str) for key in ("test", "outcome", "words"))
+    return test if texts and isinstance(test.get("seconds"), int | float) else None

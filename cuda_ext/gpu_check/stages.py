@@ -30,12 +30,22 @@ _KEPT += ("gpu", "gpu_memory_bytes", "instance_buffers_grown")
 
 
 def wheels_stage(check: Check) -> dict[str, Any]:
-    """Install the wheels that were brought along into a scratch folder; continue without what is absent."""
+    """Install the wheels that were brought along into a scratch folder; continue without what is absent.
+
+    Where pip refuses them together, each is installed by itself, so that a damaged one costs no other.
+    """
     wheels = sorted(map(str, (check.packed / "wheels").glob("*.whl"))) if check.packed else []
     if not wheels:
         return skipped("no wheels were brought along (--packed FOLDER, made by --pack)")
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--no-compile", "--upgrade"]
-    return check.run([*pip, "--target", str(check.site), *wheels], check.seconds) | {"wheels": list(map(_stem, wheels))}
+    into, end = [*pip, "--target", str(check.site)], time.monotonic() + check.seconds
+    found = check.run([*into, *wheels], check.seconds)
+    if found["status"] == 0:
+        return found | {"wheels": list(map(_stem, wheels))}
+    each = {wheel: check.run([*into, wheel], max(end - time.monotonic(), 1.0)) for wheel in wheels}
+    bad = {_stem(wheel): one["output"][-500:] for wheel, one in each.items() if one["status"] != 0}
+    sound = [_stem(wheel) for wheel in wheels if _stem(wheel) not in bad]
+    return found | {"wheels": sound, "damaged": bad, "output": "\n".join(bad.values()) or found["output"]}
 
 
 def build_stage(check: Check) -> dict[str, Any]:

@@ -121,7 +121,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """Read a file of this check; nothing where it is absent or damaged."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
 

@@ -28,7 +28,7 @@ _FIGURE: Final = """
     pop-repro figure 3 --scale small --data DATA            trains 1,000 steps, on the CPU, from a 3DGS model
 """
 _CLAIMS: Final = """
-    pop-repro claims --scale small                          each claim, its verdict, and the numbers behind it
+    pop-repro claims --scale small                          each claim, its verdict, its intervals, what would decide it
 """
 
 
@@ -111,11 +111,10 @@ def claims(words: Sequence[str]) -> int:
     add_results(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="write claims.md there instead of printing")
     args = parser.parse_args(words)
-    from paper_repro import claims as judging
+    from paper_repro.claims_page import markdown
     from paper_repro.results import existing_folder, read_all
 
-    results = read_all(args.scale, existing_folder(args.results))
-    text = judging.markdown(judging.claims(args.scale, results), args.scale)
+    text = markdown(args.scale, read_all(args.scale, existing_folder(args.results)))
     if args.out is None:
         print(text)
     else:

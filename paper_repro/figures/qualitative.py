@@ -18,6 +18,7 @@ from paper_repro.figures.foot import foot
 from paper_repro.figures.sheet import Drawn, Sheet, show
 from paper_repro.figures.style import INK, TEXT, color_of, name_of
 from paper_repro.results import Result
+from pop_fast.view.report.source import read_view
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -111,8 +112,7 @@ def _view(asked: Asked, runs: dict[tuple[str, str], Result], scene: str) -> View
         kept = sorted(folder.glob("val_step*_0000.npz"))
         if not kept:
             return None
-        with np.load(kept[-1]) as arrays:
-            found[row] = {key: arrays[key] for key in ("name", "render", "photo", "psnr")}
+        found[row] = read_view(kept[-1])
     photo, renders = found["pop"]["photo"], {row: found[row]["render"] for row in _ROWS}
     side = max(min(photo.shape[:2]) // 4, 1)
     psnr = {row: float(found[row]["psnr"]) for row in _ROWS}

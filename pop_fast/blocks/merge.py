@@ -9,6 +9,7 @@ result; what another one makes is what the next round starts from.
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -39,7 +40,7 @@ from pop_fast.train.results import ResultFolder
 from pop_fast.train.schedule import active_sh_degree
 from pop_fast.train.views import ViewTensors
 
-__all__ = ["TAKEN", "kept_of", "merge", "moved"]
+__all__ = ["TAKEN", "kept_of", "merge", "moved", "read_round"]
 
 # of what a round has changed. On bonsai in 2x2, where all four cores stand in most views, a round of 300 steps that
 # draws from all views made 27.69, 27.92 and 27.56 dB of 26.49 dB with shares of 0.5, 0.75 and 1; on fox in 2x1 it made
@@ -107,7 +108,7 @@ def merge(folder: Path, config: TrainConfig, capture: Capture, part: Part) -> di
     try:
         if not part.last:
             return _hand_on(folder, config, capture, params, rows, part, partition)
-        before = [_read_round(folder, number) for number in range(part.round)]
+        before = [read_round(folder, number) for number in range(part.round)]
         _write_splat(results, config, capture, params)
         stats = _measured(results, config, capture, params, rows, before)
     finally:
@@ -200,11 +201,31 @@ def _stats_path(folder: Path, number: int) -> Path:
     return round_folder(folder, number) / "stats.json"
 
 
-def _read_round(folder: Path, number: int) -> dict[str, Any]:
+def read_round(folder: Path, number: int) -> dict[str, Any]:
+    """Read what a round that another one follows came to.
+
+    Args:
+        folder: the run's.
+        number: of the round, from 0.
+
+    Raises:
+        PopError: it is absent or damaged.
+    """
     path, fix = _stats_path(folder, number), f"run pop blocks merge {folder} --round {number}"
     if not path.is_file():
         raise PopError(f"{path}: is absent; {fix}")
-    return read_json(path, fix)
+    found = read_json(path, fix)
+    blocks = found.get("blocks")
+    if not isinstance(blocks, list) or not blocks or not all(map(_is_row, blocks)):
+        raise PopError(f"{path}: blocks is not what 'pop blocks merge' writes; {fix}")
+    return found
+
+
+def _is_row(row: Any) -> bool:
+    if not isinstance(row, dict) or not isinstance(row.get("name"), str):
+        return False
+    numbers = (row.get(name) for name in ("seconds", "seconds_total", "memory_bytes"))
+    return all(isinstance(number, int | float) and 0.0 <= number <= sys.maxsize for number in numbers)
 
 
 def _write_splat(results: ResultFolder, config: TrainConfig, capture: Capture, params: dict[str, Tensor]) -> None:

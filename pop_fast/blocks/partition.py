@@ -124,7 +124,7 @@ class Partition:
         """Take back what `plain` gave.
 
         Raises:
-            ValueError, KeyError, TypeError: it is something else.
+            ValueError, KeyError, TypeError, OverflowError: it is something else.
         """
         arrays = {name: np.array(plain[name], np.float64) for name in ("origin", "axes", "strips", "low", "high")}
         cores = np.array(plain["cores"], np.float64).reshape(len(plain["cores"]), -1)

@@ -78,6 +78,7 @@ _FIX: Final = "start 'pop train --blocks' again with --overwrite"
 # third give back 1.5, 0.5 and 0.3; and the steps of one as a share of a block's training
 DEFAULT_ROUNDS: Final = 2
 ROUND_SHARE: Final = 0.1
+_WHOLE: Final = ("rounds", "round_steps")
 # more parts than a workflow shows, and surely a slip
 _MOST_ROUNDS: Final = 100
 
@@ -230,6 +231,8 @@ def read_job(folder: Path) -> Job | None:
         return None
     content = read_json(path, _FIX)
     try:
+        if type(content.get("blocks")) is not str or any(type(content.get(k, 0)) is not int for k in _WHOLE):
+            raise TypeError(f"blocks must be a text, {' and '.join(_WHOLE)} whole numbers")
         return Job(**content)
     except (TypeError, PopError) as error:
         raise PopError(f"{path}: is not what 'pop train --blocks' writes ({error}); {_FIX}") from error
@@ -288,7 +291,7 @@ def read_plan(folder: Path) -> tuple[Partition, list[dict[str, Any]]] | None:
         entries: Sequence[dict[str, Any]] = content["blocks"]
         if [entry["name"] for entry in entries] != partition.names:
             raise ValueError("its blocks are not those of its borders")
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise PopError(f"{path}: is not what 'pop train --blocks' writes ({error!r}); {_FIX}") from error
     return partition, list(entries)
 

@@ -26,7 +26,6 @@ from pop_fast.stages.splatting import ProjectionSettings, covariances, project
 from pop_fast.train.checkpoint import load_splats
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.model import KEYS
-from pop_ref.constants import profile_named
 
 __all__ = ["Start", "check_merged", "own_of", "read_core", "read_start", "shown_in", "write_counts"]
 
@@ -121,7 +120,7 @@ def shown_in(views: Sequence[View], params: Mapping[str, Tensor], config: TrainC
         params: raw parameters.
         config: profile and antialiasing are read.
     """
-    profile = profile_named(config.profile)
+    profile = config.renderer
     cameras = [
         (
             torch.from_numpy(view.viewmat).float(),

@@ -59,11 +59,11 @@ def run(argv: Sequence[str]) -> int:
 
 def look_over(root: Path, images: str | None = None) -> list[Finding]:
     """Examine a capture, or photographs alone; all findings in reading order."""
-    from pop_fast.cli.doctor import memory_bytes
     from pop_fast.data import check_dataset
     from pop_fast.data.finding import Finding
     from pop_fast.data.photo_quality import about_quality, measure_file
     from pop_fast.data.sfm import photo_folder, photographs
+    from pop_fast.machine import memory_bytes
 
     listing = check_dataset.read_listing(root, images)
     if listing is None:

@@ -6,14 +6,13 @@ import contextlib
 import importlib
 import os
 import platform
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
 from pop_fast.api.registry import backend_names, get_backend
 from pop_fast.cli.arguments import parse
-from pop_fast.machine import machine_name
+from pop_fast.machine import machine_name, memory_bytes
 from pop_fast.torch_install import cuda_version, why_torch_fails
 
 State = Literal["ok", "missing", "off"]
@@ -142,20 +141,6 @@ def lpips(args: Args) -> Iterator[Finding]:
 
             weights = LPIPS(net, files)
             yield Finding(f"LPIPS {net}", "ok", ", ".join(f"{k} {v[:12]}" for k, v in weights.sha256.items()))
-
-
-def memory_bytes() -> tuple[int, int]:
-    """Give the machine's memory and what is free of it, bytes; (0, 0) where the system does not tell."""
-    try:
-        with open("/proc/meminfo", encoding="utf-8") as file:
-            sizes = {line.split(":")[0]: int(line.split()[1]) * 1024 for line in file}
-        return sizes["MemTotal"], sizes["MemAvailable"]
-    except (OSError, KeyError, ValueError, IndexError):
-        pass
-    if sys.platform != "win32" and "SC_PHYS_PAGES" in os.sysconf_names:
-        total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        return total, total
-    return 0, 0
 
 
 def _why_not_imported(module: str) -> str | None:

@@ -81,7 +81,9 @@ def _explain(args: Args, at: tuple[int, int] | None) -> int:
     view = chosen_view(capture, args.view)
     if at is not None:
         check_inside(view, *at)
-    config = with_objective(config if args.profile is None else config.but(profile=args.profile), args.objective)
+    if args.profile is not None:
+        config = config.but(profile=args.profile, near_plane=None).in_world(capture.world_scale)
+    config = with_objective(config, args.objective)
     with reproducible(config.threads):
         scene = explain_view(splat.params, view, config, splat.sh_degree, splat.step)
         parting = None if args.diff is None or at is None else difference(scene, *args.diff, *at)

@@ -176,7 +176,11 @@ def _begun(folder: Path, config: TrainConfig, job: Job) -> Job | None:
         if (folder / "cfg.json").is_file():
             raise PopError(f"{folder}: was begun without blocks; resume it without --blocks, or choose another folder")
         return None
-    theirs = {**read_config(folder).binding(), **_dividing(before)}
+    begun = read_config(folder)
+    if config.near_plane is None and config.profile == begun.profile:
+        # what the profile's comes to in the world of this capture was written down when the run began
+        config = replace(config, near_plane=begun.near_plane)
+    theirs = {**begun.binding(), **_dividing(before)}
     found = first_difference({**config.binding(), **_dividing(_no_longer(job, before))}, theirs)
     if found:
         name, ours, theirs = found
@@ -244,6 +248,7 @@ def _begin(folder: Path, config: TrainConfig, options: Any, job: Job, division: 
     record = record_text(record_of(division.capture, options))
     beside = {RECORD: record, COMMANDS_FILE: commands_text(None, ["pop", "train", *argv]), JOB: job_text(job)}
     first = np.full(len(division.capture.points), config.init_opacity)
+    config = config.in_world(division.capture.world_scale)
     results = ResultFolder(folder)
     try:
         results.check(options.resume, options.overwrite)

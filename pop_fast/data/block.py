@@ -10,16 +10,21 @@ the block alone.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
+from pop_fast.data.fields import Numbers, check_size
 from pop_fast.data.pinhole import make_camera
 from pop_fast.data.posed_images import Listing, PosedImage, SparsePoints
-from pop_fast.errors import CaptureError
+from pop_fast.errors import CaptureError, PopError
 from pop_fast.io.atomic import write_atomically
+from pop_fast.io.read_back import read_arrays, read_json
+
+T = TypeVar("T")
 
 __all__ = ["BLOCK", "find_block", "read_block", "write_block"]
 
@@ -61,25 +66,36 @@ def read_block(folder: Path) -> Listing:
         CaptureError: the capture is not where it was, or a file is damaged; names it.
     """
     path, points = folder / _LIST, folder / _POINTS
+    content = _refused_as_capture(lambda: read_json(path, _FIX))
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
         root = Path(content["capture"])
         transform = _matrix(content["transform"])
         shots = [_shot(entry) for entry in content["photographs"]]
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    # pycolmap says what it does not know of a camera by errors of many kinds
+    except Exception as error:
         raise CaptureError(f"{path}: is not what 'pop train --blocks' writes ({error!r}); {_FIX}") from error
-    try:
-        with np.load(points, allow_pickle=False) as arrays:
-            cloud = SparsePoints(np.asarray(arrays["xyz"], np.float64), np.asarray(arrays["rgb"], np.uint8))
-        if cloud.xyz.ndim != 2 or cloud.xyz.shape[1] != 3 or cloud.rgb.shape != cloud.xyz.shape:
-            raise ValueError(f"xyz has shape {list(cloud.xyz.shape)}, rgb {list(cloud.rgb.shape)}")
-        if not np.isfinite(cloud.xyz).all():
-            raise ValueError("xyz has an entry that is not finite")
-    except (ValueError, KeyError, OSError, EOFError) as error:
-        raise CaptureError(f"{points}: is not what 'pop train --blocks' writes ({error!r}); {_FIX}") from error
+    cloud = _points(points)
     if not root.is_dir():
         raise CaptureError(f"{path}: is a block of {root}, which is not there; put the capture back, or {_FIX}")
     return Listing(root, path, shots, cloud, BLOCK, transform=transform)
+
+
+def _refused_as_capture(read: Callable[[], T]) -> T:
+    try:
+        return read()
+    except PopError as error:
+        raise CaptureError(str(error)) from error
+
+
+def _points(path: Path) -> SparsePoints:
+    arrays = _refused_as_capture(lambda: read_arrays(path, {"xyz": ("f", 2), "rgb": ("u", 2)}, _FIX))
+    cloud = SparsePoints(arrays["xyz"].astype(np.float64), arrays["rgb"].astype(np.uint8))
+    if cloud.xyz.shape[1] != 3 or cloud.rgb.shape != cloud.xyz.shape:
+        shapes = f"xyz has shape {list(cloud.xyz.shape)}, rgb {list(cloud.rgb.shape)}"
+        raise CaptureError(f"{path}: is not what 'pop train --blocks' writes ({shapes}); {_FIX}")
+    if not np.isfinite(cloud.xyz).all():
+        raise CaptureError(f"{path}: xyz has an entry that is not finite; {_FIX}")
+    return cloud
 
 
 def _entry(shot: PosedImage) -> dict[str, Any]:
@@ -109,15 +125,25 @@ def _entry(shot: PosedImage) -> dict[str, Any]:
 def _shot(entry: Any) -> PosedImage:
     lens = entry["camera"]
     camera = None
+    texts = [entry[name] for name in ("name", "folder", "file")]
+    if not all(isinstance(text, str) and "\0" not in text for text in texts):
+        raise ValueError(f"name, folder and file are {texts}")
+    if type(entry["turns"]) is not int or not 0 <= entry["turns"] <= 3:
+        raise ValueError(f"turns is {entry['turns']!r}")
     if lens is not None:
-        camera = make_camera(
-            lens["id"], lens["model"], lens["width"], lens["height"], [float(p) for p in lens["params"]]
-        )
+        where = f"camera of {entry['name']}"
+        read = Numbers(where, lens)
+        width, height = check_size(where, read("width"), read("height"))
+        params = [float(p) for p in lens["params"]]
+        if not np.isfinite(params).all():
+            raise ValueError(f"{where} has parameters that are not finite")
+        camera = make_camera(lens["id"], lens["model"], width, height, params)
     shot = PosedImage(entry["name"], entry["folder"], entry["file"], camera, _matrix(entry["viewmat"]))
     mask = None if entry["mask"] is None else Path(entry["mask"])
     if entry["split"] not in ("train", "test"):
         raise ValueError(f"split is {entry['split']!r}")
-    return replace(shot, angle_x=entry["angle_x"], mask=mask, split=entry["split"], turns=int(entry["turns"]))
+    angle_x = None if entry["angle_x"] is None else Numbers(entry["name"], entry)("angle_x")
+    return replace(shot, angle_x=angle_x, mask=mask, split=entry["split"], turns=entry["turns"])
 
 
 def _matrix(rows: Any) -> np.ndarray:

@@ -220,14 +220,22 @@ def about_reprojection(root: Path) -> Iterator[Finding]:
     model = find_model(root)
     if model is None:
         return
-    with quiet_colmap():
-        reconstruction = require_colmap().Reconstruction(model)
-        observations = int(reconstruction.compute_num_observations())
-        if observations == 0:
-            yield Finding("ok", "reprojection", "the model has no tracks, so its error is unknown")
-            return
-        reconstruction.update_point_3d_errors()
-        error = float(reconstruction.compute_mean_reprojection_error())
+    colmap = require_colmap()
+    try:
+        with quiet_colmap():
+            reconstruction = colmap.Reconstruction(model)
+            observations = int(reconstruction.compute_num_observations())
+            reconstruction.update_point_3d_errors()
+            error = float(reconstruction.compute_mean_reprojection_error()) if observations else 0.0
+    # COLMAP holds tracks against each other, and says what does not agree by errors of many kinds, without a file
+    except Exception as problem:
+        words = " ".join(str(problem).split())
+        fix = "training does without its tracks; write the model again to have them"
+        yield Finding("warn", "reprojection", f"{model}: COLMAP cannot read its tracks ({words}); {fix}")
+        return
+    if observations == 0:
+        yield Finding("ok", "reprojection", "the model has no tracks, so its error is unknown")
+        return
     state: State = "ok" if error < 2.0 else "warn"
     yield Finding(state, "reprojection", f"mean error {error:.2f} px over {observations:,} observations")
 

@@ -105,8 +105,11 @@ def read_metashape(path: Path, root: Path, images: str) -> tuple[list[PosedImage
     twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
         raise CaptureError(f"{path}: two cameras have the label {twice}; export one chunk, with labels that differ")
-    notes = [f"{len(unaligned)} cameras of {path.name} are not aligned and left out, first {unaligned[0]}"]
-    return sorted(shots, key=lambda shot: shot.name), notes if unaligned else []
+    notes = [
+        f"{len(unaligned)} cameras of {path.name} are not aligned and left out, first {label}"
+        for label in unaligned[:1]
+    ]
+    return sorted(shots, key=lambda shot: shot.name), notes
 
 
 def _numbers(where: str, element: ET.Element | None, count: int) -> np.ndarray:

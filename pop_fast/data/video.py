@@ -18,11 +18,13 @@ import numpy as np
 
 from pop_fast.data.capture import Progress
 from pop_fast.data.photo_quality import look_the_same, sharpness, thumbnail
-from pop_fast.errors import CaptureError
+from pop_fast.errors import CaptureError, PopError
 from pop_fast.io.atomic import folder_atomically
+from pop_fast.io.budget import PICTURE, check_memory
 
 __all__ = ["Taken", "take_frames"]
 
+_CONVERT: Final = "convert it, for example to MP4 with H.264"
 _JPEG_QUALITY: Final = 97
 
 
@@ -114,7 +116,16 @@ def _open(path: Path) -> Any:
     finally:
         cv2.utils.logging.setLogLevel(level)
     if not video.isOpened():
-        raise CaptureError(f"{path}: is no video that OpenCV can read; convert it, for example to MP4 with H.264")
+        raise CaptureError(f"{path}: is no video that OpenCV can read; {_CONVERT}")
+    width, height = (int(video.get(size)) for size in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    try:
+        # as it is decoded, as it is handed over, and the sharpest so far
+        check_memory(
+            path, 9 * width * height, path.stat().st_size, f"its frames of {width}x{height} px", _CONVERT, PICTURE
+        )
+    except PopError as error:
+        video.release()
+        raise CaptureError(str(error)) from error
     return video
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,7 +11,7 @@ from torch import Tensor
 from pop_fast.density import rows
 from pop_fast.density.info import dominant_counts, visible_from_radii, visible_in
 from pop_fast.density.protocol import DensificationContext, DensificationStep, Draws, Info, Params, State
-from pop_fast.stages.density import SPLIT_CHILDREN, Statistics, blur_is_over, blur_set, grow_masks, prune_mask
+from pop_fast.stages.density import SPLIT_CHILDREN, Statistics, blur_set, grow_masks, prune_mask
 from pop_fast.stages.polarization import importance_mask, opacity_entropy, pop_loss
 
 if TYPE_CHECKING:
@@ -32,8 +31,6 @@ def initialize_state(scene_scale: float, seed: int, count: int) -> State:
         "sh_rest_sum": None,
         "scene_scale": float(scene_scale),
         "first_count": count,
-        "loss_sum": 0.0,
-        "blur_windows": None,
         "generator": generator,
     }
 
@@ -150,24 +147,10 @@ def prune(of: DensificationContext, mask: Tensor) -> int:
 def who_grows(plan: DensityControl, of: DensificationContext) -> tuple[Tensor, Tensor]:
     """Return who is cloned and who is split; see `pop_ref.density.grow_masks`. [N] bool each"""
     state = of.state
-    if plan.blur_stop_gain > 0.0 and plan.is_blur_step(of.step):
-        plan = _without_blur_that_does_not_pay(plan, of)
     masks = grow_masks(window(state), torch.exp(of.params["scales"]), state["scene_scale"], of.step, plan)
     if of.step < plan.refine_scale2d_stop_iter:
         return masks[0], masks[1] | (state["radii"] > plan.grow_scale2d)
     return masks
-
-
-def _without_blur_that_does_not_pay(plan: DensityControl, of: DensificationContext) -> DensityControl:
-    """Note the window that ends; see `pop_ref.density.without_blur_that_does_not_pay`."""
-    state = of.state
-    if not state["loss_sum"] > 0.0:
-        raise ValueError("blur_stop_gain compares losses; add every step's to state['loss_sum'], or set it to 0")
-    noted = torch.tensor([[float(len(of))], [state["loss_sum"] / state["views"]]], dtype=torch.float64)
-    known = state["blur_windows"]
-    state["blur_windows"] = noted if known is None else torch.cat([known, noted], 1)
-    windows = [(n, loss) for n, loss in state["blur_windows"].T.tolist()]
-    return replace(plan, blur_stop_iter=-1) if blur_is_over(windows, plan.blur_stop_span, plan.blur_stop_gain) else plan
 
 
 def window(state: State) -> Statistics:
@@ -200,7 +183,7 @@ def clear(state: State) -> None:
     """Start a new window."""
     state["grad2d"].zero_()
     state["count"].zero_()
-    state["views"], state["loss_sum"] = 0, 0.0
+    state["views"] = 0
     # rows that wait are not those of Gaussians that have been edited
     state["blurred"] = state["dominant_sum"] = state["sh_rest_sum"] = None
     if state["radii"] is not None:
@@ -211,7 +194,7 @@ def forget(state: State) -> None:
     """Leave a window behind whose Gaussians are gone."""
     state["grad2d"] = state["count"] = state["radii"] = None
     state["blurred"] = state["dominant_sum"] = state["sh_rest_sum"] = None
-    state["views"], state["loss_sum"] = 0, 0.0
+    state["views"] = 0
 
 
 def standard_normals(generator: torch.Generator, n: int) -> Tensor:

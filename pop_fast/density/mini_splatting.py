@@ -1,12 +1,12 @@
 """Mini-Splatting: blur split, points set anew from depth, then importance-weighted sampling and pruning.
 
 Source: Fang and Wang 2024 and its code. Beside 3DGS's growth by gradient, who dominates more than HW / 5000 pixels of
-a view is split whatever its size. At steps 5,000 and 10,000 all Gaussians are replaced by points on the rays of pixels
-drawn from every training view, where the Gaussian that the pixel belongs to is densest (`pop_ref.chord`). At 15,000
-half of them, drawn by importance, keep place and colour and begin anew; at 20,000 the least important go that make up
-1 % of all importance. Opacities are never reset, colours have one band until 15,000, and the positions' rate goes back
-at 15,000 to what it was at 5,000. Everything else is 3DGS of 2023. The paper's Mini-Splatting* samples a share of 0.4
-on Tanks & Temples.
+any view since the last densification step is split whatever its size. At steps 5,000 and 10,000 all Gaussians are
+replaced by points on the rays of pixels drawn from every training view, where the Gaussian that the pixel belongs to is
+densest (`pop_ref.chord`). At 15,000 half of them, drawn by importance, keep place and colour and begin anew; at 20,000
+the least important go that make up 1 % of all importance. Opacities are never reset, colours have one band until
+15,000, and the positions' rate goes back at 15,000 to what it was at 5,000. Everything else is 3DGS of 2023. The
+paper's Mini-Splatting* samples a share of 0.4 on Tanks & Temples.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ class MiniSplattingStrategy(InriaStrategy):
     theta_blur: float = _MINI.density.theta_blur
     blur_start_iter: int = _MINI.density.blur_start_iter
     blur_stop_iter: int = _MINI.density.blur_stop_iter
+    blur_window: Literal["any_view", "sum", "own_view"] = _MINI.density.blur_window
     blur_rule: Literal["by_scale", "split"] = _MINI.density.blur_rule
     sh_start_iter: int = _MINI.updates.sh_start_iter
     means_rewind_iter: int = _MINI.updates.means_rewind_iter

@@ -84,7 +84,7 @@ class Passes:
         cls, backend: Any, views: Sequence[ViewTensors], config: TrainConfig, device: torch.device | None = None
     ) -> Passes:
         """Make passes with the settings of a run."""
-        return cls(backend, views, config.profile, config.background, config.antialiased, device)
+        return cls(backend, views, config.renderer, config.background, config.antialiased, device)
 
     @property
     def n_views(self) -> int:

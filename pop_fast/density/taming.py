@@ -4,9 +4,10 @@ Source: Mallick et al. 2024 and its code. Every 500 steps the Gaussians may grow
 first number to the budget (`pop_ref.taming`). Ten training views score each Gaussian by the view's loss times nine
 terms; of those that 3DGS would clone or split, as many as the parabola has room for are drawn by score. Of those that
 3DGS would prune, only who is drawn too goes, half as many as there are, by the inverse of the score; the last
-densification step prunes all. The bands beyond the first move each 16 steps by the sum of their gradients, opacities
-not at all after step 15,000, where the code hands Adam a tensor that it does not train. Everything else is 3DGS of
-2024, with twice its rate for these bands.
+densification step prunes nothing. The draw takes the scores in the order from before the split, where they belong to
+other Gaussians: a slip of the released code, with which the published numbers were made. The bands beyond the first
+move each 16 steps by the sum of their gradients, opacities not at all after step 15,000, where the code hands Adam a
+tensor that it does not train. Everything else is 3DGS of 2024, with twice its rate for these bands.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ class TamingStrategy(InriaStrategy):
             Temples, 5 on Deep Blending. The paper's count on Mip-NeRF 360 is that of 3 everywhere.
         final_count: the budget itself; 0 takes the multiplier.
         score_views: training views that a densification step scores by.
-        sampled_prunes: densification steps, from the first, that prune by sampling; the others prune all.
+        sampled_prunes: densification steps, from the first, that prune; the last one of all prunes nothing.
         misaligned_prune_weights: draw who is pruned with the scores in the order from before the split, as the released
-            code does, where they belong to other Gaussians.
+            code does, where they belong to other Gaussians; False draws with those of the Gaussians themselves.
     """
 
     refine_every: int = _TAMING.density.refine_every
@@ -42,7 +43,7 @@ class TamingStrategy(InriaStrategy):
     final_count: int = 0
     score_views: int = 10
     sampled_prunes: int = 27
-    misaligned_prune_weights: bool = False
+    misaligned_prune_weights: bool = True
 
     def needs_passes(self, step: int) -> bool:
         """Tell whether scores are asked for."""

@@ -31,7 +31,7 @@ def refine(plan: TamingStrategy, of: DensificationContext) -> DensificationStep:
 
     def who_goes() -> Tensor:
         mask = densify.who_goes(plan, of)
-        return mask if nth > plan.sampled_prunes else mask & _drawn_to_go(mask, weights, of)
+        return torch.zeros_like(mask) if nth > plan.sampled_prunes else mask & _drawn_to_go(mask, weights, of)
 
     return densify.refine(plan, of, clones, splits, who_goes)
 

@@ -6,10 +6,11 @@ not to be obeyed again.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -19,14 +20,28 @@ HEIF_SUFFIXES: Final = (".heic", ".heif", ".hif")
 INSTALL: Final = "pip install pillow-heif"
 _BRANDS: Final = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 
+T = TypeVar("T")
+
 
 def can_read_heif() -> bool:
     """Tell whether pillow-heif is installed."""
     return find_spec("pillow_heif") is not None
 
 
-def _pillow_heif() -> Any:
-    return import_module("pillow_heif")
+def _opened(data: bytes, read: Callable[[Any], T], **how: Any) -> T:
+    """Open a file and read something of it.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    try:
+        return read(import_module("pillow_heif").open_heif(data, **how))
+    # memory can be had again, and no damage
+    except (MemoryError, ImportError):
+        raise
+    # libheif's findings come as errors of many kinds: SyntaxError, RuntimeError, EOFError, IndexError
+    except Exception as error:
+        raise ValueError(" ".join(str(error).split())) from error
 
 
 def is_heif(data: bytes) -> bool:
@@ -40,7 +55,7 @@ def heif_size(data: bytes) -> tuple[int, int]:
     Raises:
         ValueError: the file is damaged.
     """
-    width, height = _pillow_heif().open_heif(data).size
+    width, height = _opened(data, lambda file: file.size)
     return int(width), int(height)
 
 
@@ -50,16 +65,15 @@ def decode_heif(data: bytes) -> np.ndarray:
     Raises:
         ValueError: the file is damaged.
     """
-    picture = _pillow_heif().open_heif(data, convert_hdr_to_8bit=True)
+    pixels = _opened(data, lambda file: np.ascontiguousarray(np.asarray(file)), convert_hdr_to_8bit=True)
     # one channel is gray
-    pixels = np.ascontiguousarray(np.asarray(picture))
     return np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels
 
 
 def heif_exif(path: Path) -> bytes:
     """Return the TIFF block of a file's EXIF tags, empty where it has none or cannot be read."""
     try:
-        block = _pillow_heif().open_heif(path.read_bytes()).info.get("exif") or b""
+        block = _opened(path.read_bytes(), lambda file: file.info.get("exif")) or b""
     except (OSError, ValueError):
         return b""
     return block.removeprefix(b"Exif\0\0")

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from pop_fast.io.heif import can_read_heif, heif_exif, is_heif
 
-__all__ = ["LARGEST", "Exif", "read_exif", "read_size", "size_of"]
+__all__ = ["LARGEST", "Exif", "bytes_per_pixel", "read_exif", "read_size", "size_of"]
 
 # pixels of one photograph: more than cameras have, and under 1 GiB decoded
 LARGEST: Final = 2**28
@@ -27,6 +27,7 @@ _FRAMES: Final = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
 _WIDTHS: Final = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 7: 1, 9: 4, 10: 8}
 _LETTERS: Final = {1: "B", 3: "H", 4: "I", 9: "i"}
 _WIDTH, _HEIGHT, _MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x100, 0x101, 0x10F, 0x110, 0x112, 0x8769
+_BITS, _SAMPLES = 0x102, 0x115
 _EXPOSURE, _ISO, _FOCAL, _FOCAL_35MM = 0x829A, 0x8827, 0x920A, 0xA405
 # a JPEG holds its tags in segments of 64 kB before its pixels; TIFF and WebP may hold them anywhere
 _HEAD: Final = 2**20
@@ -82,6 +83,20 @@ def size_of(data: bytes) -> tuple[int, int] | None:
     except (struct.error, KeyError, ValueError, TypeError):
         return None
     return None
+
+
+def bytes_per_pixel(data: bytes) -> int:
+    """Return how many bytes a pixel has when it is decoded, by a file's first bytes; 4 where they tell nothing else."""
+    try:
+        if data.startswith(_PNG):
+            depth, kind = data[24], data[25]
+            return {0: 1, 2: 3, 3: 3}.get(kind, 4) * (2 if depth == 16 else 1)
+        if data[:4] in _TIFF:
+            tags = _tags(data, 0)
+            return max(1, int(tags.get(_SAMPLES, 1))) * max(1, int(tags.get(_BITS, 8)) // 8)
+    except (IndexError, struct.error, KeyError, ValueError, TypeError):
+        pass
+    return 4
 
 
 def read_exif(path: Path) -> Exif:

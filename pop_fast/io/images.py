@@ -15,10 +15,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pop_fast.errors import CaptureError
+from pop_fast.errors import CaptureError, PopError
 from pop_fast.io.atomic import write_atomically
+from pop_fast.io.budget import PICTURE, check_memory
 from pop_fast.io.heif import HEIF_SUFFIXES, INSTALL, can_read_heif, decode_heif, heif_size, is_heif
-from pop_fast.io.image_header import LARGEST, size_of
+from pop_fast.io.image_header import LARGEST, bytes_per_pixel, size_of
 
 __all__ = [
     "FIX",
@@ -201,10 +202,14 @@ def _decode(path: Path) -> np.ndarray:
         raise CaptureError(f"{path}: could not be read: {error.strerror}; check the file's permissions") from error
     if is_heif(data):
         return _decode_heif(path, data)
-    _check_size(path, size_of(data))
+    size = size_of(data)
+    _check_size(path, size, len(data), bytes_per_pixel(data))
     defect = _defect(data)
     if defect:
         raise CaptureError(f"{path}: {defect}; {FIX}")
+    if size is None:
+        # a size that nobody has seen is nobody's to judge, and OpenCV also decodes what no camera writes
+        raise CaptureError(f"{path}: is no image that states its size as PNG, JPEG, WebP, TIFF and BMP do; {FIX}")
     try:
         # IMREAD_UNCHANGED keeps alpha and 16 bit, and leaves the EXIF orientation alone
         with _QUIET:
@@ -214,18 +219,26 @@ def _decode(path: Path) -> np.ndarray:
     if image is None or image.size == 0:
         raise CaptureError(f"{path}: is not an image that OpenCV can decode, or is corrupt; {FIX}")
     if image.dtype == np.uint16:
-        return ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
+        return cv2.convertScaleAbs(image, alpha=1.0 / 257.0)
     if image.dtype != np.uint8:
         raise CaptureError(f"{path}: has samples of type {image.dtype}; save it with 8 or 16 bit per channel")
     return image
 
 
-def _check_size(path: Path, size: tuple[int, int] | None) -> None:
-    if size is not None and size[0] * size[1] > LARGEST:
+def _check_size(path: Path, size: tuple[int, int] | None, packed: int, each: int) -> None:
+    if size is None:
+        return
+    if size[0] * size[1] > LARGEST:
         raise CaptureError(
             f"{path}: is {size[0]}x{size[1]} px by its header; more than {LARGEST // 10**6} million pixels are not "
             "decoded: make it smaller"
         )
+    what = f"its header's size of {size[0]}x{size[1]} px"
+    try:
+        # once as it is decoded, and once in 8 bit and in our order of the channels
+        check_memory(path, 2 * each * size[0] * size[1], packed, what, FIX, PICTURE)
+    except PopError as error:
+        raise CaptureError(str(error)) from error
 
 
 def _decode_heif(path: Path, data: bytes) -> np.ndarray:
@@ -233,7 +246,7 @@ def _decode_heif(path: Path, data: bytes) -> np.ndarray:
     if not can_read_heif():
         raise CaptureError(f"{path}: is HEIC, which needs pillow-heif: {INSTALL}, or convert it to JPEG")
     try:
-        _check_size(path, heif_size(data))
+        _check_size(path, heif_size(data), len(data), 4)
         image = decode_heif(data)
     except CaptureError:
         raise

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -11,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from pop_fast.errors import PopError
+from pop_fast.io.budget import check_members
 
 __all__ = ["check_record", "parse_json", "read_arrays", "read_json"]
 
@@ -102,9 +104,13 @@ def read_arrays(path: Path, forms: Mapping[str, tuple[str, int]], fix: str) -> d
         PopError: it is damaged, or an array is absent or of another form; names it.
     """
     try:
+        with zipfile.ZipFile(path) as archive:
+            check_members(path, archive, path.stat().st_size, fix)
         with np.load(path, allow_pickle=False) as stored:
             # what is no array in such a file is bytes
             arrays = {name: np.asarray(stored[name]) for name in stored.files if name in forms or f"{name}?" in forms}
+    except PopError:
+        raise
     # a damaged zip ends in errors of many kinds
     except Exception as error:
         raise PopError(f"{path}: is damaged ({error}); {fix}") from error

@@ -7,8 +7,7 @@ reads, a strategy for example.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -70,17 +69,6 @@ def grow_masks(
     if config.blur_rule == "split":
         return by_grad & small, (by_grad & ~small) | by_blur
     return (by_grad | by_blur) & small, (by_grad | by_blur) & ~small
-
-
-def blur_is_over(windows: Sequence[tuple[float, float]], span: int, gain: float) -> bool:
-    """See `pop_ref.density.blur_is_over`."""
-    for end in range(2 * span, len(windows) + 1):
-        before, after = windows[end - 2 * span : end - span], windows[end - span : end]
-        grown = math.log(sum(n for n, _ in after) / sum(n for n, _ in before))
-        won = math.log(sum(loss for _, loss in before) / sum(loss for _, loss in after))
-        if won < gain * grown:
-            return True
-    return False
 
 
 def prune_mask(opacities: Tensor, scales: Tensor, scene_scale: float, step: int, config: Any) -> Tensor:

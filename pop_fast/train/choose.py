@@ -59,5 +59,5 @@ def _begun_with(folder: Path) -> Any:
     path = folder / "cfg.json"
     try:
         return json.loads(path.read_text(encoding="utf-8"))["resolved"]["backend"]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None

@@ -16,7 +16,7 @@ from pop_fast.errors import PopError
 from pop_fast.train.jsonable import from_plain, to_plain
 from pop_fast.train.limits import check_values
 from pop_fast.train.presets import METHODS, MILESTONES, Given, defaults, laid_over, method_of
-from pop_ref.constants import PAPER
+from pop_ref.constants import NEAR_IN_CAPTURE_UNITS, PAPER, Profile, profile_named
 from pop_ref.settings import LAMBDA_SSIM_3DGS, MAX_SH_DEGREE, AppearanceRates, LearningRates, Recipe
 
 __all__ = ["LearningRates", "TrainConfig", "first_difference"]
@@ -29,6 +29,8 @@ _FREE: Final = frozenset(
         *("max_renders", "progress", "lpips_vgg", "lpips_alex", "target_cache_mb"),
     }
 )
+# settings of density control that are gone, with the value at which they did nothing: results with it still open
+_GONE: Final = {"blur_stop_gain": 0.0, "blur_stop_span": 5}
 # the two parts of cfg.json
 _GIVEN, _RESOLVED = "given", "resolved"
 
@@ -49,6 +51,8 @@ class TrainConfig:
             else "compiled" where that was compiled, else "fast".
         profile: the rasterizer's constants: "paper", "gsplat_1_5", "gsplat_1_6", "inria" (that of method "3dgs" and of
             those built on it) or "speedy_splat".
+        near_plane: depth up to which a camera shows nothing, in units of the world that is trained in; None takes the
+            profile's, which Inria's family counts in the capture's own units: a run writes down what that comes to.
         antialiased: render with opacity compensation (Mip-Splatting) instead of classically.
         factor: photographs are shrunk by it.
         resize: how, where the capture does not bring them shrunk: "area" averages, "bicubic" does as Pillow does, and
@@ -99,6 +103,7 @@ class TrainConfig:
     seed: int = 42
     backend: str = "auto"
     profile: str = PAPER.name
+    near_plane: float | None = None
     antialiased: bool = False
     factor: int = 1
     resize: Literal["area", "bicubic"] = "area"
@@ -186,7 +191,10 @@ class TrainConfig:
     @classmethod
     def _from_values(cls, values: dict[str, Any], method: str) -> Self:
         rest = {name: value for name, value in values.items() if name != "strategy"}
-        strategy = from_plain(METHODS[method].strategy, values.get("strategy", {}), f"config.{method}")
+        own = values.get("strategy", {})
+        if isinstance(own, dict):
+            own = {name: value for name, value in own.items() if name not in _GONE or value != _GONE[name]}
+        strategy = from_plain(METHODS[method].strategy, own, f"config.{method}")
         return replace(from_plain(cls, rest, "config", skipped=("given", "strategy")), strategy=strategy)
 
     @property
@@ -198,6 +206,22 @@ class TrainConfig:
     def preset(self) -> str | None:
         """The preset that gave the defaults; None where every value was written down."""
         return None if self.given is None else self.given.preset
+
+    @property
+    def renderer(self) -> Profile:
+        """The rasterizer's constants, with the near plane of these settings."""
+        profile = profile_named(self.profile)
+        return profile if self.near_plane is None else replace(profile, near_plane=self.near_plane)
+
+    def in_world(self, world_scale: float) -> Self:
+        """Return these settings with the near plane of a world, unless one was said.
+
+        Args:
+            world_scale: length of one unit of the capture's own frame in the world that is trained in.
+        """
+        if self.near_plane is not None or self.profile not in NEAR_IN_CAPTURE_UNITS:
+            return self
+        return replace(self, near_plane=self.renderer.near_plane * world_scale)
 
     def photometric_at(self, step: int) -> tuple[Literal["l1", "l2"], float]:
         """Return the pixel-wise loss of a step and the weight of 1 - SSIM; the rest of the weight, to 1, is its own."""
@@ -246,8 +270,10 @@ class TrainConfig:
 
     def binding(self) -> dict[str, Any]:
         """Return the settings that a resumed run must share, flat."""
-        # a batch of one is what every run had before there were others: its checkpoints say nothing of it
-        free = _FREE | {"batch_size"} if self.batch_size == 1 else _FREE
+        # a batch of one and a profile's own near plane are what every run had before there were others: its
+        # checkpoints say nothing of them
+        usual = {"batch_size": self.batch_size == 1, "near_plane": self.near_plane is None}
+        free = _FREE | {name for name, is_usual in usual.items() if is_usual}
         return {name: value for name, value in self.flat().items() if name not in free}
 
     def flat(self) -> dict[str, Any]:

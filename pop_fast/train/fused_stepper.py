@@ -21,7 +21,6 @@ from pop_fast.train.config import TrainConfig
 from pop_fast.train.model import KEYS
 from pop_fast.train.stepper import Task
 from pop_fast.train.views import ViewTensors
-from pop_ref.constants import PROFILES
 
 Rows = Mapping[str, Tensor]
 
@@ -158,6 +157,6 @@ def step_settings(config: TrainConfig, updates: Updates) -> StepSettings:
         theta_blur=pop.theta_blur,
         blur_min_pixels=pop.blur_min_pixels,
         background=config.background,
-        profile=PROFILES[config.profile],
+        profile=config.renderer,
         antialiased=config.antialiased,
     )

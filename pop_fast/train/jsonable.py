@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import types
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
+from functools import cache
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from pop_fast.errors import PopError
@@ -11,6 +13,8 @@ from pop_fast.errors import PopError
 T = TypeVar("T")
 # up to here a float holds every whole number
 _LARGEST = 2**53
+# compiling the annotations takes as long as all else
+_hints: Callable[[type], dict[str, Any]] = cache(get_type_hints)
 
 
 def to_plain(value: Any) -> Any:
@@ -38,7 +42,7 @@ def from_plain(kind: type[T], plain: Any, where: str, skipped: tuple[str, ...] =
     """
     if not isinstance(plain, dict):
         raise PopError(f"{where} is {_shown(plain)}; it must be an object of settings")
-    hints = {name: hint for name, hint in get_type_hints(kind).items() if name not in skipped}
+    hints = {name: hint for name, hint in _hints(kind).items() if name not in skipped}
     for name in plain:
         if name not in hints:
             raise PopError(f"{where}.{name} is not a setting; the settings are {', '.join(hints)}")

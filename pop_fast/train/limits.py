@@ -39,7 +39,7 @@ _OVER_ZERO: Final = (
 )
 # of the strategy, whose settings errors call by the method's name as the command line does
 _AT_LEAST_OF_STRATEGY: Final = {
-    **dict.fromkeys(("refine_every", "sh_rest_every", "round_steps", "round_decay_every", "blur_stop_span"), 1),
+    **dict.fromkeys(("refine_every", "sh_rest_every", "round_steps", "round_decay_every"), 1),
     **dict.fromkeys(("score_views", "score_divisor", "reinit_points", "max_gaussians"), 1),
     **dict.fromkeys(("reset_every", "pause_refine_after_reset", "final_count", "sampled_prunes"), 0),
 }

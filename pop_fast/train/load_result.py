@@ -186,7 +186,7 @@ def open_capture(
     elif splat.path.suffix.lower() != ".pt":
         origin = "says nothing of its world, and is taken to be in pop's training frame"
         print(f"note: {splat.path}: {origin}; that of another program needs --own-frame", file=sys.stderr)
-    config = replace(splat.config, **changes)
+    config = _in_frame(replace(splat.config, **changes), splat)
     capture = load_capture(
         data,
         factor=config.factor,
@@ -205,6 +205,15 @@ def open_capture(
     if config.normalize:
         _check_same_frame(splat, capture)
     return capture, config
+
+
+def _in_frame(config: TrainConfig, splat: Splat) -> TrainConfig:
+    """Give the near plane of the frame that a splat is looked at in, where that is not the one it was trained in."""
+    record = read_record(splat.folder)
+    if config.near_plane is None or record is None or config.normalize or not splat.config.normalize:
+        return config
+    scale = np.cbrt(np.linalg.det(np.array(record.world_transform)[:3, :3]))
+    return replace(config, near_plane=config.near_plane / float(scale))
 
 
 def frame_of_splat(splat: Splat, options: CaptureOptions) -> Literal["capture", "training"] | None:

@@ -113,7 +113,7 @@ class TrainingRun:
         check_batch(config, strategy is None, ranks)
         self._ranks = ranks
         self._engine = engine_of(choose_backend(config, resume)[0], strategy is None) if engine is None else engine
-        self.config = replace(config, backend=self._engine.name)
+        self.config = replace(config, backend=self._engine.name).in_world(capture.world_scale)
         self._resume, self._overwrite, self._beside = resume, overwrite, beside or {}
         self._prepare_capture(capture, initial)
         self.optimizers = make_optimizers(self.params)
@@ -256,8 +256,6 @@ class TrainingRun:
             self._require_finite()
             raise PopError(f"{error}; {self._what_is_left}") from error
         self.step = last
-        if "loss_sum" in self.state and phase.statistics:
-            self.state["loss_sum"] += self.config.batch_size * sum(found.objective + found.pop for found in stats)
         for step, found in enumerate(stats, first):
             if not math.isfinite(found.objective + found.pop):
                 self._require_finite()

@@ -160,7 +160,7 @@ def rasterization_arguments(
         "packed": False,
         "backgrounds": None if background is None else background.to(opacities)[None],
         "rasterize_mode": "antialiased" if config.antialiased else "classic",
-        "profile": config.profile,
+        "profile": config.renderer,
     }
 
 

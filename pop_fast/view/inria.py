@@ -44,7 +44,7 @@ def write_inria_folder(splat: Splat, capture: Capture, out: Path, overwrite: boo
     steps = Recipe.max_steps if splat.step is None else splat.step + 1
     held_out = capture.test_views(splat.config.test_every)
     keeps = paths_read(splat, Path(splat.config.data), capture)
-    with folder_atomically(out, overwrite, keeps=keeps, recognise=_exported_to(out)) as folder:
+    with folder_atomically(out, overwrite, keeps=keeps, recognise=exported_to(out)) as folder:
         params = to_capture_frame(splat.params, transform)
         path = folder / "point_cloud" / f"iteration_{steps}" / "point_cloud.ply"
         save_ply(path, params, splat.config.antialiased, frame=Frame("capture"))
@@ -57,7 +57,7 @@ def write_inria_folder(splat: Splat, capture: Capture, out: Path, overwrite: boo
             write_png(folder / "test" / f"ours_{steps}" / "gt" / f"{i:05d}.png", view.image)
 
 
-def _exported_to(folder: Path) -> Callable[[Path], bool]:
+def exported_to(folder: Path) -> Callable[[Path], bool]:
     """Tell which files of a folder an earlier export wrote; none where another trainer left the folder."""
     try:
         ours = _BY in (folder / "cfg_args").read_text(encoding="utf-8")

@@ -13,6 +13,7 @@ from pop_ref.conformance.scenes import Scene
 from pop_ref.constants import Profile
 from pop_ref.records import Camera, Gaussians
 
+_CAMERA = ("viewmat", "K", "background")
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 
 
@@ -42,9 +43,19 @@ def save_scene(path: Path, scene: Scene) -> None:
 
 
 def load_scene(path: Path) -> Scene:
-    """Read a scene that `save_scene` wrote."""
-    with np.load(path) as stored:
-        return scene_from(dict(stored), json.loads(str(stored["options"])))
+    """Read a scene that `save_scene` wrote.
+
+    Raises:
+        ValueError: the file is none; names it.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: np.asarray(stored[name], np.float64) for name in (*_ARRAYS, *_CAMERA)}
+            options = json.loads(str(stored["options"]))
+        return scene_from(arrays, options)
+    # what is damaged in a zip, in an array's head or in a scene ends in errors of many kinds
+    except Exception as error:
+        raise ValueError(f"{path}: is no scene of the kit ({error!r}); write it again") from error
 
 
 def scene_from(arrays: dict[str, np.ndarray], options: dict[str, Any]) -> Scene:

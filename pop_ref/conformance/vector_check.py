@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import zipfile
-import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,13 @@ import numpy as np
 from pop_ref.conformance.corpus_answers import weighted_blocks, weighted_runs
 from pop_ref.conformance.vector_schema import FORMAT, VERSION
 
+# bytes of all arrays of a file; the largest vector has a few million
+_LARGEST = 2**28
 AGAIN = "write the vectors again with 'pop vectors export'"
+
+
+class VectorsError(ValueError):
+    """Tell what is wrong with a folder of vectors or with a port's results, in a line that names the file."""
 
 
 @dataclass(frozen=True)
@@ -73,12 +78,26 @@ def check(folder: Path, results: Path, precision: str = "float32") -> Judgement:
         precision: "float32" or "float64", that the port computes in.
 
     Raises:
-        ValueError: a folder, file or array is missing, damaged or of another version or shape; or nothing is there to
+        VectorsError: a folder, file or array is missing, damaged or of another version or shape; or nothing is there to
             be judged. Says which and what to do.
     """
     index = read_index(folder)
+    try:
+        return _check(index, folder, results, precision)
+    except VectorsError:
+        raise
+    # what the index says is taken as it stands: where it does not fit the arrays, any step of the rules may fail
+    except Exception as error:
+        raise VectorsError(
+            f"{folder / 'index.json'}: does not fit the vectors beside it ({error!r}); {AGAIN}"
+        ) from error
+
+
+def _check(index: dict[str, Any], folder: Path, results: Path, precision: str) -> Judgement:
     if not results.is_dir():
-        raise ValueError(f"{results}: no such folder; a port writes its results there, NAME.npz or NAME.json a vector")
+        raise VectorsError(
+            f"{results}: no such folder; a port writes its results there, NAME.npz or NAME.json a vector"
+        )
     found = Judgement()
     known = {f"{name}{suffix}" for name in index["vectors"] for suffix in (".npz", ".json")}
     found.strange = sorted(path.name for path in results.iterdir() if path.name not in known)
@@ -101,7 +120,7 @@ def check(folder: Path, results: Path, precision: str = "float32") -> Judgement:
             for rule in outputs[array]["compare"]:
                 found.verdicts.append(_judge(name, array, wanted, result[array], rule, index["tiny"], precision))
     if not found.verdicts:
-        raise ValueError(
+        raise VectorsError(
             f"{results}: holds nothing to judge; write one file for each vector, as "
             f"{next(iter(index['vectors']))}.npz with {', '.join(known_outputs)}"
         )
@@ -113,24 +132,24 @@ def read_index(folder: Path) -> dict[str, Any]:
     """Read the index of a folder of vectors.
 
     Raises:
-        ValueError: the folder or the index is missing, damaged, foreign or of another version.
+        VectorsError: the folder or the index is missing, damaged, foreign or of another version.
     """
     path = folder / "index.json"
     if not folder.is_dir():
-        raise ValueError(f"{folder}: no such folder; write the vectors with 'pop vectors export {folder}'")
+        raise VectorsError(f"{folder}: no such folder; write the vectors with 'pop vectors export {folder}'")
     if not path.is_file():
-        raise ValueError(f"{path}: absent, so {folder} holds no vectors; write them with 'pop vectors export'")
+        raise VectorsError(f"{path}: absent, so {folder} holds no vectors; write them with 'pop vectors export'")
     try:
         index = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: is damaged ({error}); {AGAIN}") from error
+    except (ValueError, RecursionError) as error:
+        raise VectorsError(f"{path}: is damaged ({error}); {AGAIN}") from error
     if not isinstance(index, dict) or index.get("format") != FORMAT:
-        raise ValueError(f"{path}: format is not {FORMAT!r}, so it is no index of vectors; {AGAIN}")
+        raise VectorsError(f"{path}: format is not {FORMAT!r}, so it is no index of vectors; {AGAIN}")
     if index.get("version") != VERSION:
-        raise ValueError(f"{path}: version is {index.get('version')}, this program reads {VERSION}; {AGAIN}")
+        raise VectorsError(f"{path}: version is {index.get('version')}, this program reads {VERSION}; {AGAIN}")
     lacks = [name for name in ("kinds", "vectors", "tiny") if name not in index]
     if lacks:
-        raise ValueError(f"{path}: {lacks[0]} is absent; {AGAIN}")
+        raise VectorsError(f"{path}: {lacks[0]} is absent; {AGAIN}")
     return index
 
 
@@ -138,37 +157,43 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Read an npz, or a JSON file of nested lists, as arrays by name.
 
     Raises:
-        ValueError: the file is neither, or an array of it holds no numbers.
+        VectorsError: the file is neither, or an array of it holds no numbers.
     """
     try:
         if path.suffix == ".json":
-            arrays = {name: np.asarray(value) for name, value in json.loads(path.read_text(encoding="utf-8")).items()}
-        else:
-            with np.load(path, allow_pickle=False) as stored:
-                arrays = {name: stored[name] for name in stored.files}
-    except (ValueError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+            return {name: np.asarray(value) for name, value in json.loads(path.read_text(encoding="utf-8")).items()}
+        with zipfile.ZipFile(path) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > _LARGEST:
+            raise ValueError(f"its arrays have {size} bytes, more than any vector's")
+        with np.load(path, allow_pickle=False) as stored:
+            # what is no array in such a file is bytes
+            return {name: np.asarray(stored[name]) for name in stored.files}
+    # a damaged zip, a damaged head of an array and lists of lists that are no array end in errors of many kinds
+    except Exception as error:
         kind = "JSON of number lists by name" if path.suffix == ".json" else "npz file of numbers"
-        raise ValueError(f"{path}: is no {kind} ({error}); write it again") from error
-    return arrays
+        raise VectorsError(f"{path}: is no {kind} ({error}); write it again") from error
 
 
 def _vector(path: Path, shapes: dict[str, list[int]]) -> dict[str, np.ndarray]:
     if not path.is_file():
-        raise ValueError(f"{path}: absent; {AGAIN}")
+        raise VectorsError(f"{path}: absent; {AGAIN}")
     arrays = read_arrays(path)
     for name, shape in shapes.items():
         if name not in arrays:
-            raise ValueError(f"{path}: has no array {name}; {AGAIN}")
+            raise VectorsError(f"{path}: has no array {name}; {AGAIN}")
+        if arrays[name].dtype.kind not in "fiub":
+            raise VectorsError(f"{path}: {name} has type {arrays[name].dtype}, not numbers; {AGAIN}")
         if list(arrays[name].shape) != shape:
-            raise ValueError(f"{path}: {name} has shape {list(arrays[name].shape)}, the index says {shape}; {AGAIN}")
+            raise VectorsError(f"{path}: {name} has shape {list(arrays[name].shape)}, the index says {shape}; {AGAIN}")
     return arrays
 
 
 def _check_shape(path: Path, array: str, result: np.ndarray, wanted: list[int]) -> None:
     if result.dtype.kind not in "fiub":
-        raise ValueError(f"{path}: {array} has type {result.dtype}; it must hold numbers")
+        raise VectorsError(f"{path}: {array} has type {result.dtype}; it must hold numbers")
     if list(result.shape) != wanted:
-        raise ValueError(f"{path}: {array} has shape {list(result.shape)}; it must be {wanted}")
+        raise VectorsError(f"{path}: {array} has shape {list(result.shape)}; it must be {wanted}")
 
 
 def _judge(

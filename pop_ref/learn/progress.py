@@ -124,9 +124,11 @@ def _notes(folder: Path) -> dict[str, Any]:
     path = folder / _NOTES
     try:
         found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    except ValueError:
+        if not (isinstance(found.get("passed", {}), dict) and isinstance(found.get("asked", []), list)):
+            raise ValueError("passed must be an object, and asked a list")
+    except (ValueError, AttributeError, RecursionError):
         raise ValueError(f"{path} is damaged; delete it, and check the stages again") from None
-    return found if isinstance(found, dict) else {}
+    return found
 
 
 def _keep(folder: Path, notes: dict[str, Any]) -> None:

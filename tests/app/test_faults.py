@@ -32,14 +32,14 @@ def tried(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 @pytest.mark.parametrize("reader", READERS)
 def test_a_damaged_file_is_read_or_refused_in_a_line(tried: dict[str, Any], reader: str) -> None:
     found = tried["fuzz"]["readers"][reader]
-    assert sum(found.values()) == 15 + len(kept(reader))
+    assert sum(found.values()) == 10 + len(kept(reader))
     failures = {key: value for key, value in tried["fuzz"]["failures"].items() if key.startswith(f"{reader}: ")}
     assert found["escaped"] + found["crashed"] + found["hung"] == 0, failures
-    assert found["refused"] > 0
+    assert found["refused"] > 0 or not READERS[reader].refuses
 
 
 def test_inputs_that_once_broke_something_are_kept() -> None:
-    assert sum(len(kept(reader)) for reader in READERS) >= 3
+    assert sum(len(kept(reader)) for reader in READERS) >= 60
 
 
 JOBS = {
@@ -110,6 +110,34 @@ def test_the_units_of_cpp_are_clean_under_sanitizers(tried: dict[str, Any], chec
     assert found["told"]
 
 
+FAULTY = {
+    "libasan.so": 'extern "C" int fault(int n) { int *p = new int[4]; int last = p[n]; delete[] p; return last; }',
+    "libtsan.so": """#include <thread>
+static int shared;
+extern "C" int fault(int n) {
+  std::thread other([n] { for (int k = 0; k < 100 * n; k++) shared++; });
+  for (int k = 0; k < 100 * n; k++) shared++;
+  other.join();
+  return shared;
+}""",
+}
+
+
+@pytest.mark.parametrize("check", sanitizers.CHECKS)
+def test_a_sanitizer_notices_a_fault_of_its_kind(check: str, tmp_path: Path) -> None:
+    made = sanitizers.CHECKS[check]
+    if (reason := sanitizers.why_not(made)) is not None:
+        pytest.skip(reason)
+    compiler = sanitizers.find_compiler() or []
+    (tmp_path / "faulty.cpp").write_text(FAULTY[made.runtime])
+    built = [*compiler, *made.flags, "-o", str(tmp_path / "faulty.so"), str(tmp_path / "faulty.cpp")]
+    subprocess.run(built, check=True, capture_output=True, cwd=tmp_path)
+    words = [sys.executable, "-c", f"import ctypes; print(ctypes.CDLL('{tmp_path}/faulty.so').fault(4))"]
+    _, failures = sanitizers._ran(words, made, compiler, {})
+    assert len(failures) == 1
+    assert {"libasan.so": "heap-buffer-overflow", "libtsan.so": "data race"}[made.runtime] in failures[0]
+
+
 def test_every_unit_of_cpp_is_under_a_sanitizer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = {unit.name for unit in sanitizers.units()}
     assert {"blend.cpp", "scores.cpp", "step.cpp", "mirror.cpp", "emulator.cpp", "bindings.cpp"} <= names
@@ -167,7 +195,7 @@ def test_the_fuzzer_notices_what_readers_must_not_do() -> None:
         "a fault": {"escaped": 2},
         "aborts": {"crashed": 2},
         "hangs": {"hung": 2},
-        "takes all memory": {"told": 2},
+        "takes all memory": {"escaped": 2},
         "ends": {"crashed": 2},
     }
 

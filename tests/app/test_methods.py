@@ -327,6 +327,29 @@ def test_taming_grows_and_prunes_who_the_oracle_draws(misaligned: bool, tmp_path
     np.testing.assert_array_equal(after["opacities"], grown[~gone])
 
 
+def test_the_last_densification_step_of_taming_prunes_nothing(tmp_path: Any) -> None:
+    run, _ = in_double(tmp_path, "taming")
+    run.strategy = replace(run.strategy, prune_opa=0.6, sampled_prunes=run.strategy.densification_at(16) - 1)
+    stopped_before(run, 16)
+    faint = (torch.sigmoid(run.params["opacities"].detach()) < 0.6).sum()
+    assert hold_change(run, 16)[2].pruned == 0 < faint
+
+
+def test_mini_splatting_splits_who_was_blurred_in_any_view_since_the_last_densification_step(tmp_path: Any) -> None:
+    default = METHODS["mini-splatting"].strategy().blur_window
+    runs = {window: in_double(tmp_path, "mini-splatting")[0] for window in (default, "own_view")}
+    runs["own_view"].strategy = replace(runs["own_view"].strategy, blur_window="own_view")
+    flags: dict[str, list[Tensor]] = {window: [] for window in runs}
+    # the first densification step comes after step 4: until then both runs have the same Gaussians
+    for step in range(1, 5):
+        for window, run in runs.items():
+            run.take_steps(step)
+            flags[window].append(run.state["blurred"].bool().clone())
+    of_own_views = torch.stack(flags["own_view"])
+    assert torch.equal(flags[default][-1], of_own_views.any(0))
+    assert not torch.equal(of_own_views.any(0), of_own_views[-1])
+
+
 @pytest.mark.parametrize(
     ("method", "setting", "words"),
     [
@@ -340,7 +363,7 @@ def test_taming_grows_and_prunes_who_the_oracle_draws(misaligned: bool, tmp_path
         ),
         ("taming", {"sh_rest_every": 0}, "taming.sh_rest_every is 0; it must be at least 1"),
         ("taming", {"budget_multiplier": -2.0}, "taming.budget_multiplier is -2.0; it must be >= 0 and finite"),
-        ("pop", {"blur_stop_span": 0}, "pop.blur_stop_span is 0; it must be at least 1"),
+        ("pop", {"refine_every": 0}, "pop.refine_every is 0; it must be at least 1"),
     ],
 )
 def test_a_setting_that_cannot_be_is_named_as_the_command_line_names_it(

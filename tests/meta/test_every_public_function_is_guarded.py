@@ -107,7 +107,6 @@ LAWS = {
     "polarization.pop_loss_vjp": "agreement:pop_loss_vjp_is_the_transpose",
     "polarization.opacity_entropy": "polarization:the_entropy_of_opacities_is_the_mean_of_what_each_leaves_open",
     "polarization.opacity_entropy_vjp": "polarization:the_entropy_pulls_every_opacity_to_the_pole_that_it_is_nearer_to",
-    "density.blur_is_over": "density:blur_ends_for_good_at_the_first_growth_that_has_not_paid",
     "projection.project_means": "agreement:project_means_vjp_is_the_transpose",
     "projection.project_means_vjp": "agreement:project_means_vjp_is_the_transpose",
     "projection.projection_jacobians": "agreement:projection_jacobians_vjp_is_the_transpose",
@@ -194,7 +193,6 @@ DOCTESTS = (
     "depth.expected_depth",
     "depth.expected_depth_vjp",
     "depth.with_depth_channel",
-    "density.without_blur_that_does_not_pay",
     *("constants.profile_named", "notation.symbol_named", "magnitudes.distance", "magnitudes.colors_magnitudes"),
     *("loss_magnitudes.d_ssim_magnitudes", "loss_magnitudes.pixelwise_magnitudes"),
 )

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from paper_repro import status
 from paper_repro.paper import paper
-from paper_repro.results import RESULTS, SCALES, read_all
+from paper_repro.results import RESULTS, SCALES, Result, read_all
 from paper_repro.status import HERE, files, status_table, with_part
 from pop_fast.errors import PopError
 from pop_ref.ambiguities import AMBIGUITIES
-from tests.repro.made import result
+from tests.repro.made import whole as result
 
 PROTOCOL = (HERE / "protocol.md").read_text(encoding="utf-8")
 FOUND = [r for scale in SCALES for r in read_all(scale, RESULTS)]
@@ -60,24 +62,37 @@ def test_what_is_made_from_the_results_is_current(path: Path, text: str) -> None
     assert path.read_text(encoding="utf-8") == text, "run 'python -m paper_repro.status --write'"
 
 
+def seeds(row: str, n: int, **more: Any) -> list[Result]:
+    """Make a row on fox with two seeds that differ by a thousandth of their Gaussians."""
+    return [result(row, n=round(n * (1.0 + off)), seed=42 + i, **more) for i, off in enumerate((-0.0005, 0.0005))]
+
+
 def test_a_new_result_changes_what_is_made_from_it() -> None:
-    told = [result("pop", n=40, commit="abcdef1"), result("l2_blur", n=100, commit="abcdef1")]
+    told = [*seeds("pop", 40_000, commit="abcdef1"), *seeds("l2_blur", 100_000, commit="abcdef1")]
     lines = status_table(told).splitlines()
     half = next(line for line in lines if line.startswith("| POP cuts"))
-    assert "holds at scale small, on fox" in half
+    assert "| holds at scale small: holds on fox |" in half
     assert half.endswith("| abcdef1 |")
     assert any("small: 2 of 16" in line for line in lines if line.startswith("| table 3"))
-    assert len(lines) == 2 + 8 + 5 + 1
-    made = {path.name: text for path, text in files(told).items()}
-    assert "40 of 100, 40.0%" in made["claims.md"]
-    assert "holds at scale small" in made["README.md"]
+    assert len(lines) == 2 + 12 + 5 + 1
+    # a claim without its runs names the command that trains them
+    blur = next(line for line in lines if line.startswith("| the blur rule multiplies"))
+    assert "| `pop-repro queue --scale small --data DATA --rows l2 l2_pop --scenes fox` |" in blur
+    made = {path.relative_to(HERE.parent).as_posix(): text for path, text in files(told).items()}
+    assert "N pop / l2_blur 40.0% (39.9% to 40.1%)" in made["paper_repro/claims.md"]
+    assert "holds at scale small" in made["paper_repro/README.md"]
+    reset = [*seeds("pop", 40_000, psnr=31.0), *seeds("reset", 40_000)]
+    for name in ("README.md", "docs/paper.md"):
+        assert "- POP is no worse than opacity reset in PSNR: **not decided**" in made[name]
+        text = next(text for path, text in files(reset).items() if path == HERE.parent / name)
+        assert "- POP is no worse than opacity reset in PSNR: **holds** at scale small (fox PSNR pop - reset +1" in text
 
 
 def test_every_scale_that_decides_a_claim_is_told() -> None:
-    told = [result("pop", n=80), result("l2_blur", n=100)]
-    full = [result(row, n=n, scale="full", scene="bonsai_800") for row, n in (("pop", 40), ("l2_blur", 100))]
+    told = [*seeds("pop", 80_000), *seeds("l2_blur", 100_000)]
+    full = [replace(r, scale="full", scene="bonsai_800") for r in [*seeds("pop", 40_000), *seeds("l2_blur", 100_000)]]
     half = next(line for line in status_table([*told, *full]).splitlines() if line.startswith("| POP cuts"))
-    assert "| holds at scale full, on bonsai_800; does not hold at scale small, not on fox |" in half
+    assert "| holds at scale full: holds on bonsai_800; does not hold at scale small: does not hold on fox |" in half
 
 
 def test_marks_that_are_absent_are_told() -> None:

@@ -32,8 +32,6 @@ RULES = UpdateRules(
 UPDATES = replace(SHORT, updates=RULES, sh_interval=1)
 ENTROPY = replace(SHORT, lambda_pop=0.0, lambda_entropy=0.3)
 BOTH_PRIORS = replace(SHORT, lambda_entropy=0.3)
-OFTEN = replace(SHORT.density, refine_every=2, blur_start_iter=2, blur_stop_iter=8, reset_every=0)
-ADAPTIVE = replace(SHORT, density=replace(OFTEN, blur_stop_gain=50.0, blur_stop_span=1))
 PRUNED = replace(SHORT, density=replace(SHORT.density, final_prune_iter=9, final_prune_opa=0.4))
 
 
@@ -52,8 +50,8 @@ def run_of(recipe: Recipe, folder: Path, engine: Any, dtype: torch.dtype) -> Tra
 
 @pytest.mark.parametrize(
     "recipe",
-    [UPDATES, ENTROPY, BOTH_PRIORS, ADAPTIVE, PRUNED],
-    ids=["updates", "entropy", "both", "adaptive", "pruned"],
+    [UPDATES, ENTROPY, BOTH_PRIORS, PRUNED],
+    ids=["updates", "entropy", "both", "pruned"],
 )
 def test_ten_steps_in_double_precision_are_the_oracles(recipe: Recipe, tmp_path: Path) -> None:
     run = run_of(recipe, tmp_path, torch_engine("fast"), torch.float64)
@@ -67,17 +65,6 @@ def test_ten_steps_in_double_precision_are_the_oracles(recipe: Recipe, tmp_path:
         assert segment.stats[0].objective + segment.stats[0].pop == pytest.approx(loss, rel=1e-10)
         for key in KEYS:
             np.testing.assert_allclose(run.params[key].detach().numpy(), state.rows.params[key], rtol=1e-7, atol=1e-9)
-
-
-def test_blur_that_does_not_pay_ends_and_blur_that_is_asked_for_little_goes_on(tmp_path: Path) -> None:
-    grown = {}
-    for gain in (0.0, 1e-6, 50.0):
-        recipe = replace(SHORT, density=replace(OFTEN, blur_stop_gain=gain, blur_stop_span=1))
-        run = run_of(recipe, tmp_path / str(gain), torch_engine("fast"), torch.float64)
-        while run.step < 10:
-            run.take_steps(run.step + 1)
-        grown[gain] = len(run.params["means"])
-    assert grown[50.0] < grown[0.0]
 
 
 def test_each_engine_moves_whom_the_rules_move_and_nobody_else(engine: Any, tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 
 from pop_fast.errors import PopError
+from pop_fast.io.budget import check_members, check_memory
 from pop_fast.io.formats.cloud import COEFFICIENTS, Cloud, logits_of_bytes, to_bytes
 from pop_fast.io.formats.palette import codebook, nearest, row_palette
 from pop_fast.io.formats.smallest_three import drop_largest, restore_largest
@@ -35,6 +36,8 @@ _LARGEST_PALETTE: Final = 65536
 _SHARED_BY: Final = 2
 _LOSSLESS: Final = (cv2.IMWRITE_WEBP_QUALITY, 101)
 _LARGEST_META: Final = 2**20
+# bytes of a Gaussian while it is decoded, at most
+_IN_MEMORY: Final = 700
 _WRITE_AGAIN: Final = "copy or write the file again"
 
 
@@ -134,10 +137,11 @@ def decode(data: bytes, path: Path) -> Cloud:
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            check_members(path, archive, len(data), _WRITE_AGAIN)
             return _read(archive, path)
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
         raise PopError(f"{path}: is no readable ZIP file ({error}); {_WRITE_AGAIN}") from error
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError, RecursionError) as error:
         if isinstance(error, PopError):
             raise
         raise PopError(f"{path}: {_META} is not that of SOG version 2 ({error!r}); {_WRITE_AGAIN}") from error
@@ -154,6 +158,13 @@ def _read(archive: zipfile.ZipFile, path: Path) -> Cloud:
     n = meta["count"]
     if not isinstance(n, int) or n < 0:
         raise PopError(f"{path}: {_META}.count is {n}; it must be a number of Gaussians: {_WRITE_AGAIN}")
+    check_memory(
+        path,
+        n * _IN_MEMORY,
+        sum(member.file_size for member in archive.infolist()),
+        f"{_META}.count of {n}",
+        _WRITE_AGAIN,
+    )
 
     def pixels(entry: str, index: int, least: int = n) -> np.ndarray:
         return _pixels(archive, str(meta[entry]["files"][index]), least, path)[:least]

@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 
 from pop_fast.errors import PopError
+from pop_fast.io.budget import check_memory
 from pop_fast.io.formats.cloud import COEFFICIENTS, Cloud, logits_of_bytes, to_bytes
 from pop_fast.io.formats.smallest_three import drop_largest, restore_largest
 
@@ -38,6 +39,8 @@ _SH_STEP: Final = 2.5
 _WIDEST_STEP: Final = 64
 # what deflate can expand a byte to, at most
 _EXPANSION: Final = 1032
+# bytes of a Gaussian while it is decoded, at most
+_IN_MEMORY: Final = 700
 _WRITE_AGAIN: Final = "copy or write the file again"
 
 
@@ -178,6 +181,7 @@ def _unpacked(data: bytes, path: Path) -> tuple[bytes, tuple[int, int, int, int,
         size = n * (19 + (version == 3) + 3 * COEFFICIENTS[degree])
         if size > _EXPANSION * len(data):
             raise PopError(f"{path}: numPoints is {n}, more than {len(data)} bytes can hold; {_WRITE_AGAIN}")
+        check_memory(path, n * _IN_MEMORY, len(data), f"its numPoints of {n}", _WRITE_AGAIN)
         body = stream.decompress(stream.unconsumed_tail, size + 1)
     except zlib.error as error:
         raise PopError(f"{path}: its gzip stream is damaged ({error}); {_WRITE_AGAIN}") from error

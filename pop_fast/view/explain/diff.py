@@ -128,10 +128,11 @@ def _side(scene: ExplainedView, name: str, region: tuple[int, int, int, int]) ->
     if name == "ref":
         return _oracle_side(scene, region)
     if name in PROFILES:
-        profile = PROFILES[name]
-        image, info = scene.rasterized(profile=name)
+        own = scene.config.renderer
+        profile = own if own.name == name else PROFILES[name]
+        image, info = scene.rasterized(profile=profile)
     elif name in backend_names():
-        backend, profile = get_backend(name), PROFILES[scene.config.profile]
+        backend, profile = get_backend(name), scene.config.renderer
         image, info = scene.rasterized(torch.float32, backend)
     else:
         raise PopError(
@@ -150,7 +151,7 @@ def _side(scene: ExplainedView, name: str, region: tuple[int, int, int, int]) ->
 
 def _oracle_side(scene: ExplainedView, region: tuple[int, int, int, int]) -> Side:
     left, top, width, height = region
-    profile = PROFILES[scene.config.profile]
+    profile = scene.config.renderer
     ids = candidates(scene.info, left, top)
     splats = oracle_splats(scene, ids, profile)
     image = np.zeros((height, width, 3))

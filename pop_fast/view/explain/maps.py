@@ -14,7 +14,6 @@ from pop_fast.io.atomic import write_atomically
 from pop_fast.io.images import write_png
 from pop_fast.view.explain.scene import TILE_SIZE, ExplainedView
 from pop_fast.view.pictures import error_magnitude, error_scale, id_colors
-from pop_ref.constants import PROFILES
 
 # scales end at this quantile, so that a few pixels do not set them
 _TOP = 0.995
@@ -138,7 +137,7 @@ def _shares(scene: ExplainedView) -> tuple[np.ndarray, np.ndarray]:
 
 def termination_depths(scene: ExplainedView) -> np.ndarray:
     """Give the camera z of the entry that ended each pixel (D7); NaN where the list ran out first. [H, W]"""
-    info, profile = scene.info, PROFILES[scene.config.profile]
+    info, profile = scene.info, scene.config.renderer
     # T only falls, so a walk stops somewhere if and only if all of the list would take T to the stop
     nothing = scene.gaussians["means"].new_zeros((len(scene.counts), 1))
     endless = replace(profile, transmittance_stop=0.0)

@@ -14,7 +14,7 @@ from pop_fast.view.explain.model import PixelExplanation, Row, Status, Triple
 from pop_fast.view.explain.scene import ExplainedView, explain_view
 from pop_fast.view.explain.walk import Walk, candidates, oracle_splats, walk
 from pop_ref.alpha import alpha_from_sigma_vjp
-from pop_ref.constants import PROFILES, Profile
+from pop_ref.constants import Profile
 from pop_ref.dominance import dominant_id
 from pop_ref.pixel import composite_pixel_vjp, zero_gradients
 
@@ -54,7 +54,7 @@ def explain_pixel(
         check_inside(view, x, y)
         scene = explain_view(scene, view, config, sh_degree)
     check_inside(scene.view, x, y)
-    profile = PROFILES[scene.config.profile]
+    profile = scene.config.renderer
     ids = candidates(scene.info, x, y)
     walked = walk(scene, oracle_splats(scene, ids, profile), x, y, profile)
     v_alphas = _v_alphas(scene, walked, x, y, profile)

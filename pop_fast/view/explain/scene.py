@@ -90,7 +90,7 @@ def settings_of(view: View, config: TrainConfig, dtype: torch.dtype) -> dict[str
         "packed": False,
         "tile_size": TILE_SIZE,
         "rasterize_mode": "antialiased" if config.antialiased else "classic",
-        "profile": config.profile,
+        "profile": config.renderer,
         "dominance": True,
         "counts": True,
     }

@@ -16,7 +16,6 @@ from torch import Tensor
 from pop_fast.io.formats import encoded
 from pop_fast.train.config import TrainConfig
 from pop_fast.view.html.cameras import PageCamera, camera_of_points, view_distances
-from pop_ref.constants import profile_named
 
 _KEYS: Final = "drag: turn · shift or right button: move · wheel: nearer · arrows, + −, wasd · n, p: cameras · r: back"
 # nothing is fetched; the worker is made from the page's own text
@@ -85,7 +84,7 @@ def page_of(
 
 
 def _scene(means: Tensor, cameras: Sequence[PageCamera], config: TrainConfig) -> dict[str, Any]:
-    profile = profile_named(config.profile)
+    profile = config.renderer
     chosen = list(cameras) or [camera_of_points(means)]
     distances = view_distances(chosen, means)
     upwards = -np.mean([camera.viewmat[1, :3] for camera in chosen], axis=0)

@@ -166,6 +166,15 @@ def read_stats(path: Path) -> dict[str, Any]:
     return check_record(read_json(path, fix), str(path), fix)
 
 
+def read_view(path: Path) -> dict[str, np.ndarray]:
+    """Read what a run has kept of a held-out view: its name, render, photo, psnr and ssim.
+
+    Raises:
+        PopError: the file is damaged; names the array.
+    """
+    return read_arrays(path, _VIEW, _AGAIN)
+
+
 def headline(stats: Mapping[str, Any]) -> list[Tile]:
     """Choose the numbers at the top of the page."""
     tiles: list[Tile] = []
@@ -288,7 +297,7 @@ def _views(folder: Path) -> list[ReportView]:
     depths = dict(_depths(folder))
     views = []
     for path in _last_view_files(folder):
-        a = read_arrays(path, _VIEW, _AGAIN)
+        a = read_view(path)
         name = str(a["name"])
         views.append(ReportView(name, a["render"], a["photo"], float(a["psnr"]), float(a["ssim"]), depths.get(name)))
     return sorted(views, key=lambda view: (view.psnr is None, view.psnr))
@@ -302,7 +311,7 @@ def _depths(folder: Path) -> Iterator[tuple[str, np.ndarray]]:
 
 def _dominant(folder: Path) -> tuple[str, np.ndarray, np.ndarray] | None:
     for path in _last_view_files(folder):
-        a = read_arrays(path, _VIEW, _AGAIN)
+        a = read_view(path)
         if "dominant_ids" in a:
             return str(a["name"]), a["dominant_ids"], a["render"]
     return None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from hypothesis import reject
 from hypothesis import strategies as st
 
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
@@ -223,21 +222,6 @@ def test_the_gaussians_change_every_hundred_steps_and_opacities_are_reset_where_
         resets = reset_every > 0 and at % 3000 == 0 and at < 15_000 and (at > 0 or at_zero)
         assert backend.stage("densifies_at")(at, config) == (due and at % 3000 >= pause)
         assert backend.stage("resets_at")(at, config) == resets
-
-
-windows = st.lists(st.tuples(st.integers(1, 64), dyadic(0.125, 8.0)), max_size=9)
-
-
-@law("density", "blur_is_over", windows=windows, span=st.integers(1, 3), gain=st.sampled_from([0.0625, 0.5, 1.0, 2.0]))
-def test_blur_ends_for_good_at_the_first_growth_that_has_not_paid(backend, windows, span, gain):
-    expected = False
-    for end in range(2 * span, len(windows) + 1):
-        before, after = (np.mean(windows[a : a + span], axis=0) for a in (end - 2 * span, end - span))
-        promised, found = (after[0] / before[0]) ** gain, before[1] / after[1]
-        if abs(found - promised) < 1e-9 * promised:
-            reject()
-        expected |= bool(found < promised)
-    assert backend.stage("blur_is_over")(windows, span, gain) == expected
 
 
 @law("density", "densify_and_prune", choices=choices, scene_scale=scene_scales)

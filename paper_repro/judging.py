@@ -1,0 +1,246 @@
+"""How a question is judged by the runs of one scale: scene by scene, under the default readings and under others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from paper_repro.evidence import (
+    DATASETS,
+    JUDGE,
+    Claim,
+    Evidence,
+    Groups,
+    Told,
+    Verdict,
+    command,
+    conditions,
+    is_shortened,
+    told,
+)
+from paper_repro.noise import PSNR, Comparison, Group, Noise
+from paper_repro.paper import paper
+from paper_repro.scales import scale_named
+
+__all__ = ["OTHERS", "Other", "Question", "judge"]
+
+# what a question gets on one scene: comparisons; None for one that lacks a run; why one cannot be made of its runs
+Asked = Sequence[Comparison | str | None]
+# seeds of each row where nothing is known of the noise yet
+_FIRST_SEEDS: Final = 3
+
+
+@dataclass(frozen=True)
+class Question:
+    """A claim before it is judged.
+
+    Attributes:
+        id: short, for tables and links.
+        says: the claim.
+        paper: the paper's own numbers for it.
+        holds_if: what is asked of a scene.
+        rows: that it needs on a scene.
+        ask: makes its comparisons on one scene from the groups by row and the noise.
+        of_duration: whether it asks what a length of the schedule does, which no shortened schedule decides.
+        of_times: whether it compares times, which only runs on one machine allow.
+        datasets: of which the paper says it.
+        always: other readings under which it is told even where nothing was run.
+    """
+
+    id: str
+    says: str
+    paper: str
+    holds_if: str
+    rows: tuple[str, ...]
+    ask: Callable[[Mapping[str, Group], Noise], Asked]
+    of_duration: bool = False
+    of_times: bool = False
+    datasets: tuple[str, ...] = DATASETS
+    always: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Other:
+    """Another reading of the paper.
+
+    Attributes:
+        name: the label of the open question and its other answer.
+        rows: the rows that train otherwise under it, each with the row that does so, or None where there is none.
+    """
+
+    name: str
+    rows: Mapping[str, str | None]
+
+
+_WINDOWS: Final = ("blur_3k_4k", "blur_3k_11k", "blur_3k_15k")
+_SWEEP: Final = tuple(f"l1_div_{n}" for n in (1, 2, 5, 10, 20, 50, 100))
+
+
+def _other(name: str, concerned: Iterable[str], trained: Mapping[str, str]) -> Other:
+    return Other(name, {row: trained.get(row) for row in concerned})
+
+
+OTHERS: Final = (
+    # no row but Reset has resets, so that pruning by size is off in all of them under the default
+    _other("A16 on", ("pop", "l2", "l2_blur", "l2_pop", *_WINDOWS, *_SWEEP), {"pop": "pop_size_prune"}),
+    _other(
+        "A2 any view",
+        ("pop", "l2_blur", "reset", *_WINDOWS),
+        {"pop": "pop_any_view", "l2_blur": "l2_blur_any_view"},
+    ),
+    _other("A2 added up", ("pop", "l2_blur", "reset", *_WINDOWS), {"pop": "pop_sum"}),
+    _other("A12 visible", ("pop", "l2_pop", *_WINDOWS), {"pop": "pop_visible"}),
+)
+
+
+def judge(question: Question, found: Groups, noise: Noise, scale: str) -> Claim:
+    """Judge a question by the groups of one scale, under the default readings and under others that have runs."""
+    default = _under("", question, found, noise, scale, {row: row for row in question.rows})
+    others: list[Told] = []
+    for other in OTHERS:
+        rows = {row: other.rows.get(row, row) for row in question.rows}
+        if None in rows.values() or all(row == name for row, name in rows.items()):
+            continue
+        trained = {row: name for row, name in rows.items() if name is not None}
+        has_runs = any(all(name in by_row for name in trained.values()) for by_row in found.values())
+        if has_runs or other.name in question.always:
+            others.append(_under(other.name, question, found, noise, scale, trained))
+    return Claim(question.id, question.says, question.paper, question.holds_if, default, tuple(others))
+
+
+@dataclass(frozen=True)
+class _At:
+    """One scene: the groups that a question uses, what could be compared, the rows that lack, and seeds for those."""
+
+    scene: str
+    rows: Mapping[str, Group]
+    asked: Asked
+    missing: tuple[str, ...]
+    seeds: int
+
+    @property
+    def made(self) -> tuple[Comparison, ...]:
+        """The comparisons that could be made."""
+        return tuple(c for c in self.asked if isinstance(c, Comparison))
+
+
+def _under(reading: str, question: Question, found: Groups, noise: Noise, scale: str, rows: Mapping[str, str]) -> Told:
+    """Judge a question with the rows that stand for its own under one reading."""
+    at: list[_At] = []
+    for scene in _scenes(question, found, scale):
+        by_row = found.get(scene, {})
+        used = {row: by_row[name] for row, name in rows.items() if name in by_row}
+        if question.of_times:
+            used = _on_one_machine(used)
+        missing = tuple(name for row, name in rows.items() if row not in used)
+        # a run that is there and not used, since it was timed elsewhere, is not trained again
+        have = max((len(by_row[name].runs) for name in missing if name in by_row), default=0)
+        seeds = max(_seeds_at_first(noise), have + 1)
+        at.append(_At(scene, used, question.ask(used, noise) if used else (), missing, seeds))
+    together = sum(c.asked != "nothing" for one in at for c in one.made)
+    names = tuple(rows.values())
+    evidence, deciders = [], _Deciders(scale)
+    for one in at:
+        if not any(one.asked) and one.missing:
+            deciders.add(one.missing or names, one.scene, one.seeds, bool(found.get(one.scene)))
+            continue
+        verdict, why = _verdict(question, one, together)
+        said = "; ".join(c if isinstance(c, str) else c.text(together) for c in one.asked if c is not None)
+        groups = list(one.rows.values())
+        runs = tuple(id for group in groups for id in group.ids)
+        # what a scene has may speak against the claim although it lacks rows
+        is_whole = verdict != "not decided" or not one.missing
+        evidence.append(
+            Evidence(one.scene, said, verdict, why, conditions(groups), runs, _nearest(one, together), is_whole)
+        )
+        if verdict == "not decided":
+            _decide(deciders, question, one, names, together)
+    return told(reading, evidence, deciders.commands())
+
+
+def _verdict(question: Question, at: _At, together: int) -> tuple[Verdict, str]:
+    """Give the verdict of one scene, and what keeps it from one."""
+    if question.of_duration and is_shortened(r for group in at.rows.values() for r in group.runs):
+        return "not decided", "a shortened schedule decides no question of duration"
+    held = [c.holds(together) for c in at.made if c.asked != "nothing"]
+    if False in held:
+        return "does not hold", ""
+    if at.missing:
+        return "not decided", f"not run: {', '.join(at.missing)}"
+    if len(at.made) < len(at.asked):
+        said = [c for c in at.asked if isinstance(c, str)]
+        return "not decided", "; ".join(said) or "a run has no value of what is compared"
+    if held and all(held):
+        return "holds", ""
+    if any(c.error is None for c in at.made):
+        return "not decided", "no row has two seeds at this scale, and one seed decides nothing by itself"
+    return "not decided", "within the noise of the seeds"
+
+
+def _nearest(at: _At, together: int) -> str:
+    asked = [c for c in at.made if c.asked != "nothing"]
+    # in units of its own noise, since dB and logarithms do not compare
+    return min(asked, key=lambda c: c.margin / (c.error or 1.0)).text(together) if asked else ""
+
+
+def _decide(deciders: _Deciders, question: Question, at: _At, names: tuple[str, ...], together: int) -> None:
+    """Add the runs that would decide a scene."""
+    if question.of_duration and is_shortened(r for group in at.rows.values() for r in group.runs):
+        deciders.elsewhere(names, at.scene)
+    elif at.missing:
+        deciders.add(at.missing, at.scene, at.seeds)
+    elif len(at.made) == len(at.asked):
+        left = [c for c in at.made if c.asked != "nothing" and c.holds(together) is None]
+        deciders.add(names, at.scene, max(c.seeds_needed(together) for c in left))
+
+
+class _Deciders:
+    """Commands that train what is missing, with the scenes put together that lack the same; begun scenes come first."""
+
+    def __init__(self, scale: str) -> None:
+        self.scale = scale
+        self.begun: dict[tuple[str, tuple[str, ...], int], list[str]] = {}
+        self.others: dict[tuple[str, tuple[str, ...], int], list[str]] = {}
+
+    def add(self, rows: tuple[str, ...], scene: str, seeds: int, is_begun: bool = True) -> None:
+        asked = self.begun if is_begun else self.others
+        asked.setdefault((self.scale, rows, seeds), []).append(scene)
+
+    def elsewhere(self, rows: tuple[str, ...], scene: str) -> None:
+        """Ask for the whole schedule, at the scale that has it, on this scene or on all of its scenes."""
+        scenes = tuple(scale_named(JUDGE).factors)
+        for one in (scene,) if scene in scenes else scenes:
+            self.begun.setdefault((JUDGE, rows, _FIRST_SEEDS), []).append(one)
+
+    def commands(self) -> list[str]:
+        asked = [*self.begun.items(), *self.others.items()]
+        return [command(scale, rows, dict.fromkeys(scenes), seeds) for (scale, rows, seeds), scenes in asked]
+
+
+def _seeds_at_first(noise: Noise) -> int:
+    """With a noise floor one seed can decide; without one every row needs several."""
+    return 1 if noise.of(PSNR) is not None else _FIRST_SEEDS
+
+
+def _scenes(question: Question, found: Groups, scale: str) -> list[str]:
+    """List the scenes of a scale, and further ones that have results; of the paper's those that it speaks of."""
+    named = [*scale_named(scale).factors, *found]
+    if scale == "paper":
+        spoken_of = {scene for dataset in question.datasets for scene in paper().datasets[dataset]}
+        named = [scene for scene in named if scene in spoken_of]
+    return list(dict.fromkeys(named))
+
+
+def _on_one_machine(used: Mapping[str, Group]) -> dict[str, Group]:
+    """Keep the runs on that machine, engine and number of threads on which most rows were timed."""
+    rows: dict[str, set[str]] = {}
+    for row, group in used.items():
+        for run in group.runs:
+            if run.is_timed:
+                rows.setdefault(run.trained_on, set()).add(row)
+    if not rows:
+        return {}
+    best = max(sorted(rows), key=lambda where: ("pop" in rows[where], len(rows[where])))
+    kept = {row: tuple(r for r in group.runs if r.is_timed and r.trained_on == best) for row, group in used.items()}
+    return {row: Group(runs) for row, runs in kept.items() if runs}
