@@ -3,10 +3,10 @@
 Runs the parts below, prints what failed, and writes benchmarks/results/faults.json, of which docs/reliability.md has
 the tables; a part that is run alone replaces its own results. With --minutes the fuzzer and the kill loop share that
 time, or the one of them that runs has it; without, they stop after their least. --save keeps the files that broke a
-reader among the regressions of benchmarks/faults/corpus. Runs are tried of every --kind: by the native step, on two ranks
-and in blocks; --kills says how often each is killed at least, --places at how many changes of the disk it is disturbed.
---quick tries a few places of those parts that have no test of their own, as the tests do. Exit status 1 where anything
-failed.
+reader among the regressions of benchmarks/faults/corpus. Runs are tried of every --kind: by the native step, on two
+ranks and in blocks; --kills says how often each is killed at least, --places at how many changes of the disk it is
+disturbed. --quick tries a few places of those parts that have no test of their own, as the tests do. Exit status 1
+where anything failed.
 
     fuzz        mutated files to every reader, in children with limits of memory and time
     kills       SIGKILL at random moments of a run; continuing gives the same bits
