@@ -41,6 +41,8 @@ _WORDS: Final = (
     *("--pop.grow-grad2d", "1e-5", "--pop.pop-stop-iter", "14"),
     *("--no-progress", "--quiet", "--skip-checks", "--skip-sizes"),
 )
+# of one run, after which it is left alone to its end
+MOST_KILLS: Final = 6
 # of a process whose fellow has ended, as torchrun does
 _GRACE, _PATIENCE = 0.2, 5.0
 
@@ -210,7 +212,7 @@ def same(a: Any, b: Any) -> bool:
 
 
 def kill_loop(of: Scene, kills: int, minutes: float, seed: int) -> dict[str, Any]:
-    """Kill runs at random moments until each of them has ended by itself, with one thread or two by turns.
+    """Kill runs at random moments, each at most so often, with one thread or two by turns, then let them end.
 
     Of two ranks one is killed, or both at once; of a run in blocks the starter with the part that it waits for.
 
@@ -227,7 +229,7 @@ def kill_loop(of: Scene, kills: int, minutes: float, seed: int) -> dict[str, Any
     while count["kills"] < kills or time.monotonic() < end:
         name = f"killed_{count['runs']}"
         count["runs"] += 1
-        for turn in range(1_000):
+        for turn in range(MOST_KILLS):
             if not _killed(of, name, 1 + turn % 2, rng, longest):
                 break
             count["kills"] += 1
