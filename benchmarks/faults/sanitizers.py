@@ -11,7 +11,6 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from cuda_ext.compiler import find_compiler
 from cuda_ext.host import emulate
 from cuda_ext.host.mirror import HERE as HOST
 from cuda_ext.host.mirror import mirror_sources
+from pop_fast.children import module_command
 from pop_fast.compiled.build import CUDA, HERE, SHARED, SOURCES, UNITS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -42,7 +42,7 @@ class Check:
         sources: all that its text depends on.
         flags: of the compiler.
         runtime: the sanitizers' library, which must be loaded before all others.
-        words: after `python`, in whose process it is used; it is told the library by `POP_SANITIZED`.
+        use: what `sanitized_child` does with it, told the library by `POP_SANITIZED`.
         about: the sanitizers, in words.
     """
 
@@ -50,7 +50,7 @@ class Check:
     sources: tuple[Path, ...]
     flags: tuple[str, ...]
     runtime: str
-    words: tuple[str, ...]
+    use: str
     about: str
 
     @property
@@ -65,21 +65,20 @@ class Check:
 _COMPILED: Final = tuple(HERE / unit for unit in UNITS)
 _OF_COMPILED: Final = (*(HERE / name for name in SOURCES), *(CUDA / name for name in SHARED))
 _TUNED: Final = (*_FLAGS, "-march=native", f"-I{CUDA.parent}")
-_CHILD: Final = ("-m", "benchmarks.faults.sanitized_child")
 _ADDRESS: Final = "AddressSanitizer and UndefinedBehaviorSanitizer"
 CHECKS: Final[Mapping[str, Check]] = {
     "compiled backend": Check(
-        _COMPILED, _OF_COMPILED, (*_TUNED, *_MEMORY, *_COUNTED), "libasan.so", (*_CHILD, "compiled"), _ADDRESS
+        _COMPILED, _OF_COMPILED, (*_TUNED, *_MEMORY, *_COUNTED), "libasan.so", "compiled", _ADDRESS
     ),
     "compiled backend, four threads": Check(
-        _COMPILED, _OF_COMPILED, (*_TUNED, "-fsanitize=thread"), "libtsan.so", (*_CHILD, "threads"), "ThreadSanitizer"
+        _COMPILED, _OF_COMPILED, (*_TUNED, "-fsanitize=thread"), "libtsan.so", "threads", "ThreadSanitizer"
     ),
     "host mirror": Check(
         (HOST / "mirror.cpp",),
         tuple(mirror_sources()),
         (*_FLAGS, "-ffp-contract=off", *_MEMORY, *_COUNTED),
         "libasan.so",
-        (*_CHILD, "mirror"),
+        "mirror",
         _ADDRESS,
     ),
 }
@@ -149,7 +148,8 @@ def _checked(check: Check, compile_first: bool) -> dict[str, Any]:
         _compile(compiler, check)
     for counts in target.parent.glob("*.gcda"):
         counts.unlink()
-    told, failures = _ran([sys.executable, *check.words], check, compiler, {"POP_SANITIZED": str(target)})
+    words = module_command("benchmarks.faults.sanitized_child", check.use)
+    told, failures = _ran(words, check, compiler, {"POP_SANITIZED": str(target)})
     return {"about": check.about, "told": told, "lines": _lines(check), "failures": failures}
 
 
@@ -202,6 +202,6 @@ def _emulated(compile_first: bool) -> dict[str, Any]:
     if reason is not None:
         return {"about": about, "skipped": reason, "failures": []}
     check, compiler = CHECKS["host mirror"], find_compiler() or []
-    words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *_EMULATED_TESTS]
+    words = module_command("pytest", "-q", "-p", "no:cacheprovider", *_EMULATED_TESTS)
     told, failures = _ran(words, check, compiler, {"POP_EMULATED_FLAGS": _EMULATED_FLAGS})
     return {"about": about, "told": told[-1:], "failures": failures}

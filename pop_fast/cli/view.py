@@ -38,7 +38,7 @@ class Args(CaptureArguments):
     splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|PLY")]
     """What to show."""
     host: str = "127.0.0.1"
-    """The address to listen on; 0.0.0.0 lets other machines see it, without a password."""
+    """The address to listen on; 0.0.0.0 shows it, unencrypted, to other machines that know the whole address too."""
     port: int = 8080
     """The port; where it is taken, the next free one."""
 
@@ -112,7 +112,7 @@ def announce(viewer: LiveViewer) -> None:
 
     print(f"viewer: {viewer.url}", flush=True)
     if viewer.host not in LOOPBACK:
-        print(f"note: whoever reaches {viewer.host}:{viewer.port} sees the splat and its photographs", flush=True)
+        print("note: whoever has this address and reaches it sees the splat and its photographs", flush=True)
 
 
 def check_port(port: int) -> None:
