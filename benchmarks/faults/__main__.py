@@ -60,7 +60,10 @@ def main() -> int:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     found = {part: result for part in args.only or (QUICK if args.quick else PARTS) for result in [_run(part, args)]}
-    write_json(args.out, {**read_json(args.out), "machine": machine(), **found})
+    earlier = read_json(args.out)
+    # kinds of runs that are tried alone replace their own results
+    kept = {part: {**earlier.get(part, {}), **found[part]} for part in found if args.kind is not None}
+    write_json(args.out, {**earlier, "machine": machine(), **found, **kept})
     failed = [line for part, result in found.items() for line in _failures(part, result)]
     print("\n".join(failed) or "nothing failed")
     return 1 if failed else 0
