@@ -55,11 +55,11 @@ def markdown(scale: str, results: Iterable[Result]) -> str:
         open_ = [c.id for c in judged if not any(told.evidence for told in (c.told, *c.others))]
         judged = tuple(c for c in judged if c.id not in open_)
         if open_:
-            parts.append(f"No scene has runs for: {', '.join(open_)}.")
+            decided_by = f"`pop-repro claims --scale {JUDGE}` names the runs that would decide them"
+            parts.append(f"No scene has runs for: {', '.join(open_)}; {decided_by}.")
     verdicts = [[c.says, c.paper, c.verdict, c.line, c.under or "nothing"] for c in judged]
-    parts.append(
-        grid(["claim", "in the paper", "verdict", "where, and under other readings", "trained with"], verdicts)
-    )
+    head = ["claim", "in the paper", "verdict", "where, and under other readings", "trained with"]
+    parts += [grid(head, verdicts)] if verdicts else []
     parts += [_one(c) for c in judged]
     return "\n\n".join(parts) + "\n"
 

@@ -351,7 +351,10 @@ def test_a_toy_is_said_to_tell_nothing_and_other_data_to_be_a_yardstick() -> Non
     assert "PSNR 0.014 dB (2 degrees of freedom, 2 pairs of row and scene" in text
     assert "| default | fox | N pop / l2_blur 40.0% (39.8% to 40.2%)" in text
     assert text.count("```sh") >= 12
-    assert "Noise floor: none" in markdown("paper", [])
+    empty = markdown("paper", [])
+    assert "Noise floor: none" in empty
+    assert "| verdict |" not in empty
+    assert "`pop-repro claims --scale small` names the runs that would decide them" in empty
     assert "NOT the paper's" not in markdown("paper", [])
 
 
