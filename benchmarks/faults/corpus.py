@@ -12,6 +12,7 @@ import math
 import shutil
 import struct
 import tempfile
+import zipfile
 from dataclasses import asdict
 from pathlib import Path
 
@@ -33,6 +34,8 @@ from pop_fast.view.live.recording import KeyCamera, path_of
 from pop_fast.view.report.checks import Checks
 from pop_ref.conformance.scene_files import save_scene
 from pop_ref.conformance.vectors import export
+
+from .ksplat import ksplat_of
 
 HERE = Path(__file__).resolve().parent / "corpus"
 WIDTH, HEIGHT, FOCAL, VIEWS, POINTS = 24, 16, 20.0, 3, 12
@@ -127,11 +130,15 @@ def _write_result(folder: Path, capture: Path) -> None:
     path.write_text(path.read_text().replace(str(folder), "result"))
 
 
-def _write_splats(folder: Path) -> None:
-    folder.mkdir(exist_ok=True)
+def _few_gaussians() -> dict[str, torch.Tensor]:
     random = torch.Generator().manual_seed(0)
     shapes = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
-    params = {key: 0.5 * torch.randn((3, *shape), generator=random) for key, shape in shapes.items()}
+    return {key: 0.5 * torch.randn((3, *shape), generator=random) for key, shape in shapes.items()}
+
+
+def _write_splats(folder: Path) -> None:
+    folder.mkdir(exist_ok=True)
+    params = _few_gaussians()
     save_ply(folder / "splat.ply", params)
     for name, format in FORMATS.items():
         if name != "ply":
@@ -140,12 +147,20 @@ def _write_splats(folder: Path) -> None:
 
 def make_more(folder: Path) -> None:
     """Write the files that are made of the others, and those of formats that came later."""
+    _write_later_splats(folder / "splats")
     _write_pictures(folder)
     _write_exports(folder)
     _write_blocks(folder)
     _write_records(folder / "result", folder / "records")
     _write_vectors(folder / "vectors")
     _write_kit(folder)
+
+
+def _write_later_splats(folder: Path) -> None:
+    with zipfile.ZipFile(folder / "sog.sog") as archive:
+        archive.extractall(folder / "sog")
+    for level in range(3):
+        (folder / f"level_{level}.ksplat").write_bytes(ksplat_of(_few_gaussians(), level))
 
 
 def _write_pictures(folder: Path) -> None:

@@ -20,6 +20,7 @@ from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, Ste
 from pop_fast.compiled.library import PROJECTION_CONSTANTS, Moments, call_library, stepper_functions
 from pop_fast.stages.blend.transmittance import Stop, below
 from pop_fast.stages.ssim import REACH, Padding, border_of, check_size, kept_windows
+from pop_fast.train.signals import StopRequest, heard
 
 # steps that are taken before Python is asked again: Ctrl-C, a progress bar
 LONGEST: Final = 10
@@ -141,6 +142,7 @@ class NativeTrainer:
         step: the step to begin at.
         threads: None takes torch's number.
         cache_mb: memory for what is made of photographs; the others' is made anew at every visit, to the same bits.
+        stop: whether somebody has asked for an end; a step that is being taken is then left, and changes nothing.
 
     Attributes:
         step: steps taken.
@@ -161,8 +163,9 @@ class NativeTrainer:
         *,
         threads: int | None = None,
         cache_mb: float = 1024,
+        stop: StopRequest | None = None,
     ) -> None:
-        self.settings, self.step = settings, step
+        self.settings, self.step, self._stop = settings, step, stop
         self._padding: Padding = "same" if settings.padding == "same" else "valid"
         self._views, self._order = views, list(order)
         self._targets: dict[int, _Target] = {}
@@ -223,7 +226,7 @@ class NativeTrainer:
         return dict(zip(COUNTS, found, strict=True))
 
     def run(self, until: int, phase: Phase) -> None:
-        """Take steps until the counter stands at `until`, all of one phase.
+        """Take steps until the counter stands at `until`, all of one phase, or until somebody has asked for an end.
 
         Raises:
             ValueError: a Gaussian is no longer finite; the message names its row and step.
@@ -231,8 +234,12 @@ class NativeTrainer:
         """
         self._history = {}
         self._set_phase(phase)
-        while self.step < until:
+        while self.step < until and not self._asked:
             self._take(min(until - self.step, LONGEST))
+
+    @property
+    def _asked(self) -> bool:
+        return self._stop is not None and self._stop.asked
 
     def step_stats(self, first: int, last: int) -> list[StepStats]:
         """Return the measurements of the steps from `first` to before `last`; the last `run` must have taken them."""
@@ -281,19 +288,22 @@ class NativeTrainer:
             self._set_step(self.step + k, view)
             self._given.values = values[k].data_ptr()
             steps[k] = self._given
-        taken = self._functions.steps(self._stepper, steps, n)
+        if self._stop is None:
+            taken = self._functions.steps(self._stepper, steps, n, None)
+        else:
+            taken = heard(self._functions.steps, self._stepper, steps, n, self._stop.address)
         if taken < 0:
             raise MemoryError("the native training step ran out of memory")
         for k in range(taken):
             self._history[self.step + k] = StepStats(*values[k].tolist())
         self.step += taken
-        if taken < n and int(self._bad_row) < 0:
+        if int(self._bad_row) >= 0:
+            raise ValueError(f"step {self.step}: Gaussian {int(self._bad_row)} has a value that is not finite")
+        if taken < n and not self._asked:
             raise MemoryError(
                 f"step {self.step}: the Gaussians reach more than {MOST_ENTRIES:,} tiles altogether; "
                 "train on smaller photographs (--factor), or bound the number of Gaussians"
             )
-        if taken < n:
-            raise ValueError(f"step {self.step}: Gaussian {int(self._bad_row)} has a value that is not finite")
 
     def _set_step(self, step: int, view: _Target) -> None:
         given, settings = self._given, self.settings

@@ -26,7 +26,9 @@ import zstandard
 pytest.importorskip("viser", reason="pip install 'viser>=1.1,<1.2'")
 
 import viser
+from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.http11 import Request
 from websockets.sync.client import connect
 
 from pop_fast.cli import view as cli_view
@@ -36,7 +38,7 @@ from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
 from pop_fast.train.checkpoint import load_splats
 from pop_fast.view.live.follow import scene_of
-from pop_fast.view.live.guard import MOST_VIEWS, listen
+from pop_fast.view.live.guard import MOST_VIEWS, Guard, listen
 from pop_fast.view.live.incoming import interval, number, one_of, passed_on
 from pop_fast.view.live.server import LiveViewer
 from tests.app.conftest import TRAIN, Pop
@@ -385,6 +387,48 @@ def test_an_address_that_is_not_ours_is_refused_within_a_second(host: str) -> No
     with pytest.raises(PopError, match="the viewer cannot listen on"):
         listen(host, 18_900)
     assert time.monotonic() - begun < 1.5
+
+
+def test_it_is_said_before_a_splat_or_photographs_are_read(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
+    for words in (
+        ("view", "absent", "--host"),
+        ("train", shared_capture, "--out", tmp_path / "r", "--view", "--view-host"),
+    ):
+        outcome = pop(*words, "192.0.2.1")
+        assert outcome.status == 2
+        assert outcome.err.startswith("pop: error: the viewer cannot listen on 192.0.2.1:8080 ("), outcome.err
+        assert not outcome.out
+
+
+@pytest.mark.parametrize(
+    ("host", "arrived_at", "named", "status"),
+    [
+        ("0.0.0.0", "192.0.2.7", "192.0.2.7", None),
+        ("0.0.0.0", "192.0.2.7", socket.gethostname(), None),
+        ("0.0.0.0", "192.0.2.7", "localhost", 403),
+        ("0.0.0.0", "127.0.0.1", "localhost", None),
+        ("0.0.0.0", "127.0.0.1", "0.0.0.0", 403),
+        ("::", "::ffff:192.0.2.7", "192.0.2.7", None),
+        ("::", "fe80::1%eth0", "[fe80::1]", None),
+        ("::1", "::1", "[::1]", None),
+        ("192.0.2.7", "192.0.2.7", "192.0.2.7", None),
+        ("192.0.2.7", "192.0.2.7", "192.0.2.8", 403),
+        ("box.example.org", "192.0.2.7", "BOX.example.org", None),
+        ("box.example.org", "192.0.2.7", "rebound.example.org", 403),
+        ("192.0.2.7", "192.0.2.7", "localhost", 403),
+    ],
+)
+def test_a_request_must_name_what_is_listened_on(host: str, arrived_at: str, named: str, status: int | None) -> None:
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        guard = Guard(host, listening, print)
+        port = listening.getsockname()[1]
+        headers = Headers({"Host": f"{named}:{port}", "Origin": f"http://{named}:{port}", "Upgrade": "websocket"})
+        refused = guard.refusal(Request(f"/{guard.token}", headers), arrived_at)
+        assert (refused and refused[0]) == status
+        headers["Host"] = f"{named}:{port}"
+        # a second one, which others on the way may read instead of the first
+        assert guard.refusal(Request(f"/{guard.token}", headers), arrived_at)
 
 
 def test_a_port_that_is_in_use_is_left_to_who_has_it() -> None:
