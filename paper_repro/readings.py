@@ -15,10 +15,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, NamedTuple
 
+from paper_repro.claims_page import telling
 from paper_repro.evidence import DATASETS, Group, groups
 from paper_repro.judging import OTHERS
 from paper_repro.paper import Paper, paper
-from paper_repro.results import SCALES, Result
+from paper_repro.results import Result
 from paper_repro.table_markdown import grid
 from paper_repro.tables import setting
 
@@ -209,8 +210,8 @@ def _says(reading: Reading, votes: Sequence[tuple[tuple[str, ...], int]]) -> str
 
 
 def _telling(results: Sequence[Result]) -> list[str]:
-    """List the scales that say something about a method, the paper's first: the toy does not."""
-    return [scale for scale in reversed(SCALES) if scale != "toy" and any(r.scale == scale for r in results)]
+    """List the scales that say something about a method, the paper's first: those of a made-up scene do not."""
+    return [scale for scale in telling() if any(r.scale == scale for r in results)]
 
 
 def _longer_schedules(results: Sequence[Result]) -> Answer:

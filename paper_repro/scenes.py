@@ -21,7 +21,16 @@ from typing import Any, Final
 from pop_fast.errors import PopError
 
 __all__ = [
-    *("DATASETS", "SCENES", "Dataset", "Scene", "find_folder", "load_scene", "load_scenes", "scene_named", "source_of"),
+    "DATASETS",
+    "MADE",
+    "SCENES",
+    "Dataset",
+    "Scene",
+    "find_folder",
+    "load_scene",
+    "load_scenes",
+    "scene_named",
+    "source_of",
 ]
 
 FOLDER: Final = Path(__file__).resolve().parent / "scenes"
@@ -159,6 +168,8 @@ def _is_count(value: Any) -> bool:
 
 
 SCENES: Final = load_scenes()
+# those that the program makes itself
+MADE: Final = ("demo", "still_life")
 
 
 def scene_named(name: str) -> Scene:

@@ -91,7 +91,8 @@ def _inria(args: Args) -> int:
         raise PopError("--layout inria writes all Gaussians into the folder --out; give --out, and no --to or limits")
     from pop_fast.view.inria import exported_to, write_inria_folder
 
-    check_folder(args.out, args.overwrite, recognise=exported_to(args.out))
+    keeps = [args.splat] if args.capture is None else [args.splat, args.capture]
+    check_folder(args.out, args.overwrite, keeps=keeps, recognise=exported_to(args.out))
     splat = load_splat(args.splat)
     capture, config = open_with_bars(splat, args)
     write_inria_folder(replace(splat, config=config), capture, args.out, args.overwrite)

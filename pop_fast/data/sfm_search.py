@@ -108,6 +108,9 @@ def find_cameras(search: Search, progress: Progress | None) -> Any:
     """
     begin = f"import sys; sys.path.append(sys.argv[1]); from {__name__} import main; main()"
     command = python_command("-c", begin, str(Path(__file__).parents[2]))
+    if progress is not None:
+        # the other process takes seconds to begin
+        progress(_FEATURES, 0, len(search.names))
     with tempfile.TemporaryFile() as log:
         child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log)
         try:

@@ -63,12 +63,16 @@ def check_file(path: str | os.PathLike[str]) -> None:
 
 
 def check_folder(
-    path: str | os.PathLike[str], overwrite: bool = False, *, recognise: Callable[[Path], bool] | None = None
+    path: str | os.PathLike[str],
+    overwrite: bool = False,
+    *,
+    keeps: Iterable[Path] = (),
+    recognise: Callable[[Path], bool] | None = None,
 ) -> None:
     """Refuse a folder that `folder_atomically` would not make, before the work whose result it is to hold.
 
     Args:
-        path, overwrite, recognise: as `folder_atomically`.
+        path, overwrite, keeps, recognise: as `folder_atomically`.
 
     Raises:
         PopError: as `folder_atomically`, or a part of the path is a file, or its parent may not be written to.
@@ -76,7 +80,7 @@ def check_folder(
     path = Path(path)
     path = path.resolve() if path.is_symlink() or path.name in ("", "..") else path
     check_place(path)
-    _check_replaceable(path, overwrite, (), recognise)
+    _check_replaceable(path, overwrite, keeps, recognise)
 
 
 def check_place(path: Path) -> None:
