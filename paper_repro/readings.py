@@ -11,15 +11,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import exp, log
 from statistics import fmean
-from typing import Final
+from typing import Final, NamedTuple
 
-from paper_repro.evidence import Group, decay, groups, implied_rates, paper_ratios
-from paper_repro.paper import paper
-from paper_repro.results import SCALES, Result
+from paper_repro.claims_page import telling
+from paper_repro.evidence import STEPS, Group, groups, paper_ratios
+from paper_repro.paper import Paper, paper
+from paper_repro.results import Result
 from paper_repro.table_markdown import grid
 from paper_repro.tables import setting
 
-__all__ = ["READINGS", "Answer", "Reading", "answers", "experiments", "markdown"]
+__all__ = ["READINGS", "Answer", "Reading", "answers", "experiments", "implied_rates", "markdown"]
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,8 @@ READINGS: Final = (
     Reading("A12", "does the POP term sum over all Gaussians or over visible ones?", ("pop", "pop_visible")),
     Reading("A16", "are oversized Gaussians pruned although there is no reset?", ("pop", "pop_size_prune")),
 )
+# the paper's schedule: the blur rule ends, density control and the POP term end
+_BLUR_STOP, _DENSITY_STOP = 7_000, 15_000
 _HEAD: Final = ("scale", "scene", "row", "N as the window closes", "left", "rate", "N", "of L2+Blur's", "PSNR", "runs")
 # L2+Blur under two readings of A2, the default first
 _GROWN: Final = ("l2_blur", "l2_blur_any_view")
@@ -141,18 +144,18 @@ def _growth(results: Sequence[Result]) -> Answer:
 
 
 def _telling(results: Sequence[Result]) -> list[str]:
-    """List the scales that say something about a method, the paper's first: the toy does not."""
-    return [scale for scale in reversed(SCALES) if scale != "toy" and any(r.scale == scale for r in results)]
+    """List the scales that say something about a method, the paper's first: those of a made-up scene do not."""
+    return [scale for scale in telling() if any(r.scale == scale for r in results)]
 
 
 def _rate(group: Group) -> float | None:
-    found = [seen for run in group.runs if (seen := decay(run)) is not None]
+    found = [seen for run in group.runs if (seen := _decay(run)) is not None]
     return fmean(seen.rate for seen in found) if found else None
 
 
 def _line(scale: str, scene: str, row: str, rows: Mapping[str, Group]) -> tuple[str, ...]:
     group = rows[row]
-    found = [seen for run in group.runs if (seen := decay(run)) is not None]
+    found = [seen for run in group.runs if (seen := _decay(run)) is not None]
     blur = rows.get("l2_blur")
     return (
         *(scale, scene, row),
@@ -212,3 +215,47 @@ def _pruned_harder(results: Sequence[Result]) -> Answer:
         "Pruning harder at the paper's weight, below." if lines else "Not decided: no scene has POP and a harder prune."
     )
     return Answer("E4", "how compact is POP at the paper's weight if more is pruned?", says, head, tuple(lines))
+
+
+class _Decay(NamedTuple):
+    """What became of N from the end of the blur window to the end of density control.
+
+    Attributes:
+        closing: N as the blur window closes.
+        kept: the share of it that is left as density control ends.
+        steps: from the one to the other.
+    """
+
+    closing: float
+    kept: float
+    steps: int
+
+    @property
+    def rate(self) -> float:
+        """The rate per 1,000 steps: a shortened schedule scales neither learning rates nor the weight of the prior."""
+        return -log(self.kept) / (self.steps / 1000)
+
+
+def _decay(run: Result) -> _Decay | None:
+    """Read the decay of N off the curve of a run, or None without a curve."""
+    steps = setting(run, "max_steps") or float(STEPS)
+    closes = setting(run, "blur_stop_iter") or steps * _BLUR_STOP / STEPS
+    ends = setting(run, "refine_stop_iter") or steps * _DENSITY_STOP / STEPS
+    closing, left = run.at(round(closes)), run.at(round(ends))
+    if closing is None or left is None or min(closing, left) <= 0.0 or ends <= closes:
+        return None
+    return _Decay(closing, left / closing, round(ends) - round(closes))
+
+
+def implied_shares(published: Paper) -> tuple[float, ...]:
+    """Give what the paper's tables imply to be left at step 15,000 of N(7,000), by data set.
+
+    A window that lasts until density control ends shows the count at which the blur rule saturates; a shorter one
+    reaches about as much, and POP takes it down from there.
+    """
+    return paper_ratios(published, "pop", "blur_3k_15k")
+
+
+def implied_rates(published: Paper) -> tuple[float, ...]:
+    """Give the rates of decay per 1,000 steps that `implied_shares` comes to, by data set."""
+    return tuple(_Decay(1.0, share, _DENSITY_STOP - _BLUR_STOP).rate for share in implied_shares(published))

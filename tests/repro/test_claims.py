@@ -11,13 +11,13 @@ from typing import Any
 import pytest
 
 from paper_repro.claims import HEADLINES, METHODS, SWEEP, WINDOWS, claims, questions
-from paper_repro.claims_page import markdown, outcome
+from paper_repro.claims_page import markdown, outcome, telling
 from paper_repro.cli import main
-from paper_repro.evidence import DATASETS, Claim, implied_rates, is_shortened, paper_ratios
+from paper_repro.evidence import DATASETS, Claim, is_shortened, paper_ratios
 from paper_repro.jobs import job_named
 from paper_repro.judging import OTHERS
 from paper_repro.paper import paper
-from paper_repro.readings import READINGS, answers, experiments
+from paper_repro.readings import READINGS, answers, experiments, implied_rates
 from paper_repro.results import Result
 from paper_repro.rows import ROWS, load_row
 from tests.repro.made import WHOLE, curve
@@ -343,7 +343,9 @@ def test_what_bears_on_a_comparison_besides_the_method_stands_beside_it() -> Non
 
 def test_a_toy_is_said_to_tell_nothing_and_other_data_to_be_a_yardstick() -> None:
     runs = [*two("pop", n=40_000), *two("l2_blur")]
-    assert "Nothing here says anything of a method" in markdown("toy", runs)
+    for scale in ("toy", "shown"):
+        assert "Nothing here says anything of a method" in markdown(scale, runs)
+    assert telling() == ["paper", "full", "no_floor", "small"]
     text = markdown("small", runs)
     assert "NOT the paper's protocol" in text
     assert "PSNR 0.014 dB (2 degrees of freedom, 2 pairs of row and scene" in text

@@ -23,7 +23,7 @@ def keep(folder: Path, row: str, scene: str, render: np.ndarray, photo: np.ndarr
     """Leave what a run keeps of its first held-out view."""
     kept = folder / "small" / row / f"{scene}_42" / "report_data"
     kept.mkdir(parents=True)
-    np.savez(kept / "val_step9999_0000.npz", name="0001.jpg", render=render, photo=photo, psnr=psnr)
+    np.savez(kept / "val_step9999_0000.npz", name="0001.jpg", render=render, photo=photo, psnr=psnr, ssim=0.9)
 
 
 @pytest.fixture
