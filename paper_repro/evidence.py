@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 Verdict = Literal["holds", "does not hold", "not decided"]
-# the paper's schedule
+# of the paper's schedule
 STEPS: Final = 30_000
 # the scale whose runs decide what others leave open
 JUDGE: Final = "small"
