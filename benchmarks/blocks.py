@@ -187,8 +187,8 @@ def table(path: Path = RESULTS) -> str:
 
 def _measured(row: dict[str, Any], views: str) -> list[str]:
     if row["psnr"] is None:
-        return [views, "", "", f"{row['peak_gib']:.2f} GiB"]
-    return [views, f"{row['psnr']:.2f} dB", f"{row['ssim']:.4f}", f"{row['peak_gib']:.2f} GiB"]
+        return [views, "", "", f"{row['peak_gib'] * 2**30 / 1e9:.2f} GB"]
+    return [views, f"{row['psnr']:.2f} dB", f"{row['ssim']:.4f}", f"{row['peak_gib'] * 2**30 / 1e9:.2f} GB"]
 
 
 def _table(head: Sequence[str], rule: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -137,7 +137,7 @@ def do(case: Case, folder: Path) -> dict[str, Any]:
 
 @torch.no_grad()
 def _render(case: Case, path: Path, backend: str) -> dict[str, Any]:
-    params, _ = load_splat_file(path)
+    params = load_splat_file(path).params
     focal = FOCAL * case.width
     K = torch.tensor([[[focal, 0.0, case.width / 2], [0.0, focal, case.height / 2], [0.0, 0.0, 1.0]]])
     image, alpha, meta = rasterization(

@@ -111,8 +111,8 @@ def empty(
             asked *= size
         free, total = torch.cuda.mem_get_info(device)
         raise CudaMemoryError(
-            f"the GPU has no room for {what}: {asked / 2**20:.0f} MiB asked for, {free / 2**20:.0f} of "
-            f"{total / 2**20:.0f} MiB free; lower {lower}"
+            f"the GPU has no room for {what}: {asked / 1e6:.0f} MB asked for, {free / 1e6:.0f} of "
+            f"{total / 1e6:.0f} MB free; lower {lower}"
         ) from error
 
 

@@ -31,7 +31,11 @@ def page() -> str:
     return f"""# File formats
 
 `pop export RESULT --to FORMAT` and `pop convert IN OUT` write these; every command that takes a splat reads them, the
-page apart. `pop train` ends with the size of the splat in each and the held-out PSNR when it is read back from there.
+page apart. KSPLAT (`.ksplat`, `github.com/mkkellogg/GaussianSplats3D`) and SOG in a folder (its `meta.json`, or the
+folder) are read and not written. `--to spz` writes the version that most programs read, `--to spz-4` the latest one.
+Where nobody names the file, no two formats share a name: `scene.spz` and `scene-4.spz`, `scene.glb` and
+`scene-spz.glb`. Sizes are in MB, 10^6 bytes. `pop train` ends with the size of the splat in each and the held-out PSNR
+when it is read back from there.
 
 {_table(["format", "suffix", "what it is", "bytes a Gaussian, degree 0", "degree 3", "opened by"], sizes)}
 
@@ -47,7 +51,13 @@ as they are.
   `spz`, `sog`) and in `.splat`, the largest and most opaque first. Colour degrees that are all zero are left out.
 - PLY, compressed PLY, SOG and `.splat` hold the frame as it is, with y down for a capture from COLMAP; SPZ and glTF
   have y up, so that the scene is half a turn about x or z from there. Readers here turn it back.
-- SPZ is read in versions 2 and 3, SOG in version 2 as one file, glTF as one `.glb` with a splat that no node moves.
+- Every file but `.splat` says which world the splat is in, the capture's own or the frame that it was trained in, and
+  how the one came from the other: PLY and compressed PLY in a comment, SOG in `asset` of its `meta.json`, glTF in
+  `extras` of its `asset`, SPZ in an extension of the type 0x504F0001, which other readers skip. A file that says
+  nothing is taken to be in the capture's own world, as every export is where `--frame training` does not ask for the
+  other; one that gsplat's trainer wrote needs `--training-frame`.
+- SPZ is read in versions 2 to 4, also with coordinates that it says to be others (half turns of the usual ones); SOG in
+  version 2; glTF as one `.glb` with a splat that no node moves; KSPLAT in version 0.1, all of its compression levels.
 - `html` holds SPZ, and loses what that loses. It draws as the training's rasterizer does, to degree 3, but ends no
   pixel early; in the profile `inria` its cut-off is an ellipse of 3 standard deviations and not a square.
 

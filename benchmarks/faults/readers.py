@@ -77,7 +77,11 @@ class Reader:
 
 
 def _splat(path: Path) -> dict[str, torch.Tensor]:
-    return load_splat_file(path)[0]
+    return load_splat_file(path).params
+
+
+def _sog_folder(folder: Path) -> dict[str, torch.Tensor]:
+    return load_splat_file(folder / "meta.json").params
 
 
 def _splat_with_frame(path: Path) -> dict[str, torch.Tensor]:
@@ -170,7 +174,10 @@ _SPLATS = {
     "points of a PLY": Reader("splats/splat.ply", "", read_points),
     "compressed PLY": Reader("splats/compressed-ply.compressed.ply", "", _splat, finite=True),
     "SPZ": Reader("splats/spz.spz", "", _splat, "gzip", finite=True),
+    "SPZ 4": Reader("splats/spz-4.spz", "", _splat, finite=True),
     "SOG": Reader("splats/sog.sog", "", _splat, "zip", finite=True),
+    "SOG in a folder": Reader("splats/sog", "meta.json", _sog_folder, "text", finite=True),
+    **{f"KSPLAT {k}": Reader(f"splats/level_{k}.ksplat", "", _splat, finite=True) for k in range(3)},
     "splat": Reader("splats/splat.splat", "", _splat, finite=True),
     "glTF": Reader("splats/gltf.glb", "", _splat, "glb", finite=True),
     "glTF of SPZ": Reader("splats/gltf-spz.glb", "", _splat, "glb", finite=True),

@@ -1,28 +1,35 @@
-"""`pop compare`: several results side by side."""
+"""`pop compare`: several results side by side, and files of splats among them."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import tyro
 
 from pop_fast.cli.arguments import parse
+from pop_fast.cli.capture_options import CaptureArguments
 from pop_fast.errors import PopError
 
 _EXAMPLES: Final = """
     pop compare out/scene_pop out/scene_adc
+    pop compare out/scene_pop scene.sog scene.spz --capture scene    files are measured as 'pop eval' does
 """
 
 
 @dataclass(frozen=True, kw_only=True)
-class Args:
-    """Put several results side by side: quality, Gaussians, Gaussians per pixel, opacities, seconds."""
+class Args(CaptureArguments):
+    """Put several results side by side: quality, Gaussians, Gaussians per pixel, opacities, seconds.
 
-    results: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RESULT [RESULT ...]")]
-    """Folders that 'pop train' wrote."""
+    Of a result folder these are the numbers that its training left. The file of a splat is measured; the options say on
+    which photographs.
+    """
+
+    results: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|FILE [RESULT|FILE ...]")]
+    """Folders that 'pop train' wrote, and files of splats."""
     markdown: bool = False
     """Print a Markdown table."""
 
@@ -34,17 +41,33 @@ def run(argv: Sequence[str]) -> int:
         raise PopError("nothing to compare; name one or more result folders")
     from pop_fast.view.report.compare import markdown, plain, row
 
-    rows = [row(_stats(folder)) for folder in args.results]
+    found = [_stats(path, args) for path in args.results]
+    unfinished = [path for path, stats in zip(args.results, found, strict=True) if "psnr" not in stats]
+    why = "has no statistics yet; train to the first evaluation, or run pop eval"
+    if len(unfinished) == len(found):
+        raise PopError(f"{unfinished[0]}: {why} {unfinished[0]}")
+    for path in unfinished:
+        print(f"note: {path}: {why} {path}", file=sys.stderr)
+    rows = [row(stats) for stats in found]
     print(markdown(rows) if args.markdown else plain(rows))
     return 0
 
 
-def _stats(folder: Path) -> dict[str, object]:
+def _stats(path: Path, args: Args) -> dict[str, Any]:
+    """Return what a result's training left of numbers, or measure the file of a splat."""
     from pop_fast.train.results import read_config
     from pop_fast.view.report.source import read_last_stats
 
-    planned = read_config(folder).max_steps
-    stats = read_last_stats(folder)
-    if not stats:
-        raise PopError(f"{folder}: has no statistics yet; train to the first evaluation, or run pop eval {folder}")
-    return {**stats, "max_steps": planned}
+    if path.is_file():
+        return _measured(path, args)
+    config = read_config(path)
+    stats = read_last_stats(path) or {"capture": Path(config.data).name, "method": config.method}
+    return {**stats, "max_steps": config.max_steps}
+
+
+def _measured(path: Path, args: Args) -> dict[str, Any]:
+    from pop_fast.cli.eval import measured
+    from pop_fast.train.load_result import load_splat
+
+    capture, stats = measured(load_splat(path), args, [])
+    return {**stats, "capture": capture, "method": path.name}

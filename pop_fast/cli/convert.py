@@ -2,24 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
+import numpy as np
 import tyro
 
 from pop_fast.cli.arguments import parse
-from pop_fast.cli.export import check_file
+from pop_fast.cli.export import HTML, check_file, file_format, note_lost_frame, say_written
 from pop_fast.cli.limits import FormatName, LimitOptions, Shown, limited
 from pop_fast.errors import PopError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from pop_fast.io.formats import Stored
+    from pop_fast.train.config import TrainConfig
 
 _EXAMPLES: Final = """
     pop convert scene.ply scene.sog
     pop convert scene.spz scene.ply
-    pop convert scene.ply scene.glb --to gltf-spz
+    pop convert scene_sog/meta.json scene.spz --to spz-4
+    pop convert scene.ply scene.html
     pop convert scene.ply small.spz --max-gaussians 100000
 """
+# colour degree to draw
+_MOST_BANDS: Final = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,11 +37,11 @@ class Args(LimitOptions):
     """Turn a splat's file into another format; names say which. docs/FORMATS.md says what each keeps."""
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="IN")]
-    """A .ply, .compressed.ply, .spz, .sog, .splat or .glb."""
+    """A .ply, .compressed.ply, .spz, .sog, .splat, .glb or .ksplat, or the meta.json of SOG in a folder."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """The file to write, in the same frame."""
     to: FormatName | None = None
-    """The format, where the name does not say it."""
+    """The format, where the name does not say it; "spz" is its version 3, and "spz-4" the latest."""
     overwrite: bool = False
     """Replace the file."""
 
@@ -42,22 +52,49 @@ def run(argv: Sequence[str]) -> int:
     args.check()
     if args.score not in ("auto", "visibility"):
         raise PopError(f"--score {args.score} needs the training views; 'pop export RESULT' knows them")
-    from pop_fast.io.formats import encoded, load_splat_file, named_format, save_as
-    from pop_fast.io.ply import frame_of
+    from pop_fast.io.atomic import write_atomically
+    from pop_fast.io.formats import load_splat_file
     from pop_fast.train.config import TrainConfig
 
-    if args.to == "html" or args.out.suffix.lower() in (".html", ".htm"):
-        raise PopError(
-            f"{args.out}: a page starts at a training camera; 'pop export {args.source} --to html' writes it"
-        )
-    name = named_format(args.out, args.to)
+    name = file_format(args.out, args.to)
     check_file(args.out, args.source, args.overwrite)
-    params, antialiased = load_splat_file(args.source)
-    shown = Shown(params=params, sh_degree=3, config=TrainConfig(), world_transform=None, capture=None)
-    kept, said = limited(shown, args, lambda rows: len(encoded(name, rows, antialiased)))
+    stored = load_splat_file(args.source)
+    note_lost_frame(args.out, name, stored.frame)
+    config = TrainConfig(antialiased=stored.antialiased)
+    write = _writer(args, name, stored, config)
+    move = _training_frame(args.source, stored) if args.crop is not None else None
+    shown = Shown(params=stored.params, sh_degree=_MOST_BANDS, config=config, world_transform=move, capture=None)
+    kept, said = limited(shown, args, lambda rows: len(write(rows)))
     for line in said:
         print(line)
-    frame = frame_of(args.source) if args.source.suffix.lower() == ".ply" else None
-    size = save_as(args.out, name, kept, antialiased, frame)
-    print(f"{len(kept['means']):,} Gaussians, {size / 2**20:.1f} MiB -> {args.out}")
+    data = write(kept)
+    write_atomically(args.out, lambda file: file.write(data))
+    say_written(args.out, len(kept["means"]), len(data))
     return 0
+
+
+def _writer(args: Args, name: str, stored: Stored, config: TrainConfig) -> Callable[[dict[str, Tensor]], bytes]:
+    """Return what makes the file's bytes of raw parameters."""
+    if name == HTML:
+        from pop_fast.view.html import page_of
+
+        # no capture is known: it starts at a camera that sees most of the splat
+        return lambda params: page_of(params, [], config, _MOST_BANDS, args.source.resolve().name)
+    from pop_fast.io.formats import encoded
+
+    return lambda params: encoded(name, params, stored.antialiased, stored.frame)
+
+
+def _training_frame(source: Path, stored: Stored) -> np.ndarray | None:
+    """Return the training frame from the capture's; None where the splat is in the capture's own frame.
+
+    Raises:
+        PopError: it is in the training frame, and nothing says how that came from the capture's.
+    """
+    if stored.frame is None or stored.frame.name == "capture":
+        return None
+    if stored.frame.transform is None:
+        raise PopError(
+            f"{source}: is in a training frame, and --crop is meant in the capture's; pop export it with --capture DIR"
+        )
+    return np.array(stored.frame.transform)

@@ -25,6 +25,7 @@ _PACKAGES: Final = (
     ("opencv-contrib-python-headless", "cv2", "images, undistortion, video", True),
     ("pycolmap", "pycolmap", "COLMAP models, structure from motion", True),
     ("plyfile", "plyfile", "PLY files", True),
+    ("zstandard", "zstandard", "SPZ version 4", True),
     ("tqdm", "tqdm", "progress", True),
     ("tyro", "tyro", "this command line", True),
     ("matplotlib", "matplotlib", "colours of the error maps", True),
@@ -94,9 +95,9 @@ def machine() -> Iterator[Finding]:
     yield Finding("processor", "ok", f"{machine_name()}, {cores} usable core{'s' if cores != 1 else ''}")
     total, free = memory_bytes()
     if total:
-        low = free < 2 * 2**30
+        low = free < 2e9
         hint = "close other programs, or train with --factor 4" if low else ""
-        yield Finding("memory", "ok", f"{total / 2**30:.1f} GiB, {free / 2**30:.1f} GiB free", hint)
+        yield Finding("memory", "ok", f"{total / 1e9:.1f} GB, {free / 1e9:.1f} GB free", hint)
 
 
 def torch_build() -> Iterator[Finding]:

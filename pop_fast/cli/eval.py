@@ -15,7 +15,7 @@ from pop_fast.cli.arguments import parse
 from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
-from pop_fast.train.load_result import Splat, load_splat
+from pop_fast.train.load_result import CaptureOptions, Splat, load_splat
 
 if TYPE_CHECKING:
     from pop_fast.train.config import TrainConfig
@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 _EXAMPLES: Final = """
     pop eval out/scene_pop                                   the last checkpoint, on the capture it was trained on
     pop eval out/scene_pop --lpips-alex alexnet.pth lin.pth  add LPIPS to its stats and its report
-    pop eval point_cloud.ply --capture scene --own-frame     a PLY of another trainer
+    pop eval point_cloud.ply --capture scene                 a PLY of another trainer
+    pop eval point_cloud.ply --capture scene --training-frame    of gsplat's trainer, which moves the world
 """
 
 
@@ -36,7 +37,7 @@ class Args(CaptureArguments):
     For a result folder the numbers also go into its stats and its report.
     """
 
-    splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|PLY")]
+    splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|FILE")]
     """What to measure."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Also write the numbers to this file."""
@@ -51,19 +52,8 @@ class Args(CaptureArguments):
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "eval", examples=_EXAMPLES)
-    from pop_fast.train.metrics import too_small
-    from pop_fast.train.views import ViewTensors
-
     splat = load_splat(args.splat)
-    nets = _nets(args, splat.config)
-    capture, config = open_with_bars(splat, args, "held out")
-    views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
-    if not views:
-        raise PopError(f"{capture.name}: holds no view out; give --test-every 8 or another number over 0")
-    small = too_small(views)
-    if small is not None:
-        raise PopError(f"{capture.name}: {small}; use larger images (a lower --factor)")
-    stats = measure_splat(splat, config, views, nets)
+    _, stats = measured(splat, args, _nets(args, splat.config))
     if args.per_view:
         for name, numbers in stats["per_view"].items():
             print(f"{name}: " + ", ".join(f"{key} {value:.4f}" for key, value in numbers.items()))
@@ -75,6 +65,25 @@ def run(argv: Sequence[str]) -> int:
     if args.splat.is_dir() and splat.step is not None and args.capture is None:
         _record(args.splat, splat.step, stats)
     return 0
+
+
+def measured(splat: Splat, options: CaptureOptions, nets: Sequence[LPIPS]) -> tuple[str, dict[str, Any]]:
+    """Measure a splat on the held-out views of its capture, and return the capture's name and the numbers.
+
+    Raises:
+        PopError: no capture is known, it cannot be read, holds no view out, or its images are too small.
+    """
+    from pop_fast.train.metrics import too_small
+    from pop_fast.train.views import ViewTensors
+
+    capture, config = open_with_bars(splat, options, "held out")
+    views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
+    if not views:
+        raise PopError(f"{capture.name}: holds no view out; give --test-every 8 or another number over 0")
+    small = too_small(views)
+    if small is not None:
+        raise PopError(f"{capture.name}: {small}; use larger images (a lower --factor)")
+    return capture.name, measure_splat(splat, config, views, nets)
 
 
 def measure_splat(splat: Splat, config: TrainConfig, views: list[ViewTensors], nets: Sequence[LPIPS]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from pop_fast.data import Capture
-    from pop_fast.io.ply import Frame
+    from pop_fast.io.frame import Frame
 
 HTML: Final = "html"
 _EXAMPLES: Final = """
@@ -43,7 +44,8 @@ class Args(LimitOptions, CaptureArguments):
     """Where to: a file whose name says the format, or with --layout inria a new folder; by default a file beside here
     with the name of what is exported."""
     to: FormatName | None = None
-    """The format, where the name does not say it; "gltf-spz" is glTF with an SPZ stream, a draft."""
+    """The format, where the name does not say it; "spz" is its version 3, which most programs read, "spz-4" the latest
+    version, and "gltf-spz" glTF with an SPZ stream, a draft."""
     layout: Literal["file", "inria"] = "file"
     """"inria" writes point_cloud/, cameras.json, cfg_args, and held-out renders, as many tools expect."""
     frame: Literal["capture", "training"] | None = None
@@ -65,13 +67,13 @@ def run(argv: Sequence[str]) -> int:
     opened = _Opened(splat, args)
     if args.drop_invisible:
         splat = without_invisible(splat)
-    write = _writer(args, name, splat, opened)
+    write = _writer(args, out, name, splat, opened)
     params, said = limited(
         Shown(
             params=splat.params,
             sh_degree=splat.sh_degree,
             config=opened.config,
-            world_transform=_training_frame(splat, args, opened) if args.crop is not None else None,
+            world_transform=_training_frame(splat, args) if args.crop is not None else None,
             capture=opened.capture if opened.known else None,
         ),
         args,
@@ -79,8 +81,7 @@ def run(argv: Sequence[str]) -> int:
     )
     for line in said:
         print(line)
-    size = _write(out, write(params))
-    print(f"{len(params['means']):,} Gaussians, {size / 2**20:.1f} MiB -> {out}")
+    say_written(out, len(params["means"]), _write(out, write(params)))
     return 0
 
 
@@ -101,9 +102,7 @@ class _Opened:
 
     def __init__(self, splat: Splat, options: CaptureArguments) -> None:
         self._splat, self._options, self._found = splat, options, None
-        self.config = (
-            replace(splat.config, normalize=False) if frame_of_splat(splat, options) == "capture" else splat.config
-        )
+        self.config = replace(splat.config, normalize=frame_of_splat(splat, options) == "training")
 
     @property
     def known(self) -> bool:
@@ -123,24 +122,53 @@ def planned_file(args: Args) -> tuple[Path, str]:
     Raises:
         PopError: nothing says the format, the name is another's, or the place may not be written to.
     """
-    from pop_fast.io.formats import FORMATS, named_format
-
     if args.out is None and args.to is None:
         raise PopError("nothing says what to write; give --out FILE or --to FORMAT")
     if args.out is None:
-        suffix = {"ply": ".ply", HTML: ".html"}.get(str(args.to)) or FORMATS[str(args.to)].suffix
         stem = args.splat.resolve().name
-        out = Path((stem if args.splat.is_dir() else stem.split(".")[0]) + suffix)
+        out = Path(file_name(stem if args.splat.is_dir() else stem.split(".")[0], str(args.to)))
     else:
         out = args.out
-    is_page = out.suffix.lower() in (".html", ".htm")
-    if is_page != (args.to == HTML) and (args.to is not None):
-        raise PopError(f"{out}: a page ends in .html, and --to {args.to} was asked for; let them agree")
-    name = HTML if is_page else named_format(out, args.to)
+    name = file_format(out, args.to)
     if name == HTML and args.frame is not None:
         raise PopError(f"{out}: a page has no frame of its own; leave --frame out")
     check_file(out, args.splat, args.overwrite)
     return out, name
+
+
+def file_name(stem: str, to: str) -> str:
+    """Return the name of a file in a format that `--to` takes, where nobody names it."""
+    from pop_fast.io.formats import default_name
+
+    return f"{stem}.html" if to == HTML else default_name(stem, to)
+
+
+def file_format(out: Path, to: str | None) -> str:
+    """Return the format that a file is to be written in, by its name or as `--to` says.
+
+    Raises:
+        PopError: they do not agree, or neither says it.
+    """
+    from pop_fast.io.formats import named_format
+
+    is_page = out.suffix.lower() in (".html", ".htm")
+    if is_page != (to == HTML) and to is not None:
+        raise PopError(f"{out}: a page ends in .html, and --to {to} was asked for; let them agree")
+    return HTML if is_page else named_format(out, to)
+
+
+def say_written(out: Path, count: int, size: int) -> None:
+    """Print what was written: so many Gaussians and bytes."""
+    print(f"{count:,} Gaussians, {size / 1e6:.2f} MB -> {out}")
+
+
+def note_lost_frame(out: Path, name: str, frame: Frame | None) -> None:
+    """Say on stderr that a file does not say its world, where what is taken for it is another one."""
+    from pop_fast.io.formats import loses_frame
+
+    if loses_frame(name, frame):
+        what = f"{name} has no room to say that it is in the training frame"
+        print(f"note: {out}: {what}; commands that read it need --training-frame", file=sys.stderr)
 
 
 def check_file(out: Path, source: Path, overwrite: bool) -> None:
@@ -157,8 +185,8 @@ def check_file(out: Path, source: Path, overwrite: bool) -> None:
         raise PopError(f"{out}: exists; pass --overwrite or another --out")
 
 
-def _writer(args: Args, name: str, splat: Splat, opened: _Opened) -> Callable[[dict[str, Tensor]], bytes]:
-    """Return what makes the file's bytes of raw parameters in the training frame."""
+def _writer(args: Args, out: Path, name: str, splat: Splat, opened: _Opened) -> Callable[[dict[str, Tensor]], bytes]:
+    """Return what makes the file's bytes of raw parameters in the splat's frame."""
     if name == HTML:
         from pop_fast.view.html import cameras_of, page_of
 
@@ -167,7 +195,8 @@ def _writer(args: Args, name: str, splat: Splat, opened: _Opened) -> Callable[[d
     from pop_fast.data import to_capture_frame
     from pop_fast.io.formats import encoded
 
-    transform, frame = _output_frame(splat, args, opened)
+    transform, frame = _output_frame(splat, args)
+    note_lost_frame(out, name, frame)
     antialiased = splat.config.antialiased
 
     def write(params: dict[str, Tensor]) -> bytes:
@@ -184,37 +213,36 @@ def _write(out: Path, data: bytes) -> int:
     return len(data)
 
 
-def _output_frame(splat: Splat, args: Args, opened: _Opened) -> tuple[np.ndarray | None, Frame | None]:
+def _output_frame(splat: Splat, args: Args) -> tuple[np.ndarray | None, Frame | None]:
     """Return what `to_capture_frame` is given to move the splat into the file's frame, and that frame.
 
     Returns:
         The similarity [4, 4], or None where nothing moves; the frame, or None where nothing says which it is.
     """
-    from pop_fast.io.ply import Frame
+    from pop_fast.io.frame import Frame
 
     now, transform = frame_of_splat(splat, args), known_transform(splat, args)
     wanted = args.frame or ("capture" if splat.folder is not None else now)
-    if wanted is None or wanted == (now or "training"):
-        return None, None if now is None else Frame(now, _rows(transform))
+    if wanted is None or wanted == (now or "capture"):
+        return None, None if wanted is None else Frame(wanted, _rows(transform))
     if transform is None:
         transform = _loaded_transform(splat, args)
     return transform if wanted == "capture" else np.linalg.inv(transform), Frame(wanted, _rows(transform))
 
 
-def _training_frame(splat: Splat, args: Args, opened: _Opened) -> np.ndarray | None:
+def _training_frame(splat: Splat, args: Args) -> np.ndarray | None:
     """Return the training frame from the capture's; None where the splat is in the capture's own frame."""
-    now = frame_of_splat(splat, args)
-    if now == "capture" or (now is None and args.frame is None and not opened.known):
+    if frame_of_splat(splat, args) != "training":
         return None
     known = known_transform(splat, args)
     return _loaded_transform(splat, args) if known is None else known
 
 
 def _loaded_transform(splat: Splat, args: Args) -> np.ndarray:
-    from pop_fast.io.ply import Frame
+    from pop_fast.io.frame import Frame
 
-    as_trained = replace(splat, config=replace(splat.config, normalize=True), frame=Frame("training"))
-    return open_with_bars(as_trained, replace(args, own_frame=False))[0].world_transform
+    as_trained = replace(splat, frame=Frame("training"))
+    return open_with_bars(as_trained, replace(args, own_frame=False, training_frame=False))[0].world_transform
 
 
 def known_transform(splat: Splat, args: Args) -> np.ndarray | None:

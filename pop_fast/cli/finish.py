@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED
 from pop_fast.cli.errors import describe
+from pop_fast.cli.export import file_name, say_written
 from pop_fast.cli.limits import FormatName, LimitOptions, Shown, limited
 
 if TYPE_CHECKING:
@@ -82,11 +83,10 @@ def _finish(folder: Path, capture: Capture, options: FinishOptions) -> None:
         kept, said = _limited(splat, capture, options, name, page)
         for line in said if index == 0 or options.target_mb is not None else ():
             print(line)
-        suffix = ".html" if name == "html" else _suffix(name)
-        path = folder / EXPORTS / f"{title}{'-spz' if name == 'gltf-spz' else ''}{suffix}"
+        path = folder / EXPORTS / file_name(title, name)
         data = _encoded(name, kept, splat, capture, page)
         write_atomically(path, lambda file, data=data: file.write(data))
-        print(f"{len(kept['means']):,} Gaussians, {len(data) / 1e6:.2f} MB -> {path}")
+        say_written(path, len(kept["means"]), len(data))
     kept, _ = _limited(splat, capture, dataclasses.replace(options, target_mb=None), "ply", page)
     shown = page(kept)
     write_atomically(folder / VIEWER, lambda file: file.write(shown))
@@ -128,16 +128,10 @@ def _encoded(name: str, params: dict[str, Tensor], splat: Splat, capture: Captur
         return page(params)
     from pop_fast.data import to_capture_frame
     from pop_fast.io.formats import encoded
-    from pop_fast.io.ply import Frame
+    from pop_fast.io.frame import Frame
 
     frame = Frame("capture", tuple(map(tuple, capture.world_transform.tolist())))
     return encoded(name, to_capture_frame(params, capture.world_transform), splat.config.antialiased, frame)
-
-
-def _suffix(name: str) -> str:
-    from pop_fast.io.formats import FORMATS
-
-    return ".ply" if name == "ply" else FORMATS[name].suffix
 
 
 def _sizes(folder: Path, splat: Splat, capture: Capture, params: dict[str, Tensor]) -> None:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pop_fast.density.shrink import Score
     from pop_fast.train.config import TrainConfig
 
-FormatName = Literal["ply", "compressed-ply", "spz", "sog", "splat", "gltf", "gltf-spz", "html"]
+FormatName = Literal["ply", "compressed-ply", "spz", "spz-4", "sog", "splat", "gltf", "gltf-spz", "html"]
 # views that scores are summed over, at most: every so many of a larger capture
 _MOST_VIEWS: Final = 100
 # bytes of what `--target-mb` counts in

@@ -36,7 +36,7 @@ _EXAMPLES: Final = """
 class Args(CaptureArguments):
     """Render the held-out views, or a camera path through the capture."""
 
-    splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|PLY")]
+    splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|FILE")]
     """What to render."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Write one PNG a view into this new folder, and renders.json, which lists them."""

@@ -275,7 +275,7 @@ def merged_lines(stats: dict[str, Any]) -> list[str]:
     rows = [["block", "Gaussians", "kept", "PSNR", "time", "memory"]]
     for block in stats["blocks"]:
         psnr = "-" if block["psnr"] is None else f"{block['psnr']:.2f} dB"
-        memory = f"{block['memory_bytes'] / 2**30:.2f} GiB"
+        memory = f"{block['memory_bytes'] / 1e9:.2f} GB"
         counts = (f"{block['num_GS']:,}", f"{block['kept']:,}")
         rows.append([block["name"], *counts, psnr, f"{block['seconds_total']:.0f} s", memory])
     return [*table_lines(rows), *round_lines(stats.get("rounds", ()))]
@@ -288,7 +288,7 @@ def round_lines(rounds: Sequence[dict[str, Any]]) -> list[str]:
     rows = [["merged after", "Gaussians", "PSNR", "SSIM", "time", "memory"]]
     for found in rounds:
         measured = ["-", "-"] if found["psnr"] is None else [f"{found['psnr']:.2f} dB", f"{found['ssim']:.4f}"]
-        memory = f"{found['memory_bytes'] / 2**30:.2f} GiB"
+        memory = f"{found['memory_bytes'] / 1e9:.2f} GB"
         name = f"round {found['round']}"
         rows.append([name, f"{found['num_GS']:,}", *measured, f"{found['seconds_total']:.0f} s", memory])
     return table_lines(rows)

@@ -243,11 +243,11 @@ def about_reprojection(root: Path) -> Iterator[Finding]:
 def about_memory(photos: Sequence[Photo], cloud: SparsePoints | None, free: int) -> Iterator[Finding]:
     """Estimate the memory that photographs take at each factor, and Gaussians in training."""
     pixels = sum(photo.size[0] * photo.size[1] for photo in photos)
-    by_factor = ", ".join(f"{3 * pixels / f**2 / 2**20:,.0f} MiB at factor {f}" for f in (1, 2, 4, 8))
+    by_factor = ", ".join(f"{3 * pixels / f**2 / 1e6:,.0f} MB at factor {f}" for f in (1, 2, 4, 8))
     too_much = free > 0 and 3 * pixels > 0.7 * free
     yield Finding("warn" if too_much else "ok", "memory", f"photographs take {by_factor}")
     start = f"; training starts with {len(cloud):,}" if cloud is not None else ""
-    yield Finding("ok", "memory", f"Gaussians take {BYTES_IN_TRAINING * 1e6 / 2**20:,.0f} MiB a million{start}")
+    yield Finding("ok", "memory", f"Gaussians take {BYTES_IN_TRAINING:,.0f} MB a million{start}")
 
 
 def about_bare(root: Path, shown: Sequence[Shown]) -> Iterator[Finding]:

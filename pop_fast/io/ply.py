@@ -9,15 +9,14 @@ coefficients of red, then green, then blue. A header comment `SplatRenderMode: m
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 import torch
 
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
+from pop_fast.io.frame import Frame
 from pop_fast.io.ply_rows import Header, column, read_header, read_vertices, vertices_of
 
 __all__ = [
@@ -35,7 +34,6 @@ __all__ = [
 
 _SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3)}
 MODE = "SplatRenderMode:"
-_FRAME = "pop-frame:"
 # sigmoid(logit) >= 1/255, what a renderer can show at all
 _VISIBLE_LOGIT = -np.log(254.0)
 _COLUMNS = (
@@ -46,24 +44,6 @@ _COLUMNS = (
     + [f"scale_{i}" for i in range(3)]
     + [f"rot_{i}" for i in range(4)]
 )
-
-
-@dataclass(frozen=True)
-class Frame:
-    """The world that a splat is in.
-
-    Attributes:
-        name: "capture" is the capture's own, "training" the one that `pop train` moves it into.
-        transform: similarity, training frame = transform @ capture's own frame; None where it is not known. [4, 4]
-    """
-
-    name: Literal["capture", "training"]
-    transform: tuple[tuple[float, ...], ...] | None = None
-
-    @classmethod
-    def of_training(cls, transform: Any) -> Frame:
-        """Return the frame of a training that a similarity, an array [4, 4], moved, or that None left where it was."""
-        return cls("capture") if transform is None else cls("training", tuple(map(tuple, transform.tolist())))
 
 
 def save_ply(
@@ -126,8 +106,7 @@ def _file(arrays: dict[str, np.ndarray], antialiased: bool, frame: Frame | None)
 def _header(n: int, antialiased: bool, frame: Frame | None) -> bytes:
     lines = ["ply", "format binary_little_endian 1.0", f"comment {MODE} {'mip' if antialiased else 'default'}"]
     if frame is not None:
-        rows = () if frame.transform is None else frame.transform
-        lines.append(" ".join([f"comment {_FRAME} {frame.name}", *(f"{x:.17g}" for row in rows for x in row)]))
+        lines.append(f"comment {frame.comment()}")
     lines += [f"element vertex {n}", *(f"property float {name}" for name in _COLUMNS), "end_header", ""]
     return "\n".join(lines).encode("ascii")
 
@@ -215,18 +194,7 @@ def frame_of(path: str | os.PathLike[str]) -> Frame | None:
     Raises:
         PopError: the comment is not one that this program writes.
     """
-    for comment in read_header(Path(path)).comments:
-        if comment.startswith(_FRAME):
-            name, *numbers = comment.removeprefix(_FRAME).split() or [""]
-            try:
-                values = np.array([float(number) for number in numbers]).reshape(-1, 4)
-            except ValueError:
-                values = np.full((1, 4), np.nan)
-            if name not in ("capture", "training") or len(values) not in (0, 4) or not np.isfinite(values).all():
-                raise PopError(f"{path}: comment {comment[:60]!r} is damaged; remove it, or export the splat again")
-            rows = tuple(map(tuple, values.tolist())) if len(values) else None
-            return Frame("capture" if name == "capture" else "training", rows)
-    return None
+    return Frame.of_comments(read_header(Path(path)).comments, Path(path))
 
 
 def checked_params(params: dict[str, torch.Tensor]) -> dict[str, np.ndarray]:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.data.capture import Progress
     from pop_fast.data.load import Photographs
-    from pop_fast.io.ply import Frame
+    from pop_fast.io.frame import Frame
 
 RECORD = "capture.json"
 
@@ -34,7 +34,7 @@ class Splat:
         config: the settings they were trained with; the defaults for a lone file.
         step: the last step taken, from 0; None for a lone PLY.
         folder: the result folder it belongs to, if any.
-        frame: the world it is in, where that is known.
+        frame: the world it is in, where its file or its run says it.
     """
 
     path: Path
@@ -70,7 +70,10 @@ class CaptureOptions:
     missing: Literal["error", "skip"] | None = None
     """What to do about photographs that are listed but absent."""
     own_frame: bool = False
-    """The splat is in the capture's own world frame (Inria's trainer, 'pop export'), not in the training frame."""
+    """The splat is in the capture's own world frame, whatever its file or its run says."""
+    training_frame: bool = False
+    """The splat is in the frame that the capture is trained in, as gsplat's trainer leaves it; a file that says nothing
+    is taken to be in the capture's own."""
 
 
 @dataclass(frozen=True)
@@ -106,16 +109,17 @@ def read_record(folder: Path | None) -> CaptureRecord | None:
 
 
 def load_splat(path: Path) -> Splat:
-    """Read a result folder (its last checkpoint), a checkpoint (ours or gsplat's), a PLY or a file of another format.
+    """Read a result folder (its last checkpoint), a checkpoint (ours or gsplat's), a PLY or a splat of another format.
 
     Raises:
         PopError: none of these, or damaged.
     """
-    from pop_fast.io.formats import is_splat_file, load_splat_file, splat_suffixes
-    from pop_fast.io.ply import frame_of
+    from pop_fast.io.formats import is_splat_file, load_splat_file, readable_names
     from pop_fast.train.checkpoint import load_splats
     from pop_fast.train.results import read_config
 
+    if path.is_dir():
+        path = _unbundled(path) or path
     if path.is_dir():
         return _from_folder(path)
     if not path.exists():
@@ -124,16 +128,31 @@ def load_splat(path: Path) -> Splat:
     owner = folder if (folder / "cfg.json").is_file() else None
     config = read_config(owner) if owner else TrainConfig()
     if is_splat_file(path):
-        params, antialiased = load_splat_file(path)
-        config = replace(config, antialiased=antialiased)
-        frame = frame_of(path) if path.suffix.lower() == ".ply" else None
-        return Splat(path=path, params=params, config=config, folder=owner, frame=frame)
+        stored = load_splat_file(path)
+        config = replace(config, antialiased=stored.antialiased)
+        of_run = owner is not None and path.resolve().parent.name == "ply"
+        frame = stored.frame or (_frame_of_run(config) if of_run else None)
+        return Splat(path=path, params=stored.params, config=config, folder=owner, frame=frame)
     if path.suffix.lower() == ".pt":
         params, step = load_splats(path)
-        return Splat(path=path, params=params, config=config, step=step, folder=owner)
+        return Splat(path=path, params=params, config=config, step=step, folder=owner, frame=_frame_of_run(config))
     raise PopError(
-        f"{path}: is neither a result folder nor a checkpoint (.pt) nor a splat ({', '.join(splat_suffixes())})"
+        f"{path}: is neither a result folder nor a checkpoint (.pt) nor a splat ({', '.join(readable_names())})"
     )
+
+
+def _unbundled(folder: Path) -> Path | None:
+    """Return the meta.json of a folder that is SOG and no result."""
+    from pop_fast.io.formats.sog import META
+
+    return folder / META if (folder / META).is_file() and not (folder / "cfg.json").exists() else None
+
+
+def _frame_of_run(config: TrainConfig) -> Frame:
+    """Return the world that a run trains in."""
+    from pop_fast.io.frame import Frame
+
+    return Frame("training" if config.normalize else "capture")
 
 
 def _from_folder(folder: Path) -> Splat:
@@ -145,11 +164,12 @@ def _from_folder(folder: Path) -> Splat:
     checkpoints = list_checkpoints(folder)
     if checkpoints:
         params, step = load_splats(checkpoints[-1][1])
-        return Splat(path=checkpoints[-1][1], params=params, config=config, step=step, folder=folder)
+        frame = _frame_of_run(config)
+        return Splat(path=checkpoints[-1][1], params=params, config=config, step=step, folder=folder, frame=frame)
     plys = sorted((folder / "ply").glob("point_cloud_*.ply"), key=lambda p: (len(p.name), p.name))
     if not plys:
         raise PopError(f"{folder}: holds no checkpoint and no PLY yet; train longer, or continue with --resume")
-    frame = frame_of(plys[-1])
+    frame = frame_of(plys[-1]) or _frame_of_run(config)
     return Splat(path=plys[-1], params=load_ply(plys[-1]), config=config, folder=folder, frame=frame)
 
 
@@ -180,12 +200,11 @@ def open_capture(
         changes["factor"] = options.factor
     if options.test_every is not None:
         changes["test_every"] = options.test_every
-    frame = frame_of_splat(splat, options)
-    if frame is not None:
-        changes["normalize"] = frame == "training"
-    elif splat.path.suffix.lower() != ".pt":
-        origin = "says nothing of its world, and is taken to be in pop's training frame"
-        print(f"note: {splat.path}: {origin}; that of another program needs --own-frame", file=sys.stderr)
+    said = frame_of_splat(splat, options)
+    changes["normalize"] = said == "training"
+    if said is None:
+        taken = "says nothing of its world, and is taken to be in the capture's own"
+        print(f"note: {splat.path}: {taken}; that of gsplat's trainer needs --training-frame", file=sys.stderr)
     config = _in_frame(replace(splat.config, **changes), splat)
     capture = load_capture(
         data,
@@ -217,14 +236,21 @@ def _in_frame(config: TrainConfig, splat: Splat) -> TrainConfig:
 
 
 def frame_of_splat(splat: Splat, options: CaptureOptions) -> Literal["capture", "training"] | None:
-    """Tell which world a splat is in: as the command says, else its file, else its run; None where nothing does."""
+    """Tell which world a splat is in: as the command says, else its file or its run.
+
+    Returns:
+        None where nothing says it; then it is taken to be in the capture's own, as every export is.
+
+    Raises:
+        PopError: the command says both.
+    """
+    if options.own_frame and options.training_frame:
+        raise PopError("--own-frame and --training-frame exclude each other; choose one")
     if options.own_frame:
         return "capture"
-    if splat.frame is not None:
-        return splat.frame.name
-    if splat.folder is None:
-        return None
-    return "training" if splat.config.normalize else "capture"
+    if options.training_frame:
+        return "training"
+    return None if splat.frame is None else splat.frame.name
 
 
 def _check_same_frame(splat: Splat, capture: Capture) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pop_fast.io.formats import FORMATS
 from pop_fast.io.formats.cloud import Cloud
+from pop_fast.io.frame import Frame
 
 
 def _floats(low: float, high: float) -> st.SearchStrategy[float]:
@@ -57,9 +58,11 @@ def many(n: int, bands: int = 15, seed: int = 0) -> dict[str, Tensor]:
     }
 
 
-def decoded(name: str, params: dict[str, Tensor], antialiased: bool = False) -> tuple[Cloud, Cloud, bytes]:
+def decoded(
+    name: str, params: dict[str, Tensor], antialiased: bool = False, frame: Frame | None = None
+) -> tuple[Cloud, Cloud, bytes]:
     """Return what went into a file, in its order, what came out, and the file."""
-    format, cloud = FORMATS[name], Cloud.of(params, antialiased)
+    format, cloud = FORMATS[name], Cloud.of(params, antialiased, frame)
     cloud = cloud if format.order is None else cloud.take(format.order(cloud))
     data = format.encode(cloud)
     return cloud, format.decode(data, Path(f"x{format.suffix}")), data

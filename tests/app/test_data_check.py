@@ -46,7 +46,7 @@ def test_a_capture_made_in_place_is_ready_as_training_finds_it(pop: Pop, tmp_pat
     outcome = pop("data", "check", root)
     assert outcome.status == 0, outcome.out
     assert "absent" not in outcome.out
-    assert "0 MiB at factor 1" in outcome.out
+    assert "0 MB at factor 1" in outcome.out
     assert "ready to train" in outcome.out
 
 

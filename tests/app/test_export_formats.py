@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from pop_fast.cli.limits import FormatName
-from pop_fast.io.formats import FORMATS, format_names, load_splat_file
-from pop_fast.io.ply import load_ply
+from pop_fast.io.formats import FORMATS, default_name, format_names, load_splat_file
+from pop_fast.io.ply import Frame, load_ply, save_ply
 from tests.app.conftest import Pop
 
 
@@ -31,9 +31,9 @@ def test_an_export_shows_in_the_training_frame_what_was_trained(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     said = exported(pop, shared_result, "--to", name, "--frame", "training")
-    path = tmp_path / f"toy_pop{FORMATS[name].suffix}"
+    path = tmp_path / default_name("toy_pop", name)
     assert f"-> {path.name}" in said
-    params, _ = load_splat_file(path)
+    params = load_splat_file(path).params
     trained = load_ply(shared_result / "ply" / "point_cloud_29.ply")
     assert len(params["means"]) == len(trained["means"])
     torch.testing.assert_close(params["means"].mean(0), trained["means"].mean(0), atol=0.01, rtol=0.0)
@@ -51,6 +51,41 @@ def test_an_export_can_be_measured_and_is_as_good(
     assert values["a.glb"] == pytest.approx(values["a.ply"], abs=1e-3)
     assert values["a.spz"] == pytest.approx(values["a.ply"], abs=0.1)
     assert values["a.sog"] == pytest.approx(values["a.ply"], abs=0.1)
+
+
+def test_no_two_formats_share_a_name_that_nobody_chose(
+    pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = typing.get_args(FormatName)
+    for name in names:
+        exported(pop, shared_result, "--to", name)
+    assert len(list(tmp_path.iterdir())) == len(names)
+    for path in tmp_path.iterdir():
+        assert path.suffix == ".html" or len(load_splat_file(path).params["means"]) > 0
+
+
+def test_a_conversion_writes_a_page_too(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
+    exported(pop, shared_result, "--out", tmp_path / "a.ply")
+    outcome = pop("convert", tmp_path / "a.ply", tmp_path / "b.html")
+    assert outcome.status == 0, outcome.err
+    size = (tmp_path / "b.html").stat().st_size
+    assert f"Gaussians, {size / 1e6:.2f} MB -> {tmp_path / 'b.html'}" in outcome.out
+    assert (tmp_path / "b.html").read_text().startswith("<!doctype html>")
+
+
+def test_a_box_is_in_the_frame_of_the_capture_in_a_conversion_too(
+    pop: Pop, shared_result: Path, tmp_path: Path
+) -> None:
+    exported(pop, shared_result, "--out", tmp_path / "own.ply")
+    exported(pop, shared_result, "--out", tmp_path / "t.ply", "--frame", "training")
+    own = load_ply(tmp_path / "own.ply")["means"]
+    box = [f"{value:.6f}" for value in (*own.quantile(0.2, dim=0).tolist(), *own.quantile(0.9, dim=0).tolist())]
+    for name in ("own", "t"):
+        words = (tmp_path / f"{name}.ply", tmp_path / f"{name}_box.ply", "--crop", *box)
+        assert pop("convert", *words).status == 0
+    assert 0 < len(load_ply(tmp_path / "own_box.ply")["means"]) < len(own)
+    assert len(load_ply(tmp_path / "own_box.ply")["means"]) == len(load_ply(tmp_path / "t_box.ply")["means"])
 
 
 def test_limits_are_applied_one_after_the_other_and_said(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
@@ -144,7 +179,10 @@ def test_a_file_is_converted_to_every_format_and_back(pop: Pop, shared_result: P
         (("a.ply", "b.obj"), "must end in one of"),
         (("a.ply", "a.ply"), "is the splat that is read"),
         (("a.ply", "there.spz"), "exists; pass --overwrite"),
-        (("a.ply", "b.html"), "'pop export a.ply --to html' writes it"),
+        (("a.ply", "b.html", "--to", "sog"), "a page ends in .html, and --to sog was asked for"),
+        (("a.ply", "b.ksplat"), "b.ksplat: is of a format that is read and not written"),
+        (("a.ply", "meta.json"), "meta.json: is of a format that is read and not written"),
+        (("t.ply", "b.spz", "--crop", "0", "0", "0", "1", "1", "1"), "t.ply: is in a training frame"),
         (("a.ply", "b.spz", "--score", "dominance"), "needs the training views"),
         (("empty.spz", "b.ply"), "empty.spz: is cut off in its header"),
         (("empty.splat2", "b.ply"), "must end in one of"),
@@ -155,6 +193,7 @@ def test_what_cannot_be_converted_is_said(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     exported(pop, shared_result, "--out", "a.ply")
+    save_ply("t.ply", load_ply("a.ply"), frame=Frame("training"))
     for file in ("there.spz", "empty.spz"):
         Path(file).touch()
     outcome = pop("convert", *words)

@@ -7,15 +7,28 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from pop_fast.errors import PopError
-from pop_fast.io.formats import FORMATS, encoded, format_names, load_splat_file, named_format, save_as
+from pop_fast.io.formats import (
+    FORMATS,
+    encoded,
+    format_names,
+    load_splat_file,
+    loses_frame,
+    named_format,
+    save_as,
+)
+from pop_fast.io.formats import decoded as from_bytes
 from pop_fast.io.formats.cloud import SH_C0, Cloud, morton_order
 from pop_fast.io.formats.compressed_ply import chunked
 from pop_fast.io.formats.palette import codebook, nearest, row_palette
+from pop_fast.io.frame import Frame
 from pop_fast.io.ply import load_ply, save_ply
 from pop_ref.covariance import covars_from_quats_scales
 from pop_ref.harmonics import sh_basis
@@ -46,9 +59,9 @@ def bounds_of(name: str, was: Cloud) -> dict[str, Any]:
         return {"means": 0.0, "log_scales": 1e-6, "degrees": 0.001, "opacities": 1e-7, "sh0": 0.0, "rest": 0.0}
     if name == "splat":
         return {"means": 0.0, "log_scales": 1e-6, "degrees": 1.2, "opacities": BYTE, "sh0": COLOR_BYTE}
-    if name in ("spz", "gltf-spz"):
+    if name in ("spz", "spz-4", "gltf-spz"):
         bits = min(20, int(np.floor(np.log2((2**23 - 1) / max(np.abs(was.means).max(initial=0.0), 1e-6)))))
-        turn = 0.28 if name == "spz" else 14.0
+        turn = 14.0 if name == "gltf-spz" else 0.28
         same = {"log_scales": 1 / 32, "opacities": BYTE, "sh0": 0.5 / 0.15 / 255.0, "rest": 0.25}
         smallest = np.exp(was.log_scales.astype(np.float64)).min(axis=1, keepdims=True, initial=np.inf)
         return {"means": np.maximum(0.5 / 2.0**bits, smallest / 16.0), "degrees": turn, **same}
@@ -237,7 +250,7 @@ def test_the_same_splat_gives_the_same_bytes(name: str) -> None:
     assert encoded(name, many(300)) == encoded(name, many(300))
 
 
-@pytest.mark.parametrize("name", ["spz", "sog", "gltf-spz"])
+@pytest.mark.parametrize("name", ["spz", "spz-4", "sog", "gltf-spz"])
 def test_a_small_format_is_small(name: str) -> None:
     # noise hardly compresses; beside a PLY's 248 bytes it is small
     assert len(encoded(name, many(3000))) < 248 * 3000 / 4
@@ -247,12 +260,34 @@ def test_a_small_format_is_small(name: str) -> None:
 def test_a_file_is_read_by_its_name(name: str, tmp_path: Path) -> None:
     path = tmp_path / ("x.ply" if name == "ply" else f"x{FORMATS[name].suffix}")
     size = save_as(path, name, many(9), True)
-    params, antialiased = load_splat_file(path)
+    params, antialiased, frame = load_splat_file(path)
     assert size == path.stat().st_size
+    assert frame is None
     assert {key: tuple(value.shape) for key, value in params.items()} == {
         key: tuple(value.shape) for key, value in load_reference(tmp_path).items()
     }
     assert antialiased == (name != "splat")
+
+
+@given(
+    turn=arrays(np.float64, 3, elements=st.floats(-3.0, 3.0)),
+    scale=st.floats(1e-3, 1e3),
+    move=arrays(np.float64, 3, elements=st.floats(-1e4, 1e4)),
+    kind=st.sampled_from(("capture", "training")),
+)
+@pytest.mark.parametrize("name", format_names())
+def test_a_file_says_the_frame_to_the_last_bit(
+    name: str, turn: np.ndarray, scale: float, move: np.ndarray, kind: Any
+) -> None:
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = scale * Rotation.from_rotvec(turn).as_matrix(), move
+    for frame in (Frame(kind), Frame(kind, tuple(map(tuple, transform.tolist())))):
+        stored = from_bytes(name, encoded(name, many(3), True, frame))
+        assert stored.frame == (None if name == "splat" else frame)
+        assert loses_frame(name, frame) == (name == "splat" and kind == "training")
+        # what is drawn is the same with it and without
+        plain = from_bytes(name, encoded(name, many(3), True))
+        assert all(torch.equal(value, plain.params[key]) for key, value in stored.params.items())
 
 
 def load_reference(tmp_path: Path) -> dict[str, Tensor]:
@@ -285,5 +320,6 @@ def test_the_name_says_the_format() -> None:
     assert named_format(Path("a.SPZ")) == "spz"
     assert named_format(Path("a.glb")) == "gltf"
     assert named_format(Path("a.glb"), "gltf-spz") == "gltf-spz"
+    assert named_format(Path("a.spz"), "spz-4") == "spz-4"
     assert named_format(Path("a.compressed.ply")) == "compressed-ply"
     assert named_format(Path("a"), "sog") == "sog"

@@ -56,17 +56,35 @@ def test_a_run_s_own_ply_says_its_frame_and_the_layout_of_inria_too(
     assert psnr(pop, tmp_path, ply, "--capture", shared_capture) == pytest.approx(trained, abs=1e-2)
 
 
-def test_a_ply_that_says_nothing_is_measured_with_a_note(
-    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path
+def test_a_ply_that_says_nothing_is_taken_to_be_in_the_capture_s_frame_with_a_note(
+    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path, trained: float
 ) -> None:
-    save_ply(tmp_path / "s.ply", load_ply(shared_result / "ply" / "point_cloud_29.ply"))
-    outcome = pop("eval", tmp_path / "s.ply", "--capture", shared_capture)
+    assert pop("export", shared_result, "--out", tmp_path / "o.ply").status == 0
+    save_ply(tmp_path / "s.ply", load_ply(tmp_path / "o.ply"))
+    outcome = pop("eval", tmp_path / "s.ply", "--capture", shared_capture, "--json", tmp_path / "e.json")
     assert outcome.status == 0
-    assert "s.ply: says nothing of its world" in outcome.err
-    assert "--own-frame" in outcome.err
+    assert json.loads((tmp_path / "e.json").read_text())["psnr"] == pytest.approx(trained, abs=1e-2)
+    assert "s.ply: says nothing of its world, and is taken to be in the capture's own" in outcome.err
+    assert "--training-frame" in outcome.err
+    # who says it is told nothing
+    psnr(pop, tmp_path, tmp_path / "s.ply", "--capture", shared_capture, "--own-frame")
     # what is not known is not made up
     assert pop("export", tmp_path / "s.ply", "--out", tmp_path / "t.ply").status == 0
     assert frame_of(tmp_path / "t.ply") is None
+
+
+def test_a_ply_of_a_trainer_that_moves_the_world_is_read_as_the_command_says(
+    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path, trained: float
+) -> None:
+    save_ply(tmp_path / "s.ply", load_ply(shared_result / "ply" / "point_cloud_29.ply"))
+    about = ("--capture", shared_capture, "--training-frame")
+    assert psnr(pop, tmp_path, tmp_path / "s.ply", *about) == pytest.approx(trained, abs=1e-2)
+    outcome = pop("export", tmp_path / "s.ply", "--out", tmp_path / "t.ply", *about, "--frame", "capture")
+    assert outcome.status == 0, outcome.err
+    assert psnr(pop, tmp_path, tmp_path / "t.ply", "--capture", shared_capture) == pytest.approx(trained, abs=1e-2)
+    outcome = pop("eval", tmp_path / "s.ply", *about, "--own-frame")
+    assert outcome.status == 2
+    assert "--own-frame and --training-frame exclude each other" in outcome.err
 
 
 def test_another_capture_than_the_one_trained_on_is_refused(
@@ -88,7 +106,9 @@ def test_the_comment_reads_back_to_the_last_bit(tmp_path: Path) -> None:
         assert frame_of(tmp_path / "a.ply") == frame
 
 
-@pytest.mark.parametrize("words", ["", "world", "capture 1 2", "training nan" + 15 * " 0", "training " + 16 * "x "])
+@pytest.mark.parametrize(
+    "words", ["", "world", "capture 1 2", "training nan" + 15 * " 0", "training " + 16 * "x ", "training" + 16 * " 1"]
+)
 def test_a_damaged_comment_is_named(tmp_path: Path, words: str) -> None:
     save_ply(tmp_path / "a.ply", make(3)[0], frame=Frame("capture"))
     data = (tmp_path / "a.ply").read_bytes()

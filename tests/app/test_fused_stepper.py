@@ -151,7 +151,7 @@ def test_a_number_that_is_not_finite_is_named_and_the_last_checkpoint_kept(key, 
 
 
 @pytest.mark.parametrize(
-    "error", [CudaMemoryError("no room for tile lists: 9 MiB asked for"), torch.cuda.OutOfMemoryError("CUDA. Tried")]
+    "error", [CudaMemoryError("no room for tile lists: 9 MB asked for"), torch.cuda.OutOfMemoryError("CUDA. Tried")]
 )
 def test_a_full_gpu_says_what_to_lower(error, tmp_path, monkeypatch):
     def fails(self, step):

@@ -79,7 +79,7 @@ def test_a_browser_draws_what_is_rendered(
     page = tmp_path / "x.html"
     page.write_bytes(page_of(params, [camera_of(view) for view in views], config, degree, "x"))
     save_as(tmp_path / "x.spz", "spz", params, antialiased)
-    held, _ = load_splat_file(tmp_path / "x.spz")
+    held = load_splat_file(tmp_path / "x.spz").params
     for index, view in enumerate(views):
         picture = shown(tab, page, index)
         drawn = rendered(held, view, config, degree)

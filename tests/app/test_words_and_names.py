@@ -175,6 +175,25 @@ def test_an_unfinished_run_is_marked_beside_a_finished_one(
     assert " 1 threads" not in finished
 
 
+def test_a_run_without_numbers_keeps_no_other_from_being_compared(
+    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = tmp_path / "r"
+    interrupt(monkeypatch, at=10)
+    words = ("--eval-steps", "30", "--checkpoint-every", "5")
+    assert pop("train", shared_capture, "--out", begun, *TRAIN, *words).status == 130
+    outcome = pop("compare", begun, shared_result)
+    assert outcome.status == 0
+    assert outcome.err.startswith(f"note: {begun}: has no statistics yet")
+    _, row, finished = outcome.out.splitlines()
+    assert row.split()[:2] == [shared_capture.name, "POP"]
+    assert "dB" not in row
+    assert f"{json.loads((shared_result / 'stats' / 'val_step0029.json').read_text())['psnr']:.2f}" in finished
+    outcome = pop("compare", begun)
+    assert outcome.status == 2
+    assert f"{begun}: has no statistics yet; train to the first evaluation" in outcome.err
+
+
 def test_which_folder_a_factor_reads_is_told(tmp_path: Path) -> None:
     root = colmap_capture(tmp_path)
     assert load_capture(root).notes == ()

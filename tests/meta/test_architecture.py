@@ -339,3 +339,26 @@ def test_the_fast_twins_point_to_the_oracle() -> None:
             if function.name in twins and "`pop_ref." not in (ast.get_docstring(function) or ""):
                 complaints.append(f"{_name(path)}: {function.name} does not name its meaning in pop_ref")
     assert not complaints, "\n".join(complaints)
+
+
+def _printed(path: Path) -> Iterator[str]:
+    """Yield the strings of a module that are no docstrings."""
+    docs = {
+        id(node.body[0].value)
+        for node in ast.walk(_tree(path))
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        and node.body
+        and isinstance(node.body[0], ast.Expr)
+    }
+    for node in ast.walk(_tree(path)):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs:
+            yield node.value
+
+
+def test_what_the_program_prints_is_in_megabytes() -> None:
+    printing = [p for p in FILES if _name(p).startswith(("pop_fast/", "cuda_ext/arrays"))]
+    assert len(printing) > 100
+    found = [f"{_name(p)}: {text}" for p in printing for text in _printed(p) if re.search(r"\b[KMG]iB\b", text)]
+    assert found == []
+    # the search sees what it is about
+    assert any("MB" in text for text in _printed(ROOT / "pop_fast" / "cli" / "export.py"))

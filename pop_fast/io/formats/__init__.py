@@ -1,13 +1,17 @@
-"""File formats of splats beside PLY: PlayCanvas's compressed PLY and SOG, Niantic's SPZ, `.splat` and glTF."""
+"""File formats of splats: PlayCanvas's compressed PLY and SOG, Niantic's SPZ, `.splat`, glTF, and KSPLAT to read."""
 
 from pop_fast.io.formats.files import (
     PLY,
+    Stored,
     decoded,
+    default_name,
     encoded,
     format_names,
     is_splat_file,
     load_splat_file,
+    loses_frame,
     named_format,
+    readable_names,
     save_as,
     splat_suffixes,
 )
@@ -17,12 +21,16 @@ __all__ = [
     "FORMATS",
     "PLY",
     "Format",
+    "Stored",
     "decoded",
+    "default_name",
     "encoded",
     "format_names",
     "is_splat_file",
     "load_splat_file",
+    "loses_frame",
     "named_format",
+    "readable_names",
     "save_as",
     "splat_suffixes",
 ]

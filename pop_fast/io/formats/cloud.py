@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.errors import PopError
+from pop_fast.io.frame import Frame
 from pop_fast.io.ply import checked_params
 
 SH_C0: Final = 0.28209479177387814
@@ -45,6 +46,7 @@ class Cloud:
         sh0: colour of degree 0. [N, 3]
         rest: colours of the higher degrees. [N, 0|3|8|15, 3]
         antialiased: to be drawn with antialiasing.
+        frame: the world that they are in, where it is known.
     """
 
     means: np.ndarray
@@ -54,6 +56,7 @@ class Cloud:
     sh0: np.ndarray
     rest: np.ndarray
     antialiased: bool = False
+    frame: Frame | None = None
 
     def __len__(self) -> int:
         return len(self.means)
@@ -75,12 +78,13 @@ class Cloud:
         return self.opacities * np.sqrt(scales[:, 1] * scales[:, 2])
 
     @classmethod
-    def of(cls, params: Mapping[str, Tensor], antialiased: bool = False) -> Cloud:
+    def of(cls, params: Mapping[str, Tensor], antialiased: bool = False, frame: Frame | None = None) -> Cloud:
         """Take over raw parameters; colour degrees in which all coefficients are exactly 0 are left out.
 
         Args:
             params: means [N, 3], scales [N, 3], quats [N, 4], opacities [N], sh0 [N, 1, 3], shN [N, 0|3|8|15, 3], raw.
             antialiased: to be drawn with antialiasing.
+            frame: the world that they are in, where it is known.
 
         Raises:
             PopError: a parameter is absent, of the wrong shape, NaN or Inf, or a quaternion is zero.
@@ -98,6 +102,7 @@ class Cloud:
             sh0=arrays["sh0"][:, 0],
             rest=np.ascontiguousarray(arrays["shN"][:, :bands]),
             antialiased=antialiased,
+            frame=frame,
         )
 
     def params(self) -> dict[str, Tensor]:

@@ -17,6 +17,7 @@ import numpy as np
 from pop_fast.errors import PopError
 from pop_fast.io.formats.cloud import SH_C0, Cloud, logits_of_bytes, to_bytes
 from pop_fast.io.formats.smallest_three import drop_largest, restore_largest
+from pop_fast.io.frame import Frame
 from pop_fast.io.ply import MODE, asks_for_antialiasing
 from pop_fast.io.ply_rows import header_of, read_header
 
@@ -87,12 +88,14 @@ def encode(cloud: Cloud) -> bytes:
     ).astype("<u4")
     flat = cloud.rest.transpose(0, 2, 1).reshape(n, 3 * cloud.rest.shape[1]).astype(np.float64)
     rest = np.clip(np.floor(_SH_STEPS * flat + 128.0), 0, 255).astype(np.uint8)
-    header = _header(n, len(chunks), flat.shape[1], cloud.antialiased)
+    header = _header(cloud, len(chunks), flat.shape[1])
     return header + chunks.tobytes() + words.tobytes() + rest.tobytes()
 
 
-def _header(n: int, chunks: int, coefficients: int, antialiased: bool) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", f"comment {MODE} {'mip' if antialiased else 'default'}"]
+def _header(cloud: Cloud, chunks: int, coefficients: int) -> bytes:
+    n = len(cloud)
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {MODE} {'mip' if cloud.antialiased else 'default'}"]
+    lines += [] if cloud.frame is None else [f"comment {cloud.frame.comment()}"]
     lines += [f"element chunk {chunks}", *(f"property float {name}" for name in (*_RANGES, *_COLOR_RANGES))]
     lines += [f"element vertex {n}", *(f"property uint {name}" for name in _WORDS)]
     if coefficients:
@@ -144,6 +147,7 @@ def decode(data: bytes, path: Path) -> Cloud:
         raise PopError(
             f"{path}: has {len(chunks)} chunks for {n} vertices; {-(-n // _CHUNK)} are needed: {_WRITE_AGAIN}"
         )
+    header = header_of(data, path)
     which = np.arange(n) // _CHUNK
     colors = _COLOR_RANGES if set(_COLOR_RANGES) & set(chunks.dtype.names or ()) else ()
     if not {*_RANGES, *colors} <= set(chunks.dtype.names or ()) or not set(_WORDS) <= set(words.dtype.names or ()):
@@ -163,7 +167,8 @@ def decode(data: bytes, path: Path) -> Cloud:
         logits=logits_of_bytes(rgba[:, 3]),
         sh0=(((spread(colors, rgb) if colors else rgb) - 0.5) / SH_C0).astype(np.float32),
         rest=_rest(elements.get("sh"), n, path),
-        antialiased=asks_for_antialiasing(header_of(data, path)),
+        antialiased=asks_for_antialiasing(header),
+        frame=Frame.of_comments(header.comments, path),
     )
     return cloud.checked(path)
 

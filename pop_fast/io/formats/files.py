@@ -5,19 +5,35 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from torch import Tensor
 
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
+from pop_fast.io.formats import sog
 from pop_fast.io.formats.cloud import Cloud
 from pop_fast.io.formats.compressed_ply import is_compressed
-from pop_fast.io.formats.table import FORMATS
-from pop_fast.io.ply import Frame, asks_for_antialiasing, params_of_ply, ply_bytes
+from pop_fast.io.formats.table import FORMATS, READ_ONLY
+from pop_fast.io.frame import Frame
+from pop_fast.io.ply import asks_for_antialiasing, params_of_ply, ply_bytes
 from pop_fast.io.ply_rows import header_of
 
 PLY: Final = "ply"
+
+
+class Stored(NamedTuple):
+    """What a file holds.
+
+    Attributes:
+        params: raw parameters, as `pop_fast.io.ply.load_ply` returns them.
+        antialiased: to be drawn with antialiasing.
+        frame: the world that they are in, where the file says it.
+    """
+
+    params: dict[str, Tensor]
+    antialiased: bool
+    frame: Frame | None
 
 
 def format_names() -> tuple[str, ...]:
@@ -26,14 +42,29 @@ def format_names() -> tuple[str, ...]:
 
 
 def splat_suffixes() -> tuple[str, ...]:
-    """Return the suffixes of all formats, without repetition, the longest first."""
+    """Return the suffixes of all formats that are written, without repetition, the longest first."""
     found = dict.fromkeys([".ply", *(format.suffix for format in FORMATS.values())])
     return tuple(sorted(found, key=len, reverse=True))
 
 
+def readable_names() -> tuple[str, ...]:
+    """Return how the names of files end that are read, in alphabetical order."""
+    return tuple(sorted([*splat_suffixes(), *READ_ONLY, sog.META]))
+
+
 def is_splat_file(path: Path) -> bool:
-    """Tell whether a name ends as one of the formats' do."""
-    return path.name.lower().endswith(splat_suffixes())
+    """Tell whether a name ends as one of the formats' do that are read."""
+    return path.name.lower().endswith(readable_names())
+
+
+def default_name(stem: str, name: str) -> str:
+    """Return the name of a file in a format, where nobody names it: no two formats share one."""
+    return f"{stem}.ply" if name == PLY else f"{stem}{FORMATS[name].mark}{FORMATS[name].suffix}"
+
+
+def loses_frame(name: str, frame: Frame | None) -> bool:
+    """Tell whether a file in a format does not say its world, and what is taken for it is another one."""
+    return frame is not None and frame.name != "capture" and name != PLY and not FORMATS[name].has_frame
 
 
 def named_format(path: Path, to: str | None = None) -> str:
@@ -43,6 +74,8 @@ def named_format(path: Path, to: str | None = None) -> str:
         PopError: neither says, or the suffix is another format's.
     """
     name = path.name.lower()
+    if path.suffix.lower() in READ_ONLY or name == sog.META:
+        raise PopError(f"{path}: is of a format that is read and not written; choose .sog or another")
     suffix = next((s for s in splat_suffixes() if name.endswith(s)), None)
     by_suffix = [PLY] if suffix == ".ply" else [key for key, format in FORMATS.items() if format.suffix == suffix]
     if to is None:
@@ -64,18 +97,18 @@ def encoded(name: str, params: Mapping[str, Tensor], antialiased: bool = False, 
         name: of the format.
         params: raw parameters, as for `pop_fast.io.ply.save_ply`.
         antialiased: to be drawn with antialiasing.
-        frame: the world that they are in, where it is known; only PLY has a place for it.
+        frame: the world that they are in, where it is known; `.splat` has no room for it.
 
     Raises:
         PopError: a parameter is absent, of the wrong shape, NaN or Inf, or the format cannot hold it.
     """
     if name == PLY:
         return ply_bytes(dict(params), antialiased, frame)
-    format, cloud = FORMATS[name], Cloud.of(params, antialiased)
+    format, cloud = FORMATS[name], Cloud.of(params, antialiased, frame)
     return format.encode(cloud if format.order is None else cloud.take(format.order(cloud)))
 
 
-def decoded(name: str, data: bytes, path: Path = Path("memory")) -> tuple[dict[str, Tensor], bool]:
+def decoded(name: str, data: bytes, path: Path = Path("memory")) -> Stored:
     """Read a splat from a file's bytes.
 
     Args:
@@ -83,16 +116,17 @@ def decoded(name: str, data: bytes, path: Path = Path("memory")) -> tuple[dict[s
         data: the bytes.
         path: their name, for errors.
 
-    Returns:
-        As `load_splat_file`.
-
     Raises:
         PopError: the bytes are damaged; names the field.
     """
     if name == PLY:
-        return params_of_ply(data, path), asks_for_antialiasing(header_of(data, path))
-    cloud = FORMATS[name].decode(data, path)
-    return cloud.params(), cloud.antialiased
+        params, header = params_of_ply(data, path), header_of(data, path)
+        return Stored(params, asks_for_antialiasing(header), Frame.of_comments(header.comments, path))
+    return _stored(FORMATS[name].decode(data, path))
+
+
+def _stored(cloud: Cloud) -> Stored:
+    return Stored(cloud.params(), cloud.antialiased, cloud.frame)
 
 
 def save_as(
@@ -115,24 +149,34 @@ def save_as(
     return len(data)
 
 
-def load_splat_file(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], bool]:
+def load_splat_file(path: str | os.PathLike[str]) -> Stored:
     """Read a splat in any format.
 
-    Returns:
-        Raw parameters, as `pop_fast.io.ply.load_ply` returns them, and whether they are to be drawn with antialiasing.
+    Args:
+        path: the file; the meta.json of SOG in a folder stands for all of it.
 
     Raises:
         PopError: the file is absent, of an unknown kind or damaged; names the field.
     """
     path = Path(path)
+    suffix = path.suffix.lower()
+    if path.name.lower() == sog.META:
+        return _stored(sog.decode_folder(path))
+    if suffix in READ_ONLY:
+        return _stored(READ_ONLY[suffix](_bytes(path), path))
+    if not is_splat_file(path):
+        raise PopError(f"{path}: the name must end in one of {', '.join(readable_names())}")
     name = named_format(path)
     if name in (PLY, "compressed-ply"):
         # either may stand under the name of the other
         name = "compressed-ply" if is_compressed(path) else PLY
+    return decoded(name, _bytes(path), path)
+
+
+def _bytes(path: Path) -> bytes:
     try:
-        data = path.read_bytes()
+        return path.read_bytes()
     except FileNotFoundError:
         raise PopError(f"{path}: the file is absent; check the path") from None
     except OSError as error:
         raise PopError(f"{path}: could not be read: {error.strerror}; check the path and its permissions") from error
-    return decoded(name, data, path)

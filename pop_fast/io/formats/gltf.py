@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,6 +22,7 @@ import numpy as np
 from pop_fast.errors import PopError
 from pop_fast.io.formats import spz
 from pop_fast.io.formats.cloud import COEFFICIENTS, SH_C0, Cloud, to_bytes
+from pop_fast.io.frame import KEY, Frame
 
 NAME: Final = "KHR_gaussian_splatting"
 SPZ_NAME: Final = "KHR_gaussian_splatting_compression_spz_2"
@@ -45,7 +47,7 @@ def encode_spz(cloud: Cloud) -> bytes:
     Raises:
         PopError: as `spz.encode`.
     """
-    return _glb(cloud.turned("z"), {}, spz.encode(cloud, version=2))
+    return _glb(cloud.turned("z"), {}, spz.encode(replace(cloud, frame=None), version=2))
 
 
 def _attributes(turned: Cloud) -> dict[str, np.ndarray]:
@@ -94,7 +96,7 @@ def _glb(turned: Cloud, data: Mapping[str, bytes], stream: bytes | None) -> byte
         "extensions": {NAME: extension},
     }
     content: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "pop-splatting", "extras": {"antialiased": turned.antialiased}},
+        "asset": {"version": "2.0", "generator": "pop-splatting", "extras": _extras(turned)},
         "extensionsUsed": used,
         **({} if stream is None else {"extensionsRequired": used}),
         "scene": 0,
@@ -110,6 +112,11 @@ def _glb(turned: Cloud, data: Mapping[str, bytes], stream: bytes | None) -> byte
     if views:
         chunks += struct.pack("<II", len(body), _BIN) + bytes(body)
     return _MAGIC + struct.pack("<II", 2, 12 + len(chunks)) + chunks
+
+
+def _extras(cloud: Cloud) -> dict[str, Any]:
+    """Return what the asset holds that glTF has no place for."""
+    return {"antialiased": cloud.antialiased, **({} if cloud.frame is None else {KEY: cloud.frame.entry()})}
 
 
 def decode(data: bytes, path: Path) -> Cloud:
@@ -128,8 +135,11 @@ def decode(data: bytes, path: Path) -> Cloud:
         primitive = _splat(content, path)
         inner = primitive["extensions"][NAME].get("extensions", {})
         if SPZ_NAME in inner:
-            return spz.decode(_part(content, body, inner[SPZ_NAME]["bufferView"], path), path)
-        return _from_attributes(content, body, primitive["attributes"], path)
+            cloud = spz.decode(_part(content, body, inner[SPZ_NAME]["bufferView"], path), path)
+        else:
+            cloud = _from_attributes(content, body, primitive["attributes"], path)
+        frame = Frame.of_entry(content.get("asset", {}).get("extras"), path)
+        return cloud if frame is None else replace(cloud, frame=frame)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         if isinstance(error, PopError):
             raise

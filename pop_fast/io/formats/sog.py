@@ -1,4 +1,4 @@
-"""PlayCanvas's SOG, version 2: lossless WebP images of bytes and meta.json, in one ZIP file.
+"""PlayCanvas's SOG, version 2: lossless WebP images of bytes and meta.json, in one ZIP file or as files of a folder.
 
 An image pixel is a Gaussian: centres with 16 bits in a logarithmic space, scales and colours as indices of 256 numbers,
 rotations as the smallest three components with 8 bits each, and the colours beyond degree 0 as an index of a palette of
@@ -14,7 +14,7 @@ import json
 import math
 import struct
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,8 +26,9 @@ from pop_fast.io.budget import check_members, check_memory
 from pop_fast.io.formats.cloud import COEFFICIENTS, Cloud, logits_of_bytes, to_bytes
 from pop_fast.io.formats.palette import codebook, nearest, row_palette
 from pop_fast.io.formats.smallest_three import drop_largest, restore_largest
+from pop_fast.io.frame import KEY, Frame
 
-_META: Final = "meta.json"
+META: Final = "meta.json"
 _FIRST_ROTATION: Final = 252
 # palette rows in a row of the image of the palette
 _ROW: Final = 64
@@ -69,7 +70,7 @@ def encode(cloud: Cloud) -> bytes:
     rgba = np.concatenate([nearest(colors, cloud.sh0), np.rint(255.0 * cloud.opacities)[:, None]], axis=1)
     meta: dict[str, Any] = {
         "version": 2,
-        "asset": {"generator": "pop-splatting"},
+        "asset": {"generator": "pop-splatting", **({} if cloud.frame is None else {KEY: cloud.frame.entry()})},
         "count": n,
         "antialias": cloud.antialiased,
         "means": {
@@ -117,7 +118,7 @@ def _zipped(meta: Mapping[str, Any], images: Mapping[str, np.ndarray]) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         # a fixed time, so that the same splat gives the same bytes
-        archive.writestr(zipfile.ZipInfo(_META), json.dumps(meta))
+        archive.writestr(zipfile.ZipInfo(META), json.dumps(meta))
         for name, pixels in images.items():
             order = [2, 1, 0, 3][: pixels.shape[2]]
             _, data = cv2.imencode(".webp", np.ascontiguousarray(pixels[..., order]), _LOSSLESS)
@@ -138,36 +139,71 @@ def decode(data: bytes, path: Path) -> Cloud:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             check_members(path, archive, len(data), _WRITE_AGAIN)
-            return _read(archive, path)
+            return _read(lambda name: _unzipped(archive, name, path), path, len(data))
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
         raise PopError(f"{path}: is no readable ZIP file ({error}); {_WRITE_AGAIN}") from error
+
+
+def decode_folder(path: Path) -> Cloud:
+    """Read SOG whose images lie as files in the folder of its meta.json.
+
+    Args:
+        path: meta.json.
+
+    Raises:
+        PopError: as `decode`, or a file is absent.
+    """
+    packed = sum(file.stat().st_size for file in path.parent.glob("*.webp"))
+    return _read(lambda name: _file(path.parent, name, path), path, packed)
+
+
+def _unzipped(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
+    """Return an entry."""
+    size = archive.getinfo(name).file_size
+    if name == META and size > _LARGEST_META:
+        raise PopError(f"{path}: {META} has {size} bytes; {_WRITE_AGAIN}")
+    return archive.read(name)
+
+
+def _file(folder: Path, name: str, path: Path) -> bytes:
+    """Return a file of the folder."""
+    if Path(name).name != name:
+        raise PopError(f"{path}: names the file {name!r}, which is not in its folder; put it there, and name it so")
+    try:
+        size = (folder / name).stat().st_size
+        if name == META and size > _LARGEST_META:
+            raise PopError(f"{path}: has {size} bytes; {_WRITE_AGAIN}")
+        return (folder / name).read_bytes()
+    except FileNotFoundError:
+        raise PopError(f"{folder / name}: is absent, and {path.name} names it; copy it beside {path.name}") from None
+    except OSError as error:
+        raise PopError(f"{folder / name}: could not be read: {error.strerror}; check its permissions") from error
+
+
+def _read(read: Callable[[str], bytes], path: Path, packed: int) -> Cloud:
+    """Read the parts, each by its name; `packed` are the bytes of all."""
+    try:
+        return _decoded(read, path, packed)
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError, RecursionError) as error:
         if isinstance(error, PopError):
             raise
-        raise PopError(f"{path}: {_META} is not that of SOG version 2 ({error!r}); {_WRITE_AGAIN}") from error
+        raise PopError(f"{path}: {META} is not that of SOG version 2 ({error!r}); {_WRITE_AGAIN}") from error
 
 
-def _read(archive: zipfile.ZipFile, path: Path) -> Cloud:
-    if archive.getinfo(_META).file_size > _LARGEST_META:
-        raise PopError(f"{path}: {_META} has {archive.getinfo(_META).file_size} bytes; {_WRITE_AGAIN}")
-    meta = json.loads(archive.read(_META))
+def _decoded(read: Callable[[str], bytes], path: Path, packed: int) -> Cloud:
+    meta = json.loads(read(META))
     if meta.get("version") != 2:
         raise PopError(
-            f"{path}: {_META}.version is {meta.get('version')}; write it as version 2, which this program reads"
+            f"{path}: {META}.version is {meta.get('version')}; write it as version 2, which this program reads"
         )
     n = meta["count"]
     if not isinstance(n, int) or n < 0:
-        raise PopError(f"{path}: {_META}.count is {n}; it must be a number of Gaussians: {_WRITE_AGAIN}")
-    check_memory(
-        path,
-        n * _IN_MEMORY,
-        sum(member.file_size for member in archive.infolist()),
-        f"{_META}.count of {n}",
-        _WRITE_AGAIN,
-    )
+        raise PopError(f"{path}: {META}.count is {n}; it must be a number of Gaussians: {_WRITE_AGAIN}")
+    check_memory(path, n * _IN_MEMORY, packed, f"{META}.count of {n}", _WRITE_AGAIN)
 
     def pixels(entry: str, index: int, least: int = n) -> np.ndarray:
-        return _pixels(archive, str(meta[entry]["files"][index]), least, path)[:least]
+        name = str(meta[entry]["files"][index])
+        return _pixels(read(name), name, least, path)[:least]
 
     low, high = (np.array(meta["means"][end], np.float64).reshape(3) for end in ("mins", "maxs"))
     fixed = pixels("means", 0)[:, :3] + 256.0 * pixels("means", 1)[:, :3]
@@ -186,6 +222,7 @@ def _read(archive: zipfile.ZipFile, path: Path) -> Cloud:
         sh0=_codes(meta, "sh0")[colors[:, :3]],
         rest=_rest(meta, pixels, path) if "shN" in meta else np.zeros((n, 0, 3), np.float32),
         antialiased=bool(meta.get("antialias", False)),
+        frame=Frame.of_entry(meta.get("asset"), path),
     )
     return cloud.checked(path)
 
@@ -197,7 +234,7 @@ def _codes(meta: Mapping[str, Any], entry: str) -> np.ndarray:
 def _rest(meta: Mapping[str, Any], pixels: Any, path: Path) -> np.ndarray:
     count, bands = meta["shN"]["count"], meta["shN"]["bands"]
     if bands not in (1, 2, 3) or not 0 < count <= _LARGEST_PALETTE:
-        raise PopError(f"{path}: {_META}.shN has {count} rows of {bands} bands; 1 to 65536 of 1 to 3 are allowed")
+        raise PopError(f"{path}: {META}.shN has {count} rows of {bands} bands; 1 to 65536 of 1 to 3 are allowed")
     each = COEFFICIENTS[bands]
     palette = _codes(meta, "shN")[pixels("shN", 0, count * each)[:, :3]].reshape(count, each, 3)
     labels = pixels("shN", 1)[:, :2].astype(np.int64) @ np.array([1, 256])
@@ -206,9 +243,8 @@ def _rest(meta: Mapping[str, Any], pixels: Any, path: Path) -> np.ndarray:
     return palette[labels]
 
 
-def _pixels(archive: zipfile.ZipFile, name: str, least: int, path: Path) -> np.ndarray:
+def _pixels(data: bytes, name: str, least: int, path: Path) -> np.ndarray:
     """Return an image's pixels in reading order, with four channels. uint8 [M, 4]"""
-    data = archive.read(name)
     width, height = _size(data)
     if width * height < least:
         raise PopError(f"{path}: {name} is {width}x{height} pixels; {least} are needed: {_WRITE_AGAIN}")
@@ -225,7 +261,7 @@ def _pixels(archive: zipfile.ZipFile, name: str, least: int, path: Path) -> np.n
 
 def _size(data: bytes) -> tuple[int, int]:
     """Return the width and the height that a WebP file states, 0 where it is none."""
-    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 30:
+    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 32:
         return 0, 0
     kind = data[12:16]
     if kind == b"VP8L" and data[20] == 0x2F:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from pop_fast.io.formats import compressed_ply, dot_splat, gltf, sog, spz
+from pop_fast.io.formats import compressed_ply, dot_splat, gltf, ksplat, sog, spz
 from pop_fast.io.formats.cloud import Cloud, morton_order
 
 
@@ -28,6 +29,8 @@ class Format:
         encode: makes a file's bytes of Gaussians in the file's order.
         decode: reads them; the path is for errors.
         order: of the Gaussians in the file; None keeps theirs.
+        mark: what a file's name has before the suffix where nobody names it, so that no two formats share a name.
+        has_frame: whether it has room for the world that the splat is in.
     """
 
     name: str
@@ -40,6 +43,8 @@ class Format:
     encode: Callable[[Cloud], bytes]
     decode: Callable[[bytes, Path], Cloud]
     order: Callable[[Cloud], np.ndarray] | None = None
+    mark: str = ""
+    has_frame: bool = True
 
 
 def _by_place(cloud: Cloud) -> np.ndarray:
@@ -93,6 +98,19 @@ FORMATS: Final[Mapping[str, Format]] = {
             order=_by_place,
         ),
         Format(
+            name="spz-4",
+            suffix=".spz",
+            title="Niantic SPZ, version 4",
+            source="https://github.com/nianticlabs/spz",
+            size=("20, then Zstandard", "65, then Zstandard"),
+            losses=_SPZ_LOSSES,
+            readers="Niantic's own programs, PlayCanvas's splat-transform",
+            encode=partial(spz.encode, version=4),
+            decode=spz.decode,
+            order=_by_place,
+            mark="-4",
+        ),
+        Format(
             name="sog",
             suffix=".sog",
             title="PlayCanvas SOG, version 2",
@@ -129,6 +147,7 @@ FORMATS: Final[Mapping[str, Format]] = {
             encode=dot_splat.encode,
             decode=dot_splat.decode,
             order=dot_splat.largest_first,
+            has_frame=False,
         ),
         Format(
             name="gltf",
@@ -159,6 +178,10 @@ FORMATS: Final[Mapping[str, Format]] = {
             encode=gltf.encode_spz,
             decode=gltf.decode,
             order=_by_place,
+            mark="-spz",
         ),
     )
 }
+
+# what is read and not written, by suffix
+READ_ONLY: Final[Mapping[str, Callable[[bytes, Path], Cloud]]] = {".ksplat": ksplat.decode}

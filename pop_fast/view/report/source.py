@@ -22,7 +22,6 @@ from pop_fast.view.report.files_section import checked_encodings, encoding_heads
 from pop_fast.view.report.model import Histogram, ReportData, ReportView, Tile
 from pop_fast.view.report.verdict import verdict
 
-MIB: Final = 2**20
 # float32 numbers of a Gaussian: as gsplat's checkpoints hold it, and as Inria's PLY does (with three zero normals)
 BYTES_CKPT: Final = 59 * 4
 BYTES_PLY: Final = 62 * 4
@@ -189,8 +188,8 @@ def headline(stats: Mapping[str, Any]) -> list[Tile]:
         n = int(stats["num_GS"])
         left = stats.get("num_GS_above_floor")
         tiles.append(Tile("Gaussians", f"{n:,}", "", "" if left is None else f"{int(left):,} with opacity ≥ 1/255"))
-        as_ply = f"as PLY {n * BYTES_PLY / MIB:.1f} ({BYTES_PLY} B)"
-        tiles.append(Tile("Size", f"{n * BYTES_CKPT / MIB:.1f}", "MiB", f"{BYTES_CKPT} B each; {as_ply}"))
+        as_ply = f"as PLY {n * BYTES_PLY / 1e6:.1f} ({BYTES_PLY} B)"
+        tiles.append(Tile("Size", f"{n * BYTES_CKPT / 1e6:.1f}", "MB", f"{BYTES_CKPT} B each; {as_ply}"))
     if stats.get("n_blended") is not None:
         traversed = "" if stats.get("n_traversed") is None else f"{stats['n_traversed']:.1f} traversed"
         tiles.append(Tile("Gaussians per pixel", f"{stats['n_blended']:.1f}", "blended", traversed))
@@ -205,7 +204,7 @@ def _cost_tiles(stats: Mapping[str, Any]) -> list[Tile]:
         note = "" if steps is None else f"{(steps + 1) / seconds:.1f} iterations a second"
         tiles.append(Tile("Training", value, unit, note))
     if stats.get("memory_bytes"):
-        tiles.append(Tile("Peak memory", f"{stats['memory_bytes'] / 2**30:.1f}", "GiB", "of the whole process"))
+        tiles.append(Tile("Peak memory", f"{stats['memory_bytes'] / 1e9:.1f}", "GB", "of the whole process"))
     return tiles
 
 
