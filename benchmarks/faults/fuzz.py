@@ -31,7 +31,7 @@ from .mutate import mutated
 from .readers import READERS, Reader
 
 # of one input: seconds, bytes over what importing takes, letters of a refusal
-SECONDS, MEMORY, LONGEST = 20, 2**30, 1_300
+SECONDS, MEMORY, LONGEST = 60, 2**30, 1_300
 # of a reader's turn, seconds: long beside the start of a child
 TURN = 4.0
 OUTCOMES = ("read", "refused", "told", "escaped", "crashed", "hung")
