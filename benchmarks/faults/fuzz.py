@@ -8,6 +8,7 @@ import os
 import random
 import shutil
 import signal
+import sys
 import tempfile
 import time
 import traceback
@@ -65,6 +66,9 @@ def fuzz(inputs: int, minutes: float, seed: int, only: str | None = None, save: 
     failures = {key: value for turn in turns for key, value in turn.failures.items()}
     if save:
         _save(failures)
+    print(f"seed {seed}")
+    for turn in turns:
+        print(f"{turn.name:<44} {sum(turn.counts.values()):>9,}", flush=True)
     return {
         "seed": seed,
         "minutes": round((time.monotonic() - begin) / 60.0, 1),
@@ -116,7 +120,10 @@ class _Turns:
     def _failed(self, number: int, came: str, site: str, message: str = "") -> None:
         size = len(input_of(self.name, self.seed, number))
         line = {"reader": self.name, "number": number, "seed": self.seed, "bytes": size, "message": message}
-        found = self.failures.setdefault(f"{self.name}: {came}: {site}", {**line, "times": 0})
+        key = f"{self.name}: {came}: {site}"
+        if key not in self.failures:
+            print(f"{key} (seed {self.seed}, input {number}) {message}", file=sys.stderr, flush=True)
+        found = self.failures.setdefault(key, {**line, "times": 0})
         # the smallest tells most
         found |= {**(line if size < found["bytes"] else {}), "times": found["times"] + 1}
 
