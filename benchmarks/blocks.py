@@ -24,6 +24,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pop_fast.children import module_command
+
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "blocks.json"
 GIB = 2**30
@@ -43,7 +45,7 @@ def run(words: Sequence[str], folder: Path, note: Path) -> dict[str, float]:
     again = ["--resume"] if (folder / "cfg.json").is_file() else []
     start = time.perf_counter()
     child = subprocess.Popen(
-        [sys.executable, "-m", "pop_fast.cli", "train", *words, "--out", str(folder), *again], cwd=HERE.parent
+        module_command("pop_fast.cli", "train", *words, "--out", str(folder), *again), cwd=HERE.parent
     )
     # of the process and of those that it waited for
     _, status, used = os.wait4(child.pid, 0)

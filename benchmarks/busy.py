@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -22,6 +21,7 @@ BOUND = 1.5  # times the fair share
 # ends with whoever started it, also where that is killed and cannot end it
 LOOP = """
 import os, sys
+from pop_fast.children import python_command
 while os.getppid() == int(sys.argv[1]):
     for _ in range(1_000_000):
         pass
@@ -34,7 +34,7 @@ def busy_processes(n: int = PROCESSES) -> Iterator[None]:
     running: list[subprocess.Popen[bytes]] = []
     try:
         for _ in range(n):
-            running.append(subprocess.Popen([sys.executable, "-S", "-c", LOOP, str(os.getpid())]))
+            running.append(subprocess.Popen(python_command("-S", "-c", LOOP, str(os.getpid()))))
         time.sleep(1.0)  # until all have started
         yield
     finally:

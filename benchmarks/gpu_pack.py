@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from cuda_ext.gpu_check.command import commit_of
 from cuda_ext.gpu_check.tools import ROOT, write_json
+from pop_fast.children import python_command
 from pop_fast.data import Capture, View, load_capture
 from pop_fast.errors import PopError
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
@@ -115,7 +116,7 @@ def fetch_wheels(folder: Path) -> list[str]:
     absent: list[str] = []
     folder.mkdir(parents=True, exist_ok=True)
     for name in WHEELS:
-        pip = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:"]
+        pip = python_command("-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:")
         done = subprocess.run([*pip, "-d", str(folder), name], capture_output=True, text=True, check=False)
         if done.returncode != 0:
             words = done.stderr.strip().splitlines() or ["no words"]

@@ -33,6 +33,7 @@ import torch
 
 from pop_fast import rasterization
 from pop_fast.api.registry import get_backend
+from pop_fast.children import module_command
 from pop_fast.data.load import load_capture
 from pop_fast.io.formats import load_splat_file
 from pop_fast.io.ply import save_ply
@@ -165,7 +166,7 @@ def measured(name: str, case: Case) -> dict[str, Any]:
         make(case, Path(folder))
         start = time.perf_counter()
         words = [case.photographs, case.gaussians, case.width, case.height]
-        command = [sys.executable, "-m", "benchmarks.load", "--child", folder, *map(str, words)]
+        command = module_command("benchmarks.load", "--child", folder, *map(str, words))
         done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=HERE.parent)
     if done.returncode != 0:
         raise SystemExit(f"{name}: ended with {done.returncode}: {done.stderr[-3000:]}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -17,6 +16,7 @@ from raster import SCENE
 from steps import run_of_case, take_turn
 
 from pop_fast.api.registry import get_backend
+from pop_fast.children import python_command
 from pop_fast.train.environment import keep_freed_memory
 
 HERE = Path(__file__).resolve().parent
@@ -25,8 +25,10 @@ GIB = 2**20  # kB, in which the system counts
 
 def measure(what: str, by: str) -> dict[str, Any]:
     """Measure a render and its backward ("render"), or training steps ("step"), by a backend or engine."""
-    code = f"import memory; memory.{what}_once(memory.MEMORY_CASE, {by!r})"
-    done = subprocess.run([sys.executable, "-c", code], cwd=HERE, stdout=subprocess.PIPE, text=True, check=True)
+    code = (
+        f"import sys; sys.path.insert(0, {str(HERE)!r}); import memory; memory.{what}_once(memory.MEMORY_CASE, {by!r})"
+    )
+    done = subprocess.run(python_command("-c", code), stdout=subprocess.PIPE, text=True, check=True)
     return {"what": what, "by": by, **asdict(MEMORY_CASE), **json.loads(done.stdout)}
 
 

@@ -22,6 +22,7 @@ if __package__ in (None, ""):
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.record import machine, read_json, write_json
+from pop_fast.children import module_command
 from pop_fast.io.formats import FORMATS
 
 PLY_BYTES: Final = 248
@@ -32,7 +33,7 @@ _NAMES: Final = tuple(name for name in FORMATS if name not in ("gltf", "gltf-spz
 
 def pop(*arguments: str) -> None:
     """Run the command line; its words go to standard error."""
-    subprocess.run([sys.executable, "-m", "pop_fast.cli", *arguments], check=True, stdout=sys.stderr)
+    subprocess.run(module_command("pop_fast.cli", *arguments), check=True, stdout=sys.stderr)
 
 
 def resolved(result: Path) -> dict[str, Any]:

@@ -6,15 +6,16 @@ import json
 import os
 import resource
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
+from pop_fast.children import python_command
+
 ROOT = Path(__file__).resolve().parents[1]
 # what the installed script `pop` runs
-POP = (sys.executable, "-c", "import sys; from pop_fast.cli import main; sys.exit(main())")
+POP = python_command("-c", "import sys; from pop_fast.cli import main; sys.exit(main())")
 REPEATS = 5
 LONGEST = 120.0  # s, after which a first step is given up
 COMMANDS = {

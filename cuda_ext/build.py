@@ -18,6 +18,7 @@ import sys
 from pathlib import Path
 
 from cuda_ext.toolkit import OLDEST, find_nvcc, link_flags, nvcc_version
+from pop_fast.children import SAFE_PATH
 
 HERE = Path(__file__).resolve().parent
 INSTALL = "`pip install 'pop-splatting[cuda-build]'` (from a clone: pip install -e '.[cuda-build]')"
@@ -132,7 +133,9 @@ def _of_this_machine() -> list[str]:
 
 
 def _run(doing: str, command: list[str]) -> None:
-    done = subprocess.run(command, text=True, capture_output=True, check=False, env={**os.environ, "CLICOLOR": "0"})
+    # CMake asks Python where things are
+    environment = {**os.environ, **SAFE_PATH, "CLICOLOR": "0"}
+    done = subprocess.run(command, text=True, capture_output=True, check=False, env=environment)
     if done.returncode != 0:
         tail = "\n".join((done.stdout + done.stderr).splitlines()[-40:])
         raise BuildError(f"{doing} the CUDA extension failed; {' '.join(command)} said:\n{tail}")

@@ -28,12 +28,15 @@ from PIL import Image
 from websockets.sync.client import connect
 
 from paper_repro.cli import COMMANDS as REPRO_COMMANDS
+from pop_fast.children import module_command
 from pop_fast.cli import COMMANDS as OF_POP
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 PAGE, PICTURES = DOCS / "commands.md", DOCS / "commands"
 OF_REPRO = {name: about for name, (_, about) in REPRO_COMMANDS.items()}
+# what a command prints, in its folder
+PRINTED = ".printed"
 LONGEST = 30  # lines of an output
 WIDEST = 900  # px of a picture
 # WebGL without a GPU, and inside a container
@@ -70,7 +73,7 @@ def shot(page: str, width: int = WIDEST, height: int = 700, seconds: float = 4.0
     """Return what photographs a page in a browser.
 
     Args:
-        page: an address, or a file of the folder.
+        page: a file of the folder, or the beginning of an address that the command prints.
         width, height: of the window, px.
         seconds: that the page is given to draw itself.
     """
@@ -79,7 +82,9 @@ def shot(page: str, width: int = WIDEST, height: int = 700, seconds: float = 4.0
         program = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
         if program is None:
             raise SystemExit("the pictures of pages need Chromium: apt install chromium, or set CHROMIUM")
-        address = page if "://" in page else (folder / page).resolve().as_uri()
+        address = (folder / page).resolve().as_uri()
+        if "://" in page:
+            address = next(word for word in (folder / PRINTED).read_text().split() if word.startswith(page))
         options = [*HEADLESS, f"--window-size={width},{height}", "--remote-debugging-port=0"]
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
             browser = subprocess.Popen(
@@ -169,6 +174,7 @@ RUNS = (
 REPRO = (
     Run("run", "pop-repro run pop demo --scale toy --results results --work work"),
     Run("queue", "pop-repro queue --scale toy --rows pop gsplat l2_blur --results results --work work"),
+    Run("verify", "pop-repro verify pop demo --scale toy --results results --work work --steps 100"),
     Run("status", "pop-repro status --scale small"),
     Run("table", "pop-repro table 4 --scale toy --results results --out tables"),
     Run(
@@ -191,13 +197,14 @@ def ran(run: Run, folder: Path) -> str:
     environment = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "110", "PATH": _path()}
     process = subprocess.Popen(
         run.words, shell=True, cwd=folder, env=environment, text=True, stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+        stdout=(folder / PRINTED).open("w"), stderr=subprocess.STDOUT, start_new_session=True,
     )  # fmt: skip
     if run.seconds is not None:
         time.sleep(run.seconds / 4)
         drawn(run, folder)
         os.killpg(process.pid, signal.SIGTERM)
-    return process.communicate()[0]
+    process.wait()
+    return (folder / PRINTED).read_text()
 
 
 def _path() -> str:
@@ -228,6 +235,8 @@ def shown(text: str, folder: Path) -> str:
         (Path.home(), "~"),
     ):
         text = text.replace(str(path), name)
+    # the viewer's word is another one each time
+    text = re.sub(r"(viewer: http://[^/]+/)[\w-]+/", r"\1WORD/", text)
     lines = [line.rstrip() for line in text.rstrip().splitlines()]
     if len(lines) > LONGEST:
         half = LONGEST // 2
@@ -254,8 +263,11 @@ def page() -> str:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         shutil.rmtree(PICTURES, ignore_errors=True)
-        subprocess.run(f"{sys.executable} -m pop_fast.cli demo bare && mv bare/images photos", shell=True, cwd=folder,
-                       check=True, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True)  # fmt: skip
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        subprocess.run(
+            module_command("pop_fast.cli", "demo", "bare"), cwd=folder, check=True, env=environment, capture_output=True
+        )
+        (folder / "bare" / "images").rename(folder / "photos")
         parts = [*sections(folder, RUNS, "pop", OF_POP), *sections(folder, REPRO, "pop-repro", OF_REPRO)]
     return "\n\n".join([_HEAD, *parts]) + "\n"
 

@@ -20,8 +20,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from stages import ROOT, STAGES, files, functions, laws
 
 from paper_repro.claims_page import outcome as outcome_of
+from paper_repro.methods import load_pinned
 from paper_repro.status import everything, status_table
-from pop_fast.train.presets import options_for
+from pop_fast.train.presets import METHODS, options_for
 from pop_ref.conformance.capabilities import STAGES as LAW_STAGES
 from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM
 from pop_ref.conformance.mutants.trial import every_law
@@ -111,6 +112,27 @@ RECIPE_NOTES = {
     "Taming-3DGS": "growth to a budget, by sampling from a score",
     "Speedy-Splat": "exact tile lists, soft and hard pruning by sensitivity",
 }
+
+
+def methods() -> str:
+    """Make a table a method: every setting that decides a training, its value, and where its source says so."""
+    parts = []
+    for name in METHODS:
+        table = load_pinned(name)
+        rows = [_cited(setting, of) for setting, of in table.settings.items()]
+        differing = {**{f"row {row}": of for row, of in table.rows.items()}, **table.scenes}
+        rows += [_cited(f"{where}: {setting}", one) for where, of in differing.items() for setting, one in of.items()]
+        order = [_cited(kind, (" · ".join(events), source)) for kind, (events, source) in table.order.items()]
+        read = "".join(f"- {source}\n" for source in table.sources)
+        settings = _table(["setting", "value", "where its source says so"], rows)
+        steps = _table(["step", "what happens to the Gaussians, in this order", "where"], order)
+        parts.append(f"## {name}\n\n{read}\n{settings}\n\n{steps}")
+    return "\n\n".join(parts)
+
+
+def _cited(name: str, of: tuple[Any, str]) -> list[str]:
+    value, source = of
+    return [f"`{name}`", "none" if value is None else str(value), source]
 
 
 def reproduction() -> str:
@@ -324,6 +346,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **{name: _of_faults(name) for name in ("fuzzed", "disturbed", "loads")},
     "blocks": blocks,
     "recipes": recipes,
+    "methods": methods,
     "reproduction": reproduction,
     "settled": outcome,
     "outcome": outcome,

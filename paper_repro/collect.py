@@ -22,7 +22,10 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
 
-__all__ = ["BESIDE", "PROBE", "collect", "first_change", "read_probe", "spacing", "state_of_data"]
+__all__ = [
+    *("BESIDE", "PROBE", "collect", "curve_of", "digits", "final_stats", "first_change", "read_probe", "spacing"),
+    "state_of_data",
+]
 
 # what `train_row` leaves in the result folder about the capture and the program, from before the first step
 BESIDE: Final = "row.json"
@@ -44,8 +47,8 @@ _COLUMNS: Final = (
     *("l1", "l2", "d_ssim", "pop", "cloned", "split", "pruned"),
 )
 _PROBED: Final = ("grad_", "probe_")
-# significant ones of a number in a curve, of others four; a PSNR has three after the point
-_DIGITS: Final = {"psnr": 5, "psnr_test": 5, "seconds": 5}
+# a PSNR of five digits has three after the point
+_PRECISE: Final = ("psnr", "psnr_test", "seconds")
 _SSIM: Final = "11 x 11 Gaussian window, sigma 1.5, windows inside the image, floats clamped to [0, 1]"
 _LPIPS: Final = {
     "vgg_01": "vgg_01: VGG16, images in [0, 1]",
@@ -110,7 +113,7 @@ def collect(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
 def _collected(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
     config = read_config(folder)
     last = config.max_steps - 1
-    stats, before = _stats(folder, "val", last), _stats(folder, "train", last)
+    stats, before = final_stats(folder, last), final_stats(folder, last, "train")
     said = read_json(folder / BESIDE, _AGAIN)
     data_hash, commit = said.pop("data_hash"), said.pop("commit")
     settings = _settings(config)
@@ -128,7 +131,8 @@ def _collected(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
         data_hash=data_hash,
         machine=", ".join(stats[name] for name in ("machine", "gpu") if name in stats),
         cpu=processor_kind(),
-        engine=stats["stepper"],
+        # a step by autograd is as a backend draws it
+        engine=f"torch ({stats['backend']})" if stats["stepper"] == "torch" else stats["stepper"],
         threads=stats["threads"],
         versions=stats["versions"],
         protocol={
@@ -156,7 +160,7 @@ def _collected(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
         opacity_below_01=stats["opacity_below_0.1"],
         opacity_above_09=stats["opacity_above_0.9"],
         opacity_histogram=_histogram(folder, last),
-        curve=_curve(folder, config.max_steps),
+        curve=curve_of(folder, config.max_steps),
         per_view={name: {key: view[key] for key in ("psnr", "ssim")} for name, view in stats["per_view"].items()},
         ply_hash=file_hash(ply_of(folder, last)),
         files=files,
@@ -178,7 +182,17 @@ def _settings(config: TrainConfig) -> dict[str, Any]:
     return {name: value for name, value in config.flat().items() if name not in _APART}
 
 
-def _stats(folder: Path, kind: str, step: int) -> dict[str, Any]:
+def final_stats(folder: Path, step: int, kind: str = "val") -> dict[str, Any]:
+    """Read what a finished training has measured after its last step.
+
+    Args:
+        folder: its result folder.
+        step: the last, counted from 0.
+        kind: "val" for everything, "train" for what was known before the held-out views were measured.
+
+    Raises:
+        PopError: it is not finished; names the file.
+    """
     results = ResultFolder(folder)
     found = results.read_stats(kind, step)
     if found is None:
@@ -205,9 +219,15 @@ def _histogram(folder: Path, last: int) -> tuple[int, ...]:
     return tuple(int(count) for count in counts.reshape(BINS, -1).sum(axis=1))
 
 
-def _curve(folder: Path, max_steps: int) -> tuple[dict[str, Any], ...]:
-    """Make the curve of the records of single training views, of the measurements of all held-out views, and of what a
-    few training views say all along."""
+def curve_of(folder: Path, max_steps: int) -> tuple[dict[str, Any], ...]:
+    """Make the curve of a training, as far as it has come.
+
+    It has the records of single training views, the measurements of all held-out views, and what a few training views
+    say all along.
+
+    Raises:
+        PopError: a record is damaged.
+    """
     points = {record["step"]: dict(record) for record in _thinned(read_records(folder), max_steps)}
     for path in sorted((folder / "stats").glob("val_step*.json")):
         stats = read_json(path, _AGAIN)
@@ -250,12 +270,17 @@ def _known(point: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in point.items() if value is not None}
 
 
+def digits(name: str) -> int:
+    """Return how many significant digits a column of a curve keeps."""
+    return 5 if name in _PRECISE else 4
+
+
 def _point(found: Mapping[str, Any]) -> dict[str, Any]:
     """Take what a curve holds, in one order, rounded to what a figure shows; what JSON cannot hold is left out."""
     more = sorted(name for name in found if name.startswith(_PROBED))
     values = {name: found[name] for name in (*_COLUMNS, *more) if found.get(name) is not None}
     return {
-        name: float(f"{value:.{_DIGITS.get(name, 4)}g}") if isinstance(value, float) else value
+        name: float(f"{value:.{digits(name)}g}") if isinstance(value, float) else value
         for name, value in values.items()
         if math.isfinite(value)
     }

@@ -22,6 +22,7 @@ from paper_repro.jobs import Job, NotTrainableError
 from paper_repro.results import RESULTS
 from paper_repro.status import everything, stale_files
 from paper_repro.train_row import BusyError
+from pop_fast.children import module_command
 
 __all__ = ["Outcome", "run_queue"]
 
@@ -88,17 +89,27 @@ def run_queue(jobs: Sequence[Job], results: Path, words: Sequence[str], threads:
                 continue
             print(f"[{number}/{len(missing)}] {job}", flush=True)
             start = time.monotonic()
-            status = child.run([sys.executable, "-m", "paper_repro", "run", *_words_of(job), *words], threads)
+            status = child.run(module_command("paper_repro", "run", *_words_of(job), *words), threads)
             kinds = {0: outcome.done, BusyError.status: outcome.busy, NotTrainableError.status: outcome.impossible}
             if child.stop and status != 0:
                 break
             kinds.get(status, outcome.failed).append(job)
-            if status == 0:
+            if status != 0:
+                print(f"[{number}/{len(missing)}] {job} {_why(status)}", flush=True)
+            else:
                 print(f"[{number}/{len(missing)}] done after {(time.monotonic() - start) / 60:.1f} min", flush=True)
                 if commit:
                     _commit(job, results)
         outcome.stopped = child.stop
     return outcome
+
+
+def _why(status: int) -> str:
+    """Say what became of a row, at once: the queue's own end may be days away."""
+    if status < 0:
+        return f"was killed by {signal.Signals(-status).name}; the queue, called again, continues with it"
+    told = {BusyError.status: "is left to another process", NotTrainableError.status: "cannot be trained"}
+    return told.get(status, f"failed with status {status}; its last lines say why")
 
 
 @contextmanager

@@ -65,7 +65,7 @@ class Result:
         machine: the processor, and after ", " the GPU where one was used.
         cpu: family, model, stepping and instructions of the processor, by which two machines are of one kind; None
             where nothing tells them.
-        engine: the engine that trained.
+        engine: what took the steps: "native", "cuda", or "torch (BACKEND)", autograd over a backend.
         threads: CPU threads.
         versions: of Python and the packages that compute.
         protocol: split, images, size, metrics, timing, and the bytes of a Gaussian in a checkpoint; "base" is the id of

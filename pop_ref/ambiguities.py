@@ -201,8 +201,8 @@ AMBIGUITIES: Final = (
     Ambiguity(
         "A25",
         "M",
-        "Are opacities reset at step 0, as old gsplat does?",
-        "no",
+        "Are opacities reset at step 0, as gsplat 1.1 to 1.5.2 does?",
+        "no, in no row: as gsplat's main since August 2025",
         "pop_ref.density_config:resets_at",
         ("DensityConfig.reset_at_zero = True",),
     ),

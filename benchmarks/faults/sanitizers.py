@@ -5,12 +5,12 @@ from __future__ import annotations
 import hashlib
 import os
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 from cuda_ext.compiler import find_compiler
+from pop_fast.children import module_command
 from pop_fast.compiled.build import CUDA, HERE, SHARED, SOURCES, UNITS
 
 _FLAGS = (
@@ -67,7 +67,7 @@ def sanitized(compile_first: bool = True) -> dict[str, Any]:
         "PYTHONPATH": str(ROOT),
         "POP_SANITIZED": str(target),
     }
-    command = [sys.executable, "-m", "benchmarks.faults.sanitized_child"]
+    command = module_command("benchmarks.faults.sanitized_child")
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, cwd=ROOT)
     failures = [] if done.returncode == 0 else [f"status {done.returncode}: {done.stderr[:3000]}"]
     return {"compiler": compiler[0], "told": done.stdout.split("\n")[:-1], "failures": failures}

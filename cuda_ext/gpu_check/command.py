@@ -25,7 +25,6 @@ import argparse
 import os
 import platform
 import subprocess
-import sys
 import tempfile
 import time
 import traceback
@@ -37,6 +36,7 @@ from cuda_ext.gpu_check.budget import SHORTEST, Budget
 from cuda_ext.gpu_check.shared import Check
 from cuda_ext.gpu_check.stages import JOBS, SHARES, STAGES
 from cuda_ext.gpu_check.tools import ROOT, first_line, python_path, read_json, write_json
+from pop_fast.children import python_command
 
 PLACE = ROOT / "out" / "gpu_check"
 PACKED = ROOT / "out" / "gpu_pack"
@@ -133,7 +133,8 @@ def _pack(folder: Path, args: argparse.Namespace) -> int:
     words = [str(ROOT / "benchmarks" / "gpu_pack.py"), str(folder), "--pixels", str(args.pixels)]
     words += ["--runs", *map(str, args.runs), "--captures", *map(str, args.captures)]
     words += ["--no-wheels"] if args.no_wheels else []
-    done = subprocess.run([sys.executable, *words], env={**os.environ, "PYTHONPATH": python_path(ROOT)}, check=False)
+    path = python_path(ROOT, ROOT / "benchmarks")
+    done = subprocess.run(python_command(*words), env={**os.environ, "PYTHONPATH": path}, check=False)
     return done.returncode
 
 

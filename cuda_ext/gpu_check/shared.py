@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +10,7 @@ from types import MappingProxyType
 from typing import Any
 
 from cuda_ext.gpu_check.tools import ROOT, Command, python_path, run
+from pop_fast.children import python_command
 
 NOTHING: Mapping[str, str] = MappingProxyType({})
 
@@ -53,7 +53,7 @@ class Check:
     def python(self, *words: str) -> list[str]:
         """Return the command that runs Python's `words`, with the emulator in the GPU's place in a rehearsal."""
         rehearse = [str(ROOT / "tests" / "cuda" / "emulated" / "rehearse.py")] if self.rehearsal else []
-        return [sys.executable, *rehearse, *words]
+        return python_command(*rehearse, *words)
 
     def run(
         self,

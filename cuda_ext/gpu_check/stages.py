@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -20,6 +19,7 @@ from cuda_ext.gpu_check.tests import (
     steps_stage,
 )
 from cuda_ext.gpu_check.tools import ROOT, Command, python_path, read_json
+from pop_fast.children import python_command
 
 _TRAIN = "from pop_fast.cli import main; raise SystemExit(main())"
 _COMPILE = "import time; t = time.time(); from gsplat.cuda._backend import _C; print(round(time.time() - t), 's');"
@@ -37,7 +37,7 @@ def wheels_stage(check: Check) -> dict[str, Any]:
     wheels = sorted(map(str, (check.packed / "wheels").glob("*.whl"))) if check.packed else []
     if not wheels:
         return skipped("no wheels were brought along (--packed FOLDER, made by --pack)")
-    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--no-compile", "--upgrade"]
+    pip = python_command("-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--no-compile", "--upgrade")
     into, end = [*pip, "--target", str(check.site)], time.monotonic() + check.seconds
     found = check.run([*into, *wheels], check.seconds)
     if found["status"] == 0:
@@ -113,7 +113,7 @@ def reproduce_stage(check: Check) -> dict[str, Any]:
     found = check.run(check.python(*words), check.seconds)
     if found["status"] == 130:
         found |= {"status": 0, "note": "the time was up; the rows that were finished are under `rows`"}
-    return found | {"rows": sorted(str(path.relative_to(results)) for path in results.rglob("*.json"))}
+    return found | {"rows": sorted(str(path.relative_to(results)) for path in results.rglob("*.jsonl"))}
 
 
 def train_one(check: Check, path: Path, limit: float, backend: str = "cuda") -> dict[str, Any]:
@@ -138,7 +138,7 @@ def train_one(check: Check, path: Path, limit: float, backend: str = "cuda") -> 
 
 def _start_gsplat(check: Check) -> None:
     environment = {"PYTHONPATH": python_path(ROOT, check.site), **_of_gsplat(check)}
-    command = [sys.executable, "-c", _COMPILE]
+    command = python_command("-c", _COMPILE)
     check.beside["gsplat"] = Command(command, check.work / "gsplat_compilation.log", environment)
 
 
@@ -152,7 +152,9 @@ def _benchmark(check: Check, script: str, limit: float, over: Mapping[str, str] 
     target.unlink(missing_ok=True)
     words = [str(ROOT / "benchmarks" / script), str(target), "--scenes", *check.scenes()]
     words += ["--device", "cpu", "--cases", "tiny", "--full-size", "3000"] if check.rehearsal else []
-    found = check.run(check.python(*words), limit, over)
+    # they import each other by their bare names
+    path = python_path(ROOT, check.site, ROOT / "benchmarks")
+    found = check.run(check.python(*words), limit, {"PYTHONPATH": path, **over})
     # case by case: also what was measured before the time was up
     return found | {"results": read_json(target)}
 

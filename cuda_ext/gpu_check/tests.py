@@ -6,13 +6,13 @@ import importlib.util
 import os
 import shutil
 import signal
-import sys
 from collections.abc import Mapping
 from typing import Any
 
 from cuda_ext.gpu_check.outcomes import FILE, outcomes
 from cuda_ext.gpu_check.shared import NOTHING, Check, skipped
 from cuda_ext.gpu_check.tools import ROOT
+from pop_fast.children import python_command
 
 LAWS = tuple(f"test_gpu_{name}.py" for name in ("whole", "compositing", "dominance", "gradients", "agreement"))
 STEPS = tuple(
@@ -118,7 +118,7 @@ def _pytest(
     chosen = [str(folder / (_emulated(test) if check.rehearsal else test)) for test in tests]
     lines = check.out / f"{name}.jsonl"
     lines.unlink(missing_ok=True)
-    words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "cuda_ext.gpu_check.outcomes"]
+    words = python_command("-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "cuda_ext.gpu_check.outcomes")
     over = {"OMP_NUM_THREADS": "1" if check.rehearsal else "4", FILE: str(lines), **over}
     # interrupted, pytest says what it has seen so far
     found = check.run([*before, *words, *options, *chosen], limit or check.seconds, over, signal.SIGINT)

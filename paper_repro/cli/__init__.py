@@ -25,6 +25,7 @@ EXIT_INTERRUPTED: Final = 130
 COMMANDS: Final = {
     "run": ("training", "train one row on one scene, or continue with it"),
     "queue": ("training", "train every row of a scale that is missing, the cheapest first"),
+    "verify": ("verifying", "train a finished row again at its commit, and compare the bits"),
     "status": ("showing", "say which rows of a scale are done"),
     "table": ("showing", "make one of the paper's tables from the results"),
     "figure": ("showing", "draw one of the paper's figures from the results"),

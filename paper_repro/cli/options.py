@@ -9,7 +9,7 @@ from typing import Final
 
 from paper_repro.scales import SCALES
 
-__all__ = ["add_data", "add_results", "add_scale", "add_training", "training_words"]
+__all__ = ["add_backend", "add_data", "add_results", "add_scale", "add_training", "training_words"]
 
 RESULTS: Final = Path(__file__).resolve().parents[1] / "results"
 WORK: Final = Path(__file__).resolve().parents[1] / "work"
@@ -35,6 +35,11 @@ def add_data(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, default=Path(root), metavar="DIR", help=note)
 
 
+def add_backend(parser: argparse.ArgumentParser, note: str) -> None:
+    """Add --backend."""
+    parser.add_argument("--backend", choices=("auto", "fast", "compiled", "cuda", "ref"), default="auto", help=note)
+
+
 def add_training(parser: argparse.ArgumentParser) -> None:
     """Add what says how rows are trained, and changes nothing of what they are."""
     add_scale(parser)
@@ -45,8 +50,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     note = "the folder of splats and renders of finished rows, to be published (default: published in --work)"
     parser.add_argument("--published", type=Path, metavar="DIR", help=note)
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="CPU threads, 0 for all cores (default: 1)")
-    note = "what takes the steps, as for pop train (default: %(default)s)"
-    parser.add_argument("--backend", choices=("auto", "fast", "compiled", "cuda", "ref"), default="auto", help=note)
+    add_backend(parser, "what takes the steps, as for pop train (default: %(default)s)")
     note = "steps that a kill can cost (default: the scale's, 500 or so)"
     parser.add_argument("--checkpoint-every", type=int, metavar="STEPS", help=note)
     note = "steps between two points of the curves (default: the scale's, 100 or so)"

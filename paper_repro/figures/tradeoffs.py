@@ -6,11 +6,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from paper_repro.claims import SWEEP, claims
+from paper_repro.evidence import Evidence, Groups, groups
 from paper_repro.figures.data import Asked, Chosen, choose, mean_of
-from paper_repro.figures.foot import foot
+from paper_repro.figures.foot import foot, foot_of
 from paper_repro.figures.names import Marker, along, places
 from paper_repro.figures.sheet import Drawn, Margins, Sheet
-from paper_repro.figures.style import color_of, count, darker, log_ticks, name_of
+from paper_repro.figures.style import COLUMN, TEXT, color_of, count, darker, log_ticks, name_of
+from paper_repro.noise import Group
 from paper_repro.paper import paper
 from paper_repro.results import Result
 
@@ -23,8 +26,9 @@ _METHODS: Final = (
     *("3dgs", "gsplat", "pup", "pup_star", "mini_splatting", "mini_splatting_star"),
     *("taming", "speedy_splat", "pop"),
 )
-_DIVISORS: Final = (1, 2, 5, 10, 20, 50, 100)
 _STAR: Final = "l2"
+# height of a panel of figure 6b with its title and its axis, inches
+_PANEL: Final = 1.85
 # area of the largest marker, square points
 _LARGEST: Final = 330.0
 # and of the smallest in which its middle is marked
@@ -77,20 +81,47 @@ def psnr_against_time(asked: Asked) -> Drawn:
 
 
 def psnr_against_count(asked: Asked) -> Drawn:
-    """Figure 6b: PSNR against the number of Gaussians, for L1 / n and for L2."""
-    rows = [f"l1_div_{n}" for n in _DIVISORS]
-    chosen = choose(asked, [*rows, _STAR], asked.scenes(paper().datasets["Mip-NeRF 360"]))
-    points = []
-    for row in chosen.runs:
-        _, psnr, n = _means(chosen, row)
-        text = "L2" if row == _STAR else "L1" if row == "l1_div_1" else name_of(row).replace(" ", "")
-        points.append(_Point(row, n, psnr, n, 90.0 if row == _STAR else 18.0, text))
-    note = foot(
-        *(asked, chosen),
-        "Circles: L1 / n; star: L2. Each with 1 - SSIM at weight 0.01; growth by gradient alone.",
+    """Figure 6b: PSNR against the number of Gaussians, for L1 / n and for L2, a panel a capture."""
+    scenes = asked.scenes(paper().datasets["Mip-NeRF 360"])
+    rows = (*SWEEP, _STAR)
+    found = groups(r for r in asked.results if r.row in rows and r.scene in scenes)
+    shown = [scene for scene in scenes if scene in found]
+    if not shown:
+        # which says what was not run
+        _ = choose(asked, rows, scenes)
+    claim = next(claim for claim in claims(asked.scale, asked.results) if claim.id == "l2")
+    judged = {e.scene: e for e in claim.told.evidence}
+    runs = [r for scene in shown for group in found[scene].values() for r in group.runs]
+    missing = [
+        f"Not run on {scene}: {', '.join(map(name_of, lacking))}."
+        for scene in shown
+        if (lacking := [row for row in rows if row not in found[scene]])
+    ]
+    note = " ".join(
+        [
+            "Circles: L1 / n; star: L2. Each with 1 - SSIM at weight 0.01; growth by gradient alone. Means over seeds.",
+            *foot_of(asked.scale, runs, averaged=False),
+            *missing,
+        ]
     )
-    sheet = Sheet(note, 1.9)
-    axes = sheet.panel(Margins(right=0.1))
+    columns = 1 if len(shown) < 3 else 2
+    lines = -(-len(shown) // columns)
+    sheet = Sheet(note, lines * _PANEL, COLUMN if columns == 1 else TEXT)
+    for i, scene in enumerate(shown):
+        width = sheet.width / columns
+        left, bottom = 0.44 + width * (i % columns), 0.33 + (lines - 1 - i // columns) * _PANEL
+        axes = sheet.axes(left, bottom, width - 0.54, _PANEL - 0.33 - 0.2)
+        _sweep_panel(axes, found[scene])
+        axes.set_title(f"{scene}: {_told(judged.get(scene))}")
+    return Drawn(sheet.figure, *_sweep_table(found, shown, judged))
+
+
+def _sweep_panel(axes: Axes, by_row: Mapping[str, Group]) -> None:
+    """Draw the runs of one capture: L1 / n joined by rising count, which is the curve that the claim judges by."""
+    points = [
+        _Point(row, group.n, group.psnr, group.n, 90.0 if row == _STAR else 18.0, _short(row))
+        for row, group in sorted(by_row.items(), key=lambda item: item[1].n)
+    ]
     _plane(axes, points, "Gaussians", 0.12)
     circles = [point for point in points if point.row != _STAR]
     color = color_of("l1_div_1")
@@ -99,7 +130,30 @@ def psnr_against_count(asked: Asked) -> Drawn:
     for point in (p for p in points if p.row == _STAR):
         axes.scatter(point.x, point.y, s=point.area, marker="*", color=color_of(_STAR), linewidth=0, zorder=4)
     _name(axes, points, [point.row for point in circles])
-    return Drawn(sheet.figure, *_table(chosen))
+
+
+def _short(row: str) -> str:
+    return "L2" if row == _STAR else "L1" if row == "l1_div_1" else name_of(row).replace(" ", "")
+
+
+def _told(evidence: Evidence | None) -> str:
+    """Say what the claim says of one capture, in a few words."""
+    if evidence is None or not evidence.nearest:
+        return "not compared"
+    return f"L2 less L1 / n {evidence.nearest.rpartition(': ')[2]}, {evidence.verdict}"
+
+
+def _sweep_table(
+    found: Groups, scenes: Sequence[str], judged: Mapping[str, Evidence]
+) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
+    rows: list[Sequence[Any]] = []
+    for scene in scenes:
+        for row in (row for row in (*SWEEP, _STAR) if row in found[scene]):
+            group = found[scene][row]
+            rows += [(scene, row, r.seed, r.run, r.psnr, r.num_gaussians) for r in group.runs]
+            rows.append((scene, row, "mean", "", group.psnr, group.n))
+        rows.append((scene, "l2 less l1_div", "", _told(judged.get(scene)), "", ""))
+    return ("scene", "row", "seed", "run", "psnr", "num_gaussians"), rows
 
 
 def _timed(asked: Asked, scenes: Sequence[str]) -> tuple[Chosen, tuple[str, ...]]:

@@ -11,7 +11,6 @@ import importlib.util
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import Final
 
 from pop_fast.blocks.parts import Part, parts_of
 from pop_fast.blocks.plan import FOLDER, Job
+from pop_fast.children import SAFE_PATH, module_command
 from pop_fast.errors import PopError
 from pop_fast.train.signals import stop_requests
 
@@ -69,7 +69,7 @@ def run_in_turn(folder: Path, job: Job, quiet: bool = False, say: Callable[[str]
         if part.marker(folder).is_file():
             continue
         say(_begins(part, job))
-        status = _run([sys.executable, "-m", "pop_fast.cli", "blocks", *part.words(folder)], quiet)
+        status = _run(module_command("pop_fast.cli", "blocks", *part.words(folder)), quiet)
         if status != 0:
             return status
     return 0
@@ -119,7 +119,7 @@ def workflow_words(
     # a machine is taken to have one GPU; the folder is locked by who calls this
     here = ["--cores", str(each * many), "--resources", "gpu=1", "--nolock"]
     where = here if profile is None else ["--profile", str(profile), "--nolock"]
-    command = [sys.executable, "-m", "snakemake", "-s", str(SNAKEFILE), "--directory", str(place / FOLDER)]
+    command = module_command("snakemake", "-s", str(SNAKEFILE), "--directory", str(place / FOLDER))
     settings = {"folder": place, "threads": each, "gpus": int(backend == "cuda")}
     return [*command, *where, *more, "--config", *(f"{name}={value}" for name, value in settings.items())]
 
@@ -128,7 +128,8 @@ def _run(words: Sequence[str], quiet: bool) -> int:
     """Run a process and wait; the first Ctrl-C, SIGTERM or SIGHUP is passed on once to it and its children."""
     alone = os.name == "posix"
     with stop_requests() as stop:
-        process = subprocess.Popen(words, start_new_session=alone, stdout=subprocess.DEVNULL if quiet else None)
+        shown, environment = subprocess.DEVNULL if quiet else None, {**os.environ, **SAFE_PATH}
+        process = subprocess.Popen(words, start_new_session=alone, stdout=shown, env=environment)
         try:
             while process.poll() is None:
                 if stop.asked:

@@ -42,11 +42,9 @@ def check_viewer(options: Any) -> None:
     """Refuse a viewer that cannot be before the minutes of loading, not after.
 
     Raises:
-        PopError: viser is absent, or the port is none.
+        PopError: viser is absent, or the address cannot be listened on.
     """
     if options.view:
-        from pop_fast.cli.view import check_port
-        from pop_fast.view.live.server import require_viser
+        from pop_fast.cli.view import check_address
 
-        check_port(options.view_port)
-        require_viser()
+        check_address(options.view_host, options.view_port)

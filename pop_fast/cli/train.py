@@ -94,7 +94,7 @@ class _Run(BlocksOptions, FinishOptions):
         sfm: how the cameras of bare photographs are found.
         quiet: print nothing but warnings and errors; --no-progress leaves out the bars alone.
         view: show the training in the browser while it runs, as `pop view` does, to the same bits. Needs viser.
-        view_host: the address that the viewer listens on; 0.0.0.0 lets other machines see it, without a password.
+        view_host: the address that the viewer listens on; 0.0.0.0 shows it to other machines too; see `pop view`.
         view_port: its port; where it is taken, the next free one.
     """
 

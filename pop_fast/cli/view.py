@@ -38,7 +38,7 @@ class Args(CaptureArguments):
     splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|PLY")]
     """What to show."""
     host: str = "127.0.0.1"
-    """The address to listen on; 0.0.0.0 lets other machines see it, without a password."""
+    """The address to listen on; 0.0.0.0 shows it, unencrypted, to other machines that know the whole address too."""
     port: int = 8080
     """The port; where it is taken, the next free one."""
 
@@ -47,10 +47,8 @@ def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "view", examples=_EXAMPLES)
     from pop_fast.train.environment import reproducible
-    from pop_fast.view.live.server import require_viser
 
-    check_port(args.port)
-    require_viser()
+    check_address(args.host, args.port)
     splat = load_splat(args.splat)
     with reproducible(splat.config.threads), make_viewer(args, splat) as viewer:
         announce(viewer)
@@ -112,14 +110,19 @@ def announce(viewer: LiveViewer) -> None:
 
     print(f"viewer: {viewer.url}", flush=True)
     if viewer.host not in LOOPBACK:
-        print(f"note: whoever reaches {viewer.host}:{viewer.port} sees the splat and its photographs", flush=True)
+        print("note: whoever has this address and reaches it sees the splat and its photographs", flush=True)
 
 
-def check_port(port: int) -> None:
-    """Refuse what is no port.
+def check_address(host: str, port: int) -> None:
+    """Refuse an address that the viewer cannot listen on, within a second or so.
 
     Raises:
-        PopError: it is none.
+        PopError: the port is none, viser is absent, or the address is not this machine's.
     """
     if not 0 < port < 65536:
         raise PopError(f"port is {port}; give --port a number from 1 to 65535")
+    from pop_fast.view.live.guard import listen
+    from pop_fast.view.live.server import require_viser
+
+    require_viser()
+    listen(host, port).close()

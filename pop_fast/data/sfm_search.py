@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from pop_fast.children import python_command
 from pop_fast.data.capture import Progress
 from pop_fast.data.colmap import quiet_colmap
 from pop_fast.data.pinhole import require_colmap
@@ -94,9 +95,8 @@ def find_cameras(search: Search, progress: Progress | None) -> Any:
     Raises:
         CaptureError: there is none, or COLMAP failed.
     """
-    # -P: no module of the working folder stands in for one of the program's
     begin = f"import sys; sys.path.append(sys.argv[1]); from {__name__} import main; main()"
-    command = [sys.executable, "-P", "-c", begin, str(Path(__file__).parents[2])]
+    command = python_command("-c", begin, str(Path(__file__).parents[2]))
     with tempfile.TemporaryFile() as log:
         child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log)
         try:

@@ -15,8 +15,8 @@ _GSPLAT: Final[Recipe] = RECIPES["gsplat"]
 class GsplatStrategy(DensityControl):
     """Growth by gradient alone, and opacity reset at steps 3000, 6000, 9000 and 12000.
 
-    The defaults are those of gsplat before 1.5.3, without its reset at step 0 (1.5.3 itself never resets, by a slip of
-    operator precedence that was fixed later).
+    The defaults are those of gsplat's main since August 2025: 1.1 to 1.5.2 reset at step 0 as well (`reset_at_zero`),
+    and 1.5.3 never, by a slip of operator precedence.
     """
 
     reset_every: int = _GSPLAT.density.reset_every

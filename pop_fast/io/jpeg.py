@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO
 
+from pop_fast.children import python_command
 from pop_fast.errors import CaptureError
 from pop_fast.io.images import FIX
 
@@ -72,8 +73,7 @@ def sound_jpegs(paths: Sequence[Path]) -> Iterator[None]:
 
 
 def _listen(stack: ExitStack, files: Sequence[Path], log: IO[bytes]) -> subprocess.Popen[bytes]:
-    # -P: no module of the working folder stands in for one of the program's
-    command = [sys.executable, "-P", str(_LISTENER)]
+    command = python_command(str(_LISTENER))
     # a file and not a pipe, which would have to be fed while the block runs
     with tempfile.TemporaryFile() as names:
         names.write(b"\0".join(os.fsencode(path.absolute()) for path in files))

@@ -64,7 +64,7 @@ class Browser:
             answer = self._receive()
             if answer.get("method") == "Network.requestWillBeSent":
                 self.requests.append(answer["params"]["request"]["url"])
-            if answer.get("method") == "Runtime.exceptionThrown":
+            if answer.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
                 self.errors.append(json.dumps(answer["params"])[:500])
             if answer.get("id") == self._number:
                 assert "error" not in answer, answer

@@ -18,6 +18,7 @@ import torch
 
 from pop_fast.blocks import jobs
 from pop_fast.blocks.plan import read_plan
+from pop_fast.children import module_command
 from pop_fast.cli import main
 from pop_fast.data.block import write_block
 from pop_fast.data.load import list_capture, load_capture
@@ -36,8 +37,8 @@ LAST = "ckpts/ckpt_29_rank0.pt"
 
 def in_this_process(words: Sequence[str], quiet: bool) -> int:
     """Do a part without the seconds that a new process takes to import torch."""
-    assert words[1:3] == ["-m", "pop_fast.cli"]
-    return main(words[3:])
+    assert list(words[:4]) == module_command("pop_fast.cli")
+    return main(list(words[4:]))
 
 
 @pytest.fixture(autouse=True)

@@ -17,6 +17,7 @@ from pop_fast.blocks.merge import TAKEN
 from pop_fast.blocks.parts import block_folder, parts_of
 from pop_fast.blocks.plan import Job, read_job, read_plan
 from pop_fast.blocks.round_views import write_round_block
+from pop_fast.children import module_command
 from pop_fast.cli import main
 from pop_fast.data.load import load_capture
 from pop_fast.data.random_points import in_picture
@@ -42,7 +43,8 @@ def _one_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def in_this_process(words: Sequence[str], quiet: bool) -> int:
-    return main(words[3:])
+    assert list(words[:4]) == module_command("pop_fast.cli")
+    return main(list(words[4:]))
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from benchmarks.faults.corpus import ksplat_of
+from benchmarks.faults.ksplat import ksplat_of
 from pop_fast.errors import PopError
 from pop_fast.io.formats import FORMATS, encoded, load_splat_file
 from tests.app.clouds import many

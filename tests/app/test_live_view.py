@@ -7,6 +7,7 @@ import re
 import socket
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -246,7 +247,7 @@ def test_without_viser_one_line_says_how_to_get_it(
     for words in (("view", shared_result), ("train", shared_capture, "--out", tmp_path / "r", "--view")):
         outcome = pop(*words)
         assert outcome.status == 2
-        assert "pip install 'viser>=1.1'" in outcome.err
+        assert "pip install 'viser>=1.1,<1.2'" in outcome.err
         assert len(outcome.err.strip().splitlines()) == 1
     assert not (tmp_path / "r").exists()
 
@@ -267,7 +268,7 @@ def test_the_command_prints_its_address_serves_it_and_ends_with_ctrl_c(
     caplog: pytest.LogCaptureFixture,
     lone: bool,
 ) -> None:
-    pytest.importorskip("viser", reason="pip install 'viser>=1.1'")
+    pytest.importorskip("viser", reason="pip install 'viser>=1.1,<1.2'")
     from pop_fast.view.live.server import LiveViewer
 
     served: list[bytes] = []
@@ -285,7 +286,7 @@ def test_the_command_prints_its_address_serves_it_and_ends_with_ctrl_c(
     outcome = pop("view", file if lone else shared_result, "--port", 18_432)
     assert outcome.status == 0, outcome.err
     assert re.fullmatch(
-        r"(note: no capture is known.*\n)?viewer: http://127\.0\.0\.1:\d+\nCtrl-C ends it\n", outcome.out
+        r"(note: no capture is known.*\n)?viewer: http://127\.0\.0\.1:\d+/[\w-]{24}/\nCtrl-C ends it\n", outcome.out
     )
     assert ("note: no capture" in outcome.out) is lone
     assert b"<html" in served[0].lower()
@@ -305,7 +306,7 @@ class Viewer:
         self.scene = scene
         self.drawn.append(note)
 
-    def draw_due(self) -> int:
+    def draw_due(self, share: float) -> int:
         assert self.scene is not None
         state = ViewState(ring(1)[0], 0.9, 24, 16)
         for mode in ("colour", "dominant", "depth"):
@@ -340,9 +341,9 @@ def test_a_watched_training_shows_the_gaussians_as_they_are(tmp_path: Path) -> N
 
 
 def test_a_browser_shows_the_first_training_camera_and_moves_on(
-    shown: tuple[SplatScene, ViewState, Any], tmp_path: Path
+    shown: tuple[SplatScene, ViewState, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("viser", reason="pip install 'viser>=1.1'")
+    pytest.importorskip("viser", reason="pip install 'viser>=1.1,<1.2'")
     from pop_fast.view.live.server import LiveViewer
 
     scene, state, capture = shown
@@ -358,6 +359,7 @@ def test_a_browser_shows_the_first_training_camera_and_moves_on(
                 assert time.monotonic() < until, (tab.errors, tab.value("document.body.innerText"))
                 viewer.wait(0.05)
                 viewer.draw_due()
+            viewer.draw_due()
 
         sharp = "document.body.innerText.includes('900 x 600')"
         draw_until(sharp)
@@ -381,7 +383,51 @@ def test_a_browser_shows_the_first_training_camera_and_moves_on(
         saved = read_path(tmp_path / "files" / "toy_path.json").along(1, capture.world_transform)[0]
         np.testing.assert_allclose(saved.viewmat, there.viewmat, atol=1e-3)
         assert cv2.imread(str(tmp_path / "files" / "toy_001.png")).shape == (27, 40, 3)
+        use_every_control(tab, lambda: draw_until("true"))
+        assert viewer.watched
+        assert "closed a view" not in capsys.readouterr().err
+        # the page asks nobody else, and its policy forbids it nothing that it needs
+        assert not [error for error in tab.errors if "Security Policy" in error], tab.errors
         assert all(url.startswith((viewer.url, "data:", "blob:", "about:", "ws:")) for url in tab.requests)
+
+
+def use_every_control(tab: Any, draw: Callable[[], None]) -> None:
+    """Drag, scroll, move every slider to its ends, tick every box and choose from a list."""
+    place = {"x": 300, "y": 300, "button": "left", "clickCount": 1}
+    for kind in ("mousePressed", "mouseMoved", "mouseReleased"):
+        place |= {"x": place["x"] + 40}
+        tab.call("Input.dispatchMouseEvent", type=kind, **place)
+    tab.call("Input.dispatchMouseEvent", type="mouseWheel", x=300, y=300, deltaX=0, deltaY=300)
+    tab.value("[...document.querySelectorAll('*')].filter(e => e.innerText === 'Crop').at(-1).click()")
+    # the folder opens slowly
+    time.sleep(0.5)
+    tab.value("document.querySelectorAll('input[type=checkbox]').forEach(e => e.click())")
+    for key in ("ArrowRight", "ArrowLeft", "End", "Home"):
+        tab.value("document.querySelector('[role=slider]').focus()")
+        for kind in ("rawKeyDown", "keyUp"):
+            tab.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=KEYS[key])
+        draw()
+    # the box that is cropped to: both ends of each slider inwards, and past the end
+    for k in range(6):
+        thumb = f"document.querySelectorAll('.multi-slider-thumb')[{k}].getBoundingClientRect()"
+        x, y = (tab.value(f"{thumb}.{name} + 4") for name in "xy")
+        for kind, by in (("mousePressed", 0), ("mouseMoved", 20), ("mouseMoved", -15), ("mouseReleased", -15)):
+            tab.call("Input.dispatchMouseEvent", type=kind, x=x + by, y=y, button="left", clickCount=1)
+            draw()
+    for name in ("dominant", "opacity", "depth"):
+        tab.value("document.querySelectorAll('input[aria-haspopup=listbox]')[0].click()")
+        time.sleep(0.3)
+        tab.value(f"[...document.querySelectorAll('[role=option]')].find(e => e.innerText.trim() === {name!r}).click()")
+        time.sleep(0.1)
+        draw()
+    for name in ("previous", "Remove the last"):
+        click(tab, name)
+        draw()
+    time.sleep(0.3)
+    draw()
+
+
+KEYS = {"ArrowRight": 39, "ArrowLeft": 37, "End": 35, "Home": 36}
 
 
 def click(tab: Any, name: str) -> None:

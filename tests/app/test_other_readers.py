@@ -15,7 +15,7 @@ import pytest
 import torch
 import zstandard
 
-from benchmarks.faults.corpus import ksplat_of
+from benchmarks.faults.ksplat import ksplat_of
 from pop_fast.io.formats import FORMATS, encoded, load_splat_file
 from pop_fast.io.frame import Frame
 from pop_fast.train.load_result import load_splat

@@ -210,7 +210,7 @@ def test_rows_of_the_paper_are_trained_and_brought_back(tmp_path, monkeypatch):
         check(tmp_path, captures=(tmp_path / "demo",), rehearsal=True, seconds=600.0)
     )
     assert found["status"] == 0, found["output"]
-    assert found["rows"] == ["toy/l1_div_100/demo_42.json"]
+    assert found["rows"] == ["toy/l1_div_100.jsonl"]
 
 
 def test_gsplat_that_was_not_compiled_is_told_and_is_no_failure(tmp_path):

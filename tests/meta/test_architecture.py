@@ -251,6 +251,48 @@ def test_a_run_begins_without_what_it_does_not_need(script: str, heavy: tuple[st
     assert done.returncode == 0, done.stderr
 
 
+# where Python's path is read and no Python is started with it
+NAMES_THE_PYTHON = {
+    "cuda_ext/build.py": 2,  # CMake's own Python, which is told -P; a program beside it
+    "docs/commands.py": 1,  # the folder of its programs
+    "pop_fast/io/jpeg.py": 1,  # whether there is one
+}
+STARTS_PYTHON = re.compile(r"^python[\d.]*$")
+
+
+def _starts_python(tree: ast.Module) -> Iterator[int]:
+    """List the lines of a module that start a Python: by `sys.executable`, by its name, or without a command."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and node.attr in ("executable", "_base_executable"):
+            yield node.lineno
+        if isinstance(node, ast.List | ast.Tuple) and node.elts and isinstance(first := node.elts[0], ast.Constant):
+            yield from [node.lineno] * bool(STARTS_PYTHON.search(str(first.value)))
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names = [alias.name for alias in node.names] + [getattr(node, "module", None) or ""]
+            if any(name.split(".")[0] == "multiprocessing" or name == "ProcessPoolExecutor" for name in names):
+                yield node.lineno
+
+
+def test_one_place_makes_the_commands_of_child_pythons() -> None:
+    for path in FILES:
+        if path.parts[len(ROOT.parts)] == "tests" or _name(path) == "pop_fast/children.py":
+            continue
+        lines = list(_starts_python(_tree(path)))
+        fix = "take python_command or module_command of pop_fast.children, which leave the current folder out"
+        assert len(lines) == NAMES_THE_PYTHON.get(_name(path), 0), f"{_name(path)} starts a Python at {lines}: {fix}"
+    for workflow in (ROOT / "pop_fast/blocks/Snakefile", ROOT / "paper_repro/Snakefile"):
+        text = workflow.read_text(encoding="utf-8")
+        assert "os.environ.update(SAFE_PATH)" in text
+        assert "sys.executable" not in text
+
+
+@pytest.mark.parametrize(
+    "line", ["run([sys.executable, '-m', 'x'])", "run(['python3', '-m', 'x'])", "from multiprocessing import Pool"]
+)
+def test_a_python_that_is_started_elsewhere_is_seen(line: str) -> None:
+    assert list(_starts_python(ast.parse(line)))
+
+
 def _too_long(path: Path) -> Iterator[str]:
     text = path.read_text(encoding="utf-8")
     # the prose of a chapter is a page's, and no code

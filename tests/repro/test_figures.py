@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -11,8 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from paper_repro import figures
+from paper_repro.claims import SWEEP, claims
 from paper_repro.cli import main
 from paper_repro.figures import FIGURES, opacities, style
 from paper_repro.figures.data import NoDataError, choose, curve_of
@@ -149,20 +153,78 @@ def test_gaussians_per_pixel_are_of_the_probed_views_and_else_of_the_held_out_on
     assert [x["value"] for x in lines(made) if (x["row"], x["quantity"]) == ("pop", "n_blended")] == [8.0, 4.0, 2.0]
 
 
-def test_a_figure_of_psnr_has_every_run_and_the_means(written):
-    for figure, shown in (("1", 9), ("6b", 8)):
-        made = lines(drawn(figure, full()))
-        means = {line["row"]: line for line in made if line["scene"] == "mean"}
-        runs = {(line["row"], line["scene"]): line for line in made if line["scene"] != "mean"}
-        assert (len(means), len(runs)) == (shown, 2 * shown)
-        for one in full():
-            if one.row in means:
-                line = runs[one.row, one.scene]
-                told = (line["run"], line["seconds"], line["psnr"], line["num_gaussians"])
-                assert told == (one.run, one.seconds["train"], one.psnr, one.num_gaussians)
-        for row, line in means.items():
-            assert line["psnr"] == sum(runs[row, scene]["psnr"] for scene in ("fox", "bear_512")) / 2
-            assert line["num_gaussians"] == sum(runs[row, s]["num_gaussians"] for s in ("fox", "bear_512")) / 2
+def test_figure_1_has_every_run_and_the_means(written):
+    made = lines(drawn("1", full()))
+    means = {line["row"]: line for line in made if line["scene"] == "mean"}
+    runs = {(line["row"], line["scene"]): line for line in made if line["scene"] != "mean"}
+    assert (len(means), len(runs)) == (9, 18)
+    for one in full():
+        if one.row in means:
+            line = runs[one.row, one.scene]
+            told = (line["run"], line["seconds"], line["psnr"], line["num_gaussians"])
+            assert told == (one.run, one.training_seconds, one.psnr, one.num_gaussians)
+    for row, line in means.items():
+        assert line["psnr"] == sum(runs[row, scene]["psnr"] for scene in ("fox", "bear_512")) / 2
+        assert line["num_gaussians"] == sum(runs[row, s]["num_gaussians"] for s in ("fox", "bear_512")) / 2
+
+
+def test_figure_6b_has_every_run_in_the_panel_of_its_capture_and_no_mean_over_captures():
+    made = drawn("6b", full())
+    told = lines(made)
+    assert {line["scene"] for line in told} == {"fox", "bear_512"}
+    runs = {(line["row"], line["scene"]): line for line in told if line["run"] and line["psnr"] != ""}
+    assert len(runs) == 16
+    for one in full():
+        if (one.row, one.scene) in runs:
+            line = runs[one.row, one.scene]
+            assert (line["run"], line["psnr"], line["num_gaussians"]) == (one.run, one.psnr, one.num_gaussians)
+    assert [axes.get_title(loc="left").partition(":")[0] for axes in made.figure.axes] == ["fox", "bear_512"]
+    four = [replace(r, scene=scene) for r in full() for scene in ("fox", "bear_512", "garden_512", "bonsai_800")
+            if r.scene == "fox"]  # fmt: skip
+    assert len(drawn("6b", four).figure.axes) == 4
+
+
+@given(
+    offsets=st.lists(st.sampled_from((-2.0, -0.3, -0.01, 0.01, 0.3, 2.0)), min_size=1, max_size=3),
+    seeds=st.integers(1, 3),
+    order=st.permutations(range(7)),
+    counts=st.lists(st.integers(1, 200), min_size=7, max_size=7, unique=True),
+    place=st.floats(0.01, 0.99),
+)
+@settings(max_examples=12)
+def test_the_star_of_figure_6b_lies_on_that_side_of_the_curve_that_the_claim_says(offsets, seeds, order, counts, place):
+    scenes = ("fox", "bear_512", "garden_512")[: len(offsets)]
+    found, expected = [], {}
+    for scene, offset in zip(scenes, offsets, strict=True):
+        # counts need not fall with the divisor, and a seed differs by 0.02 dB
+        each = {row: (2_000 * counts[k], 25.0 + 0.5 * k) for row, k in zip(SWEEP, order, strict=True)}
+        x, y = zip(*sorted((np.log(n), psnr) for n, psnr in each.values()), strict=True)
+        n = round(float(np.exp(x[0] + place * (x[-1] - x[0]))))
+        each["l2"] = (n, float(np.interp(np.log(n), x, y)) + offset)
+        expected[scene] = offset
+        found += [
+            result(row, scene, seed=42 + i, n=n, psnr=psnr + 0.02 * (i - (seeds - 1) / 2))
+            for row, (n, psnr) in each.items()
+            for i in range(seeds)
+        ]
+    made = drawn("6b", found)
+    verdicts = {e.scene: e for c in claims("small", found) if c.id == "l2" for e in c.told.evidence}
+    for axes, scene in zip(made.figure.axes, scenes, strict=True):
+        curve_drawn = axes.transData.transform(np.column_stack(axes.lines[0].get_data()))
+        star = axes.transData.transform(axes.collections[-1].get_offsets())[0]
+        above = star[1] - np.interp(star[0], curve_drawn[:, 0], curve_drawn[:, 1])
+        told = re.search(r"L2 less L1 / n ([+-]\d+\.\d\d)", axes.get_title(loc="left"))
+        assert told is not None
+        if abs(float(told[1])) > 0.05:
+            assert (above > 0.0) == (float(told[1]) > 0.0), scene
+        verdict = verdicts[scene].verdict
+        assert axes.get_title(loc="left").endswith(verdict)
+        if verdict != "not decided":
+            assert (above > 0.0) == (verdict == "holds")
+        if seeds == 1:
+            assert verdict == "not decided"
+        elif abs(expected[scene]) > 1.0:
+            assert verdict == ("holds" if expected[scene] > 0.0 else "does not hold")
 
 
 def test_areas_of_markers_are_as_the_numbers_of_gaussians():
@@ -176,7 +238,8 @@ def test_areas_of_markers_are_as_the_numbers_of_gaussians():
 def test_the_marked_shares_are_those_of_the_histogram():
     # edges belong to the bin above them: 0.1 opens b5, 0.9 opens b45
     counts = histogram(b0=30, b4=70, b5=500, b44=150, b45=200, b49=50)
-    made = drawn("2", [result("3dgs", n=1000, opacity_histogram=counts, schedule=STEPS)])
+    kitchen = result("3dgs", "kitchen", n=1000, opacity_histogram=counts, schedule=STEPS, scale="paper")
+    made = drawn("2", [kitchen], scale="paper")
     shares = {line["what"]: line["share"] for line in lines(made) if line["what"] != "bin"}
     assert shares["ours under 0.1"] == pytest.approx(0.1, rel=1e-12)
     assert shares["ours over 0.9"] == pytest.approx(0.25, rel=1e-12)
@@ -186,6 +249,11 @@ def test_the_marked_shares_are_those_of_the_histogram():
     said = texts(made)
     for text in ("10.0 % under 0.1", "25.0 % over 0.9", "paper: 33.7 %", "paper: 19.9 %"):
         assert text in said
+    # beside another capture stands no number of the paper's
+    other = drawn("2", [result("3dgs", n=1000, opacity_histogram=counts, schedule=STEPS)])
+    assert "paper:" not in texts(other)
+    assert "The paper's figure is of another capture, kitchen." in texts(other).replace("\n", " ")
+    assert {line["what"] for line in lines(other)} == {"bin", "ours under 0.1", "ours over 0.9"}
     with pytest.raises(ValueError, match=r"edge is 0\.15; it must lie between two of 50 bins"):
         opacities.share_below(np.ones(BINS), 0.15)
 

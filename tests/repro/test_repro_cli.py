@@ -102,6 +102,27 @@ def test_a_queue_lists_what_is_missing_cheapest_first(capsys, tmp_path):
     assert chosen == ["pop fox --scale small --seed 42", "gsplat fox --scale small --seed 42"]
 
 
+def test_a_row_that_was_killed_is_named_at_once(capsys, tmp_path, monkeypatch):
+    killed = tmp_path / "python"
+    killed.write_text("#!/bin/sh\nkill -9 $$\n")
+    killed.chmod(0o755)
+    monkeypatch.setattr(repro_queue.sys, "executable", str(killed))
+    words = ["--scale", "toy", "--rows", "l2_pop", "l1_div_100", "--results", tmp_path, "--work", tmp_path]
+    told = call("queue", *words, status=1, capsys=capsys).splitlines()
+    name = "l1_div_100 demo --scale toy --seed 42"
+    said = "was killed by SIGKILL; the queue, called again, continues with it"
+    assert told[1:3] == [f"[1/2] {name}", f"[1/2] {name} {said}"]
+    assert told[3].startswith("[2/2] ")
+
+
+@pytest.mark.parametrize("command", ["status", "table 1", "figure 7", "claims", "verify pop fox"])
+def test_a_folder_of_results_that_is_not_there_is_one_error(command, capsys, tmp_path):
+    text = call(*command.split(), "--results", tmp_path / "typo", status=2, capsys=capsys)
+    assert text == (
+        f"pop-repro: error: {tmp_path / 'typo'}: no such folder; name the one that holds the results with --results\n"
+    )
+
+
 @pytest.fixture(scope="module")
 def queued(tmp_path_factory):
     """A queue of two toy rows that is stopped by SIGTERM in the first, then called again to the end."""

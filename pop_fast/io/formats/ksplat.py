@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 
 from pop_fast.errors import PopError
+from pop_fast.io.budget import check_memory
 from pop_fast.io.formats.cloud import COEFFICIENTS, SH_C0, Cloud, logits_of_bytes
 
 _HEADER_SIZE, _SECTION_SIZE, _BUCKET_SIZE = 4096, 1024, 12
@@ -32,6 +33,8 @@ _LEVELS: Final = (("<f4", "<f4", "<f4", 1), ("<u2", "<f2", "<f2", 32767), ("<u2"
 _COEFFICIENT_RANGE: Final = (-1.5, 1.5)
 # what becomes 0 as a half float
 _SMALLEST_SCALE: Final = 2.0**-25
+# bytes of a Gaussian while it is decoded, at most
+_IN_MEMORY: Final = 1500
 _WRITE_AGAIN: Final = "copy or write the file again"
 
 
@@ -105,6 +108,7 @@ def decode(data: bytes, path: Path) -> Cloud:
     sections = _sections(data, count, level, path)
     if sum(section.used for section in sections) != n:
         raise PopError(f"{path}: splatCount is {n}, and its sections hold other than that; {_WRITE_AGAIN}")
+    check_memory(path, n * _IN_MEMORY, len(data), f"its splatCount of {n}", _WRITE_AGAIN)
     ends = (low or _COEFFICIENT_RANGE[0], high or _COEFFICIENT_RANGE[1])
     bands = COEFFICIENTS[max((section.degree for section in sections), default=0)]
     parts = [_rows(data, section, ends, bands, path) for section in sections]

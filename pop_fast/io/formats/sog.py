@@ -139,7 +139,7 @@ def decode(data: bytes, path: Path) -> Cloud:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             check_members(path, archive, len(data), _WRITE_AGAIN)
-            return _read(lambda name: _unzipped(archive, name, path), path, len(data))
+            return _read(lambda name: _unzipped(archive, name, path), len(data), path)
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
         raise PopError(f"{path}: is no readable ZIP file ({error}); {_WRITE_AGAIN}") from error
 
@@ -153,8 +153,11 @@ def decode_folder(path: Path) -> Cloud:
     Raises:
         PopError: as `decode`, or a file is absent.
     """
-    packed = sum(file.stat().st_size for file in path.parent.glob("*.webp"))
-    return _read(lambda name: _file(path.parent, name, path), path, packed)
+    try:
+        held = sum(image.stat().st_size for image in path.parent.glob("*.webp"))
+    except OSError as error:
+        raise PopError(f"{path}: could not be read: {error.strerror}; check its permissions") from error
+    return _read(lambda name: _file(path.parent, name, path), held, path)
 
 
 def _unzipped(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
@@ -180,17 +183,17 @@ def _file(folder: Path, name: str, path: Path) -> bytes:
         raise PopError(f"{folder / name}: could not be read: {error.strerror}; check its permissions") from error
 
 
-def _read(read: Callable[[str], bytes], path: Path, packed: int) -> Cloud:
-    """Read the parts, each by its name; `packed` are the bytes of all."""
+def _read(read: Callable[[str], bytes], held: int, path: Path) -> Cloud:
+    """Read the parts, each by its name; together they have so many bytes."""
     try:
-        return _decoded(read, path, packed)
+        return _decoded(read, held, path)
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError, RecursionError) as error:
         if isinstance(error, PopError):
             raise
         raise PopError(f"{path}: {META} is not that of SOG version 2 ({error!r}); {_WRITE_AGAIN}") from error
 
 
-def _decoded(read: Callable[[str], bytes], path: Path, packed: int) -> Cloud:
+def _decoded(read: Callable[[str], bytes], held: int, path: Path) -> Cloud:
     meta = json.loads(read(META))
     if meta.get("version") != 2:
         raise PopError(
@@ -199,7 +202,7 @@ def _decoded(read: Callable[[str], bytes], path: Path, packed: int) -> Cloud:
     n = meta["count"]
     if not isinstance(n, int) or n < 0:
         raise PopError(f"{path}: {META}.count is {n}; it must be a number of Gaussians: {_WRITE_AGAIN}")
-    check_memory(path, n * _IN_MEMORY, packed, f"{META}.count of {n}", _WRITE_AGAIN)
+    check_memory(path, n * _IN_MEMORY, held, f"{META}.count of {n}", _WRITE_AGAIN)
 
     def pixels(entry: str, index: int, least: int = n) -> np.ndarray:
         name = str(meta[entry]["files"][index])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -11,6 +11,10 @@ from pop_fast.view.live.draw import SplatScene
 if TYPE_CHECKING:
     from pop_fast.train.training_run import TrainingRun
     from pop_fast.view.live.server import LiveViewer
+
+
+# of the time at most, however many browsers there are and whatever they ask
+_SHARE: Final = 0.5
 
 
 def scene_of(run: TrainingRun, world_transform: np.ndarray) -> SplatScene:
@@ -32,4 +36,4 @@ def follow(viewer: LiveViewer, run: TrainingRun, world_transform: np.ndarray) ->
         return
     note = f"step {run.step:,} of {run.config.max_steps:,}"
     viewer.show(scene_of(run, world_transform), note)
-    viewer.draw_due()
+    viewer.draw_due(_SHARE)

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import time
+from collections import deque
+from collections.abc import Callable, MutableMapping, Sequence
 from typing import Any, Final
 
 import cv2
 import numpy as np
 
+from pop_fast.view.live.incoming import Rule, flag, interval, number, one_of
 from pop_fast.view.live.recording import KeyCamera, path_of
 from pop_fast.view.live.state import MODES, Box, Mode, ViewState
 
 _LONGEST: Final = (480, 720, 960, 1280, 1920)
 _AXES: Final = ("x", "y", "z")
+# files that a browser is given in so many seconds at most: those that it does not take wait in memory
+_FILES, _FILES_IN = 8, 10.0
+_LONGEST_PATH: Final = 500
 
 
 class Panel:
@@ -24,9 +30,22 @@ class Panel:
         title: in the names of files.
         box: what holds nearly all Gaussians, in the capture's own frame.
         world_transform: world = world_transform @ the capture's own frame. [4, 4]
+        rules: is given what each control may be set to, by viser's name of it; see `pop_fast.view.live.incoming`.
+        held: wraps what is called when a control is used, and deals with its errors.
     """
 
-    def __init__(self, client: Any, names: Sequence[str], title: str, box: Box, world_transform: np.ndarray) -> None:
+    def __init__(
+        self,
+        client: Any,
+        names: Sequence[str],
+        title: str,
+        box: Box,
+        world_transform: np.ndarray,
+        rules: MutableMapping[str, Rule],
+        held: Callable[[Callable[[], None]], Callable[[Any], None]],
+    ) -> None:
+        self._rules, self._held, self._controls = rules, held, list[str]()
+        self._sent: deque[float] = deque(maxlen=_FILES)
         self._client, self._title, self._names = client, title, list(names)
         self._world_transform = world_transform
         self._changed: Callable[[], None] = lambda: None
@@ -45,8 +64,17 @@ class Panel:
         self._add_crop(gui, box)
         self._add_cameras(gui)
         self._add_files(gui)
-        for control in (self._mode, self._opacity, self._side, self._cropped, *self._ranges):
-            control.on_update(lambda event: self._update())
+        self._use(self._mode, one_of(MODES), self._update)
+        self._use(self._opacity, number(0.0, 1.0), self._update)
+        self._use(self._side, one_of(tuple(map(str, _LONGEST))), self._update)
+        self._use(self._cropped, flag, self._update)
+        for control in self._ranges:
+            self._use(control, interval(control.min, control.max), self._update)
+
+    def close(self) -> None:
+        """Forget the controls, which nobody can set any more."""
+        for name in self._controls:
+            self._rules.pop(name, None)
 
     def on_change(self, call: Callable[[], None]) -> None:
         """Call this when something else is to be shown."""
@@ -101,7 +129,7 @@ class Panel:
 
     def record(self) -> None:
         """Add the camera that is shown to the path."""
-        if self.now is not None:
+        if self.now is not None and len(self._path) < _LONGEST_PATH:
             self._path.append(KeyCamera(self.now.viewmat, self.now.fov_y))
         self._count()
 
@@ -110,7 +138,18 @@ class Panel:
         if self._path:
             self._send(f"{self._title}_path.json", path_of(self._path, self._world_transform).text().encode())
 
+    def _use(self, control: Any, rule: Rule, call: Callable[[], None]) -> None:
+        """Call this when a control was set to a value that the rule allows."""
+        name = control._impl.uuid  # viser tells it nowhere else
+        self._controls.append(name)
+        self._rules[name] = rule
+        (control.on_click if hasattr(control, "on_click") else control.on_update)(self._held(call))
+
     def _send(self, name: str, data: bytes) -> None:
+        now = time.monotonic()
+        if len(self._sent) == _FILES and now - self._sent[0] < _FILES_IN:
+            return
+        self._sent.append(now)
         self._client.send_file_download(name, data, save_immediately=True)
 
     def _add_crop(self, gui: Any, box: Box) -> None:
@@ -128,22 +167,22 @@ class Panel:
             choice = gui.add_dropdown("look from", tuple(self._names), initial_value=self._names[0])
             step = gui.add_button_group("", ("previous", "next"))
             shown = gui.add_checkbox("show cameras and photographs", False)
-        choice.on_update(lambda event: self._stand(self._names.index(choice.value)))
+        self._use(choice, one_of(self._names), lambda: self._stand(self._names.index(choice.value)))
 
-        def move(event: Any) -> None:
+        def move() -> None:
             by = 1 if step.value == "next" else -1
             # which looks from there
             choice.value = self._names[(self._names.index(choice.value) + by) % len(self._names)]
 
-        step.on_click(move)
-        shown.on_update(lambda event: self._frustums(shown.value))
+        self._use(step, one_of(("previous", "next")), move)
+        self._use(shown, flag, lambda: self._frustums(shown.value))
 
     def _add_files(self, gui: Any) -> None:
-        gui.add_button("Screenshot").on_click(lambda event: self._ask())
+        self._use(gui.add_button("Screenshot"), flag, self._ask)
         with gui.add_folder("Path"):
-            gui.add_button("Add this camera").on_click(lambda event: self.record())
-            gui.add_button("Remove the last").on_click(lambda event: self._forget())
-            gui.add_button("Save").on_click(lambda event: self.save_path())
+            self._use(gui.add_button("Add this camera"), flag, self.record)
+            self._use(gui.add_button("Remove the last"), flag, self._forget)
+            self._use(gui.add_button("Save"), flag, self.save_path)
             self._path_words = gui.add_markdown("")
         self._count()
 

@@ -6,12 +6,15 @@ its steps. viser's threads only note what is wanted.
 
 from __future__ import annotations
 
+import asyncio
 import importlib
 import io
 import logging
+import sys
 import threading
 import time
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -21,6 +24,7 @@ import numpy as np
 from pop_fast.errors import PopError
 from pop_fast.view.html.cameras import view_distances
 from pop_fast.view.live.draw import SplatScene
+from pop_fast.view.live.guard import Guard, is_any, listen
 from pop_fast.view.live.pace import Pace
 from pop_fast.view.live.panel import Panel
 from pop_fast.view.live.state import ViewState, pose_of_viewmat, viewmat_of_pose
@@ -29,7 +33,8 @@ if TYPE_CHECKING:
     from pop_fast.view.html.cameras import PageCamera
 
 LOOPBACK: Final = ("127.0.0.1", "localhost", "::1")
-_FIX: Final = "pip install 'viser>=1.1' (or pop-splatting[viewer])"
+_MOST_LINES: Final = 20
+_FIX: Final = "pip install 'viser>=1.1,<1.2' (or pop-splatting[viewer])"
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,20 +96,24 @@ class LiveViewer:
         self, scene: SplatScene, stands: Sequence[Stand], title: str, host: str = "127.0.0.1", port: int = 8080
     ) -> None:
         viser = require_viser()
+        listening = listen(host, port)
         self._scene, self._stands, self._title = scene, list(stands), title
         self.box = scene.extent()
         self.note = ""
+        self._free_at = 0.0
         self._views: dict[int, _View] = {}
         self._lock, self._wake = threading.Lock(), threading.Event()
         # browsers open connections ahead and drop them, which is logged as an error with a traceback
         logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
-        try:
-            # it prints a box of its own, whatever `verbose` is
-            with redirect_stdout(io.StringIO()):
-                self._server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
-        except (OSError, RuntimeError) as error:
-            raise PopError(f"the viewer cannot listen on {host}:{port} ({error}); give --host or --port") from error
-        self.host, self.port = host, int(self._server.get_port())
+        # and leave while their panel is made
+        warnings.filterwarnings("ignore", message=r"Queued a \w+ on a closed connection")
+        self.host, self.port = host, int(listening.getsockname()[1])
+        self._lines = 0
+        self._guard = Guard(host, listening, self._tell)
+        # it prints a box of its own, whatever `verbose` is
+        with self._guard.around_viser(), redirect_stdout(io.StringIO()):
+            self._server = viser.ViserServer(host=host, port=self.port, label=title, verbose=False)
+        self._forget_sharing()
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         upwards = -np.mean([stand.camera.viewmat[1, :3] for stand in self._stands], axis=0)
         self._server.scene.set_up_direction(tuple(float(v) for v in upwards))
@@ -117,9 +126,9 @@ class LiveViewer:
 
     @property
     def url(self) -> str:
-        """The address to open."""
-        shown = "127.0.0.1" if self.host in ("0.0.0.0", "::", "") else self.host
-        return f"http://{f'[{shown}]' if ':' in shown else shown}:{self.port}"
+        """The address to open; whoever knows it sees the splat."""
+        shown = "127.0.0.1" if is_any(self.host) else self.host
+        return f"http://{f'[{shown}]' if ':' in shown else shown}:{self.port}/{self._guard.token}/"
 
     @property
     def watched(self) -> bool:
@@ -139,9 +148,21 @@ class LiveViewer:
         self._wake.wait(min([seconds, *awaited]))
         self._wake.clear()
 
-    def draw_due(self) -> int:
-        """Draw what is due, at most one picture a browser; returns how many."""
-        return sum(view.draw(self._scene, self.note) for view in self._present())
+    def draw_due(self, share: float = 1.0) -> int:
+        """Draw what is due, at most one picture a browser; an error closes the browser's view.
+
+        Args:
+            share: of the time that drawing may take; until it is so much, nothing is drawn.
+
+        Returns:
+            How many pictures were drawn.
+        """
+        begun = time.monotonic()
+        if begun < self._free_at:
+            return 0
+        drawn = sum(view.draw(self._scene, self.note) for view in self._present())
+        self._free_at = time.monotonic() + (time.monotonic() - begun) * (1.0 / share - 1.0)
+        return drawn
 
     def close(self) -> None:
         """End the server."""
@@ -159,14 +180,47 @@ class LiveViewer:
             return list(self._views.values())
 
     def _connected(self, client: Any) -> None:
-        view = _View(client, self._stands, self._title, self.box, self._scene.world_transform, self._wake)
+        try:
+            view = _View(client, self, self._wake)
+        except Exception as error:
+            self._fail(client.client_id, error)
+            return
         with self._lock:
             self._views[client.client_id] = view
+        if client.client_id not in self._server.get_clients():
+            # it has left while its panel was made
+            self._disconnected(client)
         self._wake.set()
 
     def _disconnected(self, client: Any) -> None:
         with self._lock:
-            self._views.pop(client.client_id, None)
+            view = self._views.pop(client.client_id, None)
+        if view is not None:
+            view.panel.close()
+
+    def _fail(self, client_id: int, error: Exception) -> None:
+        """Close a view that had an error; neither the other views nor whoever owns the Gaussians hear of it."""
+        with self._lock:
+            known = self._views.pop(client_id, None)
+        if known is not None:
+            known.panel.close()
+        self._tell(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
+        connection = self._server._websock_server._live_connections.get(client_id)
+        if connection is not None:
+            asyncio.run_coroutine_threadsafe(connection.close(1011, "the view had an error"), connection.loop)
+
+    def _tell(self, why: str) -> None:
+        """Print why a view was closed, a bounded number of times."""
+        self._lines += 1
+        if self._lines <= _MOST_LINES:
+            last = "; what follows of this kind is not shown" if self._lines == _MOST_LINES else ""
+            print(f"note: the viewer closed a view: {why}{last}", file=sys.stderr, flush=True)
+
+    def _forget_sharing(self) -> None:
+        """Take away what viser does when a browser asks it to publish the server by a relay on the internet."""
+        messages, server = importlib.import_module("viser._messages"), self._server._websock_server
+        for kind in (messages.ShareUrlRequest, messages.ShareUrlDisconnect):
+            server.unregister_handler(kind)
 
 
 def pose_at(stand: Stand) -> tuple[Any, Any, Any, float]:
@@ -180,17 +234,18 @@ def pose_at(stand: Stand) -> tuple[Any, Any, Any, float]:
 class _View:
     """One browser."""
 
-    def __init__(
-        self, client: Any, stands: Sequence[Stand], title: str, box: Any, world_transform: Any, wake: threading.Event
-    ) -> None:
-        self._client, self._stands, self._wake = client, stands, wake
+    def __init__(self, client: Any, viewer: LiveViewer, wake: threading.Event) -> None:
+        self._client, self._stands, self._wake = client, viewer._stands, wake
+        self._fail = viewer._fail
         self.pace = Pace()
         self._frustums: list[Any] = []
-        self.panel = Panel(client, [stand.camera.name for stand in stands], title, box, world_transform)
+        names = [stand.camera.name for stand in self._stands]
+        transform, rules = viewer._scene.world_transform, viewer._guard.rules
+        self.panel = Panel(client, names, viewer._title, viewer.box, transform, rules, self._held)
         self.panel.on_change(self._changed)
         self.panel.on_stand(self.look_from)
         self.panel.on_frustums(self._show_frustums)
-        client.camera.on_update(self._moved)
+        client.camera.on_update(self._held(self._moved))
 
     def look_from(self, index: int) -> None:
         """Move this browser's camera to a place to look from."""
@@ -201,7 +256,25 @@ class _View:
         self._changed()
 
     def draw(self, scene: SplatScene, note: str) -> int:
-        """Draw what is due; returns how many pictures."""
+        """Draw what is due; returns how many pictures. An error closes the view."""
+        try:
+            return self._draw(scene, note)
+        except Exception as error:
+            self._fail(self._client.client_id, error)
+            return 0
+
+    def _held(self, call: Callable[[], None]) -> Callable[[Any], None]:
+        """Return a call for viser's threads; an error in it closes the view."""
+
+        def held(event: Any) -> None:
+            try:
+                call()
+            except Exception as error:
+                self._fail(self._client.client_id, error)
+
+        return held
+
+    def _draw(self, scene: SplatScene, note: str) -> int:
         now, camera = time.monotonic(), self._client.camera
         shot = self.panel.take_screenshot()
         kind = self.pace.due(now)
@@ -232,7 +305,7 @@ class _View:
             viewmat, float(camera.fov), max(width, 1), max(height, 1), panel.mode, panel.min_opacity, panel.crop
         )
 
-    def _moved(self, camera: Any) -> None:
+    def _moved(self) -> None:
         self.pace.moved(time.monotonic())
         self._wake.set()
 
@@ -261,5 +334,5 @@ class _View:
             wxyz=tuple(wxyz.tolist()),
             position=tuple(position.tolist()),
         )
-        added.on_click(lambda event: self.look_from(index))
+        added.on_click(self._held(lambda: self.look_from(index)))
         return added

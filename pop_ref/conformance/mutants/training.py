@@ -96,14 +96,6 @@ TRAINING: Final = (
         "test_polarization:the_entropy_pulls_every_opacity_to_the_pole_that_it_is_nearer_to",
     ),
     Mutant(
-        "blur_comes_back",
-        "blur that has ceased to pay is tried again at the next densification step",
-        "density.py",
-        "for end in range(2 * span, len(windows) + 1):",
-        "for end in range(max(2 * span, len(windows)), len(windows) + 1):",
-        "test_density:blur_ends_for_good_at_the_first_growth_that_has_not_paid",
-    ),
-    Mutant(
         "prior_pushes_the_wrong_way",
         "important opacities are pushed to 0",
         "polarization.py",
