@@ -23,7 +23,15 @@ if TYPE_CHECKING:
     from pop_fast.train import TrainConfig
 
 __all__ = [
-    *("BESIDE", "PROBE", "collect", "curve_of", "digits", "final_stats", "first_change", "read_probe", "spacing"),
+    "BESIDE",
+    "PROBE",
+    "collect",
+    "curve_of",
+    "digits",
+    "final_stats",
+    "first_change",
+    "read_probe",
+    "spacing",
     "state_of_data",
 ]
 

@@ -21,7 +21,16 @@ from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 
 __all__ = [
-    *("RESULTS", "SCALES", "Result", "existing_folder", "find", "kept", "path_of", "read", "read_all", "write"),
+    "RESULTS",
+    "SCALES",
+    "Result",
+    "existing_folder",
+    "find",
+    "kept",
+    "path_of",
+    "read",
+    "read_all",
+    "write",
 ]
 
 SCALES: Final = tuple(_SCALES)

@@ -19,7 +19,7 @@ class Scale:
     Attributes:
         name: its name in results and on the command line.
         about: one sentence for people.
-        factors: its scenes, each with what its photographs are shrunk by after they were read.
+        factors: its scenes, each with what its photographs are shrunk by after they were read, by the scenes' files.
         steps_scaler: multiplies every step number of the method.
         settings: what else differs from the method's own values, in the names of `pop_fast.train.TrainConfig`; those
             of density control under "strategy.".
@@ -42,6 +42,10 @@ class Scale:
     checkpoint_every: int = 500
 
 
+def _factors(scale: str) -> dict[str, int]:
+    return {scene.name: scene.factors[scale] for scene in SCENES.values() if scale in scene.factors}
+
+
 # theta_blur comes to 10.7 pixels in the paper's smallest images, and to less in images smaller than those
 _FLOOR: Final = {"strategy.blur_min_pixels": 10.0}
 
@@ -55,7 +59,7 @@ _ALL: Final = (
     Scale(
         name="toy",
         about="the demo capture in seconds: that everything runs, and nothing more",
-        factors={"demo": 1},
+        factors=_factors("toy"),
         # 300 steps, in which density control acts 14 times and resets, where it does, at 30, 60, 90 and 120
         steps_scaler=0.01,
         settings={**_FLOOR, "strategy.refine_every": 10},
@@ -67,20 +71,20 @@ _ALL: Final = (
     Scale(
         name="small",
         about="real photographs for a CPU: the whole schedule, small images, theta_blur at least 10 pixels",
-        factors={"fox": 4, "bear_512": 2, "garden_512": 2, "bonsai_800": 2},
+        factors=_factors("small"),
         settings=_FLOOR,
         of_methods=_POINTS["small"],
     ),
     Scale(
         name="no_floor",
         about="fox at half its size and the whole schedule, where theta_blur is 10.4 pixels by itself",
-        factors={"fox": 2},
+        factors=_factors("no_floor"),
         of_methods=_POINTS["small"],
     ),
     Scale(
         name="full",
         about="bonsai_800 at its size and the whole schedule, theta_blur at least 10 pixels",
-        factors={"bonsai_800": 1},
+        factors=_factors("full"),
         settings=_FLOOR,
         of_methods=_POINTS["full"],
         log_every=25,
@@ -88,11 +92,15 @@ _ALL: Final = (
     Scale(
         name="paper",
         about="the published protocol",
-        factors={scene.name: 1 for scene in SCENES.values() if scene.in_paper},
+        factors=_factors("paper"),
         checkpoint_every=1_000,
     ),
 )
 SCALES: Final = {scale.name: scale for scale in _ALL}
+for _scene in SCENES.values():
+    for _name in _scene.factors:
+        if _name not in SCALES:
+            raise PopError(f"scenes/{_scene.name}.toml: factors.{_name} is not a scale; they are {', '.join(SCALES)}")
 
 
 def scale_named(name: str) -> Scale:

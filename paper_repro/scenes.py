@@ -1,5 +1,6 @@
 """The scenes of the paper and the further ones: where each lies under a data root, its photographs, and their source.
 
+A scene is one file of the folder `scenes`, read with errors that name file and field; one more is one file more.
 Published layouts are looked for in turn, so that the archives can be unpacked side by side under one root:
 
     <root>/mipnerf360/garden    <root>/360_v2/garden        <root>/garden
@@ -11,13 +12,27 @@ Counts and sizes that were not compared with the photographs themselves are mark
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import tomllib
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from pop_fast.errors import PopError
 
-__all__ = ["DATASETS", "SCENES", "Dataset", "Scene", "find_folder", "scene_named"]
+__all__ = [
+    "DATASETS",
+    "SCENES",
+    "Dataset",
+    "Scene",
+    "find_folder",
+    "load_scene",
+    "load_scenes",
+    "scene_named",
+    "source_of",
+]
+
+FOLDER: Final = Path(__file__).resolve().parent / "scenes"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,15 +55,16 @@ class Scene:
     """One capture.
 
     Attributes:
-        name: its name here, in results and on the command line.
+        name: its name here, in results and on the command line, and of its file.
         dataset: its dataset, by its key in `DATASETS`.
+        order: its place among the scenes of the dataset.
         folder: its folder's name.
         images: the folder with its photographs; None where the capture's list says.
         shrunk: how much smaller those photographs are than the camera model's images, as published (images_4 is 4).
         n_images: photographs with a known camera.
         size: width and height of these photographs, px.
+        factors: the scales that have it, each with what the photographs are shrunk by after they were read.
         verified: whether count and size were compared with the photographs.
-        in_paper: whether the paper reports it, in this form.
         source: where it comes from, where that is not the dataset's.
         note: what it is, where its name does not tell.
         centred: whether Inria's rasterizer, which puts the principal point in the middle of the image, may draw it.
@@ -56,16 +72,22 @@ class Scene:
 
     name: str
     dataset: str
+    order: int
     folder: str
-    images: str | None
+    images: str | None = None
     shrunk: int
     n_images: int
     size: tuple[int, int]
+    factors: Mapping[str, int]
     verified: bool = False
-    in_paper: bool = True
     source: str = ""
     note: str = ""
     centred: bool = True
+
+    @property
+    def in_paper(self) -> bool:
+        """Whether the paper reports it, in this form."""
+        return "paper" in self.factors
 
 
 _M360_PARENTS: Final = ("mipnerf360", "mip-nerf-360", "m360", "360_v2", "360_extra_scenes", "360", "")
@@ -87,83 +109,64 @@ DATASETS: Final = {
     ),
     "further": Dataset(name="further scenes", parents=("",), source=""),
 }
-_EXTRA: Final = (
-    "http://storage.googleapis.com/gresearch/refraw360/360_extra_scenes.zip (https://jonbarron.info/mipnerf360)"
-)
-_GAUSSCTRL: Final = "https://github.com/ActiveVisionLab/gaussctrl"
+# of a scene's file: what each field must be
+_KINDS: Final = {
+    **dict.fromkeys(("dataset", "folder", "images", "source", "note"), (str, "a text")),
+    **dict.fromkeys(("order", "shrunk", "n_images"), (int, "a whole number of at least 1")),
+    **dict.fromkeys(("verified", "centred"), (bool, "true or false")),
+}
 
 
-def _m360(name: str, n_images: int, size: tuple[int, int], shrunk: int, source: str = "") -> Scene:
-    # image counts of garden and bonsai are those of the further scenes below, which hold all of their photographs
-    return Scene(
-        name=name,
-        dataset="mipnerf360",
-        folder=name,
-        images=f"images_{shrunk}",
-        shrunk=shrunk,
-        n_images=n_images,
-        size=size,
-        source=source,
-    )
+def load_scene(path: Path) -> Scene:
+    """Read a scene's file.
+
+    Raises:
+        PopError: it is not TOML, or a field is absent, unknown or not what it must be; names it.
+    """
+    try:
+        found = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise PopError(f"{path}: is not a scene's TOML file: {error}") from error
+    known = {field.name: field for field in fields(Scene) if field.name != "name"}
+    for name in [*known, *found]:
+        if name not in known:
+            raise PopError(f"{path}: {name} is not a field of a scene; the fields are {', '.join(known)}")
+        if name not in found and known[name].default is MISSING:
+            raise PopError(f"{path}: has no {name}")
+
+    def fail(field: str, must: str) -> PopError:
+        return PopError(f"{path}: {field} is {found[field]!r}; it must be {must}")
+
+    for name, (kind, must) in _KINDS.items():
+        if name in found and (type(found[name]) is not kind or (kind is int and found[name] < 1)):
+            raise fail(name, must)
+    size, factors = found["size"], found["factors"]
+    if not isinstance(size, list) or len(size) != 2 or not all(map(_is_count, size)):
+        raise fail("size", "[width, height] in pixels")
+    if not isinstance(factors, dict) or not factors or not all(map(_is_count, factors.values())):
+        raise fail("factors", "a table of whole numbers of at least 1, by scale")
+    if found["dataset"] not in DATASETS:
+        raise fail("dataset", f"one of {', '.join(DATASETS)}")
+    return Scene(name=path.stem, **{**found, "size": (size[0], size[1])})
 
 
-def _native(name: str, dataset: str, n_images: int, size: tuple[int, int]) -> Scene:
-    return Scene(name=name, dataset=dataset, folder=name, images="images", shrunk=1, n_images=n_images, size=size)
+def load_scenes(folder: Path = FOLDER) -> dict[str, Scene]:
+    """Read every scene, in the order of the datasets and of `Scene.order`.
+
+    Raises:
+        PopError: as `load_scene`.
+    """
+    keys = list(DATASETS)
+    found = [load_scene(path) for path in folder.glob("*.toml")]
+    found.sort(key=lambda scene: (keys.index(scene.dataset), scene.order, scene.name))
+    return {scene.name: scene for scene in found}
 
 
-def _further(name: str, folder: str, n_images: int, size: tuple[int, int], source: str, note: str) -> Scene:
-    return Scene(
-        name=name,
-        dataset="further",
-        folder=folder,
-        images=None,
-        shrunk=1,
-        n_images=n_images,
-        size=size,
-        verified=True,
-        in_paper=False,
-        source=source,
-        note=note,
-    )
+def _is_count(value: Any) -> bool:
+    return type(value) is int and value >= 1
 
 
-_ALL: Final = (
-    _m360("bicycle", 194, (1237, 822), 4),
-    _m360("flowers", 173, (1256, 828), 4, _EXTRA),
-    _m360("garden", 185, (1297, 840), 4),
-    _m360("stump", 125, (1245, 825), 4),
-    _m360("treehill", 141, (1267, 832), 4, _EXTRA),
-    _m360("room", 311, (1557, 1038), 2),
-    _m360("counter", 240, (1558, 1038), 2),
-    _m360("kitchen", 279, (1558, 1039), 2),
-    _m360("bonsai", 292, (1559, 1039), 2),
-    _native("train", "tandt", 301, (980, 545)),
-    _native("truck", "tandt", 251, (979, 546)),
-    _native("drjohnson", "db", 263, (1332, 876)),
-    _native("playroom", "db", 225, (1264, 832)),
-    _further(
-        *("garden_512", "m360_garden_512", 185, (512, 512), _GAUSSCTRL),
-        "Mip-NeRF 360 garden, cropped to the middle and shrunk to 512 x 512; not comparable with the paper's numbers",
-    ),
-    _further(
-        *("bonsai_800", "m360_bonsai_800", 292, (800, 533), "https://github.com/EricXu23/Bonsaidownload"),
-        "Mip-NeRF 360 bonsai at half the paper's size, recompressed; not comparable with the paper's numbers",
-    ),
-    replace(
-        _further("bear_512", "bear_512", 96, (512, 512), _GAUSSCTRL, "a statue in a park, 512 x 512; not in the paper"),
-        # the principal point lies 17 pixels from there
-        centred=False,
-    ),
-    _further(
-        *("fox", "fox", 50, (1080, 1920), "https://github.com/NVlabs/instant-ngp, data/nerf/fox"),
-        "a fox's head in a room, by telephone; not in the paper",
-    ),
-    _further(
-        *("demo", "demo", 24, (96, 72), "pop-repro makes it"),
-        "a ray-traced still life, made by the program; for tests, its numbers say nothing about a method",
-    ),
-)
-SCENES: Final = {scene.name: scene for scene in _ALL}
+SCENES: Final = load_scenes()
 
 
 def scene_named(name: str) -> Scene:

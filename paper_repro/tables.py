@@ -14,18 +14,14 @@ from typing import Final
 
 from paper_repro.checks import places
 from paper_repro.paper import Metric, NotComparable, Paper, PaperTable, paper
-from paper_repro.results import SCALES, Result
+from paper_repro.results import Result
+from paper_repro.scales import SCALES
 from pop_fast.errors import PopError
 
 __all__ = ["BEYOND", "REFERENCES", "SCENES_OF", "Block", "Cell", "Line", "Table", "beyond", "setting", "table"]
 
 # what a scale is meant to train; results of further scenes are shown too
-SCENES_OF: Final = {
-    "toy": ("demo",),
-    "small": ("fox", "bear_512", "garden_512", "bonsai_800"),
-    "no_floor": ("fox",),
-    "full": ("bonsai_800",),
-}
+SCENES_OF: Final = {name: tuple(scale.factors) for name, scale in SCALES.items() if name != "paper"}
 # the line that the others of its table are compared with where the data is not the paper's
 REFERENCES: Final = {1: "gsplat", 2: "gsplat", 3: "l2_blur", 4: "pop", 5: "reset"}
 # lines of the table of what goes beyond the paper, which has none of their numbers, with the method itself first

@@ -25,7 +25,14 @@ if TYPE_CHECKING:
     from pop_fast.train import TrainConfig
 
 __all__ = [
-    *("PUBLISHED", "BusyError", "Options", "capture_folder", "commit", "finished", "load_capture_of", "only_one"),
+    "PUBLISHED",
+    "BusyError",
+    "Options",
+    "capture_folder",
+    "commit",
+    "finished",
+    "load_capture_of",
+    "only_one",
     "train_row",
 ]
 

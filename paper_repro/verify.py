@@ -14,7 +14,6 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -27,6 +26,7 @@ from paper_repro.jobs import Job
 from paper_repro.published import file_hash, ply_of
 from paper_repro.record import Result
 from paper_repro.train_row import Options
+from pop_fast.children import python_command
 from pop_fast.errors import PopError
 from pop_fast.machine import machine_name, processor_kind
 
@@ -150,7 +150,7 @@ def _check_out(commit: str, clone: Path) -> None:
         for library in (_ROOT / "pop_fast" / "compiled").glob("_blend_*.so"):
             shutil.copy2(library, partial / "pop_fast" / "compiled")
         partial.rename(clone)
-    build = [sys.executable, "-P", "-m", "pop_fast.compiled.build", "--if-possible"]
+    build = python_command("-m", "pop_fast.compiled.build", "--if-possible")
     subprocess.run(build, env=_environment(clone, 1), cwd=clone, check=True, stdout=subprocess.DEVNULL)
 
 
@@ -166,7 +166,7 @@ def _train(job: Job, result: Result, options: Options, place: Path, steps: int |
         "threads": result.threads,
         "backend": options.backend if options.backend != "auto" else _backend_of(result),
     }
-    command = [sys.executable, "-P", "-c", _TRAIN, json.dumps(asked)]
+    command = python_command("-c", _TRAIN, json.dumps(asked))
     clone, work = place / "clone", job.work(place / "work")
     # a session of its own: a terminal's Ctrl-C would reach it beside what is passed on, and two mean "at once"
     with open(place / "log.txt", "w") as log:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from paper_repro.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED, parser_of
 from paper_repro.cli.options import add_training, training_words
+
+if TYPE_CHECKING:
+    from paper_repro.jobs import Job
 
 __all__ = ["queue", "run"]
 
@@ -23,6 +26,7 @@ _QUEUE: Final = """
     pop-repro queue --scale small --data DATA --nice 10     days; Ctrl-C or SIGTERM stops it, the same command continues
     pop-repro queue --scale small --data DATA --rows pop gsplat 3dgs --scenes fox bear_512 --seeds 3
     pop-repro queue --scale small --data DATA --list        what is missing, in order, without training
+    pop-repro queue --scale paper --data DATA --check     the hours of each row, and what is lacking here
 """
 
 
@@ -61,6 +65,8 @@ def queue(words: Sequence[str]) -> int:
     parser.add_argument("--nice", type=int, default=0, metavar="N", help="give way to other programs, 0 to 19")
     parser.add_argument("--commit", action="store_true", help="commit each result in git when it is there")
     parser.add_argument("--list", action="store_true", help="list what is missing, in order, and train nothing")
+    note = "say the hours and what of data, disk, memory and GPU is lacking, and train nothing; scale paper begins so"
+    parser.add_argument("--check", action="store_true", help=note)
     add_training(parser)
     args = parser.parse_args(words)
     from paper_repro.jobs import jobs_of
@@ -72,6 +78,10 @@ def queue(words: Sequence[str]) -> int:
     if args.list:
         print("\n".join(str(job) for job in jobs if not job.is_done(args.results)))
         return 0
+    if args.check or args.scale == "paper":
+        ready = _ready([job for job in jobs if not job.is_done(args.results)], args)
+        if args.check or not ready:
+            return 0 if ready else EXIT_INCOMPLETE
     if args.nice:
         os.nice(args.nice)
     outcome = run_queue(jobs, args.results, training_words(args), args.threads, args.commit)
@@ -84,6 +94,16 @@ def queue(words: Sequence[str]) -> int:
         print("stopped; the same command continues")
         return EXIT_INTERRUPTED
     return EXIT_INCOMPLETE if any(left.values()) else 0
+
+
+def _ready(missing: Sequence[Job], args: argparse.Namespace) -> bool:
+    """Print what the missing rows take and what is lacking for them; tell whether nothing is."""
+    from paper_repro.preflight import hours_by_row, lacking
+
+    print("\n".join([f"{len(missing)} trainings to go", *hours_by_row(missing)]), flush=True)
+    found = lacking(missing, args.data, args.work, args.backend)
+    print("\n".join(["lacking:", *(f"  {line}" for line in found)] if found else ["nothing is lacking"]), flush=True)
+    return not found
 
 
 def _options(args: argparse.Namespace) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def run(argv: Sequence[str]) -> int:
 def look_over(root: Path, images: str | None = None) -> list[Finding]:
     """Examine a capture, or photographs alone; all findings in reading order."""
     from pop_fast.data import check_dataset
-    from pop_fast.data.finding import Finding
+    from pop_fast.data.finding import Finding, number
     from pop_fast.data.photo_quality import about_quality, measure_file
     from pop_fast.data.sfm import photo_folder, photographs
     from pop_fast.machine import memory_bytes
@@ -75,8 +75,12 @@ def look_over(root: Path, images: str | None = None) -> list[Finding]:
             *(Finding("bad", "photographs", problem) for problem in damage),
         ]
         return [*findings, *about_quality(shown)]
-    made_from, shots, cloud = listing
-    findings = [Finding("ok" if len(shots) > 1 else "bad", "poses", f"{len(shots)} views from the {made_from}")]
+    shots, cloud = listing.shots, listing.cloud
+    where = listing.path.relative_to(root).as_posix()
+    inside = "" if listing.made_from == where else f" in {where}"
+    what = f"{len(shots)} {number(len(shots), 'view', 'views')} from the {listing.made_from}{inside}"
+    findings = [Finding("ok" if len(shots) > 1 else "bad", "poses", what)]
+    findings += [Finding("warn", "poses", note) for note in listing.notes]
     findings += check_dataset.about_cameras(shots)
     paths = {id(shot): check_dataset.file_of(root, shot) for shot in shots}
     photos, damage = _each(

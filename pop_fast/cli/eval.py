@@ -14,7 +14,7 @@ import tyro
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import write_atomically
+from pop_fast.io.atomic import check_file, write_atomically
 from pop_fast.train.load_result import CaptureOptions, Splat, load_splat
 
 if TYPE_CHECKING:
@@ -52,6 +52,8 @@ class Args(CaptureArguments):
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "eval", examples=_EXAMPLES)
+    if args.json is not None:
+        check_file(args.json)
     splat = load_splat(args.splat)
     _, stats = measured(splat, args, _nets(args, splat.config))
     if args.per_view:

@@ -14,7 +14,7 @@ import tyro
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import folder_atomically, write_atomically
+from pop_fast.io.atomic import check_file, check_folder, folder_atomically, write_atomically
 from pop_fast.train.load_result import load_splat
 from pop_ref.constants import PROFILES
 
@@ -63,6 +63,11 @@ def run(argv: Sequence[str]) -> int:
     at = None if args.pixel is None else parse_pixel(args.pixel)
     if at is None and (args.maps is None or args.html or args.json or args.diff):
         raise PopError("pixel is not given; say which with --pixel X,Y, or ask for maps alone with --maps DIR")
+    for file in (args.json, args.html):
+        if file is not None:
+            check_file(file)
+    if args.maps is not None:
+        check_folder(args.maps, args.overwrite)
     return _explain(args, at)
 
 

@@ -15,6 +15,7 @@ from pop_fast.cli.arguments import parse
 from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
 from pop_fast.cli.limits import FormatName, LimitOptions, Shown, limited
 from pop_fast.errors import PopError
+from pop_fast.io.atomic import check_folder, check_place
 from pop_fast.train.load_result import Splat, frame_of_splat, load_splat, read_record
 
 if TYPE_CHECKING:
@@ -86,10 +87,12 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _inria(args: Args) -> int:
-    from pop_fast.view.inria import write_inria_folder
-
     if args.out is None or args.to is not None or args.any:
         raise PopError("--layout inria writes all Gaussians into the folder --out; give --out, and no --to or limits")
+    from pop_fast.view.inria import exported_to, write_inria_folder
+
+    keeps = [args.splat] if args.capture is None else [args.splat, args.capture]
+    check_folder(args.out, args.overwrite, keeps=keeps, recognise=exported_to(args.out))
     splat = load_splat(args.splat)
     capture, config = open_with_bars(splat, args)
     write_inria_folder(replace(splat, config=config), capture, args.out, args.overwrite)
@@ -183,6 +186,7 @@ def check_file(out: Path, source: Path, overwrite: bool) -> None:
         raise PopError(f"{out}: is the splat that is read; choose another --out")
     if out.exists() and not overwrite:
         raise PopError(f"{out}: exists; pass --overwrite or another --out")
+    check_place(out)
 
 
 def _writer(args: Args, out: Path, name: str, splat: Splat, opened: _Opened) -> Callable[[dict[str, Tensor]], bytes]:

@@ -18,8 +18,9 @@ _SWITCH_INTERVAL: Final = 2e-4
 def importing(*modules: str) -> Iterator[None]:
     """Import modules in a thread of their own while the block runs; they are there, or have failed, when it ends.
 
-    A failure is not reported here: whoever imports such a module afterwards meets it. The block must have imported all
-    that it needs, as two threads do not import one package at a time.
+    A block that is left by an error or an interruption waits for nothing. A failure is not reported here: whoever
+    imports such a module afterwards meets it. The block must have imported all that it needs, as two threads do not
+    import one package at a time.
 
     Args:
         modules: their names.
@@ -30,12 +31,12 @@ def importing(*modules: str) -> Iterator[None]:
             for name in modules:
                 importlib.import_module(name)
 
-    thread = threading.Thread(target=work, name="importing")
+    thread = threading.Thread(target=work, name="importing", daemon=True)
     before = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_INTERVAL)
     thread.start()
     try:
         yield
+        thread.join()
     finally:
         sys.setswitchinterval(before)
-        thread.join()

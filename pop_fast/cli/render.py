@@ -17,7 +17,7 @@ import tyro
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import folder_atomically, write_atomically
+from pop_fast.io.atomic import check_file, check_folder, folder_atomically, write_atomically
 from pop_fast.train.load_result import load_splat, paths_read
 
 if TYPE_CHECKING:
@@ -58,15 +58,19 @@ def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "render", examples=_EXAMPLES)
     if args.out is None and args.video is None:
         raise PopError("nothing to write; give --out DIR for pictures, --video FILE for a video, or both")
-    return _render(args)
+    # all that can be refused without a splat, before anything of torch is imported
+    check_path(args.path)
+    if args.frames < 1:
+        raise PopError(f"frames is {args.frames}; give --frames 1 or more")
+    if args.out is not None:
+        check_folder(args.out, args.overwrite, recognise=listed_in(args.out))
+    return _render(args, planned_video(args))
 
 
-def _render(args: Args) -> int:
+def _render(args: Args, video: VideoFile | None) -> int:
     from pop_fast.io.names import picture_names
     from pop_fast.view.frames import check_one_size, planned_views, rendered, write_pictures, write_video
 
-    check_path(args.path)
-    video = planned_video(args)
     splat = load_splat(args.splat)
     capture, config = open_with_bars(splat, args)
     views = planned_views(capture, config, args.path, args.frames)
@@ -95,7 +99,6 @@ def check_path(path: str) -> None:
     Raises:
         PopError: it is neither a name that is known nor a file that was recorded.
     """
-    from pop_fast.view.live import read_path
     from pop_fast.view.paths import PATHS
 
     if path in ("views", *PATHS):
@@ -105,6 +108,8 @@ def check_path(path: str) -> None:
         raise PopError(
             f"path is '{path}', which is no file; give --path one of {names}, or a file that 'pop view' saved"
         )
+    from pop_fast.view.live import read_path
+
     read_path(Path(path))
 
 
@@ -125,6 +130,7 @@ def planned_video(args: Args) -> VideoFile | None:
         )
     if args.video.exists() and not args.overwrite:
         raise PopError(f"{args.video}: exists; pass --overwrite or another --video")
+    check_file(args.video)
     return video
 
 

@@ -26,6 +26,7 @@ from pop_fast.cli.live_view import LiveView, check_viewer
 from pop_fast.cli.printable import printable
 from pop_fast.cli.result_folder import as_begun, check_output, record_of, resumption, stopped
 from pop_fast.cli.said import PLAN, plan_of, said
+from pop_fast.cli.told_early import about_large, check_early
 from pop_fast.cli.train_blocks import check_blocks, train_in_blocks
 from pop_fast.data.sfm_options import SfmOptions
 from pop_fast.errors import PopError
@@ -63,6 +64,8 @@ _SHOWN: Final = frozenset(
         *("exposure", "random_background", "refine_cameras"),
     }
 )
+# whose options the help lists after all others, in this order; those of limits belong to exports too
+_LATER: Final = (FinishOptions, LimitOptions, BlocksOptions)
 _DOCUMENTED: Final = (BlocksOptions, FinishOptions, LimitOptions, Given, TrainConfig)
 # words of other trainers' command lines: Inria's, gsplat's
 _ALIASES: Final = {
@@ -71,6 +74,12 @@ _ALIASES: Final = {
     "--data-factor": "--factor",
     "--iterations": "--max-steps",
 }
+_SMALLER: Final = (
+    "--factor 2 (4, 8) trains on photographs shrunk by so much; --sfm.max-size is only how large they are while "
+    "cameras are searched for"
+)
+# of which the nearest option by its letters is another thing
+_ELSEWHERE: Final = dict.fromkeys(("--max-size", "--resolution", "-r", "--downscale", "--downscale-factor"), _SMALLER)
 # what trains, and takes longest to import
 _TRAINING: Final = ("pop_fast.train.training_run", "pop_fast.compiled.native_step")
 _IGNORED: Final = frozenset({"--eval"})  # Inria: hold out every 8th view; here the default (--test-every 0 holds none)
@@ -127,6 +136,7 @@ def run(argv: Sequence[str]) -> int:
         options = as_begun(folder, options)
         config, chosen = choose_backend(config, options.resume)
         check_backend(config)
+        check_early(config, options.source, options.images, ranks)
         if options.blocks is not None:
             return train_in_blocks(config, options, chosen, argv)
         status = train_capture(config, options, chosen, argv, ranks)
@@ -174,19 +184,27 @@ def train_capture(
 
     folder, start = Path(config.result_dir), time.perf_counter()
     capture = _open_in_turn(config, options, ranks)
-    loading = time.perf_counter() - start
+    searching = capture.sfm_seconds or 0.0
+    loading = time.perf_counter() - start - searching
+    from pop_fast.io.heartbeat import duration
     from pop_fast.train.environment import keep_freed_memory
     from pop_fast.train.ranks import ALONE
     from pop_fast.train.training_run import TrainingRun
 
     keep_freed_memory()
+    if capture.sfm_seconds is not None:
+        print(f"cameras found in {duration(searching)}")
     for note in capture.notes:
         print(f"note: {printable(note)}")
     print(printable(f"{capture.name}: {capture.source}; {_plan(config)}"))
     print(chosen)
+    large = about_large(capture, config)
+    if large is not None:
+        print(f"note: {large}")
     if takes_hours(config):
         print(f"note: {config.max_steps:,} steps take hours on a CPU; --preset quick takes a tenth of the schedule")
     how = {"resume": options.resume, "overwrite": options.overwrite, "loading_seconds": loading}
+    how["sfm_seconds"] = searching
     commands = commands_text(folder if options.resume else None, ["pop", "train", *argv])
     beside = {RECORD: record_text(record_of(capture, options)), COMMANDS_FILE: commands}
     # absolute, so that the result can be looked at from another folder too
@@ -277,6 +295,8 @@ def rename_aliases(argv: Sequence[str]) -> list[str]:
         word = word.replace("--adc.", "--gsplat.", 1) if word.startswith("--adc.") else word
         name, equals, value = word.partition("=")
         name = name.replace("_", "-") if name.startswith("--") else name
+        if name in _ELSEWHERE:
+            raise PopError(f"{name} is no option of pop train; {_ELSEWHERE[name]}")
         target = _ALIASES.get(name)
         if name in _IGNORED:
             continue
@@ -319,10 +339,15 @@ def _arguments_type(base: TrainConfig, plan: dict[str, Any], short: bool) -> typ
         elif short and field.name not in _SHOWN:
             kind = Annotated[kind, tyro.conf.Suppress]
         columns.append((field.name, kind, default))
+    # the settings first: in order of inheritance the help would open with the limits of an export
+    surrounding = typing.get_type_hints(_Run, include_extras=True)
+    own = {field.name: field for field in dataclasses.fields(_Run)}
+    later = {field.name: place for place, kind in enumerate(_LATER) for field in dataclasses.fields(kind)}
+    for name in sorted(own, key=lambda name: later.get(name, -1)):
+        columns.append((name, surrounding[name], own[name]))
     documented = str(_Run.__doc__) + "".join((kind.__doc__ or "").partition("Attributes:")[2] for kind in _DOCUMENTED)
-    return dataclasses.make_dataclass(
-        "TrainArguments", columns, bases=(_Run,), frozen=True, kw_only=True, namespace={"__doc__": documented}
-    )
+    methods = {"__doc__": documented, "check": _Run.check, "any": _Run.any}
+    return dataclasses.make_dataclass("TrainArguments", columns, frozen=True, kw_only=True, namespace=methods)
 
 
 def check_backend(config: TrainConfig) -> None:
@@ -397,5 +422,6 @@ def summary(stats: dict[str, Any]) -> str:
         parts.append(f"LPIPS {stats['lpips']:.4f} ({stats['lpips_net']})")
     parts.append(f"{stats['num_GS']:,} Gaussians ({stats['num_GS_above_floor']:,} with opacity >= 1/255)")
     loading = f", loading {stats['seconds_loading']:.0f} s" if "seconds_loading" in stats else ""
+    loading += f", finding cameras {stats['seconds_sfm']:.0f} s" if "seconds_sfm" in stats else ""
     parts.append(f"{stats['seconds']:.0f} s on {stats.get('gpu', 'the CPU')}{loading}")
     return ", ".join(parts)

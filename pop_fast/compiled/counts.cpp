@@ -6,7 +6,7 @@ namespace pop {
 
 StepCounts Stepper::counted() const {
   StepCounts found = {};
-  if (offsets.empty()) return found;
+  if (!ended) return found;
   found.visible = n_visible;
   const Thresholds<float> thresholds(blend);
   Entries<float> entries;

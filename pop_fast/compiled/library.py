@@ -231,7 +231,8 @@ def stepper_functions(given_bytes: int) -> StepperFunctions:
         raise OSError(f"{path} expects arguments of another layout")
     loaded.pop_stepper_open.argtypes, loaded.pop_stepper_open.restype = (_WHOLE,), _POINTER
     loaded.pop_stepper_close.argtypes, loaded.pop_stepper_close.restype = (_POINTER,), None
-    loaded.pop_stepper_steps.argtypes, loaded.pop_stepper_steps.restype = (_POINTER, _POINTER, _WHOLE), _WHOLE
+    steps = loaded.pop_stepper_steps
+    steps.argtypes, steps.restype = (_POINTER, _POINTER, _WHOLE, _POINTER), _WHOLE
     loaded.pop_stepper_bytes.argtypes, loaded.pop_stepper_bytes.restype = (_POINTER,), _WHOLE
     loaded.pop_stepper_counts.argtypes, loaded.pop_stepper_counts.restype = (_POINTER, _POINTER), None
     return StepperFunctions(

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import ctypes
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, Ste
 from pop_fast.compiled.library import PROJECTION_CONSTANTS, Moments, call_library, stepper_functions
 from pop_fast.stages.blend.transmittance import Stop, below
 from pop_fast.stages.ssim import REACH, Padding, border_of, check_size, kept_windows
+from pop_fast.train.signals import Abandoned, StopRequest, heard
 
 # steps that are taken before Python is asked again: Ctrl-C, a progress bar
 LONGEST: Final = 10
@@ -30,6 +31,7 @@ N_VALUES: Final = 5
 PARTS: Final = ("see", "list", "blend", "compare", "gather", "transpose", "update")
 # what a step had to do: `pop::StepCounts` of step.h, where each is explained, in its order
 COUNTS: Final = ("visible", "entries", "walked", "chunks", "pairs", "marked", "reached")
+T = TypeVar("T")
 _POINTER, _WHOLE, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 
 
@@ -141,6 +143,7 @@ class NativeTrainer:
         step: the step to begin at.
         threads: None takes torch's number.
         cache_mb: memory for what is made of photographs; the others' is made anew at every visit, to the same bits.
+        stop: whether somebody has asked for an end; a step that is being taken is then left, and changes nothing.
 
     Attributes:
         step: steps taken.
@@ -161,8 +164,10 @@ class NativeTrainer:
         *,
         threads: int | None = None,
         cache_mb: float = 1024,
+        stop: StopRequest | None = None,
     ) -> None:
         self.settings, self.step = settings, step
+        self._stop, self._alone = stop or StopRequest(), stop is None
         self._padding: Padding = "same" if settings.padding == "same" else "valid"
         self._views, self._order = views, list(order)
         self._targets: dict[int, _Target] = {}
@@ -223,7 +228,7 @@ class NativeTrainer:
         return dict(zip(COUNTS, found, strict=True))
 
     def run(self, until: int, phase: Phase) -> None:
-        """Take steps until the counter stands at `until`, all of one phase.
+        """Take steps until the counter stands at `until`, all of one phase, or until somebody has asked for an end.
 
         Raises:
             ValueError: a Gaussian is no longer finite; the message names its row and step.
@@ -231,8 +236,16 @@ class NativeTrainer:
         """
         self._history = {}
         self._set_phase(phase)
-        while self.step < until:
+        while self.step < until and not self._asked:
             self._take(min(until - self.step, LONGEST))
+
+    @property
+    def _asked(self) -> bool:
+        return self._stop.asked
+
+    def _called(self, function: Callable[..., T], *given: Any) -> T:
+        """Call what may take seconds, so that a request to stop is heard meanwhile where there can be one."""
+        return function(*given) if self._alone else heard(function, *given)
 
     def step_stats(self, first: int, last: int) -> list[StepStats]:
         """Return the measurements of the steps from `first` to before `last`; the last `run` must have taken them."""
@@ -274,25 +287,29 @@ class NativeTrainer:
     def _take(self, n: int) -> None:
         values = torch.zeros((n, N_VALUES), dtype=torch.float64)
         # held until the steps have been taken: the arguments only point
-        views = [self._target(self._order[step]) for step in range(self.step, self.step + n)]
+        try:
+            with self._stop.abandoning():
+                views = [self._target(self._order[step]) for step in range(self.step, self.step + n)]
+        except Abandoned:
+            return
         steps = (StepGiven * n)()
         for k, view in enumerate(views):
             self._set_step(self.step + k, view)
             self._given.values = values[k].data_ptr()
             steps[k] = self._given
-        taken = self._functions.steps(self._stepper, steps, n)
+        taken = self._called(self._functions.steps, self._stepper, steps, n, self._stop.address)
         if taken < 0:
             raise MemoryError("the native training step ran out of memory")
         for k in range(taken):
             self._history[self.step + k] = StepStats(*values[k].tolist())
         self.step += taken
-        if taken < n and int(self._bad_row) < 0:
+        if int(self._bad_row) >= 0:
+            raise ValueError(f"step {self.step}: Gaussian {int(self._bad_row)} has a value that is not finite")
+        if taken < n and not self._asked:
             raise MemoryError(
                 f"step {self.step}: the Gaussians reach more than {MOST_ENTRIES:,} tiles altogether; "
                 "train on smaller photographs (--factor), or bound the number of Gaussians"
             )
-        if taken < n:
-            raise ValueError(f"step {self.step}: Gaussian {int(self._bad_row)} has a value that is not finite")
 
     def _set_step(self, step: int, view: _Target) -> None:
         given, settings = self._given, self.settings
@@ -311,7 +328,7 @@ class NativeTrainer:
     def _target(self, index: int) -> _Target:
         if index in self._targets:
             return self._targets[index]
-        made = _Target.of(self._views[index], self._padding)
+        made = self._called(_Target.of, self._views[index], self._padding)
         if made.bytes <= self._cache_left:
             self._cache_left -= made.bytes
             self._targets[index] = made

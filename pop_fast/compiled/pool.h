@@ -34,6 +34,8 @@ public:
   virtual ~Plan() = default;
   // Do what must be done by one thread alone, and say what can be shared next; false when there is no more.
   virtual bool next(Work &work) = 0;
+  // Whether parts need not be done any more. While it holds, `next` must return false.
+  virtual bool abandoned() const { return false; }
 };
 
 class Pool {
@@ -129,7 +131,7 @@ private:
     for (int64_t left = untaken.load(); left > 0;) {
       if (!untaken.compare_exchange_weak(left, left - 1)) continue;
       try {
-        work.do_part(thread, work.parts() - left);
+        if (!plan->abandoned()) work.do_part(thread, work.parts() - left);
       } catch (...) {
         failed = true;
       }

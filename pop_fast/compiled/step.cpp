@@ -7,7 +7,8 @@
 
 namespace pop {
 
-int64_t Stepper::steps(const StepGiven *first, int64_t n) {
+int64_t Stepper::steps(const StepGiven *first, int64_t n, const int32_t *stop) {
+  asked = stop;
   given = first;
   last_given = first + n;
   stage = 0;
@@ -15,8 +16,11 @@ int64_t Stepper::steps(const StepGiven *first, int64_t n) {
   return given - first;
 }
 
+// Nothing that outlives the call is changed before the update, which is done to its end.
+bool Stepper::abandoned() const { return stage <= UPDATE_STAGE && asked && __atomic_load_n(asked, __ATOMIC_RELAXED) != 0; }
+
 bool Stepper::next(Work &work) {
-  if (given == last_given) return false;
+  if (given == last_given || abandoned()) return false;
   book_time();
   switch (stage++) {
   case 0:
@@ -43,7 +47,7 @@ bool Stepper::next(Work &work) {
   case 6:
     work = transpose_tiles();
     return true;
-  case 7:
+  case UPDATE_STAGE:
     count_sides();
     work = update();
     return true;
@@ -65,6 +69,7 @@ void Stepper::book_time() {
 
 void Stepper::begin() {
   const StepGiven &g = *given;
+  ended = false;
   camera = camera_from_matrices(g.viewmat, g.K, int(g.width), int(g.height), g.centred != 0);
   profile = {};
   profile.near_plane = float(g.near_plane);
@@ -145,6 +150,7 @@ void Stepper::finish() {
   g.values[SQUARE] = pixels_summed[2] / n_values;
   g.values[POP] = g.lambda_pop * (sides[0] / double(std::max<int64_t>(n_important, 1)) +
                                   sides[1] / double(std::max<int64_t>(n_others, 1)));
+  ended = true;
 }
 
 int64_t Stepper::bytes() const {
@@ -167,10 +173,11 @@ void *pop_stepper_open(int64_t threads) {
 
 void pop_stepper_close(void *stepper) { delete static_cast<pop::Stepper *>(stepper); }
 
-// how many steps were taken: fewer where a row is not finite or lists are too long; -1 where there is no memory
-int64_t pop_stepper_steps(void *stepper, const pop::StepGiven *first, int64_t n) {
+// how many steps were taken: fewer where a row is not finite, lists are too long or *stop is not 0 any more; -1 where there
+// is no memory
+int64_t pop_stepper_steps(void *stepper, const pop::StepGiven *first, int64_t n, const int32_t *stop) {
   try {
-    return static_cast<pop::Stepper *>(stepper)->steps(first, n);
+    return static_cast<pop::Stepper *>(stepper)->steps(first, n, stop);
   } catch (...) {
     return -1;
   }

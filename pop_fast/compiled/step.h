@@ -12,6 +12,7 @@
 // number of threads, so that no bit does.
 #pragma once
 
+#include <atomic>
 #include <chrono>
 #include <cstdint>
 #include <memory>
@@ -133,11 +134,12 @@ struct Part {
 class Stepper : public Plan {
 public:
   explicit Stepper(int64_t threads) : pool(threads), pixels(STEP_TILE) {}
-  // Take n steps, fewer where a row is found that is not finite, and return how many.
-  int64_t steps(const StepGiven *first, int64_t n);
+  // Take n steps, fewer where a row is found that is not finite or *stop is not 0 any more, and return how many.
+  int64_t steps(const StepGiven *first, int64_t n, const int32_t *stop);
   bool next(Work &work) override;
+  bool abandoned() const override;
   int64_t bytes() const;
-  // of the last step that was taken to its end; none before there is one
+  // of the last step; none where it was not taken to its end
   StepCounts counted() const;
 
 private:
@@ -163,7 +165,11 @@ private:
 
   // of the step that is taken
   const StepGiven *given = nullptr, *last_given = nullptr;
-  int stage = 0;
+  // the next work of the step; the last one, the update, is `UPDATE_STAGE`
+  static constexpr int UPDATE_STAGE = 7;
+  std::atomic<int> stage{0};
+  const int32_t *asked = nullptr;
+  bool ended = false;
   std::chrono::steady_clock::time_point stage_began;
   Camera<float> camera;
   Profile<float> profile;

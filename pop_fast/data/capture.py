@@ -87,6 +87,7 @@ class Capture:
         world_transform: similarity, world = world_transform @ capture's own frame; the identity where the capture was
             loaded with `normalize=False`. float64 [4, 4]
         notes: what was skipped, chosen or made up while loading, one line each.
+        sfm_seconds: how long its cameras were searched for, where they were not there before; else None.
     """
 
     name: str
@@ -96,6 +97,7 @@ class Capture:
     source: str
     world_transform: np.ndarray = field(default_factory=lambda: np.eye(4))
     notes: tuple[str, ...] = ()
+    sfm_seconds: float | None = None
 
     def __post_init__(self) -> None:
         if len(self.views) < 2:

@@ -10,14 +10,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pop_fast.data.colmap import find_model, read_model
-from pop_fast.data.exports import EXPORTS, find_export, read_export
-from pop_fast.data.finding import Finding, State
-from pop_fast.data.load import beside_the_model, turned_upright
+from pop_fast.data.colmap import find_model
+from pop_fast.data.finding import Finding, State, number
+from pop_fast.data.load import find_listing
 from pop_fast.data.photo_quality import Shown, about_number, measure
-from pop_fast.data.posed_images import PosedImage, SparsePoints
-from pop_fast.data.sfm import photo_folder, photographs
-from pop_fast.data.transforms import find_transforms, read_transforms
+from pop_fast.data.photo_use import about_mixed_sizes, about_use
+from pop_fast.data.posed_images import Listing, PosedImage, SparsePoints
+from pop_fast.data.sfm import photo_folder
 from pop_fast.errors import CaptureError
 from pop_fast.io.images import find_image, list_images, read_image, read_mask, unreadable_photographs
 
@@ -38,44 +37,17 @@ class Photo:
     shown: Shown | None = None
 
 
-def read_listing(root: Path, images: str | None = None) -> tuple[str, list[PosedImage], SparsePoints | None] | None:
-    """Read where photographs were taken from: a COLMAP model, transforms.json, an export; what, its shots, its points.
+def read_listing(root: Path, images: str | None = None) -> Listing | None:
+    """Read where photographs were taken, as training does; see `pop_fast.data.load.find_listing`.
 
     Args:
         root: the capture's folder.
         images: the folder in it with the photographs, in place of the listed one.
-
-    Returns:
-        None where there is neither, but photographs that cameras can be found for.
-
-    Raises:
-        CaptureError: the folder is absent or holds no photographs, or what says so is damaged.
     """
-    if not root.is_dir():
-        raise CaptureError(f"{root}: no such folder; give the folder that holds the photographs and their cameras")
-    model = find_model(root)
-    if model is not None:
-        shots, cloud = read_model(model)
-        # as training reads them: beside the model, where the capture was made in place
-        shots = turned_upright(root, beside_the_model(root, shots, images), model)
-        return f"COLMAP model in {model.relative_to(root)}", _in_folder(shots, images), cloud
-    lists = find_transforms(root)
-    if lists:
-        shots, cloud = read_transforms(lists)
-        return " and ".join(path.name for path in lists), _in_folder(shots, images), cloud
-    export = find_export(root)
-    if export is not None:
-        shots, cloud, _ = read_export(*export, root, images)
-        return f"{EXPORTS[export[0]][0]} in {export[1].relative_to(root)}", shots, cloud
-    folder = photo_folder(root)
-    if not photographs(folder):
-        hint = unreadable_photographs(folder) or "give the folder of a capture"
-        raise CaptureError(f"{root}: has no photographs, no COLMAP model and no transforms.json; {hint}")
-    return None
-
-
-def _in_folder(shots: list[PosedImage], images: str | None) -> list[PosedImage]:
-    return shots if images is None else [replace(shot, folder=images) for shot in shots]
+    listing = find_listing(root, images=images)
+    if listing is None or images is None:
+        return listing
+    return replace(listing, shots=[replace(shot, folder=images) for shot in listing.shots])
 
 
 def file_of(root: Path, shot: PosedImage) -> Path | None:
@@ -257,7 +229,8 @@ def about_bare(root: Path, shown: Sequence[Shown]) -> Iterator[Finding]:
     fix = (
         "pop train finds their cameras first, or pop sfm alone" if enough else "a scene needs two or more that overlap"
     )
-    yield Finding("ok" if enough else "bad", "poses", f"none yet, {len(sound)} photographs: {fix}")
+    count = f"{len(sound)} {number(len(sound), 'photograph', 'photographs')}"
+    yield Finding("ok" if enough else "bad", "poses", f"none yet, {count}: {fix}")
     sizes = Counter(one.size for one in sound)
     listed = ", ".join(f"{count} of {w}x{h} px" for (w, h), count in sizes.most_common(4))
     yield Finding("ok" if sizes else "bad", "photographs", listed or "none could be read")
@@ -265,6 +238,10 @@ def about_bare(root: Path, shown: Sequence[Shown]) -> Iterator[Finding]:
         if one.problem:
             yield Finding("bad", "photographs", one.problem)
     yield from about_number(len(sound))
+    yield from about_use(sound)
+    mixed = about_mixed_sizes(sound)
+    if mixed is not None:
+        yield mixed
     left = unreadable_photographs(photo_folder(root))
     if left:
         yield Finding("warn", "photographs", left)

@@ -16,6 +16,8 @@ __all__ = ["about_other_models", "about_random_points", "about_unplaced"]
 
 # the mean of the cameras' viewing directions, as unit vectors, is this long where they all look about the same way
 _SAME_WAY = 0.9
+# photographs that a line names
+_NAMED = 12
 
 
 def about_other_models(root: Path, models: Sequence[tuple[Path, int]]) -> list[str]:
@@ -34,7 +36,7 @@ def about_other_models(root: Path, models: Sequence[tuple[Path, int]]) -> list[s
 
 
 def about_unplaced(folder: Path, shots: Sequence[PosedImage]) -> list[str]:
-    """Tell how many photographs of a folder have no camera.
+    """Tell which photographs of a folder have no camera.
 
     Args:
         folder: where the photographs are.
@@ -46,9 +48,10 @@ def about_unplaced(folder: Path, shots: Sequence[PosedImage]) -> list[str]:
     left = [name for name in names if not placed & {name, splitext(name)[0]}]
     if not left:
         return []
+    more = f" and {len(left) - _NAMED} more" if len(left) > _NAMED else ""
     return [
-        f"{len(names) - len(left)} of {len(names)} photographs in {folder} are placed; the model has no camera for the "
-        f"others, first {left[0]}"
+        f"{len(names) - len(left)} of {len(names)} photographs in {folder} are placed; the model has no camera for "
+        f"{', '.join(left[:_NAMED])}{more}"
     ]
 
 

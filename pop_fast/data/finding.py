@@ -8,6 +8,11 @@ from typing import Literal
 State = Literal["ok", "warn", "bad"]
 
 
+def number(count: int, one: str, more: str) -> str:
+    """Choose the word that goes with a number."""
+    return one if count == 1 else more
+
+
 @dataclass(frozen=True)
 class Finding:
     """One line: how bad, about what, and what was found."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Literal
+from zipfile import is_zipfile
 
 import numpy as np
 
@@ -23,9 +25,18 @@ from pop_fast.data.sfm_files import read_upright
 from pop_fast.data.sfm_options import SfmOptions
 from pop_fast.data.transforms import find_transforms, read_transforms
 from pop_fast.errors import CaptureError
+from pop_fast.io.image_header import read_size
 from pop_fast.io.images import VIDEO_SUFFIXES, find_image, unreadable_photographs
 
-__all__ = ["Photographs", "beside_the_model", "list_capture", "load_capture", "turned_upright"]
+__all__ = [
+    "Photographs",
+    "beside_the_model",
+    "check_factor",
+    "find_listing",
+    "list_capture",
+    "load_capture",
+    "turned_upright",
+]
 
 Photographs = Literal["all", "held out", "none"]
 Source = Literal["auto", "colmap", "transforms", "polycam", "metashape", "realitycapture", "photos"]
@@ -127,36 +138,31 @@ def list_capture(
         CaptureError: one line that names the file, the field and the fix.
     """
     root = Path(path)
-    if not root.is_dir():
-        what = "is a file, not a folder" if root.exists() else "no such folder"
-        if root.suffix.lower() in VIDEO_SUFFIXES and root.exists():
-            raise CaptureError(f"{root}: is a video; take photographs out of it first: pop frames {root}")
-        raise CaptureError(f"{root}: {what}; give the folder that holds the photographs and their cameras")
-    listing = _read_listing(root, source, images, sfm, progress)
-    shots = listing.shots
-    if len(shots) < 2:
-        raise CaptureError(f"{listing.path}: has {len(shots)} view(s) with a known camera; a scene needs two or more")
-    if listing.made_from == "COLMAP model":
-        shots = turned_upright(root, beside_the_model(root, shots, images), listing.path)
-        notes = listing.notes + about_unplaced(root / (images or shots[0].folder), shots)
-        listing = replace(listing, shots=shots, notes=notes)
+    listing = find_listing(root, source, images)
+    if listing is None:
+        listing = _from_photos(root, images, sfm, progress)
+    if len(listing.shots) < 2:
+        raise CaptureError(
+            f"{listing.path}: has {len(listing.shots)} view(s) with a known camera; a scene needs two or more"
+        )
     return listing
 
 
-def _background(color: tuple[float, float, float]) -> tuple[float, float, float]:
-    if len(color) != 3 or not all(0.0 <= c <= 1.0 for c in color):
-        raise CaptureError(f"background is {tuple(color)}; it must be three numbers in [0, 1]")
-    return (float(color[0]), float(color[1]), float(color[2]))
+def find_listing(root: Path, source: Source = "auto", images: str | None = None) -> Listing | None:
+    """Read what says where a capture's photographs were taken, as training and `pop data check` both see it.
 
+    Returns:
+        None where nothing says so, but there are photographs that cameras can be found for.
 
-def _read_listing(
-    root: Path, source: Source, images: str | None, sfm: bool | SfmOptions, progress: Progress | None
-) -> Listing:
+    Raises:
+        CaptureError: the folder is absent or none, it holds no photographs, or what says so is damaged.
+    """
+    _check_root(root)
     if source == "auto" and find_block(root):
         return read_block(root)
     models = find_models(root) if source in ("auto", "colmap") else []
     if models:
-        return Listing(root, models[0][0], *read_model(models[0][0]), "COLMAP model", about_other_models(root, models))
+        return _of_model(root, models, images)
     found = find_transforms(root) if source in ("auto", "transforms") else []
     if found:
         return Listing(root, found[0], *read_transforms(found), found[0].name, [])
@@ -172,9 +178,39 @@ def _read_listing(
         raise CaptureError(f"{root}: has no transforms.json and no transforms_train.json; choose another --source")
     if source in EXPORTS:
         raise CaptureError(f"{root}: has no {EXPORTS[source][2]}; export it there, or choose another --source")
-    model = _from_photos(root, sfm, progress)
-    left = unreadable_photographs(photo_folder(root))
-    return Listing(root, model, *read_model(model), "COLMAP model", [left] if left else [])
+    folder = photo_folder(root)
+    if not photographs(folder):
+        hint = unreadable_photographs(folder) or "give the folder of a capture"
+        raise CaptureError(f"{root}: has no photographs, no COLMAP model and no transforms.json; {hint}")
+    return None
+
+
+def _check_root(root: Path) -> None:
+    if root.is_dir():
+        return
+    if not root.exists():
+        raise CaptureError(f"{root}: no such folder; give the folder that holds the photographs and their cameras")
+    if root.suffix.lower() in VIDEO_SUFFIXES:
+        raise CaptureError(f"{root}: is a video; take photographs out of it first: pop frames {root}")
+    if is_zipfile(root):
+        raise CaptureError(f"{root}: is a ZIP archive; unpack it first, and give the folder that it makes")
+    raise CaptureError(f"{root}: is a file, not a folder; give the folder that holds the photographs and their cameras")
+
+
+def _of_model(root: Path, models: Sequence[tuple[Path, int]], images: str | None) -> Listing:
+    model = models[0][0]
+    listed, cloud = read_model(model)
+    if len(listed) < 2:
+        return Listing(root, model, listed, cloud, "COLMAP model")
+    shots = turned_upright(root, beside_the_model(root, listed, images), model)
+    notes = about_other_models(root, models) + about_unplaced(root / (images or shots[0].folder), shots)
+    return Listing(root, model, shots, cloud, "COLMAP model", notes)
+
+
+def _background(color: tuple[float, float, float]) -> tuple[float, float, float]:
+    if len(color) != 3 or not all(0.0 <= c <= 1.0 for c in color):
+        raise CaptureError(f"background is {tuple(color)}; it must be three numbers in [0, 1]")
+    return (float(color[0]), float(color[1]), float(color[2]))
 
 
 def beside_the_model(root: Path, shots: list[PosedImage], images: str | None) -> list[PosedImage]:
@@ -194,18 +230,44 @@ def turned_upright(root: Path, shots: list[PosedImage], model: Path) -> list[Pos
     return [replace(shot, turns=turns.get(shot.file, 0)) for shot in shots] if turns else shots
 
 
-def _from_photos(root: Path, sfm: bool | SfmOptions, progress: Progress | None) -> Path:
+def _from_photos(root: Path, images: str | None, sfm: bool | SfmOptions, progress: Progress | None) -> Listing:
+    """Find the cameras of bare photographs, and read them."""
     photos = photo_folder(root)
-    count = len(photographs(photos))
-    if count == 0:
-        hint = unreadable_photographs(photos) or "give the folder of a capture"
-        raise CaptureError(f"{root}: has no photographs, no COLMAP model and no transforms.json; {hint}")
     if not sfm:
+        count = len(photographs(photos))
         raise CaptureError(
             f"{root}: has {count} photographs but nothing says where they were taken; run pop sfm {root} first"
         )
-    run_sfm(photos, root, progress=progress, **asdict(sfm if isinstance(sfm, SfmOptions) else SfmOptions()))
-    return root / "sparse" / "0"
+    start = time.perf_counter()
+    options = sfm if isinstance(sfm, SfmOptions) else SfmOptions()
+    found = run_sfm(photos, root, progress=progress, **asdict(options))
+    seconds = time.perf_counter() - start
+    listing = _of_model(root, [(root / "sparse" / "0", found.registered)], images)
+    left = unreadable_photographs(photos)
+    notes = [*found.notes, *([left] if left else []), *listing.notes]
+    return replace(listing, notes=notes, sfm_seconds=seconds)
+
+
+def check_factor(root: Path, factor: int, smallest: int = 1) -> None:
+    """Refuse a factor that leaves nothing of bare photographs, by their headers, before their cameras are searched for.
+
+    Args:
+        root: the capture's folder.
+        factor: by which photographs are shrunk.
+        smallest: side of the smallest photograph that can be used, px.
+
+    Raises:
+        CaptureError: names the first photograph that would be smaller.
+    """
+    folder = photo_folder(root)
+    if factor == 1 or (root / f"{folder.name}_{factor}").is_dir():
+        return
+    for path in photographs(folder):
+        size = read_size(path)
+        if size is not None and round(min(size) / factor) < smallest:
+            raise CaptureError(
+                f"{path}: is {size[0]}x{size[1]} px, too small for factor {factor}; use {min(size) // smallest} at most"
+            )
 
 
 def _assemble(root: Path, listing: Listing, views: list[View], normalize: bool, points: int, seed: int) -> Capture:
@@ -232,4 +294,5 @@ def _assemble(root: Path, listing: Listing, views: list[View], normalize: bool, 
     except CaptureError as error:
         raise CaptureError(f"{listing.path}: {error}") from error
     name = root.resolve().name
-    return Capture(name, tuple(views), cloud.xyz, cloud.rgb, source, transform, tuple(notes))
+    points_of = (cloud.xyz, cloud.rgb)
+    return Capture(name, tuple(views), *points_of, source, transform, tuple(notes), listing.sfm_seconds)

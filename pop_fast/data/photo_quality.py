@@ -12,7 +12,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from pop_fast.data.finding import Finding
+from pop_fast.data.finding import Finding, number
 from pop_fast.errors import CaptureError
 from pop_fast.io.image_header import Exif, read_exif
 from pop_fast.io.images import read_image
@@ -27,6 +27,7 @@ _CLIPPED: Final = 0.25
 # stops between the darkest and the brightest of a set
 _STOPS: Final = 1.5
 _THUMB: Final = 24
+_FEATURES: Final = 500
 # mean difference of two thumbnails, of 255: noise and compression leave less, a step to the side more
 _SAME: Final = 1.2
 # photographs of a set under which there is too little to see from all sides
@@ -48,6 +49,8 @@ class Shown:
         dark: share of pixels under 4.
         bright: share of pixels over 251.
         thumb: gray. float32 [24, 24]
+        features: places and descriptors of up to 500 SIFT features of the gray picture, sides up to 512 px; places are
+            px of that picture. float32 [P, 2], uint8 [P, 128]
     """
 
     name: str
@@ -60,6 +63,9 @@ class Shown:
     dark: float = 0.0
     bright: float = 0.0
     thumb: np.ndarray = field(default_factory=lambda: np.zeros((_THUMB, _THUMB), np.float32))
+    features: tuple[np.ndarray, np.ndarray] = field(
+        default_factory=lambda: (np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8))
+    )
 
 
 def measure_file(path: Path, name: str) -> Shown:
@@ -85,7 +91,15 @@ def measure(path: Path, image: np.ndarray, name: str) -> Shown:
         dark=float((small < 4).mean()),
         bright=float((small > 251).mean()),
         thumb=thumbnail(gray),
+        features=_features(small),
     )
+
+
+def _features(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    points, descriptors = cv2.SIFT.create(nfeatures=_FEATURES).detectAndCompute(gray, None)
+    if descriptors is None:
+        return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8)
+    return np.array([point.pt for point in points], np.float32), descriptors.astype(np.uint8)
 
 
 def sharpness(gray: np.ndarray) -> float:
@@ -128,7 +142,7 @@ def about_number(count: int) -> Iterator[Finding]:
     """Tell that there are few photographs."""
     if count < _FEW:
         fix = f"{_FEW} to 200 that overlap by two thirds show a scene from all sides"
-        yield Finding("warn", "photographs", f"{count} are few; {fix}")
+        yield Finding("warn", "photographs", f"{count} {number(count, 'is', 'are')} few; {fix}")
 
 
 def _about_camera(shown: Sequence[Shown]) -> Iterator[Finding]:
@@ -143,7 +157,11 @@ def _about_camera(shown: Sequence[Shown]) -> Iterator[Finding]:
     without = [one.name for one in shown if not one.exif.focal]
     if without:
         fix = "where photographs were edited, use the originals: cameras are found more surely from a known lens"
-        yield Finding("warn", "EXIF", f"{len(without)} have no focal length, {_some(without)}; {fix}")
+        yield Finding(
+            "warn",
+            "EXIF",
+            f"{len(without)} {number(len(without), 'has', 'have')} no focal length, {some(without)}; {fix}",
+        )
     if len(kinds) > 1 or len(lenses) > 1:
         yield Finding("warn", "EXIF", f"{text}: several lenses or zooms; one fixed lens is placed more surely")
     else:
@@ -157,9 +175,8 @@ def _about_blur(shown: Sequence[Shown]) -> Iterator[Finding]:
     blurred = [one.name for one, median in zip(shown, around, strict=True) if one.sharpness < _BLURRED * median]
     if blurred:
         fix = "out of focus or shaken: leave them out"
-        yield Finding(
-            "warn", "blur", f"{len(blurred)} are far less sharp than those around them, {_some(blurred)}; {fix}"
-        )
+        what = f"{len(blurred)} {number(len(blurred), 'is', 'are')} far less sharp than those around them"
+        yield Finding("warn", "blur", f"{what}, {some(blurred)}; {fix}")
     else:
         yield Finding("ok", "blur", "all about as sharp as those around them")
 
@@ -169,7 +186,11 @@ def _about_exposure(shown: Sequence[Shown]) -> Iterator[Finding]:
     bright = [one.name for one in shown if one.bright > _CLIPPED]
     for names, what in ((dark, "black"), (bright, "white")):
         if names:
-            yield Finding("warn", "exposure", f"{len(names)} are over a quarter pure {what}, {_some(names)}")
+            yield Finding(
+                "warn",
+                "exposure",
+                f"{len(names)} {number(len(names), 'is', 'are')} over a quarter pure {what}, {some(names)}",
+            )
     taken = [one.exif.exposure * one.exif.iso for one in shown if one.exif.exposure and one.exif.iso]
     stops = float(np.log2(max(taken) / min(taken))) if len(taken) == len(shown) else 0.0
     fix = "lock the exposure, or train with --exposure: without it training takes one brightness for all"
@@ -185,9 +206,7 @@ def _about_copies(shown: Sequence[Shown]) -> Iterator[Finding]:
     digests = Counter(one.digest for one in shown)
     copies = [one.name for one in shown if digests[one.digest] > 1]
     if copies:
-        yield Finding(
-            "warn", "duplicates", f"{len(copies)} are the same file more than once, {_some(copies)}; keep one"
-        )
+        yield Finding("warn", "duplicates", f"{len(copies)} are the same file more than once, {some(copies)}; keep one")
     thumbs = np.stack([one.thumb for one in shown])
     alike: list[str] = []
     for i in range(len(shown) - 1):
@@ -196,10 +215,15 @@ def _about_copies(shown: Sequence[Shown]) -> Iterator[Finding]:
         alike += [f"{shown[i].name} and {other.name}" for other in others if other.digest != shown[i].digest]
     if alike:
         fix = "they add nothing, from the same place"
-        yield Finding("warn", "duplicates", f"{len(alike)} pairs look the same, {_some(alike)}; {fix}")
+        yield Finding(
+            "warn",
+            "duplicates",
+            f"{len(alike)} {number(len(alike), 'pair looks', 'pairs look')} the same, {some(alike)}; {fix}",
+        )
     if not copies and not alike:
         yield Finding("ok", "duplicates", "none")
 
 
-def _some(names: Sequence[str]) -> str:
+def some(names: Sequence[str]) -> str:
+    """Name the first of some photographs."""
     return "first " + ", ".join(names[:3])

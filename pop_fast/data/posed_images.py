@@ -69,6 +69,7 @@ class Listing:
         made_from: what kind of list it is.
         notes: one line each.
         transform: the training frame, where that is decided already; None normalizes. float64 [4, 4]
+        sfm_seconds: how long the cameras were searched for, where that was done now.
     """
 
     root: Path
@@ -78,3 +79,4 @@ class Listing:
     made_from: str
     notes: list[str] = field(default_factory=list)
     transform: np.ndarray | None = None
+    sfm_seconds: float | None = None

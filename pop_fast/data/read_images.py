@@ -145,10 +145,11 @@ def _about_folders(root: Path, shots: Sequence[PosedImage], options: PhotoOption
     if options.factor == 1:
         return []
     read = {_image_folder(root, folder, options) for folder in {shot.folder for shot in shots}}
-    names = ", ".join(sorted(f"{chosen or '.'}/" for chosen, _ in read))
+    names = ", ".join(sorted(f"{chosen}/" for chosen, _ in read if chosen))
+    whose = f"the photographs of {names}" if names else "the photographs"
     if all(shrink == 1 for _, shrink in read):
-        return [f"the photographs of {names} are used, made smaller before; --images says otherwise"]
-    return [f"the photographs of {names} are shrunk by {options.factor} here"]
+        return [f"{whose} are used, made smaller before; --images says otherwise"]
+    return [f"{whose} are shrunk by {options.factor} here"]
 
 
 def _image_folder(root: Path, folder: str, options: PhotoOptions) -> tuple[str, int]:

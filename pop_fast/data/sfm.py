@@ -20,12 +20,14 @@ from typing import Any, Literal
 
 from pop_fast.data.capture import Progress
 from pop_fast.data.colmap import quiet_colmap
+from pop_fast.data.photo_quality import Shown, measure
+from pop_fast.data.photo_use import about_mixed_sizes, about_use
 from pop_fast.data.polycam import photographs_of_polycam
 from pop_fast.data.sfm_files import UPRIGHT, recognise_result, write_list
 from pop_fast.data.sfm_options import SfmOptions
 from pop_fast.data.sfm_search import Search, check_camera_model, find_cameras
 from pop_fast.errors import CaptureError
-from pop_fast.io.atomic import folder_atomically
+from pop_fast.io.atomic import check_folder, folder_atomically
 from pop_fast.io.heif import HEIF_SUFFIXES
 from pop_fast.io.image_header import read_exif
 from pop_fast.io.images import list_images, read_image, unreadable_photographs, write_png
@@ -44,6 +46,7 @@ class SfmResult:
         photographs: photographs that were given.
         points: sparse points.
         reprojection_error: mean, px.
+        notes: what its owner may not know of the photographs, one line each.
     """
 
     capture: Path
@@ -51,6 +54,7 @@ class SfmResult:
     photographs: int
     points: int
     reprojection_error: float
+    notes: tuple[str, ...] = ()
 
 
 def photo_folder(root: Path) -> Path:
@@ -117,11 +121,16 @@ def run_sfm(
     if len(names) < 2:
         hint = unreadable_photographs(photos) or "a scene needs two or more that overlap"
         raise CaptureError(f"{photos}: has {len(names)} photograph(s); {hint}")
-    sizes = _sizes(photos, names, progress)
-    if single_camera is None:
-        options = replace(options, single_camera=len(sizes) == 1)
     in_place = target != capture.resolve()
     own = recognise_result(capture.resolve(), target)
+    check_folder(target, overwrite, recognise=own)
+    shown = _looked_at(photos, names, progress)
+    hopeless = [finding.text for finding in about_use(shown) if finding.state == "bad"]
+    if hopeless:
+        raise CaptureError(f"{photos}: {'; '.join(hopeless)}")
+    mixed = about_mixed_sizes(shown)
+    if single_camera is None:
+        options = replace(options, single_camera=mixed is None)
     with folder_atomically(target, overwrite, recognise=own) as folder:
         sparse = folder if in_place else folder / "sparse"
         with tempfile.TemporaryDirectory(prefix="pop_sfm_") as work, quiet_colmap():
@@ -138,7 +147,8 @@ def run_sfm(
         _write_upright(sparse, photos, names)
         write_list(sparse, folder, "sparse/" if in_place else "")
     error = float(best.compute_mean_reprojection_error())
-    return SfmResult(capture, best.num_reg_images(), len(names), best.num_points3D(), error)
+    notes = () if mixed is None or options.single_camera else (mixed.text,)
+    return SfmResult(capture, best.num_reg_images(), len(names), best.num_points3D(), error, notes)
 
 
 def _is_utf8(name: str) -> bool:
@@ -193,22 +203,24 @@ def _plain_suffix(name: Path) -> str:
     return ".png" if suffix in HEIF_SUFFIXES else suffix
 
 
-def _sizes(photos: Path, names: list[Path], progress: Progress | None) -> set[tuple[int, int]]:
-    """Read all photographs once: damaged ones are found before the long work begins."""
-    sizes: set[tuple[int, int]] = set()
+def _looked_at(photos: Path, names: list[Path], progress: Progress | None) -> list[Shown]:
+    """Read all photographs once: damaged and useless ones are found before the long work begins."""
+    found: list[Shown] = []
     files = [photos / name for name in names]
     with sound_jpegs(files), ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
-        jobs = [pool.submit(lambda file: read_image(file).shape, file) for file in files]
+        jobs = [
+            pool.submit(lambda file, name: measure(file, read_image(file), name.as_posix()), file, name)
+            for file, name in zip(files, names, strict=True)
+        ]
         try:
-            for done, job in enumerate(jobs, start=1):
-                height, width = job.result()[:2]
-                sizes.add((width, height))
+            for job in jobs:
+                found.append(job.result())
                 if progress is not None:
-                    progress("checking photographs", done, len(names))
+                    progress("checking photographs", len(found), len(names))
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    return sizes
+    return found
 
 
 def _find_cameras(job: _Job, options: SfmOptions) -> Any:

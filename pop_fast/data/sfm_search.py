@@ -2,7 +2,8 @@
 
 COLMAP computes for minutes inside one call, where no signal is heard. A process can be ended at any moment, and takes
 COLMAP's threads, its log and its memory with it. The words of the two processes are lines of JSON: one job, and for it
-any number of reports of progress and one end.
+any number of reports of progress and one end. Between two reports the one that waits counts what COLMAP has written to
+its database: photographs with features, and pairs that were compared.
 """
 
 from __future__ import annotations
@@ -11,19 +12,23 @@ import contextlib
 import itertools
 import json
 import os
+import queue
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
 from pop_fast.children import python_command
 from pop_fast.data.capture import Progress
 from pop_fast.data.colmap import quiet_colmap
+from pop_fast.data.photo_use import FIX
 from pop_fast.data.pinhole import require_colmap
 from pop_fast.errors import CaptureError
 
@@ -33,8 +38,14 @@ _EXHAUSTIVE_UP_TO: Final = 60
 _NEIGHBOURS: Final = 10
 # photographs, and the square of it pairs, between two reports of progress
 _BATCH: Final = 8
-FIX: Final = "take photographs that overlap by two thirds, from different places, of a scene with texture"
 _DONE: Final = b"."
+# s between two looks into the database
+_LOOK_EVERY: Final = 0.5
+# the stages of which COLMAP says nothing itself, and the table of its database that has a row for each one that is done
+_FEATURES: Final = "finding features in photographs"
+_MATCHES: Final = "matching pairs of photographs"
+_CAMERAS: Final = "finding cameras of photographs"
+_TABLES: Final = {_FEATURES: "descriptors", _MATCHES: "two_view_geometries"}
 # letters of what COLMAP says that an error shows
 _LONGEST: Final = 300
 
@@ -97,6 +108,9 @@ def find_cameras(search: Search, progress: Progress | None) -> Any:
     """
     begin = f"import sys; sys.path.append(sys.argv[1]); from {__name__} import main; main()"
     command = python_command("-c", begin, str(Path(__file__).parents[2]))
+    if progress is not None:
+        # the other process takes seconds to begin
+        progress(_FEATURES, 0, len(search.names))
     with tempfile.TemporaryFile() as log:
         child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log)
         try:
@@ -130,13 +144,43 @@ def _listen(child: subprocess.Popen[bytes], search: Search, progress: Progress |
     with contextlib.suppress(BrokenPipeError):
         child.stdin.write(json.dumps(asdict(search)).encode() + b"\n")
         child.stdin.flush()
-    for line in child.stdout:
-        word = json.loads(line)
-        if isinstance(word, str):
-            return word
-        if progress is not None:
-            progress(*word)
-    return None
+    lines: queue.Queue[bytes] = queue.Queue()
+    threading.Thread(target=_hand_on, args=(child.stdout, lines), name="sfm", daemon=True).start()
+    stage, told, total = "", 0, 0
+    while True:
+        try:
+            line = lines.get(timeout=_LOOK_EVERY)
+        except queue.Empty:
+            done = _rows(search.database, _TABLES.get(stage))
+        else:
+            word = json.loads(line) if line else None
+            if not isinstance(word, list):
+                return word
+            stage, done, total = word
+            # another stage, or a model that was given up for another
+            told = 0
+        if progress is not None and stage:
+            told = min(max(told, done), total)
+            progress(stage, told, total)
+
+
+def _hand_on(pipe: IO[bytes], lines: queue.Queue[bytes]) -> None:
+    """Put every line into a queue, and an empty one at the end."""
+    with contextlib.suppress(ValueError, OSError):
+        for line in pipe:
+            lines.put(line)
+    lines.put(b"")
+
+
+def _rows(database: Path, table: str | None) -> int:
+    """Count the rows of a table; 0 where that cannot be done now. COLMAP's database lets others read meanwhile."""
+    if table is None:
+        return 0
+    try:
+        with contextlib.closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True, timeout=0.1)) as opened:
+            return int(opened.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+    except sqlite3.Error:
+        return 0
 
 
 def main() -> None:
@@ -205,7 +249,7 @@ def _extract(job: Search, tell: Progress) -> None:
         options=pycolmap.ImageReaderOptions(camera_model=job.camera_model),
     )
     for start in range(0, n, _BATCH):
-        tell("finding features", start, n)
+        tell(_FEATURES, start, n)
         pycolmap.extract_features(
             job.database,
             job.images,
@@ -213,7 +257,7 @@ def _extract(job: Search, tell: Progress) -> None:
             extraction_options=pycolmap.FeatureExtractionOptions(max_image_size=job.max_size),
             device=pycolmap.Device.cpu,
         )
-    tell("finding features", n, n)
+    tell(_FEATURES, n, n)
 
 
 def pairs_of(n: int, matcher: str) -> list[tuple[int, int]]:
@@ -231,7 +275,7 @@ def _match(job: Search, tell: Progress) -> None:
     pairs = pairs_of(len(job.names), job.matcher)
     listing = Path(job.work, "pairs.txt")
     for start in range(0, len(pairs), _BATCH**2):
-        tell("matching photographs", start, len(pairs))
+        tell(_MATCHES, start, len(pairs))
         batch = pairs[start : start + _BATCH**2]
         listing.write_text("".join(f"{job.names[i]} {job.names[j]}\n" for i, j in batch), encoding="utf-8")
         pycolmap.match_image_pairs(
@@ -240,7 +284,7 @@ def _match(job: Search, tell: Progress) -> None:
             verification_options=verification,
             device=pycolmap.Device.cpu,
         )
-    tell("matching photographs", len(pairs), len(pairs))
+    tell(_MATCHES, len(pairs), len(pairs))
 
 
 def _map(job: Search, tell: Progress) -> Any:
@@ -259,11 +303,11 @@ def _map(job: Search, tell: Progress) -> Any:
     def advance(by: int) -> Callable[[], None]:
         def callback() -> None:
             found[0] += by
-            tell("finding cameras", min(found[0], len(job.names)), len(job.names))
+            tell(_CAMERAS, min(found[0], len(job.names)), len(job.names))
 
         return callback
 
-    tell("finding cameras", 0, len(job.names))
+    tell(_CAMERAS, 0, len(job.names))
     out = _made(Path(job.work, "models"))
     models: dict[int, Any] = pycolmap.incremental_mapping(
         job.database,

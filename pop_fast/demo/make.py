@@ -19,11 +19,12 @@ from pop_fast.data.pinhole import require_colmap
 from pop_fast.demo.scene import Scene, make_scene
 from pop_fast.demo.tracer import first_hits, render_view
 from pop_fast.errors import CaptureError
-from pop_fast.io.atomic import folder_atomically
+from pop_fast.io.atomic import check_folder, folder_atomically
 from pop_fast.io.images import write_png
 
 __all__ = ["make_demo"]
 
+_MODEL = {f"{name}.bin" for name in ("cameras", "images", "points3D", "rigs", "frames")}
 _CANDIDATES = 150  # a view
 _PIXEL_NOISE = 0.4  # px, standard deviation
 _SEEN_BY = 3  # views, at least
@@ -61,12 +62,13 @@ def make_demo(
         raise CaptureError(f"seed is {seed}; it must be at least 0")
     # asked for before the minutes of tracing, not after
     require_colmap()
+    out = Path(out_dir)
+    check_folder(out, overwrite, recognise=_is_ours)
     scene = make_scene(seed)
     generator = np.random.default_rng([seed, 2])
     viewmats = _orbit(generator, views)
     K = np.array([[0.94 * width, 0.0, 0.503 * width], [0.0, 0.94 * width, 0.496 * height], [0.0, 0.0, 1.0]])
-    out = Path(out_dir)
-    with folder_atomically(out, overwrite) as folder:
+    with folder_atomically(out, overwrite, recognise=_is_ours) as folder:
         photographs = _photograph(scene, viewmats, K, (width, height), progress)
         (folder / "images").mkdir()
         for i, photograph in enumerate(photographs):
@@ -75,6 +77,11 @@ def make_demo(
         (folder / "sparse" / "0").mkdir(parents=True)
         _write_model(folder / "sparse" / "0", viewmats, K, (width, height), survey)
     return out
+
+
+def _is_ours(file: Path) -> bool:
+    """Tell by its path whether a file of a folder is one that a demo writes."""
+    return file.match("images/view_*.png") or (file.parent == Path("sparse", "0") and file.name in _MODEL)
 
 
 def _name(index: int) -> str:

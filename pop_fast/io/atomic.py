@@ -21,7 +21,15 @@ from typing import BinaryIO
 
 from pop_fast.errors import PopError
 
-__all__ = ["file_atomically", "folder_atomically", "is_left_behind", "write_atomically"]
+__all__ = [
+    "check_file",
+    "check_folder",
+    "check_place",
+    "file_atomically",
+    "folder_atomically",
+    "is_left_behind",
+    "write_atomically",
+]
 
 # of renameat2(2)
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
@@ -40,6 +48,52 @@ _REASONS = {
     errno.EISDIR: "a folder of this name is in the way; remove it or choose another name",
     errno.ENAMETOOLONG: "the name is too long for this file system; choose a shorter one",
 }
+
+
+def check_file(path: str | os.PathLike[str]) -> None:
+    """Refuse a file that cannot be written, before the work whose result it is to hold.
+
+    Raises:
+        PopError: a folder is in the way, a part of the path is a file, or its folder may not be written to.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise PopError(f"{path}: {_REASONS[errno.EISDIR]}")
+    check_place(path)
+
+
+def check_folder(
+    path: str | os.PathLike[str],
+    overwrite: bool = False,
+    *,
+    keeps: Iterable[Path] = (),
+    recognise: Callable[[Path], bool] | None = None,
+) -> None:
+    """Refuse a folder that `folder_atomically` would not make, before the work whose result it is to hold.
+
+    Args:
+        path, overwrite, keeps, recognise: as `folder_atomically`.
+
+    Raises:
+        PopError: as `folder_atomically`, or a part of the path is a file, or its parent may not be written to.
+    """
+    path = Path(path)
+    path = path.resolve() if path.is_symlink() or path.name in ("", "..") else path
+    check_place(path)
+    _check_replaceable(path, overwrite, keeps, recognise)
+
+
+def check_place(path: Path) -> None:
+    """Refuse a place in which nothing new can be made, as the nearest folder over it that exists does not allow it.
+
+    Raises:
+        PopError: a part of the path is a file, or that folder may not be written to.
+    """
+    parent = next((parent for parent in path.absolute().parents if parent.exists()), None)
+    if parent is not None and not parent.is_dir():
+        raise PopError(f"{path}: could not be written: {_REASONS[errno.ENOTDIR]}")
+    if parent is not None and not os.access(parent, os.W_OK | os.X_OK):
+        raise PopError(f"{path}: could not be written: {_REASONS[errno.EACCES]}")
 
 
 def write_atomically(path: str | os.PathLike[str], writer: Callable[[BinaryIO], object]) -> None:

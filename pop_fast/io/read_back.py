@@ -20,7 +20,7 @@ _TEXTS: Final = frozenset({"method", "capture", "machine", "backend", "lpips_net
 _NUMBERS: Final = frozenset(
     {
         *("step", "num_GS", "num_GS_above_floor", "opacity_below_0.1", "opacity_above_0.9", "psnr", "ssim", "lpips"),
-        *("n_blended", "n_traversed", "views", "threads", "seconds", "seconds_total", "seconds_loading"),
+        *("n_blended", "n_traversed", "views", "threads", "seconds", "seconds_total", "seconds_loading", "seconds_sfm"),
         "seconds_cpu",
         *("memory_bytes", "mem", "ellipse_time", "loss", "pop", "num_gaussians", "cloned", "split", "pruned"),
     }

@@ -52,8 +52,9 @@ class BatchStepper(TorchStepper):
                 keys[:] = [key for key, param in self._params.items() if param.grad is not None]
                 yield self._flat_gradients(keys)
 
-        total = ranks.total(gradients()).div_(size)
-        stats = self._agreed(ranks.gather(numbers), indices, step)
+        with task.stop.abandoning(task.may_abandon):
+            total = ranks.total(gradients()).div_(size)
+            stats = self._agreed(ranks.gather(numbers), indices, step)
         self._give_gradients(keys, total)
         adam_step(self._params, self._optimizers, task.updates, step, self._state)
         self._collect(looks, indices, step)

@@ -21,10 +21,10 @@ from pop_fast.train.stepper import Engine, Task
 from pop_fast.train.torch_stepper import TorchStepper
 from pop_fast.train.views import ViewTensors
 
-# so many steps at most before the host looks up from a GPU: Ctrl-C, the progress bar
-LONGEST_ON_GPU = 500
+# so many steps at most before the host looks up from a GPU, however quick they are: Ctrl-C, the progress bar
+MOST_ON_GPU = 500
 # and from a CPU
-LONGEST_ON_CPU = 20
+MOST_ON_CPU = 20
 # of the card's free memory, what the photographs' blurred values may take; the rest is for Gaussians and tile lists
 MOMENTS_SHARE = 0.25
 _BYTES_OF_MOMENTS = 24  # a pixel
@@ -71,7 +71,7 @@ def native_engine(backend: str | Backend = "compiled") -> Engine:
     """
     return replace(
         torch_engine(backend),
-        make_stepper=lambda task: FusedStepper(task, "native", LONGEST_ON_CPU, _native_trainer(task)),
+        make_stepper=lambda task: FusedStepper(task, "native", MOST_ON_CPU, _native_trainer(task)),
         depends_on_threads=False,
     )
 
@@ -80,7 +80,7 @@ def _native_trainer(task: Task) -> MakeFused:
     """Make the native step, with what it needs of the photographs in the memory that the settings give it."""
     from pop_fast.compiled.native_step import NativeTrainer
 
-    return partial(NativeTrainer, cache_mb=task.config.target_cache_mb)
+    return partial(NativeTrainer, cache_mb=task.config.target_cache_mb, stop=task.stop)
 
 
 def cuda_engine() -> Engine:
@@ -103,7 +103,7 @@ def cuda_engine() -> Engine:
 
 def cuda_stepper(task: Task) -> FusedStepper:
     """Make what takes the steps on a GPU."""
-    return FusedStepper(task, "cuda", LONGEST_ON_GPU, _fused_trainer)
+    return FusedStepper(task, "cuda", MOST_ON_GPU, _fused_trainer)
 
 
 def _fused_trainer(

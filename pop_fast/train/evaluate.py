@@ -15,6 +15,7 @@ from pop_fast.train.config import TrainConfig
 from pop_fast.train.lpips import LPIPS
 from pop_fast.train.metrics import ViewMetrics, average, measure
 from pop_fast.train.results import ResultFolder
+from pop_fast.train.signals import heard
 from pop_fast.train.views import Rendered, ViewTensors, render_view
 from pop_fast.view.pictures import error_magnitude, error_picture, id_colors
 
@@ -86,7 +87,8 @@ def _keep_pictures(
     photo = view.photo.numpy()
     error = error_picture(error_magnitude(render, photo), _ERROR_TOP)
     ids = rendered.info["dominant_ids"][0].numpy()
-    write_png(folder.path / "renders" / f"val_{name}.png", np.concatenate([render, photo, error], axis=1))
+    # of a large view, a second or more within OpenCV
+    heard(write_png, folder.path / "renders" / f"val_{name}.png", np.concatenate([render, photo, error], axis=1))
     write_png(folder.path / "renders" / f"dominant_{name}.png", id_colors(ids))
     folder.write_arrays(
         f"val_{name}",

@@ -43,9 +43,14 @@ class HoldingStepper:
     """
 
     def __init__(self, stepper: Stepper, rows: Mapping[str, Tensor]) -> None:
-        self.name, self.longest, self.step = stepper.name, stepper.longest, stepper.step
+        self.name, self.step = stepper.name, stepper.step
         self._stepper, self._rows = stepper, dict(rows)
         self._places: dict[str, Tensor] = {}
+
+    @property
+    def longest(self) -> int:
+        """See `Stepper.longest`."""
+        return self._stepper.longest
 
     def rebind(self, params: dict[str, Parameter], optimizers: Mapping[str, Adam], state: State) -> None:
         """See `Stepper.rebind`.
@@ -71,6 +76,8 @@ class HoldingStepper:
                 found += self._stepper.steps(step, step + 1, phase)
             finally:
                 self.step = self._stepper.step
+            if self.step == step:
+                break
             for key, place in self._places.items():
                 place.copy_(self._rows[key])
         return found

@@ -6,9 +6,10 @@ arrays, which are copied into the strategy's state after every segment, in the s
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from torch import Tensor
 from torch.nn import Parameter
@@ -23,6 +24,8 @@ from pop_fast.train.stepper import Task
 from pop_fast.train.views import ViewTensors
 
 Rows = Mapping[str, Tensor]
+# s, after which a block of steps should be done, so that its progress is seen
+BLOCK_SECONDS: Final = 1.0
 
 
 class Fused(Protocol):
@@ -42,7 +45,7 @@ class Fused(Protocol):
         ...
 
     def run(self, until: int, phase: Phase) -> None:
-        """Take steps of one phase until the counter stands at `until`."""
+        """Take steps of one phase until the counter stands at `until`, or until somebody has asked for an end."""
         ...
 
     def step_stats(self, first: int, last: int) -> list[StepStats]:
@@ -61,18 +64,20 @@ class FusedStepper:
     Args:
         task: what is trained; its strategy is one that `unsupported` has nothing against.
         name: of the engine.
-        longest: most steps at a time.
+        most: steps at a time, where they take less than a second.
         make: makes what takes them.
     """
 
     task: Task
     name: str
-    longest: int
+    most: int
     make: MakeFused
     fused: Fused | None = None
 
     def __post_init__(self) -> None:
         self.step = self.task.step
+        # of the last steps, a pixel
+        self._seconds: float | None = None
         self._optimizers: Mapping[str, Adam] = {}
         self._params: dict[str, Parameter] = {}
         self._state: State = {}
@@ -91,14 +96,35 @@ class FusedStepper:
             self.fused.rebind(rows, m, v)
         self._give_statistics(self.fused.statistics)
 
+    @property
+    def longest(self) -> int:
+        """See `Stepper.longest`: as many as take about a second, if a pixel takes what it took last; one at least."""
+        if self._seconds is None:
+            return 1
+        seconds = 0.0
+        for count, index in enumerate(self.task.order[self.step : self.step + self.most]):
+            seconds += self._seconds * self._pixels(index)
+            if seconds > BLOCK_SECONDS:
+                return max(count, 1)
+        return self.most
+
+    def _pixels(self, index: int) -> int:
+        view = self.task.views[index]
+        return view.height * view.width
+
     def steps(self, first: int, last: int, phase: Phase) -> list[StepStats]:
         """See `Stepper.steps`."""
         assert self.fused is not None
+        start = time.perf_counter()
         try:
             self.fused.run(last, phase)
         finally:
-            self.step = self.fused.step
+            self.step = last = self.fused.step
+        if last <= first:
+            return []
         self._take_statistics(self.fused.statistics, first, last, phase)
+        pixels = sum(map(self._pixels, self.task.order[first:last]))
+        self._seconds = (time.perf_counter() - start) / max(pixels, 1)
         numbers = self.task.updates.numbers[first:last].amax(0).tolist()
         for key, number in zip(KEYS, numbers, strict=True):
             if number > 0:

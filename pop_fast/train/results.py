@@ -7,7 +7,8 @@
     ckpts/ckpt_{step}_rank0.pt      checkpoints; `step` counts from 0 here and below, so 30,000 steps end at 29999
     ply/point_cloud_{step}.ply      Gaussians in Inria's layout
     stats/train_step{step}.json     Gaussians, opacities, seconds (by the clock; seconds_cpu, on a CPU, is processor
-                                    time of training over all threads), memory, machine, versions
+                                    time of training over all threads; seconds_sfm, of searching for cameras, where
+                                    there were none), memory, machine, versions
     stats/val_step{step}.json       the same and PSNR, SSIM, LPIPS of the held-out views, and each view's own; of the
                                     last step also encodings: bytes in every file format, and the PSNR from there
     stats/appearance_step{step}.json  what was learned of each training photograph, by name: exposure, and the camera
@@ -44,7 +45,7 @@ from typing import Any
 import numpy as np
 
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import is_left_behind, write_atomically
+from pop_fast.io.atomic import check_place, is_left_behind, write_atomically
 from pop_fast.io.lock import FolderLock
 from pop_fast.io.read_back import read_json
 from pop_fast.train.config import TrainConfig
@@ -86,6 +87,8 @@ class ResultFolder:
         """
         if self.path.exists() and not self.path.is_dir():
             raise PopError(f"{self.path}: is a file; choose another result folder")
+        if not self.path.exists():
+            check_place(self.path)
         if self._lock.held:
             return self._check(resume, overwrite)
         self.hold()

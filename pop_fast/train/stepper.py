@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import torch
@@ -18,6 +18,7 @@ from pop_fast.density.protocol import State
 from pop_fast.train.appearance import Appearance
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.ranks import ALONE, Ranks
+from pop_fast.train.signals import StopRequest
 from pop_fast.train.views import ViewTensors
 
 
@@ -29,13 +30,16 @@ class Stepper(Protocol):
 
     Attributes:
         name: of the engine, for the statistics of a run.
-        longest: steps that `steps` is asked for at most, so that a run can be stopped and its progress seen.
         step: steps taken.
     """
 
     name: str
-    longest: int
     step: int
+
+    @property
+    def longest(self) -> int:
+        """Return how many steps `steps` is asked for at most, so that a run's progress is seen every second or so."""
+        ...
 
     def rebind(self, params: dict[str, Parameter], optimizers: Mapping[str, Adam], state: State) -> None:
         """Go on with these rows, moments and statistics: at the beginning, and after the Gaussians have changed."""
@@ -43,6 +47,9 @@ class Stepper(Protocol):
 
     def steps(self, first: int, last: int, phase: Phase) -> list[StepStats]:
         """Take the steps from `first` to before `last`, all of one phase, and return each one's measurements.
+
+        They are fewer where somebody has asked for an end: `step` then tells how many, and nothing is changed by the
+        one that was left.
 
         Raises:
             ValueError: a number is no longer finite; `step` tells at which step, which has not changed the parameters.
@@ -67,6 +74,7 @@ class Task:
         step: steps taken.
         appearance: what is learned of the photographs.
         ranks: the processes that draw the views of a step.
+        stop: whether somebody has asked for an end.
     """
 
     config: TrainConfig
@@ -77,6 +85,12 @@ class Task:
     step: int
     appearance: Appearance
     ranks: Ranks = ALONE
+    stop: StopRequest = field(default_factory=StopRequest)
+
+    @property
+    def may_abandon(self) -> bool:
+        """Tell whether a step may be left half way: not where other processes or somebody else's strategy take part."""
+        return self.ranks.size == 1 and isinstance(self.strategy, DensityControl)
 
 
 @dataclass(frozen=True)

@@ -28,11 +28,13 @@ class Times:
 
     Attributes:
         loading: of reading the capture and of compiling, by the clock.
+        sfm: of searching for the capture's cameras before that, by the clock; 0 where they were there.
         train: of steps and density control, by the clock.
         cpu: of the same on the processor; None where a part of the run did not count it.
     """
 
     loading: float = 0.0
+    sfm: float = 0.0
     train: float = 0.0
     cpu: float | None = 0.0
     _started: float = 0.0
@@ -62,7 +64,8 @@ class Times:
     def facts(self, on_cpu: bool) -> dict[str, float]:
         """Give what belongs beside `seconds` and `seconds_total`: processor time is that of a training on a CPU."""
         counted = {"seconds_cpu": self.cpu} if on_cpu and self.cpu is not None else {}
-        return {"seconds_loading": self.loading, **counted}
+        searched = {"seconds_sfm": self.sfm} if self.sfm else {}
+        return {"seconds_loading": self.loading, **searched, **counted}
 
     def state_dict(self) -> dict[str, float | None]:
         """Give what a checkpoint keeps."""

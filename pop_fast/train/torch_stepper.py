@@ -17,6 +17,7 @@ from pop_fast.density.protocol import State
 from pop_fast.train.evaluate import gaussians_per_pixel
 from pop_fast.train.model import adam_step
 from pop_fast.train.objective import Objective
+from pop_fast.train.signals import Abandoned
 from pop_fast.train.stepper import Task
 from pop_fast.train.views import Rendered, render_view
 
@@ -63,21 +64,33 @@ class TorchStepper:
 
     def steps(self, first: int, last: int, phase: Phase) -> list[StepStats]:
         """See `Stepper.steps`."""
-        return [self._take(step, phase) for step in range(first, last)]
+        found: list[StepStats] = []
+        for step in range(first, last):
+            try:
+                found.append(self._take(step, phase))
+            except Abandoned:
+                self._forget_gradients()
+                break
+        return found
 
     def facts(self) -> dict[str, Any]:
         """See `Stepper.facts`."""
         return {}
 
     def _take(self, step: int, phase: Phase) -> StepStats:
-        look = self._look(self._task.order[step], step, phase)
-        self._require_finite(look.loss, look.index, step)
-        stats = self._measured(look, step, phase)
+        with self._task.stop.abandoning(self._task.may_abandon):
+            look = self._look(self._task.order[step], step, phase)
+            self._require_finite(look.loss, look.index, step)
+            stats = self._measured(look, step, phase)
         adam_step(self._params, self._optimizers, self._task.updates, step, self._state)
         self._task.appearance.update(step)
         self._task.strategy.collect(self._params, self._state, step, look.rendered.info)
         self.step = step + 1
         return stats
+
+    def _forget_gradients(self) -> None:
+        for param in (*self._params.values(), *self._task.appearance.params.values()):
+            param.grad = None
 
     def _look(self, index: int, step: int, phase: Phase) -> Look:
         """Render a view, compare it with its photograph and go back to the gradients of the parameters."""

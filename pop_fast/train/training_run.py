@@ -52,7 +52,7 @@ from pop_fast.train.ranks import ALONE, Ranks
 from pop_fast.train.records import Segment, record_of
 from pop_fast.train.results import ResultFolder
 from pop_fast.train.schedule import ViewOrder, active_sh_degree
-from pop_fast.train.signals import StopRequest, stop_requests
+from pop_fast.train.signals import Abandoned, StopRequest, stop_requests
 from pop_fast.train.stepper import Engine, Stepper, Task
 from pop_fast.train.times import Stopwatch, Times
 from pop_fast.train.views import ViewTensors
@@ -83,6 +83,7 @@ class TrainingRun:
         resume: bool = False,
         overwrite: bool = False,
         loading_seconds: float = 0.0,
+        sfm_seconds: float = 0.0,
         beside: Mapping[str, str] | None = None,
         strategy: Strategy | None = None,
         initial: Mapping[str, Tensor] | None = None,
@@ -97,7 +98,7 @@ class TrainingRun:
             capture: the photographs and cameras.
             resume: continue from the latest checkpoint of `config.result_dir`, or start where there is none.
             overwrite: replace the results of an earlier run in `config.result_dir`, once the first step has been taken.
-            loading_seconds: how long reading the capture took, for the statistics.
+            loading_seconds, sfm_seconds: how long reading and the search for cameras took, for the statistics.
             beside: texts to write beside cfg.json, by file name.
             strategy: decides over the Gaussians in the place of the config's, by gsplat's protocol; on the CPU.
             initial: raw parameters to start from, which are copied; None makes them from the capture's points. Their
@@ -126,7 +127,8 @@ class TrainingRun:
         self.step = 0
         self._watch = watch
         self._stepper: Stepper | None = None
-        self._times = Times(loading_seconds)
+        self._stop = StopRequest()
+        self._times = Times(loading_seconds, sfm_seconds)
         # the first Gaussians' opacities while the folder is still as it was found
         self._unwritten: np.ndarray | None = None
         # the training PSNR of the last record, in words
@@ -163,15 +165,17 @@ class TrainingRun:
         Raises:
             PopError: the folder is in use, a checkpoint does not fit, or a number is no longer finite.
             KeyboardInterrupt: after Ctrl-C or SIGTERM, when a checkpoint has been written; or at once after the second.
+                A step that was being taken is left, and changes nothing; a measurement is made by who resumes.
         """
         if self._ranks.writes and not isinstance(self.strategy, ForeignStrategy):
             for warning in find_warnings(self.config, self._train):
                 print(f"warning: {warning}", file=sys.stderr, flush=True)
         self._times.start()
-        with reproducible(self.config.threads), stop_requests() as stop:
+        self._stop = StopRequest()
+        with reproducible(self.config.threads), stop_requests(self._stop):
             try:
                 self._begin()
-                return self._loop(stop)
+                return self._loop()
             finally:
                 self._results.close()
 
@@ -190,35 +194,38 @@ class TrainingRun:
             self._unwritten = self._opacities().numpy()
         with self._times.is_loading():
             self._stepper = self.stepper
+        due = found and writes and self.step in self.config.eval_steps
+        if due and not self._results.read_stats("val", self.step - 1):  # as somebody had asked for an end meanwhile
+            self._evaluate(self.step - 1)
 
-    def _loop(self, stop: StopRequest) -> dict[str, Any]:
+    def _loop(self) -> dict[str, Any]:
         config = self.config
         shown = config.progress and self._ranks.writes
         bars = tqdm(total=config.max_steps, initial=self.step, disable=None if shown else True)
         with bars as bar, Heartbeat(shown) as beat:
+            beat.say(f"step {self.step:,} of {config.max_steps:,}, {len(self.params['means']):,} Gaussians")
             while self.step < config.max_steps:
                 longest = min(self.stepper.longest, config.max_steps if self._watch is None else _WATCHED_STEPS)
                 segment = self.take_steps(segment_end(config, self.strategy, self.step, longest))
-                self._log(segment, bar)
-                beat.say(
-                    so_far(self.step, config.max_steps, len(self.params["means"]), self._times.train, self._latest)
-                )
-                if self._unwritten is not None:
-                    # a rate can be so high that the first step is the last; that is no reason to replace anything
-                    self._require_finite()
-                    if self._ranks.writes:
-                        self._results.begin(self.config, self._beside, self._unwritten, self._overwrite)
-                    self._unwritten = None
-                self._milestones(self.step - 1)
-                if self._watch is not None:
-                    self._watch(self)
-                if self._ranks.any(stop.asked) and self.step < config.max_steps:
-                    self._save()
+                if segment.stats:
+                    self._log(segment, bar)
+                    n, seconds = len(self.params["means"]), self._times.train
+                    beat.say(so_far(self.step, config.max_steps, n, seconds, self._latest))
+                    if self._unwritten is not None:
+                        # a rate can be so high that the first step is the last; that is no reason to replace anything
+                        self._require_finite()
+                        if self._ranks.writes:
+                            self._results.begin(self.config, self._beside, self._unwritten, self._overwrite)
+                        self._unwritten = None
+                    self._milestones(self.step - 1)
+                    if self._watch is not None:
+                        self._watch(self)
+                if self._ranks.any(self._stop.asked) and self.step < config.max_steps:
+                    if self._unwritten is None:
+                        self._save()
                     raise KeyboardInterrupt
         last = config.max_steps - 1
-        if not self._ranks.writes:
-            return {}
-        return self._results.read_stats("val", last) or self._evaluate(last)
+        return (self._results.read_stats("val", last) or self._evaluate(last)) if self._ranks.writes else {}
 
     def take_steps(self, last: int) -> Segment:
         """Take the steps up to `last`, and the densification step that is due after them.
@@ -229,7 +236,8 @@ class TrainingRun:
             last: how many steps will have been taken, over `step`.
 
         Returns:
-            What the steps measured and what became of the Gaussians.
+            What the steps measured and what became of the Gaussians; of fewer steps, or none, where somebody has
+            asked for an end.
 
         Raises:
             PopError: a number is no longer finite; names it.
@@ -238,10 +246,10 @@ class TrainingRun:
         first, before = self.step, len(self.params["means"])
         phase, stepper = phase_at(self.config, self.strategy, first), self.stepper
         size = self.config.batch_size
-        views = [", ".join(self._train[self._order.next()].name for _ in range(size)) for _ in range(first, last)]
         with words_for_memory():
             stats = self._measured(stepper, first, last, phase)
-            densification = self._change(last - 1)
+            densification = self._change(self.step - 1) if stats else None
+        views = [", ".join(self._train[self._order.next()].name for _ in range(size)) for _ in stats]
         after = len(self.params["means"])
         return Segment(first, phase, views, stats, densification, before, after, *took.read())
 
@@ -255,7 +263,7 @@ class TrainingRun:
             self.step = stepper.step
             self._require_finite()
             raise PopError(f"{error}; {self._what_is_left}") from error
-        self.step = last
+        self.step = stepper.step
         for step, found in enumerate(stats, first):
             if not math.isfinite(found.objective + found.pop):
                 self._require_finite()
@@ -285,23 +293,20 @@ class TrainingRun:
 
     @property
     def stepper(self) -> Stepper:
-        """What takes the steps; it is made at the first use, for the rows as they are then."""
+        """What takes the steps; it is made at the first use, for the rows as they are then, on the engine's device."""
         if self._stepper is None:
-            self._place()
+            if self._engine.device.type != "cpu":
+                with words_for_memory():
+                    given = (self.params, self.optimizers, self.state)
+                    self.params, self.optimizers = moved_to(self._engine.device, *given)
             config, size, done = self.config, self.config.batch_size, self.step
             # the views of steps that were taken are not known any more
             order = [0] * size * done + self._order.ahead(size * (config.max_steps - done))
-            task = Task(config, self.strategy, self._train, order, self.updates, done, self.appearance, self._ranks)
-            self._stepper = self._engine.make_stepper(task)
+            given = (config, self.strategy, self._train, order, self.updates, done, self.appearance, self._ranks)
+            self._stepper = self._engine.make_stepper(Task(*given, self._stop))
             with words_for_memory():
                 self._stepper.rebind(self.params, self.optimizers, self.state)
         return self._stepper
-
-    def _place(self) -> None:
-        """Move parameters, moments and statistics to the engine's device."""
-        if self._engine.device.type != "cpu":
-            with words_for_memory():
-                self.params, self.optimizers = moved_to(self._engine.device, self.params, self.optimizers, self.state)
 
     def _log(self, segment: Segment, bar: tqdm) -> None:
         """Write the records of a segment."""
@@ -322,31 +327,36 @@ class TrainingRun:
         # the checkpoint comes last: a run that is killed in between does this step's milestones again
         due = config.checkpoint_every > 0 and taken % config.checkpoint_every == 0
         saves = due or taken in config.save_steps or last
-        if self._ranks.writes:
-            self._write_milestones(step, last)
+        try:
+            if self._ranks.writes:
+                self._write_milestones(step, last)
+        except Abandoned:
+            self._save()
+            raise
         if saves:
             self._save()
 
     def _write_milestones(self, step: int, last: bool) -> None:
-        """Keep histograms, measure, write the PLY."""
+        """Keep histograms, write the PLY, measure."""
         config, taken = self.config, step + 1
         if taken == config.strategy.blur_stop_iter or last:
             self._results.write_opacities(step, self._opacities().numpy())
-        if taken in config.eval_steps or last:
-            self._evaluate(step)
         if self.appearance.params and (taken in config.save_steps or last):
             self._results.write_stats("appearance", step, self.appearance.by_view(self._train))
         if taken in config.save_steps or last:
             path = self._results.path / "ply" / f"point_cloud_{step}.ply"
             frame = Frame.of_training(self._capture.world_transform if config.normalize else None)
             save_ply(path, self._detached(), config.antialiased, frame=frame)
+        # last, as it may be left half way
+        if taken in config.eval_steps or last:
+            self._evaluate(step)
 
     def _evaluate(self, step: int) -> dict[str, Any]:
         self._require_finite()
-        config = self.config
+        config, strategy = self.config, self.strategy
         stats = {
             "step": step,
-            **self._of_settings(),
+            **({"method": strategy.name} if isinstance(strategy, ForeignStrategy) else facts(config, self._train)),
             "capture": self._capture.name,
             **population(self._opacities()),
             **self._facts(),
@@ -354,15 +364,11 @@ class TrainingRun:
         self._results.write_stats("train", step, {**stats, "ellipse_time": self._times.train})
         folder = self._results if step + 1 == config.max_steps else None
         given = (self._engine.backend, self.params, self._test, config, self.sh_degree(step), self._nets)
-        stats |= evaluate(*given, folder, step)
+        with self._stop.abandoning(self._ranks.size == 1):
+            stats |= evaluate(*given, folder, step)
         stats["seconds_total"] = self._times.total
         self._results.write_stats("val", step, stats)
         return stats
-
-    def _of_settings(self) -> dict[str, Any]:
-        if isinstance(self.strategy, ForeignStrategy):
-            return {"method": self.strategy.name}
-        return facts(self.config, self._train)
 
     def _facts(self) -> dict[str, Any]:
         stepper, engine = self.stepper, self._engine

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, StepStats
 from pop_fast.api.registry import get_backend
-from pop_fast.train.engines import LONGEST_ON_GPU
+from pop_fast.train.engines import MOST_ON_GPU
 from pop_fast.train.fused_stepper import FusedStepper
 from pop_fast.train.stepper import Engine
 from pop_fast.train.views import ViewTensors
@@ -90,6 +90,6 @@ def drift_engine() -> Engine:
         "cuda",
         torch.device("cpu"),
         get_backend("fast"),
-        lambda task: FusedStepper(task, "cuda", LONGEST_ON_GPU, Drift),
+        lambda task: FusedStepper(task, "cuda", MOST_ON_GPU, Drift),
         lambda: facts,
     )

@@ -5,7 +5,9 @@ The search for cameras itself is replaced here by a model made beforehand; `test
 
 from __future__ import annotations
 
+import json
 import shutil
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import pytest
 from pop_fast.data import load_capture, run_sfm, sfm
 from pop_fast.io import images
 from tests.app.captures import assert_one_line, make_model, photograph, ring, write_photograph
+from tests.app.conftest import TRAIN, Pop
 from tests.app.damage import contents
 
 
@@ -100,7 +103,7 @@ def test_photographs_that_could_not_be_placed_are_told(tmp_path: Path) -> None:
     fill(tmp_path, tuple(f"{i}.png" for i in range(5)))
     (note,) = load_capture(tmp_path, sfm=True).notes
     assert note.startswith("3 of 5 photographs in")
-    assert note.endswith("first 3.png")
+    assert note.endswith("has no camera for 3.png, 4.png")
 
 
 def test_photographs_in_a_format_that_is_not_read_are_named_with_the_way_to_convert_them(
@@ -112,3 +115,22 @@ def test_photographs_in_a_format_that_is_not_read_are_named_with_the_way_to_conv
     words = ("3 files are HEIC", "pip install pillow-heif, or convert them to JPEG", "mogrify -format jpg *.HEIC")
     assert_one_line(lambda: load_capture(tmp_path, sfm=True), "has no photographs", *words)
     assert_one_line(lambda: run_sfm(tmp_path), "has 0 photograph(s)", *words)
+
+
+def test_the_search_for_cameras_is_told_apart_from_loading(pop: Pop, tmp_path: Path, monkeypatch: Any) -> None:
+    fill(tmp_path / "photos", tuple(f"{i}.png" for i in range(4)))
+    searched = sfm._find_cameras
+
+    def slowly(*given: Any) -> Any:
+        time.sleep(1.0)
+        return searched(*given)
+
+    monkeypatch.setattr(sfm, "_find_cameras", slowly)
+    done = pop("train", tmp_path / "photos", "--out", tmp_path / "out", "--max-steps", "2", *TRAIN, "--skip-sizes")
+    assert done.status == 0, done.err
+    lines = done.out.splitlines()
+    assert lines[0] in ("cameras found in 1 s", "cameras found in 2 s", "cameras found in 3 s")
+    assert any("the model has no camera for 3.png" in line for line in lines)
+    stats = json.loads((tmp_path / "out" / "stats" / "val_step0001.json").read_text())
+    assert stats["seconds_sfm"] >= 1.0
+    assert f"loading {stats['seconds_loading']:.0f} s, finding cameras {stats['seconds_sfm']:.0f} s" in done.out

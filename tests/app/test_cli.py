@@ -6,16 +6,23 @@ import errno
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pop_fast.cli import COMMANDS, main
 from pop_fast.cli.errors import describe
+from pop_fast.cli.told_early import about_large
 from pop_fast.cli.train import arguments, rename_aliases
+from pop_fast.data.capture import Capture, View
+from pop_fast.data.sfm import SfmResult
 from pop_fast.errors import PopError
+from pop_fast.train import TrainConfig
 from tests.app.conftest import TRAIN, Pop
+from tests.app.damage import says
 from tests.app.interruptions import interrupt
 
 
@@ -120,9 +127,10 @@ def test_a_bare_folder_of_photographs_is_placed_then_trained_on_and_the_end_is_t
 ) -> None:
     (capture / "sparse").rename(tmp_path / "sparse")
 
-    def placed(photos: Path, root: Path, **_: Any) -> None:
+    def placed(photos: Path, root: Path, **_: Any) -> SfmResult:
         assert photos == capture / "images"
         (tmp_path / "sparse").rename(root / "sparse")
+        return SfmResult(root, 8, 8, 100, 0.5)
 
     monkeypatch.setattr("pop_fast.data.load.run_sfm", placed)
     outcome = pop("train", capture, "--out", tmp_path / "r", *TRAIN)
@@ -181,6 +189,31 @@ def test_eval_of_a_ply_needs_a_capture_and_agrees_with_the_checkpoint(
     measured = json.loads((tmp_path / "e.json").read_text())
     trained = json.loads((shared_result / "stats" / "val_step0029.json").read_text())
     assert measured["psnr"] == pytest.approx(trained["psnr"], abs=1e-3)
+
+
+def test_the_help_of_train_begins_with_what_is_trained_and_ends_with_blocks(pop: Pop) -> None:
+    shown = pop("train", "--help").out
+    places = [
+        shown.index(f"--{name}") for name in ("method {", "factor INT", "resume,", "export [", "crop {", "blocks {")
+    ]
+    assert places == sorted(places)
+
+
+@pytest.mark.parametrize("option", ["--max-size", "-r", "--resolution"])
+def test_the_size_of_photographs_is_told_where_it_is_asked_for_by_another_name(pop: Pop, option: str) -> None:
+    says(pop("train", "photos", option, "1600"), option, "--factor 2")
+
+
+def test_photographs_of_full_size_are_told_what_they_cost() -> None:
+    image = np.broadcast_to(np.zeros(3, np.uint8), (3000, 4000, 3))
+    view = View("a.jpg", image, np.eye(4), np.eye(3))
+    large = Capture("large", (view, replace(view, name="b.jpg")), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "")
+    told = about_large(large, TrainConfig())
+    assert told is not None
+    assert "4000x3000 px" in told
+    assert "--factor 3 takes about 1/9 of the time, at 1333x1000 px" in told
+    small = replace(view, image=image[:1000, :1333])
+    assert about_large(replace(large, views=(small, replace(small, name="b.jpg"))), TrainConfig()) is None
 
 
 def test_compare_puts_results_side_by_side(pop: Pop, shared_result: Path) -> None:

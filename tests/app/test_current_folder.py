@@ -52,8 +52,9 @@ WORDS = {
     "doctor": "",
 }
 REPRO_WORDS = {
-    "run": "pop fox --scale dev --data absent --out results --work work",
-    "queue": "--scale dev --rows pop --scenes fox --data absent --out results --work work",
+    "run": "pop fox --scale small --data absent --results results --work work",
+    "queue": "--scale small --rows pop --scenes fox --data absent --results results --work work",
+    "verify": "pop fox --scale small --data absent --results absent",
     "status": "--scale toy --results results",
     "table": "1 --scale toy --results results --out tables",
     "figure": "7 --scale toy --results results --work work --out figures",
@@ -77,7 +78,7 @@ def planted(tmp_path: Path) -> tuple[Path, Path]:
 
 
 def call(folder: Path, calls: list[tuple[str, list[str]]], before: str = "") -> str:
-    """Make calls of the command lines in a process whose current folder it is; return what it wrote to its errors."""
+    """Make calls of the command lines in a process whose current folder it is; return what it printed."""
     script = folder.parent / "bin" / "pop"
     script.parent.mkdir()
     script.write_text(before + SCRIPT)
@@ -85,9 +86,10 @@ def call(folder: Path, calls: list[tuple[str, list[str]]], before: str = "") -> 
     # a checkout that was never installed is found as well
     environment |= {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(script), json.dumps(calls)]
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    return done.stderr
+    output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    done = subprocess.run(command, cwd=folder, env=environment, timeout=300, **output)
+    assert done.returncode == 0, done.stdout
+    return done.stdout
 
 
 def test_the_planted_modules_run_where_python_takes_the_current_folder(planted: tuple[Path, Path]) -> None:
@@ -120,7 +122,10 @@ def test_no_command_runs_a_module_of_the_current_folder(
     calls += [("pop-repro", [*name.split(), *words.split()]) for name, words in REPRO_WORDS.items()]
     said = call(folder, calls)
     assert not marker.exists(), f"{marker.read_text()}\n{said}"
-    assert said.count("\nstatus ") == len(calls)
+    assert said.count("\nstatus ") == len(calls), said
+    # of the commands that start processes, those had begun
+    assert "[1/1] pop fox --scale small --seed 42 failed with status 2" in said, said
+    assert "no cameras could be found for these 3 photographs" in said, said
 
 
 # the first child comes to its end at once

@@ -171,7 +171,7 @@ def test_an_export_takes_the_place_of_nothing_that_it_reads(
     assert pop(*words, tmp_path / "inria").status == 0
     before = contents(tmp_path)
     says(pop(*words, capture), f"{capture}: is read by this command, so it is not replaced")
-    says(pop(*words, result), f"{result}: holds", "read by this command")
+    says(pop(*words, result), f"{result}: is read by this command, so it is not replaced")
     lone = tmp_path / "inria" / "point_cloud" / "iteration_30" / "point_cloud.ply"
     again = ["export", lone, "--capture", capture, "--own-frame", "--overwrite"]
     says(

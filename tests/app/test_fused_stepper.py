@@ -14,7 +14,7 @@ from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from pop_fast.train.engines import LONGEST_ON_GPU
+from pop_fast.train.engines import MOST_ON_GPU
 from pop_fast.train.fused_settings import unsupported
 from pop_fast.train.fused_stepper import step_settings
 from pop_fast.train.phases import phase_at, segment_end
@@ -110,18 +110,18 @@ def test_the_device_is_left_alone_between_densification_steps(tmp_path):
     trainer.run()
     runs = trainer.stepper.fused.runs
     assert [(first, end) for first, end, _ in runs] == [
-        *((0, 5), (5, 9), (9, 12), (12, 13), (13, 16), (16, 17), (17, 21), (21, 24), (24, 30))
+        *((0, 1), (1, 5), (5, 9), (9, 12), (12, 13), (13, 16), (16, 17), (17, 21), (21, 24), (24, 30))
     ]
-    assert [phase.blur for _, _, phase in runs] == [True] * 6 + [False] * 3
-    assert [phase.statistics for _, _, phase in runs] == [phase.pop for _, _, phase in runs] == [True] * 8 + [False]
+    assert [phase.blur for _, _, phase in runs] == [True] * 7 + [False] * 3
+    assert [phase.statistics for _, _, phase in runs] == [phase.pop for _, _, phase in runs] == [True] * 9 + [False]
 
 
 def test_a_segment_ends_where_something_is_due():
     config = tiny_config("x", max_steps=9000, checkpoint_every=1000, strategy=POPStrategy())
     strategy, first = config.strategy, 0
     while first < config.max_steps:
-        end = segment_end(config, strategy, first, LONGEST_ON_GPU)
-        assert first < end <= min(first + LONGEST_ON_GPU, config.max_steps)
+        end = segment_end(config, strategy, first, MOST_ON_GPU)
+        assert first < end <= min(first + MOST_ON_GPU, config.max_steps)
         assert len({phase_at(config, strategy, step) for step in range(first, end)}) == 1
         assert not any(strategy.changes_after(step) for step in range(first, end - 1))
         assert not any(taken % 1000 == 0 or taken == 12 for taken in range(first + 1, end))

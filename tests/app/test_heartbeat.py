@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from pop_fast.cli import progress
 from pop_fast.cli.progress import bars
 from pop_fast.io import heartbeat
 from pop_fast.io.heartbeat import Heartbeat, duration
@@ -35,14 +36,29 @@ def test_a_line_comes_by_itself_from_within_a_long_computation(capsys: pytest.Ca
 
 def test_stages_that_report_are_told(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(heartbeat, "PERIOD", 0.01)
-    with bars() as progress:
-        progress("matching photographs", 64, 1225)
+    with bars() as report:
+        report("matching photographs", 64, 1225)
         assert wait_for_a_line(capsys).startswith("pop: matching photographs: 64 of 1,225 (")
 
 
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True
+
+
+def test_the_time_that_is_left_is_told(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(heartbeat, "PERIOD", 0.01)
+    clock = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
+    with bars() as report:
+        report("matching pairs of photographs", 0, 300)
+        clock[0] += 60.0
+        report("matching pairs of photographs", 100, 300)
+        end = time.perf_counter() + 60.0
+        told = ""
+        while " left" not in told and time.perf_counter() < end:
+            told = capsys.readouterr().err
+    assert "pop: matching pairs of photographs: 100 of 300, 2 min 0 s left (" in told
 
 
 @pytest.mark.parametrize("quiet", [True, False])

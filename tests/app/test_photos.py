@@ -73,13 +73,13 @@ def test_the_same_photographs_give_the_same_bytes_and_progress_is_told(
     n = len(CENTERS)
     assert {stage for stage, _, _ in told} == {
         "checking photographs",
-        "finding features",
-        "matching photographs",
-        "finding cameras",
+        "finding features in photographs",
+        "matching pairs of photographs",
+        "finding cameras of photographs",
     }
-    assert ("finding features", n, n) in told
-    assert ("matching photographs", n * (n - 1) // 2, n * (n - 1) // 2) in told
-    assert ("finding cameras", n, n) in told
+    assert ("finding features in photographs", n, n) in told
+    assert ("matching pairs of photographs", n * (n - 1) // 2, n * (n - 1) // 2) in told
+    assert ("finding cameras of photographs", n, n) in told
     assert all(0 <= done <= total for _, done, total in told)
     assert len(load_capture(tmp_path / "in").views) == n
     assert_one_line(lambda: run_sfm(tmp_path / "in"), "sparse", "--overwrite")

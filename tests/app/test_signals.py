@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
+from pop_fast.api.registry import get_backend
+from pop_fast.train import TrainingRun, training_run
 from pop_fast.train import checkpoint as ckpt
 from tests.app.captures import write_photograph
 from tests.app.children import in_a_child
 from tests.app.conftest import TRAIN
 from tests.app.damage import contents
+from tests.app.tiny import last_checkpoint, tiny_capture, tiny_config
 
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
@@ -171,3 +178,71 @@ def test_a_request_to_stop_is_heard_at_every_line_of_waiting_for_a_process() -> 
     outcome = in_a_child(_AT_EVERY_LINE, seconds=120.0)
     assert outcome.status == 0, outcome.err
     assert outcome.out.split() == ["130"] * 60
+
+
+_IN_A_CALL = """
+import ctypes, os, signal, threading, time
+from pop_fast.train.signals import Abandoned, heard, stop_requests
+
+def seconds_until_left(call):
+    start = time.monotonic()
+    with stop_requests() as stop:
+        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        try:
+            with stop.abandoning():
+                call()
+        except Abandoned:
+            return time.monotonic() - start
+    raise SystemExit("nobody was heard")
+
+# as long as a call of compiled code, in which Python runs no handler
+pthread_mutex = ctypes.create_string_buffer(64)
+library = ctypes.CDLL(None)
+library.pthread_mutex_init(pthread_mutex, None)
+library.pthread_mutex_lock(pthread_mutex)
+threading.Timer(2.5, library.pthread_mutex_unlock, (pthread_mutex,)).start()
+print(seconds_until_left(lambda: heard(library.pthread_mutex_lock, pthread_mutex)), flush=True)
+"""
+
+
+def test_a_signal_is_heard_through_a_call_of_compiled_code() -> None:
+    outcome = in_a_child(_IN_A_CALL, seconds=60.0)
+    assert outcome.status == 0, outcome.err
+    assert float(outcome.out) < 2.0
+
+
+@pytest.mark.parametrize("engine", ["fast", "compiled"])
+def test_a_measurement_that_is_left_is_made_by_who_resumes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: str
+) -> None:
+    reason = get_backend(engine).why_not()
+    if reason is not None:
+        pytest.skip(reason)
+    whole = tiny_config(tmp_path / "whole", eval_steps=(12,), backend=engine)
+    TrainingRun(whole, tiny_capture()).run()
+    parts = replace(whole, result_dir=str(tmp_path / "parts"))
+    measured = training_run.evaluate
+
+    def asking(*given: Any) -> Any:
+        # the last argument is the step, from 0
+        if given[-1] == due - 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return measured(*given)
+
+    for due in (12, 30):
+        with monkeypatch.context() as patch:
+            patch.setattr(training_run, "evaluate", asking)
+            with pytest.raises(KeyboardInterrupt):
+                TrainingRun(parts, tiny_capture(), resume=due == 30).run()
+        assert ckpt.list_checkpoints(tmp_path / "parts")[-1][0] == due - 1
+        assert not (tmp_path / "parts" / "stats" / f"val_step{due - 1:04d}.json").exists()
+    TrainingRun(parts, tiny_capture(), resume=True).run()
+    for step in (11, 29):
+        mine, theirs = (
+            json.loads((tmp_path / name / "stats" / f"val_step{step:04d}.json").read_text())
+            for name in ("parts", "whole")
+        )
+        assert mine["psnr"] == theirs["psnr"]
+        assert mine["per_view"] == theirs["per_view"]
+    mine, theirs = (last_checkpoint(tmp_path / name)[".splats.means"] for name in ("parts", "whole"))
+    assert torch.equal(mine, theirs)

@@ -175,6 +175,14 @@ def test_an_unfinished_run_is_marked_beside_a_finished_one(
     assert " 1 threads" not in finished
 
 
+def test_photographs_beside_their_model_have_no_folder_to_name(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path)
+    for path in (root / "images").iterdir():
+        path.rename(root / path.name)
+    (root / "images").rmdir()
+    assert load_capture(root, factor=2).notes == ("the photographs are shrunk by 2 here",)
+
+
 def test_a_run_without_numbers_keeps_no_other_from_being_compared(
     pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

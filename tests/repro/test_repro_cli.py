@@ -8,14 +8,16 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from paper_repro import queue as repro_queue
 from paper_repro.cli import COMMANDS, main
 from paper_repro.jobs import job_named
+from paper_repro.paper import paper
 from paper_repro.results import read_all
-from paper_repro.rows import ROWS
+from paper_repro.rows import ROWS, load_row
 
 ROOT = Path(__file__).parents[2]
 HEAVY = ("torch", "scipy", "cv2", "matplotlib", "pycolmap", "tyro", "snakemake")
@@ -121,6 +123,45 @@ def test_a_folder_of_results_that_is_not_there_is_one_error(command, capsys, tmp
     assert text == (
         f"pop-repro: error: {tmp_path / 'typo'}: no such folder; name the one that holds the results with --results\n"
     )
+
+
+def test_the_papers_scale_begins_with_its_hours_and_what_is_lacking(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(repro_queue.subprocess, "Popen", lambda *_, **__: pytest.fail("trained"))
+    words = ["queue", "--scale", "paper", "--rows", "pop", "3dgs", "l1_div_2", "--scenes", "train", "truck", "playroom"]
+    where = ["--results", tmp_path, "--work", tmp_path / "work", "--data", tmp_path, "--backend", "cuda"]
+    told = call(*words, *where, status=1, capsys=capsys).splitlines()
+    assert told[0] == "9 trainings to go"
+    taken = {line.split()[0]: float(line.split()[1]) for line in told[1:4]}
+    tanks, blending = paper().table(2), paper().table(1)
+    seconds = {
+        row: 2 * tanks.value(row, "Tanks & Temples", "time_s") + blending.value(row, "Deep Blending", "time_s")
+        for row in ("pop", "3dgs")
+    }
+    # the paper prints no time of it
+    seconds["l1_div_2"] = seconds["pop"] * load_row("l1_div_2").cost
+    assert taken == {row: pytest.approx(due / 3600, abs=0.05) for row, due in seconds.items()}
+    assert told[4].startswith(f"{sum(seconds.values()) / 3600:.1f} hours of one RTX 4090 in all")
+    assert told[5] == "lacking:"
+    assert {line.split(" is ")[0] for line in told[6:9]} == {f"  data: {s}" for s in ("train", "truck", "playroom")}
+    assert "it comes from https://repo-sam.inria.fr/" in told[6]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("shutil.disk_usage", lambda _: SimpleNamespace(free=10**6)), "disk: 1 trainings leave up to "),
+        (("pop_fast.machine.free_bytes", lambda: 10**9), "memory: pop on demo takes about "),
+    ],
+)
+def test_a_check_names_what_the_machine_lacks(change, says, capsys, tmp_path, monkeypatch):
+    where = ["--scale", "toy", "--rows", "pop", "--results", tmp_path, "--work", tmp_path / "work", "--check"]
+    told = call("queue", *where, capsys=capsys).splitlines()
+    assert told == ["1 trainings to go", "nothing is lacking"]
+    monkeypatch.setattr(*change)
+    told = call("queue", *where, status=1, capsys=capsys).splitlines()
+    assert told[1] == "lacking:"
+    assert told[2].startswith(f"  {says}")
+    assert not (tmp_path / "work").exists()
 
 
 @pytest.fixture(scope="module")

@@ -247,9 +247,6 @@ def test_a_missing_field_a_strange_scene_and_what_is_no_toml_are_named(tmp_path:
         header_of("pop", tmp_path)
 
 
-def test_scales_and_tables_speak_of_the_same_scenes():
-    from paper_repro.tables import SCENES_OF
-
-    assert {name: tuple(scale.factors) for name, scale in SCALES.items() if name != "paper"} == SCENES_OF
+def test_the_scenes_of_the_papers_scale_are_the_papers():
     of_paper = {scene.name for scene in scenes.SCENES.values() if scene.in_paper}
     assert {scene for names in paper().datasets.values() for scene in names} == of_paper == set(SCALES["paper"].factors)

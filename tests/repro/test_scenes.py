@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +15,7 @@ from paper_repro import scenes
 from paper_repro.data_check import HOLD_OUT, check_capture, check_scene, table
 from paper_repro.jobs import job_named
 from paper_repro.scales import SCALES
-from paper_repro.scenes import DATASETS, SCENES, Scene, find_folder, scene_named, source_of
+from paper_repro.scenes import DATASETS, SCENES, Scene, find_folder, load_scenes, scene_named, source_of
 from pop_fast.data import load_capture
 from pop_fast.demo import make_demo
 from pop_fast.errors import PopError
@@ -78,6 +81,48 @@ def test_every_scene_says_what_it_is_and_where_it_comes_from():
     assert {scene.name for scene in SCENES.values() if scene.verified} == {
         *("garden_512", "bonsai_800", "bear_512", "fox", "demo")
     }
+
+
+def test_a_scene_is_one_file_and_nothing_else_is_edited_to_add_one(tmp_path: Path):
+    package = Path(scenes.__file__).parent
+    shutil.copytree(package, tmp_path / "paper_repro", ignore=shutil.ignore_patterns("work", "results", "__pycache__"))
+    fox = (package / "scenes" / "fox.toml").read_text(encoding="utf-8")
+    (tmp_path / "paper_repro" / "scenes" / "porch.toml").write_text(fox.replace('folder = "fox"', 'folder = "porch"'))
+    asked = ["queue", "--scale", "small", "--rows", "pop", "--results", str(tmp_path), "--list"]
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "paper_repro", *asked],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(package.parent)])},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "pop porch --scale small --seed 42" in done.stdout.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('folder = "fox"', "folder = 3", "folder is 3; it must be a text"),
+        ('folder = "fox"', "", "has no folder"),
+        ("shrunk = 1", "shrunk = 0", "shrunk is 0; it must be a whole number of at least 1"),
+        ("verified = true", "verified = 1", "verified is 1; it must be true or false"),
+        (
+            'dataset = "further"',
+            'dataset = "moon"',
+            "dataset is 'moon'; it must be one of mipnerf360, tandt",
+        ),
+        ("size = [1080, 1920]", "size = [1080]", r"size is \[1080\]; it must be \[width, height\] in pixels"),
+        ("small = 4", "small = 0", "factors is .*; it must be a table of whole numbers of at least 1, by scale"),
+        ("shrunk = 1", "shrunken = 1", "shrunk"),
+        ("size = [", "size = ", "is not a scene's TOML file: "),
+    ],
+)
+def test_a_mistake_in_a_scenes_file_is_told_by_file_and_field(old, new, says, tmp_path: Path):
+    fox = (Path(scenes.__file__).parent / "scenes" / "fox.toml").read_text(encoding="utf-8")
+    assert old in fox
+    (tmp_path / "fox.toml").write_text(fox.replace(old, new))
+    with pytest.raises(PopError, match=rf"fox\.toml: .*{says}"):
+        load_scenes(tmp_path)
 
 
 def test_a_scene_as_published_is_ok(root: Path):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import io
 import re
 from dataclasses import replace
@@ -287,14 +286,6 @@ def test_unknown_names_are_refused() -> None:
         table(1, "x", [])
     with pytest.raises(PopError, match="scale is 'x'"):
         beyond("x", [])
-
-
-def test_the_scenes_of_a_scale_are_those_that_the_runner_trains() -> None:
-    if importlib.util.find_spec("paper_repro.scales") is None:
-        pytest.skip("paper_repro.scales is absent")
-    from paper_repro.scales import SCALES as RUN
-
-    assert {name: tuple(RUN[name].factors) for name in SCENES_OF} == SCENES_OF
 
 
 def test_results_that_were_written_make_the_same_table(tmp_path: Path) -> None:

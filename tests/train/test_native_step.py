@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,13 +20,13 @@ from pop_fast.compiled import native_step
 from pop_fast.data.initialize import initialize_params
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.train import TrainingRun
+from pop_fast.train import TrainingRun, engines, fused_stepper
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.engines import engine_of, native_engine, torch_engine
 from pop_fast.train.model import KEYS
 from pop_fast.train.stepper import Engine
 from tests.app.interruptions import interrupt
-from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config
+from tests.app.tiny import HEIGHT, WIDTH, last_checkpoint, tiny_capture, tiny_config
 
 REASON = get_backend("compiled").why_not()
 pytestmark = pytest.mark.skipif(REASON is not None, reason=REASON or "")
@@ -125,6 +128,60 @@ def test_the_bits_depend_neither_on_threads_nor_on_how_many_steps_are_asked_for_
     for stats, params in found[1:]:
         assert stats == found[0][0]
         assert all(torch.equal(params[key], found[0][1][key]) for key in params)
+
+
+def test_a_step_that_is_left_changes_nothing_and_is_taken_by_whoever_goes_on(tmp_path: Path) -> None:
+    last, settings = 24, {**SETTINGS["blur of summed counts"], "sh_interval": 100}
+
+    def state(run: TrainingRun) -> list[torch.Tensor]:
+        kept = [param.detach().clone() for param in run.params.values()]
+        kept += [value.clone() for of in run.optimizers.values() for value in of.state_dict()["state"][0].values()]
+        return [*kept, *(run.state[name].clone() for name in ("grad2d", "count", "dominant_sum", "blurred"))]
+
+    whole = run_of(tmp_path, native_engine(), settings)
+    states, seconds = {}, time.perf_counter()
+    for step in range(last):
+        whole.take_steps(step + 1)
+        states[step + 1] = state(whole)
+    seconds = time.perf_counter() - seconds
+    stopped = set()
+    for trial in range(12):
+        run = run_of(tmp_path, native_engine(), settings)
+        run.take_steps(1)
+        timer = threading.Timer(seconds * trial / 16, run._stop.ask)
+        timer.start()
+        taken_until = run.take_steps(last).stats
+        timer.join()
+        assert run.step == 1 + len(taken_until)
+        assert all(map(torch.equal, state(run), states[run.step]))
+        stopped.add(run.step)
+        if run.step < last:
+            assert run.take_steps(last).stats == []
+            run._stop._flag.value = 0
+            run.take_steps(last)
+        assert all(map(torch.equal, state(run), states[last]))
+    assert len(stopped) > 1, "nothing was left half way"
+
+
+@pytest.mark.parametrize("method", ["pop", "gsplat"])
+def test_how_many_steps_are_taken_at_a_time_changes_no_bit(
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[dict[str, Any]] = []
+    for seconds, most in ((0.0, 20), (math.inf, 3), (math.inf, 20)):
+        monkeypatch.setattr(fused_stepper, "BLOCK_SECONDS", seconds)
+        monkeypatch.setattr(engines, "MOST_ON_CPU", most)
+        folder = tmp_path / f"{seconds}_{most}"
+        config = tiny_config(folder, method, backend="compiled", checkpoint_every=0, save_steps=())
+        # the sums of the last window are among what is kept
+        config = replace(config, strategy=replace(config.strategy, refine_every=13, refine_stop_iter=60))
+        TrainingRun(config, tiny_capture()).run()
+        found.append(last_checkpoint(folder, "seconds", "metrics_bytes"))
+    assert found[0][".strategy.count"].any()
+    for other in found[1:]:
+        for name, value in found[0].items():
+            same = torch.equal(value, other[name]) if isinstance(value, torch.Tensor) else value == other[name]
+            assert same, name
 
 
 @pytest.mark.parametrize("method", ["pop", "gsplat"])
