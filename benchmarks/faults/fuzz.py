@@ -130,9 +130,10 @@ class _Turns:
 
 def _save(failures: dict[str, dict[str, Any]]) -> None:
     for key, found in failures.items():
-        folder, reader = _folder(found["reader"]), READERS[found["reader"]]
+        folder = _folder(found["reader"])
         folder.mkdir(parents=True, exist_ok=True)
-        name = f"{zlib.crc32(key.encode()):08x}_{Path(reader.file or reader.root).name}"
+        # no suffix that a tool would look for
+        name = f"{zlib.crc32(key.encode()):08x}.damaged"
         (folder / name).write_bytes(input_of(found["reader"], found["seed"], found["number"]))
 
 
@@ -219,10 +220,11 @@ def _outcome(reader: Reader, path: Path) -> tuple[str, ...]:
     except Exception as error:
         # as the command line prints it
         line = message(str(error) if isinstance(error, PopError) else describe(error) or str(error))
-        if isinstance(error, OSError) and describe(error) is not None and path.name in line:
+        named = any(name in line for name in (path.name, HERE.name))
+        if isinstance(error, OSError) and describe(error) is not None and named:
             return ("told",)
         known = isinstance(error, PopError) or (isinstance(error, ValueError) and describe(error) is not None)
-        if known and "\n" not in line and len(line) < LONGEST and any(name in line for name in (path.name, HERE.name)):
+        if known and "\n" not in line and len(line) < LONGEST and named:
             return ("refused",)
         frames = traceback.extract_tb(error.__traceback__)
         # our own line says more than the library's that it called

@@ -62,7 +62,6 @@ EXEMPT = {
     "paper_repro.base:begin_from_base": "takes what load_checkpoint has judged",
     "paper_repro.train_row:_begin": "takes one text of its own note",
     "paper_repro.methods": OWN,
-    "paper_repro.scenes:load_scene": OWN,
     "paper_repro.verify": "reads what its own training has written",
     "paper_repro.status": "reads the pages of the clone that it writes",
 }
