@@ -67,7 +67,7 @@ lint: setup  ## ruff (rules and format) and pyright
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
-faults: setup  ## damaged files, kills, crashes, full disks, sanitizers, then large captures (half an hour)
+faults: setup  ## damaged files, kills, crashes, full disks, sanitizers, then large captures (forty minutes)
 	$(BIN)/python -m benchmarks.faults --minutes 10
 	$(BIN)/python -m benchmarks.load
 

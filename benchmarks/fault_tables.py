@@ -27,19 +27,31 @@ def _outcomes(row: dict[str, int]) -> list[str]:
 def disturbed() -> str:
     """Make the table of runs that were killed or refused their writes, of flipped bits and of sanitizers."""
     found = _read("faults.json")
-    kills, flips, clean = found["kills"], found["flips"], found["sanitizers"]
-    ended = f"{kills['kills']:,} kills in {kills['runs']:,} runs"
-    rows = [["SIGKILL at random moments of `pop train`, then `--resume`", ended, "the same bits", _failed(kills)]]
+    rows = []
+    for kind, kills in found["kills"].items():
+        what = f"SIGKILL at random moments of `pop train`, then `--resume`: {kind}"
+        tried = f"{kills['kills']:,} kills in {kills['runs']:,} runs"
+        rows.append([what, tried, "another ending" if kills["failures"] else "the same bits", _failed(kills)])
     for part, what in (("crashes", "the process ends before"), ("writes", "the system refuses")):
         for job, of in found[part].items():
             came = ", ".join(f"{of[key]} {key}" for key in ("ended", "told", "continued") if of.get(key))
             place = f"{what} a change of the disk: {job}"
             rows.append([place, f"{of['tried']} of {of['points']} places", came, _failed(of)])
-    came = f"{flips['refused']:,} refused, {flips['the same']:,} read as before"
-    rows.append(["a flipped bit of a checkpoint", f"{flips['flips']:,}", came, _failed(flips)])
-    what = "C++ kernels under AddressSanitizer and UndefinedBehaviorSanitizer"
-    rows.append([what, ", ".join(clean.get("told", [clean.get("skipped", "")])), "", _failed(clean)])
+    for flips in found["flips"].values():
+        came = f"{flips['refused']:,} refused, {flips['the same']:,} read as before"
+        rows.append(["a flipped bit of a checkpoint", f"{flips['flips']:,}", came, _failed(flips)])
     return _table(["what happens", "tried", "what came", "failures"], ["---", "---", "---", "---:"], rows)
+
+
+def sanitized() -> str:
+    """Make the table of sanitizers: what was run under which, and of every unit how many of its lines ran."""
+    found = _read("faults.json")["sanitizers"]
+    rows = [
+        [name, of["about"], ", ".join(of.get("told", [])) or f"not tried: {of['skipped']}", _failed(of)]
+        for name, of in found["checks"].items()
+    ]
+    rows += [[f"`{unit}`", "", f"{run} of {of} lines ran", ""] for unit, (run, of) in found["lines"].items()]
+    return _table(["what", "under", "tried", "failures"], ["---", "---", "---", "---:"], rows)
 
 
 def _failed(result: dict[str, Any]) -> str:

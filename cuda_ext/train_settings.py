@@ -58,6 +58,7 @@ class StepSettings:
         d_ssim_halved: (1 - SSIM) / 2 instead of 1 - SSIM.
         pixelwise_scale: multiplies the L1 or L2 term.
         lambda_pop: weight of the POP term where it is on.
+        lambda_entropy: weight of the mean entropy of the opacities where it is on; the step on a GPU has no such term.
         pop_views: who dominates a pixel of the "current" view is important, or of any view of the "window".
         pop_over: the POP term averages over "all" Gaussians, or over those "visible" in the view.
         blur_window: under "any_view" a blur flag stays up, under "own_view" it is the last view's alone, under "sum"
@@ -76,6 +77,7 @@ class StepSettings:
     d_ssim_halved: bool = Recipe.d_ssim_halved
     pixelwise_scale: float = Recipe.pixel_scale
     lambda_pop: float = Recipe.lambda_pop
+    lambda_entropy: float = Recipe.lambda_entropy
     pop_views: str = Recipe.pop_views
     pop_over: str = Recipe.pop_over
     blur_window: str = DensityConfig.blur_window
@@ -108,6 +110,7 @@ class Phase(NamedTuple):
         l1: L1 instead of L2.
         lambda_ssim: weight of D-SSIM; the rest, to 1, is that of L1 or L2.
         window: dominant pixels are summed over the window for the POP term, also where blur is not asked for.
+        entropy: the entropy of the opacities is in the loss.
     """
 
     sh_degree: int
@@ -117,6 +120,7 @@ class Phase(NamedTuple):
     l1: bool = False
     lambda_ssim: float = Recipe.lambda_ssim
     window: bool = False
+    entropy: bool = False
 
     @property
     def dominance(self) -> bool:

@@ -343,7 +343,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "summary": summary,
     "results": results,
     "differences": differences,
-    **{name: _of_faults(name) for name in ("fuzzed", "disturbed", "loads")},
+    **{name: _of_faults(name) for name in ("fuzzed", "disturbed", "sanitized", "loads")},
     "blocks": blocks,
     "recipes": recipes,
     "methods": methods,

@@ -10,6 +10,8 @@ from paper_repro.claims import HEADLINES, claims, noise_of
 from paper_repro.evidence import JUDGE, Claim, Told
 from paper_repro.noise import ALPHA, PSNR, QUANTITIES, Noise, Spread
 from paper_repro.results import SCALES, Result
+from paper_repro.scales import scale_named
+from paper_repro.scenes import MADE
 from paper_repro.table_markdown import grid
 
 __all__ = ["deciding", "markdown", "method", "outcome", "telling"]
@@ -18,8 +20,8 @@ _HEAD: Final = ("reading", "scene", "found, with its interval", "verdict", "trai
 
 
 def telling() -> list[str]:
-    """List the scales that say something of a method, the most telling first."""
-    return [scale for scale in reversed(SCALES) if scale != "toy"]
+    """List the scales that say something of a method, the most telling first: those of photographs."""
+    return [scale for scale in reversed(SCALES) if not set(scale_named(scale).factors) & set(MADE)]
 
 
 def method() -> str:
@@ -44,8 +46,8 @@ def markdown(scale: str, results: Iterable[Result]) -> str:
     mine = [r for r in results if r.scale == scale]
     judged = claims(scale, mine)
     parts = [f"## Claims, scale {scale}"]
-    if scale == "toy":
-        parts.append("**NOT the paper's protocol: a made-up scene for tests. Nothing here says anything of a method.**")
+    if scale not in telling():
+        parts.append("**NOT the paper's protocol: a made-up scene. Nothing here says anything of a method.**")
     elif scale != "paper":
         parts.append("**NOT the paper's protocol: other photographs. The paper's numbers are a yardstick here.**")
     parts.append(_noise(scale, noise_of(mine)))
@@ -53,11 +55,11 @@ def markdown(scale: str, results: Iterable[Result]) -> str:
         open_ = [c.id for c in judged if not any(told.evidence for told in (c.told, *c.others))]
         judged = tuple(c for c in judged if c.id not in open_)
         if open_:
-            parts.append(f"No scene has runs for: {', '.join(open_)}.")
+            decided_by = f"`pop-repro claims --scale {JUDGE}` names the runs that would decide them"
+            parts.append(f"No scene has runs for: {', '.join(open_)}; {decided_by}.")
     verdicts = [[c.says, c.paper, c.verdict, c.line, c.under or "nothing"] for c in judged]
-    parts.append(
-        grid(["claim", "in the paper", "verdict", "where, and under other readings", "trained with"], verdicts)
-    )
+    head = ["claim", "in the paper", "verdict", "where, and under other readings", "trained with"]
+    parts += [grid(head, verdicts)] if verdicts else []
     parts += [_one(c) for c in judged]
     return "\n\n".join(parts) + "\n"
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from math import log
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal
 
 from paper_repro.noise import Group
 from paper_repro.paper import Paper
@@ -29,10 +28,7 @@ __all__ = [
     "Verdict",
     "command",
     "conditions",
-    "decay",
     "groups",
-    "implied_rates",
-    "implied_shares",
     "is_shortened",
     "paper_ratios",
     "told",
@@ -40,8 +36,8 @@ __all__ = [
 ]
 
 Verdict = Literal["holds", "does not hold", "not decided"]
-# the paper's schedule: the blur rule ends, density control and the POP term end, the training ends
-BLUR_STOP, DENSITY_STOP, STEPS = 7_000, 15_000, 30_000
+# of the paper's schedule
+STEPS: Final = 30_000
 # the scale whose runs decide what others leave open
 JUDGE: Final = "small"
 DATASETS: Final = ("Mip-NeRF 360", "Tanks & Temples", "Deep Blending")
@@ -224,47 +220,3 @@ def paper_ratios(published: Paper, row: str, base: str) -> tuple[float, ...]:
     return tuple(
         published.ablation(row, d, "num_gaussians_k") / published.ablation(base, d, "num_gaussians_k") for d in DATASETS
     )
-
-
-class Decay(NamedTuple):
-    """What became of N from the end of the blur window to the end of density control.
-
-    Attributes:
-        closing: N as the blur window closes.
-        kept: the share of it that is left as density control ends.
-        steps: from the one to the other.
-    """
-
-    closing: float
-    kept: float
-    steps: int
-
-    @property
-    def rate(self) -> float:
-        """The rate per 1,000 steps: a shortened schedule scales neither learning rates nor the weight of the prior."""
-        return -log(self.kept) / (self.steps / 1000)
-
-
-def decay(run: Result) -> Decay | None:
-    """Read the decay of N off the curve of a run, or None without a curve."""
-    steps = setting(run, "max_steps") or float(STEPS)
-    closes = setting(run, "blur_stop_iter") or steps * BLUR_STOP / STEPS
-    ends = setting(run, "refine_stop_iter") or steps * DENSITY_STOP / STEPS
-    closing, left = run.at(round(closes)), run.at(round(ends))
-    if closing is None or left is None or min(closing, left) <= 0.0 or ends <= closes:
-        return None
-    return Decay(closing, left / closing, round(ends) - round(closes))
-
-
-def implied_shares(published: Paper) -> tuple[float, ...]:
-    """Give what the paper's tables imply to be left at step 15,000 of N(7,000), by data set.
-
-    A window that lasts until density control ends shows the count at which the blur rule saturates; a shorter one
-    reaches about as much, and POP takes it down from there.
-    """
-    return paper_ratios(published, "pop", "blur_3k_15k")
-
-
-def implied_rates(published: Paper) -> tuple[float, ...]:
-    """Give the rates of decay per 1,000 steps that `implied_shares` comes to, by data set."""
-    return tuple(Decay(1.0, share, DENSITY_STOP - BLUR_STOP).rate for share in implied_shares(published))

@@ -14,7 +14,7 @@ from typing import Final
 from paper_repro.data_check import check_scene
 from paper_repro.jobs import Job
 from paper_repro.paper import paper
-from paper_repro.scenes import DATASETS, Scene
+from paper_repro.scenes import DATASETS, MADE, Scene
 
 __all__ = ["hours", "hours_by_row", "lacking"]
 
@@ -67,7 +67,7 @@ def lacking(jobs: Sequence[Job], data: Path, work: Path, backend: str) -> list[s
 
 
 def _data(jobs: Sequence[Job], data: Path) -> list[str]:
-    scenes = {job.scene.name: job.scene for job in jobs if job.scene.name != "demo"}
+    scenes = {job.scene.name: job.scene for job in jobs if job.scene.name not in MADE}
     found = [check_scene(scene, data) for scene in scenes.values()]
     return [f"data: {item.scene.name} is {item.status}: {item.reason}" for item in found if item.status != "ok"]
 

@@ -33,13 +33,12 @@ def publish(job: Job, work: Path, folder: Path, last: int) -> dict[str, str]:
     Raises:
         PopError: the training is not finished, or a file cannot be written; names it.
     """
-    from pop_fast.io.formats.files import save_as
+    from pop_fast.io.formats.files import load_splat_file, save_as
     from pop_fast.io.images import write_png
-    from pop_fast.io.ply import is_antialiased, load_ply
     from pop_fast.view.report.source import read_view
 
-    place, ply = job.work(folder), ply_of(work, last)
-    save_as(place / _SPLAT, "spz", load_ply(ply), is_antialiased(ply))
+    place, stored = job.work(folder), load_splat_file(ply_of(work, last))
+    save_as(place / _SPLAT, "spz", stored.params, stored.antialiased, stored.frame)
     names = [_SPLAT]
     kept = sorted((work / "report_data").glob(f"val_step{last}_*.npz"))
     for path in dict.fromkeys([*kept[:1], *kept[-1:]]):

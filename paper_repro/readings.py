@@ -1,34 +1,56 @@
 """What the runs say of other readings of the paper (A2, A12, A16), and of two experiments (E2, E4).
 
-A reading is known by what it does to the number of Gaussians: at which rate per 1,000 steps N falls from the end of the
-blur window to the end of density control. The paper's tables imply that rate; the reading that comes nearest to it, on
-the scenes where all were run, is named. On photographs that are not the paper's this is evidence, not proof.
+A reading is judged by every column of the paper's tables that its runs reach: for each pair of rows of one table N over
+N, the difference of PSNR and that of SSIM, and the growth a densification step between the windows of table 4. A column
+speaks for the reading whose value lies nearer to the range of the paper's three data sets; within it both are alike. A
+reading is named when more columns speak for it than against it, and still so without any one pair of rows: a claim
+rests on one pair, so that no claim decides the reading under which it is then judged. On photographs that are not the
+paper's this is evidence, not proof.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import exp, log
-from statistics import fmean
-from typing import Final
+from itertools import pairwise
+from typing import Final, NamedTuple
 
-from paper_repro.evidence import Group, decay, groups, implied_rates, paper_ratios
-from paper_repro.paper import paper
-from paper_repro.results import SCALES, Result
+from paper_repro.claims_page import telling
+from paper_repro.evidence import DATASETS, Group, groups
+from paper_repro.judging import OTHERS
+from paper_repro.paper import Paper, paper
+from paper_repro.results import Result
 from paper_repro.table_markdown import grid
 from paper_repro.tables import setting
 
-__all__ = ["READINGS", "Answer", "Reading", "answers", "experiments", "markdown"]
+__all__ = ["READINGS", "Answer", "Column", "Reading", "answers", "columns", "experiments", "markdown"]
 
 
 @dataclass(frozen=True)
 class Reading:
-    """An open question of the paper with a row for each reading, the default first."""
+    """An open question of the paper, and its other answer by its name in `judging.OTHERS`."""
 
     id: str
     asks: str
+    other: str
+
+
+class Column(NamedTuple):
+    """A number that the tables print for two rows, or for the windows of table 4.
+
+    Attributes:
+        rows: that it is made of; what a reading is judged by has to hold without any one of these.
+        quantity: what of them.
+        printed: by data set.
+    """
+
     rows: tuple[str, ...]
+    quantity: str
+    printed: tuple[float, ...]
+
+    def apart(self, value: float) -> float:
+        """Give how far a value lies from the range of the data sets; 0 within it."""
+        return max(min(self.printed) - value, value - max(self.printed), 0.0)
 
 
 @dataclass(frozen=True)
@@ -51,14 +73,23 @@ class Answer:
 
 
 READINGS: Final = (
-    Reading("A2", "over what is a dominant count cumulative in the blur rule?", ("pop", "pop_any_view")),
-    Reading("A2, added up", "or are the counts of several views added up?", ("pop", "pop_sum")),
-    Reading("A12", "does the POP term sum over all Gaussians or over visible ones?", ("pop", "pop_visible")),
-    Reading("A16", "are oversized Gaussians pruned although there is no reset?", ("pop", "pop_size_prune")),
+    Reading("A2", "over what is a dominant count cumulative in the blur rule?", "A2 any view"),
+    Reading("A2, added up", "or are the counts of several views added up?", "A2 added up"),
+    Reading("A12", "does the POP term sum over all Gaussians or over visible ones?", "A12 visible"),
+    Reading("A16", "are oversized Gaussians pruned although there is no reset?", "A16 on"),
 )
-_HEAD: Final = ("scale", "scene", "row", "N as the window closes", "left", "rate", "N", "of L2+Blur's", "PSNR", "runs")
-# L2+Blur under two readings of A2, the default first
-_GROWN: Final = ("l2_blur", "l2_blur_any_view")
+_HEAD: Final = ("scale", "scene", "rows", "column", "in the paper", "default", "other", "nearer")
+# the pairs of rows that a table of the paper sets side by side
+_PAIRS: Final = (
+    *(("pop", "l2_blur"), ("pop", "l2_pop"), ("l2_blur", "l2"), ("l2_pop", "l2")),
+    *(("pop", "reset"), ("pop", "gsplat"), ("blur_3k_4k", "pop"), ("blur_3k_11k", "pop"), ("blur_3k_15k", "pop")),
+)
+# the windows of table 4 by their length, with the steps between two densification steps of the paper's schedule
+_WINDOWS: Final = (("blur_3k_4k", 4_000), ("pop", 7_000), ("blur_3k_11k", 11_000), ("blur_3k_15k", 15_000))
+_EVERY: Final = 100
+_N: Final = "N over N"
+_DIFFERENCES: Final = (("PSNR", "psnr"), ("SSIM", "ssim"))
+_GROWTH: Final = "growth a densification step over N of the shorter"
 # the rows of E4: pruning harder at the paper's weight, in place of a tenfold weight
 _PRUNED: Final = ("final_prune", "pop_prune_002")
 
@@ -70,9 +101,9 @@ def answers(results: Iterable[Result]) -> tuple[Answer, ...]:
 
 
 def experiments(results: Iterable[Result]) -> tuple[Answer, ...]:
-    """Answer E2, E4, and A2 without the prior, from the results of all scales."""
+    """Answer E2 and E4 from the results of all scales."""
     found = list(results)
-    return _longer_schedules(found), _pruned_harder(found), _growth(found)
+    return _longer_schedules(found), _pruned_harder(found)
 
 
 def markdown(found: Sequence[Answer]) -> str:
@@ -85,87 +116,102 @@ def markdown(found: Sequence[Answer]) -> str:
     return "\n\n".join(parts)
 
 
+def columns(published: Paper) -> tuple[Column, ...]:
+    """List every column that a reading is judged by, with what the paper prints."""
+    found = []
+    for row, base in _PAIRS:
+        both = [_printed(published, dataset, row, base) for dataset in DATASETS]
+        counts = tuple(ours["num_gaussians_k"] / theirs["num_gaussians_k"] for ours, theirs in both)
+        found.append(Column((row, base), _N, counts))
+        for name, metric in _DIFFERENCES:
+            found.append(Column((row, base), name, tuple(ours[metric] - theirs[metric] for ours, theirs in both)))
+    for (shorter, first), (longer, last) in pairwise(_WINDOWS):
+        counts = [tuple(published.ablation(row, d, "num_gaussians_k") for row in (longer, shorter)) for d in DATASETS]
+        grown = tuple(_growth(more, less, first, last) for more, less in counts)
+        found.append(Column((longer, shorter), _GROWTH, grown))
+    return tuple(found)
+
+
+def _printed(published: Paper, dataset: str, *rows: str) -> list[Mapping[str, float]]:
+    """Give the lines of rows from the first table that has them on a data set."""
+    for table in published.tables:
+        if dataset in table.datasets and set(rows) <= {line.row for line in table.rows}:
+            return [table.row(row).values[dataset] for row in rows]
+    raise KeyError(rows)
+
+
+def _growth(more: float, less: float, first: int, last: int) -> float:
+    return (more - less) / less / ((last - first) / _EVERY)
+
+
+def _found(column: Column, rows: Mapping[str, Group], trained: Mapping[str, str | None]) -> float | None:
+    """Read a column off the runs of a scene, with the rows that stand for its own; None where one is not there."""
+    stand_ins = [trained.get(row, row) for row in column.rows]
+    if any(row is None or row not in rows for row in stand_ins):
+        return None
+    ours, theirs = (rows[row] for row in stand_ins if row is not None)
+    if column.quantity == _N:
+        return ours.n / theirs.n
+    if column.quantity == _GROWTH:
+        ends = dict(_WINDOWS)
+        longer, shorter = column.rows
+        return _growth(ours.n, theirs.n, ends[shorter], ends[longer])
+    metric = dict(_DIFFERENCES)[column.quantity]
+    return _mean(ours, metric) - _mean(theirs, metric)
+
+
+def _mean(group: Group, metric: str) -> float:
+    return sum(getattr(run, metric) for run in group.runs) / len(group.runs)
+
+
 def _answer(reading: Reading, results: Sequence[Result]) -> Answer:
+    trained = next(other.rows for other in OTHERS if other.name == reading.other)
     lines: list[tuple[str, ...]] = []
-    distances: dict[str, list[float]] = {row: [] for row in reading.rows}
-    scenes = []
-    goal = exp(fmean(log(rate) for rate in implied_rates(paper())))
+    votes: list[tuple[tuple[str, ...], int]] = []
     for scale in _telling(results):
         for scene, rows in groups(r for r in results if r.scale == scale).items():
-            present = [row for row in reading.rows if row in rows]
-            if len(present) < 2:
-                continue
-            lines += [_line(scale, scene, row, rows) for row in present]
-            rates = {row: _rate(rows[row]) for row in reading.rows if row in rows}
-            known = {row: rate for row, rate in rates.items() if rate is not None}
-            if set(known) == set(reading.rows):
-                scenes.append(f"{scene} ({scale})")
-                for row, rate in known.items():
-                    distances[row].append(abs(rate - goal))
-    says = "Not decided: no scene has a run of every reading."
-    if scenes:
-        nearest = min(reading.rows, key=lambda row: fmean(distances[row]))
-        kind = "the default" if nearest == reading.rows[0] else "not the default"
-        says = (
-            f"Nearest to the paper's {goal:.3f} per 1,000 steps (the mean of what its tables imply) is `{nearest}`, "
-            f"{kind}, on {', '.join(scenes)}."
-        )
-    return Answer(reading.id, reading.asks, says, _HEAD, tuple(lines))
+            for column in columns(paper()):
+                if not set(column.rows) & trained.keys():
+                    continue
+                default, other = _found(column, rows, {}), _found(column, rows, trained)
+                if default is None or other is None:
+                    continue
+                # over the default's: who is nearer, or both within the range
+                ahead = column.apart(other) - column.apart(default)
+                votes.append((column.rows, (ahead > 0.0) - (ahead < 0.0)))
+                lines.append((scale, scene, *_shown(column, default, other), _NEARER[votes[-1][1]]))
+    return Answer(reading.id, reading.asks, _says(reading, votes), _HEAD, tuple(lines))
 
 
-def _growth(results: Sequence[Result]) -> Answer:
-    """A2 without the prior: by what the blur rule multiplies the Gaussians under either reading."""
-    lines: list[tuple[str, ...]] = []
-    factors: dict[str, list[float]] = {row: [] for row in _GROWN}
-    goal = paper_ratios(paper(), "l2_blur", "l2")
-    for scale in _telling(results):
-        for scene, rows in groups(r for r in results if r.scale == scale).items():
-            if "l2" not in rows:
-                continue
-            found = {row: rows[row].n / rows["l2"].n for row in _GROWN if row in rows}
-            for row, factor in found.items():
-                runs = (*rows[row].ids, *rows["l2"].ids)
-                lines.append((scale, scene, row, f"{rows[row].n:,.0f}", f"x {factor:.2f}", ", ".join(runs)))
-            if len(found) == len(_GROWN):
-                for row, factor in found.items():
-                    factors[row].append(abs(log(factor) - fmean(map(log, goal))))
-    printed = ", ".join(f"x {factor:.2f}" for factor in goal)
-    says = "Not decided: no scene has L2 and both readings of L2+Blur."
-    if factors[_GROWN[0]]:
-        nearest = min(_GROWN, key=lambda row: fmean(factors[row]))
-        says = f"Nearest to the paper's factors ({printed}) is `{nearest}`."
-    head = ("scale", "scene", "row", "N", "of L2's", "runs")
-    return Answer(
-        "A2, without the prior", "by what does the blur rule multiply the Gaussians?", says, head, tuple(lines)
+_NEARER: Final = {1: "default", 0: "alike", -1: "other"}
+
+
+def _shown(column: Column, default: float, other: float) -> tuple[str, ...]:
+    form = {_N: "{:.3f}", "PSNR": "{:+.2f} dB", "SSIM": "{:+.3f}", _GROWTH: "{:+.2%}"}[column.quantity]
+    printed = ", ".join(form.format(value) for value in column.printed)
+    return " and ".join(column.rows), column.quantity, printed, form.format(default), form.format(other)
+
+
+def _says(reading: Reading, votes: Sequence[tuple[tuple[str, ...], int]]) -> str:
+    """Name the reading that more columns speak for, also without any one pair of rows."""
+    if not votes:
+        return "Not decided: no scene has the runs of a column under both readings."
+    of_each = [sum(vote == side for _, vote in votes) for side in (1, -1, 0)]
+    counted = (
+        f"of {len(votes)} columns {of_each[0]} are nearer to the paper's under the default, {of_each[1]} under "
+        f"{reading.other}, {of_each[2]} alike"
     )
+    lead = of_each[0] - of_each[1]
+    pairs = {frozenset(rows) for rows, _ in votes}
+    without = [sum(vote for rows, vote in votes if set(rows) != pair) for pair in pairs]
+    if lead == 0 or any(left * lead <= 0 for left in without):
+        return f"Not decided: {counted}, and without one pair of rows the lead is gone."
+    return f"The runs speak for {'the default' if lead > 0 else reading.other}: {counted}, also without any one pair."
 
 
 def _telling(results: Sequence[Result]) -> list[str]:
-    """List the scales that say something about a method, the paper's first: the toy does not."""
-    return [scale for scale in reversed(SCALES) if scale != "toy" and any(r.scale == scale for r in results)]
-
-
-def _rate(group: Group) -> float | None:
-    found = [seen for run in group.runs if (seen := decay(run)) is not None]
-    return fmean(seen.rate for seen in found) if found else None
-
-
-def _line(scale: str, scene: str, row: str, rows: Mapping[str, Group]) -> tuple[str, ...]:
-    group = rows[row]
-    found = [seen for run in group.runs if (seen := decay(run)) is not None]
-    blur = rows.get("l2_blur")
-    return (
-        *(scale, scene, row),
-        *(
-            (f"{fmean(f.closing for f in found):,.0f}", f"{fmean(f.kept for f in found):.1%}", f"{_rate(group):.3f}")
-            if found
-            else ("no curve",) * 3
-        ),
-        f"{group.n:,.0f}",
-        f"{group.n / blur.n:.1%}" if blur is not None else "l2_blur not run",
-        f"{group.psnr:.2f}",
-        ", ".join(group.ids),
-    )
+    """List the scales that say something about a method, the paper's first: those of a made-up scene do not."""
+    return [scale for scale in telling() if any(r.scale == scale for r in results)]
 
 
 def _longer_schedules(results: Sequence[Result]) -> Answer:

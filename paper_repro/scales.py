@@ -52,7 +52,7 @@ _FLOOR: Final = {"strategy.blur_min_pixels": 10.0}
 # Mini-Splatting's 3.5 million points are one to three of a hundred pixels of the paper's views; so many are these
 _POINTS: Final = {
     scale: {"mini-splatting": {"strategy.reinit_points": count}}
-    for scale, count in (("toy", 3_000), ("small", 200_000), ("full", 1_000_000))
+    for scale, count in (("toy", 3_000), ("shown", 50_000), ("small", 200_000), ("full", 1_000_000))
 }
 
 _ALL: Final = (
@@ -67,6 +67,14 @@ _ALL: Final = (
         reset_every=30,
         log_every=10,
         checkpoint_every=100,
+    ),
+    Scale(
+        name="shown",
+        about="the still life of the demo at its size, a tenth of the schedule: pictures that may be published",
+        factors=_factors("shown"),
+        steps_scaler=0.1,
+        settings=_FLOOR,
+        of_methods=_POINTS["shown"],
     ),
     Scale(
         name="small",

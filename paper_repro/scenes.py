@@ -22,6 +22,7 @@ from pop_fast.errors import PopError
 
 __all__ = [
     "DATASETS",
+    "MADE",
     "SCENES",
     "Dataset",
     "Scene",
@@ -167,6 +168,8 @@ def _is_count(value: Any) -> bool:
 
 
 SCENES: Final = load_scenes()
+# those that the program makes itself
+MADE: Final = ("demo", "still_life")
 
 
 def scene_named(name: str) -> Scene:

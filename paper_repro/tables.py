@@ -348,6 +348,7 @@ def _header(scale: str, found: Sequence[Result]) -> tuple[str, ...]:
     else:
         names = ", ".join(dict.fromkeys((*SCENES_OF[scale], *sorted({r.scene for r in found}))))
         what = {"toy": "a test of the program on a made-up scene, its numbers say nothing about a method",
+                "shown": "a made-up scene, its numbers say nothing about a method",
                 "small": "other photographs, small",
                 "no_floor": "other photographs, theta_blur without a floor",
                 "full": "other photographs, on the whole schedule"}[scale]  # fmt: skip

@@ -17,7 +17,7 @@ from paper_repro import results
 from paper_repro.base import begin_from_base, keep_for_others, remove_what_was_kept, steps_for_others
 from paper_repro.jobs import WORK, Job
 from paper_repro.results import Result
-from paper_repro.scenes import Scene, find_folder
+from paper_repro.scenes import MADE, Scene, find_folder
 from pop_fast.errors import PopError
 
 if TYPE_CHECKING:
@@ -143,15 +143,15 @@ def train_row(job: Job, options: Options) -> Result:
 
 
 def capture_folder(scene: Scene, options: Options) -> Path:
-    """Find a scene's capture; the demo is made where it is absent.
+    """Find a scene's capture; one that the program makes is made where it is absent.
 
     Raises:
         PopError: it is not there; says where it comes from.
     """
-    if scene.name != "demo":
+    if scene.name not in MADE:
         return find_folder(scene, options.data)
-    folder = options.work / "demo"
-    with only_one(options.work / "demo.lock", f"{folder}: another process makes it", wait=True):
+    folder = options.work / scene.folder
+    with only_one(options.work / f"{scene.folder}.lock", f"{folder}: another process makes it", wait=True):
         if not folder.is_dir():
             from pop_fast.demo import make_demo
 

@@ -3,15 +3,17 @@
 Runs the parts below, prints what failed, and writes benchmarks/results/faults.json, of which docs/reliability.md has
 the tables; a part that is run alone replaces its own results. With --minutes the fuzzer and the kill loop share that
 time, or the one of them that runs has it; without, they stop after their least. --save keeps the files that broke a
-reader among the regressions of benchmarks/faults/corpus. --quick tries a few places of those parts that have no test of
-their own, as the tests do. Exit status 1 where anything failed.
+reader among the regressions of benchmarks/faults/corpus. Runs are tried of every --kind: by the native step, on two
+ranks and in blocks; --kills says how often each is killed at least, --places at how many changes of the disk it is
+disturbed. --quick tries a few places of those parts that have no test of their own, as the tests do. Exit status 1
+where anything failed.
 
     fuzz        mutated files to every reader, in children with limits of memory and time
     kills       SIGKILL at random moments of a run; continuing gives the same bits
     crashes     the process ends right before each rename, flush, new folder and removal
     writes      the system refuses each of them, or a write in its middle
     flips       single bits of a checkpoint
-    sanitizers  the C++ kernels with AddressSanitizer and UndefinedBehaviorSanitizer
+    sanitizers  every unit of C++ with AddressSanitizer, UndefinedBehaviorSanitizer and ThreadSanitizer
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from typing import Any
 import cv2
 import torch
 
-from . import fuzz, runs, sanitizers
+from . import disk, fuzz, runs, sanitizers
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -33,6 +35,11 @@ from record import machine, read_json, write_json
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "faults.json"
 PARTS = ("fuzz", "kills", "crashes", "writes", "flips", "sanitizers")
 QUICK = ("fuzz", "crashes", "writes", "sanitizers")
+KINDS = tuple(runs.KINDS)
+# how often at least, and at how many places of a job at most; a run takes a second, two, and five
+KILLS = {"native step": 50, "two ranks": 20, "blocks 2x1": 10}
+PLACES = {"native step": None, "two ranks": 50, "blocks 2x1": 40}
+QUICK_PLACES = {"native step": 2, "two ranks": 1, "blocks 2x1": 1}
 
 
 def main() -> int:
@@ -42,6 +49,9 @@ def main() -> int:
     parser.add_argument("--only", choices=PARTS, action="append")
     parser.add_argument("--reader", choices=tuple(fuzz.READERS))
     parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--kind", choices=KINDS, action="append")
+    parser.add_argument("--kills", type=int)
+    parser.add_argument("--places", type=int)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--save", action="store_true")
     parser.add_argument("--out", type=Path, default=RESULTS)
@@ -50,7 +60,10 @@ def main() -> int:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     found = {part: result for part in args.only or (QUICK if args.quick else PARTS) for result in [_run(part, args)]}
-    write_json(args.out, {**read_json(args.out), "machine": machine(), **found})
+    earlier = read_json(args.out)
+    # kinds of runs that are tried alone replace their own results
+    kept = {part: {**earlier.get(part, {}), **found[part]} for part in found if args.kind is not None}
+    write_json(args.out, {**earlier, "machine": machine(), **found, **kept})
     failed = [line for part, result in found.items() for line in _failures(part, result)]
     print("\n".join(failed) or "nothing failed")
     return 1 if failed else 0
@@ -63,17 +76,27 @@ def _run(part: str, args: argparse.Namespace) -> dict[str, Any]:
         return fuzz.fuzz(10 if args.quick else 1_000, minutes, args.seed, args.reader, args.save)
     if part == "sanitizers":
         return sanitizers.sanitized(compile_first=not args.quick)
-    with runs.scene() as scene:
+    reason = runs.why_not()
+    if reason is not None:
+        return {"skipped": {"skipped": reason, "failures": []}}
+    kinds = ("native step",) if part == "flips" else KINDS if args.kind is None else args.kind
+    return {name: result for kind in kinds for name, result in _of_kind(part, kind, args).items()}
+
+
+def _of_kind(part: str, kind: str, args: argparse.Namespace) -> dict[str, Any]:
+    share = args.minutes / 2.0 / len(KINDS)
+    with runs.scene(kind) as scene:
         if part == "kills":
-            return runs.kill_loop(scene, 2 if args.quick else 50, args.minutes / 2.0, args.seed)
+            return {kind: runs.kill_loop(scene, 2 if args.quick else args.kills or KILLS[kind], share, args.seed)}
         if part == "flips":
-            return runs.bit_flips(scene, 100 if args.quick else 5_000, args.seed)
-        work = runs.crash_points if part == "crashes" else runs.failing_writes
-        return work(scene, 2 if args.quick else None)
+            return {kind: disk.bit_flips(scene, 100 if args.quick else 5_000, args.seed)}
+        work = disk.crash_points if part == "crashes" else disk.failing_writes
+        found = work(scene, QUICK_PLACES[kind] if args.quick else args.places or PLACES[kind])
+        return {f"{kind}: {job}": result for job, result in found.items()}
 
 
 def _failures(part: str, result: dict[str, Any]) -> list[str]:
-    if part in ("crashes", "writes"):
+    if part in ("kills", "crashes", "writes", "flips"):
         return [f"{part}: {line}" for job in result.values() for line in job["failures"]]
     found = result["failures"]
     return [f"{part}: {line}: {found[line]}" if isinstance(found, dict) else f"{part}: {line}" for line in found]

@@ -18,11 +18,11 @@ TRACEBACK = 70
 TOLD = 2
 
 
-def start(work: Callable[[], object], said: Path, memory: int | None = None) -> int:
+def start(work: Callable[[], int | None], said: Path, memory: int | None = None) -> int:
     """Begin some work in a child.
 
     Args:
-        work: done there.
+        work: done there; what it returns is the child's exit status, and None is 0.
         said: where what it prints goes.
         memory: bytes of address space that it may take over what this process has.
 
@@ -44,8 +44,7 @@ def start(work: Callable[[], object], said: Path, memory: int | None = None) -> 
         if memory is not None:
             have = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
             resource.setrlimit(resource.RLIMIT_AS, (have + memory, have + memory))
-        work()
-        status = 0
+        status = work() or 0
     except BaseException as error:
         from pop_fast.cli.errors import describe
 

@@ -1,102 +1,205 @@
-"""A run that is killed, whose disk fails or whose checkpoints rot: it continues to the same bits."""
+"""Runs as users start them, killed at random moments: they go on to the same bits.
+
+Every run is `pop train`, called in a child that has imported everything already: by the native step, on two ranks that
+find each other as torchrun lets them, and in two blocks. A part of a run in blocks, and a rank, is a child as well.
+"""
 
 from __future__ import annotations
 
-import builtins
-import errno
 import io
 import os
 import random
 import shutil
 import signal
+import socket
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
 
-from pop_fast.data.capture import Capture
-from pop_fast.data.load import load_capture
-from pop_fast.density import POPStrategy
-from pop_fast.errors import PopError
-from pop_fast.io.formats import load_splat_file
-from pop_fast.io.ply import save_ply
-from pop_fast.train import TrainConfig, TrainingRun
+import pop_fast.compiled
+from pop_fast.blocks import jobs
+from pop_fast.cli import main
 from pop_fast.train import checkpoint as ckpt
+from pop_fast.train.results import ResultFolder
 
 from .corpus import HERE
-from .forks import TOLD, start, wait
+from .forks import start, wait
 
 STEPS, EVERY = 16, 4
-# what changes a disk; a process may end, and the system may refuse, right before each of them
-_CHANGES = ((os, "replace"), (os, "fsync"), (Path, "mkdir"), (Path, "unlink"), (Path, "rmdir"), (shutil, "rmtree"))
-CRASHED = 77
-_ERRORS = (errno.ENOSPC, errno.EACCES, errno.EIO, errno.EROFS)
+# growth, pruning, checkpoints, measurements and files in between; the report's extra renders are left out
+_WORDS: Final = (
+    *("--backend", "compiled", "--max-steps", str(STEPS), "--checkpoint-every", str(EVERY)),
+    *("--eval-steps", "8", "--save-steps", "8", "--test-every", "3", "--ssim-padding", "same", "--max-renders", "1"),
+    *("--pop.refine-start-iter", "2", "--pop.refine-stop-iter", "14", "--pop.refine-every", "4"),
+    *("--pop.grow-grad2d", "1e-5", "--pop.pop-stop-iter", "14"),
+    *("--no-progress", "--quiet", "--skip-checks", "--skip-sizes"),
+)
+# of one run, after which it is left alone to its end
+MOST_KILLS: Final = 6
+# of a process whose fellow has ended, as torchrun does
+_GRACE, _PATIENCE = 0.2, 5.0
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A way to start a run.
+
+    Attributes:
+        words: further ones of `pop train`.
+        ranks: processes that train together.
+        stepper: what must have taken the steps.
+    """
+
+    words: tuple[str, ...]
+    ranks: int
+    stepper: str | None
+
+
+KINDS: Final = {
+    "native step": Kind((), 1, "native"),
+    "two ranks": Kind(("--batch-size", "2"), 2, "torch"),
+    "blocks 2x1": Kind(("--blocks", "2x1", "--blocks-rounds", "0"), 1, None),
+}
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What is trained, and what a run of it that nobody disturbs ends with."""
+    """What is trained and how, and what a run of it that nobody disturbs ends with.
 
-    capture: Capture
+    Attributes:
+        kind: how runs are started.
+        capture: the folder of photographs.
+        folder: where runs write.
+        whole: what a run ends with; of ranks, one process that draws all views.
+    """
+
+    kind: Kind
+    capture: Path
     folder: Path
     whole: dict[str, Any]
 
-    def config(self, name: str) -> TrainConfig:
-        """Return the settings of a run in a folder of this name."""
-        plan = POPStrategy(refine_start_iter=2, refine_stop_iter=14, refine_every=4, grow_grad2d=1e-5, pop_stop_iter=14)
-        return TrainConfig(
-            result_dir=str(self.folder / name),
-            max_steps=STEPS,
-            checkpoint_every=EVERY,
-            eval_steps=(8,),
-            save_steps=(8,),
-            strategy=plan,
-            backend="fast",
-            threads=1,
-            test_every=3,
-            ssim_padding="same",
-            progress=False,
-        )
+    def train(self, name: str, *more: str, threads: int = 1) -> int:
+        """Call `pop train` in this process, which is one of `kind.ranks`, and return its status."""
+        out = ("--out", str(self.folder / name), "--threads", str(threads))
+        with redirect_stdout(io.StringIO()):
+            return main(["train", str(self.capture), *_WORDS, *self.kind.words, *out, *more])
 
-    def train(self, name: str, resume: bool = True, overwrite: bool = False) -> None:
-        """Train, from the last checkpoint where there is one."""
-        TrainingRun(self.config(name), self.capture, resume=resume, overwrite=overwrite).run()
+    def together(self, works: Sequence[Callable[[], int]], said: Path) -> tuple[list[int], list[int]]:
+        """Start the processes of a run, and return their numbers; see `ended`."""
+        if len(works) == 1:
+            return [start(works[0], said)], []
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        told = {"WORLD_SIZE": str(len(works)), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
 
-    def finish(self, name: str) -> str | None:
-        """Continue a run until its end, in a child; say what is wrong with what it ends with, or None."""
+        def ranked(rank: int) -> int:
+            os.environ.update(told, RANK=str(rank))
+            return works[rank]()
+
+        pids = [start(lambda rank=rank: ranked(rank), said) for rank in range(len(works))]
+        return pids[:1], pids[1:]
+
+    def run(self, name: str, *more: str, threads: int = 1) -> tuple[int, str]:
+        """Train until the end in children, and return the status of the one that writes, and what they said."""
         said = self.folder / "said"
         said.unlink(missing_ok=True)
-        status = wait(start(lambda: self.train(name), said))
+        work = lambda: self.train(name, *more, threads=threads)  # noqa: E731  the same for every rank
+        status = ended(*self.together([work] * self.kind.ranks, said))
+        return status, said.read_text()
+
+    def finish(self, name: str, *more: str) -> str | None:
+        """Continue a run until its end; say what is wrong with what it ends with, or None."""
+        status, said = self.run(name, *(more or ("--resume",)))
         if status != 0:
-            return f"continuing ended with {status}: {said.read_text()[-300:]}"
+            return f"continuing ended with {status}: {said[-300:]}"
         if not same(ended_with(self.folder / name), self.whole):
             return "the bits differ"
         left = [
-            path.name for path in (self.folder / name).rglob("*") if "partial" in path.name or "replaced" in path.name
+            str(path.relative_to(self.folder))
+            for path in (self.folder / name).rglob("*")
+            if "partial" in path.name or "replaced" in path.name
         ]
         return f"{left} is left" if left else None
 
 
+def ended(writer: Sequence[int], others: Sequence[int]) -> int:
+    """Wait for the processes of a run and return the writer's status; where one fails the others are stopped."""
+    left, statuses, since = {*writer, *others}, dict[int, int](), 0.0
+    while left:
+        for pid in list(left):
+            found, status = os.waitpid(pid, os.WNOHANG)
+            if found:
+                statuses[pid] = os.waitstatus_to_exitcode(status)
+                left.remove(pid)
+        failed = any(statuses.values())
+        if failed and left:
+            since = since or time.monotonic()
+            late = time.monotonic() - since
+            for pid in left if late > _GRACE else ():
+                os.kill(pid, signal.SIGKILL if late > _PATIENCE else signal.SIGTERM)
+                time.sleep(0.05)
+        time.sleep(0.005)
+    return statuses[writer[0]]
+
+
+def why_not() -> str | None:
+    """Say why runs of the native step cannot be tried here, or None."""
+    return pop_fast.compiled.why_not()
+
+
 @contextmanager
-def scene() -> Iterator[Scene]:
-    """Train once, undisturbed."""
+def scene(kind: str) -> Iterator[Scene]:
+    """Train once, undisturbed, in this process, which then has imported all that its children need."""
+    run_parts(in_children=True)
     with tempfile.TemporaryDirectory() as folder:
-        made = Scene(load_capture(str(HERE / "colmap")), Path(folder), {})
-        made.train("whole")
+        capture = HERE / "colmap"
+        if kind.startswith("blocks"):
+            capture = Path(folder) / "toy"
+            with redirect_stdout(io.StringIO()):
+                main(["demo", str(capture), "--views", "8", "--width", "40", "--height", "32"])
+        made = Scene(KINDS[kind], capture, Path(folder), {})
+        status = made.train("whole")
+        stats = ResultFolder(Path(folder) / "whole").read_stats("val", STEPS - 1) or {}
+        stepper = made.kind.stepper or stats.get("stepper")
+        if status != 0 or stats.get("stepper") != stepper:
+            raise RuntimeError(f"{kind}: status {status}, steps by {stats.get('stepper')}")
         made.whole.update(ended_with(Path(folder) / "whole"))
         yield made
 
 
+def run_parts(in_children: bool) -> None:
+    """Let the parts of a run in blocks be done without an import: in children of their starter, or in its own process.
+
+    Args:
+        in_children: as outside; if not, every change of the disk is one of a single process, which can be numbered.
+    """
+
+    def run_part(words: Sequence[str], quiet: bool) -> int:
+        told = list(words[words.index("pop_fast.cli") + 1 :])
+        return wait(start(lambda: main(told), Path(os.devnull))) if in_children else main(told)
+
+    jobs._run = run_part
+    jobs.has_snakemake = lambda: False
+
+
 def ended_with(folder: Path) -> dict[str, Any]:
-    """Return what a finished run's last checkpoint holds, but for the clock."""
-    content = ckpt.load_checkpoint(ckpt.checkpoint_path(folder, STEPS - 1))
-    return {key: value for key, value in content.items() if key not in ("seconds", "metrics_bytes")}
+    """Return what a finished run's last checkpoint holds, but for the clock and the number of threads."""
+    path = ckpt.checkpoint_path(folder, STEPS - 1)
+    if (folder / "blocks").is_dir():
+        # merged blocks are not gone on with: they have Gaussians alone
+        return {"splats": ckpt.load_splats(path)[0]}
+    content = ckpt.load_checkpoint(path)
+    free = ("seconds", "metrics_bytes", "threads", "config")
+    config = {key: value for key, value in content.get("config", {}).items() if key != "threads"}
+    return {**{key: value for key, value in content.items() if key not in free}, "config": config}
 
 
 def same(a: Any, b: Any) -> bool:
@@ -109,212 +212,47 @@ def same(a: Any, b: Any) -> bool:
 
 
 def kill_loop(of: Scene, kills: int, minutes: float, seed: int) -> dict[str, Any]:
-    """Kill runs at random moments until each of them has ended by itself.
+    """Kill runs at random moments, each at most so often, with one thread or two by turns, then let them end.
+
+    Of two ranks one is killed, or both at once; of a run in blocks the starter with the part that it waits for.
 
     Args:
         of: what is trained.
         kills: at least.
         minutes: at least.
-        seed: decides when.
+        seed: decides when, and whom.
     """
     rng, end = random.Random(seed), time.monotonic() + 60.0 * minutes
     begun = time.monotonic()
-    of.train("timed")
-    longest, found, failures = time.monotonic() - begun, Counter[str](), list[str]()
-    while found["kills"] < kills or time.monotonic() < end:
-        name = f"killed_{found['runs']}"
-        found["runs"] += 1
-        while True:
-            pid = start(lambda name=name: of.train(name), of.folder / "said")
-            time.sleep(rng.uniform(0.0, longest))
-            os.kill(pid, signal.SIGKILL)
-            if wait(pid) != -signal.SIGKILL:
+    of.run("timed")
+    longest, count, failures = time.monotonic() - begun, Counter[str](), list[str]()
+    while count["kills"] < kills or time.monotonic() < end:
+        name = f"killed_{count['runs']}"
+        count["runs"] += 1
+        for turn in range(MOST_KILLS):
+            if not _killed(of, name, 1 + turn % 2, rng, longest):
                 break
-            found["kills"] += 1
+            count["kills"] += 1
         wrong = of.finish(name)
-        failures += [f"run {found['runs']} of seed {seed}: {wrong}"] if wrong else []
+        failures += [f"run {count['runs']} of seed {seed}: {wrong}"] if wrong else []
         shutil.rmtree(of.folder / name)
-    return {"kills": found["kills"], "runs": found["runs"], "seed": seed, "failures": failures}
+    return {"kills": count["kills"], "runs": count["runs"], "seed": seed, "failures": failures}
 
 
-def crash_points(of: Scene, most: int | None) -> dict[str, Any]:
-    """End the process right before every change of the disk, and look at what is left.
+def _killed(of: Scene, name: str, threads: int, rng: random.Random, longest: float) -> bool:
+    """Start or continue a run, kill it at a random moment, and tell whether that was before its end."""
 
-    Args:
-        of: what is trained.
-        most: so many points of each job at most, spread evenly; None takes all.
-    """
-    return _at_points(of, most, lambda number: lambda: os._exit(CRASHED), short_writes=False)
+    def work() -> int:
+        # a group of its own, with the parts that it starts
+        os.setpgid(0, 0)
+        return of.train(name, "--resume", threads=threads if of.kind.ranks == 1 else 1)
 
-
-def failing_writes(of: Scene, most: int | None) -> dict[str, Any]:
-    """Let every change of the disk, and every write of a file in its middle, be refused by the system in turn."""
-
-    def refused(number: int) -> Callable[[], None]:
-        def refuse() -> None:
-            code = _ERRORS[number % len(_ERRORS)]
-            raise OSError(code, os.strerror(code))
-
-        return refuse
-
-    return _at_points(of, most, refused, short_writes=True)
-
-
-def _at_points(
-    of: Scene, most: int | None, fault: Callable[[int], Callable[[], None]], short_writes: bool
-) -> dict[str, Any]:
-    results: dict[str, Any] = {}
-    for job, (work, check) in _jobs(of).items():
-        points = _count(of, job, work, short_writes)
-        step = 1 if most is None else max(points / most, 1.0)
-        chosen = sorted({int(step * k) for k in range(points) if step * k < points})
-        failures, statuses = list[str](), Counter[str]()
-        for number in chosen:
-            _prepare(of, job)
-            said = of.folder / "said"
-            said.unlink(missing_ok=True)
-
-            def disturbed(number: int = number, work: Callable[[], None] = work) -> None:
-                with disturbing(number, fault(number), short_writes):
-                    work()
-
-            status = wait(start(disturbed, said))
-            text = said.read_text() if said.exists() else ""
-            statuses[{CRASHED: "ended", 0: "continued", TOLD: "told"}.get(status, "else")] += 1
-            wrong = None if status in (CRASHED, 0, TOLD) else f"status {status}: {text[-300:]}"
-            wrong = wrong or check()
-            failures += [f"{job}, point {number}: {wrong}"] if wrong else []
-        results[job] = {"points": points, "tried": len(chosen), **statuses, "failures": failures}
-    return results
-
-
-def _jobs(of: Scene) -> dict[str, tuple[Callable[[], None], Callable[[], str | None]]]:
-    """List what writes, each with what must hold after it was disturbed."""
-    splat = of.folder / "splat.ply"
-    old = of.folder / "old.ply"
-
-    def rewrite() -> None:
-        params = {key: value + 0.25 for key, value in load_splat_file(old)[0].items()}
-        save_ply(splat, params)
-
-    def old_or_new() -> str | None:
-        found = load_splat_file(splat)[0]["means"]
-        moved = float((found - load_splat_file(old)[0]["means"]).abs().max())
-        return None if moved in (0.0, 0.25) or abs(moved - 0.25) < 1e-6 else "a splat is neither the old nor the new"
-
-    def replaced() -> str | None:
-        # whoever looks next finds the old result or the new one, and can train over it
-        said = of.folder / "said"
-        status = wait(start(lambda: of.train("over", resume=False, overwrite=True), said))
-        if status != 0:
-            return f"training over it ended with {status}: {said.read_text()[-300:]}"
-        return of.finish("over")
-
-    return {
-        "train": (lambda: of.train("run"), lambda: of.finish("run")),
-        "train --overwrite": (lambda: of.train("over", resume=False, overwrite=True), replaced),
-        "write a PLY": (rewrite, old_or_new),
-    }
-
-
-def _prepare(of: Scene, job: str) -> None:
-    for name in ("run", "over"):
-        shutil.rmtree(of.folder / name, ignore_errors=True)
-    if job == "train --overwrite":
-        shutil.copytree(of.folder / "whole", of.folder / "over")
-    if job == "write a PLY":
-        for name in ("splat.ply", "old.ply"):
-            shutil.copy(HERE / "splats" / "splat.ply", of.folder / name)
-
-
-def _count(of: Scene, job: str, work: Callable[[], None], short_writes: bool) -> int:
-    """Count the changes of the disk of a job that nobody disturbs."""
-    told = of.folder / "count"
-
-    def counted() -> None:
-        with disturbing(-1, lambda: None, short_writes) as reached:
-            work()
-        told.write_text(str(reached[0]))
-
-    _prepare(of, job)
-    status = wait(start(counted, of.folder / "said"))
-    if status != 0:
-        raise RuntimeError(f"{job} ended with {status}: {(of.folder / 'said').read_text()[-2000:]}")
-    return int(told.read_text())
-
-
-@contextmanager
-def disturbing(at: int, fault: Callable[[], None], short_writes: bool) -> Iterator[list[int]]:
-    """Let something happen right before the change of the disk with this number, and count them all."""
-    reached = [0]
-
-    def meet() -> None:
-        reached[0] += 1
-        if reached[0] - 1 == at:
-            fault()
-
-    def wrapped(function: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*words: Any, **named: Any) -> Any:
-            meet()
-            return function(*words, **named)
-
-        return call
-
-    def opening(file: Any, mode: str = "r", *words: Any, **named: Any) -> Any:
-        if mode == "wb" and isinstance(file, Path):
-            return io.BufferedWriter(_Meeting(file, meet), 512)
-        return plain(file, mode, *words, **named)
-
-    plain, before = builtins.open, [(owner, name, getattr(owner, name)) for owner, name in _CHANGES]
-    try:
-        for owner, name, function in before:
-            setattr(owner, name, wrapped(function))
-        if short_writes:
-            builtins.open = opening  # type: ignore[assignment]
-        yield reached
-    finally:
-        builtins.open = plain
-        for owner, name, function in before:
-            setattr(owner, name, function)
-
-
-class _Meeting(io.FileIO):
-    """A file of which half a write gets to the disk before something happens, at the first and the third."""
-
-    def __init__(self, path: Path, meet: Callable[[], None]) -> None:
-        super().__init__(path, "w")
-        self._meet, self._writes = meet, 0
-
-    def write(self, data: Any) -> int:  # type: ignore[override]
-        self._writes += 1
-        if self._writes in (1, 3):
-            super().write(memoryview(data)[: len(data) // 2])
-            self._meet()
-            self.seek(-(len(data) // 2), os.SEEK_CUR)
-        return super().write(data) or 0
-
-
-def bit_flips(of: Scene, flips: int, seed: int) -> dict[str, Any]:
-    """Flip single bits of a checkpoint: it is refused, or read as what it was."""
-    path = ckpt.checkpoint_path(of.folder / "whole", STEPS - 1)
-    data, whole, rng = path.read_bytes(), ckpt.load_checkpoint(path), random.Random(seed)
-    told = of.folder / "flips"
-
-    def read_all() -> None:
-        found = Counter[str]()
-        target = of.folder / "rotten" / "ckpts" / path.name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        for _ in range(flips):
-            changed = bytearray(data)
-            changed[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-            target.write_bytes(changed)
-            with suppress(PopError):
-                found["the same" if same(ckpt.load_checkpoint(target), whole) else "another"] += 1
-        told.write_text(f"{found['the same']} {found['another']}")
-
-    status = wait(start(read_all, of.folder / "said"))
-    if status != 0:
-        return {"flips": flips, "failures": [f"ended with {status}: {(of.folder / 'said').read_text()[-300:]}"]}
-    equal, other = map(int, told.read_text().split())
-    failures = [f"{other} of {flips} were read as another content (seed {seed})"] if other else []
-    return {"flips": flips, "refused": flips - equal - other, "the same": equal, "failures": failures}
+    writer, others = of.together([work] * of.kind.ranks, of.folder / "said")
+    time.sleep(rng.uniform(0.0, longest))
+    whom = [rng.choice([*writer, *others])] if others and rng.random() < 0.5 else [*writer, *others]
+    for pid in whom:
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(pid, signal.SIGKILL)
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    return ended(writer, others) != 0

@@ -1,82 +1,207 @@
-"""The compiled CPU kernels with AddressSanitizer and UndefinedBehaviorSanitizer, on the scenes that the laws keep."""
+"""Every unit of C++ under sanitizers: of the compiled backend, of the host mirror, and of the kernels' emulator.
+
+Two libraries are made of the compiled backend, one for AddressSanitizer and UndefinedBehaviorSanitizer, one for
+ThreadSanitizer. The first also counts which lines ran, so that a unit that nothing calls is a failure.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
+import shutil
 import subprocess
-import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+import cuda_ext
 from cuda_ext.compiler import find_compiler
+from cuda_ext.host import emulate
+from cuda_ext.host.mirror import HERE as HOST
+from cuda_ext.host.mirror import mirror_sources
 from pop_fast.children import module_command
 from pop_fast.compiled.build import CUDA, HERE, SHARED, SOURCES, UNITS
 
-_FLAGS = (
-    *("-std=c++17", "-O1", "-g1", "-fno-omit-frame-pointer", "-fsanitize=address,undefined", "-fPIC", "-shared"),
-    *("-fno-sanitize-recover=undefined", "-pthread", "-march=native"),
-)
 ROOT = Path(__file__).resolve().parents[2]
+CUDA_EXT = Path(cuda_ext.__file__).resolve().parent
+_MEMORY: Final = ("-fsanitize=address,undefined", "-fno-sanitize-recover=undefined")
+_COUNTED: Final = ("--coverage", "-fprofile-update=atomic")
+_FLAGS: Final = ("-std=c++17", "-O1", "-g1", "-fno-omit-frame-pointer", "-fPIC", "-shared", "-pthread")
+# of a unit's own lines, which are doors to what its headers hold
+LEAST_SHARE: Final = 0.5
 
 
-def library() -> Path:
-    """Return where the library of this source is kept, in the checkout, whether or not it has been compiled."""
-    digest = hashlib.sha256()
-    for path in (*(HERE / name for name in SOURCES), *(CUDA / name for name in SHARED)):
-        digest.update(path.read_bytes())
-    return ROOT / "out" / "faults" / f"_sanitized_{digest.hexdigest()[:16]}.so"
+@dataclass(frozen=True)
+class Check:
+    """A library under sanitizers, and who uses it.
+
+    Attributes:
+        units: what it is made of.
+        sources: all that its text depends on.
+        flags: of the compiler.
+        runtime: the sanitizers' library, which must be loaded before all others.
+        use: what `sanitized_child` does with it, told the library by `POP_SANITIZED`.
+        about: the sanitizers, in words.
+    """
+
+    units: tuple[Path, ...]
+    sources: tuple[Path, ...]
+    flags: tuple[str, ...]
+    runtime: str
+    use: str
+    about: str
+
+    @property
+    def library(self) -> Path:
+        """Where it is kept, in the checkout, whether or not it has been compiled."""
+        digest = hashlib.sha256(" ".join(self.flags).encode())
+        for path in self.sources:
+            digest.update(path.read_bytes())
+        return ROOT / "out" / "faults" / digest.hexdigest()[:16] / "kernels.so"
 
 
-def why_not() -> str | None:
-    """Say why the kernels cannot be compiled with sanitizers here, or None."""
+_COMPILED: Final = tuple(HERE / unit for unit in UNITS)
+_OF_COMPILED: Final = (*(HERE / name for name in SOURCES), *(CUDA / name for name in SHARED))
+_TUNED: Final = (*_FLAGS, "-march=native", f"-I{CUDA.parent}")
+_ADDRESS: Final = "AddressSanitizer and UndefinedBehaviorSanitizer"
+CHECKS: Final[Mapping[str, Check]] = {
+    "compiled backend": Check(
+        _COMPILED, _OF_COMPILED, (*_TUNED, *_MEMORY, *_COUNTED), "libasan.so", "compiled", _ADDRESS
+    ),
+    "compiled backend, four threads": Check(
+        _COMPILED, _OF_COMPILED, (*_TUNED, "-fsanitize=thread"), "libtsan.so", "threads", "ThreadSanitizer"
+    ),
+    "host mirror": Check(
+        (HOST / "mirror.cpp",),
+        tuple(mirror_sources()),
+        (*_FLAGS, "-ffp-contract=off", *_MEMORY, *_COUNTED),
+        "libasan.so",
+        "mirror",
+        _ADDRESS,
+    ),
+}
+EMULATION: Final = "kernels under the emulator"
+# these are compiled by the emulator's own build, with the flags that POP_EMULATED_FLAGS adds
+EMULATED: Final = (HOST / "emulator.cpp", CUDA_EXT / "bindings.cpp", CUDA_EXT / "bindings_training.cpp")
+# its fibers switch stacks, which AddressSanitizer must not follow
+_EMULATED_FLAGS: Final = "-fsanitize=address --param asan-stack=0"
+_EMULATED_TESTS: Final = tuple(f"tests/cuda/emulated/test_emulated_{name}.py" for name in ("smoke", "ten_steps"))
+# Python keeps what it has, and asks for much at once
+_OPTIONS: Final = {
+    "ASAN_OPTIONS": "detect_leaks=0:allocator_may_return_null=1",
+    "UBSAN_OPTIONS": "print_stacktrace=1:halt_on_error=1",
+    "TSAN_OPTIONS": "halt_on_error=1:exitcode=66:report_signal_unsafe=0:ignore_noninstrumented_modules=1",
+}
+
+
+def units() -> list[Path]:
+    """List every unit of C++ that the package and its host build are made of."""
+    found = (*HERE.glob("*.cpp"), *CUDA_EXT.rglob("*.cpp"))
+    return sorted(path for path in found if "build" not in path.relative_to(ROOT).parts)
+
+
+def uncovered() -> list[str]:
+    """List the units that no check is made of."""
+    covered = {*(unit for check in CHECKS.values() for unit in check.units), *EMULATED}
+    return [str(path.relative_to(ROOT)) for path in units() if path not in covered]
+
+
+def why_not(check: Check) -> str | None:
+    """Say why a library cannot be compiled here, or None."""
     compiler = find_compiler()
     if compiler is None:
         return "there is no C++ compiler"
-    runtime = _runtime(compiler)
-    return None if runtime else f"{compiler[0]} has no AddressSanitizer"
+    return None if _runtime(compiler, check.runtime) else f"{compiler[0]} has no {check.runtime}"
 
 
-def _runtime(compiler: list[str]) -> str | None:
-    """Return the library that must be loaded before all others, as the interpreter is not built with sanitizers."""
-    asked = [*compiler, "-print-file-name=libasan.so"]
-    found = subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip()
-    return found if os.path.isabs(found) else None
+def _runtime(compiler: list[str], name: str) -> str | None:
+    asked = [*compiler, f"-print-file-name={name}"]
+    path = subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip()
+    return path if os.path.isabs(path) else None
 
 
 def sanitized(compile_first: bool = True) -> dict[str, Any]:
-    """Draw the kept scenes, go back, and train some steps, in a child with the sanitized library.
+    """Use every library in a child of its own.
 
     Args:
-        compile_first: compile it where it is not there, which takes about a minute.
+        compile_first: compile what is not there, which takes minutes; if not, those are left out, and named.
     """
-    reason = why_not()
-    target = library()
+    checks = {name: _checked(check, compile_first) for name, check in CHECKS.items()}
+    checks[EMULATION] = _emulated(compile_first)
+    lines = {name: share for check in checks.values() for name, share in check.pop("lines", {}).items()}
+    failures = [f"{name}: {line}" for name, check in checks.items() for line in check["failures"]]
+    failures += [f"{name}: no check compiles it" for name in uncovered()]
+    failures += [f"{name}: {run} of {of} lines ran" for name, (run, of) in lines.items() if run < LEAST_SHARE * of]
+    return {"checks": checks, "lines": lines, "failures": failures}
+
+
+def _checked(check: Check, compile_first: bool) -> dict[str, Any]:
+    reason, target = why_not(check), check.library
     if reason is None and not target.exists() and not compile_first:
-        reason = f"{target.name} is not compiled"
+        reason = f"{target.parent.name} is not compiled"
     if reason is not None:
-        return {"skipped": reason, "failures": []}
+        return {"about": check.about, "skipped": reason, "failures": []}
     compiler = find_compiler() or []
     if not target.exists():
-        _compile(compiler, target)
-    environment = {
-        **os.environ,
-        "LD_PRELOAD": str(_runtime(compiler)),
-        "ASAN_OPTIONS": "detect_leaks=0:allocator_may_return_null=1",
-        "UBSAN_OPTIONS": "print_stacktrace=1:halt_on_error=1",
-        "PYTHONPATH": str(ROOT),
-        "POP_SANITIZED": str(target),
-    }
-    command = module_command("benchmarks.faults.sanitized_child")
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, cwd=ROOT)
-    failures = [] if done.returncode == 0 else [f"status {done.returncode}: {done.stderr[:3000]}"]
-    return {"compiler": compiler[0], "told": done.stdout.split("\n")[:-1], "failures": failures}
+        _compile(compiler, check)
+    for counts in target.parent.glob("*.gcda"):
+        counts.unlink()
+    words = module_command("benchmarks.faults.sanitized_child", check.use)
+    told, failures = _ran(words, check, compiler, {"POP_SANITIZED": str(target)})
+    return {"about": check.about, "told": told, "lines": _lines(check), "failures": failures}
 
 
-def _compile(compiler: list[str], target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent) as folder:
-        made = Path(folder) / target.name
-        command = [*compiler, *_FLAGS, f"-I{CUDA.parent}", "-o", str(made), *(str(HERE / unit) for unit in UNITS)]
-        subprocess.run(command, check=True, capture_output=True)
-        os.replace(made, target)
+def _ran(words: list[str], check: Check, compiler: list[str], more: dict[str, str]) -> tuple[list[str], list[str]]:
+    """Return what a child printed, and its failure, if it was one."""
+    runtime = str(_runtime(compiler, check.runtime))
+    environment = {**os.environ, **_OPTIONS, **more, "LD_PRELOAD": runtime, "PYTHONPATH": str(ROOT)}
+    # the kernel lays memory out more freely than ThreadSanitizer of this age expects
+    fixed = ["setarch", "-R"] if check.runtime == "libtsan.so" and shutil.which("setarch") else []
+    done = subprocess.run([*fixed, *words], env=environment, capture_output=True, text=True, check=False, cwd=ROOT)
+    failures = [] if done.returncode == 0 else [f"status {done.returncode}: {(done.stderr or done.stdout)[:3000]}"]
+    return done.stdout.split("\n")[:-1], failures
+
+
+def _compile(compiler: list[str], check: Check) -> None:
+    folder = check.library.parent
+    folder.mkdir(parents=True, exist_ok=True)
+    made = folder / "making.so"
+    command = [*compiler, *check.flags, "-o", str(made), *map(str, check.units)]
+    # counters of lines are written where the compiler worked
+    subprocess.run(command, check=True, capture_output=True, cwd=folder)
+    os.replace(made, check.library)
+
+
+def _lines(check: Check) -> dict[str, tuple[int, int]]:
+    """Return how many lines of each unit ran, and of how many; nothing where they are not counted."""
+    folder, program = check.library.parent, shutil.which("gcov")
+    if program is None or "--coverage" not in check.flags:
+        return {}
+    found: dict[str, tuple[int, int]] = {}
+    for unit in check.units:
+        counted = [path.name for path in folder.glob(f"*-{unit.stem}.gcda")]
+        asked = [program, "--json-format", "--stdout", *counted]
+        done = subprocess.run(asked, capture_output=True, text=True, check=False, cwd=folder)
+        # a line of a template is counted once for each type that it is made for
+        ran: dict[int, bool] = {}
+        for text in done.stdout.splitlines():
+            for file in json.loads(text)["files"]:
+                for line in file["lines"] if Path(file["file"]).name == unit.name else ():
+                    ran[line["line_number"]] = ran.get(line["line_number"], False) or line["count"] > 0
+        found[str(unit.relative_to(ROOT))] = (sum(ran.values()), len(ran)) if ran else (0, 1)
+    return found
+
+
+def _emulated(compile_first: bool) -> dict[str, Any]:
+    """Run the kernels' own source, their bindings and the emulator through some of their tests."""
+    about, reason = "AddressSanitizer", emulate.why_not()
+    if reason is None and not compile_first:
+        reason = "its build takes minutes"
+    if reason is not None:
+        return {"about": about, "skipped": reason, "failures": []}
+    check, compiler = CHECKS["host mirror"], find_compiler() or []
+    words = module_command("pytest", "-q", "-p", "no:cacheprovider", *_EMULATED_TESTS)
+    told, failures = _ran(words, check, compiler, {"POP_EMULATED_FLAGS": _EMULATED_FLAGS})
+    return {"about": about, "told": told[-1:], "failures": failures}

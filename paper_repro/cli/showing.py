@@ -125,14 +125,14 @@ def claims(words: Sequence[str]) -> int:
 def _absent(scale: str, data: Path) -> list[str]:
     """List the scenes of a scale that are not under the data root; nothing is known where there is no root."""
     from paper_repro.scales import scale_named
-    from paper_repro.scenes import SCENES, find_folder
+    from paper_repro.scenes import MADE, SCENES, find_folder
 
     if not data.is_dir():
         return []
     absent: list[str] = []
     for name in scale_named(scale).factors:
         try:
-            _ = name == "demo" or find_folder(SCENES[name], data)
+            _ = name in MADE or find_folder(SCENES[name], data)
         except PopError:
             absent.append(name)
     return absent

@@ -43,9 +43,9 @@ class CompiledBackend(TorchBackend):
     def make_engine(self, config: Any, own_strategy: bool) -> Any:
         """Return the native step where it knows all settings, else autograd over the compiled stages."""
         from pop_fast.train.engines import native_engine, torch_engine
-        from pop_fast.train.fused_settings import unsupported
+        from pop_fast.train.fused_settings import unsupported_setting
 
-        if own_strategy and unsupported(config) is None:
+        if own_strategy and unsupported_setting(config) is None:
             return native_engine(self)
         return torch_engine(self)
 

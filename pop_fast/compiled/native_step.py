@@ -52,7 +52,7 @@ class StepGiven(ctypes.Structure):
         *_fields(_REAL, "floor_below", "alpha_ceiling", "stop"),
         *_fields(_REAL * 3, "background"),
         *_fields(_WHOLE, "degree", "border", "l1"),
-        *_fields(_REAL, "pixel_weight", "ssim_weight", "lambda_pop"),
+        *_fields(_REAL, "pixel_weight", "ssim_weight", "lambda_pop", "lambda_entropy"),
         *_fields(_WHOLE, "dominance", "pop_window", "pop_visible", "blur_own_view"),
         *_fields(_REAL, "blur_pixels"),
         *_fields(_REAL * len(GROUPS), "lr"),
@@ -276,6 +276,7 @@ class NativeTrainer:
         given.pixel_weight = (1.0 - phase.lambda_ssim) * settings.pixelwise_scale
         given.ssim_weight = phase.lambda_ssim * (0.5 if settings.d_ssim_halved else 1.0)
         given.lambda_pop = settings.lambda_pop if phase.pop else 0.0
+        given.lambda_entropy = settings.lambda_entropy if phase.entropy else 0.0
         given.dominance = phase.dominance
         summed = phase.window or (phase.blur and settings.blur_window == "sum")
         blurs = phase.blur and settings.blur_window != "sum"

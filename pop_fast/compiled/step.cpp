@@ -138,10 +138,10 @@ void Stepper::make_workers() {
 
 void Stepper::finish() {
   const StepGiven &g = *given;
-  double pixels_summed[3] = {}, windows = 0.0, sides[2] = {};
+  double pixels_summed[3] = {}, windows = 0.0, sides[PRIOR_SUMS] = {};
   for (size_t k = 0; k < tile_sums.size(); k++) pixels_summed[k % 3] += tile_sums[k];
   for (const double sum : window_sums) windows += sum;
-  for (size_t k = 0; k < pop_sums.size(); k++) sides[k % 2] += pop_sums[k];
+  for (size_t k = 0; k < pop_sums.size(); k++) sides[k % PRIOR_SUMS] += pop_sums[k];
   const double n_values = double(3 * std::max<int64_t>(g.n_kept, 1));
   const double dissimilarity = g.n_windows > 0 ? windows / double(3 * g.n_windows) : 0.0;
   g.values[PIXELWISE] = pixels_summed[g.l1 ? 0 : 1] / n_values;
@@ -149,7 +149,8 @@ void Stepper::finish() {
   g.values[OBJECTIVE] = g.pixel_weight * g.values[PIXELWISE] + g.ssim_weight * dissimilarity;
   g.values[SQUARE] = pixels_summed[2] / n_values;
   g.values[POP] = g.lambda_pop * (sides[0] / double(std::max<int64_t>(n_important, 1)) +
-                                  sides[1] / double(std::max<int64_t>(n_others, 1)));
+                                  sides[1] / double(std::max<int64_t>(n_others, 1))) +
+                  g.lambda_entropy * sides[2] / double(std::max<int64_t>(g.n, 1));
   ended = true;
 }
 

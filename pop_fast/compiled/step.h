@@ -48,7 +48,8 @@ struct StepGiven {
   double floor_below, alpha_ceiling, stop;        // as in `Blend`
   double background[3];
   int64_t degree, border, l1;                     // active band; black pixels around the image for SSIM; L1 instead of L2
-  double pixel_weight, ssim_weight, lambda_pop;   // lambda_pop is 0 where the POP term is off
+  double pixel_weight, ssim_weight;
+  double lambda_pop, lambda_entropy;              // each 0 where its term is off
   int64_t dominance, pop_window, pop_visible, blur_own_view;  // dominance: counts are made
   double blur_pixels;                             // a view's count above it blurs
   double lr[GROUPS], beta1, beta2, eps;
@@ -71,6 +72,7 @@ struct Seen {
   int32_t n, first;                            // entries, -1 where it is culled; the first one's slot in its part
 };
 
+constexpr int PRIOR_SUMS = 3;       // of a part: opacities of both sides of the POP term, entropies
 constexpr int COLUMNS = 9;          // of an entry's row: six moments, colours
 constexpr int64_t ROWS = 256;       // Gaussians in a part
 static_assert(ROWS % ROW_BLOCK == 0);

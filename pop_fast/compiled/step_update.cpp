@@ -1,4 +1,4 @@
-// The update: per Gaussian back to raw parameters, the POP term, statistics of density control, Adam.
+// The update: per Gaussian back to raw parameters, the priors on opacities, statistics of density control, Adam.
 
 #include <algorithm>
 
@@ -36,11 +36,11 @@ void Stepper::count_sides() {
 }
 
 Work Stepper::update() {
-  pop_sums.assign(size_t(2 * parts_of(given->n, ROWS)), 0.0);
+  pop_sums.assign(size_t(PRIOR_SUMS * parts_of(given->n, ROWS)), 0.0);
   Work work = {given->n, ROWS, {}};
   with_degree(given->degree, [&](auto degree) {
     work.f = [this](int thread, int64_t first, int64_t last) {
-      double *const pop_sum = &pop_sums[size_t(2 * (first / ROWS))];
+      double *const pop_sum = &pop_sums[size_t(PRIOR_SUMS * (first / ROWS))];
       for (int64_t block = first; block < last; block += ROW_BLOCK)
         update_block<decltype(degree)::value>(*workers[size_t(thread)], block, std::min(last, block + ROW_BLOCK), pop_sum);
     };
@@ -61,6 +61,11 @@ template <int DEGREE> void Stepper::update_block(Worker &own, int64_t first, int
   float *const v_logits = gradients_of(own, OPACITIES);
   transpose_block<DEGREE>(own, first, last);
   for (int64_t i = first; i < last; i++) {
+    if (g.lambda_entropy != 0.0) {
+      const float logit = g.params[OPACITIES][i];
+      pop_sum[2] += opacity_entropy_one(logit);
+      v_logits[i - first] += opacity_entropy_vjp_one(logit, float(g.lambda_entropy / double(g.n)));
+    }
     if (blend.dominant_counts) {
       const int32_t count = blend.dominant_counts[i];
       if (g.lambda_pop != 0.0) {

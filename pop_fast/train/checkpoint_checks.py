@@ -90,14 +90,17 @@ def check_content(content: Mapping[str, Any]) -> dict[str, Any]:
     # files of older versions do not have processor time
     seconds = {"cpu": None, **_mapping(content["seconds"], "seconds")}
     _mapping(seconds, "seconds", ("train", "total", "cpu"))
-    _check_words(_mapping(content["config"], "config"), content["capture"])
+    config = _mapping(content["config"], "config")
+    _check_words(config, content["capture"])
+    # where the settings do not name it, a step has one view
+    drawn = (step + 1) * _whole(config.get("batch_size", 1), "config.batch_size", least=1)
     _whole(content["metrics_bytes"], "metrics_bytes")
     _whole(content["threads"], "threads", least=1)
     checked = {
         **content,
         "splats": splats,
         "optimizers": {key: _moments(packed[key], f"optimizers.{key}", splats[key], step + 1) for key in KEYS},
-        "strategy": _strategy(content["strategy"], list(splats["shN"].shape), step + 1),
+        "strategy": _strategy(content["strategy"], list(splats["shN"].shape), drawn),
         "view_order": _view_order(content["view_order"]),
         "appearance": _appearance(content.get("appearance", {}), step + 1),
         "seconds": {
@@ -144,11 +147,11 @@ def _moments(packed: Any, name: str, param: Tensor, taken: int) -> dict[str, Ten
     return checked
 
 
-def _strategy(packed: Any, sh_rest: list[int], taken: int) -> dict[str, Any]:
+def _strategy(packed: Any, sh_rest: list[int], drawn: int) -> dict[str, Any]:
     found = _mapping(packed, "strategy", ("generator",), others=True)
     checked = {**found, "generator": _generator(found["generator"], "strategy.generator")}
     if "views" in found:
-        _whole(found["views"], "strategy.views", most=taken)
+        _whole(found["views"], "strategy.views", most=drawn)
     if "scene_scale" in found:
         checked["scene_scale"] = _number(found["scene_scale"], "strategy.scene_scale")
     for key in _ROWS.keys() & found.keys():

@@ -177,6 +177,7 @@ def step_settings(config: TrainConfig, updates: Updates) -> StepSettings:
         d_ssim_halved=config.d_ssim_halved,
         pixelwise_scale=1.0 / config.photometric_divisor,
         lambda_pop=pop.lambda_pop,
+        lambda_entropy=pop.lambda_entropy,
         pop_views=pop.pop_views,
         pop_over=pop.pop_over,
         blur_window=pop.blur_window,

@@ -27,6 +27,7 @@ def phase_at(config: TrainConfig, strategy: DensityControl | ForeignStrategy, st
         l1=kind == "l1",
         lambda_ssim=weight,
         window=own and strategy.collects_window(step),
+        entropy=own and strategy.lambda_entropy != 0.0 and strategy.regularizes(step),
     )
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.faults import sanitizers
 from benchmarks.faults.fuzz import kept
 from benchmarks.faults.readers import READERS
 from tests.app.children import ROOT, in_a_child
@@ -41,31 +42,124 @@ def test_inputs_that_once_broke_something_are_kept() -> None:
     assert sum(len(kept(reader)) for reader in READERS) >= 60
 
 
-@pytest.mark.parametrize("job", ["train", "train --overwrite", "write a PLY"])
+JOBS = {
+    "native step: train": 2,
+    "native step: train --overwrite": 2,
+    "native step: write a PLY": 2,
+    "two ranks: train": 1,
+    "blocks 2x1: train": 1,
+}
+
+
+def of_runs(tried: dict[str, Any], part: str, job: str) -> dict[str, Any]:
+    if "skipped" in tried[part]:
+        pytest.skip(tried[part]["skipped"]["skipped"])
+    assert set(tried[part]) == set(JOBS)
+    return tried[part][job]
+
+
+@pytest.mark.parametrize("job", JOBS)
 def test_a_process_that_ends_between_two_changes_of_the_disk_leaves_sound_files(
     tried: dict[str, Any], job: str
 ) -> None:
-    found = tried["crashes"][job]
+    found = of_runs(tried, "crashes", job)
     assert found["failures"] == []
-    assert found["ended"] == found["tried"] == 2
+    assert found["ended"] == found["tried"] == JOBS[job]
     assert found["points"] >= 4
 
 
-@pytest.mark.parametrize("job", ["train", "train --overwrite", "write a PLY"])
+@pytest.mark.parametrize("job", JOBS)
 def test_what_the_system_refuses_is_told_in_a_line_and_harms_nothing(tried: dict[str, Any], job: str) -> None:
-    found = tried["writes"][job]
+    found = of_runs(tried, "writes", job)
     assert found["failures"] == []
     # a run does without the flush of a folder
-    assert found.get("told", 0) + found.get("continued", 0) == found["tried"] == 2
-    assert "told" in found or job != "write a PLY"
+    assert found.get("told", 0) + found.get("continued", 0) == found["tried"] == JOBS[job]
+    assert "told" in found or "PLY" not in job
 
 
-def test_the_compiled_kernels_are_clean_under_sanitizers(tried: dict[str, Any]) -> None:
-    found = tried["sanitizers"]
+BITS = """
+from benchmarks.faults import runs
+
+with runs.scene("native step") as scene:
+    assert scene.finish("run") is None
+    scene.whole["splats"]["means"][0, 0] += 1e-6
+    print(scene.finish("run"))
+    runs.KINDS["native step"] = runs.Kind(("--exposure",), 1, "native")
+try:
+    with runs.scene("native step"):
+        pass
+except RuntimeError as error:
+    print(error)
+"""
+
+
+def test_another_bit_and_another_stepper_are_noticed(tried: dict[str, Any]) -> None:
+    if "skipped" in tried["crashes"]:
+        pytest.skip(tried["crashes"]["skipped"]["skipped"])
+    outcome = in_a_child(BITS)
+    assert outcome.status == 0, outcome.err[-3000:]
+    assert outcome.out.splitlines() == ["the bits differ", "native step: status 0, steps by torch"]
+
+
+@pytest.mark.parametrize("check", [*sanitizers.CHECKS, sanitizers.EMULATION])
+def test_the_units_of_cpp_are_clean_under_sanitizers(tried: dict[str, Any], check: str) -> None:
+    found = tried["sanitizers"]["checks"][check]
     if "skipped" in found:
-        pytest.skip(f"{found['skipped']}; python -m benchmarks.faults --only sanitizers compiles it, in a minute")
+        pytest.skip(f"{found['skipped']}; python -m benchmarks.faults --only sanitizers compiles all, in minutes")
     assert found["failures"] == []
-    assert len(found["told"]) == 2
+    assert found["told"]
+
+
+# what is wrong, in which library, and what must be said
+READ_LATE = 'extern "C" int fault(int n) { int *p = new int[n]; delete[] p; return p[1]; }'
+OVERFLOW = 'extern "C" int fault(int n) { return n * 1000000000; }'
+RACE = """#include <thread>
+static int shared;
+extern "C" int fault(int n) {
+  std::thread other([n] { for (int k = 0; k < 100 * n; k++) shared++; });
+  for (int k = 0; k < 100 * n; k++) shared++;
+  other.join();
+  return shared;
+}"""
+FAULTY = (
+    ("compiled backend", READ_LATE, "heap-use-after-free"),
+    ("compiled backend", OVERFLOW, "signed integer overflow"),
+    ("compiled backend, four threads", RACE, "data race"),
+    ("host mirror", READ_LATE, "heap-use-after-free"),
+)
+
+
+@pytest.mark.parametrize(("check", "code", "words"), FAULTY, ids=["late", "overflow", "race", "mirror"])
+def test_a_sanitizer_notices_a_fault_of_its_kind(check: str, code: str, words: str, tmp_path: Path) -> None:
+    made = sanitizers.CHECKS[check]
+    if (reason := sanitizers.why_not(made)) is not None:
+        pytest.skip(reason)
+    compiler = sanitizers.find_compiler() or []
+    (tmp_path / "faulty.cpp").write_text(code)
+    built = [*compiler, *made.flags, "-o", str(tmp_path / "faulty.so"), str(tmp_path / "faulty.cpp")]
+    subprocess.run(built, check=True, capture_output=True, cwd=tmp_path)
+    script = f"import ctypes; print(ctypes.CDLL('{tmp_path}/faulty.so').fault(4))"
+    _, failures = sanitizers._ran([sys.executable, "-c", script], made, compiler, {})
+    assert len(failures) == 1
+    assert words in failures[0]
+
+
+def test_every_unit_of_cpp_is_under_a_sanitizer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = {unit.name for unit in sanitizers.units()}
+    assert {"blend.cpp", "scores.cpp", "step.cpp", "mirror.cpp", "emulator.cpp", "bindings.cpp"} <= names
+    assert sanitizers.uncovered() == []
+    new = tmp_path / "new.cpp"
+    monkeypatch.setattr(sanitizers, "ROOT", tmp_path)
+    monkeypatch.setattr(sanitizers, "units", lambda: [new])
+    assert sanitizers.uncovered() == ["new.cpp"]
+
+
+def test_the_sanitizers_have_run_the_lines_of_every_unit_that_counts_them() -> None:
+    stored = json.loads((ROOT / "benchmarks" / "results" / "faults.json").read_text())["sanitizers"]
+    assert stored["failures"] == []
+    counted = {str(unit.relative_to(ROOT)) for check in sanitizers.CHECKS.values() for unit in check.units}
+    assert set(stored["lines"]) == counted
+    assert all(run >= sanitizers.LEAST_SHARE * of > 0 for run, of in stored["lines"].values())
 
 
 BAD = """

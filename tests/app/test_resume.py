@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -167,3 +168,15 @@ def test_a_second_ctrl_c_is_obeyed_at_once_and_handlers_are_put_back():
     with pytest.raises(KeyboardInterrupt):
         press_twice()
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_run_in_batches_goes_on_from_a_checkpoint_within_a_window(tmp_path):
+    # three steps of four views each: the window has seen more views than steps were taken
+    config = {"batch_size": 4, "max_steps": 4, "eval_steps": (), "save_steps": (), "checkpoint_every": 3}
+    TrainingRun(tiny_config(tmp_path / "whole", **config), tiny_capture()).run()
+    shutil.copytree(tmp_path / "whole", tmp_path / "parts")
+    ckpt.checkpoint_path(tmp_path / "parts", 3).unlink()
+    assert ckpt.load_checkpoint(ckpt.checkpoint_path(tmp_path / "parts", 2))["strategy"]["views"] == 12
+    TrainingRun(tiny_config(tmp_path / "parts", **config), tiny_capture(), resume=True).run()
+    parts, whole = (ckpt.load_checkpoint(ckpt.checkpoint_path(tmp_path / name, 3)) for name in ("parts", "whole"))
+    assert all(torch.equal(parts["splats"][key], value) for key, value in whole["splats"].items())

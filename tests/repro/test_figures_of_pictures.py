@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import shutil
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -13,6 +14,7 @@ from paper_repro.figures import artifact, opacity_one, qualitative, style
 from paper_repro.figures.data import NoDataError
 from paper_repro.figures.sheet import save
 from paper_repro.jobs import job_named
+from paper_repro.results import RESULTS
 from paper_repro.train_row import Options, capture_folder, load_capture_of
 from pop_fast.errors import PopError
 from tests.repro.drawing import asked, lines, texts
@@ -23,7 +25,7 @@ def keep(folder: Path, row: str, scene: str, render: np.ndarray, photo: np.ndarr
     """Leave what a run keeps of its first held-out view."""
     kept = folder / "small" / row / f"{scene}_42" / "report_data"
     kept.mkdir(parents=True)
-    np.savez(kept / "val_step9999_0000.npz", name="0001.jpg", render=render, photo=photo, psnr=psnr)
+    np.savez(kept / "val_step9999_0000.npz", name="0001.jpg", render=render, photo=photo, psnr=psnr, ssim=0.9)
 
 
 @pytest.fixture
@@ -65,6 +67,13 @@ def test_a_scene_that_was_trained_elsewhere_is_not_said_not_to_be_run(renders):
         said = texts(qualitative.renders_and_photographs(asked("5", runs, folder))).replace("\n", " ")
     assert "The work folder has no renders of bear_512." in said
     assert "Not every row was run on garden_512 and bonsai_800." in said
+
+
+def test_the_grid_in_the_repository_is_of_the_still_life_and_worth_showing():
+    with (RESULTS / "shown" / "figures" / "figure_5.csv").open(encoding="utf-8", newline="") as file:
+        found = list(csv.DictReader(file))
+    assert [(line["scene"], line["row"]) for line in found] == [("still_life", "pop"), ("still_life", "3dgs")]
+    assert all(float(line["psnr"]) > 25.0 for line in found)
 
 
 def test_without_renders_the_grid_says_where_it_looked(tmp_path):

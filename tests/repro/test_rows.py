@@ -202,7 +202,7 @@ def test_jobs_come_cheapest_first_and_names_are_checked():
         job_named("pop", "foxes", "small")
     with pytest.raises(PopError, match="scale 'small' has no garden; its scenes are fox, "):
         job_named("pop", "garden", "small")
-    with pytest.raises(PopError, match="scale is 'tiny'; it must be one of toy, small, no_floor, full, paper"):
+    with pytest.raises(PopError, match="scale is 'tiny'; it must be one of toy, shown, small, no_floor, full, paper"):
         job_named("pop", "fox", "tiny")
 
 

@@ -15,7 +15,7 @@ from paper_repro import scenes
 from paper_repro.data_check import HOLD_OUT, check_capture, check_scene, table
 from paper_repro.jobs import job_named
 from paper_repro.scales import SCALES
-from paper_repro.scenes import DATASETS, SCENES, Scene, find_folder, load_scenes, scene_named, source_of
+from paper_repro.scenes import DATASETS, MADE, SCENES, Scene, find_folder, load_scenes, scene_named, source_of
 from pop_fast.data import load_capture
 from pop_fast.demo import make_demo
 from pop_fast.errors import PopError
@@ -79,7 +79,7 @@ def test_every_scene_says_what_it_is_and_where_it_comes_from():
     assert {scene for scale in SCALES.values() for scene in scale.factors} == set(SCENES)
     # what was compared with the photographs, and nothing else
     assert {scene.name for scene in SCENES.values() if scene.verified} == {
-        *("garden_512", "bonsai_800", "bear_512", "fox", "demo")
+        *("garden_512", "bonsai_800", "bear_512", "fox", *MADE)
     }
 
 
@@ -135,7 +135,7 @@ def test_a_scene_as_published_is_ok(root: Path):
 
 
 def test_a_scene_that_is_absent_is_missing_and_its_source_is_named(root: Path):
-    found = [check_scene(scene, root) for scene in SCENES.values() if scene.name != "demo"]
+    found = [check_scene(scene, root) for scene in SCENES.values() if scene.name not in MADE]
     assert {item.scene.name for item in found if item.status != "missing"} == {"bonsai"}
     lines = table(found, root)
     assert "  train, truck: from https://repo-sam.inria.fr/" in "\n".join(lines)

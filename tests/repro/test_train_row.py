@@ -11,15 +11,19 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from paper_repro import train_row as module
 from paper_repro.collect import collect, first_change
 from paper_repro.jobs import NotTrainableError
+from paper_repro.published import file_hash
 from paper_repro.record import run_id, settings_hash
 from paper_repro.results import read, write
 from paper_repro.train_row import BusyError, Options, commit, finished, only_one, train_row
 from pop_fast.errors import PopError
+from pop_fast.io.formats.files import load_splat_file
+from pop_fast.io.images import read_image
 from pop_fast.train import TrainingRun
 from tests.app.interruptions import interrupt
 from tests.repro.trained import options, toy, values
@@ -227,3 +231,28 @@ def test_sigterm_leaves_a_checkpoint_and_the_same_command_goes_on(made, tmp_path
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True)
     assert done.stdout.splitlines()[-1] == str(job.file(how.results))
     assert values(job.result(how.results)) == values(made[1])
+
+
+def test_a_finished_row_leaves_its_splat_and_two_renders_with_their_hashes(made):
+    how, result = made
+    place = how.work / "published" / "toy" / "pop" / "demo_42"
+    assert {path.name: file_hash(path) for path in place.iterdir()} == result.files
+    assert set(result.files) == {"splat.spz", "held_out_0000.png", "held_out_0002.png"}
+    stored = load_splat_file(place / "splat.spz")
+    assert (len(stored.params["means"]), stored.antialiased) == (result.num_gaussians, False)
+    with np.load(toy("pop").work(how.work) / "report_data" / "val_step299_0002.npz") as kept:
+        assert np.array_equal(read_image(place / "held_out_0002.png"), kept["render"])
+
+
+def test_a_finished_row_is_trained_again_where_that_is_asked_for_and_its_result_replaced(tmp_path, monkeypatch):
+    # with its last checkpoint, from which it would continue with nothing left to do
+    how, job = options(tmp_path, keep_checkpoints=True, published=tmp_path / "shown"), toy("pop", steps_scaler=0.001)
+    first = train_row(job, how)
+    write(replace(first, machine="another"), how.results)
+    assert train_row(job, how).machine == "another"
+    steps, take = [], TrainingRun.take_steps
+    monkeypatch.setattr(TrainingRun, "take_steps", lambda run, last: steps.append(run.step) or take(run, last))
+    assert values(train_row(job, replace(how, again=True))) == values(first)
+    assert min(steps) == 0
+    assert values(job.result(how.results)) == values(first)
+    assert set(first.files) == {path.name for path in job.work(tmp_path / "shown").iterdir()}
