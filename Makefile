@@ -67,8 +67,8 @@ lint: setup  ## ruff (rules and format) and pyright
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
-faults: setup  ## damaged files, kills, crashes, full disks, sanitizers, then large captures (forty minutes)
-	$(BIN)/python -m benchmarks.faults --minutes 10
+faults: setup  ## damaged files, kills, crashes, full disks, sanitizers (MINUTES=10), then large captures
+	$(BIN)/python -m benchmarks.faults --minutes $(or $(MINUTES),10)
 	$(BIN)/python -m benchmarks.load
 
 bench: setup  ## check the fast path against the oracle, then time it

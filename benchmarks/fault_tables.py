@@ -15,7 +15,7 @@ def fuzzed() -> str:
     found = _read("faults.json")["fuzz"]["readers"]
     total = {key: sum(row[key] for row in found.values()) for key in next(iter(found.values()))}
     rows = [[name, *_outcomes(row)] for name, row in found.items()] + [["**all**", *_outcomes(total)]]
-    head = ["reader", "inputs", "read", "refused in a line", "memory, system", "traceback", "crash", "hang"]
+    head = ["reader", "inputs", "read", "refused in a line", "system", "failures", "crash", "hang"]
     return _table(head, ["---", *["---:"] * 7], rows)
 
 

@@ -10,8 +10,6 @@ import hashlib
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from paper_repro.jobs import Job
 from pop_fast.errors import PopError
 
@@ -37,6 +35,7 @@ def publish(job: Job, work: Path, folder: Path, last: int) -> dict[str, str]:
     """
     from pop_fast.io.formats.files import load_splat_file, save_as
     from pop_fast.io.images import write_png
+    from pop_fast.view.report.source import read_view
 
     place, stored = job.work(folder), load_splat_file(ply_of(work, last))
     save_as(place / _SPLAT, "spz", stored.params, stored.antialiased, stored.frame)
@@ -44,8 +43,7 @@ def publish(job: Job, work: Path, folder: Path, last: int) -> dict[str, str]:
     kept = sorted((work / "report_data").glob(f"val_step{last}_*.npz"))
     for path in dict.fromkeys([*kept[:1], *kept[-1:]]):
         names.append(f"held_out_{path.stem.rpartition('_')[2]}.png")
-        with np.load(path) as found:
-            write_png(place / names[-1], found["render"])
+        write_png(place / names[-1], read_view(path)["render"])
     return {name: file_hash(place / name) for name in names}
 
 

@@ -7,6 +7,7 @@ table `[scenes]`, by its key there or by the scene's name.
 
 from __future__ import annotations
 
+import sys
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -136,7 +137,7 @@ def _checked(name: str, path: Path, found: Mapping[str, Any]) -> Row:
     if strange is not None:
         raise PopError(f"{path}: scenes.{strange} is neither a dataset nor a scene")
     cost, size = found["cost"], found["bytes_per_gaussian"]
-    if not isinstance(cost, int | float) or isinstance(cost, bool) or not 0.0 < cost < float("inf"):
+    if not isinstance(cost, int | float) or isinstance(cost, bool) or not 0.0 < cost <= sys.float_info.max:
         raise fail("cost", "a number above 0")
     if size not in _BYTES:
         raise fail("bytes_per_gaussian", " or ".join(map(str, _BYTES)))

@@ -126,7 +126,7 @@ def load_scene(path: Path) -> Scene:
     """
     try:
         found = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise PopError(f"{path}: is not a scene's TOML file: {error}") from error
     known = {field.name: field for field in fields(Scene) if field.name != "name"}
     for name in [*known, *found]:

@@ -73,7 +73,7 @@ def _run(part: str, args: argparse.Namespace) -> dict[str, Any]:
     print(f"{part} ...", flush=True)
     if part == "fuzz":
         minutes = args.minutes if args.only == ["fuzz"] else args.minutes / 2.0
-        return fuzz.fuzz(10 if args.quick else 2_000, minutes, args.seed, args.reader, args.save)
+        return fuzz.fuzz(10 if args.quick else 1_000, minutes, args.seed, args.reader, args.save)
     if part == "sanitizers":
         return sanitizers.sanitized(compile_first=not args.quick)
     reason = runs.why_not()

@@ -297,6 +297,7 @@ def _write_records(result: Path, folder: Path) -> None:
     found["curve"] = [{name: [*column[:1], *column[-2:]] for name, column in table.items()} for table in found["curve"]]
     (folder / "full" / "pop_size_prune.jsonl").write_text(json.dumps(found, separators=(",", ":")) + "\n")
     shutil.copy(repro / "configs" / "pop.toml", folder / "pop.toml")
+    shutil.copy(repro / "scenes" / "fox.toml", folder / "fox.toml")
     shutil.copy(repro / "paper.toml", folder / "paper.toml")
 
 

@@ -8,6 +8,7 @@ import os
 import random
 import shutil
 import signal
+import sys
 import tempfile
 import time
 import traceback
@@ -31,7 +32,7 @@ from .mutate import mutated
 from .readers import READERS, Reader
 
 # of one input: seconds, bytes over what importing takes, letters of a refusal
-SECONDS, MEMORY, LONGEST = 20, 2**30, 1_300
+SECONDS, MEMORY, LONGEST = 60, 2**30, 1_300
 # of a reader's turn, seconds: long beside the start of a child
 TURN = 4.0
 OUTCOMES = ("read", "refused", "told", "escaped", "crashed", "hung")
@@ -65,6 +66,9 @@ def fuzz(inputs: int, minutes: float, seed: int, only: str | None = None, save: 
     failures = {key: value for turn in turns for key, value in turn.failures.items()}
     if save:
         _save(failures)
+    print(f"seed {seed}")
+    for turn in turns:
+        print(f"{turn.name:<44} {sum(turn.counts.values()):>9,}", flush=True)
     return {
         "seed": seed,
         "minutes": round((time.monotonic() - begin) / 60.0, 1),
@@ -116,16 +120,20 @@ class _Turns:
     def _failed(self, number: int, came: str, site: str, message: str = "") -> None:
         size = len(input_of(self.name, self.seed, number))
         line = {"reader": self.name, "number": number, "seed": self.seed, "bytes": size, "message": message}
-        found = self.failures.setdefault(f"{self.name}: {came}: {site}", {**line, "times": 0})
+        key = f"{self.name}: {came}: {site}"
+        if key not in self.failures:
+            print(f"{key} (seed {self.seed}, input {number}) {message}", file=sys.stderr, flush=True)
+        found = self.failures.setdefault(key, {**line, "times": 0})
         # the smallest tells most
         found |= {**(line if size < found["bytes"] else {}), "times": found["times"] + 1}
 
 
 def _save(failures: dict[str, dict[str, Any]]) -> None:
     for key, found in failures.items():
-        folder, reader = _folder(found["reader"]), READERS[found["reader"]]
+        folder = _folder(found["reader"])
         folder.mkdir(parents=True, exist_ok=True)
-        name = f"{zlib.crc32(key.encode()):08x}_{Path(reader.file or reader.root).name}"
+        # no suffix that a tool would look for
+        name = f"{zlib.crc32(key.encode()):08x}.damaged"
         (folder / name).write_bytes(input_of(found["reader"], found["seed"], found["number"]))
 
 
@@ -212,10 +220,11 @@ def _outcome(reader: Reader, path: Path) -> tuple[str, ...]:
     except Exception as error:
         # as the command line prints it
         line = message(str(error) if isinstance(error, PopError) else describe(error) or str(error))
-        if isinstance(error, OSError) and describe(error) is not None and path.name in line:
+        named = any(name in line for name in (path.name, HERE.name))
+        if isinstance(error, OSError) and describe(error) is not None and named:
             return ("told",)
         known = isinstance(error, PopError) or (isinstance(error, ValueError) and describe(error) is not None)
-        if known and "\n" not in line and len(line) < LONGEST and any(name in line for name in (path.name, HERE.name)):
+        if known and "\n" not in line and len(line) < LONGEST and named:
             return ("refused",)
         frames = traceback.extract_tb(error.__traceback__)
         # our own line says more than the library's that it called

@@ -18,7 +18,7 @@ import torch
 
 from cuda_ext.gpu_check.command import begun_report
 from cuda_ext.gpu_check.outcomes import outcomes
-from paper_repro import paper, results, rows
+from paper_repro import paper, results, rows, scenes
 from paper_repro.collect import collect
 from paper_repro.jobs import job_named
 from pop_fast.blocks.merge import read_round
@@ -259,6 +259,7 @@ _PAPER = {
         "records/full", "pop_size_prune.jsonl", lambda full: results.read_all("full", full.parent), "text"
     ),
     "row": Reader("records/pop.toml", "", _row, "text"),
+    "scene of the paper": Reader("records/fox.toml", "", scenes.load_scene, "text"),
     "paper.toml": Reader("records/paper.toml", "", paper.load, "text"),
     **{
         f"collected: {name}": Reader("result", name, _collected, kind)  # type: ignore[arg-type]

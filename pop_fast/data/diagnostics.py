@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from os.path import splitext
 from pathlib import Path
 
 import numpy as np
@@ -42,9 +43,9 @@ def about_unplaced(folder: Path, shots: Sequence[PosedImage]) -> list[str]:
         shots: what the model lists.
     """
     # by stem too, because a photograph may have been converted since the model was made
-    placed = {shot.file for shot in shots} | {Path(shot.file).with_suffix("").as_posix() for shot in shots}
-    names = [path.relative_to(folder) for path in photographs(folder)]
-    left = [n.as_posix() for n in names if not placed & {n.as_posix(), n.with_suffix("").as_posix()}]
+    placed = {name for shot in shots for name in (shot.file, splitext(shot.file)[0])}
+    names = [path.relative_to(folder).as_posix() for path in photographs(folder)]
+    left = [name for name in names if not placed & {name, splitext(name)[0]}]
     if not left:
         return []
     more = f" and {len(left) - _NAMED} more" if len(left) > _NAMED else ""

@@ -15,6 +15,9 @@ import numpy as np
 
 from pop_fast.errors import CaptureError
 
+# of a point from the middle of all, times the median camera distance
+_FARTHEST = 1e100
+
 __all__ = ["normalizing_transform", "transform_points", "transform_viewmats"]
 
 
@@ -51,7 +54,7 @@ def normalizing_transform(viewmats: np.ndarray, points: np.ndarray | None) -> np
         points: [P, 3] sparse points; without points, or with fewer than four, only step (1) is taken.
 
     Raises:
-        CaptureError: the cameras have no extent or no common up direction.
+        CaptureError: the cameras have no extent or no common up direction, or points are too far away.
     """
     transform = _from_cameras(viewmats)
     if points is None or len(points) < 4:
@@ -98,6 +101,13 @@ def _rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _principal_axes(points: np.ndarray) -> np.ndarray:
     middle = np.median(points, axis=0)
+    # the square of what is too far is no float
+    farthest = float(np.abs(points - middle).max())
+    if not farthest < _FARTHEST:
+        raise CaptureError(
+            f"in units of the cameras' distance, points lie up to {farthest:.3g} from their middle, which cannot be "
+            "normalized; correct the positions of cameras and points, or use --no-normalize"
+        )
     _, axes = np.linalg.eigh(np.cov(points - middle, rowvar=False))
     rotation = axes.T[::-1].copy()
     for row in rotation[:2]:

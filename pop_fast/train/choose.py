@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pop_fast.api.registry import get_backend
+from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.fused_settings import unsupported, unsupported_setting
 
@@ -35,7 +36,11 @@ def _choose(config: TrainConfig, resume: bool) -> tuple[TrainConfig, str]:
         return config, f"backend {config.backend}, as asked for"
     begun = _begun_with(Path(config.result_dir)) if resume else None
     if begun is not None:
-        return replace(config, backend=begun), f"backend {begun}, with which the run was begun"
+        try:
+            return replace(config, backend=begun), f"backend {begun}, with which the run was begun"
+        except PopError as error:
+            path = Path(config.result_dir) / "cfg.json"
+            raise PopError(f"{path}: {error}; repair the file, copy it again or train again") from error
     reason = get_backend("cuda").why_not()
     if reason is not None and not has_gpu():
         reason = "there is no NVIDIA GPU here"

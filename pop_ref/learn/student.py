@@ -114,6 +114,9 @@ def _parsed(path: Path) -> ast.Module:
         raise ValueError(f"{path}, line {error.lineno}: this is not Python yet: {error.msg}") from None
     except UnicodeDecodeError:
         raise ValueError(f"{path} is not UTF-8 text; save it as UTF-8") from None
+    # which of the two comes is up to Python's version
+    except (MemoryError, RecursionError):
+        raise ValueError(f"{path} has more brackets in each other than Python reads; take some out") from None
 
 
 @contextmanager

@@ -129,6 +129,18 @@ def test_a_damaged_photograph_stands_against_training(pop: Pop, bare: Path) -> N
     assert "3.png: the PNG file is truncated" in outcome.out
 
 
+def test_tracks_that_colmap_refuses_are_told_with_the_models_folder(pop: Pop, tmp_path: Path) -> None:
+    corpus = Path(__file__).parents[2] / "benchmarks" / "faults" / "corpus"
+    shutil.copytree(corpus / "colmap", tmp_path / "scene")
+    outcome = pop("data", "check", tmp_path / "scene")
+    assert outcome.err == ""
+    (line,) = [line for line in outcome.out.splitlines() if " reprojection " in line]
+    assert line.startswith("LOOK")
+    assert f"{tmp_path / 'scene' / 'sparse' / '0'}: COLMAP cannot read its tracks" in line
+    assert line.endswith("training does without its tracks; write the model again to have them")
+    assert pop("data", "check", corpus / "tracked").out.count("mean error") == 1
+
+
 def noise(seed: int) -> np.ndarray:
     """A photograph with hundreds of features and nothing in common with another."""
     coarse = np.random.default_rng(seed).integers(0, 256, (48, 64, 3), dtype=np.uint8)

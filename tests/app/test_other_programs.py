@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from pathlib import Path
 
@@ -58,6 +59,21 @@ def test_the_cameras_of_an_export_are_those_it_was_made_from(
         {"polycam": "Polycam", "metashape": "Metashape", "realitycapture": "RealityCapture"}[program]
     )
     assert any("not aligned and left out, first lost" in note for note in found.notes) == (program == "metashape")
+
+
+def test_a_metashape_export_of_which_every_camera_is_aligned_is_read(
+    original: Capture, shared_capture: Path, tmp_path: Path
+) -> None:
+    folder = write("metashape", original, shared_capture, tmp_path)
+    (path,) = folder.glob("*.xml")
+    tree = ET.parse(path)
+    for group in tree.iter("cameras"):
+        for camera in [camera for camera in group.iter("camera") if camera.find("transform") is None]:
+            next(parent for parent in tree.iter() if camera in list(parent)).remove(camera)
+    tree.write(path)
+    found = load_capture(folder, normalize=False, points=20)
+    same_cameras(found, original)
+    assert not any("not aligned" in note for note in found.notes)
 
 
 def test_polycams_first_cameras_are_read_where_it_has_not_corrected_them(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -236,3 +237,23 @@ def test_a_path_through_one_training_view_is_refused_with_a_way_out(
     )
     assert not (tmp_path / "r").exists()
     assert pop(*words, "orbit", "--frames", "2").status == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda entry: entry["viewmat"][0].__setitem__(0, -1.0), ("viewmat is mirrored", "record it again")),
+        (lambda entry: entry.update(fov_y_degrees=10**400), ("needs viewmat and fov_y_degrees", "record it again")),
+    ],
+    ids=["mirrored", "no float"],
+)
+def test_a_camera_of_a_recorded_path_that_is_none_is_refused(
+    pop: Pop, shared_result: Path, tmp_path: Path, change: Callable[[dict[str, Any]], None], words: tuple[str, ...]
+) -> None:
+    entries = [{"viewmat": np.eye(4).tolist(), "fov_y_degrees": 50.0} for _ in range(2)]
+    change(entries[1])
+    content = {"kind": "pop camera path", "frame": "capture", "cameras": entries}
+    (tmp_path / "path.json").write_text(json.dumps(content))
+    outcome = pop("render", shared_result, "--path", tmp_path / "path.json", "--out", tmp_path / "views")
+    says(outcome, f"{tmp_path / 'path.json'}: cameras[1]: ", *words)
+    assert not (tmp_path / "views").exists()

@@ -20,9 +20,10 @@ from cuda_ext.gpu_check.budget import MARGIN, Budget, Share
 from cuda_ext.gpu_check.command import commit_of, main
 from cuda_ext.gpu_check.outcomes import outcomes
 from cuda_ext.gpu_check.shared import Check
-from cuda_ext.gpu_check.stages import JOBS, SHARES, STAGES, train_one
+from cuda_ext.gpu_check.stages import JOBS, SHARES, STAGES, train_one, wheels_stage
 from cuda_ext.gpu_check.tools import Command, first_line, run, write_json
 from pop_fast.cli import main as pop
+from tests.cuda.bare_node import stand_in_gsplat
 
 
 def check(folder: Path, **changes: object) -> Check:
@@ -219,6 +220,37 @@ def test_gsplat_that_was_not_compiled_is_told_and_is_no_failure(tmp_path):
     found = gpu_check_stages.gsplat_stage(check(tmp_path, beside={"gsplat": failing}))
     assert (found["status"], "was not compiled" in found["skipped"]) == (0, True)
     assert "nvcc does not know this" in found["compilation"]["output"]
+
+
+@pytest.mark.parametrize("stages_before", ["[]", '"x"', "null", '{"old": {"status": 0}}'])
+def test_a_report_of_an_earlier_call_is_gone_on_with_or_begun_anew(stages, tmp_path, stages_before):
+    (tmp_path / "gpu_check_1.json").write_text(f'{{"job": 1, "stages": {stages_before}}}')
+    stages["laws"] = lambda check: {"status": 0, "seconds": 1.0}
+    assert main([str(tmp_path), "--stages", "laws"]) == 0
+    found = report(tmp_path)["stages"]
+    assert found["laws"]["status"] == 0
+    assert ("old" in found) == ("old" in stages_before)
+
+
+def test_a_damaged_wheel_costs_no_other(tmp_path):
+    wheels = tmp_path / "packed" / "wheels"
+    wheels.mkdir(parents=True)
+    sound = stand_in_gsplat(wheels)
+    (wheels / "broken-1.0-py3-none-any.whl").write_bytes(sound.read_bytes()[:200])
+    found = wheels_stage(check(tmp_path, packed=tmp_path / "packed"))
+    assert found["status"] != 0
+    assert found["wheels"] == ["gsplat-0.0"]
+    assert list(found["damaged"]) == ["broken-1.0"]
+    assert "broken-1.0-py3-none-any.whl" in found["output"]
+    assert (tmp_path / "work" / "site" / "gsplat" / "__init__.py").is_file()
+
+
+@pytest.mark.parametrize("damage", [b'{"test": "a", "outc', b"[1]", b"\xff", b'{"test": 1}', b"[" * 100_000])
+def test_a_damaged_line_of_outcomes_is_counted_and_left_out(tmp_path, damage):
+    line = json.dumps({"test": "a", "outcome": "passed", "seconds": 0.5, "words": ""})
+    (tmp_path / "x.jsonl").write_bytes(line.encode() + b"\n" + damage)
+    found = outcomes(tmp_path / "x.jsonl")
+    assert (found["passed"], found["damaged"]) == (1, 1)
 
 
 def test_outcomes_are_those_of_the_tests(tmp_path, monkeypatch):

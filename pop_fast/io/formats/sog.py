@@ -139,8 +139,7 @@ def decode(data: bytes, path: Path) -> Cloud:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             check_members(path, archive, len(data), _WRITE_AGAIN)
-            held = sum(member.file_size for member in archive.infolist())
-            return _read(lambda name: _unzipped(archive, name, path), held, path)
+            return _read(lambda name: _unzipped(archive, name, path), len(data), path)
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
         raise PopError(f"{path}: is no readable ZIP file ({error}); {_WRITE_AGAIN}") from error
 
