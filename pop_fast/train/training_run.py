@@ -442,7 +442,10 @@ class TrainingRun:
 
     @property
     def _what_is_left(self) -> str:
-        return "the latest checkpoint is kept" if self._unwritten is None else "nothing was written"
+        if self._unwritten is not None:
+            return "nothing was written"
+        kept = ckpt.list_checkpoints(self._results.path)
+        return "the latest checkpoint is kept" if kept else "no checkpoint was written yet"
 
     def _require_finite(self) -> None:
         require_usable(self._detached(), f"after {self.step} steps; {self._what_is_left}")
