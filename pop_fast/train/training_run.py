@@ -444,8 +444,7 @@ class TrainingRun:
     def _what_is_left(self) -> str:
         if self._unwritten is not None:
             return "nothing was written"
-        kept = ckpt.list_checkpoints(self._results.path)
-        return "the latest checkpoint is kept" if kept else "no checkpoint was written yet"
+        return f"{'the latest' if ckpt.list_checkpoints(self._results.path) else 'no'} checkpoint is kept"
 
     def _require_finite(self) -> None:
         require_usable(self._detached(), f"after {self.step} steps; {self._what_is_left}")
