@@ -14,6 +14,7 @@ import torch
 from steps import Maker, engines, take_turn
 from timing import turns
 
+from pop_fast.children import python_command
 from pop_fast.train.environment import reproducible
 
 PROCESSES, STEPS = 8, 5
@@ -21,7 +22,6 @@ BOUND = 1.5  # times the fair share
 # ends with whoever started it, also where that is killed and cannot end it
 LOOP = """
 import os, sys
-from pop_fast.children import python_command
 while os.getppid() == int(sys.argv[1]):
     for _ in range(1_000_000):
         pass

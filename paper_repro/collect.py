@@ -16,7 +16,6 @@ from pop_fast.errors import PopError
 from pop_fast.io.read_back import read_arrays, read_json
 from pop_fast.machine import processor_kind
 from pop_fast.train.results import ResultFolder, read_config
-from pop_fast.view.report.source import read_records
 
 if TYPE_CHECKING:
     from pop_fast.data import Capture
@@ -236,6 +235,9 @@ def curve_of(folder: Path, max_steps: int) -> tuple[dict[str, Any], ...]:
     Raises:
         PopError: a record is damaged.
     """
+    # it needs torch, which listing rows does not
+    from pop_fast.view.report.source import read_records
+
     points = {record["step"]: dict(record) for record in _thinned(read_records(folder), max_steps)}
     for path in sorted((folder / "stats").glob("val_step*.json")):
         stats = read_json(path, _AGAIN)

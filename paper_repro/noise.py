@@ -22,8 +22,6 @@ from math import exp, inf, log, sqrt
 from statistics import fmean
 from typing import Final, Literal, NamedTuple
 
-from scipy.special import stdtrit
-
 from paper_repro.results import Result
 
 __all__ = [
@@ -196,7 +194,7 @@ class Comparison:
         """Give half of the interval's width where so many comparisons are made together; infinite without noise."""
         if self.error is None:
             return inf
-        return float(stdtrit(self.df, 1.0 - ALPHA / (2.0 * max(together, 1)))) * self.error
+        return _quantile(self.df, together) * self.error
 
     def holds(self, together: int) -> bool | None:
         """Say whether what is asked is so; None where the interval has the bound inside, or nothing is asked."""
@@ -209,7 +207,7 @@ class Comparison:
             return max(3, self.seeds[-1])
         for n in range(max(self.seeds[0], 1) + 1, MOST_SEEDS):
             df = self.df + sum(max(n - have, 0) for have in self.seeds)
-            half = float(stdtrit(df, 1.0 - ALPHA / (2.0 * max(together, 1)))) * sqrt(self.variance / n)
+            half = _quantile(df, together) * sqrt(self.variance / n)
             if half <= abs(self.value - self.bound):
                 return n
         return MOST_SEEDS
@@ -296,3 +294,11 @@ def with_error(
     error = sqrt(sum(v / n for v, (_, _, n) in zip(each, parts, strict=True)))
     df = min(spread.df for spread in known)
     return Comparison(says, value, asked, bound, sum(each), error, df, seeds, shown_as)
+
+
+def _quantile(df: float, together: int) -> float:
+    """Give Student's t that so many comparisons, made together, stay under with a probability of 1 - `ALPHA`."""
+    # the rows and their queue are listed with NumPy alone
+    from scipy.special import stdtrit
+
+    return float(stdtrit(df, 1.0 - ALPHA / (2.0 * max(together, 1))))

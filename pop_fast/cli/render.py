@@ -63,7 +63,8 @@ def run(argv: Sequence[str]) -> int:
     if args.frames < 1:
         raise PopError(f"frames is {args.frames}; give --frames 1 or more")
     if args.out is not None:
-        check_folder(args.out, args.overwrite, recognise=listed_in(args.out))
+        keeps = [args.splat] if args.capture is None else [args.splat, args.capture]
+        check_folder(args.out, args.overwrite, keeps=keeps, recognise=listed_in(args.out))
     return _render(args, planned_video(args))
 
 

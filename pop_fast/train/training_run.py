@@ -442,7 +442,9 @@ class TrainingRun:
 
     @property
     def _what_is_left(self) -> str:
-        return "the latest checkpoint is kept" if self._unwritten is None else "nothing was written"
+        if self._unwritten is not None:
+            return "nothing was written"
+        return f"{'the latest' if ckpt.list_checkpoints(self._results.path) else 'no'} checkpoint is kept"
 
     def _require_finite(self) -> None:
         require_usable(self._detached(), f"after {self.step} steps; {self._what_is_left}")

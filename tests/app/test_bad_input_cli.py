@@ -54,7 +54,7 @@ CAPTURES: list[tuple[str, Damage, tuple[str, ...]]] = [
     ("a PNG is corrupt", corrupt_pixels, ("view_000.png", "corrupt", "copy it again")),
     ("a JPEG is truncated", corrupt_jpeg, ("view_000.jpg", "truncated", "copy it again")),
     ("a photograph is empty", lambda f: photo(f).write_bytes(b""), ("view_000.png", "empty", "copy it again")),
-    ("a photograph is text", lambda f: photo(f).write_text("hello"), ("view_000.png", "not an image")),
+    ("a photograph is text", lambda f: photo(f).write_text("hello"), ("view_000.png", "is no image")),
     ("a photograph has another shape", other_shape, ("view_001.png", "32x40", "40x32", "use the photographs")),
     ("the cameras are truncated", lambda f: truncate(f / "sparse/0/cameras.bin"), ("cameras.bin", "truncated")),
     ("the images are truncated", lambda f: truncate(f / "sparse/0/images.bin"), ("images.bin", "truncated")),

@@ -139,7 +139,9 @@ def another(value, hint):
     if isinstance(value, tuple):
         return (0.25, 0.5, 0.75) if value and isinstance(value[0], float) else (*value, *((3,) if value else ("x",)))
     if isinstance(value, str):
-        return value + "x"
+        # of backends and profiles, which are names in tables, another one that there is
+        of_tables = {"auto": "ref", "paper": "inria"}
+        return of_tables.get(value, value + "x")
     if isinstance(value, float):
         return 0.625 if value != 0.625 else 0.375
     return 2 if value != 2 else 3

@@ -152,7 +152,7 @@ def test_what_cameras_append_to_a_jpeg_does_no_harm(tmp_path: Path, name: str) -
 
 
 @pytest.mark.parametrize(
-    ("content", "word"), [(b"", "empty"), (b"no picture at all", "not an image"), (b"\xff\xd8\xff", "truncated")]
+    ("content", "word"), [(b"", "empty"), (b"no picture at all", "is no image"), (b"\xff\xd8\xff", "truncated")]
 )
 def test_what_is_no_photograph_is_named_by_the_capture_too(tmp_path: Path, content: bytes, word: str) -> None:
     root = colmap_capture(tmp_path)

@@ -65,7 +65,7 @@ def test_photographs_without_a_camera_are_told(tmp_path: Path, folder: str) -> N
         shutil.rmtree(root / "images")
     (note,) = load_capture(root).notes
     assert note.startswith(f"3 of 5 photographs in {root / folder} are placed")
-    assert note.endswith("first 9.png")
+    assert note.endswith("the model has no camera for 9.png, left/0.png")
 
 
 def test_photographs_without_a_mask_are_told_where_others_have_one(tmp_path: Path) -> None:

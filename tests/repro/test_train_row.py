@@ -73,7 +73,8 @@ def test_a_curve_has_every_densification_step_and_the_held_out_views_of_every_fi
     last, result = curve[-1], made[1]
     assert (last["step"], last["num_gaussians"], last["psnr_test"]) == (
         *(299, result.num_gaussians),
-        pytest.approx(result.psnr, rel=1e-5),
+        # a curve keeps five digits
+        pytest.approx(result.psnr, rel=5e-5),
     )
 
 

@@ -135,5 +135,5 @@ def test_a_number_that_is_not_finite_is_found_on_the_device(engine, tmp_path):
         return found
 
     trainer.take_steps = poisoned
-    with pytest.raises(ValueError, match=r"quats\[7, 2\] is nan after 5 steps; nothing was written"):
+    with pytest.raises(ValueError, match=r"quats\[7, 2\] is nan after 5 steps; no checkpoint is kept"):
         trainer.run()
