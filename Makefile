@@ -7,7 +7,7 @@ WORKERS ?= $(shell $(PYTHON) -c "import os; print((os.cpu_count() or 1) + 1)")
 TORCH := $(shell sed -n 's/^\(torch==.*\)/\1/p' constraints.txt)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo walkthrough repro site test test-fast explore lint bench faults cuda sass emulate gpu-check docs-check clean
+.PHONY: help setup demo walkthrough repro site test test-fast explore lint bench faults wheel cuda sass emulate gpu-check docs-check clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
@@ -16,10 +16,10 @@ setup: $(STAMP)  ## make .venv, install everything into it, compile the CPU kern
 	@$(BIN)/python -m pop_fast.compiled.build --if-possible
 
 # torch goes first and by exact version: left to the resolver, pip picks the newest build and its gigabytes of CUDA.
-$(STAMP): pyproject.toml constraints.txt
+$(STAMP): pyproject.toml pop_ref/pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet $(TORCH)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e ./pop_ref -e '.[dev]'
 	@touch $@
 
 demo: setup  ## write the demo capture, train POP on it, leave report.html, PLY, renders and metrics in out/demo
@@ -73,6 +73,10 @@ faults: setup  ## damaged files, kills, crashes, full disks, sanitizers (MINUTES
 
 bench: setup  ## check the fast path against the oracle, then time it
 	$(BIN)/python benchmarks/run.py
+
+wheel: setup  ## build both distributions into dist/, pop-splatting's with compiled kernels (needs a C++ compiler)
+	$(BIN)/python -m build --wheel --outdir dist pop_ref
+	POP_WHEEL_KERNELS=1 $(BIN)/python -m build --wheel --outdir dist .
 
 cuda: setup  ## compile the CUDA extension (needs nvcc; no GPU)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[cuda-build]'

@@ -31,7 +31,7 @@ _PACKAGES: Final = (
     ("matplotlib", "matplotlib", "colours of the error maps", True),
     ("viser", "viser", "pop view: pip install 'pop-splatting[viewer]'", False),
     ("snakemake", "snakemake", "blocks on a cluster, or several at a time: pip install 'pop-splatting[blocks]'", False),
-    ("hypothesis", "hypothesis", "the conformance kit: pip install 'pop-splatting[conformance]'", False),
+    ("hypothesis", "hypothesis", "the conformance kit: pip install 'pop-ref[conformance]'", False),
 )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,83 +78,12 @@ class Args:
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     action = parse(Args, argv, "learn", examples=_EXAMPLES).action
+    from pop_ref.learn import __main__ as course
+
     if isinstance(action, Start):
-        return _start(action)
+        return course.write_stubs(action.folder)
     if isinstance(action, Check):
-        return _check(action)
-    return _map(action) if isinstance(action, Map) else _train(action)
-
-
-def _start(args: Start) -> int:
-    from pop_ref.learn.stubs import start
-
-    written = start(args.folder)
-    print(f"{len(written)} new files -> {args.folder}" if written else f"{args.folder} has all files already")
-    print(f"next: open {args.folder / 'alpha.py'}, write a function, and 'pop learn check alpha {args.folder}'")
-    return 0
-
-
-def _check(args: Check) -> int:
-    from pop_ref.learn import needs_of_judging
-    from pop_ref.learn.course import stage_named
-    from pop_ref.learn.progress import asked_before, note_passed
-    from pop_ref.learn.stubs import answer
-    from pop_ref.learn.student import read_work
-
-    stage, work = stage_named(args.stage), read_work(args.folder)
-    needs_of_judging()
-    from pop_ref.learn.drawing import drawn_counterexample
-    from pop_ref.learn.judge import judge
-    from pop_ref.learn.splat import write_png
-    from pop_ref.learn.telling import told
-
-    verdict = judge(work, stage)
-    print(told(stage, verdict))
-    picture = args.folder / f"counterexample_{stage.name}.png"
-    image = drawn_counterexample(verdict)
-    if image is None:
-        # an earlier one is not of this file
-        picture.unlink(missing_ok=True)
-    else:
-        write_png(picture, image)
-        print(f"the counterexample, yours in orange and what it should be in blue -> {picture}")
-    if verdict.passed:
-        note_passed(args.folder, stage)
-    if args.answer and (verdict.passed or asked_before(args.folder, stage)):
-        print(f"\nthe oracle's {stage.name}:\n\n{answer(stage)}")
-    elif args.answer:
-        print("\nThe answer is shown when you ask again. Try the hint first.")
-    return 0 if verdict.passed else 1
-
-
-def _map(args: Map) -> int:
-    from pop_ref.learn.progress import course_map, picture
-    from pop_ref.learn.student import read_work
-
-    work = read_work(args.folder)
-    print(course_map(work, color=sys.stdout.isatty()))
-    image, complaints = picture(work)
-    for line in complaints:
-        print(line)
-    out = args.out or args.folder / "picture.png"
-    _write(out, image)
-    print(f"the picture as it stands -> {out}")
-    return 0
-
-
-def _train(args: Train) -> int:
-    from pop_ref.learn.student import read_work
-    from pop_ref.learn.training import train
-
-    out = args.out or args.folder / "trained.png"
-    for told in train(read_work(args.folder), args.steps):
-        print(f"step {told.step:3d}   loss {told.loss:.5f}   {told.psnr:.2f} dB   {told.n} Gaussians", flush=True)
-        _write(out, told.picture)
-    print(f"photograph and render -> {out}")
-    return 0
-
-
-def _write(path: Path, image) -> None:
-    from pop_ref.learn.splat import write_png
-
-    write_png(path, image.repeat(8, axis=0).repeat(8, axis=1))
+        return course.check(action.stage, action.folder, action.answer)
+    if isinstance(action, Map):
+        return course.show_map(action.folder, action.out)
+    return course.train_work(action.folder, action.steps, action.out)

@@ -3,7 +3,9 @@
     python -m pop_fast.compiled.build [--if-possible]
 
 The library's name holds a digest of its source, the compiler's options and the processor's features, because it is
-compiled for exactly the processor that it is compiled on: what was built for another one is never loaded.
+compiled for exactly the processor that it is compiled on: what was built for another one is never loaded. A wheel
+brings libraries for levels of instructions instead, of which `library_path` takes the highest that this processor has,
+unless one was compiled here.
 """
 
 from __future__ import annotations
@@ -62,6 +64,16 @@ FLAGS: Final = (
 # for this processor, as compilers of different kinds and ages spell it; the last resort is any processor of its kind
 # whole vectors where there are any: compilers halve those of sixteen floats unasked, which costs the transpose a fifth
 TUNING: Final = (("-march=native", "-mprefer-vector-width=512"), ("-march=native",), ("-mcpu=native",), ())
+# What a wheel brings for a kind of machine, the highest level first: the compiler's name of the level, and the features
+# by which Linux tells that a processor has it, beside those of the lower ones (the x86-64 psABI, section 3.1.1).
+LEVELS: Final = {
+    "x86_64": (
+        ("x86-64-v4", "avx512f avx512bw avx512cd avx512dq avx512vl"),
+        ("x86-64-v3", "avx avx2 bmi1 bmi2 f16c fma abm movbe"),
+        ("x86-64-v2", "cx16 lahf_lm popcnt pni sse4_1 sse4_2 ssse3"),
+    ),
+    "aarch64": (("armv8-a", "fp asimd"),),
+}
 
 
 class BuildError(RuntimeError):
@@ -70,11 +82,39 @@ class BuildError(RuntimeError):
 
 @cache
 def library_path() -> Path:
-    """Return where the library of this version is on this processor, whether or not it has been compiled."""
+    """Return where the library to load is: compiled for this processor, else what a wheel brought for its like.
+
+    Where neither is there, it is where the first would be.
+    """
+    own = native_path()
+    brought = (HERE / level_name(level) for level in supported_levels())
+    return own if own.exists() else next((path for path in brought if path.exists()), own)
+
+
+def native_path() -> Path:
+    """Return where the library of this version for exactly this processor is, whether or not it has been compiled."""
+    return HERE / f"_blend_{_source()}_{_machine()}.so"
+
+
+def level_name(level: str) -> str:
+    """Return the name of the library of this version that a wheel brings for a level."""
+    return f"_blend_{_source()}_{level}.so"
+
+
+def supported_levels() -> list[str]:
+    """Return the levels whose libraries this processor can run, the highest first; none where the system tells none."""
+    features = set((processor_features() or "").lower().split())
+    levels = LEVELS.get(platform.machine(), ())
+    needed = [set(" ".join(words for _, words in levels[at:]).split()) for at in range(len(levels))]
+    return [level for (level, _), words in zip(levels, needed, strict=True) if words <= features]
+
+
+def _source() -> str:
+    """Return a digest of what the library is compiled from."""
     source = hashlib.sha256()
     for path in (*(HERE / name for name in SOURCES), *(CUDA / name for name in SHARED)):
         source.update(path.read_bytes())
-    return HERE / f"_blend_{source.hexdigest()[:16]}_{_machine()}.so"
+    return source.hexdigest()[:16]
 
 
 def _machine() -> str:
@@ -99,7 +139,7 @@ def _tuning() -> tuple[tuple[str, ...], ...]:
 
 
 def build(verbose: bool = False) -> Path:
-    """Compile the library, unless it is there and loads; this processor's of other versions of the source are removed.
+    """Compile the library for this processor, unless it is there and loads; older versions of it are removed.
 
     Args:
         verbose: print the compiler's command.
@@ -110,12 +150,10 @@ def build(verbose: bool = False) -> Path:
     Raises:
         BuildError: no compiler was found, it failed, or the folder cannot be written to.
     """
-    library = library_path()
+    library = native_path()
     if library.exists() and _loads(library):
         return library
-    compiler = find_compiler()
-    if compiler is None:
-        raise BuildError(no_compiler())
+    compiler = _compiler()
     try:
         # beside and then renamed, so that nobody loads half a library
         descriptor, partial = tempfile.mkstemp(dir=HERE, prefix="_partial_", suffix=".so")
@@ -123,7 +161,7 @@ def build(verbose: bool = False) -> Path:
         raise BuildError(f"{HERE} cannot be written to ({error.strerror}); install the package for yourself") from error
     os.close(descriptor)
     try:
-        _compile(compiler, partial, verbose)
+        _compile(compiler, partial, _tuning(), verbose)
         os.chmod(partial, 0o644)
         os.replace(partial, library)
     except OSError as error:
@@ -134,7 +172,35 @@ def build(verbose: bool = False) -> Path:
     for other in HERE.glob(f"_blend_*_{_machine()}.so"):
         if other != library:
             other.unlink(missing_ok=True)
+    library_path.cache_clear()
     return library
+
+
+def build_levels(folder: Path) -> list[Path]:
+    """Compile the libraries of a wheel for this kind of machine.
+
+    Args:
+        folder: where they go.
+
+    Raises:
+        BuildError: there are no levels for this kind of machine, no compiler was found, or it failed.
+    """
+    levels = LEVELS.get(platform.machine(), ())
+    if not levels or platform.system() != "Linux":
+        raise BuildError(f"wheels bring no CPU kernels for {platform.system()} on {platform.machine()}")
+    compiler = _compiler()
+    libraries = [folder / level_name(level) for level, _ in levels]
+    for library, (level, _) in zip(libraries, levels, strict=True):
+        width = ("-mprefer-vector-width=512",) if platform.machine() == "x86_64" else ()
+        _compile(compiler, str(library), ((f"-march={level}", *width),))
+    return libraries
+
+
+def _compiler() -> list[str]:
+    compiler = find_compiler()
+    if compiler is None:
+        raise BuildError(no_compiler())
+    return compiler
 
 
 def _loads(library: Path) -> bool:
@@ -145,9 +211,9 @@ def _loads(library: Path) -> bool:
     return True
 
 
-def _compile(compiler: list[str], library: str, verbose: bool) -> None:
+def _compile(compiler: list[str], library: str, tunings: tuple[tuple[str, ...], ...], verbose: bool = False) -> None:
     failures: list[str] = []
-    for tuning in _tuning():
+    for tuning in tunings:
         command = [*compiler, *FLAGS, *tuning, f"-I{CUDA.parent}", "-o", library, *(str(HERE / unit) for unit in UNITS)]
         if verbose:
             print(" ".join(command))

@@ -15,7 +15,7 @@ HEAD = """# What the kit asks of a rasterizer
 Made by `python -m pop_ref.conformance.catalogue`; a test holds it to the code.
 
 ```sh
-pip install 'pop-splatting[conformance]'
+pip install 'pop-ref[conformance]'
 pytest --pyargs pop_ref.conformance --rasterizer my.module:rasterization --profile gsplat_1_6 --scorecard card.html
 ```
 

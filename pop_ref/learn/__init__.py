@@ -19,4 +19,4 @@ def needs_of_judging() -> None:
         ValueError: Hypothesis is not installed; the message says how to get it.
     """
     if find_spec("hypothesis") is None or find_spec("pytest") is None:
-        raise ValueError("judging needs hypothesis and pytest: pip install 'pop-splatting[conformance]'")
+        raise ValueError("judging needs hypothesis and pytest: pip install 'pop-ref[conformance]'")

@@ -21,7 +21,7 @@ Chapter {chapter} of the walk-through explains it, and every docstring has an ex
 stage is your own function where you have written it, and the oracle's where you have not. The course has one profile,
 `paper`: readings of other profiles that a docstring speaks of may be left out.
 
-    pop learn check {name}
+    pop-learn check {name}
 """
 '''
 

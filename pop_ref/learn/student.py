@@ -87,7 +87,7 @@ def read_work(folder: Path) -> Work:
     if not any((folder / stage.file).exists() for stage in COURSE):
         if any(Path(stage.file).exists() for stage in COURSE):
             raise ValueError(f"{folder} has no stubs; you are in a folder that has some: write . for it, at the end")
-        raise ValueError(f"{folder} has no stubs; 'pop learn start {folder}' writes them")
+        raise ValueError(f"{folder} has no stubs; 'pop-learn start {folder}' writes them")
     written = {}
     for stage in COURSE:
         path = folder / stage.file

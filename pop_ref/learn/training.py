@@ -32,7 +32,7 @@ def train(work: Work, steps: int = 60, size: int = 24, n: int = 100, every: int 
     """
     missing = [stage.name for stage in COURSE if not work.is_whole(stage)]
     if missing:
-        raise ValueError(f"not all is written yet: {', '.join(missing)}; 'pop learn check' says what each lacks")
+        raise ValueError(f"not all is written yet: {', '.join(missing)}; 'pop-learn check' says what each lacks")
     with borrowing(work) as borrowed:
         try:
             yield from _steps(borrowed, steps, size, n, every, np.random.default_rng(seed))
@@ -41,7 +41,7 @@ def train(work: Work, steps: int = 60, size: int = 24, n: int = 100, every: int 
             if at == str(work.folder):
                 raise
             raise ValueError(
-                f"{at}: it stops with {said(error)}; 'pop learn check {Path(at.split(',')[0]).stem}'"
+                f"{at}: it stops with {said(error)}; 'pop-learn check {Path(at.split(',')[0]).stem}'"
             ) from None
 
 

@@ -72,7 +72,7 @@ def main(arguments: list[str] | None = None) -> int:
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         print(
-            f"{', '.join(missing)} missing; pip install 'pop-splatting[walkthrough]'",
+            f"{', '.join(missing)} missing; pip install 'pop-ref[walkthrough]'",
             file=sys.stderr,
         )
         return 2

@@ -294,8 +294,8 @@ picture(
 #
 # {{chapters}}
 #
-# Short of time? 0, 1, 2, 4, 5 and 8 make a lecture. To learn by doing, `pop learn start mine` writes twelve files with
-# empty functions and judges what you write into them, stage by stage (`pop learn check alpha`).
+# Short of time? 0, 1, 2, 4, 5 and 8 make a lecture. To learn by doing, `pop-learn start mine` writes twelve files with
+# empty functions and judges what you write into them, stage by stage (`pop-learn check alpha`).
 #
 # ## The papers
 #

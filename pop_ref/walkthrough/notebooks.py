@@ -41,7 +41,7 @@ def notebook(chapter: Chapter) -> str:
     """
     about = (
         f"*Made from `pop_ref/walkthrough/{chapter.path.name}`. It runs where pop-splatting is installed: "
-        "`pip install 'pop-splatting[walkthrough]' jupyterlab`.*"
+        "`pip install 'pop-ref[walkthrough]' jupyterlab`.*"
     )
     cells = [_prose(about)]
     for cell in chapter.cells:
@@ -78,7 +78,7 @@ def notebook_index(chapters: Sequence[Chapter]) -> str:
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
         f"<style>{(FOLDER / 'page.css').read_text(encoding='utf-8')}</style></head><body><main><h1>Notebooks</h1>"
         "<p>Every chapter as a Jupyter notebook, to be run where pop-splatting is installed: "
-        "<code>pip install 'pop-splatting[walkthrough]' jupyterlab</code>, then <code>jupyter lab</code>.</p>"
+        "<code>pip install 'pop-ref[walkthrough]' jupyterlab</code>, then <code>jupyter lab</code>.</p>"
         f"<ul>{items}</ul></main></body></html>\n"
     )
 

@@ -394,5 +394,5 @@ def test_what_is_not_installed_is_named(capsys: pytest.CaptureFixture[str], monk
     found = importlib.util.find_spec
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "latex2mathml" else found(name))
     assert main(["anywhere"]) == 2
-    assert capsys.readouterr().err == "latex2mathml missing; pip install 'pop-splatting[walkthrough]'\n"
+    assert capsys.readouterr().err == "latex2mathml missing; pip install 'pop-ref[walkthrough]'\n"
     assert not Path("anywhere").exists()

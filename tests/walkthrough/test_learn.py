@@ -304,8 +304,8 @@ def test_who_has_written_all_trains(mine: Path, capsys: pytest.CaptureFixture[st
         ),
         ({"alpha.py": "import math\nimport maths\ndef falloff(sigma):\n    return 1\n"}, ["map"], "alpha.py, line 2"),
         ({}, ["train"], "not all is written yet: activations"),
-        (None, ["check", "alpha"], "has no stubs; 'pop learn start"),
-        (None, ["map"], "has no stubs; 'pop learn start"),
+        (None, ["check", "alpha"], "has no stubs; 'pop-learn start"),
+        (None, ["map"], "has no stubs; 'pop-learn start"),
     ],
 )
 def test_bad_input_gets_one_line(

@@ -1,0 +1,129 @@
+"""The course's command: `python -m pop_ref.learn`, `pop-learn`, and `pop learn` of the program."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pop_ref.learn import needs_of_judging
+from pop_ref.learn.course import stage_named
+from pop_ref.learn.progress import asked_before, course_map, note_passed, picture
+from pop_ref.learn.splat import write_png
+from pop_ref.learn.stubs import answer, start
+from pop_ref.learn.student import read_work
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one action of the command line.
+
+    Args:
+        arguments: default the process's own.
+
+    Returns:
+        The exit status: 0; 1 for a stage that has not passed yet; 2, with one line on stderr, for what cannot be done.
+    """
+    given = _parser().parse_args(arguments)
+    actions = {
+        "start": lambda: write_stubs(given.folder),
+        "check": lambda: check(given.stage, given.folder, given.answer),
+        "map": lambda: show_map(given.folder, given.out),
+        "train": lambda: train_work(given.folder, given.steps, given.out),
+    }
+    try:
+        return actions[given.action]()
+    except (ValueError, OSError) as error:
+        print(f"pop-learn: error: {error}", file=sys.stderr)
+        return 2
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="pop-learn", description="Build your own Gaussian splatting in NumPy.")
+    actions = parser.add_subparsers(dest="action", required=True)
+    starting = actions.add_parser("start", help="write twelve files to fill in; nothing is written over")
+    checking = actions.add_parser("check", help="judge one of them, in seconds")
+    mapping = actions.add_parser("map", help="the pipeline, and the picture that it draws as it stands")
+    training = actions.add_parser("train", help="when all is written: train with your own code")
+    checking.add_argument("stage", help="a file's name without .py: alpha, covariance, ...")
+    checking.add_argument("--answer", action="store_true", help="show the oracle's code, asked for twice or passed")
+    training.add_argument("--steps", type=int, default=60, help="default 60")
+    for action in (starting, checking, mapping, training):
+        action.add_argument("folder", type=Path, nargs="?", default=Path("mine"), help="your files, default mine")
+    for action in (mapping, training):
+        action.add_argument("--out", type=Path, help="the picture; a file in the folder if not given")
+    return parser
+
+
+def write_stubs(folder: Path) -> int:
+    """Write the twelve modules that are not there yet, and return the exit status 0."""
+    written = start(folder)
+    print(f"{len(written)} new files -> {folder}" if written else f"{folder} has all files already")
+    print(f"next: open {folder / 'alpha.py'}, write a function, and 'pop-learn check alpha {folder}'")
+    return 0
+
+
+def check(name: str, folder: Path, wants_answer: bool) -> int:
+    """Judge a stage, draw its counterexample, and return 0 when it has passed, 1 when not yet.
+
+    Raises:
+        ValueError: the stage is unknown, a file cannot be read, or Hypothesis is missing.
+    """
+    stage, work = stage_named(name), read_work(folder)
+    needs_of_judging()
+    from pop_ref.learn.drawing import drawn_counterexample
+    from pop_ref.learn.judge import judge
+    from pop_ref.learn.telling import told
+
+    verdict = judge(work, stage)
+    print(told(stage, verdict))
+    counterexample = folder / f"counterexample_{stage.name}.png"
+    image = drawn_counterexample(verdict)
+    if image is None:
+        # an earlier one is not of this file
+        counterexample.unlink(missing_ok=True)
+    else:
+        write_png(counterexample, image)
+        print(f"the counterexample, yours in orange and what it should be in blue -> {counterexample}")
+    if verdict.passed:
+        note_passed(folder, stage)
+    if wants_answer and (verdict.passed or asked_before(folder, stage)):
+        print(f"\nthe oracle's {stage.name}:\n\n{answer(stage)}")
+    elif wants_answer:
+        print("\nThe answer is shown when you ask again. Try the hint first.")
+    return 0 if verdict.passed else 1
+
+
+def show_map(folder: Path, out: Path | None) -> int:
+    """Print the pipeline, write the picture that the stages draw as they stand, and return the exit status 0."""
+    work = read_work(folder)
+    print(course_map(work, color=sys.stdout.isatty()))
+    image, complaints = picture(work)
+    for line in complaints:
+        print(line)
+    out = out or folder / "picture.png"
+    _write(out, image)
+    print(f"the picture as it stands -> {out}")
+    return 0
+
+
+def train_work(folder: Path, steps: int, out: Path | None) -> int:
+    """Train a small scene with the student's code, and return the exit status 0."""
+    from pop_ref.learn.training import train
+
+    out = out or folder / "trained.png"
+    for told in train(read_work(folder), steps):
+        print(f"step {told.step:3d}   loss {told.loss:.5f}   {told.psnr:.2f} dB   {told.n} Gaussians", flush=True)
+        _write(out, told.picture)
+    print(f"photograph and render -> {out}")
+    return 0
+
+
+def _write(path: Path, image: np.ndarray) -> None:
+    write_png(path, image.repeat(8, axis=0).repeat(8, axis=1))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
