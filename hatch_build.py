@@ -1,4 +1,4 @@
-"""Compile the CPU kernels into the wheel, where POP_WHEEL_KERNELS=1 asks for it; without, the wheel is of Python alone."""
+"""Compile the CPU kernels into the wheel where POP_WHEEL_KERNELS=1 asks for it; else the wheel is of Python alone."""
 
 from __future__ import annotations
 

@@ -36,7 +36,9 @@ class Blend(Adapter):
                 alpha = np.minimum(profile.alpha_ceiling, splats.opacities[i] * np.exp(-sigma))
                 takes = alive & (sigma >= 0.0) & (alpha >= profile.alpha_floor)
                 after = T * (1.0 - alpha)
-                stops = after <= profile.transmittance_stop if profile.stop_inclusive else after < profile.transmittance_stop
+                stops = (after < profile.transmittance_stop) | (
+                    profile.stop_inclusive & (after == profile.transmittance_stop)
+                )
                 alive &= ~(takes & stops)
                 takes &= ~stops
                 color += np.where(takes, T * alpha, 0.0)[..., None] * splats.colors[i]

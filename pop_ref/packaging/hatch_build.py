@@ -1,4 +1,4 @@
-"""Lay out the wheel of pop-ref: this folder as the package pop_ref, and the pytest plugin's entry beside it."""
+"""Lay out the wheel of pop-ref: this folder as the package pop_ref, and the pytest plugin's entry next to it."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 # of the distribution, not of the package
-_LEFT_OUT = {"hatch_build.py", "LICENSE", "PKG-INFO", "pyproject.toml", "README.md"}
-_MADE = {"__pycache__", "build", "dist"}
+_LEFT_OUT = {"LICENSE", "PKG-INFO", "pyproject.toml", "README.md"}
+_NOT_ITS_FOLDERS = {"__pycache__", "build", "dist", "packaging"}
 
 
 class PackageHook(BuildHookInterface):
-    """Give every file its place; an editable install finds the package in the folder above, and needs the entry only."""
+    """Give every file its place; an editable install finds the package in the folder above and needs the entry only."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Tell hatchling of the files."""
@@ -24,7 +24,7 @@ class PackageHook(BuildHookInterface):
             return
         paths = [path.relative_to(root) for path in sorted(root.rglob("*")) if path.is_file()]
         for path in paths:
-            if path.name.startswith(".") or str(path) in _LEFT_OUT or _MADE & set(path.parts):
+            if path.name.startswith(".") or str(path) in _LEFT_OUT or _NOT_ITS_FOLDERS & set(path.parts):
                 continue
             build_data["force_include"][str(root / path)] = f"pop_ref/{path.as_posix()}"
         build_data["force_include"].update(entry)
