@@ -44,7 +44,7 @@ def test_ten_fused_steps_under_another_reading_are_the_cpus(gpu, reading, backwa
 
 
 def test_the_share_that_blurs_is_of_the_pixels_that_a_view_keeps(gpu):
-    from cuda_ext.train_settings import Phase
+    from pop_fast.train.steps import Phase
 
     scene = training_scene()
     masks = [None if k % 2 else torch.arange(WIDTH) < WIDTH // 4 for k in range(len(scene.photographs))]
