@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import cuda_ext
-from pop_fast.api.plugin import DrawingBackend
+from pop_fast.api.plugin import BaseBackend
 from pop_fast.train.whole_step import WholeStep
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class CudaBackend(DrawingBackend):
+class CudaBackend(BaseBackend):
     """Draws on the GPU that holds the tensors.
 
     Attributes:
@@ -45,11 +45,11 @@ class CudaBackend(DrawingBackend):
 
         return CudaStages(self.backward, self.deterministic)
 
-    def open_view(self, of: Any) -> Any:
+    def open_view(self, pass_input: Any) -> Any:
         """Draw a view for passes over it."""
         from pop_fast.cuda.passes import CudaView
 
-        return CudaView(of)
+        return CudaView(pass_input)
 
     def whole_step(self) -> WholeStep:
         """Return the fused step, which takes all steps on a GPU: a setting that it does not know is refused."""
