@@ -25,7 +25,7 @@ class TorchBackend(BaseBackend):
         """Project and list a view for passes over it."""
         from pop_fast.stages.passes import view_of
 
-        return view_of(of, self.stages())
+        return view_of(pass_input, self.stages())
 
 
 FAST: Final = TorchBackend("fast", "cpu", ("float32", "float64"), speed=0)

@@ -104,7 +104,7 @@ def test_large_gaussians_are_pruned_by_every_method_but_pop_and_after_a_reset_in
     ],
 )
 def test_a_preset_gives_defaults_and_what_is_said_is_taken_literally(said, read):
-    config = TrainConfig.of(preset="quick", scale_lambda_pop=True, steps_scaler=0.05, **overrides)
+    config = TrainConfig.of(preset="quick", scale_lambda_pop=True, steps_scaler=0.05, **said)
     assert read(config) == next(iter(said.values()))
     assert config.given.settings == {name.replace("strategy.", "pop."): to_plain(v) for name, v in said.items()}
 
@@ -139,8 +139,8 @@ def another(value, hint):
     if isinstance(value, tuple):
         return (0.25, 0.5, 0.75) if value and isinstance(value[0], float) else (*value, *((3,) if value else ("x",)))
     if isinstance(value, str):
-        # of backends and profiles, which are names in tables, another one that there is
-        of_tables = {"auto": "ref", "paper": "inria"}
+        # of backends, profiles and losses, which are names in tables, another one that there is
+        of_tables = {"auto": "ref", "paper": "inria", "l2": "l1", "l1": "l2"}
         return of_tables.get(value, value + "x")
     if isinstance(value, float):
         return 0.625 if value != 0.625 else 0.375

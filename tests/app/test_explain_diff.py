@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import cuda_ext
-from pop_fast.api.registry import BACKENDS
+from pop_fast.api.registry import BACKENDS, get_backend
 from pop_fast.cli.explain import chosen_view
 from pop_fast.errors import PopError
 from pop_fast.stages.backend import FAST, TorchBackend
@@ -172,8 +172,8 @@ def test_a_backend_with_another_ceiling_parts_by_d6_and_the_worst_pixel_is_looke
     scene: ExplainedView, instead_of_cuda: Callable[[Change], None]
 ) -> None:
     instead_of_cuda(lambda given: {"profile": "gsplat_1_6"})
-    image, info = scene.rasterized(torch.float32, backends.get_backend("cuda"))
-    sound, own = scene.rasterized(torch.float32, backends.get_backend("fast"))
+    image, info = scene.rasterized(torch.float32, get_backend("cuda"))
+    sound, own = scene.rasterized(torch.float32, get_backend("fast"))
     differs = (image - sound).abs().amax(dim=2) + (info["n_contrib"] != own["n_contrib"])[0]
     x, y = next((x, y) for x, y in PIXELS if differs[y, x] == 0.0)
     found = difference(scene, "fast", "cuda", x, y)
