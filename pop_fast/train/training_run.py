@@ -23,7 +23,6 @@ from tqdm import tqdm
 
 from pop_fast.data.capture import Capture
 from pop_fast.data.initialize import initialize_params
-from pop_fast.density.densify import draws_of
 from pop_fast.density.foreign import ForeignStrategy
 from pop_fast.density.passes import Passes
 from pop_fast.density.protocol import DensificationStep, Draws, Strategy
@@ -282,7 +281,7 @@ class TrainingRun:
     @cached_property
     def draws(self) -> Draws:
         """What changes of the Gaussians are decided by, the same numbers whatever takes the steps."""
-        return draws_of(self.state["generator"])
+        return Draws.of(self.state["generator"])
 
     @cached_property
     def _passes(self) -> Passes:

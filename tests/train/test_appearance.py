@@ -275,10 +275,8 @@ def test_what_shows_nothing_costs_nothing_before_any_background(tmp_path: Path, 
             run.appearance.params["exposures"].copy_(tensor(EXPOSURES[:4]))
     (stats,) = run.stepper.steps(0, 1, phase_at(config, config.strategy, 0))
     assert stats.objective < 1e-9
-    assert (
-        run.stepper._objective(tensor(np.zeros((24, 32, 3))), 0, phase_at(config, config.strategy, 0), torch.ones(3))
-        > 0.1
-    )
+    nothing = tensor(np.zeros((24, 32, 3)))
+    assert run.stepper._photo_loss(nothing, 0, config.objective_at(0), torch.ones(3)) > 0.1
 
 
 def test_transparency_matters_to_a_random_background_alone(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from pop_fast.compiled import native_step
 from pop_fast.data.initialize import initialize_params
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.train import TrainingRun, engines, fused_stepper
+from pop_fast.train import TrainingRun, fused_stepper
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.engines import engine_of, torch_engine, whole_engine
 from pop_fast.train.model import KEYS
@@ -170,9 +170,10 @@ def test_how_many_steps_are_taken_at_a_time_changes_no_bit(
     method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found: list[dict[str, Any]] = []
+    own = CompiledBackend.whole_step
     for seconds, most in ((0.0, 20), (math.inf, 3), (math.inf, 20)):
         monkeypatch.setattr(fused_stepper, "BLOCK_SECONDS", seconds)
-        monkeypatch.setattr(engines, "MOST_ON_CPU", most)
+        monkeypatch.setattr(CompiledBackend, "whole_step", lambda self, most=most: replace(own(self), most=most))
         folder = tmp_path / f"{seconds}_{most}"
         config = tiny_config(folder, method, backend="compiled", checkpoint_every=0, save_steps=())
         # the sums of the last window are among what is kept
