@@ -198,7 +198,7 @@ class TrainConfig:
         own = values.get("strategy", {})
         if isinstance(own, dict):
             own = {name: value for name, value in own.items() if name not in _GONE or value != _GONE[name]}
-        strategy = from_plain(METHODS.named(method).strategy, own, f"config.{method}")
+        strategy = from_plain(METHODS[method].strategy, own, f"config.{method}")
         return replace(from_plain(cls, rest, "config", skipped=("given", "strategy")), strategy=strategy)
 
     @property

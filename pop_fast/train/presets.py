@@ -187,7 +187,7 @@ def method_of(strategy: DensityControl) -> str:
 
 def defaults(given: Given) -> dict[str, Any]:
     """Return every setting that method, preset and scaler decide, without overrides, by its name in `TrainConfig`."""
-    kind, recipe, _ = METHODS.named(given.method)
+    kind, recipe, _ = METHODS[given.method]
     by = given.scaler
     values = values_of(recipe)
     strategy = kind().scaled(by)
