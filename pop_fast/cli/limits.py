@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 from pop_fast.errors import PopError
+from pop_fast.io.format_registry import format_names
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,7 +17,10 @@ if TYPE_CHECKING:
     from pop_fast.density.shrink import Score
     from pop_fast.train.config import TrainConfig
 
-FormatName = Literal["ply", "compressed-ply", "spz", "spz-4", "sog", "splat", "gltf", "gltf-spz", "html"]
+    FormatName = str
+else:
+    # what is registered when the program starts
+    FormatName = Literal[(*format_names(), "html")]
 # views that scores are summed over, at most: every so many of a larger capture
 _MOST_VIEWS: Final = 100
 # bytes of what `--target-mb` counts in

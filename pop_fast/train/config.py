@@ -50,7 +50,7 @@ class TrainConfig:
             oracle, slow), one that another package registers, or "auto": "cuda" where a GPU and the build are there,
             else "compiled" where that was compiled, else "fast".
         profile: the rasterizer's constants: "paper", "gsplat_1_5", "gsplat_1_6", "inria" (that of method "3dgs" and of
-            those built on it) or "speedy_splat".
+            those built on it), "speedy_splat", or one that another package registers.
         near_plane: depth up to which a camera shows nothing, in units of the world that is trained in; None takes the
             profile's, which Inria's family counts in the capture's own units: a run writes down what that comes to.
         antialiased: render with opacity compensation (Mip-Splatting) instead of classically.

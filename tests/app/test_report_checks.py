@@ -16,10 +16,10 @@ import torch
 from pop_fast.data import load_capture
 from pop_fast.data.capture import View
 from pop_fast.errors import PopError
+from pop_fast.io.pictures import colormap_table
 from pop_fast.train.gpu_proxy import renderer
 from pop_fast.train.load_result import load_splat
 from pop_fast.view.paths import frames_in
-from pop_fast.view.pictures import colormap_table
 from pop_fast.view.report import checks, write_report
 from pop_fast.view.report.checks import (
     Checks,

@@ -1,4 +1,4 @@
-"""Pictures of the report: error maps, dominant-id maps, and their way into a page as data URIs."""
+"""Pictures of arrays: error maps, dominant-id maps, and their way into a page as data URIs."""
 
 from __future__ import annotations
 
