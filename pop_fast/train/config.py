@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final, Literal, Self
 
@@ -171,6 +172,32 @@ class TrainConfig:
         given = Given.of(overrides, method=method, preset=preset, **plan)
         return replace(cls._promised(given), given=given)
 
+    @classmethod
+    def from_options(cls, words: Sequence[str], *, method: str = "pop", preset: str = "paper") -> Self:
+        """Make the settings that options of `pop train` say, as `pop_fast.train.presets.options_for` writes them.
+
+        Args:
+            words: `--name value`, `--group.name value ...`, `--flag` and `--no-flag`.
+            method, preset: as of `of`.
+
+        Raises:
+            PopError: an unknown option, or a value that it cannot have; names it.
+        """
+        usual, said = cls.of(method=method, preset=preset).flat(), dict[str, Any]()
+        dashed = {name.replace("-", "_"): name for name in usual}
+        for option, values in _options_of(words):
+            group, dot, last = option.rpartition(".")
+            name, positive = (dashed.get(n, n) for n in (option, f"{group}{dot}{last.removeprefix('no_')}"))
+            if not values and name not in usual:
+                said[positive] = False
+            elif isinstance(usual.get(name), list):
+                said[name] = values
+            else:
+                said[name] = values[0] if len(values) == 1 else " ".join(map(str, values)) or True
+        # as the settings have them, in their order: a whole number where a real one is meant is one
+        resolved = cls.of(method=method, preset=preset, **said).flat()
+        return cls.of(method=method, preset=preset, **{name: resolved[name] for name in resolved if name in said})
+
     def with_overrides(self, **overrides: Any) -> Self:
         """Return these settings with some said anew; those that nobody said stay the defaults they are."""
         if self.given is None:
@@ -297,6 +324,28 @@ class TrainConfig:
     def digest(self) -> str:
         """Hash the settings that decide the result's bits."""
         return hashlib.sha256(json.dumps(self.binding(), sort_keys=True).encode()).hexdigest()
+
+
+def _options_of(words: Sequence[str]) -> Iterator[tuple[str, list[Any]]]:
+    """Give every option's name, as settings are called, with its values."""
+    rest = list(words)
+    while rest:
+        word = rest.pop(0)
+        if not word.startswith("--"):
+            raise PopError(f"{word!r} stands where an option of pop train is expected, as --max-steps 100")
+        name, equals, value = word.removeprefix("--").partition("=")
+        values = [value] if equals else []
+        while rest and not rest[0].startswith("--"):
+            values.append(rest.pop(0))
+        yield name.replace("-", "_"), [_read(value) for value in values]
+
+
+def _read(text: str) -> Any:
+    """Read a word as JSON has it, or as the text that it is."""
+    try:
+        return None if text == "None" else json.loads(text)
+    except ValueError:
+        return text
 
 
 def _as_dict(config: TrainConfig) -> dict[str, Any]:
