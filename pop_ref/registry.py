@@ -138,7 +138,7 @@ class Registry(Mapping[str, T], Generic[T]):
             raise self._error(
                 f"{place} is a {type(value).__name__} without {', '.join(lacks)}, so it is no {self.kind}"
             )
-        own = getattr(value, "name", name)
+        own = value.name if "name" in self._needs else name
         if own != name:
             raise self._error(f"{place} calls itself {own!r} and is registered as {name!r}; use one name for both")
 

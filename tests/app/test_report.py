@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pop_fast.errors import PopError
-from pop_fast.view import pictures
+from pop_fast.io import pictures
 from pop_fast.view.report import write_report
 from pop_fast.view.report.curves import Chart, Series, Window, draw, draw_histogram, nice_ticks, short_number
 from pop_fast.view.report.source import read_result, running_mean, thin_out
