@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final, Literal, Self
 
@@ -341,11 +342,11 @@ def _options_of(words: Sequence[str]) -> Iterator[tuple[str, list[Any]]]:
 
 
 def _read(text: str) -> Any:
-    """Read a word as JSON has it, or as the text that it is."""
-    try:
-        return None if text == "None" else json.loads(text)
-    except ValueError:
-        return text
+    """Read a word as a number, as None, or as the text that it is."""
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(text)
+    return None if text == "None" else text
 
 
 def _as_dict(config: TrainConfig) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pop_fast.train import TrainConfig, TrainingRun
-from pop_fast.train.effects import facts, find_warnings
+from pop_fast.train.preflight import facts, find_warnings
 from pop_fast.train.views import ViewTensors
 from tests.app.tiny import tiny_capture, tiny_config
 
