@@ -72,7 +72,7 @@ LAWS_ELSEWHERE = {
     "depth": "pop_ref/conformance/laws/test_signature_depth.py",
     "training": "tests/golden",
     "appearance": "tests/oracle/test_appearance.py",
-    "refinement": "tests/oracle/test_refinement.py",
+    "refinement": "tests/oracle/test_appearance.py",
     "margins": "tests/thresholds",
 }
 
