@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import importlib
 import json
 import os
 import subprocess
@@ -20,12 +19,11 @@ from paper_repro.cli import COMMANDS as REPRO_COMMANDS
 from pop_fast.children import module_command, python_command
 from pop_fast.cli import COMMANDS, main
 from pop_fast.cli.errors import describe
-from pop_fast.cli.told_early import about_large
 from pop_fast.cli.train import arguments, rename_aliases
+from pop_fast.cli.train_checks import about_large
 from pop_fast.data.capture import Capture, View
 from pop_fast.data.sfm import SfmResult
 from pop_fast.errors import PopError
-from pop_fast.moved import MOVED
 from pop_fast.train import TrainConfig
 from tests.app.captures import write_photograph
 from tests.app.children import ROOT
@@ -267,7 +265,7 @@ def test_a_fault_of_the_program_keeps_its_traceback(pop: Pop, monkeypatch: pytes
     def broken(_: object) -> None:
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("pop_fast.view.report.write.write_report", broken)
+    monkeypatch.setattr("pop_fast.view.report.page.write_report", broken)
     with pytest.raises(ZeroDivisionError):
         pop("report", ".")
 
@@ -276,7 +274,7 @@ def test_ctrl_c_anywhere_exits_with_130(pop: Pop, monkeypatch: pytest.MonkeyPatc
     def interrupted(_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pop_fast.view.report.write.write_report", interrupted)
+    monkeypatch.setattr("pop_fast.view.report.page.write_report", interrupted)
     outcome = pop("report", ".")
     assert outcome.status == 130
     assert outcome.err.strip() == "pop: interrupted"
@@ -306,7 +304,7 @@ def test_results_are_complete_before_the_report_and_whatever_becomes_of_it(
         raise fault
 
     with monkeypatch.context() as patch:
-        patch.setattr("pop_fast.view.report.write.write_report", broken)
+        patch.setattr("pop_fast.view.report.page.write_report", broken)
         outcome = pop("train", shared_capture, "--out", folder, *TRAIN)
     assert {"ckpts/ckpt_29_rank0.pt", "ply/point_cloud_29.ply", "stats/val_step0029.json", "cfg.json"} <= set(found)
     assert outcome.status == status
@@ -490,46 +488,3 @@ def test_no_child_of_a_training_in_blocks_does(planted: tuple[Path, Path], share
     assert not marker.exists(), f"{marker.read_text()}\n{said}"
     # said by the child itself
     assert "out: is no run in blocks" in said, said
-
-
-# Names that users import: where they are now, and where they were before, with a warning.
-
-
-@pytest.mark.parametrize("old", MOVED)
-def test_a_module_under_its_old_name_gives_what_its_successor_gives_and_warns(old, monkeypatch):
-    monkeypatch.delitem(sys.modules, f"pop_fast.{old}", raising=False)
-    successor = importlib.import_module(f"pop_fast.{MOVED[old]}")
-    with pytest.warns(DeprecationWarning, match=rf"pop_fast\.{old} is now pop_fast\.{MOVED[old]}"):
-        found = importlib.import_module(f"pop_fast.{old}")
-    names = getattr(successor, "__all__", [name for name in vars(successor) if not name.startswith("_")])
-    assert names
-    assert all(getattr(found, name) is getattr(successor, name) for name in names)
-
-
-@pytest.mark.parametrize(
-    ("package", "old", "home", "new"),
-    [
-        ("pop_fast.data", "make_demo", "pop_fast.demo", "make_demo"),
-        ("pop_fast.density", "StepEvent", "pop_fast.density", "DensificationStep"),
-    ],
-)
-def test_a_name_in_its_old_package_warns(package, old, home, new):
-    with pytest.warns(DeprecationWarning, match=rf"{package}\.{old} is now {home}\.{new}"):
-        found = getattr(importlib.import_module(package), old)
-    assert found is getattr(importlib.import_module(home), new)
-
-
-def test_a_name_that_never_was_is_refused():
-    for package in ("pop_fast.data", "pop_fast.density", "pop_fast.api"):
-        with pytest.raises(AttributeError, match="nothing_of_this_name"):
-            getattr(importlib.import_module(package), "nothing_of_this_name")  # noqa: B009  the name is not there
-    with pytest.raises(ModuleNotFoundError):
-        importlib.import_module("pop_fast.nothing_of_this_name")
-
-
-def test_the_public_names_are_where_the_readme_says():
-    from pop_fast.api import rasterization
-    from pop_fast.density import POPStrategy
-
-    assert callable(rasterization)
-    assert POPStrategy().needs_dominance

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from pop_fast.data import Capture, load_capture
 from pop_fast.data.colmap import read_model
-from pop_fast.data.colmap_records import model_name, parameter_count
+from pop_fast.data.colmap_files import model_name, parameter_count
 from pop_fast.data.pinhole import PINHOLES, make_camera
 from tests.app.captures import (
     HEIGHT,

@@ -17,7 +17,7 @@ import pop_fast.compiled
 from cuda_ext.arrays import CudaMemoryError
 from cuda_ext.train_settings import GROUPS
 from pop_fast.api.registry import require_backend
-from pop_fast.blocks.start import shown_in
+from pop_fast.blocks.rounds import shown_in
 from pop_fast.data.initialize import initialize_params
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
@@ -302,7 +302,7 @@ def test_what_is_shown_is_found_in_pieces_as_at_once(monkeypatch):
     config = tiny_config("nowhere")
     at_once = shown_in(capture.views[:2], initial, config)
     assert 0 < at_once.sum() < N_POINTS
-    monkeypatch.setattr("pop_fast.blocks.start._AT_A_TIME", 7)
+    monkeypatch.setattr("pop_fast.blocks.rounds._AT_A_TIME", 7)
     assert torch.equal(shown_in(capture.views[:2], initial, config), at_once)
 
 

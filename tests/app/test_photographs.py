@@ -21,8 +21,7 @@ from pop_fast.data.read_images import _upright
 from pop_fast.data.resample import shrink_bicubic
 from pop_fast.errors import CaptureError
 from pop_fast.io import images
-from pop_fast.io.heif import can_read_heif
-from pop_fast.io.image_header import Exif, read_exif, read_size, size_of
+from pop_fast.io.image_header import Exif, can_read_heif, read_exif, read_size, size_of
 from pop_fast.io.images import list_images, read_image
 from pop_fast.io.jpeg import sound_jpegs
 from tests.app.captures import (

@@ -19,12 +19,11 @@ from hypothesis import strategies as st
 from pop_fast.blocks import jobs
 from pop_fast.data import Capture, View, load_capture
 from pop_fast.errors import PopError
-from pop_fast.io.names import inside, picture_names
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
 from pop_fast.train.results import read_config
-from pop_fast.view.frames import write_pictures
-from pop_fast.view.paths.video import frames_in
+from pop_fast.view.frames import inside, picture_names, write_pictures
+from pop_fast.view.paths import frames_in
 from tests.app.captures import (
     assert_one_line,
     camera,

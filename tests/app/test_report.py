@@ -23,7 +23,7 @@ from pop_fast.errors import PopError
 from pop_fast.train.gpu_proxy import renderer
 from pop_fast.train.load_result import load_splat
 from pop_fast.view import pictures
-from pop_fast.view.paths.video import frames_in
+from pop_fast.view.paths import frames_in
 from pop_fast.view.pictures import colormap_table
 from pop_fast.view.report import checks, write_report
 from pop_fast.view.report.checks import (
@@ -36,9 +36,9 @@ from pop_fast.view.report.checks import (
     write_checks,
 )
 from pop_fast.view.report.curves import Chart, Series, Window, draw, draw_histogram, nice_ticks, short_number
+from pop_fast.view.report.model import verdict
+from pop_fast.view.report.sections import depth_picture, depth_range
 from pop_fast.view.report.source import read_result, running_mean, thin_out
-from pop_fast.view.report.verdict import verdict
-from pop_fast.view.report.views_section import depth_picture, depth_range
 from tests.app.browser import browser
 from tests.app.conftest import TRAIN, TRAIN_AND_CHECK, Pop
 from tests.app.result_folder import VIEWS, write_result
