@@ -15,27 +15,27 @@ from torch import Tensor
 
 import pop_fast.compiled
 from cuda_ext.arrays import CudaMemoryError
-from cuda_ext.train_settings import GROUPS
 from pop_fast.api.registry import require_backend
 from pop_fast.blocks.rounds import shown_in
+from pop_fast.cuda.backend import CUDA
 from pop_fast.data.initialize import initialize_params
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.batch_stepper import BatchStepper
-from pop_fast.train.engines import MOST_ON_GPU, engine_of, torch_engine
+from pop_fast.train.engines import engine_of, torch_engine
 from pop_fast.train.fixed_rows import hold_last
-from pop_fast.train.fused_settings import unsupported
 from pop_fast.train.fused_stepper import FusedStepper, step_settings
 from pop_fast.train.model import KEYS
-from pop_fast.train.phases import phase_at, segment_end
 from pop_fast.train.presets import METHODS
 from pop_fast.train.refining import at_rest, refining
-from pop_fast.train.schedule import updates_of
+from pop_fast.train.schedule import phase_at, segment_end, updates_of
 from pop_fast.train.stepper import Task
 from pop_fast.train.torch_stepper import TorchStepper
-from tests.app.drift import Drift, drift_engine
+from pop_fast.train.whole_step import why_not_trained
+from pop_ref.settings import PARAMETERS
+from tests.app.drift import MOST, Drift, drift_engine
 from tests.app.interruptions import interrupt as fixed_rows_interrupt
 from tests.app.tiny import HEIGHT, N_POINTS, WIDTH, last_checkpoint, tiny_capture, tiny_config
 
@@ -137,8 +137,8 @@ def test_a_segment_ends_where_something_is_due():
     config = tiny_config("x", max_steps=9000, checkpoint_every=1000, strategy=POPStrategy())
     strategy, first = config.strategy, 0
     while first < config.max_steps:
-        end = segment_end(config, strategy, first, MOST_ON_GPU)
-        assert first < end <= min(first + MOST_ON_GPU, config.max_steps)
+        end = segment_end(config, strategy, first, MOST)
+        assert first < end <= min(first + MOST, config.max_steps)
         assert len({phase_at(config, strategy, step) for step in range(first, end)}) == 1
         assert not any(strategy.changes_after(step) for step in range(first, end - 1))
         assert not any(taken % 1000 == 0 or taken == 12 for taken in range(first + 1, end))
@@ -195,13 +195,13 @@ def test_settings_that_the_device_does_not_know_are_refused_before_anything_star
         TrainingRun(tiny_config(tmp_path / "new", backend="cuda", **changes), tiny_capture())
     assert words in str(error.value)
     assert not (tmp_path / "new").exists()
-    assert unsupported(tiny_config("x")) is None
+    assert why_not_trained(CUDA, tiny_config("x")) is None
 
 
 def test_the_fused_step_gets_the_learning_rates_in_its_own_words():
     config = tiny_config("x")
     settings = step_settings(config, updates_of(config.lr, 2.0, config.max_steps))
-    first = dict(zip(GROUPS, settings.updates.rates[0].tolist(), strict=True))
+    first = dict(zip(PARAMETERS, settings.updates.rates[0].tolist(), strict=True))
     assert first == {**config.lr.by_parameter(), "means": 2.0 * config.lr.means}
     assert settings.blur_pixels(WIDTH * HEIGHT) == int(0.02 * WIDTH * HEIGHT)
     assert replace(settings, blur_min_pixels=40.0).blur_pixels(WIDTH * HEIGHT) == 40.0
@@ -455,7 +455,7 @@ def test_the_step_in_cpp_leaves_batches_to_autograd() -> None:
 
 
 def test_the_fused_step_on_a_gpu_refuses_batches() -> None:
-    reason = unsupported(tiny_config("x", batch_size=2))
+    reason = why_not_trained(CUDA, tiny_config("x", batch_size=2))
     assert reason is not None
     assert "batch_size = 1 only, not 2; use --backend fast, or leave batch_size as it is" in reason
 

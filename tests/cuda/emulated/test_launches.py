@@ -12,10 +12,11 @@ import torch
 from cuda_ext.arrays import Settings
 from cuda_ext.host import emulate
 from cuda_ext.render.lists import WARP_TILE, make_lists, splat_struct
-from cuda_ext.train_settings import Phase, StepSettings, steady_updates
 from cuda_ext.training.resident import ResidentViews
 from cuda_ext.training.train_step import FusedTrainer
 from pop_fast.density.passes import Passes
+from pop_fast.train.schedule import steady_updates
+from pop_fast.train.steps import Phase, StepSettings
 from pop_ref.constants import PAPER
 from tests.cuda.conftest import FOLDER
 from tests.cuda.gpu.scene import HEIGHT, STEPS, WIDTH, fused_trainer, training_scene

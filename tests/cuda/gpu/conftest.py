@@ -97,6 +97,6 @@ def gpu(request: pytest.FixtureRequest) -> Any:
 @pytest.fixture
 def engine(gpu: Any) -> Any:
     """Return the GPU as `pop train` finds it."""
-    from pop_fast.train.engines import cuda_engine
+    from pop_fast.train.engines import whole_engine
 
-    return cuda_engine() if gpu.type == "cuda" else emulated_engine()
+    return whole_engine("cuda") if gpu.type == "cuda" else emulated_engine()

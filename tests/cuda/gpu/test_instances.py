@@ -102,7 +102,7 @@ def test_more_entries_than_the_kernels_can_number_are_refused_in_one_line(gpu):
 
 def test_room_shrinks_after_a_phase_of_fat_splats_and_the_steps_stay_the_same(gpu, monkeypatch):
     from cuda_ext.render import capacity
-    from cuda_ext.train_settings import Phase
+    from pop_fast.train.steps import Phase
 
     monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 64))
     phase, scene = Phase(3, True, True, True), training_scene()
@@ -143,7 +143,7 @@ def test_ten_fused_steps_under_another_reading_are_the_cpus(gpu, reading, backwa
     losses, params, trainer = fused(scene, gpu, window, backward=backward, theta_blur=THETA, **strong, **reading)
     expected, terms, wanted, state = on_the_cpu(scene, **strong, **reading)
     torch.testing.assert_close(torch.tensor(losses), torch.tensor(expected), rtol=1e-4, atol=1e-6)
-    told = torch.tensor([values.pop for values in trainer.step_stats(0, STEPS)])
+    told = torch.tensor([values[4] for values in trainer.step_stats(0, STEPS)])
     torch.testing.assert_close(told, torch.tensor(terms), rtol=1e-4, atol=1e-6)
     for name, value in wanted.items():
         assert apart(params[name], value, name) < 0.01, name
@@ -160,7 +160,7 @@ def test_ten_fused_steps_under_another_reading_are_the_cpus(gpu, reading, backwa
 
 
 def test_the_share_that_blurs_is_of_the_pixels_that_a_view_keeps(gpu):
-    from cuda_ext.train_settings import Phase
+    from pop_fast.train.steps import Phase
 
     scene = training_scene()
     masks = [None if k % 2 else torch.arange(WIDTH) < WIDTH // 4 for k in range(len(scene.photographs))]
