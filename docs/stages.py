@@ -68,7 +68,9 @@ STAGES = (
 )
 
 # modules of pop_ref that are data or types, not stages
-NOT_STAGES = frozenset({"__init__", "_shapes", "ambiguities", "constants", "notation", "settings", "records"})
+NOT_STAGES = frozenset(
+    {"__init__", "_shapes", "ambiguities", "constants", "notation", "records", "registry", "settings"}
+)
 # stages whose laws stand in a file of another name: whole views, and what is tested elsewhere
 LAWS_ELSEWHERE = {
     "render": "pop_ref/conformance/laws/test_whole.py",
