@@ -84,7 +84,8 @@ sass: setup  ## count the kernels' machine instructions into benchmarks (needs n
 	$(BIN)/python benchmarks/gpu_predictions.py --write
 
 emulate: setup  ## run the CUDA kernels' own source on the host, warp by warp: every law, training steps (minutes)
-	POP_EMULATED_LAWS=1 POP_CUDA_KINDS="pixel_parallel atomics gaussian_parallel" $(BIN)/python -m pytest -q tests/cuda/emulated
+	POP_CUDA_ON=emulated POP_EMULATED_LAWS=1 POP_CUDA_KINDS="pixel_parallel atomics gaussian_parallel" \
+		$(BIN)/python -m pytest -q tests/cuda/gpu tests/cuda/emulated
 
 # no environment is made and nothing installed: it runs on a node with a GPU, torch and nvcc, and writes to $$OUT
 gpu-check:  ## JOB=1: build, smoke, times; JOB=2: laws, steps, sanitizer, training on CAPTURES="a b" (needs a GPU)

@@ -18,13 +18,14 @@ from pop_fast.stages.density import blur_set
 from pop_fast.train import LearningRates, TrainConfig
 from pop_fast.train.config import first_difference
 from pop_fast.train.jsonable import to_plain
-from pop_fast.train.presets import METHODS, Given
+from pop_fast.train.presets import METHODS, Given, options_for
 from pop_fast.train.results import read_config
 from pop_fast.train.schedule import ViewOrder, active_sh_degree, updates_of
+from pop_ref.constants import PROFILES
 from pop_ref.density import densifies_at
 from pop_ref.optimizer import learning_rates, update_numbers
-from pop_ref.recipes import BASELINES, RECIPES
-from pop_ref.settings import PARAMETERS, AppearanceRates, Objective, UpdateRules
+from pop_ref.recipes import BASELINES, L1_DIVIDED, RECIPES
+from pop_ref.settings import PARAMETERS, AppearanceRates, DensityConfig, Objective, PopTerm, UpdateRules
 
 
 def test_the_defaults_are_the_papers_schedule():
@@ -357,3 +358,30 @@ def test_every_setting_is_documented():
         text = "".join(cls.__doc__ or "" for cls in kind.__mro__)
         missing = [f.name for f in fields(kind) if f"{f.name}:" not in text]
         assert not missing
+
+
+# The rows of the paper's tables as options of `pop train`: each trains what the oracle's recipe of that name says.
+
+ROWS = {**RECIPES, **{f"L1 div {n}": recipe for n, recipe in L1_DIVIDED.items()}}
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_a_row_can_be_trained_from_the_command_line(name):
+    recipe, words = ROWS[name], options_for(ROWS[name])
+    config, _ = arguments(["scene", *words])
+    for kind, said in ((DensityConfig, recipe.density), (PopTerm, recipe)):
+        for field in fields(kind):
+            assert getattr(config.strategy, field.name) == getattr(said, field.name), field.name
+    photometric = (config.photometric, config.lambda_ssim, config.l2_stop_iter, config.ssim_padding)
+    assert photometric == (recipe.pixelwise, recipe.lambda_ssim, recipe.l2_stop_iter, recipe.padding)
+    assert config.photometric_divisor == pytest.approx(1.0 / recipe.pixel_scale, rel=1e-15)
+    assert config.d_ssim_halved == recipe.d_ssim_halved
+    assert (config.lr, PROFILES[config.profile]) == (recipe.lr, recipe.profile)
+    assert (config.max_steps, config.sh_interval) == (recipe.max_steps, recipe.sh_interval)
+
+
+def test_rows_differ_and_their_options_are_few():
+    named = {name: tuple(options_for(recipe)) for name, recipe in ROWS.items()}
+    assert len(set(named.values())) == len(named)
+    assert (named["POP"], named["gsplat"], named["3DGS"]) == ((), ("--method", "gsplat"), ("--method", "3dgs"))
+    assert named["L2+Blur"] == ("--pop.lambda-pop", "0")

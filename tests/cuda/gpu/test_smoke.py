@@ -8,8 +8,7 @@ import torch
 
 from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render
-
-from .scene import HEIGHT, LR, WIDTH, training_scene
+from tests.cuda.gpu.scene import HEIGHT, LR, WIDTH, training_scene
 
 
 @pytest.mark.parametrize("backward", ["pixel_parallel", "gaussian_parallel"])

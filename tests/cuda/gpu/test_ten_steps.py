@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from .scene import HEIGHT, LR, STEPS, WIDTH, training_scene
-from .steps import apart, fused, fused_trainer, on_the_cpu
+from tests.cuda.gpu.scene import HEIGHT, LR, STEPS, WIDTH, apart, fused, fused_trainer, on_the_cpu, training_scene
 
 
 @pytest.mark.graph

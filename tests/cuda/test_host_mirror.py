@@ -1,6 +1,9 @@
-"""The mirror beside the oracle, closer than the laws ask: double at 1e-12, both families, the kernels' own forms."""
+"""The host mirror: the laws of the stages that are mathematics of the kernels, and agreement closer than they ask."""
 
 from __future__ import annotations
+
+import functools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,10 +12,12 @@ from hypothesis import strategies as st
 
 from cuda_ext.compiler import find_compiler
 from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.backends import shipped
 from pop_ref.conformance.cases import CASES, cotangent_like, rounded, sensitivity, transposed
 from pop_ref.conformance.error_bounds import pixel_error_bounds
 from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
+from pop_ref.conformance.plugin import parametrize_backends
 from pop_ref.conformance.scenes import cotangents
 from pop_ref.conformance.strategies import arrays_of, scenes, viewmats
 from pop_ref.constants import PAPER
@@ -21,6 +26,7 @@ from pop_ref.density_rows import rows_from_params, split_rows
 from pop_ref.optimizer import adam_step
 from pop_ref.polarization import pop_loss_vjp
 from pop_ref.tiles import tile_lists
+from tests.judged import law_classes
 
 if find_compiler() is None:
     pytest.skip("no C++ compiler: the host mirror cannot be built (install g++ or set CXX)", allow_module_level=True)
@@ -28,6 +34,24 @@ if find_compiler() is None:
 from pop_ref.conformance.mirror_adapter import FOLDER, MirrorAdapter
 from pop_ref.conformance.mirror_library import Mirror
 from pop_ref.conformance.mirror_stages import STAGES
+
+MODULES = (
+    *("activations", "agreement", "alpha", "camera", "compositing", "covariance", "dominance", "footprint"),
+    *("gradients", "harmonics", "optimizer", "projection", "whole"),
+)
+globals().update(law_classes(MODULES))
+
+
+@functools.cache
+def mirrors() -> list[Any]:
+    return [shipped("mirror64"), shipped("mirror32")]
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    # in double the mirror is the oracle to 1e-12, for which the laws are proved already; float has to stand by itself
+    agreement = metafunc.cls is not None and metafunc.cls.__name__ == "TestAgreement"
+    parametrize_backends(metafunc, mirrors() if agreement else mirrors()[1:])
+
 
 ORACLE = OracleAdapter()
 DOUBLE = 1e-12  # of the oracle's own sensitivity
