@@ -209,6 +209,8 @@ TABLE: Final[dict[str, Tolerance]] = {
     "taming.pixel_weights": Tolerance(units=10, worst=1.1),
     "taming.score": Tolerance(units=20, worst=1.9),
     "tight_tiles.box": Tolerance(units=6, worst=0.72),
+    "training.rows": Tolerance(units=80, worst=9.8),
+    "training.term": Tolerance(units=16, worst=1.9),
     "whole.crop": Tolerance(units=10, worst=1.2),
     "whole.invisible": Tolerance(units=1, worst=0),
     "whole.mirror": Tolerance(units=80, worst=7.8),
