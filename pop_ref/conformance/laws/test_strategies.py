@@ -118,13 +118,18 @@ READINGS = (
     ("pop", {"lambda_entropy": 0.25, **SCREEN}, {}),
     ("gsplat", {**SCREEN, "inclusive": True, "pause_refine_after_reset": 3}, {"cameras": 2, "packed": True}),
     ("gsplat", {"sh_rest_every": 3, "edits_replace_update": True, "revised_opacity": True}, {}),
+    ("gsplat", {"prune_opa": 0.3, "prune_too_big": False}, {"steps": EVERY_STEP[:14]}),
+    ("mini-splatting", {"importance": "outdoor", "max_gaussians": 40}, {"cameras": 2}),
+    ("taming", {"final_count": 30, "misaligned_prune_weights": False}, {"packed": True}),
 )
 
 
 @law("training", "scripted_steps", "method_settings")
 def test_a_training_is_the_oracles_under_every_reading(backend):
     for seed, (method, settings, more) in enumerate(READINGS):
-        _assert_the_oracles(backend, _script(method, settings=settings, seed=seed, steps=EVERY_STEP[:34], **more))
+        _assert_the_oracles(
+            backend, _script(method, settings=settings, seed=seed, **{"steps": EVERY_STEP[:34], **more})
+        )
 
 
 @law("training", "scripted_steps", "method_settings")
