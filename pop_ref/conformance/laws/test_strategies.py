@@ -90,7 +90,10 @@ def _method(method):
     def sentence(backend):
         happened = _assert_the_oracles(backend, _script(method))
         happened |= _assert_the_oracles(
-            backend, _script(method, cameras=2, packed=True, seed=1, scene_scale=4.0, settings={"absgrad": True})
+            backend,
+            _script(
+                method, cameras=2, packed=True, seed=1, scene_scale=4.0, settings={"absgrad": True, "grow_grad2d": 1.0}
+            ),
         )
         # a training in which nothing happens would say nothing
         wanted = {
