@@ -61,6 +61,17 @@ def made_by(path: str) -> Adapter:
     return made
 
 
+def strategy_named(path: str, dtype: str = "float32") -> Any:
+    """Return the adapter of somebody's density strategy, the class or function that makes it at `my.module:Mine`."""
+    make = function_named(path)
+    try:
+        from pop_ref.conformance.torch_strategy import StrategyAdapter
+
+        return StrategyAdapter(path, make, dtype)
+    except ModuleNotFoundError as error:
+        raise Unavailable(f"{path} needs {error.name}, which is not installed") from error
+
+
 def shipped(name: str) -> Any:
     """Return the adapter of that name.
 

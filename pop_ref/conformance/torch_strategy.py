@@ -54,7 +54,8 @@ def drive(strategy: Any, script: Script, rows: Any, trainer: Trainer, dtype: Any
     Returns:
         Of every step what `pop_ref.methods.scripted_steps` returns, as tensors, and besides: whether each parameter
         is trained and of which type ("trainable", "dtypes"), whether its optimizer holds it and nothing else ("held"),
-        and whether the strategy left all bits as they were ("unmoved") and all counters ("counted").
+        which parameters the strategy has "moved", whether it adds noise to the centres at every step ("noisy", which
+        who has a `noise_lr` does, as gsplat's MCMC), and whether it left all counters as they were ("counted").
     """
     params, optimizers = population(rows, trainer.optimizers, dtype)
     if hasattr(strategy, "check_sanity"):
@@ -82,9 +83,15 @@ def population(rows: Any, make: Callable[[dict[str, Any]], dict[str, Any]], dtyp
 
 
 def _first_state(strategy: Any, script: Script) -> dict[str, Any]:
-    offered = inspect.signature(strategy.initialize_state).parameters
     asked = {"scene_scale": script.scene_scale, "count": script.n}
-    return strategy.initialize_state(**{name: value for name, value in asked.items() if name in offered})
+    return strategy.initialize_state(**_known(strategy.initialize_state, asked))
+
+
+def _known(function: Callable[..., Any], options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options that a function takes."""
+    parameters = inspect.signature(function).parameters
+    takes_any = any(each.kind is each.VAR_KEYWORD for each in parameters.values())
+    return {name: value for name, value in options.items() if takes_any or name in parameters}
 
 
 def _taken(
@@ -114,11 +121,12 @@ def _taken(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(step)
         done = _looked(strategy, script, trainer, (params, optimizers, state), step, info)
-    unmoved = all(len(before[key]) == len(params[key]) and torch.equal(before[key], params[key]) for key in KEYS)
+    same = [key for key in KEYS if len(before[key]) == len(params[key]) and torch.equal(before[key], params[key])]
     return _recorded(params, optimizers) | {
         "term": 0.0 if term is None else float(term.detach()),
         "done": done,
-        "unmoved": unmoved,
+        "moved": [key for key in KEYS if key not in same],
+        "noisy": bool(getattr(strategy, "noise_lr", 0.0)),
         "counted": counted == _counters(params, optimizers),
     }
 
@@ -130,9 +138,8 @@ def _looked(
     params, optimizers, state = of
     if not hasattr(strategy, "collect"):
         # gsplat's strategies take what they need: MCMC the rate of the means, and no word of packed rows
-        offered = inspect.signature(strategy.step_post_backward).parameters
         more = {"packed": script.packed, "lr": optimizers["means"].param_groups[0]["lr"]}
-        more = {name: value for name, value in more.items() if name in offered}
+        more = _known(strategy.step_post_backward, more)
         strategy.step_post_backward(params, optimizers, state, step, info, **more)
         return {}
     strategy.collect(params, state, step, info, script.packed)
@@ -278,8 +285,7 @@ class StrategyAdapter(Adapter):
 
     def scripted_steps(self, script: Script, rows: Any) -> list[dict[str, Any]]:
         """Take the strategy through a script from these rows, with torch's own Adam."""
-        known = inspect.signature(self._make).parameters
-        strategy = self._make(**{name: value for name, value in script.settings.items() if name in known})
+        strategy = self._make(**_known(self._make, script.settings))
 
         def optimizers(params: dict[str, Any]) -> dict[str, Any]:
             rates = script.lr.by_parameter()
