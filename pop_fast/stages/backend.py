@@ -23,7 +23,7 @@ class TorchBackend(BaseBackend):
 
     def open_view(self, pass_input: Any) -> Any:
         """Project and list a view for passes over it."""
-        from pop_fast.stages.passes import view_of
+        from pop_fast.stages.stage_set import view_of
 
         return view_of(pass_input, self.stages())
 
