@@ -139,7 +139,7 @@ def program(name: str, package: str, backend: str, dtype: str) -> Any:
     trains = training_stages(package)
     if backend == "compiled" and dtype == "float32":
         # what trains in this precision is the native step, which has an Adam of its own
-        native = importlib.import_module(f"{package}.compiled.optimizer")
+        native = importlib.import_module(f"{package}.compiled.native_step")
         trains |= {name: getattr(native, name) for name in ("adam_step", "adam_steps")}
     return TorchAdapter(name, rasterization, stages, dtype, stages=trains)
 

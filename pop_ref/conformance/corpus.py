@@ -76,13 +76,13 @@ PLANS: Final[dict[str, Plan]] = {
     "five_thousand": Plan(5000, 200, 120, 4, (0.75, 4.0), (0.02, 0.95), 0, (5.0, -1.0, 0.5, 1.0), 1.0),
     "hundreds_of_tiles_a_splat": Plan(50, 121, 90, 4, (8.0, 30.0), (0.02, 0.9), 0, (3.0, -1.0, 1.0, 2.0), 1.0),
     "far_and_huge": Plan(
-        40, 521, 37, 4, (8.0, 450.0), (0.05, 0.6), 0, (1.0, 0.25, -0.5, 0.25), 1.0, depths=(1.5, 3000.0), beyond=260.0
+        16, 521, 37, 4, (8.0, 450.0), (0.05, 0.6), 0, (1.0, 0.25, -0.5, 0.25), 1.0, depths=(1.5, 3000.0), beyond=260.0
     ),
     "near_equal_depths": Plan(
         400, 64, 48, 16, (1.0, 4.0), (0.1, 0.8), 0, (1.0, 0.5, 0.25, -0.5), 1.0, depths=(0.5, 500.0), apart=4e-5
     ),
     "ten_thousand_in_a_tile": Plan(
-        10_000, 17, 16, 16, (0.05, 0.4), (0.006, 0.03), 0, (1.0, 0.0, 1.0, 0.5), without=_DECIDED
+        10_000, 16, 15, 16, (0.05, 0.4), (0.006, 0.03), 0, (1.0, 0.0, 1.0, 0.5), without=_DECIDED, beyond=0.25
     ),
     "seventy_thousand": Plan(70_000, 521, 259, 4, (0.2, 1.2), (0.05, 0.9), 0, (1.0, -0.25, 0.5, 0.25), beyond=1.5),
     "fifty_of_inria": Plan(
@@ -103,8 +103,8 @@ def _depths(plan: Plan) -> np.ndarray:
     """Return depths of which no two are so close to each other that rounding could exchange them."""
     low, high = plan.depths
     n = plan.n // 2 if plan.apart else plan.n
-    share = (np.mod(np.arange(n) * _stride(n), n) + 0.5) / n
-    found = _between(low, high, share) if high < 10.0 * low else low * (high / low) ** share
+    place = np.mod(np.arange(n) * _stride(n), n) + 0.5
+    found = low + (high - low) * place / n if high < 10.0 * low else low * (high / low) ** (place / n)
     if plan.apart:
         # of a pair the first in memory is as often the farther one
         farther = np.where(np.arange(n) % 2 == 0, plan.apart, -plan.apart)

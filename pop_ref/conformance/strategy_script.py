@@ -14,7 +14,8 @@ import numpy as np
 
 from pop_ref.contributions import Contributions
 from pop_ref.density_rows import Rows
-from pop_ref.methods import KEYS, RECIPE_OF, Pass, ScriptedView
+from pop_ref.methods import KEYS, RECIPE_OF
+from pop_ref.scripted import Pass, ScriptedView
 from pop_ref.settings import LearningRates
 
 # the kit's names of the methods whose every step it knows

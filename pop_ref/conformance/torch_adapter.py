@@ -31,7 +31,7 @@ from pop_ref.conformance.capabilities import (
 )
 from pop_ref.conformance.cases import BY_NAME, Case
 from pop_ref.conformance.scenes import Scene
-from pop_ref.conformance.torch_autograd import Ask, Differentiated, differentiate
+from pop_ref.conformance.torch_autograd import Ask, Differentiated, differentiated
 from pop_ref.constants import PAPER, Profile
 
 # arguments at the values by which a rasterizer that lacks them draws
@@ -217,25 +217,12 @@ class TorchAdapter(Adapter):
     def differentiate(self, scene: Scene, v_image: Any, v_T_final: Any, ask: Ask) -> Differentiated:
         """Draw a scene and pull cotangents back in an order of passes, and of arguments in a layout, as it is asked."""
 
-        def draw(arguments: dict[str, Any]) -> tuple[Any, Any]:
-            image, alphas, _ = self._call(scene, arguments, dominance=False, counts=False)
+        def draw(of: Scene, arguments: dict[str, Any]) -> tuple[Any, Any]:
+            image, alphas, _ = self._call(of, arguments, dominance=False, counts=False)
             return image, alphas
 
-        def other() -> Any:
-            smaller = scene.rows(np.arange(len(scene.gaussians) // 2))
-            return draw(self._leaves(smaller, grad=True))
-
-        H, W = scene.camera.height, scene.camera.width
-        v_image, v_alpha = self._tensor(v_image).reshape(1, H, W, -1), -self._tensor(v_T_final).reshape(1, H, W, 1)
-        found = differentiate(draw, self._leaves(scene, grad=False), other, v_image, v_alpha, ask)
-        shapes = {"viewmat": (4, 4), "background": (-1,)}
-        gradients = {
-            name: None if value is None else self._array(value).reshape(shapes.get(name, value.shape))
-            for name, value in found.gradients.items()
-            if name not in self._without
-        }
-        image, still = (None if each is None else self._array(each) for each in found.image)
-        return dataclasses.replace(found, gradients=gradients, image=(image, still))
+        arrays = (self._tensor(v_image), self._tensor(v_T_final))
+        return differentiated(scene, draw, self._leaves, arrays, ask, self._without)
 
     def _drawn(self, scene: Scene, dominance: bool, counts: bool, grad: bool = False) -> View:
         leaves = self._leaves(scene, grad)

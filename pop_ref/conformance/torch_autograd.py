@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+
+from pop_ref.conformance.scenes import Scene
 
 NAMES: Final = ("means", "quats", "scales", "opacities", "sh", "viewmat", "background")
 # how a tensor may lie in memory beside densely from its beginning
@@ -53,12 +55,12 @@ class Differentiated:
         image: the image, and the one drawn without gradients.
     """
 
-    gradients: dict[str, np.ndarray | None]
+    gradients: dict[str, Any]
     others: tuple[str, ...]
     changed: tuple[str, ...]
     refused: str
     follows: tuple[bool, bool]
-    image: tuple[np.ndarray, np.ndarray | None]
+    image: tuple[Any, Any]
 
 
 class Laid:
@@ -99,7 +101,47 @@ class Laid:
         return None if self.base.grad is None else self._of(self.base.grad)
 
 
-def differentiate(
+def differentiated(
+    scene: Scene,
+    draw: Callable[[Scene, dict[str, Any]], Sequence[Any]],
+    leaves: Callable[[Scene, bool], dict[str, Any]],
+    cotangents: tuple[Any, Any],
+    ask: Ask,
+    without: Sequence[str] = (),
+) -> Differentiated:
+    """Draw a scene and go back as it is asked.
+
+    Args:
+        scene: with one camera.
+        draw: given a scene and its arguments by name, an image and alphas.
+        leaves: the arguments of a scene by name, which require gradients or not.
+        cotangents: of the image and of the remaining transmittance. [H, W, 3], [H, W]
+        ask: how.
+        without: names of gradients that the program does not offer.
+    """
+
+    def other() -> Any:
+        smaller = scene.rows(np.arange(len(scene.gaussians) // 2))
+        return draw(smaller, leaves(smaller, True))
+
+    H, W = scene.camera.height, scene.camera.width
+    v_image, v_alpha = cotangents[0].reshape(1, H, W, -1), -cotangents[1].reshape(1, H, W, 1)
+    found = _differentiate(lambda given: draw(scene, given), leaves(scene, False), other, v_image, v_alpha, ask)
+    shapes = {"viewmat": (4, 4), "background": (-1,)}
+    gradients = {
+        name: None if value is None else _array(value).reshape(shapes.get(name, tuple(value.shape)))
+        for name, value in found.gradients.items()
+        if name not in without
+    }
+    image, still = (None if each is None else _array(each) for each in found.image)
+    return replace(found, gradients=gradients, image=(image, still))
+
+
+def _array(tensor: Any) -> Any:
+    return tensor.detach().cpu().numpy().astype(np.float64)
+
+
+def _differentiate(
     draw: Callable[[dict[str, Any]], Sequence[Any]],
     values: dict[str, Any],
     other: Callable[[], Any],

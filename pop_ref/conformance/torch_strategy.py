@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from pop_ref.conformance.adapter import Adapter
-from pop_ref.conformance.strategy_script import Script, ScriptedView
+from pop_ref.conformance.strategy_script import Script
 from pop_ref.methods import COUNTER, KEYS
+from pop_ref.scripted import ScriptedView
 from pop_ref.settings import BETAS, EPS
 
 # what a strategy changed: parameters and optimizers, as they are

@@ -56,9 +56,8 @@ def _returned(change: Callable[[Any, Any, dict[str, Any]], tuple[Any, Any]]) -> 
 
 def _function(forward: Callable[..., Any], backward: Callable[..., Any]) -> Callable[..., Any]:
     """Return an autograd function of these two, which take the context first."""
-    made = type("Broken", (_torch().autograd.Function,), {
-        "forward": staticmethod(forward), "backward": staticmethod(backward)})  # fmt: skip
-    return made.apply
+    body = {"forward": staticmethod(forward), "backward": staticmethod(backward)}
+    return type("Broken", (_torch().autograd.Function,), body).apply
 
 
 def _nowhere_unless(all_of: tuple[str, ...], dropped: tuple[str, ...]) -> Callable[[dict[str, Any]], dict[str, Any]]:
@@ -139,7 +138,6 @@ _WORKSPACE: dict[str, Any] = {}
 
 def _one_workspace(sound: Rasterization, given: dict[str, Any]) -> Any:
     """Go back through what the last forward pass has left, whoever asks."""
-    image, alphas, meta = sound(**given)
     _WORKSPACE["opacities"] = given["opacities"].detach().clone()
 
     def backward(ctx: Any, v: Any) -> Any:
@@ -150,8 +148,7 @@ def _one_workspace(sound: Rasterization, given: dict[str, Any]) -> Any:
         return found
 
     own = _function(lambda ctx, x: x.clone(), backward)(given["opacities"])
-    image, alphas, meta = sound(**given | {"opacities": own})
-    return image, alphas, meta
+    return sound(**given | {"opacities": own})
 
 
 def _freed_after_use(image: Any, alphas: Any, given: dict[str, Any]) -> tuple[Any, Any]:
@@ -284,10 +281,7 @@ def _order_in_steps(steps: int, farthest: float) -> Callable[[dict[str, Any]], d
         shift = (wanted / depths)[:, None]
         centre = -(view[:3, :3].T @ view[:3, 3])
         # along the ray of the pixel, with the size that it has there
-        return {
-            "means": centre + (given["means"] - centre) * shift,
-            "scales": given["scales"] * shift,
-        }
+        return {"means": centre + (given["means"] - centre) * shift, "scales": given["scales"] * shift}
 
     return change
 
@@ -450,5 +444,5 @@ _SEEN_IN_LOSSES: Final = (
 
 SEAMS: Final = (
     *(BlackBox(*line) for line in (*_AUTOGRAD, *_SCALE)),
-    *(Loss(*line) for line in _SEEN_IN_LOSSES),
+    *(Loss(*line) for line in list[Any](_SEEN_IN_LOSSES)),
 )
