@@ -344,9 +344,7 @@ def test_a_training_in_the_page_takes_the_oracles_steps() -> None:
         v_params = params_vjp(rows.params, gradients, v_prior)
         now = {name: rate * 0.1 ** (step / n_steps) for name, rate in rates.items()}
         rows = Rows(*adam_step(rows.params, v_params, rows.m, rows.v, step, now))
-        window = accumulate(
-            window, gradients.means2d, drawn.splats.visible, drawn.dominant_counts, size, size, config
-        )
+        window = accumulate(window, gradients.means2d, drawn.splats.visible, drawn.dominant_counts, size, size, config)
         if step % every == 0 and step <= until:
             scales = np.exp(rows.params["scales"])
             clone, split = grow_masks(window, scales, 3.0, step, config)
