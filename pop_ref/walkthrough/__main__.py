@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib.util
 import os
+import shutil
+import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from pop_ref.walkthrough.browser import BrowserError, chromium, print_pdf
-from pop_ref.walkthrough.cells import (
+from pop_ref.walkthrough.builder.chapter import (
     Chapter,
     ChapterError,
     chapter_files,
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from pop_ref.walkthrough.pages import Outcome
 
 # the mistakes that readers look for are judged by the kit, which needs hypothesis
-_NEEDED = (
+_NEEDED: Final = (
     "matplotlib",
     "markdown_it",
     "mdit_py_plugins",
@@ -34,11 +35,25 @@ _NEEDED = (
     "pygments",
     "hypothesis",
 )
-# what `--all` writes into the folder of the pages, and what the contents calls it
-NOTEBOOKS: Final = "notebooks"
-SLIDES: Final = "slides.html"
-BOOK: Final = "walkthrough.pdf"
-
+_BROWSERS: Final = (
+    "chromium",
+    "chromium-browser",
+    "google-chrome",
+    "google-chrome-stable",
+    "chrome",
+)
+# inside a container Chromium may neither make its sandbox nor rely on /dev/shm
+CHROMIUM_OPTIONS: Final = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-dev-shm-usage",
+    "--hide-scrollbars",
+    "--no-first-run",
+    "--disable-extensions",
+    "--disable-background-networking",
+    "--force-color-profile=srgb",
+)
 _EXAMPLES: Final = """examples:
   python -m pop_ref.walkthrough out/walkthrough                  pages
   python -m pop_ref.walkthrough --notebooks out/notebooks        Jupyter notebooks, which run anew
@@ -48,15 +63,8 @@ _EXAMPLES: Final = """examples:
 """
 
 
-@dataclass(frozen=True)
-class Wanted:
-    """What to write and where, None for nothing; `only` these chapters, None for all."""
-
-    pages: Path | None = None
-    notebooks: Path | None = None
-    slides: Path | None = None
-    pdf: Path | None = None
-    only: list[str] | None = None
+class BrowserError(Exception):
+    """There is no Chromium, or it wrote nothing; the message says what to do."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -68,7 +76,7 @@ def main(arguments: list[str] | None = None) -> int:
     Returns:
         The exit status: 0, or 2 with one line on stderr.
     """
-    wanted = _parsed(arguments)
+    wanted = _wanted(arguments)
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         print(
@@ -84,7 +92,7 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def _parsed(arguments: list[str] | None) -> Wanted:
+def _wanted(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m pop_ref.walkthrough",
         description="Write the walk-through.",
@@ -97,25 +105,20 @@ def _parsed(arguments: list[str] | None) -> Wanted:
     parser.add_argument(
         "--notebooks", type=Path, metavar="DIR", help="write one notebook a chapter"
     )
-    parser.add_argument(
-        "--slides",
-        type=Path,
-        metavar="FILE",
-        help="write the lecture, chapters 0 1 2 4 5 8",
-    )
+    parser.add_argument("--slides", type=Path, metavar="FILE", help="write the lecture")
     parser.add_argument(
         "--pdf",
         type=Path,
         metavar="FILE",
         help="print all chapters; needs Chromium or Chrome",
     )
+    also = "write the other forms into the folder too; the PDF where there is a Chromium"
+    parser.add_argument("--all", action="store_true", help=also)
     parser.add_argument(
-        "--all",
-        action="store_true",
-        help="write the other forms into the folder too; the PDF where there is a Chromium",
-    )
-    parser.add_argument(
-        "--only", nargs="+", metavar="N", help="run these chapters only, 4 or 4b"
+        "--only",
+        nargs="+",
+        metavar="N",
+        help="run these chapters only, 4 or 4b; no slides with --all",
     )
     given = parser.parse_args(arguments)
     if given.all and given.folder is None:
@@ -124,114 +127,100 @@ def _parsed(arguments: list[str] | None) -> Wanted:
         parser.error(
             "name the folder that the pages go to, or --notebooks, --slides or --pdf"
         )
-    beside = given.folder if given.all else None
-    return Wanted(
-        given.folder,
-        given.notebooks or (beside and beside / NOTEBOOKS),
-        given.slides or (beside and beside / SLIDES),
-        given.pdf or (beside and beside / BOOK if chromium() else None),
-        given.only,
-    )
+    if given.all:
+        given.notebooks = given.notebooks or given.folder / "notebooks"
+        given.slides = given.slides or (
+            None if given.only else given.folder / "slides.html"
+        )
+        given.pdf = given.pdf or (given.folder / "walkthrough.pdf" if chromium() else None)
+    return given
 
 
-def write(wanted: Wanted) -> None:
+def write(wanted: argparse.Namespace) -> None:
     """Write what is wanted; a chapter that several forms need is run once.
 
-    Where only some chapters are, the contents lists what can be read: while one chapter is being written, another may
-    be out of form.
+    Args:
+        wanted: `folder`, `notebooks`, `slides`, `pdf`: where each goes, None for nothing; `only`: numbers of chapters,
+            None for all. Where only some chapters are, the contents lists what can be read: while one chapter is being
+            written, another may be out of form.
 
     Raises:
         ChapterError: a chapter failed; pages of earlier chapters are written.
         BrowserError: the PDF cannot be printed.
     """
+    from pop_ref.walkthrough.builder import layout, notebooks, slides
+
+    only = wanted.only
     chapters = [
         read_chapter(path)
         for path in chapter_files()
-        if wanted.only is None or chapter_number(path) in wanted.only or _readable(path)
+        if not only or chapter_number(path) in only or _readable(path)
     ]
-    chosen = [
-        each for each in chapters if wanted.only is None or each.number in wanted.only
-    ]
-    for place in (wanted.slides, wanted.pdf):
-        if place is not None:
-            place.parent.mkdir(parents=True, exist_ok=True)
-    if wanted.notebooks is not None:
-        _write_notebooks(wanted.notebooks, chosen)
-    run = _once()
-    if wanted.pages is not None:
-        _write_pages(wanted, chosen, chapters, run)
-    if wanted.slides is not None:
-        from pop_ref.walkthrough.slides import LECTURE, deck
-
+    chosen = [each for each in chapters if not only or each.number in only]
+    if wanted.notebooks:
+        names = [notebooks.notebook_name(each) for each in chosen]
+        for chapter, name in zip(chosen, names, strict=True):
+            _write(wanted.notebooks / name, notebooks.notebook(chapter))
+        _write(wanted.notebooks / "index.html", layout.notebook_index(chosen, names))
+    if wanted.folder:
+        _write_pages(wanted, chosen, chapters)
+    if wanted.slides:
+        told = slides.read_slides(slides.FILE.read_text(encoding="utf-8"))
+        numbered = {each.number: each for each in chapters}
         _write(
             wanted.slides,
-            deck([(each, run(each)) for each in chosen if each.number in LECTURE]),
+            slides.deck(told, lambda number: (numbered[number], _run(numbered[number]))),
         )
-        print(f"open {wanted.slides}")
-    if wanted.pdf is not None:
-        _write_book(wanted.pdf, [(each, run(each)) for each in chosen])
-    if wanted.pages is not None:
-        print(f"open {wanted.pages / 'index.html'}")
-
-
-def _once() -> Callable[[Chapter], Sequence[Outcome]]:
-    from pop_ref.walkthrough.pages import run_chapter
-
-    ran: dict[str, Sequence[Outcome]] = {}
-
-    def run(chapter: Chapter) -> Sequence[Outcome]:
-        if chapter.number not in ran:
-            start = time.perf_counter()
-            ran[chapter.number] = run_chapter(chapter)
-            took = time.perf_counter() - start
-            print(f"{chapter.number:>3}  {chapter.title}  {took:.1f} s", flush=True)
-        return ran[chapter.number]
-
-    return run
+    if wanted.pdf:
+        _write(wanted.pdf, _printed(layout.book([(each, _run(each)) for each in chosen])))
+    opened = [wanted.folder and wanted.folder / "index.html", wanted.slides, wanted.pdf]
+    print("\n".join(f"open {each}" for each in opened if each))
+    if wanted.notebooks:
+        print(f"jupyter lab {wanted.notebooks}")
 
 
 def _write_pages(
-    wanted: Wanted,
-    chosen: Sequence[Chapter],
-    chapters: Sequence[Chapter],
-    run: Callable[[Chapter], Sequence[Outcome]],
+    wanted: argparse.Namespace, chosen: Sequence[Chapter], chapters: Sequence[Chapter]
 ) -> None:
-    from pop_ref.walkthrough.glossary import GLOSSARY_PAGE
-    from pop_ref.walkthrough.layout import chapter_page, glossary_page, index_page
+    from pop_ref.walkthrough.builder import glossary, layout, notebooks
 
-    folder = wanted.pages
-    assert folder is not None
+    folder: Path = wanted.folder
     folder.mkdir(parents=True, exist_ok=True)
-    for chapter in chosen:
-        _write(folder / chapter.page, chapter_page(chapter, run(chapter), chapters))
-    _write(folder / GLOSSARY_PAGE, glossary_page())
-    places = {"notebooks": wanted.notebooks, "slides": wanted.slides, "PDF": wanted.pdf}
+    forms = {
+        "notebooks": wanted.notebooks and wanted.notebooks / "index.html",
+        "slides": wanted.slides,
+        "PDF": wanted.pdf,
+    }
     beside = {
         name: place.relative_to(folder).as_posix()
-        for name, place in places.items()
-        if place is not None and place.is_relative_to(folder)
+        for name, place in forms.items()
+        if place and place.is_relative_to(folder)
     }
-    _write(folder / "index.html", index_page(chapters, beside))
+    for chapter in chosen:
+        near = (
+            f"{Path(beside['notebooks']).parent}/{notebooks.notebook_name(chapter)}"
+            if "notebooks" in beside
+            else None
+        )
+        _write(
+            folder / chapter.page,
+            layout.chapter_page(chapter, _run(chapter), chapters, near),
+        )
+    _write(folder / glossary.GLOSSARY_PAGE, layout.glossary_page())
+    _write(folder / "index.html", layout.index_page(chapters, beside))
 
 
-def _write_notebooks(folder: Path, chapters: Sequence[Chapter]) -> None:
-    from pop_ref.walkthrough.notebooks import notebook, notebook_index, notebook_name
+@functools.cache
+def _run(chapter: Chapter) -> Sequence[Outcome]:
+    from pop_ref.walkthrough.pages import run_chapter
 
-    folder.mkdir(parents=True, exist_ok=True)
-    for chapter in chapters:
-        _write(folder / notebook_name(chapter), notebook(chapter))
-    _write(folder / "index.html", notebook_index(chapters))
-    print(f"jupyter lab {folder}")
-
-
-def _write_book(pdf: Path, told: Sequence[tuple[Chapter, Sequence[Outcome]]]) -> None:
-    from pop_ref.walkthrough.printed import book
-
-    with tempfile.TemporaryDirectory() as folder:
-        page = Path(folder) / "book.html"
-        page.write_text(book(told), encoding="utf-8")
-        print_pdf(page, pdf)
-    print(f"open {pdf}")
+    start = time.perf_counter()
+    outcomes = run_chapter(chapter)
+    print(
+        f"{chapter.number:>3}  {chapter.title}  {time.perf_counter() - start:.1f} s",
+        flush=True,
+    )
+    return outcomes
 
 
 def _readable(path: Path) -> bool:
@@ -242,10 +231,46 @@ def _readable(path: Path) -> bool:
     return True
 
 
-def _write(path: Path, text: str) -> None:
-    beside = path.with_name(f".{path.name}.partial")
-    beside.write_text(text, encoding="utf-8")
-    os.replace(beside, path)
+def chromium() -> str | None:
+    """Find the browser's program: the environment's `CHROMIUM`, or one of its usual names on the path."""
+    wanted = os.environ.get("CHROMIUM")
+    if wanted:
+        return shutil.which(wanted)
+    return next((found for name in _BROWSERS if (found := shutil.which(name))), None)
+
+
+def _printed(page: str) -> bytes:
+    """Print a page to PDF.
+
+    Raises:
+        BrowserError: there is no Chromium, or it printed nothing.
+    """
+    program = chromium()
+    if program is None:
+        raise BrowserError(
+            "a PDF needs Chromium or Chrome: install it (apt install chromium) or set CHROMIUM to its path"
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        source, printed = Path(folder) / "book.html", Path(folder) / "printed.pdf"
+        source.write_text(page, encoding="utf-8")
+        to = [
+            f"--user-data-dir={folder}/profile",
+            "--no-pdf-header-footer",
+            f"--print-to-pdf={printed}",
+        ]
+        command = [program, *CHROMIUM_OPTIONS, *to, source.as_uri()]
+        done = subprocess.run(command, capture_output=True, text=True)
+        if not printed.exists():
+            why = f"(exit status {done.returncode}): {done.stderr.strip()[-400:]}"
+            raise BrowserError(f"{program} printed nothing {why}")
+        return printed.read_bytes()
+
+
+def _write(path: Path, what: str | bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_bytes(what.encode() if isinstance(what, str) else what)
+    os.replace(partial, path)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pop_ref.conformance.mutants import MUTANTS, Mutant
 from pop_ref.conformance.mutants.trial import killed_by, sound
-from pop_ref.walkthrough.docstrings import without_docstring
+from pop_ref.walkthrough.builder.chapter import without_docstring
 
 
 def bug_named(name: str) -> Mutant:

@@ -25,7 +25,7 @@ from matplotlib.patches import FancyBboxPatch
 from pop_fast.data import load_capture
 from pop_fast.demo import make_demo
 from pop_ref.learn import splat
-from pop_ref.walkthrough.glossary import STAGES, shapes
+from pop_ref.walkthrough.builder.glossary import STAGES, shapes
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, INK, MUTED, SECOND, axes, show_image
 
@@ -154,10 +154,10 @@ picture(
 #    This is the *gradient*. That it can be computed, for all numbers at once, is the heart of the method.
 # 4. **Step**: change each number a little in the direction that lowers the loss.
 #
-# Here the loop runs in front of you, in this page: three balls on a chequered floor, photographed from 24 sides at 64 by
-# 64 pixels, and 300 grey Gaussians that know nothing yet. Left is the method of 2023, right the same with the prior that
-# this walk-through is about; both are explained later. The numbers under a picture say how like the photograph it is
-# (PSNR, in decibels; larger is better) and how opaque the Gaussians are.
+# Here the loop runs in front of you, in this page: three balls on a chequered floor, photographed from 24 sides at 64
+# by 64 pixels, and 300 grey Gaussians that know nothing yet. Right is the same training with the prior that this
+# walk-through is about; it is explained later. The numbers under a picture say how like the photograph it is (PSNR, in
+# decibels; larger is better) and how opaque the Gaussians are.
 #
 # {{widget: train}}
 #

@@ -405,7 +405,7 @@ for camera in cameras:
 
 # %% [markdown]
 # And in three dimensions: the toy of chapter 0 once more, trained in this page. Train it to the end. Then change
-# $\lambda_{\mathrm{pop}}$, or $\theta$ of chapter 7, and start again.
+# $\lambda_{\mathrm{POP}}$, or $\theta$ of chapter 7, and start again.
 #
 # {{widget: train}}
 

@@ -15,11 +15,17 @@ from pop_ref.constants import DECISIONS, KINKS
 from pop_ref.notation import AXES, SYMBOLS
 from pop_ref.walkthrough import widgets
 from pop_ref.walkthrough.__main__ import main
-from pop_ref.walkthrough.cells import TIERS, ChapterError, read_chapter
-from pop_ref.walkthrough.docstrings import as_wide_as_a_page
-from pop_ref.walkthrough.folding import Part, parts, said_and_done
-from pop_ref.walkthrough.glossary import GLOSSARY_PAGE, TERMS, Term
-from pop_ref.walkthrough.layout import chapter_page, index_page
+from pop_ref.walkthrough.builder.chapter import (
+    TIERS,
+    ChapterError,
+    Part,
+    as_wide_as_a_page,
+    parts,
+    read_chapter,
+    said_and_done,
+)
+from pop_ref.walkthrough.builder.glossary import GLOSSARY_PAGE, TERMS, Term
+from pop_ref.walkthrough.builder.layout import chapter_page, index_page
 from pop_ref.walkthrough.pages import run_chapter
 from tests.walkthrough.ran import CHAPTERS, ran
 
@@ -82,7 +88,7 @@ def test_a_chapter_becomes_a_page(path: Path) -> None:
     every = [read_chapter(each) for each in CHAPTERS]
     page = chapter_page(chapter, outcomes, every)
     read = _read(page)
-    assert page.count("<summary>Answer</summary>") == chapter.n_exercises
+    assert page.count("<summary>Answer</summary>") == len(chapter.tiers)
     guessed = sum(tier in ("predict", "find the bug") for tier in chapter.tiers)
     assert page.count('<p class="guess" hidden>') == guessed
     assert read.tags.count("figure") == sum(len(outcome.pictures) for outcome in outcomes)

@@ -19,7 +19,7 @@ from pop_ref.learn.mistakes import MISTAKES
 from pop_ref.learn.progress import PASSED, WRITTEN, course_map, note_passed, picture, state
 from pop_ref.learn.student import borrowing, read_work
 from pop_ref.learn.telling import told
-from pop_ref.walkthrough.cells import chapter_files, chapter_number
+from pop_ref.walkthrough.builder.chapter import chapter_files, chapter_number
 
 ROOT = Path(__file__).resolve().parents[2]
 ORACLE = ROOT / "pop_ref"

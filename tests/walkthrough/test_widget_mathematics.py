@@ -244,7 +244,7 @@ def test_harmonics_and_their_colours() -> None:
 
 
 def _toy(seed: int, n: int, size: int) -> tuple[dict[str, np.ndarray], Camera]:
-    """Draw a scene with needles, discs, splats past the picture, behind the camera, under the floor, over the ceiling."""
+    """Draw a scene with needles and discs, splats past the picture, behind the camera, under the floor, too opaque."""
     rng = np.random.default_rng(seed)
     params = {
         "means": rng.uniform(-1.6, 1.6, (n, 3)),
@@ -313,48 +313,62 @@ def test_the_page_that_trains_draws_and_differentiates_as_the_oracle_does(seed: 
         _close(told["grads"][name], value, 1e-9, name)
 
 
+RATES = {"means": 4e-3, "quats": 1e-2, "scales": 1.5e-2, "opacities": 5e-2, "sh0": 2e-2}
+TRAINING = {"steps": 12, "lambda_pop": 0.05, "theta_blur": 0.02, "densify_every": 5, "densify_until": 10}
+
+
+def _oracles_training(
+    params: dict[str, np.ndarray],
+    cameras: list[Camera],
+    photographs: list[np.ndarray],
+    config: DensityConfig,
+    draw: Callable[[int], np.ndarray],
+) -> Rows:
+    """Take the steps that `TRAINING` names with the oracle's functions; no rule of density control stays idle."""
+    rows, window, n_steps = rows_from_params(params), zero_statistics(len(params["means"])), TRAINING["steps"]
+    happened = dict.fromkeys(("clone", "split", "blur", "prune"), 0)
+    for step in range(1, round(n_steps) + 1):
+        camera, gaussians = cameras[step % 3], gaussians_from_params(rows.params)
+        drawn = render(gaussians, camera, np.zeros(3))
+        v_image = losses.l2_vjp(drawn.image, photographs[step % 3], 1.0)
+        gradients = render_vjp(gaussians, camera, v_image, background=np.zeros(3))
+        v_prior = pop_loss_vjp(gaussians.opacities, drawn.dominant_counts > 0, TRAINING["lambda_pop"])
+        now = {name: rate * 0.1 ** (step / n_steps) for name, rate in RATES.items()}
+        grads = params_vjp(rows.params, gradients, v_prior)
+        rows = Rows(*adam_step(rows.params, grads, rows.m, rows.v, step, now))
+        size = (camera.width, camera.height)
+        window = accumulate(window, gradients.means2d, drawn.splats.visible, drawn.dominant_counts, *size, config)
+        if step % TRAINING["densify_every"] == 0 and step <= TRAINING["densify_until"]:
+            masks = grow_masks(window, np.exp(rows.params["scales"]), 3.0, step, config)
+            n_grown = len(rows) + int(np.sum(masks))
+            happened["clone"] += int(np.sum(masks[0]))
+            happened["split"] += int(np.sum(masks[1]))
+            happened["blur"] += int(np.sum(window.blurred))
+            rows, window = densify_and_prune(rows, window, 3.0, step, draw, config)
+            happened["prune"] += n_grown - len(rows)
+    assert min(happened.values()) > 0, happened
+    return rows
+
+
 def test_a_training_in_the_page_takes_the_oracles_steps() -> None:
     """Twelve steps, two of them densification steps, with every Gaussian's parameters and both moments compared."""
-    size, n_steps, every, until, n_normals = 20, 12, 5, 10, 3000
-    params, _ = _toy(1, 40, size)
+    params, _ = _toy(1, 40, 20)
     rng = np.random.default_rng(8)
     params["scales"] = rng.uniform(-4.2, -1.5, params["scales"].shape)
     params["opacities"] = rng.uniform(-5.6, 2.0, 40)
-    cameras = [Camera(*splat.orbit(angle, size)) for angle in (0.0, 1.0, 2.5)]
-    photographs = [splat.photograph((c.viewmat, c.K, size, size)) for c in cameras]
-    rates = {"means": 4e-3, "quats": 1e-2, "scales": 1.5e-2, "opacities": 5e-2, "sh0": 2e-2}
-    lambda_pop, theta, background = 0.05, 0.02, np.zeros(3)
-    normals = rng.standard_normal(n_normals)
-    config = DensityConfig(theta_blur=theta, refine_every=1, refine_start_iter=0, blur_start_iter=0, blur_stop_iter=99)
-
-    rows = rows_from_params(params)
-    window, at, told_of = zero_statistics(40), 0, {"clone": 0, "split": 0, "blur": 0, "prune": 0}
+    cameras = [Camera(*splat.orbit(angle, 20)) for angle in (0.0, 1.0, 2.5)]
+    photographs = [splat.photograph((c.viewmat, c.K, 20, 20)) for c in cameras]
+    config = DensityConfig(
+        theta_blur=TRAINING["theta_blur"], refine_every=1, refine_start_iter=0, blur_start_iter=0, blur_stop_iter=99
+    )
+    normals, at = rng.standard_normal(3000), 0
 
     def draw(n: int) -> np.ndarray:
         nonlocal at
         at += 6 * n
         return normals[at - 6 * n : at].reshape(2, n, 3)
 
-    for step in range(1, n_steps + 1):
-        camera, gaussians = cameras[step % 3], gaussians_from_params(rows.params)
-        drawn = render(gaussians, camera, background)
-        v_image = losses.l2_vjp(drawn.image, photographs[step % 3], 1.0)
-        gradients = render_vjp(gaussians, camera, v_image, background=background)
-        v_prior = pop_loss_vjp(gaussians.opacities, drawn.dominant_counts > 0, lambda_pop)
-        v_params = params_vjp(rows.params, gradients, v_prior)
-        now = {name: rate * 0.1 ** (step / n_steps) for name, rate in rates.items()}
-        rows = Rows(*adam_step(rows.params, v_params, rows.m, rows.v, step, now))
-        window = accumulate(window, gradients.means2d, drawn.splats.visible, drawn.dominant_counts, size, size, config)
-        if step % every == 0 and step <= until:
-            scales = np.exp(rows.params["scales"])
-            clone, split = grow_masks(window, scales, 3.0, step, config)
-            told_of["clone"] += int(np.sum(clone))
-            told_of["split"] += int(np.sum(split))
-            told_of["blur"] += int(np.sum(window.blurred))
-            told_of["prune"] += len(scales) + int(np.sum(clone)) + int(np.sum(split))
-            rows, window = densify_and_prune(rows, window, 3.0, step, draw, config)
-            told_of["prune"] -= len(rows)
-    assert min(told_of.values()) > 0, told_of
+    rows = _oracles_training(params, cameras, photographs, config, draw)
     told = _ran(
         """let at = 0;
         const state = new_training(typed(given.params));
@@ -368,16 +382,7 @@ def test_a_training_in_the_page_takes_the_oracles_steps() -> None:
         cameras=[_told(c) for c in cameras],
         photographs=[p.ravel().tolist() for p in photographs],
         normals=normals,
-        settings={
-            "steps": n_steps,
-            "rates": rates,
-            "lambda_pop": lambda_pop,
-            "theta_blur": theta,
-            "densify_every": every,
-            "densify_until": until,
-            "grow_grad2d": config.grow_grad2d,
-            "prune_opa": config.prune_opa,
-        },
+        settings={**TRAINING, "rates": RATES, "grow_grad2d": config.grow_grad2d, "prune_opa": config.prune_opa},
     )
     assert told["used"] == at
     for of, expected in (("params", rows.params), ("m", rows.m), ("v", rows.v)):

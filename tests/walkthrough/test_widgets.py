@@ -12,7 +12,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from pop_ref.walkthrough.cells import FOLDER
+from pop_ref.walkthrough.builder.layout import asset
 from pop_ref.walkthrough.widgets import FOLDER as WIDGET_FOLDER
 from pop_ref.walkthrough.widgets import WIDGETS, html
 from tests.walkthrough.chromium import WHY_NOT, Page, keep
@@ -30,7 +30,7 @@ def page() -> Iterator[Page]:
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("widgets")
-    style = (FOLDER / "page.css").read_text(encoding="utf-8")
+    style = asset("page.css")
     texts = {name: html(name) for name in NAMES} | {"all": "".join(html(name) for name in NAMES)}
     for name, text in texts.items():
         head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><style>{style}</style>'

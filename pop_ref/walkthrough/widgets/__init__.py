@@ -108,7 +108,13 @@ def _script(name: str, widget: Widget) -> str:
         f"for (const root of document.querySelectorAll('.pop-widget[data-widget=\"{name}\"][hidden]')) "
         f"{{ root.hidden = false; {name}(root); }}"
     )
-    parts = (mathematics(*widget.stages), _text("kit.js"), worker, _text(f"{name}.js"), start)
+    parts = (
+        mathematics(*widget.stages),
+        _text("kit.js"),
+        worker,
+        _text(f"{name}.js"),
+        start,
+    )
     return "(() => {\n" + "\n".join(part for part in parts if part) + "\n})();"
 
 

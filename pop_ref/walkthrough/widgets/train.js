@@ -22,7 +22,7 @@ function train(root) {
   const plot = kit.fit(kit.make(body, "div", { class: "pw-wide" }), 150, { "aria-label": "PSNR against steps" }, drawPlot);
   const sliders = kit.make(body, "div", { class: "pw-sliders pw-wide" });
   const log = { min: -4, max: -0.5, step: 0.25 };
-  kit.slider(sliders, { ...log, label: "weight of the prior, \u03bb_pop", value: -2, show: (x) => kit.small(10 ** x) }, (x) => { settings.lambda_pop = 10 ** x; });
+  kit.slider(sliders, { ...log, label: "weight of the prior, \u03bb_POP", value: -2, show: (x) => kit.small(10 ** x) }, (x) => { settings.lambda_pop = 10 ** x; });
   const share = (x) => (x >= 0 ? "off" : `${kit.number(100 * 10 ** x, 1)} % of the pixels`);
   kit.slider(sliders, { label: "blurred if it wins over \u03b8", min: -3, max: 0, step: 0.25, value: -2, show: share }, (x) => { settings.theta_blur = 10 ** x; });
   for (const [label, names] of [["places", ["means"]], ["widths and rotations", ["scales", "quats"]], ["opacities", ["opacities"]], ["colours", ["sh0"]]]) {
