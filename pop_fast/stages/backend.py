@@ -25,7 +25,7 @@ class TorchBackend(BaseBackend):
         """Project and list a view for passes over it."""
         from pop_fast.stages.passes import view_of
 
-        return view_of(of, self.stages())
+        return view_of(pass_input, self.stages())
 
     def make_engine(self, config: Any, own_strategy: bool) -> Any:
         """Return autograd over the stages, which knows every setting."""
