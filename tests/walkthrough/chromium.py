@@ -12,8 +12,8 @@ import tempfile
 from pathlib import Path
 from typing import Any, Self
 
-from pop_ref.walkthrough.__main__ import CHROMIUM_OPTIONS as OPTIONS
-from pop_ref.walkthrough.__main__ import chromium
+from pop_ref.walkthrough.builder.command import CHROMIUM_OPTIONS as OPTIONS
+from pop_ref.walkthrough.builder.command import chromium
 
 # where pictures are kept to be looked at
 SCREENSHOTS = os.environ.get("POP_SCREENSHOTS")

@@ -14,7 +14,6 @@ import pytest
 from pop_ref.constants import DECISIONS, KINKS
 from pop_ref.notation import AXES, SYMBOLS
 from pop_ref.walkthrough import widgets
-from pop_ref.walkthrough.__main__ import main
 from pop_ref.walkthrough.builder.chapter import (
     TIERS,
     ChapterError,
@@ -24,6 +23,7 @@ from pop_ref.walkthrough.builder.chapter import (
     read_chapter,
     said_and_done,
 )
+from pop_ref.walkthrough.builder.command import main
 from pop_ref.walkthrough.builder.glossary import GLOSSARY_PAGE, TERMS, Term
 from pop_ref.walkthrough.builder.layout import chapter_page, index_page
 from pop_ref.walkthrough.pages import run_chapter
@@ -390,7 +390,7 @@ def test_a_broken_chapter_ends_the_command_with_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / NAME).write_text(GOOD.replace("assert two == 2", "assert two == 3"), encoding="utf-8")
-    monkeypatch.setattr("pop_ref.walkthrough.__main__.chapter_files", lambda: [tmp_path / NAME])
+    monkeypatch.setattr("pop_ref.walkthrough.builder.command.chapter_files", lambda: [tmp_path / NAME])
     assert main([str(tmp_path / "pages")]) == 2
     assert capsys.readouterr().err.startswith("chapter_01_small.py:29: AssertionError")
     assert list((tmp_path / "pages").iterdir()) == []

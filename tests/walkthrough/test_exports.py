@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from pop_ref.walkthrough import __main__ as command
-from pop_ref.walkthrough.__main__ import main
+from pop_ref.walkthrough.builder import command
 from pop_ref.walkthrough.builder.chapter import Chapter, ChapterError, chapter_number, read_chapter
+from pop_ref.walkthrough.builder.command import main
 from pop_ref.walkthrough.builder.layout import book
 from pop_ref.walkthrough.builder.slides import FILE, chapters_of, deck, read_slides
 from pop_ref.walkthrough.pages import Outcome, run_chapter
