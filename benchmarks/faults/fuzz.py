@@ -22,8 +22,7 @@ from typing import Any
 
 import torch
 
-from pop_fast.cli.errors import describe
-from pop_fast.cli.printable import message
+from pop_fast.cli.errors import describe, message
 from pop_fast.errors import PopError
 
 from .corpus import HERE, pack

@@ -1,4 +1,4 @@
-"""Backends on the CPU: torch's stages, and the engine that trains by autograd over them."""
+"""The backend on the CPU that draws with torch."""
 
 from __future__ import annotations
 
@@ -23,15 +23,9 @@ class TorchBackend(BaseBackend):
 
     def open_view(self, pass_input: Any) -> Any:
         """Project and list a view for passes over it."""
-        from pop_fast.stages.passes import view_of
+        from pop_fast.stages.stage_set import view_of
 
         return view_of(pass_input, self.stages())
-
-    def make_engine(self, config: Any, own_strategy: bool) -> Any:
-        """Return autograd over the stages, which knows every setting."""
-        from pop_fast.train.engines import torch_engine
-
-        return torch_engine(self)
 
 
 FAST: Final = TorchBackend("fast", "cpu", ("float32", "float64"), speed=0)

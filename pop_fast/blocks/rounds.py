@@ -1,23 +1,33 @@
-"""What a block starts from in a round: the merged Gaussians of its core, and those of other cores that its views see.
+"""The rounds of a run in blocks: what a block starts from, the views that it draws, and its training among the others.
 
-The first are trained, the others held fixed. Who sees what is found once, by projecting every Gaussian into the
-block's views: those that no view shows take no part in any of the round's renders, and are not held in memory. Merged
-Gaussians are read one core at a time.
+A block starts from the merged Gaussians of its core, which are trained, and those of other cores that its views see,
+which are held fixed. Which Gaussians a view sees is computed once, by projecting every Gaussian into the block's views:
+those that no view shows take no part in any of the round's renders, and are not held in memory. Merged Gaussians are
+read one core at a time.
+
+A block's own views are those that see most of its core. Others show it too, behind or next to what they look at, and
+how it looks from there no training has corrected. So each round draws other views among all that show the core, and
+holds no more photographs than the block's own training did. The cameras of all views are those of all blocks' lists,
+because every training view stands in one core; the capture's own list is not read again.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from pop_fast.blocks.parts import block_folder, core_of, marker_of
+from pop_fast.blocks.jobs import block_folder, core_of, marker_of
 from pop_fast.blocks.plan import read_plan
-from pop_fast.data.capture import View
+from pop_fast.data.block import find_block, read_block, write_block
+from pop_fast.data.capture import Capture, View
+from pop_fast.data.load import load_capture
+from pop_fast.data.random_points import in_picture
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.read_back import read_json
@@ -25,9 +35,12 @@ from pop_fast.stages.activations import opacities_from_logits, scales_from_log_s
 from pop_fast.stages.splatting import ProjectionSettings, covariances, project
 from pop_fast.train.checkpoint import load_splats
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.engines import engine_of
+from pop_fast.train.environment import keep_freed_memory
+from pop_fast.train.fixed_rows import hold_last
+from pop_fast.train.load_result import CaptureRecord
 from pop_fast.train.model import KEYS
-
-__all__ = ["Start", "check_merged", "own_of", "read_core", "read_start", "shown_in", "write_counts"]
+from pop_fast.train.training_run import TrainingRun
 
 # Gaussians that are projected at a time: some 20 MB
 _AT_A_TIME = 65_536
@@ -165,3 +178,75 @@ def own_of(folder: Path, name: str, number: int) -> dict[str, int]:
     if not isinstance(found, dict) or any(type(found.get(key)) is not int for key in ("own", "fixed", "merged")):
         raise PopError(f"{path}: is not what 'pop blocks train' writes; {fix}")
     return found
+
+
+def prepare(
+    config: TrainConfig,
+    capture: Capture,
+    start: Start,
+    *,
+    resume: bool = False,
+    loading_seconds: float = 0.0,
+    beside: Mapping[str, str] | None = None,
+) -> TrainingRun:
+    """Prepare the training of a block in a round.
+
+    Args:
+        config: its settings, of `pop_fast.train.refining`, with a backend's name.
+        capture: the block's photographs.
+        start: what it begins with.
+        resume: continue from the latest checkpoint of `config.result_dir`, or start where there is none.
+        loading_seconds: how long reading took, for the statistics.
+        beside: texts to write beside cfg.json, by file name.
+    """
+    keep_freed_memory()
+    engine = hold_last(engine_of(config), start.fixed)
+    how = {"resume": resume, "loading_seconds": loading_seconds, "beside": beside}
+    return TrainingRun(config, capture, initial=start.params, engine=engine, **how)
+
+
+# of the Gaussians of a core, what a view must have in its picture to be drawn: fewer are strays
+_SHOWN = 0.01
+
+
+def write_round_block(
+    folder: Path, config: TrainConfig, record: CaptureRecord, names: list[str], name: str, number: int, core: np.ndarray
+) -> None:
+    """Draw the views of a block for a round and write their list, unless that is there already.
+
+    Args:
+        folder: the run's.
+        config: its settings; the seed is read, and how photographs are.
+        record: how the capture is read.
+        names: of all blocks.
+        name: of this one.
+        number: of the round, from 1.
+        core: centres of the Gaussians in its core, in the training frame. [N, 3]
+
+    Raises:
+        CaptureError: a block's list is damaged.
+    """
+    place = block_folder(folder, name, number)
+    if find_block(place):
+        return
+    listings = {other: read_block(block_folder(folder, other)) for other in names}
+    own = listings[name]
+    shots = {shot.name: shot for each in listings.values() for shot in each.shots if shot.split == "train"}
+    cameras = load_capture(
+        block_folder(folder, name),
+        factor=config.factor,
+        normalize=config.normalize,
+        masks=record.masks,
+        missing=record.missing,
+        images=record.images,
+        resize=config.resize,
+        photographs="none",
+        listing=replace(own, shots=list(shots.values())),
+    )
+    points = core.astype(np.float64)
+    showing = [view.name for view in cameras.views if in_picture(points, view).mean() >= _SHOWN] if len(core) else []
+    had = [shot for shot in own.shots if shot.split == "train"]
+    draw = np.random.default_rng([config.seed, number, names.index(name)])
+    drawn = draw.permutation(len(showing))[: len(had)]
+    chosen = [shots[showing[index]] for index in sorted(drawn)] or had
+    write_block(place, replace(own, shots=[*chosen, *(shot for shot in own.shots if shot.split == "test")]))
