@@ -88,8 +88,8 @@ def linked(start: list[str]) -> dict[str, str]:
     waiting = [target for path in start for target in targets((ROOT / path).read_text(encoding="utf-8"), path)]
     while waiting:
         path = waiting.pop()
-        elsewhere = path == "README.md" or path.startswith("docs/") or path.endswith(PICTURES) or CHAPTER.fullmatch(path)
-        if path in found or elsewhere:
+        elsewhere = path == "README.md" or path.startswith("docs/") or CHAPTER.fullmatch(path)
+        if path in found or elsewhere or path.endswith(PICTURES):
             continue
         found[path] = content(path)
         if path.endswith(".md"):

@@ -209,7 +209,6 @@ def expanded(text: str) -> str:
 
 
 def _expanded(name: str, argument: str, whole: str) -> str:
-    from pop_ref.walkthrough.bugs import broken_function
     from pop_ref.walkthrough.builder import glossary
 
     if name == "widget":
@@ -251,6 +250,25 @@ def source_of(path: str) -> tuple[str, str]:
         if isinstance(node, ast.FunctionDef) and node.name == name:
             return without_docstring(text, node), f"{module.replace('.', '/')}.py"
     raise ValueError(f"{path}: there is no such function")
+
+
+def broken_function(name: str) -> tuple[str, str]:
+    """Return the function that a mutant of the kit breaks, broken, without its docstring; and its file.
+
+    Raises:
+        ValueError: there is no such mutant, or it breaks no function.
+    """
+    from pop_ref.walkthrough.bugs import bug_named
+
+    mutant = bug_named(name)
+    sound, broken = (CHAPTERS.parent / mutant.file).read_text(encoding="utf-8"), mutant.broken_source()
+    pairs = zip(ast.parse(sound).body, ast.parse(broken).body, strict=True)
+    for before, after in pairs:
+        if isinstance(before, ast.FunctionDef) and isinstance(after, ast.FunctionDef):
+            new = without_docstring(broken, after)
+            if new != without_docstring(sound, before):
+                return new, f"pop_ref/{mutant.file}, with one mistake"
+    raise ValueError(f"mutant {name!r} breaks no function")
 
 
 def without_docstring(text: str, node: ast.FunctionDef) -> str:
