@@ -12,8 +12,7 @@ import numpy as np
 
 from pop_ref.conformance.scenes import Scene
 from pop_ref.learn.judge import Verdict
-from pop_ref.learn.mistakes import numbers
-from pop_ref.learn.student import Call
+from pop_ref.learn.student import Call, numbers
 from pop_ref.render import render
 
 SIDE: Final = 240

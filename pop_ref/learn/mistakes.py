@@ -1,18 +1,19 @@
 """Mistakes that everyone makes once: what they compute, and the sentence that helps.
 
-A mistake is recognised by its numbers: it explains a wrong function if it gives what the function gave, on every input
-of a broken law on which the function was wrong. The first that does is told.
+A mistake is recognised by its numbers: it explains a wrong function if it gives what the function gave on every input
+that was tried. The first that does is told.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
+from pop_ref.learn.student import Call, same
 from pop_ref.optimizer import BETAS, EPS
 
 Oracle = dict[str, Callable[..., Any]]
@@ -35,9 +36,23 @@ class Mistake:
     hint: str
 
 
-def _scalar_sigma(o: Oracle, squares: float, cross: float, mean2d: Any, conic: Any, px: float, py: float) -> float:
-    (A, B, C), dx, dy = conic, mean2d[0] - px, mean2d[1] - py
-    return squares * (A * dx * dx + C * dy * dy) + cross * B * dx * dy
+def _sigma(squares: float = 0.5, cross: float = 1.0, right: float = 0.0, down: float = 0.0) -> Callable[..., Any]:
+    """Make `sigma_at_pixel` with other factors, or with the pixel's centre elsewhere."""
+
+    def made(o: Oracle, mean2d: Any, conic: Any, px: float, py: float) -> float:
+        (A, B, C), dx, dy = conic, mean2d[0] - px - right, mean2d[1] - py - down
+        return squares * (A * dx * dx + C * dy * dy) + cross * B * dx * dy
+
+    return made
+
+
+def _shifted(right: float, down: float) -> Mistake:
+    return Mistake(
+        "sigma_at_pixel",
+        _sigma(right=right, down=down),
+        "Your pixel is half a pixel off: px and py are the pixel's centre already, its index + 0.5.",
+        "Use d = mean2d - (px, py) as they are given; add or take away no half.",
+    )
 
 
 def _pixel_vjp(tail: bool) -> Callable[..., Any]:
@@ -45,7 +60,7 @@ def _pixel_vjp(tail: bool) -> Callable[..., Any]:
 
     def made(o: Oracle, pixel: Any, rows: Any, px: float, py: float, background: Any, v_color: Any, v_T_final: float,
              totals: Any, *profile: Any) -> None:  # fmt: skip
-        behind = 0.0
+        behind = v_T_final if tail else 0.0
         totals.v_background[:] += pixel.T_final * np.array(v_color)
         for i, alpha, T in zip(
             reversed(pixel.ids), reversed(pixel.alphas), reversed(pixel.transmittances), strict=True
@@ -93,6 +108,13 @@ def _without_length(o: Oracle, quats: Any) -> Any:
     return np.moveaxis(np.array(rows), 2, 0)
 
 
+def _without_length_back(o: Oracle, quats: Any, v_rotmats: Any) -> Any:
+    """Make `rotmats_from_quats_vjp` up to the unit quaternion; R is quadratic, so central differences are exact."""
+    units = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    slopes = [0.5 * (_without_length(o, units + e) - _without_length(o, units - e)) for e in np.eye(4)]
+    return np.stack([np.sum(v_rotmats * slope, axis=(1, 2)) for slope in slopes], axis=1)
+
+
 def _positive_first_harmonics(o: Oracle, dirs: Any, degree: int) -> Any:
     signs = np.ones((degree + 1) ** 2)
     signs[1:4:2] = -1.0
@@ -110,15 +132,68 @@ def _colors(half: float, unit: bool) -> Callable[..., Any]:
     return made
 
 
-def _adam_from_zero(o: Oracle, params: Any, grads: Any, m: Any, v: Any, step: Any, lr: Any,
-                    betas: Any = BETAS, eps: float = EPS) -> Any:  # fmt: skip
-    """Make `adam_step` without the divisions by 1 - beta^t."""
-    params, m, v = dict(params), dict(m), dict(v)
-    for name, g in grads.items():
-        m[name] = betas[0] * m[name] + (1.0 - betas[0]) * g
-        v[name] = betas[1] * v[name] + (1.0 - betas[1]) * g * g
-        params[name] = params[name] - lr[name] * m[name] / (np.sqrt(v[name]) + eps)
-    return params, m, v
+def _adam(first: bool = True, second: bool = True, sign: float = -1.0) -> Callable[..., Any]:
+    """Make `adam_step` without the division by 1 - beta1^t or by 1 - beta2^t, or uphill."""
+
+    def made(o: Oracle, params: Any, grads: Any, m: Any, v: Any, step: Any, lr: Any,
+             betas: Any = BETAS, eps: float = EPS) -> Any:  # fmt: skip
+        params, m, v = dict(params), dict(m), dict(v)
+        for name, g in grads.items():
+            t = step if isinstance(step, int) else step[name]
+            m[name] = betas[0] * m[name] + (1.0 - betas[0]) * g
+            v[name] = betas[1] * v[name] + (1.0 - betas[1]) * g * g
+            mean = m[name] / (1.0 - betas[0] ** t if first else 1.0)
+            size = np.sqrt(v[name] / (1.0 - betas[1] ** t if second else 1.0)) + eps
+            params[name] = params[name] + sign * lr[name] * mean / size
+        return params, m, v
+
+    return made
+
+
+def _pixel_by_alpha(o: Oracle, ids: Any, rows: Any, px: float, py: float, background: Any, *profile: Any) -> Any:
+    """Make `composite_pixel` with alpha for a weight."""
+    pixel = o["composite_pixel"](ids, rows, px, py, background, *profile)
+    color = [pixel.T_final * b for b in background]
+    for i, alpha in zip(pixel.ids, pixel.alphas, strict=True):
+        color = [sum_ + alpha * c for sum_, c in zip(color, rows.colors[i], strict=True)]
+    return pixel._replace(color=color)
+
+
+def _lists(order: Callable[..., Any], by_column: bool = False) -> Callable[..., Any]:
+    """Make `tile_lists` in another order of splats, or with the tiles of a column one after the other."""
+
+    def made(
+        o: Oracle, means2d: Any, radii: Any, depths: Any, width: int, height: int, size: int, *profile: Any
+    ) -> Any:
+        n_x, n_y = o["grid_size"](width, height, size)
+        lists: list[list[int]] = [[] for _ in range(n_x * n_y)]
+        rects = o["tile_rects"](means2d, radii, width, height, size, *profile).tolist()
+        for i in sorted(range(len(depths)), key=lambda i: order(float(depths[i]), i)):
+            for y in range(rects[i][1], rects[i][3]):
+                for x in range(rects[i][0], rects[i][2]):
+                    lists[x * n_y + y if by_column else y * n_x + x].append(i)
+        return lists
+
+    return made
+
+
+def _split_beside(o: Oracle, rows: Any, mask: Any, normals: Any, *revised: Any) -> Any:
+    """Make `split_rows` that keeps the parents."""
+    kept = o["split_rows"](rows, mask, normals, *revised)
+    n = int(np.sum(~mask))
+
+    def both(old: Any, new: Any) -> Any:
+        return {name: np.concatenate([old[name], new[name][n:]]) for name in old}
+
+    return type(kept)(both(rows.params, kept.params), both(rows.m, kept.m), both(rows.v, kept.v))
+
+
+def _unturned(o: Oracle, rows: Any, mask: Any, normals: Any, *revised: Any) -> Any:
+    """Make `split_rows` that draws children along the world's axes."""
+    upright = {**rows.params, "quats": np.tile([1.0, 0.0, 0.0, 0.0], (len(mask), 1))}
+    split = o["split_rows"](type(rows)(upright, rows.m, rows.v), mask, normals, *revised)
+    quats = o["split_rows"](rows, mask, normals, *revised).params["quats"]
+    return type(split)({**split.params, "quats": quats}, split.m, split.v)
 
 
 def _pixel(o: Oracle, ids: Any, rows: Any, px: float, py: float, background: Any, *profile: Any) -> Any:
@@ -183,19 +258,19 @@ MISTAKES: Final = (
     ),
     Mistake(
         "sigma_at_pixel",
-        lambda o, *given: _scalar_sigma(o, 1.0, 1.0, *given),
+        _sigma(1.0, 1.0),
         f"A half is missing before the two squares. {_HALF}",
         "The cross term has no half, because B stands twice in the symmetric matrix Q and once in the conic.",
     ),
     Mistake(
         "sigma_at_pixel",
-        lambda o, *given: _scalar_sigma(o, 1.0, 2.0, *given),
+        _sigma(1.0, 2.0),
         f"A half is missing: your exponent is twice what it should be. {_HALF}",
         "Halve the whole of A dx dx + 2 B dx dy + C dy dy.",
     ),
     Mistake(
         "sigma_at_pixel",
-        lambda o, *given: _scalar_sigma(o, 0.5, 0.5, *given),
+        _sigma(0.5, 0.5),
         "The cross term is halved once too often: B stands twice in the symmetric matrix Q, once in the conic.",
         "Write Q = [[A, B], [B, C]] and multiply d^T Q d out before you halve it.",
     ),
@@ -259,7 +334,9 @@ MISTAKES: Final = (
     ),
     Mistake(
         "conics_from_covars2d",
-        lambda o, covars2d: covars2d.reshape(-1, 4)[:, [0, 1, 3]],
+        lambda o, covars2d: np.where(
+            np.linalg.det(covars2d)[:, None] > 0.0, covars2d.reshape(-1, 4)[:, [0, 1, 3]], 0.0
+        ),
         "You return the covariance; a conic is its inverse.",
         "[[a, b], [b, c]] has the inverse [[c, -b], [-b, a]] / (a c - b b).",
     ),
@@ -283,7 +360,7 @@ MISTAKES: Final = (
     ),
     Mistake(
         "adam_step",
-        _adam_from_zero,
+        _adam(first=False, second=False),
         "The two running means are not corrected: both start at 0, so that the first steps have the wrong length.",
         "Divide m by 1 - beta1^t and v by 1 - beta2^t before the quotient; keep m and v themselves as they are.",
     ),
@@ -299,14 +376,153 @@ MISTAKES: Final = (
         "A two is missing: the derivative of a square is twice its base.",
         "l2 is a mean of squares, without a half in front.",
     ),
+    Mistake(
+        "covars_from_quats_scales",
+        lambda o, quats, scales: np.stack([np.diag(s * s) for s in scales]),
+        "The rotation has gone from your covariance, diag(s)^2 is left: you multiply M^T M where M M^T is asked for, or"
+        " your M scales its rows, diag(s) R.",
+        "M = R diag(s) scales columns, R * s in NumPy; a column of R is an axis of the Gaussian. Then M @ M.T.",
+    ),
+    Mistake(
+        "covars_from_quats_scales",
+        lambda o, quats, scales: o["covars_from_quats_scales"](quats, scales**2),
+        "Your scales enter four times; a covariance holds squares of standard deviations, so each enters twice.",
+        "With M = R diag(s), without a square, the covariance is M M^T.",
+    ),
+    Mistake(
+        "sh_basis",
+        lambda o, dirs, degree: o["sh_basis"](-dirs, degree),
+        "Your direction runs from the Gaussian to the camera; it is asked for from the camera to the Gaussian.",
+        "Use (x, y, z) as they are given: the harmonics of degree 1 are (-y, z, -x) times a constant.",
+    ),
+    Mistake(
+        "camera_center",
+        lambda o, viewmat: -viewmat[:3, :3] @ viewmat[:3, 3],
+        "Your rotation is not transposed: the centre is -R^T t, and yours is -R t.",
+        "Solve R c + t = 0; the inverse of a rotation is its transpose.",
+    ),
+    Mistake(
+        "means_cam_from_means",
+        lambda o, means, viewmat: (means + viewmat[:3, 3]) @ viewmat[:3, :3].T,
+        "You add t before it turns; a point is turned first and moved then.",
+        "p = R mean + t.",
+    ),
+    Mistake(
+        "rotmats_from_quats_vjp",
+        _without_length_back,
+        "The division by the length is not walked back: yours is the cotangent of the unit quaternion, not of q.",
+        "End with unit_quats_from_quats_vjp(quats, v_units).",
+    ),
+    _shifted(0.5, 0.5),
+    _shifted(-0.5, -0.5),
+    _shifted(0.5, 0.0),
+    _shifted(0.0, 0.5),
+    _shifted(-0.5, 0.0),
+    _shifted(0.0, -0.5),
+    Mistake(
+        "sigma_at_pixel",
+        _sigma(0.5, 0.0),
+        "The cross term is missing: a splat that is turned has B, too.",
+        "sigma = (A dx dx + C dy dy) / 2 + B dx dy.",
+    ),
+    Mistake(
+        "sigma_at_pixel",
+        lambda o, mean2d, conic, px, py: o["sigma_at_pixel"](mean2d, conic, py, px),
+        "The pixel's x and y are exchanged: rows stand for columns.",
+        "px runs along the columns of an image, py along its rows: dx = mean2d[0] - px, dy = mean2d[1] - py.",
+    ),
+    Mistake(
+        "alpha_from_sigma",
+        lambda o, sigma, opacity, *profile: o["alpha_from_sigma"](sigma, 1.0, *profile),
+        "The opacity is missing: alpha is the opacity times the falloff.",
+        "alpha = min(ceiling, opacity * falloff(sigma)).",
+    ),
+    Mistake(
+        "composite_pixel",
+        _pixel_by_alpha,
+        "Your weight is alpha alone: a splat gives its colour times alpha, times the light that is left, T.",
+        "weight = T * alpha, with T before this splat.",
+    ),
+    Mistake(
+        "composite_pixel",
+        lambda o, ids, *given: o["composite_pixel"](list(reversed(ids)), *given),
+        "You walk from back to front; the list is in order, front first.",
+        "Go through ids as they come: T starts at 1 at the eye.",
+    ),
+    Mistake(
+        "tile_lists",
+        _lists(lambda depth, i: (depth, i), by_column=True),
+        "Your tiles are numbered down the columns: columns stand for rows. Tile (x, y) is number y * tiles_x + x.",
+        "Row-major order: all tiles of the first row, then the second.",
+    ),
+    Mistake(
+        "tile_lists",
+        _lists(lambda depth, i: (-depth, i)),
+        "Your lists run from back to front; the nearest splat comes first.",
+        "Sort by (depth, index), the smaller depth first.",
+    ),
+    Mistake(
+        "tile_lists",
+        _lists(lambda depth, i: i),
+        "Your lists are not sorted by depth.",
+        "Go through the splats in the order of (depth, index).",
+    ),
+    Mistake(
+        "tile_rects",
+        lambda o, *given: o["tile_rects"](*given)[:, [1, 0, 3, 2]],
+        "x and y are exchanged: columns stand for rows. A rectangle is (x0, y0, x1, y1).",
+        "tiles_x, tiles_y = grid_size(width, height, tile_size), x first.",
+    ),
+    Mistake(
+        "tile_rects",
+        lambda o, *given: o["tile_rects"](*given)[:, [0, 2, 1, 3]],
+        "Your rectangle has one axis after the other, (x0, x1, y0, y1); it is (x0, y0, x1, y1).",
+        "First the corner with the smaller numbers, then the other.",
+    ),
+    Mistake(
+        "tile_rects",
+        lambda o, *given: o["tile_rects"](*given) - np.pad(o["tile_rects"](*given)[:, :2], ((0, 0), (2, 0))),
+        "Your last two numbers are the number of tiles; what is asked for is one past the last tile.",
+        "(x0, y0, x1, y1), half open: x1 - x0 tiles lie between.",
+    ),
+    Mistake(
+        "adam_step",
+        _adam(sign=1.0),
+        "You go up the loss: the gradient points to where the loss rises, so a step is taken against it.",
+        "x - lr m / sqrt(v), with a minus.",
+    ),
+    Mistake(
+        "adam_step",
+        _adam(first=False),
+        "The running mean m is not divided by 1 - beta1^t: it starts at 0, so that the first steps are too short.",
+        "Divide for the quotient only; what is kept and returned is m itself.",
+    ),
+    Mistake(
+        "adam_step",
+        _adam(second=False),
+        "The running mean v is not divided by 1 - beta2^t: it starts at 0, so that the first steps are too long.",
+        "Divide for the quotient only; what is kept and returned is v itself.",
+    ),
+    Mistake(
+        "split_rows",
+        _split_beside,
+        "The parents stay; a split puts two children in the place of one parent.",
+        "Keep the rows that were not selected, rows[~mask], and append both kinds of children.",
+    ),
+    Mistake(
+        "split_rows",
+        _unturned,
+        "The draws are not turned: the children must lie along the parent's own axes.",
+        "mean + R(q) (s * eps): scale each draw first, then turn it.",
+    ),
 )
 
 
-def explained_by(calls: list[Any], oracle: Oracle) -> Mistake | None:
-    """Find the mistake that gives what a function gave, on every call on which it was wrong.
+def explained_by(calls: Sequence[Call], oracle: Oracle) -> Mistake | None:
+    """Find the mistake that gives what a function gave, on every call, also on those that came out right.
 
     Args:
-        calls: wrong calls of one function, see `student.Call`.
+        calls: of one function.
         oracle: the oracle's functions by name.
     """
     for mistake in MISTAKES:
@@ -315,7 +531,7 @@ def explained_by(calls: list[Any], oracle: Oracle) -> Mistake | None:
     return None
 
 
-def _explains(mistake: Mistake, call: Any, oracle: Oracle) -> bool:
+def _explains(mistake: Mistake, call: Call, oracle: Oracle) -> bool:
     given = copy.deepcopy(call.given)
     try:
         made = mistake.made(oracle, *given, *call.named.values())
@@ -324,29 +540,3 @@ def _explains(mistake: Mistake, call: Any, oracle: Oracle) -> bool:
         return False
     changed = tuple(a for b, a in zip(call.given, given, strict=True) if repr(b) != repr(a))
     return same((made, changed), call.found)
-
-
-def numbers(value: Any) -> np.ndarray:
-    """Flatten whatever a function returns into one row of numbers.
-
-    Example:
-        >>> numbers((0.5, [np.eye(2)], None))
-        array([0.5, 1. , 0. , 0. , 1. ])
-    """
-    if value is None:
-        return np.zeros(0)
-    if isinstance(value, dict):
-        value = tuple(value.values())
-    elif hasattr(value, "__dataclass_fields__"):
-        value = tuple(getattr(value, name) for name in value.__dataclass_fields__)
-    if isinstance(value, tuple | list):
-        return np.concatenate([np.zeros(0), *map(numbers, value)])
-    return np.asarray(value, dtype=np.float64).ravel()
-
-
-def same(one: Any, other: Any) -> bool:
-    """Tell whether two results are one but for rounding."""
-    a, b = numbers(one), numbers(other)
-    if a.shape != b.shape:
-        return False
-    return bool(np.allclose(a, b, rtol=1e-9, atol=1e-12, equal_nan=True))
