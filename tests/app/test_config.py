@@ -187,11 +187,11 @@ def test_a_label_cannot_be_carried_by_settings_that_do_not_follow_it():
         replace(quick, max_steps=5)
     with pytest.raises(PopError, match="max_steps is 30000, but preset 'quick'"):
         TrainConfig(given=quick.given)
-    cut = quick.but(max_steps=5, seed=3).but(**{"pop.lambda_pop": 0.5})
+    cut = quick.with_overrides(max_steps=5, seed=3).with_overrides(**{"pop.lambda_pop": 0.5})
     assert (cut.max_steps, cut.seed, cut.strategy.lambda_pop, cut.preset) == (5, 3, 0.5, "quick")
     assert cut.given.settings == {"max_steps": 5, "seed": 3, "pop.lambda_pop": 0.5}
     # where it runs and where it writes is not part of a preset
-    assert replace(quick, result_dir="x", backend="fast").but(seed=1).result_dir == "x"
+    assert replace(quick, result_dir="x", backend="fast").with_overrides(seed=1).result_dir == "x"
     assert TrainConfig().preset is None
     # what was run is read back also where the preset has other values now
     written = json.loads(quick.to_json())

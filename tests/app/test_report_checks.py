@@ -18,7 +18,7 @@ from pop_fast.data.capture import View
 from pop_fast.errors import PopError
 from pop_fast.train.gpu_proxy import renderer
 from pop_fast.train.load_result import load_splat
-from pop_fast.view.paths.video import frames_in
+from pop_fast.view.paths import frames_in
 from pop_fast.view.pictures import colormap_table
 from pop_fast.view.report import checks, write_report
 from pop_fast.view.report.checks import (
@@ -30,9 +30,9 @@ from pop_fast.view.report.checks import (
     stops_between,
     write_checks,
 )
+from pop_fast.view.report.model import verdict
+from pop_fast.view.report.sections import depth_picture, depth_range
 from pop_fast.view.report.source import read_result
-from pop_fast.view.report.verdict import verdict
-from pop_fast.view.report.views_section import depth_picture, depth_range
 from tests.app.browser import browser
 from tests.app.conftest import TRAIN, TRAIN_AND_CHECK, Pop
 from tests.app.result_folder import VIEWS, write_result
@@ -162,7 +162,7 @@ def test_a_gaussian_in_front_of_a_camera_is_a_floater(result: Path, shared_captu
 @pytest.mark.usefixtures("short_orbit")
 def test_the_worst_views_come_first_and_have_pictures_whatever_was_kept(result: Path, shared_capture: Path) -> None:
     splat, capture = load_splat(result), load_capture(shared_capture)
-    config = splat.config.but(test_every=2, max_renders=1)
+    config = splat.config.with_overrides(test_every=2, max_renders=1)
     write_checks(result, capture, splat.params, config, splat.sh_degree, renderer("auto")[0], 29)
     views = read_result(result).views
     assert [view.psnr for view in views] == sorted(view.psnr for view in views)

@@ -25,17 +25,114 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from pop_fast.stages.blend import buffers
-from pop_fast.stages.blend.active_tiles import ActiveTiles
 from pop_fast.stages.blend.alpha import Entries, exponent_coefficients, pixel_basis
 from pop_fast.stages.blend.tile_groups import BLOCK, TileGroup
-from pop_fast.stages.blend.transmittance import Stop, below, count_passed, weights_of_alphas
 from pop_fast.stages.dominance import Dominance
 from pop_ref.constants import Profile
+
+
+class ActiveTiles:
+    """Named states with a row per tile of a group, of which a shrinking choice is held close together.
+
+    Attributes:
+        rows: the tiles that are held, ascending; all when None.
+    """
+
+    def __init__(self, states: dict[str, Tensor]) -> None:
+        self.rows: Tensor | None = None
+        self._whole = states
+        self._held = states
+
+    def __getitem__(self, name: str) -> Tensor:
+        return self._held[name]
+
+    def count_below(self, reached: int) -> int:
+        """Return how many of the held tiles are among the group's first `reached`."""
+        return reached if self.rows is None else int((self.rows < reached).sum())
+
+    def select(self, rows: Tensor | None) -> None:
+        """Hold these tiles; what was held before is written back first."""
+        if rows is self.rows:
+            return
+        whole = self.whole()
+        self.rows = rows
+        self._held = whole if rows is None else {name: state[rows] for name, state in whole.items()}
+
+    def drop(self, n: int, transmittance: Tensor, below: float) -> None:
+        """Hold only the tiles with light left, out of the first `n`, when these are less than a share of them."""
+        bright = transmittance.amax(1) > 0.0
+        if int(bright.sum()) < below * n:
+            keep = bright.nonzero().squeeze(1)
+            self.select(keep if self.rows is None else self.rows[keep])
+
+    def whole(self) -> dict[str, Tensor]:
+        """Return the states of all tiles."""
+        if self.rows is not None:
+            for name, state in self._held.items():
+                self._whole[name].index_copy_(0, self.rows, state)
+        return self._whole
+
+
+@dataclass(frozen=True)
+class Stop:
+    """The transmittance that a pixel must stay above.
+
+    Attributes:
+        at: a pixel stops where T <= at.
+    """
+
+    at: float
+
+    @classmethod
+    def of(cls, profile: Profile, dtype: torch.dtype) -> Stop:
+        """Return the profile's stop, its strictness folded into the number."""
+        stop = profile.transmittance_stop
+        return cls(stop if profile.stop_inclusive else below(stop, dtype))
+
+
+def weights_of_alphas(alpha: Tensor, transmittances: Tensor, stop: Stop) -> Tensor:
+    """Take a step's alphas off the light and return the weights; both are 0 from where a pixel stops.
+
+    T never grows, so that one comparison of all T with the stop finds what lies behind it, with no flag carried along.
+
+    Args:
+        alpha: in and, where a pixel stops, out. [n, K, P]
+        transmittances: T before the step in the first of K + 1 rows; out: T after it in the last, still to be
+            compared with the stop, and in the others the weights. [n, K + 1, P]
+        stop: when pixels stop.
+
+    Returns:
+        The weights, a view of `transmittances`. [n, K, P]
+    """
+    rows = transmittances.unbind(1)
+    for before, after, a in zip(rows, rows[1:], alpha.unbind(1), strict=False):
+        torch.addcmul(before, before, a, value=-1.0, out=after)
+    torch.ops.aten.threshold_backward.grad_input(alpha, transmittances[:, 1:], stop.at, grad_input=alpha)
+    return transmittances[:, :-1].mul_(alpha)
+
+
+def count_passed(alpha: Tensor, transmittance: Tensor, stop: Stop) -> Tensor:
+    """Count the entries of a step that each pixel goes past without stopping. [n, P] int64"""
+    transmittance = transmittance.clone()
+    passed = torch.zeros(transmittance.shape, dtype=torch.int64)
+    for a in alpha.unbind(1):
+        torch.threshold_(transmittance.addcmul_(transmittance, a, value=-1.0), stop.at, 0.0)
+        passed += transmittance > 0.0
+    return passed
+
+
+@lru_cache
+def below(value: float, dtype: torch.dtype) -> float:
+    """Return the number just under `value` in a type, so that `>` of it means `>= value`."""
+    at = torch.tensor(value, dtype=dtype)
+    return float(torch.nextafter(at, torch.zeros_like(at)))
+
 
 COMPACT_BELOW = 0.8  # share of live tiles under which the group is compacted
 
@@ -47,12 +144,12 @@ class Step:
     Attributes:
         blocks: of eight entries each, the null block where a list has ended. [n, K / 8]
         rows: which of the group's tiles took part: the first `n` of these, or of all when None.
-        light: T before the step; belongs to the buffers. [n, P]
+        transmittance: T before the step; belongs to the buffers. [n, P]
     """
 
     blocks: Tensor
     rows: Tensor | None
-    light: Tensor
+    transmittance: Tensor
 
 
 @dataclass
@@ -120,14 +217,14 @@ class Blender:
         with buffers.acquired(2, group.slab, self.table.dtype) as scratch:
             while start < len(group.reached) and (n := active.count_below(group.reached[start])) > 0:
                 blocks = group.blocks(active.rows, n, start, group.step_blocks(start, n))
-                entries, light = self._entries(blocks), active["light"][:n]
-                alpha, lights = _shaped(scratch, entries, group.n_pixels)
+                entries, transmittance = self._entries(blocks), active["transmittance"][:n]
+                alpha, transmittances = _shaped(scratch, entries, group.n_pixels)
                 self._alphas(entries, alpha)
                 if counted:
-                    active["n_passed"][:n].add_(count_passed(alpha, light, self.stop))
-                before = buffers.copy(light)
-                weight = self._weights(alpha, lights, before)
-                torch.ops.aten.threshold.out(lights[:, -1], self.stop.at, 0.0, out=light)
+                    active["n_passed"][:n].add_(count_passed(alpha, transmittance, self.stop))
+                before = buffers.copy(transmittance)
+                weight = self._weights(alpha, transmittances, before)
+                torch.ops.aten.threshold.out(transmittances[:, -1], self.stop.at, 0.0, out=transmittance)
                 active["image"][:n].baddbmm_(entries[:, :, 6:].transpose(1, 2), weight)
                 if counted:
                     active["n_blended"][:n].add_((weight > 0.0).sum(1))
@@ -139,13 +236,13 @@ class Blender:
                     steps.append(Step(blocks, active.rows, before))
                 else:
                     buffers.release(before)
-                active.drop(n, light, COMPACT_BELOW)
+                active.drop(n, transmittance, COMPACT_BELOW)
         return self._result(active.whole(), steps, n_pairs)
 
     def _active(self, group: TileGroup, counted: bool, dominance: bool) -> ActiveTiles:
         size = (len(group.tiles), self.basis.shape[1])
         states = {
-            "light": self.basis.new_ones(size),
+            "transmittance": self.basis.new_ones(size),
             "image": self.basis.new_zeros((size[0], self.table.shape[2] - 6, size[1])),
         }
         if counted:
@@ -179,9 +276,9 @@ class Blender:
         if self.clamps:
             flat.clamp_max_(self.profile.alpha_ceiling)
 
-    def _weights(self, alpha: Tensor, lights: Tensor, before: Tensor) -> Tensor:
-        lights[:, 0] = before
-        return weights_of_alphas(alpha, lights, self.stop)
+    def _weights(self, alpha: Tensor, transmittances: Tensor, before: Tensor) -> Tensor:
+        transmittances[:, 0] = before
+        return weights_of_alphas(alpha, transmittances, self.stop)
 
     def transpose(
         self, group: TileGroup, blend: GroupBlend, v_image: Tensor, absolute: bool
@@ -204,8 +301,8 @@ class Blender:
                     q_k.sub_(behind)
                     behind.addcmul_(a, q_k)
                 # nothing lies behind a pixel that had stopped before this step
-                torch.ops.aten.threshold_backward.grad_input(behind, step.light, 0.0, grad_input=behind)
-                buffers.release(step.light)
+                torch.ops.aten.threshold_backward.grad_input(behind, step.transmittance, 0.0, grad_input=behind)
+                buffers.release(step.transmittance)
                 yield step.blocks.view(-1), self._rows(entries, alpha, weight, q, v, absolute)
 
     def again(self, group: TileGroup, step: Step, scratch: list[Tensor]) -> list[Tensor]:
@@ -221,9 +318,9 @@ class Blender:
             where a pixel stops [n, K, P], and of a third slab as much.
         """
         entries = self._entries(step.blocks)
-        alpha, lights, *rest = _shaped(scratch, entries, group.n_pixels)
+        alpha, transmittances, *rest = _shaped(scratch, entries, group.n_pixels)
         self._alphas(entries, alpha)
-        return [entries, alpha, self._weights(alpha, lights, step.light), *rest]
+        return [entries, alpha, self._weights(alpha, transmittances, step.transmittance), *rest]
 
     def _rows(self, entries: Tensor, alpha: Tensor, weight: Tensor, q: Tensor, v: Tensor, absolute: bool) -> Tensor:
         n_colors, n_rows = v.shape[1] - 1, q.shape[0] * q.shape[1]
