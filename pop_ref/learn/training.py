@@ -48,7 +48,7 @@ class Told:
 
 
 def the_toy(size: int = SIZE, n_views: int = 8, seed: int = 0) -> Subject:
-    """Photograph the toy all around, and start from points of its surfaces, none quite in place.
+    """Photograph the toy all around, and start from flat Gaussians on its surfaces, none in place, half as colourful.
 
     Example:
         >>> len(the_toy(8).views)
@@ -57,11 +57,17 @@ def the_toy(size: int = SIZE, n_views: int = 8, seed: int = 0) -> Subject:
     rng = np.random.default_rng(seed)
     cameras = [orbit(2 * np.pi * k / n_views, size) for k in range(n_views)]
     unseen = orbit(np.pi / n_views, size)
-    points = toy()
-    means = points["means"] + rng.normal(0.0, 0.02, points["means"].shape)
-    colors = SH_C0 * points["sh0"][:, 0] + 0.5 + rng.normal(0.0, 0.05, means.shape)
+    points, n = toy(), len(toy()["means"])
+    colors = 0.25 + 0.5 * (SH_C0 * points["sh0"][:, 0] + 0.5) + rng.normal(0.0, 0.05, (n, 3))
+    params = {
+        **points,
+        "means": points["means"] + rng.normal(0.0, 0.02, (n, 3)),
+        "scales": points["scales"] + np.log(1.3),
+        "opacities": np.full(n, 1.0),
+        "sh0": ((colors - 0.5) / SH_C0)[:, None],
+    }
     views = [(camera, photograph(camera)) for camera in cameras]
-    return Subject(views, (unseen, photograph(unseen)), _started(means, colors, 0.07))
+    return Subject(views, (unseen, photograph(unseen)), params)
 
 
 def a_picture(image: np.ndarray, size: int = SIZE, cells: int = 16) -> Subject:
@@ -105,7 +111,9 @@ def a_capture(
         ValueError: there are fewer than two views, or no points.
     """
     if len(views) < 2 or not len(points):
-        raise ValueError(f"the capture has {len(views)} views and {len(points)} points; two views and a point are needed")
+        raise ValueError(
+            f"the capture has {len(views)} views and {len(points)} points; two views and a point are needed"
+        )
     picked = np.random.default_rng(0).permutation(len(points))[:n]
     means = points[picked]
     # so wide that each reaches its third neighbour
@@ -160,15 +168,14 @@ def train(work: Work, subject: Subject, steps: int = 120, every: int = 10, seed:
             ) from None
 
 
-def _steps(
-    borrowed: Borrowed, subject: Subject, steps: int, every: int, rng: np.random.Generator
-) -> Iterator[Told]:
+def _steps(borrowed: Borrowed, subject: Subject, steps: int, every: int, rng: np.random.Generator) -> Iterator[Told]:
     training, types, recipes = (borrowed.module(name) for name in ("training", "records", "recipes"))
     recipe = recipes.RECIPES["POP"]
     scale = subject.scene_scale
-    rates = replace(recipe.lr, means=2e-3, means_decay=0.1, quats=1e-2, scales=2e-2, opacities=5e-2, sh0=2e-2)
-    # density control ends at half time, so that what it adds has time to settle; so does the prior
-    density = replace(recipe.density, refine_start_iter=0, refine_every=max(2, steps // 6), refine_stop_iter=steps // 2)
+    rates = replace(recipe.lr, means=4e-3, means_decay=0.1, quats=2e-2, scales=4e-2, opacities=1e-1, sh0=4e-2)
+    # density control acts once, after a quarter, so that what it adds has time to settle; the prior ends at half time
+    density = replace(recipe.density, refine_start_iter=0, refine_every=max(2, steps // 4), refine_stop_iter=steps // 2)
+    density = replace(density, grow_grad2d=1e-3)
     recipe = replace(recipe, max_steps=steps, lr=rates, density=density, pop_stop_iter=steps // 2)
     camera, target = types.Camera(*subject.shown[0]), subject.shown[1]
     state, loss = training.start(subject.params), float("nan")

@@ -1,4 +1,4 @@
-"""Right solutions in other styles than the oracle's: whole arrays, other names, constants as the chapters print them."""
+"""Right solutions in other styles than the oracle's: whole arrays, other names, constants as chapters print them."""
 
 from __future__ import annotations
 
