@@ -33,7 +33,7 @@ LEAD: Final = (
 )
 
 BY_DOING: Final = (
-    "To learn by doing, <code>pop learn start mine</code> writes twelve files for you to fill in and judges them; the "
+    "To learn by doing, <code>pop learn start mine</code> writes thirteen files to fill in and judges them; the "
     "whole method in 300 lines of NumPy is <code>pop_ref/learn/splat.py</code>, and <code>python -m "
     "pop_ref.learn.splat</code> trains a small scene with it in a minute."
 )
