@@ -13,26 +13,33 @@ import re
 from pathlib import Path
 from typing import Final
 
+from pop_ref.learn.course import COURSE
 from pop_ref.walkthrough.cells import MINUTES, chapter_files
 from pop_ref.walkthrough.docstrings import as_wide_as_a_page, without_docstring
 
 DIRECTIVE: Final = re.compile(r"^\{\{(\w+)(?:: ([^}]+))?\}\}$", re.MULTILINE)
 
 
-def expanded(text: str) -> str:
+def expanded(text: str, marked: bool = False) -> str:
     """Expand the directives of a prose cell to markdown; widgets stay.
+
+    Args:
+        text: of the cell.
+        marked: say of a function that the course asks for in which stage it is, for a page that folds it.
 
     Raises:
         ValueError: a directive, or what it names, is not known.
     """
-    return DIRECTIVE.sub(lambda found: _expanded(found[1], found[2] or "", found[0]), text)
+    return DIRECTIVE.sub(
+        lambda found: _expanded(found[1], found[2] or "", found[0], marked), text
+    )
 
 
-def _expanded(name: str, argument: str, whole: str) -> str:
+def _expanded(name: str, argument: str, whole: str, marked: bool) -> str:
     if name == "widget":
         return whole
     if name == "source":
-        return _quoted(*source_of(argument))
+        return _quoted(*source_of(argument), _stage_of(argument) if marked else "")
     if name == "bug":
         from pop_ref.walkthrough.bugs import broken_function
 
@@ -89,5 +96,14 @@ def function_in(text: str, name: str, path: str) -> str:
     raise ValueError(f"{path}: there is no such function")
 
 
-def _quoted(code: str, file: str) -> str:
-    return f"`{file}`:\n\n```python\n{as_wide_as_a_page(code)}\n```"
+def _stage_of(path: str) -> str:
+    """Name the stage of `pop learn` in which a reader writes this function, if there is one."""
+    return next(
+        (stage.name for stage in COURSE if path.rpartition(".")[2] in stage.names), ""
+    )
+
+
+def _quoted(code: str, file: str, stage: str = "") -> str:
+    # a page folds what is marked so (`layout`)
+    yours = f", yours to write first in `pop learn check {stage}`" if stage else ""
+    return f"`{file}`{yours}:\n\n```python\n{as_wide_as_a_page(code)}\n```"

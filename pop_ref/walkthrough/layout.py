@@ -61,6 +61,11 @@ _PUNCTUATED: Final = re.compile(
 )
 # labels of decisions and kinks in prose; what code quotes is left alone
 _LABEL: Final = re.compile(r"(<(pre|code|a|math|h\d)\b.*?</\2>)|\b([DB][1-8])\b", re.DOTALL)
+# a printed function that the course asks the reader to write
+_YOURS: Final = re.compile(
+    r"<p>(<code>[\w/.]+</code>), yours to write first in <code>(pop learn check \w+)</code>:</p>\s*(<pre>.*?</pre>)",
+    re.DOTALL,
+)
 _WIDGET: Final = re.compile(r"<p>\{\{widget: (\w+)\}\}</p>")
 
 
@@ -208,6 +213,12 @@ def _aside(title: str, code: str) -> str:
     return _folded(title, _code(code), ' class="drawing"')
 
 
+def _folded_source(found: re.Match[str]) -> str:
+    """Fold a function that a reader may write first; a script opens it at the second click."""
+    told = f'<span role="status" data-first="Yours to write: {found[2]}. Click again to see it."></span>'
+    return _folded(f"The oracle's, {found[1]} {told}", found[3], ' class="yours"')
+
+
 def _folded(title: str, body: str, attributes: str = "") -> str:
     return f"<details{attributes}><summary>{title}</summary>{body}</details>"
 
@@ -306,12 +317,13 @@ _MARKDOWN.add_render_rule("table_close", lambda *_: "</table></div>")
 
 def _prose(chapter: Chapter, cell: Cell) -> str:
     try:
-        text = expanded(cell.text)
+        text = expanded(cell.text, marked=True)
     except ValueError as error:
         raise ChapterError(chapter.path, cell.line, str(error)) from error
     try:
         rendered = _LABEL.sub(_label, _MARKDOWN.render(text))
         rendered = _PUNCTUATED.sub(r'<span class="math inline stays">\1\2</span>', rendered)
+        rendered = _YOURS.sub(_folded_source, rendered)
         return _WIDGET.sub(lambda found: widgets.html(found[1]), rendered)
     except Exception as error:
         raise ChapterError(
