@@ -291,7 +291,7 @@ picture(
 #
 # {{chapters}}
 #
-# Short of time? 0, 1, 2, 4, 5 and 8 make a lecture. To learn by doing, `pop learn start mine` writes twelve files with
+# Short of time? 0, 1, 2, 4, 5 and 8 make a lecture. To learn by doing, `pop learn start mine` writes 13 files with
 # empty functions and judges what you write into them, stage by stage (`pop learn check alpha`).
 #
 # ## The papers

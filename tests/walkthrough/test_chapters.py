@@ -284,6 +284,14 @@ def test_a_prediction_is_asked_for_before_its_answer() -> None:
 def test_a_directive_stands_for_what_the_package_says() -> None:
     page = _whole(GOOD.replace("# What is two?", "# {{source: pop_ref.alpha.falloff}}\n#\n# Decision D5 and `D6`."))
     assert "pop_ref/alpha.py" in page
+    # the course asks for it, so it is folded, and says which stage it is
+    yours = re.search(r'<details class="yours"><summary>.*?</summary>(.*?)</details>', page, re.DOTALL)
+    assert yours is not None
+    assert "falloff" in yours[1]
+    assert "pop learn check alpha" in page
+    assert '<details class="yours"' not in _whole(
+        GOOD.replace("# What is two?", "# {{source: pop_ref.tiles.listed_pixels}}")
+    )
     assert "Falloff" not in page, "the docstring is left out"
     assert f'href="{GLOSSARY_PAGE}#D5"' in page
     assert f'href="{GLOSSARY_PAGE}#D6"' not in page, "code is left alone"

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
+from pop_ref.learn.course import COURSE
+
 Kind = Literal["prose", "code", "setup", "answer"]
 Role = Literal["plain", "imports", "checks", "draws"]
 
@@ -199,27 +201,39 @@ def _parsed(path: Path, cell: Cell) -> ast.Module:
 # Directives.
 
 
-def expanded(text: str) -> str:
+def expanded(text: str, marked: bool = False) -> str:
     """Expand the directives of a prose cell to markdown; widgets stay.
+
+    Args:
+        text: of the cell.
+        marked: say of a function that the course asks for in which stage it is, for a page that folds it.
 
     Raises:
         ValueError: a directive, or what it names, is not known.
     """
-    return _DIRECTIVE.sub(lambda found: _expanded(found[1], found[2] or "", found[0]), text)
+    return _DIRECTIVE.sub(lambda found: _expanded(found[1], found[2] or "", found[0], marked), text)
 
 
-def _expanded(name: str, argument: str, whole: str) -> str:
+def _expanded(name: str, argument: str, whole: str, marked: bool) -> str:
     from pop_ref.walkthrough.builder import glossary
 
     if name == "widget":
         return whole
     if name in ("source", "bug"):
         code, file = source_of(argument) if name == "source" else broken_function(argument)
-        return f"`{file}`:\n\n```python\n{as_wide_as_a_page(code)}\n```"
+        stage = _stage_of(argument) if name == "source" and marked else ""
+        # a page folds what is marked so (`layout`)
+        yours = f", yours to write first in `pop learn check {stage}`" if stage else ""
+        return f"`{file}`{yours}:\n\n```python\n{as_wide_as_a_page(code)}\n```"
     tables = {"glossary": glossary.glossary, "stages": glossary.stages, "chapters": _chapters}
     if name not in tables:
         raise ValueError(f"{whole} is not a directive")
     return tables[name]()
+
+
+def _stage_of(path: str) -> str:
+    """Name the stage of `pop learn` in which a reader writes this function, if there is one."""
+    return next((stage.name for stage in COURSE if path.rpartition(".")[2] in stage.names), "")
 
 
 def _chapters() -> str:

@@ -38,7 +38,7 @@ LEAD: Final = (
     "runs, and each of its exercises has an answer that runs."
 )
 BY_DOING: Final = (
-    "To learn by doing, <code>pop learn start mine</code> writes files for you to fill in and judges them; the whole "
+    "To learn by doing, <code>pop learn start mine</code> writes thirteen files to fill in and judges them; the whole "
     "method in 300 lines of NumPy is <code>pop_ref/learn/splat.py</code>, and "
     "<code>python -m pop_ref.learn.splat</code> trains a small scene with it in a minute. After <code>make</code>, "
     "<code>pop</code> and <code>python</code> are in <code>.venv/bin</code>; "
@@ -54,6 +54,11 @@ _THIN: Final = '<mspace width="0.167em" />'
 _PUNCTUATED: Final = re.compile(r'<span class="math inline">((?:(?!</math>).)*</math>)</span>([,.;:)?]+)', re.DOTALL)
 # labels of decisions and kinks in prose; what code quotes is left alone
 _LABEL: Final = re.compile(r"(<(pre|code|a|math|h\d)\b.*?</\2>)|\b([DB][1-8])\b", re.DOTALL)
+# a printed function that the course asks the reader to write
+_YOURS: Final = re.compile(
+    r"<p>(<code>[\w/.]+</code>), yours to write first in <code>(pop learn check \w+)</code>:</p>\s*(<pre>.*?</pre>)",
+    re.DOTALL,
+)
 _WIDGET: Final = re.compile(r"<p>\{\{widget: (\w+)\}\}</p>")
 # two pictures of a page, or two chapters of a book, may use one id for different things
 _ID: Final = re.compile(r'(\bid="|\bfor="|href="#|url\(#)')
@@ -221,12 +226,13 @@ def prose(chapter: Chapter, text: str, line: int = 1) -> str:
         ChapterError: a directive is not known, or a formula cannot be set.
     """
     try:
-        told = expanded(text)
+        told = expanded(text, marked=True)
     except ValueError as error:
         raise ChapterError(chapter.path, line, str(error)) from error
     try:
         rendered = _LABEL.sub(_label, _MARKDOWN.render(told))
         rendered = _PUNCTUATED.sub(r'<span class="math inline stays">\1\2</span>', rendered)
+        rendered = _YOURS.sub(_folded_source, rendered)
         return _WIDGET.sub(lambda found: widgets.html(found[1]), rendered)
     except Exception as error:
         at = text.find(str(error).partition("\n")[0]) if isinstance(error, _FormulaError) else -1
@@ -286,6 +292,12 @@ def _asked(name: str, tier: str, answer: str) -> str:
 
 def _aside(title: str, code: str) -> str:
     return f'<details class="drawing"><summary>{title}</summary>{_code(code)}</details>'
+
+
+def _folded_source(found: re.Match[str]) -> str:
+    """Fold a function that a reader may write first; a script opens it at the second click."""
+    told = f'<span role="status" data-first="Yours to write: {found[2]}. Click again to see it."></span>'
+    return f'<details class="yours"><summary>The oracle\'s, {found[1]} {told}</summary>{found[3]}</details>'
 
 
 def _code(text: str) -> str:
