@@ -21,6 +21,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet $(TORCH)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
 	@touch $@
+	@echo "pop is $(BIN)/pop; 'source $(BIN)/activate' puts it on the path"
 
 demo: setup  ## write the demo capture, train POP on it, leave report.html, PLY, renders and metrics in out/demo
 	$(BIN)/pop demo out/demo_capture --overwrite
@@ -40,7 +41,6 @@ repro: setup  ## train every row of the paper at toy scale (minutes), leave its 
 site: demo walkthrough  ## build docs/, the walk-through and the demo's report as one site into out/site
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
 	$(BIN)/mkdocs build --strict --quiet
-	cp -r out/walkthrough out/site/learn
 	mkdir -p out/site/demo && cp out/demo/report.html out/site/demo/
 	@echo "open out/site/index.html"
 

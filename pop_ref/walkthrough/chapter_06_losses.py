@@ -49,6 +49,9 @@ np.testing.assert_allclose(pull_l2[[0, 1, -1]], [0.0, 2.0 / 255.0, 2.0])
 assert np.array_equal(pull_l2[1:] > pull_l1[1:], errors[1:] > 0.5)
 
 # %% [markdown]
+# How good a picture is at the end is told by its *PSNR*, $-10 \log_{10} L_2$ in decibels (dB): 20 dB is an error of a
+# tenth, 10 dB more is a tenth of the mean squared error, and halving every error adds 6 dB.
+#
 # ## Against a prior
 #
 # POP's argument is about what happens when something else pushes. Take one white splat over black at one pixel, so that
@@ -98,7 +101,11 @@ right.set(
 )
 for ax in (left, right):
     ax.legend()
-picture(fig, "Left: eq. 4. Right: L1 holds or breaks, L2 bends.")
+picture(
+    fig,
+    "Left: eq. 4. Right: under L1 the splat keeps the photograph's grey up to a weight of 1 and is white beyond it; "
+    "under L2 its error grows in proportion to the weight.",
+)
 
 # %% [markdown]
 # Read the right picture both ways. L2 is the better opponent of a *strong* prior, because large errors pull up to twice
@@ -346,8 +353,8 @@ assert (rest_error(l1, 0.5), rest_error(lambda *both: 0.1 * l1(*both), 0.5)) == 
 
 # %% [markdown]
 # ### Exercise 4: code
-# A *held-out* view is one that was put aside and not trained on, as in chapter 0. Its quality is told as *PSNR*, $-10
-# \log_{10} L_2$ in decibels (dB). Write it. What does the same error of a tenth give everywhere, and what does halving
+# A *held-out* view is one that was put aside and not trained on, as in chapter 0. Its quality is told as PSNR. Write
+# it. What does the same error of a tenth give everywhere, and what does halving
 # every error gain? What happens if only one pixel in a hundred is wrong, by 1?
 
 

@@ -110,11 +110,11 @@ def test_the_course_adds_the_kit_and_what_the_kit_needs_and_is_used_by_its_comma
     assert course
     for path in course:
         assert not _foreign(path, {"numpy", "pop_ref", "hypothesis"}), _name(path)
-    # by the script that records two trainings of its toy for a page, by the chapter that shows a whole training, and by
-    # the fuzzer, which damages a student's files
+    # by the chapter that shows a whole training, by pages, which fold what a student may write, and by the fuzzer,
+    # which damages a student's files
     users = (
         "pop_fast/cli/learn.py",
-        "pop_ref/walkthrough/widgets/record.py",
+        "pop_ref/walkthrough/builder/chapter.py",
         "pop_ref/walkthrough/chapter_00_one_picture.py",
         "benchmarks/faults/corpus.py",
         "benchmarks/faults/readers.py",

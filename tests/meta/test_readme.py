@@ -295,6 +295,7 @@ spec.loader.exec_module(site)
         ("pop_ref/alpha.py", "source/pop_ref/alpha.py.md"),
         ("pop_ref/conformance/LAWS.md", "source/pop_ref/conformance/LAWS.md"),
         ("benchmarks/results/scorecards", "source/benchmarks/results/scorecards.md"),
+        ("pop_ref/walkthrough/chapter_04b_tiles.py", "learn/chapter_04b_tiles.html"),
     ],
 )
 def test_every_file_has_its_place(path: str, where: str) -> None:
@@ -310,6 +311,7 @@ def test_every_file_has_its_place(path: str, where: str) -> None:
         ("docs/learn.md", "../README.md", "index.md"),
         ("docs/speed.md", "../benchmarks/NOTES.md#where", "source/benchmarks/NOTES.md#where"),
         ("paper_repro/README.md", "claims.py", "claims.py.md"),
+        ("docs/learn.md", "../pop_ref/walkthrough/chapter_01b_learning.py", "learn/chapter_01b_learning.html"),
         ("paper_repro/README.md", "../docs/paper.md", "../../paper.md"),
         ("docs/kit.md", "https://example.org/a.py", "https://example.org/a.py"),
     ],
@@ -423,3 +425,25 @@ def test_every_command_of_a_workflow_is_there(path: Path) -> None:
     targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     assert set(re.findall(r"\bmake ([a-z-]+)", text)) <= set(targets)
     assert all((ROOT / script).is_file() for script in re.findall(r"\bbash (\S+)", text))
+
+
+def test_no_page_on_learning_leads_to_the_source_of_a_chapter() -> None:
+    text = (ROOT / "docs" / "learn.md").read_text(encoding="utf-8")
+    assert text.count("](../pop_ref/walkthrough/chapter_") == 17
+    links = site.LINK.findall(site.with_links_of_the_site(text, "docs/learn.md"))
+    assert not [target for _, target, _ in links if target.startswith("source/pop_ref/walkthrough")]
+    assert not [path for path in site.linked(["docs/learn.md"]) if path.startswith("pop_ref/walkthrough")]
+
+
+def test_chapters_lead_back_to_the_site_and_have_been_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(site, "WALKTHROUGH", tmp_path)
+    with pytest.raises(FileNotFoundError, match="run 'make walkthrough' first"):
+        site.walkthrough()
+    (tmp_path / "notebooks").mkdir()
+    for name in ("index.html", "notebooks/index.html"):
+        (tmp_path / name).write_text("<body><main><h1>It</h1></main></body>", encoding="utf-8")
+    (tmp_path / "book.pdf").write_bytes(b"%PDF-\xff")
+    made = site.walkthrough()
+    assert b'<main><nav><a href="../index.html">' in made["learn/index.html"]
+    assert b'<a href="../../learn.html">Learn</a></nav><h1>It' in made["learn/notebooks/index.html"]
+    assert made["learn/book.pdf"] == b"%PDF-\xff"

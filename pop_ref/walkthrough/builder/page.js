@@ -15,6 +15,20 @@ for (const asked of document.querySelectorAll(".asked")) {
     if (event.key === "Enter" && input.value.trim()) details.open = true;
   });
 }
+// a function that the course asks for opens at the second click, and stays open to who has opened it once
+for (const yours of document.querySelectorAll("details.yours")) {
+  const summary = yours.querySelector("summary"), status = summary.querySelector("span");
+  let asked = false;
+  summary.addEventListener("click", (event) => {
+    if (!asked && !yours.open) {
+      event.preventDefault();
+      status.textContent = status.dataset.first;
+    } else {
+      status.textContent = "";
+    }
+    asked = true;
+  });
+}
 // a strip of frames becomes one frame, a slider and a button
 for (const film of document.querySelectorAll(".film")) {
   const frames = [...film.querySelectorAll("li")], controls = film.querySelector("p");
