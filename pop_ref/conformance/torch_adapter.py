@@ -6,6 +6,7 @@ torch is imported when an adapter is made, never when the kit is.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import inspect
 import itertools
@@ -106,6 +107,30 @@ class TorchAdapter(Adapter):
         if need == SIGNATURE:
             return self._rasterization is not None and self._whole_signature
         return super().has(need) or self._stage(need) is not None
+
+    def takes(self, argument: str) -> bool:
+        """Tell whether the rasterizer's signature has the argument."""
+        return argument in self._parameters or (argument == "tile_size" and self._takes_anything)
+
+    def sees(self, scene: Scene) -> Scene:
+        """Return the scene as the rasterizer reads it: with tiles of its own side where it takes none."""
+        seen = super().sees(scene)
+        if self._rasterization is None or self.takes("tile_size") or seen.profile.extent == "square":
+            return seen
+        return seen.but(tile_size=self.own_tile_size)
+
+    @functools.cached_property
+    def own_tile_size(self) -> int | None:
+        """Return the side of the tiles of a rasterizer that takes none, as its meta tells it; None if it does not. px"""
+        from pop_ref.conformance.golden import golden_scene
+
+        scene = super().sees(golden_scene())
+        try:
+            meta = self._call(scene, self._leaves(scene, grad=False), dominance=False, counts=False)[2]
+            return int(meta["tile_size"])
+        except Exception:
+            # it tells nothing, or cannot draw, which the laws will find
+            return None
 
     def _asked_for_gradients(self) -> bool:
         """Tell whether an image follows its Gaussians in autograd; a renderer that only draws does not."""
@@ -277,7 +302,7 @@ class TorchAdapter(Adapter):
         """
         if self._rasterization is None:
             raise LookupError(f"{self.name} has no rasterization function")
-        scene, pulls = call.frames[0][0].scene, v_images is not None
+        scene, pulls = call.first.scene, v_images is not None
         leaves = {name: self._tensor(value).requires_grad_(pulls) for name, value in call.tensors().items()}
         images, alphas, meta = self._rasterization(
             **{"quats": None, "scales": None} | leaves,
@@ -287,12 +312,12 @@ class TorchAdapter(Adapter):
             sh_degree=call.sh_degree,
             **self._taken(
                 packed=call.packed,
-                tile_size=scene.profile.tile_size if scene.tile_size is None else scene.tile_size,
+                tile_size=call.tile_size,
                 **self._asked_by(call),
             ),
-            **(self._absgrad if pulls else {}),
+            **(self._absgrad if pulls and call.absgrad else {}),
         )
-        B, C, H, W = len(call.frames), len(call.frames[0]), scene.camera.height, scene.camera.width
+        (B, C, _), H, W = call.shape, scene.camera.height, scene.camera.width
         images, alphas = images.reshape(B, C, H, W, -1), alphas.reshape(B, C, H, W)
         gradients: dict[str, np.ndarray] = {}
         if pulls:
@@ -305,17 +330,20 @@ class TorchAdapter(Adapter):
                 absolute = getattr(means2d, "absgrad", None)
                 of_screen = {"means2d": self._grad_of(means2d)}
                 of_screen |= {} if absolute is None else {"means2d_abs": self._array(absolute)}
-                gradients |= {name: unpacked(call, value, meta) for name, value in of_screen.items()}
+                rows = {name: unpacked(call, value, meta) for name, value in of_screen.items()}
+                gradients |= {name: value for name, value in rows.items() if value is not None}
         shown = {name: self._array(meta[name]) for name in meta if meta[name] is not None}
         return Called(self._array(images), self._array(alphas), shown, gradients)
 
     def _asked_by(self, call: Call) -> dict[str, Any]:
         """Return the arguments of a call that are not at gsplat's defaults, and the profile for who takes one."""
-        scene = call.frames[0][0].scene
+        scene = call.first.scene
         asked: dict[str, Any] = {"near_plane": scene.profile.near_plane, "eps2d": scene.profile.eps2d} | call.planes
         asked |= {"render_mode": call.render_mode} if call.render_mode != "RGB" else {}
         asked |= {"radius_clip": call.radius_clip} if call.radius_clip else {}
         asked |= {"sparse_grad": True} if call.sparse_grad else {}
+        asked |= {"rasterize_mode": "antialiased"} if call.antialiased else {}
+        asked |= {"dominance": call.dominance} if self.takes("dominance") else {}
         return asked | ({"profile": scene.profile} if self._takes_profile else {})
 
     def _taken(self, **options: Any) -> dict[str, Any]:

@@ -81,7 +81,7 @@ def call_arrays(call: Call) -> dict[str, np.ndarray]:
 
 
 def _gradients(row: list[Expected], colors: str) -> dict[str, np.ndarray]:
-    pulled = [e.gradients() for e in row]
+    pulled = [e.gradients for e in row]
     found: dict[str, np.ndarray] = {}
     for name in (*_GAUSSIANS, "colors"):
         own = f"v_{colors if name == 'colors' else name}"
