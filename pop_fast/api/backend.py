@@ -139,11 +139,11 @@ class Backend(Renderer, Protocol):
         """Return the losses, in a module as `pop_fast.stages.losses`; a backend may leave them to that one."""
         ...
 
-    def open_view(self, of: Any) -> Any:
+    def open_view(self, pass_input: Any) -> Any:
         """Project and list a view for passes over it.
 
         Args:
-            of: a `pop_fast.stages.view_pass.PassInput`.
+            pass_input: a `pop_fast.stages.view_pass.PassInput`.
 
         Returns:
             A `pop_fast.stages.view_pass.ViewPass`.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class DrawingBackend:
+class BaseBackend:
     """A backend by its facts; what it draws with comes from those who derive from it.
 
     Attributes:

@@ -23,9 +23,9 @@ from pop_fast.cli.errors import describe
 from pop_fast.cli.finish import FinishOptions, finish
 from pop_fast.cli.limits import LimitOptions
 from pop_fast.cli.live_view import LiveView, check_viewer
+from pop_fast.cli.overrides import PLAN, overrides, plan_of
 from pop_fast.cli.printable import printable
 from pop_fast.cli.result_folder import as_begun, check_output, record_of, resumption, stopped
-from pop_fast.cli.said import PLAN, plan_of, said
 from pop_fast.cli.told_early import about_large, check_early
 from pop_fast.cli.train_blocks import check_blocks, train_in_blocks
 from pop_fast.data.sfm_options import SfmOptions
@@ -274,7 +274,7 @@ def arguments(argv: Sequence[str]) -> tuple[TrainConfig, Any]:
     plan = plan_of(words)
     base = TrainConfig.of(**plan, result_dir="")
     args = parse(_arguments_type(base, plan, short_help), words, "train", examples=_EXAMPLES)
-    config = TrainConfig.of(**{name: getattr(args, name) for name in PLAN}, **said(args, base, words))
+    config = TrainConfig.of(**{name: getattr(args, name) for name in PLAN}, **overrides(args, base, words))
     if args.quiet:
         config = replace(config, progress=False)
     if not args.result_dir:
@@ -384,13 +384,13 @@ def open_capture(config: TrainConfig, options: Any) -> Capture:
 
     The cameras of bare photographs are found first.
     """
-    from pop_fast.cli.meanwhile import importing
+    from pop_fast.cli.background_import import background_import
     from pop_fast.cli.progress import bars
     from pop_fast.data.load import load_capture
 
     # a folder that is not there is said at once
     modules = _TRAINING if Path(config.data).is_dir() else ()
-    with importing(*modules), bars(config.progress) as progress:
+    with background_import(*modules), bars(config.progress) as progress:
         return load_capture(
             config.data,
             factor=config.factor,

@@ -25,14 +25,14 @@ template <class Real> struct Again {
   int words() const { return (strips + 63) / 64; }
 
   template <bool ROW>
-  void blend_again(const Thresholds<Real> &thresholds, const Pixels<Real> &pixels, const Real *lights,
+  void blend_again(const Thresholds<Real> &thresholds, const Pixels<Real> &pixels, const Real *transmittances,
                    const uint16_t *reached) {
     std::fill(marks.begin(), marks.end(), 0);
     Real *to_alphas = alphas.data(), *to_weights = weights.data();
     for (int strip = 0; strip < strips; strip++) {
       const int at = strip * LANES<Real>;
       const Vec<Real> x = load(&pixels.x[at]), y = load(&pixels.y[at]);
-      Vec<Real> T = load(lights + at);
+      Vec<Real> T = load(transmittances + at);
       each_marked(reached[strip], [&](int k) {
         marks[k * words() + strip / 64] |= uint64_t(1) << strip % 64;
         Vec<Real> alpha, weight;
@@ -180,7 +180,7 @@ void transpose_tile(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_
     const int n = int(std::min<int64_t>(CHUNK, place.begin + n_reached - first));
     state.entries.gather(blend, place, first, n, first - CHUNK);
     if (ROW) state.rows.expand(state.entries, pixels);
-    state.template blend_again<ROW>(thresholds, pixels, blend.lights + at * state.padded,
+    state.template blend_again<ROW>(thresholds, pixels, blend.transmittances + at * state.padded,
                                     blend.reached + at * state.strips);
     Real *rows[CHUNK];
     for (int k = n - 1; k >= 0; k--) {

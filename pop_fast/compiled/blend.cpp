@@ -4,7 +4,7 @@
 
 #include "backward.h"
 #include "colors.h"
-#include "door.h"
+#include "c_api.h"
 #include "forward.h"
 #include "lists.h"
 #include "moments.h"

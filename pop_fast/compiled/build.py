@@ -35,7 +35,7 @@ UNITS: Final = (
 )
 SOURCES: Final = (
     *("projection.h", "colors.h", "lists.h", "tile.h", "forward.h", "backward.h", "ssim.h", "moments.h"),
-    *("scores.h", "door.h", "lanes.h", "threads.h", "pool.h", "step.h", "step_rows.h"),
+    *("scores.h", "c_api.h", "lanes.h", "threads.h", "pool.h", "step.h", "step_rows.h"),
     "row_block.h",
     *UNITS,
 )

@@ -114,7 +114,7 @@ def _lights(lists: TileLists, like: Tensor) -> dict[str, Tensor]:
     n_pixels = int(chunks.sum()) * pixels
     return {
         "first_chunks": chunks.cumsum(0) - chunks,
-        "lights": like.new_empty(n_pixels),
+        "transmittances": like.new_empty(n_pixels),
         "reached": torch.empty(n_pixels // library.lanes(like.dtype.itemsize), dtype=torch.int16),
     }
 

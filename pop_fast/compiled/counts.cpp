@@ -24,7 +24,7 @@ StepCounts Stepper::counted() const {
       lines.look(entries, pixels, thresholds);
       found.chunks++;
       for (int strip = 0; strip < pixels.strips; strip++) {
-        if (!any(load(&blend.lights[chunk * pixels.padded() + strip * LANES<float>]) > 0.0f)) continue;
+        if (!any(load(&blend.transmittances[chunk * pixels.padded() + strip * LANES<float>]) > 0.0f)) continue;
         found.pairs += n * LANES<float>;
         found.marked += __builtin_popcount(lines.of_strip(pixels, strip));
         found.reached += __builtin_popcount(blend.reached[chunk * pixels.strips + strip]);

@@ -151,8 +151,8 @@ void blend_tile(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_t ti
     entries.gather(blend, place, at, std::min<int64_t>(CHUNK, place.end - at), at + CHUNK);
     canvas.rows.expand(entries, pixels);
     canvas.rows.look(entries, pixels, thresholds);
-    const int64_t chunk = blend.lights ? blend.first_chunks[tile] + (at - place.begin) / CHUNK : 0;
-    if (blend.lights) std::copy(canvas.T.begin(), canvas.T.end(), blend.lights + chunk * canvas.padded);
+    const int64_t chunk = blend.transmittances ? blend.first_chunks[tile] + (at - place.begin) / CHUNK : 0;
+    if (blend.transmittances) std::copy(canvas.T.begin(), canvas.T.end(), blend.transmittances + chunk * canvas.padded);
     for (int strip = 0; strip < pixels.strips; strip++) {
       uint32_t reached = 0;
       if (canvas.lit(strip)) {

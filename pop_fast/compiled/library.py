@@ -100,7 +100,7 @@ class Blend(ctypes.Structure):
         *_fields(_WHOLE, "pixel_stride", "channel_stride"),
         *_fields(_REAL, "alpha_floor", "alpha_ceiling", "stop"),
         *_fields(_WHOLE, "ceiling_passes"),
-        *_fields(_POINTER, "splats", "lights", "reached", "n_reached", "n_pairs", "image", "alphas"),
+        *_fields(_POINTER, "splats", "transmittances", "reached", "n_reached", "n_pairs", "image", "alphas"),
         *_fields(_POINTER, "dominant_ids", "dominant_weights", "n_blended", "n_traversed"),
         *_fields(_POINTER, "v_image", "v_alphas", "rows"),
         *_fields(_POINTER, "v_means2d", "v_conics", "v_opacities", "v_colors", "absgrad"),

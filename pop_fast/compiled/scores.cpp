@@ -3,7 +3,7 @@
 
 #include "scores.h"
 
-#include "door.h"
+#include "c_api.h"
 
 namespace pop {
 

@@ -45,12 +45,12 @@ template <class Real> struct LaneSums {
 };
 
 // The light of a tile's pixels on the way through its list.
-template <class Real> struct Light {
+template <class Real> struct TileState {
   std::vector<Real> T;
   Entries<Real> entries;
   Rows<Real> rows;
 
-  explicit Light(const Pixels<Real> &pixels) : T(pixels.padded()), rows(pixels.size) {}
+  explicit TileState(const Pixels<Real> &pixels) : T(pixels.padded()), rows(pixels.size) {}
 
   void begin(const Place<Real> &place) {
     // pixels off the image and padding have no light, as if they had stopped
@@ -68,32 +68,32 @@ template <class Real> struct Light {
 // Blend a tile's list front to back. Calls before(chunk) and after(chunk, first entry), and between the two
 // pair(k, strip, alpha, weight) where an entry may reach a strip, after which reached(strip, entries that take light).
 template <class Real, bool ROW, class Before, class Pair, class Reached, class After>
-void walk(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_t tile, Light<Real> &light, Before before,
+void walk(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_t tile, TileState<Real> &state, Before before,
           Pair pair, Reached reached, After after) {
   const Place<Real> place(blend, tile);
   const Thresholds<Real> thresholds(blend);
-  light.begin(place);
+  state.begin(place);
   int64_t chunk = 0;
-  for (int64_t first = place.begin; first < place.end && light.lit(); first += CHUNK, chunk++) {
-    light.entries.gather(blend, place, first, std::min<int64_t>(CHUNK, place.end - first), first + CHUNK);
-    light.rows.expand(light.entries, pixels);
-    light.rows.look(light.entries, pixels, thresholds);
+  for (int64_t first = place.begin; first < place.end && state.lit(); first += CHUNK, chunk++) {
+    state.entries.gather(blend, place, first, std::min<int64_t>(CHUNK, place.end - first), first + CHUNK);
+    state.rows.expand(state.entries, pixels);
+    state.rows.look(state.entries, pixels, thresholds);
     before(chunk);
     for (int strip = 0; strip < pixels.strips; strip++) {
       uint32_t took = 0;
-      if (light.lit(strip)) {
+      if (state.lit(strip)) {
         const int at = strip * LANES<Real>;
         const Vec<Real> x = load(&pixels.x[at]), y = load(&pixels.y[at]);
-        Vec<Real> T = load(&light.T[at]);
-        each_marked(light.rows.of_strip(pixels, strip), [&](int k) {
+        Vec<Real> T = load(&state.T[at]);
+        each_marked(state.rows.of_strip(pixels, strip), [&](int k) {
           const Vec<Real> T_before = T;
           Vec<Real> alpha, weight;
-          take(thresholds, exponent<Real, ROW>(light.entries, light.rows, strip, k, x, y), T, alpha, weight);
+          take(thresholds, exponent<Real, ROW>(state.entries, state.rows, strip, k, x, y), T, alpha, weight);
           // also the entry at which a pixel stops, which has no weight there
           took |= uint32_t(any(T < T_before)) << k;
           pair(k, strip, alpha, weight);
         });
-        store(&light.T[at], T);
+        store(&state.T[at], T);
       }
       reached(strip, took);
     }
@@ -109,18 +109,18 @@ template <class Real> inline Vec<Real> root_of(Vec<Real> v) {
 }
 
 template <class Real> struct ContributionsState {
-  Light<Real> light;
+  TileState<Real> tile;
   LaneSums<Real> sums;
   std::vector<Real> map;
 
-  explicit ContributionsState(const Pixels<Real> &pixels) : light(pixels), sums(CONTRIBUTIONS), map(pixels.padded()) {}
+  explicit ContributionsState(const Pixels<Real> &pixels) : tile(pixels), sums(CONTRIBUTIONS), map(pixels.padded()) {}
 };
 
 template <class Real, bool ROW>
 void contributions_of_tile(const Scores<Real> &scores, const Pixels<Real> &pixels, int64_t tile,
                            ContributionsState<Real> &state) {
   const Place<Real> place(scores, tile);
-  const Entries<Real> &entries = state.light.entries;
+  const Entries<Real> &entries = state.tile.entries;
   place.each_row([&](int64_t pixel, int64_t from) {
     if (scores.pixel_map) std::copy_n(scores.pixel_map + from, place.columns(), &state.map[pixel]);
   });
@@ -138,20 +138,20 @@ void contributions_of_tile(const Scores<Real> &scores, const Pixels<Real> &pixel
   const auto after = [&](int64_t, int64_t first) {
     state.sums.write(CONTRIBUTIONS, entries.count, scores.rows + CONTRIBUTIONS * first);
   };
-  walk<Real, ROW>(scores, pixels, tile, state.light, before, pair, [](int, uint32_t) {}, after);
+  walk<Real, ROW>(scores, pixels, tile, state.tile, before, pair, [](int, uint32_t) {}, after);
 }
 
 // What the way back needs of the way there, a chunk that is blended again, and the light from behind. D channels.
 template <class Real, int D> struct BackState {
-  Light<Real> light;
+  TileState<Real> tile;
   Again<Real> again;
   LaneSums<Real> sums;
-  std::vector<Real> lights;       // T before every chunk. [chunks, pixels]
+  std::vector<Real> transmittances;       // T before every chunk. [chunks, pixels]
   std::vector<uint16_t> reached;  // [chunks, strips]
   std::vector<Real> suffix_color;       // [D, pixels]
 
   BackState(const Pixels<Real> &pixels, int columns)
-      : light(pixels), again(pixels), sums(columns), suffix_color(D * pixels.padded()) {}
+      : tile(pixels), again(pixels), sums(columns), suffix_color(D * pixels.padded()) {}
 
   Real *suffix_color_of(int d, int at) { return &suffix_color[d * again.padded + at]; }
 };
@@ -164,14 +164,14 @@ void walk_back(const Scores<Real> &scores, const Pixels<Real> &pixels, int64_t t
   const Thresholds<Real> thresholds(scores);
   const int padded = pixels.padded(), strips = pixels.strips;
   const int64_t most = (place.end - place.begin + CHUNK - 1) / CHUNK;
-  if (int64_t(state.lights.size()) < most * padded) {
-    state.lights.resize(most * padded);
+  if (int64_t(state.transmittances.size()) < most * padded) {
+    state.transmittances.resize(most * padded);
     state.reached.resize(most * strips);
   }
   int64_t n_chunks = 0;
   walk<Real, ROW>(
-      scores, pixels, tile, state.light,
-      [&](int64_t chunk) { std::copy(state.light.T.begin(), state.light.T.end(), &state.lights[chunk * padded]); },
+      scores, pixels, tile, state.tile,
+      [&](int64_t chunk) { std::copy(state.tile.T.begin(), state.tile.T.end(), &state.transmittances[chunk * padded]); },
       [](int, int, Vec<Real>, Vec<Real>) {},
       [&](int strip, uint32_t took) { state.reached[n_chunks * strips + strip] = uint16_t(took); },
       [&](int64_t, int64_t) { n_chunks++; });
@@ -182,7 +182,7 @@ void walk_back(const Scores<Real> &scores, const Pixels<Real> &pixels, int64_t t
     const int n = int(std::min<int64_t>(CHUNK, place.begin + n_reached - first));
     state.again.entries.gather(scores, place, first, n, first - CHUNK);
     if (ROW) state.again.rows.expand(state.again.entries, pixels);
-    state.again.template blend_again<ROW>(thresholds, pixels, &state.lights[chunk * padded],
+    state.again.template blend_again<ROW>(thresholds, pixels, &state.transmittances[chunk * padded],
                                           &state.reached[chunk * strips]);
     state.sums.clear();
     for (int k = n - 1; k >= 0; k--)
@@ -253,13 +253,13 @@ void moments_of_tile(const Scores<Real> &scores, const Pixels<Real> &pixels, int
 }
 
 template <class Real> struct PointsState {
-  Light<Real> light;
+  TileState<Real> tile;
   std::vector<Real> across, down, best, left;  // the rays' directions in the camera's axes, z being 1; T
   std::vector<Whole<Real>> winner;
   Real facing[CHUNK][3];
 
   explicit PointsState(const Pixels<Real> &pixels)
-      : light(pixels), across(pixels.padded()), down(pixels.padded()), best(pixels.padded()), left(pixels.padded()),
+      : tile(pixels), across(pixels.padded()), down(pixels.padded()), best(pixels.padded()), left(pixels.padded()),
         winner(pixels.padded()) {}
 };
 
@@ -277,7 +277,7 @@ void points_of_tile(const Scores<Real> &scores, const Pixels<Real> &pixels, int6
   int64_t place_in_list = 0;
   const auto before = [&](int64_t chunk) {
     place_in_list = chunk * CHUNK;
-    for (int k = 0; k < state.light.entries.count; k++)
+    for (int k = 0; k < state.tile.entries.count; k++)
       std::copy_n(scores.facing + 3 * scores.ids[place.begin + place_in_list + k], 3, state.facing[k]);
   };
   const auto pair = [&](int k, int strip, Vec<Real> alpha, Vec<Real> weight) {
@@ -291,7 +291,7 @@ void points_of_tile(const Scores<Real> &scores, const Pixels<Real> &pixels, int6
     store_whole<Real>(&state.winner[at], wins ? Mask<Real>{} + Whole<Real>(place_in_list + k) : winner);
     store(&state.left[at], left - left * alpha);
   };
-  walk<Real, ROW>(scores, pixels, tile, state.light, before, pair, [](int, uint32_t) {}, [](int64_t, int64_t) {});
+  walk<Real, ROW>(scores, pixels, tile, state.tile, before, pair, [](int, uint32_t) {}, [](int64_t, int64_t) {});
   place.each_pixel([&](int64_t pixel, int64_t to) {
     const int64_t winner = state.winner[pixel];
     scores.dominant_ids[to] = winner < 0 ? -1 : scores.ids[place.begin + winner];

@@ -156,7 +156,7 @@ void Stepper::finish() {
 
 int64_t Stepper::bytes() const {
   return seen.bytes() + splats.bytes() + counts.bytes() + keys.bytes() + sorted.bytes() + ids.bytes() +
-         slots.bytes() + lights.bytes() + rows.bytes() + reached.bytes() + difference.bytes() + alphas.bytes() +
+         slots.bytes() + transmittances.bytes() + rows.bytes() + reached.bytes() + difference.bytes() + alphas.bytes() +
          partials.bytes() + v_image.bytes() + v_alphas.bytes();
 }
 

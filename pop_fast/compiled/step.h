@@ -159,7 +159,7 @@ private:
   std::vector<int64_t> starts, offsets, first_chunks, n_reached;
   Buffer<int64_t> ids;
   Buffer<int32_t> slots;
-  Buffer<float> lights, rows;
+  Buffer<float> transmittances, rows;
   Buffer<uint16_t> reached;
   // of pixels
   Buffer<float> difference, alphas, partials, v_image, v_alphas;

@@ -201,7 +201,7 @@ Work Stepper::place_entries() {
   int32_t *const to_slots = slots.get(total);
   blend.ids = to_ids;
   blend.slots = to_slots;
-  blend.lights = lights.get(n_chunks * pixels.padded());
+  blend.transmittances = transmittances.get(n_chunks * pixels.padded());
   blend.reached = reached.get(n_chunks * pixels.strips);
   blend.rows = rows.get(total * COLUMNS);
   return {n_visible, part, [=](int, int64_t first, int64_t last) {

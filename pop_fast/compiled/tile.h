@@ -43,7 +43,7 @@ template <class Real> struct Blend {
   double alpha_floor, alpha_ceiling, stop;  // alpha > floor is blended, T > stop continues: strictness is folded in
   int64_t ceiling_passes;                   // B3: whether the gradient goes through the ceiling
   Splat *splats;                            // the forward pass makes them, and the transpose takes them. [N]
-  Real *lights;                             // T before every chunk, for the transpose. [chunks, strips, lanes]
+  Real *transmittances;                             // T before every chunk, for the transpose. [chunks, strips, lanes]
   uint16_t *reached;                        // likewise, which entries of a chunk blend in a strip. [chunks, strips]
   int64_t *n_reached, *n_pairs;             // entries blended before all pixels had stopped; pairs. [tiles]
   Real *image, *alphas;                     // [H, W, D] or [D, H, W], [H, W]

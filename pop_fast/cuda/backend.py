@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import cuda_ext
-from pop_fast.api.plugin import DrawingBackend
+from pop_fast.api.plugin import BaseBackend
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class CudaBackend(DrawingBackend):
+class CudaBackend(BaseBackend):
     """Draws on the GPU that holds the tensors.
 
     Attributes:
@@ -42,11 +42,11 @@ class CudaBackend(DrawingBackend):
 
         return CudaStages(self.backward, self.deterministic)
 
-    def open_view(self, of: Any) -> Any:
+    def open_view(self, pass_input: Any) -> Any:
         """Draw a view for passes over it."""
         from pop_fast.cuda.passes import CudaView
 
-        return CudaView(of)
+        return CudaView(pass_input)
 
     def make_engine(self, config: Any, own_strategy: bool) -> Any:
         """Return the fused step and nothing else; a setting that it does not know is refused."""

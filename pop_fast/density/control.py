@@ -248,35 +248,37 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         with torch.no_grad():
             return self.edit(DensificationContext(params, optimizers, state, step, draws, passes, sh_degree))
 
-    def edit(self, of: DensificationContext) -> DensificationStep:
+    def edit(self, context: DensificationContext) -> DensificationStep:
         """Do what is due after a step after which the Gaussians change: refine, reset, prune for the last time."""
-        done = self.refine(of) if self.is_refine_step(of.step) else DensificationStep()
-        return self.prune_finally(of, self.reset(of, done))
+        done = self.refine(context) if self.is_refine_step(context.step) else DensificationStep()
+        return self.prune_finally(context, self.reset(context, done))
 
-    def refine(self, of: DensificationContext) -> DensificationStep:
+    def refine(self, context: DensificationContext) -> DensificationStep:
         """Clone, split and prune by the window's statistics."""
         from pop_fast.density import densify
 
-        return densify.refine(self, of, *densify.who_grows(self, of), lambda: densify.who_goes(self, of))
+        return densify.refine(
+            self, context, *densify.planned_growth(self, context), lambda: densify.planned_prune(self, context)
+        )
 
-    def prune_finally(self, of: DensificationContext, done: DensificationStep) -> DensificationStep:
+    def prune_finally(self, context: DensificationContext, done: DensificationStep) -> DensificationStep:
         """Prune faint Gaussians once more if it is time, and say so in what was done."""
-        if of.step != self.final_prune_iter:
+        if context.step != self.final_prune_iter:
             return done
         import torch
 
         from pop_fast.density import densify
 
-        faint = torch.sigmoid(of.params["opacities"].flatten()) < self.final_prune_opa
-        return replace(done, pruned=done.pruned + densify.prune(of, faint))
+        faint = torch.sigmoid(context.params["opacities"].flatten()) < self.final_prune_opa
+        return replace(done, pruned=done.pruned + densify.prune(context, faint))
 
-    def reset(self, of: DensificationContext, done: DensificationStep) -> DensificationStep:
+    def reset(self, context: DensificationContext, done: DensificationStep) -> DensificationStep:
         """Reset opacities if it is time, and say so in what was done."""
-        if not self.is_reset_step(of.step):
+        if not self.is_reset_step(context.step):
             return done
         from pop_fast.density import densify
 
-        densify.reset(self, of)
+        densify.reset(self, context)
         return replace(done, reset=True)
 
 

@@ -111,44 +111,51 @@ def draws_of(generator: torch.Generator) -> Draws:
 
 
 def refine(
-    plan: DensityControl, of: DensificationContext, clones: Tensor, splits: Tensor, prunes: Callable[[], Tensor]
+    plan: DensityControl, context: DensificationContext, clones: Tensor, splits: Tensor, prunes: Callable[[], Tensor]
 ) -> DensificationStep:
     """Clone, split, prune, and start a new window.
 
     Args:
         plan: the strategy.
-        of: the Gaussians, and what a step may ask for.
+        context: the Gaussians, and what a step may ask for.
         clones: who is cloned. [N] bool
         splits: who is split. [N] bool
         prunes: asked of the grown set of Gaussians who of it is pruned. -> bool
     """
     n_clones, n_splits = int(clones.sum()), int(splits.sum())
     if n_clones:
-        rows.clone(of.params, of.optimizers, of.state, clones)
+        rows.clone(context.params, context.optimizers, context.state, clones)
     if n_splits:
         # a clone of this densification step is never split in it
         padded = torch.cat([splits, splits.new_zeros(n_clones)])
-        rows.split(of.params, of.optimizers, of.state, padded, of.draws.normals(n_splits), plan.revised_opacity)
-    done = DensificationStep(n_clones, n_splits, prune(of, prunes()))
-    clear(of.state)
+        rows.split(
+            context.params,
+            context.optimizers,
+            context.state,
+            padded,
+            context.draws.normals(n_splits),
+            plan.revised_opacity,
+        )
+    done = DensificationStep(n_clones, n_splits, prune(context, prunes()))
+    clear(context.state)
     if plan.verbose:
         print(f"step {of.step}: {done}, {len(of)} Gaussians")
     return done
 
 
-def prune(of: DensificationContext, mask: Tensor) -> int:
+def prune(context: DensificationContext, mask: Tensor) -> int:
     """Remove the selected Gaussians and return how many they were."""
     n_pruned = int(mask.sum())
     if n_pruned:
-        rows.prune(of.params, of.optimizers, of.state, mask)
+        rows.prune(context.params, context.optimizers, context.state, mask)
     return n_pruned
 
 
-def who_grows(plan: DensityControl, of: DensificationContext) -> tuple[Tensor, Tensor]:
+def planned_growth(plan: DensityControl, context: DensificationContext) -> tuple[Tensor, Tensor]:
     """Return who is cloned and who is split; see `pop_ref.density.grow_masks`. [N] bool each"""
-    state = of.state
-    masks = grow_masks(window(state), torch.exp(of.params["scales"]), state["scene_scale"], of.step, plan)
-    if of.step < plan.refine_scale2d_stop_iter:
+    state = context.state
+    masks = grow_masks(window(state), torch.exp(context.params["scales"]), state["scene_scale"], context.step, plan)
+    if context.step < plan.refine_scale2d_stop_iter:
         return masks[0], masks[1] | (state["radii"] > plan.grow_scale2d)
     return masks
 
@@ -165,18 +172,18 @@ def window(state: State) -> Statistics:
     )
 
 
-def who_goes(plan: DensityControl, of: DensificationContext) -> Tensor:
+def planned_prune(plan: DensityControl, context: DensificationContext) -> Tensor:
     """Return who is too faint or too big; see `pop_ref.density.prune_mask`. [N] bool"""
-    opacities, state = torch.sigmoid(of.params["opacities"].flatten()), of.state
-    mask = prune_mask(opacities, torch.exp(of.params["scales"]), state["scene_scale"], of.step, plan)
-    if plan.prune_too_big_after < of.step < plan.refine_scale2d_stop_iter:
+    opacities, state = torch.sigmoid(context.params["opacities"].flatten()), context.state
+    mask = prune_mask(opacities, torch.exp(context.params["scales"]), state["scene_scale"], context.step, plan)
+    if plan.prune_too_big_after < context.step < plan.refine_scale2d_stop_iter:
         mask |= state["radii"] > plan.prune_scale2d
     return mask
 
 
-def reset(plan: DensityControl, of: DensificationContext) -> None:
+def reset(plan: DensityControl, context: DensificationContext) -> None:
     """Lower all opacities to the ceiling of a reset."""
-    rows.reset_opacities(of.params, of.optimizers, ceiling=plan.reset_opa)
+    rows.reset_opacities(context.params, context.optimizers, ceiling=plan.reset_opa)
 
 
 def clear(state: State) -> None:

@@ -15,19 +15,19 @@ from pop_fast.density.protocol import DensificationContext
 from pop_fast.stages.selection import lowest_share
 
 
-def summed_over_views(of: DensificationContext, score: Callable[[int], Tensor]) -> Tensor:
+def summed_over_views(context: DensificationContext, score: Callable[[int], Tensor]) -> Tensor:
     """Add up what a score gives for every training view, in float64.
 
     Args:
-        of: the Gaussians, and what a step may ask for.
+        context: the Gaussians, and what a step may ask for.
         score: of a view by its index, any shape.
     """
     total = score(0).to(torch.float64)
-    for index in range(1, of.views.n_views):
+    for index in range(1, context.views.n_views):
         total += score(index)
     return total
 
 
-def prune_lowest(of: DensificationContext, scores: Tensor, share: float) -> int:
+def prune_lowest(context: DensificationContext, scores: Tensor, share: float) -> int:
     """Remove the share of Gaussians with the lowest scores, and return how many those were."""
-    return densify.prune(of, lowest_share(scores, share).to(of.params["means"].device))
+    return densify.prune(context, lowest_share(scores, share).to(context.params["means"].device))

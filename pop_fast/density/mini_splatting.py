@@ -78,14 +78,18 @@ class MiniSplattingStrategy(InriaStrategy):
         """Tell whether the Gaussians are edited after this step."""
         return super().changes_after(step) or self.needs_passes(step)
 
-    def edit(self, of: DensificationContext) -> DensificationStep:
+    def edit(self, context: DensificationContext) -> DensificationStep:
         """Do what is due after this step."""
-        if of.step in self.adam_restarts:
+        if context.step in self.adam_restarts:
             from pop_fast.density import mini_splatting_steps as events
 
-            if of.step in self.reinit_iters:
-                return events.set_anew_from_depth(self, of)
-            return events.draw_by_importance(self, of) if of.step == self.sample_iter else events.prune(self, of)
-        if self.is_refine_step(of.step) and len(of) >= self.max_gaussians:
+            if context.step in self.reinit_iters:
+                return events.set_anew_from_depth(self, context)
+            return (
+                events.draw_by_importance(self, context)
+                if context.step == self.sample_iter
+                else events.prune(self, context)
+            )
+        if self.is_refine_step(context.step) and len(context) >= self.max_gaussians:
             return DensificationStep()
-        return super().edit(of)
+        return super().edit(context)

@@ -18,65 +18,67 @@ if TYPE_CHECKING:
     from pop_fast.density.mini_splatting import MiniSplattingStrategy
 
 
-def set_anew_from_depth(plan: MiniSplattingStrategy, of: DensificationContext) -> DensificationStep:
+def set_anew_from_depth(plan: MiniSplattingStrategy, context: DensificationContext) -> DensificationStep:
     """Replace all Gaussians by points of the training views, with their pixels' colours."""
     points, colors = [], []
-    for index in range(of.views.n_views):
-        found, color = _points_of_view(plan, of, index)
+    for index in range(context.views.n_views):
+        found, color = _points_of_view(plan, context, index)
         points.append(found)
         colors.append(color)
     sh0 = ((torch.cat(colors) - 0.5) / SH_C0)[:, None]
-    return _begin_anew(plan, of, torch.cat(points), sh0)
+    return _begin_anew(plan, context, torch.cat(points), sh0)
 
 
-def _points_of_view(plan: MiniSplattingStrategy, of: DensificationContext, index: int) -> tuple[Tensor, Tensor]:
+def _points_of_view(plan: MiniSplattingStrategy, context: DensificationContext, index: int) -> tuple[Tensor, Tensor]:
     """Draw pixels by their opacity, and return their points and their photograph's colours. [M, 3] each"""
-    views = of.views
-    points, ids, T_final = views.dominant_points(of.params, index, of.sh_degree)
+    views = context.views
+    points, ids, T_final = views.dominant_points(context.params, index, context.sh_degree)
     height, width = ids.shape
     mask = views.view(index).mask
     shown = ids >= 0 if mask is None else (ids >= 0) & mask.to(ids.device)
     weights = torch.where(shown, 1.0 - T_final, 0.0).flatten().to("cpu", torch.float64)
     wanted = samples_per_view(views.n_views, width, height, plan.reinit_points)
     wanted = min(wanted, int((weights > 0.0).sum()))
-    drawn = sample_without_replacement(weights, wanted, of.draws.uniforms(len(weights))).to(points.device)
+    drawn = sample_without_replacement(weights, wanted, context.draws.uniforms(len(weights))).to(points.device)
     photo = views.photo(index).reshape(-1, 3).to(points.device)
     return points.reshape(-1, 3)[drawn], photo[drawn].to(points.dtype) / 255.0
 
 
-def importance(plan: MiniSplattingStrategy, of: DensificationContext) -> Tensor:
+def importance(plan: MiniSplattingStrategy, context: DensificationContext) -> Tensor:
     """Sum the importance of every Gaussian over the training views; 0 where none is dominated at any pixel. [N]"""
-    n = len(of)
+    n = len(context)
     total, dominant_sum = torch.zeros(n, dtype=torch.float64), torch.zeros(n, dtype=torch.int64)
-    for index in range(of.views.n_views):
-        found = of.views.contributions(of.params, index, of.sh_degree)
+    for index in range(context.views.n_views):
+        found = context.views.contributions(context.params, index, context.sh_degree)
         total += view_importance(found, found.dominant_counts, plan.importance == "outdoor").to("cpu", torch.float64)
         dominant_sum += found.dominant_counts.cpu()
     return torch.where(dominant_sum > 0, total, 0.0)
 
 
-def draw_by_importance(plan: MiniSplattingStrategy, of: DensificationContext) -> DensificationStep:
+def draw_by_importance(plan: MiniSplattingStrategy, context: DensificationContext) -> DensificationStep:
     """Let a share of the Gaussians, drawn by importance, keep place and colour and begin anew; the others go."""
-    weights = importance(plan, of)
+    weights = importance(plan, context)
     wanted = int(plan.sampling_factor * int((weights > 0.0).sum()))
-    drawn = sample_without_replacement(weights, wanted, of.draws.uniforms(len(weights)))
-    drawn = drawn.to(of.params["means"].device)
-    return _begin_anew(plan, of, of.params["means"].detach()[drawn], of.params["sh0"].detach()[drawn])
+    drawn = sample_without_replacement(weights, wanted, context.draws.uniforms(len(weights)))
+    drawn = drawn.to(context.params["means"].device)
+    return _begin_anew(plan, context, context.params["means"].detach()[drawn], context.params["sh0"].detach()[drawn])
 
 
-def prune(plan: MiniSplattingStrategy, of: DensificationContext) -> DensificationStep:
+def prune(plan: MiniSplattingStrategy, context: DensificationContext) -> DensificationStep:
     """Remove the least important Gaussians, and start Adam anew."""
-    mask = least_mass(importance(plan, of), plan.prune_mass)
-    pruned = densify.prune(of, mask.to(of.params["means"].device))
-    rows.restart(of.params, of.optimizers)
+    mask = least_mass(importance(plan, context), plan.prune_mass)
+    pruned = densify.prune(context, mask.to(context.params["means"].device))
+    rows.restart(context.params, context.optimizers)
     return DensificationStep(pruned=pruned)
 
 
 def _begin_anew(
-    plan: MiniSplattingStrategy, of: DensificationContext, points: Tensor, sh0: Tensor
+    plan: MiniSplattingStrategy, context: DensificationContext, points: Tensor, sh0: Tensor
 ) -> DensificationStep:
-    densify.forget(of.state)
-    rows.replace_rows(of.params, of.optimizers, of.state, _rows(of.params, points, sh0, plan.reinit_opacity))
+    densify.forget(context.state)
+    rows.replace_rows(
+        context.params, context.optimizers, context.state, _rows(context.params, points, sh0, plan.reinit_opacity)
+    )
     return DensificationStep(replaced=len(points))
 
 

@@ -45,17 +45,19 @@ class PupStrategy(InriaStrategy):
         """Tell whether the Gaussians are edited after this step."""
         return super().changes_after(step) or self.needs_passes(step)
 
-    def edit(self, of: DensificationContext) -> DensificationStep:
+    def edit(self, context: DensificationContext) -> DensificationStep:
         """Refine and reset as 3DGS; at the beginning of a round prune and start Adam anew."""
-        if of.step not in self.adam_restarts:
-            return super().edit(of)
+        if context.step not in self.adam_restarts:
+            return super().edit(context)
         from pop_fast.density import rows
         from pop_fast.density.importance import prune_lowest, summed_over_views
         from pop_fast.stages.fisher import log_det_scores
 
-        views, divisor = of.views, self.score_divisor
-        blocks = summed_over_views(of, lambda index: views.fisher(of.params, index, of.sh_degree, divisor))
-        share = self.prune_shares[self.adam_restarts.index(of.step)]
-        pruned = prune_lowest(of, log_det_scores(blocks), share)
-        rows.restart(of.params, of.optimizers)
+        views, divisor = context.views, self.score_divisor
+        blocks = summed_over_views(
+            context, lambda index: views.fisher(context.params, index, context.sh_degree, divisor)
+        )
+        share = self.prune_shares[self.adam_restarts.index(context.step)]
+        pruned = prune_lowest(context, log_det_scores(blocks), share)
+        rows.restart(context.params, context.optimizers)
         return DensificationStep(pruned=pruned)

@@ -45,14 +45,16 @@ class SpeedySplatStrategy(InriaStrategy):
         """Tell whether the Gaussians are edited after this step."""
         return super().changes_after(step) or self.needs_passes(step)
 
-    def edit(self, of: DensificationContext) -> DensificationStep:
+    def edit(self, context: DensificationContext) -> DensificationStep:
         """Refine, prune by sensitivity, reset: in this order."""
-        done = self.refine(of) if self.is_refine_step(of.step) else DensificationStep()
-        share = self.prune_share_at(of.step)
+        done = self.refine(context) if self.is_refine_step(context.step) else DensificationStep()
+        share = self.prune_share_at(context.step)
         if share > 0.0:
             from pop_fast.density.importance import prune_lowest, summed_over_views
 
-            views = of.views
-            scores = summed_over_views(of, lambda index: views.sensitivities(of.params, index, of.sh_degree))
-            done = replace(done, pruned=done.pruned + prune_lowest(of, scores, share))
-        return self.reset(of, done)
+            views = context.views
+            scores = summed_over_views(
+                context, lambda index: views.sensitivities(context.params, index, context.sh_degree)
+            )
+            done = replace(done, pruned=done.pruned + prune_lowest(context, scores, share))
+        return self.reset(context, done)

@@ -58,11 +58,11 @@ class TamingStrategy(InriaStrategy):
         """Return which step of the parabola this is, from 1."""
         return (step - self.refine_start_iter) // self.refine_every
 
-    def refine(self, of: DensificationContext) -> DensificationStep:
+    def refine(self, context: DensificationContext) -> DensificationStep:
         """Clone, split and prune who is drawn."""
         from pop_fast.density import taming_steps
 
-        return taming_steps.refine(self, of)
+        return taming_steps.refine(self, context)
 
     def target(self, first_count: int) -> int:
         """Return the budget."""

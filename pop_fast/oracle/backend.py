@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from pop_fast.api.plugin import DrawingBackend
+from pop_fast.api.plugin import BaseBackend
 
 if TYPE_CHECKING:
     from pop_fast.oracle.stages import OracleStages
 
 
 @dataclass(frozen=True)
-class OracleBackend(DrawingBackend):
+class OracleBackend(BaseBackend):
     """Draws with `pop_ref`, whatever the precision of the tensors."""
 
     def stages(self) -> OracleStages:
@@ -21,7 +21,7 @@ class OracleBackend(DrawingBackend):
 
         return OracleStages()
 
-    def open_view(self, of: Any) -> Any:
+    def open_view(self, pass_input: Any) -> Any:
         """Draw a view for passes over it."""
         from pop_fast.oracle.passes import OracleView
 

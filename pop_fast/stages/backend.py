@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from pop_fast.api.plugin import DrawingBackend
+from pop_fast.api.plugin import BaseBackend
 
 if TYPE_CHECKING:
     from pop_fast.stages.stage_set import Stages
 
 
 @dataclass(frozen=True)
-class TorchBackend(DrawingBackend):
+class TorchBackend(BaseBackend):
     """Draws with torch on the CPU."""
 
     def stages(self) -> Stages:
@@ -21,7 +21,7 @@ class TorchBackend(DrawingBackend):
 
         return Stages()
 
-    def open_view(self, of: Any) -> Any:
+    def open_view(self, pass_input: Any) -> Any:
         """Project and list a view for passes over it."""
         from pop_fast.stages.passes import view_of
 

@@ -39,11 +39,11 @@ def screen_moments(
     behind = background_or_black(background, three_channels(splats))
     walk = PairWalk(splats, lists, width, height, profile)
     rows = EntryRows(walk, N_MOMENTS)
-    for pairs, worth in walk.worths(behind):
+    for pairs, color_dot_grad in walk.color_dot_grads(behind):
         slopes = _slopes(walk, pairs, splats.conics)
         through = pairs.scratch.copy_(pairs.weight)
         walk.blender.pass_ceiling(pairs.coefficients, pairs.alpha, through)
-        G = worth.mul_(through)
+        G = color_dot_grad.mul_(through)
         seconds = _products(slopes * G.square().sum(0)[:, :, None], slopes)
         mixed = _products(slopes, G.mul_(pairs.weight).permute(1, 2, 0, 3))
         upper = [seconds[..., i, j] for i, j in _UPPER]

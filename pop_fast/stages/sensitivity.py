@@ -32,8 +32,8 @@ def sensitivities(
     walk = PairWalk(grey, lists, width, height, profile)
     rows = EntryRows(walk, 1)
     behind = background_or_black(background, colors_of(splats))
-    for pairs, worth in walk.worths(behind.sum(0, keepdim=True)):
+    for pairs, color_dot_grad in walk.color_dot_grads(behind.sum(0, keepdim=True)):
         # T = weight / alpha, and both are 0 where nothing is blended
-        T = torch.div(pairs.weight, pairs.alpha.clamp_min_(torch.finfo(worth.dtype).tiny), out=pairs.scratch)
-        rows.put(pairs, [worth[0].mul_(T).square_().sum(2)])
+        T = torch.div(pairs.weight, pairs.alpha.clamp_min_(torch.finfo(color_dot_grad.dtype).tiny), out=pairs.scratch)
+        rows.put(pairs, [color_dot_grad[0].mul_(T).square_().sum(2)])
     return rows.totals()[:, 0] * splats.opacities.double().square()

@@ -27,7 +27,7 @@ from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.model import adam_step
 from pop_fast.train.ranks import Ranks
-from pop_fast.train.torch_stepper import Look, TorchStepper
+from pop_fast.train.torch_stepper import TorchStepper, ViewGradient
 
 
 class BatchStepper(TorchStepper):
@@ -61,7 +61,7 @@ class BatchStepper(TorchStepper):
         self.step = step + 1
         return stats
 
-    def _seen(self, look: Look, step: int) -> dict[str, Tensor]:
+    def _seen(self, look: ViewGradient, step: int) -> dict[str, Tensor]:
         """Take from a view what density control will read of it."""
         strategy, info = self._strategy, look.rendered.info
         if not strategy.collects(step):

@@ -1,7 +1,7 @@
 """Everything a training run is decided by, as one frozen value that goes through JSON and back unchanged.
 
 A `TrainConfig` holds the values as they are run. `TrainConfig.of` makes one as the command line does: method, preset
-and `steps_scaler` give the defaults (see `pop_fast.train.presets`), and what is said besides wins, as it is said.
+and `steps_scaler` give the defaults (see `pop_fast.train.presets`), and what the user sets wins, taken literally.
 """
 
 from __future__ import annotations
@@ -148,34 +148,36 @@ class TrainConfig:
         if name is not None:
             raise PopError(
                 f"{name} is {getattr(self, name)}, but preset {self.given.preset!r} and what was said make it "
-                f"{getattr(promised, name)}; say it with config.but({name}=...), or replace given=None too"
+                f"{getattr(promised, name)}; say it with config.with_overrides({name}=...), or replace given=None too"
             )
 
     @classmethod
-    def of(cls, *, method: str = "pop", preset: str = "paper", **said: Any) -> Self:
+    def of(cls, *, method: str = "pop", preset: str = "paper", **overrides: Any) -> Self:
         """Make the settings of a method and a preset, except for what is said besides.
 
         Args:
             method: "pop", "gsplat" ("adc" is another name of it) or "3dgs".
             preset: "paper" or "quick".
-            said: `steps_scaler` and `scale_lambda_pop` (see `Given`), and settings by name, taken as they are: those
-                of the strategy and the learning rates with a dot, `**{"pop.lambda_pop": 0.002}`, as a dict,
+            overrides: `steps_scaler` and `scale_lambda_pop` (see `Given`), and settings by name, taken as they
+                are: those of the strategy and the learning rates with a dot, `**{"pop.lambda_pop": 0.002}`, as a dict,
                 `lr={"opacities": 0.01}`, or whole.
 
         Raises:
             PopError: an unknown setting, or a value that it cannot have; names it.
         """
-        plan = {name: said.pop(name, None) for name in ("steps_scaler", "scale_lambda_pop")}
-        given = Given.of(said, method=method, preset=preset, **plan)
+        plan = {name: overrides.pop(name, None) for name in ("steps_scaler", "scale_lambda_pop")}
+        given = Given.of(overrides, method=method, preset=preset, **plan)
         return replace(cls._promised(given), given=given)
 
-    def but(self, **said: Any) -> Self:
+    def with_overrides(self, **overrides: Any) -> Self:
         """Return these settings with some said anew; those that nobody said stay the defaults they are."""
         if self.given is None:
-            return replace(self, **said)
-        again = Given.of(said, method=self.given.method)
+            return replace(self, **overrides)
+        again = Given.of(overrides, method=self.given.method)
         given = replace(self.given, settings={**self.given.settings, **again.settings})
-        free = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in (*defaults(given), *said, "given")}
+        free = {
+            f.name: getattr(self, f.name) for f in fields(self) if f.name not in (*defaults(given), *overrides, "given")
+        }
         return replace(self._promised(given), **free, given=given)
 
     @classmethod
@@ -214,7 +216,7 @@ class TrainConfig:
         return profile if self.near_plane is None else replace(profile, near_plane=self.near_plane)
 
     def in_world(self, world_scale: float) -> Self:
-        """Return these settings with the near plane of a world, unless one was said.
+        """Return these settings with the near plane of a world, unless one was set.
 
         Args:
             world_scale: length of one unit of the capture's own frame in the world that is trained in.

@@ -49,7 +49,7 @@ class GpuProxy:
         """
         there = [self._moved(value) for value in args]
         named = {key: self._moved(value) for key, value in kwargs.items()}
-        with words_for_memory(), torch.no_grad():
+        with translate_oom(), torch.no_grad():
             image, alphas, info = self._backend.rasterization(*there, **named)
         return image.cpu(), alphas.cpu(), info.changed(_fetched)
 
@@ -62,7 +62,7 @@ def _fetched(value: Any) -> Any:
 
 
 @contextmanager
-def words_for_memory() -> Iterator[None]:
+def translate_oom() -> Iterator[None]:
     """Turn what says that the GPU's memory is full into a sentence on what to lower.
 
     Raises:

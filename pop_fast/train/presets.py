@@ -13,7 +13,7 @@ A default is the method's recipe (`pop_ref.recipes`), with the schedule multipli
     learning rates, other weights, thresholds       no: Adam's step does not depend on the length of a run
     checkpoint_every, log_every                     no: they are about time, not about the schedule
 
-What is said is taken as it is said: neither a preset nor the scaler changes it.
+What the user sets is taken literally: neither a preset nor the scaler changes it.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Given:
         steps_scaler: multiplies the default of every step number; None takes the preset's.
         scale_lambda_pop: divide the default of lambda_pop by the scaler, so that the push of the prior adds up to the
             same over a short schedule; it then weighs more against the photographs than in the paper.
-        settings: what was said, as plain values by dotted name.
+        settings: what the user set, as plain values by dotted name.
     """
 
     method: MethodName = "pop"
@@ -101,11 +101,11 @@ class Given:
             raise PopError(f"steps_scaler is {scaler}; it must be at most {_LARGEST_SCALER:.0f}")
 
     @classmethod
-    def of(cls, said: Mapping[str, Any], **plan: Any) -> Self:
-        """Check method, preset and scaler, and flatten what was said.
+    def of(cls, overrides: Mapping[str, Any], **plan: Any) -> Self:
+        """Check method, preset and scaler, and flatten what the user set.
 
         Args:
-            said: settings by name; those of a group with a dot, or the group as a dict or whole.
+            overrides: settings by name; those of a group with a dot, or the group as a dict or whole.
             plan: method, preset, steps_scaler, scale_lambda_pop; None leaves the default.
 
         Raises:
@@ -116,7 +116,7 @@ class Given:
             plan["method"] = ALIASES.get(plan["method"], plan["method"])
         given = from_plain(cls, plan, "config", skipped=("settings",))
         settings: dict[str, Any] = {}
-        for name, value in said.items():
+        for name, value in overrides.items():
             group, dot, rest = name.partition(".")
             known = group == "strategy" or ALIASES.get(group, group) == given.method
             path = f"{given.method}{dot}{rest}" if known else name
@@ -161,7 +161,7 @@ def method_of(strategy: DensityControl) -> str:
 
 
 def defaults(given: Given) -> dict[str, Any]:
-    """Return every setting that method, preset and scaler decide, nothing said, by its name in `TrainConfig`."""
+    """Return every setting that method, preset and scaler decide, without overrides, by its name in `TrainConfig`."""
     kind, recipe = METHODS[given.method]
     by = given.scaler
     values = values_of(recipe)

@@ -23,7 +23,7 @@ from pop_fast.train.views import Rendered, render_view
 
 
 @dataclass(frozen=True)
-class Look:
+class ViewGradient:
     """A view after its backward pass: its index, render, photometric loss, prior or None, and their sum.
 
     `behind` is what its photograph was laid over if that is transparent; None where that is the settings' background.
@@ -92,7 +92,7 @@ class TorchStepper:
         for param in (*self._params.values(), *self._task.appearance.params.values()):
             param.grad = None
 
-    def _look(self, index: int, step: int, phase: Phase) -> Look:
+    def _look(self, index: int, step: int, phase: Phase) -> ViewGradient:
         """Render a view, compare it with its photograph and go back to the gradients of the parameters."""
         strategy, params, optimizers, state = self._task.strategy, self._params, self._optimizers, self._state
         rendered = self._render(index, step, phase)
@@ -103,7 +103,7 @@ class TorchStepper:
         strategy.step_pre_backward(params, optimizers, state, step, rendered.info)
         loss = objective if term is None else objective + term
         loss.backward()
-        return Look(index, replace(rendered, image=image), behind, objective, term, loss)
+        return ViewGradient(index, replace(rendered, image=image), behind, objective, term, loss)
 
     def _render(self, index: int, step: int, phase: Phase) -> Rendered:
         config, strategy, appearance = self._task.config, self._task.strategy, self._task.appearance
@@ -123,7 +123,7 @@ class TorchStepper:
         if not math.isfinite(loss.item()):
             raise ValueError(f"the loss of view {self._task.views[index].name} is {loss.item()} at step {step}")
 
-    def _measured(self, look: Look, step: int, phase: Phase) -> StepStats:
+    def _measured(self, look: ViewGradient, step: int, phase: Phase) -> StepStats:
         """Return the loss's parts, and where a record is due everything else too."""
         photometric, pop = look.objective.item(), 0.0 if look.term is None else look.term.item()
         if step % self._task.config.log_every != 0 and not self._task.strategy.changes_after(step):

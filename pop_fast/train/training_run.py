@@ -41,7 +41,7 @@ from pop_fast.train.effects import facts, find_warnings
 from pop_fast.train.engines import engine_of
 from pop_fast.train.environment import reproducible, run_facts, versions
 from pop_fast.train.evaluate import evaluate
-from pop_fast.train.gpu_proxy import words_for_memory
+from pop_fast.train.gpu_proxy import translate_oom
 from pop_fast.train.lpips import load_nets
 from pop_fast.train.metrics import population
 from pop_fast.train.model import KEYS, make_optimizers, require_usable
@@ -246,7 +246,7 @@ class TrainingRun:
         first, before = self.step, len(self.params["means"])
         phase, stepper = phase_at(self.config, self.strategy, first), self.stepper
         size = self.config.batch_size
-        with words_for_memory():
+        with translate_oom():
             stats = self._measured(stepper, first, last, phase)
             densification = self._change(self.step - 1) if stats else None
         views = [", ".join(self._train[self._order.next()].name for _ in range(size)) for _ in stats]
@@ -296,7 +296,7 @@ class TrainingRun:
         """What takes the steps; it is made at the first use, for the rows as they are then, on the engine's device."""
         if self._stepper is None:
             if self._engine.device.type != "cpu":
-                with words_for_memory():
+                with translate_oom():
                     given = (self.params, self.optimizers, self.state)
                     self.params, self.optimizers = moved_to(self._engine.device, *given)
             config, size, done = self.config, self.config.batch_size, self.step
@@ -304,7 +304,7 @@ class TrainingRun:
             order = [0] * size * done + self._order.ahead(size * (config.max_steps - done))
             given = (config, self.strategy, self._train, order, self.updates, done, self.appearance, self._ranks)
             self._stepper = self._engine.make_stepper(Task(*given, self._stop))
-            with words_for_memory():
+            with translate_oom():
                 self._stepper.rebind(self.params, self.optimizers, self.state)
         return self._stepper
 

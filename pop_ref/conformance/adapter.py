@@ -258,7 +258,7 @@ def under(scene: Scene, profile: Profile | None) -> Scene:
         aside = depths[:, None] * (K[:2, 2] - centre) / np.array([K[0, 0], K[1, 1]])
         K[:2, 2] = centre
         changes |= {"K": K, "means": scene.gaussians.means + aside @ viewmat[:2, :3]}
-    return scene.but(**changes)
+    return scene.with_overrides(**changes)
 
 
 def _shown(splats: Any) -> dict[str, Any]:

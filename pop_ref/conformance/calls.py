@@ -304,12 +304,12 @@ def drawn_scene(call: Call, frame: Frame) -> Scene:
 
     A Gaussian that is culled keeps its row; its opacity is 0, which every extent that reads opacities culls.
     """
-    scene = frame.scene.but(profile=call.profile)
+    scene = frame.scene.with_overrides(profile=call.profile)
     if call.radius_clip <= 0.0:
         return scene
     radii = project(scene.gaussians, scene.camera, scene.sh_degree, scene.profile, scene.antialiased).radii
     small = np.all(radii <= call.radius_clip, axis=1)
-    return scene.but(opacities=np.where(small, 0.0, scene.gaussians.opacities))
+    return scene.with_overrides(opacities=np.where(small, 0.0, scene.gaussians.opacities))
 
 
 def oracle_frame(scene: Scene, colors: np.ndarray | None, render_mode: RenderMode) -> Render:

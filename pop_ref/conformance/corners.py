@@ -100,5 +100,5 @@ def corners(degree: int = 0, turned: bool = True, with_: dict[str, Any] | None =
         scene = Scene(
             pack(_records(width, height, degree)[name], camera), camera, (0.25, 0.5, 0.125), tile_size=tile_size
         )
-        found.append({"scene": scene.but(**changes), **(with_ or {})})
+        found.append({"scene": scene.with_overrides(**changes), **(with_ or {})})
     return found

@@ -280,11 +280,11 @@ def _color_bounds(scene: Scene, v_colors: Bound) -> tuple[Bound, np.ndarray]:
     basis = Bound(np.broadcast_to(height, (len(g), n_sh)), height * (1.0 + 2.0 * degree * e_dirs[:, None]))
     sh = np.zeros(g.sh.shape)
     sh[:, :n_sh] = basis.m[..., None] * v_colors.error_bound[:, None] + basis.e[..., None] * v_colors.m[:, None]
-    worth = np.einsum("nkc,nc->n", np.abs(g.sh[:, :n_sh]), v_colors.m)
-    e_worth = np.einsum("nkc,nc->n", np.abs(g.sh[:, :n_sh]), v_colors.e)
+    color_dot_grad = np.einsum("nkc,nc->n", np.abs(g.sh[:, :n_sh]), v_colors.m)
+    e_color_dot_grad = np.einsum("nkc,nc->n", np.abs(g.sh[:, :n_sh]), v_colors.e)
     slope = 2.0 * degree * np.max(height) / length
-    m = slope * worth
-    e = slope * (e_worth + worth * (2.0 * degree * e_dirs + 4.0))
+    m = slope * color_dot_grad
+    e = slope * (e_color_dot_grad + color_dot_grad * (2.0 * degree * e_dirs + 4.0))
     return Bound(np.repeat(m[:, None], 3, 1), np.repeat(e[:, None], 3, 1)), sh
 
 

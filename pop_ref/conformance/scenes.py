@@ -78,7 +78,7 @@ class Scene:
         # Hypothesis prints dataclasses by field unless asked otherwise; a scene must paste
         printer.text(repr(self))
 
-    def but(self, **changes: Any) -> Scene:
+    def with_overrides(self, **changes: Any) -> Scene:
         """Return this scene with some fields, of the Gaussians or the camera too, replaced."""
         gaussians = {k: changes.pop(k) for k in list(changes) if k in ("means", "quats", "scales", "opacities", "sh")}
         camera = {k: changes.pop(k) for k in list(changes) if k in ("viewmat", "K", "width", "height")}

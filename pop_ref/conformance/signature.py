@@ -122,7 +122,7 @@ def _frame_error_bounds(call: Call, frame: Frame, scene: Scene, dtype: Any) -> P
     behind = np.append(scene.background if colored else [], [0.0] * with_depth)
     square = scene.profile.extent == "square"
     lists = oracle_frame(scene, frame.colors, call.render_mode).tile_lists if square else None
-    return pixel_error_bounds(scene.but(background=behind), dtype, lists, channels)
+    return pixel_error_bounds(scene.with_overrides(background=behind), dtype, lists, channels)
 
 
 def expectations(backend: Any, call: Call) -> list[list[Expected]]:

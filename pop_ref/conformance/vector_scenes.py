@@ -57,7 +57,7 @@ def vector_scenes() -> dict[str, Scene]:
         "a clamped jacobian": _scene([one, *far_out]),
         "hidden splats": _scene(hidden),
         "a needle": _scene([needle, one]),
-        "antialiased": _scene([one, dataclasses.replace(one, size=(0.25, 0.5, 0.25), opacity=1.0)]).but(
+        "antialiased": _scene([one, dataclasses.replace(one, size=(0.25, 0.5, 0.25), opacity=1.0)]).with_overrides(
             antialiased=True
         ),
         "the ceiling of 0.99": _scene(stack, profile=GSPLAT_1_6),

@@ -50,10 +50,10 @@ def _pixel_vjp(tail: bool) -> Callable[..., Any]:
         for i, alpha, T in zip(
             reversed(pixel.ids), reversed(pixel.alphas), reversed(pixel.transmittances), strict=True
         ):
-            worth = float(np.dot(rows.colors[i], v_color))
+            color_dot_grad = float(np.dot(rows.colors[i], v_color))
             totals.v_colors[i] += T * alpha * np.array(v_color)
-            v_alpha = T * (worth - behind)
-            behind += alpha * (worth - behind) if tail else 0.0
+            v_alpha = T * (color_dot_grad - behind)
+            behind += alpha * (color_dot_grad - behind) if tail else 0.0
             sigma = o["sigma_at_pixel"](rows.means2d[i], rows.conics[i], px, py)
             v_sigma, v_opacity = o["alpha_from_sigma_vjp"](sigma, rows.opacities[i], v_alpha, *profile)
             v_mean2d, v_conic = o["sigma_at_pixel_vjp"](rows.means2d[i], rows.conics[i], px, py, v_sigma)
@@ -223,7 +223,7 @@ MISTAKES: Final = (
         "The tail is missing from dC/dalpha: more alpha shows more of a splat's own colour, and hides the colour of all"
         " that is behind it. Yours has the first part only.",
         "C = T (alpha c + (1 - alpha) behind), so dC/dalpha = T (c - behind). Walk from the back: start with behind ="
-        " background . v_color + v_T_final, and after each splat behind += alpha (worth - behind).",
+        " background . v_color + v_T_final, and after each splat behind += alpha (color_dot_grad - behind).",
     ),
     Mistake(
         "composite_pixel_vjp",

@@ -115,11 +115,11 @@ def render_vjp(params, s, v_image):
     # what the light that passes a splat is worth to the loss; behind all splats it shows the background
     behind = v_image @ s.background
     for i, box, dx, dy, G, alpha, T in reversed(s.tape):
-        worth = v_image[box] @ s.colors[i]
+        color_dot_grad = v_image[box] @ s.colors[i]
         v_colors[i] = np.tensordot(T * alpha, v_image[box], axes=2)
         # more alpha shows more of this splat and hides what is behind it: both parts count
-        v_alpha = np.where(alpha > 0, T * (worth - behind[box]), 0.0)
-        behind[box] += alpha * (worth - behind[box])
+        v_alpha = np.where(alpha > 0, T * (color_dot_grad - behind[box]), 0.0)
+        behind[box] += alpha * (color_dot_grad - behind[box])
         v_G = np.where(s.opacities[i] * G <= ALPHA_CEILING, v_alpha, 0.0)
         v_opacities[i] = np.sum(G * v_G)
         v_sigma = -s.opacities[i] * G * v_G

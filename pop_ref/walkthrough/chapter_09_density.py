@@ -227,12 +227,12 @@ def pulled_back(params, v_image, weights, alpha, light, order):
     """Walk from back to front (chapter 5); return gradients of opacities and colours."""
     behind, v_alpha = np.zeros(WIDTH * HEIGHT), np.zeros_like(alpha)
     g = v_image.reshape(-1, 3)
-    worth = params["colors"] @ g.T
+    color_dot_grad = params["colors"] @ g.T
     for k in reversed(order):
         v_alpha[k] = np.where((alpha[k] > 0) & (alpha[k] < 0.999), light[k], 0.0) * (
-            worth[k] - behind
+            color_dot_grad[k] - behind
         )
-        behind = behind + alpha[k] * (worth[k] - behind)
+        behind = behind + alpha[k] * (color_dot_grad[k] - behind)
     return np.sum(v_alpha * falloffs[params["who"]], axis=1), weights @ g
 
 

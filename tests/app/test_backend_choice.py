@@ -16,7 +16,7 @@ from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.engines import cuda_engine
-from pop_fast.train.gpu_proxy import GpuProxy, renderer, words_for_memory
+from pop_fast.train.gpu_proxy import GpuProxy, renderer, translate_oom
 from pop_fast.train.views import ViewTensors, render_view
 from tests.app.conftest import TRAIN, Pop
 from tests.app.drift import drift_engine
@@ -147,5 +147,5 @@ def test_images_and_what_is_told_of_them_come_back_from_the_device(tmp_path):
 
 
 def test_other_errors_keep_their_words():
-    with pytest.raises(RuntimeError, match="a launch failed"), words_for_memory():
+    with pytest.raises(RuntimeError, match="a launch failed"), translate_oom():
         raise RuntimeError("a launch failed")

@@ -104,7 +104,7 @@ def test_large_gaussians_are_pruned_by_every_method_but_pop_and_after_a_reset_in
     ],
 )
 def test_a_preset_gives_defaults_and_what_is_said_is_taken_literally(said, read):
-    config = TrainConfig.of(preset="quick", scale_lambda_pop=True, steps_scaler=0.05, **said)
+    config = TrainConfig.of(preset="quick", scale_lambda_pop=True, steps_scaler=0.05, **overrides)
     assert read(config) == next(iter(said.values()))
     assert config.given.settings == {name.replace("strategy.", "pop."): to_plain(v) for name, v in said.items()}
 
@@ -187,11 +187,11 @@ def test_a_label_cannot_be_carried_by_settings_that_do_not_follow_it():
         replace(quick, max_steps=5)
     with pytest.raises(PopError, match="max_steps is 30000, but preset 'quick'"):
         TrainConfig(given=quick.given)
-    cut = quick.but(max_steps=5, seed=3).but(**{"pop.lambda_pop": 0.5})
+    cut = quick.with_overrides(max_steps=5, seed=3).with_overrides(**{"pop.lambda_pop": 0.5})
     assert (cut.max_steps, cut.seed, cut.strategy.lambda_pop, cut.preset) == (5, 3, 0.5, "quick")
     assert cut.given.settings == {"max_steps": 5, "seed": 3, "pop.lambda_pop": 0.5}
     # where it runs and where it writes is not part of a preset
-    assert replace(quick, result_dir="x", backend="fast").but(seed=1).result_dir == "x"
+    assert replace(quick, result_dir="x", backend="fast").with_overrides(seed=1).result_dir == "x"
     assert TrainConfig().preset is None
     # what was run is read back also where the preset has other values now
     written = json.loads(quick.to_json())

@@ -162,7 +162,7 @@ def test_a_gaussian_in_front_of_a_camera_is_a_floater(result: Path, shared_captu
 @pytest.mark.usefixtures("short_orbit")
 def test_the_worst_views_come_first_and_have_pictures_whatever_was_kept(result: Path, shared_capture: Path) -> None:
     splat, capture = load_splat(result), load_capture(shared_capture)
-    config = splat.config.but(test_every=2, max_renders=1)
+    config = splat.config.with_overrides(test_every=2, max_renders=1)
     write_checks(result, capture, splat.params, config, splat.sh_degree, renderer("auto")[0], 29)
     views = read_result(result).views
     assert [view.psnr for view in views] == sorted(view.psnr for view in views)

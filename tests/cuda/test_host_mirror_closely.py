@@ -89,7 +89,7 @@ def test_the_golden_scene_and_its_gradients_are_the_oracles(per_splat, kernel_ti
 
 
 # a needle on the camera's axis: what it does to its rotation is a small difference of large numbers
-NEEDLE = golden_scene().but(
+NEEDLE = golden_scene().with_overrides(
     means=[[-2.5, 0.078125, 0.07812500000000054], [-1.0, 0.0625, 0.0625]],
     quats=[[1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 1.0, -1.0]],
     scales=[[0.3125, 0.3125, 0.3125], [8.0, 0.015625, 0.015625]],

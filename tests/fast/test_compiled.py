@@ -188,8 +188,8 @@ def test_what_is_kept_for_the_transpose_goes_with_it() -> None:
     leaf = given.opacities.clone().requires_grad_()
     found = native(given.means2d, given.conics, leaf, given.colors, given.lists, WIDTH, HEIGHT)
     node = found.image.grad_fn
-    names = [name for name in node.kept if name == "lights"]
-    assert names == ["lights"]
+    names = [name for name in node.kept if name == "transmittances"]
+    assert names == ["transmittances"]
     assert not any(isinstance(value, Tensor) for value in vars(node).values())
     found.image.sum().backward()
     with pytest.raises(RuntimeError, match="after they have already been freed"):

@@ -207,7 +207,7 @@ class InriasDivision(OracleAdapter):
         R, t = scene.camera.viewmat[:3, :3], scene.camera.viewmat[:3, 3]
         p = scene.gaussians.means @ R.T + t
         aside = p * np.array([1.0, 1.0, 0.0]) * (p[:, 2:] / (p[:, 2:] + 1e-7) - 1.0)
-        return super().render(scene.but(means=scene.gaussians.means + aside @ R))
+        return super().render(scene.with_overrides(means=scene.gaussians.means + aside @ R))
 
 
 def test_inrias_divisor_breaks_no_law_of_its_profile() -> None:
@@ -222,7 +222,7 @@ class Greyish(OracleAdapter):
     """The oracle with a background that is a little too bright."""
 
     def render(self, scene: Scene) -> View:
-        return super().render(scene.but(background=scene.background + 2.0**-10))
+        return super().render(scene.with_overrides(background=scene.background + 2.0**-10))
 
 
 def test_an_empty_scene_has_a_report() -> None:

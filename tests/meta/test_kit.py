@@ -38,14 +38,14 @@ def _same(one: Scene, other: Scene) -> bool:
 @given(scene=scenes(max_degree=2))
 def test_a_printed_scene_can_be_pasted(scene: Scene) -> None:
     scope: dict[str, object] = {}
-    exec(scene_as_code(scene.but(profile=INRIA, background=[0.25, 0.5, 1.0])), scope)
+    exec(scene_as_code(scene.with_overrides(profile=INRIA, background=[0.25, 0.5, 1.0])), scope)
     pasted = scope["scene"]
     assert isinstance(pasted, Scene)
-    assert _same(pasted, scene.but(profile=INRIA, background=[0.25, 0.5, 1.0]))
+    assert _same(pasted, scene.with_overrides(profile=INRIA, background=[0.25, 0.5, 1.0]))
 
 
 def test_a_stored_scene_is_the_same_scene(tmp_path: Path) -> None:
-    scene = golden_scene().but(tile_size=4, antialiased=True)
+    scene = golden_scene().with_overrides(tile_size=4, antialiased=True)
     save_scene(tmp_path / "deep" / "scene.npz", scene)
     assert _same(load_scene(tmp_path / "deep" / "scene.npz"), scene)
 

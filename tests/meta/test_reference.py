@@ -37,21 +37,21 @@ def test_another_scene_or_question_is_answered_anew() -> None:
     viewmat = scene.camera.viewmat.copy()
     viewmat[0, 3] += 2.0**-30
     others = [
-        scene.but(means=moved),
-        scene.but(background=[0.0, 0.0, 0.5]),
-        scene.but(profile=GSPLAT_1_6),
-        scene.but(tile_size=3),
-        scene.but(sh_degree=0),
-        scene.but(antialiased=True),
-        scene.but(width=scene.camera.width + 1),
-        scene.but(viewmat=viewmat),
+        scene.with_overrides(means=moved),
+        scene.with_overrides(background=[0.0, 0.0, 0.5]),
+        scene.with_overrides(profile=GSPLAT_1_6),
+        scene.with_overrides(tile_size=3),
+        scene.with_overrides(sh_degree=0),
+        scene.with_overrides(antialiased=True),
+        scene.with_overrides(width=scene.camera.width + 1),
+        scene.with_overrides(viewmat=viewmat),
     ]
     questions = [(scene,), *((other,) for other in others), (scene, np.float32), (scene, np.zeros(2), np.zeros(3))]
     first = [answer(*question) for question in questions]
     assert first == list(range(1, len(questions) + 1))
     assert [answer(*question) for question in questions] == first
     # the same numbers in other arrays are the same question
-    assert answer(scene.but(means=scene.gaussians.means.copy())) == 1
+    assert answer(scene.with_overrides(means=scene.gaussians.means.copy())) == 1
 
 
 def test_the_oldest_answers_and_large_scenes_are_forgotten() -> None:

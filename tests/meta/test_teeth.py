@@ -46,7 +46,7 @@ class _Off(OracleAdapter):
     quats = 0.0
 
     def render(self, scene: Any) -> Any:
-        return super().render(scene.but(background=scene.background + self.background))
+        return super().render(scene.with_overrides(background=scene.background + self.background))
 
     def gradients(self, scene: Any, v_image: Any, v_T_final: Any) -> Any:
         found = super().gradients(scene, v_image, v_T_final)

@@ -32,9 +32,9 @@ class ActiveTiles:
         self.rows = rows
         self._held = whole if rows is None else {name: state[rows] for name, state in whole.items()}
 
-    def drop(self, n: int, light: Tensor, below: float) -> None:
+    def drop(self, n: int, transmittance: Tensor, below: float) -> None:
         """Hold only the tiles with light left, out of the first `n`, when these are less than a share of them."""
-        bright = light.amax(1) > 0.0
+        bright = transmittance.amax(1) > 0.0
         if int(bright.sum()) < below * n:
             keep = bright.nonzero().squeeze(1)
             self.select(keep if self.rows is None else self.rows[keep])

@@ -47,12 +47,12 @@ class Step:
     Attributes:
         blocks: of eight entries each, the null block where a list has ended. [n, K / 8]
         rows: which of the group's tiles took part: the first `n` of these, or of all when None.
-        light: T before the step; belongs to the buffers. [n, P]
+        transmittance: T before the step; belongs to the buffers. [n, P]
     """
 
     blocks: Tensor
     rows: Tensor | None
-    light: Tensor
+    transmittance: Tensor
 
 
 @dataclass
@@ -120,14 +120,14 @@ class Blender:
         with buffers.acquired(2, group.slab, self.table.dtype) as scratch:
             while start < len(group.reached) and (n := active.count_below(group.reached[start])) > 0:
                 blocks = group.blocks(active.rows, n, start, group.step_blocks(start, n))
-                entries, light = self._entries(blocks), active["light"][:n]
-                alpha, lights = _shaped(scratch, entries, group.n_pixels)
+                entries, transmittance = self._entries(blocks), active["transmittance"][:n]
+                alpha, transmittances = _shaped(scratch, entries, group.n_pixels)
                 self._alphas(entries, alpha)
                 if counted:
-                    active["n_passed"][:n].add_(count_passed(alpha, light, self.stop))
-                before = buffers.copy(light)
-                weight = self._weights(alpha, lights, before)
-                torch.ops.aten.threshold.out(lights[:, -1], self.stop.at, 0.0, out=light)
+                    active["n_passed"][:n].add_(count_passed(alpha, transmittance, self.stop))
+                before = buffers.copy(transmittance)
+                weight = self._weights(alpha, transmittances, before)
+                torch.ops.aten.threshold.out(transmittances[:, -1], self.stop.at, 0.0, out=transmittance)
                 active["image"][:n].baddbmm_(entries[:, :, 6:].transpose(1, 2), weight)
                 if counted:
                     active["n_blended"][:n].add_((weight > 0.0).sum(1))
@@ -139,13 +139,13 @@ class Blender:
                     steps.append(Step(blocks, active.rows, before))
                 else:
                     buffers.release(before)
-                active.drop(n, light, COMPACT_BELOW)
+                active.drop(n, transmittance, COMPACT_BELOW)
         return self._result(active.whole(), steps, n_pairs)
 
     def _active(self, group: TileGroup, counted: bool, dominance: bool) -> ActiveTiles:
         size = (len(group.tiles), self.basis.shape[1])
         states = {
-            "light": self.basis.new_ones(size),
+            "transmittance": self.basis.new_ones(size),
             "image": self.basis.new_zeros((size[0], self.table.shape[2] - 6, size[1])),
         }
         if counted:
@@ -179,9 +179,9 @@ class Blender:
         if self.clamps:
             flat.clamp_max_(self.profile.alpha_ceiling)
 
-    def _weights(self, alpha: Tensor, lights: Tensor, before: Tensor) -> Tensor:
-        lights[:, 0] = before
-        return weights_of_alphas(alpha, lights, self.stop)
+    def _weights(self, alpha: Tensor, transmittances: Tensor, before: Tensor) -> Tensor:
+        transmittances[:, 0] = before
+        return weights_of_alphas(alpha, transmittances, self.stop)
 
     def transpose(
         self, group: TileGroup, blend: GroupBlend, v_image: Tensor, absolute: bool
@@ -204,8 +204,8 @@ class Blender:
                     q_k.sub_(behind)
                     behind.addcmul_(a, q_k)
                 # nothing lies behind a pixel that had stopped before this step
-                torch.ops.aten.threshold_backward.grad_input(behind, step.light, 0.0, grad_input=behind)
-                buffers.release(step.light)
+                torch.ops.aten.threshold_backward.grad_input(behind, step.transmittance, 0.0, grad_input=behind)
+                buffers.release(step.transmittance)
                 yield step.blocks.view(-1), self._rows(entries, alpha, weight, q, v, absolute)
 
     def again(self, group: TileGroup, step: Step, scratch: list[Tensor]) -> list[Tensor]:
@@ -221,9 +221,9 @@ class Blender:
             where a pixel stops [n, K, P], and of a third slab as much.
         """
         entries = self._entries(step.blocks)
-        alpha, lights, *rest = _shaped(scratch, entries, group.n_pixels)
+        alpha, transmittances, *rest = _shaped(scratch, entries, group.n_pixels)
         self._alphas(entries, alpha)
-        return [entries, alpha, self._weights(alpha, lights, step.light), *rest]
+        return [entries, alpha, self._weights(alpha, transmittances, step.transmittance), *rest]
 
     def _rows(self, entries: Tensor, alpha: Tensor, weight: Tensor, q: Tensor, v: Tensor, absolute: bool) -> Tensor:
         n_colors, n_rows = v.shape[1] - 1, q.shape[0] * q.shape[1]

@@ -74,7 +74,7 @@ class PairWalk:
         """Yield the steps such that, in every tile, farther entries come first; within a step the nearer do."""
         return self._walk(backwards=True)
 
-    def worths(self, background: Tensor) -> Iterator[tuple[Pairs, Tensor]]:
+    def color_dot_grads(self, background: Tensor) -> Iterator[tuple[Pairs, Tensor]]:
         """Yield the steps back to front, with how far every splat's colour exceeds the light from behind it.
 
         With B_m = background behind a pixel's last splat and B_{i-1} = alpha_i c_i + (1 - alpha_i) B_i, that is
@@ -91,12 +91,12 @@ class PairWalk:
         for pairs in self.back_to_front():
             passing = behind.index_select(1, pairs.tiles)
             colors = pairs.colors.permute(2, 1, 0)[..., None]
-            worth = behind.new_empty((len(behind), *pairs.alpha.shape))
+            color_dot_grad = behind.new_empty((len(behind), *pairs.alpha.shape))
             for k in range(pairs.alpha.shape[1] - 1, -1, -1):
-                torch.sub(colors[:, k], passing, out=worth[:, :, k])
-                passing.addcmul_(pairs.alpha[:, k], worth[:, :, k])
+                torch.sub(colors[:, k], passing, out=color_dot_grad[:, :, k])
+                passing.addcmul_(pairs.alpha[:, k], color_dot_grad[:, :, k])
             behind.index_copy_(1, pairs.tiles, passing)
-            yield pairs, worth
+            yield pairs, color_dot_grad
 
     def _walk(self, backwards: bool) -> Iterator[Pairs]:
         for group in self.groups:
@@ -104,7 +104,7 @@ class PairWalk:
             with buffers.acquired(3, group.slab, self.blender.table.dtype) as scratch:
                 for step in reversed(blend.steps) if backwards else blend.steps:
                     yield self._pairs(group, step.rows, step.blocks, self.blender.again(group, step, scratch))
-                    buffers.release(step.light)
+                    buffers.release(step.transmittance)
 
     def _pairs(self, group: TileGroup, chosen: Tensor | None, blocks: Tensor, made: list[Tensor]) -> Pairs:
         entries, alpha, weight, scratch = made

@@ -167,7 +167,7 @@ def test_the_image_of_inrias_profile_is_the_oracles(backend, scene):
     RENDER,
     ANTIALIASING,
     first=corners(1, antialiased=True),
-    scene=scenes(max_gaussians=4, anchored=True, size=plain_sizes()).map(lambda s: s.but(antialiased=True)),
+    scene=scenes(max_gaussians=4, anchored=True, size=plain_sizes()).map(lambda s: s.with_overrides(antialiased=True)),
 )
 def test_the_antialiased_image_is_one_of_the_oracles_outcomes(backend, scene):
     seen, error_bounds = with_error_bounds(backend, scene)
@@ -213,7 +213,7 @@ def test_gradients_under_the_lower_ceiling_are_the_oracles(backend, scene):
     GRADIENTS,
     ANTIALIASING,
     first=corners(1, antialiased=True),
-    scene=scenes(anchored=True, max_gaussians=3, size=plain_sizes()).map(lambda s: s.but(antialiased=True)),
+    scene=scenes(anchored=True, max_gaussians=3, size=plain_sizes()).map(lambda s: s.with_overrides(antialiased=True)),
 )
 def test_antialiased_gradients_are_the_oracles(backend, scene):
     _gradients_agree(backend, scene)

@@ -39,7 +39,7 @@ faint = scenes(anchored=True, opacity=faint_opacities(), size=plain_sizes())
 
 def colored(scene, colors):
     """Return the scene with plain colours [N, 3], >= 0, from every direction."""
-    return scene.but(sh=((np.asarray(colors) - 0.5) / SH_C0)[:, None, :])
+    return scene.with_overrides(sh=((np.asarray(colors) - 0.5) / SH_C0)[:, None, :])
 
 
 def camera_depths(scene):
@@ -49,7 +49,7 @@ def camera_depths(scene):
 
 @law("compositing", RENDER, first=corners(), scene=plain)
 def test_weights_and_remaining_light_sum_to_one(backend, scene):
-    white = colored(scene, np.ones((len(scene.gaussians), 3))).but(background=np.zeros(3))
+    white = colored(scene, np.ones((len(scene.gaussians), 3))).with_overrides(background=np.zeros(3))
     seen, error_bounds = with_error_bounds(backend, white)
     view = backend.render(seen)
     assert_seen(view)
@@ -81,7 +81,7 @@ def test_a_list_composites_as_its_front_over_its_back(backend, scene, cut):
     seen, error_bounds = with_error_bounds(backend, scene)
     order = np.lexsort((np.arange(len(seen.gaussians)), camera_depths(seen)))
     front, back = np.sort(order[:cut]), np.sort(order[cut:])
-    over = backend.render(seen.rows(front).but(background=np.zeros(3)))
+    over = backend.render(seen.rows(front).with_overrides(background=np.zeros(3)))
     under = backend.render(seen.rows(back))
     expected = over.image + over.T_final[..., None] * under.image
     whole = backend.render(seen)
@@ -100,7 +100,7 @@ def test_a_list_composites_as_its_front_over_its_back(backend, scene, cut):
 )
 def test_the_image_is_linear_in_the_colours(backend, scene, one, other):
     n = len(scene.gaussians)
-    dark = scene.but(background=np.zeros(3))
+    dark = scene.with_overrides(background=np.zeros(3))
     both, error_bounds = with_error_bounds(backend, colored(dark, one[:n] + other[:n]))
     parts = [backend.render(backend.sees(colored(dark, c[:n]))).image for c in (one, other)]
     error_bounds.absolute += 1.0  # a colour is written as an SH coefficient, offset by one half
@@ -115,8 +115,8 @@ def test_the_image_is_linear_in_the_colours(backend, scene, one, other):
     background=arrays_of((3,), 0.0, 2.0),
 )
 def test_the_background_enters_with_the_remaining_light(backend, scene, background):
-    seen, error_bounds = with_error_bounds(backend, scene.but(background=background))
-    over_black = backend.render(seen.but(background=np.zeros(3)))
+    seen, error_bounds = with_error_bounds(backend, scene.with_overrides(background=background))
+    over_black = backend.render(seen.with_overrides(background=np.zeros(3)))
     over = backend.render(seen)
     expected = over_black.image + over_black.T_final[..., None] * background
     assert_same_bits("remaining transmittance", over.T_final, over_black.T_final)

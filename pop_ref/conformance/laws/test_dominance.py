@@ -72,7 +72,7 @@ def test_a_pixel_without_blended_splats_belongs_to_nobody(backend, scene):
 @law("dominance", RENDER, DOMINANCE, first=corners(), scene=plain)
 def test_the_winner_is_the_splat_whose_weight_shows_most_in_the_image(backend, scene):
     # a Gaussian that is white among black ones paints its own weight
-    seen, error_bounds = with_error_bounds(backend, scene.but(background=np.zeros(3)))
+    seen, error_bounds = with_error_bounds(backend, scene.with_overrides(background=np.zeros(3)))
     view = backend.render(seen)
     assert_seen(view)
     n = len(scene.gaussians)
@@ -97,7 +97,7 @@ def test_the_winner_is_the_splat_whose_weight_shows_most_in_the_image(backend, s
 )
 def test_colours_and_background_do_not_matter(backend, scene, colors, background):
     seen = backend.sees(scene)
-    painted = backend.sees(colored(scene, colors[: len(scene.gaussians)]).but(background=background))
+    painted = backend.sees(colored(scene, colors[: len(scene.gaussians)]).with_overrides(background=background))
     one, other = backend.render(seen), backend.render(painted)
     assert_same_bits("winner", one.dominant_ids, other.dominant_ids)
     if one.dominant_weights is not None:

@@ -219,7 +219,7 @@ def test_a_step_along_any_direction_changes_the_image_as_the_gradient_says(backe
         steps[name] *= {"scales": value, "opacities": np.minimum(value, 1.0 - value)}.get(name, 1.0)
     ends = []
     for sign in (1.0, -1.0):
-        moved = seen.but(**{name: values[name] + sign * h * steps[name] for name in PARAMETERS})
+        moved = seen.with_overrides(**{name: values[name] + sign * h * steps[name] for name in PARAMETERS})
         # a decision that flips within the step is not a derivative's business
         moved_bounds = pixel_error_bounds(moved, np.float64)
         same = all(
@@ -252,8 +252,8 @@ def _no_kink_near(seen, h):
 def test_gradients_ignore_the_coefficients_of_other_bands(backend, scene, opacity):
     g = scene.gaussians
     sh = np.concatenate([g.sh[:, :1], np.ones((len(g), 3, 3))], axis=1)
-    padded = backend.sees(scene.but(sh=sh, opacities=opacity[: len(g)], sh_degree=0))
-    plain_scene = backend.sees(scene.but(sh=sh[:, :1], opacities=opacity[: len(g)], sh_degree=0))
+    padded = backend.sees(scene.with_overrides(sh=sh, opacities=opacity[: len(g)], sh_degree=0))
+    plain_scene = backend.sees(scene.with_overrides(sh=sh[:, :1], opacities=opacity[: len(g)], sh_degree=0))
     v_image, v_T_final = cotangents(padded)
     one, other = (backend.gradients(s, v_image, v_T_final) for s in (padded, plain_scene))
     assert_same_bits("v_sh of unused bands", one["sh"][:, 1:], np.zeros_like(one["sh"][:, 1:]))

@@ -77,7 +77,7 @@ def test_twice_the_colours_are_four_times_the_sensitivity(backend, scene):
 def test_the_same_light_added_to_everything_changes_no_sensitivity(backend, scene, more):
     given = screened(backend, scene)
     lit = dataclasses.replace(given, splats=dataclasses.replace(given.splats, colors=given.splats.colors + more))
-    under = given.scene.but(background=given.scene.background + more)
+    under = given.scene.with_overrides(background=given.scene.background + more)
     bright = _scored(backend, lit, under.background)
     # an error bound is of absolute values, so take it of the brighter scene
     error_bounds = dataclasses.replace(given.error_bounds, scene=under)

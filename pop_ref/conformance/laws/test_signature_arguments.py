@@ -73,7 +73,7 @@ def test_the_near_and_the_far_plane_are_where_the_call_says(backend):
 def test_a_centre_on_the_far_plane_is_drawn_and_one_on_the_near_plane_as_the_profile_says(backend):
     (frame,) = frames(backend, 5)
     one = {"means": [[0.0, 0.0, 3.0]], "scales": [[0.5, 0.5, 0.5]], "opacities": [0.75], "viewmat": np.eye(4)}
-    scene = backend.sees(frame.scene.rows([0]).but(**{name: np.array(value) for name, value in one.items()}))
+    scene = backend.sees(frame.scene.rows([0]).with_overrides(**{name: np.array(value) for name, value in one.items()}))
     assert scene.gaussians.means[0, 2] == 3.0
     for plane, drawn in (("far_plane", True), ("near_plane", not scene.profile.near_inclusive)):
         called = backend.call(Call(((Frame(scene, None),),), planes={plane: 3.0}))

@@ -123,7 +123,7 @@ def test_tight_lists_are_parts_of_the_rectangles_in_the_same_order(backend, scen
 
 @law("tight_tiles", "tight_tile_lists", scene=plain)
 def test_no_tile_is_listed_that_lies_outside_the_ellipse(backend, scene):
-    given = screened(backend, scene.but(tile_size=SIZE))
+    given = screened(backend, scene.with_overrides(tile_size=SIZE))
     tight, _ = _listed(backend, given)
     s, across = given.splats, -(-given.view[2] // SIZE)
     for tile, ids in enumerate(tight):

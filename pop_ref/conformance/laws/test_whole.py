@@ -65,7 +65,7 @@ def test_any_tile_size_gives_the_same_image(backend, scene, size):
     seen, error_bounds = with_error_bounds(backend, scene)
     view = backend.render(seen)
     assert_seen(view)
-    _same_render("whole.tiles", backend, backend.render(seen.but(tile_size=size)), view, error_bounds)
+    _same_render("whole.tiles", backend, backend.render(seen.with_overrides(tile_size=size)), view, error_bounds)
 
 
 @law("whole", RENDER, scene=plain, seed=st.randoms(use_true_random=False))
@@ -137,7 +137,7 @@ def test_scaling_the_world_by_a_power_of_two_changes_no_bit(backend, scene, powe
     viewmat = seen.camera.viewmat.copy()
     viewmat[:3, 3] *= scale
     g = seen.gaussians
-    bigger = seen.but(means=g.means * scale, scales=g.scales * scale, viewmat=viewmat)
+    bigger = seen.with_overrides(means=g.means * scale, scales=g.scales * scale, viewmat=viewmat)
     depths = g.means @ seen.camera.viewmat[2, :3] + seen.camera.viewmat[2, 3]
     # the near plane is in world units, so only what is well before or behind it is scaled
     clear = (depths < 0.0) | (depths > 10.0 * seen.profile.near_plane)
@@ -162,7 +162,7 @@ def test_moving_world_and_camera_together_changes_nothing(backend, scene, turn, 
     g = scene.gaussians
     w, x, y, z = np.array(turn) / np.linalg.norm(turn)
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    moved = scene.but(
+    moved = scene.with_overrides(
         means=g.means @ R.T + t, quats=g.quats @ left.T, viewmat=scene.camera.viewmat @ np.linalg.inv(motion)
     )
     seen, error_bounds = with_error_bounds(backend, scene)
@@ -195,7 +195,7 @@ def test_cropping_commutes_with_rendering(backend, scene, left, top):
     u, v = (scene.camera.K[a, a] * p[:, a] / p[:, 2] + scene.camera.K[a, 2] for a in (0, 1))
     inside = (p[:, 2] > 0.0) & (u > left) & (u < W) & (v > top) & (v < H)
     seen, error_bounds = with_error_bounds(backend, scene.rows(inside))
-    crop = backend.sees(seen.but(K=K, width=W - left, height=H - top))
+    crop = backend.sees(seen.with_overrides(K=K, width=W - left, height=H - top))
     whole, part = backend.render(seen), backend.render(crop)
     window = (slice(top, None), slice(left, None))
     sure = error_bounds.unambiguous[window]
@@ -214,8 +214,10 @@ def test_a_mirrored_world_makes_a_mirrored_image(backend, scene):
     K[0, 2] = c.width - K[0, 2]
     viewmat[0, 3] = -viewmat[0, 3]
     viewmat[:3, :3] = np.eye(3)
-    upright = scene.but(viewmat=np.vstack([np.hstack([np.eye(3), c.viewmat[:3, 3:]]), [[0.0, 0.0, 0.0, 1.0]]]))
-    mirrored = upright.but(
+    upright = scene.with_overrides(
+        viewmat=np.vstack([np.hstack([np.eye(3), c.viewmat[:3, 3:]]), [[0.0, 0.0, 0.0, 1.0]]])
+    )
+    mirrored = upright.with_overrides(
         means=g.means * mirror, quats=g.quats * np.array([1.0, 1.0, -1.0, -1.0]), K=K, viewmat=viewmat
     )
     seen, error_bounds = with_error_bounds(backend, upright)
@@ -233,7 +235,7 @@ def test_denormal_sizes_and_opacities_give_finite_images(backend, small, record)
     g = pack([record, Record(2.5, 2.5)], camera)
     tiny_opacity, tiny_scales = g.opacities.copy(), g.scales.copy()
     tiny_opacity[1], tiny_scales[0] = small, small
-    view = backend.render(backend.sees(Scene(g, camera).but(opacities=tiny_opacity, scales=tiny_scales)))
+    view = backend.render(backend.sees(Scene(g, camera).with_overrides(opacities=tiny_opacity, scales=tiny_scales)))
     assert np.all(np.isfinite(view.image))
     assert np.all(np.isfinite(view.T_final))
 
@@ -244,5 +246,7 @@ def test_a_huge_world_far_away_is_finite(backend, scene):
     g = scene.gaussians
     viewmat = scene.camera.viewmat.copy()
     viewmat[:3, 3] *= scale
-    view = backend.render(backend.sees(scene.but(means=g.means * scale, scales=g.scales * scale, viewmat=viewmat)))
+    view = backend.render(
+        backend.sees(scene.with_overrides(means=g.means * scale, scales=g.scales * scale, viewmat=viewmat))
+    )
     assert np.all(np.isfinite(view.image))

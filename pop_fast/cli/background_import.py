@@ -15,7 +15,7 @@ _SWITCH_INTERVAL: Final = 2e-4
 
 
 @contextlib.contextmanager
-def importing(*modules: str) -> Iterator[None]:
+def background_import(*modules: str) -> Iterator[None]:
     """Import modules in a thread of their own while the block runs; they are there, or have failed, when it ends.
 
     A block that is left by an error or an interruption waits for nothing. A failure is not reported here: whoever

@@ -30,7 +30,7 @@ def plan_of(words: Sequence[str]) -> dict[str, Any]:
     return plan
 
 
-def said(args: Any, base: TrainConfig, words: Sequence[str]) -> dict[str, Any]:
+def overrides(args: Any, base: TrainConfig, words: Sequence[str]) -> dict[str, Any]:
     """Return the settings that the words name, also where what they say is the default.
 
     Args:
