@@ -59,7 +59,8 @@ def assert_close(
         units = difference[where] / (eps * scale[where])
         raise AssertionError(
             f"{key}: {_first(wrong, actual, expected, place)}; differs by {difference[where]:.3e} = {units:.3g} units,"
-            f" allowed {limit / eps:.3g} units of {eps * scale[where]:.3e}; {int(np.sum(wrong))} of {int(np.sum(compared))} differ"
+            f" allowed {limit / eps:.3g} units of {eps * scale[where]:.3e};"
+            f" {int(np.sum(wrong))} of {int(np.sum(compared))} differ"
         )
 
 
@@ -75,9 +76,7 @@ def assert_same_bits(
     assert not np.any(wrong), f"{what}: {_first(wrong, actual, expected, place)}; must be equal exactly"
 
 
-def _first(
-    wrong: Any, actual: Any, expected: Any, place: Callable[[tuple[int, ...]], str] | None = None
-) -> str:
+def _first(wrong: Any, actual: Any, expected: Any, place: Callable[[tuple[int, ...]], str] | None = None) -> str:
     where = tuple(int(i) for i in np.argwhere(wrong)[0])
     at = f"first at {list(where)}" if place is None else place(where)
     return f"{at}: got {actual[where].item()!r}, expected {expected[where].item()!r}"

@@ -224,7 +224,7 @@ def simpler_calls(call: Call) -> Iterator[Call]:
         yield replace(call, frames=shared, camera_colors=False)
     if call.first.colors is not None:
         behind = np.zeros(3) if call.no_background else np.array([0.25, 0.5, 0.75])
-        yield _each_frame(call, lambda f: Frame(f.scene.but(background=behind), None, f.blind))
+        yield _each_frame(call, lambda f: Frame(f.scene.with_overrides(background=behind), None, f.blind))
     for name, default in (("packed", False), ("render_mode", "RGB"), ("covars", False), ("radius_clip", 0.0),
                           ("sparse_grad", False), ("dominance", False), ("absgrad", False)):  # fmt: skip
         if getattr(call, name) != default and not (name == "packed" and call.sparse_grad):
@@ -244,7 +244,7 @@ def _plainer_scenes(call: Call) -> Iterator[Call]:
     width, height = scene.camera.width, scene.camera.height
     changes += [{"width": 17, "height": 11}] * (width > 17 and height > 11)
     for change in changes:
-        yield _each_frame(call, lambda f, change=change: replace(f, scene=f.scene.but(**change)))
+        yield _each_frame(call, lambda f, change=change: replace(f, scene=f.scene.with_overrides(**change)))
 
 
 def fewer_gaussians(call: Call) -> Iterator[Call]:
@@ -265,7 +265,7 @@ def _each_frame(call: Call, change: Callable[[Frame], Frame]) -> Call:
 
 def without_backgrounds(call: Call) -> Call:
     """Return the call with its argument left out, and scenes black behind."""
-    black = _each_frame(call, lambda f: replace(f, scene=f.scene.but(background=np.zeros(f.n_colors))))
+    black = _each_frame(call, lambda f: replace(f, scene=f.scene.with_overrides(background=np.zeros(f.n_colors))))
     return replace(black, no_background=True)
 
 
@@ -274,13 +274,13 @@ def with_backgrounds(call: Call) -> Call:
 
     def change(frame: Frame) -> Frame:
         behind = np.mod(np.arange(frame.n_colors) * 3.0 + 2.0, 8.0) / 8.0
-        return replace(frame, scene=frame.scene.but(background=behind))
+        return replace(frame, scene=frame.scene.with_overrides(background=behind))
 
     return replace(_each_frame(call, change), no_background=False)
 
 
 def _colored_as(frame: Frame, other: Frame) -> Frame:
-    return Frame(frame.scene.but(sh=other.scene.gaussians.sh), other.colors, frame.blind)
+    return Frame(frame.scene.with_overrides(sh=other.scene.gaussians.sh), other.colors, frame.blind)
 
 
 @dataclass(frozen=True)

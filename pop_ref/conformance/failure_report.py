@@ -21,6 +21,8 @@ from pop_ref.conformance.scenes import Scene, cotangents, scene_as_code
 from pop_ref.margins import margins
 
 ORACLE = OracleAdapter()
+# a call of larger pictures is reported with all its Gaussians: to try without each would take minutes
+MOST_PIXELS = 1200
 # what a rasterizer's meta may show of the stages before the pixel, in the order of a render
 SHOWN = (("depths", "means_cam_from_means"), ("means2d", "project_means"), ("conics", "conics_from_covars2d"))
 
@@ -222,7 +224,8 @@ def call_findings(backend: Any, call: Call) -> list[str]:
             f"call to paste:\n{call_as_code(call)}",
         ]
     what, check = found
-    plain, words = narrowed(backend, call, check, gaussians=True)
+    camera = call.first.scene.camera
+    plain, words = narrowed(backend, call, check, gaussians=camera.width * camera.height <= MOST_PIXELS)
     lines = [f"first difference: {what}: {words}", f"first cause: {cause(backend, plain, check)}"]
     if not plain.described():
         lines += _findings(backend, plain.first.scene)[0]

@@ -106,8 +106,9 @@ def _telling(sentence: Callable[..., None], quantified: Callable[..., Any]) -> C
             test(*args, **named)
         except Exception as error:
             seen = _example_of(error)
-            for report in FAILURE_REPORTS if seen is not None else ():
-                error.add_note(_safely(report, sentence.__name__, seen, seen.scenes))
+            if seen is not None:
+                for report in FAILURE_REPORTS:
+                    error.add_note(_safely(report, sentence.__name__, seen, seen.scenes))
             raise
 
     return reported
@@ -125,9 +126,9 @@ def _example_of(error: BaseException) -> _Watched | None:
 
 def is_crash(error: BaseException) -> bool:
     """Tell whether a law broke because the backend raised an error, not because of a comparison."""
-    from pop_ref.conformance.narrowing import Crash
+    from pop_ref.conformance.narrowing import RasterizerError
 
-    return isinstance(error, Crash) or bool(error.__dict__.get(_RAISED_BY_BACKEND))
+    return isinstance(error, RasterizerError) or bool(error.__dict__.get(_RAISED_BY_BACKEND))
 
 
 class _Watched:

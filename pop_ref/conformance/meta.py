@@ -35,7 +35,8 @@ def assert_rows(backend: Any, of: Made) -> None:
     Packed rows that do not tell whose they are have nothing to be compared with.
     """
     call, meta = of.call, of.called.meta
-    rows = {name: unpacked(call, meta[name], meta) for name in (*ROWS, "radii") if name in meta}
+    given = {name: unpacked(call, meta[name], meta) for name in (*ROWS, "radii") if name in meta}
+    rows = {name: value for name, value in given.items() if value is not None}
     index = packed_index(call, meta) if call.packed else None
     present = np.zeros(call.shape, dtype=np.int64)
     if index is not None:
@@ -49,16 +50,16 @@ def assert_rows(backend: Any, of: Made) -> None:
 
         if index is not None:
             assert_same_bits("packed rows of it", present[b, c], visible.astype(np.int64), clear, gaussian)
-        if rows.get("radii") is not None:
+        if "radii" in rows:
             assert_same_bits("meta radii", rows["radii"][b, c], e.render.splats.radii, clear, gaussian)
         units = {"means2d": s.e_means2d, "depths": s.e_depths, "conics": s.e_conics, "opacities": s.e_opacities}
         # what is culled holds no number
         drawn, splats = clear & visible, e.render.splats
-        for name in (name for name in ROWS if rows.get(name) is not None):
+        for name in (name for name in ROWS if name in rows):
             size = units[name] + np.abs(getattr(splats, name))
             place = functools.partial(_of, name, gaussian)
-            given = (rows[name][b, c], getattr(splats, name), size, backend.dtype, True, drawn, place)
-            assert_close("meta.rows", *given)
+            values = (rows[name][b, c], getattr(splats, name), size)
+            assert_close("meta.rows", *values, backend.dtype, True, drawn, place)
 
 
 def _of(name: str, gaussian: Callable[[tuple[int, ...]], str], at: tuple[int, ...]) -> str:

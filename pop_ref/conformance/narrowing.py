@@ -12,7 +12,7 @@ from pop_ref.conformance.views import refuses_on_purpose
 Check = Callable[[Any, Made], None]
 
 
-class Crash(AssertionError):
+class RasterizerError(AssertionError):
     """The rasterizer raised an error where it had to answer: it was not compared with anything."""
 
 

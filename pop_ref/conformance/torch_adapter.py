@@ -117,11 +117,11 @@ class TorchAdapter(Adapter):
         seen = super().sees(scene)
         if self._rasterization is None or self.takes("tile_size") or seen.profile.extent == "square":
             return seen
-        return seen.but(tile_size=self.own_tile_size)
+        return seen.with_overrides(tile_size=self.own_tile_size)
 
     @functools.cached_property
     def own_tile_size(self) -> int | None:
-        """Return the side of the tiles of a rasterizer that takes none, as its meta tells it; None if it does not. px"""
+        """Give the side of the tiles of a rasterizer that takes none, as its meta tells it; None if it does not. px"""
         from pop_ref.conformance.golden import golden_scene
 
         scene = super().sees(golden_scene())

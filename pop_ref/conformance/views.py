@@ -25,7 +25,9 @@ NEAREST, FARTHEST = 1.0, 6.0
 BEHIND = 32.0
 
 
-def cameras(count: int, centred: bool = False, size: tuple[int, int] = SIZE, blind: int | None = None) -> list[Camera]:
+def cameras(
+    count: int, centred: bool = False, size: tuple[int, int] = SIZE, blind: int | None = None, aside: float = 0.0
+) -> list[Camera]:
     """Return cameras side by side, each turned and shifted a little and with intrinsics of its own.
 
     Args:
@@ -33,12 +35,14 @@ def cameras(count: int, centred: bool = False, size: tuple[int, int] = SIZE, bli
         centred: whether every principal point is the middle of the image.
         size: width and height, px.
         blind: the camera that has every Gaussian behind it.
+        aside: how far the first stands from where it does, in distances from one to the next.
     """
     found, base = [], rigid((0.9, 0.2, -0.3, 0.15), (0.25, -0.5, 0.75))
     larger = np.diag([size[0] / SIZE[0], size[1] / SIZE[1], 1.0])
-    for c in range(count):
+    for number in range(count):
+        c = number + aside
         moved = rigid((1.0, 0.03 * c, -0.05 * c, 0.02 * c), (0.125 * c, -0.0625 * c, 0.1875 * c)) @ base
-        if c == blind:
+        if number == blind:
             moved = rigid((0.0, 0.0, 1.0, 0.0), (0.0, 0.0, -BEHIND)) @ moved
         K = larger @ np.array([[18.0 + 3.0 * c, 0.0, 8.25 + c], [0.0, 16.0 + 2.0 * c, 5.75 - 0.5 * c], [0.0, 0.0, 1.0]])
         if centred:
@@ -81,6 +85,7 @@ def frames(
     size: tuple[int, int] = SIZE,
     tile_size: int = 4,
     blind: int | None = None,
+    entry: int = 0,
 ) -> tuple[Frame, ...]:
     """Return the frames of one batch entry, as a backend reads them.
 
@@ -97,6 +102,7 @@ def frames(
         size: width and height, px.
         tile_size: px, where tiles change no image.
         blind: the camera that has every Gaussian behind it.
+        entry: of the batch; each has cameras of its own.
     """
     g, rng = gaussians(seed, degree, size=size), np.random.default_rng(1000 + seed)
     shared = rng.uniform(-0.5, 1.5, (len(g), channels))
@@ -104,7 +110,7 @@ def frames(
     profile = backend.profile or PAPER
     # where extents are square the grid is the profile's own
     side = None if profile.extent == "square" else tile_size
-    for c, camera in enumerate(cameras(count, profile.principal_point == "centred", size, blind)):
+    for c, camera in enumerate(cameras(count, profile.principal_point == "centred", size, blind, 0.5 * entry)):
         mixed = camera_colors * 0.125 * c
         own = Gaussians(g.means, g.quats, g.scales, g.opacities, g.sh * (1.0 - mixed))
         behind = np.zeros(channels or 3) if black else np.round(16.0 * rng.uniform(-0.25, 1.25, channels or 3)) / 16.0
@@ -127,12 +133,11 @@ def call_for(backend: Any, seed: int = 0, **asks: Any) -> Call:
         seed: of the first entry's Gaussians; the other entries have the next ones.
         asks: options by name; planes as near_plane, far_plane, eps2d.
     """
-    of_call = {"absgrad": False} | {name: asks[name] for name in _OF_CALL if name in asks}
+    of_call: dict[str, Any] = {"absgrad": False} | {name: asks[name] for name in _OF_CALL if name in asks}
     of_call["planes"] = {name: asks[name] for name in _PLANES if name in asks}
     of_frames = {name: value for name, value in asks.items() if name not in (*_OF_CALL, *_PLANES)}
     of_frames["black"] = asks.get("no_background", False)
-    entries = range(seed, seed + math.prod(asks.get("batch", ())))
-    rows = tuple(frames(backend, each, **of_frames) for each in entries)
+    rows = tuple(frames(backend, seed + b, **of_frames, entry=b) for b in range(math.prod(asks.get("batch", ()))))
     return Call(rows, camera_colors=asks.get("camera_colors", False), **of_call)
 
 
@@ -152,9 +157,11 @@ def clear_call(backend: Any, first_seed: int, **asks: Any) -> Call:
 
 
 def _clearly_culled(call: Call, dtype: Any) -> bool:
-    culls = dict.fromkeys((*(name for name in call.planes if name != "eps2d"), *["clip"] * (call.radius_clip > 0)), False)
+    culls = dict.fromkeys(
+        (*(name for name in call.planes if name != "eps2d"), *["clip"] * (call.radius_clip > 0)), False
+    )
     for _, _, frame in call.each:
-        scene = frame.scene.but(profile=call.profile)
+        scene = frame.scene.with_overrides(profile=call.profile)
         unplaned = project(scene.gaussians, scene.camera, scene.sh_degree, frame.scene.profile, scene.antialiased)
         for name in culls.keys() & call.planes.keys():
             off = unplaned.depths - call.planes[name]

@@ -5,11 +5,9 @@ Every two values of two arguments that the rasterizer takes alone meet in some c
 
 from __future__ import annotations
 
-from pop_ref.conformance.calls import Call
-from pop_ref.conformance.capabilities import BATCHES, CAMERAS, GRADIENTS, SIGNATURE
+from pop_ref.conformance.capabilities import GRADIENTS, SIGNATURE
 from pop_ref.conformance.law import law
 from pop_ref.conformance.pairs import assert_every_pair, assert_no_pair_fails
-from pop_ref.conformance.views import frames
 
 
 @law("signature", SIGNATURE)
