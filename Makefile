@@ -97,5 +97,5 @@ docs-check: setup  ## fail when a table, name, path or command in README.md is n
 
 clean:  ## remove what was built here; .venv stays
 	rm -rf out build dist .pytest_cache .ruff_cache .hypothesis htmlcov .coverage
-	rm -rf pop_fast/compiled/_*.so cuda_ext/build tests/cuda/emulated/build
+	rm -rf pop_fast/compiled/_*.so cuda_ext/build tests/cuda/emulated/build benchmarks/faults/corpus
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +

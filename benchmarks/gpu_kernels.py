@@ -29,7 +29,7 @@ from gpu_steps import kernel_times, step_kernels, whole_step
 from torch import Tensor
 
 import cuda_ext
-from cuda_ext.gpu_check.tools import write_json
+from cuda_ext.gpu_check.shared import write_json
 from pop_fast.cuda import rasterization
 
 WARM_UP, REPEATS, STEPS = 5, 50, 200

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cuda_ext.gpu_check.command import commit_of
-from cuda_ext.gpu_check.tools import ROOT, write_json
+from cuda_ext.gpu_check.shared import ROOT, write_json
 from pop_fast.children import python_command
 from pop_fast.data import Capture, View, load_capture
 from pop_fast.errors import PopError

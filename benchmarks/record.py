@@ -47,5 +47,11 @@ def write_json(path: Path, result: dict[str, Any]) -> None:
     """Write results beside and rename, so that a file is whole or not there."""
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_suffix(".part")
-    beside.write_text(json.dumps(result, indent=2) + "\n")
+    beside.write_text(text_of(result), encoding="utf-8")
     os.replace(beside, path)
+
+
+def text_of(result: dict[str, Any]) -> str:
+    """Write results as JSON with one line for each entry, so that a difference shows which entry has changed."""
+    lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(value)}" for name, value in result.items())
+    return f"{{\n{lines}\n}}\n"

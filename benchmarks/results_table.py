@@ -1,7 +1,8 @@
 """The tables of training results, from the statistics of training runs.
 
-Copy stats/val_step*.json of a finished run to benchmarks/results/training/<capture>_<method>_<seed>.json; then
+benchmarks/results/training.jsonl has one line a run: what the run wrote into stats/val_step*.json, after its name here.
 
+    python benchmarks/results_table.py --add FILE NAME      add a run's statistics under a name
     python benchmarks/results_table.py                      print the tables
     python benchmarks/results_table.py --check PAGE...      exit with 1 when these pages hold others
 
@@ -21,20 +22,22 @@ from paper_repro.paper import paper
 from pop_fast.view.report.compare import COLUMNS, markdown, row
 
 RESULTS = Path(__file__).resolve().parent / "results"
-RUNS = RESULTS / "training"
+RUNS = RESULTS / "training.jsonl"
+# of runs under the older reading of growth by blur, which stand in no table
+ANY_VIEW = "any_view/"
 
 Stats = dict[str, Any]
 
 
-def table(folder: Path = RUNS) -> str:
-    """Make the table of all runs in a folder, by capture, POP before others."""
-    return markdown([_row(runs) for runs in _groups(folder)])
+def table(runs: Path = RUNS) -> str:
+    """Make the table of all runs, by capture, POP before others."""
+    return markdown([_row(runs) for runs in _groups(runs)])
 
 
-def summary(folder: Path = RUNS) -> str:
+def summary(runs: Path = RUNS) -> str:
     """Make the short table: POP at the paper's weight of its term, and the two baselines, a capture a line."""
     chosen: dict[str, dict[str, Stats]] = {}
-    for stats in map(_mean, _groups(folder)):
+    for stats in map(_mean, _groups(runs)):
         # of several weights of the POP term the smallest, which is the paper's
         chosen.setdefault(stats["capture"], {}).setdefault(stats["method"], stats)
     lines = ["| capture | POP | gsplat's default strategy | 3DGS |", "| --- | --- | --- | --- |"]
@@ -48,11 +51,11 @@ def _short(stats: Stats | None) -> str:
     return "not run" if stats is None else f"{stats['psnr']:.2f} dB, {stats['num_GS']:,}"
 
 
-def differences(folder: Path = RUNS) -> str:
+def differences(runs: Path = RUNS) -> str:
     """Make the table of what POP is less gsplat's strategy: of these runs, and of the paper's main tables."""
     lines = ["| scene | schedule | PSNR | SSIM | Gaussians |", "| --- | --- | ---: | ---: | ---: |"]
     means: dict[tuple[str, str], Stats] = {}
-    for stats in map(_mean, _groups(folder)):
+    for stats in map(_mean, _groups(runs)):
         # of several weights of the POP term the smallest, which is the paper's
         means.setdefault((stats["capture"], stats["method"]), stats)
     for capture in sorted({capture for capture, _ in means}):
@@ -76,10 +79,12 @@ def _difference(scene: str, schedule: str, psnr: float, ssim: float, share: floa
     return f"| {scene} | {schedule} | {psnr:+.2f} dB | {ssim:+.3f} | {share:.1%} |"
 
 
-def _groups(folder: Path) -> list[list[Stats]]:
-    runs = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.json"))]
+def _groups(path: Path) -> list[list[Stats]]:
+    runs = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     groups: dict[tuple[Any, ...], list[Stats]] = {}
     for stats in runs:
+        if stats["run"].startswith(ANY_VIEW):
+            continue
         key = (stats["capture"], stats["method"] != "pop", stats["method"], stats.get("lambda_pop", 0.0))
         groups.setdefault(key, []).append(stats)
     return [groups[key] for key in sorted(groups)]
@@ -106,8 +111,20 @@ def _row(runs: Sequence[Stats]) -> list[str]:
     return cells
 
 
+def add(statistics: Path, name: str, runs: Path = RUNS) -> None:
+    """Add a run's statistics; a run of the same name is replaced."""
+    kept = [json.loads(line) for line in runs.read_text(encoding="utf-8").splitlines()]
+    kept = [stats for stats in kept if stats["run"] != name]
+    kept.append({"run": name, **json.loads(statistics.read_text(encoding="utf-8"))})
+    kept.sort(key=lambda stats: (stats["run"].startswith(ANY_VIEW), stats["run"]))
+    runs.write_text("".join(json.dumps(stats, separators=(",", ":")) + "\n" for stats in kept), encoding="utf-8")
+
+
 def main(words: list[str]) -> int:
     """Run the script."""
+    if words[:1] == ["--add"]:
+        add(Path(words[1]), words[2])
+        return 0
     tables = (table(), differences(), summary())
     if words[:1] != ["--check"]:
         print("\n\n".join(tables))

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from pop_fast.errors import PopError
 from pop_fast.lazy import given_by
-from pop_fast.moved import keep_old_names
 
 if TYPE_CHECKING:
     from pop_fast.api import rasterization
@@ -36,7 +35,6 @@ __all__ = [
     "save_ply",
 ]
 
-keep_old_names(__name__)
 _given = given_by(
     __name__,
     {

@@ -137,7 +137,7 @@ def colors_from_sh(
         degree: 0, 1, 2 or 3.
 
     Returns:
-        Colours, linear rgb, >= 0, not bounded above.
+        Colours, encoded rgb, >= 0, not bounded above.
 
     Raises:
         ValueError: the degree is not 0 to 3, or `sh` has fewer than (degree + 1)^2 coefficients.

@@ -30,7 +30,7 @@ def l1(
     Departs: nothing.
 
     Args:
-        image: the render, linear rgb, not clamped.
+        image: the render, encoded rgb, not clamped.
         target: the photograph in [0, 1].
         mask: True where a pixel counts; None keeps all.
 
@@ -92,7 +92,7 @@ def l2(
     Departs: nothing.
 
     Args:
-        image: the render, linear rgb, not clamped.
+        image: the render, encoded rgb, not clamped.
         target: the photograph in [0, 1].
         mask: True where a pixel counts; None keeps all.
 
@@ -156,7 +156,7 @@ def photometric_3dgs(
     Departs: gsplat crops the SSIM map ("valid", the default here), Inria zero-pads ("same").
 
     Args:
-        image: the render, linear rgb, not clamped.
+        image: the render, encoded rgb, not clamped.
         target: the photograph in [0, 1].
         lambda_ssim: weight of D-SSIM, in [0, 1].
         padding: SSIM's border, "valid" or "same".
@@ -232,7 +232,7 @@ def photometric_pop(
     Departs: nothing; the SSIM is gsplat's ("valid"), on which the paper builds.
 
     Args:
-        image: the render, linear rgb, not clamped.
+        image: the render, encoded rgb, not clamped.
         target: the photograph in [0, 1].
         lambda_ssim: weight of D-SSIM, in [0, 1].
         padding: SSIM's border, "valid" or "same".

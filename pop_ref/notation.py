@@ -3,7 +3,8 @@
 Conventions that the table cannot say: plural is an axis, singular one item; batching is only ever a leading axis
 (`viewmats [C, 4, 4]`, `Ks [C, 3, 3]`); `scales` and `opacities` are always activated; quaternions are wxyz; cameras are
 OpenCV's (+x right, +y down, +z forward); pixel centres lie at index + 0.5; verbs are `x_from_y` (builds), `project_*`
-(changes space) and `*_vjp` (the transpose), and the cotangent of x is `v_x`.
+(changes space) and `*_vjp` (the transpose), and the cotangent of x is `v_x`. Encoded rgb is what a photograph's file
+holds, byte / 255, with the file's gamma in it; no stage decodes it.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ SYMBOLS: Final = (
     Symbol("scales", "[N, 3]", "world", "Gaussian", r"s_i", "standard deviations"),
     Symbol("logit_opacities", "[N]", "1", "", "", "raw parameter of opacities"),
     Symbol("opacities", "[N]", "1", "", r"o_i", "opacities, in [0, 1]"),
-    Symbol("sh", "[N, n_sh, 3]", "linear rgb", "world", "", "spherical-harmonics coefficients"),
+    Symbol("sh", "[N, n_sh, 3]", "encoded rgb", "world", "", "spherical-harmonics coefficients"),
     Symbol("dirs", "[N, 3]", "world", "world", "", "from the camera's centre to the Gaussians"),
-    Symbol("colors", "[N, D]", "linear rgb", "", r"c_i", "colours as this camera sees them"),
+    Symbol("colors", "[N, D]", "encoded rgb", "", r"c_i", "colours as this camera sees them"),
     Symbol("covars", "[N, 3, 3]", "world^2", "world", r"\Sigma_i", "covariances"),
     Symbol("viewmat", "[4, 4]", "world", "world -> camera", "W", "rigid transformation"),
     Symbol("K", "[3, 3]", "px", "camera -> screen", "", "intrinsics without skew"),
@@ -64,8 +65,8 @@ SYMBOLS: Final = (
     Symbol("alpha", "", "1", "", r"\alpha_i", "opacity of one splat at one pixel"),
     Symbol("T", "", "1", "", r"T_i", "transmittance before a splat"),
     Symbol("weight", "", "1", "", r"T_i \alpha_i", "what a splat contributes to a pixel"),
-    Symbol("background", "[D]", "linear rgb", "", "", "colour behind everything"),
-    Symbol("image", "[H, W, D]", "linear rgb", "screen", r"\mathbf{c}(\mathbf{p})", "rendered colours, not clamped"),
+    Symbol("background", "[D]", "encoded rgb", "", "", "colour behind everything"),
+    Symbol("image", "[H, W, D]", "encoded rgb", "screen", r"\mathbf{c}(\mathbf{p})", "rendered colours, not clamped"),
     Symbol("T_final", "[H, W]", "1", "screen", "", "transmittance behind the last blended splat"),
     Symbol("n_blended", "[H, W]", "1", "screen", "m", "splats blended at a pixel"),
     Symbol("n_traversed", "[H, W]", "1", "screen", "", "list entries visited until the pixel stopped"),

@@ -1,9 +1,9 @@
 """One pixel: front-to-back blending with early ray termination, and its transpose.
 
 With T_1 = 1 and T_{i+1} = T_i (1 - alpha_i), a pixel is C = sum_i T_i alpha_i c_i + T_final background. Let g be the
-cotangent of C, q_i = c_i . g the product of splat i's colour with it, and B_i that of the colour behind splat i:
-B_m = background . g + v_T_final behind the last splat, and B_{i-1} = alpha_i q_i + (1 - alpha_i) B_i. Then
-    dL/dalpha_i = T_i (q_i - B_i),    dL/dc_i = T_i alpha_i g,
+cotangent of C, q_i = c_i . g the product of splat i's colour with it, and β_i that of the colour behind splat i:
+β_m = background . g + v_T_final behind the last splat, and β_{i-1} = alpha_i q_i + (1 - alpha_i) β_i. Then
+    dL/dalpha_i = T_i (q_i - β_i),    dL/dc_i = T_i alpha_i g,
 so one scalar, walked from back to front, is all the backward pass carries: it never divides by 1 - alpha.
 """
 
@@ -87,9 +87,10 @@ def stops(next_T: float, profile: Profile = PAPER) -> bool:
     """Tell whether a pixel ends before the splat that would leave `next_T` (D7).
 
     Source: POP paper, section 3.1: early ray termination at `T_{i+1} <= 1e-4`.
-    Departs: Inria stops at `<`; everyone leaves the terminating splat unblended (D7). In every profile the second of
-        two opaque splats is the terminating one: they would leave 1e-6 under a ceiling of 0.999, and 9.99998e-5 under
-        the 0.99 of float32, which the profiles therefore hold (see `constants`).
+    Departs: Inria stops at `<`. Inria and gsplat leave the terminating splat unblended, as here; Faster-GS and LiteGS
+        blend it (D7). In every profile the second of two opaque splats is the terminating one: they would leave 1e-6
+        under a ceiling of 0.999, and 9.99998e-5 under the 0.99 of float32, which the profiles therefore hold (see
+        `constants`).
 
     Args:
         next_T: the transmittance that would be left behind the splat.

@@ -101,7 +101,7 @@ def pixel_weights(image: Float64[np.ndarray, "H W 3"], photo: np.ndarray) -> Flo
     Departs: where all pixels are alike the code divides by 0; here such a map is 0.
 
     Args:
-        image: the render, linear rgb, not clamped.
+        image: the render, encoded rgb, not clamped.
         photo: the photograph, uint8 [H, W, 3].
 
     Returns:

@@ -1,14 +1,18 @@
 """The files that the fuzzer starts from: one small sound file of each kind that the program reads.
 
-They are kept in `corpus/`, so that a number names the same input everywhere; `python -m benchmarks.faults.corpus` makes
-them anew, which changes what every number means. `corpus/regressions` holds inputs that once broke something, each in
-a folder named after its reader; they are read as they are, before anything is mutated.
+They are kept in `corpus.zip`, so that a number names the same input everywhere, and unpacked into the folder `corpus`,
+which git ignores, when this module is imported. `python -m benchmarks.faults.corpus` makes them anew, which changes
+what every number means. `corpus/regressions` holds inputs that once broke something, each in a folder named after its
+reader; they are read as they are, before anything is mutated.
 """
 
 from __future__ import annotations
 
+import fcntl
+import hashlib
 import json
 import math
+import os
 import shutil
 import struct
 import tempfile
@@ -21,28 +25,61 @@ import numpy as np
 import torch
 
 from pop_fast.blocks.plan import Job, job_text, make_plan, write_plan
+from pop_fast.data.capture import Listing
 from pop_fast.data.colmap import read_model
 from pop_fast.data.load import load_capture
-from pop_fast.data.posed_images import Listing
 from pop_fast.data.sfm_files import UPRIGHT, write_list
 from pop_fast.io.formats import FORMATS, encoded
-from pop_fast.io.heif import can_read_heif
+from pop_fast.io.image_header import can_read_heif
 from pop_fast.io.ply import save_ply
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.load_result import RECORD, CaptureRecord, record_text
-from pop_fast.view.live.recording import KeyCamera, path_of
+from pop_fast.view.live.state import KeyCamera, path_of
 from pop_fast.view.report.checks import Checks
 from pop_ref.conformance.scene_files import save_scene
 from pop_ref.conformance.vectors import export
 
 from .ksplat import ksplat_of
 
-HERE = Path(__file__).resolve().parent / "corpus"
+ARCHIVE = Path(__file__).resolve().with_name("corpus.zip")
+# beside the files: the digest of the archive that they are from
+_STAMP = ".archive"
 WIDTH, HEIGHT, FOCAL, VIEWS, POINTS = 24, 16, 20.0, 3, 12
 
 _COLUMNS = ("x", "y", "z", "red", "green", "blue")
 _PROTOCOL = {"split": "every 3rd by name", "test_views": 1, "images": "images", "factor": 1, "width": WIDTH}
 _PROTOCOL |= {"height": HEIGHT, "resize": "area"}
+
+
+def unpacked(archive: Path = ARCHIVE) -> Path:
+    """Unpack the archive into the folder of its name, where that holds another one's files, and return the folder."""
+    folder = archive.with_suffix("")
+    with open(archive, "rb") as file:
+        # one process unpacks while others wait
+        fcntl.flock(file, fcntl.LOCK_EX)
+        digest = hashlib.sha256(file.read()).hexdigest()
+        stamp = folder / _STAMP
+        if not stamp.exists() or stamp.read_text(encoding="utf-8") != digest:
+            shutil.rmtree(folder, ignore_errors=True)
+            with zipfile.ZipFile(file) as members:
+                members.extractall(folder)
+            stamp.write_text(digest, encoding="utf-8")
+    return folder
+
+
+def pack(folder: Path, archive: Path = ARCHIVE) -> None:
+    """Write the archive from the folder; the same files give the same bytes."""
+    beside = archive.with_suffix(".part")
+    with zipfile.ZipFile(beside, "w") as members:
+        for path in sorted(folder.rglob("*")):
+            if path.is_file() and path.name != _STAMP:
+                entry = zipfile.ZipInfo(path.relative_to(folder).as_posix())
+                members.writestr(entry, path.read_bytes(), zipfile.ZIP_DEFLATED, 9)
+    os.replace(beside, archive)
+    (folder / _STAMP).write_text(hashlib.sha256(archive.read_bytes()).hexdigest(), encoding="utf-8")
+
+
+HERE = unpacked()
 
 
 def make(folder: Path) -> None:
@@ -346,3 +383,4 @@ def _write_kit(folder: Path) -> None:
 if __name__ == "__main__":
     make(HERE)
     make_more(HERE)
+    pack(HERE)

@@ -22,11 +22,10 @@ from typing import Any
 
 import torch
 
-from pop_fast.cli.errors import describe
-from pop_fast.cli.printable import message
+from pop_fast.cli.errors import describe, message
 from pop_fast.errors import PopError
 
-from .corpus import HERE
+from .corpus import HERE, pack
 from .forks import start, wait
 from .mutate import mutated
 from .readers import READERS, Reader
@@ -135,6 +134,8 @@ def _save(failures: dict[str, dict[str, Any]]) -> None:
         # no suffix that a tool would look for
         name = f"{zlib.crc32(key.encode()):08x}.damaged"
         (folder / name).write_bytes(input_of(found["reader"], found["seed"], found["number"]))
+    if failures:
+        pack(HERE)
 
 
 def _folder(name: str) -> Path:

@@ -23,7 +23,7 @@ from paper_repro.collect import collect
 from paper_repro.jobs import job_named
 from pop_fast.blocks.merge import read_round
 from pop_fast.blocks.plan import read_job, read_plan
-from pop_fast.blocks.start import own_of
+from pop_fast.blocks.rounds import own_of
 from pop_fast.cli import compare
 from pop_fast.cli.data_check import look_over
 from pop_fast.cli.render import listed_in
@@ -33,19 +33,18 @@ from pop_fast.data.sfm_files import recognise_result
 from pop_fast.data.video import take_frames
 from pop_fast.errors import CaptureError
 from pop_fast.io.formats import load_splat_file
-from pop_fast.io.heif import can_read_heif
-from pop_fast.io.image_header import read_exif, read_size
+from pop_fast.io.image_header import can_read_heif, read_exif, read_size
 from pop_fast.io.images import read_image, read_mask
-from pop_fast.io.points import read_points
+from pop_fast.io.ply_rows import read_points
 from pop_fast.train import TrainConfig
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.load_result import load_splat, read_record
 from pop_fast.train.lpips import LPIPS
 from pop_fast.train.results import read_config
-from pop_fast.view.inria import exported_to
-from pop_fast.view.live.recording import read_path
-from pop_fast.view.paths.video import frames_in
+from pop_fast.view.frames import exported_to
+from pop_fast.view.live.state import read_path
+from pop_fast.view.paths import frames_in
 from pop_fast.view.report.source import read_result
 from pop_ref.conformance import vector_check
 from pop_ref.conformance.scene_files import load_scene

@@ -15,8 +15,8 @@ from pop_fast.compiled import build, library
 from pop_fast.compiled.backend import COMPILED
 from pop_fast.compiled.native_step import NativeTrainer
 from pop_fast.data.load import load_capture
+from pop_fast.stages.stage_set import PassInput
 from pop_fast.stages.types import Camera, Gaussians
-from pop_fast.stages.view_pass import PassInput
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_ref.conformance.corpus import PLANS, corpus_scene
 from pop_ref.constants import PAPER

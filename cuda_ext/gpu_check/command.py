@@ -32,10 +32,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cuda_ext.gpu_check.budget import SHORTEST, Budget
-from cuda_ext.gpu_check.shared import Check
+from cuda_ext.gpu_check.shared import ROOT, SHORTEST, Budget, Check, first_line, python_path, read_json, write_json
 from cuda_ext.gpu_check.stages import JOBS, SHARES, STAGES
-from cuda_ext.gpu_check.tools import ROOT, first_line, python_path, read_json, write_json
 from pop_fast.children import python_command
 
 PLACE = ROOT / "out" / "gpu_check"

@@ -9,8 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from cuda_ext.gpu_check.budget import Share
-from cuda_ext.gpu_check.shared import NOTHING, Check, skipped
+from cuda_ext.gpu_check.shared import NOTHING, ROOT, Check, Command, Share, python_path, read_json, skipped
 from cuda_ext.gpu_check.tests import (
     laws_of_gaussian_parallel_stage,
     laws_stage,
@@ -18,7 +17,6 @@ from cuda_ext.gpu_check.tests import (
     smoke_stage,
     steps_stage,
 )
-from cuda_ext.gpu_check.tools import ROOT, Command, python_path, read_json
 from pop_fast.children import python_command
 
 _TRAIN = "from pop_fast.cli import main; raise SystemExit(main())"

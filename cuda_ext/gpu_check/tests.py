@@ -10,8 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from cuda_ext.gpu_check.outcomes import FILE, outcomes
-from cuda_ext.gpu_check.shared import NOTHING, Check, skipped
-from cuda_ext.gpu_check.tools import ROOT
+from cuda_ext.gpu_check.shared import NOTHING, ROOT, Check, skipped
 from pop_fast.children import python_command
 
 LAWS = tuple(f"test_gpu_{name}.py" for name in ("whole", "compositing", "dominance", "gradients", "agreement"))

@@ -143,10 +143,10 @@ class Backend(Renderer, Protocol):
         """Project and list a view for passes over it.
 
         Args:
-            pass_input: a `pop_fast.stages.view_pass.PassInput`.
+            pass_input: a `pop_fast.stages.stage_set.PassInput`.
 
         Returns:
-            A `pop_fast.stages.view_pass.ViewPass`.
+            A `pop_fast.stages.stage_set.ViewPass`.
         """
         ...
 

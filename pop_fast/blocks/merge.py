@@ -18,10 +18,10 @@ from typing import Any, Final
 import torch
 from torch import Tensor
 
+from pop_fast.blocks.jobs import Part, core_of, result_of, round_folder
 from pop_fast.blocks.partition import Partition
-from pop_fast.blocks.parts import Part, core_of, result_of, round_folder
 from pop_fast.blocks.plan import read_plan
-from pop_fast.blocks.start import own_of
+from pop_fast.blocks.rounds import own_of
 from pop_fast.data.capture import Capture
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically

@@ -28,7 +28,7 @@ and of every round r, from 0, that another one follows:
     blocks/round_r/stats.json  what they measure
     blocks/round_r/merged      is there when these are
 
-and of every round from 1 (see `pop_fast.blocks.round_views` and `pop_fast.blocks.start`):
+and of every round from 1 (see `pop_fast.blocks.rounds` and `pop_fast.blocks.rounds`):
 
     blocks/round_r/i_j/block.json  the views that the block drew (with points.npz, as above)
     blocks/round_r/i_j/start.json  how many Gaussians the block trained, and how many it held fixed
@@ -48,8 +48,7 @@ import numpy as np
 
 from pop_fast.blocks.partition import Partition, divide, grid_of
 from pop_fast.data.block import write_block
-from pop_fast.data.capture import Capture
-from pop_fast.data.posed_images import Listing, SparsePoints
+from pop_fast.data.capture import Capture, Listing, SparsePoints
 from pop_fast.data.random_points import in_picture
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically

@@ -19,8 +19,7 @@ from collections.abc import Iterator, Sequence
 from types import FrameType
 from typing import Final
 
-from pop_fast.cli.errors import describe
-from pop_fast.cli.printable import message
+from pop_fast.cli.errors import describe, message
 
 COMMANDS: Final = {
     "train": "fit a splat to a capture or a folder of photographs",

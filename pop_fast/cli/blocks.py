@@ -18,7 +18,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 
 if TYPE_CHECKING:
-    from pop_fast.blocks.parts import Part
+    from pop_fast.blocks.jobs import Part
     from pop_fast.blocks.plan import Job
     from pop_fast.train.config import TrainConfig
     from pop_fast.train.load_result import CaptureRecord
@@ -83,7 +83,7 @@ def _part(args: Args, job: Job) -> Part:
     Raises:
         PopError: it has no such block or round.
     """
-    from pop_fast.blocks.parts import parts_of
+    from pop_fast.blocks.jobs import parts_of
 
     if args.part == "train" and args.block not in job.names:
         raise PopError(f"{args.result}: has no block {args.block}; its blocks are {', '.join(job.names)}")
@@ -110,7 +110,7 @@ def _partition(folder: Path, config: TrainConfig, record: CaptureRecord, job: Jo
 
 
 def _train(folder: Path, config: TrainConfig, block: str, argv: Sequence[str]) -> int:
-    from pop_fast.blocks.parts import marker_of
+    from pop_fast.blocks.jobs import marker_of
     from pop_fast.blocks.plan import read_plan
     from pop_fast.blocks.run import config_of
     from pop_fast.cli.train import check_backend, train_capture
@@ -139,8 +139,8 @@ def _options(folder: Path, own: TrainConfig) -> Any:
         folder: the run's.
         own: the settings of the training.
     """
-    from pop_fast.cli.result_folder import as_begun, check_output
     from pop_fast.cli.train import arguments
+    from pop_fast.cli.train_checks import as_begun, check_output
     from pop_fast.train.load_result import read_record
 
     record, place = read_record(folder), Path(own.result_dir)
@@ -154,13 +154,12 @@ def _options(folder: Path, own: TrainConfig) -> Any:
 
 def _train_round(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job, part: Part) -> int:
     """Train what a block has in its core, in a round from 1, among what its views see of the other cores."""
-    from pop_fast.blocks.parts import marker_of
-    from pop_fast.blocks.round_views import write_round_block
+    from pop_fast.blocks.jobs import marker_of
+    from pop_fast.blocks.rounds import check_merged, read_core, read_start, write_counts, write_round_block
     from pop_fast.blocks.run import round_config
-    from pop_fast.blocks.start import check_merged, read_core, read_start, write_counts
-    from pop_fast.cli.printable import printable
-    from pop_fast.cli.result_folder import record_of, resumption, stopped
+    from pop_fast.cli.errors import printable
     from pop_fast.cli.train import check_backend, open_capture, summary
+    from pop_fast.cli.train_checks import record_of, resumption, stopped
     from pop_fast.train.choose import choose_backend
     from pop_fast.train.load_result import RECORD, record_text
 
@@ -181,7 +180,7 @@ def _train_round(folder: Path, config: TrainConfig, record: CaptureRecord, job: 
         f"{start.own:,} Gaussians are trained; {seen:,} of the {start.merged - start.own:,} others show and are fixed"
     )
     if start.own > 0:
-        from pop_fast.blocks.refine import prepare
+        from pop_fast.blocks.rounds import prepare
 
         print(chosen)
         beside = {RECORD: record_text(record_of(capture, options))}

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import tyro
 
 from pop_fast.cli.arguments import parse
-from pop_fast.cli.printable import printable
+from pop_fast.cli.errors import printable
 
 if TYPE_CHECKING:
-    from pop_fast.data.finding import Finding
+    from pop_fast.data.photo_quality import Finding
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -60,8 +60,7 @@ def run(argv: Sequence[str]) -> int:
 def look_over(root: Path, images: str | None = None) -> list[Finding]:
     """Examine a capture, or photographs alone; all findings in reading order."""
     from pop_fast.data import check_dataset
-    from pop_fast.data.finding import Finding, number
-    from pop_fast.data.photo_quality import about_quality, measure_file
+    from pop_fast.data.photo_quality import Finding, about_quality, measure_file, number
     from pop_fast.data.sfm import photo_folder, photographs
     from pop_fast.machine import memory_bytes
 

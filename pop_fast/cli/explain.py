@@ -76,10 +76,10 @@ def _explain(args: Args, at: tuple[int, int] | None) -> int:
     from pop_fast.view.explain import explain_pixel, explain_view
     from pop_fast.view.explain.diff import difference
     from pop_fast.view.explain.maps import view_maps, write_maps
+    from pop_fast.view.explain.model import WIDTH, table
     from pop_fast.view.explain.page import page
     from pop_fast.view.explain.pixel import check_inside
     from pop_fast.view.explain.scene import with_objective
-    from pop_fast.view.explain.table import WIDTH, table
 
     splat = load_splat(args.splat)
     capture, config = open_with_bars(splat, args)

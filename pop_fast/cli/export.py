@@ -89,7 +89,7 @@ def run(argv: Sequence[str]) -> int:
 def _inria(args: Args) -> int:
     if args.out is None or args.to is not None or args.any:
         raise PopError("--layout inria writes all Gaussians into the folder --out; give --out, and no --to or limits")
-    from pop_fast.view.inria import exported_to, write_inria_folder
+    from pop_fast.view.frames import exported_to, write_inria_folder
 
     keeps = [args.splat] if args.capture is None else [args.splat, args.capture]
     check_folder(args.out, args.overwrite, keeps=keeps, recognise=exported_to(args.out))

@@ -141,7 +141,7 @@ def _sizes(folder: Path, splat: Splat, capture: Capture, params: dict[str, Tenso
     from pop_fast.train.gpu_proxy import renderer
     from pop_fast.train.results import ResultFolder
     from pop_fast.train.views import ViewTensors
-    from pop_fast.view.report.files_section import encoding_heads, encoding_rows
+    from pop_fast.view.report.sections import encoding_heads, encoding_rows
 
     config = splat.config
     views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]

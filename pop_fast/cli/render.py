@@ -69,8 +69,7 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _render(args: Args, video: VideoFile | None) -> int:
-    from pop_fast.io.names import picture_names
-    from pop_fast.view.frames import check_one_size, planned_views, rendered, write_pictures, write_video
+    from pop_fast.view.frames import check_one_size, picture_names, planned_views, rendered, write_pictures, write_video
 
     splat = load_splat(args.splat)
     capture, config = open_with_bars(splat, args)

@@ -10,7 +10,7 @@ from typing import Annotated, Final, Literal
 import tyro
 
 from pop_fast.cli.arguments import parse
-from pop_fast.data.sfm_options import SfmOptions
+from pop_fast.data.sfm_files import SfmOptions
 
 _EXAMPLES: Final = """
     pop sfm photos                 writes photos/sparse/0

@@ -18,17 +18,14 @@ import tyro
 from pop_fast.api.registry import backend_names
 from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED
 from pop_fast.cli.arguments import parse
-from pop_fast.cli.blocks_options import BlocksOptions
-from pop_fast.cli.errors import describe
+from pop_fast.cli.errors import describe, printable
 from pop_fast.cli.finish import FinishOptions, finish
 from pop_fast.cli.limits import LimitOptions
-from pop_fast.cli.live_view import LiveView, check_viewer
-from pop_fast.cli.overrides import PLAN, overrides, plan_of
-from pop_fast.cli.printable import printable
-from pop_fast.cli.result_folder import as_begun, check_output, record_of, resumption, stopped
-from pop_fast.cli.told_early import about_large, check_early
 from pop_fast.cli.train_blocks import check_blocks, train_in_blocks
-from pop_fast.data.sfm_options import SfmOptions
+from pop_fast.cli.train_checks import about_large, as_begun, check_early, check_output, record_of, resumption, stopped
+from pop_fast.cli.train_options import PLAN, BlocksOptions, overrides, plan_of
+from pop_fast.cli.view import LiveView, check_viewer
+from pop_fast.data.sfm_files import SfmOptions
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.presets import ALIASES, METHODS, Given
@@ -384,9 +381,9 @@ def open_capture(config: TrainConfig, options: Any) -> Capture:
 
     The cameras of bare photographs are found first.
     """
-    from pop_fast.cli.background_import import background_import
     from pop_fast.cli.progress import bars
     from pop_fast.data.load import load_capture
+    from pop_fast.lazy import background_import
 
     # a folder that is not there is said at once
     modules = _TRAINING if Path(config.data).is_dir() else ()

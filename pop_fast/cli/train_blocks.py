@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pop_fast.cli import EXIT_INTERRUPTED
-from pop_fast.cli.blocks_options import BlocksOptions
+from pop_fast.cli.errors import printable
 from pop_fast.cli.finish import FinishOptions, table_lines
-from pop_fast.cli.printable import printable
+from pop_fast.cli.train_options import BlocksOptions
 from pop_fast.errors import PopError
 
 if TYPE_CHECKING:
@@ -118,10 +118,9 @@ def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequen
     Returns:
         The exit status.
     """
-    from pop_fast.blocks.jobs import has_snakemake, profile_folder, run_in_turn, run_workflow
-    from pop_fast.blocks.parts import marker_of
+    from pop_fast.blocks.jobs import has_snakemake, marker_of, profile_folder, run_in_turn, run_workflow
     from pop_fast.blocks.plan import FOLDER, read_plan
-    from pop_fast.io.lock import FolderLock
+    from pop_fast.io.atomic import FolderLock
 
     folder, job = Path(config.result_dir), _job(config, options)
     config = replace(config, data=str(Path(config.data).absolute()))
@@ -200,7 +199,7 @@ def _no_longer(job: Job, before: Job) -> Job:
 
 def _extend(folder: Path, before: Job, job: Job) -> None:
     """Let a run have more rounds than it was begun with; its merge is then the last one no more."""
-    from pop_fast.blocks.parts import marker_of
+    from pop_fast.blocks.jobs import marker_of
     from pop_fast.blocks.plan import JOB, job_text
     from pop_fast.io.atomic import write_atomically
 
@@ -240,7 +239,7 @@ def _begin(folder: Path, config: TrainConfig, options: Any, job: Job, division: 
     import numpy as np
 
     from pop_fast.blocks.plan import JOB, job_text
-    from pop_fast.cli.result_folder import record_of
+    from pop_fast.cli.train_checks import record_of
     from pop_fast.train.commands import COMMANDS_FILE, commands_text
     from pop_fast.train.load_result import RECORD, record_text
     from pop_fast.train.results import ResultFolder

@@ -1,8 +1,9 @@
-"""`pop view`: a splat in the browser, drawn by the package's own renderers."""
+"""`pop view` and `pop train --view`: a splat in the browser, drawn by the package's own renderers."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pop_fast.data import Capture
+    from pop_fast.train.training_run import TrainingRun
     from pop_fast.view.live.server import LiveViewer
 
 _EXAMPLES: Final = """
@@ -64,7 +66,7 @@ def run(argv: Sequence[str]) -> int:
 def make_viewer(args: Args, splat: Splat) -> LiveViewer:
     """Start the viewer of a splat: with the cameras of its capture, or where none is known with one made up."""
     from pop_fast.train.gpu_proxy import renderer
-    from pop_fast.view.html.cameras import camera_of_points
+    from pop_fast.view.html import camera_of_points
     from pop_fast.view.live import SplatScene
     from pop_fast.view.live.server import LiveViewer, stands_of
 
@@ -94,7 +96,7 @@ def transform_of(splat: Splat) -> np.ndarray | None:
 
 def stands_of_capture(capture: Capture, test_every: int, means: Any) -> list[Any]:
     """Make places to look from of the training views, at most sixty."""
-    from pop_fast.view.html.cameras import cameras_of
+    from pop_fast.view.html import cameras_of
     from pop_fast.view.live.server import stands_of
     from pop_fast.view.pictures import fit
 
@@ -126,3 +128,39 @@ def check_address(host: str, port: int) -> None:
 
     require_viser()
     listen(host, port).close()
+
+
+class LiveView:
+    """The viewer of a training; see `pop_fast.view.live.draw`."""
+
+    def __init__(self, capture: Capture, options: Any, showing: ExitStack) -> None:
+        self._capture, self._options, self._showing = capture, options, showing
+        self._viewer: LiveViewer | None = None
+
+    def start(self, run: TrainingRun) -> None:
+        """Start the server, and print where it is."""
+        from pop_fast.view.live.draw import scene_of
+        from pop_fast.view.live.server import LiveViewer
+
+        capture, options = self._capture, self._options
+        stands = stands_of_capture(capture, run.config.test_every, run.params["means"])
+        scene = scene_of(run, capture.world_transform)
+        viewer = LiveViewer(scene, stands, capture.name, options.view_host, options.view_port)
+        self._viewer = self._showing.enter_context(viewer)
+        announce(viewer)
+
+    def __call__(self, run: TrainingRun) -> None:
+        from pop_fast.view.live.draw import follow
+
+        if self._viewer is not None:
+            follow(self._viewer, run, self._capture.world_transform)
+
+
+def check_viewer(options: Any) -> None:
+    """Refuse a viewer that cannot be before the minutes of loading, not after.
+
+    Raises:
+        PopError: viser is absent, or the address cannot be listened on.
+    """
+    if options.view:
+        check_address(options.view_host, options.view_port)

@@ -22,13 +22,9 @@ class CompiledBackend(TorchBackend):
 
     def stages(self) -> Stages:
         """Return the compiled stages."""
-        from pop_fast.compiled.chord import dominant_points
-        from pop_fast.compiled.compositing import composite
-        from pop_fast.compiled.contributions import contributions
-        from pop_fast.compiled.fisher import screen_moments
-        from pop_fast.compiled.sensitivity import sensitivities
+        from pop_fast.compiled.compositing import composite, tile_lists
+        from pop_fast.compiled.scores import contributions, dominant_points, screen_moments, sensitivities
         from pop_fast.compiled.splatting import colors_of_view, covariances, project
-        from pop_fast.compiled.tiles import tile_lists
         from pop_fast.stages.stage_set import Stages, large_tile
 
         passes = (contributions, sensitivities, screen_moments, dominant_points)

@@ -17,10 +17,44 @@ import torch
 from torch import Tensor
 
 from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, StepStats
-from pop_fast.compiled.library import PROJECTION_CONSTANTS, Moments, call_library, stepper_functions
-from pop_fast.stages.blend.transmittance import Stop, below
+from pop_fast.compiled.library import PROJECTION_CONSTANTS, Moments, call_library, stepper_functions, this_library
+from pop_fast.stages.blend.blend import Stop, below
 from pop_fast.stages.ssim import REACH, Padding, border_of, check_size, kept_windows
 from pop_fast.train.signals import Abandoned, StopRequest, heard
+from pop_ref.settings import BETAS, EPS
+
+Moved = tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]
+
+
+def adam_step(
+    params: Mapping[str, Tensor],
+    grads: Mapping[str, Tensor],
+    m: Mapping[str, Tensor],
+    v: Mapping[str, Tensor],
+    step: int,
+    lr: Mapping[str, float],
+) -> Moved:
+    """See `pop_ref.optimizer.adam_step`; betas and eps are those of a training."""
+    x, first, second = ({key: value.clone().contiguous() for key, value in group.items()} for group in (params, m, v))
+    for key in grads:
+        _move(x[key], first[key], second[key], grads[key].contiguous(), step, lr[key])
+    return x, first, second
+
+
+def adam_steps(params: Mapping[str, Tensor], grads: Sequence[Mapping[str, Tensor]], lr: Mapping[str, float]) -> Moved:
+    """See `pop_ref.optimizer.adam_steps`: what waits is not touched, and the counter is that of the steps."""
+    x = {key: value.clone().contiguous() for key, value in params.items()}
+    m, v = ({key: torch.zeros_like(value) for key, value in x.items()} for _ in range(2))
+    for step, given in enumerate(grads, 1):
+        for key, gradient in given.items():
+            _move(x[key], m[key], v[key], gradient.contiguous(), step, lr[key])
+    return x, m, v
+
+
+def _move(x: Tensor, m: Tensor, v: Tensor, gradient: Tensor, step: int, lr: float) -> None:
+    arrays = (tensor.data_ptr() for tensor in (x, m, v, gradient))
+    this_library().adam(*arrays, x.numel(), step, lr, *BETAS, EPS)
+
 
 # steps that are taken before Python is asked again: Ctrl-C, a progress bar
 LONGEST: Final = 10

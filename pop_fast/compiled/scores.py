@@ -10,11 +10,19 @@ import torch
 from torch import Tensor
 
 from pop_fast.compiled.compositing import aligned_records, blend_numbers
-from pop_fast.compiled.library import Scores, call_library, this_library
+from pop_fast.compiled.library import MomentScores, PointScores, Scores, SensitivityScores, call_library, this_library
+from pop_fast.compiled.splatting import colors_of_view, covariances, project
+from pop_fast.stages.blend.pairs import background_or_black, check_grid
+from pop_fast.stages.chord import DominantPoints, points_on_rays, towards_camera
 from pop_fast.stages.compositing import BlendOptions
-from pop_fast.stages.splatting import Splats
+from pop_fast.stages.contributions import Contributions, checked_map
+from pop_fast.stages.fisher import N_MOMENTS, three_channels
+from pop_fast.stages.fisher import fisher_blocks as fisher_blocks_of_stages
+from pop_fast.stages.projection import intrinsics
+from pop_fast.stages.splatting import Splats, colors_of
 from pop_fast.stages.tiles import TileLists
-from pop_ref.constants import Profile
+from pop_fast.stages.types import Camera, Gaussians
+from pop_ref.constants import PAPER, Profile
 
 
 def scored(
@@ -68,3 +76,98 @@ def totals(
     rows = splats.means2d.new_empty((len(lists.ids), columns))
     scored(layout, splats, colors, lists, size, profile, {}, rows=rows, totals=found, **tensors)
     return found
+
+
+def dominant_points(
+    splats: Splats,
+    lists: TileLists,
+    gaussians: Gaussians,
+    camera: Camera,
+    tile_size: int,
+    profile: Profile = PAPER,
+) -> DominantPoints:
+    """See `pop_ref.chord.dominant_points`. A Gaussian with a scale of 0 does not compete.
+
+    Optimizations: those of `pop_fast.stages.chord`; the walk through the lists is in C++ (`scores.h`).
+    """
+    width, height = camera.width, camera.height
+    check_grid(lists, width, height, tile_size)
+    like = splats.means2d
+    ids = torch.empty((height, width), dtype=torch.int64)
+    T_final = like.new_empty((height, width))
+    fx, fy, cx, cy = intrinsics(camera.K, width, height, profile)
+    rays = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    facing = towards_camera(gaussians, camera).to(like.dtype)
+    results = {"dominant_ids": ids, "T_final": T_final}
+    colors = like.new_empty((len(like), 0))
+    scored(PointScores, splats, colors, lists, (width, height), profile, rays, facing=facing, **results)
+    return DominantPoints(points_on_rays(ids, gaussians, camera, profile).to(like.dtype), ids, T_final)
+
+
+def contributions(
+    splats: Splats,
+    lists: TileLists,
+    width: int,
+    height: int,
+    tile_size: int,
+    pixel_map: Tensor | None = None,
+    profile: Profile = PAPER,
+) -> Contributions:
+    """See `pop_ref.contributions.contributions`. Optimizations: one blend without colours, in C++ (`scores.h`)."""
+    check_grid(lists, width, height, tile_size)
+    colors = splats.means2d.new_empty((len(splats.means2d), 0))
+    pixel_map = checked_map(pixel_map, width, height, colors.dtype)
+    found = totals(Scores, 4, splats, colors, lists, (width, height), profile, pixel_map=pixel_map)
+    weight_sum, n_pixels, map_sum, distance_sum = found.T
+    return Contributions(weight_sum, n_pixels.to(torch.int64), map_sum, distance_sum)
+
+
+def sensitivities(
+    splats: Splats,
+    lists: TileLists,
+    width: int,
+    height: int,
+    tile_size: int,
+    background: Tensor | None = None,
+    profile: Profile = PAPER,
+) -> Tensor:
+    """See `pop_ref.sensitivity.sensitivities`. [N] float64
+
+    Optimizations: the sum of the channels is blended as one, in C++, there and back (`scores.h`).
+    """
+    check_grid(lists, width, height, tile_size)
+    colors = colors_of(splats)
+    behind = background_or_black(background, colors).sum(0, keepdim=True)
+    grey = colors.sum(1, keepdim=True)
+    found = totals(SensitivityScores, 1, splats, grey, lists, (width, height), profile, background=behind)
+    return found[:, 0] * splats.opacities.double().square()
+
+
+def screen_moments(
+    splats: Splats,
+    lists: TileLists,
+    width: int,
+    height: int,
+    tile_size: int,
+    background: Tensor | None = None,
+    profile: Profile = PAPER,
+) -> Tensor:
+    """See `pop_ref.fisher.screen_moments`. [N, 31] float64
+
+    Optimizations: those of `pop_fast.stages.fisher.screen_moments`, in C++, there and back (`scores.h`).
+
+    Raises:
+        ValueError: there are not three channels, or the lists are not of that grid.
+    """
+    check_grid(lists, width, height, tile_size)
+    colors = three_channels(splats)
+    behind = background_or_black(background, colors)
+    return totals(MomentScores, N_MOMENTS, splats, colors, lists, (width, height), profile, background=behind)
+
+
+def fisher_blocks(
+    gaussians: Gaussians, camera: Camera, moments: Tensor, sh_degree: int | None = None, profile: Profile = PAPER
+) -> Tensor:
+    """See `pop_ref.fisher.fisher_blocks`. [N, 6, 6] Optimizations: the compiled stages' transposes."""
+    chain = {"project": project, "colors_of_view": colors_of_view, "covariances": covariances}
+    return fisher_blocks_of_stages(gaussians, camera, moments, sh_degree, profile, **chain)

@@ -10,8 +10,8 @@ from pop_fast.stages.chord import DominantPoints, points_on_rays, towards_camera
 from pop_fast.stages.contributions import Contributions
 from pop_fast.stages.fisher import fisher_blocks
 from pop_fast.stages.projection import intrinsics
+from pop_fast.stages.stage_set import PassInput, Seen
 from pop_fast.stages.types import Camera, Gaussians
-from pop_fast.stages.view_pass import PassInput, Seen
 from pop_fast.train.gpu_proxy import translate_oom
 
 

@@ -35,5 +35,4 @@ __getattr__ = given_by(
         "sfm": ("run_sfm",),
         "similarity": ("apply_similarity", "to_capture_frame"),
     },
-    moved={"make_demo": "pop_fast.demo"},
 )

@@ -10,12 +10,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from pop_fast.data.capture import Listing, PosedImage, SparsePoints
 from pop_fast.data.colmap import find_model
-from pop_fast.data.finding import Finding, State, number
 from pop_fast.data.load import find_listing
-from pop_fast.data.photo_quality import Shown, about_number, measure
-from pop_fast.data.photo_use import about_mixed_sizes, about_use
-from pop_fast.data.posed_images import Listing, PosedImage, SparsePoints
+from pop_fast.data.photo_quality import (
+    Finding,
+    Shown,
+    State,
+    about_mixed_sizes,
+    about_number,
+    about_use,
+    measure,
+    number,
+)
 from pop_fast.data.sfm import photo_folder
 from pop_fast.errors import CaptureError
 from pop_fast.io.images import find_image, list_images, read_image, read_mask, unreadable_photographs

@@ -9,14 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from pop_fast.data.colmap_binary import count_images_binary, read_binary
-from pop_fast.data.colmap_records import ImageRecord, Model
-from pop_fast.data.colmap_text import count_images_text, read_text
+from pop_fast.data.capture import PosedImage, SparsePoints
+from pop_fast.data.colmap_files import (
+    ImageRecord,
+    Model,
+    count_images_binary,
+    count_images_text,
+    read_binary,
+    read_text,
+)
+from pop_fast.data.fields import rigid_from_quat
 from pop_fast.data.pinhole import require_colmap
-from pop_fast.data.posed_images import PosedImage, SparsePoints
-from pop_fast.data.rigid import rigid_from_quat
 from pop_fast.errors import CaptureError
-from pop_fast.io.points import FARTHEST, find_bad_coordinate
+from pop_fast.io.ply_rows import FARTHEST, find_bad_coordinate
 
 __all__ = ["find_model", "find_models", "quiet_colmap", "read_model"]
 

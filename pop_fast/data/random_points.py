@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pop_fast.data.capture import View
-from pop_fast.data.posed_images import SparsePoints
+from pop_fast.data.capture import SparsePoints, View
 from pop_fast.errors import CaptureError
 
 __all__ = ["in_picture", "random_points"]

@@ -20,9 +20,8 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from pop_fast.data.capture import Progress, View
+from pop_fast.data.capture import PosedImage, Progress, View
 from pop_fast.data.pinhole import make_camera
-from pop_fast.data.posed_images import PosedImage
 from pop_fast.data.resample import shrink_bicubic
 from pop_fast.data.undistort import Undistortion, undistortion
 from pop_fast.errors import CaptureError

@@ -20,16 +20,13 @@ from typing import Any, Literal
 
 from pop_fast.data.capture import Progress
 from pop_fast.data.colmap import quiet_colmap
-from pop_fast.data.photo_quality import Shown, measure
-from pop_fast.data.photo_use import about_mixed_sizes, about_use
-from pop_fast.data.polycam import photographs_of_polycam
-from pop_fast.data.sfm_files import UPRIGHT, recognise_result, write_list
-from pop_fast.data.sfm_options import SfmOptions
+from pop_fast.data.exports import photographs_of_polycam
+from pop_fast.data.photo_quality import Shown, about_mixed_sizes, about_use, measure
+from pop_fast.data.sfm_files import UPRIGHT, SfmOptions, recognise_result, write_list
 from pop_fast.data.sfm_search import Search, check_camera_model, find_cameras
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import check_folder, folder_atomically
-from pop_fast.io.heif import HEIF_SUFFIXES
-from pop_fast.io.image_header import read_exif
+from pop_fast.io.image_header import HEIF_SUFFIXES, read_exif
 from pop_fast.io.images import list_images, read_image, unreadable_photographs, write_png
 from pop_fast.io.jpeg import sound_jpegs
 

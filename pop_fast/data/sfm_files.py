@@ -1,7 +1,8 @@
-"""What structure from motion leaves beside its model: a list of its files, and which photographs are to be turned.
+"""The options of structure from motion, and what it leaves beside its model.
 
-With the list, replacing a result never removes anything else. It lies beside the model as `sparse/sfm.sha256`, in the
-format of `sha256sum`, with paths relative to the capture.
+It leaves a list of its files, and which photographs are to be turned. With the list, replacing a result never removes
+anything else. It lies beside the model as `sparse/sfm.sha256`, in the format of `sha256sum`, with paths relative to the
+capture.
 """
 
 from __future__ import annotations
@@ -9,11 +10,42 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Final, Literal
 
 from pop_fast.errors import CaptureError
 
-__all__ = ["UPRIGHT", "read_upright", "recognise_result", "write_list"]
+MATCHERS: Final = ("auto", "exhaustive", "sequential")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SfmOptions:
+    """How cameras are found.
+
+    Attributes:
+        max_size: longest side at which features are looked for, px; cameras are always in full size.
+        camera_model: COLMAP's name of the lens model.
+        single_camera: all photographs share one camera; by default when they are all of one size.
+        matcher: "exhaustive" matches all photographs with all, "sequential" each with its neighbours by name; "auto"
+            matches up to 60 exhaustively.
+        seed: of every random choice.
+    """
+
+    max_size: int = 1600
+    camera_model: str = "SIMPLE_RADIAL"
+    single_camera: bool | None = None
+    matcher: Literal["auto", "exhaustive", "sequential"] = "auto"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.max_size < 64:
+            raise CaptureError(f"max_size is {self.max_size}; it must be at least 64 px, or there are no features")
+        if self.matcher not in MATCHERS:
+            raise CaptureError(f"matcher is {self.matcher!r}; use one of {', '.join(MATCHERS)}")
+        if not 0 <= self.seed < 2**31:
+            raise CaptureError(f"seed is {self.seed}; it must be a whole number from 0 to {2**31 - 1}")
+
 
 UPRIGHT = "upright.json"
 _LIST = "sfm.sha256"

@@ -28,7 +28,7 @@ from typing import IO, Any, Final
 from pop_fast.children import python_command
 from pop_fast.data.capture import Progress
 from pop_fast.data.colmap import quiet_colmap
-from pop_fast.data.photo_use import FIX
+from pop_fast.data.photo_quality import FIX
 from pop_fast.data.pinhole import require_colmap
 from pop_fast.errors import CaptureError
 

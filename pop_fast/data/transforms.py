@@ -15,12 +15,11 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from pop_fast.data.capture import Split
+from pop_fast.data.capture import PosedImage, SparsePoints, Split
 from pop_fast.data.fields import WIDEST, Numbers, brown_lens, shortened, viewmat_from_pose
 from pop_fast.data.pinhole import make_camera
-from pop_fast.data.posed_images import PosedImage, SparsePoints
 from pop_fast.errors import CaptureError
-from pop_fast.io.points import read_points
+from pop_fast.io.ply_rows import read_points
 
 __all__ = ["find_transforms", "points_beside", "read_transforms"]
 

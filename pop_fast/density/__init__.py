@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 from pop_fast.density.control import DensityControl
 from pop_fast.density.gsplat import GsplatStrategy, Inria2023Strategy, InriaStrategy
 from pop_fast.density.mini_splatting import MiniSplattingStrategy
@@ -26,11 +24,3 @@ __all__ = [
     "Strategy",
     "TamingStrategy",
 ]
-
-
-def __getattr__(name: str) -> object:
-    # the name that a `DensificationStep` had before
-    if name != "StepEvent":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    warnings.warn(f"{__name__}.StepEvent is now {__name__}.DensificationStep", DeprecationWarning, stacklevel=2)
-    return DensificationStep

@@ -139,7 +139,7 @@ def refine(
     done = DensificationStep(n_clones, n_splits, prune(context, prunes()))
     clear(context.state)
     if plan.verbose:
-        print(f"step {of.step}: {done}, {len(of)} Gaussians")
+        print(f"step {context.step}: {done}, {len(context)} Gaussians")
     return done
 
 

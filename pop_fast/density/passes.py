@@ -18,8 +18,8 @@ from pop_fast.errors import PopError
 from pop_fast.stages.activations import opacities_from_logits, scales_from_log_scales
 from pop_fast.stages.contributions import Contributions
 from pop_fast.stages.dominance import dominant_counts
+from pop_fast.stages.stage_set import PassInput
 from pop_fast.stages.types import Camera, Gaussians
-from pop_fast.stages.view_pass import PassInput
 from pop_ref.constants import Profile, profile_named
 
 if TYPE_CHECKING:

@@ -18,8 +18,17 @@ import numpy as np
 from pop_fast.errors import CaptureError, PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.budget import PICTURE, check_memory
-from pop_fast.io.heif import HEIF_SUFFIXES, INSTALL, can_read_heif, decode_heif, heif_size, is_heif
-from pop_fast.io.image_header import LARGEST, bytes_per_pixel, size_of
+from pop_fast.io.image_header import (
+    HEIF_SUFFIXES,
+    INSTALL,
+    LARGEST,
+    bytes_per_pixel,
+    can_read_heif,
+    decode_heif,
+    heif_size,
+    is_heif,
+    size_of,
+)
 
 __all__ = [
     "FIX",

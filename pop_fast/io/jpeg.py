@@ -1,4 +1,9 @@
-"""Find JPEG files whose coded pixels are damaged, which decoders fill with gray or wrong colours without an error."""
+"""Find JPEG files whose coded pixels are damaged, which decoders fill with gray or wrong colours without an error.
+
+OpenCV reports nothing when libjpeg finds damage in the coded pixels: libjpeg itself prints a line on standard error,
+which belongs to the whole process. So a process in which nothing else happens decodes the files in turn, and announces
+each on standard error by a NUL and its number: then every line can be assigned to its file.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +17,13 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO
 
-from pop_fast.children import python_command
+import cv2
+import numpy as np
+
+from pop_fast.children import module_command
 from pop_fast.errors import CaptureError
 from pop_fast.io.images import FIX
 
-__all__ = ["jpeg_damage", "sound_jpegs"]
-
-_LISTENER = Path(__file__).with_name("jpeg_listener.py")
 # a process takes as long to start as to read so many
 _A_LISTENER_FOR = 64
 _LISTENERS = 4
@@ -34,7 +39,7 @@ _PADDING = 64
 def jpeg_damage(paths: Sequence[Path]) -> Iterator[dict[Path, str]]:
     """Listen to what libjpeg says of photographs, while the block reads them or does anything else.
 
-    The files are decoded a second time, small, in up to four processes beside this one; see `jpeg_listener`.
+    The files are decoded a second time, small, in up to four further processes; see `main`.
 
     Args:
         paths: photographs of any format; only JPEG files are listened to.
@@ -73,7 +78,7 @@ def sound_jpegs(paths: Sequence[Path]) -> Iterator[None]:
 
 
 def _listen(stack: ExitStack, files: Sequence[Path], log: IO[bytes]) -> subprocess.Popen[bytes]:
-    command = python_command(str(_LISTENER))
+    command = module_command(__name__)
     # a file and not a pipe, which would have to be fed while the block runs
     with tempfile.TemporaryFile() as names:
         names.write(b"\0".join(os.fsencode(path.absolute()) for path in files))
@@ -94,3 +99,18 @@ def _damage(files: Sequence[Path], log: IO[bytes]) -> dict[Path, str]:
         if complaint and int(complaint[1] or _PADDING + 1) > _PADDING:
             found[files[int(number)]] = complaint[0].decode("ascii")
     return found
+
+
+def main() -> None:
+    """Decode the JPEG files whose names standard input holds, separated by NUL."""
+    for number, name in enumerate(sys.stdin.buffer.read().split(b"\0")):
+        os.write(2, b"\0%d\n" % number)
+        try:
+            # an eighth of the size: all coded pixels are read, and few computed
+            cv2.imdecode(np.fromfile(os.fsdecode(name), np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8)
+        except (OSError, cv2.error):
+            continue  # whoever reads the photograph itself says so
+
+
+if __name__ == "__main__":
+    main()

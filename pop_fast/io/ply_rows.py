@@ -18,8 +18,6 @@ import numpy as np
 
 from pop_fast.errors import PopError
 
-__all__ = ["Header", "column", "header_of", "read_header", "read_vertices", "vertices_of"]
-
 _ORDERS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _SIGNED: Final = {"char": "i1", "short": "i2", "int": "i4", "float": "f4", "double": "f8"}
 _UNSIGNED: Final = {"uchar": "u1", "ushort": "u2", "uint": "u4"}
@@ -213,3 +211,60 @@ def _parse(head: bytes) -> Header:
         if not names or len(set(names)) < len(names):
             raise ValueError(f"element {element.name!r} has {'two properties of a name' if names else 'no properties'}")
     return Header(order, tuple(elements), tuple(comments), len(text) + len(found))
+
+
+# the square of a distance must stay a number in single precision, and a scene of this size is a corrupt file
+FARTHEST = 1e15
+# a float colour may lie a little over 1 without being one of those up to 255
+_BRIGHTEST = 2.0
+
+
+def find_bad_coordinate(xyz: np.ndarray) -> tuple[int, int] | None:
+    """Find the first coordinate that is NaN, Inf or beyond `FARTHEST`: its row and axis, or None. xyz: [P, 3]"""
+    bad = np.argwhere(~(np.abs(xyz) <= FARTHEST))
+    return (int(bad[0, 0]), int(bad[0, 1])) if len(bad) else None
+
+
+def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read positions float64 [P, 3] and colours uint8 [P, 3] (mid-gray where the file has none).
+
+    Colours are stored as floats in [0, 1], or as numbers up to 255 or up to 65535; the largest tells which.
+
+    Raises:
+        PopError: as `read_vertices`; a coordinate is absent, NaN, Inf or absurd, or a colour is none of these.
+    """
+    rows = read_vertices(path)
+    names = rows.dtype.names or ()
+    for name in "xyz":
+        if name not in names:
+            raise PopError(f"{path}: vertex has no property {name!r}; a point cloud needs x, y and z")
+    xyz = np.stack([column(path, rows, name, np.float64) for name in "xyz"], axis=1)
+    bad = find_bad_coordinate(xyz)
+    if bad is not None:
+        row, axis = bad
+        raise PopError(
+            f"{path}: vertex[{row}].{'xyz'[axis]} is {xyz[row, axis]}; every coordinate must be finite and within "
+            f"{FARTHEST:.0e}"
+        )
+    if not {"red", "green", "blue"} <= set(names):
+        return xyz, np.full((len(xyz), 3), 128, np.uint8)
+    return xyz, _colors(path, rows)
+
+
+def _colors(path: Path, rows: np.ndarray) -> np.ndarray:
+    names = ("red", "green", "blue")
+    fractions = any(rows.dtype[name].kind == "f" for name in names)
+    rgb = np.stack([column(path, rows, name, np.float64) for name in names], axis=1)
+    bad = np.argwhere(~((rgb >= 0.0) & (rgb <= 65535.0)))
+    if len(bad):
+        row, which = (int(i) for i in bad[0])
+        raise PopError(
+            f"{path}: vertex[{row}].{names[which]} is {rgb[row, which]:g}; a colour must be in [0, 1], up to 255 or up "
+            "to 65535"
+        )
+    largest = rgb.max(initial=0.0)
+    if fractions and largest <= _BRIGHTEST:
+        rgb = 255.0 * np.minimum(rgb, 1.0)
+    elif largest > 255.0:
+        rgb /= 257.0
+    return np.rint(rgb).astype(np.uint8)

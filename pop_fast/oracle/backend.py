@@ -25,7 +25,7 @@ class OracleBackend(BaseBackend):
         """Draw a view for passes over it."""
         from pop_fast.oracle.passes import OracleView
 
-        return OracleView(of)
+        return OracleView(pass_input)
 
     def make_engine(self, config: Any, own_strategy: bool) -> Any:
         """Return autograd over the oracle's stages."""

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pop_fast.stages.chord import DominantPoints
 from pop_fast.stages.contributions import Contributions
-from pop_fast.stages.view_pass import PassInput, Seen
+from pop_fast.stages.stage_set import PassInput, Seen
 from pop_ref.chord import dominant_points
 from pop_ref.contributions import contributions
 from pop_ref.fisher import fisher_blocks, screen_moments

@@ -23,9 +23,9 @@ class TorchBackend(BaseBackend):
 
     def open_view(self, pass_input: Any) -> Any:
         """Project and list a view for passes over it."""
-        from pop_fast.stages.passes import view_of
+        from pop_fast.stages.stage_set import view_of
 
-        return view_of(of, self.stages())
+        return view_of(pass_input, self.stages())
 
     def make_engine(self, config: Any, own_strategy: bool) -> Any:
         """Return autograd over the stages, which knows every setting."""

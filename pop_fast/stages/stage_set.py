@@ -1,11 +1,15 @@
-"""The stages of a backend on the CPU: functions that may each be torch's or compiled, and a view made of them."""
+"""The stages of a backend on the CPU: functions that may each be torch's or compiled, and a view made of them.
+
+`PassInput` and `Seen` are what a pass over a view is given, and what every backend's pass answers;
+`pop_fast.density.passes` makes them.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -13,10 +17,75 @@ from torch import Tensor
 from pop_fast.stages.chord import DominantPoints, dominant_points
 from pop_fast.stages.compositing import Composite, composite
 from pop_fast.stages.contributions import Contributions, contributions
-from pop_fast.stages.fisher import screen_moments
+from pop_fast.stages.fisher import fisher_blocks, screen_moments
 from pop_fast.stages.sensitivity import sensitivities
 from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of, colors_of_view, covariances, project
 from pop_fast.stages.tiles import TileLists, tile_lists
+from pop_fast.stages.types import Camera, Gaussians
+from pop_ref.constants import Profile
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A view before its sums.
+
+    Attributes:
+        image: [H, W, 3]
+        dominant_ids: -1 where none. [H, W]
+        radii: [N, 2]
+        depths: [N]
+    """
+
+    image: Tensor
+    dominant_ids: Tensor
+    radii: Tensor
+    depths: Tensor
+
+
+@dataclass(frozen=True)
+class PassInput:
+    """What a pass draws: Gaussians, a camera, the bands of their colours in use, and how.
+
+    Attributes:
+        gaussians: activated.
+        camera: the view.
+        sh_degree: bands to use.
+        background: colour behind everything. [3]
+        profile: constants and strictness.
+        antialiased: scale opacities by the antialiasing factor.
+    """
+
+    gaussians: Gaussians
+    camera: Camera
+    sh_degree: int
+    background: Tensor
+    profile: Profile
+    antialiased: bool
+
+
+class ViewPass(Protocol):
+    """A shot that has been projected and listed."""
+
+    def seen(self) -> Seen:
+        """Draw it."""
+        ...
+
+    def contributions(self, pixel_map: Tensor | None) -> Contributions:
+        """As `pop_fast.stages.contributions.contributions`."""
+        ...
+
+    def sensitivities(self) -> Tensor:
+        """As `pop_fast.stages.sensitivity.sensitivities`."""
+        ...
+
+    def fisher_blocks(self) -> Tensor:
+        """As `pop_fast.stages.fisher.fisher_blocks`, of its own screen moments."""
+        ...
+
+    def dominant_points(self) -> DominantPoints:
+        """As `pop_fast.stages.chord.dominant_points`."""
+        ...
+
 
 SMALL_TILE, LARGE_TILE = 8, 16  # px
 SMALL_TILE_BELOW = 14.0  # px, root mean square extent of the visible splats; see benchmarks/NOTES.md
@@ -140,3 +209,71 @@ class Stages:
     def counts_entries(self, tile_size: int) -> bool:
         """Visited entries are counted with tiles of any size."""
         return True
+
+
+@dataclass(frozen=True)
+class StagesView:
+    """A shot that has been projected and listed.
+
+    Attributes:
+        shot: what is drawn.
+        stages: of the backend.
+        splats: with colours.
+        lists: without the entries that reach no pixel.
+    """
+
+    shot: PassInput
+    stages: Stages
+    splats: Splats
+    lists: TileLists
+
+    def seen(self) -> Seen:
+        """Draw it."""
+        s, camera, background = self.splats, self.shot.camera, self.shot.background
+        blend = self.stages.composite(
+            *(s.means2d, s.conics, s.opacities, colors_of(s), self.lists, camera.width, camera.height),
+            self.shot.profile,
+            dominance=True,
+        )
+        assert blend.dominant_ids is not None
+        image = blend.image + (1.0 - blend.alphas)[..., None] * background
+        return Seen(image, blend.dominant_ids, s.radii, s.depths)
+
+    def contributions(self, pixel_map: Tensor | None) -> Contributions:
+        """As `pop_fast.stages.contributions.contributions`."""
+        camera = self.shot.camera
+        size = (camera.width, camera.height, self.lists.tile_size)
+        return self.stages.contributions(self.splats, self.lists, *size, pixel_map, self.shot.profile)
+
+    def sensitivities(self) -> Tensor:
+        """As `pop_fast.stages.sensitivity.sensitivities`."""
+        return self.stages.sensitivities(*self._blended())
+
+    def fisher_blocks(self) -> Tensor:
+        """As `pop_fast.stages.fisher.fisher_blocks`, of its own screen moments."""
+        stages, shot = self.stages, self.shot
+        chain = {"project": stages.project, "colors_of_view": stages.colors_of_view, "covariances": stages.covariances}
+        return fisher_blocks(shot.gaussians, shot.camera, self._moments(), shot.sh_degree, shot.profile, **chain)
+
+    def dominant_points(self) -> DominantPoints:
+        """As `pop_fast.stages.chord.dominant_points`."""
+        shot, size = self.shot, self.lists.tile_size
+        return self.stages.dominant_points(self.splats, self.lists, shot.gaussians, shot.camera, size, shot.profile)
+
+    def _moments(self) -> Tensor:
+        return self.stages.screen_moments(*self._blended())
+
+    def _blended(self) -> tuple[object, ...]:
+        shot, size = self.shot, self.lists.tile_size
+        return self.splats, self.lists, shot.camera.width, shot.camera.height, size, shot.background, shot.profile
+
+
+def view_of(shot: PassInput, stages: Stages) -> StagesView:
+    """Project and list a shot."""
+    g, camera, profile = shot.gaussians, shot.camera, shot.profile
+    settings = ProjectionSettings(camera.K, camera.width, camera.height, profile, shot.antialiased)
+    shapes = stages.covariances(g.quats, g.scales)
+    splats = stages.splats(g.means, shapes, g.opacities, g.sh, camera.viewmat, settings, shot.sh_degree)
+    # in the profile whose square cuts visible alpha off, the grid is part of the meaning
+    size = profile.tile_size if profile.extent == "square" else None
+    return StagesView(shot, stages, splats, stages.visible_lists(splats, settings, size))

@@ -9,10 +9,8 @@ from torch import Tensor
 
 from pop_fast.stages.contributions import Contributions
 from pop_fast.stages.losses import photometric_3dgs
-from pop_fast.stages.passes import view_of
-from pop_fast.stages.stage_set import Stages
+from pop_fast.stages.stage_set import PassInput, Stages, view_of
 from pop_fast.stages.types import Camera, Gaussians
-from pop_fast.stages.view_pass import PassInput
 from pop_ref.constants import INRIA, Profile
 
 # weights of the nine terms, of the view and of the two halves of the pixel map

@@ -24,7 +24,7 @@ from pop_fast.data.capture import Capture
 from pop_fast.density.protocol import State
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
-from pop_fast.io.torch_file import read_torch_file
+from pop_fast.io.read_back import read_torch_file
 from pop_fast.train.checkpoint_checks import check_content, check_splats, shown
 from pop_fast.train.config import TrainConfig, first_difference
 

@@ -45,8 +45,7 @@ from typing import Any
 import numpy as np
 
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import check_place, is_left_behind, write_atomically
-from pop_fast.io.lock import FolderLock
+from pop_fast.io.atomic import FolderLock, check_place, is_left_behind, write_atomically
 from pop_fast.io.read_back import read_json
 from pop_fast.train.config import TrainConfig
 

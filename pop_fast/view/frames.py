@@ -1,28 +1,101 @@
-"""What `pop render` and `pop export` draw: cameras of views and paths, their frames, and where these are written."""
+"""What `pop render` and `pop export` draw: cameras of views and paths, their frames, and the files of these.
+
+Whatever a capture calls its views, their pictures stay in one folder, one each. `write_inria_folder` writes the folder
+that 3DGS's own trainer leaves, which SIBR, metrics.py and most papers' scripts read.
+"""
 
 from __future__ import annotations
 
+import json
+import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from pathlib import Path
+from itertools import takewhile
+from pathlib import Path, PureWindowsPath
+from typing import Any, Final
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
-from pop_fast.data import Capture
+from pop_fast.data import Capture, View, to_capture_frame
 from pop_fast.errors import PopError
+from pop_fast.io.atomic import folder_atomically
 from pop_fast.io.heartbeat import Heartbeat
-from pop_fast.io.images import write_png
-from pop_fast.io.names import inside
+from pop_fast.io.image_header import HEIF_SUFFIXES
+from pop_fast.io.images import IMAGE_SUFFIXES, write_png
+from pop_fast.io.ply import Frame, save_ply
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.environment import reproducible
 from pop_fast.train.gpu_proxy import renderer
-from pop_fast.train.load_result import Splat
+from pop_fast.train.load_result import Splat, paths_read
 from pop_fast.train.views import ViewTensors, render_view
 from pop_fast.view.paths import PATHS, VideoFile, camera_path
+from pop_ref.settings import Recipe
+
+_PICTURES = (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
+
+
+def picture_names(views: Sequence[str], suffix: str = ".png") -> list[Path]:
+    """Give every view a file name of its own, relative to the folder that the pictures go to.
+
+    "images/a.jpg" becomes images/a.png. A suffix that is no image's is part of the name: "cam.00" becomes cam.00.png.
+    What leads out of the folder is dropped: "..", and of absolute names the root and the folders that all of them
+    share. Views that differ only in their suffix keep it (x.jpg.png, x.png.png), and what still meets is numbered.
+    Names that differ only in case count as the same, because some file systems hold them to be.
+
+    Args:
+        views: names of views as their capture lists them.
+        suffix: of the pictures, with its dot.
+
+    Returns:
+        Relative paths in the order of the views, all different. [len(views)]
+
+    Example:
+        >>> [path.as_posix() for path in picture_names(["/data/a/0.jpg", "/data/b/0.jpg", "../c/1.png"])]
+        ['a/0.png', 'b/0.png', 'c/1.png']
+    """
+    whole = [Path(*parts) for parts in _inner_parts(views)]
+    plain = [path.with_name((path.stem if path.suffix.lower() in _PICTURES else path.name) + suffix) for path in whole]
+    wanted = Counter(map(_key, plain))
+    taken: set[str] = set()
+    names: list[Path] = []
+    for path, short in zip(whole, plain, strict=True):
+        first = short if wanted[_key(short)] == 1 else path.with_name(path.name + suffix)
+        name, number = first, 2
+        while _key(name) in taken:
+            name, number = first.with_stem(f"{first.stem}_{number}"), number + 1
+        taken.add(_key(name))
+        names.append(name)
+    return names
+
+
+def inside(folder: Path, name: Path) -> Path:
+    """Join a relative name to a folder.
+
+    Raises:
+        PopError: the file would lie outside the folder.
+    """
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise PopError(f"{name}: leads out of {folder}; give it a name without '..' and without a root")
+    return path
+
+
+def _inner_parts(names: Sequence[str]) -> list[tuple[str, ...]]:
+    # Windows' rules know both slashes and drives, so lists that were written there are understood everywhere
+    paths = [PureWindowsPath(name) for name in names]
+    rooted = [path.parts[1:-1] for path in paths if path.anchor]
+    shared = 1 + sum(1 for _ in takewhile(lambda parts: len(set(parts)) == 1, zip(*rooted, strict=False)))
+    parts = [path.parts[shared:] if path.anchor else path.parts for path in paths]
+    return [tuple(part for part in some if part != "..") or ("view",) for some in parts]
+
+
+def _key(path: Path) -> str:
+    return path.as_posix().casefold()
 
 
 def check_one_size(video: VideoFile, views: Sequence[ViewTensors]) -> None:
@@ -129,3 +202,82 @@ def write_video(frames: Iterator[np.ndarray], video: VideoFile | None) -> int:
                 video.add(frame)
             count += 1
     return count
+
+
+_BY: Final = "exported_by='pop export'"
+_FILES: Final = re.compile(
+    r"cfg_args|cameras\.json|point_cloud/iteration_\d+/point_cloud\.ply|test/ours_\d+/(renders|gt)/\d{5,}\.png"
+)
+
+
+def write_inria_folder(splat: Splat, capture: Capture, out: Path, overwrite: bool) -> None:
+    """Write a splat and its capture in Inria's layout, whole or not at all, in the capture's own world frame.
+
+        cfg_args  cameras.json  point_cloud/iteration_N/point_cloud.ply
+        test/ours_N/renders/00000.png  test/ours_N/gt/00000.png
+
+    Args:
+        splat: what to write, in the frame of `capture`.
+        capture: its cameras and photographs.
+        out: the folder to make.
+        overwrite: replace a folder that an earlier export wrote, if nothing else is in it.
+
+    Raises:
+        PopError: `out` is there and may not be replaced, or cannot be written.
+    """
+    transform = capture.world_transform
+    steps = Recipe.max_steps if splat.step is None else splat.step + 1
+    held_out = capture.test_views(splat.config.test_every)
+    keeps = paths_read(splat, Path(splat.config.data), capture)
+    with folder_atomically(out, overwrite, keeps=keeps, recognise=exported_to(out)) as folder:
+        params = to_capture_frame(splat.params, transform)
+        path = folder / "point_cloud" / f"iteration_{steps}" / "point_cloud.ply"
+        save_ply(path, params, splat.config.antialiased, frame=Frame("capture"))
+        cameras = [_camera(i, view, transform, capture.world_scale) for i, view in enumerate(capture.views)]
+        (folder / "cameras.json").write_text(json.dumps(cameras), encoding="utf-8")
+        (folder / "cfg_args").write_text(_cfg_args(splat, out), encoding="utf-8")
+        frames = rendered(splat, splat.config, [ViewTensors.of(view) for view in held_out], as_measured=True)
+        for i, (view, frame) in enumerate(zip(held_out, frames, strict=True)):
+            write_png(folder / "test" / f"ours_{steps}" / "renders" / f"{i:05d}.png", frame)
+            write_png(folder / "test" / f"ours_{steps}" / "gt" / f"{i:05d}.png", view.image)
+
+
+def exported_to(folder: Path) -> Callable[[Path], bool]:
+    """Tell which files of a folder an earlier export wrote; none where another trainer left the folder."""
+    try:
+        ours = _BY in (folder / "cfg_args").read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        ours = False
+    return lambda file: ours and _FILES.fullmatch(file.as_posix()) is not None
+
+
+def _camera(index: int, view: View, transform: np.ndarray, scale: float) -> dict[str, Any]:
+    """Describe a camera of the capture's own frame: position, camera-to-world rotation, focal lengths."""
+    rotation = (view.viewmat[:3, :3] @ (transform[:3, :3] / scale)).T
+    position = (np.linalg.inv(transform) @ np.append(view.camera_center, 1.0))[:3]
+    return {
+        "id": index,
+        "img_name": Path(view.name).stem,
+        "width": view.width,
+        "height": view.height,
+        "position": position.tolist(),
+        "rotation": rotation.tolist(),
+        "fy": float(view.K[1, 1]),
+        "fx": float(view.K[0, 0]),
+    }
+
+
+def _cfg_args(splat: Splat, out: Path) -> str:
+    """Write the settings as Inria's scripts read them back: the text of an argparse Namespace."""
+    settings = {
+        "data_device": "cpu",
+        "eval": splat.config.test_every > 0,
+        "images": "images",
+        "model_path": str(out),
+        "resolution": splat.config.factor,
+        "sh_degree": splat.sh_degree,
+        "source_path": splat.config.data,
+        "white_background": splat.config.background == (1.0, 1.0, 1.0),
+    }
+    # last comes a setting that no script asks for: it tells our exports from folders that took days to train
+    return f"Namespace({', '.join(f'{name}={value!r}' for name, value in settings.items())}, {_BY})"

@@ -19,7 +19,7 @@ class Layers:
     """What one camera sees.
 
     Attributes:
-        image: linear RGB, not clamped. float32 [H, W, 3]
+        image: encoded RGB, not clamped. float32 [H, W, 3]
         alpha: 1 - T_final, how much of the background is covered. float32 [H, W]
         depth: mean camera z of what is blended, by weight; world units, 0 where nothing is. float32 [H, W]
         dominant_ids: the Gaussian with the largest weight, -1 none; None where it was not asked for. int [H, W]

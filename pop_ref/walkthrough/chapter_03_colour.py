@@ -55,17 +55,20 @@ grey = colors_from_sh(np.zeros((1, 16, 3)), np.array([[1.0, 2.0, 3.0]]), degree=
 assert np.array_equal(grey, [[0.5, 0.5, 0.5]])
 
 # %% [markdown]
-# Here they are. Each globe shows one $Y_k$ as seen from the front; blue is positive, orange negative. The first is
-# constant, the next three divide the sphere in halves, and so on to finer and finer patterns.
+# Here they are. Each globe shows one $Y_k$: at a point of the globe stands its value for the camera that looks at this
+# point from outside. So $d$ runs inwards, and in the middle it is $(0, 0, 1)$, the way in which a camera in front
+# looks. Blue is positive, orange negative. The first is constant, the next three divide the sphere in halves, and so on
+# to finer and finer patterns.
 
 # %%
 side = np.linspace(-1, 1, 64)
 right, down = np.meshgrid(side, side)
 on_globe = right**2 + down**2 <= 1
-# looking along +z with y down: the near half of the sphere has z < 0
-toward = -np.sqrt(np.maximum(1 - right**2 - down**2, 0))
-globe = np.stack([right, down, toward], axis=-1)
-values = sh_basis(globe.reshape(-1, 3), 3).reshape(64, 64, 16)
+# looking along +z with y down: the near half of the sphere has z < 0, and d runs from the camera inwards
+near = -np.sqrt(np.maximum(1 - right**2 - down**2, 0))
+inwards = -np.stack([right, down, near], axis=-1)
+values = sh_basis(inwards.reshape(-1, 3), 3).reshape(64, 64, 16)
+assert inwards[32, 32, 2] > 0.99
 
 fig, panels = axes(7, 4, height=4.3)
 for panel in panels:
@@ -81,7 +84,7 @@ for k in range(16):
 picture(fig, "The sixteen harmonics, one row a degree.")
 
 # %% [markdown]
-# Their sum, with a slider for each coefficient. The middle of the globe is the view direction.
+# Their sum, with a slider for each coefficient. The ring in the middle is what the camera in front of you sees.
 #
 # {{widget: harmonics}}
 #
@@ -112,9 +115,15 @@ assert np.allclose(Y.T @ (weights[:, None] * Y), np.eye(16), atol=1e-12)
 # The first harmonic is $Y_0 = 1/\sqrt{4\pi} \approx 0.2821$ everywhere, so $h_0$ alone sets the mean colour: $c = 1/2 +
 # Y_0 h_0$. Only the direction of $d$ counts, not its length. And a negative sum is cut to 0, while nothing is cut at 1:
 # a picture is clipped only when it is shown.
+#
+# What do the numbers of a colour measure? Not light. A photograph's file stores about $L^{1/2.2}$, near the root of the
+# light $L$, because eyes tell dark tones apart more finely; the exponent is called *gamma*. 3DGS, POP and all that
+# follow compare and blend these encoded numbers as they are and never decode them. A pixel that is an even mixture of a
+# black and a white splat is 0.5, which a screen shows with a fifth of the light of white, not with half of it.
 
 # %%
 assert round(1 / math.sqrt(4 * math.pi), 4) == 0.2821
+assert 0.2 < 0.5**2.2 < 0.23
 assert np.allclose(Y[:, 0], 0.5 / math.sqrt(math.pi))
 
 rng = np.random.default_rng(3)

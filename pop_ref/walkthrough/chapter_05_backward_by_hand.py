@@ -72,15 +72,15 @@ assert v_alphas_of(three, 0.0).tolist() == [1 / 8, -1 / 8, 1 / 4]
 
 # %% [markdown]
 # With three channels little changes. Let $g = \partial L / \partial C$ be the gradient of a loss $L$ with respect to
-# the pixel. Only the product of a colour with $g$ counts, $q_i = c_i \cdot g$, and with $b_i$ now the same product of
-# the light behind,
+# the pixel. Only the product of a colour with $g$ counts, $q_i = c_i \cdot g$. With the same product of the light
+# behind, $\beta_i = b_i \cdot g$,
 #
-# $$\frac{\partial L}{\partial \alpha_i} = T_i\,(q_i - b_i),
+# $$\frac{\partial L}{\partial \alpha_i} = T_i\,(q_i - \beta_i),
 # \qquad \frac{\partial L}{\partial c_i} = T_i \alpha_i\, g .$$
 #
 # So one scalar, walked from back to front, is all that the backward pass of a pixel carries, however many channels it
-# has. In the oracle $q_i$ is `color_dot_grad` and the scalar `suffix_dot_grad`, the same product of all that lies
-# behind. It starts with the background; the last lines belong to the next section:
+# has. In the oracle $q_i$ is `color_dot_grad` and the scalar $\beta_i$ is `suffix_dot_grad`. It starts with the
+# background; the last lines belong to the next section:
 #
 # {{source: pop_ref.pixel.composite_pixel_vjp}}
 
@@ -91,23 +91,23 @@ ray = stack(rng.uniform(0.1, 0.6, n).tolist(), rng.uniform(0.05, 1.0, n).tolist(
 pixel = composite_pixel(range(n), ray, 0.5, 0.5, [0.3])
 T, alphas, q = np.array(pixel.transmittances), np.array(pixel.alphas), np.ravel(ray.colors)
 
-# the walk
-b = np.full(n, 0.3)
+# the walk, with g = 1
+beta = np.full(n, 0.3)
 for i in reversed(range(1, n)):
-    b[i - 1] = alphas[i] * q[i] + (1.0 - alphas[i]) * b[i]
-v_alphas = T * (q - b)
-print("light behind", b.round(3))
+    beta[i - 1] = alphas[i] * q[i] + (1.0 - alphas[i]) * beta[i]
+v_alphas = T * (q - beta)
+print("light behind", beta.round(3))
 print("derivatives ", v_alphas.round(3))
 np.testing.assert_allclose(v_alphas, v_alphas_of(ray, 0.3), rtol=1e-12)
 # the pixel grows with a splat's alpha exactly where the splat is brighter than what it covers
-assert np.array_equal(v_alphas > 0.0, q > b)
+assert np.array_equal(v_alphas > 0.0, q > beta)
 
 fig, (left, right) = axes(2, height=3.0)
 where = np.arange(1, n + 1)
 left.bar(
     where, q, color=[str(grey) for grey in q], edgecolor=MUTED, label=r"the splat, $q_i$"
 )
-left.plot(where, b, color=SECOND, marker="o", ms=4, label=r"light behind $b_i$")
+left.plot(where, beta, color=SECOND, marker="o", ms=4, label=r"light behind $\beta_i$")
 left.set(xlabel="splat, front to back", ylabel="grey", xticks=where, ylim=(0.0, 1.3))
 left.legend(loc="upper right", ncols=2)
 right.bar(where, v_alphas, color=[ACCENT if v > 0.0 else SECOND for v in v_alphas])
@@ -189,7 +189,7 @@ for sigma in (0.0, 10.0):
 #
 # Put the halves together. For one splat at one pixel let
 #
-# $$\Gamma = T \alpha\, (q - b) = \alpha \frac{\partial L}{\partial \alpha},$$
+# $$\Gamma = T \alpha\, (q - \beta) = \alpha \frac{\partial L}{\partial \alpha},$$
 #
 # the weight that the forward pass had, times the difference between the splat and what it hides. Then
 # $\partial L / \partial \sigma = -\Gamma$, and every gradient of the splat's shape and opacity is linear in six sums

@@ -25,7 +25,7 @@
 # The way forwards, from chapter 2 (3DGS, eq. 6 and eq. 5), and the way back, below:
 #
 # $$q, s \;\to\; M = R\,\mathrm{diag}(s) \;\to\; \Sigma = M M^\top \;\to\;
-# \Sigma_{\mathrm{cam}} = W \Sigma W^\top$$
+# \Sigma_{\mathrm{cam}} = R_c\, \Sigma R_c^\top$$
 #
 # $$\Sigma_{\mathrm{cam}} \;\to\; \Sigma^{2D} = J \Sigma_{\mathrm{cam}} J^\top \;\to\;
 # Q = (\Sigma^{2D} + 0.3\, I)^{-1}$$
@@ -200,13 +200,14 @@ assert np.allclose(
 # %% [markdown]
 # ## From the camera to the world
 #
-# Both steps are linear. A point is turned and moved, $p = W \mu + t$, so its cotangent is turned back, $v_\mu = W^\top
-# v_p$. A covariance is turned on both sides, so by the first rule $v_\Sigma = W^\top v_{\Sigma_{\mathrm{cam}}} W$.
+# Both steps are linear. A point is turned and moved, $p = R_c\, \mu + t$, so its cotangent is turned back, $v_\mu =
+# R_c^\top v_p$. A covariance is turned on both sides, so by the first rule
+# $v_\Sigma = R_c^\top v_{\Sigma_{\mathrm{cam}}} R_c$.
 
 # %%
-W = viewmat[:3, :3]
-v_covars = np.array([W.T @ v @ W for v in v_covars_cam])
-v_means = (through_center + through_J) @ W
+R_cam = viewmat[:3, :3]
+v_covars = np.array([R_cam.T @ v @ R_cam for v in v_covars_cam])
+v_means = (through_center + through_J) @ R_cam
 
 # %% [markdown]
 # ## From the covariance to widths and rotation
@@ -297,8 +298,8 @@ show_image(left, view.image, "the scene")
 left.set(xticks=[], yticks=[])
 places = np.arange(n)
 shares = {
-    "the centre": through_center @ W,
-    "the Jacobian": through_J @ W,
+    "the centre": through_center @ R_cam,
+    "the Jacobian": through_J @ R_cam,
     "the colour": v_dirs,
 }
 for k, ((name, part), shade) in enumerate(
@@ -354,12 +355,12 @@ assert np.allclose(mine, compensations_vjp(covars2d, 0.3, np.ones(n)))
 
 # %% [markdown]
 # ### Exercise 3: code
-# The camera has a gradient, too: that is how poses are refined. For $p = W \mu + t$, what are $v_W$ and $v_t$, given
-# $v_p$ of every Gaussian? (Take the part through the centres only.) Check against a difference.
+# The camera has a gradient, too: that is how poses are refined. For $p = R_c\, \mu + t$, what are $v_{R_c}$ and
+# $v_t$, given $v_p$ of every Gaussian? (Take the part through the centres only.) Check against a difference.
 
 # %% answer
-# $dL = \sum_i v_{p_i} \cdot (dW \mu_i + dt)$, so $v_W = \sum_i v_{p_i} \mu_i^\top$ and $v_t = \sum_i v_{p_i}$.
-v_W = through_center.T @ scene.means
+# $dL = \sum_i v_{p_i} \cdot (dR_c\, \mu_i + dt)$, so $v_{R_c} = \sum_i v_{p_i} \mu_i^\top$ and $v_t = \sum_i v_{p_i}$.
+v_R_cam = through_center.T @ scene.means
 v_t = through_center.sum(axis=0)
 
 
@@ -370,7 +371,7 @@ def moved(matrix: np.ndarray) -> np.ndarray:
 
 by_difference = slope(moved, viewmat, v_means2d)
 print(v_t.round(6), by_difference[:3, 3].round(6))
-assert np.allclose(v_W, by_difference[:3, :3], rtol=1e-5, atol=1e-9)
+assert np.allclose(v_R_cam, by_difference[:3, :3], rtol=1e-5, atol=1e-9)
 assert np.allclose(v_t, by_difference[:3, 3], rtol=1e-5, atol=1e-9)
 
 # %% [markdown]

@@ -13,12 +13,12 @@
 # the lens maps directions to pixels, and the *pose*, which tells where the camera stood and how it was turned:
 #
 # $$K = \begin{pmatrix} f_x & 0 & c_x \\ 0 & f_y & c_y \\ 0 & 0 & 1 \end{pmatrix}, \qquad
-# \text{viewmat} = \begin{pmatrix} W & t \\ 0 & 1 \end{pmatrix}$$
+# \text{viewmat} = \begin{pmatrix} R_c & t \\ 0 & 1 \end{pmatrix}$$
 #
-# $$p = W \mu + t, \quad u = \left( f_x \frac{x}{z} + c_x, \; f_y \frac{y}{z} + c_y \right)$$
+# $$p = R_c\, \mu + t, \quad u = \left( f_x \frac{x}{z} + c_x, \; f_y \frac{y}{z} + c_y \right)$$
 #
 # (the projection of chapter 2; POP paper, eq. 1, begins after it). The pose takes the world to the camera; the camera
-# itself stands at $o = -W^\top t$. The focal length in pixels and the angle of view say the same thing: $f_x =
+# itself stands at $-R_c^\top t$. The focal length in pixels and the angle of view say the same thing: $f_x =
 # \frac{\text{width}}{2} / \tan \frac{\text{angle}}{2}$.
 #
 # Programs agree on this and disagree on the rest. Every mix-up below gives a picture that is mirrored, upside down,
@@ -51,20 +51,20 @@ with tempfile.TemporaryDirectory() as folder:
     files = sorted(str(path.relative_to(folder)) for path in Path(folder).rglob("*.bin"))
     capture = load_capture(Path(folder) / "demo")
 view = capture.views[0]
-W, t = view.viewmat[:3, :3], view.viewmat[:3, 3]
-center = -W.T @ t
+R_cam, t = view.viewmat[:3, :3], view.viewmat[:3, 3]
+center = -R_cam.T @ t
 angle = 2 * np.degrees(np.arctan(view.width / 2 / view.K[0, 0]))
 print(f"fx {view.K[0, 0]:.1f} px, so the view is {angle:.0f} degrees wide")
 print(f"the camera stands at {center.round(2)}")
 assert np.allclose(center, view.camera_center)
-assert np.allclose(W @ W.T, np.eye(3))
-assert np.isclose(np.linalg.det(W), 1.0)
+assert np.allclose(R_cam @ R_cam.T, np.eye(3))
+assert np.isclose(np.linalg.det(R_cam), 1.0)
 
 # from OpenGL's axes and camera-to-world to the pose here, and back
 flip = np.diag([1.0, -1.0, -1.0, 1.0])
 for_blender = np.linalg.inv(view.viewmat) @ flip
 assert np.allclose(np.linalg.inv(for_blender @ flip), view.viewmat)
-print("forwards in the world:          ", W[2].round(2))
+print("forwards in the world:          ", R_cam[2].round(2))
 print("minus OpenGL's third column:    ", -for_blender[:3, 2].round(2))
 
 # %% [markdown]
@@ -274,7 +274,7 @@ assert rates[1]["scales"] == rates[0]["scales"]
 
 
 # %% answer
-# The rows of $W$ are the camera's axes in the world: right, down, forward. $t = -W \cdot \text{eye}$.
+# The rows of $R_c$ are the camera's axes in the world: right, down, forward. $t = -R_c \cdot \text{eye}$.
 def look_at(eye, target, up):
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, up)
@@ -304,6 +304,6 @@ assert np.isclose(np.linalg.det(mine[:3, :3]), 1.0)
 # {{bug: camera_in_world_axes}}
 
 # %% answer
-# $-t$ is the centre in the *camera's* axes; it has to be turned back, $-W^\top t$. It is right for cameras that are not
-# turned. With the others, colours that depend on the direction come out wrong, which looks like a bad training.
+# $-t$ is the centre in the *camera's* axes; it has to be turned back, $-R_c^\top t$. It is right for cameras that are
+# not turned. With the others, colours that depend on the direction come out wrong, which looks like a bad training.
 print(caught("camera_in_world_axes"))

@@ -94,6 +94,11 @@ TERMS: Final = (
         "3",
         "fixed polynomials of a direction, of which a colour is a sum",
     ),
+    Term(
+        "gamma",
+        "3",
+        "the exponent by which a photograph's file encodes light; no stage here decodes it",
+    ),
     Term("transmittance", "4", "the share of light that passes all splats in front"),
     Term("weight", "4", "what a splat contributes to a pixel: transmittance times alpha"),
     Term("early ray termination", "4", "a pixel ends when next to no light is left"),

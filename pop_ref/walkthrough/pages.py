@@ -85,7 +85,7 @@ def film(
     """Hand a sequence of images to the page under construction, which plays them; elsewhere show some as a strip.
 
     Args:
-        images: [H, W, 3] linear rgb each, clipped to [0, 1] here.
+        images: [H, W, 3] encoded rgb each, clipped to [0, 1] here.
         labels: one an image, such as "step 20".
         caption: one or two sentences of markdown, formulas allowed.
         enlarged: how many pixels of the page an image's pixel is wide.

@@ -104,7 +104,7 @@ def show_image(ax: Any, image: np.ndarray, title: str = "", **options: Any) -> A
 
     Args:
         ax: where to draw.
-        image: [H, W, 3] linear rgb, clipped to [0, 1] here, or [H, W] numbers for a colour map.
+        image: [H, W, 3] encoded rgb, clipped to [0, 1] here, or [H, W] numbers for a colour map.
         title: above it.
         options: passed to `imshow`, for example `cmap`, `vmin`, `vmax`.
 

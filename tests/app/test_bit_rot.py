@@ -16,7 +16,7 @@ import torch
 
 from pop_fast.errors import PopError
 from pop_fast.io.ply import load_ply, save_ply
-from pop_fast.io.points import read_points
+from pop_fast.io.ply_rows import read_points
 from pop_fast.train import checkpoint as ckpt
 from tests.app.children import in_a_child
 from tests.app.conftest import Outcome

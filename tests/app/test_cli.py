@@ -15,8 +15,8 @@ import pytest
 
 from pop_fast.cli import COMMANDS, main
 from pop_fast.cli.errors import describe
-from pop_fast.cli.told_early import about_large
 from pop_fast.cli.train import arguments, rename_aliases
+from pop_fast.cli.train_checks import about_large
 from pop_fast.data.capture import Capture, View
 from pop_fast.data.sfm import SfmResult
 from pop_fast.errors import PopError
@@ -259,7 +259,7 @@ def test_a_fault_of_the_program_keeps_its_traceback(pop: Pop, monkeypatch: pytes
     def broken(_: object) -> None:
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("pop_fast.view.report.write.write_report", broken)
+    monkeypatch.setattr("pop_fast.view.report.page.write_report", broken)
     with pytest.raises(ZeroDivisionError):
         pop("report", ".")
 
@@ -268,7 +268,7 @@ def test_ctrl_c_anywhere_exits_with_130(pop: Pop, monkeypatch: pytest.MonkeyPatc
     def interrupted(_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pop_fast.view.report.write.write_report", interrupted)
+    monkeypatch.setattr("pop_fast.view.report.page.write_report", interrupted)
     outcome = pop("report", ".")
     assert outcome.status == 130
     assert outcome.err.strip() == "pop: interrupted"
@@ -298,7 +298,7 @@ def test_results_are_complete_before_the_report_and_whatever_becomes_of_it(
         raise fault
 
     with monkeypatch.context() as patch:
-        patch.setattr("pop_fast.view.report.write.write_report", broken)
+        patch.setattr("pop_fast.view.report.page.write_report", broken)
         outcome = pop("train", shared_capture, "--out", folder, *TRAIN)
     assert {"ckpts/ckpt_29_rank0.pt", "ply/point_cloud_29.ply", "stats/val_step0029.json", "cfg.json"} <= set(found)
     assert outcome.status == status

@@ -104,7 +104,7 @@ def test_large_gaussians_are_pruned_by_every_method_but_pop_and_after_a_reset_in
     ],
 )
 def test_a_preset_gives_defaults_and_what_is_said_is_taken_literally(said, read):
-    config = TrainConfig.of(preset="quick", scale_lambda_pop=True, steps_scaler=0.05, **overrides)
+    config = TrainConfig.of(preset="quick", scale_lambda_pop=True, steps_scaler=0.05, **said)
     assert read(config) == next(iter(said.values()))
     assert config.given.settings == {name.replace("strategy.", "pop."): to_plain(v) for name, v in said.items()}
 

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
+from benchmarks.faults.corpus import HERE
 from pop_fast.data import load_capture, sfm
 from pop_fast.demo.scene import make_scene
 from pop_fast.demo.tracer import render_view
@@ -130,15 +131,14 @@ def test_a_damaged_photograph_stands_against_training(pop: Pop, bare: Path) -> N
 
 
 def test_tracks_that_colmap_refuses_are_told_with_the_models_folder(pop: Pop, tmp_path: Path) -> None:
-    corpus = Path(__file__).parents[2] / "benchmarks" / "faults" / "corpus"
-    shutil.copytree(corpus / "colmap", tmp_path / "scene")
+    shutil.copytree(HERE / "colmap", tmp_path / "scene")
     outcome = pop("data", "check", tmp_path / "scene")
     assert outcome.err == ""
     (line,) = [line for line in outcome.out.splitlines() if " reprojection " in line]
     assert line.startswith("LOOK")
     assert f"{tmp_path / 'scene' / 'sparse' / '0'}: COLMAP cannot read its tracks" in line
     assert line.endswith("training does without its tracks; write the model again to have them")
-    assert pop("data", "check", corpus / "tracked").out.count("mean error") == 1
+    assert pop("data", "check", HERE / "tracked").out.count("mean error") == 1
 
 
 def noise(seed: int) -> np.ndarray:

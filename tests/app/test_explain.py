@@ -18,11 +18,10 @@ from pop_fast.errors import PopError
 from pop_fast.stages.losses import photometric_pop
 from pop_fast.train.config import TrainConfig
 from pop_fast.view.explain import ExplainedView, explain_pixel, explain_view
-from pop_fast.view.explain.diff import difference
-from pop_fast.view.explain.flips import first_flip
+from pop_fast.view.explain.diff import difference, first_flip
 from pop_fast.view.explain.maps import termination_depths
-from pop_fast.view.explain.table import WIDTH, table
-from pop_fast.view.explain.walk import candidates, oracle_splats, walk
+from pop_fast.view.explain.model import WIDTH, table
+from pop_fast.view.explain.pixel import candidates, oracle_splats, walk
 from pop_ref.constants import PAPER, PROFILES, Profile
 from pop_ref.records import Splats
 from tests.app.browser import browser

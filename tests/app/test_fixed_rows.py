@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 import pop_fast.compiled
-from pop_fast.blocks.start import shown_in
+from pop_fast.blocks.rounds import shown_in
 from pop_fast.data.initialize import initialize_params
 from pop_fast.errors import PopError
 from pop_fast.train import TrainConfig, TrainingRun
@@ -119,7 +119,7 @@ def test_what_is_shown_is_found_in_pieces_as_at_once(monkeypatch):
     config = tiny_config("nowhere")
     at_once = shown_in(capture.views[:2], initial, config)
     assert 0 < at_once.sum() < N_POINTS
-    monkeypatch.setattr("pop_fast.blocks.start._AT_A_TIME", 7)
+    monkeypatch.setattr("pop_fast.blocks.rounds._AT_A_TIME", 7)
     assert torch.equal(shown_in(capture.views[:2], initial, config), at_once)
 
 

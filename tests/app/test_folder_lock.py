@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pop_fast.errors import PopError
-from pop_fast.io.lock import FolderLock
+from pop_fast.io.atomic import FolderLock
 from pop_fast.train import TrainingRun
 from pop_fast.train.results import ResultFolder
 from tests.app.captures import assert_one_line
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no 
 _HOLD = """
 import sys, time
 from pathlib import Path
-from pop_fast.io.lock import FolderLock
+from pop_fast.io.atomic import FolderLock
 FolderLock(Path(sys.argv[1])).take()
 print("held", flush=True)
 time.sleep(300.0)

@@ -12,8 +12,7 @@ import pytest
 from pop_fast.data import load_capture, sfm
 from pop_fast.errors import CaptureError
 from pop_fast.io import images
-from pop_fast.io.heif import can_read_heif
-from pop_fast.io.image_header import read_exif
+from pop_fast.io.image_header import can_read_heif, read_exif
 from pop_fast.io.images import list_images, read_image
 from tests.app.captures import photograph
 from tests.app.conftest import Pop

@@ -32,14 +32,12 @@ from websockets.http11 import Request
 from websockets.sync.client import connect
 
 from pop_fast.cli import view as cli_view
-from pop_fast.cli.live_view import LiveView
-from pop_fast.cli.view import stands_of_capture
+from pop_fast.cli.view import LiveView, stands_of_capture
 from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
 from pop_fast.train.checkpoint import load_splats
-from pop_fast.view.live.follow import scene_of
-from pop_fast.view.live.guard import MOST_VIEWS, Guard, listen
-from pop_fast.view.live.incoming import interval, number, one_of, passed_on
+from pop_fast.view.live.draw import scene_of
+from pop_fast.view.live.guard import MOST_VIEWS, Guard, interval, listen, number, one_of, passed_on
 from pop_fast.view.live.server import LiveViewer
 from tests.app.conftest import TRAIN, Pop
 from tests.app.tiny import tiny_capture, tiny_config

@@ -16,8 +16,7 @@ from pop_fast.io.formats import load_splat_file, save_as
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
 from pop_fast.train.views import ViewTensors, render_view
-from pop_fast.view.html import PageCamera, cameras_of, page_of
-from pop_fast.view.html.cameras import camera_of_points, view_distances
+from pop_fast.view.html import PageCamera, camera_of_points, cameras_of, page_of, view_distances
 from tests.app.browser import Browser, browser
 from tests.app.clouds import many
 from tests.app.conftest import Pop

@@ -25,11 +25,10 @@ from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
 from pop_fast.train.views import ViewTensors, render_view
 from pop_fast.view.layers import render_layers
 from pop_fast.view.live import KeyCamera, RecordedPath, SplatScene, ViewState, read_path
-from pop_fast.view.live.follow import follow, scene_of
-from pop_fast.view.live.pace import Pace
-from pop_fast.view.live.recording import from_capture, path_of, to_capture
-from pop_fast.view.live.state import field_of_view, pose_of_viewmat, viewmat_of_pose
-from pop_fast.view.paths.video import frames_in
+from pop_fast.view.live.draw import follow, scene_of
+from pop_fast.view.live.server import Pace
+from pop_fast.view.live.state import field_of_view, from_capture, path_of, pose_of_viewmat, to_capture, viewmat_of_pose
+from pop_fast.view.paths import frames_in
 from pop_fast.view.pictures import id_colors
 from tests.app.browser import browser
 from tests.app.conftest import Pop

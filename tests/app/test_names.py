@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from pop_fast.io.names import inside, picture_names
+from pop_fast.view.frames import inside, picture_names
 from tests.app.captures import assert_one_line
 
 

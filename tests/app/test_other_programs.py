@@ -106,7 +106,7 @@ def test_points_beside_an_export_are_read(original: Capture, shared_capture: Pat
 def test_a_metashape_lens_is_opencvs_with_its_tangential_terms_exchanged(
     original: Capture, shared_capture: Path, tmp_path: Path
 ) -> None:
-    from pop_fast.data.metashape import read_metashape
+    from pop_fast.data.exports import read_metashape
 
     lens = "<k1>-0.1</k1><k2>0.02</k2><k3>0.003</k3><p1>0.004</p1><p2>-0.005</p2>"
     folder = write("metashape", original, shared_capture, tmp_path, lens=lens)
@@ -123,7 +123,7 @@ def test_a_metashape_lens_is_opencvs_with_its_tangential_terms_exchanged(
 
 
 def test_a_metashape_fisheye_is_opencvs(original: Capture, shared_capture: Path, tmp_path: Path) -> None:
-    from pop_fast.data.metashape import read_metashape
+    from pop_fast.data.exports import read_metashape
 
     folder = write("metashape", original, shared_capture, tmp_path, lens="<k1>0.1</k1><k4>0.01</k4>", kind="fisheye")
     camera = read_metashape(folder / "cameras.xml", folder, "images")[0][0].camera

@@ -14,9 +14,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pop_fast.errors import PopError
-from pop_fast.view.paths import PATHS, VideoFile, camera_path, interpolate, orbit, video
-from pop_fast.view.paths.cameras import camera_centers, focus_point, look_at, mean_up
-from pop_fast.view.paths.video import frames_in, has_h264
+from pop_fast.view import paths
+from pop_fast.view.paths import (
+    PATHS,
+    VideoFile,
+    camera_centers,
+    camera_path,
+    focus_point,
+    frames_in,
+    has_h264,
+    interpolate,
+    look_at,
+    mean_up,
+    orbit,
+)
 from tests.app.captures import assert_one_line
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -241,7 +252,7 @@ def test_an_unknown_video_ending_names_the_known_ones(tmp_path: Path) -> None:
 def test_an_mp4_that_would_hold_what_players_do_not_expect_is_refused_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(video, "has_h264", lambda: False)
+    monkeypatch.setattr(paths, "has_h264", lambda: False)
     words = ("cannot write H.264", "name it clip.webm", "ffmpeg -i clip.webm clip.mp4")
     assert_one_line(lambda: VideoFile(tmp_path / "clip.mp4"), "clip.mp4", *words)
     assert not os.listdir(tmp_path)

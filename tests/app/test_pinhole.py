@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pop_fast.data.colmap_records import model_name, parameter_count
+from pop_fast.data.colmap_files import model_name, parameter_count
 from pop_fast.data.pinhole import PINHOLES, make_camera
 from tests.app.captures import colmap_capture, transforms_capture
 

@@ -15,7 +15,7 @@ from plyfile import PlyData, PlyElement
 
 from pop_fast.io.formats import save_as
 from pop_fast.io.ply import is_antialiased, load_ply, save_ply
-from pop_fast.io.points import read_points
+from pop_fast.io.ply_rows import read_points
 from tests.app.captures import assert_one_line
 
 ANY = {"allow_nan": False, "allow_infinity": False, "width": 32}

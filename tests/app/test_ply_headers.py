@@ -16,7 +16,7 @@ from plyfile import PlyData, PlyElement
 
 from pop_fast.errors import PopError
 from pop_fast.io.ply import is_antialiased, load_ply, save_ply
-from pop_fast.io.points import read_points
+from pop_fast.io.ply_rows import read_points
 from tests.app.captures import assert_one_line
 from tests.app.children import pop_in_a_child
 from tests.app.damage import says

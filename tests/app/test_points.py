@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from pop_fast.io.points import read_points
+from pop_fast.io.ply_rows import read_points
 from tests.app.captures import assert_one_line
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from pop_fast.errors import PopError
 from pop_fast.view.frames import write_pictures
-from pop_fast.view.paths.video import frames_in
+from pop_fast.view.paths import frames_in
 from tests.app.captures import (
     camera,
     edit_transforms,

@@ -18,7 +18,7 @@ from pop_fast.data.capture import View
 from pop_fast.errors import PopError
 from pop_fast.train.gpu_proxy import renderer
 from pop_fast.train.load_result import load_splat
-from pop_fast.view.paths.video import frames_in
+from pop_fast.view.paths import frames_in
 from pop_fast.view.pictures import colormap_table
 from pop_fast.view.report import checks, write_report
 from pop_fast.view.report.checks import (
@@ -30,9 +30,9 @@ from pop_fast.view.report.checks import (
     stops_between,
     write_checks,
 )
+from pop_fast.view.report.model import verdict
+from pop_fast.view.report.sections import depth_picture, depth_range
 from pop_fast.view.report.source import read_result
-from pop_fast.view.report.verdict import verdict
-from pop_fast.view.report.views_section import depth_picture, depth_range
 from tests.app.browser import browser
 from tests.app.conftest import TRAIN, TRAIN_AND_CHECK, Pop
 from tests.app.result_folder import VIEWS, write_result

@@ -13,15 +13,13 @@ from pathlib import Path
 import pytest
 
 from cuda_ext.gpu_check import command as gpu_check
+from cuda_ext.gpu_check import shared as gpu_check_tools
 from cuda_ext.gpu_check import stages as gpu_check_stages
 from cuda_ext.gpu_check import tests as gpu_check_tests
-from cuda_ext.gpu_check import tools as gpu_check_tools
-from cuda_ext.gpu_check.budget import MARGIN, Budget, Share
 from cuda_ext.gpu_check.command import commit_of, main
 from cuda_ext.gpu_check.outcomes import outcomes
-from cuda_ext.gpu_check.shared import Check
+from cuda_ext.gpu_check.shared import MARGIN, Budget, Check, Command, Share, first_line, run, write_json
 from cuda_ext.gpu_check.stages import JOBS, SHARES, STAGES, train_one, wheels_stage
-from cuda_ext.gpu_check.tools import Command, first_line, run, write_json
 from pop_fast.cli import main as pop
 from tests.cuda.bare_node import stand_in_gsplat
 
@@ -136,7 +134,7 @@ def test_a_job_that_is_ended_takes_its_commands_along(tmp_path):
     mark = tmp_path / "begun"
     child = f"import pathlib, time; pathlib.Path({str(mark)!r}).write_text('x'); time.sleep(60)"
     code = (
-        "import signal, sys, pathlib; from cuda_ext.gpu_check.tools import Command;"
+        "import signal, sys, pathlib; from cuda_ext.gpu_check.shared import Command;"
         "signal.signal(signal.SIGTERM, lambda *_: sys.exit(143));"
         f"command = Command([sys.executable, '-c', {child!r}], pathlib.Path({str(tmp_path / 'log')!r}));"
         "print(command._process.pid, flush=True); command.wait(50.0)"

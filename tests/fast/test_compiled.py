@@ -253,7 +253,7 @@ def test_pairs_are_counted_where_pixels_are_lit() -> None:
 @pytest.mark.parametrize("exact", [True, False], ids=["entries that reach no pixel left out", "whole rectangles"])
 @pytest.mark.parametrize("tile_size", [4, 8, 16])
 def test_tile_lists_are_those_of_torch(tile_size: int, exact: bool, profile: Profile) -> None:
-    from pop_fast.compiled.tiles import tile_lists as native_lists
+    from pop_fast.compiled.compositing import tile_lists as native_lists
 
     generator = torch.Generator().manual_seed(3)
     given = splats(n=700)
@@ -275,7 +275,7 @@ def test_tile_lists_are_those_of_torch(tile_size: int, exact: bool, profile: Pro
 
 
 def test_no_splat_on_the_screen_makes_empty_lists() -> None:
-    from pop_fast.compiled.tiles import tile_lists as native_lists
+    from pop_fast.compiled.compositing import tile_lists as native_lists
 
     given = splats(n=5)
     lists = native_lists(given.means2d, torch.zeros(5, 2, dtype=torch.int32), torch.ones(5), WIDTH, HEIGHT, 8)

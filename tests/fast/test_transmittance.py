@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from pop_fast.stages.blend.transmittance import Stop, count_passed, weights_of_alphas
+from pop_fast.stages.blend.blend import Stop, count_passed, weights_of_alphas
 from pop_ref.constants import INRIA, PAPER
 from pop_ref.pixel import stops
 

@@ -34,7 +34,7 @@ EXEMPT = {
     "pop_ref.conformance.vector_answer": "reads vectors that the same call has exported",
     "pop_ref.learn.stubs": OWN,
     "pop_fast.view.document": OWN,
-    "pop_fast.view.html.page": OWN,
+    "pop_fast.view.html": OWN,
     "pop_fast.compiled.build": OWN,
     "pop_fast.compiled.library": SYSTEM,
     "pop_fast.compiled.native_step": "opens a handle of the compiled library, no file",
@@ -45,16 +45,16 @@ EXEMPT = {
     "paper_repro.published:publish": "takes what read_view has judged",
     "pop_fast.cli.eval:_record": "adds to what read_stats has judged",
     "pop_fast.view.report.source:_read": "puts a film into the page as it is",
-    "pop_fast.io.lock": "takes the lock of a file and reads nothing of it",
+    "pop_fast.io.atomic": "takes the lock of a file and reads nothing of it",
     "pop_fast.train.results:ResultFolder.open_metrics": "appends to it",
     "pop_fast.cli:main": "the null device",
-    "pop_fast.view.paths.video:_no_standard_error": "the null device",
+    "pop_fast.view.paths:_no_standard_error": "the null device",
     "paper_repro.cli:main": "the null device",
     "pop_fast.cli.explain:_explain": "parses what it has made itself",
     "pop_fast.demo.make:_write_model": "makes a model, and reads none",
     "pop_fast.data.sfm_search": "reads what the search has written, and what its own child process says",
-    "pop_fast.io.jpeg_listener:main": "a child process that decodes what has been read; its end harms nobody",
-    "cuda_ext.gpu_check.tools:Command._words": "the end of a log that it has written, with any bytes",
+    "pop_fast.io.jpeg:main": "a child process that decodes what has been read; its end harms nobody",
+    "cuda_ext.gpu_check.shared:Command._words": "the end of a log that it has written, with any bytes",
     "cuda_ext.gpu_check.stages": "shows what its own training has written",
     "cuda_ext.gpu_check.command:commit_of": "takes one text of a file that read_json has judged",
     "cuda_ext.host": OWN,
@@ -207,7 +207,7 @@ def test_a_function_that_opens_a_file_is_noticed() -> None:
     known = openers()
     for key in (
         ("pop_fast.io.images", "_decode"),
-        ("pop_fast.io.heif", "heif_exif"),
+        ("pop_fast.io.image_header", "heif_exif"),
         ("pop_fast.data.block", "read_block"),  # through read_json
         ("pop_fast.blocks.plan", "read_job"),
         ("pop_fast.train.checkpoint", "load_splats"),  # through read_torch_file

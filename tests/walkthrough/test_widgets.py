@@ -214,7 +214,7 @@ def test_splats_of_a_stack_change_places_and_a_wall_ends_the_pixel(page: Page, f
 
 @browser
 def test_a_globe_turns_and_a_gaussian_is_walked_around(page: Page, files: dict[str, Path]) -> None:
-    for name, reading in (("harmonics", "view direction d"), ("orbit", "by EWA")):
+    for name, reading in (("harmonics", "direction d, camera to Gaussian"), ("orbit", "by EWA")):
         page.open(files[name])
         _settle(page)
         before = _reading(page, reading)

@@ -26,8 +26,7 @@ import numpy as np
 
 from pop_fast.errors import PopError
 from pop_fast.io.budget import check_memory
-from pop_fast.io.formats.cloud import COEFFICIENTS, Cloud, logits_of_bytes, to_bytes
-from pop_fast.io.formats.smallest_three import drop_largest, restore_largest
+from pop_fast.io.formats.cloud import COEFFICIENTS, Cloud, drop_largest, logits_of_bytes, restore_largest, to_bytes
 from pop_fast.io.frame import KEY, Frame
 
 MAGIC: Final = 0x5053474E

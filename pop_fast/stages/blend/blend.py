@@ -25,17 +25,114 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from pop_fast.stages.blend import buffers
-from pop_fast.stages.blend.active_tiles import ActiveTiles
 from pop_fast.stages.blend.alpha import Entries, exponent_coefficients, pixel_basis
 from pop_fast.stages.blend.tile_groups import BLOCK, TileGroup
-from pop_fast.stages.blend.transmittance import Stop, below, count_passed, weights_of_alphas
 from pop_fast.stages.dominance import Dominance
 from pop_ref.constants import Profile
+
+
+class ActiveTiles:
+    """Named states with a row per tile of a group, of which a shrinking choice is held close together.
+
+    Attributes:
+        rows: the tiles that are held, ascending; all when None.
+    """
+
+    def __init__(self, states: dict[str, Tensor]) -> None:
+        self.rows: Tensor | None = None
+        self._whole = states
+        self._held = states
+
+    def __getitem__(self, name: str) -> Tensor:
+        return self._held[name]
+
+    def count_below(self, reached: int) -> int:
+        """Return how many of the held tiles are among the group's first `reached`."""
+        return reached if self.rows is None else int((self.rows < reached).sum())
+
+    def select(self, rows: Tensor | None) -> None:
+        """Hold these tiles; what was held before is written back first."""
+        if rows is self.rows:
+            return
+        whole = self.whole()
+        self.rows = rows
+        self._held = whole if rows is None else {name: state[rows] for name, state in whole.items()}
+
+    def drop(self, n: int, transmittance: Tensor, below: float) -> None:
+        """Hold only the tiles with light left, out of the first `n`, when these are less than a share of them."""
+        bright = transmittance.amax(1) > 0.0
+        if int(bright.sum()) < below * n:
+            keep = bright.nonzero().squeeze(1)
+            self.select(keep if self.rows is None else self.rows[keep])
+
+    def whole(self) -> dict[str, Tensor]:
+        """Return the states of all tiles."""
+        if self.rows is not None:
+            for name, state in self._held.items():
+                self._whole[name].index_copy_(0, self.rows, state)
+        return self._whole
+
+
+@dataclass(frozen=True)
+class Stop:
+    """The transmittance that a pixel must stay above.
+
+    Attributes:
+        at: a pixel stops where T <= at.
+    """
+
+    at: float
+
+    @classmethod
+    def of(cls, profile: Profile, dtype: torch.dtype) -> Stop:
+        """Return the profile's stop, its strictness folded into the number."""
+        stop = profile.transmittance_stop
+        return cls(stop if profile.stop_inclusive else below(stop, dtype))
+
+
+def weights_of_alphas(alpha: Tensor, transmittances: Tensor, stop: Stop) -> Tensor:
+    """Take a step's alphas off the light and return the weights; both are 0 from where a pixel stops.
+
+    T never grows, so that one comparison of all T with the stop finds what lies behind it, with no flag carried along.
+
+    Args:
+        alpha: in and, where a pixel stops, out. [n, K, P]
+        transmittances: T before the step in the first of K + 1 rows; out: T after it in the last, still to be
+            compared with the stop, and in the others the weights. [n, K + 1, P]
+        stop: when pixels stop.
+
+    Returns:
+        The weights, a view of `transmittances`. [n, K, P]
+    """
+    rows = transmittances.unbind(1)
+    for before, after, a in zip(rows, rows[1:], alpha.unbind(1), strict=False):
+        torch.addcmul(before, before, a, value=-1.0, out=after)
+    torch.ops.aten.threshold_backward.grad_input(alpha, transmittances[:, 1:], stop.at, grad_input=alpha)
+    return transmittances[:, :-1].mul_(alpha)
+
+
+def count_passed(alpha: Tensor, transmittance: Tensor, stop: Stop) -> Tensor:
+    """Count the entries of a step that each pixel goes past without stopping. [n, P] int64"""
+    transmittance = transmittance.clone()
+    passed = torch.zeros(transmittance.shape, dtype=torch.int64)
+    for a in alpha.unbind(1):
+        torch.threshold_(transmittance.addcmul_(transmittance, a, value=-1.0), stop.at, 0.0)
+        passed += transmittance > 0.0
+    return passed
+
+
+@lru_cache
+def below(value: float, dtype: torch.dtype) -> float:
+    """Return the number just under `value` in a type, so that `>` of it means `>= value`."""
+    at = torch.tensor(value, dtype=dtype)
+    return float(torch.nextafter(at, torch.zeros_like(at)))
+
 
 COMPACT_BELOW = 0.8  # share of live tiles under which the group is compacted
 

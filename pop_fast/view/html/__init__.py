@@ -1,6 +1,194 @@
-"""A splat in one HTML file, which any browser with WebGL 2 opens."""
+"""One HTML file that shows a splat: no network, the splat inside as SPZ, drawn by WebGL 2, sorted in a worker.
 
-from pop_fast.view.html.cameras import PageCamera, cameras_of
-from pop_fast.view.html.page import page_of
+Any browser with WebGL 2 opens it.
+"""
 
-__all__ = ["PageCamera", "cameras_of", "page_of"]
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pop_fast.data.capture import View
+from pop_fast.io.formats import encoded
+from pop_fast.train.config import TrainConfig
+
+# of a larger capture every so many, evenly
+_MOST: Final = 60
+
+
+@dataclass(frozen=True)
+class PageCamera:
+    """A pinhole camera.
+
+    Attributes:
+        name: what the page shows of it.
+        viewmat: world -> camera, y down, z forward. [4, 4]
+        K: intrinsics, px. [3, 3]
+        width: px
+        height: px
+    """
+
+    name: str
+    viewmat: np.ndarray
+    K: np.ndarray
+    width: int
+    height: int
+
+    @property
+    def eye(self) -> np.ndarray:
+        """Its place in the world. [3]"""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def entry(self, distance: float) -> dict[str, Any]:
+        """Return what the page reads, with the distance from the eye to the point that the view turns about."""
+        lens = {"fx": self.K[0, 0], "fy": self.K[1, 1], "cx": self.K[0, 2], "cy": self.K[1, 2]}
+        return {
+            "name": self.name,
+            "rotation": self.viewmat[:3, :3].tolist(),
+            "eye": self.eye.tolist(),
+            "distance": distance,
+            **{key: float(value) for key, value in lens.items()},
+            "width": self.width,
+            "height": self.height,
+        }
+
+
+def cameras_of(views: Sequence[View]) -> list[PageCamera]:
+    """Take over the cameras of views, at most sixty, evenly."""
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _MOST)).round().astype(int)) if views else []
+    return [
+        PageCamera(views[i].name, views[i].viewmat, views[i].K, views[i].image.shape[1], views[i].image.shape[0])
+        for i in chosen
+    ]
+
+
+def camera_of_points(means: Tensor) -> PageCamera:
+    """Make a camera that sees most of some points, for a splat whose cameras are not known; y is down."""
+    points = means.double().numpy() if len(means) else np.zeros((1, 3))
+    middle = np.median(points, axis=0)
+    radius = max(float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.7)), 1e-3)
+    viewmat = np.eye(4)
+    viewmat[:3, 3] = -middle + [0.0, 0.0, 2.5 * radius]
+    return PageCamera("view", viewmat, np.array([[800.0, 0.0, 400.0], [0.0, 800.0, 300.0], [0.0, 0.0, 1.0]]), 800, 600)
+
+
+def view_distances(cameras: Sequence[PageCamera], means: Tensor) -> list[float]:
+    """Return how far ahead of every camera lies the point that its view turns about.
+
+    It is at the depth of the point that is nearest to all optical axes, or where that is behind the camera, of the
+    median Gaussian ahead of it.
+    """
+    axes = np.stack([camera.viewmat[2, :3] for camera in cameras])
+    eyes = np.stack([camera.eye for camera in cameras])
+    across = np.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
+    # parallel axes meet nowhere: then it is the least-norm answer, which the test below mostly refuses
+    focus = np.linalg.lstsq(across.sum(0), (across @ eyes[:, :, None]).sum(0)[:, 0], rcond=1e-6)[0]
+    points = means.double().numpy()
+    found = []
+    for axis, eye in zip(axes, eyes, strict=True):
+        depths = (points - eye) @ axis
+        ahead = depths[depths > 0.0]
+        typical = float(np.median(ahead)) if len(ahead) else 1.0
+        depth = float((focus - eye) @ axis)
+        found.append(depth if 0.1 * typical < depth < 10.0 * typical else typical)
+    return found
+
+
+_KEYS: Final = "drag: turn · shift or right button: move · wheel: nearer · arrows, + −, wasd · n, p: cameras · r: back"
+# nothing is fetched; the worker is made from the page's own text
+_POLICY: Final = (
+    "default-src 'none'; script-src 'unsafe-inline' blob:; style-src 'unsafe-inline'; worker-src blob:; img-src data:"
+)
+_TOUCH: Final = "one finger turns, two move and zoom"
+
+
+def page_of(
+    params: Mapping[str, Tensor],
+    cameras: Sequence[PageCamera],
+    config: TrainConfig,
+    sh_degree: int,
+    title: str,
+) -> bytes:
+    """Make the page.
+
+    It draws as the training's rasterizer does: the same projection, low-pass, cut-offs of alpha and background, colours
+    to degree 3. It loses what SPZ loses, ends no pixel early, and holds sums of layers in half precision.
+
+    Args:
+        params: raw parameters, in the frame of the cameras.
+        cameras: where it may start; none makes one that sees most of the splat.
+        config: profile, background and antialiasing are read.
+        sh_degree: highest colour band to draw.
+        title: of the page.
+
+    Returns:
+        The file's bytes.
+
+    Raises:
+        PopError: the splat does not fit into SPZ.
+    """
+    drawn = {**params, "shN": params["shN"][:, : (sh_degree + 1) ** 2 - 1]}
+    scene = _scene(params["means"].detach().cpu(), cameras, config)
+    data = base64.b64encode(encoded("spz", drawn, config.antialiased)).decode("ascii")
+    scripts = [
+        ("scene", "application/json", json.dumps(scene).replace("<", "\\u003c")),
+        ("splat", "application/octet-stream", data),
+        ("splat-vert", "x-shader/x-vertex", _asset("splat.vert")),
+        ("splat-frag", "x-shader/x-fragment", _asset("splat.frag")),
+        ("sorter", "text/x-worker", _asset("sorter.js")),
+    ]
+    held = "\n".join(f'<script id="{name}" type="{kind}">{content}</script>' for name, kind, content in scripts)
+    buttons = "".join(
+        f'<button id="{name}" aria-label="{what}" title="{what} ({key})">{sign}</button>'
+        for name, what, key, sign in (
+            ("previous", "previous camera", "p", "◀"),
+            ("reset", "back to the camera", "r", "⟲"),
+            ("next", "next camera", "n", "▶"),
+        )
+    )
+    keys = f'<span class="keys">{escape(_KEYS)}</span><span class="touch">{escape(_TOUCH)}</span>'
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
+        f"<title>{escape(title)}</title><style>{_asset('page.css')}</style></head>"
+        f'<body><canvas id="view" tabindex="0" aria-label="{escape(title)}: {escape(_KEYS)}"></canvas>'
+        '<div id="message" role="status"></div>'
+        f'<div id="panel"><span class="buttons">{buttons}</span><span id="name"></span>'
+        f'<span id="help">{keys}</span></div>'
+        f"{held}<script>{_asset('viewer.js')}</script></body></html>\n"
+    ).encode()
+
+
+def _scene(means: Tensor, cameras: Sequence[PageCamera], config: TrainConfig) -> dict[str, Any]:
+    profile = config.renderer
+    chosen = list(cameras) or [camera_of_points(means)]
+    distances = view_distances(chosen, means)
+    upwards = -np.mean([camera.viewmat[1, :3] for camera in chosen], axis=0)
+    norm = np.linalg.norm(upwards)
+    return {
+        "cameras": [camera.entry(distance) for camera, distance in zip(chosen, distances, strict=True)],
+        "up": (upwards / norm if norm > 1e-3 else np.array([0.0, -1.0, 0.0])).tolist(),
+        "extent": max(distances),
+        "background": [float(value) for value in torch.tensor(config.background)],
+        "antialiased": config.antialiased,
+        "near": profile.near_plane,
+        "eps2d": profile.eps2d,
+        "margin": profile.frustum_margin,
+        "sigmas": profile.extent_sigmas,
+        "floor": profile.alpha_floor,
+        "ceiling": profile.alpha_ceiling,
+    }
+
+
+def _asset(name: str) -> str:
+    return files("pop_fast.view.html").joinpath(name).read_text(encoding="utf-8")

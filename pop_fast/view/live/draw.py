@@ -1,10 +1,10 @@
-"""From a state to a picture."""
+"""From a state to a picture, of a splat at rest or of a training between its steps."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import torch
@@ -15,7 +15,11 @@ from pop_fast.train.config import TrainConfig
 from pop_fast.view.layers import Layers, render_layers
 from pop_fast.view.live.state import Box, ViewState
 from pop_fast.view.pictures import colormap_table, id_colors
-from pop_fast.view.report.views_section import depth_picture, depth_range
+from pop_fast.view.report.sections import depth_picture, depth_range
+
+if TYPE_CHECKING:
+    from pop_fast.train.training_run import TrainingRun
+    from pop_fast.view.live.server import LiveViewer
 
 # what covers a pixel by less has no depth
 _SEEN = 0.1
@@ -108,3 +112,29 @@ class SplatScene:
     def _own_means(self) -> Tensor:
         back = torch.from_numpy(np.linalg.inv(self.world_transform))
         return self.params["means"].cpu().double() @ back[:3, :3].T + back[:3, 3]
+
+
+# of the time at most, however many browsers there are and whatever they ask
+_SHARE: Final = 0.5
+
+
+def scene_of(run: TrainingRun, world_transform: np.ndarray) -> SplatScene:
+    """Return the Gaussians of a run as they are now; a later step changes what this draws."""
+    degree = run.sh_degree(max(run.step - 1, 0))
+    return SplatScene(run.params, run.config, degree, run.backend, world_transform)
+
+
+def follow(viewer: LiveViewer, run: TrainingRun, world_transform: np.ndarray) -> None:
+    """Draw what is due of a run, on its own thread; call it between steps.
+
+    Args:
+        viewer: what shows it.
+        run: the training.
+        world_transform: of its capture.
+    """
+    # without a browser it costs nothing
+    if not viewer.watched:
+        return
+    note = f"step {run.step:,} of {run.config.max_steps:,}"
+    viewer.show(scene_of(run, world_transform), note)
+    viewer.draw_due(_SHARE)

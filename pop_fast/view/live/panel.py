@@ -10,9 +10,8 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from pop_fast.view.live.incoming import Rule, flag, interval, number, one_of
-from pop_fast.view.live.recording import KeyCamera, path_of
-from pop_fast.view.live.state import MODES, Box, Mode, ViewState
+from pop_fast.view.live.guard import Rule, flag, interval, number, one_of
+from pop_fast.view.live.state import MODES, Box, KeyCamera, Mode, ViewState, path_of
 
 _LONGEST: Final = (480, 720, 960, 1280, 1920)
 _AXES: Final = ("x", "y", "z")
@@ -30,7 +29,7 @@ class Panel:
         title: in the names of files.
         box: what holds nearly all Gaussians, in the capture's own frame.
         world_transform: world = world_transform @ the capture's own frame. [4, 4]
-        rules: is given what each control may be set to, by viser's name of it; see `pop_fast.view.live.incoming`.
+        rules: is given what each control may be set to, by viser's name of it; see `pop_fast.view.live.guard`.
         held: wraps what is called when a control is used, and deals with its errors.
     """
 

@@ -184,7 +184,7 @@ def stops_between(photo: np.ndarray, render: np.ndarray) -> float:
 
 def neighbour_degrees(viewmats: np.ndarray) -> float | None:
     """Give the median angle from a camera to the nearest other one, seen from the point they look at. [M, 4, 4]"""
-    from pop_fast.view.paths.cameras import camera_centers, focus_point
+    from pop_fast.view.paths import camera_centers, focus_point
 
     if len(viewmats) < 2:
         return None

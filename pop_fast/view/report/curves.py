@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from html import escape
 from typing import Final
 
-from pop_fast.view.svg import card, element, path, text
+from pop_fast.view.document import card, element, path, text
 
 WIDTH: Final = 440
 HEIGHT: Final = 220

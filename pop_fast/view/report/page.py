@@ -4,17 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from html import escape
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from pop_fast.io.atomic import write_atomically
 from pop_fast.view import pictures
 from pop_fast.view.document import asset, document
 from pop_fast.view.report.curves import Chart, Series, draw, draw_histogram
-from pop_fast.view.report.files_section import is_framed, sizes_section, viewer_script, viewer_section
 from pop_fast.view.report.model import Histogram, ReportData, Tile
-from pop_fast.view.report.run_sections import command_section, open_section, orbit_section, verdict_section
-from pop_fast.view.report.views_section import views_section
+from pop_fast.view.report.sections import (
+    command_section,
+    is_framed,
+    open_section,
+    orbit_section,
+    sizes_section,
+    verdict_section,
+    viewer_script,
+    viewer_section,
+    views_section,
+)
+from pop_fast.view.report.source import read_result
 
 # (title, ((curve, legend, colour, dots), ...), log axis, axis from zero, unit)
 _CHARTS: Final = (
@@ -180,3 +191,20 @@ def _cell(value: Any) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(_cell(v) for v in value)
     return str(value)
+
+
+def write_report(result_dir: str | Path) -> Path:
+    """Write report.html into a result folder, from the files in it alone.
+
+    Returns:
+        The page's path.
+
+    Raises:
+        PopError: the folder is not a result of `pop train`, or one of its files cannot be read.
+    """
+    folder = Path(result_dir)
+    # a name that is no text is shown with escapes
+    html = page(read_result(folder)).encode("utf-8", "backslashreplace")
+    target = folder / "report.html"
+    write_atomically(target, lambda file: file.write(html))
+    return target

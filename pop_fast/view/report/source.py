@@ -18,9 +18,8 @@ from pop_fast.train.results import read_config
 from pop_fast.view.report.checks import Checks, read_checks
 from pop_fast.view.report.compare import threads_of
 from pop_fast.view.report.curves import Window
-from pop_fast.view.report.files_section import checked_encodings, encoding_heads, encoding_rows
-from pop_fast.view.report.model import Histogram, ReportData, ReportView, Tile
-from pop_fast.view.report.verdict import verdict
+from pop_fast.view.report.model import Histogram, ReportData, ReportView, Tile, verdict
+from pop_fast.view.report.sections import checked_encodings, encoding_heads, encoding_rows
 
 # float32 numbers of a Gaussian: as gsplat's checkpoints hold it, and as Inria's PLY does (with three zero normals)
 BYTES_CKPT: Final = 59 * 4

@@ -41,12 +41,14 @@ WIDGETS: Final = {
     ),
     "orbit": Widget(
         "A Gaussian in space and its ellipse",
-        "walk around it by dragging, then come as near as 2 world units: when does the ellipse leave the points?",
+        "walk around it by dragging, then come as near as 2 world units: is the ellipse as wide as the points, and are "
+        "its two sides theirs?",
         ("covariance", "projection"),
     ),
     "harmonics": Widget(
         "Sixteen harmonics",
-        "set all to zero, raise one slider at a time, and turn the globe: which are even, which odd?",
+        "set all to zero, raise one slider at a time, and turn the globe by half a turn: which harmonics have the same "
+        "value seen from opposite sides (even), which the negative (odd)?",
         ("harmonics",),
     ),
     "scrubber": Widget(

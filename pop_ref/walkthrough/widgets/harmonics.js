@@ -1,29 +1,29 @@
-// Sixteen harmonics: one coefficient each, a globe of view directions painted with their sum, and what one view sees.
+// Sixteen harmonics: one coefficient each, a globe painted with what each camera around it sees, and what one of them sees.
 
 function harmonics(root) {
   const channels = { "all three": [0, 1, 2], red: [0], green: [1], blue: [2] };
   const sh = Array.from({ length: 16 }, () => [0, 0, 0]);
   let chosen = channels["all three"];
-  // rows: right, down and out of the page, in world coordinates; the middle of the globe is the view direction
-  let view = [[1, 0, 0], [0, 1, 0], [0, 0, -1]];
+  // the camera in front, in world coordinates: right, down and forward; the middle of the globe shows what it sees
+  let view = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
 
   const body = kit.make(root, "div", { class: "pw-body" });
   const left = kit.make(body, "div");
   const stage = kit.make(left, "div", {
     class: "pw-stage pw-handle", tabindex: 0, role: "application", style: "max-width:290px;margin:0 auto",
-    "aria-label": "globe of view directions; drag or use the arrow keys to turn it",
+    "aria-label": "globe of the cameras around a Gaussian; drag or use the arrow keys to turn it",
   });
   const canvas = kit.make(stage, "canvas", { width: 220, height: 220, "aria-hidden": "true" });
   const over = kit.svg(stage, "svg", { class: "pw-over", viewBox: "0 0 220 220" });
   kit.svg(over, "circle", { cx: 110, cy: 110, r: 107, class: "pw-thin pw-rule", "stroke-width": 1 });
   kit.svg(over, "circle", { cx: 110, cy: 110, r: 9, class: "pw-thin", style: "stroke:#fff;stroke-width:4;opacity:.7" });
   kit.svg(over, "circle", { cx: 110, cy: 110, r: 9, class: "pw-thin", style: "stroke:#222;stroke-width:1.6" });
-  const names = ["x", "y", "z"].map((name) => kit.svg(over, "text", { "text-anchor": "middle", style: "font-weight:600" }, name));
+  const names = ["x", "y", "z"].map((name) => kit.svg(over, "text", { "text-anchor": "middle", style: "font-weight:600" }, `d = ${name}`));
 
   const controls = kit.make(body, "div", { class: "pw-controls" });
   const patch = kit.make(controls, "div", { class: "pw-patch", role: "img" });
   const reading = kit.readings(controls);
-  const told = { dir: reading("view direction d"), color: reading("colour c(d)"), raw: reading("least and most on the globe") };
+  const told = { dir: reading("direction d, camera to Gaussian"), color: reading("colour that it sees, c(d)"), raw: reading("least and most on this side") };
   kit.choice(controls, "colour channel", Object.keys(channels), "all three", (name) => { chosen = channels[name]; show(); });
   const line = kit.make(controls, "div", { class: "pw-choice" });
   const presets = { "all zero": () => 0, "a highlight": highlight, random: () => 0.7 * (Math.random() + Math.random() - 1) };
@@ -61,11 +61,11 @@ function harmonics(root) {
 
   // the series of a bright spot around one direction: each harmonic's value there, fading with its degree
   function highlight(k) {
-    const towards = [0.35, -0.45, -Math.sqrt(1 - 0.35 ** 2 - 0.45 ** 2)];
+    const towards = [-0.35, 0.45, Math.sqrt(1 - 0.35 ** 2 - 0.45 ** 2)];
     return [1.1, 0.95, 0.7, 0.4][Math.floor(Math.sqrt(k))] * sh_basis(towards, 3)[k] - (k === 0 ? 0.9 : 0);
   }
 
-  // calls back for every pixel of a round picture with its direction
+  // calls back for every pixel of a globe with the direction in which a camera looks at it from outside
   function sphere(size, rotation, paint) {
     const r = size / 2 - size / 73;
     const image = new ImageData(size, size);
@@ -75,7 +75,7 @@ function harmonics(root) {
         const square = x * x + y * y;
         if (square > 1.04) continue;
         const z = Math.sqrt(Math.max(0, 1 - square));
-        const dir = [0, 1, 2].map((k) => rotation[0][k] * x + rotation[1][k] * y + rotation[2][k] * z);
+        const dir = [0, 1, 2].map((k) => rotation[2][k] * z - rotation[0][k] * x - rotation[1][k] * y);
         const edge = kit.clamp((1 - Math.sqrt(square)) * r + 0.5, 0, 1);
         image.data.set([...paint(dir), 255 * edge], 4 * (j * size + i));
       }
@@ -112,7 +112,7 @@ function harmonics(root) {
     told.color(color.map((c) => kit.number(c)).join("  "));
     told.raw(`${kit.number(least)} \u2026 ${kit.number(most)}`);
     names.forEach((node, k) => {
-      const at = [0, 1].map((axis) => 110 + 94 * view[axis][k]);
+      const at = [0, 1].map((axis) => 110 - 94 * view[axis][k]);
       kit.set(node, { x: at[0], y: at[1] + 4, opacity: view[2][k] > -0.2 ? 0.9 : 0 });
       node.style.fill = colors_from_sh(sh, [0, 1, 2].map((j) => (j === k ? 1 : 0)), 3)[1] > 0.5 ? "#111" : "#fff";
     });
@@ -128,8 +128,8 @@ function harmonics(root) {
       const [c, s] = [Math.cos(angle), Math.sin(angle)];
       [view[a], view[b]] = [view[a].map((x, k) => c * x + s * view[b][k]), view[b].map((x, k) => c * x - s * view[a][k])];
     };
-    spin(0, 2, dx);
-    spin(1, 2, dy);
+    spin(0, 2, -dx);
+    spin(1, 2, -dy);
     draw();
     drawIcons();
   }

@@ -21,7 +21,7 @@ function orbit(root) {
   const ours = [1, 2, 3].map(() => kit.svg(over, "ellipse", { class: "pw-thin pw-2", "stroke-width": 2 }));
   const cloud = kit.svg(over, "ellipse", { class: "pw-thin pw-3 pw-dash", "stroke-width": 2 });
   kit.legend(left, [
-    ["c2", "1, 2, 3 standard deviations by EWA"], ["c3", "2 of the projected points", true], ["ink", "the Gaussian\u2019s axes"],
+    ["c2", "1, 2, 3 standard deviations by EWA"], ["c3", "middle 68 % of the projected points", true], ["ink", "the Gaussian\u2019s axes"],
   ]);
 
   const controls = kit.make(body, "div", { class: "pw-controls" });
@@ -32,27 +32,24 @@ function orbit(root) {
     slider(`${name} scale`, 0.02, 1.5, 0.01, state.scales[i], kit.number, (x) => { state.scales[i] = x; }));
   slider("distance", 1.5, 12, 0.1, state.distance, world, (x) => { state.distance = x; });
   slider("sideways, x/z", -1, 1, 0.01, 0, kit.number, (x) => { state.sideways = x; });
-  kit.make(controls, "p", { class: "pw-caption" }, "standard deviations on the screen");
+  kit.make(controls, "p", { class: "pw-caption" }, "half-widths on the screen: standard deviations, and of the points the middle 68 %");
   const reading = kit.readings(controls);
   const told = {
     ewa: reading("by EWA"),
     cloud: reading("of the points"),
-    off: reading("mismatch of \u03a3"),
+    sides: reading("to the long axis\u2019 two sides"),
     clamp: reading("frustum clamp (B1)"),
     J: kit.readings(controls)("J, px / unit"),
   };
 
-  // the same normals at every visit: a generator of 32 bits, and pairs by Box and Muller
+  // the same normals at every visit, and evenly spread: multiples of four incommensurable numbers, by Box and Muller
   function draw_normals(n) {
-    let seed = 7;
-    const uniform = () => {
-      seed = (seed + 0x6d2b79f5) | 0;
-      let t = Math.imul(seed ^ (seed >>> 15), seed | 1);
-      t ^= t + Math.imul(t ^ (t >>> 7), t | 61);
-      return ((t ^ (t >>> 14)) >>> 0) / 2 ** 32;
-    };
-    const normal = () => Math.sqrt(-2 * Math.log(1 - uniform())) * Math.cos(2 * Math.PI * uniform());
-    return Array.from({ length: n }, () => [normal(), normal(), normal()]);
+    const steps = [1, 2, 3, 4].map((k) => 1.1673039782614187 ** -k);
+    return Array.from({ length: n }, (_, i) => {
+      const [u, v, s, t] = steps.map((step) => (0.5 + (i + 1) * step) % 1);
+      const [near, far] = [u, s].map((x) => Math.sqrt(-2 * Math.log(1 - x)));
+      return [near * Math.cos(2 * Math.PI * v), near * Math.sin(2 * Math.PI * v), far * Math.cos(2 * Math.PI * t)];
+    });
   }
 
   // +x right, +y down, +z forward; the Gaussian lies at the world's origin
@@ -78,17 +75,19 @@ function orbit(root) {
     return points;
   }
 
-  function moments(points) {
-    const n = points.length;
-    const mean = [0, 1].map((k) => points.reduce((sum, p) => sum + p[k], 0) / n);
-    const second = (j, k) => points.reduce((sum, p) => sum + (p[j] - mean[j]) * (p[k] - mean[k]), 0) / n;
-    return { mean, covar2d: [[second(0, 0), second(0, 1)], [second(0, 1), second(1, 1)]] };
+  // how far the middle 68 % of the points reach from the centre, to either side along the ellipse's two axes; quantiles,
+  // because some points land so far out that a variance says nothing
+  function spread(points, mean2d, angle) {
+    return [angle, angle + Math.PI / 2].map((way) => {
+      const [c, s] = [Math.cos(way), Math.sin(way)];
+      const along = points.map((p) => (p[0] - mean2d[0]) * c + (p[1] - mean2d[1]) * s).sort((a, b) => a - b);
+      return [0.16, 0.84].map((share) => along[Math.round(share * (along.length - 1))]);
+    });
   }
 
-  function put(node, mean2d, covar2d, times) {
-    const { long, short, angle } = kit.ellipse(covar2d);
+  function put(node, mean2d, long, short, angle, shift = [0, 0]) {
     const turn = `rotate(${(angle * 180) / Math.PI} ${mean2d[0]} ${mean2d[1]})`;
-    kit.set(node, { cx: mean2d[0], cy: mean2d[1], rx: times * long, ry: times * short, transform: turn });
+    kit.set(node, { cx: mean2d[0] + shift[0], cy: mean2d[1] + shift[1], rx: long, ry: short, transform: turn });
   }
 
   function drawPoints(points) {
@@ -122,18 +121,18 @@ function orbit(root) {
     const covar_cam = covars_cam_from_covars(covars_from_quats_scales(quat, state.scales), viewmat);
     const covar2d = project_covars(covar_cam, J);
     const points = project_cloud(viewmat);
-    const seen = moments(points);
+    const { long, short, angle } = kit.ellipse(covar2d);
+    const seen = spread(points, mean2d, angle);
+    const half = seen.map(([low, high]) => (high - low) / 2);
+    const middle = seen.map(([low, high]) => (high + low) / 2);
     drawPoints(points);
     drawArms(viewmat);
-    ours.forEach((node, i) => put(node, mean2d, covar2d, i + 1));
-    put(cloud, seen.mean, seen.covar2d, 2);
-    const [a, b] = [kit.ellipse(covar2d), kit.ellipse(seen.covar2d)];
+    ours.forEach((node, i) => put(node, mean2d, (i + 1) * long, (i + 1) * short, angle));
+    put(cloud, mean2d, half[0], half[1], angle, middle);
     told.J(J.map((line) => line.map((x) => kit.number(x, 1).padStart(6, "\u2007")).join(" ")).join("\n"));
-    told.ewa(`${kit.number(a.long, 1)} \u00d7 ${kit.number(a.short, 1)} px`);
-    told.cloud(`${kit.number(b.long, 1)} \u00d7 ${kit.number(b.short, 1)} px`);
-    const norm = (A) => Math.hypot(A[0][0], A[0][1], A[1][0], A[1][1]);
-    const apart = seen.covar2d.map((line, i) => line.map((x, j) => covar2d[i][j] - x));
-    told.off(`${kit.number((100 * norm(apart)) / norm(seen.covar2d), 0)} %`);
+    told.ewa(`${kit.number(long, 1)} \u00d7 ${kit.number(short, 1)} px`);
+    told.cloud(`${kit.number(half[0], 1)} \u00d7 ${kit.number(half[1], 1)} px`);
+    told.sides(seen[0].map((x) => kit.number(Math.abs(x), 1)).join(" and ").concat(" px"));
     told.clamp(Math.abs(J[0][2] + (f * mean_cam[0]) / mean_cam[2] ** 2) > 1e-9 ? "active" : "inactive");
   }
 

@@ -49,7 +49,8 @@ function splat2d(root) {
     k: reading("edge (1/255)"),
     radii: reading("extent"),
     pixels: reading("pixels drawn"),
-    energy: reading("energy after blur"),
+    paint: reading("paint after blur, 1/\u03c1"),
+    rho: reading("\u03c1, antialiased mode only"),
     probe: reading("pixel read"),
     sigma: reading("its exponent \u03c3"),
     alpha: reading("its alpha"),
@@ -154,7 +155,9 @@ function splat2d(root) {
     told.k(k ? `at ${kit.number(k)} deviations` : "nowhere");
     told.radii(`${2 * radii[0]} \u00d7 ${2 * radii[1]} px`);
     told.pixels(`${n} of ${W * H}`);
-    told.energy(`${kit.number(100 * compensations(covar2d, splat.eps2d), 0)} %`);
+    const rho = compensations(covar2d, splat.eps2d);
+    told.paint(`\u00d7 ${kit.number(1 / rho)}`);
+    told.rho(kit.number(rho, 3));
     told.probe(`column ${probe[0]}, row ${probe[1]}`);
     told.sigma(kit.number(sigma, 3));
     told.alpha(skip ? `${kit.small(alpha)}, skipped` : kit.number(alpha, 4));

@@ -1,0 +1,252 @@
+"""The rounds of a run in blocks: what a block starts from, the views that it draws, and its training among the others.
+
+A block starts from the merged Gaussians of its core, which are trained, and those of other cores that its views see,
+which are held fixed. Which Gaussians a view sees is computed once, by projecting every Gaussian into the block's views:
+those that no view shows take no part in any of the round's renders, and are not held in memory. Merged Gaussians are
+read one core at a time.
+
+A block's own views are those that see most of its core. Others show it too, behind or next to what they look at, and
+how it looks from there no training has corrected. So each round draws other views among all that show the core, and
+holds no more photographs than the block's own training did. The cameras of all views are those of all blocks' lists,
+because every training view stands in one core; the capture's own list is not read again.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pop_fast.blocks.jobs import block_folder, core_of, marker_of
+from pop_fast.blocks.plan import read_plan
+from pop_fast.data.block import find_block, read_block, write_block
+from pop_fast.data.capture import Capture, View
+from pop_fast.data.load import load_capture
+from pop_fast.data.random_points import in_picture
+from pop_fast.errors import PopError
+from pop_fast.io.atomic import write_atomically
+from pop_fast.io.read_back import read_json
+from pop_fast.stages.activations import opacities_from_logits, scales_from_log_scales
+from pop_fast.stages.splatting import ProjectionSettings, covariances, project
+from pop_fast.train.checkpoint import load_splats
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.engines import engine_of
+from pop_fast.train.environment import keep_freed_memory
+from pop_fast.train.fixed_rows import hold_last
+from pop_fast.train.load_result import CaptureRecord
+from pop_fast.train.model import KEYS
+from pop_fast.train.training_run import TrainingRun
+
+# Gaussians that are projected at a time: some 20 MB
+_AT_A_TIME = 65_536
+_COUNTS = "start.json"
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a block starts from.
+
+    Attributes:
+        params: raw parameters: first those that are trained, then those that are held fixed.
+        own: how many are trained.
+        merged: how many Gaussians there are in all cores.
+    """
+
+    params: dict[str, Tensor]
+    own: int
+    merged: int
+
+    @property
+    def fixed(self) -> dict[str, Tensor]:
+        """Return a copy of the rows that are held fixed."""
+        return {key: value[self.own :].clone() for key, value in self.params.items()}
+
+
+def check_merged(folder: Path, number: int) -> list[str]:
+    """Return the names of the blocks of a run in which a round can begin.
+
+    Args:
+        folder: the run's.
+        number: of the round, from 1.
+
+    Raises:
+        PopError: the capture is not divided, or the blocks of the round before are not merged.
+    """
+    plan, before = read_plan(folder), number - 1
+    if plan is None:
+        raise PopError(f"{folder}: its capture is not divided yet; run pop blocks partition {folder}")
+    if not marker_of(folder, None, before).is_file():
+        raise PopError(
+            f"{folder}: round {number} starts from the merged blocks of round {before}, which are not there; run "
+            f"pop blocks merge {folder} --round {before}"
+        )
+    return plan[0].names
+
+
+def read_core(folder: Path, name: str, number: int) -> dict[str, Tensor]:
+    """Read the merged Gaussians of a block's core that a round starts from.
+
+    Args:
+        folder: the run's.
+        name: of the block.
+        number: of the round, from 1.
+    """
+    return load_splats(core_of(folder, name, number - 1))[0]
+
+
+def read_start(folder: Path, name: str, number: int, config: TrainConfig, views: Sequence[View]) -> Start:
+    """Read what a block starts from in a round.
+
+    Args:
+        folder: the run's.
+        name: of the block.
+        number: of the round, from 1.
+        config: profile and antialiasing are read.
+        views: of the block, to train on and held out.
+
+    Raises:
+        PopError: the capture is not divided, or the blocks of the round before are not merged.
+    """
+    names, own = check_merged(folder, number), read_core(folder, name, number)
+    parts, merged = [own], len(own["means"])
+    for other in names:
+        if other != name:
+            params = read_core(folder, other, number)
+            merged += len(params["means"])
+            shown = shown_in(views, params, config)
+            parts.append({key: value[shown] for key, value in params.items()})
+    params = {key: torch.cat([part[key] for part in parts]) for key in KEYS}
+    return Start(params, len(own["means"]), merged)
+
+
+@torch.no_grad()
+def shown_in(views: Sequence[View], params: Mapping[str, Tensor], config: TrainConfig) -> Tensor:
+    """Tell which Gaussians at least one view shows, behind others or not. bool [N]
+
+    Args:
+        views: with their cameras; photographs are not read.
+        params: raw parameters.
+        config: profile and antialiasing are read.
+    """
+    profile = config.renderer
+    cameras = [
+        (
+            torch.from_numpy(view.viewmat).float(),
+            ProjectionSettings(
+                torch.from_numpy(view.K).float(), view.width, view.height, profile, antialiased=config.antialiased
+            ),
+        )
+        for view in views
+    ]
+    shown = torch.zeros(len(params["means"]), dtype=torch.bool)
+    for rows in torch.arange(len(shown)).split(_AT_A_TIME):
+        means, opacities = params["means"][rows], opacities_from_logits(params["opacities"][rows])
+        shapes = covariances(params["quats"][rows], scales_from_log_scales(params["scales"][rows]))
+        for viewmat, settings in cameras:
+            if len(rows) == 0:
+                break
+            seen = (project(means, shapes, opacities, viewmat, settings).radii > 0).all(1)
+            shown[rows[seen]] = True
+            rows, means, shapes, opacities = rows[~seen], means[~seen], shapes[~seen], opacities[~seen]
+    return shown
+
+
+def write_counts(folder: Path, name: str, number: int, start: Start) -> None:
+    """Write what a block starts from in a round, in numbers, as `own_of` reads them."""
+    seen = len(start.params["means"])
+    counts = {"own": start.own, "fixed": seen - start.own, "merged": start.merged}
+    text = json.dumps(counts) + "\n"
+    write_atomically(block_folder(folder, name, number) / _COUNTS, lambda file: file.write(text.encode()))
+
+
+def own_of(folder: Path, name: str, number: int) -> dict[str, int]:
+    """Read how many Gaussians a block trained in a round (`own`), held fixed (`fixed`), and how many there were.
+
+    Raises:
+        PopError: the block has not begun the round, or the file is damaged.
+    """
+    path = block_folder(folder, name, number) / _COUNTS
+    fix = f"run pop blocks train {folder} {name} --round {number}"
+    if not path.is_file():
+        raise PopError(f"{path}: is absent; {fix}")
+    found = read_json(path, fix)
+    if not isinstance(found, dict) or any(type(found.get(key)) is not int for key in ("own", "fixed", "merged")):
+        raise PopError(f"{path}: is not what 'pop blocks train' writes; {fix}")
+    return found
+
+
+def prepare(
+    config: TrainConfig,
+    capture: Capture,
+    start: Start,
+    *,
+    resume: bool = False,
+    loading_seconds: float = 0.0,
+    beside: Mapping[str, str] | None = None,
+) -> TrainingRun:
+    """Prepare the training of a block in a round.
+
+    Args:
+        config: its settings, of `pop_fast.train.refining`, with a backend's name.
+        capture: the block's photographs.
+        start: what it begins with.
+        resume: continue from the latest checkpoint of `config.result_dir`, or start where there is none.
+        loading_seconds: how long reading took, for the statistics.
+        beside: texts to write beside cfg.json, by file name.
+    """
+    keep_freed_memory()
+    engine = hold_last(engine_of(config), start.fixed)
+    how = {"resume": resume, "loading_seconds": loading_seconds, "beside": beside}
+    return TrainingRun(config, capture, initial=start.params, engine=engine, **how)
+
+
+# of the Gaussians of a core, what a view must have in its picture to be drawn: fewer are strays
+_SHOWN = 0.01
+
+
+def write_round_block(
+    folder: Path, config: TrainConfig, record: CaptureRecord, names: list[str], name: str, number: int, core: np.ndarray
+) -> None:
+    """Draw the views of a block for a round and write their list, unless that is there already.
+
+    Args:
+        folder: the run's.
+        config: its settings; the seed is read, and how photographs are.
+        record: how the capture is read.
+        names: of all blocks.
+        name: of this one.
+        number: of the round, from 1.
+        core: centres of the Gaussians in its core, in the training frame. [N, 3]
+
+    Raises:
+        CaptureError: a block's list is damaged.
+    """
+    place = block_folder(folder, name, number)
+    if find_block(place):
+        return
+    listings = {other: read_block(block_folder(folder, other)) for other in names}
+    own = listings[name]
+    shots = {shot.name: shot for each in listings.values() for shot in each.shots if shot.split == "train"}
+    cameras = load_capture(
+        block_folder(folder, name),
+        factor=config.factor,
+        normalize=config.normalize,
+        masks=record.masks,
+        missing=record.missing,
+        images=record.images,
+        resize=config.resize,
+        photographs="none",
+        listing=replace(own, shots=list(shots.values())),
+    )
+    points = core.astype(np.float64)
+    showing = [view.name for view in cameras.views if in_picture(points, view).mean() >= _SHOWN] if len(core) else []
+    had = [shot for shot in own.shots if shot.split == "train"]
+    draw = np.random.default_rng([config.seed, number, names.index(name)])
+    drawn = draw.permutation(len(showing))[: len(had)]
+    chosen = [shots[showing[index]] for index in sorted(drawn)] or had
+    write_block(place, replace(own, shots=[*chosen, *(shot for shot in own.shots if shot.split == "test")]))
