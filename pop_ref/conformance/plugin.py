@@ -221,7 +221,8 @@ class _Recorder:
             crash = getattr(report.longrepr, "reprcrash", None)
             detail = str(crash.message if crash else report.longrepr).splitlines()[0]
             differences = tuple(DIFFERENCES.findall(report.longreprtext))
-        (backend, stage, law), more = named, dict(report.user_properties)
+        more: dict[str, Any] = dict(report.user_properties)
+        backend, stage, law = named
         outcome, cpu = ("crashed" if "crash" in more else report.outcome), more.get("cpu", 0.0)
         self.card.entries.append(Entry(backend, stage, law, outcome, detail, report.duration, differences, cpu))
 

@@ -30,7 +30,8 @@ from pop_ref.conformance.capabilities import (
     SIGNATURE,
     same_constants,
 )
-from pop_ref.conformance.cases import BY_NAME, Case
+from pop_ref.conformance.cases import BY_NAME, Case, with_own_lists
+from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.scenes import Scene
 from pop_ref.constants import PAPER, Profile
 
@@ -122,8 +123,6 @@ class TorchAdapter(Adapter):
     @functools.cached_property
     def own_tile_size(self) -> int | None:
         """Give the side of the tiles of a rasterizer that takes none, as its meta tells it; None if it does not. px"""
-        from pop_ref.conformance.golden import golden_scene
-
         scene = super().sees(golden_scene())
         try:
             meta = self._call(scene, self._leaves(scene, grad=False), dominance=False, counts=False)[2]
@@ -134,8 +133,6 @@ class TorchAdapter(Adapter):
 
     def _asked_for_gradients(self) -> bool:
         """Tell whether an image follows its Gaussians in autograd; a renderer that only draws does not."""
-        from pop_ref.conformance.golden import golden_scene
-
         scene = self.sees(golden_scene())
         try:
             image, _, _ = self._call(scene, self._leaves(scene, grad=True), dominance=False, counts=False)
@@ -197,7 +194,7 @@ class TorchAdapter(Adapter):
         def with_arrays(*args: Any, **kwargs: Any) -> Any:
             if any(isinstance(a, Profile) and not self._implements(a) for a in (*args, *kwargs.values())):
                 reject()
-            args, kwargs = _with_own_lists(function, args, kwargs)
+            args, kwargs = with_own_lists(function, args, kwargs)
             tensors = {key: self._tensor(value, own) for key, value in kwargs.items()}
             return self._array(function(*[self._tensor(a, own) for a in args], **tensors))
 
@@ -310,11 +307,7 @@ class TorchAdapter(Adapter):
             width=scene.camera.width,
             height=scene.camera.height,
             sh_degree=call.sh_degree,
-            **self._taken(
-                packed=call.packed,
-                tile_size=call.tile_size,
-                **self._asked_by(call),
-            ),
+            **self._taken(packed=call.packed, tile_size=call.tile_size, **self._asked_by(call)),
             **(self._absgrad if pulls and call.absgrad else {}),
         )
         (B, C, _), H, W = call.shape, scene.camera.height, scene.camera.width
@@ -437,19 +430,3 @@ class TorchAdapter(Adapter):
             return value
         array = value.detach().cpu().numpy()
         return array.astype({"f": np.float64, "i": np.int64}.get(array.dtype.kind, array.dtype))
-
-
-def _with_own_lists(
-    function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]
-) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Return a stage function's arguments with tile lists as the `TileLists` that its module knows, if it knows any."""
-    own = getattr(sys.modules.get(function.__module__), "TileLists", None)
-    signature = inspect.signature(function)
-    if own is None or "lists" not in signature.parameters:
-        return args, kwargs
-    given = signature.bind(*args, **kwargs)
-    named = given.arguments
-    camera = named.get("camera")
-    size = (named["width"], named["height"]) if camera is None else (camera.width, camera.height)
-    named["lists"] = own.of(named["lists"], *size, named["tile_size"])
-    return given.args, given.kwargs

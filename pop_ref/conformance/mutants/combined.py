@@ -6,6 +6,7 @@ where that is known.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -21,6 +22,10 @@ ROWS: Final = f"{PAIRS}shows_the_oracles_splats"
 DOMINANCE: Final = f"{PAIRS}tells_the_dominant_gaussians_of_every_camera"
 TILES: Final = f"{PAIRS}lists_tiles_front_to_back"
 TOGETHER: Final = "test_signature_pairs:arguments_that_are_taken_alone_are_taken_together"
+
+
+def _torch() -> Any:
+    return importlib.import_module("torch")
 
 
 # what is asked
@@ -148,10 +153,8 @@ def _first_colors(given: Given) -> Any:
 
 
 def _higher_bands_of_the_first(given: Given) -> Any:
-    import torch
-
     sh = given["colors"]
-    return torch.cat((sh[..., :4, :], _first_colors(given)[..., 4:, :]), -2)
+    return _torch().cat((sh[..., :4, :], _first_colors(given)[..., 4:, :]), -2)
 
 
 def _seen_from_the_first(sound: Rasterization, given: Given) -> Any:
@@ -175,9 +178,7 @@ def _clipped_along(axes: Callable[[Any], Any]) -> Breaks:
     def breaks(sound: Rasterization, given: Given) -> Any:
         if not _clipped(given) or _several(given):
             return sound(**given)
-        import torch
-
-        with torch.no_grad():
+        with _torch().no_grad():
             radii = sound(**given | {"radius_clip": 0.0, "packed": False})[2]["radii"]
         gone = axes(radii <= given["radius_clip"]).squeeze(-2)
         return sound(**given | {"radius_clip": 0.0, "opacities": given["opacities"] * ~gone})
@@ -190,9 +191,7 @@ def _images_of(change: Callable[[Given, Any, Any], Any]) -> Callable[..., Any]:
 
 
 def _last_camera_alone(given: Given, images: Any, alphas: Any, meta: Any) -> Any:
-    import torch
-
-    parts = [torch.cat((each[..., :-1, :, :, :].detach(), each[..., -1:, :, :, :]), -4) for each in (images, alphas)]
+    parts = [_torch().cat((each[..., :-1, :, :, :].detach(), each[..., -1:, :, :, :]), -4) for each in (images, alphas)]
     return *parts, meta
 
 
@@ -206,17 +205,13 @@ def _depth_before_colors(given: Given, images: Any, alphas: Any) -> Any:
 
 
 def _background_behind_depth(given: Given, images: Any, alphas: Any) -> Any:
-    import torch
-
     last = given["backgrounds"][..., None, None, -1:] * (1.0 - alphas)
-    return torch.cat((images[..., :-1], images[..., -1:] + last), -1)
+    return _torch().cat((images[..., :-1], images[..., -1:] + last), -1)
 
 
 def _divided_by_the_first(given: Given, images: Any, alphas: Any) -> Any:
-    import torch
-
     a = alphas.clamp_min(1e-10)
-    return torch.cat((images[..., :-1], images[..., -1:] * a / a[..., :1, :, :, :]), -1)
+    return _torch().cat((images[..., :-1], images[..., -1:] * a / a[..., :1, :, :, :]), -1)
 
 
 def _tiles_in_a_byte(given: Given, images: Any, alphas: Any) -> Any:
@@ -228,9 +223,7 @@ def _tiles_in_a_byte(given: Given, images: Any, alphas: Any) -> Any:
 
 
 def _cut(images: Any, count: int) -> Any:
-    import torch
-
-    return torch.cat((images[..., :count], torch.zeros_like(images[..., count:])), -1)
+    return _torch().cat((images[..., :count], _torch().zeros_like(images[..., count:])), -1)
 
 
 def _rows_by_number(given: Given) -> Any:
@@ -258,16 +251,12 @@ def _mirrored(given: Given) -> Any:
 
 
 def _all_to_the_first(v: Any) -> Any:
-    import torch
-
     total = v.sum(-3, keepdim=True)
-    return torch.cat((total, torch.zeros_like(v[..., 1:, :, :])), -3)
+    return _torch().cat((total, _torch().zeros_like(v[..., 1:, :, :])), -3)
 
 
 def _repeated(colors: Any) -> Any:
-    import torch
-
-    return torch.cat((colors[..., :32], colors[..., : colors.shape[-1] - 32]), -1)
+    return _torch().cat((colors[..., :32], colors[..., : colors.shape[-1] - 32]), -1)
 
 
 def _asserting(sound: Rasterization, given: Given) -> Any:
