@@ -330,8 +330,8 @@ BOX_HEAD = """
 
 ## Behind gsplat's signature
 
-{n} rasterizers that draw one small view rightly and break one argument around it, or two together, judged as any `--rasterizer` is: by
-what they return alone. {n} of {n} are killed.
+{n} rasterizers that draw one small view rightly and break one argument around it, or two together, judged as any
+`--rasterizer` is: by what they return alone. {n} of {n} are killed.
 
 """
 
