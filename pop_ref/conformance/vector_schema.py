@@ -67,7 +67,7 @@ OPTIONS: Final = {
     "sh_degree": "bands that are used",
     "antialiased": "opacities are multiplied by sqrt(max(0, det(covar2d) / det(covar2d + eps2d I)))",
     "render_mode": "what an image of a call holds; its kind explains it under 'modes'",
-    "radius_clip": "px; Gaussians whose extents 'radii' are both at most this are left out of a call; 0 leaves none out",
+    "radius_clip": "px; Gaussians whose extents 'radii' are both at most this are left out of a call; 0: nobody",
     "profile.near_plane, near_inclusive": "Gaussians with camera z < near_plane are left out; z = near_plane too if "
     "near_inclusive (D1)",
     "profile.far_plane": "Gaussians with camera z > far_plane are left out",
