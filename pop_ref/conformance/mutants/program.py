@@ -368,7 +368,7 @@ _LINES: Final = (
         "nobody is pruned by screen size, as in Inria's code",
         "density/control.py",
         "if self.prune_too_big_after < context.step < self.refine_scale2d_stop_iter:",
-        "if False:",
+        "if context.step < -1:",
         READINGS,
     ),
     (
