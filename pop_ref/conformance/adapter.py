@@ -61,6 +61,7 @@ STAGE_MODULES = (
     "density",
     "optimizer",
     "training",
+    "methods",
     "contributions",
     "sensitivity",
     "fisher",

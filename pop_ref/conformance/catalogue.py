@@ -48,9 +48,13 @@ batch entry, camera and pixel, and prints the call to paste.
 What is drawn where nothing but an image is asked for may be other code than what also counts. A rasterizer with the
 arguments `dominance` and `counts` is judged as training asks it, and a law holds every choice of the two together.
 
-Density control and Adam are judged as what trains: `torch_training.training_stages` makes stage functions of a
-trainer's strategy, row operations and optimizers, and `TorchAdapter(stages=...)` takes any such functions, on tensors
-under the oracle's names; those of another engine are one more entry of `backends.py`.
+What trains is judged as it trains. A strategy is driven by a script (`strategy_script.py`), as a run drives it: the
+prior joins the loss, the backward pass, Adam, statistics, and then the Gaussians change; with one camera and several,
+packed and not, with signed and absolute gradients. `pop_ref.methods` says what POP, gsplat, 3DGS, Mini-Splatting,
+Taming-3DGS, Speedy-Splat and PUP-3DGS do at every step. `torch_training.training_stages` makes stage functions of a
+trainer's strategies, row operations, schedules and optimizers, and `TorchAdapter(stages=...)` takes any such functions.
+`--strategy gsplat.strategy:DefaultStrategy` judges somebody's strategy by the laws of training that are about no
+method. Pictures take no part: that the step of an engine makes its statistics of renders rightly is not judged here.
 
 An adapter defines what there is, under the oracle's names, on arrays. With `composite` alone the oracle projects and
 lists the splats of whole scenes; a stage function such as `project_means` is judged by its own laws.

@@ -40,6 +40,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         help="a class derived from pop_ref.conformance.Adapter",
     )
     group.addoption(
+        "--strategy",
+        metavar="MODULE:CLASS",
+        action="append",
+        default=[],
+        help="a density strategy with gsplat's protocol, as gsplat.strategy:DefaultStrategy",
+    )
+    group.addoption(
         "--program",
         metavar="COMMAND",
         action="append",
@@ -95,7 +102,8 @@ def _chosen(config: pytest.Config) -> str:
     """Return the names of what the options choose to judge; empty for the oracle."""
     option: Any = config.getoption
     single = option("--rasterizer") or option("--stages")
-    return ", ".join([*option("--backend"), *option("--adapter"), *option("--program"), *([single] if single else [])])
+    several = [each for name in ("--backend", "--adapter", "--strategy", "--program") for each in option(name)]
+    return ", ".join([*several, *([single] if single else [])])
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -137,7 +145,14 @@ def _chosen_backends(config: pytest.Config) -> list[Any]:
 
 
 def _make_backends(config: pytest.Config) -> list[Any]:
-    from pop_ref.conformance.backends import Unavailable, adapter_for, made_by, shipped, shipped_or_absent
+    from pop_ref.conformance.backends import (
+        Unavailable,
+        adapter_for,
+        made_by,
+        shipped,
+        shipped_or_absent,
+        strategy_named,
+    )
     from pop_ref.conformance.program_adapter import ProgramAdapter
     from pop_ref.conformance.program_pipe import ProgramError
     from pop_ref.constants import profile_named
@@ -147,6 +162,7 @@ def _make_backends(config: pytest.Config) -> list[Any]:
         chosen = [shipped_or_absent(name) for name in option("--backend")] + [
             made_by(path) for path in option("--adapter")
         ]
+        chosen += [strategy_named(path, option("--dtype")) for path in option("--strategy")]
         chosen += [ProgramAdapter(command, option("--program-timeout")) for command in option("--program")]
         path, package = option("--rasterizer"), option("--stages")
         if path or package:

@@ -33,6 +33,7 @@ from pop_ref.conformance.capabilities import (
 from pop_ref.conformance.cases import BY_NAME, Case, with_own_lists
 from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.scenes import Scene
+from pop_ref.conformance.torch_autograd import Ask, Differentiated, differentiated
 from pop_ref.constants import PAPER, Profile
 
 # arguments at the values by which a rasterizer that lacks them draws
@@ -234,6 +235,16 @@ class TorchAdapter(Adapter):
     def plainly(self, scene: Scene) -> View:
         """Draw a scene that gradients may follow from, and ask for nothing else."""
         return self._drawn(scene, dominance=False, counts=False, grad=True)
+
+    def differentiate(self, scene: Scene, v_image: Any, v_T_final: Any, ask: Ask) -> Differentiated:
+        """Draw a scene and pull cotangents back in an order of passes, and of arguments in a layout, as it is asked."""
+
+        def draw(of: Scene, arguments: dict[str, Any]) -> tuple[Any, Any]:
+            image, alphas, _ = self._call(of, arguments, dominance=False, counts=False)
+            return image, alphas
+
+        arrays = (self._tensor(v_image), self._tensor(v_T_final))
+        return differentiated(scene, draw, self._leaves, arrays, ask, self._without)
 
     def _drawn(self, scene: Scene, dominance: bool, counts: bool, grad: bool = False) -> View:
         leaves = self._leaves(scene, grad)
