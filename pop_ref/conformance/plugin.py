@@ -23,7 +23,8 @@ LAWS = "pop_ref.conformance.laws"
 FAILURES = "conformance_failures"
 # the lines of a failure's report that say what differs first (`failure_report`)
 DIFFERENCES = re.compile(
-    r"^E +((?:first|nearest|no) (?:stage|pixel|Gaussian|gradient|decision)\b.*|saved as .*)$", re.MULTILINE
+    r"^E +((?:first|nearest|no) (?:stage|pixel|Gaussian|gradient|decision|difference|cause)\b.*|saved as .*)$",
+    re.MULTILINE,
 )
 
 
@@ -236,20 +237,31 @@ class _Recorder:
             crash = getattr(report.longrepr, "reprcrash", None)
             detail = str(crash.message if crash else report.longrepr).splitlines()[0]
             differences = tuple(DIFFERENCES.findall(report.longreprtext))
+        more: dict[str, Any] = dict(report.user_properties)
         backend, stage, law = named
-        cpu: Any = dict(report.user_properties).get("cpu", 0.0)
-        self.card.entries.append(Entry(backend, stage, law, report.outcome, detail, report.duration, differences, cpu))
+        outcome, cpu = ("crashed" if "crash" in more else report.outcome), more.get("cpu", 0.0)
+        self.card.entries.append(Entry(backend, stage, law, outcome, detail, report.duration, differences, cpu))
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item: pytest.Item) -> Generator[None, Any, Any]:
+        from pop_ref.conformance.law import is_crash
+
         start = time.process_time()
         try:
             return (yield)
+        except Exception as error:
+            # an error of the rasterizer's own is no comparison that failed
+            if is_crash(error):
+                item.user_properties.append(("crash", True))
+            raise
         finally:
             item.user_properties.append(("cpu", time.process_time() - start))
 
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        from pop_ref.conformance.pairs import judged_pairs
         from pop_ref.conformance.surface import surface_of
 
-        self.card.surfaces = {b.name: surface_of(b) for b in _chosen_backends(session.config)}
+        judged = _chosen_backends(session.config)
+        self.card.surfaces = {backend.name: surface_of(backend) for backend in judged}
+        self.card.pairs = {backend.name: pairs for backend in judged if (pairs := judged_pairs(backend))}
         self.card.write(self.path)

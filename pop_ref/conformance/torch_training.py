@@ -69,7 +69,6 @@ class Trainer:
         self._schedule: Any = importlib.import_module(f"{package}.train.schedule")
         self._config: Any = importlib.import_module(f"{package}.train.config")
         self._presets: Any = importlib.import_module(f"{package}.train.presets")
-        self._phases: Any = importlib.import_module(f"{package}.train.schedule")
         self._passes: Any = importlib.import_module(f"{package}.density.passes")
         self._Draws: Any = importlib.import_module(f"{package}.density.protocol").Draws
         self._Strategy: Any = importlib.import_module(f"{package}.density").POPStrategy
@@ -240,7 +239,7 @@ class Trainer:
         """Take one of the trainer's methods through a script from these rows; see `torch_strategy.drive`."""
         strategy = self._presets.METHODS[script.method or "pop"].strategy(**script.settings)
         schedule = SimpleNamespace(lr=script.lr, max_steps=script.max_steps)
-        updates = self._phases.updates_of_strategy(schedule, strategy, script.scene_scale)
+        updates = self._schedule.updates_of_strategy(schedule, strategy, script.scene_scale)
         dtype = rows.params["means"].dtype
         passes, drawn = ScriptedPasses(script, self._passes.ViewContributions, dtype), script.draws()
         draws = self._Draws(
