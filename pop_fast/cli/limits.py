@@ -167,7 +167,7 @@ def _scores(shown: Shown, params: dict[str, Tensor], score: Score) -> Tensor:
     views = shown.capture().train_views(shown.config.test_every)
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _MOST_VIEWS)).round().astype(int))
     backend, _ = renderer(shown.config.backend)
-    device = torch.device("cuda" if backend.name == "cuda" else "cpu")
+    device = torch.device(backend.device)
     passes = Passes.of(backend, [ViewTensors.of(views[i]) for i in chosen], shown.config, device)
     placed = {name: value.to(device) for name, value in params.items()}
     return shrink.view_scores(score, passes, placed, shown.sh_degree)

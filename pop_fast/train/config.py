@@ -17,7 +17,7 @@ from pop_fast.train.jsonable import from_plain, to_plain
 from pop_fast.train.limits import check_values
 from pop_fast.train.presets import METHODS, MILESTONES, Given, defaults, laid_over, method_of
 from pop_ref.constants import NEAR_IN_CAPTURE_UNITS, PAPER, Profile, profile_named
-from pop_ref.settings import LAMBDA_SSIM_3DGS, MAX_SH_DEGREE, AppearanceRates, LearningRates, Recipe
+from pop_ref.settings import MAX_SH_DEGREE, AppearanceRates, LearningRates, Objective, Recipe
 
 __all__ = ["LearningRates", "TrainConfig", "first_difference"]
 
@@ -65,9 +65,11 @@ class TrainConfig:
         sh_interval: steps between bands, from band 0 at step 0.
         init_opacity: opacity of the first Gaussians.
         init_scale: multiplies their size, which is the distance to their three nearest neighbours.
-        photometric: "l2" as in paper eq. 9, POP's, or "l1" as in eq. 2, that of the other methods.
-        photometric_divisor: divides the L1 or L2 term, as in the paper's figure of L1/n against L2.
-        lambda_ssim: weight of 1 - SSIM; the rest is L1 or L2. POP's is 0.01, that of the other methods 0.2.
+        photometric: the loss between pixels, "l2" as in paper eq. 9, POP's, or "l1" as in eq. 2, that of the other
+            methods; or one that another package registers.
+        photometric_divisor: divides that term, as in the paper's figure of L1/n against L2.
+        lambda_ssim: weight of 1 - SSIM; the rest is that of the loss between pixels. POP's is 0.01, that of the other
+            methods 0.2.
         l2_stop_iter: step from which eq. 2 (L1, 0.2) takes over; None never, as the paper says of POP alone that it
             ends (A20).
         ssim_padding: "valid" as gsplat, or "same" as Inria (and method "3dgs").
@@ -114,7 +116,7 @@ class TrainConfig:
     sh_interval: int = Recipe.sh_interval
     init_opacity: float = 0.1
     init_scale: float = 1.0
-    photometric: Literal["l1", "l2"] = Recipe.pixelwise
+    photometric: str = Recipe.pixelwise
     photometric_divisor: float = 1.0 / Recipe.pixel_scale
     lambda_ssim: float = Recipe.lambda_ssim
     l2_stop_iter: int | None = Recipe.l2_stop_iter
@@ -225,11 +227,16 @@ class TrainConfig:
             return self
         return replace(self, near_plane=self.renderer.near_plane * world_scale)
 
-    def photometric_at(self, step: int) -> tuple[Literal["l1", "l2"], float]:
-        """Return the pixel-wise loss of a step and the weight of 1 - SSIM; the rest of the weight, to 1, is its own."""
-        if self.l2_stop_iter is not None and step >= self.l2_stop_iter:
-            return "l1", LAMBDA_SSIM_3DGS
-        return self.photometric, self.lambda_ssim
+    def objective_at(self, step: int) -> Objective:
+        """Return what the render of a step is compared with its photograph by."""
+        said = {
+            "pixelwise": self.photometric,
+            "pixel_scale": 1.0 / self.photometric_divisor,
+            "lambda_ssim": self.lambda_ssim,
+            "padding": self.ssim_padding,
+            "d_ssim_halved": self.d_ssim_halved,
+        }
+        return Objective(**said).at(step, self.l2_stop_iter)
 
     def to_json(self) -> str:
         """Write the settings as JSON, in reading order: as given (null where no preset was), and as they are run."""

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from cuda_ext.train_settings import Phase, StepStats
 from pop_fast.density.protocol import DensificationStep
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.steps import Phase, StepStats
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,9 @@ def record_of(
     densification = segment.densification if last else None
     if step % config.log_every != 0 and densification is None:
         return None
-    halved = 0.5 if config.d_ssim_halved else 1.0
+    halved = 0.5 if segment.phase.objective.d_ssim_halved else 1.0
     measured = {
-        "l1" if segment.phase.l1 else "l2": stats.pixelwise,
+        segment.phase.objective.pixelwise: stats.pixelwise,
         "d_ssim": halved * (1.0 - stats.ssim),
         "psnr": -10.0 * math.log10(stats.square) if stats.square != 0.0 else math.inf,
         "n_blended": stats.n_blended,

@@ -15,7 +15,7 @@ from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
 from pop_fast.train.choose import choose_backend
-from pop_fast.train.engines import cuda_engine
+from pop_fast.train.engines import whole_engine
 from pop_fast.train.gpu_proxy import GpuProxy, renderer, translate_oom
 from pop_fast.train.views import ViewTensors, render_view
 from tests.app.conftest import TRAIN, Pop
@@ -43,7 +43,7 @@ def without_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
 def with_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a machine with a GPU and the build, whose part something else plays."""
     monkeypatch.setattr("cuda_ext.why_not", lambda: None)
-    monkeypatch.setattr("pop_fast.train.engines.cuda_engine", drift_engine)
+    monkeypatch.setattr("pop_fast.train.engines.whole_engine", lambda backend: drift_engine())
 
 
 def settings(folder: Path) -> dict[str, object]:
@@ -91,7 +91,7 @@ def test_cuda_asked_for_in_vain_is_one_sentence_before_anything_is_read(pop: Pop
     assert outcome.status == 2
     assert outcome.err == f"pop: error: backend 'cuda' cannot run: {NOT_BUILT}\n"
     with pytest.raises(PopError, match="not built"):
-        cuda_engine()
+        whole_engine("cuda")
     with pytest.raises(PopError, match="backend 'cuda' cannot run: the CUDA extension is not built"):
         get_backend("cuda").rasterization()
     one = torch.ones(1, 3)

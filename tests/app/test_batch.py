@@ -12,16 +12,17 @@ import torch
 
 import pop_fast.compiled
 from pop_fast.api.registry import require_backend
+from pop_fast.cuda.backend import CUDA
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
 from pop_fast.train.batch_stepper import BatchStepper
 from pop_fast.train.engines import engine_of, torch_engine
-from pop_fast.train.fused_settings import unsupported
 from pop_fast.train.fused_stepper import FusedStepper
-from pop_fast.train.phases import phase_at
+from pop_fast.train.schedule import phase_at
 from pop_fast.train.stepper import Task
 from pop_fast.train.torch_stepper import TorchStepper
+from pop_fast.train.whole_step import why_not_trained
 from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config
 
 # bands of colour, growth by blur and the prior are all on at this step
@@ -147,7 +148,7 @@ def test_the_step_in_cpp_leaves_batches_to_autograd() -> None:
 
 
 def test_the_fused_step_on_a_gpu_refuses_batches() -> None:
-    reason = unsupported(tiny_config("x", batch_size=2))
+    reason = why_not_trained(CUDA, tiny_config("x", batch_size=2))
     assert reason is not None
     assert "batch_size = 1 only, not 2; use --backend fast, or leave batch_size as it is" in reason
 

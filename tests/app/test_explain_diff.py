@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import cuda_ext
-from pop_fast.api import registry as backends
+from pop_fast.api.registry import BACKENDS, get_backend
 from pop_fast.cli.explain import chosen_view
 from pop_fast.errors import PopError
 from pop_fast.stages.backend import FAST, TorchBackend
@@ -128,17 +128,14 @@ class Spoilt(TorchBackend):
 
 
 @pytest.fixture
-def instead_of_cuda(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Change], None]]:
+def instead_of_cuda(monkeypatch: pytest.MonkeyPatch) -> Callable[[Change], None]:
     """Put a backend that spoils its arguments in place of "cuda"."""
 
     def put(change: Change) -> None:
         spoilt = Spoilt("cuda", "cpu", FAST.dtypes, speed=None, change=change)
-        monkeypatch.setattr("pop_fast.cuda.backend.CUDA", spoilt)
-        backends._loaded.cache_clear()
+        monkeypatch.setitem(BACKENDS._loaded, "cuda", spoilt)
 
-    yield put
-    monkeypatch.undo()
-    backends._loaded.cache_clear()
+    return put
 
 
 def fainter(gaussian: int, alpha: float, falloff: float) -> Callable[[dict[str, Any]], dict[str, Any]]:
@@ -175,8 +172,8 @@ def test_a_backend_with_another_ceiling_parts_by_d6_and_the_worst_pixel_is_looke
     scene: ExplainedView, instead_of_cuda: Callable[[Change], None]
 ) -> None:
     instead_of_cuda(lambda given: {"profile": "gsplat_1_6"})
-    image, info = scene.rasterized(torch.float32, backends.get_backend("cuda"))
-    sound, own = scene.rasterized(torch.float32, backends.get_backend("fast"))
+    image, info = scene.rasterized(torch.float32, get_backend("cuda"))
+    sound, own = scene.rasterized(torch.float32, get_backend("fast"))
     differs = (image - sound).abs().amax(dim=2) + (info["n_contrib"] != own["n_contrib"])[0]
     x, y = next((x, y) for x, y in PIXELS if differs[y, x] == 0.0)
     found = difference(scene, "fast", "cuda", x, y)

@@ -19,10 +19,9 @@ from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.engines import engine_of
 from pop_fast.train.fixed_rows import hold_last
 from pop_fast.train.model import KEYS
-from pop_fast.train.phases import phase_at
 from pop_fast.train.presets import METHODS
 from pop_fast.train.refining import at_rest, refining
-from pop_fast.train.schedule import updates_of
+from pop_fast.train.schedule import phase_at, updates_of
 from tests.app.interruptions import interrupt
 from tests.app.tiny import N_POINTS, tiny_capture, tiny_config
 

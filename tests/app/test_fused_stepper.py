@@ -9,17 +9,16 @@ import pytest
 import torch
 
 from cuda_ext.arrays import CudaMemoryError
-from cuda_ext.train_settings import GROUPS
+from pop_fast.cuda.backend import CUDA
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from pop_fast.train.engines import MOST_ON_GPU
-from pop_fast.train.fused_settings import unsupported
 from pop_fast.train.fused_stepper import step_settings
-from pop_fast.train.phases import phase_at, segment_end
-from pop_fast.train.schedule import updates_of
-from tests.app.drift import Drift, drift_engine
+from pop_fast.train.schedule import phase_at, segment_end, updates_of
+from pop_fast.train.whole_step import why_not_trained
+from pop_ref.settings import PARAMETERS
+from tests.app.drift import MOST, Drift, drift_engine
 from tests.app.tiny import HEIGHT, WIDTH, last_checkpoint, tiny_capture, tiny_config
 
 CLOCKS = ("it_per_s", "seconds")
@@ -120,8 +119,8 @@ def test_a_segment_ends_where_something_is_due():
     config = tiny_config("x", max_steps=9000, checkpoint_every=1000, strategy=POPStrategy())
     strategy, first = config.strategy, 0
     while first < config.max_steps:
-        end = segment_end(config, strategy, first, MOST_ON_GPU)
-        assert first < end <= min(first + MOST_ON_GPU, config.max_steps)
+        end = segment_end(config, strategy, first, MOST)
+        assert first < end <= min(first + MOST, config.max_steps)
         assert len({phase_at(config, strategy, step) for step in range(first, end)}) == 1
         assert not any(strategy.changes_after(step) for step in range(first, end - 1))
         assert not any(taken % 1000 == 0 or taken == 12 for taken in range(first + 1, end))
@@ -178,13 +177,13 @@ def test_settings_that_the_device_does_not_know_are_refused_before_anything_star
         TrainingRun(tiny_config(tmp_path / "new", backend="cuda", **changes), tiny_capture())
     assert words in str(error.value)
     assert not (tmp_path / "new").exists()
-    assert unsupported(tiny_config("x")) is None
+    assert why_not_trained(CUDA, tiny_config("x")) is None
 
 
 def test_the_fused_step_gets_the_learning_rates_in_its_own_words():
     config = tiny_config("x")
     settings = step_settings(config, updates_of(config.lr, 2.0, config.max_steps))
-    first = dict(zip(GROUPS, settings.updates.rates[0].tolist(), strict=True))
+    first = dict(zip(PARAMETERS, settings.updates.rates[0].tolist(), strict=True))
     assert first == {**config.lr.by_parameter(), "means": 2.0 * config.lr.means}
     assert settings.blur_pixels(WIDTH * HEIGHT) == int(0.02 * WIDTH * HEIGHT)
     assert replace(settings, blur_min_pixels=40.0).blur_pixels(WIDTH * HEIGHT) == 40.0

@@ -11,6 +11,7 @@ import torch
 
 from pop_fast.api import registry
 from pop_fast.api.rasterize import rasterization
+from pop_fast.api.registry import BACKENDS
 from pop_fast.errors import PopError
 from pop_fast.stages.backend import FAST
 from pop_fast.train import TrainConfig
@@ -37,7 +38,7 @@ class MadeUp(TorchBackend):
 
 MINE = MadeUp("mine", "cpu", ("float32", "float64"), speed=None)
 """
-ENTRIES = f"[{registry.GROUP}]\nmine = made_up_backend:MINE\nbroken = no_such_package:BACKEND\n"
+ENTRIES = f"[{BACKENDS.group}]\nmine = made_up_backend:MINE\nbroken = no_such_package:BACKEND\n"
 
 
 @pytest.fixture
@@ -57,8 +58,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[pytest.Monke
 
 
 def look_again() -> None:
-    registry._foreign.cache_clear()
-    registry._loaded.cache_clear()
+    BACKENDS.look_again()
 
 
 def test_a_registered_backend_is_known_by_its_name_and_draws(installed: pytest.MonkeyPatch) -> None:
@@ -129,6 +129,6 @@ def test_a_name_that_nobody_registers_is_refused_before_anything_is_written(
 def test_names_of_this_package_are_known_without_a_look_at_what_is_installed(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(registry, "entry_points", lambda group: pytest.fail("looked"))
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: pytest.fail("looked"))
     look_again()
     assert TrainConfig.from_json(TrainConfig(backend=name).to_json()).backend == name

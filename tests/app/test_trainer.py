@@ -9,17 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from cuda_ext.train_settings import Phase
 from pop_fast.api.registry import get_backend
 from pop_fast.data.initialize import initialize_params
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.io.ply import load_ply
+from pop_fast.stages.backend import FAST
 from pop_fast.train import TrainingRun
 from pop_fast.train.model import KEYS, adam_step, first_non_finite, make_optimizers
-from pop_fast.train.objective import Objective
 from pop_fast.train.schedule import steady_updates
+from pop_fast.train.torch_stepper import PhotoLoss
 from pop_fast.train.views import ViewTensors, render_view
+from pop_ref.settings import Objective
 from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config
 
 
@@ -80,7 +81,7 @@ def test_the_pop_term_is_logged_while_it_is_on(finished):
 
 def test_the_loss_is_the_sum_of_its_terms(finished):
     trainer, _, folder = finished
-    _, weight = trainer.config.photometric_at(0)
+    weight = trainer.config.objective_at(0).lambda_ssim
     for record in records(folder):
         pixelwise = record["l2" if trainer.config.method == "pop" else "l1"]
         total = (1 - weight) * pixelwise + weight * record["d_ssim"] + record.get("pop", 0.0)
@@ -216,8 +217,8 @@ def test_the_target_cache_changes_no_bit(tmp_path):
     losses = []
     for megabytes in (0, 1):
         config = tiny_config(tmp_path, target_cache_mb=megabytes)
-        objective = Objective(config, views, "fast")
-        losses.append([objective(image, i, Phase(0, True, True, True)) for i in (0, 1, 0)])
+        objective = PhotoLoss(config, views, FAST.losses())
+        losses.append([objective(image, i, Objective()) for i in (0, 1, 0)])
         assert len(objective._kept) == (2 if megabytes else 0)
     assert losses[0] == losses[1]
 

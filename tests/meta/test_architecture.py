@@ -23,7 +23,7 @@ ORACLE = [p for p in sorted((ROOT / "pop_ref").glob("*.py")) if p.name != "__ini
 STAGES = {p.stem for p in ORACLE}
 # values without a formula, which every engine takes its defaults from
 VALUES = {"pop_ref.constants", "pop_ref.settings", "pop_ref.recipes"}
-SHARED_WITH_FAST = VALUES | {"pop_ref.notation", "pop_ref.records"}
+SHARED_WITH_FAST = VALUES | {"pop_ref.notation", "pop_ref.records", "pop_ref.registry"}
 # rooms of the program whose work is to show what the oracle does
 SHOW_THE_ORACLE = (
     "pop_fast/view/explain/",

@@ -17,12 +17,13 @@ import torch
 from benchmarks.faults.runs import same
 from pop_fast.api.registry import get_backend
 from pop_fast.compiled import native_step
+from pop_fast.compiled.backend import CompiledBackend
 from pop_fast.data.initialize import initialize_params
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.train import TrainingRun, engines, fused_stepper
+from pop_fast.train import TrainingRun, fused_stepper
 from pop_fast.train import checkpoint as ckpt
-from pop_fast.train.engines import engine_of, native_engine, torch_engine
+from pop_fast.train.engines import engine_of, torch_engine, whole_engine
 from pop_fast.train.model import KEYS
 from pop_fast.train.stepper import Engine
 from tests.app.interruptions import interrupt
@@ -93,7 +94,7 @@ def put_where(run: TrainingRun, other: TrainingRun) -> None:
 
 @pytest.mark.parametrize("what", SETTINGS)
 def test_six_steps_are_torchs(what: str, tmp_path: Path) -> None:
-    mine, its = (run_of(tmp_path, engine, SETTINGS[what]) for engine in (native_engine(), torch_engine("fast")))
+    mine, its = (run_of(tmp_path, engine, SETTINGS[what]) for engine in (whole_engine(), torch_engine("fast")))
     moved = dict.fromkeys(KEYS, 0.0)
     for step in range(STEPS):
         put_where(mine, its)
@@ -124,7 +125,7 @@ def test_the_bits_depend_neither_on_threads_nor_on_how_many_steps_are_asked_for_
     found = []
     for threads, pace in ((1, 1), (2, STEPS), (3, 2), (7, STEPS)):
         torch.set_num_threads(threads)
-        run = run_of(tmp_path, native_engine(), SETTINGS[what])
+        run = run_of(tmp_path, whole_engine(), SETTINGS[what])
         stats = [s[:5] for last in range(pace, STEPS + 1, pace) for s in run.take_steps(last).stats]
         found.append((stats, {key: param.detach().clone() for key, param in run.params.items()}))
     for stats, params in found[1:]:
@@ -140,7 +141,7 @@ def test_a_step_that_is_left_changes_nothing_and_is_taken_by_whoever_goes_on(tmp
         kept += [value.clone() for of in run.optimizers.values() for value in of.state_dict()["state"][0].values()]
         return [*kept, *(run.state[name].clone() for name in ("grad2d", "count", "dominant_sum", "blurred"))]
 
-    whole = run_of(tmp_path, native_engine(), settings)
+    whole = run_of(tmp_path, whole_engine(), settings)
     states, seconds = {}, time.perf_counter()
     for step in range(last):
         whole.take_steps(step + 1)
@@ -148,7 +149,7 @@ def test_a_step_that_is_left_changes_nothing_and_is_taken_by_whoever_goes_on(tmp
     seconds = time.perf_counter() - seconds
     stopped = set()
     for trial in range(12):
-        run = run_of(tmp_path, native_engine(), settings)
+        run = run_of(tmp_path, whole_engine(), settings)
         run.take_steps(1)
         timer = threading.Timer(seconds * trial / 16, run._stop.ask)
         timer.start()
@@ -170,9 +171,10 @@ def test_how_many_steps_are_taken_at_a_time_changes_no_bit(
     method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found: list[dict[str, Any]] = []
+    own = CompiledBackend.whole_step
     for seconds, most in ((0.0, 20), (math.inf, 3), (math.inf, 20)):
         monkeypatch.setattr(fused_stepper, "BLOCK_SECONDS", seconds)
-        monkeypatch.setattr(engines, "MOST_ON_CPU", most)
+        monkeypatch.setattr(CompiledBackend, "whole_step", lambda self, most=most: replace(own(self), most=most))
         folder = tmp_path / f"{seconds}_{most}"
         config = tiny_config(folder, method, backend="compiled", checkpoint_every=0, save_steps=())
         # the sums of the last window are among what is kept
@@ -219,7 +221,7 @@ def test_a_step_whose_lists_cannot_be_numbered_is_told_before_it_is_taken(
     most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(native_step, "MOST_ENTRIES", most)
-    run = run_of(tmp_path, native_engine(), {})
+    run = run_of(tmp_path, whole_engine(), {})
     before = {key: param.detach().clone() for key, param in run.params.items()}
     if most > 10:
         taken(run, 1)
@@ -231,7 +233,7 @@ def test_a_step_whose_lists_cannot_be_numbered_is_told_before_it_is_taken(
 
 
 def test_memory_for_photographs_changes_no_bit(tmp_path: Path) -> None:
-    runs = [run_of(tmp_path, native_engine(), {"target_cache_mb": room}) for room in (0, 1024)]
+    runs = [run_of(tmp_path, whole_engine(), {"target_cache_mb": room}) for room in (0, 1024)]
     first, second = ([stats[:5] for stats in taken(run)] for run in runs)
     assert first == second
 
@@ -244,7 +246,7 @@ def test_photographs_of_several_sizes_are_trained_on(tmp_path: Path) -> None:
     )
     config = tiny_config(tmp_path)
     runs = [
-        TrainingRun(config, replace(capture, views=views), engine=e) for e in (native_engine(), torch_engine("fast"))
+        TrainingRun(config, replace(capture, views=views), engine=e) for e in (whole_engine(), torch_engine("fast"))
     ]
     for found, wanted in zip(*(taken(run, 3) for run in runs), strict=True):
         assert found.objective == pytest.approx(wanted.objective, rel=2e-5)
@@ -253,7 +255,7 @@ def test_photographs_of_several_sizes_are_trained_on(tmp_path: Path) -> None:
 @pytest.mark.parametrize("key", ["means", "scales", "quats", "opacities", "sh0"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_a_row_that_is_not_finite_is_named_and_nothing_moves(key: str, value: float, tmp_path: Path) -> None:
-    run = run_of(tmp_path, native_engine(), {})
+    run = run_of(tmp_path, whole_engine(), {})
     taken(run, 2)
     with torch.no_grad():
         run.params[key].view(len(run.params[key]), -1)[17, 0] = value
@@ -274,7 +276,7 @@ def test_a_run_trains_natively_where_it_can_and_says_so(tmp_path: Path) -> None:
 
 
 def test_a_stepper_takes_rows_on_the_cpu_in_single_precision_only(tmp_path: Path) -> None:
-    run = run_of(tmp_path, native_engine(), {})
+    run = run_of(tmp_path, whole_engine(), {})
     fused: Any = run.stepper
     rows = {key: param.detach() for key, param in run.params.items()}
     with pytest.raises(ValueError, match="must be a contiguous float32 tensor on the CPU"):

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from cuda_ext.train_settings import GROUPS, Phase, StepSettings, steady_updates
 from pop_fast.api.registry import get_backend
 from pop_fast.stages.tiles import TileLists, tile_lists
+from pop_fast.train.schedule import steady_updates
+from pop_fast.train.steps import Phase, StepSettings
 from pop_ref.constants import PAPER
+from pop_ref.settings import PARAMETERS
 
 WIDTH, HEIGHT, TILE, CHUNK = 40, 24, 16, 16
 
@@ -112,7 +114,7 @@ def test_counts_are_those_of_a_walk_through_the_lists() -> None:
     splats, lists = listed(params)
     expected = walked(splats, lists)
     m, v = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))
-    settings = StepSettings(steady_updates(dict.fromkeys(GROUPS, 1e-3), 10), profile=PAPER)
+    settings = StepSettings(steady_updates(dict.fromkeys(PARAMETERS, 1e-3), 10), profile=PAPER)
     trainer = NativeTrainer(params, m, v, [view()], [0] * 10, settings, threads=2)
     assert set(trainer.counts().values()) == {0}
     trainer.run(1, Phase(3, pop=True, statistics=True, blur=True))

@@ -53,7 +53,7 @@ def stand_in_engine(patch: pytest.MonkeyPatch) -> None:
     from pop_fast.train import engines
     from tests.cuda.emulated.engine import emulated_engine
 
-    patch.setattr(engines, "cuda_engine", emulated_engine)
+    patch.setattr(engines, "whole_engine", lambda backend: emulated_engine())
 
 
 def shorten_the_benchmark(patch: pytest.MonkeyPatch) -> None:

@@ -5,9 +5,10 @@ import torch
 
 from cuda_ext.arrays import Settings
 from cuda_ext.render.lists import WARP_TILE, make_lists, splat_struct
-from cuda_ext.train_settings import Phase, StepSettings, steady_updates
 from cuda_ext.training.resident import ResidentViews
 from cuda_ext.training.train_step import FusedTrainer
+from pop_fast.train.schedule import steady_updates
+from pop_fast.train.steps import Phase, StepSettings
 from pop_ref.constants import PAPER
 
 WIDTH, HEIGHT = 90, 50

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from cuda_ext.host import emulate
-from cuda_ext.train_settings import Phase
 from pop_fast.density.passes import Passes
+from pop_fast.train.steps import Phase
 from tests.cuda.gpu.scene import HEIGHT, STEPS, WIDTH, training_scene
 from tests.cuda.gpu.steps import fused_trainer
 from tests.fast.pass_scenes import raw_params, views

@@ -85,6 +85,6 @@ def gpu() -> Any:
 @pytest.fixture
 def engine(gpu: Any) -> Any:
     """Return the GPU as `pop train` finds it, or skip with the reason why there is none."""
-    from pop_fast.train.engines import cuda_engine
+    from pop_fast.train.engines import whole_engine
 
-    return cuda_engine()
+    return whole_engine("cuda")

@@ -12,9 +12,10 @@ THETA = 0.02
 
 def fused_trainer(scene: TrainingScene, device, masks=None, **options):
     """Return rows (parameters and moments) and the trainer of them."""
-    from cuda_ext.train_settings import StepSettings, steady_updates
     from cuda_ext.training.resident import ResidentViews
     from cuda_ext.training.train_step import FusedTrainer
+    from pop_fast.train.schedule import steady_updates
+    from pop_fast.train.steps import StepSettings
 
     params = {name: value.to(device).clone() for name, value in scene.params.items()}
     m, v = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))
@@ -25,7 +26,7 @@ def fused_trainer(scene: TrainingScene, device, masks=None, **options):
 
 def fused(scene: TrainingScene, device, window: bool = False, **options):
     """Take the steps of one phase; return objectives, parameters and the trainer."""
-    from cuda_ext.train_settings import Phase
+    from pop_fast.train.steps import Phase
 
     (params, _, _), trainer = fused_trainer(scene, device, **options)
     losses = []

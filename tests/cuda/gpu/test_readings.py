@@ -27,7 +27,7 @@ def test_ten_fused_steps_under_another_reading_are_the_cpus(gpu, reading, backwa
     losses, params, trainer = fused(scene, gpu, window, backward=backward, theta_blur=THETA, **strong, **reading)
     expected, terms, wanted, state = on_the_cpu(scene, **strong, **reading)
     torch.testing.assert_close(torch.tensor(losses), torch.tensor(expected), rtol=1e-4, atol=1e-6)
-    told = torch.tensor([values.pop for values in trainer.step_stats(0, STEPS)])
+    told = torch.tensor([values[4] for values in trainer.step_stats(0, STEPS)])
     torch.testing.assert_close(told, torch.tensor(terms), rtol=1e-4, atol=1e-6)
     for name, value in wanted.items():
         assert apart(params[name], value, name) < 0.01, name
@@ -44,7 +44,7 @@ def test_ten_fused_steps_under_another_reading_are_the_cpus(gpu, reading, backwa
 
 
 def test_the_share_that_blurs_is_of_the_pixels_that_a_view_keeps(gpu):
-    from cuda_ext.train_settings import Phase
+    from pop_fast.train.steps import Phase
 
     scene = training_scene()
     masks = [None if k % 2 else torch.arange(WIDTH) < WIDTH // 4 for k in range(len(scene.photographs))]

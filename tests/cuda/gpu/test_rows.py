@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 import torch
 
+from pop_ref.settings import Objective
+
 from .scene import HEIGHT, LR, WIDTH, TrainingScene, training_scene
 
 N = 70
@@ -42,15 +44,16 @@ def _moments(
     floats: int = 0,
     settings: Mapping[str, Any] | None = None,
     waits: int = 0,
-    **phase: float,
+    **phase: Any,
 ):
     """Take a step on the device and return Adam's first moments, a tenth of the gradients, and the parameters.
 
     Before it, `waits` steps are taken in which the harmonics beyond the first band take no part.
     """
-    from cuda_ext.train_settings import Phase, StepSettings, steady_updates
     from cuda_ext.training.resident import ResidentViews
     from cuda_ext.training.train_step import FusedTrainer
+    from pop_fast.train.schedule import steady_updates
+    from pop_fast.train.steps import Phase, StepSettings
 
     params = {name: _moved(value.to(device), floats) for name, value in scene.params.items()}
     m, v = ({name: _moved(torch.zeros_like(value), floats) for name, value in params.items()} for _ in range(2))
@@ -66,7 +69,7 @@ def _moments(
 @pytest.mark.parametrize("scale", [1.0, 1e-3, 1e-6])
 def test_a_first_step_has_the_length_of_the_learning_rate_however_small_the_gradient(gpu, scale):
     # x - lr g / (|g| + eps): with an eps under the root, or of 1e-8, small gradients take small steps
-    found, after = _moments(_scene(15), gpu, 3, settings={"pixelwise_scale": scale}, lambda_ssim=0.0)
+    found, after = _moments(_scene(15), gpu, 3, objective=Objective(pixel_scale=scale, lambda_ssim=0.0))
     smallest = []
     for name, m in found.items():
         g, before = m.double() / 0.1, _scene(15).params[name].double()
