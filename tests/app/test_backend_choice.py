@@ -188,10 +188,10 @@ import resource, sys
 import torch
 from pop_fast.train.environment import keep_freed_memory
 kept = sys.argv[1] == "keep" and keep_freed_memory()
-for _ in range(12):
+for _ in range(6):
     torch.ones(16 << 20)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-for _ in range(10):
+for _ in range(5):
     torch.ones(16 << 20)
 print(int(kept), resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """

@@ -8,7 +8,6 @@ import json
 import re
 import struct
 import sys
-import tempfile
 import tracemalloc
 import zipfile
 import zlib
@@ -20,9 +19,6 @@ import cv2
 import numpy as np
 import pytest
 import zstandard
-from hypothesis import given
-from hypothesis import strategies as st
-from torch import Tensor
 
 from benchmarks.faults.ksplat import ksplat_of
 from pop_fast.data.video import take_frames
@@ -186,19 +182,6 @@ def test_a_damaged_ksplat_is_named(at: int, change: bytes, said: str, tmp_path: 
     assert len(load_splat_file(path).params["means"]) == 12
 
 
-@given(level=st.integers(0, 2), data=st.data())
-def test_a_ksplat_that_lost_or_changed_bytes_is_read_or_refused_by_name(level: int, data: st.DataObject) -> None:
-    whole = ksplat_of(many(5, 3), level, 1)
-    heads = st.one_of(st.integers(0, 47), st.integers(4096, 4138), st.integers(5120, 5162), st.integers(6144, 9999))
-    at = min(data.draw(heads), len(whole) - 1)
-    damaged = whole[:at] if data.draw(st.booleans()) else whole[:at] + bytes([whole[at] ^ 0x55]) + whole[at + 1 :]
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "x.ksplat"
-        path.write_bytes(damaged)
-        found, refusal = read_or_refused(path)
-    assert str(path) in refusal if found is None else all(value.isfinite().all() for value in found.values())
-
-
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
@@ -260,26 +243,6 @@ def changed(change: Callable[[dict[str, Any]], Any]) -> bytes:
 def test_a_damaged_sog_is_named(data: bytes, said: str | None) -> None:
     with pytest.raises(PopError, match=f"x.sog: {said or ''}"):
         FORMATS["sog"].decode(data, Path("x.sog"))
-
-
-@pytest.mark.parametrize("name", FORMATS)
-@given(data=st.data())
-def test_a_file_that_lost_or_changed_bytes_is_read_or_refused_by_name(name: str, data: st.DataObject) -> None:
-    whole = encoded(name, many(5, 3))
-    at = data.draw(st.integers(0, len(whole) - 1))
-    damaged = whole[:at] if data.draw(st.booleans()) else whole[:at] + bytes([whole[at] ^ 0x55]) + whole[at + 1 :]
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"x{FORMATS[name].suffix}"
-        path.write_bytes(damaged)
-        found, refusal = read_or_refused(path)
-    assert str(path) in refusal if found is None else all(value.isfinite().all() for value in found.values())
-
-
-def read_or_refused(path: Path) -> tuple[dict[str, Tensor] | None, str]:
-    try:
-        return load_splat_file(path)[0], ""
-    except PopError as error:
-        return None, str(error)
 
 
 @pytest.mark.parametrize(
@@ -475,6 +438,7 @@ def test_a_video_whose_frames_find_no_room_is_refused(tmp_path: Path, monkeypatc
 
 NOT_JSON = [b"", b"{", b"\xff\xfe", b"[" * 5000, b"1" * 5000]
 NO_OBJECT = [b"[]", b"3", b"null", b'"text"']
+KEYS = ("num_GS", "step", "seconds", "n_blended", "opacity_above_0.9")
 NO_NUMBER = ["text", [], {}, True, 10**400, 1e300]
 
 
@@ -500,8 +464,11 @@ def test_a_record_that_a_kill_cut_off_is_left_out(pop: Pop, result: Path) -> Non
     assert pop("report", result).status == 0
 
 
-@pytest.mark.parametrize("value", NO_NUMBER, ids=range(6))
-@pytest.mark.parametrize("key", ["psnr", "num_GS", "step", "seconds", "n_blended", "opacity_above_0.9"])
+# every value under one key, and one value under every other
+ODD = [*(("psnr", value) for value in NO_NUMBER), *((key, "text") for key in KEYS)]
+
+
+@pytest.mark.parametrize(("key", "value"), ODD, ids=range(len(ODD)))
 def test_a_number_that_is_none_is_named(pop: Pop, result: Path, key: str, value: Any) -> None:
     path = result / "stats" / "val_step0029.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
