@@ -21,6 +21,7 @@ $(STAMP): pyproject.toml pop_ref/pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet $(TORCH)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e ./pop_ref -e '.[dev]'
 	@touch $@
+	@echo "pop is $(BIN)/pop; 'source $(BIN)/activate' puts it on the path"
 
 demo: setup  ## write the demo capture, train POP on it, leave report.html, PLY, renders and metrics in out/demo
 	$(BIN)/pop demo out/demo_capture --overwrite
@@ -40,7 +41,6 @@ repro: setup  ## train every row of the paper at toy scale (minutes), leave its 
 site: demo walkthrough  ## build docs/, the walk-through and the demo's report as one site into out/site
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
 	$(BIN)/mkdocs build --strict --quiet
-	cp -r out/walkthrough out/site/learn
 	mkdir -p out/site/demo && cp out/demo/report.html out/site/demo/
 	@echo "open out/site/index.html"
 
@@ -88,7 +88,8 @@ sass: setup  ## count the kernels' machine instructions into benchmarks (needs n
 	$(BIN)/python benchmarks/gpu_predictions.py --write
 
 emulate: setup  ## run the CUDA kernels' own source on the host, warp by warp: every law, training steps (minutes)
-	POP_EMULATED_LAWS=1 POP_CUDA_KINDS="pixel_parallel atomics gaussian_parallel" $(BIN)/python -m pytest -q tests/cuda/emulated
+	POP_CUDA_ON=emulated POP_EMULATED_LAWS=1 POP_CUDA_KINDS="pixel_parallel atomics gaussian_parallel" \
+		$(BIN)/python -m pytest -q tests/cuda/gpu tests/cuda/emulated
 
 # no environment is made and nothing installed: it runs on a node with a GPU, torch and nvcc, and writes to $$OUT
 gpu-check:  ## JOB=1: build, smoke, times; JOB=2: laws, steps, sanitizer, training on CAPTURES="a b" (needs a GPU)

@@ -50,7 +50,7 @@ class GpuCase:
 
 # the first is the one that times were predicted for: 160,000 visible, 2 million instances of 16 x 8 px tiles, 120
 # evaluated and 35 contributing pairs a pixel. Counted by the emulated kernels, the whole of it: 157,934 visible,
-# 2,004,926 instances, 119.2 and 35.7 pairs; tests/cuda/emulated/test_gpu_cases.py counts a part of it
+# 2,004,926 instances, 119.2 and 35.7 pairs; tests/cuda/emulated/test_gpu_benchmark.py counts a part of it
 CASES = (
     GpuCase("270k_1.6MP", 270_000, 1552, 1032, 1.05),
     GpuCase("1M_1.6MP", 1_000_000, 1552, 1032, 0.55),

@@ -14,10 +14,11 @@ from gpu_floors import Loads
 from gpu_profile import kernel_sums
 from torch import Tensor
 
-from cuda_ext.train_settings import Phase, StepSettings, steady_updates
 from cuda_ext.training import step_program
 from cuda_ext.training.resident import ResidentViews
 from cuda_ext.training.train_step import FusedTrainer
+from pop_fast.train.schedule import steady_updates
+from pop_fast.train.steps import Phase, StepSettings
 
 PLAIN, POP = Phase(3, False, False, False), Phase(3, True, True, True)
 # what a step launches, in order (`StepProgram.launch`)

@@ -25,11 +25,10 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from busy import time_beside
 from cases import RASTER_CASES, STEP_CASES, capture_of
-from gate import gate
 from memory import measure
 from parts import floors
 from peak import LARGEST, bytes_per_s, vector_ops_per_s
-from raster import backends, blend_of, time_raster
+from raster import backends, blend_of, gate, time_raster
 from record import commit, machine, read_json, write_json
 from startup import time_startup
 from steps import capture_runs, engines, first_view, run_of, run_of_case, stepping, time_capture, time_case

@@ -70,7 +70,7 @@ def first_view(training: Any, capture: Capture) -> Rendered:
 
 def take_turn(training: Any, steps: int, threads: int) -> None:
     """Take steps of a run as its own loop does, with so many threads; 0 leaves their number as it is."""
-    from pop_fast.train.phases import segment_end
+    from pop_fast.train.schedule import segment_end
 
     if threads > 0:
         torch.set_num_threads(threads)
@@ -81,10 +81,10 @@ def take_turn(training: Any, steps: int, threads: int) -> None:
 
 
 def _engine(name: str) -> Any:
-    from pop_fast.train.engines import native_engine, torch_engine
+    from pop_fast.train.engines import torch_engine, whole_engine
 
     if name == "native":
-        return native_engine()
+        return whole_engine()
     return torch_engine("compiled" if name == "compiled" else "fast")
 
 

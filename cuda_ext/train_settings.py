@@ -1,160 +1,84 @@
-"""What a training step that runs as a whole depends on, and what it reports: to records and to density control."""
+"""What the step on a GPU reads of a run, as whoever trains with it has it; `pop_fast.train.steps` explains each."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from pop_ref.constants import Profile
-from pop_ref.settings import BETAS, EPS, DensityConfig, Recipe
-
-# in the kernels' order (csrc/train.h)
-GROUPS = ("means", "scales", "quats", "opacities", "sh0", "shN")
+from pop_ref.settings import Objective
 
 
-class Updates(NamedTuple):
-    """Whom Adam moves at every step of a schedule, and how far: meaning in `pop_ref.optimizer`.
-
-    Attributes:
-        rates: learning rates, that of the means in world units. [steps, groups] float64
-        numbers: the number of the update, from 1, that the bias corrections are of; 0 where a parameter is not moved.
-            [steps, groups] int32
-        sh_rest_every: gradients of the bands beyond the first are summed up from one update to the next if it is > 1;
-            else those of a step without an update are lost, as all other parameters' are.
-    """
-
-    rates: Tensor
-    numbers: Tensor
-    sh_rest_every: int = 1
-
-    def __len__(self) -> int:
-        return len(self.rates)
-
-
-def steady_updates(lr: Mapping[str, float], steps: int) -> Updates:
-    """Move every parameter at every step, at rates that stay the same.
-
-    Args:
-        lr: learning rate by parameter.
-        steps: length of the schedule.
-    """
-    rates = torch.tensor([[lr[name] for name in GROUPS]], dtype=torch.float64).repeat(steps, 1)
-    numbers = torch.arange(1, steps + 1, dtype=torch.int32)[:, None].repeat(1, len(GROUPS))
-    return Updates(rates, numbers)
-
-
-@dataclass(frozen=True)
-class StepSettings:
-    """What the objective and the update depend on.
-
-    Attributes:
-        updates: whom Adam moves at which step.
-        padding: SSIM's border, "valid" or "same".
-        d_ssim_halved: (1 - SSIM) / 2 instead of 1 - SSIM.
-        pixelwise_scale: multiplies the L1 or L2 term.
-        lambda_pop: weight of the POP term where it is on.
-        lambda_entropy: weight of the mean entropy of the opacities where it is on; the step on a GPU has no such term.
-        pop_views: who dominates a pixel of the "current" view is important, or of any view of the "window".
-        pop_over: the POP term averages over "all" Gaussians, or over those "visible" in the view.
-        blur_window: under "any_view" a blur flag stays up, under "own_view" it is the last view's alone, under "sum"
-            the caller makes it of the summed counts.
-        theta_blur: share of the image a Gaussian must dominate to be blurred.
-        blur_min_pixels: and at least so many pixels.
-        background: colour behind everything.
-        profile, antialiased, backward, deterministic: as `cuda_ext.arrays.Settings` says.
-        betas, eps: Adam's.
-        replay: replay steps as CUDA graphs; False launches every kernel anew, for debuggers and profilers.
-        counts: also tell how many splats every pixel blends and visits, which training does not read.
-    """
-
-    updates: Updates
-    padding: str = Recipe.padding
-    d_ssim_halved: bool = Recipe.d_ssim_halved
-    pixelwise_scale: float = Recipe.pixel_scale
-    lambda_pop: float = Recipe.lambda_pop
-    lambda_entropy: float = Recipe.lambda_entropy
-    pop_views: str = Recipe.pop_views
-    pop_over: str = Recipe.pop_over
-    blur_window: str = DensityConfig.blur_window
-    theta_blur: float = DensityConfig.theta_blur
-    blur_min_pixels: float = DensityConfig.blur_min_pixels
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    profile: Profile = Recipe.profile
-    antialiased: bool = False
-    backward: str = "pixel_parallel"
-    deterministic: bool = True
-    betas: tuple[float, float] = BETAS
-    eps: float = EPS
-    replay: bool = True
-    counts: bool = False
-
-    def blur_pixels(self, kept_pixels: int) -> float:
-        """Return the whole number of pixels that a blurred Gaussian dominates more than, of a view's that count."""
-        # counts are whole, so that rounding down changes no comparison and a float holds the bound exactly
-        return float(math.floor(max(self.theta_blur * kept_pixels, self.blur_min_pixels)))
-
-
-class Phase(NamedTuple):
-    """What one kind of step does; steps of one phase and one image size share a graph.
-
-    Attributes:
-        sh_degree: highest active colour band.
-        pop: the POP term is on.
-        statistics: screen gradients are collected.
-        blur: dominant pixels are collected.
-        l1: L1 instead of L2.
-        lambda_ssim: weight of D-SSIM; the rest, to 1, is that of L1 or L2.
-        window: dominant pixels are summed over the window for the POP term, also where blur is not asked for.
-        entropy: the entropy of the opacities is in the loss.
-    """
-
-    sh_degree: int
-    pop: bool
-    statistics: bool
-    blur: bool
-    l1: bool = False
-    lambda_ssim: float = Recipe.lambda_ssim
-    window: bool = False
-    entropy: bool = False
+class Updates(Protocol):
+    """Learning rates and numbers of Adam's updates, [steps, parameters] each."""
 
     @property
-    def dominance(self) -> bool:
-        """Whether dominant Gaussians are asked for."""
-        return self.pop or self.blur or self.window
+    def rates(self) -> Tensor: ...
+    @property
+    def numbers(self) -> Tensor: ...
+    @property
+    def sh_rest_every(self) -> int: ...
 
 
-class StepStats(NamedTuple):
-    """Measurements of one step, the first five in the kernels' order (csrc/train.h).
+class StepSettings(Protocol):
+    """What stays the same over a run."""
 
-    An engine need not measure all of them at every step; NaN stands for what it has not measured.
+    @property
+    def updates(self) -> Updates: ...
+    @property
+    def lambda_pop(self) -> float: ...
+    @property
+    def pop_views(self) -> str: ...
+    @property
+    def pop_over(self) -> str: ...
+    @property
+    def blur_window(self) -> str: ...
+    @property
+    def background(self) -> tuple[float, float, float]: ...
+    @property
+    def profile(self) -> Profile: ...
+    @property
+    def antialiased(self) -> bool: ...
+    @property
+    def backward(self) -> str: ...
+    @property
+    def deterministic(self) -> bool: ...
+    @property
+    def betas(self) -> tuple[float, float]: ...
+    @property
+    def eps(self) -> float: ...
+    @property
+    def replay(self) -> bool: ...
+    @property
+    def counts(self) -> bool: ...
+    def blur_pixels(self, kept_pixels: int) -> float: ...
 
-    Attributes:
-        pixelwise: mean of the L1 or L2 term, without its weight.
-        ssim: SSIM.
-        objective: the photometric objective.
-        square: mean square of the difference, the render clamped to [0, 1].
-        pop: the weighted regularizer of the strategy, as the POP term is, 0 where it is off.
-        n_blended: Gaussians that a pixel blends, on average.
-        n_traversed: entries of its tile's list that a pixel visits, on average.
-    """
 
-    pixelwise: float
-    ssim: float
-    objective: float
-    square: float
-    pop: float
-    n_blended: float = math.nan
-    n_traversed: float = math.nan
+class Phase(Protocol):
+    """What one kind of step does; hashable."""
+
+    @property
+    def sh_degree(self) -> int: ...
+    @property
+    def pop(self) -> bool: ...
+    @property
+    def statistics(self) -> bool: ...
+    @property
+    def blur(self) -> bool: ...
+    @property
+    def window(self) -> bool: ...
+    @property
+    def dominance(self) -> bool: ...
+    @property
+    def objective(self) -> Objective: ...
 
 
 @dataclass
-class Statistics:
-    """What density control reads, one entry a Gaussian, added to by every step of a phase that collects it.
+class Collected:
+    """What the kernels collect, one entry a Gaussian, until new rows come.
 
     `sh_rest_sum` is Adam's, of the same life: gradients that wait for their update; None where none do. [N, n_rest, 3]
     """
@@ -166,7 +90,7 @@ class Statistics:
     sh_rest_sum: Tensor | None = None
 
     @classmethod
-    def zeros(cls, n: int, device: torch.device, n_rest: int | None = None) -> Statistics:
+    def zeros(cls, n: int, device: torch.device, n_rest: int | None = None) -> Collected:
         """Start from nothing; `n_rest` bands' gradients wait, None for none."""
         visible, dominant = (torch.zeros(n, dtype=torch.int32, device=device) for _ in range(2))
         flags = torch.zeros(n, dtype=torch.uint8, device=device)

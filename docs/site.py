@@ -1,5 +1,7 @@
 """The hook of `make site`: README.md becomes the first page, and every file that a page links to becomes one.
 
+A link to a chapter's script leads to the chapter's page, which `make walkthrough` has made before.
+
 mkdocs calls `on_files` and `on_page_markdown` (https://www.mkdocs.org/user-guide/configuration/#hooks). Links in the
 pages lead to files of the repository, so that they work where it is read; on the site they lead to copies.
 """
@@ -16,13 +18,15 @@ ROOT = Path(__file__).resolve().parents[1]
 LINK = re.compile(r"(\]\()([^)#\s]+)((?:#[^)\s]*)?\))")
 HIGHLIGHTED = {".py": "python", ".cu": "cuda", ".cuh": "cuda", ".toml": "toml", ".json": "json"}
 PICTURES = (".png", ".svg")
-# as HTML, because they are copied to the site after it is built
+# the report as HTML, because it is copied to the site after that is built
 BUILT_ELSEWHERE = """
 ## Built with this site
 
-- <a href="learn/index.html">The walk-through</a>: the algorithm step by step, with pictures and exercises.
+- [The walk-through](learn/index.html): the algorithm step by step, with pictures and exercises.
 - <a href="demo/report.html">The demo's report</a>: what `make demo` leaves.
 """
+CHAPTER = re.compile(r"pop_ref/walkthrough/(chapter_\w+)\.py")
+WALKTHROUGH = ROOT / "out" / "walkthrough"
 FORMULA = re.compile(r"\$([^$\n`|]+)\$")
 
 
@@ -36,6 +40,9 @@ def place(path: str) -> str:
         return "index.md"
     if path.startswith("docs/"):
         return path.removeprefix("docs/")
+    chapter = CHAPTER.fullmatch(path)
+    if chapter:
+        return f"learn/{chapter[1]}.html"
     return f"source/{path}" if path.endswith((".md", *PICTURES)) else f"source/{path}.md"
 
 
@@ -81,7 +88,8 @@ def linked(start: list[str]) -> dict[str, str]:
     waiting = [target for path in start for target in targets((ROOT / path).read_text(encoding="utf-8"), path)]
     while waiting:
         path = waiting.pop()
-        if path in found or path == "README.md" or path.startswith("docs/") or path.endswith(PICTURES):
+        elsewhere = path == "README.md" or path.startswith("docs/") or CHAPTER.fullmatch(path)
+        if path in found or elsewhere or path.endswith(PICTURES):
             continue
         found[path] = content(path)
         if path.endswith(".md"):
@@ -106,8 +114,25 @@ def with_formulas(text: str) -> str:
     return FORMULA.sub(lambda formula: str(convert(formula[1])), text)
 
 
+def walkthrough() -> dict[str, bytes]:
+    """Give place and content of every file of the walk-through; its pages lead back to the site.
+
+    Raises:
+        FileNotFoundError: it has not been built.
+    """
+    if not (WALKTHROUGH / "index.html").is_file():
+        raise FileNotFoundError(f"{WALKTHROUGH} has no index.html; run 'make walkthrough' first")
+    found = {}
+    for file in sorted(each for each in WALKTHROUGH.rglob("*") if each.is_file()):
+        path, content = file.relative_to(WALKTHROUGH).as_posix(), file.read_bytes()
+        up = "../" * (1 + path.count("/"))
+        home = f'<main><nav><a href="{up}index.html">pop-splatting</a><a href="{up}learn.html">Learn</a></nav>'
+        found[f"learn/{path}"] = content.replace(b"<main>", home.encode(), 1)
+    return found
+
+
 def on_files(files: Any, config: Any) -> Any:
-    """Add README.md and all that is linked to."""
+    """Add README.md, the walk-through, and all that is linked to."""
     from mkdocs.structure.files import File
 
     pages = ["README.md", *(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md"))]
@@ -116,6 +141,8 @@ def on_files(files: Any, config: Any) -> Any:
     files.append(File.generated(config, "index.md", content=texts["README.md"] + BUILT_ELSEWHERE))
     for path, text in made.items():
         files.append(File.generated(config, place(path), content=text))
+    for place_of_page, page in walkthrough().items():
+        files.append(File.generated(config, place_of_page, content=page))
     for path in pictures({**texts, **made}):
         files.append(File.generated(config, place(path), abs_src_path=str(ROOT / path)))
     return files

@@ -264,7 +264,7 @@ def kit() -> str:
     where = f"[{MUTANT_LIST.name}]({MUTANT_LIST.relative_to(ROOT).as_posix()})"
     return (
         f"{len(every_law())} laws in {len(LAW_STAGES)} stages; {len(MUTANTS)} mutants of the oracle and {len(PROGRAM)} "
-        f"of the program that trains, and {len(BLACK_BOXES)} rasterizers with one argument broken, every one of them "
+        f"of the program that trains, and {len(BLACK_BOXES)} rasterizers that break arguments, every one of them "
         f"killed by a named law within the `ci` profile: {where}."
     )
 
@@ -330,8 +330,8 @@ BOX_HEAD = """
 
 ## Behind gsplat's signature
 
-{n} rasterizers that draw one small view rightly and break one argument around it, judged as any `--rasterizer` is: by
-what they return alone. {n} of {n} are killed.
+{n} rasterizers that draw one small view rightly and break one argument around it, or two together, judged as any
+`--rasterizer` is: by what they return alone. {n} of {n} are killed.
 
 """
 

@@ -6,8 +6,6 @@ defaults of a method (`DensityControl.scaled`), so that "blur from 3,000 to 4,00
 
 from __future__ import annotations
 
-import contextlib
-import io
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -181,28 +179,25 @@ def _whole(job: Job) -> TrainConfig:
     if missing is not None:
         raise NotTrainableError(missing)
     try:
-        return _parsed(tuple(job.words()))
-    except (SystemExit, PopError) as error:
-        reason = f": {error}" if isinstance(error, PopError) else ""
+        return _whole_of(job.row.method, job.row.options_for(job.scene))
+    except PopError as error:
         words = " ".join(job.words())
         raise NotTrainableError(
-            f"row {job.row.name}: this version of pop train does not take {words}{reason}"
+            f"row {job.row.name}: this version of pop train does not take {words}: {error}"
         ) from error
 
 
 @lru_cache
-def _parsed(words: tuple[str, ...]) -> TrainConfig:
-    from pop_fast.cli.train import arguments
+def _whole_of(method: str, options: tuple[str, ...]) -> TrainConfig:
+    from pop_fast.train import TrainConfig
 
-    # what the parser prints about a word that it does not know says no more than the words do
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        return arguments(["capture", "--out", "out", *words])[0]
+    return TrainConfig.from_options(options, method=method)
 
 
 def _scaled(whole: TrainConfig, scaler: float) -> dict[str, Any]:
     """Return what a row's options say, its step numbers as they are on a schedule `scaler` times as long."""
     given = whole.given
-    said = {} if given is None else {n: v for n, v in given.settings.items() if n not in ("data", "result_dir")}
+    said = {} if given is None else dict(given.settings)
     scaled = whole.strategy.scaled(scaler)
     for name, value in said.items():
         group, dot, field = name.partition(".")

@@ -16,18 +16,23 @@ from typing import Any, Final
 
 from paper_repro.scenes import DATASETS, SCENES, Scene
 from pop_fast.errors import PopError
+from pop_ref.registry import Registry
 
-__all__ = ["CONFIGS", "ROWS", "Row", "header_of", "load_row", "load_rows"]
+__all__ = ["CONFIGS", "ROWS", "Row", "added_rows", "header_of", "load_row", "load_rows"]
 
 CONFIGS: Final = Path(__file__).resolve().parent / "configs"
 # in the order of the tables; what they hold is in the files
-ROWS: Final = (
+_OWN: Final = (
     *("3dgs", "3dgs_2023", "gsplat", "pup", "pup_star", "mini_splatting", "mini_splatting_star"),
     *("taming", "speedy_splat", "pop"),
     *("l2", "l2_blur", "l2_pop", "reset", "blur_3k_4k", "blur_3k_11k", "blur_3k_15k"),
     *("l2_without_ssim", *(f"l1_div_{n}" for n in (1, 2, 5, 10, 20, 50, 100))),
     *("final_prune", "opacity_entropy"),
     *("pop_visible", "pop_any_view", "l2_blur_any_view", "pop_sum", "pop_size_prune", "pop_prune_002"),
+)
+# another package adds a row as the path of its file, under the entry point group or with `ROWS.register`
+ROWS: Final[Registry[Path]] = Registry(
+    "row", "pop_splatting.rows", {name: CONFIGS / f"{name}.toml" for name in _OWN}, needs=("read_text",), error=PopError
 )
 # floats of one Gaussian in the files whose size the tables give: gsplat's checkpoint, and Inria's PLY with its normals
 _BYTES: Final = (236, 248)
@@ -76,7 +81,7 @@ def load_row(name: str, folder: Path = CONFIGS) -> Row:
     Raises:
         PopError: there is no such row, or its file is not TOML, or a field is absent, unknown or of the wrong type.
     """
-    path = folder / f"{name}.toml"
+    path = _file_of(name, folder)
     if not path.is_file():
         raise PopError(f"row is '{name}'; it must be one of {', '.join(ROWS)}")
     try:
@@ -92,6 +97,15 @@ def load_row(name: str, folder: Path = CONFIGS) -> Row:
     return _checked(name, path, {"scenes": {}, **found})
 
 
+def added_rows() -> list[Row]:
+    """Read the rows of other packages."""
+    return [load_row(name) for name in ROWS if name not in _OWN]
+
+
+def _file_of(name: str, folder: Path) -> Path:
+    return ROWS[name] if name not in _OWN and name in ROWS else folder / f"{name}.toml"
+
+
 def load_rows(folder: Path = CONFIGS) -> list[Row]:
     """Read every row, in the order of the tables."""
     return [load_row(name, folder) for name in ROWS]
@@ -103,7 +117,7 @@ def header_of(name: str, folder: Path = CONFIGS) -> dict[str, str]:
     Raises:
         PopError: one of the three is absent.
     """
-    path = folder / f"{name}.toml"
+    path = _file_of(name, folder)
     found: dict[str, str] = {}
     for line in path.read_text(encoding="utf-8").splitlines():
         if not line.startswith("#"):

@@ -20,7 +20,7 @@ from paper_repro.evidence import DATASETS, JUDGE, Claim
 from paper_repro.paper import paper
 from paper_repro.results import RESULTS, SCALES, Result, read_all
 from paper_repro.table_markdown import grid
-from paper_repro.tables import BEYOND, SCENES_OF
+from paper_repro.tables import SCENES_OF, beyond_rows
 from pop_fast.errors import PopError
 from pop_ref.ambiguities import AMBIGUITIES
 
@@ -49,8 +49,8 @@ def status_table(results: Iterable[Result]) -> str:
                 _commits(used),
             ]
         )
-    used = [r for r in found if r.row in BEYOND and r.row != "pop"]
-    progress = _progress([row for row in BEYOND if row != "pop"], DATASETS, used)
+    used = [r for r in found if r.row in beyond_rows() and r.row != "pop"]
+    progress = _progress([row for row in beyond_rows() if row != "pop"], DATASETS, used)
     rows.append(
         ["beyond the paper", "not in the paper", progress, "`pop-repro table beyond --scale small`", _commits(used)]
     )

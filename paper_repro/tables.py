@@ -15,10 +15,23 @@ from typing import Final
 from paper_repro.checks import places
 from paper_repro.paper import Metric, NotComparable, Paper, PaperTable, paper
 from paper_repro.results import Result
+from paper_repro.rows import added_rows
 from paper_repro.scales import SCALES
 from pop_fast.errors import PopError
 
-__all__ = ["BEYOND", "REFERENCES", "SCENES_OF", "Block", "Cell", "Line", "Table", "beyond", "setting", "table"]
+__all__ = [
+    "BEYOND",
+    "REFERENCES",
+    "SCENES_OF",
+    "Block",
+    "Cell",
+    "Line",
+    "Table",
+    "beyond",
+    "beyond_rows",
+    "setting",
+    "table",
+]
 
 # what a scale is meant to train; results of further scenes are shown too
 SCENES_OF: Final = {name: tuple(scale.factors) for name, scale in SCALES.items() if name != "paper"}
@@ -154,6 +167,11 @@ def table(number: int, scale: str, results: Iterable[Result], absent: Iterable[s
     )
 
 
+def beyond_rows() -> dict[str, str]:
+    """Return what goes beyond the paper, by row: ours, and the rows of other packages."""
+    return BEYOND | {row.name: row.title for row in added_rows()}
+
+
 def beyond(scale: str, results: Iterable[Result], absent: Iterable[str] = ()) -> Table:
     """Make the table of what goes beyond the paper: PSNR against bytes, beside the paper's method.
 
@@ -161,13 +179,14 @@ def beyond(scale: str, results: Iterable[Result], absent: Iterable[str] = ()) ->
         PopError: there is no such scale.
     """
     published = paper()
-    found = [r for r in _of_scale(scale, results) if r.row in BEYOND]
+    rows = beyond_rows()
+    found = [r for r in _of_scale(scale, results) if r.row in rows]
     metrics = tuple(published.metrics.values())
     groups = _groups(scale, found, published.datasets)
     blocks = []
     for title, scenes in groups.items():
         make = _Maker(published, None, scale, title, scenes, frozenset(absent))
-        lines = [make.line(row, name, found) for row, name in BEYOND.items()]
+        lines = [make.line(row, name, found) for row, name in rows.items()]
         blocks.append(Block(_titled(title, scale, found), _placed(lines, metrics, 1)))
     return Table("beyond", scale, "Beyond the paper", _header(scale, found), metrics, tuple(blocks), None, {})
 

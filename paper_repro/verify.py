@@ -26,6 +26,7 @@ from paper_repro.jobs import Job
 from paper_repro.published import file_hash, ply_of
 from paper_repro.record import Result
 from paper_repro.train_row import Options
+from pop_fast.api.registry import backend_names, get_backend
 from pop_fast.children import python_command
 from pop_fast.errors import PopError
 from pop_fast.machine import machine_name, processor_kind
@@ -269,7 +270,10 @@ def _within(name: str, now: float, then: float) -> bool:
 def _backend_of(result: Result) -> str:
     """Return the backend that takes the steps as a result's engine did."""
     by_autograd = re.fullmatch(r"torch \((.+)\)", result.engine)
-    return by_autograd[1] if by_autograd else {"native": "compiled", "cuda": "cuda"}.get(result.engine, "auto")
+    if by_autograd:
+        return by_autograd[1]
+    steps = {name: get_backend(name).whole_step() for name in backend_names()}
+    return next((name for name, step in steps.items() if step is not None and step.name == result.engine), "auto")
 
 
 def _environment(clone: Path, threads: int) -> Mapping[str, str]:

@@ -35,7 +35,7 @@ class Ambiguity:
 
 _CONFIG: Final = "pop_ref.settings:DensityConfig"
 _TERM: Final = "pop_ref.settings:PopTerm"
-_PHOTOMETRIC: Final = "pop_ref.settings:Photometric"
+_PHOTOMETRIC: Final = "pop_ref.settings:Objective"
 _RECIPE: Final = "pop_ref.settings:Recipe"
 _RECIPES: Final = "pop_ref.recipes:RECIPES"
 
@@ -170,7 +170,7 @@ AMBIGUITIES: Final = (
         "H",
         "Does the L2 loss stay after 15k?",
         "yes, only POP is said to end",
-        _PHOTOMETRIC,
+        "pop_ref.settings:Recipe",
         ("Recipe.l2_stop_iter = 15000",),
     ),
     Ambiguity("A21", "L", "Do learning rates change with the L2 loss?", "no", "pop_ref.optimizer:learning_rates"),

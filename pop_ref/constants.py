@@ -27,6 +27,8 @@ from typing import Final, Literal
 
 import numpy as np
 
+from pop_ref.registry import Registry
+
 DECISIONS: Final = {
     "D1": "near plane: is the centre in front of it",
     "D2": "extent and cull: how far a splat reaches, and whether it reaches the image",
@@ -150,7 +152,13 @@ INRIA: Final = Profile(
 # Speedy-Splat draws with Inria's constants and lists whatever is bright enough to be seen (SnugBox)
 SPEEDY_SPLAT: Final = replace(INRIA, name="speedy_splat", extent="opacity_aware", extent_sigmas=3.33)
 
-PROFILES: Final = {p.name: p for p in (PAPER, GSPLAT_1_5, GSPLAT_1_6, INRIA, SPEEDY_SPLAT)}
+# other packages add theirs under the entry point group, or with `PROFILES.register`
+PROFILES: Final[Registry[Profile]] = Registry(
+    "profile",
+    "pop_splatting.profiles",
+    {p.name: p for p in (PAPER, GSPLAT_1_5, GSPLAT_1_6, INRIA, SPEEDY_SPLAT)},
+    needs=tuple(field.name for field in fields(Profile)),
+)
 
 # profiles whose near plane is a length of the capture's own world: Inria's family trains in COLMAP's units. In a world
 # that was scaled it lies as many times farther (`TrainConfig.in_world`)
@@ -164,7 +172,7 @@ def profile_named(name: str) -> Profile:
     Departs: nothing.
 
     Args:
-        name: one of "paper", "gsplat_1_5", "gsplat_1_6", "inria", "speedy_splat".
+        name: one of "paper", "gsplat_1_5", "gsplat_1_6", "inria", "speedy_splat", or of another package's.
 
     Returns:
         The profile.
@@ -176,6 +184,4 @@ def profile_named(name: str) -> Profile:
         >>> profile_named("gsplat_1_6").alpha_ceiling
         0.9900000095367432
     """
-    if name not in PROFILES:
-        raise ValueError(f"profile {name!r} is unknown; use one of {', '.join(PROFILES)}")
-    return PROFILES[name]
+    return PROFILES.named(name)

@@ -9,7 +9,7 @@ Sources: POP paper, sections 3 and 4.1; Kerbl et al. 2023 and Inria's code; gspl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from pop_ref.constants import PAPER, Profile
@@ -19,6 +19,8 @@ Padding = Literal["valid", "same"]
 # Adam's, of Inria's and of gsplat's trainer
 BETAS: Final = (0.9, 0.999)
 EPS: Final = 1e-15
+# raw parameters in the order of Adam's groups, which the compiled steps share
+PARAMETERS: Final = ("means", "scales", "quats", "opacities", "sh0", "shN")
 # the last degree of the harmonics, and the loss of 3DGS: 0.8 L1 + 0.2 D-SSIM (eq. 2)
 MAX_SH_DEGREE: Final = 3
 LAMBDA_SSIM_3DGS: Final = 0.2
@@ -131,25 +133,33 @@ class PopTerm:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Photometric:
-    """What a render is compared with its photograph by.
+class Objective:
+    """What a render is compared with its photograph by: `(1 - lambda_ssim) pixel_scale pixelwise + lambda_ssim D-SSIM`.
 
     Attributes:
-        pixelwise: "l2" for eq. 9, "l1" for eq. 2.
+        pixelwise: name of the loss between pixels: "l2" for eq. 9, "l1" for eq. 2.
         pixel_scale: factor on that term (A10, A28).
         lambda_ssim: weight of D-SSIM; the rest, to 1, is the pixelwise term's.
         padding: of SSIM, "valid" as gsplat, "same" as Inria.
         d_ssim_halved: D-SSIM as (1 - SSIM) / 2 instead of 1 - SSIM (A11).
-        l2_stop_iter: step from which eq. 2 with `LAMBDA_SSIM_3DGS` takes over; None never, as only POP is said to stop
-            (A20).
     """
 
-    pixelwise: Literal["l1", "l2"] = "l2"
+    pixelwise: str = "l2"
     pixel_scale: float = 1.0
     lambda_ssim: float = 0.01
     padding: Padding = "valid"
     d_ssim_halved: bool = False
-    l2_stop_iter: int | None = None
+
+    @property
+    def weights(self) -> tuple[float, float]:
+        """Return what the pixelwise term and 1 - SSIM are multiplied by."""
+        return (1.0 - self.lambda_ssim) * self.pixel_scale, self.lambda_ssim * (0.5 if self.d_ssim_halved else 1.0)
+
+    def at(self, step: int, l2_stop_iter: int | None) -> Objective:
+        """Return what a step minimises: eq. 2 with `LAMBDA_SSIM_3DGS` takes over where L2 stops, if it does (A20)."""
+        if l2_stop_iter is None or step < l2_stop_iter:
+            return self
+        return replace(self, pixelwise="l1", lambda_ssim=LAMBDA_SSIM_3DGS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,10 +245,12 @@ INRIA_RATES: Final = LearningRates(opacities=0.025)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recipe(Photometric, PopTerm):
+class Recipe(Objective, PopTerm):
     """What a training minimises, and its schedule; the defaults are POP's.
 
     Attributes:
+        l2_stop_iter: step from which eq. 2 with `LAMBDA_SSIM_3DGS` takes over; None never, as only POP is said to stop
+            (A20).
         density: of the Gaussians.
         lr: learning rates.
         max_steps: length of the training, over which the positions' learning rate decays.
@@ -248,6 +260,7 @@ class Recipe(Photometric, PopTerm):
         adam_restarts: steps after which Adam begins anew, its moments zero: where all Gaussians are replaced.
     """
 
+    l2_stop_iter: int | None = None
     density: DensityConfig = POP
     lr: LearningRates = LearningRates()
     max_steps: int = 30_000

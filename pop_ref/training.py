@@ -42,7 +42,12 @@ from pop_ref.polarization import importance_mask, opacity_entropy, opacity_entro
 from pop_ref.recipes import RECIPES, Recipe
 from pop_ref.records import Camera, Gaussians, Render
 from pop_ref.render import RenderGradients, render, render_vjp
-from pop_ref.settings import LAMBDA_SSIM_3DGS
+
+# the objective of every pixelwise loss, and its transpose
+_PHOTOMETRIC = {
+    "l1": (losses.photometric_3dgs, losses.photometric_3dgs_vjp),
+    "l2": (losses.photometric_pop, losses.photometric_pop_vjp),
+}
 
 
 @dataclass(frozen=True)
@@ -260,15 +265,10 @@ def objective(
         >>> round(loss, 12), v_opacities.tolist()
         (0.0005, [-0.001])
     """
-    l1_again = recipe.l2_stop_iter is not None and state.step >= recipe.l2_stop_iter
-    lambda_ssim = LAMBDA_SSIM_3DGS if l1_again else recipe.lambda_ssim
-    options = (lambda_ssim, recipe.padding, None, recipe.d_ssim_halved, recipe.pixel_scale)
-    if recipe.pixelwise == "l1" or l1_again:
-        loss = losses.photometric_3dgs(view.image, target, *options)
-        v_image = losses.photometric_3dgs_vjp(view.image, target, 1.0, *options)
-    else:
-        loss = losses.photometric_pop(view.image, target, *options)
-        v_image = losses.photometric_pop_vjp(view.image, target, 1.0, *options)
+    goal = recipe.at(state.step, recipe.l2_stop_iter)
+    options = (goal.lambda_ssim, goal.padding, None, goal.d_ssim_halved, goal.pixel_scale)
+    value, value_vjp = _PHOTOMETRIC[goal.pixelwise]
+    loss, v_image = value(view.image, target, *options), value_vjp(view.image, target, 1.0, *options)
     if not recipe.pop_start_iter <= state.step < recipe.pop_stop_iter:
         return loss, v_image, np.zeros(len(gaussians))
     counts = view.dominant_counts

@@ -87,7 +87,7 @@ EMULATION: Final = "kernels under the emulator"
 EMULATED: Final = (HOST / "emulator.cpp", CUDA_EXT / "bindings.cpp", CUDA_EXT / "bindings_training.cpp")
 # its fibers switch stacks, which AddressSanitizer must not follow
 _EMULATED_FLAGS: Final = "-fsanitize=address --param asan-stack=0"
-_EMULATED_TESTS: Final = tuple(f"tests/cuda/emulated/test_emulated_{name}.py" for name in ("smoke", "ten_steps"))
+_EMULATED_TESTS: Final = tuple(f"tests/cuda/gpu/test_{name}.py" for name in ("smoke", "ten_steps"))
 # Python keeps what it has, and asks for much at once
 _OPTIONS: Final = {
     "ASAN_OPTIONS": "detect_leaks=0:allocator_may_return_null=1",
@@ -203,5 +203,5 @@ def _emulated(compile_first: bool) -> dict[str, Any]:
         return {"about": about, "skipped": reason, "failures": []}
     check, compiler = CHECKS["host mirror"], find_compiler() or []
     words = module_command("pytest", "-q", "-p", "no:cacheprovider", *_EMULATED_TESTS)
-    told, failures = _ran(words, check, compiler, {"POP_EMULATED_FLAGS": _EMULATED_FLAGS})
+    told, failures = _ran(words, check, compiler, {"POP_EMULATED_FLAGS": _EMULATED_FLAGS, "POP_CUDA_ON": "emulated"})
     return {"about": about, "told": told[-1:], "failures": failures}

@@ -13,21 +13,8 @@ from cuda_ext.gpu_check.outcomes import FILE, outcomes
 from cuda_ext.gpu_check.shared import NOTHING, ROOT, Check, skipped
 from pop_fast.children import python_command
 
-LAWS = tuple(f"test_gpu_{name}.py" for name in ("whole", "compositing", "dominance", "gradients", "agreement"))
-STEPS = tuple(
-    f"test_{name}.py"
-    for name in (
-        "ten_steps",
-        "struct_fields",
-        "instances",
-        "readings",
-        "rows",
-        "photometric",
-        "device_training",
-        "oracle_steps",
-        "passes",
-    )
-)
+LAWS = ("test_laws.py",)
+STEPS = tuple(f"test_{name}.py" for name in ("ten_steps", "instances", "rows", "device_training", "passes"))
 SMOKE = tuple(
     f"test_ten_steps.py::test_{name}"
     for name in (
@@ -112,20 +99,15 @@ def _pytest(
     limit: float | None = None,
     over: Mapping[str, str] = NOTHING,
 ) -> dict[str, Any]:
-    """Run tests of the GPU's folder, or of the emulator's twin of it, and add up how they ended."""
-    folder = ROOT / "tests" / "cuda" / ("emulated" if check.rehearsal else "gpu")
-    chosen = [str(folder / (_emulated(test) if check.rehearsal else test)) for test in tests]
+    """Run tests of the GPU's folder, in a rehearsal under the emulator, and add up how they ended."""
+    chosen = [str(ROOT / "tests" / "cuda" / "gpu" / test) for test in tests]
     lines = check.out / f"{name}.jsonl"
     lines.unlink(missing_ok=True)
     words = python_command("-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "cuda_ext.gpu_check.outcomes")
-    over = {"OMP_NUM_THREADS": "1" if check.rehearsal else "4", FILE: str(lines), **over}
+    on = "emulated" if check.rehearsal else "cuda"
+    over = {"OMP_NUM_THREADS": "1" if check.rehearsal else "4", "POP_CUDA_ON": on, FILE: str(lines), **over}
     # interrupted, pytest says what it has seen so far
     found = check.run([*before, *words, *options, *chosen], limit or check.seconds, over, signal.SIGINT)
     found["tests"] = outcomes(lines)
     # without a GPU everything is skipped, which is no pass
     return found | {"status": found["status"] or int(found["tests"]["passed"] == 0)}
-
-
-def _emulated(test: str) -> str:
-    name = test.removeprefix("test_").removeprefix("gpu_").removeprefix("device_")
-    return f"test_emulated_{name}"

@@ -12,7 +12,7 @@ from cuda_ext import load
 from cuda_ext.arrays import STEP, Settings, empty, new_state
 from cuda_ext.render.capacity import Size
 from cuda_ext.render.lists import LOWER, TileBuffers, list_tile
-from cuda_ext.train_settings import Statistics, StepSettings
+from cuda_ext.train_settings import Collected, StepSettings
 from cuda_ext.training.resident import ResidentViews
 
 Rows = Mapping[str, Tensor]
@@ -99,7 +99,7 @@ class RowBuffers:
     params: Rows
     m: Rows
     v: Rows
-    statistics: Statistics
+    statistics: Collected
     splats: dict[str, Tensor]
     records: Tensor
     sums: Tensor
@@ -118,7 +118,7 @@ class RowBuffers:
             dict(params),
             dict(m),
             dict(v),
-            Statistics.zeros(n, device, params["shN"].shape[1] if waits else None),
+            Collected.zeros(n, device, params["shN"].shape[1] if waits else None),
             splats,
             empty("packed splats", LOWER, (rows, kernels.RECORD), device),
             torch.zeros((rows, kernels.RECORD), device=device),
@@ -131,7 +131,7 @@ class RowBuffers:
 
 
 @dataclass(frozen=True)
-class Frame:
+class FrameBuffers:
     """Buffers of one image size for the present number of Gaussians.
 
     Attributes:
@@ -149,7 +149,7 @@ class Frame:
     work: dict[str, Tensor]
 
     @classmethod
-    def make(cls, shared: Shared, n: int, size: Size, capacity: int) -> Frame:
+    def make(cls, shared: Shared, n: int, size: Size, capacity: int) -> FrameBuffers:
         """Allocate for n Gaussians and a capacity of instances.
 
         Raises:

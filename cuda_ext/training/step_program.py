@@ -9,9 +9,10 @@ from torch import Tensor
 from cuda_ext import load
 from cuda_ext.arrays import fill, pointer, stream_of
 from cuda_ext.render.lists import splat_struct
-from cuda_ext.train_settings import GROUPS, Phase
+from cuda_ext.train_settings import Phase
 from cuda_ext.training.resident import MARGIN
-from cuda_ext.training.step_buffers import Frame, RowBuffers, Shared
+from cuda_ext.training.step_buffers import FrameBuffers, RowBuffers, Shared
+from pop_ref.settings import PARAMETERS
 
 
 class StepProgram:
@@ -27,7 +28,7 @@ class StepProgram:
         phase: what the steps do.
     """
 
-    def __init__(self, shared: Shared, rows: RowBuffers, frame: Frame, phase: Phase) -> None:
+    def __init__(self, shared: Shared, rows: RowBuffers, frame: FrameBuffers, phase: Phase) -> None:
         self._shared, self._rows, self._frame, self._phase = shared, rows, frame, phase
         kernels, (width, height) = load(), frame.size
         render = shared.render(frame.size, phase.sh_degree)
@@ -36,7 +37,7 @@ class StepProgram:
         self._splats = fill(splat_struct(**rows.splats, colors=None), records=rows.records)
         self._view = fill(kernels.View(), viewmat=shared.viewmat, K=shared.K, width=width, height=height)
         self._schedule, self._gaussians = _schedule(shared), _gaussians(rows)
-        self._photographs, self._objective = shared.views.photographs(), _objective(shared, phase)
+        self._photographs, self._objective = shared.views.photographs(), _objective(phase)
         self._loss = _loss(shared, frame)
         self._forward, self._backward = _blends(shared, rows, frame, phase)
         self._term = _pop_term(shared, rows, frame, phase) if phase.pop else None
@@ -79,22 +80,22 @@ def _gaussians(rows: RowBuffers) -> Any:
     return made
 
 
-def _objective(shared: Shared, phase: Phase) -> Any:
-    s, weight = shared.settings, phase.lambda_ssim
-    made = fill(load().LossSettings(), pixelwise_weight=(1.0 - weight) * s.pixelwise_scale)
-    made.ssim_weight = weight * (0.5 if s.d_ssim_halved else 1.0)
-    made.margin = MARGIN if s.padding == "valid" else 0
-    made.set_pixelwise(phase.l1)
+def _objective(phase: Phase) -> Any:
+    goal = phase.objective
+    pixel_weight, ssim_weight = goal.weights
+    made = fill(load().LossSettings(), pixelwise_weight=pixel_weight, ssim_weight=ssim_weight)
+    made.margin = MARGIN if goal.padding == "valid" else 0
+    made.set_pixelwise(goal.pixelwise == "l1")
     return made
 
 
-def _loss(shared: Shared, frame: Frame) -> Any:
+def _loss(shared: Shared, frame: FrameBuffers) -> Any:
     work = {name: frame.work[name] for name in ("windows", "partials", "v_image")}
     made = fill(load().LossArrays(), image=frame.image, values=shared.values, **work)
     return fill(made, width=frame.size[0], height=frame.size[1])
 
 
-def _blends(shared: Shared, rows: RowBuffers, frame: Frame, phase: Phase) -> tuple[Any, Any]:
+def _blends(shared: Shared, rows: RowBuffers, frame: FrameBuffers, phase: Phase) -> tuple[Any, Any]:
     kernels, deterministic = load(), shared.settings.deterministic
     passed = {key: frame.work.get(key) for key in ("T_final", "last", "checkpoints")}
     drawn = {"channels": 3, "records": rows.records, "background": shared.background, "image": frame.image, **passed}
@@ -107,7 +108,7 @@ def _blends(shared: Shared, rows: RowBuffers, frame: Frame, phase: Phase) -> tup
     return forward, backward
 
 
-def _pop_term(shared: Shared, rows: RowBuffers, frame: Frame, phase: Phase) -> Any:
+def _pop_term(shared: Shared, rows: RowBuffers, frame: FrameBuffers, phase: Phase) -> Any:
     s = shared.settings
     before: Tensor | None = rows.statistics.dominant_sum if s.pop_views == "window" else None
     shown: Tensor | None = rows.splats["radii"] if s.pop_over == "visible" else None
@@ -117,7 +118,7 @@ def _pop_term(shared: Shared, rows: RowBuffers, frame: Frame, phase: Phase) -> A
     return fill(made, radii=shown, logits=rows.params["opacities"], sides=rows.pop_sides, sums=rows.pop_sums)
 
 
-def _update(shared: Shared, rows: RowBuffers, frame: Frame, phase: Phase) -> Any:
+def _update(shared: Shared, rows: RowBuffers, frame: FrameBuffers, phase: Phase) -> Any:
     s, found = shared.settings, rows.statistics
     made = fill(load().UpdateArrays(), n=len(rows), n_rest=rows.params["shN"].shape[1], sums=rows.sums)
     counts = frame.render_stats["dominant_counts"] if phase.dominance else None
@@ -131,7 +132,7 @@ def _update(shared: Shared, rows: RowBuffers, frame: Frame, phase: Phase) -> Any
         fill(made, blurred=found.blurred, blur_pixels=shared.blur_pixels)
     if phase.blur or phase.window:
         fill(made, dominant_sum=found.dominant_sum)
-    for k, name in enumerate(GROUPS):
+    for k, name in enumerate(PARAMETERS):
         made.set_group(k, *(pointer(name, group[name]) for group in (rows.params, rows.m, rows.v)))
     return made
 

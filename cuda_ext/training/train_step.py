@@ -17,10 +17,10 @@ from torch import Tensor
 
 from cuda_ext.arrays import BAD_ROW, N_INSTANCES, NOT_BAD, OVERFLOW, STEP, VIEW
 from cuda_ext.render.capacity import Capacity, Size
-from cuda_ext.train_settings import Phase, Statistics, StepSettings, StepStats
+from cuda_ext.train_settings import Collected, Phase, StepSettings
 from cuda_ext.training.graphs import Watch, captured
 from cuda_ext.training.resident import ResidentViews
-from cuda_ext.training.step_buffers import Frame, RowBuffers, Shared
+from cuda_ext.training.step_buffers import FrameBuffers, RowBuffers, Shared
 from cuda_ext.training.step_program import StepProgram
 
 LATE = 2  # steps between an overflow and its notice
@@ -72,7 +72,7 @@ class FusedTrainer:
         """Take new rows after a densification step: buffers, statistics and graphs start anew."""
         # what the old number of Gaussians needed goes first, so that old and new need not fit side by side
         self._kinds: dict[tuple[Size, Phase], _Kind] = {}
-        self._frames: dict[Size, Frame] = {}
+        self._frames: dict[Size, FrameBuffers] = {}
         self._rows = None
         self._capacity.settle(len(params["means"]))
         with torch.cuda.device_of(params["means"]):
@@ -103,9 +103,12 @@ class FusedTrainer:
             else:
                 self.step = self._recover()
 
-    def step_stats(self, first: int, last: int) -> list[StepStats]:
-        """Return the measurements of the steps from `first` to before `last`, which `run` must have taken here."""
-        return [StepStats(*row) for row in self._shared.history[first:last].tolist()]
+    def step_stats(self, first: int, last: int) -> list[list[float]]:
+        """Return the measurements of the steps from `first` to before `last`, which `run` must have taken here.
+
+        They are in the order of csrc/train.h: pixelwise loss, SSIM, objective, square, POP term.
+        """
+        return self._shared.history[first:last].tolist()
 
     @property
     def n(self) -> int:
@@ -118,13 +121,13 @@ class FusedTrainer:
         return self._population.params
 
     @property
-    def statistics(self) -> Statistics:
+    def statistics(self) -> Collected:
         """What density control reads; zeros after `rebind`."""
         return self._population.statistics
 
     @property
     def values(self) -> Tensor:
-        """The statistics of the last step, in the order of `StepStats`."""
+        """The statistics of the last step, in the order of csrc/train.h."""
         return self._shared.values
 
     @property
@@ -187,7 +190,7 @@ class FusedTrainer:
             kind.replay = captured(kind.program.launch, self.device)
         kind.replay()
 
-    def _frame(self, size: Size) -> Frame:
+    def _frame(self, size: Size) -> FrameBuffers:
         if size not in self._frames:
-            self._frames[size] = Frame.make(self._shared, self.n, size, self._capacity.room(size))
+            self._frames[size] = FrameBuffers.make(self._shared, self.n, size, self._capacity.room(size))
         return self._frames[size]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from paper_repro.scales import SCALES
+from pop_fast.api.registry import backend_names
 
 __all__ = ["add_backend", "add_data", "add_results", "add_scale", "add_training", "training_words"]
 
@@ -37,7 +38,7 @@ def add_data(parser: argparse.ArgumentParser) -> None:
 
 def add_backend(parser: argparse.ArgumentParser, note: str) -> None:
     """Add --backend."""
-    parser.add_argument("--backend", choices=("auto", "fast", "compiled", "cuda", "ref"), default="auto", help=note)
+    parser.add_argument("--backend", choices=("auto", *backend_names()), default="auto", help=note)
 
 
 def add_training(parser: argparse.ArgumentParser) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, Literal
 
 from paper_repro.figures.style import COLUMN, GREY, SAVED_DPI, SMALL
 from pop_fast.io.atomic import write_atomically
@@ -108,18 +109,31 @@ def save(drawn: Drawn, stem: Path) -> list[Path]:
     formats: tuple[Literal["svg", "png"], ...] = ("svg", "png")
     paths = [stem.with_name(f"{stem.name}.{suffix}") for suffix in (*formats, "csv")]
     for suffix, path in zip(formats, paths, strict=False):
-        # no date: the same numbers are the same bytes
         if suffix == "svg":
-            more: dict[str, Any] = {"metadata": {"Date": None}}
+            write_atomically(path, partial(_write_svg, drawn.figure))
         else:
-            more = {"metadata": {"Software": None}, "pil_kwargs": {"optimize": True}}
-        write_atomically(path, partial(drawn.figure.savefig, format=suffix, **more))
+            more: dict[str, Any] = {"metadata": {"Software": None}, "pil_kwargs": {"optimize": True}}
+            write_atomically(path, partial(drawn.figure.savefig, format=suffix, **more))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(drawn.columns)
     writer.writerows([_cell(value) for value in row] for row in drawn.rows)
     write_atomically(paths[-1], lambda file: file.write(text.getvalue().encode("utf-8")))
     return paths
+
+
+def _write_svg(figure: Any, file: BinaryIO) -> None:
+    """Write a figure as SVG with one line a path, where matplotlib writes one line a point."""
+    drawn = io.StringIO()
+    # no date: the same numbers are the same bytes
+    figure.savefig(drawn, format="svg", metadata={"Date": None})
+    file.write(_compact(drawn.getvalue()).encode("utf-8"))
+
+
+def _compact(text: str) -> str:
+    """Join the lines inside a tag, and leave out what indents tags and what ends groups on lines of their own."""
+    joined = re.sub(r"\s*\n(?!\s*<)", " ", text)
+    return re.sub(r"\n\s*(</|<use|<path|<g>)", r"\1", re.sub(r"\n\s+<", "\n<", joined))
 
 
 def _cell(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What a backend is: a name, whether it can run here, the stages that it draws with, and the engine that trains on it.
+"""What a backend is: a name, whether it can run here, the stages that it draws with, and the whole step if it has one.
 
 `rasterization` checks, gathers and makes `meta` for all of them; a backend supplies what is between. Stages take one
 scene and one camera at a time, and are differentiable.
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pop_fast.stages.compositing import Composite
     from pop_fast.stages.splatting import ProjectionSettings, Splats
     from pop_fast.stages.tiles import TileLists
+    from pop_fast.train.whole_step import WholeStep
 
 
 class ViewStages(Protocol):
@@ -91,6 +92,11 @@ class Renderer(Protocol):
         """Return the backend's name."""
         ...
 
+    @property
+    def device(self) -> Any:
+        """Return where it draws, as `torch.device` takes it."""
+        ...
+
     def available(self) -> bool:
         """Tell whether it can run here."""
         ...
@@ -150,14 +156,6 @@ class Backend(Renderer, Protocol):
         """
         ...
 
-    def make_engine(self, config: Any, own_strategy: bool) -> Any:
-        """Return the engine that takes the steps of a run, a `pop_fast.train.stepper.Engine`.
-
-        Args:
-            config: the settings, a `pop_fast.train.config.TrainConfig`.
-            own_strategy: whether the density strategy is one of this package.
-
-        Raises:
-            PopError: the backend cannot take the steps of these settings.
-        """
+    def whole_step(self) -> WholeStep | None:
+        """Return how it takes a whole training step by itself, or None: autograd over the stages takes them."""
         ...

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from pop_fast.api.backend import Backend
     from pop_fast.api.meta import RenderMeta
+    from pop_fast.train.whole_step import WholeStep
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,10 @@ class BaseBackend:
         from pop_fast.stages import losses
 
         return losses
+
+    def whole_step(self) -> WholeStep | None:
+        """Return None: training takes its steps by autograd over the stages."""
+        return None
 
     def rasterization(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, RenderMeta]:
         """Render; see `pop_fast.api.rasterize.rasterization`.

@@ -1,38 +1,30 @@
-"""Backends by name: "fast" (torch, CPU), "compiled" (C++, CPU), "cuda" (cuda_ext), "ref" (the oracle, slow), and those
-that other packages register under the entry point group `pop_splatting.backends`.
+"""Backends by name: those of this package, which `pop_fast.api` registers, and those of other packages.
 
+Another package declares its own under the entry point group `pop_splatting.backends`, or calls `BACKENDS.register`.
 Which one runs is a value that is passed; nothing is patched, so two can be alive in one process and be compared in one
 assertion. Asking which there are, and why one cannot run, imports no torch.
 """
 
 from __future__ import annotations
 
-import functools
-import importlib
-from importlib.metadata import entry_points
-from typing import Any, Final
+from collections.abc import Iterator
+from typing import Final
 
 from pop_fast.api.backend import Backend
 from pop_fast.errors import PopError
+from pop_ref.registry import Registry
 
-GROUP: Final = "pop_splatting.backends"
-# written as entry points are, and known without an installation: a checkout on the path has all of its own
-OWN: Final = {
-    "fast": "pop_fast.stages.backend:FAST",
-    "compiled": "pop_fast.compiled.backend:COMPILED",
-    "cuda": "pop_fast.cuda.backend:CUDA",
-    "ref": "pop_fast.oracle.backend:REF",
-}
-
-
-def is_own(name: str) -> bool:
-    """Tell whether a backend is one of this package, which needs no look at what is installed."""
-    return name in OWN
+BACKENDS: Final[Registry[Backend]] = Registry(
+    "backend",
+    "pop_splatting.backends",
+    needs=("name", "device", "dtypes", "speed", "lacks", "why_not", "stages", "losses", "open_view", "whole_step"),
+    error=PopError,
+)
 
 
 def backend_names() -> tuple[str, ...]:
     """Return the names that `get_backend` knows."""
-    return (*OWN, *(name for name in _foreign() if name not in OWN))
+    return tuple(BACKENDS)
 
 
 def get_backend(name: str) -> Backend:
@@ -41,9 +33,20 @@ def get_backend(name: str) -> Backend:
     Raises:
         PopError: the name is unknown, or another package registered something under it that cannot be imported.
     """
-    if name not in backend_names():
-        raise PopError(f"backend {name!r} is unknown; use one of {', '.join(backend_names())}")
-    return _loaded(OWN.get(name) or _foreign()[name])
+    return BACKENDS.named(name)
+
+
+def by_speed() -> Iterator[Backend]:
+    """Give the backends that "auto" may take, the fastest first; one that cannot be imported is none."""
+    found: list[tuple[int, Backend]] = []
+    for name in BACKENDS:
+        try:
+            backend = BACKENDS.named(name)
+        except PopError:
+            continue
+        if backend.speed is not None:
+            found.append((backend.speed, backend))
+    yield from (backend for _, backend in sorted(found, key=lambda pair: pair[0], reverse=True))
 
 
 def fastest_backend(device: str) -> Backend:
@@ -55,8 +58,8 @@ def fastest_backend(device: str) -> Backend:
     Raises:
         PopError: none can; says why.
     """
-    known = [b for b in map(get_backend, backend_names()) if b.device == device and b.speed is not None]
-    for backend in sorted(known, key=lambda b: b.speed or 0, reverse=True):
+    known = [backend for backend in by_speed() if backend.device == device]
+    for backend in known:
         if backend.why_not() is None:
             return backend
     reasons = "; ".join(f"backend {b.name!r} cannot run: {b.why_not()}" for b in known)
@@ -74,17 +77,3 @@ def require_backend(name: str) -> Backend:
     if reason is not None:
         raise PopError(f"backend {name!r} cannot run: {reason}")
     return backend
-
-
-@functools.cache
-def _foreign() -> dict[str, str]:
-    return {entry.name: entry.value for entry in entry_points(group=GROUP)}
-
-
-@functools.cache
-def _loaded(path: str) -> Any:
-    module, _, attribute = path.partition(":")
-    try:
-        return getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise PopError(f"the backend at {path} cannot be loaded: {error}") from error

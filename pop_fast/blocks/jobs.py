@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from pop_fast.api.registry import get_backend
 from pop_fast.blocks.plan import FOLDER, Job
 from pop_fast.children import SAFE_PATH, module_command
 from pop_fast.errors import PopError
@@ -169,7 +170,7 @@ def run_workflow(
         job: what was asked for.
         jobs: how many blocks are trained at a time on this machine.
         threads: of a training.
-        backend: what trains; "cuda" asks for a GPU each.
+        backend: what trains; one on a GPU asks for one each.
         profile: a profile's folder, by which it runs on a cluster; None stays here.
         quiet: what it prints is not shown; warnings and errors are.
 
@@ -196,7 +197,7 @@ def workflow_words(
     here = ["--cores", str(each * many), "--resources", "gpu=1", "--nolock"]
     where = here if profile is None else ["--profile", str(profile), "--nolock"]
     command = module_command("snakemake", "-s", str(SNAKEFILE), "--directory", str(place / FOLDER))
-    settings = {"folder": place, "threads": each, "gpus": int(backend == "cuda")}
+    settings = {"folder": place, "threads": each, "gpus": int(get_backend(backend).device != "cpu")}
     return [*command, *where, *more, "--config", *(f"{name}={value}" for name, value in settings.items())]
 
 

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import tyro
 
 from pop_fast.cli.arguments import parse
 
 _EXAMPLES: Final = """
-    pop learn start mine           write twelve files to fill in
+    pop learn start mine           write thirteen files to fill in
     pop learn check alpha          judge one of them, in seconds
+    pop learn check --all          judge all of them, with a score; --json for a program that reads it
     pop learn map                  the pipeline, and the picture that it draws as it stands
     pop learn train                when all is written: train with your own code
+    pop learn train --picture me.jpg
+    pop learn class submissions    a table of a class, one folder a student
 """
 
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
@@ -23,7 +27,7 @@ Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """Write twelve modules, one a stage, in which every function is yours to write; nothing is written over."""
+    """Write thirteen modules, one a stage, in which every function is yours to write; nothing is written over."""
 
     folder: Folder = Path("mine")
     """Where."""
@@ -31,14 +35,18 @@ class Start:
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """Judge a stage. Exit status 0 when it has passed, 1 when not yet."""
+    """Judge a stage, or all of them. Exit status 0 when it has passed, 1 when not yet."""
 
-    stage: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STAGE")]
-    """A file's name without .py: alpha, covariance, ..."""
+    stage: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STAGE")] = ""
+    """A file's name without .py: alpha, covariance, ...; with --all it is left out."""
     folder: Folder = Path("mine")
     """Your files."""
     answer: bool = False
     """Show the oracle's code: at once if the stage has passed, else when asked for the second time."""
+    all: bool = False
+    """Judge every stage, and count the functions that are right."""
+    json: bool = False
+    """With --all: print one object for a program to read."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,14 +61,30 @@ class Map:
 
 @dataclass(frozen=True, kw_only=True)
 class Train:
-    """Train a small scene with your own code, when all of it is written."""
+    """Train at 64 px with your own code, when all of it is written: the toy, or what you give."""
 
     folder: Folder = Path("mine")
     """Your files."""
-    steps: int = 60
-    """How many."""
+    picture: Path | None = None
+    """A picture to fit instead of the toy; its middle square is taken."""
+    scene: Path | None = None
+    """A capture to fit instead of the toy: a folder with photographs and cameras, as `pop train` takes it."""
+    steps: int = 120
+    """How many; the usual number takes some minutes in plain NumPy."""
     out: Path | None = None
-    """Photograph and render side by side; DIR/trained.png if not given."""
+    """Photograph and render side by side; DIR/trained.png if not given. Beside it a film, which browsers play."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Class:
+    """Grade a class, every submission in a process of its own; a submission is a program and runs with your rights."""
+
+    folder: Folder
+    """One folder a student in it, each with files of the course."""
+    seconds: float = 300.0
+    """How long one submission may take."""
+    out: Path | None = None
+    """The table as markdown; DIR/report.md if not given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,18 +96,88 @@ class Args:
         | Annotated[Check, tyro.conf.subcommand("check")]
         | Annotated[Map, tyro.conf.subcommand("map")]
         | Annotated[Train, tyro.conf.subcommand("train")]
+        | Annotated[Class, tyro.conf.subcommand("class")]
     ]
 
 
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     action = parse(Args, argv, "learn", examples=_EXAMPLES).action
+    if isinstance(action, Class):
+        return _class(action)
     from pop_ref.learn import __main__ as course
 
     if isinstance(action, Start):
         return course.write_stubs(action.folder)
-    if isinstance(action, Check):
-        return course.check(action.stage, action.folder, action.answer)
     if isinstance(action, Map):
         return course.show_map(action.folder, action.out)
-    return course.train_work(action.folder, action.steps, action.out)
+    if isinstance(action, Train):
+        return course.train_work(action.folder, _subject(action), action.steps, action.out)
+    if action.all:
+        # what stands first is the folder, as no stage is named
+        return course.check_all(Path(action.stage) if action.stage else action.folder, action.json)
+    if action.json:
+        raise ValueError("--json belongs to --all: pop learn check --all --json")
+    return course.check(action.stage, action.folder, action.answer)
+
+
+def _class(args: Class) -> int:
+    from pop_ref.learn import needs_of_judging
+
+    needs_of_judging()
+    from pop_fast.io.atomic import file_atomically
+    from pop_ref.learn.grading import class_report, submissions
+
+    grades = []
+    for folder in submissions(args.folder):
+        grades.append((folder.name, _graded_apart(folder, args.seconds)))
+        print(f"{folder.name}: {grades[-1][1].get('stopped') or grades[-1][1]['score']}", flush=True)
+    out = args.out or args.folder / "report.md"
+    with file_atomically(out) as beside:
+        beside.write_text(class_report(grades), encoding="utf-8")
+    print(f"the class -> {out}")
+    return 0
+
+
+def _graded_apart(folder: Path, seconds: float) -> dict[str, Any]:
+    """Grade a submission in a process of its own, which may take so long."""
+    from pop_fast.children import module_command
+    from pop_ref.learn.grading import read_grade, stopped
+
+    command = module_command("pop_ref.learn.grading", str(folder))
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=seconds)
+    except subprocess.TimeoutExpired:
+        return stopped(f"it runs for longer than {seconds:g} s; is there an endless loop?")
+    grade = read_grade(done.stdout)
+    if grade is not None:
+        return grade
+    if done.returncode == 0:
+        return stopped("what it prints cannot be told from a grade")
+    last = (done.stderr.strip().splitlines() or [""])[-1]
+    return stopped(f"it ended with status {done.returncode}: {last}".rstrip(": "))
+
+
+def _subject(args: Train):
+    """Read what is trained on, made small."""
+    from pop_ref.learn.training import SIZE, a_capture, a_picture, shrunk, the_toy
+
+    if args.picture is not None and args.scene is not None:
+        raise ValueError("--picture and --scene exclude each other; give one of them, or none for the toy")
+    if args.picture is not None:
+        from pop_fast.io.images import read_image
+
+        return a_picture(read_image(args.picture) / 255.0)
+    if args.scene is None:
+        return the_toy()
+    from pop_fast.data import load_capture
+
+    capture = load_capture(args.scene)
+    views = []
+    for view in capture.views[:: max(1, len(capture.views) // 24)]:
+        by = SIZE / view.width
+        height = max(1, round(view.height * by))
+        K = view.K.copy()
+        K[:2] *= [[by], [height / view.height]]
+        views.append(((view.viewmat, K, SIZE, height), shrunk(view.image[..., :3] / 255.0, SIZE, height)))
+    return a_capture(views, capture.points, capture.points_rgb / 255.0, capture.scene_scale())

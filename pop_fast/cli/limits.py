@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 from pop_fast.errors import PopError
+from pop_fast.io.format_registry import format_names
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,7 +17,10 @@ if TYPE_CHECKING:
     from pop_fast.density.shrink import Score
     from pop_fast.train.config import TrainConfig
 
-FormatName = Literal["ply", "compressed-ply", "spz", "spz-4", "sog", "splat", "gltf", "gltf-spz", "html"]
+    FormatName = str
+else:
+    # what is registered when the program starts
+    FormatName = Literal[(*format_names(), "html")]
 # views that scores are summed over, at most: every so many of a larger capture
 _MOST_VIEWS: Final = 100
 # bytes of what `--target-mb` counts in
@@ -167,7 +171,7 @@ def _scores(shown: Shown, params: dict[str, Tensor], score: Score) -> Tensor:
     views = shown.capture().train_views(shown.config.test_every)
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _MOST_VIEWS)).round().astype(int))
     backend, _ = renderer(shown.config.backend)
-    device = torch.device("cuda" if backend.name == "cuda" else "cpu")
+    device = torch.device(backend.device)
     passes = Passes.of(backend, [ViewTensors.of(views[i]) for i in chosen], shown.config, device)
     placed = {name: value.to(device) for name, value in params.items()}
     return shrink.view_scores(score, passes, placed, shown.sh_degree)

@@ -7,7 +7,7 @@ import os
 import sys
 import time
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import tyro
 
-from pop_fast.api.registry import backend_names
+from pop_fast.api.registry import BACKENDS, require_backend
 from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.errors import describe, printable
@@ -27,8 +27,10 @@ from pop_fast.cli.train_options import PLAN, BlocksOptions, overrides, plan_of
 from pop_fast.cli.view import LiveView, check_viewer
 from pop_fast.data.sfm_files import SfmOptions
 from pop_fast.errors import PopError
+from pop_fast.train.choose import choose_backend, on_gpu
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.presets import ALIASES, METHODS, Given
+from pop_fast.train.presets import ALIASES, LOSSES, METHODS, Given
+from pop_fast.train.whole_step import why_not_trained
 from pop_ref.constants import PROFILES
 
 if TYPE_CHECKING:
@@ -61,6 +63,12 @@ _SHOWN: Final = frozenset(
         *("exposure", "random_background", "refine_cameras"),
     }
 )
+# settings that are names in a registry
+_NAMED: Final[dict[str, Callable[[], Iterable[str]]]] = {
+    "backend": lambda: ("auto", *BACKENDS),
+    "profile": lambda: PROFILES,
+    "photometric": lambda: LOSSES,
+}
 # whose options the help lists after all others, in this order; those of limits belong to exports too
 _LATER: Final = (FinishOptions, LimitOptions, BlocksOptions)
 _DOCUMENTED: Final = (BlocksOptions, FinishOptions, LimitOptions, Given, TrainConfig)
@@ -120,8 +128,6 @@ class _Run(BlocksOptions, FinishOptions):
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     config, options = arguments(argv)
-    from pop_fast.train.choose import choose_backend
-
     folder = Path(config.result_dir)
     options.check()
     check_viewer(options)
@@ -233,7 +239,7 @@ def takes_hours(config: TrainConfig) -> bool:
     """Tell whether a CPU is given the paper's schedule by nobody's word: neither a preset nor steps were said."""
     given = config.given
     said = given is None or given.steps_scaler is not None or "max_steps" in given.settings
-    return not said and config.preset == "paper" and config.backend != "cuda"
+    return not said and config.preset == "paper" and not on_gpu(config)
 
 
 def report(folder: Path) -> int:
@@ -321,10 +327,8 @@ def _arguments_type(base: TrainConfig, plan: dict[str, Any], short: bool) -> typ
             continue
         kind: Any = hints[field.name]
         default: Any = dataclasses.field(default_factory=lambda name=field.name: getattr(base, name))
-        if field.name == "backend":
-            kind = Literal[("auto", *backend_names())]
-        if field.name == "profile":
-            kind = Literal[tuple(PROFILES)]
+        if field.name in _NAMED:
+            kind = Literal[tuple(_NAMED[field.name]())]
         if field.name == "strategy":
             kind = Annotated[type(base.strategy), tyro.conf.arg(name=base.method)]
         if field.name == "data":
@@ -353,15 +357,9 @@ def check_backend(config: TrainConfig) -> None:
     Raises:
         PopError: says why and what to do.
     """
-    from pop_fast.api.registry import require_backend
-
-    require_backend(config.backend)
-    if config.backend == "cuda":
-        from pop_fast.train.fused_settings import unsupported
-
-        reason = unsupported(config)
-        if reason is not None:
-            raise PopError(reason)
+    reason = why_not_trained(require_backend(config.backend), config)
+    if reason is not None:
+        raise PopError(reason)
 
 
 def _open_in_turn(config: TrainConfig, options: Any, ranks: Ranks | None) -> Capture:

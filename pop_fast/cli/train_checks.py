@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from pop_fast.errors import PopError
+from pop_fast.train.choose import on_gpu
 
 if TYPE_CHECKING:
     from pop_fast.data import Capture
@@ -54,7 +55,7 @@ def check_early(config: TrainConfig, source: Source, images: str | None, ranks: 
 def about_large(capture: Capture, config: TrainConfig) -> str | None:
     """Say what photographs of full size cost on a CPU, before the first step; None where they are not that large."""
     pixels = sum(view.width * view.height for view in capture.views) / len(capture.views)
-    if config.backend == "cuda" or pixels < _LARGE:
+    if on_gpu(config) or pixels < _LARGE:
         return None
     view = max(capture.views, key=lambda view: view.width * view.height)
     shrink = math.ceil(max(view.width, view.height) / _USUAL_SIDE)

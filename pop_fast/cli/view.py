@@ -96,9 +96,9 @@ def transform_of(splat: Splat) -> np.ndarray | None:
 
 def stands_of_capture(capture: Capture, test_every: int, means: Any) -> list[Any]:
     """Make places to look from of the training views, at most sixty."""
+    from pop_fast.io.pictures import fit
     from pop_fast.view.html import cameras_of
     from pop_fast.view.live.server import stands_of
-    from pop_fast.view.pictures import fit
 
     views = capture.train_views(test_every)
     cameras, by_name = cameras_of(views), {view.name: view for view in views}

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import pop_fast.compiled
 from pop_fast.stages.backend import TorchBackend
+from pop_fast.train.whole_step import WholeStep
 
 if TYPE_CHECKING:
     from pop_fast.stages.stage_set import Stages
+    from pop_fast.train.fused_stepper import MakeFused
+    from pop_fast.train.stepper import Task
 
 
 @dataclass(frozen=True)
@@ -36,14 +40,16 @@ class CompiledBackend(TorchBackend):
 
         return losses
 
-    def make_engine(self, config: Any, own_strategy: bool) -> Any:
-        """Return the native step where it knows all settings, else autograd over the compiled stages."""
-        from pop_fast.train.engines import native_engine, torch_engine
-        from pop_fast.train.fused_settings import unsupported_setting
+    def whole_step(self) -> WholeStep:
+        """Return the step in C++."""
+        return WholeStep("native", _native_trainer, most=20, depends_on_threads=False)
 
-        if own_strategy and unsupported_setting(config) is None:
-            return native_engine(self)
-        return torch_engine(self)
+
+def _native_trainer(task: Task) -> MakeFused:
+    """Make the native step, with what it needs of the photographs in the memory that the settings give it."""
+    from pop_fast.compiled.native_step import NativeTrainer
+
+    return partial(NativeTrainer, cache_mb=task.config.target_cache_mb, stop=task.stop)
 
 
 COMPILED: Final = CompiledBackend("compiled", "cpu", ("float32", "float64"), speed=1)

@@ -16,12 +16,12 @@ from typing import Any, Final, Protocol, TypeVar
 import torch
 from torch import Tensor
 
-from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, StepStats
 from pop_fast.compiled.library import PROJECTION_CONSTANTS, Moments, call_library, stepper_functions, this_library
 from pop_fast.stages.blend.blend import Stop, below
 from pop_fast.stages.ssim import REACH, Padding, border_of, check_size, kept_windows
 from pop_fast.train.signals import Abandoned, StopRequest, heard
-from pop_ref.settings import BETAS, EPS
+from pop_fast.train.steps import Collected, Phase, StepSettings, StepStats
+from pop_ref.settings import BETAS, EPS, PARAMETERS
 
 Moved = tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]
 
@@ -58,6 +58,8 @@ def _move(x: Tensor, m: Tensor, v: Tensor, gradient: Tensor, step: int, lr: floa
 
 # steps that are taken before Python is asked again: Ctrl-C, a progress bar
 LONGEST: Final = 10
+# the pixelwise losses that the step knows, by its number
+LOSSES: Final = ("l2", "l1")
 # of (Gaussian, tile) pairs of a step, which are numbered with 32 bits
 MOST_ENTRIES: Final = 2**31 - 1
 # what the step measures, the first of `StepStats`
@@ -77,7 +79,7 @@ class StepGiven(ctypes.Structure):
     """`pop::StepGiven` of step.h, where every field is explained, in its order."""
 
     _fields_ = (
-        *_fields(_POINTER * len(GROUPS), "params", "m", "v"),
+        *_fields(_POINTER * len(PARAMETERS), "params", "m", "v"),
         *_fields(_WHOLE, "n", "n_rest"),
         *_fields(_POINTER, "viewmat", "K", "target", "mu_y", "s_yy", "kept", "kept_windows"),
         *_fields(_WHOLE, "width", "height", "n_kept", "n_windows"),
@@ -89,10 +91,10 @@ class StepGiven(ctypes.Structure):
         *_fields(_REAL, "pixel_weight", "ssim_weight", "lambda_pop", "lambda_entropy"),
         *_fields(_WHOLE, "dominance", "pop_window", "pop_visible", "blur_own_view"),
         *_fields(_REAL, "blur_pixels"),
-        *_fields(_REAL * len(GROUPS), "lr"),
+        *_fields(_REAL * len(PARAMETERS), "lr"),
         *_fields(_REAL, "beta1", "beta2", "eps"),
         *_fields(_WHOLE, "most_entries"),
-        *_fields(_WHOLE * len(GROUPS), "updates"),
+        *_fields(_WHOLE * len(PARAMETERS), "updates"),
         *_fields(_POINTER, "sh_rest_sum"),
         *_fields(_POINTER, "grad_sum", "n_visible", "dominant_sum", "blurred"),
         *_fields(_POINTER, "values", "seconds", "bad_row"),
@@ -202,7 +204,7 @@ class NativeTrainer:
     ) -> None:
         self.settings, self.step = settings, step
         self._stop, self._alone = stop or StopRequest(), stop is None
-        self._padding: Padding = "same" if settings.padding == "same" else "valid"
+        self._padding: Padding = settings.padding
         self._views, self._order = views, list(order)
         self._targets: dict[int, _Target] = {}
         self._cache_left = cache_mb * 2**20
@@ -227,7 +229,7 @@ class NativeTrainer:
         """
         given, n = self._given, len(params["means"])
         for name, group in (("params", params), ("m", m), ("v", v)):
-            for k, key in enumerate(GROUPS):
+            for k, key in enumerate(PARAMETERS):
                 tensor = group[key]
                 if tensor.dtype != torch.float32 or not tensor.is_contiguous() or tensor.device.type != "cpu":
                     raise ValueError(f"{name}[{key!r}] must be a contiguous float32 tensor on the CPU")
@@ -236,7 +238,7 @@ class NativeTrainer:
         self._rows = (dict(params), dict(m), dict(v))
         given.n, given.n_rest = n, params["shN"].shape[1]
         waits = self.settings.updates.sh_rest_every > 1
-        self.statistics = Statistics.zeros(n, torch.device("cpu"), given.n_rest if waits else None)
+        self.statistics = Collected.zeros(n, torch.device("cpu"), given.n_rest if waits else None)
         found = self.statistics.sh_rest_sum
         given.sh_rest_sum = None if found is None else found.data_ptr()
 
@@ -306,9 +308,8 @@ class NativeTrainer:
 
     def _set_phase(self, phase: Phase) -> None:
         given, settings, found = self._given, self.settings, self.statistics
-        given.degree, given.l1 = phase.sh_degree, phase.l1
-        given.pixel_weight = (1.0 - phase.lambda_ssim) * settings.pixelwise_scale
-        given.ssim_weight = phase.lambda_ssim * (0.5 if settings.d_ssim_halved else 1.0)
+        given.degree, given.l1 = phase.sh_degree, LOSSES.index(phase.objective.pixelwise)
+        given.pixel_weight, given.ssim_weight = phase.objective.weights
         given.lambda_pop = settings.lambda_pop if phase.pop else 0.0
         given.lambda_entropy = settings.lambda_entropy if phase.entropy else 0.0
         given.dominance = phase.dominance
@@ -357,8 +358,8 @@ class NativeTrainer:
         given.n_windows = view.mu_y[0].numel() if view.kept_windows is None else int(view.kept_windows.sum())
         given.blur_pixels = settings.blur_pixels(given.n_kept)
         rates, numbers, _ = settings.updates
-        given.lr = (_REAL * len(GROUPS))(*rates[step].tolist())
-        given.updates = (_WHOLE * len(GROUPS))(*numbers[step].tolist())
+        given.lr = (_REAL * len(PARAMETERS))(*rates[step].tolist())
+        given.updates = (_WHOLE * len(PARAMETERS))(*numbers[step].tolist())
 
     def _target(self, index: int) -> _Target:
         if index in self._targets:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import cuda_ext
 from pop_fast.api.plugin import BaseBackend
+from pop_fast.train.whole_step import WholeStep
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from pop_fast.cuda.stages import CudaStages
+    from pop_fast.train.fused_stepper import MakeFused
+    from pop_fast.train.stepper import Task
 
 
 @dataclass(frozen=True)
@@ -48,18 +51,17 @@ class CudaBackend(BaseBackend):
 
         return CudaView(pass_input)
 
-    def make_engine(self, config: Any, own_strategy: bool) -> Any:
-        """Return the fused step and nothing else; a setting that it does not know is refused."""
-        from pop_fast.errors import PopError
-        from pop_fast.train import engines
-        from pop_fast.train.fused_settings import unsupported
+    def whole_step(self) -> WholeStep:
+        """Return the fused step, which takes all steps on a GPU: a setting that it does not know is refused."""
+        known = WholeStep("cuda", _fused_trainer, most=500)
+        return replace(known, only={**known.only, "strategy.lambda_entropy": 0.0})
 
-        reason = unsupported(config)
-        if not own_strategy:
-            reason = "backend 'cuda' trains with the strategies of this package only; use --backend fast"
-        if reason is not None:
-            raise PopError(reason)
-        return engines.cuda_engine()
+
+def _fused_trainer(task: Task) -> MakeFused:
+    """Make the fused step, with the photographs on the GPU."""
+    from pop_fast.cuda.training import fused_trainer
+
+    return fused_trainer
 
 
 CUDA: Final = CudaBackend(

@@ -19,10 +19,10 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from pop_fast.data.capture import PosedImage, Progress, View
 from pop_fast.data.pinhole import make_camera
-from pop_fast.data.resample import shrink_bicubic
 from pop_fast.data.undistort import Undistortion, undistortion
 from pop_fast.errors import CaptureError
 from pop_fast.io.image_header import read_size
@@ -305,6 +305,23 @@ def _read_mask(
     if not mask.any():
         raise CaptureError(f"{path}: the mask hides the whole photograph; white means keep: invert it or remove it")
     return mask
+
+
+def shrink_bicubic(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Resize as Pillow does, and so gsplat's example trainer for the photographs of Mip-NeRF 360 (A32).
+
+    Rows are resized first, and rounded to bytes before columns are: which of the two one call of Pillow takes first
+    depends on its version and the sizes, and a few values with it by one level.
+
+    Args:
+        image: uint8 [H, W, C]
+        size: new width and height, px.
+
+    Returns:
+        uint8 [size[1], size[0], C]
+    """
+    rows = Image.fromarray(image).resize((size[0], image.shape[0]), Image.Resampling.BICUBIC)
+    return np.array(rows.resize(size, Image.Resampling.BICUBIC))
 
 
 def _shrunk(image: np.ndarray, size: tuple[int, int], resize: Literal["area", "bicubic"]) -> np.ndarray:

@@ -5,14 +5,14 @@ Every step the screen-space gradients are collected; every `refine_every` steps 
 term of the loss, gsplat the reset of opacities. Sources: Kerbl et al. 2023 section 5, gsplat 1.5's default strategy for
 the order and the attribute names, the POP paper section 3.
 
-A strategy is made where only settings are read, by `pop train --help` for one. So this module does without torch, and
-what works on tensors stands in `densify`, which is imported when there are some.
+A strategy is made where only settings are read, by `pop train --help` for one: torch, which takes a second to load, is
+imported by what works on tensors.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import MutableMapping
+from collections.abc import Callable, MutableMapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
@@ -25,6 +25,9 @@ from pop_fast.density.protocol import (
     Params,
     State,
     check_layout,
+    dominant_counts,
+    visible_from_radii,
+    visible_in,
 )
 from pop_ref.settings import MAX_SH_DEGREE, DensityConfig, PopTerm, ScreenSizeRules, UpdateRules
 
@@ -84,9 +87,12 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
             seed: seeds the random numbers that changes of the Gaussians take.
             count: of the first Gaussians, which some methods measure their budget by.
         """
-        from pop_fast.density import densify
+        import torch
 
-        return densify.initialize_state(scene_scale, seed, count)
+        nothing = dict.fromkeys(("grad2d", "count", "blurred", "dominant_sum", "radii", "sh_rest_sum"))
+        generator = torch.Generator().manual_seed(seed)
+        own = {"scene_scale": float(scene_scale), "first_count": count, "generator": generator}
+        return {**nothing, "views": 0, **own}
 
     def scaled(self, factor: float) -> Self:
         """Return the same settings on a schedule `factor` times as long.
@@ -147,11 +153,23 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         """
         if not self.regularizes(step):
             return None
-        from pop_fast.density import densify
+        from pop_fast.stages.polarization import opacity_entropy
 
         if isinstance(info, MutableMapping):
             info[_REGULARIZED] = True
-        return densify.regularizer(self, opacities, state, info)
+        terms = [] if self.lambda_entropy == 0.0 else [self.lambda_entropy * opacity_entropy(_logits(opacities))]
+        if self.lambda_pop != 0.0:
+            terms.append(self.lambda_pop * self._prior(opacities, state, info))
+        return sum(terms[1:], terms[0])
+
+    def _prior(self, opacities: Tensor, state: State, info: Info) -> Tensor:
+        from pop_fast.stages.polarization import importance_mask, pop_loss
+
+        mask = importance_mask(dominant_counts(info).sum(0))
+        if self.pop_views == "window" and state["dominant_sum"] is not None:
+            mask = mask | importance_mask(state["dominant_sum"])
+        visible = visible_in(info, len(mask)) if self.pop_over == "visible" else None
+        return pop_loss(opacities.reshape(-1), mask, visible=visible)
 
     def is_blur_step(self, step: int) -> bool:
         """Tell whether the change after this step looks at blur."""
@@ -207,9 +225,56 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
             packed: whether its rows are those of visible Gaussians alone.
         """
         if self.collects(step):
-            from pop_fast.density import densify
+            import torch
 
-            densify.collect(self, params, state, step, info, packed)
+            with torch.no_grad():
+                self._collect(params, state, step, info, packed)
+
+    def _collect(self, params: Params, state: State, step: int, info: Info, packed: bool) -> None:
+        import torch
+
+        n = len(params["means"])
+        means2d = info[self.key_for_gradient]
+        grads = means2d.absgrad if self.absgrad else means2d.grad
+        if grads is None:
+            raise ValueError(f"{self.key_for_gradient} has no gradient; call step_pre_backward before loss.backward()")
+        if state["grad2d"] is None:
+            state["grad2d"] = torch.zeros(n, dtype=grads.dtype, device=grads.device)
+            state["count"] = torch.zeros(n, dtype=grads.dtype, device=grads.device)
+        # pixels -> normalised device coordinates of [-1, 1]; times the cameras, whose mean the loss is
+        cameras = int(info["n_cameras"])
+        state["views"] += cameras
+        unit = grads.new_tensor([0.5 * info["width"] * cameras, 0.5 * info["height"] * cameras])
+        norms = torch.linalg.vector_norm(grads * unit, dim=-1)
+        if packed:
+            ids = info["gaussian_ids"].long()
+            state["grad2d"].index_add_(0, ids, norms)
+            state["count"].index_add_(0, ids, torch.ones_like(norms))
+        else:
+            visible = visible_from_radii(info["radii"])
+            state["grad2d"].add_(norms.masked_fill_(~visible, 0.0).sum(0))
+            state["count"].add_(visible.sum(0))
+        if (self.blur_window == "sum" and self.collects_blur(step)) or self.collects_window(step):
+            counts = dominant_counts(info).sum(0)
+            state["dominant_sum"] = counts if state["dominant_sum"] is None else state["dominant_sum"] + counts
+        if self.collects_blur(step):
+            self._collect_blur(state, info)
+        if self.refine_scale2d_stop_iter > 0:
+            _collect_extents(state, info, packed)
+
+    def _collect_blur(self, state: State, info: Info) -> None:
+        from pop_fast.stages.density import blur_set
+
+        # where a mask leaves pixels out, counts and share are of those that it keeps
+        kept = info.get("kept_pixels")
+        bound = (int(info["width"]), int(info["height"]), self.theta_blur, self.blur_min_pixels, kept)
+        if self.blur_window == "sum":
+            state["blurred"] = blur_set(state["dominant_sum"], *bound)
+            return
+        blurred = blur_set(dominant_counts(info), *bound).any(0)
+        if self.blur_window == "any_view" and state["blurred"] is not None:
+            blurred |= state["blurred"]
+        state["blurred"] = blurred
 
     def change(
         self,
@@ -242,9 +307,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
             return None
         import torch
 
-        from pop_fast.density import densify
-
-        draws = draws or densify.draws_of(state["generator"])
+        draws = draws or Draws.of(state["generator"])
         with torch.no_grad():
             return self.edit(DensificationContext(params, optimizers, state, step, draws, passes, sh_degree))
 
@@ -255,31 +318,104 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
 
     def refine(self, context: DensificationContext) -> DensificationStep:
         """Clone, split and prune by the window's statistics."""
-        from pop_fast.density import densify
+        return self.densify(context, *self.planned_growth(context), lambda: self.planned_prune(context))
 
-        return densify.refine(
-            self, context, *densify.planned_growth(self, context), lambda: densify.planned_prune(self, context)
-        )
+    def densify(
+        self, context: DensificationContext, clones: Tensor, splits: Tensor, prunes: Callable[[], Tensor]
+    ) -> DensificationStep:
+        """Clone, split, prune, and start a new window.
+
+        Args:
+            context: the Gaussians, and what a step may ask for.
+            clones: who is cloned. [N] bool
+            splits: who is split. [N] bool
+            prunes: asked of the grown set of Gaussians who of it is pruned. -> bool
+        """
+        import torch
+
+        from pop_fast.density import rows
+
+        n_clones, n_splits = int(clones.sum()), int(splits.sum())
+        if n_clones:
+            rows.clone(context.params, context.optimizers, context.state, clones)
+        if n_splits:
+            # a clone of this densification step is never split in it
+            padded = torch.cat([splits, splits.new_zeros(n_clones)])
+            rows.split(
+                context.params,
+                context.optimizers,
+                context.state,
+                padded,
+                context.draws.normals(n_splits),
+                self.revised_opacity,
+            )
+        done = DensificationStep(n_clones, n_splits, rows.prune_marked(context, prunes()))
+        rows.clear(context.state)
+        if self.verbose:
+            print(f"step {context.step}: {done}, {len(context)} Gaussians")
+        return done
+
+    def planned_growth(self, context: DensificationContext) -> tuple[Tensor, Tensor]:
+        """Return who is cloned and who is split; see `pop_ref.density.grow_masks`. [N] bool each"""
+        from pop_fast.density.rows import window
+        from pop_fast.stages.density import grow_masks
+
+        state = context.state
+        masks = grow_masks(window(state), context.params["scales"].exp(), state["scene_scale"], context.step, self)
+        if context.step < self.refine_scale2d_stop_iter:
+            return masks[0], masks[1] | (state["radii"] > self.grow_scale2d)
+        return masks
+
+    def planned_prune(self, context: DensificationContext) -> Tensor:
+        """Return who is too faint or too big; see `pop_ref.density.prune_mask`. [N] bool"""
+        from pop_fast.stages.density import prune_mask
+
+        opacities, state = context.params["opacities"].flatten().sigmoid(), context.state
+        mask = prune_mask(opacities, context.params["scales"].exp(), state["scene_scale"], context.step, self)
+        if self.prune_too_big_after < context.step < self.refine_scale2d_stop_iter:
+            mask |= state["radii"] > self.prune_scale2d
+        return mask
 
     def prune_finally(self, context: DensificationContext, done: DensificationStep) -> DensificationStep:
         """Prune faint Gaussians once more if it is time, and say so in what was done."""
         if context.step != self.final_prune_iter:
             return done
-        import torch
+        from pop_fast.density.rows import prune_marked
 
-        from pop_fast.density import densify
-
-        faint = torch.sigmoid(context.params["opacities"].flatten()) < self.final_prune_opa
-        return replace(done, pruned=done.pruned + densify.prune(context, faint))
+        faint = context.params["opacities"].flatten().sigmoid() < self.final_prune_opa
+        return replace(done, pruned=done.pruned + prune_marked(context, faint))
 
     def reset(self, context: DensificationContext, done: DensificationStep) -> DensificationStep:
-        """Reset opacities if it is time, and say so in what was done."""
+        """Lower all opacities to the ceiling of a reset if it is time, and say so in what was done."""
         if not self.is_reset_step(context.step):
             return done
-        from pop_fast.density import densify
+        from pop_fast.density.rows import reset_opacities
 
-        densify.reset(self, context)
+        reset_opacities(context.params, context.optimizers, ceiling=self.reset_opa)
         return replace(done, reset=True)
+
+
+def _logits(opacities: Tensor) -> Tensor:
+    import torch
+
+    # of sigmoid's own output, whose inverse is exact but next to the poles, where entropy does not pull
+    return torch.logit(opacities.reshape(-1), eps=torch.finfo(opacities.dtype).eps)
+
+
+def _collect_extents(state: State, info: Info, packed: bool) -> None:
+    """Keep the largest extent of each Gaussian, as a share of the longer image side."""
+    import torch
+
+    extents = info["radii"].to(state["grad2d"].dtype) / max(int(info["width"]), int(info["height"]))
+    if state["radii"] is None:
+        state["radii"] = torch.zeros_like(state["grad2d"])
+    if packed:
+        largest = extents.amax(-1) if extents.dim() == 2 else extents
+        state["radii"].scatter_reduce_(0, info["gaussian_ids"].long(), largest, "amax")
+    else:
+        largest = extents.amax(-1) if extents.dim() == 3 else extents
+        seen = largest.masked_fill(~visible_from_radii(info["radii"]), 0.0)
+        torch.maximum(state["radii"], seen.amax(0), out=state["radii"])
 
 
 def _scaled(step: Any, factor: float) -> Any:

@@ -19,9 +19,10 @@ from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
 
-from pop_ref.settings import MAX_SH_DEGREE
+from pop_ref.settings import MAX_SH_DEGREE, SPLIT_CHILDREN
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
     from torch.optim import Optimizer
 
@@ -44,6 +45,16 @@ class Draws:
 
     normals: Callable[[int], Tensor]
     uniforms: Callable[[int], Tensor]
+
+    @classmethod
+    def of(cls, generator: torch.Generator) -> Draws:
+        """Draw from a generator on the CPU; the normals in float32, whatever trains and in what precision."""
+        import torch
+
+        return cls(
+            normals=lambda n: torch.randn((SPLIT_CHILDREN, n, 3), generator=generator, dtype=torch.float32),
+            uniforms=lambda n: torch.rand(n, generator=generator, dtype=torch.float64),
+        )
 
 
 @dataclass(frozen=True)
@@ -157,3 +168,31 @@ def check_layout(params: Params, optimizers: Optimizers, needed: tuple[str, ...]
         groups = optimizer.param_groups
         if len(groups) != 1 or len(groups[0]["params"]) != 1 or groups[0]["params"][0] is not params[key]:
             raise ValueError(f"optimizers[{key!r}] must hold exactly one tensor, params[{key!r}]")
+
+
+def visible_from_radii(radii: Tensor) -> Tensor:
+    """Return which Gaussians each camera sees: all extents > 0. [C, N, 2] (or [C, N] before gsplat 1.5) -> [C, N]"""
+    return (radii > 0).all(-1) if radii.dim() == 3 else radii > 0
+
+
+def visible_in(info: Info, n: int) -> Tensor:
+    """Return which of n Gaussians any camera sees, packed or not. [N]"""
+    import torch
+
+    if info.get("gaussian_ids") is None:
+        return visible_from_radii(info["radii"]).any(0)
+    visible = torch.zeros(n, dtype=torch.bool, device=info["radii"].device)
+    visible[info["gaussian_ids"].long()] = True
+    return visible
+
+
+def dominant_counts(info: Info) -> Tensor:
+    """Return how many pixels each Gaussian dominates in each view, [C, N], or say why it cannot be known."""
+    counts = info.get("dominant_counts")
+    if counts is None:
+        raise ValueError(
+            "info has no 'dominant_counts', which POP is built on: render with pop_fast.rasterization "
+            "(a drop-in for gsplat's), or put into info how many pixels, [cameras, Gaussians], each one dominates, "
+            "that is, has the largest blending weight at"
+        )
+    return counts

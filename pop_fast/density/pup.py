@@ -49,8 +49,7 @@ class PupStrategy(InriaStrategy):
         """Refine and reset as 3DGS; at the beginning of a round prune and start Adam anew."""
         if context.step not in self.adam_restarts:
             return super().edit(context)
-        from pop_fast.density import rows
-        from pop_fast.density.importance import prune_lowest, summed_over_views
+        from pop_fast.density.rows import prune_lowest, restart, summed_over_views
         from pop_fast.stages.fisher import log_det_scores
 
         views, divisor = context.views, self.score_divisor
@@ -59,5 +58,5 @@ class PupStrategy(InriaStrategy):
         )
         share = self.prune_shares[self.adam_restarts.index(context.step)]
         pruned = prune_lowest(context, log_det_scores(blocks), share)
-        rows.restart(context.params, context.optimizers)
+        restart(context.params, context.optimizers)
         return DensificationStep(pruned=pruned)

@@ -8,13 +8,14 @@ with zero moments; an optimizer's scalar step counter is never touched.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
 
-from pop_fast.density.protocol import Optimizers, Params, State
-from pop_fast.stages.density import split_children
+from pop_fast.density.protocol import DensificationContext, Optimizers, Params, State
+from pop_fast.stages.density import Statistics, split_children
+from pop_fast.stages.selection import lowest_share
 from pop_ref.settings import SPLIT_CHILDREN
 
 
@@ -136,3 +137,59 @@ def restart(params: Params, optimizers: Optimizers) -> None:
         for value in optimizer.state.get(params[key], {}).values():
             if isinstance(value, Tensor):
                 value.zero_()
+
+
+def prune_marked(context: DensificationContext, mask: Tensor) -> int:
+    """Remove the selected Gaussians and return how many they were."""
+    n_pruned = int(mask.sum())
+    if n_pruned:
+        prune(context.params, context.optimizers, context.state, mask)
+    return n_pruned
+
+
+def summed_over_views(context: DensificationContext, score: Callable[[int], Tensor]) -> Tensor:
+    """Add up what a score gives for every training view, in float64.
+
+    Args:
+        context: the Gaussians, and what a step may ask for.
+        score: of a view by its index, any shape.
+    """
+    total = score(0).to(torch.float64)
+    for index in range(1, context.views.n_views):
+        total += score(index)
+    return total
+
+
+def prune_lowest(context: DensificationContext, scores: Tensor, share: float) -> int:
+    """Remove the share of Gaussians with the lowest scores, and return how many those were."""
+    return prune_marked(context, lowest_share(scores, share).to(context.params["means"].device))
+
+
+def window(state: State) -> Statistics:
+    """Return what the window has collected."""
+    blurred, none = state.get("blurred"), torch.zeros_like(state["count"], dtype=torch.bool)
+    return Statistics(
+        grad_sum=state["grad2d"],
+        n_visible=state["count"],
+        n_views=state["views"],
+        dominant_sum=none,
+        blurred=none if blurred is None else blurred,
+    )
+
+
+def clear(state: State) -> None:
+    """Start a new window."""
+    state["grad2d"].zero_()
+    state["count"].zero_()
+    state["views"] = 0
+    # rows that wait are not those of Gaussians that have been edited
+    state["blurred"] = state["dominant_sum"] = state["sh_rest_sum"] = None
+    if state["radii"] is not None:
+        state["radii"].zero_()
+
+
+def forget(state: State) -> None:
+    """Leave a window behind whose Gaussians are gone."""
+    state["grad2d"] = state["count"] = state["radii"] = None
+    state["blurred"] = state["dominant_sum"] = state["sh_rest_sum"] = None
+    state["views"] = 0

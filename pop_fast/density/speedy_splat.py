@@ -50,7 +50,7 @@ class SpeedySplatStrategy(InriaStrategy):
         done = self.refine(context) if self.is_refine_step(context.step) else DensificationStep()
         share = self.prune_share_at(context.step)
         if share > 0.0:
-            from pop_fast.density.importance import prune_lowest, summed_over_views
+            from pop_fast.density.rows import prune_lowest, summed_over_views
 
             views = context.views
             scores = summed_over_views(

@@ -13,11 +13,14 @@ tensor that it does not train. Everything else is 3DGS of 2024, with twice its r
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from pop_fast.density.gsplat import InriaStrategy
 from pop_fast.density.protocol import DensificationContext, DensificationStep
 from pop_ref.recipes import BASELINES, Recipe
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 _TAMING: Final[Recipe] = BASELINES["Taming-3DGS"]
 
@@ -60,10 +63,78 @@ class TamingStrategy(InriaStrategy):
 
     def refine(self, context: DensificationContext) -> DensificationStep:
         """Clone, split and prune who is drawn."""
-        from pop_fast.density import taming_steps
+        import torch
 
-        return taming_steps.refine(self, context)
+        from pop_fast.stages.taming import budget_at, quotas
+
+        scores, nth = self._scores(context), self.densification_at(context.step)
+        clones, splits = self.planned_growth(context)
+        budget = budget_at(
+            nth, self.n_densifications, context.state["first_count"], self.target(context.state["first_count"])
+        )
+        n_clone, n_split = quotas(budget, len(context), int(clones.sum()), int(splits.sum()))
+        clones, splits = _drawn(clones, scores, n_clone, context), _drawn(splits, scores, n_split, context)
+        # after the split its parents' rows are gone
+        inverse = 1.0 / (1e-6 + scores)
+        weights = inverse if self.misaligned_prune_weights else inverse[~splits.cpu()]
+
+        def planned_prune() -> Tensor:
+            mask = self.planned_prune(context)
+            return torch.zeros_like(mask) if nth > self.sampled_prunes else mask & _drawn_to_go(mask, weights, context)
+
+        return self.densify(context, clones, splits, planned_prune)
+
+    def _scores(self, context: DensificationContext) -> Tensor:
+        """Score the Gaussians by a few training views. [N] float64, on the CPU"""
+        import torch
+
+        from pop_fast.density.rows import window
+        from pop_fast.stages.density import average_grads
+        from pop_fast.stages.losses import photometric_3dgs
+        from pop_fast.stages.taming import pixel_weights, view_score
+
+        views, params = context.views, context.params
+        order = torch.argsort(context.draws.uniforms(views.n_views))[: self.score_views].tolist()
+        grads = average_grads(window(context.state), self)
+        opacities, scales = torch.sigmoid(params["opacities"].flatten()), torch.exp(params["scales"])
+        total = torch.zeros(len(context), dtype=torch.float64)
+        for index in order:
+            photo = views.photo(index)
+            found = views.contributions(
+                params, index, context.sh_degree, lambda image, photo=photo: pixel_weights(image, photo)
+            )
+            target = photo.to(found.image.dtype) / 255.0
+            photometric = photometric_3dgs(found.image, target, padding="same")
+            total += view_score(photometric, grads, opacities, scales, found.depths, found.radii, found).cpu()
+        return total
 
     def target(self, first_count: int) -> int:
         """Return the budget."""
         return self.final_count or int(self.budget_multiplier * first_count)
+
+
+def _drawn(candidates: Tensor, scores: Tensor, wanted: int, context: DensificationContext) -> Tensor:
+    """Draw so many candidates by score. [N] bool"""
+    import torch
+
+    from pop_fast.stages.selection import sample_without_replacement
+
+    weights = torch.where(candidates.cpu(), scores, 0.0)
+    wanted = min(wanted, int((weights > 0.0).sum()))
+    mask = torch.zeros(len(weights), dtype=torch.bool)
+    mask[sample_without_replacement(weights, wanted, context.draws.uniforms(len(weights)))] = True
+    return mask.to(candidates.device)
+
+
+def _drawn_to_go(mask: Tensor, weights: Tensor, context: DensificationContext) -> Tensor:
+    """Draw half as many as may go, by the weights of the first rows; the others, which are new, stay. [N] bool"""
+    import torch
+
+    from pop_fast.stages.selection import sample_without_replacement
+
+    of_all = weights.new_zeros(len(mask))
+    of_all[: len(weights)] = weights[: len(mask)]
+    wanted = min(int(mask.sum()) // 2, int((of_all > 0.0).sum()))
+    drawn = torch.zeros(len(mask), dtype=torch.bool)
+    drawn[sample_without_replacement(of_all, wanted, context.draws.uniforms(len(mask)))] = True
+    return drawn.to(mask.device)

@@ -27,12 +27,6 @@ class OracleBackend(BaseBackend):
 
         return OracleView(pass_input)
 
-    def make_engine(self, config: Any, own_strategy: bool) -> Any:
-        """Return autograd over the oracle's stages."""
-        from pop_fast.train.engines import torch_engine
-
-        return torch_engine(self)
-
 
 REF: Final = OracleBackend(
     "ref",

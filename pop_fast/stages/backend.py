@@ -1,4 +1,4 @@
-"""Backends on the CPU: torch's stages, and the engine that trains by autograd over them."""
+"""The backend on the CPU that draws with torch."""
 
 from __future__ import annotations
 
@@ -26,12 +26,6 @@ class TorchBackend(BaseBackend):
         from pop_fast.stages.stage_set import view_of
 
         return view_of(pass_input, self.stages())
-
-    def make_engine(self, config: Any, own_strategy: bool) -> Any:
-        """Return autograd over the stages, which knows every setting."""
-        from pop_fast.train.engines import torch_engine
-
-        return torch_engine(self)
 
 
 FAST: Final = TorchBackend("fast", "cpu", ("float32", "float64"), speed=0)

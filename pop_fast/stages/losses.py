@@ -8,20 +8,39 @@ Derivatives are taken by the render only; a target that requires a gradient is r
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Any, Final, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from pop_fast.stages.ssim import Padding, TargetMoments, check_size, mean_dissimilarity, ssim_map, target_moments
-from pop_ref.settings import LAMBDA_SSIM_3DGS, Recipe
+from pop_ref.settings import LAMBDA_SSIM_3DGS, Objective, Recipe
 
-__all__ = ["Padding", "TargetMoments", "target_moments", "ssim_map", "l1", "l1_vjp", "l2", "l2_vjp"]
+__all__ = ["L1", "L2", "Loss", "Padding", "TargetMoments", "target_moments", "ssim_map", "l1", "l1_vjp", "l2", "l2_vjp"]
 __all__ += ["ssim", "ssim_vjp", "d_ssim", "d_ssim_vjp"]
-__all__ += ["photometric_3dgs", "photometric_3dgs_vjp", "photometric_pop", "photometric_pop_vjp"]
+__all__ += ["photometric", "photometric_3dgs", "photometric_3dgs_vjp", "photometric_pop", "photometric_pop_vjp"]
 
 Dissimilarity = Callable[..., tuple[Tensor, Tensor | None]]
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What the pixels of a render are compared with their photograph by, as `pop_fast.train.presets.LOSSES` names it.
+
+    Attributes:
+        name: in the settings of a run, and in its records.
+        pixelwise: given render and photograph [H, W, 3] and a mask [H, W] or None, a differentiable mean over the
+            values that the mask keeps.
+        whole: the name, in a backend's losses, of what weighs it against D-SSIM in one pass; None where the two are
+            added up.
+    """
+
+    name: str
+    pixelwise: Callable[[Tensor, Tensor, Tensor | None], Tensor]
+    whole: str | None = None
 
 
 class _Terms(NamedTuple):
@@ -185,6 +204,39 @@ def photometric_pop_vjp(
     """See `pop_ref.losses.photometric_pop_vjp`."""
     terms = _Terms("l2", (1.0 - lambda_ssim) * l2_scale, lambda_ssim * (0.5 if halved else 1.0))
     return v_loss * _gradient(image, target, terms, padding, mask, moments)
+
+
+L1: Final = Loss("l1", l1, "photometric_3dgs")
+L2: Final = Loss("l2", l2, "photometric_pop")
+
+
+def photometric(
+    loss: Loss,
+    objective: Objective,
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    moments: TargetMoments | None = None,
+    losses: Any = None,
+) -> Tensor:
+    """Weigh a loss between pixels against D-SSIM, in one pass where the losses have one for it.
+
+    Args:
+        loss: that of the objective's name.
+        objective: the weights.
+        image: the render. [H, W, 3]
+        target: the photograph. [H, W, 3]
+        mask: True where a pixel counts. [H, W]
+        moments: `target_moments(target)`, where they are at hand.
+        losses: a backend's, with the functions of this module; None takes this module's.
+    """
+    of = sys.modules[__name__] if losses is None else losses
+    if loss.whole is not None:
+        options = (objective.lambda_ssim, objective.padding, mask, objective.d_ssim_halved, objective.pixel_scale)
+        return getattr(of, loss.whole)(image, target, *options, moments=moments)
+    pixel_weight, ssim_weight = objective.weights
+    d_ssim = of.d_ssim(image, target, objective.padding, mask, False, moments)
+    return pixel_weight * loss.pixelwise(image, target, mask) + ssim_weight * d_ssim
 
 
 class _Loss(torch.autograd.Function):

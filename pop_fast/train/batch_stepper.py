@@ -21,12 +21,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cuda_ext.train_settings import Phase, StepStats
 from pop_fast.density.control import DensityControl
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.model import adam_step
 from pop_fast.train.ranks import Ranks
+from pop_fast.train.steps import Phase, StepStats
 from pop_fast.train.torch_stepper import TorchStepper, ViewGradient
 
 

@@ -18,7 +18,8 @@ from typing import Any, BinaryIO
 import numpy as np
 import torch
 from torch import Tensor
-from torch.optim import Optimizer
+from torch.nn import Parameter
+from torch.optim import Adam, Optimizer
 
 from pop_fast.data.capture import Capture
 from pop_fast.density.protocol import State
@@ -27,6 +28,7 @@ from pop_fast.io.atomic import write_atomically
 from pop_fast.io.read_back import read_torch_file
 from pop_fast.train.checkpoint_checks import check_content, check_splats, shown
 from pop_fast.train.config import TrainConfig, first_difference
+from pop_fast.train.model import KEYS, make_optimizers
 
 FORMAT = 1
 _NAME = re.compile(r"ckpt_(\d+)_rank0\.pt")
@@ -246,3 +248,25 @@ def unpack_strategy(state: State, packed: Mapping[str, Any]) -> None:
             state[key].set_state(value)
         else:
             state[key] = value
+
+
+def moved_to(
+    device: torch.device, params: Mapping[str, Parameter], optimizers: Mapping[str, Adam], state: State
+) -> tuple[dict[str, Parameter], dict[str, Adam]]:
+    """Return parameters and their optimizers on a device; the statistics in `state` are replaced by theirs there."""
+    moments = pack_optimizers(optimizers)
+    placed = {key: Parameter(params[key].detach().to(device)) for key in KEYS}
+    made = make_optimizers(placed)
+    for key, found in moments.items():
+        there = {name: value if name == "step" else value.to(device) for name, value in found.items()}
+        made[key].state[placed[key]] = there
+    for key, value in state.items():
+        state[key] = value.to(device) if isinstance(value, Tensor) else value
+    return placed, made
+
+
+def on_cpu(content: Any) -> Any:
+    """Return nested dicts with their tensors on the CPU; those that are there already are not copied."""
+    if isinstance(content, Mapping):
+        return {key: on_cpu(value) for key, value in content.items()}
+    return content.cpu() if isinstance(content, Tensor) else content

@@ -8,14 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import Backend
+from pop_fast.api.registry import by_speed, get_backend
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.fused_settings import unsupported, unsupported_setting
+from pop_fast.train.whole_step import why_not_trained
 
 
 def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConfig, str]:
-    """Settle backend "auto": "cuda" where a GPU, the build and the settings allow it, else "compiled" or "fast".
+    """Settle backend "auto": the fastest that can run here and knows the settings, a GPU's before a CPU's.
 
     A run that is gone on with keeps the backend that it was begun with.
 
@@ -27,8 +28,11 @@ def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConf
         The settings with a backend's name, and one line that says which and why.
     """
     chosen, why = _choose(config, resume)
-    name = unsupported_setting(chosen) if chosen.backend == "compiled" else None
-    return chosen, why if name is None else f"{why}; its fused step has no {name}, so autograd takes the steps"
+    step = get_backend(chosen.backend).whole_step()
+    name = None if step is None else step.unknown_setting(chosen)
+    if name is None or get_backend(chosen.backend).device != "cpu":
+        return chosen, why
+    return chosen, f"{why}; its fused step has no {name}, so autograd takes the steps"
 
 
 def _choose(config: TrainConfig, resume: bool) -> tuple[TrainConfig, str]:
@@ -41,17 +45,30 @@ def _choose(config: TrainConfig, resume: bool) -> tuple[TrainConfig, str]:
         except PopError as error:
             path = Path(config.result_dir) / "cfg.json"
             raise PopError(f"{path}: {error}; repair the file, copy it again or train again") from error
-    reason = get_backend("cuda").why_not()
-    if reason is not None and not has_gpu():
-        reason = "there is no NVIDIA GPU here"
+    reasons: list[str] = []
+    for backend in by_speed():
+        reason = _why_not(backend, config)
+        if reason is not None:
+            # the one that comes closest first
+            reasons.insert(0, reason)
+            continue
+        on_cpu = backend.device == "cpu"
+        why = "; ".join(reasons) if on_cpu else "a GPU and the build are here"
+        return replace(config, backend=backend.name), f"backend {backend.name}{' (CPU)' if on_cpu else ''}: {why}"
+    raise PopError("; ".join(reasons))
+
+
+def _why_not(backend: Backend, config: TrainConfig) -> str | None:
+    """Return why a backend does not take the steps of a run here, or None."""
+    reason = backend.why_not()
     if reason is None:
-        reason = unsupported(config)
-    if reason is None:
-        return replace(config, backend="cuda"), "backend cuda: a GPU and the build are here"
-    not_compiled = get_backend("compiled").why_not()
-    if not_compiled is None:
-        return replace(config, backend="compiled"), f"backend compiled (CPU): {reason}"
-    return replace(config, backend="fast"), f"backend fast (CPU): {not_compiled}; {reason}"
+        return why_not_trained(backend, config)
+    return "there is no NVIDIA GPU here" if backend.device == "cuda" and not has_gpu() else reason
+
+
+def on_gpu(config: TrainConfig) -> bool:
+    """Tell whether a run's backend, once it is settled, trains on a GPU."""
+    return config.backend != "auto" and get_backend(config.backend).device != "cpu"
 
 
 def has_gpu() -> bool:

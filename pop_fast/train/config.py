@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final, Literal, Self
 
@@ -17,7 +19,7 @@ from pop_fast.train.jsonable import from_plain, to_plain
 from pop_fast.train.limits import check_values
 from pop_fast.train.presets import METHODS, MILESTONES, Given, defaults, laid_over, method_of
 from pop_ref.constants import NEAR_IN_CAPTURE_UNITS, PAPER, Profile, profile_named
-from pop_ref.settings import LAMBDA_SSIM_3DGS, MAX_SH_DEGREE, AppearanceRates, LearningRates, Recipe
+from pop_ref.settings import MAX_SH_DEGREE, AppearanceRates, LearningRates, Objective, Recipe
 
 __all__ = ["LearningRates", "TrainConfig", "first_difference"]
 
@@ -50,7 +52,7 @@ class TrainConfig:
             oracle, slow), one that another package registers, or "auto": "cuda" where a GPU and the build are there,
             else "compiled" where that was compiled, else "fast".
         profile: the rasterizer's constants: "paper", "gsplat_1_5", "gsplat_1_6", "inria" (that of method "3dgs" and of
-            those built on it) or "speedy_splat".
+            those built on it), "speedy_splat", or one that another package registers.
         near_plane: depth up to which a camera shows nothing, in units of the world that is trained in; None takes the
             profile's, which Inria's family counts in the capture's own units: a run writes down what that comes to.
         antialiased: render with opacity compensation (Mip-Splatting) instead of classically.
@@ -65,9 +67,11 @@ class TrainConfig:
         sh_interval: steps between bands, from band 0 at step 0.
         init_opacity: opacity of the first Gaussians.
         init_scale: multiplies their size, which is the distance to their three nearest neighbours.
-        photometric: "l2" as in paper eq. 9, POP's, or "l1" as in eq. 2, that of the other methods.
-        photometric_divisor: divides the L1 or L2 term, as in the paper's figure of L1/n against L2.
-        lambda_ssim: weight of 1 - SSIM; the rest is L1 or L2. POP's is 0.01, that of the other methods 0.2.
+        photometric: the loss between pixels, "l2" as in paper eq. 9, POP's, or "l1" as in eq. 2, that of the other
+            methods; or one that another package registers.
+        photometric_divisor: divides that term, as in the paper's figure of L1/n against L2.
+        lambda_ssim: weight of 1 - SSIM; the rest is that of the loss between pixels. POP's is 0.01, that of the other
+            methods 0.2.
         l2_stop_iter: step from which eq. 2 (L1, 0.2) takes over; None never, as the paper says of POP alone that it
             ends (A20).
         ssim_padding: "valid" as gsplat, or "same" as Inria (and method "3dgs").
@@ -114,7 +118,7 @@ class TrainConfig:
     sh_interval: int = Recipe.sh_interval
     init_opacity: float = 0.1
     init_scale: float = 1.0
-    photometric: Literal["l1", "l2"] = Recipe.pixelwise
+    photometric: str = Recipe.pixelwise
     photometric_divisor: float = 1.0 / Recipe.pixel_scale
     lambda_ssim: float = Recipe.lambda_ssim
     l2_stop_iter: int | None = Recipe.l2_stop_iter
@@ -168,6 +172,32 @@ class TrainConfig:
         plan = {name: overrides.pop(name, None) for name in ("steps_scaler", "scale_lambda_pop")}
         given = Given.of(overrides, method=method, preset=preset, **plan)
         return replace(cls._promised(given), given=given)
+
+    @classmethod
+    def from_options(cls, words: Sequence[str], *, method: str = "pop", preset: str = "paper") -> Self:
+        """Make the settings that options of `pop train` say, as `pop_fast.train.presets.options_for` writes them.
+
+        Args:
+            words: `--name value`, `--group.name value ...`, `--flag` and `--no-flag`.
+            method, preset: as of `of`.
+
+        Raises:
+            PopError: an unknown option, or a value that it cannot have; names it.
+        """
+        usual, said = cls.of(method=method, preset=preset).flat(), dict[str, Any]()
+        dashed = {name.replace("-", "_"): name for name in usual}
+        for option, values in _options_of(words):
+            group, dot, last = option.rpartition(".")
+            name, positive = (dashed.get(n, n) for n in (option, f"{group}{dot}{last.removeprefix('no_')}"))
+            if not values and name not in usual:
+                said[positive] = False
+            elif isinstance(usual.get(name), list):
+                said[name] = values
+            else:
+                said[name] = values[0] if len(values) == 1 else " ".join(map(str, values)) or True
+        # as the settings have them, in their order: a whole number where a real one is meant is one
+        resolved = cls.of(method=method, preset=preset, **said).flat()
+        return cls.of(method=method, preset=preset, **{name: resolved[name] for name in resolved if name in said})
 
     def with_overrides(self, **overrides: Any) -> Self:
         """Return these settings with some said anew; those that nobody said stay the defaults they are."""
@@ -225,11 +255,16 @@ class TrainConfig:
             return self
         return replace(self, near_plane=self.renderer.near_plane * world_scale)
 
-    def photometric_at(self, step: int) -> tuple[Literal["l1", "l2"], float]:
-        """Return the pixel-wise loss of a step and the weight of 1 - SSIM; the rest of the weight, to 1, is its own."""
-        if self.l2_stop_iter is not None and step >= self.l2_stop_iter:
-            return "l1", LAMBDA_SSIM_3DGS
-        return self.photometric, self.lambda_ssim
+    def objective_at(self, step: int) -> Objective:
+        """Return what the render of a step is compared with its photograph by."""
+        said = {
+            "pixelwise": self.photometric,
+            "pixel_scale": 1.0 / self.photometric_divisor,
+            "lambda_ssim": self.lambda_ssim,
+            "padding": self.ssim_padding,
+            "d_ssim_halved": self.d_ssim_halved,
+        }
+        return Objective(**said).at(step, self.l2_stop_iter)
 
     def to_json(self) -> str:
         """Write the settings as JSON, in reading order: as given (null where no preset was), and as they are run."""
@@ -290,6 +325,28 @@ class TrainConfig:
     def digest(self) -> str:
         """Hash the settings that decide the result's bits."""
         return hashlib.sha256(json.dumps(self.binding(), sort_keys=True).encode()).hexdigest()
+
+
+def _options_of(words: Sequence[str]) -> Iterator[tuple[str, list[Any]]]:
+    """Give every option's name, as settings are called, with its values."""
+    rest = list(words)
+    while rest:
+        word = rest.pop(0)
+        if not word.startswith("--"):
+            raise PopError(f"{word!r} stands where an option of pop train is expected, as --max-steps 100")
+        name, equals, value = word.removeprefix("--").partition("=")
+        values = [value] if equals else []
+        while rest and not rest[0].startswith("--"):
+            values.append(rest.pop(0))
+        yield name.replace("-", "_"), [_read(value) for value in values]
+
+
+def _read(text: str) -> Any:
+    """Read a word as a number, as None, or as the text that it is."""
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(text)
+    return None if text == "None" else text
 
 
 def _as_dict(config: TrainConfig) -> dict[str, Any]:

@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from pop_fast.io.images import write_png
+from pop_fast.io.pictures import error_magnitude, error_picture, id_colors
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.lpips import LPIPS
 from pop_fast.train.metrics import ViewMetrics, average, measure
 from pop_fast.train.results import ResultFolder
 from pop_fast.train.signals import heard
 from pop_fast.train.views import Rendered, ViewTensors, render_view
-from pop_fast.view.pictures import error_magnitude, error_picture, id_colors
 
 # mean absolute error that is drawn in the brightest colour
 _ERROR_TOP = 0.25

@@ -15,10 +15,10 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from cuda_ext.train_settings import Phase, StepStats
 from pop_fast.density.protocol import State
 from pop_fast.errors import PopError
 from pop_fast.train.stepper import Engine, Stepper
+from pop_fast.train.steps import Phase, StepStats
 
 __all__ = ["HoldingStepper", "hold_last"]
 

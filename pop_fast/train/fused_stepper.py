@@ -15,12 +15,12 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from cuda_ext.train_settings import Phase, Statistics, StepSettings, StepStats, Updates
 from pop_fast.density.protocol import State
 from pop_fast.stages.density import blur_set
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.model import KEYS
 from pop_fast.train.stepper import Task
+from pop_fast.train.steps import Collected, Phase, StepSettings, StepStats, Updates
 from pop_fast.train.views import ViewTensors
 
 Rows = Mapping[str, Tensor]
@@ -36,8 +36,8 @@ class Fused(Protocol):
     grown: int
 
     @property
-    def statistics(self) -> Statistics:
-        """What density control reads."""
+    def statistics(self) -> Any:
+        """What density control reads: `Collected`, or what has its attributes."""
         ...
 
     def rebind(self, params: Rows, m: Rows, v: Rows) -> None:
@@ -48,8 +48,8 @@ class Fused(Protocol):
         """Take steps of one phase until the counter stands at `until`, or until somebody has asked for an end."""
         ...
 
-    def step_stats(self, first: int, last: int) -> list[StepStats]:
-        """Return the measurements of the steps from `first` to before `last`."""
+    def step_stats(self, first: int, last: int) -> Sequence[Sequence[float]]:
+        """Return the measurements of the steps from `first` to before `last`, in the order of `StepStats`."""
         ...
 
 
@@ -62,7 +62,7 @@ class FusedStepper:
     """Takes steps by `make`; see `Stepper`.
 
     Args:
-        task: what is trained; its strategy is one that `unsupported` has nothing against.
+        task: what is trained; its settings are known to the step.
         name: of the engine.
         most: steps at a time, where they take less than a second.
         make: makes what takes them.
@@ -129,13 +129,13 @@ class FusedStepper:
         for key, number in zip(KEYS, numbers, strict=True):
             if number > 0:
                 self._optimizers[key].state[self._params[key]]["step"].fill_(float(number))
-        return self.fused.step_stats(first, last)
+        return [StepStats(*row) for row in self.fused.step_stats(first, last)]
 
     def facts(self) -> dict[str, Any]:
         """See `Stepper.facts`."""
         return {"instance_buffers_grown": 0 if self.fused is None else self.fused.grown}
 
-    def _take_statistics(self, found: Statistics, first: int, last: int, phase: Phase) -> None:
+    def _take_statistics(self, found: Collected, first: int, last: int, phase: Phase) -> None:
         """Copy what was collected into the strategy's state."""
         state, pop = self._state, self.task.config.strategy
         if phase.statistics:
@@ -155,7 +155,7 @@ class FusedStepper:
         else:
             state["blurred"] = found.blurred.bool()
 
-    def _give_statistics(self, found: Statistics) -> None:
+    def _give_statistics(self, found: Collected) -> None:
         """Go on from the strategy's state: after a checkpoint, or a change that kept the window."""
         given = {"grad2d": found.grad_sum, "count": found.n_visible, "dominant_sum": found.dominant_sum}
         for key, target in {**given, "blurred": found.blurred, "sh_rest_sum": found.sh_rest_sum}.items():
@@ -174,8 +174,6 @@ def step_settings(config: TrainConfig, updates: Updates) -> StepSettings:
     return StepSettings(
         updates,
         padding=config.ssim_padding,
-        d_ssim_halved=config.d_ssim_halved,
-        pixelwise_scale=1.0 / config.photometric_divisor,
         lambda_pop=pop.lambda_pop,
         lambda_entropy=pop.lambda_entropy,
         pop_views=pop.pop_views,

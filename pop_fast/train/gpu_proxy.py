@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pop_fast.api.backend import Renderer
 from pop_fast.api.meta import RenderMeta
-from pop_fast.api.registry import fastest_backend, get_backend
+from pop_fast.api.registry import by_speed, fastest_backend, get_backend
 from pop_fast.errors import PopError
 
 _LESS = "use smaller images (--factor 2 or more), fewer Gaussians, or a card with more memory"
@@ -81,17 +81,15 @@ def translate_oom() -> Iterator[None]:
 def renderer(name: str) -> tuple[Renderer, str | None]:
     """Return the backend for CPU tensors under a name of settings, and a note where another one stands in for it.
 
-    "auto" is the first of "cuda", "compiled" and "fast" that can run; results trained by one of these that cannot are
-    drawn by the next.
+    "auto" is the fastest that can run here; results trained by one that "auto" takes elsewhere, and that cannot run
+    here, are drawn by the fastest on the CPU.
 
     Raises:
         PopError: the name is unknown.
     """
-    if name not in ("auto", "cuda", "compiled"):
-        return get_backend(name), None
-    if name != "compiled" and get_backend("cuda").available():
-        return GpuProxy(get_backend("cuda"), torch.device("cuda", torch.cuda.current_device())), None
+    chosen = next(b for b in by_speed() if b.available()) if name == "auto" else get_backend(name)
+    if chosen.available() or chosen.speed is None:
+        on_cpu = chosen.device == "cpu"
+        return chosen if on_cpu else GpuProxy(chosen, torch.device(chosen.device, torch.cuda.current_device())), None
     drawing = fastest_backend("cpu")
-    if name in ("auto", drawing.name):
-        return drawing, None
-    return drawing, f"backend {drawing.name!r} stands in for {name!r}: {get_backend(name).why_not()}"
+    return drawing, f"backend {drawing.name!r} stands in for {name!r}: {chosen.why_not()}"

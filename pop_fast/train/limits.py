@@ -7,8 +7,9 @@ from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from typing import Any, Final
 
-from pop_fast.api.registry import backend_names, is_own
+from pop_fast.api.registry import BACKENDS
 from pop_fast.errors import PopError
+from pop_fast.train.presets import LOSSES
 from pop_ref.constants import PROFILES
 
 _AT_LEAST: Final = {
@@ -87,14 +88,13 @@ def check_values(config: Any) -> None:
 
 def _check_names(values: dict[str, Any]) -> None:
     """Check what is one of a table, to which other packages may add."""
-    if values["profile"] not in PROFILES:
-        raise PopError(f"profile is {values['profile']!r}; it must be one of {', '.join(PROFILES)}")
-    name = values["backend"]
-    if name != "auto" and not is_own(name) and name not in backend_names():
-        known = ", ".join(("auto", *backend_names()))
-        raise PopError(
-            f"backend is {name!r}; it must be one of {known}; one of another package is known where that is installed"
-        )
+    for name, known in (("profile", PROFILES), ("photometric", LOSSES), ("backend", BACKENDS)):
+        value = values[name]
+        if (name == "backend" and value == "auto") or value in known:
+            continue
+        names = ", ".join((*(("auto",) if name == "backend" else ()), *known))
+        where = "; one of another package is known where that is installed"
+        raise PopError(f"{name} is {value!r}; it must be one of {names}{where}")
 
 
 def _check_number(name: str, value: float, is_share: bool) -> None:

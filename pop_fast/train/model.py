@@ -10,13 +10,13 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
-from cuda_ext.train_settings import GROUPS, Updates
 from pop_fast.density.protocol import State
 from pop_fast.errors import PopError
 from pop_fast.stages.activations import scales_from_log_scales
-from pop_ref.settings import BETAS, EPS
+from pop_fast.train.steps import Updates
+from pop_ref.settings import BETAS, EPS, PARAMETERS
 
-KEYS: Final = GROUPS
+KEYS: Final = PARAMETERS
 
 
 class _Moments(Adam):
@@ -60,7 +60,7 @@ def adam_step(
         state: holds the gradients that wait for an update, under "sh_rest_sum".
     """
     rates, numbers = updates.rates[step].tolist(), updates.numbers[step].tolist()
-    for key, rate, number in zip(GROUPS, rates, numbers, strict=True):
+    for key, rate, number in zip(PARAMETERS, rates, numbers, strict=True):
         if key not in params:
             continue
         param, optimizer = params[key], optimizers[key]

@@ -1,8 +1,10 @@
-"""What a run refuses before it takes a step: what would stop it at its first step, or at its first measurement."""
+"""What a run refuses before it takes a step, and what it says of its settings on the photographs of a capture."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
 
 from torch import Tensor
 
@@ -13,6 +15,15 @@ from pop_fast.train.config import TrainConfig
 from pop_fast.train.metrics import too_small
 from pop_fast.train.model import first_unusable
 from pop_fast.train.views import ViewTensors
+from pop_ref.constants import profile_named
+from pop_ref.settings import GSPLAT
+
+# theta_blur is about so many pixels in the smallest images of the paper (10.7 in 980 x 545, its section 4.1)
+ENOUGH_PIXELS: Final = 10
+# from a pixel on, a shifted image costs what a held-out PSNR shows
+ENOUGH_OFF_CENTRE: Final = 1.0
+# densification steps between two resets in 3DGS and in gsplat's default strategy: 3,000 steps, one each 100
+RECOVERY_EVENTS: Final = GSPLAT.reset_every // GSPLAT.refine_every
 
 
 def check_views(config: TrainConfig, name: str, train: Sequence[ViewTensors], test: Sequence[ViewTensors]) -> None:
@@ -58,3 +69,73 @@ def check_start(name: str, initial: Mapping[str, Tensor]) -> None:
             f"{name}: {key}{index} of the first Gaussians is {value}; lower --init-scale, "
             "or remove sparse points that are far from all others"
         )
+
+
+def facts(config: TrainConfig, views: Sequence[ViewTensors]) -> dict[str, Any]:
+    """Return what a run's statistics say of its settings.
+
+    Args:
+        config: the settings.
+        views: the training views.
+
+    Returns:
+        method, preset, seed, lambda_pop, theta_blur_pixels (share of the smallest and of the largest view, px),
+        blur_min_pixels (px), blur_events (densification steps that look at blur).
+    """
+    plan = config.strategy
+    sizes = [view.kept_pixels for view in views]
+    return {
+        "method": config.method,
+        "preset": config.preset,
+        "seed": config.seed,
+        "lambda_pop": plan.lambda_pop,
+        "theta_blur_pixels": [plan.theta_blur * min(sizes), plan.theta_blur * max(sizes)],
+        "blur_min_pixels": plan.blur_min_pixels,
+        "blur_events": sum(plan.is_blur_step(step) for step in _density_steps(config, plan.refine_every)),
+    }
+
+
+def find_warnings(config: TrainConfig, views: Sequence[ViewTensors]) -> Iterator[str]:
+    """Say, in one sentence each, what will not do as it is set, and which option fixes it.
+
+    Args:
+        config: the settings.
+        views: the training views.
+    """
+    plan = config.strategy
+    smallest = min(views, key=lambda view: view.kept_pixels)
+    pixels = plan.theta_blur * smallest.kept_pixels
+    blurs = any(plan.is_blur_step(step) for step in _density_steps(config, plan.refine_every))
+    if blurs and max(pixels, plan.blur_min_pixels) < ENOUGH_PIXELS:
+        yield (
+            f"theta_blur is {pixels:.1f} pixels of {smallest.name} ({smallest.width} x {smallest.height}), where the "
+            "paper's smallest images make it 10.7: nearly every Gaussian that is seen will count as blur and grow; "
+            f"--{config.method}.blur-min-pixels {ENOUGH_PIXELS} fixes it"
+        )
+    if profile_named(config.profile).principal_point == "centred":
+        away = {view.name: _off_centre(view) for view in views}
+        worst = max(away, key=lambda name: away[name])
+        if away[worst] > ENOUGH_OFF_CENTRE:
+            yield (
+                f"profile {config.profile} draws with the principal point in the middle of the image, as Inria's code, "
+                f"and that of {worst} lies {away[worst]:.1f} pixels from there: every photograph is compared with an "
+                "image that is shifted by as much; --profile gsplat_1_5 uses the principal point"
+            )
+    resets = [step for step in _density_steps(config, plan.reset_every) if plan.is_reset_step(step)]
+    left = [after - step for step, after in zip(resets, [*resets[1:], config.max_steps], strict=False)]
+    if resets and min(left) < RECOVERY_EVENTS * plan.refine_every:
+        step = resets[left.index(min(left))]
+        yield (
+            f"opacities are reset after step {step:,} and have {min(left):,} steps ({min(left) // plan.refine_every} "
+            f"densification steps) to recover, where 3DGS has {RECOVERY_EVENTS} densification steps; "
+            f"--{config.method}.reset-every 0 leaves resets out"
+        )
+
+
+def _off_centre(view: ViewTensors) -> float:
+    """Give the distance of the principal point from the middle of the image, px."""
+    return math.hypot(float(view.K[0, 0, 2]) - view.width / 2, float(view.K[0, 1, 2]) - view.height / 2)
+
+
+def _density_steps(config: TrainConfig, every: int) -> range:
+    return range(0, min(config.max_steps, config.strategy.refine_stop_iter) if every > 0 else 0, every or 1)

@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import Any, Final, Literal, NamedTuple, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self
 
 from pop_fast.density import (
     DensityControl,
@@ -37,27 +37,50 @@ from pop_fast.density import (
 from pop_fast.errors import PopError
 from pop_fast.train.jsonable import from_plain, to_plain
 from pop_ref.recipes import BASELINES, RECIPES, Recipe
+from pop_ref.registry import Registry
 from pop_ref.settings import DensityConfig, PopTerm, UpdateRules
+
+if TYPE_CHECKING:
+    from pop_fast.stages.losses import Loss
 
 
 class Method(NamedTuple):
-    """A method that can be trained: its strategy, and the recipe that the rest of its defaults are from."""
+    """A method that can be trained.
+
+    Attributes:
+        strategy: density control, with the method's defaults.
+        recipe: that the rest of its defaults are from.
+        title: what tables and pages call it.
+    """
 
     strategy: type[DensityControl]
     recipe: Recipe
+    title: str
 
 
-METHODS: Final = {
-    "pop": Method(POPStrategy, RECIPES["POP"]),
-    "gsplat": Method(GsplatStrategy, RECIPES["gsplat"]),
-    "3dgs": Method(InriaStrategy, RECIPES["3DGS"]),
-    "3dgs-2023": Method(Inria2023Strategy, RECIPES["3DGS 2023"]),
-    "pup": Method(PupStrategy, BASELINES["PUP-3DGS"]),
-    "mini-splatting": Method(MiniSplattingStrategy, BASELINES["Mini-Splatting"]),
-    "taming": Method(TamingStrategy, BASELINES["Taming-3DGS"]),
-    "speedy-splat": Method(SpeedySplatStrategy, BASELINES["Speedy-Splat"]),
-}
-MethodName: TypeAlias = Literal["pop", "gsplat", "3dgs", "3dgs-2023", "pup", "mini-splatting", "taming", "speedy-splat"]
+METHODS: Final[Registry[Method]] = Registry(
+    "method",
+    "pop_splatting.methods",
+    {
+        "pop": Method(POPStrategy, RECIPES["POP"], "POP"),
+        "gsplat": Method(GsplatStrategy, RECIPES["gsplat"], "gsplat (default strategy)"),
+        "3dgs": Method(InriaStrategy, RECIPES["3DGS"], "3DGS (Inria)"),
+        "3dgs-2023": Method(Inria2023Strategy, RECIPES["3DGS 2023"], "3DGS (Inria, 2023)"),
+        "pup": Method(PupStrategy, BASELINES["PUP-3DGS"], "PUP-3DGS"),
+        "mini-splatting": Method(MiniSplattingStrategy, BASELINES["Mini-Splatting"], "Mini-Splatting"),
+        "taming": Method(TamingStrategy, BASELINES["Taming-3DGS"], "Taming-3DGS"),
+        "speedy-splat": Method(SpeedySplatStrategy, BASELINES["Speedy-Splat"], "Speedy-Splat"),
+    },
+    needs=("strategy", "recipe", "title"),
+    error=PopError,
+)
+LOSSES: Final[Registry[Loss]] = Registry(
+    "loss",
+    "pop_splatting.losses",
+    {"l2": "pop_fast.stages.losses:L2", "l1": "pop_fast.stages.losses:L1"},
+    needs=("name", "pixelwise", "whole"),
+    error=PopError,
+)
 # what the control was called when there was one
 ALIASES: Final = {"adc": "gsplat"}
 QUICK_SCALER: Final = 0.1
@@ -78,7 +101,7 @@ class Given:
     Attributes:
         method: "pop", "gsplat" for gsplat's default strategy, "3dgs" for Inria's constants, learning rates, SSIM and
             rasterizer, "3dgs-2023" for those before October 2024, and on top of these "pup", "mini-splatting",
-            "taming" and "speedy-splat".
+            "taming" and "speedy-splat"; or one that another package registers.
         preset: "paper" is the paper's 30,000 steps, for a GPU or a night; "quick" a tenth of them, with thresholds for
             small images. It gives defaults: what is said besides wins.
         steps_scaler: multiplies the default of every step number; None takes the preset's.
@@ -87,13 +110,15 @@ class Given:
         settings: what the user set, as plain values by dotted name.
     """
 
-    method: MethodName = "pop"
+    method: str = "pop"
     preset: Literal["paper", "quick"] = "paper"
     steps_scaler: float | None = None
     scale_lambda_pop: bool = False
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise PopError(f"config.method is {self.method!r}; it must be one of {', '.join(map(repr, METHODS))}")
         scaler = self.steps_scaler
         if scaler is not None and not 0.0 < scaler < math.inf:
             raise PopError(f"steps_scaler is {scaler}; it must be > 0 and finite")
@@ -162,7 +187,7 @@ def method_of(strategy: DensityControl) -> str:
 
 def defaults(given: Given) -> dict[str, Any]:
     """Return every setting that method, preset and scaler decide, without overrides, by its name in `TrainConfig`."""
-    kind, recipe = METHODS[given.method]
+    kind, recipe, _ = METHODS[given.method]
     by = given.scaler
     values = values_of(recipe)
     strategy = kind().scaled(by)

@@ -1,17 +1,18 @@
-"""What depends on the step number alone: rates and numbers of Adam's updates, active colour bands, the view order."""
+"""What depends on the step number: what a step does, how far steps go by themselves, Adam's updates, the view order."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from cuda_ext.train_settings import GROUPS, Updates, steady_updates
-from pop_ref.settings import LearningRates, UpdateRules
-
-__all__ = ["Updates", "ViewOrder", "active_sh_degree", "steady_updates", "updates_of"]
+from pop_fast.density.control import DensityControl
+from pop_fast.density.foreign import ForeignStrategy
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.steps import Phase, Updates
+from pop_ref.settings import PARAMETERS, LearningRates, UpdateRules
 
 
 def updates_of(
@@ -36,19 +37,31 @@ def updates_of(
     edits, restarts = ([step for step in given if 0 <= step < max_steps] for given in (edits, restarts))
     steps = torch.arange(max_steps, dtype=torch.float64)
     base = {**lr.by_parameter(), "means": lr.means * scene_scale}
-    rates = torch.tensor([base[name] for name in GROUPS], dtype=torch.float64).repeat(max_steps, 1)
+    rates = torch.tensor([base[name] for name in PARAMETERS], dtype=torch.float64).repeat(max_steps, 1)
     rates *= _round_factor(steps, rules)[:, None]
-    rates[:, GROUPS.index("means")] = base["means"] * lr.means_decay ** _share(steps, max_steps, rules)
-    moved = torch.ones((max_steps, len(GROUPS)), dtype=torch.bool)
+    rates[:, PARAMETERS.index("means")] = base["means"] * lr.means_decay ** _share(steps, max_steps, rules)
+    moved = torch.ones((max_steps, len(PARAMETERS)), dtype=torch.bool)
     if rules.edits_replace_update:
         moved[[*edits, *restarts]] = False
     if rules.opacities_stop_iter >= 0:
-        moved[rules.opacities_stop_iter :, GROUPS.index("opacities")] = False
-    moved[:, GROUPS.index("shN")] &= (steps + 1) % rules.sh_rest_every == 0
+        moved[rules.opacities_stop_iter :, PARAMETERS.index("opacities")] = False
+    moved[:, PARAMETERS.index("shN")] &= (steps + 1) % rules.sh_rest_every == 0
     numbers = moved.cumsum(0)
     for step in sorted(restarts):
         numbers[step + 1 :] -= numbers[step].clone()
     return Updates(rates, (numbers * moved).to(torch.int32), rules.sh_rest_every)
+
+
+def steady_updates(lr: Mapping[str, float], steps: int) -> Updates:
+    """Move every parameter at every step, at rates that stay the same.
+
+    Args:
+        lr: learning rate by parameter.
+        steps: length of the schedule.
+    """
+    rates = torch.tensor([[lr[name] for name in PARAMETERS]], dtype=torch.float64).repeat(steps, 1)
+    numbers = torch.arange(1, steps + 1, dtype=torch.int32)[:, None].repeat(1, len(PARAMETERS))
+    return Updates(rates, numbers)
 
 
 def _share(steps: Tensor, max_steps: int, rules: UpdateRules) -> Tensor:
@@ -75,6 +88,68 @@ def _round_factor(steps: Tensor, rules: UpdateRules) -> Tensor:
 def active_sh_degree(step: int, interval: int, degree: int, start: int = 0) -> int:
     """Return the highest active colour band: from step `start` on one more every `interval` steps, from 0."""
     return min(max(step - start, 0) // interval, degree)
+
+
+def phase_at(config: TrainConfig, strategy: DensityControl | ForeignStrategy, step: int) -> Phase:
+    """Return what a step does.
+
+    Args:
+        config: step numbers as they are run.
+        strategy: decides what is collected; of one that is not ours it is not known, and it sees to that itself.
+        step: counts from 0.
+    """
+    own = isinstance(strategy, DensityControl)
+    return Phase(
+        sh_degree=active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter),
+        pop=own and strategy.lambda_pop != 0.0 and strategy.regularizes(step),
+        statistics=own and strategy.collects(step),
+        blur=own and strategy.collects_blur(step),
+        objective=config.objective_at(step),
+        window=own and strategy.collects_window(step),
+        entropy=own and strategy.lambda_entropy != 0.0 and strategy.regularizes(step),
+    )
+
+
+def segment_end(config: TrainConfig, strategy: DensityControl | ForeignStrategy, first: int, longest: int) -> int:
+    """Return how far a stepper goes by itself: to a densification step, a milestone, another phase, or far enough.
+
+    Args:
+        config: step numbers as they are run.
+        strategy: as in `phase_at`.
+        first: the step to begin with.
+        longest: most steps at a time.
+
+    Returns:
+        One more than the last step of the segment.
+    """
+    phase, step = phase_at(config, strategy, first), first
+    while True:
+        if strategy.changes_after(step) or is_milestone(config, step + 1) or step + 1 - first == longest:
+            return step + 1
+        step += 1
+        if phase_at(config, strategy, step) != phase:
+            return step
+
+
+def is_milestone(config: TrainConfig, taken: int) -> bool:
+    """Tell whether something is measured or written when so many steps have been taken."""
+    due = config.checkpoint_every > 0 and taken % config.checkpoint_every == 0
+    planned = (*config.eval_steps, *config.save_steps, config.strategy.blur_stop_iter, config.max_steps)
+    return due or taken in planned
+
+
+def updates_of_strategy(config: TrainConfig, strategy: DensityControl | ForeignStrategy, scene_scale: float) -> Updates:
+    """List the rates and the numbers of all of Adam's updates of a run.
+
+    Args:
+        config: step numbers as they are run.
+        strategy: at whose changes Adam may skip or restart; of one that is not ours it is not known.
+        scene_scale: the unit of the means' rate, world units.
+    """
+    if isinstance(strategy, ForeignStrategy):
+        return updates_of(config.lr, scene_scale, config.max_steps)
+    edits = [step for step in range(config.max_steps) if strategy.is_refine_step(step)]
+    return updates_of(config.lr, scene_scale, config.max_steps, strategy, edits, strategy.adam_restarts)
 
 
 class ViewOrder:

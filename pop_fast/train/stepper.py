@@ -10,7 +10,6 @@ import torch
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from cuda_ext.train_settings import Phase, StepStats, Updates
 from pop_fast.api.backend import Renderer
 from pop_fast.density.control import DensityControl
 from pop_fast.density.foreign import ForeignStrategy
@@ -19,6 +18,7 @@ from pop_fast.train.appearance import Appearance
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.ranks import ALONE, Ranks
 from pop_fast.train.signals import StopRequest
+from pop_fast.train.steps import Phase, StepStats, Updates
 from pop_fast.train.views import ViewTensors
 
 

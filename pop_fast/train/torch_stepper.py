@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from cuda_ext.train_settings import Phase, StepStats
-from pop_fast.api.backend import Renderer
+from pop_fast.api.backend import Backend
 from pop_fast.density.protocol import State
+from pop_fast.stages.losses import TargetMoments, l2, photometric, target_moments
+from pop_fast.train.config import TrainConfig
 from pop_fast.train.evaluate import gaussians_per_pixel
 from pop_fast.train.model import adam_step
-from pop_fast.train.objective import Objective
+from pop_fast.train.presets import LOSSES
 from pop_fast.train.signals import Abandoned
 from pop_fast.train.stepper import Task
-from pop_fast.train.views import Rendered, render_view
+from pop_fast.train.steps import Phase, StepStats
+from pop_fast.train.views import Rendered, ViewTensors, render_view
+from pop_ref.settings import Objective
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,58 @@ class ViewGradient:
     loss: Tensor
 
 
+class PhotoLoss:
+    """Compares renders with the photographs of the training views.
+
+    What SSIM needs of a photograph alone is computed at its first visit and kept, for as many views as
+    `target_cache_mb` has room for; the others compute it anew at every visit, to the same bits.
+
+    Args:
+        config: step numbers as they are run.
+        views: to train on.
+        losses: of a backend; see `pop_fast.stages.losses`.
+    """
+
+    def __init__(self, config: TrainConfig, views: Sequence[ViewTensors], losses: Any) -> None:
+        self._config = config
+        self._views = views
+        self._kept: dict[int, TargetMoments] = {}
+        self._background = torch.tensor(config.background, dtype=torch.float64)
+        self._room = config.target_cache_mb * 2**20
+        self._losses = losses
+
+    def __call__(self, image: Tensor, index: int, objective: Objective, background: Tensor | None = None) -> Tensor:
+        """Return the loss of a render [H, W, 3] of view `index`, over another background if one is given."""
+        moments, mask = self._moments(index, background), self._views[index].mask
+        loss = LOSSES.named(objective.pixelwise)
+        return photometric(loss, objective, image, moments.target, mask, moments, self._losses)
+
+    def measure(
+        self, image: Tensor, index: int, objective: Objective, background: Tensor | None = None
+    ) -> tuple[float, float, float]:
+        """Return the pixelwise loss, SSIM, and the mean square of the difference with the render clamped to [0, 1]."""
+        moments, mask = self._moments(index, background), self._views[index].mask
+        target = moments.target
+        pixelwise = LOSSES.named(objective.pixelwise).pixelwise(image, target, mask)
+        d_ssim = self._losses.d_ssim(image, target, objective.padding, mask, False, moments)
+        square = l2(image.clamp(0.0, 1.0), target, mask)
+        return float(pixelwise), 1.0 - float(d_ssim), float(square)
+
+    def _moments(self, index: int, background: Tensor | None) -> TargetMoments:
+        view = self._views[index]
+        if background is not None and view.alpha is not None:
+            # every step has another one
+            return target_moments(view.target_over(background, self._background), self._config.ssim_padding)
+        if index in self._kept:
+            return self._kept[index]
+        moments = target_moments(view.target(), self._config.ssim_padding)
+        needed = sum(t.numel() * t.element_size() for t in (moments.target, moments.mu_y, moments.s_yy))
+        if needed <= self._room:
+            self._room -= needed
+            self._kept[index] = moments
+        return moments
+
+
 class TorchStepper:
     """Takes steps on the CPU in the parameters' precision; see `Stepper`.
 
@@ -50,10 +106,10 @@ class TorchStepper:
     name = "torch"
     longest = 1
 
-    def __init__(self, task: Task, backend: Renderer) -> None:
+    def __init__(self, task: Task, backend: Backend) -> None:
         self.step = task.step
         self._task, self._backend = task, backend
-        self._objective = Objective(task.config, task.views, backend.name)
+        self._photo_loss = PhotoLoss(task.config, task.views, backend.losses())
         self._params: dict[str, Parameter] = {}
         self._optimizers: Mapping[str, Adam] = {}
         self._state: State = {}
@@ -98,7 +154,7 @@ class TorchStepper:
         rendered = self._render(index, step, phase)
         image = self._task.appearance.exposed(rendered.image, index)
         behind = self._task.appearance.behind_photo(index, step)
-        objective = self._objective(image, index, phase, behind)
+        objective = self._photo_loss(image, index, phase.objective, behind)
         term = strategy.regularizer(rendered.opacities, state, step, rendered.info)
         strategy.step_pre_backward(params, optimizers, state, step, rendered.info)
         loss = objective if term is None else objective + term
@@ -130,5 +186,5 @@ class TorchStepper:
             return StepStats(math.nan, math.nan, photometric, math.nan, pop)
         rendered = look.rendered
         image = rendered.image.detach()
-        pixelwise, structural, square = self._objective.measure(image, look.index, phase.l1, look.behind)
+        pixelwise, structural, square = self._photo_loss.measure(image, look.index, phase.objective, look.behind)
         return StepStats(pixelwise, structural, photometric, square, pop, *gaussians_per_pixel(rendered.info))

@@ -21,10 +21,8 @@ from torch import Tensor
 from torch.nn import Parameter
 from tqdm import tqdm
 
-from cuda_ext.train_settings import Phase, StepStats
 from pop_fast.data.capture import Capture
 from pop_fast.data.initialize import initialize_params
-from pop_fast.density.densify import draws_of
 from pop_fast.density.foreign import ForeignStrategy
 from pop_fast.density.passes import Passes
 from pop_fast.density.protocol import DensificationStep, Draws, Strategy
@@ -35,9 +33,9 @@ from pop_fast.stages.activations import opacities_from_logits
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.appearance import Appearance
 from pop_fast.train.batch_stepper import check_batch
+from pop_fast.train.checkpoint import moved_to, on_cpu
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.effects import facts, find_warnings
 from pop_fast.train.engines import engine_of
 from pop_fast.train.environment import reproducible, run_facts, versions
 from pop_fast.train.evaluate import evaluate
@@ -45,16 +43,14 @@ from pop_fast.train.gpu_proxy import translate_oom
 from pop_fast.train.lpips import load_nets
 from pop_fast.train.metrics import population
 from pop_fast.train.model import KEYS, make_optimizers, require_usable
-from pop_fast.train.phases import phase_at, segment_end, updates_of_strategy
-from pop_fast.train.placement import moved_to, on_cpu
-from pop_fast.train.preflight import check_start, check_views
+from pop_fast.train.preflight import check_start, check_views, facts, find_warnings
 from pop_fast.train.ranks import ALONE, Ranks
-from pop_fast.train.records import Segment, record_of
+from pop_fast.train.records import Segment, Stopwatch, Times, record_of
 from pop_fast.train.results import ResultFolder
-from pop_fast.train.schedule import ViewOrder, active_sh_degree
+from pop_fast.train.schedule import ViewOrder, active_sh_degree, phase_at, segment_end, updates_of_strategy
 from pop_fast.train.signals import Abandoned, StopRequest, stop_requests
 from pop_fast.train.stepper import Engine, Stepper, Task
-from pop_fast.train.times import Stopwatch, Times
+from pop_fast.train.steps import Phase, StepStats
 from pop_fast.train.views import ViewTensors
 
 Watch = Callable[["TrainingRun"], None]
@@ -283,7 +279,7 @@ class TrainingRun:
     @cached_property
     def draws(self) -> Draws:
         """What changes of the Gaussians are decided by, the same numbers whatever takes the steps."""
-        return draws_of(self.state["generator"])
+        return Draws.of(self.state["generator"])
 
     @cached_property
     def _passes(self) -> Passes:

@@ -61,6 +61,7 @@ STAGE_MODULES = (
     "density",
     "optimizer",
     "training",
+    "methods",
     "contributions",
     "sensitivity",
     "fisher",
@@ -149,6 +150,10 @@ class Adapter:
         if need == SCALE:
             return self.has(RENDER)
         return need in self.able or need in capabilities_of(self.profile) or callable(getattr(self, need, None))
+
+    def takes(self, argument: str) -> bool:
+        """Tell whether the rasterizer has an argument that changes how it works and no image: tile_size, dominance."""
+        return argument == "tile_size"
 
     def why_not(self, need: str) -> str | None:
         """Return in what words the rasterizer refuses an argument of gsplat's signature; None if it does not.
@@ -391,7 +396,7 @@ def _gathered(call: Call, pulled: list[Any], shape: tuple[int, int]) -> dict[str
         value = _folded(rows, shape)
         own = name in names or (name == "colors" and call.camera_colors)
         value = value if own else np.sum(value, axis=1)
-        found[name] = value if call.batched else value[0]
+        found[name] = call.batched(value)
     return found | {name: _folded([getattr(g, name) for g in pulled], shape) for name in ("means2d", "means2d_abs")}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,8 @@ def assert_close(
     magnitude: Any,
     dtype: Any,
     against_oracle: bool = False,
+    mask: Any = None,
+    place: Callable[[tuple[int, ...]], str] | None = None,
 ) -> None:
     """Assert that every entry differs by at most the key's tolerance times eps times its magnitude.
 
@@ -32,16 +35,22 @@ def assert_close(
         magnitude: what one unit is a multiple of eps of; broadcasts.
         dtype: the precision whose eps is meant.
         against_oracle: True gives a float64 backend the room of `tolerances.agreement`.
+        mask: the entries that are compared, along the leading axes; None for all.
+        place: writes where an entry is, from its index; None writes the index.
     """
     actual, expected = np.asarray(actual, dtype=np.float64), np.asarray(expected, dtype=np.float64)
     assert actual.shape == expected.shape, f"{key}: shape {actual.shape}, expected {expected.shape}"
-    if actual.size == 0:
+    compared = np.ones(actual.shape, dtype=bool)
+    if mask is not None:
+        compared &= np.reshape(mask, np.shape(mask) + (1,) * (actual.ndim - np.ndim(mask)))
+    if not np.any(compared):
         return
-    assert np.all(np.isfinite(actual)), f"{key}: {_first(~np.isfinite(actual), actual, expected)} is not finite"
+    strange = compared & ~np.isfinite(actual)
+    assert not np.any(strange), f"{key}: {_first(strange, actual, expected, place)} is not finite"
     eps = float(np.finfo(dtype).eps)
     # the smallest normal number keeps a magnitude of zero from asking for more than the format can hold
-    scale = np.broadcast_to(np.asarray(magnitude, dtype=np.float64), actual.shape) + np.finfo(dtype).tiny / eps
-    difference = np.abs(actual - expected)
+    scale = np.where(compared, magnitude, 0.0) + np.finfo(dtype).tiny / eps
+    difference = np.where(compared, np.abs(actual - expected), 0.0)
     tolerances.record(key, dtype, float(np.max(difference / (eps * scale))))
     limit = tolerances.agreement(key, dtype) if against_oracle else tolerances.allowed(key, dtype)
     wrong = difference > limit * scale
@@ -49,22 +58,28 @@ def assert_close(
         where = tuple(int(i) for i in np.argwhere(wrong)[0])
         units = difference[where] / (eps * scale[where])
         raise AssertionError(
-            f"{key}: {_first(wrong, actual, expected)}; differs by {difference[where]:.3e} = {units:.3g} units,"
-            f" allowed {limit / eps:.3g} units of {eps * scale[where]:.3e}; {int(np.sum(wrong))} of {wrong.size} differ"
+            f"{key}: {_first(wrong, actual, expected, place)}; differs by {difference[where]:.3e} = {units:.3g} units,"
+            f" allowed {limit / eps:.3g} units of {eps * scale[where]:.3e};"
+            f" {int(np.sum(wrong))} of {int(np.sum(compared))} differ"
         )
 
 
-def assert_same_bits(what: str, actual: Any, expected: Any) -> None:
-    """Assert equality of every entry; 0.0 and -0.0 are the same value."""
+def assert_same_bits(
+    what: str, actual: Any, expected: Any, mask: Any = None, place: Callable[[tuple[int, ...]], str] | None = None
+) -> None:
+    """Assert equality of every entry that the mask keeps; 0.0 and -0.0 are the same value."""
     actual, expected = np.asarray(actual), np.asarray(expected)
     assert actual.shape == expected.shape, f"{what}: shape {actual.shape}, expected {expected.shape}"
     wrong = ~((actual == expected) | (np.isnan(actual) & np.isnan(expected)))
-    assert not np.any(wrong), f"{what}: {_first(wrong, actual, expected)}; must be equal exactly"
+    if mask is not None:
+        wrong &= np.reshape(mask, np.shape(mask) + (1,) * (actual.ndim - np.ndim(mask)))
+    assert not np.any(wrong), f"{what}: {_first(wrong, actual, expected, place)}; must be equal exactly"
 
 
-def _first(wrong: Any, actual: Any, expected: Any) -> str:
+def _first(wrong: Any, actual: Any, expected: Any, place: Callable[[tuple[int, ...]], str] | None = None) -> str:
     where = tuple(int(i) for i in np.argwhere(wrong)[0])
-    return f"first at {list(where)}: got {actual[where].item()!r}, expected {expected[where].item()!r}"
+    at = f"first at {list(where)}" if place is None else place(where)
+    return f"{at}: got {actual[where].item()!r}, expected {expected[where].item()!r}"
 
 
 def with_error_bounds(backend: Any, scene: Scene) -> tuple[Scene, PixelErrorBounds]:

@@ -61,6 +61,17 @@ def made_by(path: str) -> Adapter:
     return made
 
 
+def strategy_named(path: str, dtype: str = "float32") -> Any:
+    """Return the adapter of somebody's density strategy, the class or function that makes it at `my.module:Mine`."""
+    make = function_named(path)
+    try:
+        from pop_ref.conformance.torch_strategy import StrategyAdapter
+
+        return StrategyAdapter(path, make, dtype)
+    except ModuleNotFoundError as error:
+        raise Unavailable(f"{path} needs {error.name}, which is not installed") from error
+
+
 def shipped(name: str) -> Any:
     """Return the adapter of that name.
 
@@ -128,7 +139,7 @@ def program(name: str, package: str, backend: str, dtype: str) -> Any:
     trains = training_stages(package)
     if backend == "compiled" and dtype == "float32":
         # what trains in this precision is the native step, which has an Adam of its own
-        native = importlib.import_module(f"{package}.compiled.optimizer")
+        native = importlib.import_module(f"{package}.compiled.native_step")
         trains |= {name: getattr(native, name) for name in ("adam_step", "adam_steps")}
     return TorchAdapter(name, rasterization, stages, dtype, stages=trains)
 

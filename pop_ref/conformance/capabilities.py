@@ -26,6 +26,8 @@ STAGES: Final = (
     "polarization",
     "density",
     "optimizer",
+    "training",
+    "autograd",
     "contributions",
     "sensitivity",
     "fisher",

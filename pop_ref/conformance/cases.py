@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -186,3 +188,19 @@ def _row_size(value: np.ndarray) -> np.ndarray:
         return np.abs(value)
     largest = np.max(np.abs(value), axis=tuple(range(1, value.ndim)), initial=0.0)
     return np.broadcast_to(largest.reshape(-1, *[1] * (value.ndim - 1)), value.shape)
+
+
+def with_own_lists(
+    function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """Return a stage function's arguments with tile lists as the `TileLists` that its module knows, if it knows any."""
+    own = getattr(sys.modules.get(function.__module__), "TileLists", None)
+    signature = inspect.signature(function)
+    if own is None or "lists" not in signature.parameters:
+        return args, kwargs
+    given = signature.bind(*args, **kwargs)
+    named = given.arguments
+    camera = named.get("camera")
+    size = (named["width"], named["height"]) if camera is None else (camera.width, camera.height)
+    named["lists"] = own.of(named["lists"], *size, named["tile_size"])
+    return given.args, given.kwargs

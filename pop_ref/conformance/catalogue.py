@@ -35,16 +35,26 @@ sides, the nearest decision with its margin, and a scene to paste, which is also
 A rasterizer is asked once for every argument of gsplat's signature: several cameras, batches, packed rows, depth modes,
 plain colours of any number of channels, colours of each camera, covariances, radius_clip, planes, no background,
 sparse_grad. What it refuses is skipped by name and in its own words: an argument that its signature lacks,
-NotImplementedError, a ValueError, TypeError or AssertionError that Python code raises by a statement, a RuntimeError
-that says "unsupported" or "not implemented". Any other error is a defect, which the laws of that argument report. What
-it accepts is compared with what the oracle draws of every frame alone. One that only draws has no gradients to judge.
+NotImplementedError, a ValueError or TypeError that Python code raises by a statement, a RuntimeError that says
+"unsupported" or "not implemented". Any other error, an assertion among them, is a defect: the laws of that argument
+report it, and the scorecard counts it as crashed. What it accepts is compared with what the oracle draws of every frame
+alone. One that only draws has no gradients to judge.
+
+Every two values of two arguments that are taken alone meet in some call of a covering array (`pairs.py`); images,
+gradients and meta of every camera are compared. To refuse two arguments together that are taken alone is a defect, too.
+The scorecard says which pairs were compared. A broken law names the fewest arguments on which its call breaks, with
+batch entry, camera and pixel, and prints the call to paste.
 
 What is drawn where nothing but an image is asked for may be other code than what also counts. A rasterizer with the
 arguments `dominance` and `counts` is judged as training asks it, and a law holds every choice of the two together.
 
-Density control and Adam are judged as what trains: `torch_training.training_stages` makes stage functions of a
-trainer's strategy, row operations and optimizers, and `TorchAdapter(stages=...)` takes any such functions, on tensors
-under the oracle's names; those of another engine are one more entry of `backends.py`.
+What trains is judged as it trains. A strategy is driven by a script (`strategy_script.py`), as a run drives it: the
+prior joins the loss, the backward pass, Adam, statistics, and then the Gaussians change; with one camera and several,
+packed and not, with signed and absolute gradients. `pop_ref.methods` says what POP, gsplat, 3DGS, Mini-Splatting,
+Taming-3DGS, Speedy-Splat and PUP-3DGS do at every step. `torch_training.training_stages` makes stage functions of a
+trainer's strategies, row operations, schedules and optimizers, and `TorchAdapter(stages=...)` takes any such functions.
+`--strategy gsplat.strategy:DefaultStrategy` judges somebody's strategy by the laws of training that are about no
+method. Pictures take no part: that the step of an engine makes its statistics of renders rightly is not judged here.
 
 An adapter defines what there is, under the oracle's names, on arrays. With `composite` alone the oracle projects and
 lists the splats of whole scenes; a stage function such as `project_means` is judged by its own laws.

@@ -1,4 +1,4 @@
-"""Scenes at scale, the same on every machine: up to 5,000 Gaussians, long lists, many tiles, tiles cut by the border.
+"""Scenes at scale, the same on every machine: up to 70,000 Gaussians, long lists, many tiles, tiles cut by the border.
 
 They are made by formula, of integers and of elementwise arithmetic alone, and every number is one of float32, so that
 all precisions read the same scene. What the oracle says of them is kept beside (`corpus_answers`), because the oracle
@@ -36,6 +36,9 @@ class Plan:
         small: the oracle itself draws it in a second.
         profile: the constants; Inria's have the principal point in the middle and their own tiles.
         without: rows that are left out, because rounding decides their extents.
+        depths: the nearest and the farthest; beyond a factor of 10 they are spread by their logarithm.
+        beyond: px by which centres lie outside the image at most.
+        apart: where it is not 0, rows come in pairs at one place, whose depths differ by this share.
     """
 
     n: int
@@ -50,6 +53,9 @@ class Plan:
     small: bool = False
     profile: Profile = PAPER
     without: tuple[int, ...] = ()
+    depths: tuple[float, float] = (1.5, 6.0)
+    beyond: float = 3.5
+    apart: float = 0.0
 
 
 # rows of hundreds_of_inria whose extents rounding decides
@@ -57,6 +63,9 @@ _UNCLEAR: Final = (
     *(25, 59, 64, 77, 93, 99, 111, 118, 131, 134, 147, 150, 158),
     *(159, 181, 202, 204, 220, 221, 236, 251, 252, 260, 275, 287),
 )
+
+# and of ten_thousand_in_a_tile
+_DECIDED: Final = (4288, 5371, 7179, 9709)
 
 PLANS: Final[dict[str, Plan]] = {
     "fifty": Plan(50, 33, 17, 16, (2.0, 9.0), (0.05, 0.8), 3, (3.0, 1.0, -2.0, 0.5), 1.25, small=True),
@@ -66,6 +75,16 @@ PLANS: Final[dict[str, Plan]] = {
     "many_tiles": Plan(2000, 121, 90, 4, (0.75, 3.5), (0.05, 0.985), 2, (1.0, 2.0, 3.0, 4.0), 0.875),
     "five_thousand": Plan(5000, 200, 120, 4, (0.75, 4.0), (0.02, 0.95), 0, (5.0, -1.0, 0.5, 1.0), 1.0),
     "hundreds_of_tiles_a_splat": Plan(50, 121, 90, 4, (8.0, 30.0), (0.02, 0.9), 0, (3.0, -1.0, 1.0, 2.0), 1.0),
+    "far_and_huge": Plan(
+        16, 521, 37, 4, (8.0, 450.0), (0.05, 0.6), 0, (1.0, 0.25, -0.5, 0.25), 1.0, depths=(1.5, 3000.0), beyond=260.0
+    ),
+    "near_equal_depths": Plan(
+        400, 64, 48, 16, (1.0, 4.0), (0.1, 0.8), 0, (1.0, 0.5, 0.25, -0.5), 1.0, depths=(0.5, 500.0), apart=4e-5
+    ),
+    "ten_thousand_in_a_tile": Plan(
+        10_000, 16, 15, 16, (0.05, 0.4), (0.006, 0.03), 0, (1.0, 0.0, 1.0, 0.5), without=_DECIDED, beyond=0.25
+    ),
+    "seventy_thousand": Plan(70_000, 521, 259, 4, (0.2, 1.2), (0.05, 0.9), 0, (1.0, -0.25, 0.5, 0.25), beyond=1.5),
     "fifty_of_inria": Plan(
         60, 33, 17, 16, (2.0, 9.0), (0.05, 1.0), 3, (3.0, 1.0, -2.0, 0.5), 1.25, True, INRIA, (9, 10, 31, 36, 45, 46)
     ),
@@ -78,6 +97,25 @@ PLANS: Final[dict[str, Plan]] = {
 def _column(n: int, k: int) -> np.ndarray:
     """Return n numbers in (0, 1), evenly spread and in an order that no other column has."""
     return (np.mod((np.arange(n, dtype=np.int64) + 1) * _MULTIPLIERS[k], 2**16) + 0.5) / 2**16
+
+
+def _depths(plan: Plan) -> np.ndarray:
+    """Return depths of which no two are so close to each other that rounding could exchange them."""
+    low, high = plan.depths
+    n = plan.n // 2 if plan.apart else plan.n
+    place = np.mod(np.arange(n) * _stride(n), n) + 0.5
+    found = low + (high - low) * place / n if high < 10.0 * low else low * (high / low) ** (place / n)
+    if plan.apart:
+        # of a pair the first in memory is as often the farther one
+        farther = np.where(np.arange(n) % 2 == 0, plan.apart, -plan.apart)
+        found = np.concatenate([found * (1.0 + farther), found])
+    return found
+
+
+def _places(plan: Plan, k: int) -> np.ndarray:
+    """Return a column of places; those of a pair are one."""
+    half = plan.n // 2
+    return np.tile(_column(half, k), 2) if plan.apart else _column(plan.n, k)
 
 
 def _between(low: float, high: float, share: np.ndarray) -> np.ndarray:
@@ -95,11 +133,10 @@ def corpus_scene(name: str) -> Scene:
     fy = fx * plan.oblong
     centred = plan.profile.principal_point == "centred"
     cx, cy = 0.5 * plan.width + (0.0 if centred else 1.25), 0.5 * plan.height - (0.0 if centred else 0.75)
-    # no two depths are alike, and none is so close to another that rounding could exchange them
-    depths = 1.5 + 4.5 * (np.mod(np.arange(n) * _stride(n), n) + 0.5) / n
-    # a few pixels beyond the image on all sides
-    x = (_between(-3.5, plan.width + 3.5, _column(n, 0)) - cx) / fx * depths
-    y = (_between(-3.5, plan.height + 3.5, _column(n, 1)) - cy) / fy * depths
+    depths = _depths(plan)
+    # a few pixels beyond the image on all sides, or many
+    x = (_between(-plan.beyond, plan.width + plan.beyond, _places(plan, 0)) - cx) / fx * depths
+    y = (_between(-plan.beyond, plan.height + plan.beyond, _places(plan, 1)) - cy) / fy * depths
     R, t = _float32(_rotation(plan.turn)), np.array([0.5, -0.25, 0.75])
     moved = np.stack([x - t[0], y - t[1], depths - t[2]])
     means = _float32(np.stack([R[0, k] * moved[0] + R[1, k] * moved[1] + R[2, k] * moved[2] for k in range(3)], 1))

@@ -1,4 +1,4 @@
-"""Where a backend parts from the oracle: the first stage, Gaussian, pixel and gradient, and the nearest decision."""
+"""Where a backend parts from the oracle: stage, Gaussian, pixel, gradient and nearest decision; of a call, argument."""
 
 from __future__ import annotations
 
@@ -9,15 +9,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pop_ref.conformance.adapter import OracleAdapter, View
+from pop_ref.conformance.calls import Call, call_as_code
 from pop_ref.conformance.capabilities import GRADIENTS, RENDER
 from pop_ref.conformance.cases import sensitivity
 from pop_ref.conformance.error_bounds import REACH, PixelErrorBounds, pixel_error_bounds
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
+from pop_ref.conformance.narrowing import Check, breaks, cause, narrowed
+from pop_ref.conformance.pairs import CHECKS
 from pop_ref.conformance.scene_files import save_scene
 from pop_ref.conformance.scenes import Scene, cotangents, scene_as_code
 from pop_ref.margins import margins
 
 ORACLE = OracleAdapter()
+# a call of larger pictures is reported with all its Gaussians: to try without each would take minutes
+MOST_PIXELS = 1200
 # what a rasterizer's meta may show of the stages before the pixel, in the order of a render
 SHOWN = (("depths", "means_cam_from_means"), ("means2d", "project_means"), ("conics", "conics_from_covars2d"))
 
@@ -184,22 +189,55 @@ def nearest_decision(scene: Scene, pixel: tuple[int, int] | None) -> str:
 
 
 def failure_report(name: str, backend: Any, scenes: dict[str, Scene]) -> str:
-    """Write a failing law's report: what differs first, the nearest decision, and the scene as code to paste.
+    """Write a failing law's report: what differs first, the nearest decision, and the scene or the call as code.
 
     Args:
         name: the law.
-        backend: who broke it; as a law watched it, it says whether gradients were asked for.
+        backend: who broke it; as a law watched it, it says whether gradients were asked for, and which calls were made.
         scenes: what was drawn, by name; the first that the backend draws otherwise than the oracle is reported.
     """
     title = f"law {name.removeprefix('test_')} fails on {backend.name}"
+    calls = getattr(backend, "calls", [])
+    if calls:
+        # a law stops at the call that breaks it
+        return "\n".join([title, *call_findings(backend, calls[-1])])
     reports = [(scene, *_findings(backend, scene)) for scene in scenes.values()]
     if not reports:
         return f"{title}\nit draws no scene; what was drawn stands above"
     scene, lines, pixel = next((report for report in reports if report[1]), reports[0])
     if not lines:
-        alike = "stages, pixels and gradients" if getattr(backend, "asked_for_gradients", True) else "stages and pixels"
-        lines = [f"{alike} of its scenes are the oracle's; the law breaks in what it compares"]
+        lines = [f"{_compared(backend, scene)} of its scenes are the oracle's; the law breaks in what it compares"]
     return "\n".join([title, *lines, nearest_decision(scene, pixel), f"scene to paste:\n{scene_as_code(scene)}"])
+
+
+def call_findings(backend: Any, call: Call) -> list[str]:
+    """Say what differs first of a call, which of its arguments it takes, and give the call as code, narrowed.
+
+    Stages are spoken of only where the call needs no argument to break, and only of those that can be compared.
+    """
+    checks: dict[str, Check | None] = {"answer": None, **CHECKS}
+    found = next(((what, check) for what, check in checks.items() if breaks(backend, call, check) is not None), None)
+    if found is None:
+        parts = ", ".join(checks if backend.has(GRADIENTS) else [what for what in checks if what != "gradients"])
+        return [
+            f"the {parts} of its last call are the oracle's; the law breaks in what it compares",
+            f"call to paste:\n{call_as_code(call)}",
+        ]
+    what, check = found
+    camera = call.first.scene.camera
+    plain, words = narrowed(backend, call, check, gaussians=camera.width * camera.height <= MOST_PIXELS)
+    lines = [f"first difference: {what}: {words}", f"first cause: {cause(backend, plain, check)}"]
+    if not plain.described():
+        lines += _findings(backend, plain.first.scene)[0]
+    return [*lines, f"call to paste:\n{call_as_code(plain)}"]
+
+
+def _compared(backend: Any, scene: Scene) -> str:
+    """Name what a report has compared of a scene."""
+    stages = sum(backend.has(name) for name, _ in _calls(scene))
+    parts = [f"{stages} stages"] * (stages > 0) + ["pixels"] * backend.has(RENDER)
+    parts += ["gradients"] * bool(getattr(backend, "asked_for_gradients", True) and backend.has(GRADIENTS))
+    return " and ".join(parts) or "nothing that could be compared"
 
 
 def _findings(backend: Any, scene: Scene) -> tuple[list[str], tuple[int, int] | None]:
@@ -207,12 +245,7 @@ def _findings(backend: Any, scene: Scene) -> tuple[list[str], tuple[int, int] | 
     lines = [] if stage is None else [f"first stage that differs: {stage}"]
     pixel = first_pixel(backend, scene) if backend.has(RENDER) else None
     if pixel is not None:
-        if stage is None:
-            shown = first_shown(backend, scene)
-            if isinstance(shown, list):
-                alike = f"{', '.join(shown)} are the oracle's, so it is" if shown else "it shows none before"
-                shown = f"{alike} alpha, order or blending"
-            lines.append(f"first stage that differs: {shown}")
+        lines += _from_meta(backend, scene, pixel[0]) if stage is None else []
         lines.append(f"first pixel that differs: {pixel[0]}")
         lines.append(f"first Gaussian: {first_gaussian(backend, scene)}")
     elif getattr(backend, "asked_for_gradients", True) and backend.has(GRADIENTS):
@@ -220,6 +253,19 @@ def _findings(backend: Any, scene: Scene) -> tuple[list[str], tuple[int, int] | 
         gradient = first_gradient(backend, scene)
         lines += [] if gradient is None else [f"first gradient that differs: {gradient}"]
     return lines, None if pixel is None else pixel[1]
+
+
+def _from_meta(backend: Any, scene: Scene, pixel: Difference) -> list[str]:
+    """Say what meta shows of the stages before the pixel; what follows from it, only where it shows all of them."""
+    shown = first_shown(backend, scene)
+    if isinstance(shown, Difference):
+        return [f"first stage that differs: {shown}"]
+    if len(shown) < len(SHOWN):
+        return [f"no stage that its meta shows differs: {', '.join(shown)}"] if shown else []
+    after = {"T_final": "so it is opacity, a cull, alpha or where a pixel ends",
+             "image": "and so is T_final, so it is colours, their order or the background"}  # fmt: skip
+    so = after.get(pixel.what, "and so is the image, so it is what is told of the pixel")
+    return [f"no stage that its meta shows differs: {', '.join(shown)}, {so}"]
 
 
 def failure_saver(folder: Path) -> Callable[[str, Any, dict[str, Scene]], str]:

@@ -81,9 +81,8 @@ def law(
 def _telling(sentence: Callable[..., None], quantified: Callable[..., Any]) -> Callable[..., None]:
     """Return the law as a test whose failure says where the backend parts from the oracle, with code to paste.
 
-    It is written once, about the last example that broke the law: the shrunk one.
+    It is about the example that raised the error, and about no other: the error carries it.
     """
-    broken: list[_Watched] = []
 
     @functools.wraps(sentence)
     def watched(backend: Any, **drawn: Any) -> None:
@@ -94,8 +93,8 @@ def _telling(sentence: Callable[..., None], quantified: Callable[..., Any]) -> C
         except HypothesisException:
             # a scene that is set aside, or a misuse of a strategy: nothing about the backend
             raise
-        except Exception:
-            broken[:] = [seen]
+        except Exception as error:
+            error.__dict__[_EXAMPLE] = seen
             raise
 
     test = quantified(watched)
@@ -103,27 +102,43 @@ def _telling(sentence: Callable[..., None], quantified: Callable[..., Any]) -> C
     @functools.wraps(test)
     def reported(*args: Any, **named: Any) -> None:
         __tracebackhide__ = True
-        broken.clear()
         try:
             test(*args, **named)
         except Exception as error:
-            for seen in broken:
+            seen = _example_of(error)
+            if seen is not None:
                 for report in FAILURE_REPORTS:
                     error.add_note(_safely(report, sentence.__name__, seen, seen.scenes))
             raise
-        finally:
-            broken.clear()
 
     return reported
 
 
+# under what names an error carries the example that raised it, and that the backend itself raised it
+_EXAMPLE, _RAISED_BY_BACKEND = "pop_example", "pop_raised_by_backend"
+
+
+def _example_of(error: BaseException) -> _Watched | None:
+    members = error.exceptions if isinstance(error, BaseExceptionGroup) else ()
+    found = [error.__dict__.get(_EXAMPLE), *map(_example_of, members)]
+    return next((seen for seen in found if seen is not None), None)
+
+
+def is_crash(error: BaseException) -> bool:
+    """Tell whether a law broke because the backend raised an error, not because of a comparison."""
+    from pop_ref.conformance.narrowing import RasterizerError
+
+    return isinstance(error, RasterizerError) or bool(error.__dict__.get(_RAISED_BY_BACKEND))
+
+
 class _Watched:
-    """A backend that remembers the scenes that it was asked to draw."""
+    """A backend that remembers what it was asked to draw, and marks the errors that it raises."""
 
     def __init__(self, adapter: Any, drawn: dict[str, Any]) -> None:
         self.adapter = adapter
         self._given = {name: value for name, value in drawn.items() if isinstance(value, Scene)}
         self._made: list[Scene] = []
+        self.calls: list[Call] = []
         self.asked_for_gradients = False
 
     def __getattr__(self, name: str) -> Any:
@@ -131,22 +146,25 @@ class _Watched:
 
     def render(self, scene: Scene) -> Any:
         self._remember(scene)
-        return self.adapter.render(scene)
+        return _marked(self.adapter.render, scene)
 
     def plainly(self, scene: Scene) -> Any:
         self._remember(scene)
-        return self.adapter.plainly(scene)
+        return _marked(self.adapter.plainly, scene)
 
     def gradients(self, scene: Scene, *cotangents: Any) -> Any:
         self._remember(scene)
         self.asked_for_gradients = True
-        return self.adapter.gradients(scene, *cotangents)
+        return _marked(self.adapter.gradients, scene, *cotangents)
 
     def call(self, call: Call, *cotangents: Any) -> Any:
-        for _, _, frame in call.each:
-            self._remember(frame.scene)
+        if call.shape[2] <= MOST_TOLD:
+            self.calls.append(call)
         self.asked_for_gradients |= bool(cotangents)
-        return self.adapter.call(call, *cotangents)
+        return _marked(self.adapter.call, call, *cotangents)
+
+    def stage(self, name: str) -> Any:
+        return functools.partial(_marked, self.adapter.stage(name))
 
     def _remember(self, scene: Scene) -> None:
         # a scene of thousands is known by its name; to report about it would take the oracle minutes
@@ -157,10 +175,22 @@ class _Watched:
     def scenes(self) -> dict[str, Scene]:
         """Return, by name, the scenes that the law drew, as the backend reads them, and those that it made of them."""
         found = {name: self.adapter.sees(scene) for name, scene in self._given.items()}
-        for scene in self._made:
+        last = [frame.scene for call in self.calls[-1:] for _, _, frame in call.each]
+        for scene in (*self._made, *last):
             if repr(scene) not in map(repr, found.values()):
                 found[f"scene{len(found)}"] = scene
         return found
+
+
+def _marked(function: Callable[..., Any], *args: Any, **named: Any) -> Any:
+    """Call a backend's function; what it raises is marked as its own."""
+    try:
+        return function(*args, **named)
+    except HypothesisException:
+        raise
+    except Exception as error:
+        error.__dict__[_RAISED_BY_BACKEND] = True
+        raise
 
 
 def _safely(report: Callable[..., str], *about: Any) -> str:

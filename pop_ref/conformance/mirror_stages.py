@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from pop_ref.conformance.mirror_library import Mirror
 from pop_ref.constants import PAPER, Profile
+from pop_ref.settings import BETAS, EPS
 
 _IDENTITY = np.eye(4)
 
@@ -169,10 +169,9 @@ def pop_loss_vjp(m: Mirror, opacities: Any, mask: Any, v_loss: float) -> Any:
 
 def adam_step(m: Mirror, params: Any, grads: Any, first: Any, second: Any, step: int, lr: Any) -> Any:
     # betas and eps are those of the fused step
-    settings = importlib.import_module("cuda_ext.train_settings").StepSettings
     moved: tuple[dict[str, Any], ...] = (dict(params), dict(first), dict(second))
     for name, g in grads.items():
-        numbers = [lr[name], *settings.betas, settings.eps]
+        numbers = [lr[name], *BETAS, EPS]
         kept = [float(m.dtype(number)) for number in numbers]
         halves = [half for number, near in zip(numbers, kept, strict=True) for half in (near, number - near)]
         rows = [params[name], first[name], second[name], g]

@@ -23,7 +23,8 @@ LAWS = "pop_ref.conformance.laws"
 FAILURES = "conformance_failures"
 # the lines of a failure's report that say what differs first (`failure_report`)
 DIFFERENCES = re.compile(
-    r"^E +((?:first|nearest|no) (?:stage|pixel|Gaussian|gradient|decision)\b.*|saved as .*)$", re.MULTILINE
+    r"^E +((?:first|nearest|no) (?:stage|pixel|Gaussian|gradient|decision|difference|cause)\b.*|saved as .*)$",
+    re.MULTILINE,
 )
 
 
@@ -37,6 +38,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="append",
         default=[],
         help="a class derived from pop_ref.conformance.Adapter",
+    )
+    group.addoption(
+        "--strategy",
+        metavar="MODULE:CLASS",
+        action="append",
+        default=[],
+        help="a density strategy with gsplat's protocol, as gsplat.strategy:DefaultStrategy",
     )
     group.addoption(
         "--program",
@@ -94,7 +102,8 @@ def _chosen(config: pytest.Config) -> str:
     """Return the names of what the options choose to judge; empty for the oracle."""
     option: Any = config.getoption
     single = option("--rasterizer") or option("--stages")
-    return ", ".join([*option("--backend"), *option("--adapter"), *option("--program"), *([single] if single else [])])
+    several = [each for name in ("--backend", "--adapter", "--strategy", "--program") for each in option(name)]
+    return ", ".join([*several, *([single] if single else [])])
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -136,7 +145,14 @@ def _chosen_backends(config: pytest.Config) -> list[Any]:
 
 
 def _make_backends(config: pytest.Config) -> list[Any]:
-    from pop_ref.conformance.backends import Unavailable, adapter_for, made_by, shipped, shipped_or_absent
+    from pop_ref.conformance.backends import (
+        Unavailable,
+        adapter_for,
+        made_by,
+        shipped,
+        shipped_or_absent,
+        strategy_named,
+    )
     from pop_ref.conformance.program_adapter import ProgramAdapter
     from pop_ref.conformance.program_pipe import ProgramError
     from pop_ref.constants import profile_named
@@ -146,6 +162,7 @@ def _make_backends(config: pytest.Config) -> list[Any]:
         chosen = [shipped_or_absent(name) for name in option("--backend")] + [
             made_by(path) for path in option("--adapter")
         ]
+        chosen += [strategy_named(path, option("--dtype")) for path in option("--strategy")]
         chosen += [ProgramAdapter(command, option("--program-timeout")) for command in option("--program")]
         path, package = option("--rasterizer"), option("--stages")
         if path or package:
@@ -220,20 +237,31 @@ class _Recorder:
             crash = getattr(report.longrepr, "reprcrash", None)
             detail = str(crash.message if crash else report.longrepr).splitlines()[0]
             differences = tuple(DIFFERENCES.findall(report.longreprtext))
+        more: dict[str, Any] = dict(report.user_properties)
         backend, stage, law = named
-        cpu: Any = dict(report.user_properties).get("cpu", 0.0)
-        self.card.entries.append(Entry(backend, stage, law, report.outcome, detail, report.duration, differences, cpu))
+        outcome, cpu = ("crashed" if "crash" in more else report.outcome), more.get("cpu", 0.0)
+        self.card.entries.append(Entry(backend, stage, law, outcome, detail, report.duration, differences, cpu))
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item: pytest.Item) -> Generator[None, Any, Any]:
+        from pop_ref.conformance.law import is_crash
+
         start = time.process_time()
         try:
             return (yield)
+        except Exception as error:
+            # an error of the rasterizer's own is no comparison that failed
+            if is_crash(error):
+                item.user_properties.append(("crash", True))
+            raise
         finally:
             item.user_properties.append(("cpu", time.process_time() - start))
 
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        from pop_ref.conformance.pairs import judged_pairs
         from pop_ref.conformance.surface import surface_of
 
-        self.card.surfaces = {b.name: surface_of(b) for b in _chosen_backends(session.config)}
+        judged = _chosen_backends(session.config)
+        self.card.surfaces = {backend.name: surface_of(backend) for backend in judged}
+        self.card.pairs = {backend.name: pairs for backend in judged if (pairs := judged_pairs(backend))}
         self.card.write(self.path)

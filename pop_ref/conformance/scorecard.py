@@ -20,7 +20,7 @@ class Entry:
 
     Attributes:
         backend, stage, law: names.
-        outcome: passed, failed or skipped.
+        outcome: passed, failed, skipped; or crashed, where the backend raised an error, so that nothing was compared.
         detail: the first line of the failure, or why it was skipped.
         seconds: how long it took.
         differences: of a failure, what differs first and where, a line each.
@@ -45,18 +45,22 @@ class Scorecard:
         title: what was judged.
         entries: in the order in which they ran.
         surfaces: by backend, what of it laws can reach (`surface.surface_of`).
+        pairs: by backend, which pairs of arguments were compared (`pairs.judged_pairs`).
     """
 
     title: str
     entries: list[Entry] = field(default_factory=list)
     surfaces: dict[str, dict[str, Any]] = field(default_factory=dict)
+    pairs: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def summary(self) -> dict[str, dict[str, dict[str, int]]]:
-        """Count outcomes by backend and stage, stages in the order of a render."""
+        """Count outcomes by backend and stage, stages in the order of a render; a crash is a failure, counted apart."""
         counts: dict[str, dict[str, dict[str, int]]] = {}
         for entry in sorted(self.entries, key=lambda e: STAGES.index(e.stage)):
             row = counts.setdefault(entry.backend, {}).setdefault(entry.stage, {"passed": 0, "failed": 0, "skipped": 0})
-            row[entry.outcome] += 1
+            if entry.outcome == "crashed":
+                row["crashed"] = row.get("crashed", 0) + 1
+            row["failed" if entry.outcome == "crashed" else entry.outcome] += 1
         return counts
 
     def write(self, path: Path) -> None:
@@ -70,7 +74,7 @@ class Scorecard:
     def as_dict(self) -> dict[str, Any]:
         """Return what the JSON file holds: counts, and by backend, stage and outcome the names of laws.
 
-        An outcome is passed, "skipped: REASON" or "failed: DETAIL".
+        An outcome is passed, "skipped: REASON", "failed: DETAIL" or "crashed: DETAIL".
         """
         laws: dict[str, dict[str, dict[str, list[str]]]] = {}
         for entry in sorted(self.entries, key=lambda e: STAGES.index(e.stage)):
@@ -84,6 +88,7 @@ class Scorecard:
             "title": self.title,
             "made": made,
             "surface": self.surfaces,
+            "pairs": self.pairs,
             "summary": self.summary(),
             "laws": laws,
         }
@@ -98,7 +103,7 @@ def _compact(card: dict[str, Any]) -> str:
     """Write JSON with a line for each stage of each backend."""
     lines = []
     for key, value in card.items():
-        if key not in ("summary", "laws", "surface"):
+        if key not in ("summary", "laws", "surface", "pairs"):
             lines.append(f" {json.dumps(key)}: {json.dumps(value)}")
             continue
         parts = []

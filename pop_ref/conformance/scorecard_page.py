@@ -18,7 +18,7 @@ def page(card: Scorecard, made_with: Mapping[str, str]) -> str:
         chosen = [entry for entry in card.entries if entry.backend == backend]
         parts += [f"<section><h2>{escape(backend)}</h2>", _verdict(chosen)]
         parts += [_surface(card.surfaces.get(backend, {})), _table(stages)]
-        parts += [*_broken(chosen), *_skipped(chosen), "</section>"]
+        parts += [*_broken(chosen), *_pairs(card.pairs.get(backend, {})), *_skipped(chosen), "</section>"]
     return "\n".join(parts)
 
 
@@ -27,10 +27,12 @@ def _count(entries: list[Entry], outcome: str) -> int:
 
 
 def _verdict(entries: list[Entry]) -> str:
-    passed, failed, skipped = (_count(entries, outcome) for outcome in ("passed", "failed", "skipped"))
+    passed, crashed, skipped = (_count(entries, outcome) for outcome in ("passed", "crashed", "skipped"))
+    failed = _count(entries, "failed") + crashed
     if not passed + failed:
         return "<p>Nothing could be judged.</p>"
     words = f"breaks {failed} of {passed + failed} laws" if failed else f"obeys all {passed} laws that could be tried"
+    words += f", {crashed} of them by errors of its own" if crashed else ""
     return f"<p class={'bad' if failed else 'good'}>{words}; {skipped} skipped</p>"
 
 
@@ -59,15 +61,26 @@ def _table(stages: dict[str, dict[str, int]]) -> str:
 
 
 def _broken(entries: list[Entry]) -> list[str]:
-    failed = [entry for entry in entries if entry.outcome == "failed"]
+    failed = [entry for entry in entries if entry.outcome in ("failed", "crashed")]
     parts = ["<h3>Broken</h3>"] if failed else []
     for entry in failed:
         lines = "".join(f"<li>{escape(line)}" for line in entry.differences)
         parts.append(
-            f"<article><b>{_sentence(entry.law)}</b> <small>{entry.stage}</small>"
+            f"<article><b>{_sentence(entry.law)}</b> <small>{entry.stage}, {entry.outcome}</small>"
             f"<p>{escape(entry.detail)}</p><ul>{lines}</ul></article>"
         )
     return parts
+
+
+def _pairs(pairs: dict[str, Any]) -> list[str]:
+    if not pairs:
+        return []
+    head = f"Pairs of arguments compared: {pairs['judged']} of {pairs['taken']}, in {pairs['calls']} calls"
+    rows = [f"<dt>refused alone: {escape(what)}<dd>{escape(why)}" for what, why in pairs["refused alone"].items()]
+    rows += [f"<dt>not compared, as every call with them fails<dd>{escape(pair)}" for pair in
+             pairs["only in calls that fail"]]  # fmt: skip
+    rows += [f"<dt>{escape(names)}<dd>{count}" for names, count in pairs["by arguments"].items()]
+    return [f"<details><summary>{head}</summary><dl>{''.join(rows)}</dl></details>"]
 
 
 def _skipped(entries: list[Entry]) -> list[str]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import functools
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bound
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scenes import Scene
 from pop_ref.conformance.screen_error_bounds import ScreenErrorBounds
+from pop_ref.conformance.views import clear_of_extents
 from pop_ref.covariance import covars_from_quats_scales_vjp
 from pop_ref.depth import SMALLEST_OPACITY
 from pop_ref.records import Render
@@ -26,13 +29,14 @@ class Expected:
 
     Attributes:
         scene: what it draws.
+        dtype: the precision that is judged.
         error_bounds: of the frame's channels, depth accumulated.
         render: the oracle's.
         v_image, v_T_final: cotangents, zero where a decision is near its threshold.
     """
 
     def __init__(self, call: Call, frame: Frame, dtype: Any, number: int) -> None:
-        self.call, self.frame = call, frame
+        self.call, self.frame, self.dtype = call, frame, dtype
         self.scene = drawn_scene(call, frame)
         self.error_bounds = _frame_error_bounds(call, frame, self.scene, dtype)
         self.render: Render = oracle_frame(self.scene, frame.colors, call.render_mode)
@@ -60,8 +64,14 @@ class Expected:
     def _opacity(self) -> np.ndarray:
         return np.maximum(1.0 - self.render.T_final, SMALLEST_OPACITY)
 
+    @functools.cached_property
+    def clear(self) -> np.ndarray:
+        """Tell whose culls, extents and tiles rounding does not decide. [N]"""
+        return clear_of_extents(self.scene, self.dtype)
+
+    @functools.cached_property
     def gradients(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Return the oracle's gradients by the rasterizer's argument, and their error bounds."""
+        """Give the oracle's gradients by the rasterizer's argument, and their error bounds."""
         colors, mode = self.frame.colors, self.call.render_mode
         g = oracle_frame_vjp(self.scene, colors, mode, self.v_image, self.v_T_final)
         found = {name: getattr(g, name) for name in ("means", "quats", "scales", "opacities", "means2d", "means2d_abs")}
@@ -121,51 +131,83 @@ def expectations(backend: Any, call: Call) -> list[list[Expected]]:
     return [[Expected(call, frame, backend.dtype, next(number)) for frame in row] for row in call.frames]
 
 
-def assert_call_is_the_oracles(backend: Any, call: Call) -> tuple[Called, list[list[Expected]]]:
-    """Assert that what a rasterizer makes of a call is the oracle's, gradients too where it has them."""
+@dataclass(frozen=True)
+class Made:
+    """A call, what a rasterizer made of it, and what the oracle says of every frame."""
+
+    call: Call
+    called: Called
+    wanted: list[list[Expected]]
+
+    def each(self) -> Iterator[tuple[int, int, Expected]]:
+        """Yield batch entry, camera and what the oracle says."""
+        for b, row in enumerate(self.wanted):
+            for c, e in enumerate(row):
+                yield b, c, e
+
+
+def made(backend: Any, call: Call) -> Made:
+    """Have a call drawn, and pulled back where the rasterizer has gradients."""
     wanted = expectations(backend, call)
-    assert all(np.min(e.render.T_final) < 1.0 for row in wanted for e in row), "nothing is blended in a frame"
     cotangents: tuple[Any, ...] = ()
     if backend.has(GRADIENTS):
         v_images = np.array([[e.v_image for e in row] for row in wanted])
         cotangents = (v_images, np.array([[-e.v_T_final for e in row] for row in wanted]))
-    called = backend.call(call, *cotangents)
-    for b, row in enumerate(wanted):
-        for c, e in enumerate(row):
-            sure, key = e.error_bounds.unambiguous, "agreement.image"
-            size, image, alpha = e.image_error_bounds, called.images[b, c], called.alphas[b, c]
-            assert image.shape == e.render.image.shape, f"images have shape {image.shape}, not {e.render.image.shape}"
-            assert_close(key, image[sure], e.render.image[sure], size[sure], backend.dtype, True)
-            transmittance = (e.error_bounds.T_final + 1.0)[sure]
-            assert_close(
-                "agreement.T_final", 1.0 - alpha[sure], e.render.T_final[sure], transmittance, backend.dtype, True
-            )
-    if cotangents:
-        _assert_gradients(backend, call, called, wanted)
-    return called, wanted
+    return Made(call, backend.call(call, *cotangents), wanted)
 
 
-def _assert_gradients(backend: Any, call: Call, called: Called, wanted: list[list[Expected]]) -> None:
-    found = {
-        name: value if call.batched or name.startswith("means2d") else value[None]
-        for name, value in called.gradients.items()
-    }
-    for b, row in enumerate(wanted):
-        pulled = [e.gradients() for e in row]
-        kinked = np.any([e.error_bounds.screen.kinked for e in row], axis=0)
-        for name, value in found.items():
-            own = name in OF_CAMERA or name.startswith("means2d") or (name == "colors" and call.camera_colors)
-            if name == "covars":
-                _assert_covariance_gradients(backend, call, value[b], b, pulled, ~kinked)
-            elif name == "viewmats" and np.any(kinked):
+def assert_call_is_the_oracles(backend: Any, call: Call) -> Made:
+    """Assert that what a rasterizer makes of a call is the oracle's, gradients too where it has them."""
+    of = made(backend, call)
+    assert all(np.min(e.render.T_final) < 1.0 for _, _, e in of.each()), "nothing is blended in a frame"
+    assert_images(backend, of)
+    assert_gradients(backend, of)
+    return of
+
+
+def in_frame(of: Made, b: int, c: int) -> str:
+    """Name a frame of a call, as briefly as the call allows."""
+    words = [f"batch entry {b}"] * bool(of.call.batch) + [f"camera {c}"] * (len(of.call.frames[0]) > 1)
+    return "".join(f"{word}, " for word in words)
+
+
+def assert_images(backend: Any, of: Made) -> None:
+    """Assert that the images and alphas of every frame are the oracle's where no decision is near its threshold."""
+    for b, c, e in of.each():
+        where, sure, dtype = in_frame(of, b, c), e.error_bounds.unambiguous, backend.dtype
+        image, alpha = of.called.images[b, c], of.called.alphas[b, c]
+        assert image.shape == e.render.image.shape, f"images have shape {image.shape}, not {e.render.image.shape}"
+
+        def pixel(index: tuple[int, ...], where: str = where) -> str:
+            y, x, *channel = index
+            return f"{where}pixel ({x}, {y})" + "".join(f", channel {k}" for k in channel)
+
+        bounds = e.error_bounds.T_final + 1.0
+        # first, because what is wrong in an alpha is wrong in its image
+        given = (1.0 - alpha, e.render.T_final, bounds, dtype, True, sure, pixel)
+        assert_close("agreement.T_final", *given)
+        assert_close("agreement.image", image, e.render.image, e.image_error_bounds, dtype, True, sure, pixel)
+
+
+def assert_gradients(backend: Any, of: Made) -> None:
+    """Assert that the gradients of every argument are the oracle's; of none, where the rasterizer has no gradients."""
+    for name, given in of.called.gradients.items():
+        value = given if name.startswith("means2d") else of.call.by_entry(given)
+        for b, row in enumerate(of.wanted):
+            pulled = [e.gradients for e in row]
+            kinked = np.any([e.error_bounds.screen.kinked for e in row], axis=0)
+            if name == "viewmats" and np.any(kinked):
                 continue
-            elif own:
-                rows = slice(None) if name in OF_CAMERA else ~kinked
+            if name == "covars":
+                _assert_covariance_gradients(backend, of, value[b], b, pulled, ~kinked)
+            elif name in OF_CAMERA or name.startswith("means2d") or (name == "colors" and of.call.camera_colors):
+                rows = None if name in OF_CAMERA else ~kinked
                 for c, (expected, bounds) in enumerate(pulled):
                     bound = bounds["means2d" if name.startswith("means2d") else name]
-                    _assert_gradient(backend, call, name, value[b, c], expected[name], bound, rows)
+                    _assert_gradient(backend, of, name, value[b, c], expected[name], bound, rows, in_frame(of, b, c))
             else:
-                _assert_gradient(backend, call, name, value[b], *_summed(pulled, name), ~kinked)
+                entry = f"batch entry {b}, " * bool(of.call.batch)
+                _assert_gradient(backend, of, name, value[b], *_summed(pulled, name), ~kinked, entry)
 
 
 def _summed(pulled: list[Any], name: str) -> tuple[Any, Any]:
@@ -174,19 +216,26 @@ def _summed(pulled: list[Any], name: str) -> tuple[Any, Any]:
 
 
 def _assert_gradient(
-    backend: Any, call: Call, name: str, value: np.ndarray, expected: Any, bound: Any, rows: Any
+    backend: Any, of: Made, name: str, value: np.ndarray, expected: Any, bound: Any, rows: Any, where: str
 ) -> None:
     assert value.shape == expected.shape, f"v_{name} has shape {value.shape}, not {expected.shape}"
     key = {"viewmats": "viewmat", "backgrounds": "background"}.get(name, name)
-    key = "sh" if name == "colors" and call.sh_degree is not None else key
-    assert_close(f"agreement.v_{key}", value[rows], expected[rows], bound[rows], backend.dtype, True)
+    key = "sh" if name == "colors" and of.call.sh_degree is not None else key
+
+    def entry(index: tuple[int, ...]) -> str:
+        if rows is None:
+            return f"{where}entry {list(index)}"
+        return f"{where}Gaussian {index[0]}" + (f", entry {list(index[1:])}" if len(index) > 1 else "")
+
+    assert_close(f"agreement.v_{key}", value, expected, bound, backend.dtype, True, rows, entry)
 
 
 def _assert_covariance_gradients(
-    backend: Any, call: Call, v_covars: np.ndarray, b: int, pulled: list[Any], rows: np.ndarray
+    backend: Any, of: Made, v_covars: np.ndarray, b: int, pulled: list[Any], rows: np.ndarray
 ) -> None:
     # through the oracle's covariances, so that it does not matter how a gradient is shared by the two triangles
-    g = call.frames[b][0].scene.gaussians
+    g = of.call.frames[b][0].scene.gaussians
     v = covars_from_quats_scales_vjp(g.quats, g.scales, 0.5 * (v_covars + np.swapaxes(v_covars, 1, 2)))
+    entry = f"batch entry {b}, " * bool(of.call.batch) + "through covars, "
     for name, value in zip(("quats", "scales"), v, strict=True):
-        _assert_gradient(backend, call, name, value, *_summed(pulled, name), rows)
+        _assert_gradient(backend, of, name, value, *_summed(pulled, name), rows, entry)

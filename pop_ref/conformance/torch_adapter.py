@@ -6,6 +6,7 @@ torch is imported when an adapter is made, never when the kit is.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import inspect
 import itertools
@@ -29,8 +30,10 @@ from pop_ref.conformance.capabilities import (
     SIGNATURE,
     same_constants,
 )
-from pop_ref.conformance.cases import BY_NAME, Case
+from pop_ref.conformance.cases import BY_NAME, Case, with_own_lists
+from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.scenes import Scene
+from pop_ref.conformance.torch_autograd import Ask, Differentiated, differentiated
 from pop_ref.constants import PAPER, Profile
 
 # arguments at the values by which a rasterizer that lacks them draws
@@ -107,10 +110,30 @@ class TorchAdapter(Adapter):
             return self._rasterization is not None and self._whole_signature
         return super().has(need) or self._stage(need) is not None
 
+    def takes(self, argument: str) -> bool:
+        """Tell whether the rasterizer's signature has the argument."""
+        return argument in self._parameters or (argument == "tile_size" and self._takes_anything)
+
+    def sees(self, scene: Scene) -> Scene:
+        """Return the scene as the rasterizer reads it: with tiles of its own side where it takes none."""
+        seen = super().sees(scene)
+        if self._rasterization is None or self.takes("tile_size") or seen.profile.extent == "square":
+            return seen
+        return seen.with_overrides(tile_size=self.own_tile_size)
+
+    @functools.cached_property
+    def own_tile_size(self) -> int | None:
+        """Give the side of the tiles of a rasterizer that takes none, as its meta tells it; None if it does not. px"""
+        scene = super().sees(golden_scene())
+        try:
+            meta = self._call(scene, self._leaves(scene, grad=False), dominance=False, counts=False)[2]
+            return int(meta["tile_size"])
+        except Exception:
+            # it tells nothing, or cannot draw, which the laws will find
+            return None
+
     def _asked_for_gradients(self) -> bool:
         """Tell whether an image follows its Gaussians in autograd; a renderer that only draws does not."""
-        from pop_ref.conformance.golden import golden_scene
-
         scene = self.sees(golden_scene())
         try:
             image, _, _ = self._call(scene, self._leaves(scene, grad=True), dominance=False, counts=False)
@@ -172,7 +195,7 @@ class TorchAdapter(Adapter):
         def with_arrays(*args: Any, **kwargs: Any) -> Any:
             if any(isinstance(a, Profile) and not self._implements(a) for a in (*args, *kwargs.values())):
                 reject()
-            args, kwargs = _with_own_lists(function, args, kwargs)
+            args, kwargs = with_own_lists(function, args, kwargs)
             tensors = {key: self._tensor(value, own) for key, value in kwargs.items()}
             return self._array(function(*[self._tensor(a, own) for a in args], **tensors))
 
@@ -212,6 +235,16 @@ class TorchAdapter(Adapter):
     def plainly(self, scene: Scene) -> View:
         """Draw a scene that gradients may follow from, and ask for nothing else."""
         return self._drawn(scene, dominance=False, counts=False, grad=True)
+
+    def differentiate(self, scene: Scene, v_image: Any, v_T_final: Any, ask: Ask) -> Differentiated:
+        """Draw a scene and pull cotangents back in an order of passes, and of arguments in a layout, as it is asked."""
+
+        def draw(of: Scene, arguments: dict[str, Any]) -> tuple[Any, Any]:
+            image, alphas, _ = self._call(of, arguments, dominance=False, counts=False)
+            return image, alphas
+
+        arrays = (self._tensor(v_image), self._tensor(v_T_final))
+        return differentiated(scene, draw, self._leaves, arrays, ask, self._without)
 
     def _drawn(self, scene: Scene, dominance: bool, counts: bool, grad: bool = False) -> View:
         leaves = self._leaves(scene, grad)
@@ -277,7 +310,7 @@ class TorchAdapter(Adapter):
         """
         if self._rasterization is None:
             raise LookupError(f"{self.name} has no rasterization function")
-        scene, pulls = call.frames[0][0].scene, v_images is not None
+        scene, pulls = call.first.scene, v_images is not None
         leaves = {name: self._tensor(value).requires_grad_(pulls) for name, value in call.tensors().items()}
         images, alphas, meta = self._rasterization(
             **{"quats": None, "scales": None} | leaves,
@@ -285,14 +318,10 @@ class TorchAdapter(Adapter):
             width=scene.camera.width,
             height=scene.camera.height,
             sh_degree=call.sh_degree,
-            **self._taken(
-                packed=call.packed,
-                tile_size=scene.profile.tile_size if scene.tile_size is None else scene.tile_size,
-                **self._asked_by(call),
-            ),
-            **(self._absgrad if pulls else {}),
+            **self._taken(packed=call.packed, tile_size=call.tile_size, **self._asked_by(call)),
+            **(self._absgrad if pulls and call.absgrad else {}),
         )
-        B, C, H, W = len(call.frames), len(call.frames[0]), scene.camera.height, scene.camera.width
+        (B, C, _), H, W = call.shape, scene.camera.height, scene.camera.width
         images, alphas = images.reshape(B, C, H, W, -1), alphas.reshape(B, C, H, W)
         gradients: dict[str, np.ndarray] = {}
         if pulls:
@@ -305,17 +334,20 @@ class TorchAdapter(Adapter):
                 absolute = getattr(means2d, "absgrad", None)
                 of_screen = {"means2d": self._grad_of(means2d)}
                 of_screen |= {} if absolute is None else {"means2d_abs": self._array(absolute)}
-                gradients |= {name: unpacked(call, value, meta) for name, value in of_screen.items()}
+                rows = {name: unpacked(call, value, meta) for name, value in of_screen.items()}
+                gradients |= {name: value for name, value in rows.items() if value is not None}
         shown = {name: self._array(meta[name]) for name in meta if meta[name] is not None}
         return Called(self._array(images), self._array(alphas), shown, gradients)
 
     def _asked_by(self, call: Call) -> dict[str, Any]:
         """Return the arguments of a call that are not at gsplat's defaults, and the profile for who takes one."""
-        scene = call.frames[0][0].scene
+        scene = call.first.scene
         asked: dict[str, Any] = {"near_plane": scene.profile.near_plane, "eps2d": scene.profile.eps2d} | call.planes
         asked |= {"render_mode": call.render_mode} if call.render_mode != "RGB" else {}
         asked |= {"radius_clip": call.radius_clip} if call.radius_clip else {}
         asked |= {"sparse_grad": True} if call.sparse_grad else {}
+        asked |= {"rasterize_mode": "antialiased"} if call.antialiased else {}
+        asked |= {"dominance": call.dominance} if self.takes("dominance") else {}
         return asked | ({"profile": scene.profile} if self._takes_profile else {})
 
     def _taken(self, **options: Any) -> dict[str, Any]:
@@ -409,19 +441,3 @@ class TorchAdapter(Adapter):
             return value
         array = value.detach().cpu().numpy()
         return array.astype({"f": np.float64, "i": np.int64}.get(array.dtype.kind, array.dtype))
-
-
-def _with_own_lists(
-    function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]
-) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Return a stage function's arguments with tile lists as the `TileLists` that its module knows, if it knows any."""
-    own = getattr(sys.modules.get(function.__module__), "TileLists", None)
-    signature = inspect.signature(function)
-    if own is None or "lists" not in signature.parameters:
-        return args, kwargs
-    given = signature.bind(*args, **kwargs)
-    named = given.arguments
-    camera = named.get("camera")
-    size = (named["width"], named["height"]) if camera is None else (camera.width, camera.height)
-    named["lists"] = own.of(named["lists"], *size, named["tile_size"])
-    return given.args, given.kwargs

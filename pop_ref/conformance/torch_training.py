@@ -10,13 +10,17 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from types import SimpleNamespace
 from typing import Any
 
+from pop_ref.conformance import torch_strategy
+from pop_ref.conformance.strategy_script import Script
+from pop_ref.conformance.torch_strategy import ScriptedPasses, arrays_of
 from pop_ref.density_config import DensityConfig
+from pop_ref.settings import LearningRates, Recipe, UpdateRules
 
-# of the Adam counter that rows are given, and of steps at which nothing but statistics happens
-COUNTER, QUIET_STEP = 7.0, 1
-# long enough that the means' rate has not begun to fall
+# at this step nothing but statistics happens
+QUIET_STEP = 1
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,8 @@ class Trainer:
         self._model: Any = importlib.import_module(f"{package}.train.model")
         self._schedule: Any = importlib.import_module(f"{package}.train.schedule")
         self._config: Any = importlib.import_module(f"{package}.train.config")
+        self._presets: Any = importlib.import_module(f"{package}.train.presets")
+        self._passes: Any = importlib.import_module(f"{package}.density.passes")
         self._Draws: Any = importlib.import_module(f"{package}.density.protocol").Draws
         self._Strategy: Any = importlib.import_module(f"{package}.density").POPStrategy
 
@@ -186,20 +192,68 @@ class Trainer:
         moved = self._rows(leaves, optimizers)
         return dict(moved.params), dict(moved.m), dict(moved.v)
 
-    def learning_rates(self, step: int, scene_scale: float) -> dict[str, float]:
-        """See `pop_ref.optimizer.learning_rates`."""
+    def learning_rates(
+        self,
+        step: int,
+        scene_scale: float,
+        max_steps: int | None = None,
+        rates: LearningRates | None = None,
+        rules: UpdateRules | None = None,
+    ) -> dict[str, float]:
+        """See `pop_ref.optimizer.learning_rates`; what is left out is the trainer's own."""
         config = self._config.TrainConfig()
-        rates = self._schedule.updates_of(config.lr, scene_scale, config.max_steps).rates[step].tolist()
-        return dict(zip(self._model.KEYS, rates, strict=True))
+        given = (rates or config.lr, scene_scale, max_steps or config.max_steps, rules)
+        found = self._schedule.updates_of(*given).rates[step].tolist()
+        return dict(zip(self._model.KEYS, found, strict=True))
+
+    def update_numbers(self, names: Sequence[str], step: int, recipe: Recipe) -> dict[str, int]:
+        """See `pop_ref.optimizer.update_numbers`."""
+        strategy = self._strategy(recipe.density)
+        edits = [each for each in range(recipe.max_steps) if strategy.is_refine_step(each)]
+        given = (recipe.lr, 1.0, recipe.max_steps, recipe.updates, edits, recipe.adam_restarts)
+        found = self._schedule.updates_of(*given).numbers[step].tolist()
+        named = dict(zip(self._model.KEYS, found, strict=True))
+        return {name: named[name] for name in names if named[name] > 0}
 
     def means_learning_rate(self, step: int, scene_scale: float) -> float:
         """See `pop_ref.optimizer.means_learning_rate`."""
         return self.learning_rates(step, scene_scale)["means"]
 
-    def sh_degree_at(self, step: int) -> int:
-        """See `pop_ref.optimizer.sh_degree_at`."""
+    def sh_degree_at(
+        self, step: int, interval: int | None = None, max_degree: int | None = None, start: int = 0
+    ) -> int:
+        """See `pop_ref.optimizer.sh_degree_at`; what is left out is the trainer's own."""
         config = self._config.TrainConfig()
-        return int(self._schedule.active_sh_degree(step, config.sh_interval, config.sh_degree))
+        degree = config.sh_degree if max_degree is None else max_degree
+        return int(self._schedule.active_sh_degree(step, interval or config.sh_interval, degree, start))
+
+    def optimizers(self) -> None:
+        """Offer to be asked which parameters the optimizers hold."""
+
+    def method_settings(self, method: str) -> dict[str, Any]:
+        """Return every setting of the strategy that a run of the method has."""
+        strategy = self._config.TrainConfig.of(method=method).strategy
+        return {f.name: getattr(strategy, f.name) for f in fields(strategy)}
+
+    def scripted_steps(self, script: Script, rows: Rows) -> list[dict[str, Any]]:
+        """Take one of the trainer's methods through a script from these rows; see `torch_strategy.drive`."""
+        strategy = self._presets.METHODS[script.method or "pop"].strategy(**script.settings)
+        schedule = SimpleNamespace(lr=script.lr, max_steps=script.max_steps)
+        updates = self._schedule.updates_of_strategy(schedule, strategy, script.scene_scale)
+        dtype = rows.params["means"].dtype
+        passes, drawn = ScriptedPasses(script, self._passes.ViewContributions, dtype), script.draws()
+        draws = self._Draws(
+            lambda n: self._torch.as_tensor(drawn.normals(n)), lambda n: self._torch.as_tensor(drawn.uniforms(n))
+        )
+
+        def extras(step: int) -> dict[str, Any]:
+            return {"draws": draws, "passes": passes, "sh_degree": script.sh_degree(step)}
+
+        def move(params: Any, optimizers: Any, step: int, state: Any) -> None:
+            self._model.adam_step(params, optimizers, updates, step, state)
+
+        trainer = torch_strategy.Trainer(self._model.make_optimizers, move, extras)
+        return arrays_of(torch_strategy.drive(strategy, script, rows, trainer, dtype))
 
     def _move(self, leaves: Any, optimizers: Any, grads: Mapping[str, Any], lr: Mapping[str, float], step: int) -> None:
         for key, grad in grads.items():
@@ -207,26 +261,16 @@ class Trainer:
         rates = {key: lr.get(key, 0.0) for key in self._model.KEYS}
         self._model.adam_step(leaves, optimizers, self._schedule.steady_updates(rates, step), step - 1, {})
 
-    def _leaf(self, tensor: Any) -> Any:
-        return self._torch.nn.Parameter(tensor.clone())
-
     def _population(
         self,
         params: Mapping[str, Any],
         moments: Rows | None = None,
-        counter: float = COUNTER,
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return leaves and the trainer's optimizers of them, with these moments or as they are made."""
-        leaves = {key: self._leaf(value) for key, value in params.items()}
-        optimizers = self._model.make_optimizers(leaves)
         if moments is not None:
-            for key, leaf in leaves.items():
-                optimizers[key].state[leaf] = {
-                    "step": self._torch.tensor(counter),
-                    "exp_avg": moments.m[key].clone(),
-                    "exp_avg_sq": moments.v[key].clone(),
-                }
-        return leaves, optimizers
+            return torch_strategy.population(moments, self._model.make_optimizers, moments.m["means"].dtype)
+        leaves = {key: self._torch.nn.Parameter(value.clone()) for key, value in params.items()}
+        return leaves, self._model.make_optimizers(leaves)
 
     def _rows(self, leaves: Mapping[str, Any], optimizers: Mapping[str, Any]) -> Rows:
         """Return parameters and moments."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +13,23 @@ from pop_ref.conformance import vector_training as training
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.calls import Call, Frame
 from pop_ref.conformance.capabilities import (
+    ANTIALIASING,
+    CAMERA_COLORS,
     CAMERAS,
     CHANNELS,
     COLORS,
     DEPTH,
     DOMINANCE,
     GRADIENTS,
+    PLANES,
+    RADIUS_CLIP,
     RENDER,
     SCALE,
     SIGNATURE,
 )
 from pop_ref.conformance.scene_files import scene_from
 from pop_ref.conformance.scenes import Scene
-from pop_ref.constants import Profile
+from pop_ref.constants import PAPER, Profile
 from pop_ref.density import DensityConfig, rows_from_params
 from pop_ref.records import Camera, Gaussians
 
@@ -61,6 +66,8 @@ def answered(backend: Any, kind: str, arrays: Arrays, options: dict[str, Any]) -
         "large": _image,
         "call": _call,
         "call_plain": _call,
+        "call_of_each_camera": _call,
+        "call_plain_of_each_camera": _call,
         "loss": _loss,
         "pop": _pop,
         "adam": _adam,
@@ -97,27 +104,52 @@ def _same(seen: Scene, scene: Scene) -> bool:
 
 
 def _call(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
-    plain = "colors" in arrays
-    needs = [SIGNATURE, CAMERAS, *([COLORS, CHANNELS] if plain else [])]
-    needs += [DEPTH] if options["render_mode"] != "RGB" else []
-    if not all(backend.has(need) for need in needs):
+    call = call_of(arrays, options)
+    if not all(backend.has(need) for need in _needs(call)):
         return {}
-    n = len(arrays["means"])
-    sh = np.zeros((n, 1, 3)) if plain else arrays["sh"]
-    gaussians = Gaussians(arrays["means"], arrays["quats"], arrays["scales"], arrays["opacities"], sh)
-    frames = []
-    profile = Profile(**options["profile"])
-    for c in range(len(arrays["viewmats"])):
-        camera = Camera(arrays["viewmats"][c], arrays["Ks"][c], options["width"], options["height"])
-        scene = Scene(gaussians, camera, arrays["backgrounds"][c], profile, options["tile_size"])
-        frames.append(Frame(scene, arrays["colors"] if plain else None))
-    call = Call((tuple(frames),), render_mode=options["render_mode"])
     cotangents = (arrays["v_images"][None], arrays["v_alphas"][None]) if backend.has(GRADIENTS) else ()
     called = backend.call(call, *cotangents)
     found = {"images": called.images[0], "alphas": called.alphas[0]}
+    if "dominant_ids" in called.meta:
+        found["dominant_ids"] = called.meta["dominant_ids"].reshape(called.alphas[0].shape)
     names = {name: name for name in ("means", "quats", "scales", "opacities", "viewmats", "backgrounds")}
-    names["colors"] = "colors" if plain else "sh"
+    names["colors"] = "colors" if call.sh_degree is None else "sh"
     return found | {f"v_{names[name]}": value for name, value in called.gradients.items() if name in names}
+
+
+def call_of(arrays: Arrays, options: dict[str, Any]) -> Call:
+    """Return the call that a vector holds."""
+    plain, given = "colors" in arrays, Profile(**options["profile"])
+    planes = {name: getattr(given, name) for name in ("near_plane", "far_plane", "eps2d")}
+    planes = {name: value for name, value in planes.items() if value != getattr(PAPER, name)}
+    profile = replace(given, **{name: getattr(PAPER, name) for name in planes})
+    colors = arrays["colors" if plain else "sh"]
+    own = colors.ndim == (3 if plain else 4)
+    n, frames = len(arrays["means"]), []
+    for c in range(len(arrays["viewmats"])):
+        of_camera = colors[c] if own else colors
+        sh = np.zeros((n, 1, 3)) if plain else of_camera
+        gaussians = Gaussians(arrays["means"], arrays["quats"], arrays["scales"], arrays["opacities"], sh)
+        camera = Camera(arrays["viewmats"][c], arrays["Ks"][c], options["width"], options["height"])
+        more = (profile, options["tile_size"], None if plain else options["sh_degree"], options["antialiased"])
+        scene = Scene(gaussians, camera, arrays["backgrounds"][c], *more)
+        frames.append(Frame(scene, of_camera if plain else None))
+    mode, clip = options["render_mode"], options["radius_clip"]
+    return Call((tuple(frames),), (), own, mode, radius_clip=clip, planes=planes)
+
+
+def _needs(call: Call) -> list[str]:
+    """Return what a rasterizer has to offer to be asked for a call."""
+    asked = {
+        COLORS: call.sh_degree is None,
+        CHANNELS: call.sh_degree is None,
+        CAMERA_COLORS: call.camera_colors,
+        DEPTH: call.render_mode != "RGB",
+        ANTIALIASING: call.antialiased,
+        PLANES: bool(call.planes),
+        RADIUS_CLIP: call.radius_clip > 0.0,
+    }
+    return [SIGNATURE, CAMERAS, *(need for need, holds in asked.items() if holds)]
 
 
 def _loss(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:

@@ -12,7 +12,7 @@ import numpy as np
 from pop_ref.conformance import tolerances
 
 FORMAT: Final = "pop-vectors"
-VERSION: Final = 3
+VERSION: Final = 4
 GRADIENTS: Final = ("means", "quats", "scales", "opacities", "sh", "viewmat", "background", "means2d", "means2d_abs")
 
 ABOUT: Final = (
@@ -66,9 +66,11 @@ OPTIONS: Final = {
     "tile_size": "px; it matters only where profile.extent is 'square'",
     "sh_degree": "bands that are used",
     "antialiased": "opacities are multiplied by sqrt(max(0, det(covar2d) / det(covar2d + eps2d I)))",
+    "render_mode": "what an image of a call holds; its kind explains it under 'modes'",
+    "radius_clip": "px; Gaussians whose extents 'radii' are both at most this are left out of a call; 0: nobody",
     "profile.near_plane, near_inclusive": "Gaussians with camera z < near_plane are left out; z = near_plane too if "
     "near_inclusive (D1)",
-    "profile.far_plane": "beyond every scene here",
+    "profile.far_plane": "Gaussians with camera z > far_plane are left out",
     "profile.eps2d": "px^2, added to both diagonal entries of the screen covariance",
     "profile.frustum_margin": "in the projection's Jacobian x/z and y/z are clamped this many half images outside the "
     "image (B1)",

@@ -20,7 +20,7 @@ from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bound
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scene_files import scene_arrays, scene_options
 from pop_ref.conformance.scenes import Scene, cotangents, rounded_to
-from pop_ref.conformance.vector_calls import call_arrays, call_kind, calls
+from pop_ref.conformance.vector_calls import call_arrays, call_kind, calls, kind_of
 from pop_ref.conformance.vector_large import large_kind, large_vectors
 from pop_ref.conformance.vector_scenes import vector_scenes
 from pop_ref.conformance.vector_schema import GRADIENTS, render_kind, schema
@@ -38,8 +38,10 @@ def kinds() -> dict[str, dict[str, Any]]:
     """Return what the index says of each kind of vector."""
     return {
         "render": render_kind(),
-        "call": call_kind(plain=False),
-        "call_plain": call_kind(plain=True),
+        "call": call_kind(plain=False, own=False),
+        "call_plain": call_kind(plain=True, own=False),
+        "call_of_each_camera": call_kind(plain=False, own=True),
+        "call_plain_of_each_camera": call_kind(plain=True, own=True),
         "large": large_kind(),
         "loss": training.loss_kind(),
         "pop": training.pop_kind(),
@@ -116,9 +118,9 @@ def export(folder: Path) -> list[str]:
         scene = rounded_to(drawn, np.float32)
         write(name, "render", expected_arrays(scene), _full_options(scene))
     for name, call in calls().items():
-        kind = "call" if call.sh_degree is not None else "call_plain"
-        options = _full_options(call.frames[0][0].scene) | {"render_mode": call.render_mode}
-        write(name, kind, call_arrays(call), options)
+        options = _full_options(call.first.scene.with_overrides(profile=call.profile))
+        options |= {"render_mode": call.render_mode, "radius_clip": call.radius_clip}
+        write(name, kind_of(call), call_arrays(call), options)
     for name, (arrays, scene, shapes) in large_vectors().items():
         write(name, "large", arrays, _full_options(scene), shapes)
     for kind, made in _TRAINING.items():

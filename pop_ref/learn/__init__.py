@@ -1,6 +1,6 @@
 """Build your own Gaussian splatting, stage by stage, judged by the conformance kit.
 
-In reading order: `splat` (the whole of it in one file), `course` (the twelve stages), `stubs` (the files to fill in),
+In reading order: `splat` (the whole of it in one file), `course` (the thirteen stages), `stubs` (the files to fill in),
 `student` (the oracle with a student's functions in it), `judge`, `mistakes` and `telling` (what a broken law says to a
 student), `progress` (the map and the picture), `training`.
 """

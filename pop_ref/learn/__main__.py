@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,11 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from pop_ref.learn import needs_of_judging
-from pop_ref.learn.course import stage_named
+from pop_ref.learn.course import BY_NAME, COURSE, stage_named
 from pop_ref.learn.progress import asked_before, course_map, note_passed, picture
 from pop_ref.learn.splat import write_png
 from pop_ref.learn.stubs import answer, start
 from pop_ref.learn.student import read_work
+from pop_ref.learn.training import Subject, the_toy, train
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -29,9 +31,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = _parser().parse_args(arguments)
     actions = {
         "start": lambda: write_stubs(given.folder),
-        "check": lambda: check(given.stage, given.folder, given.answer),
+        "check": lambda: (
+            check_all(given.folder, given.json) if given.all else check(given.stage, given.folder, given.answer)
+        ),
         "map": lambda: show_map(given.folder, given.out),
-        "train": lambda: train_work(given.folder, given.steps, given.out),
+        "train": lambda: train_work(given.folder, the_toy(), given.steps, given.out),
     }
     try:
         return actions[given.action]()
@@ -43,13 +47,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="pop-learn", description="Build your own Gaussian splatting in NumPy.")
     actions = parser.add_subparsers(dest="action", required=True)
-    starting = actions.add_parser("start", help="write twelve files to fill in; nothing is written over")
+    starting = actions.add_parser("start", help="write thirteen files to fill in; nothing is written over")
     checking = actions.add_parser("check", help="judge one of them, in seconds")
     mapping = actions.add_parser("map", help="the pipeline, and the picture that it draws as it stands")
     training = actions.add_parser("train", help="when all is written: train with your own code")
-    checking.add_argument("stage", help="a file's name without .py: alpha, covariance, ...")
+    what = checking.add_mutually_exclusive_group(required=True)
+    what.add_argument("stage", nargs="?", default="", help="a file's name without .py: alpha, covariance, ...")
+    what.add_argument("--all", action="store_true", help="judge every stage, and count the functions that are right")
+    checking.add_argument("--json", action="store_true", help="with --all: print one object for a program to read")
     checking.add_argument("--answer", action="store_true", help="show the oracle's code, asked for twice or passed")
-    training.add_argument("--steps", type=int, default=60, help="default 60")
+    training.add_argument("--steps", type=int, default=120, help="default 120")
     for action in (starting, checking, mapping, training):
         action.add_argument("folder", type=Path, nargs="?", default=Path("mine"), help="your files, default mine")
     for action in (mapping, training):
@@ -58,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def write_stubs(folder: Path) -> int:
-    """Write the twelve modules that are not there yet, and return the exit status 0."""
+    """Write the modules that are not there yet, and return the exit status 0."""
     written = start(folder)
     print(f"{len(written)} new files -> {folder}" if written else f"{folder} has all files already")
     print(f"next: open {folder / 'alpha.py'}, write a function, and 'pop-learn check alpha {folder}'")
@@ -96,6 +103,22 @@ def check(name: str, folder: Path, wants_answer: bool) -> int:
     return 0 if verdict.passed else 1
 
 
+def check_all(folder: Path, as_json: bool) -> int:
+    """Judge every stage, print the score, and return 0 when all have passed, 1 when not yet.
+
+    Raises:
+        ValueError: a file cannot be read, or Hypothesis is missing.
+    """
+    needs_of_judging()
+    from pop_ref.learn.grading import graded, told_in_lines
+
+    grade = graded(read_work(folder))
+    for name in grade["passed"]:
+        note_passed(folder, BY_NAME[name])
+    print(json.dumps(grade) if as_json else told_in_lines(grade))
+    return 0 if len(grade["passed"]) == len(COURSE) else 1
+
+
 def show_map(folder: Path, out: Path | None) -> int:
     """Print the pipeline, write the picture that the stages draw as they stand, and return the exit status 0."""
     work = read_work(folder)
@@ -109,15 +132,18 @@ def show_map(folder: Path, out: Path | None) -> int:
     return 0
 
 
-def train_work(folder: Path, steps: int, out: Path | None) -> int:
-    """Train a small scene with the student's code, and return the exit status 0."""
-    from pop_ref.learn.training import train
+def train_work(folder: Path, subject: Subject, steps: int, out: Path | None) -> int:
+    """Train on a subject with the student's code, write picture and film, and return the exit status 0."""
+    from pop_ref.learn.drawing import write_film
 
-    out = out or folder / "trained.png"
-    for told in train(read_work(folder), steps):
+    out, frames = out or folder / "trained.png", []
+    for told in train(read_work(folder), subject, steps):
         print(f"step {told.step:3d}   loss {told.loss:.5f}   {told.psnr:.2f} dB   {told.n} Gaussians", flush=True)
+        frames.append(told.picture.repeat(4, axis=0).repeat(4, axis=1))
         _write(out, told.picture)
-    print(f"photograph and render -> {out}")
+    film = out.with_name(f"{out.stem}_film.png")
+    write_film(film, frames)
+    print(f"photograph and render -> {out}; the film, for a browser -> {film}")
     return 0
 
 

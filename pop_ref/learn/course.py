@@ -1,4 +1,4 @@
-"""The course: twelve stages in the order of the pipeline, what each is made of, and which laws judge it."""
+"""The course: thirteen stages in the order of the pipeline, what each is made of, and which laws judge it."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ class Stage:
     Attributes:
         name: of the stage and its file.
         does: what it does, in a few words.
-        chapter: the walk-through's chapter that explains it.
+        chapter: the walk-through's chapter that explains it, unless `elsewhere` names another for a function.
         functions: the oracle's functions, by the oracle's module that has them.
         laws: the kit's stages whose laws judge it.
         more_laws: names of single laws of other stages.
+        elsewhere: the chapters of functions that another one explains, by function.
     """
 
     name: str
@@ -24,7 +25,21 @@ class Stage:
     chapter: str
     functions: dict[str, tuple[str, ...]]
     laws: tuple[str, ...] = ()
-    more_laws: tuple[str, ...] = field(default=())
+    more_laws: tuple[str, ...] = ()
+    elsewhere: dict[str, str] = field(default_factory=dict[str, str])
+
+    def chapter_of(self, name: str) -> str:
+        """Return the chapter that explains a function.
+
+        Example:
+            >>> stage_named("compositing").chapter_of("composite_pixel_vjp")
+            '5'
+        """
+        return self.elsewhere.get(name, self.chapter)
+
+    def home_of(self, name: str) -> str:
+        """Return the oracle's module that has a function."""
+        return next(home for home, names in self.functions.items() if name in names)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -35,6 +50,10 @@ class Stage:
     def file(self) -> str:
         """Return the name of the student's file."""
         return f"{self.name}.py"
+
+
+def _transposes_in(chapter: str, *names: str) -> dict[str, str]:
+    return {f"{name}_vjp": chapter for name in names}
 
 
 def _with_transposes(*names: str) -> tuple[str, ...]:
@@ -55,6 +74,7 @@ COURSE: Final = (
         "2",
         {"covariance": _with_transposes("rotmats_from_quats", "covars_from_quats_scales")},
         ("covariance",),
+        elsewhere=_transposes_in("5b", "rotmats_from_quats", "covars_from_quats_scales"),
     ),
     Stage(
         "harmonics",
@@ -62,6 +82,7 @@ COURSE: Final = (
         "3",
         {"harmonics": _with_transposes("sh_basis", "colors_from_sh")},
         ("harmonics",),
+        elsewhere=_transposes_in("5b", "sh_basis", "colors_from_sh"),
     ),
     Stage(
         "camera",
@@ -74,6 +95,11 @@ COURSE: Final = (
             )
         },
         ("camera",),
+        elsewhere={
+            "camera_center": "9b",
+            "view_dirs": "3",
+            **_transposes_in("5b", "camera_center", "view_dirs", "means_cam_from_means", "covars_cam_from_covars"),
+        },
     ),
     Stage(
         "projection",
@@ -81,6 +107,7 @@ COURSE: Final = (
         "2",
         {"projection": _with_transposes("project_means", "projection_jacobians", "project_covars")},
         ("projection",),
+        elsewhere=_transposes_in("5b", "project_means", "projection_jacobians", "project_covars"),
     ),
     Stage(
         "footprint",
@@ -88,6 +115,11 @@ COURSE: Final = (
         "2",
         {"footprint": (*_with_transposes("low_pass", "conics_from_covars2d"), "radii_from_covars2d", "on_screen")},
         ("footprint",),
+        elsewhere={
+            "radii_from_covars2d": "1",
+            "conics_from_covars2d": "1",
+            **_transposes_in("5b", "low_pass", "conics_from_covars2d"),
+        },
     ),
     Stage(
         "tiles",
@@ -102,6 +134,7 @@ COURSE: Final = (
         "1",
         {"alpha": _with_transposes("sigma_at_pixel", "falloff", "alpha_from_sigma")},
         ("alpha",),
+        elsewhere=_transposes_in("5", "sigma_at_pixel", "falloff", "alpha_from_sigma"),
     ),
     Stage(
         "compositing",
@@ -117,6 +150,7 @@ COURSE: Final = (
             "gradients_are_the_oracles",
             "a_step_along_any_direction_changes_the_image_as_the_gradient_says",
         ),
+        elsewhere={"composite_pixel_vjp": "5", "dominant_id": "7", "dominant_counts": "7"},
     ),
     Stage(
         "losses",
@@ -124,6 +158,7 @@ COURSE: Final = (
         "6",
         {"losses": _with_transposes("l1", "l2"), "polarization": ("importance_mask", *_with_transposes("pop_loss"))},
         ("losses", "polarization"),
+        elsewhere=dict.fromkeys(("importance_mask", "pop_loss", "pop_loss_vjp"), "8"),
     ),
     Stage(
         "optimizer",
@@ -139,9 +174,25 @@ COURSE: Final = (
         {"density_rows": ("clone_rows", "split_rows", "prune_rows"), "density": ("grow_masks", "prune_mask")},
         ("density",),
     ),
+    Stage(
+        "loop",
+        "render, compare, go back, step: what is repeated until the picture is right",
+        "10",
+        {"training": ("gaussians_from_params", "params_vjp", "train_step")},
+        elsewhere={"gaussians_from_params": "1b", "params_vjp": "1b"},
+    ),
 )
 
 BY_NAME: Final = {stage.name: stage for stage in COURSE}
+# what a student may pass and read of density control; chapter 9 teaches no other setting
+DENSITY_SETTINGS: Final = (
+    "grow_grad2d",
+    "grow_scale3d",
+    "prune_opa",
+    "theta_blur",
+    "blur_start_iter",
+    "blur_stop_iter",
+)
 
 
 def stage_named(name: str) -> Stage:

@@ -6,14 +6,17 @@ as pictures, and all other numbers as bars side by side, each pair to its own sc
 
 from __future__ import annotations
 
+import struct
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from pop_ref.conformance.scenes import Scene
 from pop_ref.learn.judge import Verdict
-from pop_ref.learn.mistakes import numbers
-from pop_ref.learn.student import Call
+from pop_ref.learn.student import Call, numbers
 from pop_ref.render import render
 
 SIDE: Final = 240
@@ -159,3 +162,36 @@ def _enlarged(image: np.ndarray) -> np.ndarray:
     panel = np.tile(_PAPER, (SIDE, SIDE, 1))
     panel[: large.shape[0], : large.shape[1]] = large
     return panel
+
+
+def write_film(path: Path, frames: Sequence[np.ndarray], seconds: float = 0.4) -> None:
+    """Write pictures of one size as an animated PNG, which browsers play: once, the last one longer.
+
+    Args:
+        path: where.
+        frames: [H, W, 3] in [0, 1] each.
+        seconds: how long each is seen.
+    """
+    height, width = frames[0].shape[:2]
+    bodies = []
+    for frame in frames:
+        rows = (np.clip(np.nan_to_num(frame), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+        bodies.append(zlib.compress(b"".join(b"\0" + row.tobytes() for row in rows)))
+    parts = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))]
+    parts.append((b"acTL", struct.pack(">II", len(frames), 1)))
+    number = 0
+    for k, body in enumerate(bodies):
+        shown = round(1000.0 * seconds * (5 if k + 1 == len(bodies) else 1))
+        parts.append((b"fcTL", struct.pack(">IIIIIHHBB", number, width, height, 0, 0, shown, 1000, 0, 0)))
+        number += 1
+        if k:
+            parts.append((b"fdAT", struct.pack(">I", number) + body))
+            number += 1
+        else:
+            parts.append((b"IDAT", body))
+    beside = path.with_name(f".{path.name}.part")
+    with beside.open("wb") as file:
+        file.write(b"\x89PNG\r\n\x1a\n")
+        for kind, data in [*parts, (b"IEND", b"")]:
+            file.write(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)))
+    beside.replace(path)

@@ -1,13 +1,18 @@
-"""Hold one stage of a student to the kit's laws, and find what to say where one breaks."""
+"""Judge one stage of a student: the examples of its docstrings, the course's own inputs, then the kit's laws.
+
+The first that fails ends it, and what is told is the smallest input that was found, with the sentence that helps.
+"""
 
 from __future__ import annotations
 
+import ast
+import doctest
 import importlib
 import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
 import numpy as np
@@ -16,15 +21,20 @@ from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.capabilities import DOMINANCE, GRADIENTS, RENDER, capabilities_of
 from pop_ref.conformance.capabilities import DOUBLE as IN_DOUBLE
 from pop_ref.conformance.law import Law, missing
+from pop_ref.conformance.scenes import Scene
 from pop_ref.constants import PAPER, Profile
-from pop_ref.learn.course import Stage
-from pop_ref.learn.mistakes import explained_by, numbers, same
+from pop_ref.density import POP, DensityConfig
+from pop_ref.learn.course import DENSITY_SETTINGS, Stage
+from pop_ref.learn.diagnosis import diagnose
+from pop_ref.learn.probes import oracle, probes
 from pop_ref.learn.stubs import formulas
-from pop_ref.learn.student import PACKAGE, Borrowed, Call, Work, borrowing, said, where
+from pop_ref.learn.student import PACKAGE, Borrowed, Call, Work, borrowing, said, same, tried_on, where
 
 EXAMPLES: Final = 12
 # a broken law is made smaller for so long, then told as it is
 PATIENCE_S: Final = 1.0
+_EXAMPLE: Final = "the example in its docstring"
+_INPUT: Final = "it gives what the oracle gives on this input"
 
 
 @dataclass(frozen=True)
@@ -33,7 +43,8 @@ class Verdict:
 
     Attributes:
         n_held: laws that hold; judging ends at the first that does not.
-        broken: the sentence of that law; empty if there is none.
+        right: functions that pass their examples and the course's inputs.
+        broken: the sentence of what does not hold; empty if there is none.
         sentence: what is wrong, in words; empty if nothing is.
         hint: where to look.
         call: the smallest call on which a function is wrong, if one is.
@@ -41,7 +52,8 @@ class Verdict:
         unwritten: functions of the stage that are still stubs.
     """
 
-    n_held: int
+    n_held: int = 0
+    right: tuple[str, ...] = ()
     broken: str = ""
     sentence: str = ""
     hint: str = ""
@@ -51,7 +63,7 @@ class Verdict:
 
     @property
     def passed(self) -> bool:
-        """Tell whether the stage is written and every law holds."""
+        """Tell whether the stage is written and all holds."""
         return not self.broken and not self.unwritten
 
 
@@ -61,16 +73,68 @@ def judge(work: Work, stage: Stage) -> Verdict:
     Raises:
         ValueError: the file cannot be run.
     """
-    unwritten = tuple(name for name in stage.names if name not in work.written[stage.name])
+    written = work.written[stage.name]
     with borrowing(work, (stage,)) as borrowed:
-        backend = _Judged(borrowed, stage, work.written[stage.name])
-        laws = [law for law in _laws(stage) if not missing(backend, law.needs)]
-        for n_held, law in enumerate(laws):
-            failure = _tried(law, backend)
-            if failure is not None:
-                plain = Verdict(n_held, law.name.replace("_", " "), unwritten=unwritten, drawn=failure.least)
-                return _told(work, stage, borrowed, backend, law, failure, plain)
-        return Verdict(len(laws), unwritten=unwritten)
+        found = [_function_tried(work, stage, borrowed, name) for name in stage.names if name in written]
+        verdict = Verdict(
+            right=tuple(name for name, wrong in zip(written, found, strict=True) if wrong is None),
+            unwritten=tuple(name for name in stage.names if name not in written),
+        )
+        for wrong in found:
+            if wrong is not None:
+                return replace(wrong, right=verdict.right, unwritten=verdict.unwritten)
+        return _laws_tried(work, stage, borrowed, verdict)
+
+
+def _function_tried(work: Work, stage: Stage, borrowed: Borrowed, name: str) -> Verdict | None:
+    """Try a function's examples and inputs; return what is wrong with it, if anything is."""
+    example = _broken_example(borrowed, stage.home_of(name), name)
+    function, truth = borrowed.installed[name], oracle()[name]
+    calls = [tried_on(function, truth, given, words) for words, given in probes(name)]
+    wrong = [call for call in calls if not call.is_right]
+    if not wrong and not example:
+        return None
+    if not wrong:
+        return Verdict(broken=_EXAMPLE, sentence=f"{name} fails {_EXAMPLE}: {example}", hint=_formula(stage, name))
+    sentence, hint = diagnose(calls, work.folder)
+    broken = f"{_EXAMPLE}: {example}" if example else _INPUT
+    return Verdict(broken=broken.rstrip("."), sentence=sentence, hint=hint or _formula(stage, name), call=wrong[0])
+
+
+def _broken_example(borrowed: Borrowed, home: str, name: str) -> str:
+    """Run the examples of a docstring with the student's function and with the oracle's; say where they part.
+
+    Values are compared and not their text: -0 is 0, and a number is one in NumPy's clothes too.
+    """
+    theirs = dict(vars(importlib.import_module(f"pop_ref.{home}")))
+    ours = dict(vars(borrowed.module(home)))
+    for each in doctest.DocTestParser().get_examples(oracle()[name].__doc__ or ""):
+        source = each.source.strip()
+        is_value = isinstance(ast.parse(source).body[-1], ast.Expr)
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            wanted = eval(source, theirs) if is_value else exec(source, theirs)
+            try:
+                found = eval(source, ours) if is_value else exec(source, ours)
+                agrees = not is_value or found is wanted or same(found, wanted)
+            except Exception as error:
+                return f"{source} stops with {said(error)}"
+        if not agrees:
+            return f"{source} should give {' '.join(each.want.split())} and gives {' '.join(repr(found).split())[:200]}"
+    return ""
+
+
+def _laws_tried(work: Work, stage: Stage, borrowed: Borrowed, verdict: Verdict) -> Verdict:
+    backend = _Judged(borrowed, stage, work.written[stage.name])
+    laws = [law for law in _laws(stage) if not missing(backend, law.needs)]
+    n_held = 0
+    for law in laws:
+        failure, was_tried = _tried(law, backend)
+        if failure is not None:
+            plain = replace(verdict, n_held=n_held, broken=law.name.replace("_", " "), drawn=failure.least)
+            return _told(work, stage, borrowed, backend, law, failure, plain)
+        n_held += was_tried
+    return replace(verdict, n_held=n_held)
 
 
 class _Judged(OracleAdapter):
@@ -98,25 +162,41 @@ class _Judged(OracleAdapter):
         function = self.borrowed.installed.get(name) or super().stage(name)
 
         def of_the_course(*given: Any, **named: Any) -> Any:
-            if any(isinstance(value, Profile) and not _is_the_courses(value) for value in (*given, *named.values())):
+            # gsplat's option of `split_rows` is a boolean, its fourth argument
+            other = name == "split_rows" and (*given[3:], named.get("revised_opacity", False))[0]
+            if other or not all(map(_is_the_courses, (*given, *named.values()))):
                 _set_aside()
             return function(*given, **named)
 
         return of_the_course
 
+    def full_render(self, scene: Scene) -> Any:
+        """Draw a scene, unless its constants are not the course's."""
+        if not _is_the_courses(scene.profile):
+            _set_aside()
+        return super().full_render(scene)
 
-def _is_the_courses(profile: Profile) -> bool:
-    return all(
-        getattr(profile, name) == getattr(PAPER, name)
-        for name in (
-            "extent",
-            "principal_point",
-            "clamp_gradient",
-            "ceiling_gradient",
-            "near_inclusive",
-            "stop_inclusive",
-        )
-    )
+    def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
+        """Return a scene's cotangents, unless its constants are not the course's."""
+        if not _is_the_courses(scene.profile):
+            _set_aside()
+        return super().gradients(scene, v_image, v_T_final)
+
+
+def _is_the_courses(value: Any) -> bool:
+    """Tell that a value is none that the course leaves out.
+
+    These are other profiles, settings of density control that chapter 9 does not teach, and cameras that are not rigid,
+    for which two right formulas differ.
+    """
+    if isinstance(value, np.ndarray) and value.shape == (4, 4):
+        return bool(np.allclose(value[:3, :3] @ value[:3, :3].T, np.eye(3), atol=1e-9))
+    if isinstance(value, Profile):
+        return replace(value, name=PAPER.name, tile_size=PAPER.tile_size) == PAPER
+    if isinstance(value, DensityConfig):
+        taught = {field.name: getattr(POP, field.name) for field in fields(POP) if field.name in DENSITY_SETTINGS}
+        return replace(value, **taught) == POP
+    return True
 
 
 def _set_aside() -> None:
@@ -149,20 +229,21 @@ class _Failure:
     error: BaseException
 
 
-def _tried(law: Law, backend: _Judged) -> _Failure | None:
-    """Try a law; return the first input that broke it, and the smallest that was found."""
+def _tried(law: Law, backend: _Judged) -> tuple[_Failure | None, bool]:
+    """Try a law; return the first input that broke it and the smallest that was found, and whether any was tried."""
     from hypothesis import HealthCheck, given, settings
     from hypothesis.errors import HypothesisException
 
     failure: _Failure | None = None
-    until = float("inf")
+    until, was_tried = float("inf"), False
 
     def sentence(**drawn: Any) -> None:
-        nonlocal failure, until
+        nonlocal failure, until, was_tried
         if time.thread_time() > until:
             return
         try:
             law.sentence(backend, **drawn)
+            was_tried = True
         except HypothesisException:
             raise
         except Exception as error:
@@ -184,8 +265,8 @@ def _tried(law: Law, backend: _Judged) -> _Failure | None:
         (options(given(**law.strategies)(sentence)) if law.strategies else sentence)()
     except Exception:
         # set aside as a whole, broken, or no longer failing once patience had run out: the last is broken too
-        return failure
-    return failure
+        return failure, was_tried
+    return failure, was_tried
 
 
 def _told(
@@ -201,10 +282,8 @@ def _told(
     if not least and not first:
         return replace(plain, sentence=f"This law does not hold: {plain.broken}.", hint=_own_words(error))
     call = (least or first)[0]
-    mistake = explained_by([each for each in (*least, *first) if each.function == call.function], borrowed.oracle)
-    if mistake:
-        return replace(plain, sentence=mistake.sentence, hint=mistake.hint, call=call)
-    return replace(plain, sentence=_general(call, plain.broken), hint=_formula(stage, call.function), call=call)
+    sentence, hint = diagnose([each for each in (*least, *first) if each.function == call.function], work.folder)
+    return replace(plain, sentence=sentence, hint=hint or _formula(stage, call.function), call=call)
 
 
 def _wrong_calls(borrowed: Borrowed, backend: _Judged, law: Law, drawn: dict[str, Any]) -> list[Call]:
@@ -218,35 +297,12 @@ def _wrong_calls(borrowed: Borrowed, backend: _Judged, law: Law, drawn: dict[str
             law.sentence(backend, **drawn)
     finally:
         borrowed.watching = False
-    return [call for call in borrowed.calls if not same(call.found, call.expected)]
-
-
-def _general(call: Call, law: str) -> str:
-    """Say what can be seen of a wrong result without knowing why it is wrong."""
-    name, (found, changed), (expected, meant) = call.function, call.found, call.expected
-    a, b = numbers(call.found), numbers(call.expected)
-    if found is None and expected is not None:
-        return f"{name} returns nothing: is a return missing?"
-    if changed and not meant:
-        return f"{name} changes its argument in place; work on a copy, the caller still needs what it gave."
-    if a.shape != b.shape:
-        return f"{name} returns {len(a)} numbers where {len(b)} are asked for: look at the shapes in its docstring."
-    if not np.all(np.isfinite(a)) and np.all(np.isfinite(b)):
-        return f"{name} returns a number that is not finite: is something divided by 0?"
-    nonzero = np.abs(b) > 1e-9
-    ratios = a[nonzero] / b[nonzero]
-    if len(ratios) and np.ptp(ratios) < 1e-6 and np.allclose(a[~nonzero], 0.0, atol=1e-9):
-        if abs(ratios[0] + 1.0) < 1e-6:
-            return f"{name} has the wrong sign."
-        return f"{name} is {ratios[0]:.4g} times what it should be: a factor is missing or one too many."
-    return f"{name} is not right yet; this law does not hold: {law}."
+    return [call for call in borrowed.calls if not call.is_right]
 
 
 def _formula(stage: Stage, name: str) -> str:
-    module = next(home for home, names in stage.functions.items() if name in names)
-    stated = formulas(module, name)
-    formula = "; ".join(stated)
-    chapter = f"chapter {stage.chapter} of the walk-through explains it"
+    formula = "; ".join(formulas(stage.home_of(name), name))
+    chapter = f"chapter {stage.chapter_of(name)} of the walk-through explains it"
     return f"The formula is {formula}; {chapter}." if formula else f"{chapter[0].upper()}{chapter[1:]}."
 
 

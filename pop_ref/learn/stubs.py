@@ -11,15 +11,37 @@ from pathlib import Path
 from typing import Final
 
 import pop_ref
+from pop_ref.constants import DECISIONS, KINKS
 from pop_ref.learn.course import COURSE, Stage
 
 _ORACLE: Final = Path(pop_ref.__file__).parent
+_ABOUT: Final = """
+{chapters} Every docstring has an example to try, and those are tried first. What you call from another stage is your
+own function where you have written it, and the oracle's where you have not. The course has one profile, `paper`, with
+the constants that the chapters print: you may leave the parameter `profile` out, and all that a docstring says of other
+programs.
+"""
+# of a docstring's lines, before it is indented
+_WIDTH: Final = 114
+_LABELS: Final = {label: f"the {words.partition(':')[0]}" for label, words in (DECISIONS | KINKS).items()}
+# what the functions of the course read of their settings
+_SETTINGS: Final = {
+    "grow_masks": {
+        "config": "of its fields you need four: `grow_grad2d` (2e-4), the average gradient over which a Gaussian is"
+        " chosen; `grow_scale3d` (0.01), the share of the scene's scale up to which it is small; `blur_start_iter` and"
+        " `blur_stop_iter` (3000 and 7000), between which, both included, the flags `statistics.blurred` count too."
+    },
+    "prune_mask": {"config": "of its fields you need one: `prune_opa` (0.005). POP prunes by opacity alone."},
+    "train_step": {
+        "recipe": "what is minimised: `objective` reads it, `learning_rates` takes its `max_steps` and `lr`,"
+        " `accumulate` and `control` take its `density`. Adam's first step is number 1, `state.step` counts from 0. The"
+        " course draws harmonics of degree 0; `waiting` and the entropy term belong to other methods."
+    },
+}
 _QUOTED: Final = re.compile(r"`([^`]*)`")
 _HEAD: Final = '''"""Stage {number} of {count}, {name}: {does}.
 
-Chapter {chapter} of the walk-through explains it, and every docstring has an example to try. What you call from another
-stage is your own function where you have written it, and the oracle's where you have not. The course has one profile,
-`paper`: readings of other profiles that a docstring speaks of may be left out.
+{about}
 
     pop-learn check {name}
 """
@@ -48,10 +70,11 @@ def stub(stage: Stage) -> str:
     Example:
         >>> from pop_ref.learn.course import stage_named
         >>> print(stub(stage_named("alpha")).splitlines()[0])
-        \"\"\"Stage 8 of 12, alpha: one splat at one pixel.
+        \"\"\"Stage 8 of 13, alpha: one splat at one pixel.
     """
     number = COURSE.index(stage) + 1
-    head = _HEAD.format(number=number, count=len(COURSE), name=stage.name, does=stage.does, chapter=stage.chapter)
+    about = textwrap.fill(" ".join(_ABOUT.format(chapters=_chapters_told(stage)).split()), 120)
+    head = _HEAD.format(number=number, count=len(COURSE), name=stage.name, does=stage.does, about=about)
     functions = [_without_body(module, name) for module, names in stage.functions.items() for name in names]
     return "\n\n".join(["\n".join([head, *_imports(stage)]), *functions])
 
@@ -95,10 +118,41 @@ def _functions(module: str) -> dict[str, ast.FunctionDef]:
 def _without_body(module: str, name: str) -> str:
     node = _functions(module)[name]
     signature = "\n".join(_source(module).splitlines()[node.lineno - 1 : node.body[0].lineno - 1])
-    docstring = textwrap.indent(f'"""{_without_formulas(ast.get_docstring(node) or "")}\n"""', "    ")
+    told = _of_the_course(name, _without_formulas(ast.get_docstring(node) or ""))
+    docstring = textwrap.indent(f'"""{told}\n"""', "    ")
     # blank lines carry no indentation
     docstring = re.sub(r"^ +$", "", docstring, flags=re.MULTILINE)
     return f'\n{signature}\n{docstring}\n    raise NotImplementedError("{name} is yours to write")'
+
+
+def _chapters_told(stage: Stage) -> str:
+    """Say which chapters explain a stage's functions."""
+    names: dict[str, list[str]] = {}
+    for name in stage.names:
+        names.setdefault(stage.chapter_of(name), []).append(name)
+    if len(names) == 1:
+        return f"Chapter {stage.chapter} of the walk-through explains it."
+    others = [f"chapter {chapter} {', '.join(each)}" for chapter, each in names.items() if chapter != stage.chapter]
+    return f"Chapter {stage.chapter} of the walk-through explains it, and of its functions {'; '.join(others)}."
+
+
+def _of_the_course(name: str, docstring: str) -> str:
+    """Write labels in words, and explain of the settings what the course has."""
+    docstring = re.sub(r" \((?:A\d+(?:, )?)+(?::[^()]*)?\)", "", docstring)
+    docstring = re.sub(r"\b[DB]\d\b", lambda label: _LABELS[label[0]], docstring)
+    docstring = re.sub(r' Under "split".*?and split\.', "", docstring, flags=re.DOTALL)
+    docstring = docstring.replace("gsplat's option of that name.", "not in this course; leave it out, or False.")
+    for setting, about in _SETTINGS.get(name, {}).items():
+        docstring = re.sub(f"    {setting}: .*", f"    {setting}: {about}", docstring)
+    return "\n".join(_wrapped(line) for line in docstring.split("\n"))
+
+
+def _wrapped(line: str) -> str:
+    """Break a line of a docstring that its labels in words have made too long."""
+    if len(line) <= _WIDTH or ">>>" in line:
+        return line
+    indent = " " * (len(line) - len(line.lstrip()))
+    return textwrap.fill(line.strip(), _WIDTH, initial_indent=indent, subsequent_indent=f"{indent}    ")
 
 
 def _without_formulas(docstring: str) -> str:
@@ -117,7 +171,7 @@ def _imports(stage: Stage) -> Iterator[str]:
     """Import what the oracle's module imports, and what else it defines that the stage does not ask for."""
     yield "from __future__ import annotations\n"
     own, seen = set(stage.names), set()
-    plain: list[str] = []
+    plain = ["import math", "import numpy as np"]
     ours: dict[str, list[str]] = {}
     for module in stage.functions:
         body = ast.parse(_source(module)).body

@@ -14,6 +14,7 @@ import importlib.abc
 import importlib.util
 import inspect
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -21,6 +22,8 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
+
+import numpy as np
 
 import pop_ref
 from pop_ref.learn.course import COURSE, Stage
@@ -48,7 +51,13 @@ class Work:
 
 @dataclass
 class Call:
-    """One call of a student's function: what went in, what came out, what the oracle says to the same input."""
+    """One call of a student's function: what went in, what came out, what the oracle says to the same input.
+
+    Attributes:
+        found, expected: what was returned, and the arguments that were written to, of both.
+        words: what is special about the input; empty for a plain one.
+        error: with which the function stopped, if it did.
+    """
 
     function: str
     parameters: tuple[str, ...]
@@ -56,6 +65,18 @@ class Call:
     named: dict[str, Any]
     found: Any
     expected: Any
+    words: str = ""
+    error: Exception | None = None
+
+    @property
+    def is_right(self) -> bool:
+        """Tell whether it is what the oracle says, but for rounding."""
+        if self.error:
+            return False
+        if self.function == "sh_basis_vjp" and not self.found[1]:
+            # what is along the direction is removed later, and polynomials that agree on the sphere differ in it
+            return same(*(_tangential(value, self.given[0]) for value, _ in (self.found, self.expected)))
+        return same(self.found, self.expected)
 
 
 @dataclass
@@ -140,7 +161,8 @@ def borrowing(work: Work, stages: Sequence[Stage] = COURSE) -> Iterator[Borrowed
         for stage in stages:
             for name in stage.names if stage.name in theirs else ():
                 if name in work.written[stage.name]:
-                    _replace(modules, borrowed, name, getattr(theirs[stage.name], name))
+                    function = getattr(theirs[stage.name], name)
+                    _replace(modules, borrowed, name, function, _with_settings(function, borrowed.oracle[name]))
                 else:
                     # a stub that the student's own functions call
                     setattr(theirs[stage.name], name, borrowed.oracle[name])
@@ -150,21 +172,42 @@ def borrowing(work: Work, stages: Sequence[Stage] = COURSE) -> Iterator[Borrowed
         _forget()
 
 
-def _replace(modules: list[ModuleType], borrowed: Borrowed, name: str, function: Callable[..., Any]) -> None:
+def _with_settings(function: Callable[..., Any], before: Callable[..., Any]) -> Callable[..., Any]:
+    """Let a function without `profile` or `config` be called with one: the course has one of each."""
+    theirs = list(inspect.signature(before).parameters)
+    own = inspect.signature(function).parameters
+    left_out = [name for name in ("profile", "config", "revised_opacity") if name in theirs and name not in own]
+    if not left_out or any(p.kind is p.VAR_POSITIONAL for p in own.values()):
+        return function
+    places = {theirs.index(name) for name in left_out}
+
+    def called(*given: Any, **named: Any) -> Any:
+        kept = {name: value for name, value in named.items() if name not in left_out}
+        return function(*(value for k, value in enumerate(given) if k not in places), **kept)
+
+    return called
+
+
+def _replace(
+    modules: list[ModuleType],
+    borrowed: Borrowed,
+    name: str,
+    function: Callable[..., Any],
+    called: Callable[..., Any],
+) -> None:
     """Put a student's function wherever the copy has the oracle's, and in the student's own modules."""
     before = borrowed.oracle[name]
-    parameters = tuple(inspect.signature(before).parameters)
 
     def watched(*given: Any, **named: Any) -> Any:
         if not borrowed.watching:
-            return function(*given, **named)
+            return called(*given, **named)
         kept = copy.deepcopy((given, named))
         theirs = copy.deepcopy(kept)
-        found = function(*given, **named)
+        found = called(*given, **named)
         # what is added to in place is part of what came out
         expected = before(*theirs[0], **theirs[1])
         results = (found, _written_to(kept, given)), (expected, _written_to(kept, theirs[0]))
-        borrowed.calls.append(Call(name, parameters, *kept, *results))
+        borrowed.calls.append(Call(name, parameters_of(before), *kept, *results))
         return found
 
     borrowed.installed[name] = watched
@@ -172,6 +215,25 @@ def _replace(modules: list[ModuleType], borrowed: Borrowed, name: str, function:
         for attribute, value in list(vars(module).items()):
             if value is before or value is function:
                 setattr(module, attribute, watched)
+
+
+def parameters_of(function: Callable[..., Any]) -> tuple[str, ...]:
+    """Return the names of a function's parameters."""
+    return tuple(inspect.signature(function).parameters)
+
+
+def tried_on(function: Callable[..., Any], truth: Callable[..., Any], given: tuple[Any, ...], words: str) -> Call:
+    """Call a student's function and the oracle's on copies of the same input."""
+    name, ours, theirs = truth.__name__, copy.deepcopy(given), copy.deepcopy(given)
+    expected = truth(*theirs)
+    meant = expected, _written_to((given,), theirs)
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        try:
+            found = function(*ours)
+        except Exception as error:
+            return Call(name, parameters_of(truth), given, {}, (None, ()), meant, words, error=error)
+    return Call(name, parameters_of(truth), given, {}, (found, _written_to((given,), ours)), meant, words)
 
 
 def _written_to(kept: tuple[Any, ...], after: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -239,3 +301,38 @@ def _file(fullname: str) -> Path:
 def _forget() -> None:
     for name in [n for n in sys.modules if n == PACKAGE or n.startswith(f"{PACKAGE}.")]:
         del sys.modules[name]
+
+
+def numbers(value: Any) -> np.ndarray:
+    """Flatten whatever a function returns into one row of numbers.
+
+    Example:
+        >>> numbers((0.5, [np.eye(2)], None))
+        array([0.5, 1. , 0. , 0. , 1. ])
+    """
+    if value is None:
+        return np.zeros(0)
+    if isinstance(value, dict):
+        value = tuple(value.values())
+    elif hasattr(value, "__dataclass_fields__"):
+        value = tuple(getattr(value, name) for name in value.__dataclass_fields__)
+    if isinstance(value, list) and any(isinstance(each, list) for each in value):
+        # lists of one tile each: where one ends is part of it
+        value = [part for each in value for part in (len(each), each)]
+    if isinstance(value, tuple | list):
+        return np.concatenate([np.zeros(0), *map(numbers, value)])
+    return np.asarray(value, dtype=np.float64).ravel()
+
+
+def same(one: Any, other: Any) -> bool:
+    """Tell whether two results are one but for rounding."""
+    a, b = numbers(one), numbers(other)
+    if a.shape != b.shape:
+        return False
+    largest = float(np.max(np.abs(b[np.isfinite(b)]), initial=0.0))
+    return bool(np.allclose(a, b, rtol=1e-8, atol=1e-11 * largest, equal_nan=True))
+
+
+def _tangential(v_dirs: Any, dirs: np.ndarray) -> np.ndarray:
+    v = np.asarray(v_dirs, dtype=np.float64)
+    return v - dirs * np.sum(dirs * v, axis=1, keepdims=True) if v.shape == dirs.shape else v

@@ -9,12 +9,18 @@ from typing import Any, Final
 import numpy as np
 
 from pop_ref.conformance.scenes import Scene
+from pop_ref.constants import PAPER
+from pop_ref.density import POP
 from pop_ref.learn.course import Stage
+from pop_ref.learn.diagnosis import leaves
 from pop_ref.learn.judge import Verdict
-from pop_ref.learn.student import Call
+from pop_ref.learn.student import Call, same
+from pop_ref.recipes import RECIPES
 
 _SHADES: Final = " .:-=+*#%@"
 _LONGEST: Final = 12
+# of an input, of what came out, and of what should
+_MOST_LINES: Final = 9
 
 
 def told(stage: Stage, verdict: Verdict) -> str:
@@ -23,22 +29,20 @@ def told(stage: Stage, verdict: Verdict) -> str:
     if verdict.sentence:
         lines += [f"{stage.name}: not yet.", "", verdict.sentence, ""]
         lines += _counterexample(verdict)
-        lines += [
-            f"hint: {verdict.hint}",
-            "",
-            f"{_held(verdict)}; the first that does not: {verdict.broken}.",
-        ]
+        lines += [f"hint: {verdict.hint}", "", f"{_held(stage, verdict)}. What does not hold: {verdict.broken}."]
     elif not verdict.unwritten:
-        lines += [f"{stage.name}: passed. {_held(verdict)}."]
-    elif verdict.n_held:
-        lines += [f"{stage.name}: right so far. {_held(verdict)}."]
+        lines += [f"{stage.name}: passed. {_held(stage, verdict)}."]
+    elif verdict.right:
+        lines += [f"{stage.name}: right so far. {_held(stage, verdict)}."]
     if verdict.unwritten:
         lines += [f"still to write in {stage.file}: {', '.join(verdict.unwritten)}"]
     return "\n".join(textwrap.fill(line, 100) if line[:1].strip() else line for line in lines)
 
 
-def _held(verdict: Verdict) -> str:
-    return "1 law holds" if verdict.n_held == 1 else f"{verdict.n_held} laws hold"
+def _held(stage: Stage, verdict: Verdict) -> str:
+    functions = f"{len(verdict.right)} of {len(stage.names)} functions give what the oracle gives"
+    laws = {0: "", 1: ", and 1 law holds"}.get(verdict.n_held, f", and {verdict.n_held} laws hold")
+    return functions + laws
 
 
 def _counterexample(verdict: Verdict) -> Iterator[str]:
@@ -46,25 +50,43 @@ def _counterexample(verdict: Verdict) -> Iterator[str]:
         yield from _call_told(verdict.call)
     elif verdict.drawn:
         yield "the smallest input that was found:"
-        for name, value in verdict.drawn.items():
-            yield from _named(name, value)
+        yield from _capped([line for name, value in verdict.drawn.items() for line in _named(name, value)])
         yield ""
 
 
 def _call_told(call: Call) -> Iterator[str]:
     yield f"{call.function} of"
-    for name, value in (*zip(call.parameters, call.given, strict=False), *call.named.items()):
-        yield from _named(name, value)
-    yield "gives"
-    yield from _shown(*call.found)
-    yield "and should give"
-    yield from _shown(*call.expected)
+    given = (*zip(call.parameters, call.given, strict=False), *call.named.items())
+    yield from _capped([line for name, value in given for line in _named(name, value)])
+    if call.error is None:
+        found, expected = _results(call)
+        yield "gives"
+        yield from _capped(found)
+        yield "and should give"
+        yield from _capped(expected)
     yield ""
 
 
-def _shown(returned: Any, changed: tuple[Any, ...]) -> Iterator[str]:
-    for value in (*([] if returned is None and changed else [returned]), *changed):
-        yield from _named("", value)
+def _results(call: Call) -> tuple[list[str], list[str]]:
+    """Write what came out and what should; of a result of many parts, those that differ."""
+    (found, changed), (expected, meant) = call.found, call.expected
+    both = leaves(call.found), leaves(call.expected)
+    if len(both[0]) == len(both[1]) > 3:
+        differ = [k for k in range(len(both[0])) if not same(both[0][k][1], both[1][k][1])]
+        return (
+            [f"  {both[0][k][0]} = {_numbers(both[0][k][1], _LONGEST)}" for k in differ],
+            [f"  {both[1][k][0]} = {_numbers(both[1][k][1], _LONGEST)}" for k in differ],
+        )
+    return _shown(found, changed), _shown(expected, meant)
+
+
+def _shown(returned: Any, changed: tuple[Any, ...]) -> list[str]:
+    values = [*([] if returned is None and changed else [returned]), *changed]
+    return [line for value in values for line in _named("", value)]
+
+
+def _capped(lines: list[str]) -> list[str]:
+    return lines if len(lines) <= _MOST_LINES else [*lines[: _MOST_LINES - 1], "  ..."]
 
 
 def _named(name: str, value: Any) -> Iterator[str]:
@@ -75,23 +97,33 @@ def _named(name: str, value: Any) -> Iterator[str]:
         for i, (mean, opacity) in enumerate(zip(value.gaussians.means, value.gaussians.opacities, strict=True)):
             yield f"    {i}: at {_numbers(mean)}, opacity {opacity:.4g}"
         return
-    parts = getattr(value, "_asdict", lambda: None)() if hasattr(value, "_asdict") else None
-    if parts is None and hasattr(value, "__dataclass_fields__"):
-        parts = {} if hasattr(value, "alpha_floor") else {f: getattr(value, f) for f in value.__dataclass_fields__}
-        if not parts:
-            yield f"{label}{value.name}"
-    if parts:
-        yield f"{label}{type(value).__name__}"
-        for each, part in parts.items():
-            yield f"    {each} = {_numbers(part)}"
+    if callable(value):
+        yield f"{label}a function"
         return
-    if parts is None:
-        array = np.asarray(value) if isinstance(value, np.ndarray) else None
-        if array is not None and array.ndim == 3 and min(array.shape[:2]) > 4:
-            yield f"{label}a picture"
-            yield from (f"    {row}" for row in drawn(array))
-        else:
-            yield f"{label}{_numbers(value)}"
+    parts = value if isinstance(value, dict) else _fields(value)
+    if parts is not None:
+        yield f"{label}{'' if isinstance(value, dict) else type(value).__name__}".rstrip()
+        for each, part in parts.items():
+            if isinstance(part, dict) or _fields(part) is not None:
+                yield from (f"    {key} = {_numbers(inner, _LONGEST)}" for key, inner in leaves(part, each))
+            else:
+                yield f"    {each} = {_numbers(part, _LONGEST)}"
+    elif isinstance(value, np.ndarray) and value.ndim == 3 and min(value.shape[:2]) > 4:
+        yield f"{label}a picture"
+        yield from (f"    {row}" for row in drawn(value))
+    else:
+        yield f"{label}{_numbers(value)}"
+
+
+def _fields(value: Any) -> dict[str, Any] | None:
+    """Return a value's parts by name; of settings those that are not the usual ones."""
+    if hasattr(value, "_asdict"):
+        return value._asdict()
+    if not hasattr(value, "__dataclass_fields__"):
+        return None
+    parts = {name: getattr(value, name) for name in value.__dataclass_fields__}
+    usual = {"DensityConfig": POP, "Recipe": RECIPES["POP"], "Profile": PAPER}.get(type(value).__name__)
+    return parts if usual is None else {name: x for name, x in parts.items() if x != getattr(usual, name)}
 
 
 def drawn(image: np.ndarray) -> list[str]:
@@ -105,9 +137,9 @@ def drawn(image: np.ndarray) -> list[str]:
     return ["".join(2 * _SHADES[round(float(x) * (len(_SHADES) - 1))] for x in row) for row in light]
 
 
-def _numbers(value: Any) -> str:
+def _numbers(value: Any, most: int = 4 * _LONGEST) -> str:
     if isinstance(value, np.ndarray):
-        if value.size > _LONGEST * 4:
+        if value.size > most:
             return f"an array {list(value.shape)} from {float(np.min(value)):.4g} to {float(np.max(value)):.4g}"
         return _numbers(value.tolist())
     if isinstance(value, list | tuple):

@@ -1,16 +1,39 @@
-"""Train a small scene with the student's own code: every stage theirs, the loop around them the oracle's."""
+"""Train with the student's own code, the loop included: the toy, a picture, or views of a capture."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
 from pop_ref.learn.course import COURSE
-from pop_ref.learn.splat import l2, orbit, photograph, start
-from pop_ref.learn.student import Work, borrowing, said, where
+from pop_ref.learn.progress import toy
+from pop_ref.learn.splat import SH_C0, l2, orbit, photograph
+from pop_ref.learn.student import Borrowed, Work, borrowing, said, where
+
+SIZE: Final = 64
+# a camera as `records.Camera` takes it, and what it sees, [H, W, 3] in [0, 1]
+View = tuple[tuple[np.ndarray, np.ndarray, int, int], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is trained on.
+
+    Attributes:
+        views: cameras and photographs; training draws one a step.
+        shown: the view that the film shows.
+        params: raw parameters of the Gaussians to start from.
+        scene_scale: world units.
+    """
+
+    views: Sequence[View]
+    shown: View
+    params: dict[str, np.ndarray]
+    scene_scale: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -24,8 +47,108 @@ class Told:
     picture: np.ndarray
 
 
-def train(work: Work, steps: int = 60, size: int = 24, n: int = 100, every: int = 10, seed: int = 0) -> Iterator[Told]:
-    """Fit the toy, telling now and then.
+def the_toy(size: int = SIZE, n_views: int = 8, seed: int = 0) -> Subject:
+    """Photograph the toy all around, and start from flat Gaussians on its surfaces, none in place, half as colourful.
+
+    Example:
+        >>> len(the_toy(8).views)
+        8
+    """
+    rng = np.random.default_rng(seed)
+    cameras = [orbit(2 * np.pi * k / n_views, size) for k in range(n_views)]
+    unseen = orbit(np.pi / n_views, size)
+    points, n = toy(), len(toy()["means"])
+    colors = 0.25 + 0.5 * (SH_C0 * points["sh0"][:, 0] + 0.5) + rng.normal(0.0, 0.05, (n, 3))
+    params = {
+        **points,
+        "means": points["means"] + rng.normal(0.0, 0.02, (n, 3)),
+        "scales": points["scales"] + np.log(1.3),
+        "opacities": np.full(n, 1.0),
+        "sh0": ((colors - 0.5) / SH_C0)[:, None],
+    }
+    views = [(camera, photograph(camera)) for camera in cameras]
+    return Subject(views, (unseen, photograph(unseen)), params)
+
+
+def a_picture(image: np.ndarray, size: int = SIZE, cells: int = 16) -> Subject:
+    """Stand before a picture and start from a grid of Gaussians, each of the colour of its cell.
+
+    Args:
+        image: [H, W, 3] in [0, 1]; its middle square is taken.
+        size: px, to which it is made smaller.
+        cells: Gaussians along each side.
+
+    Raises:
+        ValueError: the picture is smaller than `size`.
+    """
+    side = min(image.shape[:2])
+    if side < size:
+        raise ValueError(f"the picture is {image.shape[1]} x {image.shape[0]} px; it must be {size} px at least")
+    top, left = (image.shape[0] - side) // 2, (image.shape[1] - side) // 2
+    target = shrunk(image[top : top + side, left : left + side, :3], size, size)
+    depth, f = 4.0, 1.2 * size
+    x, y = (axis.ravel() for axis in np.meshgrid(*[(np.arange(cells) + 0.5) * size / cells] * 2))
+    means = np.stack([(x - size / 2) * depth / f, (y - size / 2) * depth / f, np.full(len(x), depth)], axis=1)
+    colors = shrunk(target, cells, cells).reshape(-1, 3)
+    K = np.array([[f, 0.0, size / 2], [0.0, f, size / 2], [0.0, 0.0, 1.0]])
+    view = (np.eye(4), K, size, size), target
+    return Subject([view], view, _started(means, colors, 0.6 * size / cells * depth / f), 4.0)
+
+
+def a_capture(
+    views: Sequence[View], points: np.ndarray, colors: np.ndarray, scene_scale: float, n: int = 300
+) -> Subject:
+    """Start from some of a capture's points; the first view is put aside and shown.
+
+    Args:
+        views: small ones, see `shrunk`.
+        points: [N, 3] world units.
+        colors: [N, 3] in [0, 1].
+        scene_scale: world units.
+        n: points that are taken.
+
+    Raises:
+        ValueError: there are fewer than two views, or no points.
+    """
+    if len(views) < 2 or not len(points):
+        raise ValueError(
+            f"the capture has {len(views)} views and {len(points)} points; two views and a point are needed"
+        )
+    picked = np.random.default_rng(0).permutation(len(points))[:n]
+    means = points[picked]
+    # so wide that each reaches its third neighbour
+    apart = np.sqrt(np.sum((means[:, None] - means) ** 2, axis=2))
+    widths = np.sort(apart, axis=1)[:, 1 : min(4, len(means))].mean(axis=1) if len(means) > 1 else np.ones(1)
+    return Subject(views[1:], views[0], _started(means, colors[picked], 0.6 * widths), scene_scale)
+
+
+def shrunk(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Make a picture smaller: the mean of the pixels that fall into each new one.
+
+    Example:
+        >>> shrunk(np.array([[[0.0], [1.0]], [[2.0], [3.0]]]), 1, 1)
+        array([[[1.5]]])
+    """
+    rows = np.linspace(0, image.shape[0], height + 1).astype(int)[:-1]
+    columns = np.linspace(0, image.shape[1], width + 1).astype(int)[:-1]
+    sums = np.add.reduceat(np.add.reduceat(image, rows, axis=0), columns, axis=1)
+    counts = np.diff([*rows, image.shape[0]])[:, None] * np.diff([*columns, image.shape[1]])
+    return sums / counts[..., None]
+
+
+def _started(means: np.ndarray, colors: np.ndarray, widths: Any) -> dict[str, np.ndarray]:
+    n = len(means)
+    return {
+        "means": means,
+        "quats": np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+        "scales": np.log(np.broadcast_to(np.reshape(widths, (-1, 1)), (n, 3))),
+        "opacities": np.full(n, 0.5),
+        "sh0": ((colors - 0.5) / SH_C0)[:, None],
+    }
+
+
+def train(work: Work, subject: Subject, steps: int = 120, every: int = 10, seed: int = 0) -> Iterator[Told]:
+    """Fit the subject, telling at the start and now and then.
 
     Raises:
         ValueError: a stage is not written, or stops with an error; the message names it.
@@ -35,7 +158,7 @@ def train(work: Work, steps: int = 60, size: int = 24, n: int = 100, every: int 
         raise ValueError(f"not all is written yet: {', '.join(missing)}; 'pop-learn check' says what each lacks")
     with borrowing(work) as borrowed:
         try:
-            yield from _steps(borrowed, steps, size, n, every, np.random.default_rng(seed))
+            yield from _steps(borrowed, subject, steps, every, np.random.default_rng(seed))
         except Exception as error:
             at = where(error, work.folder)
             if at == str(work.folder):
@@ -45,23 +168,24 @@ def train(work: Work, steps: int = 60, size: int = 24, n: int = 100, every: int 
             ) from None
 
 
-def _steps(borrowed, steps: int, size: int, n: int, every: int, rng: np.random.Generator) -> Iterator[Told]:
+def _steps(borrowed: Borrowed, subject: Subject, steps: int, every: int, rng: np.random.Generator) -> Iterator[Told]:
     training, types, recipes = (borrowed.module(name) for name in ("training", "records", "recipes"))
     recipe = recipes.RECIPES["POP"]
-    rates = replace(recipe.lr, means=4e-3, quats=1e-2, scales=2e-2, opacities=5e-2, sh0=3e-2)
-    density = replace(recipe.density, refine_start_iter=0, refine_every=max(2, steps // 3), refine_stop_iter=steps)
-    recipe = replace(recipe, max_steps=steps, lr=rates, density=density, lambda_ssim=0.0)
-    cameras = [orbit(2 * np.pi * k / 6, size) for k in range(6)]
-    photographs = [photograph(camera) for camera in cameras]
-    target = photographs[0]
-    state = training.start(start(n, rng))
-    for step in range(steps):
-        k = int(rng.integers(len(cameras)))
-        state, loss = training.train_step(
-            state, types.Camera(*cameras[k]), photographs[k], 1.0, lambda n: rng.standard_normal((2, n, 3)), recipe
-        )
-        if (step + 1) % every == 0 or step == steps - 1:
+    scale = subject.scene_scale
+    rates = replace(recipe.lr, means=4e-3, means_decay=0.1, quats=2e-2, scales=4e-2, opacities=1e-1, sh0=4e-2)
+    # density control acts once, after a quarter, so that what it adds has time to settle; the prior ends at half time
+    density = replace(recipe.density, refine_start_iter=0, refine_every=max(2, steps // 4), refine_stop_iter=steps // 2)
+    density = replace(density, grow_grad2d=1e-3)
+    recipe = replace(recipe, max_steps=steps, lr=rates, density=density, pop_stop_iter=steps // 2)
+    camera, target = types.Camera(*subject.shown[0]), subject.shown[1]
+    state, loss = training.start(subject.params), float("nan")
+    for step in range(steps + 1):
+        if step % every == 0 or step == steps:
             gaussians = training.gaussians_from_params(state.rows.params)
-            image = borrowed.module("render").render(gaussians, types.Camera(*cameras[0])).image
+            image = borrowed.module("render").render(gaussians, camera).image
             psnr = -10.0 * np.log10(l2(np.clip(image, 0.0, 1.0), target)[0])
-            yield Told(step + 1, loss, float(psnr), len(gaussians), np.concatenate([target, image], axis=1))
+            yield Told(step, loss, float(psnr), len(gaussians), np.concatenate([target, image], axis=1))
+        if step < steps:
+            seen, photo = subject.views[int(rng.integers(len(subject.views)))]
+            normals = lambda n: rng.standard_normal((2, n, 3))  # noqa: E731
+            state, loss = training.train_step(state, types.Camera(*seen), photo, scale, normals, recipe)

@@ -254,8 +254,8 @@ assert np.allclose(
 #
 # {{source: pop_ref.harmonics.colors_from_sh_vjp}}
 #
-# The direction runs from the camera to the Gaussian, $d = \mu - o$, so $v_\mu$ gets a **third** part, $v_d$. Some
-# programs leave it out: moving a Gaussian also changes the side from which it is seen.
+# The direction runs from the camera at $e$ to the Gaussian, $d = \mu - e$, so $v_\mu$ gets a **third** part, $v_d$.
+# Some programs leave it out: moving a Gaussian also changes the side from which it is seen.
 
 # %%
 dirs = view_dirs(scene.means, viewmat)

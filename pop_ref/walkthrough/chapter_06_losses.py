@@ -49,6 +49,9 @@ np.testing.assert_allclose(pull_l2[[0, 1, -1]], [0.0, 2.0 / 255.0, 2.0])
 assert np.array_equal(pull_l2[1:] > pull_l1[1:], errors[1:] > 0.5)
 
 # %% [markdown]
+# How good a picture is at the end is told by its *PSNR*, $-10 \log_{10} L_2$ in decibels (dB): 20 dB is an error of a
+# tenth, 10 dB more is a tenth of the mean squared error, and halving every error adds 6 dB.
+#
 # ## Against a prior
 #
 # POP's argument is about what happens when something else pushes. Take one white splat over black at one pixel, so that
@@ -98,7 +101,11 @@ right.set(
 )
 for ax in (left, right):
     ax.legend()
-picture(fig, "Left: eq. 4. Right: L1 holds or breaks, L2 bends.")
+picture(
+    fig,
+    "Left: eq. 4. Right: under L1 the splat keeps the photograph's grey up to a weight of 1 and is white beyond it; "
+    "under L2 its error grows in proportion to the weight.",
+)
 
 # %% [markdown]
 # Read the right picture both ways. L2 is the better opponent of a *strong* prior, because large errors pull up to twice
@@ -228,9 +235,10 @@ picture(
 
 # %% [markdown]
 # L1's map is one flat tone: it says which way, never how far. L2's map is the error itself, doubled. SSIM's map is
-# something else: where it is complete, away from the border, the sizes of gradient and error correlate only by about a
-# half (the paper says: no direct relation). That is its reason for L2: of the three it alone spends its force where the
-# artifacts are. (Here opacities are simply set, so the picture shows the gradients and not the fight.)
+# something else: where it is complete, away from the border, the sizes of gradient and error correlate weakly, by 0.5
+# here and by 0.2 to 0.6 for other draws of the haze (the paper says: no direct relation). That is its reason for L2: of
+# the three it alone spends its force where the artifacts are. (Here opacities are simply set, so the picture shows the
+# gradients and not the fight.)
 
 # %%
 assert np.ptp(np.abs(pulls["L1"])) == 0.0
@@ -240,7 +248,7 @@ inner = np.s_[10:-10, 10:-10]
 of_error, of_ssim = np.abs(error[inner]).ravel(), np.abs(pulls["D-SSIM"][inner]).ravel()
 correlation = np.corrcoef(of_error, of_ssim)[0, 1]
 print(f"correlation of the size of SSIM's gradient with the error: {correlation:.2f}")
-assert 0.4 < correlation < 0.6
+assert 0.0 < correlation < 0.7
 
 # %% [markdown]
 # ## While a scene trains
@@ -309,9 +317,10 @@ picture(
 )
 
 # %% [markdown]
-# L1 pulls with 1 from the first step to the last; L2 begins at 0.73 and ends under 0.1. With its weight of 0.01, D-SSIM
-# stays below L2 at every step and within a factor of three in the second half. With the 0.2 of the 3DGS objective (eq.
-# 2) it would be twenty times larger, and drown L2. Hence the small $\lambda_{\mathrm{SSIM}}$ of eq. 9.
+# L1 pulls with 1 from the first step to the last; L2 begins at 0.73 and ends at less than a sixth of that. With its
+# weight of 0.01, D-SSIM stays below L2 at every step and within a factor of three in the second half. With the 0.2 of
+# the 3DGS objective (eq. 2) it would be twenty times larger, and drown L2. Hence the small $\lambda_{\mathrm{SSIM}}$ of
+# eq. 9.
 #
 # The fading has a price. Density control, the rules that add and remove Gaussians (chapter 9), grows a Gaussian when
 # its gradient exceeds a fixed threshold (eq. 3), and under L2 fewer do. [The next chapter](chapter_07_dominance.py)
@@ -319,8 +328,8 @@ picture(
 
 # %%
 assert np.allclose(size_l1, 1.0)
-assert 0.72 < size_l2[0] < 0.74
-assert size_l2[-1] < 0.1
+assert 0.6 < size_l2[0] < 0.85
+assert size_l2[-1] < size_l2[0] / 6.0
 assert np.all(size_ssim < size_l2)
 assert np.all(size_l2[20:] < 3.0 * size_ssim[20:])
 assert np.all(20.0 * size_ssim[20:] > 5.0 * size_l2[20:])
@@ -346,8 +355,8 @@ assert (rest_error(l1, 0.5), rest_error(lambda *both: 0.1 * l1(*both), 0.5)) == 
 
 # %% [markdown]
 # ### Exercise 4: code
-# A *held-out* view is one that was put aside and not trained on, as in chapter 0. Its quality is told as *PSNR*, $-10
-# \log_{10} L_2$ in decibels (dB). Write it. What does the same error of a tenth give everywhere, and what does halving
+# A *held-out* view is one that was put aside and not trained on, as in chapter 0. Its quality is told as PSNR. Write
+# it. What does the same error of a tenth give everywhere, and what does halving
 # every error gain? What happens if only one pixel in a hundred is wrong, by 1?
 
 

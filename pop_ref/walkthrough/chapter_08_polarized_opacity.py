@@ -404,9 +404,10 @@ for camera in cameras:
     assert np.array_equal(view.n_traversed[0], listed)
 
 # %% [markdown]
-# And in three dimensions: two recorded trainings of the toy of `pop_ref/learn/splat.py`.
+# And in three dimensions: the toy of chapter 0 once more, trained in this page. Train it to the end. Then change
+# $\lambda_{\mathrm{POP}}$, or $\theta$ of chapter 7, and start again.
 #
-# {{widget: scrubber}}
+# {{widget: train}}
 
 # %% [markdown]
 # ### Exercise 3: predict

@@ -293,42 +293,14 @@ assert abs(stats["prior"]["psnr"] - stats["none"]["psnr"]) < 2.5
 assert curve("prior", "psnr")[1][-5:].mean() > curve("prior", "psnr")[1][:5].mean() + 3.0
 
 # %% [markdown]
-# ## A view that it never saw
-#
-# For every held-out view the run keeps the render, the photograph, and which Gaussian dominates each pixel.
-
-# %%
-folder = home / "prior" / "report_data"
-kept = np.load(folder / "val_step199_0000.npz")
-render, photo = (kept[key] / 255.0 for key in ("render", "photo"))
-fig, panels = axes(4, height=2.1)
-show_image(panels[0], photo, "photograph")
-show_image(panels[1], render, "render")
-show_image(
-    panels[2], np.abs(render - photo).mean(axis=2), "absolute error", vmin=0, vmax=0.3
-)
-wheel = np.random.default_rng(0).uniform(0.15, 1.0, (1000, 3))
-owner = kept["dominant_ids"]
-show_image(
-    panels[3], np.where(owner[..., None] < 0, 0.0, wheel[owner]), "dominant Gaussians"
-)
-for panel in panels:
-    panel.set(xticks=[], yticks=[])
-picture(
-    fig,
-    "View 00.png, held out. In the last panel every Gaussian has its own colour; at black pixels nothing is blended. "
-    "Large patches are what the blur rule looks for.",
-)
-assert kept["name"] == "00.png"
-
-# %% [markdown]
 # ## The report
 #
 # `report.html` shows all of this and more on one page: the headline numbers, these curves with the schedule, opacities
-# at three moments, dominance maps, held-out views beside their photographs, every setting, and every change of the
-# population. It is one file that loads nothing, so open it with any browser. `pop train` writes it at the end,
-# `pop report FOLDER` writes it again, also for a run that was stopped, and `pop compare A B` puts two side by side. The
-# runs of this page are in a temporary folder; set `home` to one of your own and its `report.html` stays there.
+# at three moments, dominance maps, held-out views beside their photographs with the Gaussian that dominates each pixel,
+# every setting, and every change of the population. It is one file that loads nothing, so open it with any browser.
+# `pop train` writes it at the end, `pop report FOLDER` writes it again, also for a run that was stopped, and `pop
+# compare A B` puts two side by side. The runs of this page are in a temporary folder; set `home` to one of your own and
+# its `report.html` stays there.
 
 # %%
 report = write_report(home / "prior")

@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from pop_ref.walkthrough import style
-from pop_ref.walkthrough.cells import Cell, Chapter, ChapterError
+from pop_ref.walkthrough.builder.chapter import Cell, Chapter, ChapterError
 
 # an SVG of more bytes than this is worth less than a PNG
 _LARGEST_SVG: Final = 400_000

@@ -12,13 +12,15 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from cuda_ext.train_settings import GROUPS, Phase, Statistics, StepSettings, StepStats
 from pop_fast.api.registry import get_backend
-from pop_fast.train.engines import MOST_ON_GPU
 from pop_fast.train.fused_stepper import FusedStepper
 from pop_fast.train.stepper import Engine
+from pop_fast.train.steps import Collected, Phase, StepSettings, StepStats
 from pop_fast.train.views import ViewTensors
+from pop_ref.settings import PARAMETERS
 
+# steps at a time, as on a GPU
+MOST = 500
 Rows = Mapping[str, Tensor]
 
 
@@ -44,7 +46,7 @@ class Drift:
 
     def rebind(self, params: Rows, m: Rows, v: Rows) -> None:
         self.params, self.m, self.v = dict(params), dict(m), dict(v)
-        self.statistics = Statistics.zeros(len(params["means"]), params["means"].device)
+        self.statistics = Collected.zeros(len(params["means"]), params["means"].device)
 
     def run(self, until: int, phase: Phase) -> None:
         self.runs.append((self.step, until, phase))
@@ -63,7 +65,7 @@ class Drift:
         """Nothing; for tests."""
 
     def _one(self, view: int, phase: Phase) -> StepStats:
-        rates = dict(zip(GROUPS, self.settings.updates.rates[self.step].tolist(), strict=True))
+        rates = dict(zip(PARAMETERS, self.settings.updates.rates[self.step].tolist(), strict=True))
         found, shift = self.statistics, torch.cos(self.params["means"].sum(1) + view)
         for name, rows in self.params.items():
             step = shift.reshape(-1, *[1] * (rows.dim() - 1))
@@ -90,6 +92,6 @@ def drift_engine() -> Engine:
         "cuda",
         torch.device("cpu"),
         get_backend("fast"),
-        lambda task: FusedStepper(task, "cuda", MOST_ON_GPU, Drift),
+        lambda task: FusedStepper(task, "cuda", MOST, Drift),
         lambda: facts,
     )

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import random
 import shutil
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,14 +18,20 @@ import torch
 
 from pop_fast.data.capture import Capture
 from pop_fast.errors import PopError
+from pop_fast.io.ply import load_ply, save_ply
+from pop_fast.io.ply_rows import read_points
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from tests.app.children import in_a_child
+from tests.app.children import in_a_child, pop_in_a_child
+from tests.app.conftest import Outcome, Pop
+from tests.app.damage import contents, says
+from tests.app.drift import drift_engine
+from tests.app.forged import FORGED, INF, Content, forge, latest, to
 from tests.app.tiny import tiny_capture, tiny_config
 
 
 @pytest.fixture(scope="module")
-def stopped(tmp_path_factory):
+def stopped_run(tmp_path_factory):
     """A run of thirty steps, of which the checkpoint after the tenth is the last that is left."""
     folder = tmp_path_factory.mktemp("stopped")
     trainer = TrainingRun(tiny_config(folder), tiny_capture())
@@ -53,17 +65,17 @@ def resume(folder, capture=None, **changes):
         ({"threads": 2}, r"threads = 1, but this run has threads = 2"),
     ],
 )
-def test_other_settings_are_refused_by_name(stopped, changes, message):
-    before = {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()}
+def test_other_settings_are_refused_by_name(stopped_run, changes, message):
+    before = {path: path.read_bytes() for path in stopped_run.rglob("*") if path.is_file()}
     with pytest.raises(PopError, match=message):
-        resume(stopped, **changes)
-    assert {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()} == before
+        resume(stopped_run, **changes)
+    assert {path: path.read_bytes() for path in stopped_run.rglob("*") if path.is_file()} == before
 
 
-def test_another_nested_setting_is_refused_by_name(stopped):
-    config = tiny_config(stopped)
+def test_another_nested_setting_is_refused_by_name(stopped_run):
+    config = tiny_config(stopped_run)
     with pytest.raises(PopError, match=r"pop\.theta_blur = 0\.02, but this run has pop\.theta_blur = 0\.5"):
-        resume(stopped, strategy=replace(config.strategy, theta_blur=0.5))
+        resume(stopped_run, strategy=replace(config.strategy, theta_blur=0.5))
 
 
 def _changed(what: str) -> Capture:
@@ -85,9 +97,9 @@ def _changed(what: str) -> Capture:
 
 
 @pytest.mark.parametrize("what", ["view names", "photographs", "masks", "cameras", "sparse points"])
-def test_another_capture_is_refused_and_what_differs_is_named(stopped, what):
+def test_another_capture_is_refused_and_what_differs_is_named(stopped_run, what):
     with pytest.raises(PopError, match=f"another capture: the {what} differ"):
-        resume(stopped, _changed(what))
+        resume(stopped_run, _changed(what))
 
 
 def test_held_out_views_are_not_part_of_the_fingerprint():
@@ -127,8 +139,8 @@ def test_a_checkpoint_cannot_run_code(tmp_path):
     assert not (tmp_path / "boom").exists()
 
 
-def test_a_newer_format_is_named(stopped, tmp_path):
-    content = ckpt.load_checkpoint(ckpt.list_checkpoints(stopped)[-1][1])
+def test_a_newer_format_is_named(stopped_run, tmp_path):
+    content = ckpt.load_checkpoint(ckpt.list_checkpoints(stopped_run)[-1][1])
     path = tmp_path / "x.pt"
     torch.save({**content, "format": 99}, path)
     with pytest.raises(PopError, match="has format 99; this version reads format 1"):
@@ -178,20 +190,20 @@ def test_the_last_few_and_the_milestones_are_kept(tmp_path):
     assert (tmp_path / "ckpts" / "notes.txt").exists()
 
 
-def test_metrics_that_the_checkpoint_vouches_for_must_be_there(stopped, tmp_path):
+def test_metrics_that_the_checkpoint_vouches_for_must_be_there(stopped_run, tmp_path):
     (tmp_path / "ckpts").mkdir()
-    for _, path in ckpt.list_checkpoints(stopped):
+    for _, path in ckpt.list_checkpoints(stopped_run):
         (tmp_path / "ckpts" / path.name).write_bytes(path.read_bytes())
-    (tmp_path / "cfg.json").write_bytes((stopped / "cfg.json").read_bytes())
+    (tmp_path / "cfg.json").write_bytes((stopped_run / "cfg.json").read_bytes())
     (tmp_path / "metrics.jsonl").write_text("{}\n")
     with pytest.raises(PopError, match=r"metrics\.jsonl: has 3 bytes, fewer than"):
         resume(tmp_path)
 
 
-def test_processor_time_goes_on_from_a_checkpoint_and_is_not_told_where_a_part_was_not_counted(stopped, tmp_path):
+def test_processor_time_goes_on_from_a_checkpoint_and_is_not_told_where_a_part_was_not_counted(stopped_run, tmp_path):
     written = []
     for name in ("counted", "older"):
-        folder = shutil.copytree(stopped, tmp_path / name)
+        folder = shutil.copytree(stopped_run, tmp_path / name)
         [(_, path)] = ckpt.list_checkpoints(folder)[-1:]
         content = torch.load(path, weights_only=True)
         before = content["seconds"]["cpu"]
@@ -202,3 +214,291 @@ def test_processor_time_goes_on_from_a_checkpoint_and_is_not_told_where_a_part_w
         written.append(TrainingRun(tiny_config(folder), tiny_capture(), resume=True).run())
     assert written[0]["seconds_cpu"] > before
     assert "seconds_cpu" not in written[1]
+
+
+# Checkpoints whose content no run can have written: each is refused before it reaches a step, file and entry named.
+
+
+@pytest.fixture
+def forged(stopped: Path, tmp_path: Path) -> Path:
+    """A copy of the run that a test may damage."""
+    for path, data in contents(stopped).items():
+        copy = tmp_path / "run" / path.relative_to(stopped)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_bytes(data)
+    return tmp_path / "run"
+
+
+def on_cpu(folder: Path) -> TrainingRun:
+    return TrainingRun(tiny_config(folder), tiny_capture(), resume=True)
+
+
+def on_device(folder: Path) -> TrainingRun:
+    # as a checkpoint of the CPU is read
+    forge(folder, to("config.backend", "cuda"))
+    return TrainingRun(tiny_config(folder), tiny_capture(), engine=drift_engine(), resume=True)
+
+
+@pytest.fixture
+def no_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a run that would take a step fail instead: with what it has accepted, a step may end the interpreter."""
+
+    def accepted(*_: Any) -> None:
+        raise AssertionError("the checkpoint was accepted")
+
+    monkeypatch.setattr(TrainingRun, "_loop", accepted)
+
+
+@pytest.mark.usefixtures("no_steps")
+@pytest.mark.parametrize("case", FORGED)
+def test_what_no_run_can_have_written_is_refused_and_named(case: str, forged: Path) -> None:
+    change, parts = FORGED[case]
+    forge(forged, change)
+    before = contents(forged)
+    with pytest.raises(PopError) as caught:
+        on_cpu(forged).run()
+    message = str(caught.value)
+    for part in parts:
+        assert part in message, message
+    assert len(message) < 1000
+    if "metrics.jsonl" not in message:
+        assert message.startswith(f"{latest(forged)}: ")
+    if not message.endswith("reads format 1") and "metrics.jsonl" not in message:
+        assert "continue from" in message
+    assert contents(forged) == before
+
+
+@pytest.mark.usefixtures("no_steps")
+@pytest.mark.parametrize(
+    "case", ["m of another shape", "v NaN", "sums of one row", "no strategy's state", "views true"]
+)
+def test_a_run_on_a_device_refuses_it_likewise(case: str, forged: Path) -> None:
+    change, parts = FORGED[case]
+    trainer = on_device(forged)
+    forge(forged, change)
+    with pytest.raises(PopError) as caught:
+        trainer.run()
+    for part in parts:
+        assert part in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [None, [], "text", 3, torch.zeros(3)], ids=lambda value: type(value).__name__)
+def test_what_is_no_dict_is_refused(content: Any, tmp_path: Path) -> None:
+    torch.save(content, tmp_path / "x.pt")
+    with pytest.raises(PopError, match=r"x\.pt: has no 'format', so it is not a checkpoint"):
+        ckpt.load_checkpoint(tmp_path / "x.pt")
+
+
+def test_a_checkpoint_under_another_ones_name_is_refused(forged: Path) -> None:
+    latest(forged).write_bytes(ckpt.checkpoint_path(forged, 4).read_bytes())
+    with pytest.raises(PopError, match=r"step is 4; it must be 9, as the file's name says; remove it to continue from"):
+        ckpt.load_checkpoint(latest(forged))
+
+
+@pytest.mark.usefixtures("no_steps")
+def test_a_step_after_the_last_is_refused(forged: Path) -> None:
+    def later(content: Content) -> None:
+        content["step"] = 99
+        for moments in content["optimizers"].values():
+            moments["step"] = torch.tensor(100.0)
+
+    forge(forged, later)
+    latest(forged).rename(ckpt.checkpoint_path(forged, 99))
+    with pytest.raises(PopError, match=r"ckpt_99_rank0\.pt: step is 99; it must be at most 29, the run's last"):
+        on_cpu(forged).run()
+
+
+def test_what_a_run_can_come_to_is_accepted(forged: Path) -> None:
+    def unusual(content: Content) -> None:
+        # the square of a large gradient overflows, and the parameter stays where it is
+        content["optimizers"]["means"]["exp_avg_sq"][0, 0] = INF
+        content["splats"]["colour"] = torch.zeros(3)
+        content["notes"] = "what nothing reads does no harm"
+        content["splats"]["scales"] = content["splats"]["scales"].t().contiguous().t()
+
+    forge(forged, unusual)
+    content = ckpt.load_checkpoint(latest(forged))
+    assert "colour" not in content["splats"]
+    assert all(value.is_contiguous() for value in content["splats"].values())
+    on_cpu(forged).run()
+    assert ckpt.list_checkpoints(forged)[-1][0] == 29
+
+
+def test_going_on_from_the_checkpoint_before_ends_in_the_same_bits(forged: Path, stopped: Path, tmp_path: Path) -> None:
+    forge(forged, FORGED["m of another shape"][0])
+    with pytest.raises(PopError, match=r"remove it to continue from ckpt_4_rank0\.pt"):
+        ckpt.load_checkpoint(latest(forged))
+    latest(forged).unlink()
+    on_cpu(forged).run()
+    TrainingRun(tiny_config(tmp_path / "whole"), tiny_capture()).run()
+    ours, theirs = (ckpt.load_checkpoint(ckpt.checkpoint_path(f, 29)) for f in (forged, tmp_path / "whole"))
+    assert all(torch.equal(ours["splats"][key], theirs["splats"][key]) for key in theirs["splats"])
+
+
+@pytest.fixture
+def unfinished(result: Path) -> Path:
+    """A result whose last checkpoint is of the seventh of thirty steps."""
+    ckpt.checkpoint_path(result, 29).unlink()
+    assert [step for step, _ in ckpt.list_checkpoints(result)] == [6]
+    return result
+
+
+def test_pop_train_refuses_a_moment_of_another_shape_and_lives(unfinished: Path, shared_capture: Path) -> None:
+    path = ckpt.checkpoint_path(unfinished, 6)
+    content = torch.load(path, weights_only=True)
+    content["optimizers"]["means"]["exp_avg"] = torch.zeros(3, 3)
+    torch.save(content, path)
+    words = ("--steps-scaler", "0.001", "--quiet", "--pop.grow-grad2d", "1e-6", "--resume")
+    outcome = pop_in_a_child("train", shared_capture, "--out", unfinished, *words)
+    says(outcome, "ckpt_6_rank0.pt: optimizers.means.exp_avg has shape [3, 3]; it must be [", "remove it")
+
+
+@pytest.mark.parametrize("command", ["eval", "export", "render"])
+def test_the_other_commands_refuse_a_flipped_bit(pop: Pop, result: Path, tmp_path: Path, command: str) -> None:
+    path = ckpt.checkpoint_path(result, 29)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 4
+    path.write_bytes(bytes(data))
+    out = () if command == "eval" else ("--out", tmp_path / "o.ply")
+    earlier = ckpt.checkpoint_path(result, 6)
+    says(pop(command, result, *out), str(path), "does not agree with its checksum", f"use an earlier one ({earlier})")
+    assert not (tmp_path / "o.ply").exists()
+
+
+# A flipped bit in a checkpoint or a PLY's header: the file is refused, or what is read is as it was.
+
+CHILD = "import sys; from tests.app.test_checkpoint import CHILDREN; CHILDREN[sys.argv[1]](*sys.argv[2:])"
+
+
+def flipped(data: bytes, seed: int, times: int) -> Iterator[bytes]:
+    """Flip one bit at a time, at places that a seed draws; a third of them in the last kilobytes, the list of a zip."""
+    rng = random.Random(seed)
+    for k in range(times):
+        place = rng.randrange(max(0, len(data) - 4096), len(data)) if k % 3 == 0 else rng.randrange(len(data))
+        changed = bytearray(data)
+        changed[place] ^= 1 << rng.randrange(8)
+        yield bytes(changed)
+
+
+def same(a: Any, b: Any) -> bool:
+    if isinstance(a, dict):
+        return isinstance(b, dict) and list(a) == list(b) and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, torch.Tensor):
+        return isinstance(b, torch.Tensor) and a.dtype == b.dtype and torch.equal(a, b)
+    return type(a) is type(b) and a == b
+
+
+def count(data: bytes, path: Path, changes: Iterator[bytes], read: Callable[[Path], Any]) -> None:
+    """Tell how many changes of a file were refused, read as what it was, and read as something else."""
+    path.write_bytes(data)
+    whole, found = read(path), dict.fromkeys(("refused", "named", "same", "different", "finite"), 0)
+    for changed in changes:
+        path.write_bytes(changed)
+        try:
+            content = read(path)
+        except PopError as error:
+            found["refused"] += 1
+            found["named"] += str(path) in str(error) and len(str(error)) < 1000
+        else:
+            found["same" if same(content, whole) else "different"] += 1
+            tensors = content if isinstance(content, dict) and "splats" not in content else {}
+            found["finite"] += all(torch.isfinite(value).all() for value in tensors.values())
+    print(json.dumps(found))
+
+
+def flip_a_checkpoint(original: str, folder: str) -> None:
+    data = Path(original).read_bytes()
+    count(data, Path(folder) / "ckpt_9_rank0.pt", flipped(data, 4, 600), ckpt.load_checkpoint)
+
+
+def mutate_a_ply(folder: str) -> None:
+    path = Path(folder) / "x.ply"
+    generator = torch.Generator().manual_seed(0)
+    shapes = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
+    save_ply(path, {key: torch.randn((4, *shape), generator=generator) for key, shape in shapes.items()})
+    data = path.read_bytes()
+
+    def read(path: Path) -> dict[str, torch.Tensor]:
+        # what is refused as a splat may still be read as points
+        try:
+            return load_ply(path)
+        finally:
+            with suppress(PopError):
+                read_points(path)
+
+    count(data, path, mutated(data, 5, 1500), read)
+
+
+def mutated(data: bytes, seed: int, times: int) -> Iterator[bytes]:
+    """Change, remove, repeat or swap words and lines of a header, or put numbers into it that nobody counts to."""
+    head, rows = data.split(b"end_header\n")
+    rng = random.Random(seed)
+    words = [
+        b"-1",
+        b"0",
+        b"4294967296",
+        b"9" * 30,
+        b"list",
+        b"uchar",
+        b"double",
+        b"element",
+        b"property",
+        b"vertex",
+        b"",
+    ]
+    words += [
+        b"ascii",
+        b"binary_big_endian",
+        b"nan",
+        b"x",
+        b"end_header",
+        b"comment",
+        b"\xff",
+        b"\r",
+        b"1e9",
+        b"list uchar int",
+    ]
+    for _ in range(times):
+        lines = head.split(b"\n")
+        for _ in range(rng.choice((1, 1, 2, 4))):
+            at = rng.randrange(len(lines))
+            match rng.randrange(5):
+                case 0:
+                    parts = lines[at].split(b" ")
+                    parts[rng.randrange(len(parts))] = rng.choice(words)
+                    lines[at] = b" ".join(parts)
+                case 1:
+                    del lines[at]
+                    lines = lines or [b""]
+                case 2:
+                    lines.insert(rng.randrange(len(lines)), lines[at])
+                case 3:
+                    other = rng.randrange(len(lines))
+                    lines[at], lines[other] = lines[other], lines[at]
+                case _:
+                    lines.insert(at, b"element foo " + rng.choice(words))
+        yield b"\n".join(lines) + b"end_header\n" + rows[: rng.choice((len(rows), rng.randrange(len(rows))))]
+
+
+CHILDREN = {"flip": flip_a_checkpoint, "mutate": mutate_a_ply}
+
+
+def counts(outcome: Outcome) -> dict[str, int]:
+    assert outcome.status == 0, (outcome.status, outcome.err[-3000:])
+    return json.loads(outcome.out)
+
+
+def test_no_flipped_bit_of_a_checkpoint_is_read_as_another_number(stopped: Path, tmp_path: Path) -> None:
+    found = counts(in_a_child(CHILD, "flip", ckpt.checkpoint_path(stopped, 9), tmp_path))
+    assert found["different"] == 0
+    assert found["refused"] + found["same"] == 600
+    # and nearly all are seen; what is not lies between the members of the zip
+    assert found["named"] == found["refused"] > 500
+
+
+def test_no_header_of_a_ply_ends_the_interpreter(tmp_path: Path) -> None:
+    found = counts(in_a_child(CHILD, "mutate", tmp_path))
+    assert found["named"] == found["refused"] > 700
+    assert found["same"] + found["different"] > 20
+    # names exchanged are another splat, but never one with a number that is none
+    assert found["finite"] == found["same"] + found["different"]

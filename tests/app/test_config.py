@@ -11,7 +11,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cuda_ext.train_settings import GROUPS
 from pop_fast.cli.train import arguments
 from pop_fast.density import DensityControl, GsplatStrategy, POPStrategy
 from pop_fast.errors import PopError
@@ -19,13 +18,14 @@ from pop_fast.stages.density import blur_set
 from pop_fast.train import LearningRates, TrainConfig
 from pop_fast.train.config import first_difference
 from pop_fast.train.jsonable import to_plain
-from pop_fast.train.presets import METHODS, Given
+from pop_fast.train.presets import METHODS, Given, options_for
 from pop_fast.train.results import read_config
 from pop_fast.train.schedule import ViewOrder, active_sh_degree, updates_of
+from pop_ref.constants import PROFILES
 from pop_ref.density import densifies_at
 from pop_ref.optimizer import learning_rates, update_numbers
-from pop_ref.recipes import BASELINES, RECIPES
-from pop_ref.settings import AppearanceRates, UpdateRules
+from pop_ref.recipes import BASELINES, L1_DIVIDED, RECIPES
+from pop_ref.settings import PARAMETERS, AppearanceRates, DensityConfig, Objective, PopTerm, UpdateRules
 
 
 def test_the_defaults_are_the_papers_schedule():
@@ -34,7 +34,7 @@ def test_the_defaults_are_the_papers_schedule():
     plan = config.strategy
     assert (plan.pop_start_iter, plan.pop_stop_iter, plan.lambda_pop) == (0, 15_000, 1e-3)
     assert (plan.blur_start_iter, plan.blur_stop_iter, plan.theta_blur) == (3000, 7000, 2e-5)
-    assert (config.photometric_at(29_999), config.ssim_padding) == (("l2", 0.01), "valid")
+    assert config.objective_at(29_999) == Objective(pixelwise="l2", lambda_ssim=0.01, padding="valid")
     lr = config.lr
     assert (lr.means, lr.means_decay, lr.scales, lr.quats, lr.opacities) == (1.6e-4, 0.01, 5e-3, 1e-3, 5e-2)
     assert (lr.sh0, lr.sh_rest) == (2.5e-3, 1.25e-4)
@@ -44,7 +44,7 @@ def test_the_defaults_are_the_papers_schedule():
 def test_the_controls_are_two_methods_with_constants_of_their_own():
     gsplat, inria = TrainConfig.of(method="gsplat"), TrainConfig.of(method="3dgs")
     for control in (gsplat, inria):
-        assert control.photometric_at(0) == ("l1", 0.2)
+        assert (control.objective_at(0).pixelwise, control.objective_at(0).lambda_ssim) == ("l1", 0.2)
         assert (control.strategy.reset_every, control.strategy.lambda_pop) == (3000, 0.0)
     assert (gsplat.method, inria.method, TrainConfig().method) == ("gsplat", "3dgs", "pop")
     assert (gsplat.lr.opacities, inria.lr.opacities) == (0.05, 0.025)
@@ -52,13 +52,14 @@ def test_the_controls_are_two_methods_with_constants_of_their_own():
     assert (gsplat.strategy.inclusive, inria.strategy.inclusive) == (False, True)
     assert (gsplat.profile, inria.profile) == ("paper", "inria")
     assert TrainConfig.of(method="adc") == gsplat
-    assert TrainConfig.of(method="gsplat", photometric="l2", lambda_ssim=0.05).photometric_at(0) == ("l2", 0.05)
+    said = TrainConfig.of(method="gsplat", photometric="l2", lambda_ssim=0.05)
+    assert said.objective_at(0) == Objective(pixelwise="l2", lambda_ssim=0.05)
 
 
 def test_eq_2_takes_over_where_the_l2_loss_is_said_to_stop():
     config = TrainConfig.of(l2_stop_iter=1500, preset="quick")
-    assert config.photometric_at(1499) == ("l2", 0.01)
-    assert config.photometric_at(1500) == ("l1", 0.2)
+    assert config.objective_at(1499) == Objective()
+    assert config.objective_at(1500) == Objective(pixelwise="l1", lambda_ssim=0.2)
     with pytest.raises(PopError, match="l2_stop_iter is -1"):
         TrainConfig(l2_stop_iter=-1)
 
@@ -139,8 +140,8 @@ def another(value, hint):
     if isinstance(value, tuple):
         return (0.25, 0.5, 0.75) if value and isinstance(value[0], float) else (*value, *((3,) if value else ("x",)))
     if isinstance(value, str):
-        # of backends and profiles, which are names in tables, another one that there is
-        of_tables = {"auto": "ref", "paper": "inria"}
+        # of backends, profiles and losses, which are names in tables, another one that there is
+        of_tables = {"auto": "ref", "paper": "inria", "l2": "l1", "l1": "l2"}
         return of_tables.get(value, value + "x")
     if isinstance(value, float):
         return 0.625 if value != 0.625 else 0.375
@@ -224,9 +225,9 @@ def test_a_run_moves_whom_the_oracle_moves_when_and_as_far(recipe):
     found = updates_of(short.lr, 2.5, short.max_steps, rules, edits, short.adam_restarts)
     for step in range(short.max_steps):
         wanted = learning_rates(step, 2.5, short.max_steps, short.lr, rules)
-        assert found.rates[step].tolist() == pytest.approx([wanted[name] for name in GROUPS], rel=1e-14)
-        numbers = update_numbers(GROUPS, step, short)
-        assert found.numbers[step].tolist() == [numbers.get(name, 0) for name in GROUPS]
+        assert found.rates[step].tolist() == pytest.approx([wanted[name] for name in PARAMETERS], rel=1e-14)
+        numbers = update_numbers(PARAMETERS, step, short)
+        assert found.numbers[step].tolist() == [numbers.get(name, 0) for name in PARAMETERS]
 
 
 def test_restarts_outside_the_run_change_no_update():
@@ -357,3 +358,30 @@ def test_every_setting_is_documented():
         text = "".join(cls.__doc__ or "" for cls in kind.__mro__)
         missing = [f.name for f in fields(kind) if f"{f.name}:" not in text]
         assert not missing
+
+
+# The rows of the paper's tables as options of `pop train`: each trains what the oracle's recipe of that name says.
+
+ROWS = {**RECIPES, **{f"L1 div {n}": recipe for n, recipe in L1_DIVIDED.items()}}
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_a_row_can_be_trained_from_the_command_line(name):
+    recipe, words = ROWS[name], options_for(ROWS[name])
+    config, _ = arguments(["scene", *words])
+    for kind, said in ((DensityConfig, recipe.density), (PopTerm, recipe)):
+        for field in fields(kind):
+            assert getattr(config.strategy, field.name) == getattr(said, field.name), field.name
+    photometric = (config.photometric, config.lambda_ssim, config.l2_stop_iter, config.ssim_padding)
+    assert photometric == (recipe.pixelwise, recipe.lambda_ssim, recipe.l2_stop_iter, recipe.padding)
+    assert config.photometric_divisor == pytest.approx(1.0 / recipe.pixel_scale, rel=1e-15)
+    assert config.d_ssim_halved == recipe.d_ssim_halved
+    assert (config.lr, PROFILES[config.profile]) == (recipe.lr, recipe.profile)
+    assert (config.max_steps, config.sh_interval) == (recipe.max_steps, recipe.sh_interval)
+
+
+def test_rows_differ_and_their_options_are_few():
+    named = {name: tuple(options_for(recipe)) for name, recipe in ROWS.items()}
+    assert len(set(named.values())) == len(named)
+    assert (named["POP"], named["gsplat"], named["3DGS"]) == ((), ("--method", "gsplat"), ("--method", "3dgs"))
+    assert named["L2+Blur"] == ("--pop.lambda-pop", "0")

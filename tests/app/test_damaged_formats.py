@@ -5,25 +5,33 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import re
 import struct
 import sys
-import tempfile
 import tracemalloc
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 import zstandard
-from hypothesis import given
-from hypothesis import strategies as st
-from torch import Tensor
 
 from benchmarks.faults.ksplat import ksplat_of
+from pop_fast.data.video import take_frames
 from pop_fast.errors import PopError
+from pop_fast.io import budget
+from pop_fast.io.budget import check_memory
 from pop_fast.io.formats import FORMATS, encoded, load_splat_file
+from pop_fast.io.images import read_image
+from pop_fast.io.read_back import read_arrays
+from tests.app.children import in_a_child
 from tests.app.clouds import many
+from tests.app.conftest import Pop
+from tests.app.damage import says
 
 # 2^28 bytes in a few thousand
 BOMB = zstandard.compress(bytes(2**28))
@@ -174,19 +182,6 @@ def test_a_damaged_ksplat_is_named(at: int, change: bytes, said: str, tmp_path: 
     assert len(load_splat_file(path).params["means"]) == 12
 
 
-@given(level=st.integers(0, 2), data=st.data())
-def test_a_ksplat_that_lost_or_changed_bytes_is_read_or_refused_by_name(level: int, data: st.DataObject) -> None:
-    whole = ksplat_of(many(5, 3), level, 1)
-    heads = st.one_of(st.integers(0, 47), st.integers(4096, 4138), st.integers(5120, 5162), st.integers(6144, 9999))
-    at = min(data.draw(heads), len(whole) - 1)
-    damaged = whole[:at] if data.draw(st.booleans()) else whole[:at] + bytes([whole[at] ^ 0x55]) + whole[at + 1 :]
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "x.ksplat"
-        path.write_bytes(damaged)
-        found, refusal = read_or_refused(path)
-    assert str(path) in refusal if found is None else all(value.isfinite().all() for value in found.values())
-
-
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
@@ -250,26 +245,6 @@ def test_a_damaged_sog_is_named(data: bytes, said: str | None) -> None:
         FORMATS["sog"].decode(data, Path("x.sog"))
 
 
-@pytest.mark.parametrize("name", FORMATS)
-@given(data=st.data())
-def test_a_file_that_lost_or_changed_bytes_is_read_or_refused_by_name(name: str, data: st.DataObject) -> None:
-    whole = encoded(name, many(5, 3))
-    at = data.draw(st.integers(0, len(whole) - 1))
-    damaged = whole[:at] if data.draw(st.booleans()) else whole[:at] + bytes([whole[at] ^ 0x55]) + whole[at + 1 :]
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"x{FORMATS[name].suffix}"
-        path.write_bytes(damaged)
-        found, refusal = read_or_refused(path)
-    assert str(path) in refusal if found is None else all(value.isfinite().all() for value in found.values())
-
-
-def read_or_refused(path: Path) -> tuple[dict[str, Tensor] | None, str]:
-    try:
-        return load_splat_file(path)[0], ""
-    except PopError as error:
-        return None, str(error)
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -294,3 +269,277 @@ def test_a_damaged_glb_is_named(change: Callable[[dict[str, Any]], Any], said: s
     chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + whole[20 + length :]
     with pytest.raises(PopError, match=said):
         FORMATS["gltf"].decode(b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks, Path("x.glb"))
+
+
+# A small file that asks for much memory is refused by what it states, before a byte of it is unpacked.
+
+MB = 2**20
+
+
+def _deflated(head: bytes, zeros: int) -> bytes:
+    """Deflate bytes and many zeros at once: between full flushes, equal input becomes equal output."""
+    packer = zlib.compressobj(9, wbits=-15)
+    made = packer.compress(head) + packer.flush(zlib.Z_FULL_FLUSH)
+    block = packer.compress(bytes(16 * MB)) + packer.flush(zlib.Z_FULL_FLUSH)
+    return made + block * (zeros // (16 * MB)) + packer.compress(bytes(zeros % (16 * MB))) + packer.flush()
+
+
+def _sum(check: Callable[[bytes, int], int], head: bytes, zeros: int, start: int) -> int:
+    value, block = check(head, start), bytes(16 * MB)
+    for at in range(0, zeros, len(block)):
+        value = check(block[: zeros - at], value)
+    return value
+
+
+def _spz(path: Path) -> None:
+    n = 5_000_000
+    head, zeros = struct.pack("<IIIBBBB", 0x5053474E, 3, n, 3, 12, 0, 0), 65 * n
+    end = struct.pack("<II", _sum(zlib.crc32, head, zeros, 0), len(head) + zeros)
+    path.write_bytes(b"\x1f\x8b\x08" + bytes(7) + _deflated(head, zeros) + end)
+
+
+def _sog(path: Path) -> None:
+    """Write a splat of nothing, of whose pictures one is a GiB of zeros."""
+    name, zeros = "means_l.webp", 2**30
+    entry = {"codebook": [0.0] * 256, "files": [name]}
+    means = {"mins": [0, 0, 0], "maxs": [0, 0, 0], "files": [name, name]}
+    meta = {"version": 2, "count": 0, "means": means, "scales": entry, "quats": entry, "sh0": entry}
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("meta.json", json.dumps(meta))
+        at = archive.fp.tell()  # type: ignore[union-attr]
+        archive.writestr(name, _deflated(b"", zeros))
+    data = bytearray(path.read_bytes())
+    sums = _sum(zlib.crc32, b"", zeros, 0)
+    for start, method in ((at, 8), (data.rindex(b"PK\x01\x02"), 10)):
+        struct.pack_into("<H", data, start + method, zipfile.ZIP_DEFLATED)
+        struct.pack_into("<I", data, start + method + 6, sums)
+        struct.pack_into("<I", data, start + method + 14, zeros)
+    path.write_bytes(data)
+    with zipfile.ZipFile(path) as archive, archive.open(name) as member:
+        assert member.read(MB) == bytes(MB)
+
+
+def _png(path: Path) -> None:
+    side = 8192
+    zeros = side * (1 + 6 * side)
+    pixels = b"\x78\xda" + _deflated(b"", zeros) + struct.pack(">I", _sum(zlib.adler32, b"", zeros, 1))
+    chunks = ((b"IHDR", struct.pack(">IIBBBBB", side, side, 16, 2, 0, 0, 0)), (b"IDAT", pixels), (b"IEND", b""))
+    made = [struct.pack(">I", len(c)) + kind + c + struct.pack(">I", zlib.crc32(kind + c)) for kind, c in chunks]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(made))
+
+
+READ = """
+import resource, sys
+from pathlib import Path
+import numpy as np, torch
+from pop_fast.errors import PopError
+from pop_fast.io.formats import load_splat_file
+from pop_fast.io.images import read_image
+
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+try:
+    (read_image if sys.argv[1].endswith(".png") else load_splat_file)(Path(sys.argv[1]))
+except PopError as error:
+    print(error)
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)
+"""
+
+
+@pytest.mark.parametrize(("name", "write"), [("a.spz", _spz), ("a.sog", _sog), ("a.png", _png)])
+def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, name: str, write: Callable[[Path], None]) -> None:
+    write(tmp_path / name)
+    assert (tmp_path / name).stat().st_size < 1.2 * MB
+    outcome = in_a_child(READ, tmp_path / name)
+    line, taken = outcome.out.splitlines()
+    assert line.startswith(f"{tmp_path / name}: ")
+    assert re.search(r"would take [0-9,.]+ MB of memory to read, and the file has [0-9.]+ MB", line)
+    assert int(taken) < 64, "MiB over what importing took"
+
+
+def test_a_command_says_it_in_a_line(tmp_path: Path, pop: Pop) -> None:
+    _spz(tmp_path / "a.spz")
+    says(
+        pop("convert", tmp_path / "a.spz", tmp_path / "a.ply"), "a.spz", "numPoints of 5000000", "holds no such content"
+    )
+
+
+def test_a_count_of_gaussians_is_held_against_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.sog"
+    meta = {"version": 2, "count": 10**8, "means": {"mins": [0, 0, 0], "maxs": [0, 0, 0], "files": []}}
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("meta.json", json.dumps(meta))
+    with pytest.raises(PopError, match=r"a\.sog: meta\.json\.count of 100000000 would take"):
+        load_splat_file(path)
+
+
+def test_arrays_of_a_run_are_held_against_their_file(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "a.npz", counts=np.zeros(2**24, np.int64))
+    with pytest.raises(PopError, match=r"a\.npz: 'counts\.npy' and what else is in it would take 134\.2 MB"):
+        read_arrays(tmp_path / "a.npz", {"counts": ("i", 1)}, "train again")
+
+
+def test_what_is_not_free_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (3000, 4200, 3), np.uint8)
+    (tmp_path / "a.bmp").write_bytes(cv2.imencode(".bmp", image)[1].tobytes())
+    assert read_image(tmp_path / "a.bmp").shape == image.shape
+    monkeypatch.setattr(budget, "free_bytes", lambda: 50 * MB)
+    with pytest.raises(
+        PopError, match=r"a\.bmp: its header's size of 4200x3000 px would take .* and 52\.4 MB are free"
+    ):
+        read_image(tmp_path / "a.bmp")
+
+
+def test_a_limit_of_this_process_counts(tmp_path: Path) -> None:
+    script = """
+import resource
+from pathlib import Path
+from pop_fast.machine import free_bytes
+
+have = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (have + 2**28, have + 2**28))
+print(free_bytes())
+"""
+    outcome = in_a_child(script)
+    assert 2**27 < int(outcome.out) <= 2**28, outcome.err[-500:]
+
+
+def test_pictures_of_one_colour_are_no_bombs(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "mask.png"), np.full((6000, 6000), 255, np.uint8))
+    assert (tmp_path / "mask.png").stat().st_size < 2 * 36_000_000 / 200
+    assert read_image(tmp_path / "mask.png").shape == (6000, 6000, 3)
+
+
+def test_a_small_need_is_never_questioned(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(budget, "free_bytes", lambda: 0)
+    check_memory("a", 2**26, 1, "x", "y")
+    with pytest.raises(PopError, match=r"^a: x would take .* and 0\.0 MB are free; y$"):
+        check_memory("a", 2**26 + 1, 2**30, "x", "y")
+
+
+def test_a_picture_that_states_no_size_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"P5 2 2 255\n" + bytes(4))
+    with pytest.raises(PopError, match=r"a\.png: is no image that states its size"):
+        read_image(tmp_path / "a.png")
+
+
+def test_a_video_whose_frames_find_no_room_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    film = cv2.VideoWriter(str(tmp_path / "a.avi"), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (3072, 3072))
+    for shade in (50, 200):
+        film.write(np.full((3072, 3072, 3), shade, np.uint8))
+    film.release()
+    monkeypatch.setattr(budget, "free_bytes", lambda: 50 * MB)
+    with pytest.raises(
+        PopError, match=r"a\.avi: its frames of 3072x3072 px would take .* and 52\.4 MB are free; convert"
+    ):
+        take_frames(tmp_path / "a.avi", tmp_path / "out", 3)
+
+
+# Files of a result folder that no run has written so: one line that names file and entry, never a traceback.
+
+NOT_JSON = [b"", b"{", b"\xff\xfe", b"[" * 5000, b"1" * 5000]
+NO_OBJECT = [b"[]", b"3", b"null", b'"text"']
+KEYS = ("num_GS", "step", "seconds", "n_blended", "opacity_above_0.9")
+NO_NUMBER = ["text", [], {}, True, 10**400, 1e300]
+
+
+@pytest.mark.parametrize("data", [*NOT_JSON, *NO_OBJECT], ids=range(9))
+@pytest.mark.parametrize("command", ["report", "compare"])
+def test_statistics_that_are_no_object_are_named(pop: Pop, result: Path, command: str, data: bytes) -> None:
+    path = result / "stats" / "val_step0029.json"
+    path.write_bytes(data)
+    says(pop(command, result), str(path), "is not JSON" if data in NOT_JSON else "must be an object", "pop eval")
+
+
+@pytest.mark.parametrize("data", [*NOT_JSON[1:], *NO_OBJECT, b"{}", b'{"step": "x"}', b'{"step": true}'], ids=range(11))
+def test_a_record_that_is_no_object_with_a_step_is_named(pop: Pop, result: Path, data: bytes) -> None:
+    path = result / "metrics.jsonl"
+    path.write_bytes(path.read_bytes() + data + b"\n")
+    number = len(path.read_bytes().splitlines())
+    says(pop("report", result), f"{path}: line {number}", "remove the file, or train again")
+
+
+def test_a_record_that_a_kill_cut_off_is_left_out(pop: Pop, result: Path) -> None:
+    path = result / "metrics.jsonl"
+    path.write_bytes(path.read_bytes() + b'{"step": 30, "view": "\xc3')
+    assert pop("report", result).status == 0
+
+
+# every value under one key, and one value under every other
+ODD = [*(("psnr", value) for value in NO_NUMBER), *((key, "text") for key in KEYS)]
+
+
+@pytest.mark.parametrize(("key", "value"), ODD, ids=range(len(ODD)))
+def test_a_number_that_is_none_is_named(pop: Pop, result: Path, key: str, value: Any) -> None:
+    path = result / "stats" / "val_step0029.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
+    for command in ("report", "compare"):
+        says(pop(command, result), f"{path}: {key} is ", "it must be a number")
+
+
+@pytest.mark.parametrize(("key", "value"), [("machine", 3), ("backend", []), ("versions", "2"), ("method", {})])
+def test_a_text_that_is_none_is_named(pop: Pop, result: Path, key: str, value: Any) -> None:
+    path = result / "stats" / "val_step0029.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
+    says(pop("compare", result), f"{path}: {key} is ")
+
+
+def test_what_is_absent_or_null_becomes_a_dash(pop: Pop, result: Path) -> None:
+    for path in (result / "stats").iterdir():
+        path.write_text(json.dumps(dict.fromkeys(json.loads(path.read_text()))))
+    assert pop("report", result).status == 0
+    assert "–" in pop("compare", result).out
+
+
+@pytest.mark.parametrize("name", ["init_scale", "max_steps", "l2_stop_iter"])
+def test_a_setting_beyond_all_floats_is_named(pop: Pop, result: Path, name: str) -> None:
+    path = result / "cfg.json"
+    config = json.loads(path.read_text())
+    config["resolved"][name] = 10**400
+    path.write_text(json.dumps(config))
+    says(pop("report", result), str(path), f"config.{name} is a number beyond 2^53")
+
+
+@pytest.mark.parametrize(("file", "command"), [("cfg.json", "report"), ("capture.json", "eval")])
+def test_settings_nested_deeper_than_python_reads_are_named(pop: Pop, result: Path, file: str, command: str) -> None:
+    (result / file).write_bytes(b"[" * 5000)
+    says(pop(command, result), str(result / file))
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "short", "no zip", "flipped"])
+@pytest.mark.parametrize("stem", ["opacity_step-1", "val_step29_0000"])
+def test_arrays_that_are_damaged_are_named(pop: Pop, result: Path, stem: str, damage: str) -> None:
+    path = result / "report_data" / f"{stem}.npz"
+    data = path.read_bytes()
+    # in the array itself, behind the name that stands before it
+    place = data.index(b"counts.npy" if "opacity" in stem else b"render.npy") + 60
+    flipped = data[:place] + bytes([data[place] ^ 255]) + data[place + 1 :]
+    damaged = {"empty": b"", "cut": data[: len(data) // 2], "short": data[:-1], "no zip": b"text", "flipped": flipped}
+    path.write_bytes(damaged[damage])
+    says(pop("report", result), f"{path}: is damaged", "remove the file, or train again")
+
+
+@pytest.mark.parametrize(
+    ("stem", "name", "value"),
+    [
+        ("opacity_step-1", "counts", None),
+        ("opacity_step-1", "counts", np.zeros(3, int)),
+        ("opacity_step-1", "counts", np.zeros((2, 2), int)),
+        ("opacity_step-1", "counts", np.zeros(0, int)),
+        ("opacity_step-1", "counts", np.array("x")),
+        ("val_step29_0000", "render", None),
+        ("val_step29_0000", "render", np.zeros(3, np.uint8)),
+        ("val_step29_0000", "photo", np.zeros((4, 4, 3))),
+        ("val_step29_0000", "psnr", np.zeros(2)),
+        ("val_step29_0000", "ssim", np.array("x")),
+        ("val_step29_0000", "name", np.array(3)),
+        ("val_step29_0000", "dominant_ids", np.zeros((2, 2))),
+        ("val_step29_0000", "dominant_ids", np.zeros((2, 2, 2), np.int32)),
+    ],
+)
+def test_an_array_of_another_form_is_named(pop: Pop, result: Path, stem: str, name: str, value: Any) -> None:
+    path = result / "report_data" / f"{stem}.npz"
+    with np.load(path) as stored:
+        arrays = {key: stored[key] for key in stored.files}
+    arrays |= {} if value is None else {name: value}
+    np.savez(path, **{key: array for key, array in arrays.items() if value is not None or key != name})
+    says(pop("report", result), f"{path}: {name} ", "which no run writes")

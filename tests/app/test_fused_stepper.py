@@ -3,24 +3,41 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
+import pop_fast.compiled
 from cuda_ext.arrays import CudaMemoryError
-from cuda_ext.train_settings import GROUPS
+from pop_fast.api.registry import require_backend
+from pop_fast.blocks.rounds import shown_in
+from pop_fast.cuda.backend import CUDA
+from pop_fast.data.initialize import initialize_params
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.train import TrainingRun
+from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from pop_fast.train.engines import MOST_ON_GPU
-from pop_fast.train.fused_settings import unsupported
-from pop_fast.train.fused_stepper import step_settings
-from pop_fast.train.phases import phase_at, segment_end
-from pop_fast.train.schedule import updates_of
-from tests.app.drift import Drift, drift_engine
-from tests.app.tiny import HEIGHT, WIDTH, last_checkpoint, tiny_capture, tiny_config
+from pop_fast.train.batch_stepper import BatchStepper
+from pop_fast.train.engines import engine_of, torch_engine
+from pop_fast.train.fixed_rows import hold_last
+from pop_fast.train.fused_stepper import FusedStepper, step_settings
+from pop_fast.train.model import KEYS
+from pop_fast.train.presets import METHODS
+from pop_fast.train.refining import at_rest, refining
+from pop_fast.train.schedule import phase_at, segment_end, updates_of
+from pop_fast.train.stepper import Task
+from pop_fast.train.torch_stepper import TorchStepper
+from pop_fast.train.whole_step import why_not_trained
+from pop_ref.settings import PARAMETERS
+from tests.app.drift import MOST, Drift, drift_engine
+from tests.app.interruptions import interrupt as fixed_rows_interrupt
+from tests.app.tiny import HEIGHT, N_POINTS, WIDTH, last_checkpoint, tiny_capture, tiny_config
 
 CLOCKS = ("it_per_s", "seconds")
 
@@ -120,8 +137,8 @@ def test_a_segment_ends_where_something_is_due():
     config = tiny_config("x", max_steps=9000, checkpoint_every=1000, strategy=POPStrategy())
     strategy, first = config.strategy, 0
     while first < config.max_steps:
-        end = segment_end(config, strategy, first, MOST_ON_GPU)
-        assert first < end <= min(first + MOST_ON_GPU, config.max_steps)
+        end = segment_end(config, strategy, first, MOST)
+        assert first < end <= min(first + MOST, config.max_steps)
         assert len({phase_at(config, strategy, step) for step in range(first, end)}) == 1
         assert not any(strategy.changes_after(step) for step in range(first, end - 1))
         assert not any(taken % 1000 == 0 or taken == 12 for taken in range(first + 1, end))
@@ -178,13 +195,273 @@ def test_settings_that_the_device_does_not_know_are_refused_before_anything_star
         TrainingRun(tiny_config(tmp_path / "new", backend="cuda", **changes), tiny_capture())
     assert words in str(error.value)
     assert not (tmp_path / "new").exists()
-    assert unsupported(tiny_config("x")) is None
+    assert why_not_trained(CUDA, tiny_config("x")) is None
 
 
 def test_the_fused_step_gets_the_learning_rates_in_its_own_words():
     config = tiny_config("x")
     settings = step_settings(config, updates_of(config.lr, 2.0, config.max_steps))
-    first = dict(zip(GROUPS, settings.updates.rates[0].tolist(), strict=True))
+    first = dict(zip(PARAMETERS, settings.updates.rates[0].tolist(), strict=True))
     assert first == {**config.lr.by_parameter(), "means": 2.0 * config.lr.means}
     assert settings.blur_pixels(WIDTH * HEIGHT) == int(0.02 * WIDTH * HEIGHT)
     assert replace(settings, blur_min_pixels=40.0).blur_pixels(WIDTH * HEIGHT) == 40.0
+
+
+# Gaussians that are held fixed keep their bits whatever takes the steps, and the others are trained among them.
+
+STEPS, OWN = 12, 25
+compiled = pytest.mark.skipif(pop_fast.compiled.why_not() is not None, reason="the CPU kernels are not compiled")
+ENGINES = ["fast", pytest.param("compiled", marks=compiled)]
+
+
+def settings(folder: Path, backend: str, **changes: Any) -> TrainConfig:
+    return replace(refining(tiny_config(folder, backend=backend), STEPS), **changes)
+
+
+def first_rows() -> dict[str, Tensor]:
+    return initialize_params(tiny_capture(), seed=3, init_opacity=0.5, init_scale=0.5)
+
+
+def trained(config: TrainConfig, initial: dict[str, Tensor], own: int, **how: Any) -> dict[str, Tensor]:
+    fixed = {key: value[own:].clone() for key, value in initial.items()}
+    given = {key: value.clone() for key, value in initial.items()}
+    run = TrainingRun(config, tiny_capture(), initial=given, engine=hold_last(engine_of(config), fixed), **how)
+    stats = run.run()
+    assert stats["fixed_gaussians"] == len(initial["means"]) - own
+    return {key: value.detach() for key, value in run.params.items()}
+
+
+@pytest.mark.parametrize("backend", ENGINES)
+def test_fixed_rows_keep_their_bits_and_the_others_move(tmp_path, backend):
+    initial = first_rows()
+    found = trained(settings(tmp_path, backend), initial, OWN)
+    for key in KEYS:
+        assert torch.equal(found[key][OWN:], initial[key][OWN:])
+        # every number of a Gaussian that a view shows has a gradient
+        assert (found[key][:OWN] != initial[key][:OWN]).any(dim=tuple(range(1, found[key].dim()))).sum() > 0.9 * OWN
+
+
+@pytest.mark.parametrize("backend", ENGINES)
+def test_every_step_draws_the_fixed_rows_as_they_were_given(tmp_path, backend):
+    # with all but one Gaussian fixed, and that one out of sight, every step of a view measures the same
+    initial = first_rows()
+    initial["means"][0] = torch.tensor([0.0, 500.0, 0.0])
+    config = settings(tmp_path, backend, log_every=1)
+    fixed = {key: value[1:].clone() for key, value in initial.items()}
+    run = TrainingRun(config, tiny_capture(), initial=initial, engine=hold_last(engine_of(config), fixed))
+    losses: dict[str, set[float]] = {}
+    while run.step < STEPS:
+        segment = run.take_steps(run.step + 1)
+        losses.setdefault(segment.views[0], set()).add(segment.stats[0].objective)
+    assert len(losses) == 4
+    assert all(len(values) == 1 for values in losses.values())
+
+
+@pytest.mark.parametrize("backend", ENGINES)
+def test_an_interrupted_training_goes_on_to_the_same_bits(tmp_path, backend, monkeypatch):
+    initial = first_rows()
+    whole = trained(settings(tmp_path / "whole", backend), initial, OWN)
+    config = settings(tmp_path / "stopped", backend)
+    with monkeypatch.context() as patch:
+        fixed_rows_interrupt(patch, at=7)
+        with pytest.raises(KeyboardInterrupt):
+            trained(config, initial, OWN)
+    gone_on = trained(config, initial, OWN, resume=True)
+    assert all(torch.equal(gone_on[key], whole[key]) for key in KEYS)
+
+
+def test_a_checkpoint_with_other_fixed_rows_is_refused(tmp_path, monkeypatch):
+    initial, config = first_rows(), settings(tmp_path, "fast")
+    with monkeypatch.context() as patch:
+        fixed_rows_interrupt(patch, at=7)
+        with pytest.raises(KeyboardInterrupt):
+            trained(config, initial, OWN)
+    initial["opacities"][-1] += 1.0
+    with pytest.raises(PopError, match="opacities of the Gaussians that are held fixed are others"):
+        trained(config, initial, OWN, resume=True)
+
+
+@pytest.mark.parametrize("backend", ENGINES)
+def test_what_no_view_shows_can_be_left_out_without_a_change_of_bits(tmp_path, backend):
+    initial, capture = first_rows(), tiny_capture()
+    # behind a ring of cameras that all look inwards, and far to the side
+    initial["means"][40:50] = torch.tensor([0.0, 300.0, 0.0]) + torch.arange(10.0)[:, None]
+    config = settings(tmp_path / "all", backend)
+    shown = shown_in(capture.views, initial, config)
+    assert shown[:40].all()
+    assert not shown[40:50].any()
+    less = {key: value[shown] for key, value in initial.items()}
+    every = trained(config, initial, OWN)
+    part = trained(replace(config, result_dir=str(tmp_path / "part")), less, OWN)
+    assert all(torch.equal(every[key][:OWN], part[key][:OWN]) for key in KEYS)
+
+
+def test_what_is_shown_is_found_in_pieces_as_at_once(monkeypatch):
+    initial, capture = first_rows(), tiny_capture()
+    initial["means"] *= 4.0
+    config = tiny_config("nowhere")
+    at_once = shown_in(capture.views[:2], initial, config)
+    assert 0 < at_once.sum() < N_POINTS
+    monkeypatch.setattr("pop_fast.blocks.rounds._AT_A_TIME", 7)
+    assert torch.equal(shown_in(capture.views[:2], initial, config), at_once)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_density_control_of_every_method_can_rest(method):
+    config = TrainConfig.of(method=method, preset="quick")
+    resting = at_rest(config.strategy)
+    steps = range(config.max_steps)
+    assert any(config.strategy.changes_after(step) for step in steps)
+    assert not any(resting.changes_after(step) or resting.needs_passes(step) for step in steps)
+    assert not set(resting.adam_restarts) & set(steps)
+    assert type(resting) is type(config.strategy)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("scaler", [1.0, 0.002])
+def test_a_training_goes_on_as_another_has_ended(method, scaler):
+    before = TrainConfig.of(method=method, steps_scaler=scaler, l2_stop_iter=1 if method == "pop" else None)
+    after = refining(before, 40)
+    last = before.max_steps - 1
+    ended = phase_at(before, before.strategy, last)
+    assert all(phase_at(after, after.strategy, step) == ended for step in range(40))
+    rates = updates_of(after.lr, 1.0, 40, after.strategy).rates[:, 0].numpy()
+    final = before.lr.means * before.lr.means_decay
+    np.testing.assert_allclose(rates, 10.0 * final * 0.1 ** (np.arange(40) / 40), rtol=1e-12)
+
+
+# A step of several views: the mean of their losses, and to density control the views one after the other.
+
+# bands of colour, growth by blur and the prior are all on at this step
+STEP = 12
+VIEWS = [2, 0, 3]
+
+
+def one_step(views: list[int], mask: Any = None, **plan: Any) -> tuple[Any, Any]:
+    """Take one step at STEP of these views, without density control; return the run and its measurements."""
+    config = tiny_config("unused", batch_size=len(views), strategy=strategy(**plan), log_every=1)
+    start = TrainingRun(config, tiny_capture(mask=mask))
+    initial = {key: value.detach().double() for key, value in start.params.items()}
+    initial["shN"] += 0.05
+    run: Any = TrainingRun(config, tiny_capture(mask=mask), initial=initial)
+    order = [0] * len(views) * STEP + views
+    task = Task(config, run.strategy, run._train, order, run.updates, STEP, run.appearance)
+    kind = TorchStepper if len(views) == 1 else BatchStepper
+    stepper = kind(task, require_backend("fast"))
+    stepper.rebind(run.params, run.optimizers, run.state)
+    (stats,) = stepper.steps(STEP, STEP + 1, phase_at(config, run.strategy, STEP))
+    return run, stats
+
+
+def strategy(**plan: Any) -> POPStrategy:
+    return POPStrategy(
+        refine_start_iter=3, refine_stop_iter=24, blur_start_iter=8, blur_stop_iter=16, theta_blur=0.02, **plan
+    )
+
+
+def moment(run: Any, key: str) -> torch.Tensor:
+    return run.optimizers[key].state[run.params[key]]["exp_avg"]
+
+
+def test_the_gradient_of_a_batch_is_the_mean_of_its_views_gradients() -> None:
+    batch, stats = one_step(VIEWS)
+    alone = [one_step([view]) for view in VIEWS]
+    for key in batch.params:
+        # Adam's first moment, from zero, is a tenth of the gradient
+        expected = torch.stack([moment(run, key) for run, _ in alone]).mean(0)
+        assert expected.abs().max() > 0
+        assert torch.allclose(moment(batch, key), expected, rtol=1e-12, atol=1e-18), key
+    for name in ("objective", "pop", "square", "pixelwise", "ssim", "n_blended"):
+        values = [getattr(found, name) for _, found in alone]
+        assert getattr(stats, name) == pytest.approx(sum(values) / len(VIEWS), rel=1e-12)
+        assert len(set(values)) > 1 or name == "pop"
+    assert stats.pop > 0.0
+
+
+@pytest.mark.parametrize("window", ["any_view", "last_view", "sum"])
+@pytest.mark.parametrize("masked", [False, True])
+def test_density_control_sees_the_views_one_after_the_other(window: str, masked: bool) -> None:
+    mask = (torch.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) % 3 > 0).numpy() if masked else None
+    plan = {"blur_window": window, "refine_scale2d_stop_iter": 20}
+    batch, _ = one_step(VIEWS, mask, **plan)
+    alone = [one_step([view], mask, **plan)[0].state for view in VIEWS]
+    state = batch.state
+    for key in ("grad2d", "count"):
+        assert torch.allclose(state[key], torch.stack([one[key] for one in alone]).sum(0), rtol=1e-12), key
+    assert state["count"].max() == len(VIEWS)
+    assert state["views"] == len(VIEWS)
+    assert torch.equal(state["radii"], torch.stack([one["radii"] for one in alone]).amax(0))
+    blurred = torch.stack([one["blurred"] for one in alone])
+    if window == "sum":
+        total = torch.stack([one["dominant_sum"] for one in alone]).sum(0)
+        assert torch.equal(state["dominant_sum"], total)
+        kept = HEIGHT * WIDTH if mask is None else int(mask.sum())
+        assert torch.equal(state["blurred"], total > batch.config.strategy.theta_blur * kept)
+    else:
+        assert torch.equal(state["blurred"], blurred.any(0) if window == "any_view" else blurred[-1])
+    assert blurred.any()
+    assert len({tuple(row.tolist()) for row in blurred}) > 1
+
+
+def test_a_run_of_batches_draws_as_many_views_a_step_and_continues_to_the_same_bits(tmp_path: Path) -> None:
+    capture = tiny_capture()
+    whole = TrainingRun(tiny_config(tmp_path / "whole", batch_size=3), capture)
+    whole.run()
+    records = [json.loads(line) for line in (tmp_path / "whole" / "metrics.jsonl").read_text().splitlines()]
+    assert all(len(record["view"].split(", ")) == 3 for record in records)
+    assert any(record.get("cloned", 0) + record.get("split", 0) > 0 for record in records)
+    config = tiny_config(tmp_path / "parts", batch_size=3)
+    first = TrainingRun(config, capture)
+    take_steps = first.take_steps
+
+    def until_17(last: int) -> Any:
+        if first.step == 17:
+            raise KeyboardInterrupt
+        return take_steps(last)
+
+    first.take_steps = until_17
+    with pytest.raises(KeyboardInterrupt):
+        first.run()
+    second = TrainingRun(config, capture, resume=True)
+    second.run()
+    for key, value in whole.params.items():
+        assert torch.equal(value, second.params[key])
+    with pytest.raises(PopError, match="batch_size = 3, but this run has batch_size = 2"):
+        TrainingRun(tiny_config(tmp_path / "parts", batch_size=2), capture, resume=True).run()
+
+
+def test_checkpoints_of_one_view_a_step_say_nothing_of_batches() -> None:
+    assert "batch_size" not in tiny_config("x").binding()
+    assert tiny_config("x", batch_size=2).binding()["batch_size"] == 2
+
+
+def test_a_loss_that_is_not_finite_names_the_view(tmp_path: Path) -> None:
+    run = TrainingRun(tiny_config(tmp_path, batch_size=2), tiny_capture())
+    assert isinstance(run.stepper, BatchStepper)
+    with torch.no_grad():
+        run.params["sh0"][0, 0, 0] = math.nan
+    with pytest.raises(PopError, match=r"sh0\[0, 0, 0\] is nan after 0 steps; nothing was written"):
+        run.run()
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(pop_fast.compiled.why_not() is not None, reason="the CPU kernels are not compiled")
+def test_the_step_in_cpp_leaves_batches_to_autograd() -> None:
+    one = engine_of(tiny_config("x", backend="compiled"))
+    several = engine_of(tiny_config("x", backend="compiled", batch_size=2))
+    assert isinstance(TrainingRun(tiny_config("x"), tiny_capture(), engine=one).stepper, FusedStepper)
+    run = TrainingRun(tiny_config("x", batch_size=2), tiny_capture(), engine=several)
+    assert isinstance(run.stepper, BatchStepper)
+
+
+def test_the_fused_step_on_a_gpu_refuses_batches() -> None:
+    reason = why_not_trained(CUDA, tiny_config("x", batch_size=2))
+    assert reason is not None
+    assert "batch_size = 1 only, not 2; use --backend fast, or leave batch_size as it is" in reason
+
+
+def test_a_strategy_of_somebody_else_takes_one_view_a_step() -> None:
+    with pytest.raises(PopError, match="batch_size is 2; it must be 1 with a strategy of somebody else"):
+        TrainingRun(tiny_config("x", batch_size=2), tiny_capture(), strategy=POPStrategy(), engine=torch_engine("fast"))
+    with pytest.raises(PopError, match="batch_size is 0; it must be at least 1"):
+        tiny_config("x", batch_size=0)

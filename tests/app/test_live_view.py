@@ -19,6 +19,7 @@ import pytest
 import torch
 
 from pop_fast.cli.view import stands_of_capture
+from pop_fast.io.pictures import id_colors
 from pop_fast.train import TrainingRun
 from pop_fast.train.gpu_proxy import renderer
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
@@ -29,7 +30,6 @@ from pop_fast.view.live.draw import follow, scene_of
 from pop_fast.view.live.server import Pace
 from pop_fast.view.live.state import field_of_view, from_capture, path_of, pose_of_viewmat, to_capture, viewmat_of_pose
 from pop_fast.view.paths import frames_in
-from pop_fast.view.pictures import id_colors
 from tests.app.browser import browser
 from tests.app.conftest import Pop
 from tests.app.test_paths import ring

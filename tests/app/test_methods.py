@@ -119,7 +119,7 @@ def tiny_method(folder: Any, method: str, **changes: Any) -> TrainConfig:
     }
     refine = {"refine_start_iter": 3, "refine_stop_iter": 18, "refine_every": 4, "prune_too_big_after": 8}
     grow = {"grow_grad2d": 3e-3, "grow_scale3d": 0.05, "prune_opa": 0.05}
-    kind, recipe = METHODS[method]
+    kind, recipe, _ = METHODS[method]
     resets = {} if method == "mini-splatting" else {"reset_every": 12, "reset_opa": 0.2}
     strategy = kind(**refine, **grow, **resets, **own.get(method, {}))
     base = tiny_config(folder)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
@@ -12,15 +13,36 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pop_fast.data import load_capture
+from pop_fast.data.capture import View
 from pop_fast.errors import PopError
-from pop_fast.view import pictures
-from pop_fast.view.report import write_report
+from pop_fast.io import pictures
+from pop_fast.io.pictures import colormap_table
+from pop_fast.train.gpu_proxy import renderer
+from pop_fast.train.load_result import load_splat
+from pop_fast.view.paths import frames_in
+from pop_fast.view.report import checks, write_report
+from pop_fast.view.report.checks import (
+    Checks,
+    near_limit,
+    nearer_than,
+    neighbour_degrees,
+    read_checks,
+    stops_between,
+    write_checks,
+)
 from pop_fast.view.report.curves import Chart, Series, Window, draw, draw_histogram, nice_ticks, short_number
+from pop_fast.view.report.model import verdict
+from pop_fast.view.report.sections import depth_picture, depth_range
 from pop_fast.view.report.source import read_result, running_mean, thin_out
+from tests.app.browser import browser
+from tests.app.conftest import TRAIN, TRAIN_AND_CHECK, Pop
 from tests.app.result_folder import VIEWS, write_result
+from tests.app.test_paths import ring
 
 
 class Tags(HTMLParser):
@@ -245,3 +267,231 @@ def test_a_data_uri_holds_the_picture(lossless: bool) -> None:
 def test_pictures_are_shrunk_to_fit_and_never_enlarged() -> None:
     assert pictures.fit(np.zeros((300, 900, 3), np.uint8), max_side=600).shape == (200, 600, 3)
     assert pictures.fit(np.zeros((30, 90, 3), np.uint8), max_side=600).shape == (30, 90, 3)
+
+
+# What the report says of a finished splat: the verdict, floaters, exposure, depth, the orbit, the command.
+
+GOOD = Checks(
+    photographs=60,
+    train_psnr=31.0,
+    train_measured=12,
+    held_out_psnr=29.5,
+    matched_psnr=29.6,
+    neighbour_degrees=4.0,
+    stops={"a": -0.02, "b": 0.03},
+    floaters={"a": 0.0, "b": 0.002},
+)
+
+
+@pytest.fixture
+def short_orbit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Film four frames."""
+    monkeypatch.setattr(checks, "_ORBIT_FRAMES", 4)
+
+
+def camera() -> View:
+    """A camera at the origin that looks along z, a right angle wide."""
+    return View("v", np.zeros((20, 20, 3), np.uint8), np.eye(4), np.array([[10.0, 0, 10], [0, 10, 10], [0, 0, 1]]))
+
+
+def test_nothing_was_photographed_nearer_than_half_the_way_to_the_nearest_points() -> None:
+    points = np.array([[0.0, 0.0, z] for z in np.linspace(4.0, 8.0, 201)])
+    outside = np.array([[9.0, 0.0, 1.0], [0.0, 0.0, -1.0]] * 50)
+    assert near_limit(camera(), np.concatenate([points, outside])) == pytest.approx(2.04)
+    assert near_limit(camera(), outside) is None
+
+
+def test_only_gaussians_between_the_camera_and_the_limit_are_near() -> None:
+    params = {"means": torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [5.0, 0.0, 1.9], [0.0, 0.0, 2.1]])}
+    assert nearer_than(params, camera(), 2.0)["means"][:, 2].tolist() == [1.0, pytest.approx(1.9)]
+
+
+def test_a_photograph_of_twice_the_light_is_one_stop_brighter() -> None:
+    render = np.full((50, 3), 0.3)
+    brighter = np.full((50, 3), 0.3 * 2.0 ** (1.0 / 2.2))
+    assert stops_between(brighter, render) == pytest.approx(1.0)
+    assert stops_between(render, render) == 0.0
+    assert stops_between(np.zeros((50, 3)), render) == 0.0
+
+
+def test_neighbours_in_a_ring_of_twelve_are_thirty_degrees_apart() -> None:
+    assert neighbour_degrees(ring(12, height=0.0)) == pytest.approx(30.0)
+    assert neighbour_degrees(ring(1)) is None
+
+
+@pytest.mark.parametrize(
+    ("about", "changes", "kind", "words"),
+    [
+        ("Overfitting", {}, "good", "training views 31.00 dB, held-out views 29.50 dB, 1.5 dB apart"),
+        ("Overfitting", {"train_psnr": 34.0}, "look", "4.5 dB apart"),
+        ("Overfitting", {"train_psnr": 39.5}, "bad", "10.0 dB apart"),
+        ("Overfitting", {"held_out_psnr": None, "matched_psnr": None}, "look", "No view was held out"),
+        ("Photographs", {}, "good", "60 trained on, neighbours 4.0 degrees apart"),
+        ("Photographs", {"photographs": 11}, "look", "11 trained on"),
+        ("Photographs", {"photographs": 11, "train_psnr": 36.0}, "bad", "too few"),
+        ("Photographs", {"neighbour_degrees": 25.0}, "look", "far apart"),
+        ("Exposure", {}, "good", "-0.02 (a) to +0.03 stops (b)"),
+        ("Exposure", {"stops": {"a": -0.2, "b": 0.2}}, "look", "standard deviation 0.20"),
+        ("Exposure", {"stops": {**{f"v{i}": 0.0 for i in range(40)}, "b": -0.4}}, "look", "-0.40 (b)"),
+        ("Exposure", {"stops": {"a": -0.5, "b": 0.5}}, "bad", "29.60 dB instead of 29.50"),
+        ("Floaters", {}, "good", "at most 0.20 % of a view"),
+        ("Floaters", {"floaters": {"a": 0.0, "b": 0.015}}, "look", "worst b, 1.5 %"),
+        ("Floaters", {"floaters": {"a": 0.1, "b": 0.3}}, "bad", "20.0 % of the pixels"),
+    ],
+)
+def test_the_verdict_gives_its_numbers(about: str, changes: dict, kind: str, words: str) -> None:
+    found = [f for f in verdict({"psnr": 29.5}, replace(GOOD, **changes), None) if f.about == about]
+    assert [f.kind for f in found] == [kind]
+    assert words in found[0].text
+
+
+@pytest.mark.parametrize(
+    ("psnr", "kind", "words"),
+    [(31.0, "good", "very close"), (26.0, "good", "close"), (22.0, "look", "recognisable"), (12.0, "bad", "far from")],
+)
+def test_the_verdict_says_how_close_the_renders_are(psnr: float, kind: str, words: str) -> None:
+    quality = verdict({"psnr": psnr}, None, None)
+    assert [(f.about, f.kind) for f in quality] == [("Quality", kind)]
+    assert words in quality[0].text
+
+
+def test_a_run_whose_held_out_views_got_worse_is_told_when_that_began() -> None:
+    fell = verdict({}, None, ([700.0, 3000.0], [20.2, 16.7]))
+    assert [f.kind for f in fell] == ["bad"]
+    assert "fell from 20.20 dB after 700 steps to 16.70 dB after 3,000" in fell[0].text
+    assert verdict({}, None, ([700.0, 3000.0], [16.7, 20.2])) == []
+
+
+def test_a_training_leaves_what_its_report_shows(shared_result: Path, shared_capture: Path) -> None:
+    found = read_checks(shared_result / "report_data" / "checks_step29.json")
+    stats = json.loads((shared_result / "stats" / "val_step0029.json").read_text())
+    assert found.photographs == 7
+    assert found.held_out_psnr == pytest.approx(stats["psnr"], abs=1e-3)
+    assert set(found.stops) == {view.name for view in load_capture(shared_capture).views}
+    assert frames_in(shared_result / "videos" / "orbit_step29.webm") == 60
+    page = (shared_result / "report.html").read_text()
+    text = unescape(re.sub(r"<[^>]+>", " ", page))
+    assert f"held-out views {found.held_out_psnr:.2f} dB" in text
+    assert f"pop train {shared_capture} --out {shared_result} {' '.join(TRAIN_AND_CHECK)}" in text
+    assert '<a href="ply/point_cloud_29.ply">' in page
+    assert 'src="data:video/webm;base64,' in page
+
+
+@pytest.mark.usefixtures("short_orbit")
+def test_a_gaussian_in_front_of_a_camera_is_a_floater(result: Path, shared_capture: Path) -> None:
+    splat, capture = load_splat(result), load_capture(shared_capture)
+    view = capture.test_views()[0]
+    before = read_checks(result / "report_data" / "checks_step29.json").floaters[view.name]
+    near = 0.3 * near_limit(view, capture.points)
+    place = torch.from_numpy(view.camera_center + near * view.viewmat[2, :3]).float()
+    row = {"means": place, "scales": torch.full((3,), float(np.log(0.1 * near))), "opacities": torch.tensor(3.0)}
+    params = {name: torch.cat([t, (row[name] if name in row else t[0])[None]]) for name, t in splat.params.items()}
+    found = write_checks(result, capture, params, splat.config, splat.sh_degree, renderer("auto")[0], 29)
+    assert found.floaters[view.name] > before + 0.02
+    # and only there
+    assert {name for name, share in found.floaters.items() if share > 0.02} == {view.name}
+
+
+@pytest.mark.usefixtures("short_orbit")
+def test_the_worst_views_come_first_and_have_pictures_whatever_was_kept(result: Path, shared_capture: Path) -> None:
+    splat, capture = load_splat(result), load_capture(shared_capture)
+    config = splat.config.with_overrides(test_every=2, max_renders=1)
+    write_checks(result, capture, splat.params, config, splat.sh_degree, renderer("auto")[0], 29)
+    views = read_result(result).views
+    assert [view.psnr for view in views] == sorted(view.psnr for view in views)
+    assert len(views) == 2
+    assert all(view.depth is not None and np.nanmin(view.depth) > 0.0 for view in views)
+
+
+@pytest.mark.usefixtures("short_orbit")
+def test_a_run_that_was_stopped_is_shown_as_it_was_then(result: Path, shared_capture: Path) -> None:
+    for path in (result / "report_data").glob("val_*"):
+        path.unlink()
+    splat, capture = load_splat(result), load_capture(shared_capture)
+    found = write_checks(result, capture, splat.params, splat.config, splat.sh_degree, renderer("auto")[0], 19)
+    data = read_result(result)
+    assert [view.name for view in data.views] == [view.name for view in capture.test_views()]
+    assert f"{found.held_out_psnr:.2f} dB on average" in data.verdict[0].text
+
+
+def test_a_resumed_run_has_all_its_commands(pop: Pop, result: Path, shared_capture: Path) -> None:
+    words = ("train", shared_capture, "--out", result, *TRAIN, "--resume", "--skip-sizes", "--skip-checks")
+    assert pop(*words).status == 0
+    commands = json.loads((result / "commands.json").read_text())
+    assert [entry["words"][:2] for entry in commands] == [["pop", "train"]] * 2
+    assert commands[0]["words"][-2:] == list(TRAIN_AND_CHECK[-2:])
+    assert commands[1]["words"] == ["pop", *map(str, words)]
+
+
+@pytest.mark.usefixtures("short_orbit")
+def test_a_run_without_checks_says_how_to_get_them(pop: Pop, result: Path) -> None:
+    (result / "report_data" / "checks_step29.json").unlink()
+    (result / "videos" / "orbit_step29.webm").unlink()
+    assert pop("report", result).status == 0
+    page = (result / "report.html").read_text()
+    assert "pop report RESULT --check" in page
+    assert "<video" not in page
+    assert pop("report", result, "--check").status == 0
+    page = (result / "report.html").read_text()
+    assert "pop report RESULT --check" not in page
+    assert "<video" in page
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("report_data/checks_step29.json", "{}", "missing 3 required"),
+        ("report_data/checks_step29.json", '{"photographs": "many"}', "photographs is not what a run writes"),
+        ("report_data/checks_step29.json", '{"stops": {"a": null}}', "stops is not what a run writes"),
+        ("commands.json", '{"words": []}', "is not a list of commands"),
+        ("commands.json", "[", "is not JSON"),
+    ],
+)
+def test_damage_is_named_and_leaves_the_report_as_it_was(result: Path, name: str, text: str, said: str) -> None:
+    before = (result / "report.html").read_bytes()
+    (result / name).write_text(text)
+    with pytest.raises(PopError, match=re.escape(said)):
+        write_report(result)
+    assert (result / "report.html").read_bytes() == before
+
+
+def test_depth_maps_share_a_range_that_outliers_do_not_set() -> None:
+    depth = np.concatenate([np.linspace(2.0, 4.0, 1000), [900.0] * 5, [np.nan] * 20]).reshape(-1, 5)
+    near, far = depth_range([depth])
+    assert near == pytest.approx(2.02, abs=0.01)
+    assert far == pytest.approx(4.0, abs=0.02)
+    picture = depth_picture(depth, near, far)
+    assert np.ptp(picture[-1], axis=0).max() == 0  # NaN in grey
+    assert picture[0, 0].sum() > picture[199, 4].sum()  # near is bright
+    # equal ratios are equal steps
+    one, two, four = (depth_picture(np.array([[value]]), 1.0, 16.0)[0, 0].tolist() for value in (1.0, 4.0, 16.0))
+    table = colormap_table("viridis_r").tolist()
+    assert [one, two, four] == [table[0], table[128], table[255]]
+    assert depth_range([]) == (0.1, 1.0)
+
+
+def test_the_slider_uncovers_the_photograph_and_the_orbit_plays(shared_result: Path, tmp_path: Path) -> None:
+    with browser(tmp_path / "browser") as tab:
+        tab.open(shared_result / "report.html", 1000, 800)
+        tab.wait_for("document.readyState === 'complete'")
+        clip = "getComputedStyle(document.querySelector('.slider .over')).clipPath"
+        assert tab.value(clip) == "inset(0px 0px 0px 50%)"
+        tab.value(
+            "(i => { i.value = 20; i.dispatchEvent(new Event('input')) })(document.querySelector('.slider input'))"
+        )
+        assert tab.value(clip) == "inset(0px 0px 0px 20%)"
+        tab.wait_for("document.querySelector('video').readyState >= 2")
+        assert tab.value("document.querySelector('video').duration") == pytest.approx(4.0, abs=0.2)
+        assert tab.errors == []
+        assert all(url.startswith(("file:", "blob:", "about:", "data:")) for url in tab.requests)
+
+
+def test_the_report_of_a_folder_without_pictures_of_depth_is_whole(tmp_path: Path) -> None:
+    page = write_report(write_result(tmp_path / "r")).read_text()
+    assert page.index(f"photo of {VIEWS[0]}") < page.index(f"photo of {VIEWS[1]}")  # 24 dB before 25
+    assert "depth of" not in page
+
+
+def test_a_frame_of_the_orbit_shows_the_scene(shared_result: Path) -> None:
+    video = cv2.VideoCapture(str(shared_result / "videos" / "orbit_step29.webm"))
+    assert video.read()[1].std() > 5.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -15,9 +16,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pop_fast.cli import capture_options, explain, export, render
+from pop_fast.cli import eval as eval_command
+from pop_fast.cli.finish import table_lines
+from pop_fast.data import load, sfm
+from pop_fast.demo import make
 from pop_fast.errors import PopError
+from pop_fast.io import formats
+from pop_fast.io.formats import format_names, load_splat_file
+from pop_fast.io.ply import load_ply
 from pop_fast.train import LearningRates, TrainingRun
 from pop_fast.train.results import ResultFolder
+from tests.app.browser import browser
+from tests.app.captures import photograph, write_photograph
 from tests.app.conftest import TRAIN, Pop
 from tests.app.damage import contents, says
 from tests.app.interruptions import Killed, interrupt, killed_after
@@ -272,3 +283,252 @@ def test_what_a_living_writer_or_somebody_else_has_there_is_kept(tmp_path, name)
     with pytest.raises(PopError, match="exists and is not empty"):
         ResultFolder(tmp_path).check(resume=False, overwrite=False)
     assert (tmp_path / name).read_text() == "{"
+
+
+# What a command cannot do it says before the long work: nothing is loaded, searched, drawn or trained first.
+
+
+class BegunError(Exception):
+    """The long work has begun."""
+
+
+@pytest.fixture
+def nothing_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let everything that takes long fail."""
+
+    def begun(*_: Any, **__: Any) -> None:
+        raise BegunError
+
+    for module in (render, eval_command, explain, export):
+        monkeypatch.setattr(module, "load_splat", begun)
+    for owner, name in (
+        (capture_options, "open_capture"),
+        (load, "run_sfm"),
+        (load, "read_views"),
+        (sfm, "find_cameras"),
+        (sfm, "measure"),
+        (make, "_photograph"),
+        (formats, "load_splat_file"),
+    ):
+        monkeypatch.setattr(owner, name, begun)
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with photographs, a file and a folder that are in the way, and one that may not be written."""
+    for i in range(4):
+        write_photograph(tmp_path / "photos" / f"{i}.png", photograph(i))
+    (tmp_path / "splat.ply").write_bytes(b"")
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "thesis.txt").write_text("mine")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+REFUSED: dict[str, tuple[str, tuple[str, ...]]] = {
+    "no such path": ("render splat.ply --out o --path spiral", ("spiral", "orbit")),
+    "no frames": ("render splat.ply --out o --path orbit --frames 0", ("--frames 1",)),
+    "pictures where somebody's files are": ("render splat.ply --out folder --overwrite", ("folder", "thesis.txt")),
+    "pictures where a folder is": ("render splat.ply --out folder", ("folder", "thesis.txt")),
+    "pictures where a file is": ("render splat.ply --out file", ("file", "in the way")),
+    "pictures under a file": ("render splat.ply --out file/o", ("file/o", "is a file")),
+    "a video of no kind": ("render splat.ply --video o.gif", ("o.gif", ".webm")),
+    "a video under a file": ("render splat.ply --video file/o.webm", ("file/o.webm", "is a file")),
+    "numbers where a folder is": ("eval splat.ply --capture photos --json folder", ("folder", "in the way")),
+    "numbers under a file": ("eval splat.ply --capture photos --json file/o.json", ("file/o.json", "is a file")),
+    "a page where a folder is": ("explain splat.ply --view 0 --pixel 1,1 --html folder", ("folder", "in the way")),
+    "maps where a folder is": ("explain splat.ply --view 0 --maps folder", ("folder", "--overwrite")),
+    "an export under a file": ("export splat.ply --out file/o.spz", ("file/o.spz", "is a file")),
+    "an export of no format": ("export splat.ply --out o.xyz", ("o.xyz", ".spz")),
+    "an Inria folder that is in use": ("export splat.ply --layout inria --out folder", ("folder", "thesis.txt")),
+    "a conversion under a file": ("convert splat.ply file/o.spz", ("file/o.spz", "is a file")),
+    "cameras where a folder is": ("sfm photos --out folder", ("folder", "thesis.txt")),
+    "cameras under a file": ("sfm photos --out file/o", ("file/o", "is a file")),
+    "a demo where somebody's files are": ("demo folder --overwrite", ("folder", "thesis.txt")),
+    "a demo under a file": ("demo file/o", ("file/o", "is a file")),
+    "a factor that leaves nothing": ("train photos --factor 1000", ("0.png", "40x30", "factor 1000", "use 30 at most")),
+    "results under a file": ("train photos --out file/o", ("file/o", "is a file")),
+    "weights that are not there": ("train photos --lpips-alex gone.pth", ("gone.pth", "--lpips-alex")),
+}
+
+
+@pytest.mark.usefixtures("nothing_long")
+@pytest.mark.parametrize("what", REFUSED)
+def test_it_is_said_before_the_long_work(pop: Pop, place: Path, what: str) -> None:
+    command, words = REFUSED[what]
+    says(pop(*command.split()), *words)
+    assert (place / "folder" / "thesis.txt").read_text() == "mine"
+
+
+@pytest.mark.usefixtures("nothing_long")
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="a folder that this user may not write to")
+@pytest.mark.parametrize("command", ["render splat.ply --out locked/o", "sfm photos --out locked/o"])
+def test_a_folder_that_may_not_be_written_to_is_said_before_the_long_work(pop: Pop, place: Path, command: str) -> None:
+    (place / "locked").mkdir(mode=0o500)
+    says(pop(*command.split()), "locked", "permission denied")
+
+
+@pytest.mark.usefixtures("nothing_long")
+def test_what_can_be_done_goes_on_to_the_long_work(pop: Pop, place: Path) -> None:
+    for command in ("render splat.ply --out o", "train photos --factor 2", "sfm photos --out o", "demo o"):
+        with pytest.raises(BegunError):
+            pop(*command.split())
+    assert np.all([not (place / name).exists() for name in ("o", "out")])
+
+
+# What `pop train` writes when the last step is taken: exports, the viewer's page, the table of sizes, the report.
+
+LAST = "stats/val_step0029.json"
+
+
+def again(pop: Pop, result: Path, capture: Path, *words: object) -> str:
+    """Finish a finished run again."""
+    outcome = pop("train", capture, "--out", result, *TRAIN, "--resume", *words)
+    assert outcome.status == 0, outcome.err
+    return outcome.out
+
+
+def test_a_run_ends_with_its_size_in_every_format(shared_result: Path) -> None:
+    entries = json.loads((shared_result / LAST).read_text())["encodings"]
+    assert [entry["format"] for entry in entries] == list(format_names())
+    by_name = {entry["format"]: entry for entry in entries}
+    n = len(load_ply(shared_result / "ply" / "point_cloud_29.ply")["means"])
+    assert {entry["num_gaussians"] for entry in entries} == {n}
+    assert 248 * n < by_name["ply"]["bytes"] < 248 * n + 3000
+    assert by_name["splat"]["bytes"] == 32 * n
+    assert by_name["spz"]["bytes"] < by_name["ply"]["bytes"] / 5
+    # what comes back from glTF is what went in; of the others little is lost
+    assert by_name["gltf"]["psnr"] == pytest.approx(by_name["ply"]["psnr"], abs=1e-3)
+    for name in ("spz", "sog", "compressed-ply"):
+        assert by_name[name]["psnr"] == pytest.approx(by_name["ply"]["psnr"], abs=0.2)
+    psnr = json.loads((shared_result / LAST).read_text())["psnr"]
+    assert by_name["ply"]["views"] == 1
+    assert by_name["ply"]["psnr"] == pytest.approx(psnr, abs=1e-3)
+
+
+def test_the_table_is_printed_and_the_report_shows_it(pop: Pop, result: Path, shared_capture: Path) -> None:
+    said = again(pop, result, shared_capture)
+    lines = said.splitlines()
+    head = next(i for i, line in enumerate(lines) if line.startswith("format "))
+    assert [line.split()[0] for line in lines[head + 1 : head + 1 + len(format_names())]] == list(format_names())
+    page = (result / "report.html").read_text()
+    assert "<h2>Files</h2>" in page
+    assert all(f"<td>{name}</td>" in page for name in format_names())
+    assert '<iframe class="viewer"' in page
+
+
+def test_exports_are_written_with_the_limits_that_are_asked_for(pop: Pop, result: Path, shared_capture: Path) -> None:
+    words = ("--export", "spz", "gltf-spz", "html", "--max-gaussians", "100", "--skip-sizes")
+    said = again(pop, result, shared_capture, *words)
+    assert "highest sensitivity: 100 of" in said
+    assert "format " not in said
+    names = sorted(path.name for path in (result / "export").iterdir())
+    assert names == ["result-spz.glb", "result.html", "result.spz"]
+    assert len(load_splat_file(result / "export" / "result.spz")[0]["means"]) == 100
+    # what was trained stays whole
+    assert len(load_ply(result / "ply" / "point_cloud_29.ply")["means"]) > 100
+
+
+def test_limits_without_a_format_make_a_ply_in_the_frame_of_the_capture(
+    pop: Pop, result: Path, shared_capture: Path, tmp_path: Path
+) -> None:
+    again(pop, result, shared_capture, "--final-prune", "0", "--min-opacity", "0", "--skip-sizes")
+    assert pop("export", result, "--out", tmp_path / "whole.ply").status == 0
+    kept = load_ply(result / "export" / "result.ply")["means"]
+    whole = load_ply(tmp_path / "whole.ply")["means"]
+    rows = {tuple(row) for row in whole.tolist()}
+    assert all(tuple(row) in rows for row in kept.tolist())
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--target-mb", "-1"), "--target-mb -1 must be over 0"),
+        (("--final-prune", "2"), "--final-prune 2 must be in [0, 1)"),
+    ],
+)
+def test_a_limit_that_cannot_be_is_said_before_training(
+    pop: Pop, shared_capture: Path, tmp_path: Path, words: tuple[str, ...], said: str
+) -> None:
+    outcome = pop("train", shared_capture, "--out", tmp_path / "new", *TRAIN, *words)
+    assert outcome.status == 2
+    assert said in outcome.err
+    assert not (tmp_path / "new").exists()
+
+
+def test_an_export_that_cannot_be_written_leaves_the_results_and_says_so(
+    pop: Pop, result: Path, shared_capture: Path
+) -> None:
+    outcome = pop(
+        "train", shared_capture, "--out", result, *TRAIN, "--resume", "--export", "spz", "--target-mb", "1e-5"
+    )
+    assert outcome.status == 1
+    assert "a file without any Gaussian has" in outcome.err
+    assert f"the results in {result} are complete" in outcome.err
+    assert not (result / "export").exists()
+
+
+def test_a_new_run_replaces_the_page_and_the_exports_of_the_old_one(
+    pop: Pop, result: Path, shared_capture: Path
+) -> None:
+    again(pop, result, shared_capture, "--export", "spz", "--skip-sizes")
+    assert (result / "export" / "result.spz").is_file()
+    outcome = pop("train", shared_capture, "--out", result, *TRAIN, "--overwrite")
+    assert outcome.status == 0, outcome.err
+    assert not (result / "export").exists()
+    assert (result / "viewer.html").is_file()
+
+
+@pytest.mark.parametrize(
+    ("entries", "said"),
+    [
+        ({}, "encodings is dict"),
+        ([{"format": "ply"}], "encodings[0].bytes is absent"),
+        ([{"format": "ply", "bytes": "many", "num_gaussians": 1, "psnr": None, "views": 0}], "encodings[0].bytes"),
+        ([7], "encodings[0].format"),
+    ],
+)
+def test_a_damaged_entry_of_the_statistics_is_named(pop: Pop, result: Path, entries: object, said: str) -> None:
+    stats = json.loads((result / LAST).read_text())
+    (result / LAST).write_text(json.dumps({**stats, "encodings": entries or {"a": 1}}))
+    outcome = pop("report", result)
+    assert outcome.status == 2
+    assert said in outcome.err
+
+
+def test_a_result_from_before_there_was_a_page_has_a_report(pop: Pop, result: Path) -> None:
+    stats = json.loads((result / LAST).read_text())
+    del stats["encodings"]
+    (result / LAST).write_text(json.dumps(stats))
+    (result / "viewer.html").unlink()
+    assert pop("report", result).status == 0
+    page = (result / "report.html").read_text()
+    assert "<h2>Files</h2>" not in page
+    assert "<iframe" not in page
+
+
+def test_the_report_shows_the_splat_in_a_frame(result: Path, tmp_path: Path) -> None:
+    shutil.copy(result / "report.html", tmp_path / "report.html")
+    with browser(tmp_path / "browser") as tab:
+        tab.open(tmp_path / "report.html", 1000, 800)
+        tab.wait_for("document.readyState === 'complete'")
+        tab.value("document.querySelector('iframe.viewer').scrollIntoView()")
+        tab.wait_for("document.querySelector('iframe.viewer').contentDocument?.getElementById('view')?.dataset.drawn")
+        picture = tab.screenshot()
+        assert all(url.startswith(("file:", "blob:", "about:", "data:")) for url in tab.requests)
+        assert tab.errors == []
+    assert picture.std() > 10.0
+
+
+def test_a_viewer_whose_script_is_not_of_this_version_is_linked(pop: Pop, result: Path) -> None:
+    viewer = result / "viewer.html"
+    viewer.write_text(viewer.read_text().replace("</script></body>", "window.other = 1</script></body>"))
+    # the same text and more is another script
+    assert pop("report", result).status == 0
+    assert 'in <a href="viewer.html">viewer.html</a>' in (result / "report.html").read_text()
+    assert "<iframe" not in (result / "report.html").read_text()
+
+
+def test_a_table_has_its_first_column_to_the_left() -> None:
+    assert table_lines([("a", "bb"), ("ccc", "d")]) == ["a    bb", "ccc   d"]

@@ -2,24 +2,38 @@
 
 from __future__ import annotations
 
+import io
 import json
+import math
+import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from cuda_ext.train_settings import Phase
 from pop_fast.api.registry import get_backend
+from pop_fast.cli import progress
+from pop_fast.cli.progress import bars
+from pop_fast.data import Capture, View
 from pop_fast.data.initialize import initialize_params
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
+from pop_fast.io import heartbeat
+from pop_fast.io.heartbeat import Heartbeat, duration
 from pop_fast.io.ply import load_ply
+from pop_fast.stages.backend import FAST
 from pop_fast.train import TrainingRun
+from pop_fast.train.metrics import average, measure, population, psnr
 from pop_fast.train.model import KEYS, adam_step, first_non_finite, make_optimizers
-from pop_fast.train.objective import Objective
 from pop_fast.train.schedule import steady_updates
+from pop_fast.train.torch_stepper import PhotoLoss
 from pop_fast.train.views import ViewTensors, render_view
+from pop_ref.settings import Objective
+from tests.app.captures import assert_one_line, cloud, photograph, ring
+from tests.app.conftest import TRAIN, Pop
 from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config
 
 
@@ -80,7 +94,7 @@ def test_the_pop_term_is_logged_while_it_is_on(finished):
 
 def test_the_loss_is_the_sum_of_its_terms(finished):
     trainer, _, folder = finished
-    _, weight = trainer.config.photometric_at(0)
+    weight = trainer.config.objective_at(0).lambda_ssim
     for record in records(folder):
         pixelwise = record["l2" if trainer.config.method == "pop" else "l1"]
         total = (1 - weight) * pixelwise + weight * record["d_ssim"] + record.get("pop", 0.0)
@@ -216,8 +230,8 @@ def test_the_target_cache_changes_no_bit(tmp_path):
     losses = []
     for megabytes in (0, 1):
         config = tiny_config(tmp_path, target_cache_mb=megabytes)
-        objective = Objective(config, views, "fast")
-        losses.append([objective(image, i, Phase(0, True, True, True)) for i in (0, 1, 0)])
+        objective = PhotoLoss(config, views, FAST.losses())
+        losses.append([objective(image, i, Objective()) for i in (0, 1, 0)])
         assert len(objective._kept) == (2 if megabytes else 0)
     assert losses[0] == losses[1]
 
@@ -274,3 +288,215 @@ def test_the_first_entry_that_is_not_finite_is_found():
     assert first_non_finite(good) is None
     bad = {**good, "c": torch.tensor([[0.0, 1.0], [float("-inf"), 2.0]])}
     assert first_non_finite(bad) == ("c", [1, 0], float("-inf"))
+
+
+# The first Gaussians: one a point, as large as its neighbourhood.
+
+
+def some_capture(points: np.ndarray, rgb: np.ndarray | None = None) -> Capture:
+    views = tuple(View(f"{i}.png", photograph(i), viewmat, np.eye(3)) for i, viewmat in enumerate(ring(3)))
+    colors = np.zeros((len(points), 3), np.uint8) if rgb is None else rgb
+    return Capture("scene", views, np.asarray(points, np.float64), colors, "test")
+
+
+def test_sizes_are_the_root_mean_square_distance_to_the_three_nearest_neighbours() -> None:
+    points, rgb = cloud(30)
+    params = initialize_params(some_capture(points, rgb), dtype=torch.float64)
+    for i, point in enumerate(points):
+        nearest = np.sort(np.linalg.norm(points - point, axis=1))[1:4]
+        want = math.log(math.sqrt(np.mean(nearest**2)))
+        assert params["scales"][i].tolist() == pytest.approx([want] * 3, rel=1e-12)
+    wider = initialize_params(some_capture(points, rgb), init_scale=2.0, dtype=torch.float64)
+    assert torch.allclose(wider["scales"], params["scales"] + math.log(2.0))
+
+
+def test_colours_places_and_opacities_are_those_of_the_points() -> None:
+    points, rgb = cloud(10)
+    params = initialize_params(some_capture(points, rgb), init_opacity=0.25)
+    assert {name: tuple(value.shape) for name, value in params.items()} == {
+        "means": (10, 3),
+        "scales": (10, 3),
+        "quats": (10, 4),
+        "opacities": (10,),
+        "sh0": (10, 1, 3),
+        "shN": (10, 15, 3),
+    }
+    assert all(value.dtype == torch.float32 for value in params.values())
+    assert np.allclose(params["means"].numpy(), points, atol=1e-6)
+    assert torch.allclose(torch.sigmoid(params["opacities"]), torch.tensor(0.25))
+    shown = 0.5 + 0.28209479177387814 * params["sh0"][:, 0]
+    assert np.allclose(shown.numpy() * 255.0, rgb, atol=1e-3)
+    assert not params["shN"].any()
+
+
+def test_rotations_are_uniform_in_the_unit_cube_and_follow_the_seed() -> None:
+    capture = some_capture(cloud(2000)[0])
+    first, again, other = (initialize_params(capture, seed)["quats"] for seed in (0, 0, 1))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert first.min() >= 0.0
+    assert first.max() < 1.0
+    assert torch.allclose(first.mean(dim=0), torch.tensor(0.5), atol=0.03)
+
+
+def test_points_that_coincide_and_single_points_get_a_finite_size() -> None:
+    same = some_capture(np.zeros((5, 3)))
+    floor = math.log(math.sqrt(1e-7) * same.scene_scale())
+    for capture in (same, some_capture(np.zeros((1, 3)))):
+        assert initialize_params(capture)["scales"].flatten().tolist() == pytest.approx(
+            [floor] * (3 * len(capture.points)), rel=1e-6
+        )
+
+
+def test_fewer_than_four_points_use_the_neighbours_there_are() -> None:
+    params = initialize_params(some_capture(np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])), dtype=torch.float64)
+    assert params["scales"].exp().flatten().tolist() == pytest.approx([2.0] * 6)
+
+
+def test_a_capture_without_points_and_an_impossible_opacity_are_refused() -> None:
+    capture = some_capture(cloud(4)[0])
+    empty = replace(capture, points=np.zeros((0, 3)), points_rgb=np.zeros((0, 3), np.uint8))
+    assert_one_line(lambda: initialize_params(empty), "scene", "no points")
+    assert_one_line(lambda: initialize_params(capture, init_opacity=1.0), "init_opacity", "between 0 and 1")
+
+
+# What is measured: PSNR, SSIM, counts of the Gaussians, and averages.
+
+
+def pictures(seed=0, height=40, width=30):
+    g = torch.Generator().manual_seed(seed)
+    target = torch.rand(height, width, 3, generator=g)
+    return (target + 0.2 * torch.randn(height, width, 3, generator=g)), target
+
+
+def test_psnr_is_scikit_images_on_the_clamped_render():
+    image, target = pictures()
+    want = peak_signal_noise_ratio(target.double().numpy(), image.clamp(0, 1).double().numpy(), data_range=1.0)
+    assert psnr(image, target) == pytest.approx(want, rel=1e-6)
+
+
+def test_psnr_of_equal_pictures_is_infinite_and_of_black_on_white_zero():
+    white = torch.ones(4, 4, 3)
+    assert psnr(white, white) == math.inf
+    assert psnr(torch.zeros(4, 4, 3), white) == 0.0
+
+
+def test_ssim_is_scikit_images_over_whole_windows():
+    image, target = pictures()
+    clamped = image.clamp(0, 1)
+    _, full = structural_similarity(
+        target.double().numpy(),
+        clamped.double().numpy(),
+        data_range=1.0,
+        channel_axis=2,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
+    )
+    assert measure(image, target).ssim == pytest.approx(full[5:-5, 5:-5].mean(), rel=1e-5)
+
+
+def test_masked_pixels_do_not_count():
+    image, target = pictures()
+    mask = torch.ones(40, 30, dtype=torch.bool)
+    mask[:, 20:] = False
+    spoiled = image.clone()
+    spoiled[:, 20:] = 1.0 - target[:, 20:].round()
+    assert measure(spoiled, target, mask) == measure(image, target, mask)
+    assert measure(spoiled, target, mask).psnr == pytest.approx(psnr(image[:, :20], target[:, :20]), rel=1e-6)
+
+
+def test_averages_are_over_views_and_no_view_gives_null():
+    measured = [measure(*pictures(seed)) for seed in (0, 1)]
+    means = average(measured, [])
+    assert means["psnr"] == pytest.approx(np.mean([m.psnr for m in measured]))
+    assert means["lpips"] is None
+    assert "lpips_vgg" in means["lpips_reason"]
+    assert average([], [])["psnr"] is None
+
+
+def test_the_population_is_counted_at_both_poles_and_at_the_floor():
+    counts = population(torch.tensor([0.0, 1 / 255 - 1e-6, 1 / 255, 0.1, 0.5, 0.9, 0.95, 1.0]))
+    assert counts == {"num_GS": 8, "num_GS_above_floor": 6, "opacity_below_0.1": 3 / 8, "opacity_above_0.9": 2 / 8}
+    assert population(torch.zeros(0))["num_GS"] == 0
+
+
+# Where nobody sees a bar, what is being done is told line by line.
+
+
+def wait_for_a_line(capsys: pytest.CaptureFixture[str]) -> str:
+    end = time.monotonic() + 60.0
+    while time.monotonic() < end:
+        told = capsys.readouterr().err
+        if told:
+            return told.splitlines()[0]
+        time.sleep(0.005)
+    raise AssertionError("nothing is told")
+
+
+def test_a_line_comes_by_itself_from_within_a_long_computation(capsys: pytest.CaptureFixture[str]) -> None:
+    with Heartbeat(period=0.01) as beat:
+        beat.say("finding cameras: 3 of 25")
+        assert wait_for_a_line(capsys) == "pop: finding cameras: 3 of 25 (0 s)"
+    capsys.readouterr()
+    time.sleep(0.05)
+    assert capsys.readouterr().err == ""
+
+
+def test_stages_that_report_are_told(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(heartbeat, "PERIOD", 0.01)
+    with bars() as report:
+        report("matching photographs", 64, 1225)
+        assert wait_for_a_line(capsys).startswith("pop: matching photographs: 64 of 1,225 (")
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_the_time_that_is_left_is_told(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(heartbeat, "PERIOD", 0.01)
+    clock = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
+    with bars() as report:
+        report("matching pairs of photographs", 0, 300)
+        clock[0] += 60.0
+        report("matching pairs of photographs", 100, 300)
+        end = time.perf_counter() + 60.0
+        told = ""
+        while " left" not in told and time.perf_counter() < end:
+            told = capsys.readouterr().err
+    assert "pop: matching pairs of photographs: 100 of 300, 2 min 0 s left (" in told
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_a_terminal_and_a_quiet_run_are_told_nothing(monkeypatch: pytest.MonkeyPatch, quiet: bool) -> None:
+    stream = io.StringIO() if quiet else Terminal()
+    monkeypatch.setattr("sys.stderr", stream)
+    with Heartbeat(show=not quiet, period=0.001) as beat:
+        beat.say("reading")
+        time.sleep(0.05)
+    assert stream.getvalue() == ""
+
+
+def test_training_tells_how_far_it_is(
+    pop: Pop, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(heartbeat, "PERIOD", 0.01)
+    words = [word for word in TRAIN if word != "--no-progress"]
+    told = pop("train", shared_capture, "--out", tmp_path / "r", *words)
+    assert told.status == 0
+    steps = [line for line in told.err.splitlines() if line.startswith("pop: step ")]
+    assert steps
+    assert all(" of 30, " in line and " Gaussians" in line and line.endswith(" s)") for line in steps)
+    assert pop("train", shared_capture, "--out", tmp_path / "q", *TRAIN).err == ""
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(0.4, "0 s"), (59.4, "59 s"), (59.6, "1 min 0 s"), (3599, "59 min 59 s"), (7860, "2 h 11 min")],
+)
+def test_times_are_written_as_people_say_them(seconds: float, words: str) -> None:
+    assert duration(seconds) == words

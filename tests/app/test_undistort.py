@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy.spatial.transform import Rotation
 
+from pop_fast.api.rasterize import rasterization
+from pop_fast.data import apply_similarity, load_capture, to_capture_frame
+from pop_fast.data.normalize import normalizing_transform, transform_points, transform_viewmats
+from pop_fast.data.similarity import rotate_sh
 from pop_fast.data.undistort import intrinsics, undistortion
-from tests.app.captures import camera, photograph
+from pop_fast.errors import PopError
+from pop_fast.stages.covariance import covars_from_quats_scales
+from pop_fast.stages.harmonics import colors_from_sh, sh_basis
+from tests.app.captures import assert_one_line, camera, cloud, colmap_capture, look_at, photograph, ring
 
 W, H = 64, 48
 PINHOLE_TERMS = {
@@ -190,3 +201,194 @@ def test_a_lens_that_folds_the_image_is_refused() -> None:
 def test_a_full_sphere_is_refused() -> None:
     with pytest.raises(ValueError, match="EQUIRECTANGULAR"):
         undistortion(camera("EQUIRECTANGULAR", (W, H), W, H), W, H)
+
+
+# The normalised world shows the same pictures, and splats find their way back.
+
+unit = st.floats(-1.0, 1.0, width=32)
+similarities = st.builds(
+    lambda turn, shift, exponent: similarity(turn, shift, 2.0**exponent),
+    hnp.arrays(np.float64, 3, elements=st.floats(-3.0, 3.0, width=32)),
+    hnp.arrays(np.float64, 3, elements=unit),
+    st.integers(-3, 3),
+)
+
+
+def similarity(turn: np.ndarray, shift: np.ndarray, scale: float) -> np.ndarray:
+    transform = np.eye(4)
+    transform[:3, :3] = scale * Rotation.from_rotvec(turn).as_matrix()
+    transform[:3, 3] = shift
+    return transform
+
+
+def some_params(n: int = 6, bands: int = 15) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    shapes = {
+        "means": (n, 3),
+        "scales": (n, 3),
+        "quats": (n, 4),
+        "opacities": (n,),
+        "sh0": (n, 1, 3),
+        "shN": (n, bands, 3),
+    }
+    return {k: torch.randn(shape, generator=generator, dtype=torch.float64) for k, shape in shapes.items()}
+
+
+@given(transform=similarities)
+def test_a_moved_world_seen_from_moved_cameras_is_the_same_picture(transform: np.ndarray) -> None:
+    viewmats, (points, _) = ring(3), cloud()
+    scale = np.cbrt(np.linalg.det(transform[:3, :3]))
+    moved, at = transform_viewmats(transform, viewmats), transform_points(transform, points)
+    for before, after in zip(viewmats, moved, strict=True):
+        R = after[:3, :3]
+        assert np.abs(R @ R.T - np.eye(3)).max() < 1e-12
+        assert np.linalg.det(R) > 0.0
+        assert after[3].tolist() == [0.0, 0.0, 0.0, 1.0]
+        seen_before = points @ before[:3, :3].T + before[:3, 3]
+        seen_after = at @ R.T + after[:3, 3]
+        assert np.allclose(seen_after, scale * seen_before, atol=1e-9 * scale)
+
+
+def test_the_normalised_world_has_its_principal_axes_along_x_y_z_at_the_median() -> None:
+    viewmats, (points, _) = ring(8), cloud(200)
+    moved = similarity(np.array([0.4, 1.0, -0.3]), np.array([5.0, 2.0, -1.0]), 3.0)
+    viewmats, points = transform_viewmats(moved, viewmats), transform_points(moved, points)
+    transform = normalizing_transform(viewmats, points)
+    normal = transform_points(transform, points)
+    covariance = np.cov(normal, rowvar=False)
+    assert np.allclose(covariance, np.diag(np.diag(covariance)), atol=1e-12)
+    assert np.all(np.diff(np.diag(covariance)) < 0.0)
+    # more points towards the bottom: at most half of them lie above the mean height
+    assert np.median(normal[:, 2]) <= np.mean(normal[:, 2]) + 1e-12
+
+
+def test_distances_are_measured_in_median_camera_distances_from_where_they_look() -> None:
+    viewmats = np.stack([look_at((d * np.cos(a), d * np.sin(a), 0.0)) for a, d in ((0.0, 2.0), (2.0, 4.0), (4.0, 9.0))])
+    transform = normalizing_transform(viewmats, None)
+    assert np.cbrt(np.linalg.det(transform[:3, :3])) == pytest.approx(1.0 / 4.0)
+    assert np.allclose(transform_points(transform, np.zeros((1, 3))), 0.0)
+    # without points only the cameras decide: up is -y, and camera z stays in the plane
+    assert np.allclose(transform[:3, :3] @ [0.0, 0.0, 4.0], [0.0, -1.0, 0.0])
+
+
+@given(exponent=st.integers(-6, 6))
+def test_the_units_of_a_capture_do_not_matter(exponent: int) -> None:
+    viewmats, (points, _) = ring(5), cloud(50)
+    scaled = np.diag([2.0**exponent] * 3 + [1.0])
+    one = transform_points(normalizing_transform(viewmats, points), points)
+    other_points = transform_points(scaled, points)
+    other = transform_points(normalizing_transform(transform_viewmats(scaled, viewmats), other_points), other_points)
+    assert np.allclose(one, other, atol=1e-10)
+
+
+def test_cameras_at_one_place_are_refused(tmp_path: Path) -> None:
+    turning = np.stack([look_at((1.0, 0.0, 0.0), (0.0, np.sin(a), 0.1)) for a in np.linspace(-1.0, 1.0, 5)])
+    assert_one_line(lambda: normalizing_transform(turning, None), "one place")
+
+
+def test_cameras_whose_up_is_plus_y_are_turned_half_round_without_a_mirror() -> None:
+    world = similarity(np.array([-np.pi / 2, 0.0, 0.0]), np.zeros(3), 1.0)
+    viewmats = transform_viewmats(world, ring(4))
+    assert np.allclose(viewmats[:, 1, :3].mean(axis=0) / np.linalg.norm(viewmats[:, 1, :3].mean(axis=0)), [0, -1, 0])
+    transform = normalizing_transform(viewmats, None)
+    assert np.allclose(transform[:3, :3] @ [0.0, 1.0, 0.0] / np.cbrt(np.linalg.det(transform[:3, :3])), [0, -1, 0])
+    assert np.linalg.det(transform[:3, :3]) > 0.0
+
+
+def test_a_capture_remembers_how_it_was_normalised(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path)
+    own, normal = load_capture(root, normalize=False), load_capture(root)
+    assert np.allclose(transform_points(normal.world_transform, own.points), normal.points)
+    assert np.allclose(
+        transform_viewmats(normal.world_transform, np.stack([view.viewmat for view in own.views])),
+        np.stack([view.viewmat for view in normal.views]),
+    )
+    assert normal.scene_scale() == pytest.approx(own.scene_scale() * normal.world_scale)
+    centers = own.camera_centers
+    assert own.scene_scale() == pytest.approx(1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+
+
+@given(transform=similarities, direction=hnp.arrays(np.float64, 3, elements=unit))
+def test_a_moved_splat_looks_the_same_from_a_moved_camera(transform: np.ndarray, direction: np.ndarray) -> None:
+    if np.linalg.norm(direction) < 1e-3:
+        direction = np.array([0.0, 0.0, 1.0])
+    params = some_params()
+    moved = apply_similarity(params, transform)
+    linear = torch.from_numpy(np.ascontiguousarray(transform[:3, :3]))
+    scale = float(np.cbrt(np.linalg.det(transform[:3, :3])))
+    assert torch.allclose(moved["means"], params["means"] @ linear.T + torch.from_numpy(transform[:3, 3].copy()))
+    assert torch.equal(moved["opacities"], params["opacities"])
+    before = covars_from_quats_scales(params["quats"], params["scales"].exp())
+    after = covars_from_quats_scales(moved["quats"], moved["scales"].exp())
+    assert torch.allclose(after, linear @ before @ linear.T, rtol=1e-9, atol=1e-9)
+    seen = torch.from_numpy(direction).expand(6, 3)
+    colors = colors_from_sh(torch.cat([params["sh0"], params["shN"]], dim=1), seen, 3)
+    turned = colors_from_sh(torch.cat([moved["sh0"], moved["shN"]], dim=1), seen @ linear.T / scale, 3)
+    assert torch.allclose(colors, turned, atol=1e-12)
+
+
+def test_a_moved_splat_renders_to_the_same_picture() -> None:
+    params, viewmats = some_params(40), ring(2)
+    params["scales"] = params["scales"] - 2.0
+    transform = similarity(np.array([0.5, -1.0, 2.0]), np.array([3.0, -1.0, 0.5]), 2.0)
+    pictures = []
+    for splat, cameras in (
+        (params, viewmats),
+        (apply_similarity(params, transform), transform_viewmats(transform, viewmats)),
+    ):
+        image, _, _ = rasterization(
+            splat["means"],
+            splat["quats"],
+            splat["scales"].exp(),
+            splat["opacities"].sigmoid(),
+            torch.cat([splat["sh0"], splat["shN"]], dim=1),
+            torch.from_numpy(cameras),
+            torch.tensor([[36.0, 0.0, 20.0], [0.0, 36.0, 15.0], [0.0, 0.0, 1.0]], dtype=torch.float64).repeat(2, 1, 1),
+            40,
+            30,
+            sh_degree=3,
+        )
+        pictures.append(image)
+    assert pictures[0].std() > 0.05
+    assert torch.allclose(pictures[0], pictures[1], atol=1e-9)
+
+
+@given(transform=similarities)
+def test_there_and_back_again_is_where_it_was(transform: np.ndarray) -> None:
+    params = some_params()
+    back = to_capture_frame(apply_similarity(params, transform), transform)
+    for name in ("means", "scales", "opacities", "sh0", "shN"):
+        assert torch.allclose(back[name], params[name], atol=1e-9), name
+    signs = torch.sign((back["quats"] * params["quats"]).sum(dim=1, keepdim=True))
+    assert torch.allclose(back["quats"] * signs, params["quats"], atol=1e-9)
+
+
+@pytest.mark.parametrize("bands", [0, 3, 8, 15])
+def test_lower_degrees_are_turned_too_and_every_band_keeps_its_energy(bands: int) -> None:
+    sh = torch.randn(4, bands + 1, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    rotation = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
+    turned = rotate_sh(sh, rotation)
+    degree = int((bands + 1) ** 0.5) - 1
+    direction = torch.tensor([[0.6, 0.0, 0.8]], dtype=torch.float64)
+    before = sh_basis(direction, degree) @ sh
+    after = sh_basis(direction @ torch.from_numpy(rotation.T.copy()), degree) @ turned
+    assert torch.allclose(before, after, atol=1e-13)
+    for band in range(degree + 1):
+        rows = slice(band**2, (band + 1) ** 2)
+        assert torch.allclose(sh[:, rows].norm(dim=1), turned[:, rows].norm(dim=1), atol=1e-13)
+
+
+def test_dtypes_are_kept_and_the_original_is_not_touched() -> None:
+    params = {name: value.to(torch.float32) for name, value in some_params().items()}
+    copies = {name: value.clone() for name, value in params.items()}
+    moved = apply_similarity(params, similarity(np.ones(3), np.ones(3), 2.0))
+    assert all(moved[name].dtype == torch.float32 for name in params)
+    assert all(torch.equal(params[name], copies[name]) for name in params)
+
+
+@pytest.mark.parametrize(
+    "matrix", [np.diag([1.0, 1.0, -1.0, 1.0]), np.diag([1.0, 2.0, 1.0, 1.0]), np.eye(3), np.full((4, 4), np.nan)]
+)
+def test_what_is_no_similarity_is_refused(matrix: np.ndarray) -> None:
+    with pytest.raises(PopError, match="similarity"):
+        apply_similarity(some_params(), matrix)

@@ -1,34 +1,70 @@
-"""The laws over the host mirror: the CUDA kernels' mathematics, without a GPU."""
+"""What stands for a GPU: the card itself, and the kernels' own source under the emulator.
+
+The tests of `gpu/` run on both, and are skipped with the reason where one is not there; POP_CUDA_ON ("cuda",
+"emulated") chooses one. Training steps run under the emulator with every test run. The laws take minutes there;
+POP_EMULATED_LAWS=1 (`make emulate`) runs them too.
+"""
 
 from __future__ import annotations
 
-import functools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from cuda_ext.compiler import find_compiler
-
 pytest.register_assert_rewrite("pop_ref.conformance.laws")
 
-from pop_ref.conformance.backends import shipped  # noqa: E402  asserts must be rewritten first
-from pop_ref.conformance.plugin import parametrize_backends  # noqa: E402
+import cuda_ext  # noqa: E402  asserts must be rewritten first
+from cuda_ext.host import emulate  # noqa: E402
+from cuda_ext.host.library_folder import library_folder  # noqa: E402
+
+# where the emulated module is built
+FOLDER = library_folder(Path(__file__).parent / "emulated")
+# asked before an emulated module can take the extension's place
+NO_CARD = cuda_ext.why_not()
 
 
-@functools.cache
-def mirrors() -> list[Any]:
-    return [shipped("mirror64"), shipped("mirror32")]
+@pytest.fixture
+def card() -> Any:
+    """Return the GPU as a device, or skip with the reason why there is none."""
+    import torch
+
+    if NO_CARD is not None:
+        pytest.skip(NO_CARD)
+    return torch.device("cuda")
 
 
-def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    # the folder of tests that need a GPU has backends of its own
-    if "backend" not in metafunc.fixturenames or metafunc.definition.path.parent != Path(__file__).parent:
-        return
-    if find_compiler() is None:
-        mark = pytest.mark.skip(reason="no C++ compiler: the host mirror cannot be built (install g++ or set CXX)")
-        metafunc.parametrize("backend", [pytest.param(None, id="mirror", marks=[mark])])
-        return
-    # in double the mirror is the oracle to 1e-12, for which the laws are proved already; float has to stand by itself
-    agreement = metafunc.cls is not None and metafunc.cls.__name__ == "TestAgreement"
-    parametrize_backends(metafunc, mirrors() if agreement else mirrors()[1:])
+@pytest.fixture
+def emulated_card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Return the device of the emulated GPU, or skip with the reason why there is none."""
+    import torch
+
+    reason = emulate.why_not()
+    if reason is not None:
+        pytest.skip(reason)
+    emulate.install(monkeypatch, emulate.build(FOLDER))
+    # threads of the CPU run that is compared with are not what is tested
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield torch.device("cpu")
+    torch.set_num_threads(before)
+
+
+def emulated_engine() -> Any:
+    """Return the emulated GPU, once it is installed, as `pop train` takes one."""
+    import torch
+
+    from pop_fast.api.registry import get_backend
+    from pop_fast.train.fused_stepper import FusedStepper
+    from pop_fast.train.gpu_proxy import GpuProxy
+    from pop_fast.train.stepper import Engine, Task
+
+    device, cuda = torch.device("cpu"), get_backend("cuda")
+    step = cuda.whole_step()
+    assert step is not None
+
+    def stepper(task: Task) -> FusedStepper:
+        return FusedStepper(task, step.name, step.most, step.make(task))
+
+    return Engine("cuda", device, GpuProxy(cuda, device), stepper, lambda: {"gpu": "emulated"})

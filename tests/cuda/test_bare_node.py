@@ -25,7 +25,7 @@ from tests.cuda.bare_node import (
     make_bare_node,
     stand_in_gsplat,
 )
-from tests.cuda.emulated.conftest import FOLDER
+from tests.cuda.conftest import FOLDER
 
 ROOT = Path(__file__).resolve().parents[2]
 WHEELS = ("plyfile", "tyro", "typeguard", "docstring_parser", "typing_extensions")

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -14,7 +17,9 @@ import cuda_ext
 from cuda_ext import build as build_module
 from cuda_ext.build import BuildError
 from cuda_ext.machine_code.check_ptxas import KernelUse, as_table, offenders, parse_ptxas
+from cuda_ext.render.capacity import GROWTH, MOST, Capacity
 from cuda_ext.toolkit import find_nvcc
+from cuda_ext.training.graphs import Watch, captured
 
 PTXAS = """
 ptxas info    : Compiling entry function '_ZN3pop20blend_forward_kernelE' for 'sm_90'
@@ -211,3 +216,261 @@ def test_the_blend_kernels_compile_for_turing_without_spills():
     from cuda_ext.machine_code.check_ptxas import check
 
     assert offenders(check(["sm_75"], only="blend")) == []
+
+
+# Room for instances follows the need: no overflow at once, no memory kept for a phase that is over, no thrashing.
+
+BIG, SMALL = (1000, 800), (500, 400)
+
+
+def drawn(capacity, counts):
+    for view, count in enumerate(counts):
+        capacity.note(view, count)
+
+
+def of_one_view(instances: int) -> Capacity:
+    """Return what is known after a step of 1,000 Gaussians had so many instances."""
+    capacity = Capacity([BIG])
+    capacity.settle(1000)
+    capacity.note(0, instances)
+    return capacity
+
+
+def test_the_first_room_is_a_guess_and_never_nothing():
+    capacity = Capacity([BIG])
+    capacity.settle(1000)
+    assert capacity.room(BIG) == 8000
+    nobody = Capacity([BIG])
+    nobody.settle(0)
+    assert nobody.room(BIG) == 1024
+
+
+def test_after_a_phase_of_fat_splats_the_room_shrinks_to_what_is_needed():
+    capacity = Capacity([BIG] * 3)
+    capacity.settle(1000)
+    assert capacity.overflowed(1, 90_000) == BIG
+    assert capacity.room(BIG) == pytest.approx(GROWTH * 90_000, abs=1)
+    drawn(capacity, [2000, 3000, 1000])
+    assert capacity.room(BIG) == pytest.approx(GROWTH * 90_000, abs=1)
+    capacity.settle(1000)
+    assert capacity.room(BIG) == pytest.approx(GROWTH * 3000, abs=1)
+
+
+def test_the_heaviest_view_counts_although_the_last_window_passed_it_by():
+    capacity = Capacity([BIG] * 3)
+    capacity.settle(1000)
+    capacity.room(BIG)
+    drawn(capacity, [2000, 9000, 1000])
+    for _ in range(5):
+        capacity.note(0, 2000)
+        capacity.settle(1000)
+    assert capacity.room(BIG) >= 9000 * 1.2
+
+
+def test_a_need_that_varies_a_little_moves_no_memory():
+    capacity = of_one_view(10_000)
+    capacity.settle(1000)
+    rooms = set()
+    for count in (10_500, 9500, 11_000, 8000, 12_000, 10_000) * 5:
+        capacity.note(0, count)
+        capacity.settle(1000)
+        rooms.add(capacity.room(BIG))
+        assert capacity.room(BIG) >= 1.2 * count
+    assert len(rooms) == 1
+
+
+def test_a_population_that_doubles_has_room_before_it_overflows():
+    capacity = of_one_view(10_000)
+    capacity.settle(2000)
+    assert capacity.room(BIG) >= 20_000 * 1.2
+
+
+def test_a_room_that_would_overflow_soon_grows_before_it_does():
+    capacity = Capacity([BIG])
+    capacity.settle(1000)
+    capacity.overflowed(0, 10_000)
+    capacity.note(0, 14_900)
+    capacity.settle(1000)
+    assert capacity.room(BIG) == pytest.approx(GROWTH * 14_900, abs=1)
+
+
+def test_every_size_has_a_room_of_its_own_and_a_new_size_is_judged_by_its_pixels():
+    capacity = Capacity([BIG, BIG, SMALL])
+    capacity.settle(1000)
+    capacity.room(BIG)
+    drawn(capacity, [40_000, 20_000])
+    capacity.settle(1000)
+    assert capacity.room(BIG) == pytest.approx(GROWTH * 40_000, abs=1)
+    assert capacity.room(SMALL) == pytest.approx(GROWTH * 10_000, abs=1)
+    assert capacity.overflowed(2, 30_000) == SMALL
+    assert capacity.room(SMALL) == pytest.approx(GROWTH * 30_000, abs=1)
+    assert capacity.room(BIG) == pytest.approx(GROWTH * 40_000, abs=1)
+
+
+def test_a_need_beyond_the_kernels_numbers_stays_what_it_is_and_one_below_gets_what_there_is():
+    capacity = Capacity([BIG])
+    capacity.settle(1000)
+    capacity.overflowed(0, MOST - 5)
+    assert capacity.room(BIG) == MOST
+    capacity.overflowed(0, 2**31 - 1)
+    assert capacity.room(BIG) == 2**31 - 1
+
+
+def test_what_a_doubled_population_may_need_is_not_refused_before_it_is_needed():
+    capacity = Capacity([BIG])
+    capacity.settle(1000)
+    capacity.note(0, MOST - 5)
+    capacity.settle(2000)
+    assert capacity.room(BIG) == MOST
+
+
+# What captures steps and fetches flags, with a recorder in torch's place: order, errors, the collector.
+
+
+class Recorder:
+    """Stands in for the parts of `torch.cuda` that are used, and notes what is asked of them."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+        self.stream = self._stream("here")
+        self.fails_at_end: Exception | None = None
+
+    def _stream(self, name):
+        return SimpleNamespace(name=name, wait_stream=lambda other: self.asked.append(f"{name} waits for {other.name}"))
+
+    def current_stream(self, device):
+        return self.stream
+
+    def Stream(self, device):
+        return self._stream("aside")
+
+    @contextmanager
+    def in_stream(self, stream):
+        before, self.stream = self.stream, stream
+        try:
+            yield
+        finally:
+            self.stream = before
+
+    def CUDAGraph(self):
+        def begin(capture_error_mode):
+            self.asked.append(f"begin in {self.stream.name}, {capture_error_mode}")
+
+        def end():
+            self.asked.append(f"end in {self.stream.name}")
+            if self.fails_at_end is not None:
+                raise self.fails_at_end
+
+        return SimpleNamespace(capture_begin=begin, capture_end=end, replay=lambda: self.asked.append("replay"))
+
+
+@pytest.fixture
+def cuda(monkeypatch):
+    recorder = Recorder()
+    for name in ("current_stream", "Stream", "CUDAGraph"):
+        monkeypatch.setattr(torch.cuda, name, getattr(recorder, name))
+    monkeypatch.setattr(torch.cuda, "stream", recorder.in_stream)
+    return recorder
+
+
+def test_a_step_is_captured_aside_and_replayed_where_it_is_asked_for(cuda):
+    def launch():
+        cuda.asked.append(f"launch in {cuda.stream.name}")
+
+    again = captured(launch, torch.device("cuda"))
+    assert cuda.asked == [
+        "aside waits for here",
+        "begin in aside, thread_local",
+        "launch in aside",
+        "end in aside",
+        "here waits for aside",
+    ]
+    again()
+    assert cuda.asked[-1] == "replay"
+
+
+def test_no_older_graph_is_collected_while_one_is_captured(cuda):
+    class Older:
+        def __del__(self):
+            cuda.asked.append("freed")
+
+    older = Older()
+    older.cycle = older
+    del older
+    was_on: list[bool] = []
+
+    def launch():
+        was_on.append(gc.isenabled())
+        # enough new containers for the collector to start, if it were on
+        [[] for _ in range(100_000)]
+
+    gc.enable()
+    captured(launch, torch.device("cuda"))
+    assert was_on == [False]
+    assert gc.isenabled()
+    middle = cuda.asked[cuda.asked.index("begin in aside, thread_local") : cuda.asked.index("end in aside")]
+    assert "freed" not in middle
+
+
+def test_the_first_of_two_errors_is_told_with_what_to_do(cuda):
+    cuda.fails_at_end = RuntimeError("operation failed due to a previous error during capture")
+
+    def launch():
+        raise RuntimeError("CUDA: cudaMalloc is not permitted when stream is capturing")
+
+    with pytest.raises(RuntimeError, match=r"cannot be captured.*cudaMalloc is not permitted.*replay=False"):
+        captured(launch, torch.device("cuda"))
+    assert cuda.asked[-1] == "end in aside"
+    assert gc.isenabled()
+    assert cuda.stream.name == "here"
+
+
+def test_flags_come_in_the_order_of_the_steps_and_no_copy_is_overwritten_before_it_is_read(monkeypatch):
+    waited: list[int] = []
+
+    class Event:
+        def __init__(self):
+            self.number = len(events)
+            events.append(self)
+
+        def record(self, stream):
+            assert stream == "the state's"
+
+        def synchronize(self):
+            waited.append(self.number)
+
+    events: list[Event] = []
+    empty = torch.empty
+    monkeypatch.setattr(torch, "empty", lambda shape, dtype, pin_memory: empty(shape, dtype=dtype))
+    monkeypatch.setattr(torch.cuda, "Event", Event)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: "the state's")
+    state = torch.zeros(2, dtype=torch.int32)
+    watch = Watch(state, 3)
+    found = []
+    for step in range(10):
+        state.fill_(step)
+        watch.post()
+        if len(watch) == 3:
+            with pytest.raises(RuntimeError, match="3 copies of the flags are on their way"):
+                watch.post()
+            found.append(watch.take()[0])
+    while watch:
+        found.append(watch.take()[0])
+    assert found == list(range(10))
+    assert waited == [k % 3 for k in range(10)]
+
+
+@pytest.mark.parametrize(("reason", "first"), [(None, ["graph", "other"]), ("no GPU", ["other", "graph"])])
+def test_graph_tests_go_first_where_there_is_a_gpu(monkeypatch, reason, first):
+    import cuda_ext
+    from tests.cuda.gpu.conftest import FOLDER, pytest_collection_modifyitems
+
+    def item(name, folder=FOLDER):
+        return SimpleNamespace(name=name, path=folder / "test.py", get_closest_marker=lambda kind: name == kind or None)
+
+    monkeypatch.setattr(cuda_ext, "why_not", lambda: reason)
+    items = [item("other"), item("graph"), item("graph", FOLDER.parent / "emulated")]
+    emulated = items[2]
+    pytest_collection_modifyitems(items)
+    assert [each.name for each in items[:2]] == first
+    assert items[2] is emulated

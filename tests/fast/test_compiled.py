@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import dedent
+from types import ModuleType
 
 import pytest
 import torch
@@ -15,10 +17,19 @@ from torch import Tensor
 from pop_fast import compiled
 from pop_fast.api.checks import check_sizes
 from pop_fast.api.registry import get_backend
+from pop_fast.compiled import splatting as in_cpp
+from pop_fast.density.passes import Passes
+from pop_fast.stages import splatting
 from pop_fast.stages.compositing import Composite
 from pop_fast.stages.compositing import composite as composite_in_torch
+from pop_fast.stages.contributions import contributions
+from pop_fast.stages.fisher import screen_moments
+from pop_fast.stages.sensitivity import sensitivities
+from pop_fast.stages.splatting import ProjectionSettings
+from pop_fast.stages.splatting import Splats as Rows
 from pop_fast.stages.tiles import TileLists, tile_lists
-from pop_ref.constants import INRIA, PAPER, Profile
+from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER, PROFILES, Profile
+from tests.fast.pass_scenes import raw_params, views
 
 pytestmark = pytest.mark.skipif(not compiled.available(), reason=compiled.why_not() or "")
 
@@ -281,3 +292,221 @@ def test_no_splat_on_the_screen_makes_empty_lists() -> None:
     lists = native_lists(given.means2d, torch.zeros(5, 2, dtype=torch.int32), torch.ones(5), WIDTH, HEIGHT, 8)
     assert len(lists.ids) == 0
     assert lists.offsets.tolist() == [0] * (6 * 5 + 1)
+
+
+# The compiled sums over pixels beside torch's: any tile size, long lists, clamped alphas, any number of threads.
+
+BACKGROUND = torch.tensor([0.3, 0.1, 0.2], dtype=torch.float64)
+PIXEL_MAP = torch.rand(HEIGHT, WIDTH, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+
+
+def as_splats(drawn: Splats) -> Rows:
+    n, dtype = len(drawn.means2d), drawn.means2d.dtype
+    radii = torch.ones((n, 2), dtype=torch.int32)
+    return Rows(drawn.means2d, torch.zeros(n, dtype=dtype), drawn.conics, drawn.opacities, radii, None, drawn.colors)
+
+
+def sums(functions: tuple[Callable, Callable, Callable], drawn: Splats, profile: Profile) -> dict[str, Tensor]:
+    """Take all sums of a view."""
+    of_view = (as_splats(drawn), drawn.lists, WIDTH, HEIGHT, drawn.lists.tile_size)
+    contributions, sensitivities, screen_moments = functions
+    found = contributions(*of_view, PIXEL_MAP, profile)
+    return {
+        **{name: getattr(found, name) for name in ("weight_sum", "n_pixels", "map_sum", "distance_sum")},
+        "sensitivities": sensitivities(*of_view, BACKGROUND, profile),
+        "moments": screen_moments(*of_view, BACKGROUND, profile),
+    }
+
+
+def passes_native() -> tuple[Callable, Callable, Callable]:
+    stages = get_backend("compiled").stages()
+    return stages.contributions, stages.sensitivities, stages.screen_moments
+
+
+def passes_assert_as_in_torch(drawn: Splats, profile: Profile = PAPER) -> None:
+    mine = sums(passes_native(), drawn, profile)
+    its = sums((contributions, sensitivities, screen_moments), drawn, profile)
+    for name, expected in its.items():
+        # a column of moments at a time: their units differ
+        size = expected.double().abs().amax(0)
+        assert float(size.min()) > 0.0, name
+        assert float(((mine[name] - expected).abs() / size).max()) < 1e-12, name
+
+
+@pytest.mark.parametrize("tile_size", [1, 4, 5, 8, 16, 64])
+def test_any_tile_size_sums_as_in_torch(tile_size: int) -> None:
+    passes_assert_as_in_torch(splats(tile_size))
+
+
+@pytest.mark.parametrize("profile", CEILINGS, ids=["paper", "low ceiling, no gradient", "low ceiling, passed through"])
+def test_clamped_alphas_sum_as_in_torch(profile: Profile) -> None:
+    passes_assert_as_in_torch(splats(16), profile)
+
+
+def test_lists_longer_than_a_chunk_sum_as_in_torch() -> None:
+    drawn = splats(16, n=900)
+    assert int(drawn.lists.lengths.max()) > 200
+    passes_assert_as_in_torch(replace(drawn, opacities=0.05 * drawn.opacities + 0.01))
+
+
+def test_the_scores_of_a_tile_size_are_those_of_any_other() -> None:
+    small, large = (sums(passes_native(), splats(size), PAPER) for size in (4, 32))
+    for name, expected in large.items():
+        size = expected.double().abs().amax(0)
+        assert float(((small[name] - expected).abs() / size).max()) < 1e-12, name
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_any_number_of_threads_gives_the_same_bits(profile: str) -> None:
+    params, before = raw_params(400, torch.float32), torch.get_num_threads()
+    pixel_map = torch.rand(22, 37, generator=torch.Generator().manual_seed(9))
+
+    def found(threads: int) -> list[Tensor]:
+        torch.set_num_threads(threads)
+        try:
+            made = Passes("compiled", views(torch.float32), profile, (0.1, 0.2, 0.3))
+            all_sums = made.contributions(params, 0, 3, pixel_map)
+            names = ("weight_sum", "n_pixels", "map_sum", "distance_sum", "dominant_counts", "image")
+            rest = [made.sensitivities(params, 0, 3), made._open(made._shot(params, 0, 3))._moments()]
+            return [*(getattr(all_sums, name) for name in names), *rest, *made.dominant_points(params, 0, 3)]
+        finally:
+            torch.set_num_threads(before)
+
+    one = found(1)
+    for threads in (2, 3, 5):
+        assert all(torch.equal(a, b) for a, b in zip(one, found(threads), strict=True))
+
+
+def test_an_empty_view_sums_to_nothing() -> None:
+    drawn = splats(16)
+    nothing = TileLists(drawn.lists.ids[:0], torch.zeros_like(drawn.lists.offsets), 16, 3, 3)
+    for name, total in sums(passes_native(), replace(drawn, lists=nothing), PAPER).items():
+        assert not bool(total.any()), name
+
+
+def test_lists_of_another_grid_are_refused() -> None:
+    drawn = splats(16)
+    for stage in passes_native():
+        with pytest.raises(ValueError, match="45 x 38 px in tiles of 8 px are 6 x 5"):
+            stage(as_splats(drawn), drawn.lists, WIDTH, HEIGHT, 8)
+
+
+def test_moments_take_three_channels() -> None:
+    drawn = splats(16, channels=2)
+    with pytest.raises(ValueError, match="2 colour channels"):
+        passes_native()[2](as_splats(drawn), drawn.lists, WIDTH, HEIGHT, 16)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 5])
+def test_sensitivities_take_any_number_of_channels(channels: int) -> None:
+    drawn = splats(16, channels=channels)
+    background = torch.linspace(0.1, 0.5, channels, dtype=torch.float64)
+    of_view = (as_splats(drawn), drawn.lists, WIDTH, HEIGHT, 16, background)
+    torch.testing.assert_close(passes_native()[1](*of_view), sensitivities(*of_view), rtol=1e-12, atol=1e-14)
+    with pytest.raises(ValueError, match="background has shape"):
+        passes_native()[1](*of_view[:-1], torch.zeros(channels + 1, dtype=torch.float64))
+
+
+# Covariances, projection and colours of the compiled library beside those of torch; the laws judge whole images.
+
+
+def projected(stages: ModuleType, profile: Profile, antialiased: bool, n: int = 3000) -> tuple[list[Tensor], ...]:
+    """Project Gaussians around a camera, and pull a cotangent of all that is shown back to everything."""
+    generator = torch.Generator().manual_seed(1)
+
+    def normal(*size: int) -> Tensor:
+        return torch.randn(size, generator=generator, dtype=torch.float64)
+
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3], viewmat[2, 3] = torch.linalg.qr(normal(3, 3)).Q, 3.0
+    inputs = [2.0 * normal(n, 3), normal(n, 4), torch.exp(normal(n, 3) - 2.0), torch.sigmoid(normal(n)), viewmat]
+    leaves = [tensor.requires_grad_() for tensor in inputs]
+    means, quats, scales, opacities, viewmat = leaves
+    K = torch.tensor([[40.0, 0.0, 21.0], [0.0, 37.0, 20.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    view = ProjectionSettings(K, WIDTH, HEIGHT, profile, antialiased)
+    found = stages.project(means, stages.covariances(quats, scales), opacities, viewmat, view)
+    shown = (found.radii > 0).all(1)
+    names = ["means2d", "depths", "conics", "opacities", *(["compensations"] if antialiased else [])]
+    values = [getattr(found, name)[shown] for name in names]
+    gradients = torch.autograd.grad(values, leaves, [normal(*value.shape) for value in values])
+    return [found.radii], [value.detach() for value in values], [*gradients]
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("profile", [PAPER, GSPLAT_1_6, INRIA], ids=lambda profile: profile.name)
+def test_projections_are_those_of_torch(profile: Profile, antialiased: bool) -> None:
+    (mine, my_values, my_gradients), (its, values, gradients) = (
+        projected(stages, profile, antialiased) for stages in (in_cpp, splatting)
+    )
+    assert torch.equal(mine[0], its[0])
+    assert 1000 < int((its[0] > 0).all(1).sum()) < 2500
+    for found, expected in zip((*my_values, *my_gradients), (*values, *gradients), strict=True):
+        torch.testing.assert_close(found, expected, rtol=0.0, atol=1e-12 * float(expected.abs().max()))
+
+
+def test_the_cameras_gradient_does_not_depend_on_the_number_of_threads() -> None:
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 5):
+            torch.set_num_threads(threads)
+            results.append(projected(in_cpp, PAPER, antialiased=False)[2])
+    finally:
+        torch.set_num_threads(before)
+    for others in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], others, strict=True))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_colours_of_a_view_are_those_of_torch(degree: int) -> None:
+    generator = torch.Generator().manual_seed(5)
+    # more than a thread takes at a time, coefficients of bands that are not evaluated, colours under 0
+    n = 3000
+    sh = torch.randn(n, 16, 3, generator=generator, dtype=torch.float64)
+    means = torch.randn(n, 3, generator=generator, dtype=torch.float64)
+    viewmat = torch.linalg.qr(torch.randn(4, 4, generator=generator, dtype=torch.float64))[0]
+    visible = (torch.rand(n, generator=generator) < 0.7).nonzero().squeeze(1)
+    v_colors = torch.randn(n, 3, generator=generator, dtype=torch.float64)
+    results = []
+    for stage in (splatting.colors_of_view, in_cpp.colors_of_view):
+        leaves = [tensor.clone().requires_grad_() for tensor in (sh, means, viewmat)]
+        colors = stage(*leaves, degree, visible)
+        results.append([colors.detach(), *torch.autograd.grad(colors, leaves, v_colors)])
+    assert bool((results[0][0] == 0.0).all(1).any())
+    assert bool((results[0][0][visible] == 0.0).any())
+    for its, mine in zip(*results, strict=True):
+        torch.testing.assert_close(mine, its, rtol=0.0, atol=1e-12 * max(1.0, float(its.abs().max())))
+
+
+@pytest.mark.parametrize("shown", [[], [0], [6], [2, 3]])
+def test_gradients_of_unseen_gaussians_are_zero(shown: list[int]) -> None:
+    sh, means = torch.ones(7, 4, 3, requires_grad=True), torch.rand(7, 3, requires_grad=True)
+    colors = in_cpp.colors_of_view(sh, means, torch.eye(4), 1, torch.tensor(shown, dtype=torch.int64))
+    v_sh, v_means = torch.autograd.grad(colors.sum(), (sh, means))
+    assert v_sh.flatten(1).any(1).nonzero().squeeze(1).tolist() == shown
+    assert set(v_means.any(1).nonzero().squeeze(1).tolist()) <= set(shown)
+    assert bool(v_means.isfinite().all())
+
+
+MASK = torch.tensor([True, False, True])
+
+
+@pytest.mark.parametrize(
+    ("visible", "words"),
+    [
+        (
+            MASK,
+            r"is a tensor of torch.bool and shape \[3\]; .* of a mask these are mask.nonzero\(\).squeeze\(1\)",
+        ),
+        (MASK.nonzero(), r"shape \[2, 1\]; it must hold the numbers of the rows to evaluate, torch.int64 \[V\]"),
+        (torch.tensor([0, 2], dtype=torch.int32), "visible is a tensor of torch.int32"),
+        (torch.tensor([0, 3]), "visible names row 0 to 3; there are 3"),
+        (torch.tensor([-1, 2]), "visible names row -1 to 2; there are 3"),
+    ],
+    ids=["mask", "columns", "int32", "beyond", "negative"],
+)
+def test_rows_that_are_none_are_refused_before_they_are_read(visible: Tensor, words: str) -> None:
+    sh, means = torch.ones(3, 4, 3), torch.ones(3, 3)
+    with pytest.raises(ValueError, match=words):
+        in_cpp.colors_of_view(sh, means, torch.eye(4), 1, visible)
+    shown = in_cpp.colors_of_view(sh, means, torch.eye(4), 1, MASK.nonzero().squeeze(1))
+    assert (shown != 0.0).any(1).tolist() == MASK.tolist()

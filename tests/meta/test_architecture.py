@@ -23,7 +23,7 @@ ORACLE = [p for p in sorted((ROOT / "pop_ref").glob("*.py")) if p.name != "__ini
 STAGES = {p.stem for p in ORACLE}
 # values without a formula, which every engine takes its defaults from
 VALUES = {"pop_ref.constants", "pop_ref.settings", "pop_ref.recipes"}
-SHARED_WITH_FAST = VALUES | {"pop_ref.notation", "pop_ref.records"}
+SHARED_WITH_FAST = VALUES | {"pop_ref.notation", "pop_ref.records", "pop_ref.registry"}
 # rooms of the program whose work is to show what the oracle does
 SHOW_THE_ORACLE = (
     "pop_fast/view/explain/",
@@ -110,11 +110,11 @@ def test_the_course_adds_the_kit_and_what_the_kit_needs_and_is_used_by_its_comma
     assert course
     for path in course:
         assert not _foreign(path, {"numpy", "pop_ref", "hypothesis"}), _name(path)
-    # by the script that records two trainings of its toy for a page, by the chapter that shows a whole training, and by
-    # the fuzzer, which damages a student's files
+    # by the chapter that shows a whole training, by pages, which fold what a student may write, and by the fuzzer,
+    # which damages a student's files
     users = (
         "pop_fast/cli/learn.py",
-        "pop_ref/walkthrough/widgets/record.py",
+        "pop_ref/walkthrough/builder/chapter.py",
         "pop_ref/walkthrough/chapter_00_one_picture.py",
         "benchmarks/faults/corpus.py",
         "benchmarks/faults/readers.py",
@@ -297,8 +297,9 @@ def _too_long(path: Path) -> Iterator[str]:
     text = path.read_text(encoding="utf-8")
     # the prose of a chapter is a page's, and no code
     lines = sum(not (line.startswith("#") and path.name.startswith("chapter_")) for line in text.splitlines())
-    # a module holds one idea, and is not cut by length; beyond this there are surely two
-    if lines > 450:
+    # a module holds one idea, and is not cut by length; beyond this there are surely two. A file of tests is read
+    # a test at a time, and has all of its module
+    if lines > (600 if path.name.startswith("test_") else 450):
         yield f"{_name(path)} has {lines} lines; split it by what it is about"
     for node in ast.walk(_tree(path)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
@@ -404,3 +405,81 @@ def test_what_the_program_prints_is_in_megabytes() -> None:
     assert found == []
     # the search sees what it is about
     assert any("MB" in text for text in _printed(ROOT / "pop_fast" / "cli" / "export.py"))
+
+
+# What words in backticks name is there: modules, what lies in them, and files of source.
+
+ALL_ROOMS = ("pop_ref", "pop_fast", "cuda_ext", "paper_repro", "benchmarks", "tests", "docs")
+SOURCES = (".py", ".h", ".cuh", ".cu", ".cpp")
+ALL_FILES = [
+    path
+    for room in ALL_ROOMS
+    for path in (ROOT / room).rglob("*")
+    if path.suffix in (*SOURCES, ".md") and not {"results", "build", "corpus", Path(__file__).name} & set(path.parts)
+]
+DOTTED = re.compile(r"`((?:pop_ref|pop_fast|cuda_ext|paper_repro|benchmarks|tests)(?:\.\w+)+)(?:\(\))?`")
+FILE = re.compile(r"`(\w+\.(?:py|h|cuh|cu|cpp))`")
+# a sentence that sends its reader to one word
+SENT_TO = re.compile(r"(?:[Ss]ee|\b(?:is|are|stands?) in|step of) `([a-z_]+)`")
+# of any number, in words on how files are called
+PATTERNS = {"chapter_NN_short_name.py"}
+
+
+@cache
+def text_of(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+@cache
+def names_of_files() -> frozenset[str]:
+    return frozenset(path.name for path in ALL_FILES)
+
+
+@cache
+def named() -> frozenset[str]:
+    """Return what a word can send its reader to: files, folders, and what is defined in Python or C++."""
+    defined = re.compile(r"\b(?:def|class|struct|void|auto|Real|T|int|bool)\s+(\w+)")
+    words = {word for path in ALL_FILES if path.suffix in SOURCES for word in defined.findall(text_of(path))}
+    return frozenset(words | {path.stem for path in ALL_FILES} | {path.parent.name for path in ALL_FILES})
+
+
+def is_there(dotted: str) -> bool:
+    """Tell whether a module of that name is in the tree, or the longest part of it that is one has the rest."""
+    parts = dotted.split(".")
+    for length in range(len(parts), 0, -1):
+        place = ROOT.joinpath(*parts[:length])
+        module = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+        if module.is_file() or place.is_dir():
+            text = text_of(module) if module.is_file() else ""
+            return all(re.search(rf"\b{part}\b", text) for part in parts[length:])
+    return False
+
+
+def missing(path: Path, text: str) -> Iterator[str]:
+    yield from (found for found in DOTTED.findall(text) if not is_there(found))
+    yield from (found for found in FILE.findall(text) if found not in names_of_files() | PATTERNS)
+    for found in SENT_TO.findall(text):
+        # a parameter is explained by its neighbours, and a setting stands as a text
+        here = rf"[(,]\s*{found}[,:=)]|[\"']{found}[\"']"
+        if path.suffix in SOURCES and found not in named() and not re.search(here, text):
+            yield found
+
+
+def test_what_is_named_in_backticks_is_there() -> None:
+    gone = {str(path.relative_to(ROOT)): list(missing(path, text_of(path))) for path in ALL_FILES}
+    assert not {path: names for path, names in gone.items() if names}
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "The arithmetic is in `blender`.",
+        "Optimizations: see `blender`; what is kept",
+        "a step of `blender` at a time",
+        "See `pop_fast.stages.blender`.",
+        "`pop_ref.training.no_such_step` has it",
+        "as in `tile_of_old.h`",
+    ],
+)
+def test_a_name_of_nothing_is_noticed(words: str) -> None:
+    assert list(missing(ROOT / "pop_fast" / "stages" / "compositing.py", words))

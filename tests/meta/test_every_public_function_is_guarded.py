@@ -151,11 +151,11 @@ LAWS = {
     "tiles.tile_lists": "tiles:lists_run_front_to_back_and_equal_depths_keep_index_order",
 }
 TESTS = {
-    "optimizer.is_updated": "test_updates.test_a_step_that_edits_the_population_moves_nothing_in_inrias_loop",
-    "optimizer.update_numbers": "test_updates.test_taming_moves_upper_bands_each_16_steps_and_opacities_until_15_000",
-    "taming.taming_scores": "test_taming.test_scores_of_a_population_add_over_views_that_are_rendered_and_weighed",
-    "fisher.screen_moments": "test_fisher.test_the_view_direction_counts_and_channels_do_not_leak_into_each_other",
-    "fisher.fisher_blocks": "test_fisher.test_the_view_direction_counts_and_channels_do_not_leak_into_each_other",
+    "optimizer.is_updated": "test_density.test_a_step_that_edits_the_population_moves_nothing_in_inrias_loop",
+    "optimizer.update_numbers": "test_density.test_taming_moves_upper_bands_each_16_steps_and_opacities_until_15_000",
+    "taming.taming_scores": "test_methods.test_scores_of_a_population_add_over_views_that_are_rendered_and_weighed",
+    "fisher.screen_moments": "test_methods.test_the_view_direction_counts_and_channels_do_not_leak_into_each_other",
+    "fisher.fisher_blocks": "test_methods.test_the_view_direction_counts_and_channels_do_not_leak_into_each_other",
     "density_config.densifies_at": SCHEDULE,
     "density_config.resets_at": SCHEDULE,
     "density_config.blurs_at": "test_density.test_split_only_blur_splits_small_ones_and_may_clone_them_as_well",
@@ -164,9 +164,9 @@ TESTS = {
     "appearance.color_correct": "test_appearance.test_correction_takes_back_gain_and_offset_by_channel",
     "appearance.over_background": "test_appearance.test_a_photograph_over_another_background_is_as_if_laid_over_it",
     "appearance.background_at": "test_appearance.test_the_stream_is_splitmix64_by_its_published_numbers",
-    "refinement.rotmat_from_vector": "test_refinement.test_a_rotation_is_the_exponential_of_its_generator",
-    "refinement.without_common_motion": "test_refinement.test_what_is_taken_out_is_orthogonal_to_what_is_left",
-    "refinement.refined_viewmat": "test_refinement.test_a_corrected_camera_is_rigid_and_moves_points_in_its_own_axes",
+    "refinement.rotmat_from_vector": "test_appearance.test_a_rotation_is_the_exponential_of_its_generator",
+    "refinement.without_common_motion": "test_appearance.test_what_is_taken_out_is_orthogonal_to_what_is_left",
+    "refinement.refined_viewmat": "test_appearance.test_a_corrected_camera_is_rigid_and_moves_points_in_its_own_axes",
     "ssim.gaussian_window": "test_losses.test_window_is_the_impulse_response_of_scipys_gaussian_filter",
     "ssim.ssim_map": "test_losses.test_ssim_of_equal_images_is_one_and_is_its_maximum",
     "ssim.replace_left_out": "test_losses.test_l1_at_equality_has_the_mean_of_its_one_sided_slopes",
@@ -194,6 +194,7 @@ DOCTESTS = (
     "depth.expected_depth_vjp",
     "depth.with_depth_channel",
     *("constants.profile_named", "notation.symbol_named", "magnitudes.distance", "magnitudes.colors_magnitudes"),
+    *("methods.scripted_steps", "methods.method_settings"),
     *("loss_magnitudes.d_ssim_magnitudes", "loss_magnitudes.pixelwise_magnitudes"),
 )
 

@@ -107,11 +107,11 @@ def without_packed(means: Any, quats: Any, scales: Any, opacities: Any, colors: 
 REFUSALS: dict[str, Callable[..., Any]] = {
     "not implemented": _refuses_packed(lambda: _raises(NotImplementedError("packed"))),
     "a ValueError by a statement": _refuses_packed(lambda: _raises(ValueError("packed=True is not for me"))),
-    "an assertion": _refuses_packed(_asserts),
     "words of compiled code": _refuses_packed(lambda: _raises(RuntimeError("packed mode is not supported"))),
     "no such argument": without_packed,
 }
 DEFECTS: dict[str, Callable[..., Any]] = {
+    "an assertion": _refuses_packed(_asserts),
     "an operation on types that have none": _refuses_packed(lambda: {} | ()),  # type: ignore[operator]
     "arrays that do not fit": _refuses_packed(lambda: np.zeros(2) + np.zeros(3)),
     "a key that is not there": _refuses_packed(lambda: {}["packed"]),

@@ -1,8 +1,9 @@
-"""No module imports itself by way of others, neither at once nor when one of its functions is called."""
+"""No module imports itself by way of others: not at once, not in a function, and not by a string that is imported."""
 
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -40,7 +41,22 @@ def imports(text: str, known: Mapping[str, object], package: str = "") -> set[st
             module = ".".join(filter(None, (base, statement.module)))
             names = {f"{module}.{alias.name}" for alias in statement.names}
             found |= {name if name in known else module for name in names}
-    return found & known.keys()
+    return (found | set(_named(text, known))) & known.keys()
+
+
+# a string that is imported: "a.module", or "a.module:attribute" as entry points are written
+IMPORTED = re.compile(r"([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+)(:[A-Za-z_]\w*)?")
+
+
+def _named(text: str, known: Mapping[str, object]) -> Iterator[str]:
+    """Give what whole strings of a source name as a module, or as an attribute of one."""
+    for node in ast.walk(ast.parse(text)):
+        match = (
+            IMPORTED.fullmatch(node.value) if isinstance(node, ast.Constant) and isinstance(node.value, str) else None
+        )
+        # a package alone is the folder of its files, as importlib.resources takes it
+        if match and (match[2] or not any(name.startswith(f"{match[1]}.") for name in known)):
+            yield match[1]
 
 
 def cycles(graph: Mapping[str, set[str]]) -> list[list[str]]:
@@ -87,8 +103,10 @@ def test_there_is_no_import_cycle() -> None:
         ({"a": "import b", "b": "if TYPE_CHECKING:\n    import a\nelse:\n    import c", "c": ""}, []),
         ({"p": "", "p.a": "from p import b", "p.b": "from p.a import x"}, [["p.a", "p.b"]]),
         ({"a": "import b\nimport c", "b": "import c", "c": "import d", "d": "import c"}, [["c", "d"]]),
+        ({"p.a": "TABLE = {'x': 'p.b:X'}", "p.b": "import_module('p.a')"}, [["p.a", "p.b"]]),
+        ({"p.a": "'see p.b for it'", "p.b": "import p.a"}, []),
     ],
-    ids=["in a function", "for type checkers", "from a package", "off to the side"],
+    ids=["in a function", "for type checkers", "from a package", "off to the side", "in strings", "in prose"],
 )
 def test_a_cycle_is_found_wherever_it_hides(sources: dict[str, str], expected: list[list[str]]) -> None:
     assert cycles({name: imports(text, sources) for name, text in sources.items()}) == expected

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,14 +17,16 @@ from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.backends import Absent, shipped_or_absent
 from pop_ref.conformance.failure_report import failure_report
 from pop_ref.conformance.golden import golden_scene
+from pop_ref.conformance.law import missing
 from pop_ref.conformance.mutants import MUTANTS, living
-from pop_ref.conformance.mutants.trial import law_named
+from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
 from pop_ref.conformance.poison import POISONED_INTEGER, poisoned_allocations
 from pop_ref.conformance.scene_files import load_scene, save_scene
 from pop_ref.conformance.scenes import Scene, cotangents, rounded_to, scene_as_code
 from pop_ref.conformance.scorecard import Entry, Scorecard, outcomes
 from pop_ref.conformance.strategies import FLOOR, scenes
 from pop_ref.conformance.tolerances import TABLE
+from pop_ref.conformance.torch_strategy import StrategyAdapter
 from pop_ref.constants import INRIA
 from pop_ref.records import Camera, Gaussians
 
@@ -327,3 +330,60 @@ def test_a_weight_is_charged_for_an_exponent_that_is_expanded_about_a_tile_far_f
     scene = Scene(gaussians, Camera(np.eye(4), np.array(K), 4, 4), tile_size=16)
     sentence = law_named("test_agreement:dominant_weights_are_the_oracles").sentence
     settings(max_examples=1, database=None)(given(scene=st.just(scene))(lambda scene: sentence(backend, scene=scene)))()
+
+
+class _OneCall:
+    """A sound strategy as gsplat's are: it collects and changes in one call."""
+
+    def __init__(self, refine_every: int = 100, refine_start_iter: int = 500, grow_grad2d: float = 2e-4) -> None:
+        from pop_fast.density import GsplatStrategy
+
+        given = {"refine_every": refine_every, "refine_start_iter": refine_start_iter, "grow_grad2d": grow_grad2d}
+        self._own = GsplatStrategy(**given)
+        self.initialize_state, self.step_pre_backward = self._own.initialize_state, self._own.step_pre_backward
+
+    def step_post_backward(
+        self, params: Any, optimizers: Any, state: Any, step: int, info: Any, packed: bool = False
+    ) -> None:
+        self._own.step_post_backward(params, optimizers, state, step, info, packed)
+
+
+class _KeepsOldTensors(_OneCall):
+    def step_post_backward(self, params: Any, optimizers: Any, *more: Any, **named: Any) -> None:
+        held = {key: optimizer.param_groups[0]["params"] for key, optimizer in optimizers.items()}
+        super().step_post_backward(params, optimizers, *more, **named)
+        for key, optimizer in optimizers.items():
+            optimizer.param_groups[0]["params"] = held[key]
+
+
+class _FreezesAll(_OneCall):
+    def step_post_backward(self, params: Any, optimizers: Any, *more: Any, **named: Any) -> None:
+        super().step_post_backward(params, optimizers, *more, **named)
+        for key, param in params.items():
+            params[key] = param.detach()
+
+
+def test_somebodys_strategy_is_judged_by_the_laws_that_are_about_no_method() -> None:
+    def broken_laws(make: Any) -> set[str]:
+        backend = StrategyAdapter(make.__name__, make)
+        laws = {path: law for path, law in every_law().items() if law.stage == "training"}
+        return {law.name for law in laws.values() if not missing(backend, law.needs) and obeys(law, backend)}
+
+    assert broken_laws(_OneCall) == set()
+    assert "after_every_step_each_optimizer_holds_its_parameter_and_nothing_else" in broken_laws(_KeepsOldTensors)
+    assert "edited_parameters_are_trained_as_they_were" in broken_laws(_FreezesAll)
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("nowhere.at_all:Strategy", "needs nowhere, which is not installed"),
+        ("math:Strategy", "module math has no function Strategy"),
+        ("math", "must be written module:name"),
+    ],
+)
+def test_a_strategy_that_is_not_there_is_one_line(path: str, words: str) -> None:
+    done = _kit("--strategy", path, "--stage", "training")
+    assert done.returncode == 4
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr

@@ -6,21 +6,32 @@ import ast
 import importlib
 import importlib.util
 import re
+import runpy
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
+import numpy as np
 import pytest
+import torch
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pop_fast.cli import COMMANDS
+from pop_fast.io.formats import FORMATS
 from pop_ref.conformance.backends import ELSEWHERE, SHIPPED
 from pop_ref.conformance.capabilities import STAGES as LAW_STAGES
 from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.conformance.plugin import pytest_addoption
 from pop_ref.conformance.scorecard import outcomes
 from pop_ref.constants import PROFILES
+from pop_ref.polarization import importance_mask
+from pop_ref.polarization import pop_loss as oracle_loss
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -213,3 +224,226 @@ def test_the_pictures_are_small_and_made_of_our_own_scene() -> None:
     pictures = re.findall(r"!\[[^]]*\]\((?!commands/)([^)]+)\)", TEXT)
     assert set(pictures) == {"docs/demo.png"}
     assert all((ROOT / picture.removeprefix("../")).stat().st_size < 300_000 for picture in pictures)
+
+
+# docs/FORMATS.md says what the program's table of formats says.
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+def test_the_page_is_the_one_that_is_made() -> None:
+    made = runpy.run_path(str(DOCS / "formats.py"))["page"]()
+    assert (DOCS / "FORMATS.md").read_text(encoding="utf-8") == made, "run 'python docs/formats.py --write'"
+
+
+def test_every_format_says_what_it_loses_of_every_field() -> None:
+    fields = ["centre", "scale", "rotation", "opacity", "colour", "view dependence"]
+    assert all(list(format.losses) == fields for format in FORMATS.values())
+
+
+# docs/commands.md shows every command of `pop` and `pop-repro`, as it was run, and nothing of the machine.
+
+SCRIPT = runpy.run_path(str(DOCS / "commands.py"), run_name="commands")
+PAGE = (DOCS / "commands.md").read_text(encoding="utf-8")
+
+
+def test_every_command_was_run_and_is_shown() -> None:
+    assert SCRIPT["lacking"](PAGE) == [], "run 'python docs/commands.py --write'"
+    assert SCRIPT["lacking"](PAGE.replace("## pop eval", "## pop evaluate")) == ["pop eval"]
+
+
+def test_every_command_line_of_the_script_is_on_the_page() -> None:
+    typed = [run.words for run in (*SCRIPT["RUNS"], *SCRIPT["REPRO"])]
+    assert re.findall(r"^\$ (.*)$", PAGE, flags=re.MULTILINE) == typed
+
+
+def test_no_command_failed_and_no_path_of_the_machine_is_shown() -> None:
+    assert "Traceback" not in PAGE
+    assert "error:" not in PAGE
+    assert not re.search(r"(^|[\s\"'(])/(tmp|home|root|work|Users)\b", PAGE)
+
+
+def test_pictures_are_there_small_and_all_used() -> None:
+    named = set(re.findall(r"!\[[^]]+\]\(([^)]+)\)", PAGE))
+    assert named == {f"commands/{path.name}" for path in (DOCS / "commands").iterdir()}
+    assert len(named) >= 8
+    assert all((DOCS / name).stat().st_size < 400_000 for name in named)
+
+
+def test_a_long_output_is_cut_in_the_middle() -> None:
+    text = "\n".join(map(str, range(100)))
+    lines = SCRIPT["shown"](text, Path("/nowhere")).splitlines()
+    assert (lines[0], lines[-1], len(lines)) == ("0", "99", SCRIPT["LONGEST"] + 1)
+    assert lines[SCRIPT["LONGEST"] // 2] == "... 70 lines more ..."
+
+
+# The hook of `make site`: links of the repository lead to the same files on the site.
+
+spec = importlib.util.spec_from_file_location("site_hook", ROOT / "docs" / "site.py")
+assert spec is not None
+assert spec.loader is not None
+site = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(site)
+
+
+@pytest.mark.parametrize(
+    ("path", "where"),
+    [
+        ("README.md", "index.md"),
+        ("docs/kit.md", "kit.md"),
+        ("docs/demo.png", "demo.png"),
+        ("pop_ref/alpha.py", "source/pop_ref/alpha.py.md"),
+        ("pop_ref/conformance/LAWS.md", "source/pop_ref/conformance/LAWS.md"),
+        ("benchmarks/results/scorecards", "source/benchmarks/results/scorecards.md"),
+        ("pop_ref/walkthrough/chapter_04b_tiles.py", "learn/chapter_04b_tiles.html"),
+    ],
+)
+def test_every_file_has_its_place(path: str, where: str) -> None:
+    assert site.place(path) == where
+
+
+@pytest.mark.parametrize(
+    ("page", "link", "turned"),
+    [
+        ("README.md", "docs/kit.md", "kit.md"),
+        ("README.md", "pop_ref/learn/splat.py", "source/pop_ref/learn/splat.py.md"),
+        ("docs/kit.md", "MUTANTS.md", "MUTANTS.md"),
+        ("docs/learn.md", "../README.md", "index.md"),
+        ("docs/speed.md", "../benchmarks/NOTES.md#where", "source/benchmarks/NOTES.md#where"),
+        ("paper_repro/README.md", "claims.py", "claims.py.md"),
+        ("docs/learn.md", "../pop_ref/walkthrough/chapter_01b_learning.py", "learn/chapter_01b_learning.html"),
+        ("paper_repro/README.md", "../docs/paper.md", "../../paper.md"),
+        ("docs/kit.md", "https://example.org/a.py", "https://example.org/a.py"),
+    ],
+)
+def test_links_are_turned(page: str, link: str, turned: str) -> None:
+    assert site.with_links_of_the_site(f"see [it]({link}).", page) == f"see [it]({turned})."
+
+
+def test_all_that_pages_lead_to_is_there_and_pages_in_markdown_are_followed() -> None:
+    made = site.linked(["README.md", "docs/paper.md"])
+    assert "paper_repro/protocol.md" in made
+    assert "pop_ref/settings.py" in made  # protocol.md leads there, not docs/paper.md
+    assert all((ROOT / path).exists() for path in made)
+
+
+def test_a_fence_is_longer_than_any_within() -> None:
+    made = site.content("docs/site.py")
+    inside = max(len(run) for run in re.findall(r"`+", (ROOT / "docs" / "site.py").read_text(encoding="utf-8")))
+    fence = re.findall(r"^(`+)\{\.python", made, re.MULTILINE)[0]
+    assert len(fence) > inside
+
+
+def test_formulas_need_no_script() -> None:
+    made = site.with_formulas("the mean $\\mu_i$, and `$HOME` stays")
+    assert "<math" in made
+    assert "\\mu" not in made
+    assert "`$HOME` stays" in made
+
+
+# docs/trainer.md: its code runs, its prior is the oracle's. CITATION.cff and the workflows agree with the project.
+
+TRAINER_PAGE = (ROOT / "docs" / "trainer.md").read_text(encoding="utf-8")
+STEP, PRIOR = (
+    compile(code, "docs/trainer.md", "exec") for code in re.findall(r"```python\n(.*?)```", TRAINER_PAGE, re.DOTALL)
+)
+
+
+def names_of(code: Any) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    exec(code, found)
+    return found
+
+
+def scene() -> tuple[dict[str, torch.nn.Parameter], dict[str, torch.optim.Optimizer]]:
+    rng = torch.Generator().manual_seed(0)
+    n = 12
+    means = torch.rand(n, 3, generator=rng) - 0.5
+    means[:, 2] += 3.0
+    values = {
+        "means": means,
+        "quats": torch.rand(n, 4, generator=rng) + 0.1,
+        "scales": torch.full((n, 3), -2.0),
+        "opacities": torch.zeros(n),
+        "sh0": torch.rand(n, 1, 3, generator=rng),
+        "shN": torch.zeros(n, 15, 3),
+    }
+    params = {name: torch.nn.Parameter(value) for name, value in values.items()}
+    return params, {name: torch.optim.Adam([value], lr=1e-2, eps=1e-15) for name, value in params.items()}
+
+
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_the_step_of_the_page_trains_with_the_prior_and_changes_the_gaussians() -> None:
+    page = names_of(STEP)
+    moved = {}
+    for prior in (True, False):
+        settings = {"refine_start_iter": 0, "refine_every": 4, "grow_grad2d": 0.0, "blur_stop_iter": -1}
+        strategy = type(page["strategy"])(**settings, lambda_pop=10.0 if prior else 0.0)
+        page["strategy"] = strategy
+        params, optimizers = scene()
+        state = strategy.initialize_state(1.0)
+        K = torch.tensor([[16.0, 0.0, 8.0], [0.0, 16.0, 6.0], [0.0, 0.0, 1.0]])
+        photograph = torch.zeros(12, 16, 3)
+        losses = [
+            page["step_with_prior"](step, params, optimizers, state, photograph, torch.eye(4), K) for step in range(4)
+        ]
+        assert losses[-1] < losses[0]
+        moved[prior] = params["opacities"].detach().clone()
+        losses += [page["step_with_prior"](4, params, optimizers, state, photograph, torch.eye(4), K)]
+        assert len(params["means"]) > 12
+        assert all(
+            len(optimizer.param_groups[0]["params"][0]) == len(params["means"]) for optimizer in optimizers.values()
+        )
+    # with the prior some opacities rise, where the black photograph alone would lower every one
+    assert (moved[True] > 0).any()
+    assert not (moved[False] > 0).any()
+
+
+@given(st.lists(st.tuples(st.floats(0.01, 0.99), st.integers(0, 2)), min_size=1, max_size=6))
+def test_the_prior_of_the_page_is_the_oracles(rows: list[tuple[float, int]]) -> None:
+    opacities, counts = np.array([o for o, _ in rows]), np.array([n for _, n in rows])
+    ours = names_of(PRIOR)["pop_loss"](torch.tensor(opacities, dtype=torch.float64), torch.tensor(counts))
+    assert ours.item() == pytest.approx(oracle_loss(opacities, importance_mask(counts)), rel=1e-12, abs=1e-15)
+
+
+def test_authors_place_and_version_are_said_once_and_repeated_rightly() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert (cited["title"], cited["version"], cited["license"]) == (
+        project["name"],
+        project["version"],
+        project["license"],
+    )
+    assert cited["repository-code"] == project["urls"]["Repository"]
+    assert cited["authors"] == project["authors"]
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / ".github").rglob("*.yml")), ids=lambda path: path.stem)
+def test_every_command_of_a_workflow_is_there(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert yaml.safe_load(text)
+    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    assert set(re.findall(r"\bmake ([a-z-]+)", text)) <= set(targets)
+    assert all((ROOT / script).is_file() for script in re.findall(r"\bbash (\S+)", text))
+
+
+def test_no_page_on_learning_leads_to_the_source_of_a_chapter() -> None:
+    text = (ROOT / "docs" / "learn.md").read_text(encoding="utf-8")
+    assert text.count("](../pop_ref/walkthrough/chapter_") == 17
+    links = site.LINK.findall(site.with_links_of_the_site(text, "docs/learn.md"))
+    assert not [target for _, target, _ in links if target.startswith("source/pop_ref/walkthrough")]
+    assert not [path for path in site.linked(["docs/learn.md"]) if path.startswith("pop_ref/walkthrough")]
+
+
+def test_chapters_lead_back_to_the_site_and_have_been_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(site, "WALKTHROUGH", tmp_path)
+    with pytest.raises(FileNotFoundError, match="run 'make walkthrough' first"):
+        site.walkthrough()
+    (tmp_path / "notebooks").mkdir()
+    for name in ("index.html", "notebooks/index.html"):
+        (tmp_path / name).write_text("<body><main><h1>It</h1></main></body>", encoding="utf-8")
+    (tmp_path / "book.pdf").write_bytes(b"%PDF-\xff")
+    made = site.walkthrough()
+    assert b'<main><nav><a href="../index.html">' in made["learn/index.html"]
+    assert b'<a href="../../learn.html">Learn</a></nav><h1>It' in made["learn/notebooks/index.html"]
+    assert made["learn/book.pdf"] == b"%PDF-\xff"

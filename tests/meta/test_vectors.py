@@ -129,9 +129,9 @@ def test_inputs_are_exact_in_float32(folder: Path) -> None:
 
 
 def test_vectors_of_an_older_version_are_refused(folder: Path, tmp_path: Path) -> None:
-    index = json.loads((folder / "index.json").read_text()) | {"version": 2}
+    index = json.loads((folder / "index.json").read_text()) | {"version": 3}
     (tmp_path / "index.json").write_text(json.dumps(index))
-    with pytest.raises(ValueError, match="version is 2, this program reads 3; write the vectors again"):
+    with pytest.raises(ValueError, match="version is 3, this program reads 4; write the vectors again"):
         check(tmp_path, tmp_path)
 
 

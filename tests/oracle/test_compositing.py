@@ -11,9 +11,26 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pop_ref import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER, Profile, Splats
+from pop_ref import (
+    GSPLAT_1_5,
+    GSPLAT_1_6,
+    INRIA,
+    PAPER,
+    SPEEDY_SPLAT,
+    Camera,
+    Gaussians,
+    Profile,
+    Splats,
+    alpha,
+    dominance,
+    render,
+)
 from pop_ref.compositing import composite, composite_vjp
+from pop_ref.contributions import contributions
+from pop_ref.depth import expected_depth, expected_depth_vjp, with_depth_channel
 from pop_ref.pixel import Pixel, SplatRows, composite_pixel, composite_pixel_vjp, stops, zero_gradients
+from tests.oracle.by_definition import blended_pixels
+from tests.oracle.scenes import camera, dyadic_camera, grey, random_gaussians, safe_gaussians, tilted_camera
 
 # floats hold every sum and product below exactly, so that the comparison is too
 DYADIC = replace(PAPER, alpha_floor=1 / 8, alpha_ceiling=7 / 8, transmittance_stop=1 / 64)
@@ -179,3 +196,186 @@ def test_lists_and_backgrounds_that_do_not_fit_are_refused() -> None:
         composite(one_splat(), [[0], []], 4, 2, 2, np.zeros(3))
     with pytest.raises(ValueError, match="lists has 1 tiles"):
         composite_vjp(one_splat(), [[0]], 4, 2, 2, np.zeros((2, 4, 2)))
+
+
+# One splat at one pixel: the quadratic form, and floor and ceiling at their edges.
+
+# the kernels' 0.99
+FLOAT32_99 = float(np.float32(0.99))
+
+coordinates = st.integers(-64, 64).map(lambda k: k / 8.0)
+
+
+@given(coordinates, coordinates, coordinates, coordinates, coordinates)
+def test_sigma_is_half_the_quadratic_form(u: float, v: float, A: float, B: float, C: float) -> None:
+    # eighths in, products of three eighths out: exact in float64
+    d = np.array([u - 0.5, v - 1.5])
+    want = 0.5 * float(d @ np.array([[A, B], [B, C]]) @ d)
+    assert alpha.sigma_at_pixel((u, v), (A, B, C), 0.5, 1.5) == want
+
+
+@given(st.floats(0.0, 700.0))
+def test_falloff_is_the_exponential(sigma: float) -> None:
+    assert alpha.falloff(sigma) == math.exp(-sigma)
+
+
+@pytest.mark.parametrize(("profile", "ceiling"), [(PAPER, 0.999), (GSPLAT_1_6, FLOAT32_99), (INRIA, FLOAT32_99)])
+def test_an_opaque_splat_stays_at_the_ceiling(profile: Profile, ceiling: float) -> None:
+    assert alpha.alpha_from_sigma(0.0, 1.0, profile) == (ceiling, False)
+
+
+def test_alpha_at_exactly_the_floor_takes_part_and_just_under_it_does_not() -> None:
+    floor = 1.0 / 255.0
+    assert alpha.alpha_from_sigma(0.0, floor) == (floor, False)
+    assert alpha.alpha_from_sigma(0.0, math.nextafter(floor, 0.0))[1]
+
+
+def test_a_negative_exponent_is_skipped_however_opaque() -> None:
+    assert alpha.alpha_from_sigma(-1e-300, 1.0) == (0.0, True)
+    assert alpha.alpha_from_sigma(-1e4, 1.0) == (0.0, True)
+
+
+def test_opacity_zero_is_skipped() -> None:
+    assert alpha.alpha_from_sigma(0.0, 0.0) == (0.0, True)
+
+
+# Dominance by brute force, ties above all.
+
+weights = st.lists(st.sampled_from([0.125, 0.25, 0.25, 0.5]), max_size=6)
+
+
+@given(weights, st.randoms())
+def test_the_winner_is_the_first_of_the_largest(values: list[float], random) -> None:
+    ids = list(range(10, 10 + len(values)))
+    random.shuffle(ids)
+    want = -1
+    for i, weight in zip(reversed(ids), reversed(values), strict=True):
+        # walking from the back, an equal one further in front takes over
+        if weight == max(values):
+            want = i
+    assert dominance.dominant_id(ids, values) == want
+
+
+def test_a_weight_of_zero_never_wins() -> None:
+    assert dominance.dominant_id([3, 4], [0.0, 0.0]) == -1
+
+
+@given(st.lists(st.lists(st.integers(-1, 4), min_size=3, max_size=3), min_size=1, max_size=4))
+def test_counts_are_pixels_won_and_with_empty_pixels_make_the_image(winners: list[list[int]]) -> None:
+    ids = np.array(winners)
+    counts = dominance.dominant_counts(ids, 5)
+    assert counts.tolist() == [int(np.sum(ids == i)) for i in range(5)]
+    assert np.sum(counts) + np.sum(ids == -1) == ids.size
+
+
+def test_of_coincident_copies_the_one_of_lower_index_dominates() -> None:
+    out = render(grey([0.5, 0.5, 0.5]), dyadic_camera(1, 1))
+    assert out.tile_lists == [[0, 1, 2]]
+    assert out.n_blended[0, 0] == 3
+    assert out.dominant_ids[0, 0] == 0
+
+
+def test_equal_weights_go_to_the_front() -> None:
+    # with no ceiling the second takes all that the first leaves: 1/2 each
+    profile = replace(PAPER, alpha_ceiling=1.0, transmittance_stop=-1.0)
+    behind = grey([1.0, 0.5], means=[[0.0, 0.0, 4.0], [0.0, 0.0, 2.0]])
+    out = render(behind, dyadic_camera(1, 1), profile=profile)
+    assert out.tile_lists == [[1, 0]]
+    assert out.dominant_weights[0, 0] == 0.5
+    assert out.dominant_ids[0, 0] == 1
+
+
+def test_the_terminating_splat_does_not_compete() -> None:
+    # the second would weigh more than the first but ends the pixel
+    profile = replace(PAPER, alpha_floor=1 / 256, alpha_ceiling=1.0, transmittance_stop=0.25)
+    out = render(grey([0.25, 0.875]), dyadic_camera(1, 1), profile=profile)
+    assert (out.n_blended[0, 0], out.n_traversed[0, 0]) == (1, 2)
+    assert out.dominant_ids[0, 0] == 0
+
+
+def test_colours_and_background_do_not_matter() -> None:
+    gaussians = grey([0.25, 0.75, 0.5], means=[[0.0, 0.0, 4.0], [0.5, 1.0, 5.0], [-1.0, 0.0, 3.0]])
+    other = replace(gaussians, sh=np.random.default_rng(0).normal(size=(3, 1, 3)))
+    view = dyadic_camera(4, 4)
+    one, two = render(gaussians, view), render(other, view, background=np.ones(3))
+    assert np.array_equal(one.dominant_ids, two.dominant_ids)
+    assert np.array_equal(one.dominant_counts, two.dominant_counts)
+    assert not np.array_equal(one.image, two.image)
+
+
+# The depth modes: by hand for one splat, and as a colour channel that holds depths.
+
+VIEW = tilted_camera()
+
+
+def test_one_splat_accumulates_its_depth_times_its_alpha_and_is_expected_at_its_depth() -> None:
+    g = Gaussians([[0, 0, 4]], [[1, 0, 0, 0]], [[1, 1, 1]], [0.5], [[[0, 0, 0]]])
+    camera = Camera(np.eye(4), np.array([[8.0, 0.0, 0.5], [0.0, 8.0, 0.5], [0.0, 0.0, 1.0]]), 1, 1)
+    seen = {mode: render(g, camera, np.ones(3), render_mode=mode).image[0, 0].tolist() for mode in ("D", "RGB+ED")}
+    assert seen == {"D": [2.0], "RGB+ED": [0.75, 0.75, 0.75, 4.0]}
+
+
+def test_the_accumulated_depth_is_a_colour_that_holds_depths() -> None:
+    g = safe_gaussians(VIEW)
+    plain = render(g, VIEW)
+    as_colour = render(g, VIEW, colors=plain.splats.depths[:, None])
+    both = render(g, VIEW, np.ones(3), render_mode="RGB+D")
+    np.testing.assert_array_equal(both.image[..., 3:], as_colour.image)
+    np.testing.assert_array_equal(both.image[..., :3], render(g, VIEW, np.ones(3)).image)
+    np.testing.assert_array_equal(render(g, VIEW, np.ones(3), render_mode="D").image, as_colour.image)
+    assert both.splats.colors.shape[1] == 3
+
+
+def test_an_empty_pixel_has_no_depth_and_passes_none_to_its_opacity() -> None:
+    empty = np.zeros((1, 1)), np.ones((1, 1))
+    assert expected_depth(*empty).item() == 0.0
+    assert [v.item() for v in expected_depth_vjp(*empty, np.ones((1, 1)))] == [1e10, 0.0]
+
+
+def test_a_mode_that_is_none_and_a_background_with_depth_are_refused() -> None:
+    g = safe_gaussians(VIEW)
+    with pytest.raises(ValueError, match="render_mode is 'depth'; it must be one of RGB, D, ED, RGB\\+D, RGB\\+ED"):
+        with_depth_channel(render(g, VIEW).splats, "depth")
+    with pytest.raises(ValueError, match=r"background has shape \[4\]; it must be \[3\]"):
+        render(g, VIEW, np.ones(4), render_mode="RGB+D")
+
+
+# Contributions against lists of what each pixel blends, made from the definition.
+
+SIZE = 4
+
+
+@pytest.mark.parametrize("profile", [PAPER, INRIA, SPEEDY_SPLAT], ids=lambda p: p.name)
+@pytest.mark.parametrize("view", [camera(), tilted_camera(9, 7)], ids=["straight", "tilted"])
+def test_the_sums_are_those_over_every_pixels_list(profile: Profile, view) -> None:
+    gaussians = random_gaussians(5, 12)
+    drawn = render(gaussians, view, profile=profile, tile_size=SIZE)
+    shown = np.random.default_rng(0).uniform(size=drawn.T_final.shape)
+    n = len(gaussians)
+    weights, counts, of_map, distances = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    for (x, y), blended in blended_pixels(drawn, SIZE, profile).items():
+        for i, T, a in blended:
+            weights[i] += T * a
+            counts[i] += 1
+            of_map[i] += shown[y, x]
+            distances[i] += np.linalg.norm(np.array([x + 0.5, y + 0.5]) - drawn.splats.means2d[i])
+    found = contributions(drawn.splats, drawn.tile_lists, view.width, view.height, SIZE, shown, profile)
+    assert np.sum(counts) > 20
+    assert found.n_pixels.tolist() == counts.tolist()
+    for have, want in ((found.weight_sum, weights), (found.map_sum, of_map), (found.distance_sum, distances)):
+        np.testing.assert_allclose(have, want, rtol=1e-12)
+
+
+def test_without_a_map_its_sum_is_zero_and_a_terminating_splat_is_not_counted() -> None:
+    # under 0.999 twice nothing would be left: the second ends the pixel and the third is never reached
+    drawn = render(grey([1.0, 1.0, 0.5]), dyadic_camera(1, 1))
+    found = contributions(drawn.splats, drawn.tile_lists, 1, 1, 16)
+    assert found.n_pixels.tolist() == [1, 0, 0]
+    assert found.weight_sum.tolist() == [PAPER.alpha_ceiling, 0.0, 0.0]
+    assert found.map_sum.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_map_of_another_size_is_told() -> None:
+    drawn = render(grey([0.5]), dyadic_camera(3, 2))
+    with pytest.raises(ValueError, match=r"pixel_map has shape \[3, 2\]; it must be \[2, 3\]"):
+        contributions(drawn.splats, drawn.tile_lists, 3, 2, 16, np.zeros((3, 2)))

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from scipy.spatial.transform import Rotation
 
+from pop_ref import density as oracle
+from pop_ref.conformance.backends import shipped
 from pop_ref.density import (
     GSPLAT,
     POP,
@@ -32,6 +37,10 @@ from pop_ref.density import (
     split_rows,
     zero_statistics,
 )
+from pop_ref.optimizer import adam_step, is_updated, learning_rates, sh_degree_at, update_numbers
+from pop_ref.recipes import BASELINES, RECIPES
+from pop_ref.settings import Recipe, UpdateRules
+from pop_ref.training import Training, update
 
 EYE = np.array([True])
 STEPS = range(30_000)
@@ -316,3 +325,213 @@ def test_unfit_rows_and_draws_are_refused_by_name() -> None:
         Rows({"means": np.zeros((2, 3))}, {"means": np.zeros((2, 3))}, {"means": np.zeros((2, 2))})
     with pytest.raises(Exception, match="normals"):
         split_rows(population(2), np.array([True, False]), draws(2))
+
+
+# Row operations against a model that keeps each Gaussian as one dictionary: nothing may come apart.
+
+KEYS = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": ()}
+LEARNING_RATE = {name: 0.0 if name == "sh0" else 0.125 for name in KEYS}
+MOST_ROWS = 24
+
+
+@dataclass
+class Member:
+    """One Gaussian of the model."""
+
+    params: dict[str, list[float]]
+    m: dict[str, list[float]]
+    v: dict[str, list[float]]
+
+    def child(self, **changed: list[float]) -> Member:
+        """Return a copy with other parameters and no history."""
+        zeros = {name: [0.0] * len(value) for name, value in self.params.items()}
+        return Member({**self.params, **changed}, zeros, dict(zeros))
+
+
+def member(tag: int) -> Member:
+    wave = [math.sin(1.0 + tag + 3 * k) for k in range(4)]
+    params = {"means": wave[:3], "scales": wave[1:], "quats": wave, "opacities": [2.0 * wave[0]], "sh0": [float(tag)]}
+    return Member(params, *({name: [0.0] * len(value) for name, value in params.items()} for _ in range(2)))
+
+
+def rotated(quat: list[float], point: list[float]) -> list[float]:
+    """Rotate by p -> p + 2 w (u x p) + 2 u x (u x p) with the unit quaternion (w, u)."""
+    norm = math.sqrt(sum(c * c for c in quat))
+    w, *u = (c / norm for c in quat)
+    once = [u[(k + 1) % 3] * point[(k + 2) % 3] - u[(k + 2) % 3] * point[(k + 1) % 3] for k in range(3)]
+    twice = [u[(k + 1) % 3] * once[(k + 2) % 3] - u[(k + 2) % 3] * once[(k + 1) % 3] for k in range(3)]
+    return [point[k] + 2.0 * (w * once[k] + twice[k]) for k in range(3)]
+
+
+class RowMachine(RuleBasedStateMachine):
+    """Apply the same edits to arrays and to the model."""
+
+    def operation(self, name: str) -> Any:
+        return getattr(oracle, name)
+
+    def edit(self, name: str, *args: Any) -> None:
+        after = self.operation(name)(*args)
+        self.rows = oracle.Rows(after.params, after.m, after.v)
+
+    @initialize(n=st.integers(0, 4))
+    def start(self, n: int) -> None:
+        self.model = [member(tag) for tag in range(n)]
+        self.updates = 0
+        params = {
+            name: np.array([g.params[name] for g in self.model], dtype=np.float64).reshape(n, *shape)
+            for name, shape in KEYS.items()
+        }
+        self.edit("rows_from_params", params)
+
+    def chosen(self, data: st.DataObject) -> tuple[list[bool], Any]:
+        n = len(self.model)
+        picks = data.draw(st.lists(st.booleans(), min_size=n, max_size=n), label="mask")
+        return picks, np.array(picks, dtype=bool)
+
+    @rule(data=st.data())
+    @precondition(lambda self: len(self.model) <= MOST_ROWS)
+    def clone(self, data: st.DataObject) -> None:
+        picks, mask = self.chosen(data)
+        self.edit("clone_rows", self.rows, mask)
+        self.model += [g.child() for g, pick in zip(self.model, picks, strict=True) if pick]
+
+    @rule(data=st.data())
+    @precondition(lambda self: len(self.model) <= MOST_ROWS)
+    def split(self, data: st.DataObject) -> None:
+        picks, mask = self.chosen(data)
+        n_split = sum(picks)
+        normals = np.cos(np.arange(6.0 * n_split)).reshape(2, n_split, 3)
+        self.edit("split_rows", self.rows, mask, normals)
+        parents = [g for g, pick in zip(self.model, picks, strict=True) if pick]
+        self.model = [g for g, pick in zip(self.model, picks, strict=True) if not pick]
+        for child in range(2):
+            for parent, eps in zip(parents, normals[child].tolist(), strict=True):
+                log_scales, mean = parent.params["scales"], parent.params["means"]
+                offset = rotated(
+                    parent.params["quats"], [math.exp(s) * e for s, e in zip(log_scales, eps, strict=True)]
+                )
+                moved = [a + b for a, b in zip(mean, offset, strict=True)]
+                self.model.append(parent.child(means=moved, scales=[s - math.log(1.6) for s in log_scales]))
+
+    @rule(data=st.data())
+    def prune(self, data: st.DataObject) -> None:
+        picks, mask = self.chosen(data)
+        self.edit("prune_rows", self.rows, mask)
+        self.model = [g for g, pick in zip(self.model, picks, strict=True) if not pick]
+
+    @rule(ceiling=st.sampled_from([0.01, 0.25]))
+    def reset(self, ceiling: float) -> None:
+        self.edit("reset_opacities", self.rows, ceiling)
+        logit = math.log(ceiling / (1.0 - ceiling))
+        for g in self.model:
+            g.params["opacities"] = [min(g.params["opacities"][0], logit)]
+            g.m["opacities"], g.v["opacities"] = [0.0], [0.0]
+
+    @rule()
+    def train(self) -> None:
+        """Give every row its own gradient, so that its moments tell it from the others."""
+        self.updates += 1
+        arrays = [{name: np.asarray(a) for name, a in part.items()} for part in self.parts()]
+        grads = {name: np.cos(array) for name, array in arrays[0].items()}
+        updated = adam_step(arrays[0], grads, arrays[1], arrays[2], self.updates, LEARNING_RATE)
+        self.rows = oracle.Rows(*updated)
+        for g in self.model:
+            lists = [{name: np.array(value) for name, value in part.items()} for part in (g.params, g.m, g.v)]
+            grads = {name: np.cos(value) for name, value in lists[0].items()}
+            new = adam_step(lists[0], grads, lists[1], lists[2], self.updates, LEARNING_RATE)
+            g.params, g.m, g.v = ({name: value.tolist() for name, value in part.items()} for part in new)
+
+    def parts(self) -> tuple[Any, Any, Any]:
+        return self.rows.params, self.rows.m, self.rows.v
+
+    @invariant()
+    def rows_are_the_models(self) -> None:
+        assert len(self.rows) == len(self.model)
+        for kind, part in zip(("params", "m", "v"), self.parts(), strict=True):
+            for name, shape in KEYS.items():
+                expected = np.array([getattr(g, kind)[name] for g in self.model], dtype=np.float64)
+                array = np.asarray(part[name])
+                assert array.shape == (len(self.model), *shape)
+                np.testing.assert_allclose(array, expected.reshape(array.shape), rtol=1e-10, atol=1e-12)
+        # tags are never computed with, so they are exact
+        assert np.asarray(self.rows.params["sh0"]).tolist() == [g.params["sh0"][0] for g in self.model]
+
+
+class TrainedRowMachine(RowMachine):
+    def operation(self, name: str) -> Any:
+        return shipped("fast64").stage(name)
+
+
+TestOracleRows = RowMachine.TestCase
+TestTrainedRows = TrainedRowMachine.TestCase
+
+
+# Whom Adam moves at which step: numbers of updates and rates of every method's schedule, against counts by hand.
+
+NAMES = ("means", "opacities", "shN")
+
+
+def moved(recipe: Recipe, name: str) -> list[int]:
+    return [step for step in range(recipe.max_steps) if is_updated(name, step, recipe)]
+
+
+def test_a_step_that_edits_the_population_moves_nothing_in_inrias_loop() -> None:
+    quiet = sorted(set(range(30_000)) - set(moved(RECIPES["3DGS"], "means")))
+    assert quiet == list(range(600, 15_000, 100))
+    assert len(quiet) == 144
+    assert moved(RECIPES["gsplat"], "means") == list(range(30_000))
+
+
+def test_a_round_of_pup_loses_the_update_that_its_pruning_replaces_and_starts_adam_anew() -> None:
+    recipe = BASELINES["PUP-3DGS"]
+    late = [step for step in moved(recipe, "means") if step >= 30_000]
+    assert late == [*range(30_001, 35_000), *range(35_001, 40_000)]
+    assert update_numbers(NAMES, 30_001, recipe) == dict.fromkeys(NAMES, 1)
+    assert update_numbers(NAMES, 34_999, recipe)["means"] == 4_999
+
+
+def test_taming_moves_upper_bands_each_16_steps_and_opacities_until_15_000() -> None:
+    recipe = replace(BASELINES["Taming-3DGS"], updates=replace(BASELINES["Taming-3DGS"].updates))
+    bands = moved(recipe, "shN")
+    assert bands[:3] == [15, 31, 47]
+    assert all((step + 1) % 16 == 0 for step in bands)
+    assert max(moved(recipe, "opacities")) == 14_999
+    assert max(moved(recipe, "means")) == 29_999
+    assert update_numbers(["shN"], 47, recipe) == {"shN": 3}
+
+
+def test_the_positions_rate_of_mini_splatting_goes_back_to_what_it_was() -> None:
+    rules, plain = BASELINES["Mini-Splatting"].updates, UpdateRules()
+    for step, like in ((14_999, 14_999), (15_000, 5_000), (29_999, 19_999)):
+        assert learning_rates(step, 1.0, rules=rules)["means"] == learning_rates(like, 1.0, rules=plain)["means"]
+    steps = (14_999, 15_999, 16_000, 17_000, 18_000)
+    assert [sh_degree_at(step, start=rules.sh_start_iter) for step in steps] == [0, 0, 1, 2, 3]
+
+
+def test_in_a_round_of_pup_rates_fall_from_where_the_training_ended() -> None:
+    rules = BASELINES["PUP-3DGS"].updates
+    first, last = (learning_rates(step, 1.0, 40_000, rules=rules) for step in (30_000, 34_999))
+    assert first["means"] == pytest.approx(1.6e-4 * 0.01 ** (30_001 / 35_000), rel=1e-14)
+    assert last["means"] == pytest.approx(1.6e-6, rel=1e-14)
+    # twelve times, 0.95 each
+    assert last["scales"] / first["scales"] == pytest.approx(0.95**12, rel=1e-14)
+    assert learning_rates(35_000, 1.0, 40_000, rules=rules) == first
+    before = learning_rates(29_999, 1.0, 40_000, rules=rules)
+    assert before["means"] == pytest.approx(1.6e-4 * 0.01 ** (29_999 / 30_000), rel=1e-14)
+    assert before["scales"] == first["scales"]
+
+
+def test_gradients_that_wait_are_spent_at_once() -> None:
+    recipe = Recipe(updates=UpdateRules(sh_rest_every=3))
+    rows = rows_from_params({"means": np.zeros((1, 3)), "shN": np.zeros((1, 3, 3))})
+    state = Training(rows, zero_statistics(1))
+    for step, size in enumerate((1.0, 2.0, 4.0)):
+        state = replace(state, step=step)
+        grads = {"means": np.ones((1, 3)), "shN": np.full((1, 3, 3), size)}
+        rows, waiting = update(state.rows, grads, state, 1.0, recipe)
+        state = replace(state, rows=rows, waiting=waiting)
+        assert (state.rows.params["shN"] != 0.0).any() == (step == 2)
+    assert not state.waiting
+    # m = (1 - beta1) g of the sum of all three
+    np.testing.assert_allclose(state.rows.m["shN"], 0.1 * 7.0, rtol=1e-14)
+    assert (state.rows.params["means"] != 0.0).all()

@@ -5,13 +5,21 @@ from __future__ import annotations
 import doctest
 import importlib
 import inspect
+import os
 import pkgutil
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
 
 import pop_ref
+from pop_ref.margins import CloseDecision
+from pop_ref.notation import AXES, SYMBOLS, symbol_named
+from pop_ref.records import Camera, Gaussians, Render, Splats
 
 # the kit, the course and the chapters are programs about the oracle
 NOT_THE_ORACLE = ("conformance", "walkthrough", "pop_ref.learn")
@@ -50,3 +58,64 @@ def test_every_public_function_names_its_source_its_departures_and_shows_an_exam
         text = inspect.getdoc(getattr(module, function)) or ""
         for heading in ("Source:", "Departs:", "Example:"):
             assert heading in text, f"{name}.{function} has no {heading}"
+
+
+# The notation table is complete and says what the value types say.
+
+# containers, not symbols
+_CONTAINERS = {"splats"}
+
+
+def test_no_symbol_stands_twice() -> None:
+    names = [s.name for s in SYMBOLS]
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize("kind", [Gaussians, Camera, Splats, Render], ids=lambda k: k.__name__)
+def test_every_field_of_a_value_type_is_in_the_table_with_the_same_shape(kind: type) -> None:
+    for field in fields(kind):
+        if field.name in _CONTAINERS:
+            continue
+        shape = symbol_named(field.name).shape
+        annotation = str(field.type)
+        if '"' in annotation:
+            assert annotation.split('"')[1].split() == shape.strip("[]").replace(",", "").split(), field.name
+
+
+def test_every_axis_in_a_shape_is_explained() -> None:
+    for symbol in SYMBOLS:
+        if symbol.shape.startswith("["):
+            for axis in symbol.shape.strip("[]").split(", "):
+                assert axis.isdigit() or axis in AXES, symbol.name
+
+
+def test_an_unknown_symbol_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="'rotation' is not in the notation table"):
+        symbol_named("rotation")
+
+
+# Names that older code uses are there, with a warning that says the new one; none shadows the standard library.
+
+
+def test_records_are_found_under_their_old_module_with_a_warning() -> None:
+    with pytest.warns(DeprecationWarning, match=r"pop_ref\.records"):
+        from pop_ref.types import Camera as Old  # pyright: ignore[reportMissingImports]
+    assert Old is Camera
+
+
+def test_a_close_decision_is_found_under_its_old_name_with_a_warning() -> None:
+    with pytest.warns(DeprecationWarning, match="CloseDecision"):
+        assert pop_ref.Doubt is CloseDecision
+    with pytest.raises(AttributeError, match="no attribute 'Doubts'"):
+        _ = pop_ref.Doubts
+
+
+def test_no_module_of_the_oracle_has_a_name_of_the_standard_library() -> None:
+    names = {path.stem for path in Path(pop_ref.__path__[0]).glob("*.py")} - {"__init__"}
+    assert not names & set(sys.stdlib_module_names)
+
+
+def test_a_module_of_the_oracle_runs_as_a_script_from_its_own_folder() -> None:
+    folder = Path(pop_ref.__path__[0])
+    environment = {**os.environ, "PYTHONPATH": str(folder.parent)}
+    subprocess.run([sys.executable, "camera.py"], cwd=folder, env=environment, check=True)

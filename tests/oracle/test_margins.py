@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
+import inspect
 import math
 from dataclasses import replace
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -12,7 +16,10 @@ from hypothesis import strategies as st
 
 from pop_ref import INRIA, PAPER, PROFILES, Gaussians, Profile, margins, render
 from pop_ref.alpha import sigma_at_pixel
+from pop_ref.ambiguities import AMBIGUITIES, Ambiguity
+from pop_ref.density import DensityConfig
 from pop_ref.magnitudes import Rounded, splat_magnitudes
+from pop_ref.recipes import Recipe
 from pop_ref.splatting import geometry
 from tests.oracle.dense import dense_render
 from tests.oracle.scenes import camera, dyadic_camera, grey, random_gaussians, tilted_camera
@@ -269,3 +276,106 @@ def test_d4_touches_the_pixels_that_see_both_splats_and_not_those_that_stopped_b
     stopped = margins(grey([1.0, 1.0, 1.0, 0.5, 0.5], means=front + tied, scale=8.0), view)
     assert np.all(stopped.pixels["D4"] > 1e-3)
     assert stopped.gaussians["D4"][3] == stopped.gaussians["D4"][4] == 0.0
+
+
+# Margins where numbers end: at the camera's centre, behind it, needles without an inverse, overflow.
+
+
+@pytest.mark.parametrize("profile", [PAPER, INRIA], ids=lambda p: p.name)
+@pytest.mark.parametrize(
+    ("mean", "eye"), [([0.0] * 3, [0.0] * 3), ([0.0, 0.0, -3.0], [0.0] * 3), ([0.5, 0.25, -1.0], [0.5, 0.25, -1.0])]
+)
+def test_a_gaussian_at_or_behind_the_camera_is_surely_culled_and_leaves_the_others_alone(
+    mean: list[float], eye: list[float], profile: Profile
+) -> None:
+    moved = np.eye(4)
+    moved[:3, 3] = -np.array(eye)
+    view = replace(dyadic_camera(3, 3), viewmat=moved)
+    # a colour of degree 1 has a direction, and at the centre there is none
+    both, alone = (
+        margins(replace(grey([0.5] * n, means=means), sh=np.full((n, 4, 3), 0.25)), view, profile=profile)
+        for n, means in ((2, [mean, [0.0, 0.0, 4.0]]), (1, [[0.0, 0.0, 4.0]]))
+    )
+    assert both.safe_gaussians(EPS32)[0]
+    assert math.isinf(both.gaussians["B2"][0])
+    for name, found in alone.gaussians.items():
+        assert both.gaussians[name][1] == found[0]
+    assert np.array_equal(both.safe_pixels(EPS32), alone.safe_pixels(EPS32))
+
+
+def test_a_needle_whose_determinant_rounds_to_zero_is_in_doubt_in_antialiased_mode_too() -> None:
+    # turned by 45 degrees its four entries are alike: the low-pass is lost in them
+    turned = [[math.cos(math.pi / 8.0), 0.0, 0.0, math.sin(math.pi / 8.0)]]
+    needle = replace(grey([0.5]), quats=np.array(turned), scales=np.array([[1e9, 0.0, 0.0]]))
+    assert splat_magnitudes(needle, 0, dyadic_camera(5, 5), antialiased=True).det.value == 0.0
+    assert not render(needle, dyadic_camera(5, 5), antialiased=True).splats.visible[0]
+    got = margins(needle, dyadic_camera(5, 5), antialiased=True)
+    assert got.gaussians["D2"][0] == 0.0
+    assert not np.any(got.safe_pixels(EPS32))
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("profile", [PAPER, INRIA], ids=lambda p: p.name)
+@pytest.mark.parametrize("power", [77, 154, 155, 300])
+def test_of_a_gaussian_too_large_for_numbers_nothing_is_sure(power: int, profile: Profile, antialiased: bool) -> None:
+    for view in (dyadic_camera(5, 5), tilted_camera()):
+        for scales in ([1.0, 1.0, 1.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0]):
+            huge = replace(grey([0.5]), scales=10.0**power * np.array([scales]), quats=np.array([[0.9, 0.1, 0.3, 0.2]]))
+            with np.errstate(all="ignore"):
+                image = render(huge, view, profile=profile, antialiased=antialiased)
+                got = margins(huge, view, profile=profile, antialiased=antialiased)
+            assert np.all(np.isfinite(image.image))
+            assert not got.safe_gaussians(EPS32)[0]
+            assert not np.any(got.safe_pixels(EPS32))
+
+
+# The table of open questions against the code: every place exists and says so, every alternative can be chosen.
+
+SETTINGS = {"Recipe": Recipe(), "DensityConfig": DensityConfig()}
+by_id = pytest.mark.parametrize("ambiguity", AMBIGUITIES, ids=lambda a: a.id)
+
+
+def source_of(where: str) -> str:
+    module_name, _, attribute = where.partition(":")
+    module = importlib.import_module(module_name)
+    place = getattr(module, attribute)
+    return inspect.getsource(place if inspect.isclass(place) or inspect.isfunction(place) else module)
+
+
+def parsed(text: str) -> Any:
+    try:
+        return ast.literal_eval(text)
+    except ValueError:
+        return text
+
+
+def test_there_are_32_questions_in_order() -> None:
+    assert [a.id for a in AMBIGUITIES] == [f"A{k}" for k in range(1, 33)]
+
+
+@by_id
+def test_the_place_that_decides_exists_and_names_the_question(ambiguity: Ambiguity) -> None:
+    assert (ambiguity.mark or ambiguity.id) in source_of(ambiguity.where)
+
+
+@by_id
+def test_a_question_that_matters_can_be_answered_otherwise(ambiguity: Ambiguity) -> None:
+    assert ambiguity.alternatives or ambiguity.impact != "H"
+
+
+@by_id
+def test_every_alternative_is_a_setting_with_another_default(ambiguity: Ambiguity) -> None:
+    for alternative in ambiguity.alternatives:
+        setting, _, text = alternative.partition(" = ")
+        owner, name = setting.split(".")
+        if owner not in SETTINGS:
+            place = getattr(importlib.import_module(ambiguity.where.partition(":")[0]), owner)
+            assert name in inspect.signature(place).parameters
+            continue
+        default = getattr(SETTINGS[owner], name)
+        value = PROFILES[text] if name == "profile" else parsed(text)
+        assert value != default
+        assert default is None or type(value) is type(default)
+        choices = get_args(get_type_hints(type(SETTINGS[owner]))[name])
+        assert not isinstance(value, str) or value in choices
+        replace(SETTINGS[owner], **{name: value})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import mpmath
@@ -9,9 +10,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from scipy.special import sph_harm_y
 
-from pop_ref import INRIA, PAPER, projection
+from pop_ref import INRIA, PAPER, activations, camera, covariance, footprint, harmonics, projection
+from pop_ref.alpha import alpha_from_sigma, sigma_at_pixel
 from tests.gradients.checks import complex_step_gradient
+from tests.oracle.scenes import tilted_camera
 
 K = np.array([[7.0, 0.0, 3.25], [0.0, 9.0, 2.0], [0.0, 0.0, 1.0]])
 WIDTH, HEIGHT = 6, 5
@@ -103,3 +108,326 @@ def test_scaling_focal_and_image_scales_centres_once_and_covariances_twice() -> 
     assert np.array_equal(projection.project_means(p, K2, 2 * WIDTH, 2 * HEIGHT), 2.0 * once)
     J, J2 = (projection.projection_jacobians(p, k, s * WIDTH, s * HEIGHT) for k, s in ((K, 1), (K2, 2)))
     assert np.array_equal(projection.project_covars(covar, J2), 4.0 * projection.project_covars(covar, J))
+
+
+# Activations against closed forms and at the ends of their ranges.
+
+
+@given(st.floats(-700.0, 700.0))
+def test_opacities_are_the_logistic_function_to_the_last_bits(logit: float) -> None:
+    with mpmath.workdps(40):
+        want = float(1 / (1 + mpmath.exp(-mpmath.mpf(logit))))
+    np.testing.assert_allclose(activations.opacities_from_logits(np.array([logit]))[0], want, rtol=4e-16)
+
+
+def test_opacities_never_overflow_and_reach_both_ends() -> None:
+    got = activations.opacities_from_logits(np.array([-1e308, -800.0, 800.0, 1e308]))
+    assert got.tolist() == [0.0, 0.0, 1.0, 1.0]
+
+
+@given(st.floats(-20.0, 20.0))
+def test_scales_are_exponentials(log_scale: float) -> None:
+    got = activations.scales_from_log_scales(np.array([[log_scale] * 3]))
+    np.testing.assert_allclose(got, math.exp(log_scale), rtol=4e-16)
+
+
+lattice = st.integers(-4096, 4096).map(lambda k: k / 512.0)
+
+
+@given(st.lists(lattice, min_size=4, max_size=4).filter(any), st.integers(-60, 60))
+def test_unit_quaternions_have_norm_one_and_forget_a_power_of_two(quat: list[float], power: int) -> None:
+    unit = activations.unit_quats_from_quats(np.array([quat]))
+    np.testing.assert_allclose(np.linalg.norm(unit), 1.0, rtol=4e-16)
+    scaled = activations.unit_quats_from_quats(np.array([quat]) * 2.0**power)
+    assert np.array_equal(unit, scaled)
+
+
+def test_quaternions_whose_squares_underflow_or_overflow_are_still_normalised() -> None:
+    for size in (1e-200, 1e200):
+        unit = activations.unit_quats_from_quats(np.array([[size, size, size, size]]))
+        np.testing.assert_allclose(unit, 0.5, rtol=1e-15)
+
+
+# Rotations and covariances against SciPy and their algebra.
+
+# multiples of 1/1024, so that no square underflows where bits are compared
+covariance_lattice = st.integers(-4096, 4096).map(lambda k: k / 1024.0)
+quat_lists = st.lists(covariance_lattice, min_size=4, max_size=4).filter(any)
+scale_lists = st.lists(covariance_lattice.map(abs), min_size=3, max_size=3)
+
+
+@given(quat_lists)
+def test_rotations_are_those_of_scipy(quat: list[float]) -> None:
+    w, x, y, z = quat
+    want = Rotation.from_quat([x, y, z, w]).as_matrix()
+    np.testing.assert_allclose(covariance.rotmats_from_quats(np.array([quat]))[0], want, atol=2e-15)
+
+
+@given(quat_lists, scale_lists)
+def test_covariances_are_symmetric_with_the_squared_scales_as_eigenvalues(
+    quat: list[float], scales: list[float]
+) -> None:
+    covar = covariance.covars_from_quats_scales(np.array([quat]), np.array([scales]))[0]
+    assert np.array_equal(covar, covar.T)
+    want = np.sort(np.square(scales))
+    np.testing.assert_allclose(np.linalg.eigvalsh(covar), want, atol=1e-13 * max(1.0, want[-1]))
+
+
+@given(quat_lists, scale_lists)
+def test_covariances_map_the_rotation_s_axes_to_their_variances(quat: list[float], scales: list[float]) -> None:
+    w, x, y, z = quat
+    covar = covariance.covars_from_quats_scales(np.array([quat]), np.array([scales]))[0]
+    axes = Rotation.from_quat([x, y, z, w]).as_matrix()
+    for k in range(3):
+        np.testing.assert_allclose(covar @ axes[:, k], scales[k] ** 2 * axes[:, k], atol=1e-12)
+
+
+@given(quat_lists, scale_lists)
+def test_a_quaternion_and_its_negative_give_the_same_bits(quat: list[float], scales: list[float]) -> None:
+    q, s = np.array([quat]), np.array([scales])
+    assert np.array_equal(covariance.rotmats_from_quats(q), covariance.rotmats_from_quats(-q))
+    assert np.array_equal(covariance.covars_from_quats_scales(q, s), covariance.covars_from_quats_scales(-q, s))
+
+
+@given(quat_lists, scale_lists)
+def test_doubling_the_scales_quadruples_the_covariance_exactly(quat: list[float], scales: list[float]) -> None:
+    q, s = np.array([quat]), np.array([scales])
+    once, twice = covariance.covars_from_quats_scales(q, s), covariance.covars_from_quats_scales(q, 2.0 * s)
+    assert np.array_equal(twice, 4.0 * once)
+
+
+def test_no_gaussians_have_no_covariances() -> None:
+    assert covariance.covars_from_quats_scales(np.zeros((0, 4)), np.zeros((0, 3))).shape == (0, 3, 3)
+
+
+# World to camera against homogeneous coordinates, and the near plane at its edge.
+
+RNG = np.random.default_rng(9)
+VIEWMAT = tilted_camera().viewmat
+MEANS = RNG.normal(size=(6, 3))
+
+
+def test_the_center_is_where_the_inverse_sends_the_origin() -> None:
+    np.testing.assert_allclose(camera.camera_center(VIEWMAT), np.linalg.inv(VIEWMAT)[:3, 3], atol=1e-15)
+
+
+def test_the_center_lands_on_the_camera_s_origin() -> None:
+    at_center = camera.means_cam_from_means(camera.camera_center(VIEWMAT)[None], VIEWMAT)
+    np.testing.assert_allclose(at_center, 0.0, atol=1e-15)
+
+
+def test_centres_are_transformed_as_homogeneous_points() -> None:
+    homogeneous = np.concatenate([MEANS, np.ones((6, 1))], axis=1)
+    np.testing.assert_allclose(
+        camera.means_cam_from_means(MEANS, VIEWMAT), (homogeneous @ VIEWMAT.T)[:, :3], atol=1e-15
+    )
+
+
+def test_view_directions_have_the_length_of_the_camera_frame_centres() -> None:
+    dirs, means_cam = camera.view_dirs(MEANS, VIEWMAT), camera.means_cam_from_means(MEANS, VIEWMAT)
+    np.testing.assert_allclose(np.linalg.norm(dirs, axis=1), np.linalg.norm(means_cam, axis=1), rtol=1e-14)
+    np.testing.assert_allclose(dirs @ VIEWMAT[:3, :3].T, means_cam, atol=1e-14)
+
+
+def test_covariances_are_those_of_transformed_samples() -> None:
+    samples = RNG.normal(size=(50, 3)) * [1.0, 2.0, 0.25]
+    covar = np.cov(samples.T)
+    moved = camera.means_cam_from_means(samples, VIEWMAT)
+    np.testing.assert_allclose(camera.covars_cam_from_covars(covar[None], VIEWMAT)[0], np.cov(moved.T), atol=1e-13)
+
+
+def test_the_near_plane_itself_is_kept_by_paper_and_culled_by_inria() -> None:
+    for profile, kept in ((PAPER, True), (INRIA, False)):
+        near = profile.near_plane
+        depths = np.array([-1.0, 0.0, math.nextafter(near, 0.0), near, math.nextafter(near, 1.0)])
+        assert camera.in_front(depths, profile).tolist() == [False, False, False, kept, True]
+
+
+def test_the_far_plane_itself_is_kept() -> None:
+    close = replace(PAPER, far_plane=8.0)
+    assert camera.in_front(np.array([8.0, math.nextafter(8.0, 9.0)]), close).tolist() == [True, False]
+
+
+# The footprint: inverses, extents that miss nothing, culls at their edges, splats without an ellipse.
+
+angles, stretches = st.floats(0.0, math.pi), st.floats(0.0, 6.0)
+any_opacity = st.one_of(st.floats(0.0, 1.0), st.sampled_from([0.0, 1.0 / 256.0, PAPER.alpha_floor, 1.0]))
+
+
+def covar2d(angle: float, a: float, b: float) -> np.ndarray:
+    c, s = math.cos(angle), math.sin(angle)
+    R = np.array([[c, -s], [s, c]])
+    return footprint.low_pass((R @ np.diag([a * a, b * b]) @ R.T)[None], PAPER.eps2d)
+
+
+@given(angles, stretches, stretches)
+def test_conics_are_inverses(angle: float, a: float, b: float) -> None:
+    covar = covar2d(angle, a, b)
+    xx, xy, yy = footprint.conics_from_covars2d(covar)[0]
+    np.testing.assert_allclose(covar[0] @ [[xx, xy], [xy, yy]], np.eye(2), atol=1e-11)
+
+
+@given(angles, stretches, stretches)
+def test_compensations_are_root_determinant_ratios(angle: float, a: float, b: float) -> None:
+    blurred = covar2d(angle, a, b)
+    raw = blurred - PAPER.eps2d * np.eye(2)
+    got = footprint.compensations(raw, PAPER.eps2d)[0]
+    ratio = np.prod(np.linalg.eigvalsh(raw[0]) / np.linalg.eigvalsh(blurred[0]))
+    assert 0.0 <= got <= 1.0
+    np.testing.assert_allclose(got**2, max(0.0, ratio), atol=1e-12)
+
+
+@given(angles, stretches, stretches, any_opacity, st.floats(0.0, 2.0 * math.pi), st.floats(1.0, 1.5))
+def test_no_point_outside_the_extent_reaches_the_alpha_floor(
+    angle: float, a: float, b: float, opacity: float, towards: float, beyond: float
+) -> None:
+    covar = covar2d(angle, a, b)
+    conic = footprint.conics_from_covars2d(covar)[0].tolist()
+    r_x, r_y = footprint.radii_from_covars2d(covar, np.array([opacity]))[0].tolist()
+    # a point on the rectangle's edge, or a little outside
+    dx, dy = math.cos(towards), math.sin(towards)
+    scale = min(r_x / abs(dx) if dx else math.inf, r_y / abs(dy) if dy else math.inf)
+    sigma = sigma_at_pixel((0.0, 0.0), conic, beyond * scale * dx, beyond * scale * dy)
+    alpha, skipped = alpha_from_sigma(sigma, opacity)
+    assert skipped or alpha < PAPER.alpha_floor * (1.0 + 1e-12)
+
+
+def test_the_extent_is_tight() -> None:
+    # at o = 1 the ellipse alpha = 1/255 reaches sqrt(2 ln 255) = 3.329 standard deviations
+    covar = np.diag([100.0**2, 10.0**2])[None]
+    assert footprint.radii_from_covars2d(covar, np.array([1.0])).tolist() == [[333, 34]]
+    assert footprint.radii_from_covars2d(covar, np.array([0.5])).tolist() == [[312, 32]]
+
+
+def test_an_opacity_under_the_floor_has_no_extent_and_one_at_the_floor_a_zero_one() -> None:
+    covars = np.tile(np.eye(2), (4, 1, 1))
+    floor = PAPER.alpha_floor
+    opacities = np.array([0.0, math.nextafter(floor, 0.0), floor, math.nextafter(floor, 1.0)])
+    assert footprint.radii_from_covars2d(covars, opacities).tolist() == [[0, 0], [0, 0], [0, 0], [1, 1]]
+
+
+def test_inria_s_extent_is_a_square_of_three_deviations_whatever_the_opacity() -> None:
+    covars = np.stack([np.diag([16.0, 1.0]), np.diag([1.0, 16.0]), np.eye(2)])
+    radii = footprint.radii_from_covars2d(covars, np.array([1.0, 0.0, 0.5]), INRIA)
+    # the last is widened: sqrt(max(0.1, 0)) is added to the equal eigenvalues
+    assert radii.tolist() == [[12, 12], [12, 12], [math.ceil(3.0 * math.sqrt(1.0 + math.sqrt(0.1)))] * 2]
+
+
+def test_a_splat_without_an_ellipse_is_culled_in_every_profile() -> None:
+    covars = np.array([[[1.0, 2.0], [2.0, 1.0]], [[1.0, 1.0], [1.0, 1.0]], [[0.0, 0.0], [0.0, 0.0]]])
+    for profile in (PAPER, INRIA):
+        assert np.all(footprint.radii_from_covars2d(covars, np.ones(3), profile) == 0)
+    assert np.all(footprint.conics_from_covars2d(covars) == 0.0)
+    assert np.all(footprint.compensations(covars, 0.25) == 0.0)
+
+
+def test_a_needle_so_long_that_the_determinant_rounds_to_nothing_is_culled() -> None:
+    needle = np.array([[[1e18, 1e18], [1e18, 1e18]]])
+    blurred = footprint.low_pass(needle, PAPER.eps2d)
+    assert np.array_equal(blurred, needle)
+    assert np.all(footprint.radii_from_covars2d(blurred, np.ones(1)) == 0)
+
+
+def test_a_huge_splat_s_extent_fits_an_int32() -> None:
+    radii = footprint.radii_from_covars2d(np.diag([1e30, 1e30])[None], np.ones(1))
+    assert radii.tolist() == [[2**31 - 1, 2**31 - 1]]
+
+
+def test_a_splat_that_only_touches_the_image_s_border_is_off_screen() -> None:
+    means2d = np.array([[-2.0, 1.0], [-1.75, 1.0], [10.0, 1.0], [9.75, 1.0], [4.0, -2.0], [4.0, 6.0], [4.0, 5.75]])
+    radii = np.full((7, 2), 2)
+    assert footprint.on_screen(means2d, radii, 8, 4).tolist() == [False, True, False, True, False, False, True]
+
+
+def test_a_splat_without_extent_is_off_screen() -> None:
+    assert footprint.on_screen(np.array([[1.0, 1.0]]), np.array([[0, 0]]), 4, 4).tolist() == [False]
+
+
+def test_inria_keeps_a_splat_if_its_square_reaches_a_tile() -> None:
+    # grid of 16 px over 20 px: the right tile ends at 32, and the square's start is kept under 32.5
+    means2d = np.array([[34.25, 8.0], [34.5, 8.0], [-0.5, 8.0], [-0.75, 8.0]])
+    radii = np.full((4, 2), 2)
+    assert footprint.on_screen(means2d, radii, 20, 16, INRIA).tolist() == [True, False, True, False]
+    assert footprint.on_screen(means2d, radii, 20, 16, replace(INRIA, tile_size=4)).tolist() == [
+        False,
+        False,
+        True,
+        False,
+    ]
+
+
+# Spherical harmonics against SciPy's, and orthonormal by quadrature.
+
+HARMONICS_RNG = np.random.default_rng(8)
+DIRS = HARMONICS_RNG.normal(size=(40, 3))
+UNITS = DIRS / np.linalg.norm(DIRS, axis=1, keepdims=True)
+
+
+def real_harmonic(l: int, m: int, units: np.ndarray) -> np.ndarray:
+    """Combine SciPy's complex harmonics (with their Condon-Shortley phase) into the real one of the code bases."""
+    theta, phi = np.arccos(units[:, 2]), np.arctan2(units[:, 1], units[:, 0])
+    complex_values = sph_harm_y(l, abs(m), theta, phi)
+    if m == 0:
+        return complex_values.real
+    return math.sqrt(2.0) * (complex_values.imag if m < 0 else complex_values.real)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_the_basis_is_that_of_scipy_in_order_and_sign(degree: int) -> None:
+    basis = harmonics.sh_basis(UNITS, degree)
+    want = [real_harmonic(l, m, UNITS) for l in range(degree + 1) for m in range(-l, l + 1)]
+    assert basis.shape == (40, len(want))
+    np.testing.assert_allclose(basis, np.stack(want, axis=1), atol=5e-15)
+
+
+def test_the_constants_are_the_decimal_literals_that_the_code_bases_print() -> None:
+    along_z = harmonics.sh_basis(np.array([[0.0, 0.0, 1.0]]), 1)[0]
+    np.testing.assert_allclose(along_z[[0, 2]], [0.28209479177387814, 0.4886025119029199], rtol=1e-15)
+    diagonal = harmonics.sh_basis(np.array([[1.0, 1.0, 1.0]]), 3)[0]
+    np.testing.assert_allclose(diagonal[4], 1.0925484305920792, rtol=1e-15)
+    np.testing.assert_allclose(diagonal[[9, 10]], [-0.5900435899266435 * 2.0, 2.890611442640554], rtol=1e-15)
+    np.testing.assert_allclose(diagonal[[11, 12]], [-0.4570457994644658 * 2.0, 0.3731763325901154 * -4.0], rtol=1e-15)
+
+
+def test_the_basis_is_orthonormal_by_gauss_legendre_quadrature() -> None:
+    nodes, node_weights = np.polynomial.legendre.leggauss(8)
+    angles = 2.0 * np.pi * np.arange(16) / 16
+    z, phi = (grid.ravel() for grid in np.meshgrid(nodes, angles, indexing="ij"))
+    r = np.sqrt(1.0 - z * z)
+    basis = harmonics.sh_basis(np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1), 3)
+    weights = np.repeat(node_weights, 16) * 2.0 * np.pi / 16
+    np.testing.assert_allclose((basis * weights[:, None]).T @ basis, np.eye(16), atol=1e-14)
+
+
+def test_colors_are_the_sum_over_the_basis_plus_one_half_clamped_at_zero() -> None:
+    sh = HARMONICS_RNG.normal(size=(40, 16, 3))
+    for degree in range(4):
+        n_sh = (degree + 1) ** 2
+        want = np.einsum("nk,nkc->nc", harmonics.sh_basis(UNITS, degree), sh[:, :n_sh]) + 0.5
+        assert np.any(want < 0.0)
+        got = harmonics.colors_from_sh(sh, DIRS, degree)
+        np.testing.assert_allclose(got, np.maximum(want, 0.0), atol=1e-14)
+
+
+def test_degree_zero_does_not_look_at_the_direction() -> None:
+    sh = HARMONICS_RNG.normal(size=(40, 1, 3))
+    assert np.array_equal(harmonics.colors_from_sh(sh, DIRS, 0), harmonics.colors_from_sh(sh, -DIRS[::-1], 0))
+
+
+def test_zero_high_bands_give_the_lower_degree_s_bits() -> None:
+    sh = HARMONICS_RNG.normal(size=(40, 16, 3))
+    sh[:, 4:] = 0.0
+    assert np.array_equal(harmonics.colors_from_sh(sh, DIRS, 3), harmonics.colors_from_sh(sh, DIRS, 1))
+
+
+def test_bands_have_parity() -> None:
+    here, there = harmonics.sh_basis(UNITS, 3), harmonics.sh_basis(-UNITS, 3)
+    sign = np.concatenate([np.full(2 * l + 1, (-1.0) ** l) for l in range(4)])
+    assert np.array_equal(there, here * sign)
+
+
+def test_wrong_degrees_and_too_few_coefficients_are_refused() -> None:
+    with pytest.raises(ValueError, match="sh_degree is 4; it must be 0, 1, 2 or 3"):
+        harmonics.sh_basis(UNITS, 4)
+    with pytest.raises(ValueError, match="sh has 4 coefficients; sh_degree 2 needs 9"):
+        harmonics.colors_from_sh(np.zeros((40, 4, 3)), DIRS, 2)

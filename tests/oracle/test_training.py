@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
-from pop_ref import density
-from pop_ref.polarization import pop_loss
-from pop_ref.recipes import RECIPES, Recipe
-from pop_ref.render import render
-from pop_ref.training import Training, control, gaussians_from_params, objective, start, train_step
+from pop_ref import density, losses
+from pop_ref.activations import opacities_from_logits, opacities_from_logits_vjp
+from pop_ref.ambiguities import AMBIGUITIES
+from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER, Profile
+from pop_ref.optimizer import LEARNING_RATES, adam_step, learning_rates, means_learning_rate, sh_degree_at
+from pop_ref.polarization import pop_loss, pop_loss_vjp
+from pop_ref.recipes import L1_DIVIDED, RECIPES, Recipe
+from pop_ref.records import Render
+from pop_ref.render import render, render_vjp
+from pop_ref.training import Training, control, gaussians_from_params, objective, params_vjp, start, train_step
 from tests.golden import ten_losses
 
 CAMERAS, PHOTOS = ten_losses.cameras(), ten_losses.photographs()
@@ -198,3 +209,281 @@ def test_a_population_may_die_out_during_training() -> None:
     state, losses = trained(faint, 6, ten_losses.RECIPE)
     assert len(state.rows) == 0
     assert np.all(np.isfinite(losses))
+
+
+# Adam against a scalar loop and against torch, and the two schedules.
+
+
+def scalar_adam(x: float, gradients: list[float], lr: float, betas: tuple[float, float], eps: float) -> list[float]:
+    """Kingma and Ba's algorithm 1, one number at a time."""
+    m = v = 0.0
+    path = []
+    for t, g in enumerate(gradients, start=1):
+        m = betas[0] * m + (1.0 - betas[0]) * g
+        v = betas[1] * v + (1.0 - betas[1]) * g**2
+        m_hat, v_hat = m / (1.0 - betas[0] ** t), v / (1.0 - betas[1] ** t)
+        x = x - lr * m_hat / (math.sqrt(v_hat) + eps)
+        path.append(x)
+    return path
+
+
+def run(x: np.ndarray, gradients: np.ndarray, lr: float, **options) -> list[np.ndarray]:
+    params, m, v = {"x": x}, {"x": np.zeros_like(x)}, {"x": np.zeros_like(x)}
+    path = []
+    for t, g in enumerate(gradients, start=1):
+        params, m, v = adam_step(params, {"x": g}, m, v, t, {"x": lr}, **options)
+        path.append(params["x"])
+    return path
+
+
+gradients_st = st.lists(st.sampled_from([0.0, 1.0, -1.0, 0.5]) | st.floats(-8.0, 8.0), min_size=1, max_size=12)
+
+
+@given(gradients_st, st.sampled_from([1e-15, 1e-8, 0.125]), st.sampled_from([(0.9, 0.999), (0.5, 0.75)]))
+def test_adam_is_the_published_algorithm_number_by_number(
+    gradients: list[float], eps: float, betas: tuple[float, float]
+) -> None:
+    path = run(np.array([[0.5]]), np.array(gradients).reshape(-1, 1, 1), 0.25, betas=betas, eps=eps)
+    expected = scalar_adam(0.5, gradients, 0.25, betas, eps)
+    np.testing.assert_allclose(np.ravel(path), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_adam_equals_torch_on_rows_of_several_shapes() -> None:
+    rng = np.random.default_rng(3)
+    params = {"means": rng.normal(size=(5, 3)), "opacities": rng.normal(size=5), "sh0": rng.normal(size=(5, 1, 3))}
+    lr = {"means": 1e-3, "opacities": 0.05, "sh0": 0.0025}
+    tensors = {name: torch.tensor(array, requires_grad=True) for name, array in params.items()}
+    groups = [{"params": [tensors[name]], "lr": lr[name]} for name in params]
+    reference = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15, foreach=False)
+    m = {name: np.zeros_like(array) for name, array in params.items()}
+    v = {name: np.zeros_like(array) for name, array in params.items()}
+    for step in range(1, 26):
+        # gradients of very different sizes, some exactly zero, as training makes them
+        grads = {name: rng.normal(size=a.shape) * 10.0 ** rng.integers(-12, 3, a.shape) for name, a in params.items()}
+        for name, g in grads.items():
+            g[step % 5] = 0.0
+            tensors[name].grad = torch.tensor(g)
+        params, m, v = adam_step(params, grads, m, v, step, lr)
+        reference.step()
+        for name in params:
+            state = reference.state[tensors[name]]
+            np.testing.assert_allclose(params[name], tensors[name].detach().numpy(), rtol=1e-13, atol=1e-15)
+            np.testing.assert_allclose(m[name], state["exp_avg"].numpy(), rtol=1e-13, atol=1e-25)
+            np.testing.assert_allclose(v[name], state["exp_avg_sq"].numpy(), rtol=1e-13, atol=1e-30)
+
+
+def test_a_steady_gradient_moves_a_parameter_by_the_learning_rate_however_small_it_is() -> None:
+    for size in (1.0, 1e-6, 1e-12):
+        path = run(np.array([0.0]), np.full((4, 1), size), 0.25)
+        np.testing.assert_allclose(np.ravel(path), [-0.25, -0.5, -0.75, -1.0], rtol=2e-3)
+
+
+def test_a_parameter_that_never_had_a_gradient_keeps_its_bits() -> None:
+    x = np.array([0.1, -7.25])
+    assert run(x, np.zeros((3, 2)), 0.25)[-1].tolist() == x.tolist()
+
+
+def test_a_parameter_without_a_gradient_coasts_on_its_moments() -> None:
+    path = np.ravel(run(np.array([0.0]), np.array([[1.0], [0.0], [0.0]]), 0.25))
+    assert path[0] > path[1] > path[2]
+
+
+def test_adam_leaves_its_arguments_alone() -> None:
+    x, g, zero = {"x": np.ones(2)}, {"x": np.ones(2)}, {"x": np.zeros(2)}
+    adam_step(x, g, zero, zero, 1, {"x": 0.5})
+    assert x["x"].tolist() == g["x"].tolist() == [1.0, 1.0]
+    assert zero["x"].tolist() == [0.0, 0.0]
+
+
+def test_adam_of_no_rows_is_no_rows() -> None:
+    none = {"x": np.zeros((0, 3))}
+    assert adam_step(none, none, none, none, 1, {"x": 0.5})[0]["x"].shape == (0, 3)
+
+
+def test_updates_count_from_one() -> None:
+    with pytest.raises(ValueError, match="step is 0"):
+        adam_step({}, {}, {}, {}, 0, {})
+
+
+@pytest.mark.parametrize(("opacity", "steps"), [(0.1, 130), (0.5, 380), (0.99, 430)])
+def test_an_opacity_that_only_pop_touches_falls_under_the_pruning_threshold_in_so_many_steps(
+    opacity: float, steps: int
+) -> None:
+    logit = {"o": np.log(np.array([opacity]) / (1.0 - opacity))}
+    m = v = {"o": np.zeros(1)}
+    taken = 0
+    while opacities_from_logits(logit["o"])[0] >= 0.005:
+        taken += 1
+        gradient = {"o": opacities_from_logits_vjp(logit["o"], np.array([1e-3 / 40_000]))}
+        logit, m, v = adam_step(logit, gradient, m, v, taken, {"o": LEARNING_RATES["opacities"]})
+    assert taken == pytest.approx(steps, abs=5)
+
+
+def test_positions_start_at_their_rate_and_end_at_a_hundredth_of_it() -> None:
+    assert means_learning_rate(0, 3.0) == 1.6e-4 * 3.0
+    assert means_learning_rate(30_000, 3.0) == pytest.approx(1.6e-6 * 3.0, rel=1e-14)
+    assert means_learning_rate(99_999, 3.0) == means_learning_rate(30_000, 3.0)
+    assert means_learning_rate(-1, 3.0) == means_learning_rate(0, 3.0)
+
+
+@given(st.integers(0, 29_999), st.sampled_from([0.5, 1.0, 4.0]))
+def test_positions_rate_falls_by_one_factor_a_step(step: int, scene_scale: float) -> None:
+    ratio = means_learning_rate(step + 1, scene_scale) / means_learning_rate(step, scene_scale)
+    assert ratio == pytest.approx(0.01 ** (1 / 30_000), rel=1e-12)
+
+
+def test_only_the_positions_rate_changes() -> None:
+    early, late = learning_rates(0, 2.0), learning_rates(20_000, 2.0)
+    assert [name for name in early if early[name] != late[name]] == ["means"]
+    assert early["shN"] == early["sh0"] / 20
+    assert learning_rates(500, 2.0, max_steps=1000)["means"] == pytest.approx(0.1 * early["means"], rel=1e-14)
+
+
+def test_harmonics_gain_a_band_each_thousand_steps_up_to_three() -> None:
+    degrees = [sh_degree_at(step) for step in range(30_000)]
+    assert [degrees.index(d) for d in range(4)] == [0, 1000, 2000, 3000]
+    assert max(degrees) == 3
+    assert [sh_degree_at(step, interval=2, max_degree=1) for step in range(5)] == [0, 0, 1, 1, 1]
+
+
+# Every setting of a recipe is seen in a training step: the loss and the next Gaussians are those found by hand.
+
+CAMERA, PHOTO = ten_losses.cameras()[0], ten_losses.photographs()[0]
+# one opaque Gaussian that shows the ceilings apart, and one that this view does not show
+RECIPES_PARAMS = {name: array.copy() for name, array in ten_losses.first_params().items()}
+RECIPES_PARAMS["opacities"][7] = 9.0
+RECIPES_PARAMS["means"][0] = [50.0, 0.0, 0.0]
+
+
+def in_this_view(view: Render) -> np.ndarray:
+    return view.dominant_counts > 0
+
+
+@dataclass(frozen=True)
+class ByHand:
+    """What a step ought to do; the defaults are POP's first step.
+
+    Attributes:
+        step: its number.
+        loss, vjp: of the image.
+        weights: their settings.
+        profile: of the renderer.
+        important: who is, None where there is no POP term.
+        visible_only: the POP term leaves out what is not seen.
+        opacity_rate: learning rate of the opacities.
+    """
+
+    step: int = 0
+    loss: Callable[..., float] = losses.photometric_pop
+    vjp: Callable[..., np.ndarray] = losses.photometric_pop_vjp
+    weights: dict[str, Any] = field(default_factory=dict)
+    profile: Profile = PAPER
+    important: Callable[[Render], np.ndarray] | None = in_this_view
+    visible_only: bool = False
+    opacity_rate: float = 0.05
+
+    def take(self, state: Training) -> tuple[dict[str, np.ndarray], float]:
+        gaussians, degree = gaussians_from_params(RECIPES_PARAMS), sh_degree_at(self.step, max_degree=1)
+        view = render(gaussians, CAMERA, sh_degree=degree, profile=self.profile)
+        loss = self.loss(view.image, PHOTO, **self.weights)
+        v_image = self.vjp(view.image, PHOTO, 1.0, **self.weights)
+        v_opacities = np.zeros(len(gaussians))
+        if self.important is not None:
+            shown = view.splats.visible if self.visible_only else None
+            loss += 1e-3 * pop_loss(gaussians.opacities, self.important(view), shown)
+            v_opacities = pop_loss_vjp(gaussians.opacities, self.important(view), 1e-3, shown)
+        gradients = render_vjp(gaussians, CAMERA, v_image, sh_degree=degree, profile=self.profile)
+        grads = params_vjp(RECIPES_PARAMS, gradients, v_opacities)
+        rates = {**learning_rates(self.step, 1.0), "opacities": self.opacity_rate}
+        return adam_step(RECIPES_PARAMS, grads, state.rows.m, state.rows.v, self.step + 1, rates)[0], loss
+
+
+L1 = {"loss": losses.photometric_3dgs, "vjp": losses.photometric_3dgs_vjp}
+SEEN_BEFORE = 6
+
+ALTERNATIVES = {
+    "Recipe.pop_views = window": ByHand(important=lambda view: in_this_view(view) | (np.arange(10) == SEEN_BEFORE)),
+    "Recipe.pixel_scale = 0.5": ByHand(weights={"l2_scale": 0.5}),
+    "Recipe.pixel_scale = 3.0": ByHand(weights={"l2_scale": 3.0}),
+    "Recipe.d_ssim_halved = True": ByHand(weights={"halved": True}),
+    "Recipe.padding = same": ByHand(weights={"padding": "same"}),
+    "Recipe.pop_over = visible": ByHand(visible_only=True),
+    "Recipe.pop_start_iter = 500": ByHand(important=None),
+    "Recipe.l2_stop_iter = 15000": ByHand(step=15_000, **L1, weights={"lambda_ssim": 0.2}, important=None),
+    "Recipe.lambda_pop = 0.0": ByHand(important=None),
+    "Recipe.lambda_ssim = 0.0": ByHand(weights={"lambda_ssim": 0.0}),
+    "Recipe.profile = gsplat_1_6": ByHand(profile=GSPLAT_1_6),
+    "Recipe.profile = inria": ByHand(profile=INRIA),
+}
+
+
+def state_at(step: int) -> Training:
+    state = replace(start(RECIPES_PARAMS), step=step)
+    state.statistics.dominant_sum[SEEN_BEFORE] = 5
+    return state
+
+
+def taken(recipe: Recipe, step: int = 0) -> tuple[dict[str, np.ndarray], float]:
+    state, loss = train_step(state_at(step), CAMERA, PHOTO, 1.0, ten_losses.draws, recipe)
+    return dict(state.rows.params), loss
+
+
+def assert_same_step(recipe: Recipe, by_hand: ByHand) -> None:
+    (params, loss), (expected, expected_loss) = taken(recipe, by_hand.step), by_hand.take(state_at(by_hand.step))
+    assert loss == pytest.approx(expected_loss, rel=1e-14)
+    for name, array in expected.items():
+        np.testing.assert_array_equal(params[name], array, err_msg=name)
+
+
+def chosen(alternative: str) -> Recipe:
+    name, text = alternative.removeprefix("Recipe.").split(" = ")
+    default = getattr(Recipe(), name)
+    values = {"gsplat_1_6": GSPLAT_1_6, "inria": INRIA, "True": True, "15000": 15_000}
+    return replace(Recipe(), **{name: values[text] if text in values else type(default)(text)})
+
+
+def test_every_alternative_of_a_recipe_is_in_the_table() -> None:
+    listed = {text for ambiguity in AMBIGUITIES for text in ambiguity.alternatives if text.startswith("Recipe.")}
+    assert set(ALTERNATIVES) == listed
+
+
+def test_a_step_of_pop_is_the_one_taken_by_hand() -> None:
+    assert_same_step(RECIPES["POP"], ByHand())
+
+
+@pytest.mark.parametrize("alternative", ALTERNATIVES)
+def test_an_alternative_reading_takes_the_step_it_says_and_not_pops(alternative: str) -> None:
+    by_hand = ALTERNATIVES[alternative]
+    assert_same_step(chosen(alternative), by_hand)
+    params, loss = taken(RECIPES["POP"], by_hand.step)
+    expected, expected_loss = by_hand.take(state_at(by_hand.step))
+    assert loss != pytest.approx(expected_loss, rel=1e-9)
+    assert any(not np.array_equal(params[name], expected[name]) for name in params)
+
+
+@pytest.mark.parametrize("n", L1_DIVIDED)
+def test_l1_divided_is_the_share_of_l1_beside_an_unchanged_d_ssim(n: int) -> None:
+    image = render(gaussians_from_params(RECIPES_PARAMS), CAMERA, sh_degree=0).image
+    expected = 0.99 * losses.l1(image, PHOTO) / n + 0.01 * losses.photometric_3dgs(image, PHOTO, 1.0)
+    assert taken(L1_DIVIDED[n])[1] == pytest.approx(expected, rel=1e-14)
+    assert_same_step(L1_DIVIDED[n], ByHand(**L1, weights={"lambda_ssim": 0.01, "l1_scale": 1.0 / n}, important=None))
+    # A28: nothing else differs from the row "L2", which has no blur, no POP and no reset
+    assert replace(L1_DIVIDED[n], pixelwise="l2", pixel_scale=1.0) == RECIPES["L2"]
+
+
+def test_the_figure_has_seven_divisors() -> None:
+    assert list(L1_DIVIDED) == [1, 2, 5, 10, 20, 50, 100]
+
+
+def test_3dgs_is_inrias_code_of_october_2024() -> None:
+    weights = {"lambda_ssim": 0.2, "padding": "same"}
+    by_hand = ByHand(**L1, weights=weights, profile=INRIA, important=None, opacity_rate=0.025)
+    assert_same_step(RECIPES["3DGS"], by_hand)
+    config = RECIPES["3DGS"].density
+    assert config.inclusive
+    assert (config.grow_grad2d, config.reset_every, config.reset_opa, config.prune_opa) == (2e-4, 3000, 0.01, 0.005)
+
+
+def test_gsplat_is_its_default_strategy() -> None:
+    assert_same_step(RECIPES["gsplat"], ByHand(**L1, weights={"lambda_ssim": 0.2}, important=None))
+    assert not RECIPES["gsplat"].density.inclusive

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -65,6 +66,25 @@ def test_a_port_in_cpp_obeys_the_laws_of_images_and_gradients(port: Path, tmp_pa
     assert done.returncode == 0, done.stdout
     passed = int(done.stdout.split(" passed")[0].split()[-1])
     assert passed >= 60, done.stdout
+
+
+@pytest.mark.parametrize(("right", "wrong", "status"), [("", "", 0), ("% w.width) + 0.5", "% w.width)", 1)])
+def test_the_port_of_the_page_obeys_the_laws_of_images_and_a_broken_one_does_not(
+    tmp_path: Path, right: str, wrong: str, status: int
+) -> None:
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("the port of docs/port.md needs node, which is not here")
+    page = (ROOT / "docs" / "port.md").read_text(encoding="utf-8")
+    code = page.partition("```js\n")[2].partition("```")[0]
+    assert right in code
+    (tmp_path / "port.js").write_text(code.replace(right, wrong) if right else code, encoding="utf-8")
+    stages = ("compositing", "dominance", "whole")
+    done = judged(
+        tmp_path, "--program", f"{node} port.js", *(w for s in stages for w in ("--stage", s)), profile="quick"
+    )
+    assert done.returncode == status, done.stdout
+    assert int(done.stdout.split(" passed")[0].split()[-1]) >= (30 if status == 0 else 1), done.stdout
 
 
 def test_a_port_says_how_large_its_error_is(port: Path) -> None:

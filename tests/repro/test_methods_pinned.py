@@ -17,7 +17,7 @@ from paper_repro.rows import ROWS, load_row
 from paper_repro.scales import SCALES
 from paper_repro.scenes import SCENES
 from pop_fast.cli.train import arguments
-from pop_fast.density import densify, rows
+from pop_fast.density import rows
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.model import KEYS
 from pop_fast.train.presets import METHODS
@@ -141,7 +141,6 @@ def traced(run: TrainingRun, patch: pytest.MonkeyPatch) -> list[str]:
     for name, event in (("clone", "clone"), ("split", "split"), ("prune", "prune"), ("replace_rows", "replace"),
                         ("restart", "restart"), ("reset_opacities", "reset")):  # fmt: skip
         patch.setattr(rows, name, noted(event, getattr(rows, name)))
-    patch.setattr(densify, "rows", rows)
     take = run.stepper.steps
 
     def steps(*given: Any) -> Any:

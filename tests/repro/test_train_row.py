@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,20 +14,35 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from paper_repro import train_row as module
-from paper_repro.collect import collect, first_change
-from paper_repro.jobs import NotTrainableError
+from paper_repro.base import base_of, steps_for_others
+from paper_repro.collect import PROBE, collect, first_change
+from paper_repro.jobs import NotTrainableError, job_named, jobs_of
+from paper_repro.probe import VIEWS, ProbedRun, gradient_sizes
 from paper_repro.published import file_hash
 from paper_repro.record import run_id, settings_hash
 from paper_repro.results import read, write
-from paper_repro.train_row import BusyError, Options, commit, finished, only_one, train_row
+from paper_repro.rows import load_rows
+from paper_repro.train_row import (
+    BusyError,
+    Options,
+    capture_folder,
+    commit,
+    finished,
+    load_capture_of,
+    only_one,
+    train_row,
+)
 from pop_fast.errors import PopError
 from pop_fast.io.formats.files import load_splat_file
 from pop_fast.io.images import read_image
+from pop_fast.stages import losses
 from pop_fast.train import TrainingRun
+from pop_fast.train.choose import choose_backend
 from tests.app.interruptions import interrupt
-from tests.repro.trained import options, toy, values
+from tests.repro.made import options, toy, values
 
 ROOT = Path(__file__).parents[2]
 
@@ -257,3 +273,172 @@ def test_a_finished_row_is_trained_again_where_that_is_asked_for_and_its_result_
     assert min(steps) == 0
     assert values(job.result(how.results)) == values(first)
     assert set(first.files) == {path.name for path in job.work(tmp_path / "shown").iterdir()}
+
+
+# Rows that begin where another one has got to: the same bits as alone, and only where that is so.
+
+# of a hundredth of the schedule, another tenth or two less
+SHORT = {"steps_scaler": 0.004}
+
+
+@pytest.mark.parametrize(
+    ("row", "base", "shared", "stop"),
+    [("pup", "3dgs_2023", 120, 140), ("mini_splatting_star", "mini_splatting", 60, 90)],
+)
+def test_a_row_that_begins_from_its_base_comes_to_what_it_comes_to_alone(
+    row, base, shared, stop, tmp_path, monkeypatch
+):
+    job, of_base = toy(row, **SHORT), toy(base, **SHORT)
+    alone = train_row(job, options(tmp_path / "alone"))
+    assert "base" not in alone.protocol
+    how = options(tmp_path / "after")
+    first = train_row(of_base, how)
+    kept = of_base.work(how.work) / "base" / f"ckpt_{shared - 1}_rank0.pt"
+    assert [path.name for path in kept.parent.iterdir()] == [kept.name]
+    assert not (of_base.work(how.work) / "ckpts").exists()
+
+    steps, take = [], TrainingRun.take_steps
+    monkeypatch.setattr(TrainingRun, "take_steps", lambda run, last: steps.append(run.step) or take(run, last))
+    with monkeypatch.context() as patch:
+        interrupt(patch, at=stop)
+        with pytest.raises(KeyboardInterrupt):
+            train_row(job, how)
+    assert kept.is_file()
+    after = train_row(job, how)
+    assert min(steps) == shared
+
+    assert after.protocol == {**alone.protocol, "base": first.run}
+    # held-out views are measured at every fifteenth of the base's steps, and then of one's own
+    differ = {name for name, value in values(after).items() if value != values(alone)[name]}
+    assert differ <= {"protocol", "curve"}
+    counts, others = ({p["step"]: p["num_gaussians"] for p in result.curve} for result in (after, alone))
+    both = counts.keys() & others.keys()
+    assert len(both) >= 12
+    assert all(counts[step] == others[step] for step in both)
+    # the time of the shared steps is in its own
+    assert sum(point["seconds"] is not None for point in after.curve if point["step"] < shared) >= shared // 10
+    assert after.seconds["train"] > after.at(shared - 10, "seconds") > 0.0
+
+
+def test_a_checkpoint_stays_as_long_as_a_row_waits_for_it(tmp_path):
+    how, job = options(tmp_path), toy("pup", steps_scaler=0.001)
+    of_base = base_of(job)
+    train_row(of_base, how)
+    kept = of_base.work(how.work) / "base"
+    done = train_row(job, how)
+    assert kept.is_dir()
+    write(replace(done, row="pup_star"), how.results)
+    module._remove_bulk(job, how)
+    assert not kept.exists()
+
+
+@pytest.mark.parametrize("change", [{"threads": 2}, {"log_every": 7}], ids=["threads", "settings"])
+def test_a_base_of_another_kind_is_not_begun_from(change, tmp_path):
+    how, job = options(tmp_path, keep_checkpoints=True), toy("pup", steps_scaler=0.001)
+    train_row(base_of(job), how)
+    assert "base" not in train_row(job, replace(how, **change)).protocol
+    job.file(how.results).unlink()
+    shutil.rmtree(job.work(how.work))
+    assert "base" in train_row(job, how).protocol
+
+
+@pytest.mark.parametrize("scale", ["toy", "small", "full", "paper"])
+def test_every_row_that_names_a_base_shares_steps_with_it_on_every_scene(scale):
+    named = [row for row in load_rows() if row.base is not None]
+    assert {row.name for row in named} == {"pup", "pup_star", "mini_splatting_star"}
+    for job in jobs_of(scale, [row.name for row in named]):
+        plan = job.config().strategy
+        parts = plan.rounds_start_iter if job.row.method == "pup" else plan.sample_iter
+        assert steps_for_others(base_of(job)) == (parts,)
+
+
+# The probe: it leaves the training alone, is taken up where a run is, and measures what it says.
+
+STEPS = 24
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory):
+    """A configuration of a few steps in some folder, and the demo capture."""
+    folder = tmp_path_factory.mktemp("probe")
+    job = job_named("pop", "demo", "toy")
+    data = str(capture_folder(job.scene, Options(data=folder, work=folder)))
+
+    def config(name: str):
+        made = job.config(data=data, result_dir=str(folder / name), max_steps=STEPS, checkpoint_every=9, threads=1)
+        return choose_backend(made)[0]
+
+    return config, load_capture_of(job, config("none"))[0]
+
+
+def probed(folder_of, name: str, capture, **more) -> ProbedRun:
+    run = ProbedRun(folder_of(name), capture, every=5, **more)
+    run.run()
+    return run
+
+
+def points(run: ProbedRun) -> dict:
+    return json.loads((run._results.path / PROBE).read_text())
+
+
+def test_a_probed_training_is_the_same_training(prepared):
+    config, capture = prepared
+    plain = TrainingRun(config("plain"), capture)
+    plain.run()
+    run = probed(config, "probed", capture)
+    for key, value in plain.params.items():
+        assert torch.equal(run.params[key], value), key
+    assert list(points(run)) == ["0", "5", "10", "15", "20"]
+
+
+def test_a_probe_is_the_mean_over_its_views(prepared):
+    config, capture = prepared
+    run = ProbedRun(config("alone"), capture, every=5)
+    views = capture.train_views(run.config.test_every)
+    assert [view.name for view in run._probed] == [views[i].name for i in (0, len(views) // 2, len(views) - 1)]
+    together = run._probe()
+    everything, singles = run._probed, []
+    for view in everything:
+        run._probed = [view]
+        singles.append(run._probe())
+    assert together["num_gaussians"] == len(run.params["means"])
+    for name in ("grad_l1", "grad_l2", "grad_ssim", "probe_blended", "probe_traversed"):
+        assert together[name] == pytest.approx(sum(one[name] for one in singles) / VIEWS, rel=1e-12)
+        assert len({one[name] for one in singles}) == VIEWS or name == "grad_l1"
+    assert together["probe_traversed"] >= together["probe_blended"] > 1.0
+
+
+def test_what_was_probed_before_a_stop_is_taken_up(prepared, monkeypatch):
+    config, capture = prepared
+    whole = probed(config, "whole", capture)
+    with monkeypatch.context() as patch:
+        interrupt(patch, at=12)
+        with pytest.raises(KeyboardInterrupt):
+            probed(config, "stopped", capture)
+    # the checkpoint is of step 9, and what was probed after it is not of this run any more
+    stale = {**points(whole), "10": {"num_gaussians": 1}}
+    (whole._results.path.parent / "stopped" / PROBE).write_text(json.dumps(stale))
+    again = probed(config, "stopped", capture, resume=True)
+    assert points(again) == points(whole)
+
+
+def test_gradients_are_those_of_autograd_in_units_of_the_slope_of_l1():
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand((20, 24, 3), generator=generator, dtype=torch.float64).requires_grad_()
+    photo = torch.rand((20, 24, 3), generator=generator, dtype=torch.float64)
+    mask = torch.rand((20, 24), generator=generator) < 0.6
+    for kept in (None, mask):
+        n = image.numel() if kept is None else 3 * int(kept.sum())
+        terms = {
+            "grad_l1": losses.l1(image, photo, kept),
+            "grad_l2": losses.l2(image, photo, kept),
+            "grad_ssim": 0.01 * losses.d_ssim(image, photo, "valid", kept),
+        }
+        found = gradient_sizes(image.detach(), photo, kept)
+        assert set(found) == set(terms)
+        for name, term in terms.items():
+            (gradient,) = torch.autograd.grad(term, image)
+            # the mean over what counts, over 1 / (3HW) of what counts
+            inside = gradient if kept is None else gradient[kept]
+            assert found[name] == pytest.approx(float(inside.abs().mean()) * n, rel=1e-12), name
+        assert found["grad_l1"] == pytest.approx(1.0, rel=1e-12)

@@ -15,8 +15,7 @@ from paper_repro.record import Result
 from paper_repro.results import RESULTS, SCALES, find, read_all, write
 from paper_repro.train_row import commit
 from paper_repro.verify import history, other_kind
-from tests.repro.made import PLAIN
-from tests.repro.trained import demo
+from tests.repro.made import PLAIN, demo
 
 FOUND = [result for scale in SCALES for result in read_all(scale, RESULTS)]
 

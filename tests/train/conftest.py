@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from pop_fast.api.registry import get_backend
-from pop_fast.train.engines import native_engine, torch_engine
+from pop_fast.train.engines import torch_engine, whole_engine
 
 ENGINES = ("fast", "compiled", "native")
 
@@ -22,7 +22,7 @@ def engine(request: pytest.FixtureRequest) -> Any:
     reason = get_backend("fast" if request.param == "fast" else "compiled").why_not()
     if reason is not None:
         pytest.skip(reason)
-    return native_engine() if request.param == "native" else torch_engine(request.param)
+    return whole_engine() if request.param == "native" else torch_engine(request.param)
 
 
 @pytest.fixture(autouse=True)

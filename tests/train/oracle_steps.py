@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from pop_fast.density import POPStrategy
-from pop_fast.density.densify import standard_normals
+from pop_fast.density.protocol import Draws
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.presets import values_of
 from pop_ref import training
@@ -154,7 +154,7 @@ def judged_step(run: TrainingRun, recipe: Recipe, scene_scale: float) -> Judged:
     def normals(n: int) -> np.ndarray:
         # the first call draws; a second, of another variant of the densification step, is given the same numbers
         if not drawn:
-            drawn.append(standard_normals(generator, n).double().numpy())
+            drawn.append(Draws.of(generator).normals(n).double().numpy())
         return np.resize(drawn[0], (2, n, 3))
 
     quiet = replace(recipe, density=replace(recipe.density, refine_start_iter=10**9, reset_every=0))

@@ -13,6 +13,7 @@ import torch
 import pop_ref.appearance
 import pop_ref.refinement
 from pop_fast.api.registry import get_backend
+from pop_fast.cuda.backend import CUDA
 from pop_fast.data.capture import Capture
 from pop_fast.data.initialize import initialize_params
 from pop_fast.errors import PopError
@@ -24,10 +25,10 @@ from pop_fast.train.appearance import Appearance
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import engine_of, torch_engine
-from pop_fast.train.fused_settings import unsupported
 from pop_fast.train.metrics import psnr, psnr_after_correction
-from pop_fast.train.phases import phase_at
+from pop_fast.train.schedule import phase_at
 from pop_fast.train.views import ViewTensors, render_view
+from pop_fast.train.whole_step import why_not_trained
 from pop_ref.losses import photometric_pop, photometric_pop_vjp
 from pop_ref.records import Camera
 from pop_ref.render import render, render_vjp
@@ -274,10 +275,8 @@ def test_what_shows_nothing_costs_nothing_before_any_background(tmp_path: Path, 
             run.appearance.params["exposures"].copy_(tensor(EXPOSURES[:4]))
     (stats,) = run.stepper.steps(0, 1, phase_at(config, config.strategy, 0))
     assert stats.objective < 1e-9
-    assert (
-        run.stepper._objective(tensor(np.zeros((24, 32, 3))), 0, phase_at(config, config.strategy, 0), torch.ones(3))
-        > 0.1
-    )
+    nothing = tensor(np.zeros((24, 32, 3)))
+    assert run.stepper._photo_loss(nothing, 0, config.objective_at(0), torch.ones(3)) > 0.1
 
 
 def test_transparency_matters_to_a_random_background_alone(tmp_path: Path) -> None:
@@ -296,8 +295,8 @@ def test_transparency_matters_to_a_random_background_alone(tmp_path: Path) -> No
 @pytest.mark.parametrize("name", sorted(ALL))
 def test_fused_steps_refuse_each_setting_and_the_compiled_backend_takes_torchs(tmp_path: Path, name: str) -> None:
     config = tiny_config(tmp_path, **{name: True})
-    assert name in str(unsupported(config))
-    assert unsupported(tiny_config(tmp_path)) is None
+    assert name in str(why_not_trained(CUDA, config))
+    assert why_not_trained(CUDA, tiny_config(tmp_path)) is None
     reason = get_backend("compiled").why_not()
     if reason is not None:
         pytest.skip(reason)

@@ -6,7 +6,7 @@ import math
 import re
 import threading
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +17,25 @@ import torch
 from benchmarks.faults.runs import same
 from pop_fast.api.registry import get_backend
 from pop_fast.compiled import native_step
+from pop_fast.compiled.backend import CompiledBackend
 from pop_fast.data.initialize import initialize_params
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.train import TrainingRun, engines, fused_stepper
+from pop_fast.stages.tiles import TileLists, tile_lists
+from pop_fast.train import TrainingRun, fused_stepper
 from pop_fast.train import checkpoint as ckpt
-from pop_fast.train.engines import engine_of, native_engine, torch_engine
+from pop_fast.train.engines import engine_of, torch_engine, whole_engine
 from pop_fast.train.model import KEYS
+from pop_fast.train.schedule import steady_updates
 from pop_fast.train.stepper import Engine
+from pop_fast.train.steps import Phase, StepSettings
+from pop_ref.constants import PAPER
+from pop_ref.settings import PARAMETERS
 from tests.app.interruptions import interrupt
 from tests.app.tiny import HEIGHT, WIDTH, last_checkpoint, tiny_capture, tiny_config
 
 REASON = get_backend("compiled").why_not()
-pytestmark = pytest.mark.skipif(REASON is not None, reason=REASON or "")
+needs_compiled = pytest.mark.skipif(REASON is not None, reason=REASON or "")
 
 STEPS = 6
 # statistics and dominance are collected at every step, and nothing is changed
@@ -91,9 +97,10 @@ def put_where(run: TrainingRun, other: TrainingRun) -> None:
             moment.copy_(other.optimizers[key].state[other.params[key]][name])
 
 
+@needs_compiled
 @pytest.mark.parametrize("what", SETTINGS)
 def test_six_steps_are_torchs(what: str, tmp_path: Path) -> None:
-    mine, its = (run_of(tmp_path, engine, SETTINGS[what]) for engine in (native_engine(), torch_engine("fast")))
+    mine, its = (run_of(tmp_path, engine, SETTINGS[what]) for engine in (whole_engine(), torch_engine("fast")))
     moved = dict.fromkeys(KEYS, 0.0)
     for step in range(STEPS):
         put_where(mine, its)
@@ -117,6 +124,7 @@ def test_six_steps_are_torchs(what: str, tmp_path: Path) -> None:
         assert found is None or torch.equal(found.to(wanted.dtype), wanted), name
 
 
+@needs_compiled
 @pytest.mark.parametrize("what", ["on grey, with a mask", "antialiased"])
 def test_the_bits_depend_neither_on_threads_nor_on_how_many_steps_are_asked_for_at_once(
     what: str, tmp_path: Path
@@ -124,7 +132,7 @@ def test_the_bits_depend_neither_on_threads_nor_on_how_many_steps_are_asked_for_
     found = []
     for threads, pace in ((1, 1), (2, STEPS), (3, 2), (7, STEPS)):
         torch.set_num_threads(threads)
-        run = run_of(tmp_path, native_engine(), SETTINGS[what])
+        run = run_of(tmp_path, whole_engine(), SETTINGS[what])
         stats = [s[:5] for last in range(pace, STEPS + 1, pace) for s in run.take_steps(last).stats]
         found.append((stats, {key: param.detach().clone() for key, param in run.params.items()}))
     for stats, params in found[1:]:
@@ -132,6 +140,7 @@ def test_the_bits_depend_neither_on_threads_nor_on_how_many_steps_are_asked_for_
         assert all(torch.equal(params[key], found[0][1][key]) for key in params)
 
 
+@needs_compiled
 def test_a_step_that_is_left_changes_nothing_and_is_taken_by_whoever_goes_on(tmp_path: Path) -> None:
     last, settings = 24, {**SETTINGS["blur of summed counts"], "sh_interval": 100}
 
@@ -140,7 +149,7 @@ def test_a_step_that_is_left_changes_nothing_and_is_taken_by_whoever_goes_on(tmp
         kept += [value.clone() for of in run.optimizers.values() for value in of.state_dict()["state"][0].values()]
         return [*kept, *(run.state[name].clone() for name in ("grad2d", "count", "dominant_sum", "blurred"))]
 
-    whole = run_of(tmp_path, native_engine(), settings)
+    whole = run_of(tmp_path, whole_engine(), settings)
     states, seconds = {}, time.perf_counter()
     for step in range(last):
         whole.take_steps(step + 1)
@@ -148,7 +157,7 @@ def test_a_step_that_is_left_changes_nothing_and_is_taken_by_whoever_goes_on(tmp
     seconds = time.perf_counter() - seconds
     stopped = set()
     for trial in range(12):
-        run = run_of(tmp_path, native_engine(), settings)
+        run = run_of(tmp_path, whole_engine(), settings)
         run.take_steps(1)
         timer = threading.Timer(seconds * trial / 16, run._stop.ask)
         timer.start()
@@ -165,14 +174,16 @@ def test_a_step_that_is_left_changes_nothing_and_is_taken_by_whoever_goes_on(tmp
     assert len(stopped) > 1, "nothing was left half way"
 
 
+@needs_compiled
 @pytest.mark.parametrize("method", ["pop", "gsplat"])
 def test_how_many_steps_are_taken_at_a_time_changes_no_bit(
     method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found: list[dict[str, Any]] = []
+    own = CompiledBackend.whole_step
     for seconds, most in ((0.0, 20), (math.inf, 3), (math.inf, 20)):
         monkeypatch.setattr(fused_stepper, "BLOCK_SECONDS", seconds)
-        monkeypatch.setattr(engines, "MOST_ON_CPU", most)
+        monkeypatch.setattr(CompiledBackend, "whole_step", lambda self, most=most: replace(own(self), most=most))
         folder = tmp_path / f"{seconds}_{most}"
         config = tiny_config(folder, method, backend="compiled", checkpoint_every=0, save_steps=())
         # the sums of the last window are among what is kept
@@ -186,6 +197,7 @@ def test_how_many_steps_are_taken_at_a_time_changes_no_bit(
             assert same, name
 
 
+@needs_compiled
 @pytest.mark.parametrize("method", ["pop", "gsplat"])
 def test_a_run_goes_on_with_another_number_of_threads_to_the_same_bits(
     method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -214,12 +226,13 @@ def test_a_run_goes_on_with_another_number_of_threads_to_the_same_bits(
         assert same(whole[part], parts[part]), part
 
 
+@needs_compiled
 @pytest.mark.parametrize("most", [1_000_000, 10])
 def test_a_step_whose_lists_cannot_be_numbered_is_told_before_it_is_taken(
     most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(native_step, "MOST_ENTRIES", most)
-    run = run_of(tmp_path, native_engine(), {})
+    run = run_of(tmp_path, whole_engine(), {})
     before = {key: param.detach().clone() for key, param in run.params.items()}
     if most > 10:
         taken(run, 1)
@@ -230,12 +243,14 @@ def test_a_step_whose_lists_cannot_be_numbered_is_told_before_it_is_taken(
     assert all(torch.equal(param, before[key]) for key, param in run.params.items())
 
 
+@needs_compiled
 def test_memory_for_photographs_changes_no_bit(tmp_path: Path) -> None:
-    runs = [run_of(tmp_path, native_engine(), {"target_cache_mb": room}) for room in (0, 1024)]
+    runs = [run_of(tmp_path, whole_engine(), {"target_cache_mb": room}) for room in (0, 1024)]
     first, second = ([stats[:5] for stats in taken(run)] for run in runs)
     assert first == second
 
 
+@needs_compiled
 def test_photographs_of_several_sizes_are_trained_on(tmp_path: Path) -> None:
     capture = tiny_capture()
     views = tuple(
@@ -244,16 +259,17 @@ def test_photographs_of_several_sizes_are_trained_on(tmp_path: Path) -> None:
     )
     config = tiny_config(tmp_path)
     runs = [
-        TrainingRun(config, replace(capture, views=views), engine=e) for e in (native_engine(), torch_engine("fast"))
+        TrainingRun(config, replace(capture, views=views), engine=e) for e in (whole_engine(), torch_engine("fast"))
     ]
     for found, wanted in zip(*(taken(run, 3) for run in runs), strict=True):
         assert found.objective == pytest.approx(wanted.objective, rel=2e-5)
 
 
+@needs_compiled
 @pytest.mark.parametrize("key", ["means", "scales", "quats", "opacities", "sh0"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_a_row_that_is_not_finite_is_named_and_nothing_moves(key: str, value: float, tmp_path: Path) -> None:
-    run = run_of(tmp_path, native_engine(), {})
+    run = run_of(tmp_path, whole_engine(), {})
     taken(run, 2)
     with torch.no_grad():
         run.params[key].view(len(run.params[key]), -1)[17, 0] = value
@@ -265,6 +281,7 @@ def test_a_row_that_is_not_finite_is_named_and_nothing_moves(key: str, value: fl
         torch.testing.assert_close(param.detach(), before[name], rtol=0.0, atol=0.0, equal_nan=True)
 
 
+@needs_compiled
 def test_a_run_trains_natively_where_it_can_and_says_so(tmp_path: Path) -> None:
     config = replace(tiny_config(tmp_path), backend="compiled")
     assert TrainingRun(config, tiny_capture()).stepper.name == "native"
@@ -273,9 +290,124 @@ def test_a_run_trains_natively_where_it_can_and_says_so(tmp_path: Path) -> None:
     assert engine_of(config, own_strategy=False).make_stepper is not None
 
 
+@needs_compiled
 def test_a_stepper_takes_rows_on_the_cpu_in_single_precision_only(tmp_path: Path) -> None:
-    run = run_of(tmp_path, native_engine(), {})
+    run = run_of(tmp_path, whole_engine(), {})
     fused: Any = run.stepper
     rows = {key: param.detach() for key, param in run.params.items()}
     with pytest.raises(ValueError, match="must be a contiguous float32 tensor on the CPU"):
         fused.fused.rebind({**rows, "means": rows["means"].double()}, rows, rows)
+
+
+# What the native step says that it had to do is what a plain walk through the tile lists has to do.
+
+WIDE, HIGH, TILE, CHUNK = 40, 24, 16, 16
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photograph in front of which the Gaussians lie."""
+
+    photo: torch.Tensor
+    viewmat: torch.Tensor
+    K: torch.Tensor
+    mask: None = None
+
+
+def gaussians(n: int = 400) -> dict[str, torch.Tensor]:
+    rng = np.random.default_rng(5)
+    z = rng.uniform(2.0, 6.0, n)
+    xy = rng.uniform(-0.8, 0.8, (n, 2)) * z[:, None]
+    # in the first tile they are so many and so opaque that all its pixels stop
+    xy[: n // 2] = rng.uniform((-0.7, -0.5), (-0.1, 0.2), (n // 2, 2)) * z[: n // 2, None]
+    opacities, scales = rng.normal(1.0, 2.0, n), rng.normal(-2.3, 0.7, (n, 3))
+    opacities[: n // 2] += 4.0
+    scales[: n // 2] += 1.0
+    made = {
+        "means": np.concatenate((xy, z[:, None]), 1),
+        "scales": scales,
+        "quats": rng.normal(size=(n, 4)),
+        "opacities": opacities,
+        "sh0": rng.normal(size=(n, 1, 3)),
+        "shN": 0.1 * rng.normal(size=(n, 15, 3)),
+    }
+    return {name: torch.tensor(value, dtype=torch.float32) for name, value in made.items()}
+
+
+def view() -> Photo:
+    K = torch.tensor([[[30.0, 0.0, WIDE / 2], [0.0, 30.0, HIGH / 2], [0.0, 0.0, 1.0]]])
+    photo = torch.zeros(HIGH, WIDE, 3, dtype=torch.uint8)
+    return Photo(photo, torch.eye(4)[None], K)
+
+
+def listed(params: dict[str, torch.Tensor]) -> tuple[dict[str, np.ndarray], TileLists]:
+    """Return splats in double precision, and their lists for the step's tiles."""
+    p, seen = {name: value.double() for name, value in params.items()}, view()
+    _, _, meta = get_backend("fast").rasterization(
+        means=p["means"],
+        quats=p["quats"],
+        scales=p["scales"].exp(),
+        opacities=p["opacities"].sigmoid(),
+        colors=torch.cat((p["sh0"], p["shN"]), 1),
+        viewmats=seen.viewmat.double(),
+        Ks=seen.K.double(),
+        width=WIDE,
+        height=HIGH,
+        sh_degree=3,
+        packed=False,
+    )
+    exact = {"conics": meta["conics"][0], "opacities": meta["opacities"][0]}
+    lists = tile_lists(meta["means2d"][0], meta["radii"][0], meta["depths"][0], WIDE, HIGH, TILE, **exact)
+    return {name: meta[name][0].numpy() for name in ("means2d", "conics", "opacities")}, lists
+
+
+def walked(splats: dict[str, np.ndarray], lists: TileLists) -> dict[str, int]:
+    """Walk through the lists entry by entry, with T of every pixel."""
+    did = dict.fromkeys(("walked", "chunks", "pairs", "reached"), 0)
+    across = -(-WIDE // TILE)
+    for tile in range(len(lists.offsets) - 1):
+        ids = lists.ids[lists.offsets[tile] : lists.offsets[tile + 1]].tolist()
+        x = tile % across * TILE + np.arange(TILE) + 0.5
+        y = (tile // across * TILE + np.arange(TILE) + 0.5)[:, None]
+        T = np.where((x < WIDE) & (y < HIGH), 1.0, 0.0)
+        for first in range(0, len(ids), CHUNK):
+            lit = (T > 0.0).any(1)
+            if not lit.any():
+                break
+            chunk = ids[first : first + CHUNK]
+            did["walked"] += len(chunk)
+            did["chunks"] += 1
+            did["pairs"] += len(chunk) * TILE * int(lit.sum())
+            for i in chunk:
+                dx, dy = splats["means2d"][i, 0] - x, splats["means2d"][i, 1] - y
+                a, b, c = splats["conics"][i]
+                raw = splats["opacities"][i] * np.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+                alpha = np.where(raw >= PAPER.alpha_floor, np.minimum(raw, PAPER.alpha_ceiling), 0.0)
+                after = T * (1.0 - alpha)
+                after = np.where(after > PAPER.transmittance_stop, after, 0.0)
+                did["reached"] += int((after < T).any(1).sum())
+                T = after
+    return did
+
+
+def test_counts_are_those_of_a_walk_through_the_lists() -> None:
+    reason = get_backend("compiled").why_not()
+    if reason is not None:
+        pytest.skip(reason)
+    from pop_fast.compiled.native_step import NativeTrainer
+
+    params = gaussians()
+    splats, lists = listed(params)
+    expected = walked(splats, lists)
+    m, v = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))
+    settings = StepSettings(steady_updates(dict.fromkeys(PARAMETERS, 1e-3), 10), profile=PAPER)
+    trainer = NativeTrainer(params, m, v, [view()], [0] * 10, settings, threads=2)
+    assert set(trainer.counts().values()) == {0}
+    trainer.run(1, Phase(3, pop=True, statistics=True, blur=True))
+    found = trainer.counts()
+    assert found["visible"] == len(set(lists.ids.tolist()))
+    assert found["entries"] == len(lists.ids)
+    assert {name: found[name] for name in expected} == expected
+    # a parabola that errs lets too much through, never too little
+    assert found["reached"] <= found["marked"] <= found["pairs"] // TILE
+    assert found["walked"] < found["entries"]

@@ -12,7 +12,8 @@ import tempfile
 from pathlib import Path
 from typing import Any, Self
 
-from pop_ref.walkthrough.browser import OPTIONS, chromium
+from pop_ref.walkthrough.builder.command import CHROMIUM_OPTIONS as OPTIONS
+from pop_ref.walkthrough.builder.command import chromium
 
 # where pictures are kept to be looked at
 SCREENSHOTS = os.environ.get("POP_SCREENSHOTS")

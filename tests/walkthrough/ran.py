@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pop_ref.walkthrough.cells import Chapter, chapter_files, read_chapter
-from pop_ref.walkthrough.notebooks import notebook
+from pop_ref.walkthrough.builder.chapter import Chapter, chapter_files, read_chapter
+from pop_ref.walkthrough.builder.notebooks import notebook
 from pop_ref.walkthrough.pages import Outcome, Picture, run_chapter
 
 CHAPTERS = chapter_files()

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from pop_ref.walkthrough import __main__ as command
-from pop_ref.walkthrough import browser
-from pop_ref.walkthrough.__main__ import main
-from pop_ref.walkthrough.cells import Chapter, chapter_number, read_chapter
+from pop_ref.walkthrough.builder import command
+from pop_ref.walkthrough.builder.chapter import Chapter, ChapterError, chapter_number, read_chapter
+from pop_ref.walkthrough.builder.command import main
+from pop_ref.walkthrough.builder.layout import book
+from pop_ref.walkthrough.builder.slides import FILE, chapters_of, deck, read_slides
 from pop_ref.walkthrough.pages import Outcome, run_chapter
-from pop_ref.walkthrough.printed import book
-from pop_ref.walkthrough.slides import LECTURE, MINUTES, deck
 from tests.walkthrough.chromium import SCREENSHOTS, WHY_NOT, Page, keep
 from tests.walkthrough.ran import CHAPTERS, ran
 
@@ -79,40 +77,82 @@ def page() -> Iterator[Page]:
         yield opened
 
 
-def _faces(text: str) -> list[str]:
-    sections = re.findall(r'<section class="slide \w+".*?</section>', text, re.DOTALL)
-    return [section.partition("<aside>")[0] for section in sections]
+SLIDES = """# A title
+
+What it is about.
+
+Notes, 1 minute.
+Say hello.
+
+---
+# A section
+
+The first, with $a. B$ and D5 in it.
+
+{{picture: 1: A li}}
+
+- one item
+
+Notes, 2 minutes.
+More of it.
+
+With two paragraphs.
+
+---
+# Play
+
+{{widget: stack}}
+
+Notes, 87 minutes.
+Let them play.
+"""
 
 
-def test_a_slide_has_first_sentences_formulas_lists_and_pictures_and_the_notes_have_all(
+def _deck(small: tuple[Chapter, list[Outcome]], text: str = SLIDES) -> str:
+    return deck(read_slides(text), lambda number: {"1": small}[number])
+
+
+def test_a_slide_has_its_text_picture_and_widget_and_its_notes_tell_the_minute(
     small: tuple[Chapter, list[Outcome]],
 ) -> None:
-    text = deck([small])
-    faces = _faces(text)
-    assert len(faces) == 5
-    assert "<h1>Title</h1>" in faces[0]
-    assert "What the reader will know. And more of it." in re.sub(r"<[^>]*>", "", faces[0])
+    text = _deck(small)
+    sections = re.findall(r'<section class="slide \w+".*?</section>', text, re.DOTALL)
+    faces, notes = zip(*(section.split("<aside>") for section in sections), strict=True)
+    assert "<h1>A title</h1>" in faces[0]
     assert "<h2>A section</h2>" in faces[1]
-    assert "The second." not in faces[1]
-    assert "eq. 11, in it. What leads on is this:" in faces[1]
-    assert "<li>another</li>" in faces[1]
-    assert "The second." in text
-    assert "<figcaption>A line.</figcaption>" in faces[2]
-    plain = re.sub(r"<[^>]*>", "", faces[3])
-    assert "pop_ref/alpha.py:\ndef falloff" in plain
-    # what is too long to be read from afar is named on the slide, and stands in its notes
-    assert "pop_ref/pixel.py:" in plain
-    assert "def composite_pixel" not in plain
-    assert "composite_pixel" in text
-    assert 'data-widget="stack"' in faces[4]
-    assert "What is two?" not in text
-    assert "label, D5." in text
+    assert faces[1].index("D5") < faces[1].index("<figcaption>A line.</figcaption>") < faces[1].index("one item")
+    assert 'data-widget="stack"' in faces[2]
+    assert "<p>With two paragraphs.</p>" in notes[1]
+    assert [re.findall(r"Minute (\d+ to \d+)", each) for each in notes] == [["0 to 1"], ["1 to 3"], ["3 to 90"]]
     assert not re.search(r'href="(?!#)', text)
-    # minute by minute, from the first to the last
-    minutes = [(int(a), int(b)) for a, b in re.findall(r"Minute (\d+) to (\d+)", text)]
-    assert minutes[0][0] == 0
-    assert minutes[-1][1] == MINUTES
-    assert all(b >= c - 1 and a < b for (a, b), (c, _) in itertools.pairwise(minutes))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("Notes, 2 minutes.", "Notes:", "slides.md:9: a slide is '# Heading', markdown, a line 'Notes, 4 minutes.'"),
+        ("1: A li", "1: A circle", "slides.md:9: 0 pictures of chapter 1 have a caption that begins with 'A circle'"),
+        ("$a. B$", "$\\nosuchthing{x}$", "slides.md:9: a formula cannot be set"),
+    ],
+)
+def test_a_slide_out_of_form_is_named_with_its_line(
+    small: tuple[Chapter, list[Outcome]], old: str, new: str, told: str
+) -> None:
+    assert SLIDES.count(old) == 1
+    with pytest.raises(ChapterError, match=re.escape(told)):
+        _deck(small, SLIDES.replace(old, new))
+
+
+def test_the_lecture_has_25_slides_for_ninety_minutes_and_something_to_say_at_each() -> None:
+    slides = read_slides(FILE.read_text(encoding="utf-8"))
+    assert len(slides) == 25
+    assert sum(slide.minutes for slide in slides) == 90
+    for slide in slides:
+        assert 60 * slide.minutes >= len(slide.notes.split()) >= 40, slide.heading
+        assert len(re.sub(r"\{\{.*?\}\}", "", slide.body).split()) <= 70, slide.heading
+    played = [slide for slide in slides if "{{widget: " in slide.body]
+    assert len(played) == 4
+    assert chapters_of(slides) <= {chapter_number(path) for path in CHAPTERS}
 
 
 @in_browser
@@ -120,11 +160,11 @@ def test_slides_turn_by_key_button_and_finger_and_show_notes(
     page: Page, small: tuple[Chapter, list[Outcome]], tmp_path: Path
 ) -> None:
     file = tmp_path / "slides.html"
-    file.write_text(deck([small]), encoding="utf-8")
+    file.write_text(_deck(small), encoding="utf-8")
     page.open(file, width=1280, height=720)
     here = "[...document.querySelectorAll('.slide')].findIndex(each => getComputedStyle(each).display !== 'none')"
     assert page.ask(here) == 0
-    for key, then in (("ArrowRight", 1), (" ", 2), ("End", 4), ("ArrowRight", 4), ("ArrowLeft", 3), ("Home", 0)):
+    for key, then in (("ArrowRight", 1), (" ", 2), ("End", 2), ("ArrowRight", 2), ("ArrowLeft", 1), ("Home", 0)):
         page.press(key)
         assert page.ask(here) == then, key
     page.ask("document.querySelector('[data-go=\"1\"]').click()")
@@ -145,14 +185,12 @@ def test_slides_turn_by_key_button_and_finger_and_show_notes(
 @in_browser
 @pytest.mark.slow
 def test_every_slide_of_the_lecture_fits_its_screen(page: Page, tmp_path: Path) -> None:
-    told = [ran(path) for path in CHAPTERS if chapter_number(path) in LECTURE]
-    assert len(told) == len(LECTURE)
+    slides = read_slides(FILE.read_text(encoding="utf-8"))
+    told = {chapter_number(path): ran(path) for path in CHAPTERS if chapter_number(path) in chapters_of(slides)}
     file = tmp_path / "slides.html"
-    file.write_text(deck(told), encoding="utf-8")
+    file.write_text(deck(slides, told.__getitem__), encoding="utf-8")
     page.open(file, width=1280, height=720)
-    n = page.ask("document.querySelectorAll('.slide').length")
-    assert 30 <= n <= 80
-    for number in range(1, n + 1):
+    for number in range(1, len(slides) + 1):
         page.ask("new Promise(done => setTimeout(() => done(1), 120))")
         face = "document.querySelector('.slide.here .face')"
         assert page.ask(f"{face}.scrollHeight <= {face}.clientHeight + 1"), page.ask(f"{face}.textContent.slice(0, 80)")
@@ -170,7 +208,10 @@ def test_the_book_holds_every_chapter_and_no_id_twice(small: tuple[Chapter, list
     chapter, outcomes = small
     other = read_chapter(Path("chapter_02_other.py"), TEXT.replace("# # 1. Title", "# # 2. Other"))
     text = book([(chapter, outcomes), (other, run_chapter(other))])
-    assert text.count("<article id=") == 2
+    assert text.count("<article id=") == 3
+    # answers stand at the back, behind every question
+    assert text.rindex("What is two?") < text.index('<article id="answers">') < text.index('<span class="n">two</span>')
+    assert text.count("The answer is at the back.") == 2
     assert '<a href="#chapter_02_other">2. Other</a>' in text
     ids = re.findall(r'\bid="([^"]+)"', text)
     assert {each for each in ids if ids.count(each) > 1} == set()
@@ -198,10 +239,10 @@ def test_without_a_browser_the_command_says_what_a_book_needs(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_browser_that_prints_nothing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_browser_that_prints_nothing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CHROMIUM", "false")
-    with pytest.raises(browser.BrowserError, match="false printed nothing"):
-        browser.print_pdf(tmp_path / "page.html", tmp_path / "book.pdf")
+    with pytest.raises(command.BrowserError, match="false printed nothing"):
+        command._printed("<p>")
 
 
 def test_all_forms_stand_beside_the_pages_and_the_contents_leads_to_them(
@@ -211,7 +252,11 @@ def test_all_forms_stand_beside_the_pages_and_the_contents_leads_to_them(
     assert main([str(tmp_path), "--all", "--only", "1"]) == 0
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
     links = re.findall(r'href="([^"]+)">(?:notebooks|slides|PDF)<', page)
-    assert links == ["notebooks/index.html", "slides.html"]
+    # the lecture shows pictures of chapters that are not among these
+    assert links == ["notebooks/index.html"]
+    near = re.findall(r'href="(notebooks/chapter[^"]+)"', (tmp_path / f"{CHAPTERS[1].stem}.html").read_text("utf-8"))
+    links += near
+    assert len(near) == 1
     for link in links:
         assert (tmp_path / link).is_file()
     listed = (tmp_path / "notebooks" / "index.html").read_text(encoding="utf-8")

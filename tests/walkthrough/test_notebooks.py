@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
+import numpy
 import pytest
 
-from pop_ref.walkthrough.cells import Chapter, chapter_number, read_chapter
-from pop_ref.walkthrough.notebooks import notebook
+import pop_ref
+from pop_ref.walkthrough.builder.chapter import Chapter, chapter_number, read_chapter
+from pop_ref.walkthrough.builder.notebooks import notebook
 from tests.walkthrough.ran import CHAPTERS, MISSING, executed, run_of
 
 runs = pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed")
@@ -59,7 +63,7 @@ def test_a_notebook_holds_the_chapter_and_folds_what_a_page_folds() -> None:
     written = json.loads(notebook(_small()))
     cells = [(c["cell_type"], c["metadata"].get("jupyter", {}).get("source_hidden", False)) for c in written["cells"]]
     texts = ["".join(c["source"]) for c in written["cells"]]
-    assert cells[1:] == [
+    assert cells[2:] == [
         ("markdown", False),
         ("code", True),
         ("markdown", False),
@@ -70,12 +74,12 @@ def test_a_notebook_holds_the_chapter_and_folds_what_a_page_folds() -> None:
         ("markdown", False),
         ("code", True),
     ]
-    assert "(chapter_02_space_to_screen.ipynb)" in texts[1]
-    assert 'html("splat2d")' in texts[2]
-    assert texts[3] == "And on."
-    assert texts[6] == "x = 2\nx + 1;"
-    assert texts[8] == "<details><summary>Answer</summary>\n\nIt is 2.\n\n</details>"
-    assert texts[9] == 'print("two")\nassert x == 2'
+    assert "(chapter_02_space_to_screen.ipynb)" in texts[2]
+    assert 'html("splat2d")' in texts[3]
+    assert texts[4] == "And on."
+    assert texts[7] == "x = 2\nx + 1;"
+    assert texts[9] == "<details><summary>Answer</summary>\n\nIt is 2.\n\n</details>"
+    assert texts[10] == 'print("two")\nassert x == 2'
     assert len({c["id"] for c in written["cells"]}) == len(cells)
     assert notebook(_small()) == notebook(_small())
 
@@ -89,6 +93,28 @@ def test_a_small_notebook_shows_its_picture_caption_widget_and_print_and_nothing
     assert data[2]["text/markdown"] == "A line with $y$."
     assert [output["text"] for output in outputs if output["output_type"] == "stream"] == ["two\n"]
     assert len(outputs) == 4
+
+
+def _first_cell(place: Path, path: list[str]) -> subprocess.CompletedProcess[str]:
+    """Run a notebook's first cell in a Python that has these folders on its path and nothing installed."""
+    cells = [each for each in json.loads(notebook(_small()))["cells"] if each["cell_type"] == "code"]
+    code = f"import sys; sys.path += {path!r}\n" + "".join(cells[0]["source"]) + "\nimport pop_ref"
+    return subprocess.run([sys.executable, "-ISc", code], cwd=place, capture_output=True, text=True)
+
+
+def test_the_first_cell_finds_the_clone_that_the_notebook_lies_in(tmp_path: Path) -> None:
+    below = tmp_path / "clone" / "out" / "notebooks"
+    below.mkdir(parents=True)
+    (tmp_path / "clone" / "pop_ref").symlink_to(Path(pop_ref.__file__).parent)
+    packages = [str(Path(numpy.__file__).parents[1])]
+    done = _first_cell(below, packages)
+    assert done.returncode == 0, done.stderr
+    # where there is no clone, one line says what to do
+    done = _first_cell(tmp_path, packages)
+    assert "ImportError: pop_ref missing. Start Jupyter inside the clone of pop-splatting, or" in done.stderr
+    done = _first_cell(below, [])
+    assert "matplotlib missing. Start Jupyter inside the clone" in done.stderr
+    assert f"{sys.executable} -m pip install matplotlib" in done.stderr
 
 
 # the first nine chapters are read without torch; from the last on, so that two workers seldom wait for one chapter

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from pop_ref.walkthrough.cells import read_chapter
-from pop_ref.walkthrough.layout import chapter_page, index_page
+from pop_ref.walkthrough.builder.chapter import read_chapter
+from pop_ref.walkthrough.builder.layout import chapter_page, index_page
 from tests.walkthrough.chromium import SCREENSHOTS, WHY_NOT, Page, keep
 from tests.walkthrough.ran import CHAPTERS, ran
 

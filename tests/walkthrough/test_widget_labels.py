@@ -6,6 +6,7 @@ The widgets' own scripts run in node, on as much of a page as they need.
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -21,7 +22,7 @@ from pop_ref.footprint import compensations, conics_from_covars2d, low_pass, rad
 from pop_ref.harmonics import colors_from_sh, sh_basis
 from pop_ref.pixel import SplatRows, composite_pixel, composite_pixel_vjp, zero_gradients
 from pop_ref.projection import project_covars, project_means, projection_jacobians
-from pop_ref.walkthrough.widgets import WIDGETS, html, record
+from pop_ref.walkthrough.widgets import FOLDER, WIDGETS, html, mathematics
 
 NODE = shutil.which("node")
 PAGE = Path(__file__).with_name("page_without_browser.js")
@@ -183,19 +184,26 @@ def test_a_stack_tells_weights_and_gradients_with_a_wall_in_the_middle_and_in_fr
     assert any("stop: T would" in text for text in shown["texts"]) == (len(pixel.ids) < pixel.n_traversed)
 
 
-def test_two_recorded_trainings_tell_their_numbers_at_every_step() -> None:
-    runs = json.loads(record.FILE.read_text(encoding="utf-8"))["runs"]
-    for at in (0, len(record.FRAMES) // 2, len(record.FRAMES) - 1):
-        shown = _shown("scrubber", ("slide", "step of training", at))["readings"]
-        # both panels have the same labels; the last, which is kept, is that of the run with the prior
-        run = runs["with"]
-        assert shown["PSNR"] == f"{run['psnr'][at]:.1f} dB"
-        assert shown["Gaussians"] == str(run["n"][at])
-        assert shown["under 0.05"] == f"{100 * run['opacities'][at][0] / run['n'][at]:.0f} %"
-        assert shown["0.05 to 0.7"] == f"{100 * sum(run['opacities'][at][1:14]) / run['n'][at]:.0f} %"
-    # the answer to the prompt
-    middle = {
-        name: [sum(o[1:14]) / n for o, n in zip(run["opacities"], run["n"], strict=True)] for name, run in runs.items()
-    }
-    assert middle["with"][-1] < 0.75 * middle["without"][-1]
-    assert middle["with"][-1] < 0.5 * middle["with"][0]
+def test_a_prior_ten_times_as_heavy_empties_the_middle_and_costs_quality() -> None:
+    """Run the widget's worker as its page does, 150 steps with each weight."""
+    assert "ten times as heavy" in WIDGETS["train"].prompt
+    worker = mathematics(*WIDGETS["train"].worker) + (FOLDER / "train_worker.js").read_text(encoding="utf-8")
+    page = (FOLDER / "train.js").read_text(encoding="utf-8")
+    constants = re.search(r"const RATES = .*?;\n\s*const settings = .*?;\n", page, re.DOTALL)
+    assert constants is not None
+    script = """let told; globalThis.postMessage = (data) => { told = data; };
+    %s
+    const STEPS = 600; %s
+    const found = [0, 0.1, 1, 10].map((times, run) => {
+        const mine = { ...settings, lambda_pop: times * settings.lambda_pop };
+        onmessage({ data: { run, seed: 1, steps: 150, settings: mine, angle: 7.5, shape: "the picture" } });
+        return [told.psnr, told.n, told.counts];
+    });
+    console.log(JSON.stringify(found));"""
+    done = subprocess.run([NODE or "", "-e", script % (worker, constants[0])], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert all(sum(counts) == n for _, n, counts in found)
+    middle = [sum(counts[1:14]) / n for _, n, counts in found]
+    assert middle[0] > middle[2] > middle[3]
+    assert found[0][0] > found[3][0] + 0.5

@@ -11,8 +11,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pop_ref import alpha, camera, covariance, dominance, footprint, harmonics, pixel, projection
+from pop_ref import alpha, camera, covariance, dominance, footprint, harmonics, losses, pixel, projection
 from pop_ref.constants import PAPER
+from pop_ref.density import (
+    DensityConfig,
+    Rows,
+    accumulate,
+    densify_and_prune,
+    grow_masks,
+    rows_from_params,
+    zero_statistics,
+)
+from pop_ref.learn import splat
+from pop_ref.optimizer import adam_step
+from pop_ref.polarization import pop_loss_vjp
+from pop_ref.records import Camera
+from pop_ref.render import render, render_vjp
+from pop_ref.training import gaussians_from_params, params_vjp
 from pop_ref.walkthrough.widgets import mathematics
 
 NODE = shutil.which("node")
@@ -226,3 +241,150 @@ def test_harmonics_and_their_colours() -> None:
         lambda c, d, degree: harmonics.colors_from_sh(np.array([c]), np.array([d]), degree)[0],
         1e-12,
     )
+
+
+def _toy(seed: int, n: int, size: int) -> tuple[dict[str, np.ndarray], Camera]:
+    """Draw a scene with needles and discs, splats past the picture, behind the camera, under the floor, too opaque."""
+    rng = np.random.default_rng(seed)
+    params = {
+        "means": rng.uniform(-1.6, 1.6, (n, 3)),
+        "quats": rng.standard_normal((n, 4)),
+        "scales": rng.uniform(-4.0, 0.3, (n, 3)),
+        "opacities": rng.uniform(-7.0, 9.0, n),
+        "sh0": rng.uniform(-2.5, 2.5, (n, 1, 3)),
+    }
+    camera = splat.orbit(0.7 * seed, size)
+    camera[0][:3, 3] *= 0.45
+    return params, Camera(*camera)
+
+
+def _told(camera: Camera) -> dict[str, Any]:
+    R, t = camera.viewmat[:3, :3].ravel().tolist(), camera.viewmat[:3, 3].tolist()
+    f, c = camera.K[[0, 1], [0, 1]].tolist(), camera.K[:2, 2].tolist()
+    return {"R": R, "t": t, "f": f, "c": c, "size": [camera.width, camera.height]}
+
+
+def _ran(body: str, **given: Any) -> Any:
+    """Run JavaScript on values; arrays come as flat Float64Arrays and go as lists."""
+    script = f"""{mathematics("training")}
+    const typed = (x) => Object.fromEntries(Object.entries(x).map(([name, y]) => [name, Float64Array.from(y)]));
+    const given = JSON.parse(require("fs").readFileSync(0, "utf8"));
+    const result = (() => {{ {body} }})();
+    console.log(JSON.stringify(result, (_, x) => (ArrayBuffer.isView(x) ? Array.from(x) : x)));"""
+    flat = {name: value.ravel().tolist() if isinstance(value, np.ndarray) else value for name, value in given.items()}
+    done = subprocess.run([NODE or "", "-e", script], input=json.dumps(flat), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def _lists(params: dict[str, np.ndarray]) -> dict[str, list[float]]:
+    return {name: x.ravel().tolist() for name, x in params.items()}
+
+
+def _close(found: Any, value: np.ndarray, relative: float, name: str = "") -> None:
+    assert np.any(value != 0.0), name
+    worst = np.max(np.abs(np.reshape(found, value.shape) - value))
+    assert worst <= relative * np.max(np.abs(value)), (name, worst)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_page_that_trains_draws_and_differentiates_as_the_oracle_does(seed: int) -> None:
+    (params, camera), background = _toy(seed, 60, 24), np.array([0.25, 0.5, 1.0])
+    gaussians = gaussians_from_params(params)
+    v_image = np.random.default_rng(seed).standard_normal((24, 24, 3))
+    expected = render(gaussians, camera, background)
+    gradients = render_vjp(gaussians, camera, v_image, background=background)
+    told = _ran(
+        """const params = typed(given.params), drawn = render(params, given.camera, given.background);
+        const { image, T_final, dominant_counts } = drawn;
+        return { image, T_final, dominant_counts, ...render_vjp(params, drawn, given.v_image) };""",
+        params=_lists(params),
+        camera=_told(camera),
+        background=background,
+        v_image=v_image,
+    )
+    assert 5 < int(np.sum(expected.splats.visible)) < len(gaussians)
+    assert float(np.min(expected.T_final)) < 1e-3
+    _close(told["image"], expected.image, 1e-12)
+    _close(told["T_final"], expected.T_final, 1e-12)
+    assert told["dominant_counts"] == expected.dominant_counts.tolist()
+    _close(told["v_means2d"], gradients.means2d, 1e-9)
+    for name, value in params_vjp(params, gradients, np.zeros(len(gaussians))).items():
+        _close(told["grads"][name], value, 1e-9, name)
+
+
+RATES = {"means": 4e-3, "quats": 1e-2, "scales": 1.5e-2, "opacities": 5e-2, "sh0": 2e-2}
+TRAINING = {"steps": 12, "lambda_pop": 0.05, "theta_blur": 0.02, "densify_every": 5, "densify_until": 10}
+
+
+def _oracles_training(
+    params: dict[str, np.ndarray],
+    cameras: list[Camera],
+    photographs: list[np.ndarray],
+    config: DensityConfig,
+    draw: Callable[[int], np.ndarray],
+) -> Rows:
+    """Take the steps that `TRAINING` names with the oracle's functions; no rule of density control stays idle."""
+    rows, window, n_steps = rows_from_params(params), zero_statistics(len(params["means"])), TRAINING["steps"]
+    happened = dict.fromkeys(("clone", "split", "blur", "prune"), 0)
+    for step in range(1, round(n_steps) + 1):
+        camera, gaussians = cameras[step % 3], gaussians_from_params(rows.params)
+        drawn = render(gaussians, camera, np.zeros(3))
+        v_image = losses.l2_vjp(drawn.image, photographs[step % 3], 1.0)
+        gradients = render_vjp(gaussians, camera, v_image, background=np.zeros(3))
+        v_prior = pop_loss_vjp(gaussians.opacities, drawn.dominant_counts > 0, TRAINING["lambda_pop"])
+        now = {name: rate * 0.1 ** (step / n_steps) for name, rate in RATES.items()}
+        grads = params_vjp(rows.params, gradients, v_prior)
+        rows = Rows(*adam_step(rows.params, grads, rows.m, rows.v, step, now))
+        size = (camera.width, camera.height)
+        window = accumulate(window, gradients.means2d, drawn.splats.visible, drawn.dominant_counts, *size, config)
+        if step % TRAINING["densify_every"] == 0 and step <= TRAINING["densify_until"]:
+            masks = grow_masks(window, np.exp(rows.params["scales"]), 3.0, step, config)
+            n_grown = len(rows) + int(np.sum(masks))
+            happened["clone"] += int(np.sum(masks[0]))
+            happened["split"] += int(np.sum(masks[1]))
+            happened["blur"] += int(np.sum(window.blurred))
+            rows, window = densify_and_prune(rows, window, 3.0, step, draw, config)
+            happened["prune"] += n_grown - len(rows)
+    assert min(happened.values()) > 0, happened
+    return rows
+
+
+def test_a_training_in_the_page_takes_the_oracles_steps() -> None:
+    """Twelve steps, two of them densification steps, with every Gaussian's parameters and both moments compared."""
+    params, _ = _toy(1, 40, 20)
+    rng = np.random.default_rng(8)
+    params["scales"] = rng.uniform(-4.2, -1.5, params["scales"].shape)
+    params["opacities"] = rng.uniform(-5.6, 2.0, 40)
+    cameras = [Camera(*splat.orbit(angle, 20)) for angle in (0.0, 1.0, 2.5)]
+    photographs = [splat.photograph((c.viewmat, c.K, 20, 20)) for c in cameras]
+    config = DensityConfig(
+        theta_blur=TRAINING["theta_blur"], refine_every=1, refine_start_iter=0, blur_start_iter=0, blur_stop_iter=99
+    )
+    normals, at = rng.standard_normal(3000), 0
+
+    def draw(n: int) -> np.ndarray:
+        nonlocal at
+        at += 6 * n
+        return normals[at - 6 * n : at].reshape(2, n, 3)
+
+    rows = _oracles_training(params, cameras, photographs, config, draw)
+    told = _ran(
+        """let at = 0;
+        const state = new_training(typed(given.params));
+        const normals = (n) => { at += n; return given.normals.slice(at - n, at); };
+        for (let step = 1; step <= given.settings.steps; step += 1) {
+            const view = step % given.cameras.length;
+            training_step(state, given.cameras[view], given.photographs[view], given.settings, normals);
+        }
+        return { ...state, used: at };""",
+        params=_lists(params),
+        cameras=[_told(c) for c in cameras],
+        photographs=[p.ravel().tolist() for p in photographs],
+        normals=normals,
+        settings={**TRAINING, "rates": RATES, "grow_grad2d": config.grow_grad2d, "prune_opa": config.prune_opa},
+    )
+    assert told["used"] == at
+    for of, expected in (("params", rows.params), ("m", rows.m), ("v", rows.v)):
+        for name, value in expected.items():
+            _close(told[of][name], value, 1e-7, f"{of} {name}")

@@ -1,12 +1,11 @@
 """File formats of splats: PlayCanvas's compressed PLY and SOG, Niantic's SPZ, `.splat`, glTF, and KSPLAT to read."""
 
+from pop_fast.io.format_registry import FORMATS, PLY, format_names
 from pop_fast.io.formats.files import (
-    PLY,
     Stored,
     decoded,
     default_name,
     encoded,
-    format_names,
     is_splat_file,
     load_splat_file,
     loses_frame,
@@ -15,7 +14,7 @@ from pop_fast.io.formats.files import (
     save_as,
     splat_suffixes,
 )
-from pop_fast.io.formats.table import FORMATS, Format
+from pop_fast.io.formats.table import Format
 
 __all__ = [
     "FORMATS",

@@ -5,21 +5,20 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from torch import Tensor
 
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
+from pop_fast.io.format_registry import FORMATS, PLY, format_names
 from pop_fast.io.formats import sog
 from pop_fast.io.formats.cloud import Cloud
 from pop_fast.io.formats.compressed_ply import is_compressed
-from pop_fast.io.formats.table import FORMATS, READ_ONLY
+from pop_fast.io.formats.table import READ_ONLY
 from pop_fast.io.frame import Frame
 from pop_fast.io.ply import asks_for_antialiasing, params_of_ply, ply_bytes
 from pop_fast.io.ply_rows import header_of
-
-PLY: Final = "ply"
 
 
 class Stored(NamedTuple):
@@ -34,11 +33,6 @@ class Stored(NamedTuple):
     params: dict[str, Tensor]
     antialiased: bool
     frame: Frame | None
-
-
-def format_names() -> tuple[str, ...]:
-    """Return the names of all formats, PLY first."""
-    return (PLY, *FORMATS)
 
 
 def splat_suffixes() -> tuple[str, ...]:

@@ -12,8 +12,8 @@ import torch
 
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.images import write_png
+from pop_fast.io.pictures import error_magnitude, error_scale, id_colors
 from pop_fast.view.explain.scene import TILE_SIZE, ExplainedView
-from pop_fast.view.pictures import error_magnitude, error_scale, id_colors
 
 # scales end at this quantile, so that a few pixels do not set them
 _TOP = 0.995

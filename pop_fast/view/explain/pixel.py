@@ -277,7 +277,8 @@ def _row(
 
 
 def _objective(config: TrainConfig, step: int) -> str:
-    kind, weight = config.photometric_at(step)
+    objective = config.objective_at(step)
+    kind, weight = objective.pixelwise, objective.lambda_ssim
     divided = "" if config.photometric_divisor == 1.0 else f"/{config.photometric_divisor:g}"
     return f"{1.0 - weight:g} {kind.upper()}{divided} + {weight:g} (1 - SSIM)"
 

@@ -13,9 +13,10 @@ from pop_fast.api.rasterize import rasterization
 from pop_fast.data.capture import View
 from pop_fast.errors import PopError
 from pop_fast.stages.activations import opacities_from_logits, scales_from_log_scales
-from pop_fast.stages.losses import photometric_3dgs, photometric_pop
+from pop_fast.stages.losses import photometric
 from pop_fast.stages.polarization import importance_mask, pop_loss_vjp
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.presets import LOSSES
 
 TILE_SIZE = 16
 
@@ -176,17 +177,8 @@ def _wanted(info: Mapping[str, Any]) -> dict[str, Any]:
 def _photometric(image: Tensor, view: View, config: TrainConfig, step: int) -> Tensor:
     target = torch.from_numpy(view.image).double() / 255.0
     mask = None if view.mask is None else torch.from_numpy(view.mask)
-    kind, weight = config.photometric_at(step)
-    loss = photometric_3dgs if kind == "l1" else photometric_pop
-    return loss(
-        image,
-        target,
-        weight,
-        config.ssim_padding,
-        mask,
-        config.d_ssim_halved,
-        1.0 / config.photometric_divisor,
-    )
+    objective = config.objective_at(step)
+    return photometric(LOSSES.named(objective.pixelwise), objective, image, target, mask)
 
 
 def _counts(info: Mapping[str, Any], view: View, n: int) -> Tensor:

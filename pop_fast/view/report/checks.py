@@ -19,6 +19,7 @@ from torch import Tensor
 from pop_fast.data.capture import Capture, View
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
+from pop_fast.io.pictures import fit
 from pop_fast.io.read_back import read_json
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.metrics import measure, psnr
@@ -26,7 +27,6 @@ from pop_fast.train.results import ResultFolder
 from pop_fast.train.views import ViewTensors
 from pop_fast.view.layers import Layers, render_layers
 from pop_fast.view.paths import VideoFile, camera_path
-from pop_fast.view.pictures import fit
 
 # training views that are rendered, evenly over the capture
 _MOST_TRAIN: Final = 12

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from pop_fast.train.presets import ALIASES, METHODS
+
 COLUMNS: Final = (
     "capture",
     "method",
@@ -19,7 +21,6 @@ COLUMNS: Final = (
     "seconds",
     "machine",
 )
-_METHODS: Final = {"pop": "POP", "gsplat": "gsplat", "adc": "gsplat", "3dgs": "3DGS"}
 _TEXT: Final = frozenset({"capture", "method", "machine"})
 
 
@@ -36,7 +37,7 @@ def row(stats: Mapping[str, Any]) -> list[str]:
     machine += [threads_of(stats)] if "threads" in stats else []
     return [
         str(stats.get("capture", "–")),
-        _METHODS.get(method, method),
+        METHODS[name].title.split(" (")[0] if (name := ALIASES.get(method, method)) in METHODS else method,
         "–" if not stats.get("lambda_pop") else f"{stats['lambda_pop']:g}",
         "–" if steps is None else _steps(steps + 1, stats.get("max_steps")),
         cell("{:.2f}", "psnr"),

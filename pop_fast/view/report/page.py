@@ -9,8 +9,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from pop_fast.io import pictures
 from pop_fast.io.atomic import write_atomically
-from pop_fast.view import pictures
 from pop_fast.view.document import asset, document
 from pop_fast.view.report.curves import Chart, Series, draw, draw_histogram
 from pop_fast.view.report.model import Histogram, ReportData, Tile

@@ -11,7 +11,7 @@ from urllib.parse import quote
 import numpy as np
 
 from pop_fast.errors import PopError
-from pop_fast.view import pictures
+from pop_fast.io import pictures
 from pop_fast.view.document import asset
 from pop_fast.view.report.model import Finding, ReportView
 

@@ -14,6 +14,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.read_back import check_record, parse_json, read_arrays, read_json
 from pop_fast.train.commands import read_commands, shell_line
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.presets import METHODS
 from pop_fast.train.results import read_config
 from pop_fast.view.report.checks import Checks, read_checks
 from pop_fast.view.report.compare import threads_of
@@ -24,7 +25,6 @@ from pop_fast.view.report.sections import checked_encodings, encoding_heads, enc
 # float32 numbers of a Gaussian: as gsplat's checkpoints hold it, and as Inria's PLY does (with three zero normals)
 BYTES_CKPT: Final = 59 * 4
 BYTES_PLY: Final = 62 * 4
-_METHODS: Final = {"pop": "POP", "gsplat": "gsplat (default strategy)", "3dgs": "3DGS (Inria)"}
 _AGAIN: Final = "remove the file, or train again"
 _COUNTS: Final = {"counts": ("iu", 1)}
 _VIEW: Final = {
@@ -48,14 +48,14 @@ def read_result(folder: Path) -> ReportData:
     config = read_config(folder)
     records = read_records(folder)
     stats = read_last_stats(folder)
-    method = _METHODS.get(config.method, config.method)
+    method = METHODS[config.method].title
     histograms = list(_histograms(folder, config.max_steps))
     views = _views(folder)
     dominant = _dominant(folder)
     changes = [record for record in records if "cloned" in record or "reset" in record]
     curves, checks = _curves(records, folder), _checks(folder)
     return ReportData(
-        title=f"{Path(config.data).resolve().name} · {_METHODS.get(config.method, config.method).split(' (')[0]}",
+        title=f"{Path(config.data).resolve().name} · {method.split(' (')[0]}",
         subtitle=" · ".join(filter(None, [method, _schedule_note(config), _views_note(stats), _machine(stats)])),
         headline=headline(stats),
         curves=curves,

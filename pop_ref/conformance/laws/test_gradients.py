@@ -16,7 +16,15 @@ from pop_ref.conformance.assertions import (
     require,
     with_error_bounds,
 )
-from pop_ref.conformance.capabilities import DERIVATIVES, DETERMINISTIC, DOUBLE, GRADIENTS, INSTRUMENTS, RENDER
+from pop_ref.conformance.capabilities import (
+    ANTIALIASING,
+    DERIVATIVES,
+    DETERMINISTIC,
+    DOUBLE,
+    GRADIENTS,
+    INSTRUMENTS,
+    RENDER,
+)
 from pop_ref.conformance.corners import corners
 from pop_ref.conformance.error_bounds import pixel_error_bounds
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
@@ -112,6 +120,25 @@ def test_culled_gaussians_get_exactly_zero(backend, scene):
     for name in (*PARAMETERS, "means2d", "means2d_abs"):
         if name in g:
             assert_same_bits(f"v_{name} of culled rows", g[name][culled], np.zeros_like(g[name][culled]))
+
+
+@law("gradients", GRADIENTS, ANTIALIASING)
+def test_antialiasing_takes_a_splat_without_area_away_with_all_its_gradients(backend):
+    # its factor is 0, where the derivative of the root is infinite; a line on the axis shows its end alone
+    for scene in [each["scene"] for each in corners(1) if len(each["scene"].gaussians) > 1]:
+        g, camera = scene.gaussians, scene.camera
+        R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+        means, quats, scales = g.means.copy(), g.quats.copy(), g.scales.copy()
+        means[0], quats[0] = R.T @ (np.array([0.0, 0.0, 4.0]) - t), (1.0, 0.0, 0.0, 0.0)
+        scales[0] = (0.0, 0.0, 0.5) if np.array_equal(R, np.eye(3)) else 0.0
+        seen = backend.sees(scene.with_overrides(means=means, quats=quats, scales=scales, antialiased=True))
+        others = seen.rows(np.arange(1, len(g)))
+        found, without = (backend.gradients(each, *cotangents(seen)) for each in (seen, others))
+        for name in PARAMETERS:
+            assert np.all(np.isfinite(found[name])), f"the gradient of {name} is not finite"
+            assert_same_bits(f"v_{name} of the splat without area", found[name][0], np.zeros_like(found[name][0]))
+            size = np.abs(without[name]) + 1.0
+            assert_close("gradients.instruments", found[name][1:], without[name], size, backend.dtype)
 
 
 @law("gradients", GRADIENTS, first=corners(), scene=plain)

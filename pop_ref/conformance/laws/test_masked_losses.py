@@ -97,6 +97,30 @@ def test_the_objectives_with_every_option_are_the_oracles(backend, image, target
         _agrees(backend, name, image, target, error_bounds, (share, padding, mask, halved, scale))
 
 
+def _large(seed):
+    """Return a picture over several blocks of any implementation, of four channels, with numbers below 0 and over 1."""
+    return 2.0 * pattern(seed, (70, 50, 4)) - 0.5
+
+
+@law("losses", "d_ssim", "d_ssim_vjp")
+def test_the_dissimilarity_of_large_pictures_beyond_black_and_white_is_the_oracles(backend):
+    kept = pattern(3, (70, 50)) > 0.3
+    for seed, (padding, mask) in enumerate((("valid", None), ("same", None), ("valid", kept))):
+        image, target = _large(4 * seed + 1), _large(4 * seed + 2)
+        error_bounds = _similarity_error_bounds(image, target, padding, mask)
+        _agrees(backend, "d_ssim", image, target, error_bounds, (padding, mask, False))
+
+
+@law("losses", *OBJECTIVES, *(f"{name}_vjp" for name in OBJECTIVES))
+def test_the_objectives_of_large_pictures_beyond_black_and_white_are_the_oracles(backend):
+    image, target, arguments = _large(5), _large(6), (0.25, "valid", None, False, 1.0)
+    of_value, of_gradient = _similarity_error_bounds(image, target, "valid", None)
+    for name, power in OBJECTIVES.items():
+        pixels = pixelwise_magnitudes(image, target, power, None)
+        error_bounds = of_value + pixels.value, of_gradient + pixels.gradient
+        _agrees(backend, name, image, target, error_bounds, arguments)
+
+
 @law("losses", "d_ssim_vjp", "l1_vjp", "l2_vjp", image=pictures, target=pictures, mask=masks, padding=paddings)
 def test_what_a_mask_leaves_out_has_no_gradient_and_no_say(backend, image, target, mask, padding):
     other = np.where(mask[..., None], image, 1.0 - image)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import strategies as st
 
+from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
 from pop_ref.conformance.strategies import arrays_of, dyadic
+from pop_ref.settings import DensityConfig, LearningRates, Recipe, UpdateRules
+
+ORACLE = OracleAdapter()
 
 gradients = st.lists(dyadic(-2.0, 2.0), min_size=1, max_size=5)
 # of what trains; a program may treat each in its own way
@@ -104,6 +110,56 @@ def test_the_position_rate_falls_log_linearly_to_a_hundredth(backend, step, scal
     rate = backend.stage("means_learning_rate")
     expected = 1.6e-4 * scale * 0.01 ** (step / 30_000)
     assert_close("optimizer.rate", rate(step, scale), expected, 16.0 * expected, backend.dtype)
+
+
+RULES_OF_RATES = (
+    UpdateRules(means_rewind_iter=150, means_rewind_to=50),
+    UpdateRules(means_rewind_iter=90, means_rewind_to=0),
+    UpdateRules(rounds_start_iter=120, round_steps=60, round_decay=0.5, round_decay_every=20),
+    UpdateRules(rounds_start_iter=100, round_steps=250, round_decay=0.875, round_decay_every=7),
+)
+# of a schedule of 300 steps, those at which a rule of the above begins or ends, and those beside
+TURNS = (0, 1, 49, 50, 89, 90, 99, 100, 107, 119, 120, 139, 140, 149, 150, 179, 180, 181, 239, 240, 299)
+SOME_RATES = LearningRates(means=0.5, means_decay=0.25, scales=0.125, quats=0.25, opacities=0.5, sh_rest=2.0)
+
+
+@law("optimizer", "learning_rates")
+def test_rates_rewind_and_fall_in_rounds_as_the_rules_say(backend):
+    for rules in RULES_OF_RATES:
+        for step in TURNS:
+            expected = ORACLE.stage("learning_rates")(step, 4.0, 300, SOME_RATES, rules)
+            found = backend.stage("learning_rates")(step, 4.0, 300, SOME_RATES, rules)
+            assert set(found) == set(expected)
+            for name, rate in expected.items():
+                assert_close("optimizer.rate", found[name], rate, 16.0 * rate, backend.dtype, against_oracle=True)
+
+
+GROWTH = {"refine_start_iter": 5, "refine_stop_iter": 40}
+OFTEN = DensityConfig(refine_every=4, **GROWTH)
+PAUSED = DensityConfig(refine_every=3, reset_every=10, pause_refine_after_reset=4, **GROWTH)
+RECIPES = (
+    Recipe(density=OFTEN, updates=UpdateRules(edits_replace_update=True)),
+    Recipe(density=PAUSED, updates=UpdateRules(edits_replace_update=True, sh_rest_every=4), adam_restarts=(16,)),
+    Recipe(density=OFTEN, updates=UpdateRules(sh_rest_every=7, opacities_stop_iter=20), adam_restarts=(12, 30)),
+    Recipe(density=PAUSED, updates=UpdateRules(opacities_stop_iter=0)),
+)
+STEPS = (0, 1, 2, 3, 5, 6, 7, 8, 9, 11, 12, 13, 14, 15, 16, 17, 19, 20, 21, 28, 30, 31, 36, 39, 40, 59)
+
+
+@law("optimizer", "update_numbers")
+def test_adam_counts_the_updates_that_the_rules_leave_each_parameter(backend):
+    for recipe in (replace(each, max_steps=60) for each in RECIPES):
+        for step in STEPS:
+            expected = ORACLE.stage("update_numbers")(KEYS, step, recipe)
+            found = backend.stage("update_numbers")(KEYS, step, recipe)
+            assert found == expected, f"step {step}: updates {found}, expected {expected}"
+
+
+@law("optimizer", "sh_degree_at", step=st.integers(0, 120), interval=st.integers(1, 9), start=st.integers(0, 60))
+def test_bands_wait_for_the_step_that_they_are_counted_from(backend, step, interval, start):
+    for most in (0, 2, 3):
+        found = backend.stage("sh_degree_at")(step, interval, most, start)
+        assert found == (0 if step < start else min((step - start) // interval, most))
 
 
 @law("optimizer", "sh_degree_at", step=st.integers(0, 10_000))

@@ -33,24 +33,22 @@ def test_every_camera_has_the_colours_and_harmonics_that_were_given_for_it(backe
 
 @law("signature", *JUDGED, CAMERAS, BATCHES)
 def test_batch_entries_do_not_know_of_each_other(backend):
-    rows = tuple(frames(backend, seed, 2, channels=channels) for seed, channels in ((4, 0), (5, 0)))
-    assert_call_is_the_oracles(backend, Call(rows, batched=True))
-    plain = tuple(frames(backend, seed, 2, channels=3, camera_colors=True) for seed in (4, 5))
-    assert_call_is_the_oracles(backend, Call(plain, batched=True, camera_colors=True))
+    rows = tuple(frames(backend, 4 + entry, 2, entry=entry) for entry in range(2))
+    assert_call_is_the_oracles(backend, Call(rows, batch=(2,)))
+    plain = tuple(frames(backend, 4 + entry, 2, channels=3, camera_colors=True, entry=entry) for entry in range(2))
+    assert_call_is_the_oracles(backend, Call(plain, batch=(2,), camera_colors=True))
 
 
 @law("signature", *JUDGED, PACKED, CAMERAS)
 def test_packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same(backend):
     for seed in (0, 6):
         call = Call((frames(backend, seed, 3),), packed=True)
-        called, wanted = assert_call_is_the_oracles(backend, call)
-        assert any(not all(e.render.splats.visible) for row in wanted for e in row), "no Gaussian is culled"
-        assert_rows(backend, call, called, wanted)
+        of = assert_call_is_the_oracles(backend, call)
+        assert any(not all(e.render.splats.visible) for _, _, e in of.each()), "no Gaussian is culled"
+        assert_rows(backend, of)
 
 
 @law("signature", *JUDGED, PACKED, CAMERAS, BATCHES)
 def test_packed_rows_of_batch_entries_draw_the_same(backend):
-    rows = tuple(frames(backend, seed, 2) for seed in (7, 8))
-    call = Call(rows, batched=True, packed=True)
-    called, wanted = assert_call_is_the_oracles(backend, call)
-    assert_rows(backend, call, called, wanted)
+    rows = tuple(frames(backend, 7 + entry, 2, entry=entry) for entry in range(2))
+    assert_rows(backend, assert_call_is_the_oracles(backend, Call(rows, batch=(2,), packed=True)))

@@ -24,8 +24,8 @@ def test_the_accumulated_depth_is_the_oracles_alone_and_behind_colours(backend):
 def test_the_expected_depth_is_the_accumulated_one_over_the_opacity(backend):
     for seed in (0, 1):
         for mode in ("ED", "RGB+ED"):
-            _, wanted = assert_call_is_the_oracles(backend, Call((frames(backend, seed),), render_mode=mode))
-            assert np.any(wanted[0][0].render.T_final > 0.125), "no pixel is transparent; both depths would be one"
+            of = assert_call_is_the_oracles(backend, Call((frames(backend, seed),), render_mode=mode))
+            assert np.any(of.wanted[0][0].render.T_final > 0.125), "no pixel is transparent; both depths would be one"
 
 
 @law("signature", *JUDGED, DEPTH, COLORS, CAMERAS)

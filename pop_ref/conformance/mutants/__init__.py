@@ -1,14 +1,20 @@
 """Broken rasterizers, one line each, built from bugs that really happened; every one is killed by a named law."""
 
 from pop_ref.conformance.mutants.baselines import BASELINES
-from pop_ref.conformance.mutants.black_box import BLACK_BOXES, BlackBox
+from pop_ref.conformance.mutants.black_box import BLACK_BOXES as SINGLE
+from pop_ref.conformance.mutants.black_box import BlackBox
+from pop_ref.conformance.mutants.combined import COMBINED
 from pop_ref.conformance.mutants.copies import Mutant, living
 from pop_ref.conformance.mutants.geometry import GEOMETRY
+from pop_ref.conformance.mutants.methods import METHOD_MUTANTS
 from pop_ref.conformance.mutants.pixels import PIXELS
 from pop_ref.conformance.mutants.program import PROGRAM
+from pop_ref.conformance.mutants.seams import SEAMS
 from pop_ref.conformance.mutants.training import TRAINING
 
 # of the oracle, and of the program that trains
-MUTANTS = (*GEOMETRY, *PIXELS, *TRAINING, *BASELINES)
+MUTANTS = (*GEOMETRY, *PIXELS, *TRAINING, *BASELINES, *METHOD_MUTANTS)
+# behind gsplat's signature: one argument broken, several together; autograd, memory, size
+BLACK_BOXES = (*SINGLE, *COMBINED, *SEAMS)
 
 __all__ = ["BLACK_BOXES", "MUTANTS", "PROGRAM", "BlackBox", "Mutant", "living"]

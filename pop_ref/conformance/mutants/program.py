@@ -22,6 +22,18 @@ RATE = "test_optimizer:the_position_rate_falls_log_linearly_to_a_hundredth"
 PLAIN = "test_agreement:the_image_that_training_draws_is_one_of_the_oracles_outcomes"
 ASKED = "test_gradients:asking_for_dominance_and_counts_changes_neither_image_nor_gradient"
 
+PRIOR = "test_strategies:the_prior_begins_and_ends_where_it_is_told_and_is_as_heavy_as_it_is_told"
+CAMERAS = "test_strategies:of_several_cameras_any_may_show_that_a_gaussian_is_important"
+READINGS = "test_strategies:a_training_is_the_oracles_under_every_reading"
+PACKED = "test_strategies:packed_rows_are_collected_as_all_rows_are"
+TRAINED = "test_strategies:edited_parameters_are_trained_as_they_were"
+HELD = "test_strategies:after_every_step_each_optimizer_holds_its_parameter_and_nothing_else"
+COUNTED = "test_strategies:an_edit_does_not_touch_the_counter_of_updates"
+OF_3DGS = "test_strategies:a_training_by_3dgs_is_the_oracles_at_every_step"
+OF_MINI = "test_strategies:a_training_by_mini_splatting_is_the_oracles_at_every_step"
+OF_TAMING = "test_strategies:a_training_by_taming_is_the_oracles_at_every_step"
+OF_PUP = "test_strategies:a_training_by_pup_is_the_oracles_at_every_step"
+
 _LINES: Final = (
     (
         "moments_of_the_next_row",
@@ -50,15 +62,15 @@ _LINES: Final = (
     (
         "splits_keep_the_opacity",
         "the step forgets that revised opacities were asked for: two children are denser than their parent (A26)",
-        "density/densify.py",
-        "padded, of.draws.normals(n_splits), plan.revised_opacity)",
-        "padded, of.draws.normals(n_splits))",
+        "density/control.py",
+        "context.draws.normals(n_splits),\n                self.revised_opacity,\n",
+        "context.draws.normals(n_splits),\n",
         STEP,
     ),
     (
         "square_pixels_of_ndc",
         "the screen gradient is scaled by the width along both axes",
-        "density/densify.py",
+        "density/control.py",
         '0.5 * info["height"] * cameras',
         '0.5 * info["width"] * cameras',
         AVERAGE,
@@ -66,7 +78,7 @@ _LINES: Final = (
     (
         "every_view_counted",
         "views that do not show a Gaussian are counted in its average (A23)",
-        "density/densify.py",
+        "density/control.py",
         'state["count"].add_(visible.sum(0))',
         'state["count"].add_(len(visible))',
         AVERAGE,
@@ -74,7 +86,7 @@ _LINES: Final = (
     (
         "window_without_end",
         "the views that showed a Gaussian are counted from the first step on, its gradients from the last change",
-        "density/densify.py",
+        "density/rows.py",
         '    state["count"].zero_()\n',
         "",
         STEP,
@@ -82,23 +94,23 @@ _LINES: Final = (
     (
         "growth_in_world_units",
         "the size that decides between clone and split is in world units: scene_scale is forgotten",
-        "density/densify.py",
-        'grow_masks(window(state), torch.exp(of.params["scales"]), state["scene_scale"]',
-        'grow_masks(window(state), torch.exp(of.params["scales"]), 1.0',
+        "density/control.py",
+        'grow_masks(window(state), context.params["scales"].exp(), state["scene_scale"]',
+        'grow_masks(window(state), context.params["scales"].exp(), 1.0',
         STEP,
     ),
     (
         "pruning_in_world_units",
         "the size over which a Gaussian is pruned is in world units: scene_scale is forgotten",
-        "density/densify.py",
-        'prune_mask(opacities, torch.exp(of.params["scales"]), state["scene_scale"]',
-        'prune_mask(opacities, torch.exp(of.params["scales"]), 1.0',
+        "density/control.py",
+        'prune_mask(opacities, context.params["scales"].exp(), state["scene_scale"]',
+        'prune_mask(opacities, context.params["scales"].exp(), 1.0',
         STEP,
     ),
     (
         "clones_before_survivors",
         "who is split is looked up as if the clones stood before the rest",
-        "density/densify.py",
+        "density/control.py",
         "padded = torch.cat([splits, splits.new_zeros(n_clones)])",
         "padded = torch.cat([splits.new_zeros(n_clones), splits])",
         STEP,
@@ -114,7 +126,7 @@ _LINES: Final = (
     (
         "blur_flag_of_one_view",
         "the blur flag of earlier views is forgotten: only the last view counts (A2)",
-        "density/densify.py",
+        "density/control.py",
         '        blurred |= state["blurred"]\n',
         "        blurred |= blurred\n",
         FLAGS,
@@ -122,15 +134,15 @@ _LINES: Final = (
     (
         "blur_bound_not_passed_on",
         "the least number of pixels of a blurred Gaussian is a setting that nothing reads",
-        "density/densify.py",
-        "plan.theta_blur, plan.blur_min_pixels, kept)",
-        "plan.theta_blur, 0.0, kept)",
+        "density/control.py",
+        "self.theta_blur, self.blur_min_pixels, kept)",
+        "self.theta_blur, 0.0, kept)",
         "test_density:the_blur_set_dominates_strictly_more_than_its_share_of_pixels",
     ),
     (
         "share_of_masked_pixels",
         "the share of a blurred Gaussian is of all pixels, also of those that a mask leaves out",
-        "density/densify.py",
+        "density/control.py",
         'kept = info.get("kept_pixels")',
         "kept = None",
         FLAGS,
@@ -278,6 +290,150 @@ _LINES: Final = (
         "gradients.add(group, blend, tiles.index_select(0, group.tiles))",
         "del blend.steps[32:]; gradients.add(group, blend, tiles.index_select(0, group.tiles))",
         "test_scale:the_gradients_of_a_thousand_in_a_tile_are_the_oracles",
+    ),
+    (
+        "weight_of_the_prior_not_read",
+        "the weight of the prior is a setting that nothing reads",
+        "density/control.py",
+        "terms.append(self.lambda_pop * self._prior(",
+        "terms.append(1e-3 * self._prior(",
+        PRIOR,
+    ),
+    (
+        "prior_never_stops",
+        "the prior goes on to the end of the training",
+        "density/control.py",
+        "return weighs and self.pop_start_iter <= step < self.pop_stop_iter",
+        "return weighs and self.pop_start_iter <= step",
+        PRIOR,
+    ),
+    (
+        "mask_of_the_first_camera",
+        "of several cameras the first one's counts say who is important",
+        "density/control.py",
+        "mask = importance_mask(dominant_counts(info).sum(0))",
+        "mask = importance_mask(dominant_counts(info)[0])",
+        CAMERAS,
+    ),
+    (
+        "entropy_of_the_other_sign",
+        "the entropy of opacities is subtracted",
+        "density/control.py",
+        "self.lambda_entropy * opacity_entropy(",
+        "-self.lambda_entropy * opacity_entropy(",
+        READINGS,
+    ),
+    (
+        "signed_gradients_for_absgrad",
+        "absgrad=True is accepted and the signed gradients are read",
+        "density/control.py",
+        "grads = means2d.absgrad if self.absgrad else means2d.grad",
+        "grads = means2d.grad",
+        OF_3DGS,
+    ),
+    (
+        "cameras_not_scaled_up",
+        "of a mean over cameras the gradients count a share each (gsplat multiplies by n_cameras)",
+        "density/control.py",
+        '0.5 * info["width"] * cameras, 0.5 * info["height"] * cameras]',
+        '0.5 * info["width"], 0.5 * info["height"]]',
+        OF_3DGS,
+    ),
+    (
+        "packed_rows_seen_once",
+        "packed rows of several cameras count their Gaussian once",
+        "density/control.py",
+        'state["count"].index_add_(0, ids, torch.ones_like(norms))',
+        'state["count"][ids] = 1.0',
+        PACKED,
+    ),
+    (
+        "packed_gradients_overwrite",
+        "of packed rows of one Gaussian the last one's gradient stays (an index_put_ without accumulate)",
+        "density/control.py",
+        'state["grad2d"].index_add_(0, ids, norms)',
+        'state["grad2d"][ids] += norms',
+        PACKED,
+    ),
+    (
+        "screen_size_rules_inert",
+        "pruning and splitting by screen size are collected and never applied",
+        "density/control.py",
+        "if context.step < self.refine_scale2d_stop_iter:",
+        "if False:",
+        READINGS,
+    ),
+    (
+        "screen_size_prune_inert",
+        "nobody is pruned by screen size, as in Inria's code",
+        "density/control.py",
+        "if self.prune_too_big_after < context.step < self.refine_scale2d_stop_iter:",
+        "if context.step < -1:",
+        READINGS,
+    ),
+    (
+        "last_prune_inert",
+        "the last prune of faint Gaussians never comes",
+        "density/control.py",
+        "if context.step != self.final_prune_iter:",
+        "if True:",
+        READINGS,
+    ),
+    (
+        "parameters_lose_their_gradient",
+        "edited parameters are tensors that do not require a gradient",
+        "density/rows.py",
+        "requires_grad=old.requires_grad)",
+        "requires_grad=False)",
+        TRAINED,
+    ),
+    (
+        "optimizers_keep_old_parameters",
+        "optimizers go on with the tensors of before the edit, and move nothing that is drawn",
+        "density/rows.py",
+        'optimizer.param_groups[0]["params"] = [new]',
+        "pass",
+        HELD,
+    ),
+    (
+        "moments_of_old_parameters_stay",
+        "the state of the tensors of before an edit stays in the optimizers (a leak of gsplat's first strategy)",
+        "density/rows.py",
+        "moments = optimizer.state.pop(old, {})",
+        "moments = dict(optimizer.state.get(old, {}))",
+        HELD,
+    ),
+    (
+        "counter_reset_by_an_edit",
+        "an edit starts the counter of updates again, so that the next steps are corrected as the first",
+        "density/rows.py",
+        "        if moments:\n",
+        '        if moments:\n            moments["step"] = torch.zeros_like(moments["step"])\n',
+        COUNTED,
+    ),
+    (
+        "opacities_set_anew_as_logits",
+        "Mini-Splatting's new points have the activated opacity as a logit",
+        "density/mini_splatting.py",
+        "torch.logit(points.new_full((n,), opacity))",
+        "points.new_full((n,), opacity)",
+        OF_MINI,
+    ),
+    (
+        "all_candidates_of_taming_go",
+        "Taming-3DGS prunes all that 3DGS would",
+        "density/taming.py",
+        "mask & _drawn_to_go(mask, weights, context)",
+        "mask",
+        OF_TAMING,
+    ),
+    (
+        "pup_first_share_twice",
+        "both rounds of PUP-3DGS remove the first share",
+        "density/pup.py",
+        "share = self.prune_shares[self.adam_restarts.index(context.step)]",
+        "share = self.prune_shares[0]",
+        OF_PUP,
     ),
 )
 

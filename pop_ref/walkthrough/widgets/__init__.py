@@ -20,12 +20,12 @@ FOLDER: Final = Path(__file__).resolve().parent
 
 @dataclass(frozen=True)
 class Widget:
-    """What a widget is called, what to try with it, the stages whose mathematics it needs, and its recorded data."""
+    """What a widget is called, what to try with it, and the stages whose mathematics it, or its worker, needs."""
 
     title: str
     prompt: str
     stages: tuple[str, ...] = ()
-    data: str | None = None
+    worker: tuple[str, ...] = ()
 
 
 WIDGETS: Final = {
@@ -51,10 +51,11 @@ WIDGETS: Final = {
         "value seen from opposite sides (even), which the negative (odd)?",
         ("harmonics",),
     ),
-    "scrubber": Widget(
+    "train": Widget(
         "Two trainings, without and with the prior",
-        "play both, and watch the middle of the histograms empty on one side only.",
-        data="scrubber.json",
+        "train, and watch the histograms. Then make the prior ten times as heavy and start again: which opacities go, "
+        "and what does the picture lose?",
+        worker=("training", "toy"),
     ),
 }
 
@@ -99,13 +100,21 @@ def mathematics(*stages: str) -> str:
 
 
 def _script(name: str, widget: Widget) -> str:
-    data = f"const RECORDING = {_text(widget.data)};" if widget.data else ""
+    # a worker begins from text, since a page that lies in a file may load nothing
+    text = mathematics(*widget.worker) + _text(f"{name}_worker.js") if widget.worker else ""
+    worker = f"const WORKER = {json.dumps(text)};" if text else ""
     # whatever a page holds more than once is started once
     start = (
         f"for (const root of document.querySelectorAll('.pop-widget[data-widget=\"{name}\"][hidden]')) "
         f"{{ root.hidden = false; {name}(root); }}"
     )
-    parts = (mathematics(*widget.stages), _text("kit.js"), data, _text(f"{name}.js"), start)
+    parts = (
+        mathematics(*widget.stages),
+        _text("kit.js"),
+        worker,
+        _text(f"{name}.js"),
+        start,
+    )
     return "(() => {\n" + "\n".join(part for part in parts if part) + "\n})();"
 
 

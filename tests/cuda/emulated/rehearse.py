@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from cuda_ext.host import emulate
-from tests.cuda.emulated.conftest import FOLDER
+from tests.cuda.conftest import FOLDER
 
 
 class StandInEvent:
@@ -51,9 +51,9 @@ def stand_in_card(patch: pytest.MonkeyPatch) -> None:
 def stand_in_engine(patch: pytest.MonkeyPatch) -> None:
     """Put the emulated GPU where `pop train` looks for one."""
     from pop_fast.train import engines
-    from tests.cuda.emulated.engine import emulated_engine
+    from tests.cuda.conftest import emulated_engine
 
-    patch.setattr(engines, "cuda_engine", emulated_engine)
+    patch.setattr(engines, "whole_engine", lambda backend: emulated_engine())
 
 
 def shorten_the_benchmark(patch: pytest.MonkeyPatch) -> None:

@@ -9,8 +9,7 @@ import pytest
 
 from cuda_ext.host import emulate
 from cuda_ext.host.emulate import FLAGS, HERE, translated
-
-from .conftest import FOLDER
+from tests.cuda.conftest import FOLDER
 
 PROGRAM = r"""
 #include <cuda_runtime.h>

@@ -1,4 +1,4 @@
-"""What needs a GPU: the laws on the CUDA backend, bits, ten training steps. Skipped, with the reason, without."""
+"""What needs a GPU: the laws on the CUDA backend, bits, training steps; on a card and under the emulator."""
 
 from __future__ import annotations
 
@@ -9,12 +9,16 @@ from typing import Any
 
 import pytest
 
-pytest.register_assert_rewrite("pop_ref.conformance.laws")
-
-import cuda_ext  # noqa: E402  asserts must be rewritten first
-from pop_ref.conformance.plugin import parametrize_backends  # noqa: E402
+import cuda_ext
+from cuda_ext.host import emulate
+from pop_ref.conformance.backends import Absent
+from pop_ref.conformance.plugin import parametrize_backends
+from tests.cuda.conftest import FOLDER as EMULATED
+from tests.cuda.conftest import NO_CARD, emulated_engine
 
 FOLDER = Path(__file__).parent
+ON = tuple(os.environ.get("POP_CUDA_ON", "cuda emulated").split())
+LAWS_EMULATED = bool(os.environ.get("POP_EMULATED_LAWS"))
 OF_META = ("means2d", "radii", "depths", "conics", "opacities", "final_T")
 DOMINANCE = ("dominant_ids", "dominant_weights", "dominant_counts")
 
@@ -50,18 +54,31 @@ def cuda_backends(device: str, name: str) -> list[Any]:
 
 
 @functools.cache
-def gpu_backends() -> list[Any]:
+def card_backends() -> list[Any]:
     return cuda_backends("cuda", "cuda")
 
 
+@functools.cache
+def emulated_backends() -> list[Any]:
+    # for good: a backend of the laws is asked while tests are collected, and goes back after its call has returned
+    emulate.install(pytest.MonkeyPatch(), emulate.build(EMULATED))
+    return cuda_backends("cpu", "emulated")
+
+
+def law_backends() -> list[Any]:
+    """Return the backends on which the laws are tried, or in the place of each device's why they are not."""
+    found: list[Any] = []
+    if "cuda" in ON:
+        found += card_backends() if NO_CARD is None else [Absent("cuda", NO_CARD)]
+    if "emulated" in ON:
+        reason = emulate.why_not() if LAWS_EMULATED else "minutes: set POP_EMULATED_LAWS=1, or `make emulate`"
+        found += emulated_backends() if reason is None else [Absent("emulated", reason)]
+    return found
+
+
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    if "backend" not in metafunc.fixturenames:
-        return
-    reason = cuda_ext.why_not()
-    if reason is None:
-        parametrize_backends(metafunc, gpu_backends())
-    else:
-        metafunc.parametrize("backend", [pytest.param(None, id="cuda", marks=[pytest.mark.skip(reason=reason)])])
+    if "backend" in metafunc.fixturenames:
+        parametrize_backends(metafunc, law_backends())
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -71,20 +88,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         items.sort(key=lambda item: item.path.parent != FOLDER or item.get_closest_marker("graph") is None)
 
 
-@pytest.fixture
-def gpu() -> Any:
+@pytest.fixture(params=ON)
+def gpu(request: pytest.FixtureRequest) -> Any:
     """Return the device, or skip with the reason why there is none."""
-    import torch
-
-    reason = cuda_ext.why_not()
-    if reason is not None:
-        pytest.skip(reason)
-    return torch.device("cuda")
+    return request.getfixturevalue({"cuda": "card", "emulated": "emulated_card"}[request.param])
 
 
 @pytest.fixture
 def engine(gpu: Any) -> Any:
-    """Return the GPU as `pop train` finds it, or skip with the reason why there is none."""
-    from pop_fast.train.engines import cuda_engine
+    """Return the GPU as `pop train` finds it."""
+    from pop_fast.train.engines import whole_engine
 
-    return cuda_engine()
+    return whole_engine("cuda") if gpu.type == "cuda" else emulated_engine()

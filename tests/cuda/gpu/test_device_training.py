@@ -14,6 +14,10 @@ from pop_fast.density import GsplatStrategy, POPStrategy
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config
+from tests.train import test_steps as rules
+from tests.train.scene import RECIPE, SHORT, STEPS
+from tests.train.test_steps import EVERYTHING, agree, climb, judged, run_of
+from tests.train.test_steps import ladder_agree as climbed
 
 COMPARED = ("loss", "pop", "psnr", "d_ssim", "l1", "l2", "lr_means", "num_gaussians")
 STILL = {"refine_stop_iter": 0}
@@ -137,3 +141,23 @@ def test_a_number_that_is_not_finite_is_found_on_the_device(engine, tmp_path):
     trainer.take_steps = poisoned
     with pytest.raises(ValueError, match=r"quats\[7, 2\] is nan after 5 steps; no checkpoint is kept"):
         trainer.run()
+
+
+# The golden ladder, and steps of a real run each judged by the oracle's from the same state; see `tests.train`.
+
+
+@pytest.mark.parametrize(("recipe", "steps"), [(SHORT, 10), (RECIPE, STEPS)], ids=["ten", "three-hundred"])
+def test_every_step_is_the_oracles(engine, recipe, steps, tmp_path):
+    found = judged(run_of(recipe, tmp_path, engine), recipe, steps)
+    agree(found)
+    happened = {kind for step in found for kind in step.happened}
+    assert happened == EVERYTHING if recipe is RECIPE else happened
+
+
+def test_the_rules_of_updates_move_whom_they_move_and_nobody_else(engine, tmp_path):
+    rules.test_each_engine_moves_whom_the_rules_move_and_nobody_else(engine, tmp_path / "moves")
+    rules.test_gradients_that_wait_are_summed_alike_by_every_engine(engine, tmp_path / "waits")
+
+
+def test_ten_losses_are_the_oracles(engine, tmp_path):
+    climbed(climb(engine, tmp_path), torch.float32)

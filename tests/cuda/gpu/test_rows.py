@@ -1,17 +1,20 @@
 """Rows of harmonics of every width and place in memory: projected, their gradients, and Adam's moments after a step.
 
-70 Gaussians are two full warps, which read pieces of 16 bytes, and a part of one, which reads floats.
-"""
+70 Gaussians are two full warps, which read pieces of 16 bytes, and a part of one, which reads floats."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from .scene import HEIGHT, LR, WIDTH, TrainingScene, training_scene
+import cuda_ext
+from pop_ref.settings import Objective
+from tests.cuda.gpu.scene import HEIGHT, LR, WIDTH, TrainingScene, training_scene
 
 N = 70
 # active degree, bands beyond the first in memory; the last is wider than any degree needs
@@ -42,15 +45,16 @@ def _moments(
     floats: int = 0,
     settings: Mapping[str, Any] | None = None,
     waits: int = 0,
-    **phase: float,
+    **phase: Any,
 ):
     """Take a step on the device and return Adam's first moments, a tenth of the gradients, and the parameters.
 
     Before it, `waits` steps are taken in which the harmonics beyond the first band take no part.
     """
-    from cuda_ext.train_settings import Phase, StepSettings, steady_updates
     from cuda_ext.training.resident import ResidentViews
     from cuda_ext.training.train_step import FusedTrainer
+    from pop_fast.train.schedule import steady_updates
+    from pop_fast.train.steps import Phase, StepSettings
 
     params = {name: _moved(value.to(device), floats) for name, value in scene.params.items()}
     m, v = ({name: _moved(torch.zeros_like(value), floats) for name, value in params.items()} for _ in range(2))
@@ -66,7 +70,7 @@ def _moments(
 @pytest.mark.parametrize("scale", [1.0, 1e-3, 1e-6])
 def test_a_first_step_has_the_length_of_the_learning_rate_however_small_the_gradient(gpu, scale):
     # x - lr g / (|g| + eps): with an eps under the root, or of 1e-8, small gradients take small steps
-    found, after = _moments(_scene(15), gpu, 3, settings={"pixelwise_scale": scale}, lambda_ssim=0.0)
+    found, after = _moments(_scene(15), gpu, 3, objective=Objective(pixel_scale=scale, lambda_ssim=0.0))
     smallest = []
     for name, m in found.items():
         g, before = m.double() / 0.1, _scene(15).params[name].double()
@@ -152,3 +156,121 @@ def test_coefficients_of_any_width_and_place_give_the_cpus_image_and_gradient(gp
     for name, value in grads[0].items():
         torch.testing.assert_close(grads[1][name], value, rtol=1e-3, atol=1e-4 * float(value.abs().max()))
     assert bool(grads[0]["sh"][:, : (degree + 1) ** 2].any(0).all())
+
+
+# What the kernels are handed: every pointer takes tensors of its own type alone, and no name is made up.
+
+EVERY_TYPE = ("float32", "float64", "float16", "int64", "int32", "int16", "uint8", "bool")
+
+
+def structs():
+    kernels = cuda_ext.load()
+    found = [getattr(kernels, name) for name in dir(kernels)]
+    return [kind for kind in found if isinstance(kind, type) and hasattr(kind, "dtypes")]
+
+
+def test_every_pointer_of_the_kernels_structs_takes_its_own_type_and_no_other(gpu):
+    from cuda_ext.arrays import fill
+
+    fields = 0
+    for kind in structs():
+        for name, dtypes in kind.dtypes.items():
+            fields += 1
+            for dtype in EVERY_TYPE:
+                tensor = torch.zeros(4, dtype=getattr(torch, dtype), device=gpu)
+                if dtype in dtypes.split():
+                    assert getattr(fill(kind(), **{name: tensor}), name) == tensor.data_ptr()
+                    continue
+                words = f"{name} has dtype {dtype}; the kernels read {dtypes.replace(' ', ' or ')} there"
+                with pytest.raises(ValueError, match=re.escape(words)):
+                    fill(kind(), **{name: tensor})
+            assert getattr(fill(kind(), **{name: None}), name) == 0
+    assert fields == pointers_in_the_bindings()
+
+
+def pointers_in_the_bindings() -> int:
+    folder = Path(cuda_ext.__file__).parent
+    text = "".join((folder / name).read_text() for name in ("bindings.cpp", "bindings_training.cpp"))
+    return len(re.findall(r"^ +POINTER\(", text, re.M)) + 2 * len(re.findall(r"^ +pointer_pair\(", text, re.M))
+
+
+def test_a_field_that_the_kernels_do_not_have_is_refused(gpu):
+    from cuda_ext.arrays import fill
+
+    kernels = cuda_ext.load()
+    with pytest.raises(TypeError, match="View has no field veiwmat; it has K, height, viewmat, width"):
+        fill(kernels.View(), veiwmat=torch.zeros(16, device=gpu))
+    with pytest.raises(TypeError, match=r"View\.width is a number, not a tensor"):
+        fill(kernels.View(), width=torch.zeros(1, device=gpu))
+
+
+# The loss kernels beside float64: sizes around a block's 32 pixels, both borders, masks, both pixelwise terms.
+
+SIZES = [(11, 12), (32, 32), (33, 31), (21, 70), (70, 43)]
+
+
+def _photographs(height: int, width: int, masked: bool):
+    g = torch.Generator().manual_seed(height + width)
+    smooth = torch.linspace(0, 9, width)[None, :, None] + torch.linspace(0, 7, height)[:, None, None]
+    target = (smooth.sin() * 0.4 + 0.5 + 0.1 * torch.rand((height, width, 3), generator=g)).clamp(0, 1)
+    photograph = (255 * target).round().to(torch.uint8)
+    # brighter than white and darker than black in places, as renders are
+    image = 1.3 * (target + 0.2 * torch.randn((height, width, 3), generator=g)) - 0.1
+    mask = torch.rand((height, width), generator=g) < 0.9 if masked else None
+    return photograph, image, mask
+
+
+def _found(device, photograph, image, mask, padding, l1, weights, cache):
+    from cuda_ext import load
+    from cuda_ext.arrays import fill, new_state, stream_of
+    from cuda_ext.training.resident import MARGIN, ResidentViews
+
+    kernels, (height, width) = load(), photograph.shape[:2]
+    masks = None if mask is None else [mask]
+    views = ResidentViews([photograph], torch.eye(4)[None], torch.eye(3)[None], masks, padding, device, cache)
+    shapes = {"windows": (9, height, width), "v_image": (height, width, 3)}
+    shapes |= {"partials": (kernels.loss_blocks(width, height), 3), "values": (kernels.N_VALUES,)}
+    made = {name: torch.full(shape, float("nan"), device=device) for name, shape in shapes.items()}
+    arrays = fill(kernels.LossArrays(), image=image.to(device), width=width, height=height, **made)
+    settings = fill(kernels.LossSettings(), pixelwise_weight=weights[0], ssim_weight=weights[1])
+    settings.margin = MARGIN if padding == "valid" else 0
+    settings.set_pixelwise(l1)
+    state = new_state(device)
+    kernels.photometric(views.photographs(), arrays, settings, state.data_ptr(), stream_of(device))
+    return made["values"].cpu().double()[:4], made["v_image"].cpu().double()
+
+
+@pytest.mark.parametrize("cache", [True, False])
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize(("padding", "l1"), [("valid", False), ("same", True)])
+@pytest.mark.parametrize("size", SIZES)
+def test_values_and_gradient_are_those_of_float64(gpu, size, padding, l1, masked, cache):
+    from pop_fast.stages import losses
+
+    photograph, image, mask = _photographs(*size, masked)
+    weights = (0.7, 0.3)
+    values, v_image = _found(gpu, photograph, image, mask, padding, l1, weights, cache)
+    leaf, target = image.double().requires_grad_(), photograph.double() / 255.0
+    pixelwise = (losses.l1 if l1 else losses.l2)(leaf, target, mask)
+    ssim = losses.ssim(leaf, target, padding, mask)
+    objective = weights[0] * pixelwise + weights[1] * (1.0 - ssim)
+    objective.backward()
+    square = losses.l2(leaf.detach().clamp(0, 1), target, mask)
+    wanted = torch.stack((pixelwise, ssim, objective, square)).detach()
+    torch.testing.assert_close(values, wanted, rtol=2e-6, atol=2e-6)
+    torch.testing.assert_close(v_image, leaf.grad, rtol=1e-4, atol=1e-5 * float(leaf.grad.abs().max()))
+
+
+def test_a_mask_that_keeps_nothing_compares_nothing(gpu):
+    photograph, image, _ = _photographs(40, 40, False)
+    values, v_image = _found(
+        gpu, photograph, image, torch.zeros(40, 40, dtype=torch.bool), "valid", False, (1, 1), True
+    )
+    assert values.tolist() == [0.0, 1.0, 0.0, 0.0]
+    assert not bool(v_image.any())
+
+
+def test_two_runs_give_the_same_bits(gpu):
+    photograph, image, mask = _photographs(70, 43, True)
+    first, second = (_found(gpu, photograph, image, mask, "valid", False, (1, 1), True) for _ in range(2))
+    assert all(torch.equal(one, other) for one, other in zip(first, second, strict=True))

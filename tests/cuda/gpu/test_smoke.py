@@ -8,8 +8,7 @@ import torch
 
 from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render
-
-from .scene import HEIGHT, LR, WIDTH, training_scene
+from tests.cuda.gpu.scene import HEIGHT, LR, WIDTH, training_scene
 
 
 @pytest.mark.parametrize("backward", ["pixel_parallel", "gaussian_parallel"])
@@ -33,9 +32,10 @@ def test_a_render_is_the_oracles(gpu, backward):
 
 
 def test_fused_steps_launched_one_by_one_give_the_same_bits_twice_and_learn(gpu):
-    from cuda_ext.train_settings import Phase, StepSettings, steady_updates
     from cuda_ext.training.resident import ResidentViews
     from cuda_ext.training.train_step import FusedTrainer
+    from pop_fast.train.schedule import steady_updates
+    from pop_fast.train.steps import Phase, StepSettings, StepStats
 
     found = []
     for _ in range(2):
@@ -45,7 +45,7 @@ def test_fused_steps_launched_one_by_one_give_the_same_bits_twice_and_learn(gpu)
         views = ResidentViews(scene.photographs, scene.viewmats, scene.Ks, None, "valid", gpu)
         trainer = FusedTrainer(params, m, v, views, [0] * 4, StepSettings(steady_updates(LR, 4), replay=False))
         trainer.run(4, Phase(3, True, True, True))
-        losses = [values.objective for values in trainer.step_stats(0, 4)]
+        losses = [StepStats(*values).objective for values in trainer.step_stats(0, 4)]
         assert losses[-1] < losses[0]
         found.append(params)
     for name, value in found[0].items():

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from .scene import HEIGHT, LR, STEPS, WIDTH, training_scene
-from .steps import apart, fused, fused_trainer, on_the_cpu
+from tests.cuda.gpu.scene import HEIGHT, LR, STEPS, WIDTH, apart, fused, fused_trainer, on_the_cpu, training_scene
 
 
 @pytest.mark.graph
@@ -21,9 +20,14 @@ def test_steps_launched_anew_are_the_replayed_steps(gpu):
     "options", [{"backward": "gaussian_parallel"}, {"deterministic": False}, {"antialiased": True}]
 )
 def test_graphs_of_several_sizes_and_phases_are_replayed_in_turn(gpu, options):
-    from cuda_ext.train_settings import Phase
+    from pop_fast.train.steps import Phase
+    from pop_ref.settings import Objective
 
-    phases = (Phase(3, True, True, True), Phase(1, False, False, False, l1=True), Phase(3, True, False, False))
+    phases = (
+        Phase(3, True, True, True),
+        Phase(1, False, False, False, objective=Objective(pixelwise="l1")),
+        Phase(3, True, False, False),
+    )
     found = []
     for replay in (True, False):
         scene = training_scene()

@@ -1,0 +1,159 @@
+"""What training steps are asked and what they report: their kind, Adam's schedule, settings, measurements, statistics.
+
+The numbers of a step that runs as a whole, in C++ or on a GPU, go in and out as these values.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+from pop_ref.constants import Profile
+from pop_ref.settings import BETAS, EPS, DensityConfig, Objective, Padding, Recipe
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+
+class Updates(NamedTuple):
+    """Whom Adam moves at every step of a schedule, and how far: meaning in `pop_ref.optimizer`.
+
+    Attributes:
+        rates: learning rates, that of the means in world units. [steps, groups] float64
+        numbers: the number of the update, from 1, that the bias corrections are of; 0 where a parameter is not moved.
+            [steps, groups] int32
+        sh_rest_every: gradients of the bands beyond the first are summed up from one update to the next if it is > 1;
+            else those of a step without an update are lost, as all other parameters' are.
+    """
+
+    rates: Tensor
+    numbers: Tensor
+    sh_rest_every: int = 1
+
+    def __len__(self) -> int:
+        return len(self.rates)
+
+
+@dataclass(frozen=True)
+class StepSettings:
+    """What all steps of a run depend on.
+
+    Attributes:
+        updates: whom Adam moves at which step.
+        padding: SSIM's border, by which photographs are prepared; that of every phase's objective.
+        lambda_pop: weight of the POP term where it is on.
+        lambda_entropy: weight of the mean entropy of the opacities where it is on; the step on a GPU has no such term.
+        pop_views: who dominates a pixel of the "current" view is important, or of any view of the "window".
+        pop_over: the POP term averages over "all" Gaussians, or over those "visible" in the view.
+        blur_window: under "any_view" a blur flag stays up, under "own_view" it is the last view's alone, under "sum"
+            the caller makes it of the summed counts.
+        theta_blur: share of the image a Gaussian must dominate to be blurred.
+        blur_min_pixels: and at least so many pixels.
+        background: colour behind everything.
+        profile, antialiased: of the renderer.
+        backward, deterministic: of the step on a GPU, as `cuda_ext.arrays.Settings` says.
+        betas, eps: Adam's.
+        replay: replay steps as CUDA graphs; False launches every kernel anew, for debuggers and profilers.
+        counts: also tell how many splats every pixel blends and visits, which training does not read.
+    """
+
+    updates: Updates
+    padding: Padding = Recipe.padding
+    lambda_pop: float = Recipe.lambda_pop
+    lambda_entropy: float = Recipe.lambda_entropy
+    pop_views: str = Recipe.pop_views
+    pop_over: str = Recipe.pop_over
+    blur_window: str = DensityConfig.blur_window
+    theta_blur: float = DensityConfig.theta_blur
+    blur_min_pixels: float = DensityConfig.blur_min_pixels
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    profile: Profile = Recipe.profile
+    antialiased: bool = False
+    backward: str = "pixel_parallel"
+    deterministic: bool = True
+    betas: tuple[float, float] = BETAS
+    eps: float = EPS
+    replay: bool = True
+    counts: bool = False
+
+    def blur_pixels(self, kept_pixels: int) -> float:
+        """Return the whole number of pixels that a blurred Gaussian dominates more than, of a view's that count."""
+        # counts are whole, so that rounding down changes no comparison and a float holds the bound exactly
+        return float(math.floor(max(self.theta_blur * kept_pixels, self.blur_min_pixels)))
+
+
+class Phase(NamedTuple):
+    """What one kind of step does; steps of one phase and one image size share a graph.
+
+    Attributes:
+        sh_degree: highest active colour band.
+        pop: the POP term is on.
+        statistics: screen gradients are collected.
+        blur: dominant pixels are collected.
+        objective: what the render is compared with its photograph by.
+        window: dominant pixels are summed over the window for the POP term, also where blur is not asked for.
+        entropy: the entropy of the opacities is in the loss.
+    """
+
+    sh_degree: int
+    pop: bool
+    statistics: bool
+    blur: bool
+    objective: Objective = Objective()
+    window: bool = False
+    entropy: bool = False
+
+    @property
+    def dominance(self) -> bool:
+        """Whether dominant Gaussians are asked for."""
+        return self.pop or self.blur or self.window
+
+
+class StepStats(NamedTuple):
+    """Measurements of one step, the first five in the order of the compiled steps.
+
+    An engine need not measure all of them at every step; NaN stands for what it has not measured.
+
+    Attributes:
+        pixelwise: mean of the objective's pixelwise loss, without its weight.
+        ssim: SSIM.
+        objective: the photometric objective.
+        square: mean square of the difference, the render clamped to [0, 1].
+        pop: the weighted regularizer of the strategy, as the POP term is, 0 where it is off.
+        n_blended: Gaussians that a pixel blends, on average.
+        n_traversed: entries of its tile's list that a pixel visits, on average.
+    """
+
+    pixelwise: float
+    ssim: float
+    objective: float
+    square: float
+    pop: float
+    n_blended: float = math.nan
+    n_traversed: float = math.nan
+
+
+@dataclass
+class Collected:
+    """What density control reads, one entry a Gaussian, added to by every step of a phase that collects it.
+
+    `sh_rest_sum` is Adam's, of the same life: gradients that wait for their update; None where none do. [N, n_rest, 3]
+    """
+
+    grad_sum: Tensor
+    n_visible: Tensor
+    dominant_sum: Tensor
+    blurred: Tensor
+    sh_rest_sum: Tensor | None = None
+
+    @classmethod
+    def zeros(cls, n: int, device: torch.device, n_rest: int | None = None) -> Collected:
+        """Start from nothing; `n_rest` bands' gradients wait, None for none."""
+        import torch
+
+        visible, dominant = (torch.zeros(n, dtype=torch.int32, device=device) for _ in range(2))
+        flags = torch.zeros(n, dtype=torch.uint8, device=device)
+        waiting = None if n_rest is None else torch.zeros((n, n_rest, 3), device=device)
+        return cls(torch.zeros(n, device=device), visible, dominant, flags, waiting)

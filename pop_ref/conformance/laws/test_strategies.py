@@ -1,0 +1,260 @@
+"""Laws of what trains: a strategy is driven by a script through whole trainings, and says at every step what it does.
+
+The first laws know each method and compare it with the oracle; the others are about no method, and judge somebody
+else's strategy as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.assertions import assert_close, assert_same_bits
+from pop_ref.conformance.law import law
+from pop_ref.conformance.strategy_script import METHODS, Script
+from pop_ref.methods import KEYS
+
+ORACLE = OracleAdapter()
+EVERY_STEP = tuple(range(1, 40))
+GROWTH = {
+    "refine_start_iter": 3,
+    "refine_stop_iter": 30,
+    "refine_every": 4,
+    "grow_grad2d": 0.5,
+    "grow_scale3d": 0.3,
+    "prune_opa": 0.05,
+    "prune_scale3d": 0.6,
+    "prune_too_big_after": 8,
+}
+RESETS = {"reset_every": 12, "reset_opa": 0.2}
+BLUR = {"theta_blur": 4.0 / 128.0, "blur_start_iter": 8, "blur_stop_iter": 20}
+OWN = {
+    "pop": {**BLUR, "lambda_pop": 0.5, "pop_start_iter": 2, "pop_stop_iter": 26},
+    "gsplat": RESETS,
+    "3dgs": RESETS,
+    "mini-splatting": {
+        "theta_blur": 4.0 / 128.0,
+        "blur_stop_iter": 18,
+        "sh_start_iter": 12,
+        "means_rewind_iter": 18,
+        "means_rewind_to": 6,
+        "reinit_iters": (7,),
+        "reinit_points": 60,
+        "sample_iter": 18,
+        "prune_iter": 34,
+        "prune_mass": 0.125,
+    },
+    "taming": {
+        **RESETS,
+        "opacities_stop_iter": 24,
+        "sh_rest_every": 4,
+        "budget_multiplier": 4.0,
+        "score_views": 2,
+        "sampled_prunes": 5,
+        "grow_grad2d": 0.125,
+        "prune_opa": 0.3,
+    },
+    "speedy-splat": {**RESETS, "soft_prune_iters": (12, 20), "soft_prune_share": 0.5, "hard_prune_iters": (33,)},
+    "pup": {**RESETS, "rounds_start_iter": 32, "round_steps": 4, "round_decay_every": 2, "prune_shares": (0.5, 0.25)},
+}
+
+
+def _script(method, n=12, **changes):
+    settings = {**GROWTH, **OWN.get(method, {}), **changes.pop("settings", {})}
+    return Script(method, settings, **{"steps": EVERY_STEP, "n": n, **changes})
+
+
+def _assert_the_oracles(backend, script):
+    rows = script.rows()
+    expected, found = ORACLE.stage("scripted_steps")(script, rows), backend.stage("scripted_steps")(script, rows)
+    happened = set()
+    for step, wanted, got in zip(script.steps, expected, found, strict=True):
+        at = f"step {step} of {script.method}"
+        term = abs(wanted["term"])
+        assert_close("training.term", got["term"], wanted["term"], term, backend.dtype, against_oracle=True)
+        assert got["done"] == wanted["done"], f"{at} did {got['done']}, expected {wanted['done']}"
+        for key in KEYS:
+            counter = wanted["counters"][key]
+            assert got["counters"][key] == counter, f"{at}: {key} counts {got['counters'][key]} updates, not {counter}"
+            for kind in ("params", "m", "v"):
+                a, b = got[kind][key], wanted[kind][key]
+                assert a.shape == b.shape, f"{at}: {kind} of {key} have shape {a.shape}, expected {b.shape}"
+                assert_close("training.rows", a, b, np.abs(b) + 1.0, backend.dtype, against_oracle=True)
+        happened |= set(wanted["done"])
+    return happened
+
+
+def _method(method):
+    def sentence(backend):
+        happened = _assert_the_oracles(backend, _script(method))
+        happened |= _assert_the_oracles(
+            backend,
+            _script(
+                method, cameras=2, packed=True, seed=1, scene_scale=4.0, settings={"absgrad": True, "grow_grad2d": 1.0}
+            ),
+        )
+        # a training in which nothing happens would say nothing
+        wanted = {
+            "mini-splatting": {"cloned", "split", "pruned", "replaced"},
+            "pop": {"cloned", "split", "pruned"},
+        }
+        assert happened >= wanted.get(method, {"cloned", "split", "pruned", "reset"}), f"{happened} only"
+
+    sentence.__name__ = f"test_a_training_by_{method.replace('-', '_')}_is_the_oracles_at_every_step"
+    return law("training", "scripted_steps", "method_settings")(sentence)
+
+
+for _name in METHODS:
+    _test = _method(_name)
+    globals()[_test.law.sentence.__name__] = _test
+del _name, _test
+
+SCREEN = {"refine_scale2d_stop_iter": 20, "grow_scale2d": 0.2, "prune_scale2d": 0.29}
+READINGS = (
+    ("pop", {"blur_window": "any_view", "blur_rule": "split", "revised_opacity": True}, {}),
+    ("pop", {"blur_window": "sum", "grad_denominator": "window", "blur_min_pixels": 6.0}, {"cameras": 2}),
+    ("pop", {"pop_views": "window", "grow_on_gradient": False}, {}),
+    ("pop", {"pop_over": "visible", "grow_on_gradient_in_blur_window": False}, {"cameras": 2, "packed": True}),
+    ("pop", {"lambda_pop": 0.0, "lambda_entropy": 0.25, "final_prune_iter": 33, "final_prune_opa": 0.5}, {}),
+    ("pop", {"lambda_entropy": 0.25, **SCREEN}, {}),
+    ("gsplat", {**SCREEN, "inclusive": True, "pause_refine_after_reset": 3}, {"cameras": 2, "packed": True}),
+    ("gsplat", {"sh_rest_every": 3, "edits_replace_update": True, "revised_opacity": True}, {}),
+    ("gsplat", {"prune_opa": 0.3, "prune_too_big": False}, {"steps": EVERY_STEP[:14]}),
+    ("mini-splatting", {"importance": "outdoor", "max_gaussians": 40}, {"cameras": 2}),
+    ("taming", {"final_count": 30, "misaligned_prune_weights": False}, {"packed": True}),
+)
+
+
+@law("training", "scripted_steps", "method_settings")
+def test_a_training_is_the_oracles_under_every_reading(backend):
+    for seed, (method, settings, more) in enumerate(READINGS):
+        _assert_the_oracles(
+            backend, _script(method, settings=settings, seed=seed, **{"steps": EVERY_STEP[:34], **more})
+        )
+
+
+@law("training", "scripted_steps", "method_settings")
+def test_a_reset_at_step_zero_happens_where_it_is_asked_for(backend):
+    for asked in (False, True):
+        settings = {"reset_at_zero": asked}
+        happened = _assert_the_oracles(backend, _script("gsplat", settings=settings, steps=(0, 1, 2)))
+        assert ("reset" in happened) == asked
+
+
+@law("training", "scripted_steps", "method_settings")
+def test_the_prior_begins_and_ends_where_it_is_told_and_is_as_heavy_as_it_is_told(backend):
+    steps = (0, 4, 5, 6, 14, 15, 16)
+    for weight in (0.5, 2.0**-10):
+        settings = {"lambda_pop": weight, "pop_start_iter": 5, "pop_stop_iter": 15, "refine_start_iter": 100}
+        script = _script("pop", settings=settings, steps=steps, quiet=True)
+        terms = [step["term"] for step in backend.stage("scripted_steps")(script, script.rows())]
+        assert [term != 0.0 for term in terms] == [False, False, True, True, True, False, False]
+        _assert_the_oracles(backend, script)
+
+
+@law("training", "scripted_steps", "method_settings")
+def test_of_several_cameras_any_may_show_that_a_gaussian_is_important(backend):
+    for pop_over in ("all", "visible"):
+        settings = {"lambda_pop": 1.0, "pop_over": pop_over}
+        for packed in (False, True):
+            _assert_the_oracles(backend, _script("pop", settings=settings, steps=(2, 3), cameras=3, packed=packed))
+
+
+@law("training", "method_settings")
+def test_every_methods_settings_are_its_recipes(backend):
+    for method in METHODS:
+        expected, found = ORACLE.stage("method_settings")(method), backend.stage("method_settings")(method)
+        for name, value in expected.items():
+            assert found[name] == value, f"{name} of {method} is {found[name]!r}, expected {value!r}"
+
+
+def _of_no_method(**changes):
+    """Return scripts for each of a backend's own strategies: the settings that most have, and none of a method."""
+    settings = {**GROWTH, **RESETS, "pause_refine_after_reset": 0}
+    return Script(settings=settings, **{"steps": EVERY_STEP[:24], "n": 12, **changes})
+
+
+def _driven(backend, script):
+    for method in METHODS if backend.has("method_settings") else (None,):
+        own = replace(script, method=method, settings={**script.settings, **OWN.get(method, {})})
+        yield method or backend.name, own, backend.stage("scripted_steps")(own, own.rows())
+
+
+def _edited(script, steps):
+    """Yield the number of a step after which the Gaussians were others, and its record."""
+    before = script.n
+    for number, step in zip(script.steps, steps, strict=True):
+        if len(step["params"]["means"]) != before or step["moved"]:
+            yield number, step
+        before = len(step["params"]["means"])
+
+
+@law("training", "scripted_steps", "optimizers")
+def test_after_every_step_each_optimizer_holds_its_parameter_and_nothing_else(backend):
+    for name, script, steps in _driven(backend, _of_no_method()):
+        assert list(_edited(script, steps)), f"{name} never changed the Gaussians"
+        for number, step in zip(script.steps, steps, strict=True):
+            lost = [key for key in KEYS if not step["held"][key]]
+            assert not lost, f"{name}, step {number}: the optimizer of {lost} does not hold the parameter, or not alone"
+
+
+@law("training", "scripted_steps", "optimizers")
+def test_edited_parameters_are_trained_as_they_were(backend):
+    for name, script, steps in _driven(backend, _of_no_method()):
+        for number, step in zip(script.steps, steps, strict=True):
+            still = [key for key in KEYS if not step["trainable"][key]]
+            assert not still, f"{name}, step {number}: {still} have no gradient any more"
+            kinds = {*step["dtypes"].values()}
+            assert kinds == {np.dtype(backend.dtype).name}, f"{name}, step {number}: parameters are {kinds}"
+
+
+@law("training", "scripted_steps", "optimizers")
+def test_an_edit_does_not_touch_the_counter_of_updates(backend):
+    for name, script, steps in _driven(backend, _of_no_method(steps=EVERY_STEP[:17])):
+        for number, step in zip(script.steps, steps, strict=True):
+            # where all Gaussians are replaced, Adam begins anew
+            if "replaced" not in step["done"]:
+                assert step["counted"], f"{name}, step {number}: after the edit updates count {step['counters']}"
+
+
+@law("training", "scripted_steps", "optimizers")
+def test_a_row_stays_one_row_in_every_parameter_and_moment(backend):
+    for name, script, steps in _driven(backend, _of_no_method(quiet=True, steps=EVERY_STEP[:16])):
+        for number, step in _edited(script, steps):
+            if "replaced" in step["done"]:
+                break
+            at = f"{name}, step {number}: "
+            tags = step["params"]["sh0"][:, 0, 0]
+            assert_same_bits(f"{at}tags of bands", step["params"]["shN"], np.ones((1, 15, 3)) * tags[:, None, None])
+            first = script.rows().params["quats"]
+            assert_same_bits(f"{at}turns", step["params"]["quats"], first[tags.astype(int) - 1].astype(backend.dtype))
+
+
+@law("training", "scripted_steps", "optimizers")
+def test_between_its_changes_a_strategy_moves_nothing(backend):
+    for name, script, steps in _driven(backend, _of_no_method(steps=(1, 2, 3, 5, 6, 7, 9))):
+        for number, step in list(zip(script.steps, steps, strict=True))[:5]:
+            moved = [key for key in step["moved"] if key != "means" or not step["noisy"]]
+            assert not moved, f"{name} changed {moved} at step {number}, where no change is due"
+
+
+@law("training", "scripted_steps", "optimizers")
+def test_packed_rows_are_collected_as_all_rows_are(backend):
+    dense, packed = (_of_no_method(cameras=2, seed=3, packed=packed, steps=EVERY_STEP[:17]) for packed in (False, True))
+    pairs = zip(_driven(backend, dense), _driven(backend, packed), strict=True)
+    for (name, script, one), (_, _, other) in pairs:
+        for number, a, b in zip(script.steps, one, other, strict=True):
+            for key in KEYS:
+                assert_same_bits(f"{name}, step {number}: {key}", b["params"][key], a["params"][key])
+
+
+@law("training", "scripted_steps", "optimizers")
+def test_a_training_leaves_nothing_to_the_next_one(backend):
+    script = _of_no_method(steps=EVERY_STEP[:16])
+    pairs = zip(_driven(backend, script), _driven(backend, script), strict=True)
+    for (name, of, one), (_, _, other) in pairs:
+        for number, a, b in zip(of.steps, one, other, strict=True):
+            for key in KEYS:
+                assert_same_bits(f"{name}, step {number}: {key}", b["params"][key], a["params"][key])

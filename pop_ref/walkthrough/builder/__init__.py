@@ -1,0 +1,1 @@
+"""What makes pages, notebooks, slides and a book of the chapters."""

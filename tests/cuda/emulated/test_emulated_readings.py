@@ -1,1 +1,0 @@
-from tests.cuda.gpu.test_readings import *  # noqa: F403  what a GPU has to do, by the kernels' own source

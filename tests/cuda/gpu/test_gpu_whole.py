@@ -1,1 +1,0 @@
-from pop_ref.conformance.laws.test_whole import *  # noqa: F403  the laws of one stage, over the CUDA backend
