@@ -1,8 +1,8 @@
 """The conformance kit's entry point, which pytest loads in every session; the kit itself only where one asks for it.
 
 Options that the kit adds have plain names ("--profile", "--device"), which other plugins may use in sessions of their
-own; so none is added before `pop_ref.conformance` stands among the words. The module stands in this package because
-importing `pop_ref` imports numpy and every stage, and a session that judges nothing shall pay nothing.
+own; so none is added before `pop_ref.conformance` stands among the words. The distribution pop-ref installs the same as
+the module `pop_ref_pytest`; this one serves environments that were made when pop_ref belonged to pop-splatting.
 """
 
 from __future__ import annotations
