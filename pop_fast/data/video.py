@@ -21,6 +21,7 @@ from pop_fast.data.photo_quality import look_the_same, sharpness, thumbnail
 from pop_fast.errors import CaptureError, PopError
 from pop_fast.io.atomic import folder_atomically
 from pop_fast.io.budget import PICTURE, check_memory
+from pop_fast.io.images import SILENT, set_log_level
 
 __all__ = ["Taken", "take_frames"]
 
@@ -110,11 +111,11 @@ def _open(path: Path) -> Any:
         raise CaptureError(f"{path}: no such file; give a video")
     # ffmpeg's own words about a damaged file; what matters is raised as one line
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    level = set_log_level(SILENT)
     try:
         video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     finally:
-        cv2.utils.logging.setLogLevel(level)
+        set_log_level(level)
     if not video.isOpened():
         raise CaptureError(f"{path}: is no video that OpenCV can read; {_CONVERT}")
     width, height = (int(video.get(size)) for size in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))

@@ -11,6 +11,7 @@ import struct
 import threading
 import zlib
 from pathlib import Path
+from typing import Final
 
 import cv2
 import numpy as np
@@ -180,6 +181,15 @@ def inline_png(image: np.ndarray, longest: int) -> str:
     return f'<img src="data:image/png;base64,{base64.b64encode(data.tobytes()).decode()}">'
 
 
+# of OpenCV's log, as a number because OpenCV 4 has no name for it in Python
+SILENT: Final = 0
+
+
+def set_log_level(level: int) -> int:
+    """Set the level of OpenCV's own log, by the function's name in OpenCV 4 or in 5, and return the level before."""
+    return (cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel)(level)  # type: ignore[attr-defined]
+
+
 class _Quiet:
     """Keep OpenCV's own log off the terminal while any thread decodes: what matters of it is raised as one line."""
 
@@ -189,14 +199,14 @@ class _Quiet:
     def __enter__(self) -> None:
         with self._lock:
             if self._inside == 0:
-                self._level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+                self._level = set_log_level(SILENT)
             self._inside += 1
 
     def __exit__(self, *_: object) -> None:
         with self._lock:
             self._inside -= 1
             if self._inside == 0:
-                cv2.utils.logging.setLogLevel(self._level)
+                set_log_level(self._level)
 
 
 _QUIET = _Quiet()

@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import file_atomically
+from pop_fast.io.images import SILENT, set_log_level
 
 # an orbit keeps out of a gap between cameras that is as wide as this and so many times wider than any other
 _WIDE_GAP: Final = np.pi / 2.0
@@ -306,11 +307,11 @@ def has_h264() -> bool:
 def _quiet() -> Iterator[None]:
     """Keep the log of OpenCV and ffmpeg off the terminal: what goes wrong is found by playing the file, and raised."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    level = set_log_level(SILENT)
     try:
         yield
     finally:
-        cv2.utils.logging.setLogLevel(level)
+        set_log_level(level)
 
 
 @contextmanager

@@ -152,6 +152,49 @@ def test_a_processor_that_nothing_is_known_of_gets_code_for_any(
     assert compiled.available()
 
 
+V2 = "cx16 lahf_lm popcnt pni sse4_1 sse4_2 ssse3"
+V3 = f"{V2} avx avx2 bmi1 bmi2 f16c fma abm movbe"
+V4 = f"{V3} avx512f avx512bw avx512cd avx512dq avx512vl"
+
+
+@pytest.mark.parametrize(
+    ("machine", "features", "levels"),
+    [
+        ("x86_64", V4, ["x86-64-v4", "x86-64-v3", "x86-64-v2"]),
+        ("x86_64", V4.replace(" avx512dq", ""), ["x86-64-v3", "x86-64-v2"]),
+        ("x86_64", V2, ["x86-64-v2"]),
+        ("x86_64", V4.replace("popcnt ", ""), []),
+        ("aarch64", "fp asimd evtstrm", ["armv8-a"]),
+        ("riscv64", "fp asimd", []),
+    ],
+)
+def test_a_wheel_brings_the_highest_level_that_the_processor_has(
+    fresh: Path, monkeypatch: pytest.MonkeyPatch, machine: str, features: str, levels: list[str]
+) -> None:
+    monkeypatch.setattr(building.platform, "machine", lambda: machine)
+    monkeypatch.setattr(building, "processor_features", lambda: f"{machine} flags : fpu {features}")
+    assert building.supported_levels() == levels
+    names = [level for of_machine in building.LEVELS.values() for level, _ in of_machine]
+    for name in names:
+        (fresh / building.level_name(name)).write_bytes(b"of a wheel")
+    for level in levels:
+        building.library_path.cache_clear()
+        assert building.library_path() == fresh / building.level_name(level)
+        building.library_path().unlink()
+    # without any that runs here, and where one was compiled here, it is that one's place
+    building.library_path.cache_clear()
+    assert building.library_path() == building.native_path()
+
+
+def test_what_was_compiled_here_goes_before_what_a_wheel_brought(fresh: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(building.platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(building, "processor_features", lambda: f"x86_64 flags : {V4}")
+    for path in (fresh / building.level_name("x86-64-v4"), building.native_path()):
+        path.write_bytes(b"a library")
+    building.library_path.cache_clear()
+    assert building.library_path() == building.native_path()
+
+
 @needs_compiler
 def test_a_library_that_no_longer_loads_is_compiled_again(fresh: Path, pop: Pop) -> None:
     building.library_path().write_bytes(b"of a system that is gone")
