@@ -1,9 +1,10 @@
 """docs/commands.md: every command, run on the demo capture, with what it printed and the pictures that it made.
 
 python docs/commands.py --write     run all of them (about ten minutes on two cores) and write the page and its pictures
+python docs/commands.py --only learn vectors    run these alone, which need no files of others, and write their sections
 python docs/commands.py --check     exit with 1 where the page does not have every command, each with its summary
 
-Nothing is typed by hand: the outputs are those of one run, each no longer than a screen.
+Nothing is typed by hand: the outputs are those of a run, each no longer than a screen.
 """
 
 from __future__ import annotations
@@ -272,6 +273,29 @@ def page() -> str:
     return "\n\n".join([_HEAD, *parts]) + "\n"
 
 
+def with_sections_of(names: list[str], text: str) -> str:
+    """Run some commands in a new folder, and return the page with their sections in the place of those that it has."""
+    with tempfile.TemporaryDirectory() as name:
+        for program, all_runs, commands in (("pop", RUNS, OF_POP), ("pop-repro", REPRO, OF_REPRO)):
+            runs = tuple(run for run in all_runs if run.of in names)
+            for run in runs:
+                PICTURES.joinpath(re.sub(r"\W+", "_", f"{run.of} {run.caption}").strip("_") + ".png").unlink(
+                    missing_ok=True
+                )
+            made = "\n\n".join(sections(Path(name), runs, program, commands))
+            for section in filter(None, re.split(r"^(?=## pop)", made, flags=re.M)):
+                head = section.partition("\n")[0]
+                text, n = re.subn(
+                    rf"^{re.escape(head)}\n.*?(?=^## pop|\Z)",
+                    lambda _, s=section: s.rstrip() + "\n\n",
+                    text,
+                    flags=re.M | re.S,
+                )
+                if n != 1:
+                    raise ValueError(f"{PAGE.name} has {n} sections {head!r}; make the whole page with --write")
+    return text.rstrip() + "\n"
+
+
 _HEAD = """# Every command
 
 One run of each on the demo capture, with what it printed; `pop COMMAND --help` has its options. What to do in which
@@ -296,6 +320,10 @@ def main() -> int:
         missing = lacking(PAGE.read_text(encoding="utf-8"))
         print("\n".join(missing) or f"{PAGE.name} has every command")
         return int(bool(missing))
+    if "--only" in sys.argv:
+        names = sys.argv[sys.argv.index("--only") + 1 :]
+        PAGE.write_text(with_sections_of(names, PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+        return 0
     made = page()
     if "--write" in sys.argv:
         PAGE.write_text(made, encoding="utf-8")
