@@ -112,6 +112,7 @@ class TrainConfig:
     factor: int = 1
     resize: Literal["area", "bicubic"] = "area"
     test_every: int = 8
+    coarse_iters: tuple[int, ...] = ()
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     normalize: bool = True
     sh_degree: int = MAX_SH_DEGREE
