@@ -39,11 +39,15 @@ class Appearance:
         self._optimizers = make_optimizers(self.params)
         self._viewmats = torch.cat([view.viewmat for view in views])
 
+    def _photo(self, index: int) -> int:
+        # the same photograph shrunk is as many places further on; see `pop_fast.train.coarse`
+        return index % len(self._viewmats)
+
     def seen_from(self, view: ViewTensors, index: int) -> ViewTensors:
         """Return a training view with its corrected camera."""
         if "cameras" not in self.params:
             return view
-        return replace(view, viewmat=refined_viewmat(view.viewmat[0], self.params["cameras"][index])[None])
+        return replace(view, viewmat=refined_viewmat(view.viewmat[0], self.params["cameras"][self._photo(index)])[None])
 
     def seen(self, views: Sequence[ViewTensors]) -> Sequence[ViewTensors]:
         """Return all training views with their cameras as they are corrected whenever one is asked for."""
@@ -51,7 +55,9 @@ class Appearance:
 
     def exposed(self, image: Tensor, index: int) -> Tensor:
         """Return a render of a training view [H, W, 3] in the colours of its photograph."""
-        return expose(image, self.params["exposures"][index]) if "exposures" in self.params else image
+        if "exposures" not in self.params:
+            return image
+        return expose(image, self.params["exposures"][self._photo(index)])
 
     def background(self, step: int) -> Tensor | None:
         """Return the background of a step [3], or None for that of the settings."""

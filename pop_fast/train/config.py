@@ -60,6 +60,8 @@ class TrainConfig:
         resize: how, where the capture does not bring them shrunk: "area" averages, "bicubic" does as Pillow does, and
             so gsplat's example trainer, which also takes the full photographs (--images images) instead of those that
             Mip-NeRF 360 brings (A32).
+        coarse_stop_iters: coarse to fine: the steps before each of these see the photographs shrunk by 2 once more, so
+            that (300, 600) shrinks by 4 until step 300 and by 2 until step 600; none in preset "paper".
         test_every: every n-th view by file name is held out; 0 holds nothing out.
         background: colour behind everything, and behind photographs with alpha. [0, 1]
         normalize: move the capture into gsplat's normalised world.
@@ -111,8 +113,8 @@ class TrainConfig:
     antialiased: bool = False
     factor: int = 1
     resize: Literal["area", "bicubic"] = "area"
+    coarse_stop_iters: tuple[int, ...] = ()
     test_every: int = 8
-    coarse_iters: tuple[int, ...] = ()
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     normalize: bool = True
     sh_degree: int = MAX_SH_DEGREE
@@ -308,9 +310,13 @@ class TrainConfig:
 
     def binding(self) -> dict[str, Any]:
         """Return the settings that a resumed run must share, flat."""
-        # a batch of one and a profile's own near plane are what every run had before there were others: its
-        # checkpoints say nothing of them
-        usual = {"batch_size": self.batch_size == 1, "near_plane": self.near_plane is None}
+        # a batch of one, a profile's own near plane and photographs at their size are what every run had before there
+        # were others: its checkpoints say nothing of them
+        usual = {
+            "batch_size": self.batch_size == 1,
+            "near_plane": self.near_plane is None,
+            "coarse_stop_iters": not self.coarse_stop_iters,
+        }
         free = _FREE | {name for name, is_usual in usual.items() if is_usual}
         return {name: value for name, value in self.flat().items() if name not in free}
 

@@ -28,6 +28,8 @@ _AT_LEAST: Final = {
     "target_cache_mb": 0,
     "l2_stop_iter": 0,
 }
+# photographs shrunk by 16 show little
+_MOST_COARSE_STOPS: Final = 4
 # each takes memory of its own, and beyond what the system allows the libraries end the process
 _MOST_THREADS: Final = 512
 # numbers that are divided by, or of which a logarithm is taken
@@ -79,6 +81,11 @@ def check_values(config: Any) -> None:
     for name in (f"{method}.{name}" for name in _BETWEEN_OF_STRATEGY):
         if name in own and not 0.0 < own[name] < 1.0:
             raise PopError(f"{name} is {own[name]}; it must lie between 0 and 1")
+    stops = values["coarse_stop_iters"]
+    if any(stop < 0 for stop in stops) or list(stops) != sorted(stops) or len(stops) > _MOST_COARSE_STOPS:
+        raise PopError(
+            f"coarse_stop_iters is {list(stops)}; it must be at most {_MOST_COARSE_STOPS} step numbers that ascend"
+        )
     if any(not 0.0 <= value <= 1.0 for value in values["background"]):
         raise PopError(f"background is {list(values['background'])}; every channel must lie in [0, 1]")
     for name in (*_OVER_ZERO, *shares, *(name for name, value in values.items() if isinstance(value, float))):

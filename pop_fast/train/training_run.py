@@ -35,7 +35,7 @@ from pop_fast.train.appearance import Appearance
 from pop_fast.train.batch_stepper import check_batch
 from pop_fast.train.checkpoint import moved_to, on_cpu
 from pop_fast.train.choose import choose_backend
-from pop_fast.train.coarse import coarse_order, with_coarser
+from pop_fast.train.coarse import index_at, with_shrunk
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import engine_of
 from pop_fast.train.environment import reproducible, run_facts, versions
@@ -299,8 +299,9 @@ class TrainingRun:
             config, size, done = self.config, self.config.batch_size, self.step
             # the views of steps that were taken are not known any more
             order = [0] * size * done + self._order.ahead(size * (config.max_steps - done))
-            views = with_coarser(self._train, len(config.coarse_iters))
-            order = coarse_order(order, config.coarse_iters, len(self._train), size)
+            stops, n_views = config.coarse_stop_iters, len(self._train)
+            views = with_shrunk(self._train, stops)
+            order = [index_at(place // size, index, n_views, stops) for place, index in enumerate(order)]
             given = (config, self.strategy, views, order, self.updates, done, self.appearance, self._ranks)
             self._stepper = self._engine.make_stepper(Task(*given, self._stop))
             with translate_oom():
