@@ -87,8 +87,8 @@ template <class Real> struct Transpose : Again<Real> {
 template <class Real>
 inline Vec<Real> through_ceiling(const Blend<Real> &blend, Real ceiling, Vec<Real> e, Vec<Real> alpha, Vec<Real> G) {
   const Mask<Real> clamped = alpha >= ceiling;
-  if (!blend.ceiling_passes) return clamped ? all(Real(0)) : G;
-  return clamped ? G * (exp2_of(e) / ceiling) : G;
+  if (!blend.ceiling_passes) return select(clamped, all(Real(0)), G);
+  return select(clamped, G * (exp2_of(e) / ceiling), G);
 }
 
 // One entry's sums in every lane: moments of G, gradient to the colours, |G dlog2(alpha)/dx| and |..dy|.
@@ -142,8 +142,8 @@ void entry_sums(const Blend<Real> &blend, const Thresholds<Real> &thresholds, co
     if (blend.absgrad) {
       const auto f = [&](int j) { return entries.f[j][k]; };
       const Vec<Real> by_x = G * (x * (2 * f(3)) + (y * f(4) + f(1))), by_y = G * (y * (2 * f(5)) + (x * f(4) + f(2)));
-      along_x += by_x < Real(0) ? -by_x : by_x;
-      along_y += by_y < Real(0) ? -by_y : by_y;
+      along_x += select(by_x < Real(0), -by_x, by_x);
+      along_y += select(by_y < Real(0), -by_y, by_y);
     }
   };
   state.each_strip(k, of_strip);

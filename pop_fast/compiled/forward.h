@@ -77,8 +77,8 @@ uint32_t blend_strip(const Blend<Real> &blend, const Thresholds<Real> &threshold
     if (DOMINANCE) {
       // strictly larger: on equal weights the entry in front keeps the pixel
       const Mask<Real> wins = weight > best, this_one = Mask<Real>{} + Whole<Real>(place_in_list + k);
-      best = wins ? weight : best;
-      winner = wins ? this_one : winner;
+      best = select(wins, weight, best);
+      winner = select(wins, this_one, winner);
     }
     if (blend.n_blended) {
       Whole<Real> *count = &canvas.blended[at];

@@ -5,101 +5,191 @@
 #include <cstdint>
 #include <cstring>
 
-#ifdef __AVX512DQ__
+#ifdef __SSE2__
 #include <immintrin.h>
 #endif
 
 namespace pop {
 
+// bytes of the widest vector whose arithmetic, comparisons and selections are all instructions
+#if defined(__AVX512DQ__)
+constexpr int WHOLE = 64;
+#elif defined(__AVX2__)
+constexpr int WHOLE = 32;
+#else
+constexpr int WHOLE = 16;
+#endif
+
+template <class Real, int BYTES> struct Halves;
+template <class Real, int BYTES, bool SPLIT> struct ChunkOf;
+template <class Real, int BYTES> struct ChunkOf<Real, BYTES, false> {
+  typedef Real type __attribute__((vector_size(BYTES)));
+};
+template <class Real, int BYTES> struct ChunkOf<Real, BYTES, true> {
+  using type = Halves<Real, BYTES>;
+};
+// so many bytes of numbers: the compiler's own vector where it is not too wide, else two halves
+template <class Real, int BYTES> using Chunk = typename ChunkOf<Real, BYTES, (BYTES > WHOLE)>::type;
+
 template <class Real> struct Lanes;
 template <> struct Lanes<float> {
   using whole = int32_t;
-  typedef float vec __attribute__((vector_size(64)));
-  typedef int32_t mask __attribute__((vector_size(64)));
 };
 template <> struct Lanes<double> {
   using whole = int64_t;
-  typedef double vec __attribute__((vector_size(64)));
-  typedef int64_t mask __attribute__((vector_size(64)));
+};
+template <> struct Lanes<int32_t> {
+  using whole = int32_t;
+};
+template <> struct Lanes<int64_t> {
+  using whole = int64_t;
 };
 template <class Real> using Whole = typename Lanes<Real>::whole;  // an integer as wide
-template <class Real> using Vec = typename Lanes<Real>::vec;
-template <class Real> using Mask = typename Lanes<Real>::mask;  // such integers; as a condition -1 where true
+template <class Real> using Vec = Chunk<Real, 64>;
+template <class Real> using Mask = Chunk<Whole<Real>, 64>;  // such integers; as a condition -1 where true
 template <class Real> constexpr int LANES = 64 / sizeof(Real);
 
-template <class To, class From> inline To bits_of(const From &from) {
+// A vector that the processor has no registers for. GCC compares and selects one of those number by number and keeps it
+// in memory, a quarter of the speed, so that its halves are told apart here.
+template <class Real, int BYTES> struct Halves {
+  using Half = Chunk<Real, BYTES / 2>;
+  using Truth = Chunk<Whole<Real>, BYTES>;
+  using HalfTruth = Chunk<Whole<Real>, BYTES / 2>;
+  Half low, high;
+
+  Real operator[](int lane) const {
+    constexpr int half = BYTES / 2 / sizeof(Real);
+    return lane < half ? low[lane] : high[lane - half];
+  }
+  friend Halves operator-(Halves a) { return {-a.low, -a.high}; }
+  friend Halves operator<<(Halves a, int n) { return {a.low << n, a.high << n}; }
+#define POP_EACH_HALF(op)                                                              \
+  friend Halves operator op(Halves a, Halves b) { return {a.low op b.low, a.high op b.high}; } \
+  friend Halves operator op(Halves a, Real b) { return {a.low op b, a.high op b}; }            \
+  friend Halves operator op(Real a, Halves b) { return {a op b.low, a op b.high}; }
+  POP_EACH_HALF(+)
+  POP_EACH_HALF(-)
+  POP_EACH_HALF(*)
+  POP_EACH_HALF(/)
+  POP_EACH_HALF(&)
+  POP_EACH_HALF(|)
+#undef POP_EACH_HALF
+#define POP_COMPARED(op)                                                                                       \
+  friend Truth operator op(Halves a, Halves b) { return {HalfTruth(a.low op b.low), HalfTruth(a.high op b.high)}; } \
+  friend Truth operator op(Halves a, Real b) { return {HalfTruth(a.low op b), HalfTruth(a.high op b)}; }
+  POP_COMPARED(<)
+  POP_COMPARED(>)
+  POP_COMPARED(>=)
+  POP_COMPARED(<=)
+#undef POP_COMPARED
+  Halves &operator+=(Halves b) { return *this = *this + b; }
+  Halves &operator-=(Halves b) { return *this = *this - b; }
+  Halves &operator*=(Halves b) { return *this = *this * b; }
+};
+
+// condition ? a : b in every lane
+template <class M, class V> inline V select(M condition, V a, V b) {
+  if constexpr (sizeof(V) <= WHOLE) {
+    return condition ? a : b;
+  } else {
+    return {select(condition.low, a.low, b.low), select(condition.high, a.high, b.high)};
+  }
+}
+
+// the same bits as numbers of another kind
+template <class To, class From> inline To bits_of(From from) {
   static_assert(sizeof(To) == sizeof(From));
-  To to;
-  std::memcpy(&to, &from, sizeof to);
-  return to;
+  if constexpr (sizeof(To) <= WHOLE) {
+    To to;
+    std::memcpy(&to, &from, sizeof to);
+    return to;
+  } else {
+    return {bits_of<typename To::Half>(from.low), bits_of<typename To::Half>(from.high)};
+  }
 }
 
-template <class Real> inline Vec<Real> load(const Real *from) {
-  Vec<Real> v;
-  std::memcpy(&v, from, sizeof v);
-  return v;
+// both halves of a chunk
+template <class Real, class C> inline Halves<Real, sizeof(C)> halves_of(C chunk) {
+  if constexpr (sizeof(C) <= WHOLE) {
+    Halves<Real, sizeof(C)> halves;
+    std::memcpy(&halves, &chunk, sizeof chunk);
+    return halves;
+  } else {
+    return chunk;
+  }
 }
 
-template <class Real> inline void store(Real *to, Vec<Real> v) { std::memcpy(to, &v, sizeof v); }
-
-template <class Real> inline Mask<Real> load_whole(const Whole<Real> *from) {
-  Mask<Real> v;
-  std::memcpy(&v, from, sizeof v);
-  return v;
+template <class C, class Real> inline C load_chunk(const Real *from) {
+  if constexpr (sizeof(C) <= WHOLE) {
+    C chunk;
+    std::memcpy(&chunk, from, sizeof chunk);
+    return chunk;
+  } else {
+    using Half = typename C::Half;
+    return {load_chunk<Half>(from), load_chunk<Half>(from + sizeof(Half) / sizeof(Real))};
+  }
 }
 
-template <class Real> inline void store_whole(Whole<Real> *to, Mask<Real> v) { std::memcpy(to, &v, sizeof v); }
+template <class C, class Real> inline void store_chunk(Real *to, C chunk) {
+  if constexpr (sizeof(C) <= WHOLE) {
+    std::memcpy(to, &chunk, sizeof chunk);
+  } else {
+    store_chunk(to, chunk.low);
+    store_chunk(to + sizeof(chunk.low) / sizeof(Real), chunk.high);
+  }
+}
+
+template <class Real> inline Vec<Real> load(const Real *from) { return load_chunk<Vec<Real>>(from); }
+template <class Real> inline void store(Real *to, Vec<Real> v) { store_chunk(to, v); }
+template <class Real> inline Mask<Real> load_whole(const Whole<Real> *from) { return load_chunk<Mask<Real>>(from); }
+template <class Real> inline void store_whole(Whole<Real> *to, Mask<Real> v) { store_chunk(to, v); }
 
 template <class Real> inline Vec<Real> all(Real x) { return Vec<Real>{} + x; }
 
 // whether a mask is true in any lane
 template <class M> inline bool any(M mask) {
-  typedef int64_t four __attribute__((vector_size(32)));
-  typedef int64_t two __attribute__((vector_size(16)));
-  struct Halves {
-    four low, high;
-  };
-  struct Quarters {
-    two low, high;
-  };
-  const Halves halves = bits_of<Halves>(mask);
-  const Quarters quarters = bits_of<Quarters>(halves.low | halves.high);
-  const two rest = quarters.low | quarters.high;
-  return (rest[0] | rest[1]) != 0;
+  if constexpr (sizeof(M) > WHOLE) {
+    return any(mask.low | mask.high);
+  } else if constexpr (sizeof(M) > 16) {
+    const auto halves = halves_of<int64_t>(mask);
+    return any(halves.low | halves.high);
+  } else {
+    const auto rest = bits_of<Chunk<int64_t, 16>>(mask);
+    return (rest[0] | rest[1]) != 0;
+  }
 }
 
 // which lanes of a mask are true, the first in the lowest bit
-template <class Real> inline uint32_t lanes_of(Mask<Real> mask) {
-#ifdef __AVX512DQ__
-  if constexpr (sizeof(Real) == 4) {
-    return _mm512_movepi32_mask(__m512i(mask));
+template <class Real, class M> inline uint32_t lanes_of(M mask) {
+  if constexpr (sizeof(M) > WHOLE) {
+    return lanes_of<Real>(mask.low) | lanes_of<Real>(mask.high) << (sizeof(M) / 2 / sizeof(Real));
   } else {
+#if defined(__AVX512DQ__)
+    if constexpr (sizeof(Real) == 4) return _mm512_movepi32_mask(__m512i(mask));
     return _mm512_movepi64_mask(__m512i(mask));
-  }
+#elif defined(__AVX2__)
+    if constexpr (sizeof(Real) == 4) return uint32_t(_mm256_movemask_ps(__m256(mask)));
+    return uint32_t(_mm256_movemask_pd(__m256d(mask)));
+#elif defined(__SSE2__)
+    if constexpr (sizeof(Real) == 4) return uint32_t(_mm_movemask_ps(__m128(mask)));
+    return uint32_t(_mm_movemask_pd(__m128d(mask)));
 #else
-  uint32_t found = 0;
-  for (int lane = 0; lane < LANES<Real>; lane++) found |= uint32_t(mask[lane] & 1) << lane;
-  return found;
+    uint32_t found = 0;
+    for (int lane = 0; lane < int(sizeof(M) / sizeof(Real)); lane++) found |= uint32_t(mask[lane] & 1) << lane;
+    return found;
 #endif
+  }
 }
 
 // the sum of all lanes, halves first: always in the same order
-template <class Real> inline Real sum(Vec<Real> v) {
-  typedef Real half __attribute__((vector_size(32)));
-  typedef Real quarter __attribute__((vector_size(16)));
-  struct Halves {
-    half low, high;
-  };
-  struct Quarters {
-    quarter low, high;
-  };
-  const Halves halves = bits_of<Halves>(v);
-  const Quarters quarters = bits_of<Quarters>(halves.low + halves.high);
-  const quarter rest = quarters.low + quarters.high;
-  if constexpr (sizeof(Real) == 8) {
-    return rest[0] + rest[1];
+template <class Real, class C> inline Real sum(C chunk) {
+  if constexpr (sizeof(C) > 16) {
+    const auto halves = halves_of<Real>(chunk);
+    return sum<Real>(halves.low + halves.high);
+  } else if constexpr (sizeof(Real) == 8) {
+    return chunk[0] + chunk[1];
   } else {
-    return (rest[0] + rest[2]) + (rest[1] + rest[3]);
+    return (chunk[0] + chunk[2]) + (chunk[1] + chunk[3]);
   }
 }
 
@@ -108,7 +198,7 @@ template <class Real> inline void sums_of_rows(const Real *rows, Real sums[16]) 
   for (int k = 0; k < 16; k++) sums[k] = sum<Real>(load(rows + k * LANES<Real>));
 }
 
-#if defined(__GNUC__) && !defined(__clang__)
+#if defined(__AVX512DQ__) && !defined(__clang__)
 // In float four rounds, each of which adds the halves of two vectors into one; row k ends in lane k.
 template <> inline void sums_of_rows<float>(const float *rows, float sums[16]) {
   using V = Vec<float>;
@@ -128,6 +218,19 @@ template <> inline void sums_of_rows<float>(const float *rows, float sums[16]) {
   store(sums, __builtin_shuffle(v[0], v[1], M{0, 16, 2, 18, 4, 20, 6, 22, 8, 24, 10, 26, 12, 28, 14, 30}) +
                   __builtin_shuffle(v[0], v[1], M{1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31}));
 }
+#elif defined(__SSE2__)
+// In float the halves of every row, then four rows at a time, whose lanes change places; row k ends in lane k.
+template <> inline void sums_of_rows<float>(const float *rows, float sums[16]) {
+  for (int k = 0; k < 16; k += 4) {
+    __m128 row[4];
+    for (int r = 0; r < 4; r++) {
+      const float *at = rows + (k + r) * 16;
+      row[r] = (_mm_loadu_ps(at) + _mm_loadu_ps(at + 8)) + (_mm_loadu_ps(at + 4) + _mm_loadu_ps(at + 12));
+    }
+    _MM_TRANSPOSE4_PS(row[0], row[1], row[2], row[3]);
+    _mm_storeu_ps(sums + k, (row[0] + row[2]) + (row[1] + row[3]));
+  }
+}
 #endif
 
 // 2^e for e < 128, within a unit in the last place and exact for whole numbers; what would be subnormal is 0 or 2^-126,
@@ -137,7 +240,7 @@ inline Vec<float> exp2_of(Vec<float> e) {
   // what is left of e beside the nearest integer, and the scaling by 2^i, are instructions
   const Vec<float> f = Vec<float>(_mm512_reduce_ps(__m512(e), _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC));
 #else
-  e = e < -126.0f ? all(-126.0f) : e;
+  e = select(e < -126.0f, all(-126.0f), e);
   const Vec<float> shift = all(12582912.0f);  // 1.5 * 2^23: adding it leaves the nearest integer in the low bits
   const Vec<float> shifted = e + shift;
   const Vec<float> f = e - (shifted - shift);
@@ -157,8 +260,10 @@ inline Vec<float> exp2_of(Vec<float> e) {
 }
 
 inline Vec<double> exp2_of(Vec<double> e) {
-  for (int lane = 0; lane < LANES<double>; lane++) e[lane] = std::exp2(e[lane]);
-  return e;
+  double lanes[LANES<double>];
+  store(lanes, e);
+  for (double &lane : lanes) lane = std::exp2(lane);
+  return load(lanes);
 }
 
 }  // namespace pop

@@ -104,8 +104,10 @@ void walk(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_t tile, Ti
 
 // The square root in every lane.
 template <class Real> inline Vec<Real> root_of(Vec<Real> v) {
-  for (int lane = 0; lane < LANES<Real>; lane++) v[lane] = std::sqrt(v[lane]);
-  return v;
+  Real lanes[LANES<Real>];
+  store(lanes, v);
+  for (Real &lane : lanes) lane = std::sqrt(lane);
+  return load(lanes);
 }
 
 template <class Real> struct ContributionsState {
@@ -131,9 +133,9 @@ void contributions_of_tile(const Scores<Real> &scores, const Pixels<Real> &pixel
     if (!any(blended)) return;
     const Vec<Real> none = {}, dx = entries.u[k] - load(&pixels.x[at]), dy = entries.v[k] - load(&pixels.y[at]);
     state.sums.add(0, k, weight);
-    state.sums.add(1, k, blended ? all(Real(1)) : none);
-    if (scores.pixel_map) state.sums.add(2, k, blended ? load(&state.map[at]) : none);
-    state.sums.add(3, k, blended ? root_of<Real>(dx * dx + dy * dy) : none);
+    state.sums.add(1, k, select(blended, all(Real(1)), none));
+    if (scores.pixel_map) state.sums.add(2, k, select(blended, load(&state.map[at]), none));
+    state.sums.add(3, k, select(blended, root_of<Real>(dx * dx + dy * dy), none));
   };
   const auto after = [&](int64_t, int64_t first) {
     state.sums.write(CONTRIBUTIONS, entries.count, scores.rows + CONTRIBUTIONS * first);
@@ -204,7 +206,7 @@ void sensitivities_of_tile(const Scores<Real> &scores, const Pixels<Real> &pixel
       const Vec<Real> alpha = load(&again.alphas[place]), weight = load(&again.weights[place]), none = {};
       const Vec<Real> suffix_color = load(state.suffix_color_of(0, at)), q = color - suffix_color;
       store(state.suffix_color_of(0, at), suffix_color + alpha * q);
-      const Vec<Real> slope = alpha > Real(0) ? q * (weight / alpha) : none;
+      const Vec<Real> slope = select(alpha > Real(0), q * (weight / alpha), none);
       total += slope * slope;
     });
     store(state.sums.at(0, k), total);
@@ -287,8 +289,8 @@ void points_of_tile(const Scores<Real> &scores, const Pixels<Real> &pixels, int6
     const Vec<Real> best = load(&state.best[at]), left = load(&state.left[at]);
     // strictly larger: on equal weights the entry in front keeps the pixel
     const Mask<Real> wins = (weight > best) & (along <= Real(0)), winner = load_whole<Real>(&state.winner[at]);
-    store(&state.best[at], wins ? weight : best);
-    store_whole<Real>(&state.winner[at], wins ? Mask<Real>{} + Whole<Real>(place_in_list + k) : winner);
+    store(&state.best[at], select(wins, weight, best));
+    store_whole<Real>(&state.winner[at], select(wins, Mask<Real>{} + Whole<Real>(place_in_list + k), winner));
     store(&state.left[at], left - left * alpha);
   };
   walk<Real, ROW>(scores, pixels, tile, state.tile, before, pair, [](int, uint32_t) {}, [](int64_t, int64_t) {});

@@ -53,15 +53,20 @@ template <class Real> inline void store_some(Real *to, Vec<Real> v, int64_t n) {
   std::memcpy(to, &v, size_t(n) * sizeof(Real));
 }
 
+template <class C> inline Chunk<double, 2 * sizeof(C)> as_double(C chunk) {
+  if constexpr (2 * sizeof(C) <= WHOLE) {
+    return __builtin_convertvector(chunk, Chunk<double, 2 * sizeof(C)>);
+  } else {
+    const auto halves = halves_of<float>(chunk);
+    return {as_double(halves.low), as_double(halves.high)};
+  }
+}
+
 // Added up in double precision.
 inline Vec<double> widened(Vec<double> v) { return v; }
 inline Vec<double> widened(Vec<float> v) {
-  typedef float half __attribute__((vector_size(32)));
-  struct Halves {
-    half low, high;
-  };
-  const Halves halves = bits_of<Halves>(v);
-  return __builtin_convertvector(halves.low, Vec<double>) + __builtin_convertvector(halves.high, Vec<double>);
+  const auto halves = halves_of<float>(v);
+  return as_double(halves.low) + as_double(halves.high);
 }
 
 // Three maps under every window of one row: blurred down into lines, then across; f(first column, blurred).

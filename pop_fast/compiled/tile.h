@@ -203,10 +203,10 @@ template <class Real> struct Rows {
       for (int row = 0; row < pixels.size; row++) {
         const Vec<Real> c1 = load(linear(row) + k), c0 = load(constant(row) + k);
         Vec<Real> x = c1 * vertex;
-        x = x < -edge ? all(-edge) : x;
-        x = x > edge ? all(edge) : x;
+        x = select(x < -edge, all(-edge), x);
+        x = select(x > edge, all(edge), x);
         const Vec<Real> square = x * x * f3, mixed = x * c1;
-        const Vec<Real> size = (mixed < Real(0) ? -mixed : mixed) + (c0 < Real(0) ? -c0 : c0) - square;
+        const Vec<Real> size = select(mixed < Real(0), -mixed, mixed) + select(c0 < Real(0), -c0, c0) - square;
         const Mask<Real> under = square + mixed + c0 + digits * size < thresholds.skip;
         may[row] |= uint16_t((~lanes_of<Real>(under & (f3 < Real(0))) & ((1 << LANES<Real>) - 1)) << k & present);
       }
@@ -232,13 +232,13 @@ inline Vec<Real> exponent(const Entries<Real> &entries, const Rows<Real> &rows, 
 // Blend one entry into one strip: T goes down; alpha and weight are 0 from where a pixel stops.
 template <class Real>
 inline void take(const Thresholds<Real> &thresholds, Vec<Real> e, Vec<Real> &T, Vec<Real> &alpha, Vec<Real> &weight) {
-  const Vec<Real> none = {}, raw = exp2_of(e), capped = raw > thresholds.ceiling ? all(thresholds.ceiling) : raw;
-  alpha = raw > thresholds.floor ? capped : none;
+  const Vec<Real> none = {}, raw = exp2_of(e), capped = select(raw > thresholds.ceiling, all(thresholds.ceiling), raw);
+  alpha = select(raw > thresholds.floor, capped, none);
   const Vec<Real> next = T - T * alpha;
   const Mask<Real> lives = next > thresholds.stop;
-  weight = lives ? T * alpha : none;
-  alpha = lives ? alpha : none;
-  T = lives ? next : none;
+  weight = select(lives, T * alpha, none);
+  alpha = select(lives, alpha, none);
+  T = select(lives, next, none);
 }
 
 // The entries of a chunk that are marked, one after the other.
