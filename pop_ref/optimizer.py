@@ -149,6 +149,11 @@ def means_learning_rate(
         >>> means_learning_rate(16_000, 1.0, rules=rules) == means_learning_rate(6_000, 1.0)
         True
     """
+    return rates.means * scene_scale * rates.means_decay ** _share(step, max_steps, rules)
+
+
+def _share(step: int, max_steps: int, rules: UpdateRules) -> float:
+    """Return how much of a decay lies behind a step."""
     start, last = rules.rounds_start_iter, max_steps
     if start > 0:
         last = start
@@ -156,8 +161,7 @@ def means_learning_rate(
             step, last = start + (step - start) % rules.round_steps + 1, start + rules.round_steps
     elif 0 < rules.means_rewind_iter <= step:
         step = step - rules.means_rewind_iter + rules.means_rewind_to
-    share = min(max(step / last, 0.0), 1.0)
-    return rates.means * scene_scale * rates.means_decay**share
+    return min(max(step / last, 0.0), 1.0)
 
 
 def learning_rates(
@@ -169,7 +173,8 @@ def learning_rates(
 ) -> dict[str, float]:
     """List every parameter's learning rate at a step; only the positions' changes, and none with the loss (A21).
 
-    In a round of PUP-3DGS the others are multiplied by `round_decay` each `round_decay_every` steps.
+    Where `rates.others_decay` is not 1, as in no published method, those of scales, quaternions and harmonics decay with
+    the positions'. In a round of PUP-3DGS the others are multiplied by `round_decay` each `round_decay_every` steps.
 
     Source: Kerbl et al. 2023; values of gsplat's trainer; gaussian-splatting-pup.
     Departs: Inria's code since October 2024 uses 0.025 for opacities (`settings.INRIA_RATES`).
@@ -196,6 +201,8 @@ def learning_rates(
         taken = (step - rules.rounds_start_iter) % rules.round_steps + 1
         factor = rules.round_decay ** (taken // rules.round_decay_every)
     found = {name: factor * rate for name, rate in rates.by_parameter().items()}
+    decay = rates.others_decay ** _share(step, max_steps, rules)
+    found = {name: rate if name == "opacities" else decay * rate for name, rate in found.items()}
     return {**found, "means": means_learning_rate(step, scene_scale, max_steps, rates, rules)}
 
 

@@ -174,6 +174,8 @@ class LearningRates:
         opacities: of the logits.
         sh0: of the harmonics' band 0.
         sh_rest: of the other bands.
+        others_decay: what all rates but those of the centres and the opacities are multiplied by from the first step
+            to the last; 1 in every published method.
     """
 
     means: float = 1.6e-4
@@ -183,6 +185,7 @@ class LearningRates:
     opacities: float = 5e-2
     sh0: float = 2.5e-3
     sh_rest: float = 2.5e-3 / 20.0
+    others_decay: float = 1.0
 
     def by_parameter(self) -> dict[str, float]:
         """List the rates under the names of the raw parameters; that of the means still in scene scales."""

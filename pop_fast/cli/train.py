@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 _EXAMPLES: Final = """
     pop train scene                          POP, the paper's 30,000 steps, results in out/scene_pop
-    pop train scene --preset quick           a tenth of the schedule, for a CPU
+    pop train scene --preset quick           1,500 steps at rates of their own, for a CPU
     pop train photos --factor 4              a bare folder of photographs: cameras are found first
     pop train scene --method gsplat          the control: gsplat's default strategy, with opacity reset
     pop train scene --method 3dgs            Inria's constants, learning rates, SSIM and rasterizer
@@ -205,7 +205,7 @@ def train_capture(
     if large is not None:
         print(f"note: {large}")
     if takes_hours(config):
-        print(f"note: {config.max_steps:,} steps take hours on a CPU; --preset quick takes a tenth of the schedule")
+        print(f"note: {config.max_steps:,} steps take hours on a CPU; --preset quick takes 1,500")
     how = {"resume": options.resume, "overwrite": options.overwrite, "loading_seconds": loading}
     how["sfm_seconds"] = searching
     commands = commands_text(folder if options.resume else None, ["pop", "train", *argv])

@@ -310,12 +310,13 @@ class TrainConfig:
 
     def binding(self) -> dict[str, Any]:
         """Return the settings that a resumed run must share, flat."""
-        # a batch of one, a profile's own near plane and photographs at their size are what every run had before there
-        # were others: its checkpoints say nothing of them
+        # a batch of one, a profile's own near plane, photographs at their size and rates that stay are what every run
+        # had before there were others: its checkpoints say nothing of them
         usual = {
             "batch_size": self.batch_size == 1,
             "near_plane": self.near_plane is None,
             "coarse_stop_iters": not self.coarse_stop_iters,
+            "lr.others_decay": self.lr.others_decay == 1.0,
         }
         free = _FREE | {name for name, is_usual in usual.items() if is_usual}
         return {name: value for name, value in self.flat().items() if name not in free}

@@ -37,6 +37,7 @@ _OVER_ZERO: Final = (
     "init_scale",
     "photometric_divisor",
     "lr.means_decay",
+    "lr.others_decay",
     "appearance_lr.exposures_decay",
     "appearance_lr.cameras_decay",
 )

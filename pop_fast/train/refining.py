@@ -54,6 +54,7 @@ def refining(config: TrainConfig, steps: int) -> TrainConfig:
     last, plan, lr = config.max_steps - 1, config.strategy, config.lr
     degree = active_sh_degree(last, config.sh_interval, config.sh_degree, plan.sh_start_iter)
     begins = min(_MEANS_AGAIN * lr.means_decay, 1.0)
+    ended = {name: lr.others_decay * getattr(lr, name) for name in ("scales", "quats", "sh0", "sh_rest")}
     strategy = replace(
         at_rest(plan),
         # a band every so many steps, counted from so long ago that those in use are there from the first step
@@ -69,8 +70,9 @@ def refining(config: TrainConfig, steps: int) -> TrainConfig:
         strategy=strategy,
         sh_interval=steps,
         l2_stop_iter=0 if config.l2_stop_iter is not None and last >= config.l2_stop_iter else None,
-        lr=replace(lr, means=begins * lr.means, means_decay=lr.means_decay / begins),
+        lr=replace(lr, **ended, others_decay=1.0, means=begins * lr.means, means_decay=lr.means_decay / begins),
         eval_steps=(),
         save_steps=(),
         max_renders=0,
+        coarse_stop_iters=(),
     )

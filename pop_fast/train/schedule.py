@@ -39,7 +39,10 @@ def updates_of(
     base = {**lr.by_parameter(), "means": lr.means * scene_scale}
     rates = torch.tensor([base[name] for name in PARAMETERS], dtype=torch.float64).repeat(max_steps, 1)
     rates *= _round_factor(steps, rules)[:, None]
-    rates[:, PARAMETERS.index("means")] = base["means"] * lr.means_decay ** _share(steps, max_steps, rules)
+    share = _share(steps, max_steps, rules)
+    decaying = [PARAMETERS.index(name) for name in PARAMETERS if name != "opacities"]
+    rates[:, decaying] *= (lr.others_decay**share)[:, None]
+    rates[:, PARAMETERS.index("means")] = base["means"] * lr.means_decay**share
     moved = torch.ones((max_steps, len(PARAMETERS)), dtype=torch.bool)
     if rules.edits_replace_update:
         moved[[*edits, *restarts]] = False

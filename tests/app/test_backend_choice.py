@@ -252,7 +252,7 @@ def test_a_mask_makes_a_view_as_small_as_what_it_keeps():
 def test_a_short_schedule_has_no_resets_unless_they_are_asked_for(method):
     assert said_of(method=method, preset="quick") == []
     (warning,) = said_of(method=method, preset="quick", **{f"{method}.reset_every": 300})
-    assert "reset after step 300 and have 300 steps (3 densification steps) to recover" in warning
+    assert "reset after step 300 and have 300 steps (6 densification steps) to recover" in warning
     assert f"--{method}.reset-every 0" in warning
     assert said_of(method=method, preset="quick", **{f"{method}.reset_every": 0}) == []
 

@@ -64,18 +64,35 @@ def test_eq_2_takes_over_where_the_l2_loss_is_said_to_stop():
         TrainConfig(l2_stop_iter=-1)
 
 
-def test_quick_is_a_tenth_of_the_schedule_with_the_papers_weights():
+def test_quick_is_a_short_schedule_with_the_papers_weights_and_its_own_rates():
     quick = TrainConfig.of(preset="quick")
     plan = quick.strategy
-    assert (quick.max_steps, quick.sh_interval) == (3000, 100)
-    assert quick.eval_steps == quick.save_steps == (700, 3000)
-    assert (plan.blur_start_iter, plan.blur_stop_iter, plan.pop_stop_iter) == (300, 700, 1500)
+    assert (quick.max_steps, quick.sh_interval) == (1500, 50)
+    assert quick.eval_steps == quick.save_steps == (350, 1500)
+    assert (plan.blur_start_iter, plan.blur_stop_iter, plan.pop_stop_iter) == (150, 350, 750)
     assert (plan.lambda_pop, plan.blur_min_pixels, plan.prune_too_big) == (0.001, 10.0, False)
-    assert quick.lr == LearningRates()
+    assert (plan.refine_every, plan.grow_grad2d) == (50, pytest.approx(1.5e-4))
+    assert quick.coarse_stop_iters == (250, 500)
+    rates, usual = quick.lr, LearningRates()
+    assert (rates.means / usual.means, rates.sh0 / usual.sh0, rates.others_decay) == pytest.approx((12.0, 8.0, 0.1))
+    assert (rates.opacities, rates.means_decay) == (usual.opacities, usual.means_decay)
     control = TrainConfig.of(preset="quick", method="gsplat").strategy
-    assert (control.refine_stop_iter, control.reset_every, control.prune_too_big_after) == (1500, 3000, 3000)
+    assert (control.refine_stop_iter, control.reset_every, control.prune_too_big_after) == (750, 3000, 3000)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_quick_has_of_its_own_reaches_no_other_preset(method):
+    paper = TrainConfig.of(method=method)
+    short = TrainConfig.of(method=method, steps_scaler=0.05)
+    for config in (paper, short):
+        assert (config.coarse_stop_iters, config.lr) == ((), METHODS[method].recipe.lr)
+        assert config.strategy.grow_grad2d == METHODS[method].strategy().grow_grad2d
+        assert config.strategy.refine_every >= 100
+    # a setting that is at its published value is not among those that decide the bits of older checkpoints
+    assert not {"coarse_stop_iters", "lr.others_decay"} & set(paper.binding())
+    assert {"coarse_stop_iters", "lr.others_decay"} <= set(TrainConfig.of(method=method, preset="quick").binding())
     assert TrainConfig.of(preset="quick", steps_scaler=0.5).max_steps == 15_000
-    assert TrainConfig.of(preset="quick", scale_lambda_pop=True).strategy.lambda_pop == pytest.approx(0.01)
+    assert TrainConfig.of(preset="quick", scale_lambda_pop=True).strategy.lambda_pop == pytest.approx(0.02)
 
 
 def test_eleven_pixels_are_blur_in_quick_and_ten_are_not():
@@ -184,7 +201,7 @@ def test_the_same_word_wins_on_the_command_line():
 
 def test_a_label_cannot_be_carried_by_settings_that_do_not_follow_it():
     quick = TrainConfig.of(preset="quick")
-    with pytest.raises(PopError, match=r"max_steps is 5, but preset 'quick' and what was said make it 3000"):
+    with pytest.raises(PopError, match=r"max_steps is 5, but preset 'quick' and what was said make it 1500"):
         replace(quick, max_steps=5)
     with pytest.raises(PopError, match="max_steps is 30000, but preset 'quick'"):
         TrainConfig(given=quick.given)
@@ -348,9 +365,16 @@ def test_a_resumed_run_must_share_what_reaches_the_bits_and_only_that():
 
 
 def test_two_ways_to_say_the_same_schedule_are_the_same_run():
-    spelled_out = TrainConfig.of(steps_scaler=0.1, **{"pop.blur_min_pixels": 10.0})
+    usual = LearningRates()
+    rates = {name: factor * getattr(usual, name) for name, factor in QUICK_RATES.items()}
+    spelled_out = TrainConfig.of(
+        steps_scaler=0.05,
+        coarse_stop_iters=(250, 500),
+        lr={**rates, "others_decay": 0.1},
+        **{"pop.blur_min_pixels": 10.0, "pop.refine_every": 50, "pop.grow_grad2d": 0.75 * POPStrategy().grow_grad2d},
+    )
     assert TrainConfig.of(preset="quick").digest() == spelled_out.digest()
-    assert TrainConfig.of(preset="quick").digest() != TrainConfig.of(steps_scaler=0.1).digest()
+    assert TrainConfig.of(preset="quick").digest() != TrainConfig.of(steps_scaler=0.05).digest()
 
 
 def test_every_setting_is_documented():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from hypothesis import strategies as st
@@ -125,13 +126,19 @@ SOME_RATES = LearningRates(means=0.5, means_decay=0.25, scales=0.125, quats=0.25
 
 @law("optimizer", "learning_rates")
 def test_rates_rewind_and_fall_in_rounds_as_the_rules_say(backend):
-    for rules in RULES_OF_RATES:
-        for step in TURNS:
-            expected = ORACLE.stage("learning_rates")(step, 4.0, 300, SOME_RATES, rules)
-            found = backend.stage("learning_rates")(step, 4.0, 300, SOME_RATES, rules)
-            assert set(found) == set(expected)
-            for name, rate in expected.items():
-                assert_close("optimizer.rate", found[name], rate, 16.0 * rate, backend.dtype, against_oracle=True)
+    for rules, decay, step in product(RULES_OF_RATES, (1.0, 0.25), TURNS):
+        rates = replace(SOME_RATES, others_decay=decay)
+        expected = ORACLE.stage("learning_rates")(step, 4.0, 300, rates, rules)
+        found = backend.stage("learning_rates")(step, 4.0, 300, rates, rules)
+        assert set(found) == set(expected)
+        for name, rate in expected.items():
+            assert_close("optimizer.rate", found[name], rate, 16.0 * rate, backend.dtype, against_oracle=True)
+        # both decays are by 0.25: those that fall do so as the positions, and opacities do not
+        fallen = found["means"] / (4.0 * SOME_RATES.means) if decay == 0.25 else 1.0
+        stay = backend.stage("learning_rates")(step, 4.0, 300, SOME_RATES, rules)
+        for name in ("scales", "quats", "sh0", "shN", "opacities"):
+            asked = stay[name] * (1.0 if name == "opacities" else fallen)
+            assert_close("optimizer.rate", found[name], asked, 16.0 * asked, backend.dtype)
 
 
 GROWTH = {"refine_start_iter": 5, "refine_stop_iter": 40}

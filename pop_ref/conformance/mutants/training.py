@@ -203,8 +203,8 @@ TRAINING: Final = (
         "rate_of_a_unit_scene",
         "the positions' learning rate is not scaled by the scene",
         "optimizer.py",
-        "rates.means * scene_scale * rates.means_decay**share",
-        "rates.means * rates.means_decay**share",
+        "rates.means * scene_scale * rates.means_decay ** _share",
+        "rates.means * rates.means_decay ** _share",
         "test_optimizer:the_position_rate_falls_log_linearly_to_a_hundredth",
     ),
     Mutant(
