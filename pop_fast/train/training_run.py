@@ -201,7 +201,7 @@ class TrainingRun:
         config = self.config
         shown = config.progress and self._ranks.writes
         bars = tqdm(total=config.max_steps, initial=self.step, disable=None if shown else True)
-        with bars as bar, Heartbeat(shown) as beat:
+        with bars as bar, Heartbeat(shown, draw=bar.refresh) as beat:
             beat.say(f"step {self.step:,} of {config.max_steps:,}, {len(self.params['means']):,} Gaussians")
             while self.step < config.max_steps:
                 longest = min(self.stepper.longest, config.max_steps if self._watch is None else _WATCHED_STEPS)
