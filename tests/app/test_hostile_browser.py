@@ -201,6 +201,28 @@ def test_a_training_does_not_hear_of_hostile_clients_and_ends_with_the_same_bits
         assert torch.equal(tensor, watched[name]), name
 
 
+def test_the_command_that_shows_a_splat_goes_on_after_hostile_clients(
+    pop: Pop, shared_result: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    attacks: list[Attack] = []
+
+    def wait(viewer: LiveViewer, *given: Any) -> None:
+        if not attacks:
+            attacks.append(Attack(viewer.url))
+        if not attacks[0].is_alive():
+            raise KeyboardInterrupt
+        wait_as_ever(viewer, *given)
+
+    wait_as_ever = LiveViewer.wait
+    monkeypatch.setattr(LiveViewer, "wait", wait)
+    outcome = pop("view", shared_result, "--port", 18_850)
+    assert outcome.status == 0, outcome.err
+    assert attacks[0].error is None, attacks[0].error
+    assert attacks[0].ends == {"nan": 1008, "zero": 1008, "text": 1008, "share": 1008, "long": 1009}
+    assert attacks[0].pictures > 0
+    assert "Traceback" not in outcome.err
+
+
 class Attack(threading.Thread):
     """What clients do who have the address, and many who come at once."""
 
