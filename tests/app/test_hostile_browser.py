@@ -73,21 +73,24 @@ class Client:
         asked = f"ws://{host or at.netloc}{(at.path if path is None else path).rstrip('/')}"
         settings = {"sock": dialled, "max_size": None, "proxy": None, "close_timeout": 1.0, **own, **options}
         self.connection = connect(asked, **settings)
+        self.kept: list[dict[str, Any]] = []
 
     def say(self, *messages: dict[str, Any]) -> None:
         for message in messages:
             self.connection.send(msgspec.msgpack.encode(message))
 
     def hear(self, kind: str, seconds: float = 10.0) -> dict[str, Any]:
-        """Wait for a message of this type."""
+        """Wait for a message of this type; those that came with it or before it are kept."""
         until = time.monotonic() + seconds
         while True:
+            for message in self.kept:
+                if message["type"] == kind:
+                    self.kept.remove(message)
+                    return message
             data = bytes(self.connection.recv(timeout=max(until - time.monotonic(), 0.0)))
             packed = data[16 : 16 + int.from_bytes(data[8:16], "little")]
             content = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(packed))
-            for message in content["messages"]:
-                if message["type"] == kind:
-                    return message
+            self.kept += content["messages"]
 
     def end(self, seconds: float = 10.0) -> int:
         """Wait until the server closes; return its code."""
@@ -243,9 +246,8 @@ class Attack(threading.Thread):
         try:
             self.ends["nan"] = self.after(NAN_CAMERA)
             watching = Client(self.url)
-            mode = watching.hear("GuiDropdownMessage", 30.0)["uuid"]
-            # after that: what comes with another message is not heard
             watching.say(CAMERA)
+            mode = watching.hear("GuiDropdownMessage", 30.0)["uuid"]
             watching.hear("BackgroundImageMessage", 30.0)
             self.pictures += 1
             self.ends["zero"] = self.after(CAMERA | {"wxyz": [0, 0, 0, 0]})
