@@ -70,6 +70,12 @@ def test_what_docs_reliability_tells_of_was_tried_of_every_reader_and_kind_of_ru
     assert sum(sum(row.values()) for row in of_readers.values()) == stored["fuzz"]["inputs"] >= 10**6
     assert not any(row[kind] for row in of_readers.values() for kind in FAILURES)
     assert stored["fuzz"]["failures"] == {}
+    again = stored["fuzz again"]
+    assert again["failures"] == {}
+    assert again["readers"].keys() | {"photograph.heic"} == READERS.keys() | {"photograph.heic"}
+    assert all(sum(row[kind] for kind in OUTCOMES[:3]) >= 1_000 for row in again["readers"].values())
+    told = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")
+    assert f"(commit {again['commit']}, seed {again['seed']}) were given {again['inputs']:,} more inputs" in told
     assert stored["kills"].keys() == KILLS.keys()
     assert all(stored["kills"][kind]["kills"] >= least for kind, least in KILLS.items())
     assert stored["crashes"].keys() == stored["writes"].keys() == JOBS.keys()
