@@ -322,6 +322,8 @@ def test_the_answer_is_shown_when_asked_twice_or_after_a_pass(mine: Path, capsys
     assert main(["learn", "check", "alpha", str(mine), "--answer"]) == 0
     printed = capsys.readouterr().out
     assert "alpha: passed" in printed
+    # what the pages then show unfolded
+    assert " .html#passed=alpha\n" in printed
     assert "def falloff(" in printed
 
 
