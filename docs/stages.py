@@ -24,16 +24,16 @@ class Stage:
 _SCORES = ("scores.cuh", "scores.cu")
 
 STAGES = (
-    Stage("raw parameters to scales, opacities, unit quaternions", "3.1", ("activations",)),
+    Stage("raw parameters to scales, opacities, unit quaternions", "3.1", ("activations",), ("stages/covariance.py",)),
     Stage("covariances from rotations and scales", "3.1", ("covariance",)),
     Stage("spherical harmonics to colour", "3.1", ("harmonics",)),
-    Stage("world to camera, near plane", "3.1", ("camera",)),
+    Stage("world to camera, near plane", "3.1", ("camera",), ("stages/projection.py",)),
     Stage("projection of means and covariances (EWA)", "3.1", ("projection",)),
-    Stage("low-pass, conics, extents, off-screen cull", "3.1", ("footprint",)),
+    Stage("low-pass, conics, extents, off-screen cull", "3.1", ("footprint",), ("stages/projection.py",)),
     Stage("tile lists in depth order", "3.1", ("tiles",), ("compiled/compositing.py",)),
-    Stage("falloff and alpha of one splat at one pixel", "eqs. 1, 11", ("alpha",), ("stages/blend/alpha.py",)),
+    Stage("falloff and alpha of one splat at one pixel", "eqs. 1, 11", ("alpha",), ("stages/blend/tile_groups.py",)),
     Stage("blending with early ray termination", "eq. 1", ("compositing", "pixel"), ("compiled/compositing.py",)),
-    Stage("dominant Gaussians", "eq. 5", ("dominance",)),
+    Stage("dominant Gaussians", "eq. 5", ("dominance",), ("stages/compositing.py",)),
     Stage("a whole view", "eq. 1", ("render", "splatting", "depth"), ("api/rasterize.py", "compiled/splatting.py")),
     Stage(
         "L1, L2, SSIM and both objectives",
@@ -45,7 +45,7 @@ STAGES = (
     Stage("density control", "eqs. 3, 6", ("density", "density_config", "density_rows")),
     Stage("Adam and its schedules", "4.1", ("optimizer",), ("train/model.py", "train/schedule.py")),
     Stage("exposure of photographs, random backgrounds", "–", ("appearance",), ("train/appearance.py",)),
-    Stage("corrections of cameras", "–", ("refinement",)),
+    Stage("corrections of cameras", "–", ("refinement",), ("stages/appearance.py",)),
     Stage("one training step", "eq. 9", ("training", "recipes"), ("train/torch_stepper.py",)),
     Stage(
         "sums of weights, pixels and distances over a view",
@@ -54,14 +54,26 @@ STAGES = (
         ("compiled/scores.py",),
         _SCORES,
     ),
-    Stage("Speedy-Splat's score", "4.2", ("sensitivity",), ("compiled/scores.py",), _SCORES),
-    Stage("PUP 3D-GS's score", "4.2", ("fisher",), ("compiled/scores.py",), _SCORES),
+    Stage(
+        "Speedy-Splat's score",
+        "4.2",
+        ("sensitivity",),
+        ("stages/contributions.py", "compiled/scores.py"),
+        _SCORES,
+    ),
+    Stage(
+        "PUP 3D-GS's score",
+        "4.2",
+        ("fisher",),
+        ("stages/contributions.py", "compiled/scores.py"),
+        _SCORES,
+    ),
     Stage(
         "Mini-Splatting's points and importance", "4.2", ("chord", "mini_splatting"), ("compiled/scores.py",), _SCORES
     ),
     Stage("Taming-3DGS's budget and score", "4.2", ("taming",)),
     Stage("selection by score, by mass, by draw", "4.2", ("selection",)),
-    Stage("exact tile lists (SnugBox, AccuTile)", "4.2", ("tight_tiles",)),
+    Stage("exact tile lists (SnugBox, AccuTile)", "4.2", ("tight_tiles",), ("stages/tiles.py",)),
     Stage(
         "distance of every decision from flipping", "–", ("margins", "extent_margins", "pixel_margins", "magnitudes")
     ),

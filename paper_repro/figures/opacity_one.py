@@ -167,7 +167,7 @@ def _seen(config: TrainConfig, capture: Capture, base: Result, ply: Path) -> Pus
 
     from pop_fast.api.registry import get_backend
     from pop_fast.io.ply import load_ply
-    from pop_fast.stages.activations import opacities_from_logits
+    from pop_fast.stages.covariance import opacities_from_logits
     from pop_fast.train.views import ViewTensors, render_view
 
     params = load_ply(ply)

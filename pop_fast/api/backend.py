@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pop_fast.stages.compositing import Composite
     from pop_fast.stages.splatting import ProjectionSettings, Splats
     from pop_fast.stages.tiles import TileLists
-    from pop_fast.train.whole_step import WholeStep
+    from pop_fast.train.steps import WholeStep
 
 
 class ViewStages(Protocol):

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from pop_fast.api.backend import ViewStages
 from pop_fast.api.meta import RenderMeta, intersections
-from pop_fast.stages.compositing import Composite
-from pop_fast.stages.dominance import dominant_counts
+from pop_fast.stages.compositing import Composite, dominant_counts
 from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
 
 _GATHERED = ("means2d", "depths", "conics", "opacities", "radii")

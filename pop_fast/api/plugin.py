@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from pop_fast.api.backend import Backend
     from pop_fast.api.meta import RenderMeta
-    from pop_fast.train.whole_step import WholeStep
+    from pop_fast.train.steps import WholeStep
 
 
 @dataclass(frozen=True)

@@ -30,11 +30,10 @@ from pop_fast.io.read_back import read_json
 from pop_fast.train.checkpoint import checkpoint_path, load_splats, save_checkpoint
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.environment import peak_memory_bytes, reproducible, run_facts
-from pop_fast.train.evaluate import evaluate
+from pop_fast.train.evaluate import evaluate, population
 from pop_fast.train.gpu_proxy import renderer
 from pop_fast.train.load_result import load_splat
 from pop_fast.train.lpips import load_nets
-from pop_fast.train.metrics import population
 from pop_fast.train.model import KEYS
 from pop_fast.train.results import ResultFolder
 from pop_fast.train.schedule import active_sh_degree

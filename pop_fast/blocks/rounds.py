@@ -9,6 +9,9 @@ A block's own views are those that see most of its core. Others show it too, beh
 how it looks from there no training has corrected. So each round draws other views among all that show the core, and
 holds no more photographs than the block's own training did. The cameras of all views are those of all blocks' lists,
 because every training view stands in one core; the capture's own list is not read again.
+
+An engine moves all rows. What it did to those that are held fixed is undone before the next step (`HoldingStepper`).
+So every step draws the very bits that were given, and their moments, which say how a row would be moved, move nothing.
 """
 
 from __future__ import annotations
@@ -17,10 +20,13 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Adam
 
 from pop_fast.blocks.jobs import block_folder, core_of, marker_of
 from pop_fast.blocks.plan import read_plan
@@ -28,18 +34,20 @@ from pop_fast.data.block import find_block, read_block, write_block
 from pop_fast.data.capture import Capture, View
 from pop_fast.data.load import load_capture
 from pop_fast.data.random_points import in_picture
+from pop_fast.density.protocol import State
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.read_back import read_json
-from pop_fast.stages.activations import opacities_from_logits, scales_from_log_scales
+from pop_fast.stages.covariance import opacities_from_logits, scales_from_log_scales
 from pop_fast.stages.splatting import ProjectionSettings, covariances, project
 from pop_fast.train.checkpoint import load_splats
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import engine_of
 from pop_fast.train.environment import keep_freed_memory
-from pop_fast.train.fixed_rows import hold_last
 from pop_fast.train.load_result import CaptureRecord
 from pop_fast.train.model import KEYS
+from pop_fast.train.stepper import Engine, Stepper
+from pop_fast.train.steps import Phase, StepStats
 from pop_fast.train.training_run import TrainingRun
 
 # Gaussians that are projected at a time: some 20 MB
@@ -250,3 +258,70 @@ def write_round_block(
     drawn = draw.permutation(len(showing))[: len(had)]
     chosen = [shots[showing[index]] for index in sorted(drawn)] or had
     write_block(place, replace(own, shots=[*chosen, *(shot for shot in own.shots if shot.split == "test")]))
+
+
+__all__ = ["HoldingStepper", "hold_last"]
+
+
+def hold_last(engine: Engine, rows: Mapping[str, Tensor]) -> Engine:
+    """Return an engine that keeps the last rows of the parameters as they are.
+
+    Args:
+        engine: takes the steps.
+        rows: raw parameters of these Gaussians, which the parameters of the run must end with; they are not copied.
+            The run's strategy must not change the number of Gaussians.
+    """
+    return replace(engine, make_stepper=lambda task: HoldingStepper(engine.make_stepper(task), rows))
+
+
+class HoldingStepper:
+    """Takes steps by another stepper, one at a time, and puts fixed rows back after each; see `Stepper`.
+
+    Args:
+        stepper: takes them.
+        rows: raw parameters of the Gaussians that are held, the last ones of those that are trained.
+    """
+
+    def __init__(self, stepper: Stepper, rows: Mapping[str, Tensor]) -> None:
+        self.name, self.step = stepper.name, stepper.step
+        self._stepper, self._rows = stepper, dict(rows)
+        self._places: dict[str, Tensor] = {}
+
+    @property
+    def longest(self) -> int:
+        """See `Stepper.longest`."""
+        return self._stepper.longest
+
+    def rebind(self, params: dict[str, Parameter], optimizers: Mapping[str, Adam], state: State) -> None:
+        """See `Stepper.rebind`.
+
+        Raises:
+            PopError: the parameters do not end with the rows that are held.
+        """
+        self._places = {key: params[key].detach()[len(params[key]) - len(self._rows[key]) :] for key in self._rows}
+        self._rows = {key: rows.to(self._places[key].device) for key, rows in self._rows.items()}
+        for key, place in self._places.items():
+            if not torch.equal(place, self._rows[key]):
+                raise PopError(
+                    f"{key} of the Gaussians that are held fixed are others than this training was begun with; remove "
+                    "its result folder and start it again"
+                )
+        self._stepper.rebind(params, optimizers, state)
+
+    def steps(self, first: int, last: int, phase: Phase) -> list[StepStats]:
+        """See `Stepper.steps`."""
+        found: list[StepStats] = []
+        for step in range(first, last):
+            try:
+                found += self._stepper.steps(step, step + 1, phase)
+            finally:
+                self.step = self._stepper.step
+            if self.step == step:
+                break
+            for key, place in self._places.items():
+                place.copy_(self._rows[key])
+        return found
+
+    def facts(self) -> dict[str, Any]:
+        """See `Stepper.facts`; `fixed_gaussians` says how many are held."""
+        return {**self._stepper.facts(), "fixed_gaussians": len(self._rows["means"])}

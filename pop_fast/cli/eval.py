@@ -75,7 +75,7 @@ def measured(splat: Splat, options: CaptureOptions, nets: Sequence[LPIPS]) -> tu
     Raises:
         PopError: no capture is known, it cannot be read, holds no view out, or its images are too small.
     """
-    from pop_fast.train.metrics import too_small
+    from pop_fast.train.evaluate import too_small
     from pop_fast.train.views import ViewTensors
 
     capture, config = open_with_bars(splat, options, "held out")
@@ -92,9 +92,8 @@ def measure_splat(splat: Splat, config: TrainConfig, views: list[ViewTensors], n
     """Measure a splat on views; the numbers are those that training itself would write."""
     from pop_fast.io.heartbeat import Heartbeat
     from pop_fast.train.environment import reproducible
-    from pop_fast.train.evaluate import evaluate
+    from pop_fast.train.evaluate import evaluate, population
     from pop_fast.train.gpu_proxy import renderer
-    from pop_fast.train.metrics import population
 
     backend, note = renderer(config.backend)
     if note:

@@ -265,7 +265,7 @@ def _rows(transform: np.ndarray | None) -> tuple[tuple[float, ...], ...] | None:
 
 def without_invisible(splat: Splat) -> Splat:
     """Leave out Gaussians that no renderer shows, and say how many there were."""
-    from pop_fast.train.metrics import ALPHA_FLOOR
+    from pop_fast.train.evaluate import ALPHA_FLOOR
 
     kept = splat.params["opacities"].sigmoid() >= ALPHA_FLOOR
     before, after = len(kept), int(kept.sum())

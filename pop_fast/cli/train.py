@@ -30,7 +30,7 @@ from pop_fast.errors import PopError
 from pop_fast.train.choose import choose_backend, on_gpu
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.presets import ALIASES, LOSSES, METHODS, Given
-from pop_fast.train.whole_step import why_not_trained
+from pop_fast.train.steps import why_not_trained
 from pop_ref.constants import PROFILES
 
 if TYPE_CHECKING:

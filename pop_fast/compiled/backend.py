@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pop_fast.compiled
 from pop_fast.stages.backend import TorchBackend
-from pop_fast.train.whole_step import WholeStep
+from pop_fast.train.steps import WholeStep
 
 if TYPE_CHECKING:
     from pop_fast.stages.stage_set import Stages

@@ -15,9 +15,8 @@ from pop_fast.compiled.splatting import colors_of_view, covariances, project
 from pop_fast.stages.blend.pairs import background_or_black, check_grid
 from pop_fast.stages.chord import DominantPoints, points_on_rays, towards_camera
 from pop_fast.stages.compositing import BlendOptions
-from pop_fast.stages.contributions import Contributions, checked_map
-from pop_fast.stages.fisher import N_MOMENTS, three_channels
-from pop_fast.stages.fisher import fisher_blocks as fisher_blocks_of_stages
+from pop_fast.stages.contributions import N_MOMENTS, Contributions, checked_map, three_channels
+from pop_fast.stages.contributions import fisher_blocks as fisher_blocks_of_stages
 from pop_fast.stages.projection import intrinsics
 from pop_fast.stages.splatting import Splats, colors_of
 from pop_fast.stages.tiles import TileLists
@@ -154,7 +153,7 @@ def screen_moments(
 ) -> Tensor:
     """See `pop_ref.fisher.screen_moments`. [N, 31] float64
 
-    Optimizations: those of `pop_fast.stages.fisher.screen_moments`, in C++, there and back (`scores.h`).
+    Optimizations: those of `pop_fast.stages.contributions.screen_moments`, in C++, there and back (`scores.h`).
 
     Raises:
         ValueError: there are not three channels, or the lists are not of that grid.

@@ -22,7 +22,7 @@ from pop_fast.compiled.library import (
     call_library,
     this_library,
 )
-from pop_fast.stages.camera import view_dirs_vjp
+from pop_fast.stages.projection import view_dirs_vjp
 from pop_fast.stages.splatting import ProjectionSettings, Splats
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import cuda_ext
 from pop_fast.api.plugin import BaseBackend
-from pop_fast.train.whole_step import WholeStep
+from pop_fast.train.steps import WholeStep
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -47,7 +47,7 @@ class CudaBackend(BaseBackend):
 
     def open_view(self, pass_input: Any) -> Any:
         """Draw a view for passes over it."""
-        from pop_fast.cuda.passes import CudaView
+        from pop_fast.cuda.stages import CudaView
 
         return CudaView(pass_input)
 

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from pop_fast.api.registry import require_backend
 from pop_fast.errors import PopError
-from pop_fast.stages.activations import opacities_from_logits, scales_from_log_scales
+from pop_fast.stages.compositing import dominant_counts
 from pop_fast.stages.contributions import Contributions
-from pop_fast.stages.dominance import dominant_counts
+from pop_fast.stages.covariance import opacities_from_logits, scales_from_log_scales
 from pop_fast.stages.stage_set import PassInput
 from pop_fast.stages.types import Camera, Gaussians
 from pop_ref.constants import Profile, profile_named

@@ -50,7 +50,7 @@ class PupStrategy(InriaStrategy):
         if context.step not in self.adam_restarts:
             return super().edit(context)
         from pop_fast.density.rows import prune_lowest, restart, summed_over_views
-        from pop_fast.stages.fisher import log_det_scores
+        from pop_fast.stages.contributions import log_det_scores
 
         views, divisor = context.views, self.score_divisor
         blocks = summed_over_views(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pop_fast.density.passes import Passes
 from pop_fast.errors import PopError
-from pop_fast.stages.activations import opacities_from_logits
+from pop_fast.stages.covariance import opacities_from_logits
 from pop_fast.stages.selection import least_mass
 
 Score = Literal["contributions", "dominance", "sensitivity", "visibility"]

@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from pop_fast.stages.blend.pairs import PairWalk, check_grid
-from pop_fast.stages.camera import camera_center
 from pop_fast.stages.covariance import rotmats_from_quats
-from pop_fast.stages.projection import intrinsics
+from pop_fast.stages.projection import camera_center, intrinsics
 from pop_fast.stages.splatting import Splats
 from pop_fast.stages.tiles import TileLists
 from pop_fast.stages.types import Camera, Gaussians

@@ -1,4 +1,7 @@
-"""Blend splats into an image, differentiably, by `pop_fast.stages.blend.blend`. Meaning: `pop_ref.compositing`."""
+"""Blend splats into an image, differentiably, by `pop_fast.stages.blend.blend`, and count what each dominates (D8).
+
+Meaning: `pop_ref.compositing`, `pop_ref.dominance`.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,16 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pop_fast.stages.blend.alpha import Entries, centred_moments, splat_gradients
 from pop_fast.stages.blend.blend import Blender, GroupBlend
-from pop_fast.stages.blend.tile_groups import BLOCK, PackedLists, TileGroup, tile_groups
+from pop_fast.stages.blend.tile_groups import (
+    BLOCK,
+    Entries,
+    PackedLists,
+    TileGroup,
+    centred_moments,
+    splat_gradients,
+    tile_groups,
+)
 from pop_fast.stages.tiles import TileLists
 from pop_ref.constants import PAPER, Profile
 
@@ -231,3 +241,8 @@ class _Gradients:
         # threads share the components, and each of these is summed in order: the bits never change
         totals = columns.new_zeros((len(columns), self.saved.n_splats + 1))
         return totals.scatter_add_(1, self.saved.entries.lists.ids.expand_as(columns), columns)[:, :-1]
+
+
+def dominant_counts(dominant_ids: Tensor, n: int) -> Tensor:
+    """See `pop_ref.dominance.dominant_counts`. Optimizations: one bincount."""
+    return torch.bincount(dominant_ids.reshape(-1) + 1, minlength=n + 1)[1:]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pop_fast.stages.layout import columns, from_columns
+from pop_fast.stages.types import columns, from_columns
 
 _C0 = math.sqrt(1.0 / (4.0 * math.pi))
 _C1 = math.sqrt(3.0 / (4.0 * math.pi))

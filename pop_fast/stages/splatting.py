@@ -13,34 +13,30 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pop_fast.stages.camera import (
-    covars_cam_from_covars,
-    covars_cam_from_covars_vjp,
-    in_front,
-    means_cam_from_means,
-    means_cam_from_means_vjp,
-    view_dirs,
-    view_dirs_vjp,
-)
 from pop_fast.stages.covariance import covars_from_quats_scales, covars_from_quats_scales_vjp
-from pop_fast.stages.footprint import (
+from pop_fast.stages.harmonics import evaluate_sh, evaluate_sh_vjp
+from pop_fast.stages.projection import (
     compensations,
     compensations_vjp,
     conics_from_covars2d,
     conics_from_covars2d_vjp,
+    covars_cam_from_covars,
+    covars_cam_from_covars_vjp,
+    in_front,
     low_pass,
     low_pass_vjp,
+    means_cam_from_means,
+    means_cam_from_means_vjp,
     on_screen,
-    radii_from_covars2d,
-)
-from pop_fast.stages.harmonics import evaluate_sh, evaluate_sh_vjp
-from pop_fast.stages.projection import (
     project_covars,
     project_covars_vjp,
     project_means,
     project_means_vjp,
     projection_jacobians,
     projection_jacobians_vjp,
+    radii_from_covars2d,
+    view_dirs,
+    view_dirs_vjp,
 )
 from pop_ref.constants import PAPER, Profile
 

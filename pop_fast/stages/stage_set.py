@@ -16,9 +16,7 @@ from torch import Tensor
 
 from pop_fast.stages.chord import DominantPoints, dominant_points
 from pop_fast.stages.compositing import Composite, composite
-from pop_fast.stages.contributions import Contributions, contributions
-from pop_fast.stages.fisher import fisher_blocks, screen_moments
-from pop_fast.stages.sensitivity import sensitivities
+from pop_fast.stages.contributions import Contributions, contributions, fisher_blocks, screen_moments, sensitivities
 from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of, colors_of_view, covariances, project
 from pop_fast.stages.tiles import TileLists, tile_lists
 from pop_fast.stages.types import Camera, Gaussians
@@ -75,11 +73,11 @@ class ViewPass(Protocol):
         ...
 
     def sensitivities(self) -> Tensor:
-        """As `pop_fast.stages.sensitivity.sensitivities`."""
+        """As `pop_fast.stages.contributions.sensitivities`."""
         ...
 
     def fisher_blocks(self) -> Tensor:
-        """As `pop_fast.stages.fisher.fisher_blocks`, of its own screen moments."""
+        """As `pop_fast.stages.contributions.fisher_blocks`, of its own screen moments."""
         ...
 
     def dominant_points(self) -> DominantPoints:
@@ -121,8 +119,8 @@ class Stages:
         composite: as `pop_fast.stages.compositing.composite`.
         blend_tile: given the splats' extents, the tile to blend them in.
         contributions: as `pop_fast.stages.contributions.contributions`.
-        sensitivities: as `pop_fast.stages.sensitivity.sensitivities`.
-        screen_moments: as `pop_fast.stages.fisher.screen_moments`.
+        sensitivities: as `pop_fast.stages.contributions.sensitivities`.
+        screen_moments: as `pop_fast.stages.contributions.screen_moments`.
         dominant_points: as `pop_fast.stages.chord.dominant_points`.
     """
 
@@ -246,11 +244,11 @@ class StagesView:
         return self.stages.contributions(self.splats, self.lists, *size, pixel_map, self.shot.profile)
 
     def sensitivities(self) -> Tensor:
-        """As `pop_fast.stages.sensitivity.sensitivities`."""
+        """As `pop_fast.stages.contributions.sensitivities`."""
         return self.stages.sensitivities(*self._blended())
 
     def fisher_blocks(self) -> Tensor:
-        """As `pop_fast.stages.fisher.fisher_blocks`, of its own screen moments."""
+        """As `pop_fast.stages.contributions.fisher_blocks`, of its own screen moments."""
         stages, shot = self.stages, self.shot
         chain = {"project": stages.project, "colors_of_view": stages.colors_of_view, "covariances": stages.covariances}
         return fisher_blocks(shot.gaussians, shot.camera, self._moments(), shot.sh_degree, shot.profile, **chain)

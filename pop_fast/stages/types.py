@@ -1,9 +1,20 @@
-"""Gaussians and a camera as tensors; meaning, names and shapes are those of `pop_ref.records`."""
+"""Gaussians and a camera as tensors, and how the stages' tensors lie in memory.
+
+Meaning, names and shapes are those of `pop_ref.records`. A tensor is component-major: it has the oracle's logical shape
+[N, ...], and each component is one contiguous row of N numbers, so that every elementwise operation vectorises.
+`columns` takes a tensor apart into components, and `from_columns` puts components together.
+
+Stages use elementwise operations only, never a matrix product over the N Gaussians: a product's rounding depends on how
+many columns it has, and then a Gaussian that nobody sees would change the bits of those that are seen.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
+import torch
 from torch import Tensor
 
 
@@ -41,3 +52,22 @@ class Camera:
     K: Tensor
     width: int
     height: int
+
+
+def columns(tensor: Tensor) -> tuple[Tensor, ...]:
+    """Return the components of [N, ...] as tensors of [N], the last axis fastest."""
+    return tuple(tensor[(slice(None), *index)] for index in product(*(range(n) for n in tensor.shape[1:])))
+
+
+def from_columns(components: Sequence[Tensor], shape: tuple[int, ...]) -> Tensor:
+    """Return [N, *shape] from its components ([N] each, the last axis fastest)."""
+    stacked = torch.stack(tuple(components)).reshape(*shape, len(components[0]))
+    return stacked.permute(stacked.dim() - 1, *range(stacked.dim() - 1))
+
+
+def sum_of_products(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
+    """Return a[0] b[0] + a[1] b[1] + ... of component rows."""
+    total = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total = total + x * y
+    return total

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from pop_fast.stages.appearance import background_at, centred_exposures, expose
-from pop_fast.stages.refinement import refined_viewmat, without_common_motion
+from pop_fast.stages.appearance import background_at, centred_exposures, expose, refined_viewmat, without_common_motion
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.model import make_optimizers
 from pop_fast.train.views import ViewTensors

@@ -12,7 +12,7 @@ from pop_fast.api.backend import Backend
 from pop_fast.api.registry import by_speed, get_backend
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.whole_step import why_not_trained
+from pop_fast.train.steps import why_not_trained
 
 
 def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConfig, str]:

@@ -15,8 +15,8 @@ from pop_fast.train.config import TrainConfig
 from pop_fast.train.fused_stepper import FusedStepper
 from pop_fast.train.gpu_proxy import GpuProxy
 from pop_fast.train.stepper import Engine, Stepper, Task
+from pop_fast.train.steps import why_not_trained
 from pop_fast.train.torch_stepper import TorchStepper
-from pop_fast.train.whole_step import why_not_trained
 
 
 def engine_of(config: TrainConfig, own_strategy: bool = True) -> Engine:

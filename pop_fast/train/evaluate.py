@@ -1,9 +1,11 @@
-"""Measure the held-out views, and keep what the report shows of them."""
+"""Measure held-out views (PSNR, SSIM and, with weights at hand, LPIPS), and keep what the report shows of them."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,12 +14,106 @@ from torch import Tensor
 
 from pop_fast.io.images import write_png
 from pop_fast.io.pictures import error_magnitude, error_picture, id_colors
+from pop_fast.stages.appearance import color_correct
+from pop_fast.stages.losses import ssim
+from pop_fast.stages.ssim import WINDOW_SIZE
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.lpips import LPIPS
-from pop_fast.train.metrics import ViewMetrics, average, measure
+from pop_fast.train.lpips import LPIPS, VARIANTS
 from pop_fast.train.results import ResultFolder
 from pop_fast.train.signals import heard
 from pop_fast.train.views import Rendered, ViewTensors, render_view
+
+NO_LPIPS = "no weights were given (lpips_vgg, lpips_alex)"
+ALPHA_FLOOR = 1.0 / 255.0
+
+
+@dataclass(frozen=True)
+class ViewMetrics:
+    """What was measured on one view; `lpips` by variant, `cc_psnr` after fitting colours, where that was asked for."""
+
+    psnr: float
+    ssim: float
+    lpips: Mapping[str, float]
+    cc_psnr: float | None = None
+
+
+def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Return `-10 log10(mean squared error)` in dB of images in [0, 1], inf when they are equal.
+
+    Args:
+        image: clamped to [0, 1], not rounded to 8 bit. [H, W, 3]
+        target: [H, W, 3]
+        mask: True where a pixel counts; None for all. [H, W]
+    """
+    squares = (image.clamp(0.0, 1.0) - target) ** 2
+    error = float((squares if mask is None else squares[mask]).double().mean())
+    return -10.0 * math.log10(error) if error > 0.0 else math.inf
+
+
+def measure(
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    nets: Sequence[LPIPS] = (),
+    color_corrected: bool = False,
+) -> ViewMetrics:
+    """Measure one view, as gsplat does: on floats clamped to [0, 1], SSIM over windows that lie inside.
+
+    Masked pixels are left out of PSNR, and given the photograph's colour for SSIM and LPIPS, whose windows need
+    whole images. With `color_corrected`, PSNR is measured again with each channel fitted to the photograph's.
+    """
+    image = image.clamp(0.0, 1.0)
+    whole = image if mask is None else torch.where(mask[..., None], image, target)
+    lpips = {variant: net(whole, target, variant) for net in nets for variant in VARIANTS[net.net]}
+    corrected = psnr_after_correction(image, target, mask) if color_corrected else None
+    return ViewMetrics(psnr(image, target, mask), float(ssim(whole, target, padding="valid")), lpips, corrected)
+
+
+def psnr_after_correction(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Return PSNR after `color_correct` over the pixels that the mask keeps: gsplat's cc_psnr; arguments as `psnr`."""
+    kept = torch.ones(image.shape[:2], dtype=torch.bool) if mask is None else mask
+    return psnr(color_correct(image.clamp(0.0, 1.0)[kept], target[kept]), target[kept])
+
+
+def too_small(views: Sequence[ViewTensors]) -> str | None:
+    """Say which view is the first that SSIM finds no whole window in, or None."""
+    for view in views:
+        if min(view.width, view.height) < WINDOW_SIZE:
+            return f"{view.name} is {view.width} x {view.height} px, and SSIM needs {WINDOW_SIZE} x {WINDOW_SIZE}"
+    return None
+
+
+def average(views: Sequence[ViewMetrics], nets: Sequence[LPIPS]) -> dict[str, Any]:
+    """Average over views; `lpips` is gsplat's variant where AlexNet's weights were given, else 3DGS's, else null."""
+    means = {name: _mean([view.lpips[name] for view in views]) for net in nets for name in VARIANTS[net.net]}
+    chosen = next((name for name in ("alex_norm", "vgg_01") if name in means), None)
+    corrected = [view.cc_psnr for view in views if view.cc_psnr is not None]
+    return {
+        "psnr": _mean([view.psnr for view in views]),
+        **({"cc_psnr": _mean(corrected)} if corrected else {}),
+        "ssim": _mean([view.ssim for view in views]),
+        "lpips": means[chosen] if chosen else None,
+        "lpips_net": chosen,
+        "lpips_variants": means,
+        "lpips_weights_sha256": {name: value for net in nets for name, value in net.sha256.items()},
+        "lpips_reason": None if chosen else NO_LPIPS,
+    }
+
+
+def population(opacities: Tensor) -> dict[str, Any]:
+    """Count Gaussians: all, those that can reach a pixel (opacity >= 1/255), and the shares at either pole."""
+    n = max(len(opacities), 1)
+    return {
+        "num_GS": len(opacities),
+        "num_GS_above_floor": int((opacities >= ALPHA_FLOOR).sum()),
+        "opacity_below_0.1": int((opacities < 0.1).sum()) / n,
+        "opacity_above_0.9": int((opacities > 0.9).sum()) / n,
+    }
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return sum(values) / len(values) if values else None
+
 
 # mean absolute error that is drawn in the brightest colour
 _ERROR_TOP = 0.25

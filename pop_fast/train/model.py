@@ -12,7 +12,7 @@ from torch.optim import Adam, Optimizer
 
 from pop_fast.density.protocol import State
 from pop_fast.errors import PopError
-from pop_fast.stages.activations import scales_from_log_scales
+from pop_fast.stages.covariance import scales_from_log_scales
 from pop_fast.train.steps import Updates
 from pop_ref.settings import BETAS, EPS, PARAMETERS
 

@@ -12,7 +12,7 @@ from pop_fast.api.checks import Checks
 from pop_fast.errors import PopError
 from pop_fast.stages.backend import FAST
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.metrics import too_small
+from pop_fast.train.evaluate import too_small
 from pop_fast.train.model import first_unusable
 from pop_fast.train.views import ViewTensors
 from pop_ref.constants import profile_named

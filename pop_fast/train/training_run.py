@@ -29,7 +29,7 @@ from pop_fast.density.protocol import DensificationStep, Draws, Strategy
 from pop_fast.errors import PopError
 from pop_fast.io.heartbeat import Heartbeat, so_far
 from pop_fast.io.ply import Frame, save_ply
-from pop_fast.stages.activations import opacities_from_logits
+from pop_fast.stages.covariance import opacities_from_logits
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.appearance import Appearance
 from pop_fast.train.batch_stepper import check_batch
@@ -38,10 +38,9 @@ from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import engine_of
 from pop_fast.train.environment import reproducible, run_facts, versions
-from pop_fast.train.evaluate import evaluate
+from pop_fast.train.evaluate import evaluate, population
 from pop_fast.train.gpu_proxy import translate_oom
 from pop_fast.train.lpips import load_nets
-from pop_fast.train.metrics import population
 from pop_fast.train.model import KEYS, make_optimizers, require_usable
 from pop_fast.train.preflight import check_start, check_views, facts, find_warnings
 from pop_fast.train.ranks import ALONE, Ranks

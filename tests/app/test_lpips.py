@@ -10,8 +10,8 @@ from torch import nn
 
 from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
+from pop_fast.train.evaluate import average, measure
 from pop_fast.train.lpips import LPIPS, load_nets
-from pop_fast.train.metrics import average, measure
 from tests.app.tiny import tiny_capture, tiny_config
 
 # the networks as torchvision lays them out: convolutions (index: in, out, kernel, stride, padding), pools by index

@@ -26,7 +26,7 @@ from pop_fast.io.heartbeat import Heartbeat, duration
 from pop_fast.io.ply import load_ply
 from pop_fast.stages.backend import FAST
 from pop_fast.train import TrainingRun
-from pop_fast.train.metrics import average, measure, population, psnr
+from pop_fast.train.evaluate import average, measure, population, psnr
 from pop_fast.train.model import KEYS, adam_step, first_non_finite, make_optimizers
 from pop_fast.train.schedule import steady_updates
 from pop_fast.train.torch_stepper import PhotoLoss

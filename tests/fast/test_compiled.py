@@ -22,9 +22,7 @@ from pop_fast.density.passes import Passes
 from pop_fast.stages import splatting
 from pop_fast.stages.compositing import Composite
 from pop_fast.stages.compositing import composite as composite_in_torch
-from pop_fast.stages.contributions import contributions
-from pop_fast.stages.fisher import screen_moments
-from pop_fast.stages.sensitivity import sensitivities
+from pop_fast.stages.contributions import contributions, screen_moments, sensitivities
 from pop_fast.stages.splatting import ProjectionSettings
 from pop_fast.stages.splatting import Splats as Rows
 from pop_fast.stages.tiles import TileLists, tile_lists

@@ -192,7 +192,7 @@ def test_fisher_blocks_are_sums_of_outer_products_of_derivatives() -> None:
 
 
 def test_scores_of_blocks_are_the_oracles() -> None:
-    from pop_fast.stages.fisher import log_det_scores as in_torch
+    from pop_fast.stages.contributions import log_det_scores as in_torch
 
     made = passes("fast")
     one = made.fisher(raw_params(), 0, 3)

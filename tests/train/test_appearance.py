@@ -18,17 +18,16 @@ from pop_fast.data.capture import Capture
 from pop_fast.data.initialize import initialize_params
 from pop_fast.errors import PopError
 from pop_fast.stages import appearance as stages
-from pop_fast.stages import refinement
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.appearance import Appearance
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import engine_of, torch_engine
-from pop_fast.train.metrics import psnr, psnr_after_correction
+from pop_fast.train.evaluate import psnr, psnr_after_correction
 from pop_fast.train.schedule import phase_at
+from pop_fast.train.steps import why_not_trained
 from pop_fast.train.views import ViewTensors, render_view
-from pop_fast.train.whole_step import why_not_trained
 from pop_ref.losses import photometric_pop, photometric_pop_vjp
 from pop_ref.records import Camera
 from pop_ref.render import render, render_vjp
@@ -61,7 +60,7 @@ def test_stages_have_the_values_of_the_oracle() -> None:
 
 def test_the_common_motion_that_is_taken_out_is_the_oracles() -> None:
     viewmats = np.stack([view.viewmat for view in tiny_capture().views])
-    found = refinement.without_common_motion(tensor(CORRECTIONS), tensor(viewmats))
+    found = stages.without_common_motion(tensor(CORRECTIONS), tensor(viewmats))
     expected = pop_ref.refinement.without_common_motion(CORRECTIONS, viewmats)
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-15)
     assert np.abs(expected - CORRECTIONS).max() > 1e-3
@@ -72,7 +71,7 @@ def test_corrections_of_cameras_and_their_gradients_are_the_oracles(size: float)
     viewmat, v_refined = tiny_capture().views[1].viewmat, np.vstack([RNG.normal(size=(3, 4)), np.zeros(4)])
     correction = size * RNG.normal(size=6)
     leaves = tensor(viewmat, requires_grad=True), tensor(correction, requires_grad=True)
-    refined = refinement.refined_viewmat(*leaves)
+    refined = stages.refined_viewmat(*leaves)
     np.testing.assert_allclose(
         refined.detach(), pop_ref.refinement.refined_viewmat(viewmat, correction), rtol=0.0, atol=1e-14
     )
@@ -227,9 +226,9 @@ def test_cameras_that_are_a_little_off_are_found_again(tmp_path: Path) -> None:
     true = [ViewTensors.of(view) for view in tiny_capture().views]
     viewmats = torch.cat([view.viewmat for view in true])
     # what moves all cameras alike cannot be found again
-    errors = refinement.without_common_motion(torch.tensor(CORRECTIONS).float(), viewmats)
+    errors = stages.without_common_motion(torch.tensor(CORRECTIONS).float(), viewmats)
     off = [
-        replace(view, viewmat=refinement.refined_viewmat(view.viewmat[0], error)[None])
+        replace(view, viewmat=stages.refined_viewmat(view.viewmat[0], error)[None])
         for view, error in zip(true, errors, strict=True)
     ]
     targets = [render_view(backend, params, view, config, 0).image for view in true]

@@ -16,7 +16,7 @@ number per pixel, B, the light from behind dotted with the pixel's gradient:
 
     q[k] = colour[k] . v_image - B;  B += alpha[k] q[k];  G[k] = weight[k] q[k]
 
-G = alpha dL/dalpha; its six moments over a tile's pixels give every geometric gradient (`alpha.splat_gradients`).
+G = alpha dL/dalpha; its six moments over a tile's pixels give every geometric gradient (`splat_gradients`).
 There is no division by 1 - alpha.
 """
 
@@ -26,15 +26,16 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Final
 
 import torch
 from torch import Tensor
 
 from pop_fast.stages.blend import buffers
-from pop_fast.stages.blend.alpha import Entries, exponent_coefficients, pixel_basis
-from pop_fast.stages.blend.tile_groups import BLOCK, TileGroup
-from pop_fast.stages.dominance import Dominance
+from pop_fast.stages.blend.tile_groups import BLOCK, Entries, TileGroup, exponent_coefficients, pixel_basis
 from pop_ref.constants import Profile
+
+EIGHT: Final = 8  # entries whose comparisons of weights make one number
 
 
 class ActiveTiles:
@@ -77,6 +78,48 @@ class ActiveTiles:
             for name, state in self._held.items():
                 self._whole[name].index_copy_(0, self.rows, state)
         return self._whole
+
+
+class Dominance:
+    """The running maximum of weights over a group's pixels, fed step by step, front to back (D8).
+
+    Optimizations: the comparisons of eight weights with their maximum become one number by a matrix product with
+    (128, …, 2, 1), whose highest set bit is the foremost entry that equals the maximum; no index ever moves through
+    the slab, and the bit is looked up once, at the end.
+    """
+
+    def __init__(self, dtype: torch.dtype) -> None:
+        self._powers = 2.0 ** torch.arange(EIGHT - 1, -1, -1, dtype=dtype)
+
+    def see(self, weight: Tensor, first: int, best: Tensor, codes: Tensor, scratch: Tensor) -> None:
+        """Take a step's weights into account.
+
+        Args:
+            weight: of the step, K a multiple of 8. [n, K, P]
+            first: place of the step's first entry, a multiple of 8.
+            best: the largest weight of each pixel so far, in and out. [n, P]
+            codes: which entry that is, -1 for none, in and out. [n, P]
+            scratch: overwritten. [n, K, P]
+        """
+        n, K, n_pixels = weight.shape
+        for start in range(0, K, EIGHT):
+            part, equal = weight[:, start : start + EIGHT], scratch[:, start : start + EIGHT]
+            largest = part.amax(1)
+            torch.ge(part, largest[:, None], out=equal)
+            code = torch.bmm(self._powers.expand(n, 1, EIGHT), equal).view(n, n_pixels)
+            code.add_(float((first + start) // EIGHT * 2**EIGHT))
+            # strictly larger: on equal weights the entry in front keeps the pixel
+            improved = torch.gt(largest, best, out=torch.empty_like(best))
+            codes.lerp_(code, improved)
+            torch.maximum(best, largest, out=best)
+
+    @staticmethod
+    def places(codes: Tensor) -> Tensor:
+        """Return the place in its tile's list of each pixel's dominant entry, -1 where nothing was blended. [G, P]"""
+        whole = codes.to(torch.int64)
+        eight, bits = whole >> EIGHT, whole & (2**EIGHT - 1)
+        highest = torch.frexp(bits.to(torch.float32)).exponent - 1
+        return torch.where(whole < 0, -1, eight * EIGHT + (EIGHT - 1 - highest))
 
 
 @dataclass(frozen=True)

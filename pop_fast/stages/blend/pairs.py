@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 
 from pop_fast.stages.blend import buffers
-from pop_fast.stages.blend.alpha import Entries
 from pop_fast.stages.blend.blend import Blender
-from pop_fast.stages.blend.tile_groups import BLOCK, PackedLists, TileGroup, tile_groups
+from pop_fast.stages.blend.tile_groups import BLOCK, Entries, PackedLists, TileGroup, tile_groups
 from pop_fast.stages.splatting import Splats
 from pop_fast.stages.tiles import TileLists
 from pop_ref.constants import Profile

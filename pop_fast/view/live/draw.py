@@ -13,7 +13,7 @@ from torch import Tensor
 from pop_fast.density.shrink import inside, opaque_enough
 from pop_fast.io.pictures import colormap_table, id_colors
 from pop_fast.train.config import TrainConfig
-from pop_fast.view.layers import Layers, render_layers
+from pop_fast.train.views import Layers, render_layers
 from pop_fast.view.live.state import Box, ViewState
 from pop_fast.view.report.sections import depth_picture, depth_range
 

@@ -22,10 +22,9 @@ from pop_fast.io.atomic import write_atomically
 from pop_fast.io.pictures import fit
 from pop_fast.io.read_back import read_json
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.metrics import measure, psnr
+from pop_fast.train.evaluate import measure, psnr
 from pop_fast.train.results import ResultFolder
-from pop_fast.train.views import ViewTensors
-from pop_fast.view.layers import Layers, render_layers
+from pop_fast.train.views import Layers, ViewTensors, render_layers
 from pop_fast.view.paths import VideoFile, camera_path
 
 # training views that are rendered, evenly over the capture

@@ -160,7 +160,7 @@ def _higher_bands_of_the_first(given: Given) -> Any:
 def _seen_from_the_first(sound: Rasterization, given: Given) -> Any:
     if _plain(given) or not _several(given) or _own_colors(given) or _batched(given):
         return sound(**given)
-    dirs = function_named("pop_fast.stages.camera:view_dirs")(given["means"], given["viewmats"][0])
+    dirs = function_named("pop_fast.stages.projection:view_dirs")(given["means"], given["viewmats"][0])
     colors = function_named("pop_fast.stages.harmonics:colors_from_sh")(given["colors"], dirs, given["sh_degree"])
     return sound(**given | {"colors": colors, "sh_degree": None})
 
