@@ -144,8 +144,7 @@ def _chapters_told(stage: Stage) -> str:
 
 def _of_the_course(name: str, docstring: str) -> str:
     """Write labels in words, and explain of the settings what the course has."""
-    docstring = re.sub(r" \((?:A\d+(?:, )?)+(?::[^()]*)?\)", "", docstring)
-    docstring = re.sub(r"\b[DB]\d\b", lambda label: _LABELS[label[0]], docstring)
+    docstring = _labels_in_words(docstring)
     docstring = re.sub(r' Under "split".*?and split\.', "", docstring, flags=re.DOTALL)
     chapter = next(stage.chapter_of(name) for stage in COURSE if name in stage.names)
     docstring = re.sub(r"see the module's text", f"see chapter {chapter}", docstring)
@@ -154,6 +153,11 @@ def _of_the_course(name: str, docstring: str) -> str:
     for setting, about in _SETTINGS.get(name, {}).items():
         docstring = re.sub(f"    {setting}: .*", f"    {setting}: {about}", docstring)
     return "\n".join(_wrapped(line) for line in docstring.split("\n"))
+
+
+def _labels_in_words(text: str) -> str:
+    text = re.sub(r" \((?:A\d+(?:, )?)+(?::[^()]*)?\)", "", text)
+    return re.sub(r"\b[DB]\d\b", lambda label: _LABELS[label[0]], text)
 
 
 def _wrapped(line: str) -> str:
@@ -197,7 +201,7 @@ def _at_hand(imported: list[str]) -> str:
 
 def _told_of(called: str, value: Any) -> list[str]:
     """Write how a class is made or a function called, and the first line of its docstring."""
-    first = re.sub(r" \([ABD]\d+\)", "", (value.__doc__ or "").strip().split("\n")[0])
+    first = _labels_in_words((value.__doc__ or "").strip().split("\n")[0])
     return textwrap.wrap(f"{called}: {first}", 116, initial_indent="    ", subsequent_indent="        ")
 
 
