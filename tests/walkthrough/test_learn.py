@@ -207,6 +207,11 @@ def test_stubs_write_labels_in_words_and_explain_the_settings_that_the_course_ha
         text = stubs.stub(stage)
         assert not re.search(r"\b(?:[DB]\d|A\d+)\b(?!\.)", text.replace("appendix A2", "")), stage.name
         assert max(map(len, text.splitlines())) <= 120
+        assert text.endswith('is yours to write")\n')
+        # a stub has no module whose text one could see
+        assert "module's text" not in text
+    assert "    Pixel(color, T_final, ids, alphas, transmittances, n_traversed): " in stubs.stub(BY_NAME["compositing"])
+    assert "    control(rows, statistics, scene_scale, step, normals, config): " in stubs.stub(BY_NAME["loop"])
     density = stubs.stub(BY_NAME["density"])
     for setting in ("grow_grad2d", "grow_scale3d", "blur_start_iter", "blur_stop_iter", "prune_opa"):
         assert f"`{setting}` (" in density or f"`{setting}`" in density
