@@ -32,6 +32,17 @@ def interrupt(monkeypatch: pytest.MonkeyPatch, at: int) -> None:
     monkeypatch.setattr(TrainingRun, "take_steps", stepping)
 
 
+def run_until(training: TrainingRun, at: int | None = None) -> None:
+    """Run to the end, or leave at once, without a checkpoint, when `at` steps are taken."""
+    if at is None:
+        training.run()
+        return
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt(patch, at)
+        with pytest.raises(KeyboardInterrupt):
+            training.run()
+
+
 @contextmanager
 def killed_after(changes: int) -> Iterator[None]:
     """Let the first so many renames, removals and new folders happen and raise `Killed` at each one after them."""

@@ -1,162 +1,36 @@
 """Bad captures and settings on the command line: status 2, one line that names file, field and fix.
 
-A few of each kind: `test_bad_input_data` and `test_config` have what is said of all others."""
+One of each kind: `test_bad_input_data` and `test_config` have what is said of all others."""
 
 from __future__ import annotations
 
 import errno
 import json
 import os
-import struct
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 import torch
 
-from pop_fast.io.ply import load_ply, save_ply
+from pop_fast.io.ply import load_ply
 from tests.app.conftest import TRAIN, Pop
-from tests.app.damage import Damage, contents, patch_bytes, photo, says, truncate
+from tests.app.damage import photo, says
 
 
-def corrupt_jpeg(folder: Path) -> None:
-    image = cv2.imread(str(photo(folder)))
-    photo(folder).unlink()
-    path = photo(folder).with_suffix(".jpg")
-    cv2.imwrite(str(path), image)
-    truncate(path)
-
-
-def other_shape(folder: Path) -> None:
-    cv2.imwrite(str(photo(folder, 1)), np.zeros((40, 32, 3), np.uint8))
-
-
-def camera_model(folder: Path) -> None:
-    patch_bytes(folder / "sparse/0/cameras.bin", 12, struct.pack("<i", 999))
-
-
-def only_one_view(folder: Path) -> None:
-    for path in sorted((folder / "images").iterdir())[1:]:
-        path.unlink()
-
-
-CAPTURES: list[tuple[str, Damage, tuple[str, ...]]] = [
-    ("an image is listed but absent", lambda f: photo(f, 3).unlink(), ("view_003.png", "absent", "--missing skip")),
-    ("a JPEG is truncated", corrupt_jpeg, ("view_000.jpg", "truncated", "copy it again")),
-    ("a photograph has another shape", other_shape, ("view_001.png", "32x40", "40x32", "use the photographs")),
-    ("the cameras are truncated", lambda f: truncate(f / "sparse/0/cameras.bin"), ("cameras.bin", "truncated")),
-    ("the camera model is unknown", camera_model, ("cameras.bin", "unknown camera model 999")),
-]
-
-
-@pytest.mark.parametrize(("damage", "parts"), [case[1:] for case in CAPTURES], ids=[case[0] for case in CAPTURES])
-def test_a_damaged_capture_is_named_before_anything_is_written(
-    pop: Pop, capture: Path, tmp_path: Path, damage: Damage, parts: tuple[str, ...]
-) -> None:
-    damage(capture)
-    says(pop("train", capture, "--out", tmp_path / "r", *TRAIN), *parts)
+def test_a_damaged_capture_is_named_before_anything_is_written(pop: Pop, capture: Path, tmp_path: Path) -> None:
+    photo(capture, 3).unlink()
+    outcome = pop("train", capture, "--out", tmp_path / "r", *TRAIN)
+    says(outcome, "view_003.png", "absent", "--missing skip")
     assert not (tmp_path / "r").exists()
 
 
-def transforms(folder: Path, **frame: object) -> Path:
-    """Write a small transforms.json beside the photographs, its second frame and its fields changed as given."""
-    pose = np.eye(4)
-    frames = [
-        {"file_path": f"images/view_{i:03d}.png", "transform_matrix": (pose + 0.1 * i * np.eye(4, k=3)).tolist()}
-        for i in range(4)
-    ]
-    listing: dict[str, object] = {"fl_x": 30.0, "fl_y": 30.0, "cx": 20.0, "cy": 16.0, "w": 40, "h": 32}
-    for key, value in frame.items():
-        (frames[1] if key in ("transform_matrix", "file_path") else listing)[key] = value
-    (folder / "transforms.json").write_text(json.dumps({**listing, "frames": frames}))
-    return folder
-
-
-STRETCHED = np.diag([2.0, 1.0, 1.0, 1.0]).tolist()
-
-
-@pytest.mark.parametrize(
-    ("change", "parts"),
-    [
-        ({"transform_matrix": STRETCHED}, ("frames[1]", "transform_matrix")),
-        ({"file_path": "images/gone.png"}, ("gone.png", "absent", "--missing skip")),
-    ],
-    ids=["non-rigid", "absent image"],
-)
-def test_a_bad_transforms_json_is_named_with_its_frame_and_field(
-    pop: Pop, capture: Path, tmp_path: Path, change: dict[str, object], parts: tuple[str, ...]
-) -> None:
-    folder = transforms(capture, **change)
-    outcome = pop("train", folder, "--source", "transforms", "--out", tmp_path / "r", *TRAIN)
-    says(outcome, "transforms.json", *parts)
+def test_settings_that_exclude_each_other_are_named(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
+    outcome = pop("train", shared_capture, "--out", tmp_path / "r", "--resume", "--overwrite")
+    says(outcome, "--resume and --overwrite")
     assert not (tmp_path / "r").exists()
 
 
-def test_a_folder_that_is_not_there_is_named(pop: Pop, tmp_path: Path) -> None:
-    says(pop("train", tmp_path / "gone", "--out", tmp_path / "r"), "gone", "no such folder", "give the folder")
-    assert not (tmp_path / "r").exists()
-
-
-def test_a_folder_without_photographs_is_named(pop: Pop, tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    says(pop("train", tmp_path / "empty", "--out", tmp_path / "r"), "empty", "no photographs", "give the folder")
-
-
-def test_absent_images_can_be_skipped_but_one_view_is_too_few(pop: Pop, capture: Path, tmp_path: Path) -> None:
-    only_one_view(capture)
-    outcome = pop("train", capture, "--out", tmp_path / "r", "--missing", "skip", *TRAIN)
-    says(outcome, "a scene")
-    assert not (tmp_path / "r").exists()
-
-
-def test_one_photograph_is_too_few_for_sfm(pop: Pop, capture: Path, tmp_path: Path) -> None:
-    only_one_view(capture)
-    says(pop("sfm", capture / "images", "--out", tmp_path / "r"), "1 photograph", "two or more")
-    assert not (tmp_path / "r").exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "parts"),
-    [
-        (["--sh-degree", "4"], ("sh_degree is 4",)),
-        (["--factor", "99"], ("factor 99", "lower it")),
-        (["--test-every", "1"], ("no view to train on", "test_every")),
-        (["--lpips-vgg", "gone.pth"], ("gone.pth", "LPIPS")),
-        (["--resume", "--overwrite"], ("--resume and --overwrite",)),
-        (["--images", "gone"], ("gone",)),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
-)
-def test_a_setting_out_of_range_is_named(
-    pop: Pop, shared_capture: Path, tmp_path: Path, words: list[str], parts: tuple[str, ...]
-) -> None:
-    says(pop("train", shared_capture, "--out", tmp_path / "r", "--quiet", *words), *parts)
-    assert not (tmp_path / "r").exists()
-
-
-# Folders in use, foreign, full or forbidden, and runs that do not fit: refused in one line, nothing touched.
-
-
-def test_an_output_folder_in_use_is_left_alone(pop: Pop, shared_capture: Path, result: Path) -> None:
-    before = contents(result)
-    says(pop("train", shared_capture, "--out", result, *TRAIN), str(result), "--resume", "--overwrite")
-    assert contents(result) == before
-
-
-def test_a_folder_of_somebody_else_is_not_overwritten(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
-    (tmp_path / "home").mkdir()
-    (tmp_path / "home" / "thesis.txt").write_text("mine")
-    outcome = pop("train", shared_capture, "--out", tmp_path / "home", "--overwrite", *TRAIN)
-    says(outcome, "home", "not a result folder")
-    assert [path.name for path in (tmp_path / "home").iterdir()] == ["thesis.txt"]
-
-
-def test_a_run_is_not_resumed_with_other_settings(pop: Pop, shared_capture: Path, result: Path) -> None:
-    before = contents(result)
-    outcome = pop("train", shared_capture, "--out", result, *TRAIN, "--resume", "--seed", "7")
-    says(outcome, "ckpt_29_rank0.pt", "seed = 42", "seed = 7", "use the same settings")
-    assert contents(result) == before
+# Disks that are full and folders that are forbidden: refused in one line, nothing touched.
 
 
 @pytest.mark.parametrize("command", ["train", "demo", "render", "export"])
@@ -231,24 +105,6 @@ def test_a_zero_quaternion_is_named_before_it_is_rendered_or_exported(
 
 
 @pytest.mark.parametrize(
-    ("damage", "parts"),
-    [
-        (lambda p: truncate(p), ("x.ply",)),
-        (lambda p: patch_bytes(p, p.stat().st_size - 248, struct.pack("<f", float("nan"))), (".x is nan", "finite")),
-    ],
-    ids=["truncated", "NaN"],
-)
-def test_a_damaged_ply_is_named_and_nothing_is_exported(
-    pop: Pop, shared_result: Path, tmp_path: Path, damage: Damage, parts: tuple[str, ...]
-) -> None:
-    path = tmp_path / "x.ply"
-    save_ply(path, load_ply(shared_result / "ply" / "point_cloud_29.ply"))
-    damage(path)
-    says(pop("export", path, "--out", tmp_path / "o.splat"), "x.ply", *parts)
-    assert not (tmp_path / "o.splat").exists()
-
-
-@pytest.mark.parametrize(
     ("words", "parts"),
     [
         (["eval", "gone"], ("gone", "no such file or folder")),
@@ -312,5 +168,4 @@ def test_endings_may_be_written_in_capitals(pop: Pop, shared_result: Path, tmp_p
     for source in (shared_result / "ply" / "point_cloud_29.ply", shared_result / "ckpts" / "ckpt_29_rank0.pt"):
         loud = tmp_path / f"LOUD{source.suffix.upper()}"
         loud.write_bytes(source.read_bytes())
-        outcome = pop("export", loud, "--out", tmp_path / f"{source.suffix[1:]}.splat")
-        assert outcome.status == 0, outcome.err
+        pop.done("export", loud, "--out", tmp_path / f"{source.suffix[1:]}.splat")

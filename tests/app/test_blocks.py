@@ -28,6 +28,7 @@ from pop_fast.train.results import ResultFolder
 from pop_fast.train.views import ViewTensors
 from tests.app.captures import assert_one_line, write_photograph
 from tests.app.conftest import TRAIN, Pop
+from tests.app.damage import says
 from tests.app.interruptions import interrupt
 
 BLOCKS = ("--blocks", "2x1", "--blocks-rounds", "0", *TRAIN, "--skip-sizes", "--threads", "1")
@@ -126,11 +127,9 @@ def test_a_block_is_trained_on_its_own_views_and_points_in_the_frame_of_the_whol
 
 def test_other_commands_take_the_merged_folder_for_a_result(pop: Pop, blocks):
     psnr = stats_of(blocks)["psnr"]
-    measured = pop("eval", blocks)
-    assert measured.status == 0, measured.err
+    measured = pop.done("eval", blocks)
     assert f"PSNR       {psnr:.3f} dB" in measured.out
-    exported = pop("export", blocks, "--out", blocks.parent / "whole.ply")
-    assert exported.status == 0, exported.err
+    pop.done("export", blocks, "--out", blocks.parent / "whole.ply")
     assert (
         pop(
             "eval",
@@ -140,16 +139,13 @@ def test_other_commands_take_the_merged_folder_for_a_result(pop: Pop, blocks):
         ).out.splitlines()[1]
         == f"PSNR       {psnr:.3f} dB"
     )
-    rendered = pop("render", blocks, "--out", blocks.parent / "pictures")
-    assert rendered.status == 0, rendered.err
-    reported = pop("report", blocks)
-    assert reported.status == 0, reported.err
+    pop.done("render", blocks, "--out", blocks.parent / "pictures")
+    pop.done("report", blocks)
 
 
 def test_what_is_finished_is_not_done_again(pop: Pop, shared_capture, blocks):
     before = written(blocks)
-    again = pop("train", shared_capture, "--out", blocks, *BLOCKS, "--resume")
-    assert again.status == 0, again.err
+    again = pop.done("train", shared_capture, "--out", blocks, *BLOCKS, "--resume")
     assert "are trained and merged" in again.out
     (blocks / "blocks" / "merged").unlink()
     assert pop("train", shared_capture, "--out", blocks, *BLOCKS, "--resume").status == 0
@@ -168,8 +164,7 @@ def test_a_block_that_was_interrupted_goes_on_to_the_same_bits(
     assert "with --resume continues" in stopped.err
     assert not (folder / "blocks" / "0_0" / "trained").exists()
     assert pop("eval", folder).err.count("\n") == 1
-    gone_on = pop(*words, "--resume")
-    assert gone_on.status == 0, gone_on.err
+    gone_on = pop.done(*words, "--resume")
     assert "continuing from step" in gone_on.out
     for key, value in splats(shared_blocks).items():
         assert torch.equal(splats(folder)[key], value)
@@ -193,8 +188,7 @@ def test_a_run_that_is_gone_on_with_otherwise_is_refused(pop: Pop, shared_captur
 def test_overwriting_begins_anew(pop: Pop, shared_capture, blocks):
     before = written(blocks)
     (blocks / "blocks" / "litter").write_text("of the run before")
-    anew = pop("train", shared_capture, "--out", blocks, *BLOCKS, "--blocks", "2x1", "--overwrite")
-    assert anew.status == 0, anew.err
+    pop.done("train", shared_capture, "--out", blocks, *BLOCKS, "--blocks", "2x1", "--overwrite")
     assert all(written(blocks)[name] > before[name] for name in NAMES)
     assert not (blocks / "blocks" / "litter").exists()
 
@@ -218,10 +212,7 @@ def test_overwriting_begins_anew(pop: Pop, shared_capture, blocks):
     ],
 )
 def test_what_cannot_be_is_said_in_a_line_and_nothing_is_written(pop: Pop, shared_capture, tmp_path, words, said):
-    outcome = pop("train", shared_capture, "--out", tmp_path / "out", *TRAIN, *words)
-    assert outcome.status == 2
-    assert said in outcome.err
-    assert outcome.err.count("\n") == 1
+    says(pop("train", shared_capture, "--out", tmp_path / "out", *TRAIN, *words), said)
     assert not (tmp_path / "out").exists()
 
 
@@ -244,8 +235,7 @@ def test_parts_ask_for_what_comes_before_them(pop: Pop, result, blocks):
     (blocks / "blocks" / "plan.json").unlink()
     assert "is not divided yet" in pop("blocks", "merge", blocks).err
     assert "is not divided yet" in pop("blocks", "train", blocks, "0_0").err
-    divided = pop("blocks", "partition", blocks)
-    assert divided.status == 0, divided.err
+    divided = pop.done("blocks", "partition", blocks)
     assert divided.out.startswith("block")
 
 
@@ -262,10 +252,7 @@ def test_parts_ask_for_what_comes_before_them(pop: Pop, result, blocks):
 )
 def test_a_damaged_file_is_named(pop: Pop, blocks, name, content, said):
     (blocks / "blocks" / name).write_bytes(content)
-    outcome = pop("blocks", "train", blocks, "0_0")
-    assert outcome.status == 2
-    assert said in outcome.err
-    assert outcome.err.count("\n") == 1
+    says(pop("blocks", "train", blocks, "0_0"), said)
 
 
 def test_a_capture_that_has_gone_is_named(pop: Pop, blocks):

@@ -18,9 +18,8 @@ from pop_fast.density import DensificationStep, POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.stages.backend import FAST
 from pop_fast.train import TrainConfig, TrainingRun
-from pop_fast.train import checkpoint as ckpt
 from tests.app.conftest import TRAIN, Pop
-from tests.app.interruptions import interrupt
+from tests.app.interruptions import run_until
 from tests.app.test_resume import assert_same_run
 from tests.app.tiny import tiny_capture, tiny_config
 from tests.fast.test_rasterization import cameras, scene
@@ -70,19 +69,7 @@ class Jitter:
 
 def run(folder: Any, stop_after: int | None = None, resume: bool = False, **options: Any) -> TrainingRun:
     training = TrainingRun(tiny_config(folder), tiny_capture(), strategy=Jitter(**options), resume=resume)
-    take_steps = training.take_steps
-
-    def stepping(last: int) -> Any:
-        if training.step == stop_after:
-            raise KeyboardInterrupt
-        return take_steps(last)
-
-    training.take_steps = stepping
-    if stop_after is None:
-        training.run()
-    else:
-        with pytest.raises(KeyboardInterrupt):
-            training.run()
+    run_until(training, stop_after)
     return training
 
 
@@ -186,41 +173,6 @@ def test_a_registered_backend_is_known_by_its_name_and_draws(installed: pytest.M
 def test_one_that_cannot_be_loaded_is_named(installed: pytest.MonkeyPatch) -> None:
     with pytest.raises(PopError, match=r"the backend at no_such_package:BACKEND cannot be loaded: No module named"):
         registry.get_backend("broken")
-
-
-def test_a_registered_backend_trains_saves_resumes_and_is_measured(
-    installed: pytest.MonkeyPatch, pop: Pop, shared_capture: Path, tmp_path: Path
-) -> None:
-    words = ("train", shared_capture, *TRAIN, "--backend", "mine", "--threads", "1", "--checkpoint-every", "5")
-    outcome = pop(*words, "--out", tmp_path / "whole")
-    assert outcome.status == 0, outcome.err
-    assert "backend mine, as asked for" in outcome.out
-    with pytest.MonkeyPatch.context() as patch:
-        interrupt(patch, at=13)
-        assert pop(*words, "--out", tmp_path / "parts").status == 130
-    # what it was begun with is what goes on
-    resumed = [word if word != "mine" else "auto" for word in words]
-    outcome = pop(*resumed, "--out", tmp_path / "parts", "--resume")
-    assert outcome.status == 0, outcome.err
-    assert "backend mine, with which the run was begun" in outcome.out
-    assert pop(*resumed, "--out", tmp_path / "fast", "--backend", "fast").status == 0
-    whole, parts, fast = (
-        ckpt.load_checkpoint(ckpt.checkpoint_path(tmp_path / name, 29))["splats"] for name in ("whole", "parts", "fast")
-    )
-    assert len(whole["means"]) > 0
-    for name, value in whole.items():
-        assert torch.equal(value, parts[name]), name
-        assert torch.equal(value, fast[name]), name
-    text = (tmp_path / "whole" / "cfg.json").read_text()
-    config = TrainConfig.from_json(text)
-    assert (config.backend, config.to_json()) == ("mine", text)
-    assert json.loads((tmp_path / "whole" / "stats" / "val_step0029.json").read_text())["backend"] == "mine"
-    import made_up_backend  # type: ignore[import-not-found]
-
-    asked = len(made_up_backend.ASKED)
-    assert asked > 2 * 30
-    assert pop("eval", tmp_path / "whole").status == 0
-    assert len(made_up_backend.ASKED) > asked
 
 
 def test_a_name_that_nobody_registers_is_refused_before_anything_is_written(

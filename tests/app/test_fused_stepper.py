@@ -36,6 +36,7 @@ from pop_fast.train.torch_stepper import TorchStepper
 from pop_ref.settings import PARAMETERS
 from tests.app.drift import MOST, Drift, drift_engine
 from tests.app.interruptions import interrupt as fixed_rows_interrupt
+from tests.app.interruptions import run_until
 from tests.app.tiny import HEIGHT, N_POINTS, WIDTH, last_checkpoint, tiny_capture, tiny_config
 
 CLOCKS = ("it_per_s", "seconds")
@@ -410,17 +411,7 @@ def test_a_run_of_batches_draws_as_many_views_a_step_and_continues_to_the_same_b
     assert all(len(record["view"].split(", ")) == 3 for record in records)
     assert any(record.get("cloned", 0) + record.get("split", 0) > 0 for record in records)
     config = tiny_config(tmp_path / "parts", batch_size=3)
-    first = TrainingRun(config, capture)
-    take_steps = first.take_steps
-
-    def until_17(last: int) -> Any:
-        if first.step == 17:
-            raise KeyboardInterrupt
-        return take_steps(last)
-
-    first.take_steps = until_17
-    with pytest.raises(KeyboardInterrupt):
-        first.run()
+    run_until(TrainingRun(config, capture), 17)
     second = TrainingRun(config, capture, resume=True)
     second.run()
     for key, value in whole.params.items():

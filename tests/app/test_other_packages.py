@@ -160,6 +160,9 @@ def test_it_trains_saves_resumes_and_exports(site: Path, shared_capture: Path, t
     whole, parts = (ckpt.load_checkpoint(ckpt.checkpoint_path(tmp_path / n, 29))["splats"] for n in ("whole", "parts"))
     assert len(whole["means"]) > 0
     assert all(torch.equal(value, parts[name]) for name, value in whole.items())
+    asked = (site / "asked.txt").stat().st_size
+    call(site, "pop_fast.cli", "eval", tmp_path / "whole")
+    assert (site / "asked.txt").stat().st_size > asked
     (exported,) = (tmp_path / "whole" / "export").iterdir()
     assert exported.suffix == ".numbers"
     assert exported.stat().st_size == 12 * len(whole["means"])
