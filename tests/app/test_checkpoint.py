@@ -24,9 +24,8 @@ from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from tests.app.children import in_a_child, pop_in_a_child
 from tests.app.conftest import Outcome, Pop
-from tests.app.damage import contents, says
+from tests.app.damage import FORGED, INF, Content, contents, forge, latest, says, to
 from tests.app.drift import drift_engine
-from tests.app.forged import FORGED, INF, Content, forge, latest, to
 from tests.app.tiny import tiny_capture, tiny_config
 
 

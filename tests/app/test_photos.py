@@ -108,6 +108,13 @@ def test_a_bare_folder_is_loaded_only_when_sfm_is_asked_for(photographs: Path, t
     assert len(load_capture(tmp_path / "scene").views) == len(CENTERS)
 
 
+def test_photographs_without_anything_in_common_give_one_line_and_no_output(tmp_path: Path) -> None:
+    for i in range(3):
+        write_photograph(tmp_path / "in" / f"{i}.png", photograph(i, 64, 48))
+    assert_one_line(lambda: run_sfm(tmp_path / "in", tmp_path / "out"), "in", "no cameras could be found", "overlap")
+    assert [file.name for file in tmp_path.iterdir()] == ["in"]
+
+
 def test_fewer_than_two_photographs_are_refused(tmp_path: Path) -> None:
     assert_one_line(lambda: run_sfm(tmp_path / "absent"), "absent", "no such folder")
     assert_one_line(lambda: run_sfm(tmp_path), "has 0 photograph")

@@ -29,7 +29,7 @@ from pop_ref.compositing import composite, composite_vjp
 from pop_ref.contributions import contributions
 from pop_ref.depth import expected_depth, expected_depth_vjp, with_depth_channel
 from pop_ref.pixel import Pixel, SplatRows, composite_pixel, composite_pixel_vjp, stops, zero_gradients
-from tests.oracle.by_definition import blended_pixels
+from tests.oracle.dense import blended_pixels
 from tests.oracle.scenes import camera, dyadic_camera, grey, random_gaussians, safe_gaussians, tilted_camera
 
 # floats hold every sum and product below exactly, so that the comparison is too

@@ -39,7 +39,7 @@ from pop_ref.mini_splatting import nearest_log_scales, samples_per_view, scene_i
 from pop_ref.selection import least_mass, lowest_share, sample_without_replacement
 from pop_ref.sensitivity import sensitivities
 from pop_ref.tiles import tile_lists
-from tests.oracle.by_definition import blended_pixels
+from tests.oracle.dense import blended_pixels
 from tests.oracle.scenes import camera, dyadic_camera, grey, random_gaussians, tilted_camera
 
 counts = st.integers(0, 10**7)

@@ -16,8 +16,7 @@ from pop_ref.chord import chord_midpoint, dominant_points
 from pop_ref.compositing import composite
 from pop_ref.tight_tiles import accutile, snug_box, tight_tile_lists
 from pop_ref.tiles import tile_lists, tile_rects
-from tests.oracle.by_definition import blended_pixels
-from tests.oracle.dense import rotations
+from tests.oracle.dense import blended_pixels, rotations
 from tests.oracle.scenes import camera, dyadic_camera, grey, random_gaussians, tilted_camera
 
 quarter_px = st.integers(-40, 120).map(lambda k: k / 4.0)
