@@ -1,4 +1,4 @@
-"""What other people write: a package that adds a backend, a method, a loss, a profile, a format and a row, and a strategy.
+"""What other people write: a strategy, and a package with a backend, a method, a loss, a profile, a format and a row.
 
 The package changes no file of ours. The strategy follows gsplat's protocol and knows nothing of ours.
 """

@@ -1,4 +1,4 @@
-"""What is kept of the corpus is what the oracle says today, and the corpus reaches what it is for."""
+"""What is kept of the corpus, and what the oracle is remembered to have answered, is what the oracle says today."""
 
 from __future__ import annotations
 

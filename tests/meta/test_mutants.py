@@ -1,4 +1,4 @@
-"""Every mutant dies by the law that its entry names, and that law holds on the oracle."""
+"""Every mutant dies by the law that its entry names, that law holds on the oracle, and the kit's teeth are measured."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""paper.toml says what the paper prints: the LaTeX source and its transcription, where they lie beside the clone."""
+"""The reproduction's words: paper.toml says what the paper prints, and protocol.md, README.md and claims.md are whole."""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""`pop-repro verify`: a result comes out again at its commit, and one that was altered does not."""
+"""`pop-repro verify`: a result comes out again at its commit, and one that was altered does not.
+
+What counts as a difference is more than noise. The noise floor and its intervals are held to numbers made by hand, to
+scipy, and to how often they decide what is noise.
+"""
 
 from __future__ import annotations
 

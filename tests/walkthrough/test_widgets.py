@@ -1,4 +1,4 @@
-"""The widgets in a browser: they appear, answer to sliders, fingers and keys, fit a phone, and say no error."""
+"""Pages in a browser: they fit a desktop and a phone, widgets answer to sliders, fingers and keys, and nobody complains."""
 
 from __future__ import annotations
 
