@@ -33,12 +33,6 @@ def truncate(path: Path, share: float = 0.5) -> None:
     path.write_bytes(data[: int(len(data) * share)])
 
 
-def patch_bytes(path: Path, at: int, data: bytes) -> None:
-    content = bytearray(path.read_bytes())
-    content[at : at + len(data)] = data
-    path.write_bytes(bytes(content))
-
-
 def contents(folder: Path) -> dict[Path, bytes]:
     """Read every file under a folder, to see that nothing changed."""
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}

@@ -66,13 +66,6 @@ def test_lists_are_row_major_and_hold_what_overlaps() -> None:
     assert got == [[0, 1, 2], [1, 2], [1, 2], [1, 2]]
 
 
-@given(st.lists(st.sampled_from([1.0, 2.0, 2.0 + 2.0**-40, 3.0]), max_size=8))
-def test_lists_are_sorted_by_depth_and_ties_keep_index_order(depths: list[float]) -> None:
-    n = len(depths)
-    (ids,) = tiles.tile_lists(np.full((n, 2), 2.0), np.full((n, 2), 1), np.array(depths), 4, 4, 16)
-    assert ids == [i for _, i in sorted(zip(depths, range(n), strict=True))]
-
-
 def test_a_culled_splat_is_in_no_list() -> None:
     assert tiles.tile_lists(np.array([[2.0, 2.0]]), np.array([[0, 0]]), np.ones(1), 4, 4, 4) == [[]]
 
