@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from pop_fast.blocks.jobs import block_folder, parts_of
 from pop_fast.blocks.merge import TAKEN
 from pop_fast.blocks.plan import Job, read_job, read_plan
 from pop_fast.blocks.rounds import write_round_block
-from pop_fast.children import module_command
 from pop_fast.cli import main
 from pop_fast.data.load import load_capture
 from pop_fast.data.random_points import in_picture
@@ -25,27 +23,22 @@ from pop_fast.train.checkpoint import load_splats, save_checkpoint
 from pop_fast.train.evaluate import evaluate
 from pop_fast.train.load_result import CaptureRecord, load_splat, read_record
 from pop_fast.train.model import KEYS
-from pop_fast.train.results import ResultFolder, read_config
+from pop_fast.train.results import read_config
 from pop_fast.train.views import ViewTensors
 from tests.app.conftest import TRAIN, Pop
 from tests.app.damage import says
 from tests.app.interruptions import interrupt
+from tests.app.test_blocks import NAMES, in_this_process, stats_of
 
 SETTINGS = (*TRAIN, "--skip-sizes", "--threads", "1", "--checkpoint-every", "5")
 BLOCKS = ("--blocks", "2x1", *SETTINGS)
 ROUNDS = ("--blocks-rounds", "2", "--blocks-round-steps", "12")
-NAMES = ("0_0", "1_0")
 
 
 @pytest.fixture(autouse=True)
 def _one_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jobs, "_run", in_this_process)
     monkeypatch.setattr("pop_fast.blocks.jobs.has_snakemake", lambda: False)
-
-
-def in_this_process(words: Sequence[str], quiet: bool) -> int:
-    assert list(words[:4]) == module_command("pop_fast.cli")
-    return main(list(words[4:]))
 
 
 @pytest.fixture(scope="module")
@@ -63,12 +56,6 @@ def shared_rounds(shared_capture: Path, tmp_path_factory: pytest.TempPathFactory
 def rounds(shared_rounds: Path, tmp_path: Path) -> Path:
     """A copy of the run that a test may change."""
     return Path(shutil.copytree(shared_rounds, tmp_path / "rounds"))
-
-
-def stats_of(folder: Path) -> dict:
-    found = ResultFolder(folder).read_stats("val", 29)
-    assert found is not None
-    return found
 
 
 def core(folder: Path, number: int, name: str) -> dict[str, torch.Tensor]:
