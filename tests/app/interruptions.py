@@ -32,15 +32,22 @@ def interrupt(monkeypatch: pytest.MonkeyPatch, at: int) -> None:
     monkeypatch.setattr(TrainingRun, "take_steps", stepping)
 
 
+@contextmanager
+def interrupted(at: int) -> Iterator[None]:
+    """Let the run in this block be left at once, without a checkpoint, when it has taken `at` steps."""
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt(patch, at)
+        with pytest.raises(KeyboardInterrupt):
+            yield
+
+
 def run_until(training: TrainingRun, at: int | None = None) -> None:
     """Run to the end, or leave at once, without a checkpoint, when `at` steps are taken."""
     if at is None:
         training.run()
         return
-    with pytest.MonkeyPatch.context() as patch:
-        interrupt(patch, at)
-        with pytest.raises(KeyboardInterrupt):
-            training.run()
+    with interrupted(at):
+        training.run()
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""The reproduction's words: paper.toml says what the paper prints, and protocol.md, README.md and claims.md are whole."""
+"""The reproduction's words: paper.toml is what the paper prints; protocol.md, README.md and claims.md are whole."""
 
 from __future__ import annotations
 

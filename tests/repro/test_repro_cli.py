@@ -1,4 +1,4 @@
-"""`pop-repro`: help that is quick, errors that name the fix, a queue that stops and continues, the Snakemake workflow."""
+"""`pop-repro`: quick help, errors that name the fix, a queue that stops and continues, the Snakemake workflow."""
 
 from __future__ import annotations
 

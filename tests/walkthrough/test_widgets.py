@@ -304,7 +304,6 @@ def test_all_stand_on_one_page_and_none_without_scripts(page: Page, files: dict[
     assert page.ask("document.body.innerText").count("where JavaScript is allowed") == len(NAMES)
 
 
-
 # how a page is opened; it is then looked at with the other preference too
 OPENED = [(900, False), (400, True)]
 # what is wider than its own box and neither scrolls nor is cut off there
