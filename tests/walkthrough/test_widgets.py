@@ -1,4 +1,4 @@
-"""Pages in a browser: they fit a desktop and a phone, widgets answer to sliders, fingers and keys, and nobody complains."""
+"""Pages in a browser: they fit a desktop and a phone, widgets answer to sliders, fingers, keys, nothing complains."""
 
 from __future__ import annotations
 
