@@ -85,6 +85,12 @@ def test_resuming_a_finished_run_returns_its_statistics_and_writes_nothing_anew(
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
+def test_resuming_where_nothing_was_trained_starts(tmp_path):
+    trainer = TrainingRun(tiny_config(tmp_path / "new", max_steps=2), tiny_capture(), resume=True)
+    trainer.run()
+    assert trainer.step == 2
+
+
 def start(folder, *words):
     command = [sys.executable, str(ROOT / "tests" / "app" / "tiny.py"), str(folder), *words]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
