@@ -1,4 +1,4 @@
-"""Pages in a browser: they fit a desktop and a phone, widgets answer to sliders, fingers, keys, nothing complains."""
+"""The widgets in a browser: they appear, answer to sliders, fingers and keys, fit a phone, and say no error."""
 
 from __future__ import annotations
 
@@ -12,12 +12,10 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from pop_ref.walkthrough.builder.chapter import read_chapter
-from pop_ref.walkthrough.builder.layout import asset, chapter_page, index_page
+from pop_ref.walkthrough.builder.layout import asset
 from pop_ref.walkthrough.widgets import FOLDER as WIDGET_FOLDER
 from pop_ref.walkthrough.widgets import WIDGETS, html
-from tests.walkthrough.chromium import SCREENSHOTS, WHY_NOT, Page, keep
-from tests.walkthrough.ran import CHAPTERS, ran
+from tests.walkthrough.chromium import WHY_NOT, Page, keep
 
 NAMES = list(WIDGETS)
 browser = pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)
@@ -302,57 +300,3 @@ def test_all_stand_on_one_page_and_none_without_scripts(page: Page, files: dict[
     page.open(files["all"], scripts=False)
     assert page.ask("document.querySelectorAll('.pop-widget[hidden]').length") == len(NAMES)
     assert page.ask("document.body.innerText").count("where JavaScript is allowed") == len(NAMES)
-
-
-# how a page is opened; it is then looked at with the other preference too
-OPENED = [(900, False), (400, True)]
-# what is wider than its own box and neither scrolls nor is cut off there
-STICKS_OUT = """[...document.querySelectorAll('main *')].filter(each => {
-    const box = each.getBoundingClientRect();
-    const scrolls = each.closest('pre, .wide, .math, svg, math, details:not([open])');
-    return box.width && box.right > innerWidth + 1 && !scrolls;
-}).map(each => each.tagName + ' ' + each.className + ' ' + each.textContent.slice(0, 60))"""
-
-
-def _looked_at(page: Page, file: Path) -> None:
-    for width, dark in OPENED:
-        page.open(file, width=width, dark=dark)
-        _is_sound(page, file.stem, width, dark)
-        page.switch(dark=not dark)
-        _is_sound(page, file.stem, width, not dark)
-
-
-def _is_sound(page: Page, name: str, width: int, dark: bool) -> None:
-    page.ask("new Promise(done => setTimeout(() => done(1), 100))")
-    assert page.complaints == []
-    assert page.ask("document.documentElement.scrollWidth") <= width, page.ask(STICKS_OUT)
-    assert page.ask(STICKS_OUT) == []
-    paper = page.ask("getComputedStyle(document.body).backgroundColor")
-    assert (sum(int(each) for each in paper[4:-1].split(",")) < 300) == dark
-    # an ink that would vanish on this paper
-    assert page.ask("getComputedStyle(document.body).color") != paper
-    # of a whole page it takes seconds
-    if SCREENSHOTS or name == "index":
-        keep(page.picture("body"), f"{name}_{width}_{'dark' if dark else 'light'}.png")
-
-
-@pytest.mark.slow
-@browser
-@pytest.mark.parametrize("path", CHAPTERS, ids=lambda path: path.stem)
-def test_a_page_fits_its_window_and_complains_of_nothing(page: Page, path: Path, tmp_path: Path) -> None:
-    chapter, outcomes = ran(path)
-    file = tmp_path / chapter.page
-    file.write_text(chapter_page(chapter, outcomes, [read_chapter(each) for each in CHAPTERS]), encoding="utf-8")
-    _looked_at(page, file)
-    widgets = page.ask("[...document.querySelectorAll('.pop-widget')].map(each => each.hidden)")
-    assert len(widgets) == sum(cell.text.count("{{widget: ") for cell in chapter.cells)
-    assert not any(widgets)
-
-
-@pytest.mark.slow
-@browser
-def test_the_contents_fits_its_window_and_complains_of_nothing(page: Page, tmp_path: Path) -> None:
-    file = tmp_path / "index.html"
-    beside = {"notebooks": "notebooks", "slides": "slides.html", "PDF": "walkthrough.pdf"}
-    file.write_text(index_page([read_chapter(each) for each in CHAPTERS], beside), encoding="utf-8")
-    _looked_at(page, file)
