@@ -7,14 +7,12 @@ from dataclasses import fields, replace
 from typing import Literal, get_args, get_origin, get_type_hints
 
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pop_fast.cli.train import arguments
 from pop_fast.density import DensityControl, GsplatStrategy, POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.stages.density import blur_set
 from pop_fast.train import LearningRates, TrainConfig
 from pop_fast.train.config import first_difference
 from pop_fast.train.jsonable import to_plain
@@ -76,12 +74,6 @@ def test_quick_is_a_tenth_of_the_schedule_with_the_papers_weights():
     assert (control.refine_stop_iter, control.reset_every, control.prune_too_big_after) == (1500, 3000, 3000)
     assert TrainConfig.of(preset="quick", steps_scaler=0.5).max_steps == 15_000
     assert TrainConfig.of(preset="quick", scale_lambda_pop=True).strategy.lambda_pop == pytest.approx(0.01)
-
-
-def test_eleven_pixels_are_blur_in_quick_and_ten_are_not():
-    plan = TrainConfig.of(preset="quick").strategy
-    counts = torch.tensor([10, 11])
-    assert blur_set(counts, 270, 480, plan.theta_blur, plan.blur_min_pixels).tolist() == [False, True]
 
 
 @pytest.mark.parametrize("preset", ["paper", "quick"])

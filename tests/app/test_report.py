@@ -155,23 +155,6 @@ def test_a_run_that_was_killed_early_still_gets_a_report(tmp_path: Path) -> None
     Tags(write_report(folder).read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (lambda r: (r / "cfg.json").unlink(), "has no cfg.json"),
-        (lambda r: (r / "metrics.jsonl").write_text('{"step": 1\n{"step": 2}\n'), "line 1 is not JSON"),
-        (lambda r: (r / "stats" / "val_step0299.json").write_text("{"), "val_step0299.json: is not JSON"),
-        (lambda r: (r / "report_data" / "opacity_step69.npz").write_bytes(b"PK"), "opacity_step69.npz: is damaged"),
-    ],
-)
-def test_a_damaged_result_is_named_and_leaves_no_report(tmp_path: Path, damage, message: str) -> None:
-    folder = write_result(tmp_path / "r")
-    damage(folder)
-    with pytest.raises(PopError, match=re.escape(message)):
-        write_report(folder)
-    assert not (folder / "report.html").exists()
-
-
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6), st.integers(2, 8))
 def test_ticks_are_even_and_inside_the_axis(low: float, span: float, n: int) -> None:
     high = low + span
