@@ -34,7 +34,7 @@ from pop_fast.cli.train_checks import (
     with_length,
     with_size,
 )
-from pop_fast.cli.train_options import PLAN, BlocksOptions, overrides, plan_of
+from pop_fast.cli.train_options import PLAN, BlocksOptions, overrides, plan_of, rename_aliases
 from pop_fast.cli.view import LiveView, check_viewer
 from pop_fast.data.sfm_files import SfmOptions
 from pop_fast.errors import PopError
@@ -85,22 +85,8 @@ _NAMED: Final[dict[str, Callable[[], Iterable[str]]]] = {
 # whose options the help lists after all others, in this order; those of limits belong to exports too
 _LATER: Final = (FinishOptions, LimitOptions, BlocksOptions)
 _DOCUMENTED: Final = (BlocksOptions, FinishOptions, LimitOptions, Given, TrainConfig)
-# words of other trainers' command lines: Inria's, gsplat's
-_ALIASES: Final = {
-    **dict.fromkeys(("-s", "--source-path", "--data-dir", "--data"), "DATA"),
-    **dict.fromkeys(("-m", "--model-path", "--result-dir", "-o"), "--out"),
-    "--data-factor": "--factor",
-    "--iterations": "--max-steps",
-}
-_SMALLER: Final = (
-    "--factor 2 (4, 8) trains on photographs shrunk by so much; --sfm.max-size is only how large they are while "
-    "cameras are searched for"
-)
-# of which the nearest option by its letters is another thing
-_ELSEWHERE: Final = dict.fromkeys(("--max-size", "--resolution", "-r", "--downscale", "--downscale-factor"), _SMALLER)
 # what trains, and takes longest to import
 _TRAINING: Final = ("pop_fast.train.training_run", "pop_fast.compiled.native_step")
-_IGNORED: Final = frozenset({"--eval"})  # Inria: hold out every 8th view; here the default (--test-every 0 holds none)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -347,31 +333,6 @@ def arguments(argv: Sequence[str]) -> tuple[TrainConfig, Any]:
         place = Path(config.data).resolve()
         config = replace(config, result_dir=f"out/{place.stem if place.is_file() else place.name}_{config.method}")
     return config, args
-
-
-def rename_aliases(argv: Sequence[str]) -> list[str]:
-    """Turn options of Inria's and gsplat's trainers into ours: `-s DIR` into `DIR`, `-m DIR` into `--out DIR`, ..."""
-    words: list[str] = []
-    rest = list(argv)
-    while rest:
-        word = rest.pop(0)
-        if not word.startswith("-"):
-            # a path may hold "="
-            words.append(word)
-            continue
-        word = word.replace("--adc.", "--gsplat.", 1) if word.startswith("--adc.") else word
-        name, equals, value = word.partition("=")
-        name = name.replace("_", "-") if name.startswith("--") else name
-        if name in _ELSEWHERE:
-            raise PopError(f"{name} is no option of pop train; {_ELSEWHERE[name]}")
-        target = _ALIASES.get(name)
-        if name in _IGNORED:
-            continue
-        if target == "DATA":
-            words += [value] if equals else []
-        else:
-            words += [target or name, value] if equals else [target or word]
-    return words
 
 
 def _arguments_type(base: TrainConfig, plan: dict[str, Any], short: bool) -> type:
