@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pop_fast.cli.train_checks import chooses_for_itself
@@ -14,6 +16,7 @@ from pop_fast.errors import CaptureError
 from pop_fast.train import TrainConfig, automatic
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.automatic import MINUTES, SHORTEST, Speed, choose_length, expected_gaussians, factor_for
+from pop_fast.view.paths import VideoFile
 from tests.app.conftest import Pop
 from tests.app.damage import says
 from tests.app.interruptions import interrupt
@@ -161,3 +164,25 @@ def test_an_archive_that_would_fill_the_disk_or_is_damaged_is_refused(tmp_path: 
         unpack(tmp_path / "c.zip", tmp_path / "c")
     assert not (tmp_path / "a").exists()
     assert not (tmp_path / "c").exists()
+
+
+def test_a_video_is_a_folder_of_its_frames_the_second_time_too(tmp_path: Path) -> None:
+    film = tmp_path / "walk.webm"
+    rng = np.random.default_rng(0)
+    with VideoFile(film, 5.0) as video:
+        for _ in range(6):
+            # nothing alike, or it would be a camera at rest
+            video.add(np.kron(rng.integers(0, 255, (6, 8, 3)), np.ones((16, 16, 1))).astype(np.uint8))
+    folder, said = capture_folder(film)
+    assert folder == tmp_path / "walk_frames"
+    assert said is not None
+    assert "of 6 frames" in said
+    taken = sorted(folder.iterdir())
+    assert len(taken) >= 2
+    again, said = capture_folder(film)
+    assert (again, sorted(again.iterdir())) == (folder, taken)
+    assert said is not None
+    assert "already" in said
+    os.utime(film, (folder.stat().st_mtime + 60.0,) * 2)
+    with pytest.raises(CaptureError, match="is older than"):
+        capture_folder(film)
