@@ -84,7 +84,9 @@ LOSSES: Final[Registry[Loss]] = Registry(
 # what the control was called when there was one
 ALIASES: Final = {"adc": "gsplat"}
 QUICK_SCALER: Final = 0.1
-PRESETS: Final = {"paper": 1.0, "quick": QUICK_SCALER}
+# chooses size and length by what is there: `pop_fast.train.automatic`
+AUTOMATIC: Final = "auto"
+PRESETS: Final = {"paper": 1.0, "quick": QUICK_SCALER, AUTOMATIC: 1.0}
 # about what theta_blur comes to in the smallest images of the paper (10.7 in 980 x 545), so that 11 pixels are blur;
 # "quick" is for images smaller than those
 QUICK_BLUR_MIN_PIXELS: Final = 10.0
@@ -103,7 +105,8 @@ class Given:
             rasterizer, "3dgs-2023" for those before October 2024, and on top of these "pup", "mini-splatting",
             "taming" and "speedy-splat"; or one that another package registers.
         preset: "paper" is the paper's 30,000 steps, for a GPU or a night; "quick" a tenth of them, with thresholds for
-            small images. It gives defaults: what is said besides wins.
+            small images; "auto" has these thresholds and as much of the schedule as the time allows, which `pop train`
+            chooses. It gives defaults: what is said besides wins.
         steps_scaler: multiplies the default of every step number; None takes the preset's.
         scale_lambda_pop: divide the default of lambda_pop by the scaler, so that the push of the prior adds up to the
             same over a short schedule; it then weighs more against the photographs than in the paper.
@@ -111,7 +114,7 @@ class Given:
     """
 
     method: str = "pop"
-    preset: Literal["paper", "quick"] = "paper"
+    preset: Literal["paper", "quick", "auto"] = "paper"
     steps_scaler: float | None = None
     scale_lambda_pop: bool = False
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -193,7 +196,7 @@ def defaults(given: Given) -> dict[str, Any]:
     strategy = kind().scaled(by)
     if given.scale_lambda_pop:
         strategy = replace(strategy, lambda_pop=strategy.lambda_pop / by)
-    if given.preset == "quick":
+    if given.preset in ("quick", AUTOMATIC):
         strategy = replace(strategy, blur_min_pixels=QUICK_BLUR_MIN_PIXELS)
 
     def scaled(step: int) -> int:
