@@ -122,8 +122,8 @@ class Replay:
     def view(self, step: int, n: int) -> ScriptedView:
         """Return the render of a step. Raises LookupError where it is of another number of Gaussians."""
         rows, kept = self._rows(step, n), int(self._arrays["kept_pixels"][self.steps.index(step)])
-        given = (np.swapaxes(self._arrays[name][rows], 0, 1) for name in _VIEW)
-        return ScriptedView(*given, None if kept < 0 else kept)
+        given = {name: np.swapaxes(self._arrays[name][rows], 0, 1) for name in _VIEW}
+        return ScriptedView(**given, kept_pixels=None if kept < 0 else kept)
 
     def gradients(self, step: int, shapes: Any) -> dict[str, np.ndarray]:
         """Return the gradients of a step."""
