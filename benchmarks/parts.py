@@ -68,14 +68,14 @@ def works(row: Mapping[str, Any]) -> dict[str, Work]:
     numbers = SHORT + rest
     adam = n * numbers * 24  # three arrays, read and written
     return {
-        "see": Work(
+        "project": Work(
             visible * _of_gaussian(f"project_kernel<{degree}, false>") / LANES,
             4 * (n * SHORT + visible * rest) + n * SEEN + visible * SPLAT,
         ),
         "list": Work(0, visible * (8 * 9 + 2 * SEEN) + entries * LISTED),
         "blend": Work(forward + channels * DIFFERENCE / LANES, lists + 12 * channels),
-        "compare": Work(channels * (TAPS + QUOTIENT) / LANES, 28 * channels),
-        "gather": Work(channels * (TAPS + SLOPE) / LANES, 24 * channels),
+        "loss": Work(channels * (TAPS + QUOTIENT) / LANES, 28 * channels),
+        "image_gradient": Work(channels * (TAPS + SLOPE) / LANES, 24 * channels),
         "transpose": Work(back, lists + 4 * COLUMNS * entries + 4 * channels),
         "update": Work(
             (visible * _of_gaussian(f"update_kernel<{degree}>") + (n - visible) * numbers * ADAM) / LANES,

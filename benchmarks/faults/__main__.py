@@ -1,12 +1,12 @@
 """python -m benchmarks.faults [--minutes M] [--only PART] [--quick] [--seed N] [--save] [--out FILE]
 
 Runs the parts below, prints what failed, and writes benchmarks/results/faults.json, of which docs/reliability.md has
-the tables; a part that is run alone replaces its own results. With --minutes the fuzzer and the kill loop share that
-time, or the one of them that runs has it; without, they stop after their least. --save keeps the files that broke a
-reader among the regressions of benchmarks/faults/corpus. Runs are tried of every --kind: by the native step, on two
-ranks and in blocks; --kills says how often each is killed at least, --places at how many changes of the disk it is
-disturbed. --quick tries a few places of those parts that have no test of their own, as the tests do. Exit status 1
-where anything failed.
+the tables; a part that is run alone replaces its own results, and so does a --reader or a --kind. With --minutes the
+fuzzer and the kill loop share that time, or the one of them that runs has it; without, they stop after their least.
+--save keeps the files that broke a reader among the regressions of benchmarks/faults/corpus. Runs are tried of every
+--kind: by the native step, on two ranks and in blocks; --kills says how often each is killed at least, --places at how
+many changes of the disk it is disturbed. --quick tries a few places of those parts that have no test of their own, as
+the tests do. Exit status 1 where anything failed.
 
     fuzz        mutated files to every reader, in children with limits of memory and time
     kills       SIGKILL at random moments of a run; continuing gives the same bits
@@ -61,8 +61,10 @@ def main() -> int:
     cv2.setNumThreads(1)
     found = {part: result for part in args.only or (QUICK if args.quick else PARTS) for result in [_run(part, args)]}
     earlier = read_json(args.out)
-    # kinds of runs that are tried alone replace their own results
+    # kinds of runs, and a reader, that are tried alone replace their own results
     kept = {part: {**earlier.get(part, {}), **found[part]} for part in found if args.kind is not None}
+    if args.reader is not None and "fuzz" in found and "fuzz" in earlier:
+        kept["fuzz"] = fuzz.renewed(earlier["fuzz"], found["fuzz"])
     write_json(args.out, {**earlier, "machine": machine(), **found, **kept})
     failed = [line for part, result in found.items() for line in _failures(part, result)]
     print("\n".join(failed) or "nothing failed")

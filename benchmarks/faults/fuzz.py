@@ -78,6 +78,20 @@ def fuzz(inputs: int, minutes: float, seed: int, only: str | None = None, save: 
     }
 
 
+def renewed(whole: dict[str, Any], part: dict[str, Any]) -> dict[str, Any]:
+    """Put what came of some readers in the place of what came of them in a run of all.
+
+    Args:
+        whole: what `fuzz` gave for all readers; seed and minutes stay its.
+        part: what it gave for some, which have their own seed.
+    """
+    again = {name: {**row, "seed": part["seed"]} for name, row in part["readers"].items()}
+    readers = {**whole["readers"], **again}
+    failures = {key: of for key, of in whole["failures"].items() if of["reader"] not in again} | part["failures"]
+    inputs = sum(row[outcome] for row in readers.values() for outcome in OUTCOMES)
+    return {**whole, "inputs": inputs, "readers": readers, "failures": failures}
+
+
 @dataclass
 class _Turns:
     """What has come of a reader's inputs so far; the next is `at`, and those below 0 once broke something."""

@@ -6,6 +6,7 @@ public function, `run(argv) -> int`, and prints nothing but its result; all erro
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import difflib
 import importlib
@@ -17,7 +18,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from types import FrameType
-from typing import Final
+from typing import Final, NoReturn
 
 from pop_fast.cli.errors import describe, message
 
@@ -47,6 +48,7 @@ COMMANDS: Final = {
 EXIT_INCOMPLETE: Final = 1
 EXIT_BAD_INPUT: Final = 2
 EXIT_INTERRUPTED: Final = 130
+EXIT_TERMINATED: Final = 128 + signal.SIGTERM
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -58,7 +60,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0, or 1 where something is missing, or 2 for bad input and bad usage, or 130 after Ctrl-C, or 143 after SIGTERM.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
+    if argv is not None:
+        return _status(list(argv))
+    status = _status(sys.argv[1:])
+    if status in (EXIT_INTERRUPTED, EXIT_TERMINATED):
+        _leave(status)
+    return status
+
+
+def _leave(status: int) -> NoReturn:
+    """End the process: what is registered for its end is done, but no object is taken apart, which takes seconds."""
+    # no public function does this alone
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(status)
+
+
+def _status(words: list[str]) -> int:
     debug = "--debug" in words or os.environ.get("POP_DEBUG", "") not in ("", "0")
     words = [word for word in words if word != "--debug"]
     for stream in (sys.stdout, sys.stderr):
@@ -74,7 +94,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return stop.code if isinstance(stop.code, int) else 0
     except KeyboardInterrupt as stop:
         print("pop: interrupted", file=sys.stderr)
-        return 128 + signal.SIGTERM if isinstance(stop, _Terminated) else EXIT_INTERRUPTED
+        return EXIT_TERMINATED if isinstance(stop, _Terminated) else EXIT_INTERRUPTED
     except BrokenPipeError:
         # the reader has gone, as in `pop train --help | head`: what is still buffered has nowhere to go
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -35,7 +35,7 @@ def bars(show: bool = True) -> Iterator[Report]:
         bar.total = total
         bar.update(done - bar.n)
 
-    with Heartbeat(show) as beat:
+    with Heartbeat(show, draw=lambda: [bar.refresh() for bar in tuple(current.values())]) as beat:
         try:
             yield report
         finally:

@@ -129,6 +129,7 @@ def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequen
     if begun is not None:
         lock.take()
         _extend(folder, begun, job)
+        _take_threads(folder, config)
     if begun is None or read_plan(folder) is None:
         division = _divided(config, options, job)
         print(
@@ -168,6 +169,7 @@ def _begun(folder: Path, config: TrainConfig, job: Job) -> Job | None:
     """
     from pop_fast.blocks.plan import read_job
     from pop_fast.train.config import first_difference
+    from pop_fast.train.engines import engine_of
     from pop_fast.train.results import read_config
 
     before = read_job(folder)
@@ -179,6 +181,9 @@ def _begun(folder: Path, config: TrainConfig, job: Job) -> Job | None:
     if config.near_plane is None and config.profile == begun.profile:
         # what the profile's comes to in the world of this capture was written down when the run began
         config = replace(config, near_plane=begun.near_plane)
+    if not job.rounds and not engine_of(config).depends_on_threads:
+        # between rounds torch sums what blocks have, which rounds otherwise with other threads
+        begun = replace(begun, threads=config.threads)
     theirs = {**begun.binding(), **_dividing(before)}
     found = first_difference({**config.binding(), **_dividing(_no_longer(job, before))}, theirs)
     if found:
@@ -207,6 +212,15 @@ def _extend(folder: Path, before: Job, job: Job) -> None:
         marker_of(folder, None, None).unlink(missing_ok=True)
         more = replace(before, rounds=job.rounds, round_steps=job.round_steps)
         write_atomically(folder / JOB, lambda file: file.write(job_text(more).encode()))
+
+
+def _take_threads(folder: Path, config: TrainConfig) -> None:
+    """Let the parts of a run that are not done yet have as many threads as are asked for now."""
+    from pop_fast.train.results import ResultFolder, read_config
+
+    begun = read_config(folder)
+    if begun.threads != config.threads:
+        ResultFolder(folder).write_settings(replace(config, near_plane=begun.near_plane), {})
 
 
 def _rounds_of(job: Job) -> str:

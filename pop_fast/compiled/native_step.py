@@ -64,7 +64,7 @@ LOSSES: Final = ("l2", "l1")
 MOST_ENTRIES: Final = 2**31 - 1
 # what the step measures, the first of `StepStats`
 N_VALUES: Final = 5
-PARTS: Final = ("see", "list", "blend", "compare", "gather", "transpose", "update")
+PARTS: Final = ("project", "list", "blend", "loss", "image_gradient", "transpose", "update")
 # what a step had to do: `pop::StepCounts` of step.h, where each is explained, in its order
 COUNTS: Final = ("visible", "entries", "walked", "chunks", "pairs", "marked", "reached")
 T = TypeVar("T")

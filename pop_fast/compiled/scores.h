@@ -135,7 +135,7 @@ void contributions_of_tile(const Scores<Real> &scores, const Pixels<Real> &pixel
     state.sums.add(0, k, weight);
     state.sums.add(1, k, select(blended, all(Real(1)), none));
     if (scores.pixel_map) state.sums.add(2, k, select(blended, load(&state.map[at]), none));
-    state.sums.add(3, k, select(blended, root_of<Real>(dx * dx + dy * dy), none));
+    state.sums.add(3, k, select(blended, root_of<Real>(fma(dx, dx, dy * dy)), none));
   };
   const auto after = [&](int64_t, int64_t first) {
     state.sums.write(CONTRIBUTIONS, entries.count, scores.rows + CONTRIBUTIONS * first);
@@ -232,7 +232,7 @@ void moments_of_tile(const Scores<Real> &scores, const Pixels<Real> &pixels, int
       if (any(alpha >= thresholds.ceiling))
         through = through_ceiling<Real>(scores, thresholds.ceiling,
                                         exponent<Real, ROW>(entries, again.rows, strip, k, x, y), alpha, weight);
-      const Vec<Real> s[5] = {A * dx + B * dy, B * dx + C * dy, half * dx * dx, dx * dy, half * dy * dy};
+      const Vec<Real> s[5] = {fma(all(A), dx, B * dy), fma(all(B), dx, C * dy), half * dx * dx, dx * dy, half * dy * dy};
       Vec<Real> G[3], squares = {};
       for (int c = 0; c < 3; c++) {
         const Vec<Real> suffix_color = load(state.suffix_color_of(c, at)), more = entries.rgb[k][c] - suffix_color;

@@ -137,7 +137,8 @@ inline Compared<Real> compare(Vec<Real> mu, Vec<Real> dd, Vec<Real> dy, Vec<Real
   const Vec<Real> B2 = two * (s_dy + s_yy) + s_dd + Real(SSIM_C2);
   const Vec<Real> a = mu_sq / B1, b = s_dd / B2, kept_a = one - a, kept_b = one - b;
   const Vec<Real> slope = (two * weight) * (kept_a / B2);
-  const Vec<Real> v_mu = (two * weight) * ((kept_a * mu - a * mu_y) * kept_b / B1) - slope * (mu - b * mu_x);
+  const Vec<Real> by_mu = fms(kept_a, mu, a * mu_y) * kept_b / B1;
+  const Vec<Real> v_mu = fms(all(two * weight), by_mu, slope * (mu - b * mu_x));
   return {a + kept_a * b, v_mu, slope * kept_b, -(slope * b)};
 }
 

@@ -25,7 +25,7 @@ bool Stepper::next(Work &work) {
   switch (stage++) {
   case 0:
     begin();
-    work = see();
+    work = project();
     return true;
   case 1:
     if (!all_finite() || !few_enough()) return false;
@@ -39,10 +39,10 @@ bool Stepper::next(Work &work) {
     work = blend_tiles();
     return true;
   case 4:
-    work = compare();
+    work = loss();
     return true;
   case 5:
-    work = gather();
+    work = image_gradient();
     return true;
   case 6:
     work = transpose_tiles();
@@ -61,7 +61,7 @@ bool Stepper::next(Work &work) {
 
 // Add the time since the last work began to what that was a part of.
 void Stepper::book_time() {
-  constexpr StepPart part_of[] = {SEE, LIST, LIST, BLEND, COMPARE, GATHER, TRANSPOSE, UPDATE};
+  constexpr StepPart part_of[] = {PROJECT, LIST, LIST, BLEND, LOSS, IMAGE_GRADIENT, TRANSPOSE, UPDATE};
   const auto now = std::chrono::steady_clock::now();
   if (stage > 0) given->seconds[part_of[stage - 1]] += std::chrono::duration<double>(now - stage_began).count();
   stage_began = now;

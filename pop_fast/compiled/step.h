@@ -1,13 +1,13 @@
 // One step of training: what it is given, and what it keeps from one step to the next.
 //
 // The step in order, every line shared out to the threads (`step_*.cpp`), `list` in two goes:
-//     see         a Gaussian's splat, colour, and the tiles it reaches
-//     list        depth order; each tile's list, front to back
-//     blend       the picture tile by tile, who dominates it, its difference from the photograph
-//     compare     SSIM and its derivatives by the windows' moments
-//     gather      the gradient with respect to the picture
-//     transpose   tile by tile back to the entries of the lists
-//     update      entries added up, back to raw parameters, the POP term, statistics of density control, Adam
+//     project         a Gaussian's splat, colour, and the tiles it reaches
+//     list            depth order; each tile's list, front to back
+//     blend           the picture tile by tile, who dominates it, its difference from the photograph
+//     loss            SSIM and its derivatives by the windows' moments
+//     image_gradient  the gradient of the loss with respect to the picture
+//     transpose       tile by tile back to the entries of the lists
+//     update          entries added up, back to raw parameters, the POP term, statistics of density control, Adam
 // The arithmetic of one Gaussian is the one that the CUDA kernels run. Every sum is over parts that do not depend on the
 // number of threads, so that no bit does.
 #pragma once
@@ -29,7 +29,7 @@
 namespace pop {
 
 enum StepGroup { MEANS, SCALES, QUATS, OPACITIES, SH0, SHN, GROUPS };
-enum StepPart { SEE, LIST, BLEND, COMPARE, GATHER, TRANSPOSE, UPDATE, PARTS };
+enum StepPart { PROJECT, LIST, BLEND, LOSS, IMAGE_GRADIENT, TRANSPOSE, UPDATE, PARTS };
 enum StepValue { PIXELWISE, SSIM, OBJECTIVE, SQUARE, POP, VALUES };
 
 constexpr int STEP_TILE = LANES<float>;  // a row of a tile is one vector
@@ -184,10 +184,10 @@ private:
   void book_time();
   void begin();
   void make_workers();
-  Work see();
-  template <int DEGREE> void see_rows(Worker &own, int64_t first, int64_t last);
-  template <int DEGREE> void see_block(RowBlock &block, int64_t first, int64_t last, Part &part);
-  template <int DEGREE> bool see_row(const RowBlock &block, int64_t i, int64_t l, Seen &to);
+  Work project();
+  template <int DEGREE> void project_part(Worker &own, int64_t first, int64_t last);
+  template <int DEGREE> void project_block(RowBlock &block, int64_t first, int64_t last, Part &part);
+  template <int DEGREE> bool project_splat(const RowBlock &block, int64_t i, int64_t l, Seen &to);
   void reach_tiles(Seen &of) const;
   template <class F> void each_tile(const Seen &of, F f) const;
   bool all_finite() const;
@@ -200,9 +200,9 @@ private:
   Work blend_tiles();
   void differ(int64_t tile);
   Ssim<float> ssim_of(int channel);
-  Work compare();
-  Work gather();
-  void gather_rows(Worker &own, int64_t first, int64_t last);
+  Work loss();
+  Work image_gradient();
+  void image_gradient_rows(Worker &own, int64_t first, int64_t last);
   Work transpose_tiles();
   void count_sides();
   int side_of(int64_t i) const;

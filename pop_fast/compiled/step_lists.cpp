@@ -29,9 +29,9 @@ uint32_t ordered_bits(float x) {
 
 }  // namespace
 
-// ---- see: from raw parameters to splats and colours
+// ---- project: from raw parameters to splats and colours
 
-Work Stepper::see() {
+Work Stepper::project() {
   const int64_t n_parts = parts_of(given->n, ROWS);
   part_visible.assign(size_t(n_parts), 0);
   part_slots.assign(size_t(n_parts), 0);
@@ -39,7 +39,7 @@ Work Stepper::see() {
   Work work = {given->n, ROWS, {}};
   with_degree(given->degree, [&](auto degree) {
     work.f = [this](int thread, int64_t first, int64_t last) {
-      see_rows<decltype(degree)::value>(*workers[size_t(thread)], first, last);
+      project_part<decltype(degree)::value>(*workers[size_t(thread)], first, last);
     };
   });
   return work;
@@ -60,15 +60,15 @@ bool Stepper::few_enough() const {
 }
 
 // The visible ones' keys begin where the part's Gaussians do.
-template <int DEGREE> void Stepper::see_rows(Worker &own, int64_t first, int64_t last) {
+template <int DEGREE> void Stepper::project_part(Worker &own, int64_t first, int64_t last) {
   Part part = {keys.get(given->n) + first};
   for (int64_t block = first; block < last; block += ROW_BLOCK)
-    see_block<DEGREE>(own.block, block, std::min(last, block + ROW_BLOCK), part);
+    project_block<DEGREE>(own.block, block, std::min(last, block + ROW_BLOCK), part);
   part_visible[first / ROWS] = part.bad < 0 ? part.visible : -part.bad - 1;
   part_slots[first / ROWS] = part.slot;
 }
 
-template <int DEGREE> void Stepper::see_block(RowBlock &block, int64_t first, int64_t last, Part &part) {
+template <int DEGREE> void Stepper::project_block(RowBlock &block, int64_t first, int64_t last, Part &part) {
   Seen *const all = seen.get(given->n);
   int32_t *const count = counts.get(given->n);
   for (int64_t i = first; i < last; i++) {
@@ -84,14 +84,14 @@ template <int DEGREE> void Stepper::see_block(RowBlock &block, int64_t first, in
     Seen &row = all[i];
     row.n = -1;
     count[i] = 0;
-    if (!see_row<DEGREE>(block, i, i - first, row)) continue;
+    if (!project_splat<DEGREE>(block, i, i - first, row)) continue;
     row.first = int32_t(part.slot);
     part.slot += row.n;
     if (row.n > 0) part.keys[part.visible++] = uint64_t(ordered_bits(row.depth)) << 32 | uint64_t(i);
   }
 }
 
-template <int DEGREE> [[gnu::flatten]] bool Stepper::see_row(const RowBlock &block, int64_t i, int64_t l, Seen &to) {
+template <int DEGREE> [[gnu::flatten]] bool Stepper::project_splat(const RowBlock &block, int64_t i, int64_t l, Seen &to) {
   if (!in_front(block.depths[0][l], profile)) return false;
   const SplatRow<float> splat = splat_on_screen(block.on_screen(l), camera, profile, options);
   if (splat.radii.x <= 0) return false;

@@ -51,7 +51,7 @@ void Stepper::differ(int64_t tile) {
   }
 }
 
-// ---- compare and gather: D-SSIM with its gradient, and that of L1 or L2
+// ---- loss and image_gradient: D-SSIM with its gradient, and that of L1 or L2
 
 Ssim<float> Stepper::ssim_of(int channel) {
   const StepGiven &g = *given;
@@ -74,7 +74,7 @@ Ssim<float> Stepper::ssim_of(int channel) {
   return of;
 }
 
-Work Stepper::compare() {
+Work Stepper::loss() {
   const int64_t rows = ssim[0].rows(), margin = ssim[0].margin();
   for (const auto &of : ssim)
     for (int map = 0; map < 3; map++) {
@@ -89,12 +89,12 @@ Work Stepper::compare() {
           }};
 }
 
-Work Stepper::gather() {
+Work Stepper::image_gradient() {
   return {given->height, WINDOW_ROWS,
-          [this](int thread, int64_t first, int64_t last) { gather_rows(*workers[size_t(thread)], first, last); }};
+          [this](int thread, int64_t first, int64_t last) { image_gradient_rows(*workers[size_t(thread)], first, last); }};
 }
 
-void Stepper::gather_rows(Worker &own, int64_t first, int64_t last) {
+void Stepper::image_gradient_rows(Worker &own, int64_t first, int64_t last) {
   const StepGiven &g = *given;
   const int64_t n_pixels = g.width * g.height, begin = first * g.width, end = last * g.width;
   const float unit = float(g.pixel_weight / double(3 * std::max<int64_t>(g.n_kept, 1))), twice = 2.0f * unit;

@@ -234,7 +234,7 @@ template <class Real>
 inline void take(const Thresholds<Real> &thresholds, Vec<Real> e, Vec<Real> &T, Vec<Real> &alpha, Vec<Real> &weight) {
   const Vec<Real> none = {}, raw = exp2_of(e), capped = select(raw > thresholds.ceiling, all(thresholds.ceiling), raw);
   alpha = select(raw > thresholds.floor, capped, none);
-  const Vec<Real> next = T - T * alpha;
+  const Vec<Real> next = fnma(T, alpha, T);
   const Mask<Real> lives = next > thresholds.stop;
   weight = select(lives, T * alpha, none);
   alpha = select(lives, alpha, none);

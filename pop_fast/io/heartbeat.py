@@ -1,27 +1,30 @@
-"""A line of progress every half minute where nobody sees a bar: in log files, under Slurm and nohup, in notebooks."""
+"""A sign of life while long work runs: a bar's clock in a terminal, a line every half minute in a log or a notebook."""
 
 from __future__ import annotations
 
 import sys
 import threading
 import time
+from collections.abc import Callable
 from types import TracebackType
 from typing import Final
 
 __all__ = ["PERIOD", "Heartbeat", "duration", "so_far"]
 
-# seconds between two lines
+# seconds between two lines, and between two looks of a bar
 PERIOD: Final = 30.0
+TICK: Final = 1.0
 
 
 class Heartbeat:
-    """Tell on standard error what is being done, while the block runs, as long as that is no terminal.
+    """Tell on standard error what is being done, while the block runs; in a terminal, draw its bar anew.
 
-    A thread of its own tells it, so that a line also comes from within one long computation.
+    A thread of its own does it, so that a line also comes from within one long computation, and a bar's clock goes on.
 
     Args:
         show: False tells nothing.
         period: seconds between two lines; None takes `PERIOD`.
+        draw: called every `TICK` seconds in a terminal, where no line is told.
 
     Example:
         with Heartbeat() as beat:
@@ -29,14 +32,19 @@ class Heartbeat:
                 beat.say(f"reading photographs: {done} of {len(photographs)}")
     """
 
-    def __init__(self, show: bool = True, period: float | None = None) -> None:
+    def __init__(
+        self, show: bool = True, period: float | None = None, draw: Callable[[], object] | None = None
+    ) -> None:
         self._period = PERIOD if period is None else period
         # pythonw and some notebooks have no such stream
-        self._shown = show and sys.stderr is not None and not sys.stderr.isatty()
+        stream = sys.stderr if show else None
+        self._does = None if stream is None else self._tell
+        if stream is not None and stream.isatty():
+            self._does, self._period = draw, TICK
         self._text = ""
         self._started = 0.0
         self._over = threading.Event()
-        self._thread = threading.Thread(target=self._tell, name="heartbeat", daemon=True)
+        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
 
     def say(self, text: str) -> None:
         """Set what the next line tells."""
@@ -44,7 +52,7 @@ class Heartbeat:
 
     def __enter__(self) -> Heartbeat:
         self._started = time.monotonic()
-        if self._shown:
+        if self._does is not None:
             self._thread.start()
         return self
 
@@ -52,14 +60,17 @@ class Heartbeat:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._over.set()
-        if self._shown:
+        if self._does is not None:
             self._thread.join()
 
+    def _beat(self) -> None:
+        while self._does is not None and not self._over.wait(self._period):
+            self._does()
+
     def _tell(self) -> None:
-        while not self._over.wait(self._period):
-            if self._text:
-                took = duration(time.monotonic() - self._started)
-                print(f"pop: {self._text} ({took})", file=sys.stderr, flush=True)
+        if self._text:
+            took = duration(time.monotonic() - self._started)
+            print(f"pop: {self._text} ({took})", file=sys.stderr, flush=True)
 
 
 def duration(seconds: float) -> str:

@@ -180,6 +180,9 @@ class TrainingRun:
             self._results.hold()
             self._results.check(self._resume, self._overwrite)
         self._ranks.wait()
+        with self._times.is_loading(), self._stop.abandoning(self._ranks.size == 1):
+            # seconds of large photographs, for which a request to stop has no time
+            _ = self._fingerprint
         found = ckpt.list_checkpoints(self._results.path) if self._resume else []
         if found:
             self._restore(found[-1][1])
@@ -197,7 +200,7 @@ class TrainingRun:
         config = self.config
         shown = config.progress and self._ranks.writes
         bars = tqdm(total=config.max_steps, initial=self.step, disable=None if shown else True)
-        with bars as bar, Heartbeat(shown) as beat:
+        with bars as bar, Heartbeat(shown, draw=bar.refresh) as beat:
             beat.say(f"step {self.step:,} of {config.max_steps:,}, {len(self.params['means']):,} Gaussians")
             while self.step < config.max_steps:
                 longest = min(self.stepper.longest, config.max_steps if self._watch is None else _WATCHED_STEPS)
@@ -389,7 +392,7 @@ class TrainingRun:
             "view_order": self._order.state_dict(),
             "appearance": self.appearance.state_dict(),
             "config": self.config.binding(),
-            "capture": self._fingerprint(),
+            "capture": self._fingerprint,
             "metrics_bytes": self._results.flush_metrics(),
             "seconds": self._times.state_dict(),
             "threads": torch.get_num_threads(),
@@ -403,7 +406,7 @@ class TrainingRun:
         content = ckpt.load_checkpoint(path)
         threads = torch.get_num_threads() if self._engine.depends_on_threads else None
         n_views = len(self._train)
-        ckpt.check_fits(path, content, self.config, self._fingerprint(), threads, n_views, self.state.keys())
+        ckpt.check_fits(path, content, self.config, self._fingerprint, threads, n_views, self.state.keys())
         self.params = {key: Parameter(content["splats"][key]) for key in KEYS}
         self.optimizers = make_optimizers(self.params)
         ckpt.unpack_optimizers(self.optimizers, content["optimizers"])
@@ -426,6 +429,7 @@ class TrainingRun:
         config = self.config
         return active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter)
 
+    @cached_property
     def _fingerprint(self) -> dict[str, str]:
         return ckpt.capture_fingerprint(self._capture, self.config.test_every)
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 
+from pop_fast.api.registry import get_backend
 from pop_fast.blocks import jobs
 from pop_fast.blocks.plan import read_plan
 from pop_fast.children import module_command
@@ -24,7 +25,7 @@ from pop_fast.data.block import write_block
 from pop_fast.data.load import list_capture, load_capture
 from pop_fast.errors import PopError
 from pop_fast.train.checkpoint import load_splats
-from pop_fast.train.results import ResultFolder
+from pop_fast.train.results import ResultFolder, read_config
 from pop_fast.train.views import ViewTensors
 from tests.app.captures import assert_one_line, write_photograph
 from tests.app.conftest import TRAIN, Pop
@@ -173,6 +174,36 @@ def test_a_block_that_was_interrupted_goes_on_to_the_same_bits(
     assert "continuing from step" in gone_on.out
     for key, value in splats(shared_blocks).items():
         assert torch.equal(splats(folder)[key], value)
+
+
+def test_a_run_of_the_native_step_goes_on_with_other_threads_to_the_same_bits(
+    pop: Pop, shared_capture, shared_blocks, tmp_path, monkeypatch
+):
+    reason = get_backend("compiled").why_not()
+    if reason is not None:
+        pytest.skip(reason)
+    folder = tmp_path / "stopped"
+    words = ("train", shared_capture, "--out", folder, *BLOCKS[:-1])
+    with monkeypatch.context() as patch:
+        interrupt(patch, at=11)
+        assert pop(*words, 1, "--checkpoint-every", "5").status == 130
+    gone_on = pop(*words, 2, "--checkpoint-every", "5", "--resume")
+    assert gone_on.status == 0, gone_on.err
+    assert "continuing from step" in gone_on.out
+    results = [folder / "blocks" / name / "result" for name in NAMES]
+    assert [read_config(result).threads for result in (folder, *results)] == [2, 2, 2]
+    for key, value in splats(shared_blocks).items():
+        assert torch.equal(splats(folder)[key], value)
+
+
+def test_a_run_by_autograd_whose_sums_depend_on_threads_keeps_them(pop: Pop, shared_capture, tmp_path, monkeypatch):
+    words = ("train", shared_capture, "--out", tmp_path / "stopped", *BLOCKS[:-1])
+    with monkeypatch.context() as patch:
+        interrupt(patch, at=1)
+        assert pop(*words, 1, "--backend", "fast").status == 130
+    gone_on = pop(*words, 2, "--backend", "fast", "--resume")
+    assert gone_on.status == 2
+    assert "was begun with threads = 1, but this run has threads = 2" in gone_on.err
 
 
 def test_a_run_that_is_gone_on_with_otherwise_is_refused(pop: Pop, shared_capture, blocks, result):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,11 +12,15 @@ from typing import Any
 import pytest
 
 from benchmarks.faults import sanitizers
-from benchmarks.faults.fuzz import kept
+from benchmarks.faults.__main__ import KILLS
+from benchmarks.faults.fuzz import FAILURES, OUTCOMES, kept
 from benchmarks.faults.readers import READERS
 from tests.app.children import ROOT, in_a_child
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="children are forked, and limited as Linux does")
+
+
+STORED = ROOT / "benchmarks" / "results" / "faults.json"
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +45,42 @@ def test_a_damaged_file_is_read_or_refused_in_a_line(tried: dict[str, Any], read
 
 def test_inputs_that_once_broke_something_are_kept() -> None:
     assert sum(len(kept(reader)) for reader in READERS) >= 60
+
+
+def test_a_reader_that_is_tried_alone_replaces_its_own_results(tmp_path: Path) -> None:
+    shutil.copy(STORED, tmp_path / "f.json")
+    told = ("--quick", "--only", "fuzz", "--reader", "mask", "--seed", "5", "--out", str(tmp_path / "f.json"))
+    done = subprocess.run([sys.executable, "-m", "benchmarks.faults", *told], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    before, after = (json.loads(path.read_text())["fuzz"] for path in (STORED, tmp_path / "f.json"))
+    row = after["readers"].pop("mask")
+    lost = before["readers"].pop("mask")
+    assert row.pop("seed") == 5
+    assert sum(row.values()) == 10 + len(kept("mask"))
+    assert after.pop("inputs") == before.pop("inputs") + sum(row.values()) - sum(lost[kind] for kind in row)
+    assert after == before
+
+
+def test_what_docs_reliability_tells_of_was_tried_of_every_reader_and_kind_of_run() -> None:
+    stored = json.loads(STORED.read_text())
+    of_readers = {name: {kind: row[kind] for kind in OUTCOMES} for name, row in stored["fuzz"]["readers"].items()}
+    # one needs a package
+    assert of_readers.keys() | {"photograph.heic"} == READERS.keys() | {"photograph.heic"}
+    assert all(sum(row.values()) >= 1_000 for row in of_readers.values())
+    assert sum(sum(row.values()) for row in of_readers.values()) == stored["fuzz"]["inputs"] >= 10**6
+    assert not any(row[kind] for row in of_readers.values() for kind in FAILURES)
+    assert stored["fuzz"]["failures"] == {}
+    again = stored["fuzz again"]
+    assert again["failures"] == {}
+    assert again["readers"].keys() | {"photograph.heic"} == READERS.keys() | {"photograph.heic"}
+    assert all(sum(row[kind] for kind in OUTCOMES[:3]) >= 1_000 for row in again["readers"].values())
+    told = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")
+    assert f"(commit {again['commit']}, seed {again['seed']}) were given {again['inputs']:,} more inputs" in told
+    assert stored["kills"].keys() == KILLS.keys()
+    assert all(stored["kills"][kind]["kills"] >= least for kind, least in KILLS.items())
+    assert stored["crashes"].keys() == stored["writes"].keys() == JOBS.keys()
+    for part in ("kills", "crashes", "writes", "flips"):
+        assert all(found["failures"] == [] for found in stored[part].values()), part
 
 
 JOBS = {
@@ -156,7 +197,7 @@ def test_every_unit_of_cpp_is_under_a_sanitizer(tmp_path: Path, monkeypatch: pyt
 
 
 def test_the_sanitizers_have_run_the_lines_of_every_unit_that_counts_them() -> None:
-    stored = json.loads((ROOT / "benchmarks" / "results" / "faults.json").read_text())["sanitizers"]
+    stored = json.loads(STORED.read_text())["sanitizers"]
     assert stored["failures"] == []
     counted = {str(unit.relative_to(ROOT)) for check in sanitizers.CHECKS.values() for unit in check.units}
     assert set(stored["lines"]) == counted

@@ -98,6 +98,34 @@ def test_resuming_a_finished_run_returns_its_statistics_and_writes_nothing_anew(
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
+def test_photographs_are_hashed_once_and_before_the_first_step(tmp_path, monkeypatch):
+    # seconds for large ones, which a request to stop must not wait for
+    took, hashed, taken = TrainingRun.take_steps, ckpt.capture_fingerprint, []
+    monkeypatch.setattr(ckpt, "capture_fingerprint", lambda *given: taken.append("hash") or hashed(*given))
+    monkeypatch.setattr(TrainingRun, "take_steps", lambda training, last: taken.append("steps") or took(training, last))
+    for stop_after, resume in ((17, False), (None, True)):
+        taken.clear()
+        run_to(tmp_path, stop_after, resume)
+        assert len(ckpt.list_checkpoints(tmp_path)) > 1
+        assert (taken[0], taken.count("hash")) == ("hash", 1)
+
+
+def test_a_request_to_stop_while_photographs_are_hashed_is_heard_at_once(tmp_path, monkeypatch):
+    hashed = ckpt.capture_fingerprint
+
+    def asked(*given):
+        os.kill(os.getpid(), signal.SIGTERM)
+        taken.append("hash")
+        return hashed(*given)
+
+    taken = []
+    monkeypatch.setattr(ckpt, "capture_fingerprint", asked)
+    with pytest.raises(KeyboardInterrupt):
+        TrainingRun(tiny_config(tmp_path / "r"), tiny_capture()).run()
+    assert taken == []
+    assert not list((tmp_path / "r").rglob("*"))
+
+
 def test_resuming_where_nothing_was_trained_starts(tmp_path):
     trainer = TrainingRun(tiny_config(tmp_path / "new", max_steps=2), tiny_capture(), resume=True)
     trainer.run()

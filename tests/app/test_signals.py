@@ -20,7 +20,7 @@ import torch
 from pop_fast.api.registry import get_backend
 from pop_fast.train import TrainingRun, training_run
 from pop_fast.train import checkpoint as ckpt
-from tests.app.captures import write_photograph
+from tests.app.captures import PINHOLE, camera, photograph, ring, write_model, write_photograph
 from tests.app.children import in_a_child
 from tests.app.conftest import TRAIN
 from tests.app.damage import contents
@@ -32,7 +32,7 @@ _POP = """
 import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
 from pop_fast.cli import main
-sys.exit(main(sys.argv[1:]))
+sys.exit(main())
 """
 
 
@@ -117,8 +117,17 @@ def test_a_hangup_that_is_ignored_stays_so(shared_capture: Path, tmp_path: Path)
 
 
 _LOADING = """
-import time
+import atexit, os, time
 from pathlib import Path
+
+class Large:
+    # taken apart when Python ends in its own way, as all that a training holds would be
+    def __del__(self, write=os.write):
+        write(1, b"taken apart")
+
+large = Large()
+atexit.register(print, "what was registered for the end is done")
+
 from pop_fast.data import load
 from pop_fast.data.pinhole import require_colmap
 
@@ -131,15 +140,45 @@ load.load_capture = slowly
 """
 
 
-def test_sigterm_while_a_capture_is_read_is_one_line(shared_capture: Path, tmp_path: Path) -> None:
+def test_sigterm_while_a_capture_is_read_is_one_line_and_the_end(shared_capture: Path, tmp_path: Path) -> None:
     script = _POP.replace("from pop_fast.cli import main", f"{_LOADING}from pop_fast.cli import main")
     # pycolmap prints a stack trace of its own where it is let
     words = ["train", str(shared_capture), "--out", f"{tmp_path}/r", "--images", str(tmp_path)]
-    process = subprocess.Popen([sys.executable, "-c", script, *words], stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    process = subprocess.Popen([sys.executable, "-c", script, *words], text=True, cwd=ROOT, **pipes)
     wait_until(lambda: (tmp_path / "reading").exists(), process)
     process.terminate()
-    assert process.communicate(timeout=60)[1] == "pop: interrupted\n"
+    out, err = process.communicate(timeout=60)
+    assert err == "pop: interrupted\n"
+    assert out == "what was registered for the end is done\n"
     assert process.returncode == 143
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_training_on_photographs_of_12_megapixels_is_gone_after_less_than_two_seconds_of_work(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    reason = get_backend("compiled").why_not()
+    if reason is not None:
+        pytest.skip(reason)
+    names, folder = [f"{i}.bmp" for i in range(6)], tmp_path / "r"
+    for i, name in enumerate(names):
+        write_photograph(tmp_path / "large" / "images" / name, photograph(i, 4000, 3000))
+    wide = camera(params=[100.0 * value for value in PINHOLE], width=4000, height=3000)
+    write_model(tmp_path / "large" / "sparse" / "0", names, ring(len(names)), [wide])
+    words = ("--out", folder, "--max-steps", "1000", "--test-every", "0", "--no-progress", "--quiet")
+    process = start(tmp_path, "train", tmp_path / "large", *words)
+    wait_until(lambda: (folder / "metrics.jsonl").exists(), process)
+    before = sum(map(int, Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[11:13]))
+    process.send_signal(number)
+    # by what it does and not by the clock, which depends on who else is at work
+    _, status, used = os.wait4(process.pid, 0)
+    assert os.waitstatus_to_exitcode(status) == 130
+    ((step, _),) = ckpt.list_checkpoints(folder)
+    assert process.stderr is not None
+    assert process.stderr.read() == f"pop: stopped after step {step + 1:,}; the same command with --resume continues\n"
+    assert used.ru_utime + used.ru_stime - before / os.sysconf("SC_CLK_TCK") < 2.0
 
 
 # the handler runs between any two lines of what the main thread is doing: here at each line of the wait in turn

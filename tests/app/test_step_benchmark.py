@@ -17,7 +17,7 @@ import pytest
 import torch
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
-PARTS = ("see", "list", "blend", "compare", "gather", "transpose", "update")
+PARTS = ("project", "list", "blend", "loss", "image_gradient", "transpose", "update")
 COUNTS = {"visible": 90, "entries": 640, "walked": 600, "chunks": 40, "pairs": 4096, "marked": 128, "reached": 64}
 
 

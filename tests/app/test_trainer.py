@@ -8,6 +8,7 @@ import math
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -479,6 +480,38 @@ def test_a_terminal_and_a_quiet_run_are_told_nothing(monkeypatch: pytest.MonkeyP
         beat.say("reading")
         time.sleep(0.05)
     assert stream.getvalue() == ""
+
+
+def test_the_bar_of_a_long_stage_is_drawn_anew_in_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stderr", stream := Terminal())
+    monkeypatch.setattr(heartbeat, "TICK", 0.01)
+    with bars() as report:
+        report("reading photographs", 3, 10)
+        drawn_anew(stream, "3/10")
+    assert "pop: " not in stream.getvalue()
+
+
+def drawn_anew(stream: io.StringIO, words: str) -> None:
+    end = time.monotonic() + 60.0
+    while stream.getvalue().count(words) < 4:
+        assert time.monotonic() < end, stream.getvalue()
+        time.sleep(0.01)
+
+
+def test_the_bar_of_a_step_that_takes_long_is_drawn_anew_in_a_terminal(
+    pop: Pop, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    took = TrainingRun.take_steps
+
+    def slowly(training: TrainingRun, last: int) -> Any:
+        drawn_anew(stream, "0/1 [")
+        return took(training, last)
+
+    monkeypatch.setattr(heartbeat, "TICK", 0.01)
+    monkeypatch.setattr("sys.stderr", stream := Terminal())
+    monkeypatch.setattr(TrainingRun, "take_steps", slowly)
+    words = ("--out", tmp_path / "r", "--max-steps", "1", "--skip-checks", "--skip-sizes")
+    assert pop("train", shared_capture, *words).status == 0
 
 
 def test_training_tells_how_far_it_is(

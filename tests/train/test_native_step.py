@@ -180,7 +180,9 @@ def test_how_many_steps_are_taken_at_a_time_changes_no_bit(
     method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found: list[dict[str, Any]] = []
-    own = CompiledBackend.whole_step
+    blocks: list[int] = []
+    own, took = CompiledBackend.whole_step, TrainingRun.take_steps
+    monkeypatch.setattr(TrainingRun, "take_steps", lambda run, last: blocks.append(last - run.step) or took(run, last))
     for seconds, most in ((0.0, 20), (math.inf, 3), (math.inf, 20)):
         monkeypatch.setattr(fused_stepper, "BLOCK_SECONDS", seconds)
         monkeypatch.setattr(CompiledBackend, "whole_step", lambda self, most=most: replace(own(self), most=most))
@@ -188,7 +190,11 @@ def test_how_many_steps_are_taken_at_a_time_changes_no_bit(
         config = tiny_config(folder, method, backend="compiled", checkpoint_every=0, save_steps=())
         # the sums of the last window are among what is kept
         config = replace(config, strategy=replace(config.strategy, refine_every=13, refine_stop_iter=60))
+        blocks.clear()
         TrainingRun(config, tiny_capture()).run()
+        # a block is bounded by time, and by a number where steps take none
+        longest = max(blocks)
+        assert longest == 1 if seconds == 0.0 else 1 < longest <= most, blocks
         found.append(last_checkpoint(folder, "seconds", "metrics_bytes"))
     assert found[0][".strategy.count"].any()
     for other in found[1:]:
