@@ -36,8 +36,8 @@ def scripts() -> dict[str, Script]:
         found[f"training_{method}"], found[f"training_{method}_of_two_cameras"] = trainings_of(method)
     late = {"pop_start_iter": 5, "pop_stop_iter": 15, "refine_start_iter": 100, "lambda_pop": 0.5}
     found["training_prior_alone"] = script_of("pop", settings=late, steps=(0, 4, 5, 6, 14, 15, 16), quiet=True)
-    three = {"lambda_pop": 1.0, "pop_over": "visible"}
-    found["training_prior_of_three_cameras"] = script_of("pop", settings=three, steps=(2, 3), cameras=3)
+    every = {"lambda_pop": 1.0, "pop_over": "visible"}
+    found["training_prior_of_four_cameras"] = script_of("pop", settings=every, steps=(2, 3), cameras=4)
     found |= {f"training_reading_{k}": script for k, script in enumerate(READINGS)}
     return {name.replace("-", "_"): script for name, script in found.items()}
 
