@@ -55,7 +55,7 @@ test: setup  ## run every test
 test-fast: setup  ## run in two minutes what a change most likely breaks: renderers, gradients, laws (5 examples), steps
 	HYPOTHESIS_PROFILE=quick $(TESTS) -q --failed-first \
 		-m "not slow" -k "not compiled64" tests/fast tests/gradients tests/golden tests/laws tests/oracle tests/thresholds \
-		tests/train tests/meta/test_architecture.py tests/meta/test_import_cycles.py
+		tests/train tests/meta/test_architecture.py tests/meta/test_architecture.py
 
 explore: setup  ## run the tests that draw examples with fresh ones, once for each of SEEDS="1 2 3"
 	@broken=; for seed in $(or $(SEEDS),$$(date +%s)); do \

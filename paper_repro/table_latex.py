@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Final
 
 from paper_repro.paper import Metric
-from paper_repro.table_notes import Notes
+from paper_repro.table_markdown import Notes
 from paper_repro.tables import Block, Cell, Line, Table
 
 __all__ = ["PREAMBLE", "latex"]

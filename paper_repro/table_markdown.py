@@ -1,17 +1,40 @@
-"""A table of the reproduction as Markdown."""
+"""A table of the reproduction as Markdown, and as CSV: one line a cell, numbers unrounded, every reason spelled out."""
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Iterable, Sequence
+from typing import Final
 
 from paper_repro.paper import Metric
-from paper_repro.table_notes import Notes
 from paper_repro.tables import Block, Line, Table
 
-__all__ = ["grid", "markdown"]
+__all__ = ["COLUMNS", "Notes", "csv_text", "grid", "markdown"]
 
 # so many run ids fit into a line; more are listed below the block
 _IDS = 3
+_LONG: Final = "not comparable: "
+COLUMNS: Final = (
+    *("table", "scale", "block", "row", "name", "metric", "value", "spread", "seeds"),
+    *("ours", "paper", "difference", "missing", "runs"),
+)
+
+
+class Notes:
+    """Reasons of a block's cells as numbered notes below it, in the order in which cells asked for them."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def short(self, text: str) -> tuple[str, int]:
+        """Give what stands in the cell, and the number of its note; 0 where the text says all itself."""
+        if not text.startswith(_LONG):
+            return text, 0
+        why = text.removeprefix(_LONG)
+        if why not in self.texts:
+            self.texts.append(why)
+        return _LONG.removesuffix(": "), 1 + self.texts.index(why)
 
 
 def markdown(table: Table) -> str:
@@ -93,3 +116,23 @@ def _runs(line: Line) -> str:
     if len(line.runs) > _IDS:
         return f"n = {line.seeds}, {len(line.runs)} runs, listed below"
     return f"n = {line.seeds}: " + ", ".join(run.split()[-1] for run in line.runs)
+
+
+def csv_text(table: Table) -> str:
+    """Render a table; `value` and `spread` are empty where `ours` says why there is no number or no spread."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for block in table.blocks:
+        for line in block.lines:
+            for metric in table.metrics:
+                cell = line.cells[metric.id]
+                numbers = ["" if x is None else repr(x) for x in (cell.value, cell.spread)]
+                writer.writerow(
+                    [
+                        *(table.name, table.scale, block.title, line.row, line.name, metric.id),
+                        *(*numbers, line.seeds, cell.ours, cell.paper, cell.difference),
+                        *("; ".join(line.missing) or "none", "; ".join(line.runs) or "none"),
+                    ]
+                )
+    return out.getvalue()

@@ -149,7 +149,7 @@ def alpha_from_sigma_vjp(sigma: float, opacity: float, v_alpha: float, profile: 
         profile: floor, ceiling and the ceiling's gradient.
 
     Returns:
-        Cotangents of `sigma` and `opacity`.
+        Cotangents of `sigma` and `opacity`; both 0 for a splat that does not take part, and over the ceiling.
 
     Example:
         >>> alpha_from_sigma_vjp(0.0, 0.5, 4.0), alpha_from_sigma_vjp(0.0, 1.0, 4.0)

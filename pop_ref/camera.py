@@ -234,7 +234,7 @@ def in_front(depths: Float64[np.ndarray, " N"], profile: Profile = PAPER) -> Boo
 
     Args:
         depths: camera z, world units.
-        profile: the near and far planes and their strictness.
+        profile: the near plane (0.01, itself kept) and the far plane (1e10), and their strictness.
 
     Returns:
         True where kept.

@@ -24,7 +24,7 @@ def dominant_id(ids: Sequence[int], weights: Sequence[float]) -> int:
         weights: their weights T alpha.
 
     Returns:
-        The winner's id, -1 where there is none.
+        The winner's id, -1 where there is none; a weight of 0 wins nothing.
 
     Example:
         >>> dominant_id([4, 2, 7], [0.25, 0.5, 0.5]), dominant_id([], [])

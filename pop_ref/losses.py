@@ -32,7 +32,7 @@ def l1(
     Args:
         image: the render, encoded rgb, not clamped.
         target: the photograph in [0, 1].
-        mask: True where a pixel counts; None keeps all.
+        mask: True where a pixel counts: the mean is over those alone; None keeps all.
 
     Returns:
         The loss, >= 0.
@@ -65,7 +65,7 @@ def l1_vjp(
         image: the render.
         target: the photograph.
         v_l1: cotangent of the loss.
-        mask: True where a pixel counts.
+        mask: True where a pixel counts; the others get 0.
 
     Returns:
         Cotangent of the render.
@@ -94,7 +94,7 @@ def l2(
     Args:
         image: the render, encoded rgb, not clamped.
         target: the photograph in [0, 1].
-        mask: True where a pixel counts; None keeps all.
+        mask: True where a pixel counts: the mean is over those alone; None keeps all.
 
     Returns:
         The loss, >= 0.
@@ -125,7 +125,7 @@ def l2_vjp(
         image: the render.
         target: the photograph.
         v_l2: cotangent of the loss.
-        mask: True where a pixel counts.
+        mask: True where a pixel counts; the others get 0.
 
     Returns:
         Cotangent of the render.

@@ -30,6 +30,7 @@ from pop_fast.cli.render import listed_in
 from pop_fast.data.block import read_block
 from pop_fast.data.load import load_capture
 from pop_fast.data.sfm_files import recognise_result
+from pop_fast.data.unpack import unpack
 from pop_fast.data.video import take_frames
 from pop_fast.errors import CaptureError
 from pop_fast.io.formats import load_splat_file
@@ -38,6 +39,7 @@ from pop_fast.io.images import read_image, read_mask
 from pop_fast.io.ply_rows import read_points
 from pop_fast.train import TrainConfig
 from pop_fast.train import checkpoint as ckpt
+from pop_fast.train.automatic import begun
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.load_result import load_splat, read_record
 from pop_fast.train.lpips import LPIPS
@@ -118,6 +120,11 @@ def _film(path: Path) -> Any:
         return take_frames(path, Path(folder) / "frames", 3)
 
 
+def _archive(path: Path) -> Any:
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        return unpack(path, Path(folder) / "unpacked")
+
+
 def _checkpoint(folder: Path) -> Any:
     return ckpt.load_checkpoint(ckpt.checkpoint_path(folder, 3))
 
@@ -127,6 +134,7 @@ def _splats_of_checkpoint(folder: Path) -> dict[str, torch.Tensor]:
 
 
 def _resumed(folder: Path) -> Any:
+    begun(folder)
     return choose_backend(TrainConfig.of(result_dir=str(folder), backend="auto"), resume=True)
 
 
@@ -209,6 +217,7 @@ _PICTURES = {
     "photograph with EXIF": Reader("photos/exif.jpg", "", _photograph),
     **({"photograph.heic": Reader("photos/photo.heic", "", _photograph)} if can_read_heif() else {}),
     "mask": Reader("photos/photo.png", "", read_mask),
+    "archive of photographs": Reader("splats/sog.sog", "", _archive, "zip"),
     **{f"video.{kind}": Reader(f"films/film.{kind}", "", _film) for kind in ("avi", "mp4", "webm")},
 }
 _RUNS = {

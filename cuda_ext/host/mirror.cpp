@@ -5,7 +5,6 @@
 
 #include <string.h>
 
-#include "mirror_losses.h"
 #include "mirror_render.h"
 #include "mirror_stages.h"
 
@@ -14,7 +13,7 @@ namespace mirror {
 
 template <class Real>
 int call(const char* name, Arguments<Real>* arguments) {
-    for (const Entry<Real>* table : {stage_table<Real>(), loss_table<Real>(), render_table<Real>()})
+    for (const Entry<Real>* table : {stage_table<Real>(), render_table<Real>()})
         for (; table->name != nullptr; ++table)
             if (strcmp(table->name, name) == 0) {
                 table->run(*arguments);

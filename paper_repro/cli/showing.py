@@ -64,9 +64,8 @@ def table(words: Sequence[str]) -> int:
     args = parser.parse_args(words)
     from paper_repro import tables
     from paper_repro.results import existing_folder, read_all
-    from paper_repro.table_csv import csv_text
     from paper_repro.table_latex import latex
-    from paper_repro.table_markdown import markdown
+    from paper_repro.table_markdown import csv_text, markdown
 
     results, absent = read_all(args.scale, existing_folder(args.results)), _absent(args.scale, args.data)
     made = (

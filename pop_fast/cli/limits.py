@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 else:
     # what is registered when the program starts
     FormatName = Literal[(*format_names(), "html")]
-# views that scores are summed over, at most: every so many of a larger capture
+# views that scores are summed over, at most; of a larger capture, an even selection
 _MOST_VIEWS: Final = 100
 # bytes of what `--target-mb` counts in
 _MEGABYTE: Final = 1_000_000

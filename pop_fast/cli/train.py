@@ -7,7 +7,7 @@ import os
 import sys
 import time
 import typing
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
@@ -22,14 +22,26 @@ from pop_fast.cli.errors import describe, printable
 from pop_fast.cli.finish import FinishOptions, finish
 from pop_fast.cli.limits import LimitOptions
 from pop_fast.cli.train_blocks import check_blocks, train_in_blocks
-from pop_fast.cli.train_checks import about_large, as_begun, check_early, check_output, record_of, resumption, stopped
-from pop_fast.cli.train_options import PLAN, BlocksOptions, overrides, plan_of
+from pop_fast.cli.train_checks import (
+    about_large,
+    as_begun,
+    check_early,
+    check_output,
+    chooses_for_itself,
+    record_of,
+    resumption,
+    stopped,
+    with_length,
+    with_size,
+)
+from pop_fast.cli.train_options import PLAN, BlocksOptions, overrides, plan_of, rename_aliases
 from pop_fast.cli.view import LiveView, check_viewer
 from pop_fast.data.sfm_files import SfmOptions
 from pop_fast.errors import PopError
+from pop_fast.train.automatic import begun, check_minutes
 from pop_fast.train.choose import choose_backend, on_gpu
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.presets import ALIASES, LOSSES, METHODS, Given
+from pop_fast.train.presets import ALIASES, AUTOMATIC, LOSSES, METHODS, Given
 from pop_fast.train.steps import why_not_trained
 from pop_ref.constants import PROFILES
 
@@ -39,9 +51,10 @@ if TYPE_CHECKING:
     from pop_fast.train.training_run import TrainingRun
 
 _EXAMPLES: Final = """
-    pop train scene                          POP, the paper's 30,000 steps, results in out/scene_pop
-    pop train scene --preset quick           1,500 steps at rates of their own, for a CPU
-    pop train photos --factor 4              a bare folder of photographs: cameras are found first
+    pop train photos                         size and schedule by what is there; results in out/photos_pop
+    pop train walk.mp4 --minutes 10          a video, or photos.zip; no longer than that
+    pop train scene --preset paper           POP as published: 30,000 steps, photographs as they are
+    pop train scene --preset quick           1,500 steps at rates of their own, for a first look
     pop train scene --method gsplat          the control: gsplat's default strategy, with opacity reset
     pop train scene --method 3dgs            Inria's constants, learning rates, SSIM and rasterizer
     pop train scene --method taming          or pup, mini-splatting, speedy-splat: the paper's other methods
@@ -72,22 +85,8 @@ _NAMED: Final[dict[str, Callable[[], Iterable[str]]]] = {
 # whose options the help lists after all others, in this order; those of limits belong to exports too
 _LATER: Final = (FinishOptions, LimitOptions, BlocksOptions)
 _DOCUMENTED: Final = (BlocksOptions, FinishOptions, LimitOptions, Given, TrainConfig)
-# words of other trainers' command lines: Inria's, gsplat's
-_ALIASES: Final = {
-    **dict.fromkeys(("-s", "--source-path", "--data-dir", "--data"), "DATA"),
-    **dict.fromkeys(("-m", "--model-path", "--result-dir", "-o"), "--out"),
-    "--data-factor": "--factor",
-    "--iterations": "--max-steps",
-}
-_SMALLER: Final = (
-    "--factor 2 (4, 8) trains on photographs shrunk by so much; --sfm.max-size is only how large they are while "
-    "cameras are searched for"
-)
-# of which the nearest option by its letters is another thing
-_ELSEWHERE: Final = dict.fromkeys(("--max-size", "--resolution", "-r", "--downscale", "--downscale-factor"), _SMALLER)
 # what trains, and takes longest to import
 _TRAINING: Final = ("pop_fast.train.training_run", "pop_fast.compiled.native_step")
-_IGNORED: Final = frozenset({"--eval"})  # Inria: hold out every 8th view; here the default (--test-every 0 holds none)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -95,9 +94,15 @@ class _Run(BlocksOptions, FinishOptions):
     """Fit a splat to a capture or a folder of photographs.
 
     DATA is a folder with a COLMAP model (the largest in sparse), with transforms.json, with what Polycam, Metashape or
-    RealityCapture export, or with photographs alone.
+    RealityCapture export, or with photographs alone; or a video, or a ZIP archive of such a folder.
+
+    Without --preset, --steps-scaler or --max-steps the run chooses for itself: photographs are shrunk until their
+    longest side is at most 2,000 px on a GPU, 1,100 px on a CPU (550 px with --minutes under 15), and the schedule is
+    what --minutes allow on this machine.
 
     Attributes:
+        minutes: train as much of the schedule as fits in so many, measuring and the report among them, the search for
+            cameras not. Without this, a preset and steps it is two hours. (default: 120)
         resume: continue from the last checkpoint in the output folder, to the same bits as without the interruption;
             start where there is none.
         overwrite: replace the results in the output folder, once the first step has been taken.
@@ -112,6 +117,7 @@ class _Run(BlocksOptions, FinishOptions):
         view_port: its port; where it is taken, the next free one.
     """
 
+    minutes: float | None = None
     resume: bool = False
     overwrite: bool = False
     missing: Literal["error", "skip"] = "error"
@@ -127,9 +133,10 @@ class _Run(BlocksOptions, FinishOptions):
 
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
-    config, options = arguments(argv)
+    config, options, chooses = _asked(argv)
     folder = Path(config.result_dir)
     options.check()
+    check_minutes(options.minutes, config, chooses)
     check_viewer(options)
     check_blocks(config, options)
     ranks = _ranks()
@@ -137,15 +144,48 @@ def run(argv: Sequence[str]) -> int:
         if _writes(ranks):
             check_output(folder, options)
         options = as_begun(folder, options)
+        config = _in_a_folder(config)
         config, chosen = choose_backend(config, options.resume)
         check_backend(config)
+        if chooses:
+            config = with_size(config, options)
         check_early(config, options.source, options.images, ranks)
         if options.blocks is not None:
             return train_in_blocks(config, options, chosen, argv)
-        status = train_capture(config, options, chosen, argv, ranks)
+        status = train_capture(config, options, chosen, argv, ranks, chooses)
     if ranks is not None:
         ranks.leave()
     return status
+
+
+def _asked(argv: Sequence[str]) -> tuple[TrainConfig, Any, bool]:
+    """Read the words; where they say no schedule, the run chooses for itself, unless it was begun with one."""
+    if not chooses_for_itself(rename_aliases(argv)):
+        config, options = arguments(argv)
+        return config, options, config.preset == AUTOMATIC and "max_steps" not in _said(config)
+    config, options = arguments(["--preset", AUTOMATIC, *argv])
+    folder = Path(config.result_dir)
+    if options.resume and (folder / "cfg.json").exists() and begun(folder) is None:
+        return *arguments(argv), False
+    return config, options, True
+
+
+def _said(config: TrainConfig) -> Mapping[str, Any]:
+    return {} if config.given is None else config.given.settings
+
+
+def _in_a_folder(config: TrainConfig) -> TrainConfig:
+    """Take photographs out of a video, or out of an archive, where the capture is one."""
+    if not Path(config.data).is_file():
+        return config
+    from pop_fast.cli.progress import bars
+    from pop_fast.data.unpack import capture_folder
+
+    with bars(config.progress) as progress:
+        folder, said = capture_folder(Path(config.data), progress)
+    if said is not None:
+        print(printable(said))
+    return replace(config, data=str(folder))
 
 
 def _ranks() -> Ranks | None:
@@ -168,7 +208,12 @@ def _stdout_closed() -> Iterator[None]:
 
 
 def train_capture(
-    config: TrainConfig, options: Any, chosen: str, argv: Sequence[str], ranks: Ranks | None = None
+    config: TrainConfig,
+    options: Any,
+    chosen: str,
+    argv: Sequence[str],
+    ranks: Ranks | None = None,
+    chooses: bool = False,
 ) -> int:
     """Train on a capture, finish the result and report on it.
 
@@ -178,6 +223,7 @@ def train_capture(
         chosen: a line on the backend.
         argv: the words after `pop train`, for commands.json.
         ranks: the processes that train together.
+        chooses: choose the schedule by the speed of this machine.
 
     Returns:
         The exit status.
@@ -199,8 +245,11 @@ def train_capture(
         print(f"cameras found in {duration(searching)}")
     for note in capture.notes:
         print(f"note: {printable(note)}")
+    config, told = with_length(config, capture, options) if chooses else (config, None)
     print(printable(f"{capture.name}: {capture.source}; {_plan(config)}"))
     print(chosen)
+    if told is not None:
+        print(told, flush=True)
     large = about_large(capture, config)
     if large is not None:
         print(f"note: {large}")
@@ -281,33 +330,9 @@ def arguments(argv: Sequence[str]) -> tuple[TrainConfig, Any]:
     if args.quiet:
         config = replace(config, progress=False)
     if not args.result_dir:
-        config = replace(config, result_dir=f"out/{Path(config.data).resolve().name}_{config.method}")
+        place = Path(config.data).resolve()
+        config = replace(config, result_dir=f"out/{place.stem if place.is_file() else place.name}_{config.method}")
     return config, args
-
-
-def rename_aliases(argv: Sequence[str]) -> list[str]:
-    """Turn options of Inria's and gsplat's trainers into ours: `-s DIR` into `DIR`, `-m DIR` into `--out DIR`, ..."""
-    words: list[str] = []
-    rest = list(argv)
-    while rest:
-        word = rest.pop(0)
-        if not word.startswith("-"):
-            # a path may hold "="
-            words.append(word)
-            continue
-        word = word.replace("--adc.", "--gsplat.", 1) if word.startswith("--adc.") else word
-        name, equals, value = word.partition("=")
-        name = name.replace("_", "-") if name.startswith("--") else name
-        if name in _ELSEWHERE:
-            raise PopError(f"{name} is no option of pop train; {_ELSEWHERE[name]}")
-        target = _ALIASES.get(name)
-        if name in _IGNORED:
-            continue
-        if target == "DATA":
-            words += [value] if equals else []
-        else:
-            words += [target or name, value] if equals else [target or word]
-    return words
 
 
 def _arguments_type(base: TrainConfig, plan: dict[str, Any], short: bool) -> type:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from pop_fast.errors import PopError
+from pop_fast.io.image_header import read_size
+from pop_fast.train import automatic
 from pop_fast.train.choose import on_gpu
 
 if TYPE_CHECKING:
@@ -139,3 +143,74 @@ def stopped(folder: Path, step: int) -> str:
     if kept[-1] == step:
         return f"stopped after step {step:,}; the same command with --resume continues"
     return f"stopped after step {step:,}; the same command with --resume continues from step {kept[-1]:,}"
+
+
+# what says how long the schedule is
+_SCHEDULE: Final = ("--preset", "--steps-scaler", "--max-steps")
+
+
+def chooses_for_itself(words: Sequence[str]) -> bool:
+    """Tell whether a command line leaves size and schedule to `pop_fast.train.automatic`.
+
+    Blocks and processes that train together take the paper's schedule, as before.
+    """
+    said = [word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")]
+    return not set(said) & {*_SCHEDULE, "--blocks"} and "WORLD_SIZE" not in os.environ
+
+
+def with_size(config: TrainConfig, options: Any) -> TrainConfig:
+    """Choose the factor of a run that chooses for itself, by the headers of its photographs, where none was said.
+
+    A run that is gone on with keeps its own, and its schedule.
+    """
+    given = config.given
+    if given is None:
+        return config
+    before = automatic.begun(Path(config.result_dir)) if options.resume else None
+    if before is not None:
+        return automatic.with_choice(config, before["scaler"], {"factor": before["factor"]})
+    if "factor" in given.settings:
+        return config
+    minutes = automatic.MINUTES if options.minutes is None else options.minutes
+    sizes = [size for path in photographs_of(config, options) if (size := read_size(path)) is not None]
+    factor = automatic.factor_for(sizes, on_gpu(config), minutes)
+    return automatic.with_choice(config, None, {"factor": factor})
+
+
+def photographs_of(config: TrainConfig, options: Any) -> list[Path]:
+    """List the photographs that a run will read, at their full size."""
+    from pop_fast.data.load import find_listing
+    from pop_fast.data.sfm import photo_folder, photographs
+    from pop_fast.io.images import find_image
+
+    root = Path(config.data)
+    listing = find_listing(root, options.source, options.images)
+    if listing is None:
+        return photographs(photo_folder(root))
+    folder = options.images
+    found = (find_image(root / (shot.folder if folder is None else folder), shot.file) for shot in listing.shots)
+    return [path for path in found if path is not None]
+
+
+def with_length(config: TrainConfig, capture: Capture, options: Any) -> tuple[TrainConfig, str | None]:
+    """Choose the schedule of a run that chooses for itself, by the speed of this machine; and say what is to come.
+
+    Returns:
+        The settings, and a line; None where the run is gone on with and its schedule stands.
+    """
+    from pop_fast.io.heartbeat import Heartbeat
+
+    given = config.given
+    if given is None or given.steps_scaler is not None:
+        return config, None
+    minutes = automatic.MINUTES if options.minutes is None else options.minutes
+    with Heartbeat(config.progress) as beat:
+        beat.say("timing a few steps of this capture on this machine")
+        speed = automatic.measure_speed(config, capture, 1.0)
+    pixels = sum(view.width * view.height for view in capture.views) / len(capture.views)
+    held_out = len(capture.test_views(config.test_every))
+    choice = automatic.choose_length(config, speed, minutes, pixels, len(capture.views), held_out)
+    largest = max(capture.views, key=lambda view: view.width * view.height)
+    terms = {"factor": config.factor, **automatic.choose_terms(capture)}
+    config = automatic.with_choice(config, choice.scaler, terms)
+    return config, automatic.line_of(choice, config, (largest.width, largest.height))

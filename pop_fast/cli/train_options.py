@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final
 
 import tyro
 
+from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.presets import ALIASES, METHODS, PRESETS
 
@@ -43,6 +44,47 @@ class BlocksOptions:
 
 # what decides the defaults of all other settings
 PLAN: Final = ("method", "preset", "steps_scaler", "scale_lambda_pop")
+
+
+# words of other trainers' command lines: Inria's, gsplat's
+_ALIASES: Final = {
+    **dict.fromkeys(("-s", "--source-path", "--data-dir", "--data"), "DATA"),
+    **dict.fromkeys(("-m", "--model-path", "--result-dir", "-o"), "--out"),
+    "--data-factor": "--factor",
+    "--iterations": "--max-steps",
+}
+_SMALLER: Final = (
+    "--factor 2 (4, 8) trains on photographs shrunk by so much; --sfm.max-size is only how large they are while "
+    "cameras are searched for"
+)
+# of which the nearest option by its letters is another thing
+_ELSEWHERE: Final = dict.fromkeys(("--max-size", "--resolution", "-r", "--downscale", "--downscale-factor"), _SMALLER)
+_IGNORED: Final = frozenset({"--eval"})  # Inria: hold out every 8th view; here the default (--test-every 0 holds none)
+
+
+def rename_aliases(argv: Sequence[str]) -> list[str]:
+    """Turn options of Inria's and gsplat's trainers into ours: `-s DIR` into `DIR`, `-m DIR` into `--out DIR`, ..."""
+    words: list[str] = []
+    rest = list(argv)
+    while rest:
+        word = rest.pop(0)
+        if not word.startswith("-"):
+            # a path may hold "="
+            words.append(word)
+            continue
+        word = word.replace("--adc.", "--gsplat.", 1) if word.startswith("--adc.") else word
+        name, equals, value = word.partition("=")
+        name = name.replace("_", "-") if name.startswith("--") else name
+        if name in _ELSEWHERE:
+            raise PopError(f"{name} is no option of pop train; {_ELSEWHERE[name]}")
+        target = _ALIASES.get(name)
+        if name in _IGNORED:
+            continue
+        if target == "DATA":
+            words += [value] if equals else []
+        else:
+            words += [target or name, value] if equals else [target or word]
+    return words
 
 
 def plan_of(words: Sequence[str]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Passes over training views: what density control asks of a view beside its image, from raw parameters.
+"""Passes over training views: what density control asks of a view in addition to its image, from raw parameters.
 
 A pass projects the Gaussians, lists them by tile and sums over the pixels where each is blended, by the stages of the
 backend that trains. Nothing here is differentiated.

@@ -95,7 +95,7 @@ def composite(
 
 @dataclass(frozen=True)
 class BlendOptions:
-    """What `composite` is given beside the tensors, and whether a transpose may follow (`keep`)."""
+    """What `composite` is given in addition to the tensors, and whether a transpose may follow (`keep`)."""
 
     lists: TileLists
     width: int

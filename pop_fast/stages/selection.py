@@ -1,4 +1,4 @@
-"""Who is kept, by a score. Meaning: `pop_ref.selection`."""
+"""Which Gaussians are kept, by a score. Meaning: `pop_ref.selection`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run learns of its photographs beside the scene: their exposures and the corrections of their cameras.
+"""What a run learns of its photographs in addition to the scene: their exposures and the corrections of their cameras.
 
 All of it is off unless the settings ask for it; then views and images pass through unchanged, to the same bits.
 """

@@ -18,7 +18,7 @@ from pop_fast.train.steps import why_not_trained
 def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConfig, str]:
     """Settle backend "auto": the fastest that can run here and knows the settings, a GPU's before a CPU's.
 
-    A run that is gone on with keeps the backend that it was begun with.
+    A resumed run keeps the backend that it was begun with.
 
     Args:
         config: the settings as given.

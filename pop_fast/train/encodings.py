@@ -16,7 +16,7 @@ from pop_fast.train.config import TrainConfig
 from pop_fast.train.evaluate import evaluate
 from pop_fast.train.views import ViewTensors
 
-# held-out views that are rendered for every format, at most: every so many of more
+# held-out views that are rendered for every format, at most; of more, an even selection
 _MOST_VIEWS: Final = 4
 
 

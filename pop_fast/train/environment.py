@@ -104,7 +104,7 @@ def peak_memory_bytes() -> int:
 
 
 def run_facts(backend: str, train_seconds: float, total_seconds: float) -> dict[str, Any]:
-    """Return what else belongs beside a result: time, memory, machine. `mem` is in GiB, as gsplat's."""
+    """Return what else goes with a result: time, memory, machine. `mem` is in GiB, as gsplat's."""
     peak = peak_memory_bytes()
     return {
         "seconds": train_seconds,

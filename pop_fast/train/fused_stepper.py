@@ -168,7 +168,7 @@ def step_settings(config: TrainConfig, updates: Updates) -> StepSettings:
 
     Args:
         config: step numbers as they are run.
-        updates: whom Adam moves at which step.
+        updates: which parameters Adam moves at which step.
     """
     pop = config.strategy
     return StepSettings(

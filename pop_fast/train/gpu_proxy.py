@@ -18,7 +18,7 @@ _LESS = "use smaller images (--factor 2 or more), fewer Gaussians, or a card wit
 
 
 class GpuProxy:
-    """Renders on a device what lies anywhere, and hands images and `info` back on the CPU.
+    """Renders tensors of any device on one device, and hands images and `info` back on the CPU.
 
     Args:
         backend: what renders there.

@@ -85,7 +85,9 @@ LOSSES: Final[Registry[Loss]] = Registry(
 # what the control was called when there was one
 ALIASES: Final = {"adc": "gsplat"}
 QUICK_SCALER: Final = 0.05
-PRESETS: Final = {"paper": 1.0, "quick": QUICK_SCALER}
+# chooses size and length by what is there: `pop_fast.train.automatic`
+AUTOMATIC: Final = "auto"
+PRESETS: Final = {"paper": 1.0, "quick": QUICK_SCALER, AUTOMATIC: 1.0}
 # what "quick" multiplies the rates by: with so few steps the published ones leave most of the way undone, and rates as
 # high as these must fall towards the end. Opacities go fast enough. Chosen on fox; what it brings on four captures
 # stands in benchmarks/NOTES.md
@@ -114,8 +116,9 @@ class Given:
             rasterizer, "3dgs-2023" for those before October 2024, and on top of these "pup", "mini-splatting",
             "taming" and "speedy-splat"; or one that another package registers.
         preset: "paper" is the paper's 30,000 steps, for a GPU or a night; "quick" 1,500 steps at higher rates that
-            fall, from coarse photographs to fine ones, with thresholds for small images. It gives defaults: what is
-            said besides wins.
+            fall, from coarse photographs to fine ones, with thresholds for small images; "auto" has these thresholds
+            and as much of the schedule as the time allows, which `pop train` chooses. It gives defaults: what is said
+            besides wins.
         steps_scaler: multiplies the default of every step number; None takes the preset's.
         scale_lambda_pop: divide the default of lambda_pop by the scaler, so that the push of the prior adds up to the
             same over a short schedule; it then weighs more against the photographs than in the paper.
@@ -123,7 +126,7 @@ class Given:
     """
 
     method: str = "pop"
-    preset: Literal["paper", "quick"] = "paper"
+    preset: Literal["paper", "quick", "auto"] = "paper"
     steps_scaler: float | None = None
     scale_lambda_pop: bool = False
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -205,6 +208,8 @@ def defaults(given: Given) -> dict[str, Any]:
     strategy = kind().scaled(by)
     if given.scale_lambda_pop:
         strategy = replace(strategy, lambda_pop=strategy.lambda_pop / by)
+    if given.preset in ("quick", AUTOMATIC):
+        strategy = replace(strategy, blur_min_pixels=QUICK_BLUR_MIN_PIXELS)
 
     def scaled(step: int) -> int:
         return max(round(step * by), 1)
@@ -223,10 +228,9 @@ def defaults(given: Given) -> dict[str, Any]:
 
 
 def _quick(strategy: DensityControl) -> DensityControl:
-    """Return density control for small images and few steps."""
+    """Return density control for few steps."""
     return replace(
         strategy,
-        blur_min_pixels=QUICK_BLUR_MIN_PIXELS,
         refine_every=max(round(strategy.refine_every * QUICK_REFINE), 1),
         grow_grad2d=strategy.grow_grad2d * QUICK_GRADIENT,
     )

@@ -134,7 +134,7 @@ class Times:
             self.cpu += cpu
 
     def facts(self, on_cpu: bool) -> dict[str, float]:
-        """Give what belongs beside `seconds` and `seconds_total`: processor time is that of a training on a CPU."""
+        """Give what goes with `seconds` and `seconds_total`: processor time is that of a training on a CPU."""
         counted = {"seconds_cpu": self.cpu} if on_cpu and self.cpu is not None else {}
         searched = {"seconds_sfm": self.sfm} if self.sfm else {}
         return {"seconds_loading": self.loading, **searched, **counted}

@@ -57,7 +57,7 @@ def refining(config: TrainConfig, steps: int) -> TrainConfig:
     ended = {name: lr.others_decay * getattr(lr, name) for name in ("scales", "quats", "sh0", "sh_rest")}
     strategy = replace(
         at_rest(plan),
-        # a band every so many steps, counted from so long ago that those in use are there from the first step
+        # bands open at regular steps, which are counted from a past in which those in use have opened
         sh_start_iter=-degree * steps,
         pop_start_iter=0,
         pop_stop_iter=steps if plan.regularizes(last) else 0,

@@ -29,7 +29,7 @@ def updates_of(
         lr: the rates to begin with.
         scene_scale: the unit of the means' rate, world units.
         max_steps: length of the run, over which the means' rate decays.
-        rules: whom Adam moves when; None moves all at every step.
+        rules: which parameters Adam moves at which step; None moves all at every step.
         edits: steps after which Gaussians are added or removed; those outside the run are left out.
         restarts: steps after which Adam begins anew, likewise.
     """

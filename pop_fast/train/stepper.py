@@ -1,4 +1,4 @@
-"""What takes the steps of a training run, whatever it is made of; `TrainingRun` does all the rest."""
+"""What takes the steps of a training run, on any engine; `TrainingRun` does all the rest."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Task:
         strategy: the one of density control.
         views: to train on.
         order: the views of every step, `config.batch_size` of them a step.
-        updates: whom Adam moves at which step.
+        updates: which parameters Adam moves at which step.
         step: steps taken.
         appearance: what is learned of the photographs.
         ranks: the processes that draw the views of a step.
@@ -103,7 +103,7 @@ class Engine:
         backend: renders there for measurements, from and to the CPU.
         make_stepper: makes what takes the steps.
         facts: goes into the statistics of a run.
-        depends_on_threads: whether another number of threads may round otherwise; if not, a run goes on with any.
+        depends_on_threads: whether another number of threads may round otherwise; if not, a run is resumed with any.
     """
 
     name: str

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class Updates(NamedTuple):
-    """Whom Adam moves at every step of a schedule, and how far: meaning in `pop_ref.optimizer`.
+    """Which parameters Adam moves at every step of a schedule, and how far: meaning in `pop_ref.optimizer`.
 
     Attributes:
         rates: learning rates, that of the means in world units. [steps, groups] float64
@@ -47,7 +47,7 @@ class StepSettings:
     """What all steps of a run depend on.
 
     Attributes:
-        updates: whom Adam moves at which step.
+        updates: which parameters Adam moves at which step.
         padding: SSIM's border, by which photographs are prepared; that of every phase's objective.
         lambda_pop: weight of the POP term where it is on.
         lambda_entropy: weight of the mean entropy of the opacities where it is on; the step on a GPU has no such term.
@@ -181,7 +181,7 @@ _ONLY: Final[Mapping[str, Any]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class WholeStep:
-    """What a backend offers beside its stages where it takes training steps by itself.
+    """What a backend offers in addition to its stages where it takes training steps by itself.
 
     Attributes:
         name: of what takes the steps, for the statistics of a run.

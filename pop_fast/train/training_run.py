@@ -68,7 +68,7 @@ class TrainingRun:
         strategy: the one of density control.
         state: the strategy's state.
         step: steps taken.
-        updates: whom Adam moves at which step.
+        updates: which parameters Adam moves at which step.
     """
 
     def __init__(
@@ -152,8 +152,8 @@ class TrainingRun:
     def run(self) -> dict[str, Any]:
         """Train to the end.
 
-        A run that is not gone on with writes nothing, and replaces nothing, before it has taken a step: one that cannot
-        take any leaves the folder as it was.
+        A run that is not resumed writes nothing, and replaces nothing, before it has taken a step: one that cannot take
+        any leaves the folder as it was.
 
         Returns:
             The statistics of the last step, as in stats/val_step{step}.json; none from a process that does not write.

@@ -33,7 +33,7 @@ from pop_ref.conformance.capabilities import (
     capabilities_of,
     same_constants,
 )
-from pop_ref.conformance.scenes import Scene, rounded_to
+from pop_ref.conformance.scenes import Scene, golden_scene, rounded_to
 from pop_ref.conformance.views import ASKED, refusal
 from pop_ref.constants import PAPER, Profile
 from pop_ref.records import Splats
@@ -170,8 +170,6 @@ class Adapter:
 
     def _tells(self, need: str) -> bool:
         """Tell whether a render shows something of dominance; one is drawn to learn it."""
-        from pop_ref.conformance.golden import golden_scene
-
         known: dict[str, bool] = self.__dict__.setdefault("_known_tellings", {})
         if not known:
             view = self.render(self.sees(golden_scene()))

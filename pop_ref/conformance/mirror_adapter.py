@@ -1,4 +1,4 @@
-"""The host mirror as a backend of the conformance kit: stage functions, whole renders, whole gradients."""
+"""The host mirror as a backend of the conformance kit: stages with the oracle's signatures, renders, gradients."""
 
 from __future__ import annotations
 
@@ -14,10 +14,243 @@ import numpy as np
 from pop_ref.conformance.adapter import Adapter, View
 from pop_ref.conformance.capabilities import ANTIALIASING, DETERMINISTIC, DOMINANCE, ROWWISE
 from pop_ref.conformance.mirror_library import Mirror
-from pop_ref.conformance.mirror_stages import STAGES
 from pop_ref.conformance.scenes import Scene
+from pop_ref.constants import PAPER, Profile
+from pop_ref.settings import BETAS, EPS
 
 FOLDER: Path = importlib.import_module("cuda_ext.host.library_folder").library_folder()
+_IDENTITY = np.eye(4)
+
+
+def _rowwise(name: str, tails: list[tuple[int, ...]]) -> Callable[..., Any]:
+    """Make a stage whose arguments are all rows, with outputs of the given shapes a row."""
+
+    def stage(m: Mirror, *arrays: Any) -> Any:
+        n = len(arrays[0])
+        found = m.call(name, n, list(arrays), [(n, *tail) for tail in tails])
+        return found[0] if len(found) == 1 else tuple(found)
+
+    return stage
+
+
+def _pinhole(name: str, tail: tuple[int, ...]) -> Callable[..., Any]:
+    def stage(m: Mirror, rows: Any, K: Any, width: int, height: int, *rest: Any) -> Any:
+        cotangent = [a for a in rest if isinstance(a, np.ndarray)]
+        profile = next((a for a in rest if isinstance(a, Profile)), PAPER)
+        n = len(rows)
+        return m.call(name, n, [rows, K, *cotangent], [(n, *tail)], integers=(width, height), profile=profile)[0]
+
+    return stage
+
+
+def sh_basis(m: Mirror, dirs: Any, degree: int) -> Any:
+    n = len(dirs)
+    return m.call("sh_basis", n, [dirs], [(n, 16)], integers=(0, 0, degree))[0][:, : (degree + 1) ** 2]
+
+
+def sh_basis_vjp(m: Mirror, dirs: Any, degree: int, v_basis: Any) -> Any:
+    padded = np.zeros((len(dirs), 16))
+    padded[:, : v_basis.shape[1]] = v_basis
+    return m.call("sh_basis_vjp", len(dirs), [dirs, padded], [(len(dirs), 3)], integers=(0, 0, degree))[0]
+
+
+def colors_from_sh(m: Mirror, sh: Any, dirs: Any, degree: int) -> Any:
+    n, n_sh = sh.shape[:2]
+    return m.call("colors_from_sh", n, [sh, dirs], [(n, 3)], integers=(0, 0, degree, n_sh))[0]
+
+
+def colors_from_sh_vjp(m: Mirror, sh: Any, dirs: Any, degree: int, v_colors: Any) -> Any:
+    shapes = [sh.shape, dirs.shape]
+    integers = (0, 0, degree, sh.shape[1])
+    return tuple(m.call("colors_from_sh_vjp", len(sh), [sh, dirs, v_colors], shapes, integers=integers))
+
+
+def camera_center(m: Mirror, viewmat: Any) -> Any:
+    return m.call("camera_center", 1, [viewmat], [(1, 3)])[0][0]
+
+
+def camera_center_vjp(m: Mirror, viewmat: Any, v_center: Any) -> Any:
+    return m.call("camera_center_vjp", 1, [viewmat, v_center], [(4, 4)])[0]
+
+
+def view_dirs(m: Mirror, means: Any, viewmat: Any) -> Any:
+    return m.call("view_dirs", len(means), [means, viewmat], [(len(means), 3)])[0]
+
+
+def means_cam_from_means(m: Mirror, means: Any, viewmat: Any) -> Any:
+    return m.call("means_cam_from_means", len(means), [means, viewmat], [(len(means), 3)])[0]
+
+
+def means_cam_from_means_vjp(m: Mirror, means: Any, viewmat: Any, v: Any) -> Any:
+    n = len(means)
+    v_means, v_viewmats = m.call("means_cam_from_means_vjp", n, [means, viewmat, v], [(n, 3), (n, 4, 4)])
+    return v_means, v_viewmats.sum(axis=0)
+
+
+def covars_cam_from_covars(m: Mirror, covars: Any, viewmat: Any) -> Any:
+    return m.call("covars_cam_from_covars", len(covars), [covars, viewmat], [covars.shape])[0]
+
+
+def covars_cam_from_covars_vjp(m: Mirror, covars: Any, viewmat: Any, v: Any) -> Any:
+    n = len(covars)
+    v_covars, v_viewmats = m.call("covars_cam_from_covars_vjp", n, [covars, viewmat, v], [covars.shape, (n, 4, 4)])
+    return v_covars, v_viewmats.sum(axis=0)
+
+
+def in_front(m: Mirror, depths: Any, profile: Profile = PAPER) -> Any:
+    return m.call("in_front", len(depths), [depths], [], [(len(depths),)], profile=profile)[0].astype(bool)
+
+
+def low_pass(m: Mirror, covars2d: Any, eps2d: float) -> Any:
+    return m.call("low_pass", len(covars2d), [covars2d], [covars2d.shape], numbers=(eps2d,))[0]
+
+
+def low_pass_vjp(m: Mirror, covars2d: Any, eps2d: float, v_blurred: Any) -> Any:
+    # the identity: the kernels leave it out
+    return v_blurred.astype(m.dtype).astype(np.float64)
+
+
+def compensations(m: Mirror, covars2d: Any, eps2d: float) -> Any:
+    return m.call("compensations", len(covars2d), [covars2d], [(len(covars2d),)], numbers=(eps2d,))[0]
+
+
+def compensations_vjp(m: Mirror, covars2d: Any, eps2d: float, v: Any) -> Any:
+    return m.call("compensations_vjp", len(covars2d), [covars2d, v], [covars2d.shape], numbers=(eps2d,))[0]
+
+
+def radii_from_covars2d(m: Mirror, covars2d: Any, opacities: Any, profile: Profile = PAPER) -> Any:
+    n = len(covars2d)
+    return m.call("radii_from_covars2d", n, [covars2d, opacities], [], [(n, 2)], profile=profile)[0]
+
+
+def on_screen(m: Mirror, means2d: Any, radii: Any, width: int, height: int, profile: Profile = PAPER) -> Any:
+    size = (width, height)
+    kept = m.call("on_screen", len(means2d), [means2d], [], [(len(means2d),)], [radii], size, profile=profile)[0]
+    return kept.astype(bool)
+
+
+def tile_rects(
+    m: Mirror, means2d: Any, radii: Any, width: int, height: int, tile_size: int, profile: Profile = PAPER
+) -> Any:
+    n, sizes = len(means2d), (width, height, tile_size)
+    return m.call("tile_rects", n, [means2d], [], [(n, 4)], [radii], sizes, profile=profile)[0]
+
+
+def sigma_at_pixel(m: Mirror, mean2d: Any, conic: Any, px: float, py: float) -> float:
+    return float(m.call("sigma_at_pixel", 1, [mean2d, conic], [(1,)], numbers=(px, py))[0][0])
+
+
+def falloff(m: Mirror, sigma: float) -> float:
+    return float(m.call("falloff", 1, [np.array([sigma])], [(1,)])[0][0])
+
+
+def alpha_from_sigma(m: Mirror, sigma: float, opacity: float, profile: Profile = PAPER) -> tuple[float, bool]:
+    rows = [np.array([sigma]), np.array([opacity])]
+    alpha, skipped = m.call("alpha_from_sigma", 1, rows, [(1,)], [(1,)], profile=profile)
+    return float(alpha[0]), bool(skipped[0])
+
+
+def dominant_id(m: Mirror, ids: Any, weights: Any) -> int:
+    found = m.call("dominant_id", 1, [np.array(weights)], [], [(1,)], [np.array(ids)], (0, 0, len(ids)))
+    return int(found[0][0])
+
+
+def _ssim(m: Mirror, image: Any, target: Any, v: float, padding: str) -> tuple[float, Any]:
+    height, width, channels = image.shape
+    integers = (width, height, channels, 5 if padding == "valid" else 0)
+    value, v_image = m.call("ssim", 1, [image, target], [(1,), image.shape], integers=integers, numbers=(v,))
+    return float(value[0]), v_image
+
+
+def ssim(m: Mirror, image: Any, target: Any, padding: str = "valid") -> float:
+    return _ssim(m, image, target, 1.0, padding)[0]
+
+
+def ssim_vjp(m: Mirror, image: Any, target: Any, v_ssim: float, padding: str = "valid") -> Any:
+    return _ssim(m, image, target, v_ssim, padding)[1]
+
+
+def pop_loss_vjp(m: Mirror, opacities: Any, mask: Any, v_loss: float) -> Any:
+    n, n_important = len(mask), int(np.sum(mask))
+    return m.call("pop_loss_vjp", n, [], [(n,)], [], [mask], (0, 0, n_important, n), (v_loss,))[0]
+
+
+def adam_step(m: Mirror, params: Any, grads: Any, first: Any, second: Any, step: int, lr: Any) -> Any:
+    # betas and eps are those of the fused step
+    moved: tuple[dict[str, Any], ...] = (dict(params), dict(first), dict(second))
+    for name, g in grads.items():
+        numbers = [lr[name], *BETAS, EPS]
+        kept = [float(m.dtype(number)) for number in numbers]
+        halves = [half for number, near in zip(numbers, kept, strict=True) for half in (near, number - near)]
+        rows = [params[name], first[name], second[name], g]
+        found = m.call("adam_step", g.size, rows, [g.shape] * 3, integers=(0, 0, step), numbers=tuple(halves))
+        for part, value in zip(moved, found, strict=True):
+            part[name] = value
+    return moved
+
+
+def adam_steps(m: Mirror, params: Any, grads: Any, lr: Any) -> Any:
+    first, second = ({name: np.zeros_like(array) for name, array in params.items()} for _ in range(2))
+    for step, given in enumerate(grads, start=1):
+        # a row that nothing reaches takes a step all the same, by a gradient of zero
+        whole = {name: given.get(name, np.zeros_like(array)) for name, array in params.items()}
+        params, first, second = adam_step(m, params, whole, first, second, step, lr)
+    return params, first, second
+
+
+STAGES: dict[str, Callable[..., Any]] = {
+    "scales_from_log_scales": _rowwise("scales_from_log_scales", [(3,)]),
+    "scales_from_log_scales_vjp": _rowwise("scales_from_log_scales_vjp", [(3,)]),
+    "opacities_from_logits": _rowwise("opacities_from_logits", [()]),
+    "opacities_from_logits_vjp": _rowwise("opacities_from_logits_vjp", [()]),
+    "unit_quats_from_quats": _rowwise("unit_quats_from_quats", [(4,)]),
+    "unit_quats_from_quats_vjp": _rowwise("unit_quats_from_quats_vjp", [(4,)]),
+    "rotmats_from_quats": _rowwise("rotmats_from_quats", [(3, 3)]),
+    "rotmats_from_quats_vjp": _rowwise("rotmats_from_quats_vjp", [(4,)]),
+    "covars_from_quats_scales": _rowwise("covars_from_quats_scales", [(3, 3)]),
+    "covars_from_quats_scales_vjp": _rowwise("covars_from_quats_scales_vjp", [(4,), (3,)]),
+    "project_covars": _rowwise("project_covars", [(2, 2)]),
+    "project_covars_vjp": _rowwise("project_covars_vjp", [(3, 3), (2, 3)]),
+    "conics_from_covars2d": _rowwise("conics_from_covars2d", [(3,)]),
+    "conics_from_covars2d_vjp": _rowwise("conics_from_covars2d_vjp", [(2, 2)]),
+    "project_means": _pinhole("project_means", (2,)),
+    "project_means_vjp": _pinhole("project_means_vjp", (3,)),
+    "projection_jacobians": _pinhole("projection_jacobians", (2, 3)),
+    "projection_jacobians_vjp": _pinhole("projection_jacobians_vjp", (3,)),
+}
+STAGES |= {
+    f.__name__: f
+    for f in (
+        sh_basis,
+        sh_basis_vjp,
+        colors_from_sh,
+        colors_from_sh_vjp,
+        camera_center,
+        camera_center_vjp,
+        view_dirs,
+        means_cam_from_means,
+        means_cam_from_means_vjp,
+        covars_cam_from_covars,
+        covars_cam_from_covars_vjp,
+        in_front,
+        low_pass,
+        low_pass_vjp,
+        compensations,
+        compensations_vjp,
+        radii_from_covars2d,
+        on_screen,
+        tile_rects,
+        sigma_at_pixel,
+        falloff,
+        alpha_from_sigma,
+        dominant_id,
+        ssim,
+        ssim_vjp,
+        pop_loss_vjp,
+        adam_step,
+        adam_steps,
+    )
+}
 
 
 def mirror(name: str) -> MirrorAdapter:

@@ -147,3 +147,80 @@ class Draws:
     def uniforms(self, n: int) -> np.ndarray:
         """Draw from [0, 1). [n]"""
         return self._rng.random(n)
+
+
+EVERY_STEP: Final = tuple(range(1, 40))
+GROWTH: Final[dict[str, Any]] = {
+    "refine_start_iter": 3,
+    "refine_stop_iter": 30,
+    "refine_every": 4,
+    "grow_grad2d": 0.5,
+    "grow_scale3d": 0.3,
+    "prune_opa": 0.05,
+    "prune_scale3d": 0.6,
+    "prune_too_big_after": 8,
+}
+RESETS: Final[dict[str, Any]] = {"reset_every": 12, "reset_opa": 0.2}
+BLUR: Final[dict[str, Any]] = {"theta_blur": 4.0 / 128.0, "blur_start_iter": 8, "blur_stop_iter": 20}
+OWN: Final[dict[str, dict[str, Any]]] = {
+    "pop": {**BLUR, "lambda_pop": 0.5, "pop_start_iter": 2, "pop_stop_iter": 26},
+    "gsplat": RESETS,
+    "3dgs": RESETS,
+    "mini-splatting": {
+        "theta_blur": 4.0 / 128.0,
+        "blur_stop_iter": 18,
+        "sh_start_iter": 12,
+        "means_rewind_iter": 18,
+        "means_rewind_to": 6,
+        "reinit_iters": (7,),
+        "reinit_points": 60,
+        "sample_iter": 18,
+        "prune_iter": 34,
+        "prune_mass": 0.125,
+    },
+    "taming": {
+        **RESETS,
+        "opacities_stop_iter": 24,
+        "sh_rest_every": 4,
+        "budget_multiplier": 4.0,
+        "score_views": 2,
+        "sampled_prunes": 5,
+        "grow_grad2d": 0.125,
+        "prune_opa": 0.3,
+    },
+    "speedy-splat": {**RESETS, "soft_prune_iters": (12, 20), "soft_prune_share": 0.5, "hard_prune_iters": (33,)},
+    "pup": {**RESETS, "rounds_start_iter": 32, "round_steps": 4, "round_decay_every": 2, "prune_shares": (0.5, 0.25)},
+}
+
+
+def script_of(method: str, n: int = 12, **changes: Any) -> Script:
+    """Return a training by a method under settings in which all that it does happens within forty steps."""
+    settings = {**GROWTH, **OWN.get(method, {}), **changes.pop("settings", {})}
+    return Script(method, settings, **{"steps": EVERY_STEP, "n": n, **changes})
+
+
+def trainings_of(method: str) -> tuple[Script, Script]:
+    """Return two trainings by a method: of one camera, and of two cameras whose renders are packed."""
+    settings = {"absgrad": True, "grow_grad2d": 1.0}
+    return script_of(method), script_of(method, cameras=2, packed=True, seed=1, scene_scale=4.0, settings=settings)
+
+
+SCREEN: Final = {"refine_scale2d_stop_iter": 20, "grow_scale2d": 0.2, "prune_scale2d": 0.29}
+_READINGS: Final[tuple[tuple[str, dict[str, Any], dict[str, Any]], ...]] = (
+    ("pop", {"blur_window": "any_view", "blur_rule": "split", "revised_opacity": True}, {}),
+    ("pop", {"blur_window": "sum", "grad_denominator": "window", "blur_min_pixels": 6.0}, {"cameras": 2}),
+    ("pop", {"pop_views": "window", "grow_on_gradient": False}, {}),
+    ("pop", {"pop_over": "visible", "grow_on_gradient_in_blur_window": False}, {"cameras": 2, "packed": True}),
+    ("pop", {"lambda_pop": 0.0, "lambda_entropy": 0.25, "final_prune_iter": 33, "final_prune_opa": 0.5}, {}),
+    ("pop", {"lambda_entropy": 0.25, **SCREEN}, {}),
+    ("gsplat", {**SCREEN, "inclusive": True, "pause_refine_after_reset": 3}, {"cameras": 2, "packed": True}),
+    ("gsplat", {"sh_rest_every": 3, "edits_replace_update": True, "revised_opacity": True}, {}),
+    ("gsplat", {"prune_opa": 0.3, "prune_too_big": False}, {"steps": EVERY_STEP[:14]}),
+    ("mini-splatting", {"importance": "outdoor", "max_gaussians": 40}, {"cameras": 2}),
+    ("taming", {"final_count": 30, "misaligned_prune_weights": False}, {"packed": True}),
+)
+# trainings under every other reading of a method
+READINGS: Final = tuple(
+    script_of(method, settings=settings, seed=seed, **{"steps": EVERY_STEP[:34], **more})
+    for seed, (method, settings, more) in enumerate(_READINGS)
+)

@@ -31,8 +31,7 @@ from pop_ref.conformance.capabilities import (
     same_constants,
 )
 from pop_ref.conformance.cases import BY_NAME, Case, with_own_lists
-from pop_ref.conformance.golden import golden_scene
-from pop_ref.conformance.scenes import Scene
+from pop_ref.conformance.scenes import Scene, golden_scene
 from pop_ref.conformance.torch_autograd import Ask, Differentiated, differentiated
 from pop_ref.constants import PAPER, Profile
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,16 +13,20 @@ import numpy as np
 
 from pop_ref.conformance import vector_training as training
 from pop_ref.conformance.adapter import OracleAdapter
-from pop_ref.conformance.calls import Call, Frame
+from pop_ref.conformance.calls import Call, Frame, unpacked
 from pop_ref.conformance.capabilities import (
     ANTIALIASING,
+    BATCHES,
     CAMERA_COLORS,
     CAMERAS,
     CHANNELS,
     COLORS,
+    COVARS,
     DEPTH,
     DOMINANCE,
     GRADIENTS,
+    NO_BACKGROUND,
+    PACKED,
     PLANES,
     RADIUS_CLIP,
     RENDER,
@@ -29,6 +35,9 @@ from pop_ref.conformance.capabilities import (
 )
 from pop_ref.conformance.scene_files import scene_from
 from pop_ref.conformance.scenes import Scene
+from pop_ref.conformance.vector_calls import FORMS, KINDS
+from pop_ref.conformance.vector_methods import Replay, step_sums
+from pop_ref.conformance.vector_stages import made, outputs
 from pop_ref.constants import PAPER, Profile
 from pop_ref.density import DensityConfig, rows_from_params
 from pop_ref.records import Camera, Gaussians
@@ -64,16 +73,15 @@ def answered(backend: Any, kind: str, arrays: Arrays, options: dict[str, Any]) -
     answers = {
         "render": _image,
         "large": _image,
-        "call": _call,
-        "call_plain": _call,
-        "call_of_each_camera": _call,
-        "call_plain_of_each_camera": _call,
+        **dict.fromkeys(KINDS, _call),
         "loss": _loss,
         "pop": _pop,
         "adam": _adam,
         "density": _density,
+        "training": _training,
     }
-    return answers[kind](backend, arrays, options)
+    # every stage function has a kind of its own
+    return answers.get(kind, _stage)(backend, arrays, options)
 
 
 def _image(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
@@ -107,25 +115,44 @@ def _call(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
     call = call_of(arrays, options)
     if not all(backend.has(need) for need in _needs(call)):
         return {}
-    cotangents = (arrays["v_images"][None], arrays["v_alphas"][None]) if backend.has(GRADIENTS) else ()
+    batched = len(call.batch) > 0
+    whole = {name: value if batched else value[None] for name, value in arrays.items()}
+    cotangents = (whole["v_images"], whole["v_alphas"]) if backend.has(GRADIENTS) else ()
     called = backend.call(call, *cotangents)
-    found = {"images": called.images[0], "alphas": called.alphas[0]}
-    if "dominant_ids" in called.meta:
-        found["dominant_ids"] = called.meta["dominant_ids"].reshape(called.alphas[0].shape)
+    found = {"images": called.images, "alphas": called.alphas}
+    for name, key in (("dominant_ids", "dominant_ids"), ("n_blended", "n_contrib")):
+        if key in called.meta:
+            found[name] = called.meta[key].reshape(called.alphas.shape)
+    if "dominant_counts" in called.meta:
+        found["dominant_counts"] = called.meta["dominant_counts"].reshape(call.shape)
+    for name in ("radii", "means2d", "depths", "conics"):
+        rows = unpacked(call, called.meta[name], called.meta) if name in called.meta else None
+        found |= {} if rows is None else {name: rows}
     names = {name: name for name in ("means", "quats", "scales", "opacities", "viewmats", "backgrounds")}
     names["colors"] = "colors" if call.sh_degree is None else "sh"
-    return found | {f"v_{names[name]}": value for name, value in called.gradients.items() if name in names}
+    found |= {f"v_{names[name]}": call.by_entry(v) for name, v in called.gradients.items() if name in names}
+    return found if batched else {name: value[0] for name, value in found.items()}
 
 
 def call_of(arrays: Arrays, options: dict[str, Any]) -> Call:
     """Return the call that a vector holds."""
+    batch = tuple(options["batch"])
+    entries = (
+        [{name: value[b] for name, value in arrays.items()} for b in range(math.prod(batch))] if batch else [arrays]
+    )
     plain, given = "colors" in arrays, Profile(**options["profile"])
     planes = {name: getattr(given, name) for name in ("near_plane", "far_plane", "eps2d")}
     planes = {name: value for name, value in planes.items() if value != getattr(PAPER, name)}
     profile = replace(given, **{name: getattr(PAPER, name) for name in planes})
-    colors = arrays["colors" if plain else "sh"]
-    own = colors.ndim == (3 if plain else 4)
-    n, frames = len(arrays["means"]), []
+    own = entries[0]["colors" if plain else "sh"].ndim == (3 if plain else 4)
+    frames = tuple(tuple(_frames(each, options, profile, plain, own)) for each in entries)
+    more = {name: options[name] for name in FORMS}
+    mode, clip = options["render_mode"], options["radius_clip"]
+    return Call(frames, batch, own, mode, radius_clip=clip, planes=planes, dominance=True, **more)
+
+
+def _frames(arrays: Arrays, options: dict[str, Any], profile: Profile, plain: bool, own: bool) -> Iterator[Frame]:
+    colors, n = arrays["colors" if plain else "sh"], len(arrays["means"])
     for c in range(len(arrays["viewmats"])):
         of_camera = colors[c] if own else colors
         sh = np.zeros((n, 1, 3)) if plain else of_camera
@@ -133,9 +160,7 @@ def call_of(arrays: Arrays, options: dict[str, Any]) -> Call:
         camera = Camera(arrays["viewmats"][c], arrays["Ks"][c], options["width"], options["height"])
         more = (profile, options["tile_size"], None if plain else options["sh_degree"], options["antialiased"])
         scene = Scene(gaussians, camera, arrays["backgrounds"][c], *more)
-        frames.append(Frame(scene, of_camera if plain else None))
-    mode, clip = options["render_mode"], options["radius_clip"]
-    return Call((tuple(frames),), (), own, mode, radius_clip=clip, planes=planes)
+        yield Frame(scene, of_camera if plain else None)
 
 
 def _needs(call: Call) -> list[str]:
@@ -148,6 +173,10 @@ def _needs(call: Call) -> list[str]:
         ANTIALIASING: call.antialiased,
         PLANES: bool(call.planes),
         RADIUS_CLIP: call.radius_clip > 0.0,
+        PACKED: call.packed,
+        COVARS: call.covars,
+        BATCHES: bool(call.batch),
+        NO_BACKGROUND: call.no_background,
     }
     return [SIGNATURE, CAMERAS, *(need for need, holds in asked.items() if holds)]
 
@@ -209,3 +238,19 @@ def _density(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
     # another number of rows is an answer, too: it is as wrong as can be
     return {name: value if value.shape == arrays[name].shape else np.full(arrays[name].shape, np.nan)
             for name, value in found.items()}  # fmt: skip
+
+
+def _training(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
+    if not backend.has("scripted_steps"):
+        return {}
+    script = Replay(arrays, options)
+    found = step_sums(backend.stage("scripted_steps")(script, script.rows()))
+    return {name: value for name, value in found.items() if not name.startswith("error_bound_")}
+
+
+def _stage(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
+    name, args = options["function"], [made(value) for value in options["arguments"].values()]
+    profiles = [arg for arg in args if isinstance(arg, Profile)]
+    if not backend.has(name) or not all(backend.profile is None or p == backend.profile for p in profiles):
+        return {}
+    return outputs(backend.stage(name)(*args))

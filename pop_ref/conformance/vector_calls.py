@@ -1,8 +1,12 @@
-"""Portable vectors of whole calls: several cameras, depth modes, plain colours of any number of channels."""
+"""Portable vectors of whole calls: cameras, batches, depth modes, plain colours of any number of channels, packed rows.
+
+What a call is packed as, and in what form covariances come, is told by options: images are the same.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
+from typing import Any, Final
 
 import numpy as np
 
@@ -13,6 +17,8 @@ from pop_ref.conformance.vector_schema import IMAGES, INPUTS, entry, equal, outp
 from pop_ref.conformance.views import clear_call
 from pop_ref.depth import RenderMode
 
+# options that change the form of what is given, and no image
+FORMS: Final = ("packed", "covars", "no_background")
 _GAUSSIANS = ("means", "quats", "scales", "opacities")
 _ABOUT = "cameras that look at the same Gaussians, each with its background; 'render_mode' says what an image is"
 MODES = {
@@ -48,16 +54,55 @@ def calls() -> dict[str, Call]:
         "colors_of_each_camera": seen(16, 3, "RGB+D", channels=4, camera_colors=True),
         "a_camera_that_sees_nothing": seen(17, 2, blind=1),
         "hundreds_of_tiles": seen(18, 2, size=(35, 33), tile_size=2),
+        "batches": seen(19, 2, "RGB+ED", batch=(2,)),
+        "batches_of_two_dimensions": seen(20, 2, batch=(2, 2), antialiased=True, eps2d=1.25),
+        "packed": seen(21, 3, packed=True),
+        "packed_depth_and_a_blind_camera": seen(22, 3, "RGB+ED", packed=True, blind=0),
+        "packed_antialiased": seen(23, 2, packed=True, antialiased=True, eps2d=1.25),
+        "packed_between_planes": seen(24, 2, packed=True, near_plane=2.0, far_plane=4.5),
+        "packed_small_splats_left_out": seen(25, 2, packed=True, radius_clip=5.5, sh_degree=1, degree=3),
+        "packed_colors_of_each_camera": seen(26, 3, packed=True, channels=4, camera_colors=True),
+        "packed_plain_colors": seen(27, 2, packed=True, channels=3),
+        "packed_batches": seen(28, 2, batch=(2,), packed=True),
+        "packed_batches_of_two_dimensions": seen(29, 2, batch=(2, 2), packed=True),
+        "packed_covariances": seen(30, 2, packed=True, covars=True),
+        "covariances": seen(31, 2, covars=True, antialiased=True),
+        "covariances_of_batches": seen(32, 2, covars=True, batch=(2,)),
+        "covariances_between_planes": seen(33, 2, covars=True, near_plane=2.0, radius_clip=5.5),
+        "small_splats_of_one_axis_stay": seen(34, 2, radius_clip=4.5),
+        "without_backgrounds": seen(35, 2, no_background=True),
+        "plain_batches": seen(36, 2, batch=(2,), channels=3),
     }
 
 
 def kind_of(call: Call) -> str:
-    """Return the kind of a call's vector: its colours' names and shapes."""
-    return f"call{'_plain' * (call.sh_degree is None)}{'_of_each_camera' * call.camera_colors}"
+    """Return the kind of a call's vector: its colours' names and shapes, and whether it has batches."""
+    form = {"_plain": call.sh_degree is None, "_of_each_camera": call.camera_colors, "_of_batches": bool(call.batch)}
+    return "call" + "".join(word for word, holds in form.items() if holds)
 
 
-def call_kind(plain: bool, own: bool) -> dict[str, Any]:
-    """Return what the index says of calls with harmonics or plain colours, of all cameras or of each its own."""
+KINDS: Final = ("call", "call_plain", "call_of_each_camera", "call_plain_of_each_camera", "call_of_batches",
+                "call_plain_of_batches")  # fmt: skip
+_OF_ROWS: Final = {
+    "means2d": ("[C, N, 2]", "screen centres, px"),
+    "depths": ("[C, N]", "camera z"),
+    "conics": ("[C, N, 3]", "inverse of the blurred screen covariance: xx, xy, yy, px^-2"),
+}
+_MASKS: Final = {
+    "unambiguous": ("[C, H, W]", "every decision of the pixel is clear of rounding"),
+    "decided": ("[C, H, W]", "unambiguous, and the dominant Gaussian is clear too"),
+    "counted_rows": ("[C, N]", "at no pixel that is undecided the Gaussian is blended, or could be"),
+    "clear_rows": ("[C, N]", "no cull and no extent of the Gaussian is within rounding"),
+    "visible_rows": ("[C, N]", "clear_rows, and the Gaussian is not culled"),
+    "smooth_rows": ("[N]", "no kink of this Gaussian is within rounding for any camera"),
+    "smooth_rows_of_each": ("[C, N]", "smooth_rows, once more for each camera"),
+    "all_smooth": ("[]", "smooth_rows holds everywhere"),
+}
+
+
+def call_kind(kind: str) -> dict[str, Any]:
+    """Return what the index says of calls of one of KINDS."""
+    plain, own, batches = (word in kind for word in ("_plain", "_of_each_camera", "_of_batches"))
     colors, shape = ("colors", "[N, D]") if plain else ("sh", INPUTS["sh"][0])
     shape = shape.replace("[N", "[C, N") if own else shape
     given = {name: INPUTS[name] for name in _GAUSSIANS}
@@ -72,7 +117,14 @@ def call_kind(plain: bool, own: bool) -> dict[str, Any]:
     arrays = {name: entry("input", *about) for name, about in given.items()}
     arrays |= output("images", "[C, H, W, X]", "what every camera sees", "agreement.image", "unambiguous")
     arrays |= output("alphas", "[C, H, W]", "1 - T_final", "agreement.T_final", "unambiguous")
-    arrays["dominant_ids"] = entry("output", "[C, H, W]", IMAGES["dominant_ids"][1], "int64", [equal("decided")])
+    for name, where in (("dominant_ids", "decided"), ("n_blended", "unambiguous")):
+        arrays[name] = entry("output", "[C, H, W]", IMAGES[name][1], "int64", [equal(where)])
+    counted = "pixels that each Gaussian dominates"
+    arrays["dominant_counts"] = entry("output", "[C, N]", counted, "int64", [equal("counted_rows")])
+    extents = "extents along x and y, px, 0 where culled"
+    arrays["radii"] = entry("output", "[C, N, 2]", extents, "int64", [equal("clear_rows")])
+    for name, about in _OF_ROWS.items():
+        arrays |= output(name, *about, "meta.rows", "visible_rows")
     for name in (*_GAUSSIANS, colors):
         whose = "" if own and name == colors else ", summed over cameras"
         where = "smooth_rows_of_each" if own and name == colors else "smooth_rows"
@@ -81,31 +133,64 @@ def call_kind(plain: bool, own: bool) -> dict[str, Any]:
     for name, key in (("viewmats", "viewmat"), ("backgrounds", "background")):
         where = "all_smooth" if name == "viewmats" else None
         arrays |= output(f"v_{name}", given[name][0], f"derivative to {name}", f"agreement.v_{key}", where)
-    arrays["unambiguous"] = entry("mask", "[C, H, W]", "every decision of the pixel is clear of rounding", "bool")
-    arrays["decided"] = entry("mask", "[C, H, W]", "unambiguous, and the dominant Gaussian is clear too", "bool")
-    arrays["smooth_rows"] = entry("mask", "[N]", "no kink of this Gaussian is within rounding for any camera", "bool")
-    arrays["smooth_rows_of_each"] = entry("mask", "[C, N]", "smooth_rows, once more for each camera", "bool")
-    arrays["all_smooth"] = entry("mask", "[]", "smooth_rows holds everywhere", "bool")
+    arrays |= {name: entry("mask", *about, "bool") for name, about in _MASKS.items()}
+    if batches:
+        for about in arrays.values():
+            about["shape"] = f"[E, {about['shape'][1:]}".replace("[E, ]", "[E]")
     return {"about": _ABOUT, "modes": MODES, "arrays": arrays}
 
 
 def call_arrays(call: Call) -> dict[str, np.ndarray]:
-    """Return a call's arrays."""
-    (row,), colors = expectations(Adapter(), call), "sh" if call.sh_degree is not None else "colors"
-    given = {colors if name == "colors" else name: value for name, value in call.tensors().items()}
-    arrays = {**given, "Ks": call.intrinsics()}
+    """Return a call's arrays; of batches the entries lie along one axis."""
+    entries = expectations(Adapter(), call)
+    rows = [_entry(call, b, row) for b, row in enumerate(entries)]
+    return {name: np.stack([row[name] for row in rows]) for name in rows[0]} if call.batch else rows[0]
+
+
+def _entry(call: Call, b: int, row: list[Expected]) -> dict[str, np.ndarray]:
+    colors = "sh" if call.sh_degree is not None else "colors"
+    # quaternions and scales are the input also where a rasterizer is given covariances
+    tensors = replace(call, covars=False, no_background=False).tensors()
+    given = {colors if name == "colors" else name: call.by_entry(value)[b] for name, value in tensors.items()}
+    arrays = {**given, "Ks": call.by_entry(call.intrinsics())[b]}
     arrays["v_images"] = np.stack([e.v_image for e in row])
     arrays["v_alphas"] = -np.stack([e.v_T_final for e in row])
     arrays["images"] = np.stack([e.render.image for e in row])
     arrays["error_bound_images"] = np.stack([e.image_error_bounds for e in row])
     arrays["alphas"] = 1.0 - np.stack([e.render.T_final for e in row])
     arrays["error_bound_alphas"] = np.stack([e.error_bounds.T_final + 1.0 for e in row])
-    arrays["dominant_ids"] = np.stack([e.render.dominant_ids for e in row])
+    for name in ("dominant_ids", "n_blended"):
+        arrays[name] = np.stack([getattr(e.render, name) for e in row])
+    n = len(given["means"])
+    counts = [np.bincount(ids[ids >= 0], minlength=n) for ids in arrays["dominant_ids"]]
+    arrays["dominant_counts"] = np.stack(counts).astype(np.int64)
     arrays["unambiguous"] = np.stack([e.error_bounds.unambiguous for e in row])
     arrays["decided"] = np.stack([e.error_bounds.decided for e in row])
+    arrays["counted_rows"] = np.stack([_counted(e, n) for e in row])
     smooth = ~np.any([e.error_bounds.screen.kinked for e in row], axis=0)
     arrays |= {"smooth_rows": smooth, "smooth_rows_of_each": np.tile(smooth, (len(row), 1))}
-    return arrays | _gradients(row, colors, call.camera_colors) | {"all_smooth": np.array(np.all(smooth))}
+    arrays |= _splats(row) | _gradients(row, colors, call.camera_colors)
+    return arrays | {"all_smooth": np.array(np.all(smooth))}
+
+
+def _counted(e: Expected, n: int) -> np.ndarray:
+    found = np.ones(n, dtype=bool)
+    for layer in e.error_bounds.layers:
+        found[layer.id] = not np.any((layer.blended | layer.near_threshold) & ~e.error_bounds.decided)
+    return found
+
+
+def _splats(row: list[Expected]) -> dict[str, np.ndarray]:
+    clear = np.stack([e.clear for e in row])
+    visible = clear & np.stack([e.render.splats.visible for e in row])
+    found = {"radii": np.stack([e.render.splats.radii for e in row]), "clear_rows": clear, "visible_rows": visible}
+    for name in _OF_ROWS:
+        # what is culled holds no number
+        values = np.stack([getattr(e.render.splats, name) for e in row])
+        bounds = np.stack([getattr(e.error_bounds.screen, f"e_{name}") for e in row]) + np.abs(values)
+        finite = np.isfinite(values) & np.isfinite(bounds)
+        found |= {name: np.where(finite, values, 0.0), f"error_bound_{name}": np.where(finite, bounds, 0.0)}
+    return found
 
 
 def _gradients(row: list[Expected], colors: str, own_colors: bool) -> dict[str, np.ndarray]:

@@ -111,20 +111,44 @@ def _check(index: dict[str, Any], folder: Path, results: Path, precision: str) -
         if path is None:
             found.missing.append(name)
             continue
-        stored = {a: shape for a, shape in vector["shapes"].items() if arrays[a].get("stored", True)}
-        wanted, result = _vector(folder / vector["file"], stored), read_arrays(path)
+        result = read_arrays(path)
         found.strange += [f"{path.name}: {array}" for array in result if array not in outputs]
-        for array in (a for a in outputs if a in result):
-            seen.add(array)
-            _check_shape(path, array, result[array], vector["shapes"][array])
-            for rule in outputs[array]["compare"]:
-                found.verdicts.append(_judge(name, array, wanted, result[array], rule, index["tiny"], precision))
+        seen |= result.keys() & outputs.keys()
+        found.verdicts += verdicts_of(index, folder, name, result, precision, path)
     if not found.verdicts:
         raise VectorsError(
             f"{results}: holds nothing to judge; write one file for each vector, as "
             f"{next(iter(index['vectors']))}.npz with {', '.join(known_outputs)}"
         )
     found.absent = [array for array in known_outputs if array not in seen]
+    return found
+
+
+def verdicts_of(
+    index: dict[str, Any], folder: Path, name: str, result: dict[str, np.ndarray], precision: str, path: Path
+) -> list[Verdict]:
+    """Hold a port's result for one vector to it.
+
+    Args:
+        index: that `read_index` read.
+        folder: of the vectors.
+        name: of the vector.
+        result: arrays by name.
+        precision: "float32" or "float64", that the port computes in.
+        path: where the result is from, for errors.
+
+    Raises:
+        VectorsError: an array of the vector or of the result is missing, damaged or of another shape.
+    """
+    vector, found = index["vectors"][name], []
+    arrays = index["kinds"][vector["kind"]]["arrays"]
+    stored = {a: shape for a, shape in vector["shapes"].items() if arrays[a].get("stored", True)}
+    wanted = _vector(folder / vector["file"], stored)
+    for array, about in arrays.items():
+        if about["role"] == "output" and array in result:
+            _check_shape(path, array, result[array], vector["shapes"][array])
+            for rule in about["compare"]:
+                found.append(_judge(name, array, wanted, result[array], rule, index["tiny"], precision))
     return found
 
 

@@ -6,8 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from pop_ref.conformance.golden import golden_scene
-from pop_ref.conformance.scenes import Record, Scene, pack
+from pop_ref.conformance.scenes import Record, Scene, golden_scene, pack
 from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER, Profile
 from pop_ref.records import Camera
 

@@ -33,6 +33,8 @@ ABOUT: Final = (
     "mask is true, each times 1 + (7 x + 13 y) mod 16, are summed over blocks of 8 x 8 pixels; row r of the expected "
     "[blocks, D] is block (r mod columns, r div columns). 'runs': rows i of an array, flattened to [N, K], each times "
     "1 + 7 i mod 16, are summed over runs of max(1, N div 100) rows.",
+    "What a vector of one stage function asks stands in its option 'arguments', by name: an array with its 'dtype', "
+    "'shape' and numbers, a 'record' with its fields 'of', a 'tuple', a list, or a plain value.",
     "'pop vectors check DIR RESULTS' does all of this.",
 )
 MODEL: Final = (
@@ -51,10 +53,17 @@ MODEL: Final = (
 )
 AXES: Final = {
     "C": "cameras",
-    "D": "channels of plain colours",
+    "E": "entries of a batch, along one axis",
+    "D": "channels of plain colours, or of a picture",
     "X": "channels of an image: colours, or depth, or both, depth last",
     "B": "channels of a background",
     "M": "Gaussians after the step",
+    "S": "steps of a training",
+    "R": "Gaussians of all steps, one step after the other",
+    "P": "passes over views",
+    "Q": "Gaussians of all passes, one pass after the other",
+    "V": "training views",
+    "U": "random numbers",
     "blocks, runs": "sums that a large result is reduced to",
     "N": "Gaussians",
     "H": "rows of the image, from the top",
@@ -68,6 +77,10 @@ OPTIONS: Final = {
     "antialiased": "opacities are multiplied by sqrt(max(0, det(covar2d) / det(covar2d + eps2d I)))",
     "render_mode": "what an image of a call holds; its kind explains it under 'modes'",
     "radius_clip": "px; Gaussians whose extents 'radii' are both at most this are left out of a call; 0: nobody",
+    "batch": "dimensions of a call's batch, whose entries lie along E; none without one",
+    "packed": "a renderer that has it keeps rows of visible Gaussians only; arrays stay those of all",
+    "covars": "a renderer that takes covariances is given rotation(quat) diag(scales)^2 rotation(quat)^T instead",
+    "no_background": "a renderer that can be called without a background is, and backgrounds are black",
     "profile.near_plane, near_inclusive": "Gaussians with camera z < near_plane are left out; z = near_plane too if "
     "near_inclusive (D1)",
     "profile.far_plane": "Gaussians with camera z > far_plane are left out",

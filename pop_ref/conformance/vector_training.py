@@ -44,11 +44,11 @@ def _in_float32(values: np.ndarray) -> np.ndarray:
 def loss_kind() -> dict[str, Any]:
     """Return what the index says of losses."""
     arrays = {
-        "picture": entry("input", "[H, W, 3]", "what is drawn"),
-        "target": entry("input", "[H, W, 3]", "the photograph"),
+        "picture": entry("input", "[H, W, D]", "what is drawn"),
+        "target": entry("input", "[H, W, D]", "the photograph"),
         "mask": entry("input", "[H, W]", "pixels that count; all where the option 'masked' is false", "bool"),
         **output("loss", "[]", "the option 'loss' of picture and target", "agreement.losses"),
-        **output("v_picture", "[H, W, 3]", "derivative of v_loss times the loss to picture", "agreement.losses_vjp"),
+        **output("v_picture", "[H, W, D]", "derivative of v_loss times the loss to picture", "agreement.losses_vjp"),
     }
     about = (
         "'l1', 'l2': mean absolute, mean squared difference. 'ssim': mean similarity under 11 x 11 Gaussian windows of "
@@ -68,6 +68,9 @@ def loss_vectors() -> dict[str, Vector]:
             for masked in (False,) if name == "ssim" else (False, True):
                 words = ("loss", name, *([padding] if similar else []), *(["masked"] if masked else []))
                 found["_".join(words)] = _loss(name, padding, masked)
+            # seams of blocks of 16 and 32, a fourth channel, values that a clamp would change
+            words = ("loss", name, *([padding] if similar else []), "of_large_pictures")
+            found["_".join(words)] = _loss(name, padding, False, (70, 50, 4), 2.0)
     return found
 
 
@@ -79,9 +82,11 @@ def loss_arguments(options: dict[str, Any], mask: np.ndarray) -> tuple[Any, ...]
     return (options["padding"],) if options["loss"] == "ssim" else (options["share"], options["padding"], kept)
 
 
-def _loss(name: str, padding: Any, masked: bool) -> Vector:
-    picture, target = (_in_float32(pattern(seed, (17, 19, 3))) for seed in (3, 11))
-    mask = pattern(5, (17, 19)) > 0.4 if masked else np.ones((17, 19), dtype=bool)
+def _loss(
+    name: str, padding: Any, masked: bool, shape: tuple[int, int, int] = (17, 19, 3), contrast: float = 1.0
+) -> Vector:
+    picture, target = (_in_float32(contrast * (pattern(seed, shape) - 0.5) + 0.5) for seed in (3, 11))
+    mask = pattern(5, shape[:2]) > 0.4 if masked else np.ones(shape[:2], dtype=bool)
     options = {"loss": name, "padding": padding, "masked": masked, "share": SHARE, "v_loss": V_LOSS}
     arguments = loss_arguments(options, mask)
     of_value, of_gradient = 0.0, np.zeros_like(picture)

@@ -20,10 +20,12 @@ from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bound
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scene_files import scene_arrays, scene_options
 from pop_ref.conformance.scenes import Scene, cotangents, rounded_to
-from pop_ref.conformance.vector_calls import call_arrays, call_kind, calls, kind_of
+from pop_ref.conformance.vector_calls import FORMS, KINDS, call_arrays, call_kind, calls, kind_of
 from pop_ref.conformance.vector_large import large_kind, large_vectors
+from pop_ref.conformance.vector_methods import training_kind, training_vectors
 from pop_ref.conformance.vector_scenes import vector_scenes
 from pop_ref.conformance.vector_schema import GRADIENTS, render_kind, schema
+from pop_ref.conformance.vector_stages import stage_kinds, stage_vectors
 from pop_ref.margins import margins
 
 _TRAINING = {
@@ -31,6 +33,7 @@ _TRAINING = {
     "pop": training.pop_vectors,
     "adam": training.adam_vectors,
     "density": training.density_vectors,
+    "training": training_vectors,
 }
 
 
@@ -38,15 +41,14 @@ def kinds() -> dict[str, dict[str, Any]]:
     """Return what the index says of each kind of vector."""
     return {
         "render": render_kind(),
-        "call": call_kind(plain=False, own=False),
-        "call_plain": call_kind(plain=True, own=False),
-        "call_of_each_camera": call_kind(plain=False, own=True),
-        "call_plain_of_each_camera": call_kind(plain=True, own=True),
+        **{kind: call_kind(kind) for kind in KINDS},
         "large": large_kind(),
         "loss": training.loss_kind(),
         "pop": training.pop_kind(),
         "adam": training.adam_kind(),
         "density": training.density_kind(),
+        "training": training_kind(),
+        **stage_kinds(),
     }
 
 
@@ -119,13 +121,15 @@ def export(folder: Path) -> list[str]:
         write(name, "render", expected_arrays(scene), _full_options(scene))
     for name, call in calls().items():
         options = _full_options(call.first.scene.with_overrides(profile=call.profile))
-        options |= {"render_mode": call.render_mode, "radius_clip": call.radius_clip}
+        options |= {name: getattr(call, name) for name in ("render_mode", "radius_clip", "batch", *FORMS)}
         write(name, kind_of(call), call_arrays(call), options)
     for name, (arrays, scene, shapes) in large_vectors().items():
         write(name, "large", arrays, _full_options(scene), shapes)
     for kind, made in _TRAINING.items():
         for name, (arrays, options) in made().items():
             write(name, kind, arrays, options)
+    for name, (arrays, options) in stage_vectors().items():
+        write(name, name, arrays, options)
     index = {**schema(kinds()), "vectors": vectors}
     (folder / "index.json").write_text(json.dumps(index, indent=1) + "\n", encoding="utf-8")
     return list(vectors)

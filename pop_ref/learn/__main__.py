@@ -12,7 +12,7 @@ import numpy as np
 
 from pop_ref.learn import needs_of_judging
 from pop_ref.learn.course import BY_NAME, COURSE, stage_named
-from pop_ref.learn.progress import asked_before, course_map, note_passed, picture
+from pop_ref.learn.progress import asked_before, course_map, note_passed, passed_stages, picture
 from pop_ref.learn.splat import write_png
 from pop_ref.learn.stubs import answer, start
 from pop_ref.learn.student import read_work
@@ -96,6 +96,7 @@ def check(name: str, folder: Path, wants_answer: bool) -> int:
         print(f"the counterexample, yours in orange and what it should be in blue -> {counterexample}")
     if verdict.passed:
         note_passed(folder, stage)
+        _tell_of_the_pages(folder)
     if wants_answer and (verdict.passed or asked_before(folder, stage)):
         print(f"\nthe oracle's {stage.name}:\n\n{answer(stage)}")
     elif wants_answer:
@@ -116,7 +117,14 @@ def check_all(folder: Path, as_json: bool) -> int:
     for name in grade["passed"]:
         note_passed(folder, BY_NAME[name])
     print(json.dumps(grade) if as_json else told_in_lines(grade))
+    if grade["passed"] and not as_json:
+        _tell_of_the_pages(folder)
     return 0 if len(grade["passed"]) == len(COURSE) else 1
+
+
+def _tell_of_the_pages(folder: Path) -> None:
+    end = f".html#passed={','.join(passed_stages(read_work(folder)))}"
+    print(f"the pages show the oracle's functions of these stages when an address ends in {end}")
 
 
 def show_map(folder: Path, out: Path | None) -> int:

@@ -283,6 +283,7 @@ def _told(
         return replace(plain, sentence=f"This law does not hold: {plain.broken}.", hint=_own_words(error))
     call = (least or first)[0]
     sentence, hint = diagnose([each for each in (*least, *first) if each.function == call.function], work.folder)
+    plain = replace(plain, right=tuple(name for name in plain.right if name != call.function))
     return replace(plain, sentence=sentence, hint=hint or _formula(stage, call.function), call=call)
 
 

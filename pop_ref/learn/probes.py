@@ -137,6 +137,7 @@ def _weights(rng: np.random.Generator) -> Iterator[Probe]:
     yield "", ([5, 3], [0.75, 0.125])
     yield "two weights are equal, and the front one wins", ([4, 2, 7], [0.25, 0.5, 0.5])
     yield "nothing is blended", ([], [])
+    yield "every weight is 0, and there is no winner", ([3, 0], [0.0, 0.0])
 
 
 def _winners(rng: np.random.Generator) -> Iterator[Probe]:

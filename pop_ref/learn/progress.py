@@ -26,6 +26,11 @@ def note_passed(folder: Path, stage: Stage) -> None:
     _keep(folder, notes)
 
 
+def passed_stages(work: Work) -> list[str]:
+    """Name the stages that have passed as their files are now."""
+    return [stage.name for stage in COURSE if state(work, stage) == PASSED]
+
+
 def asked_before(folder: Path, stage: Stage) -> bool:
     """Tell whether the answer of a stage has been asked for before, and remember that it has been now."""
     notes = _notes(folder)

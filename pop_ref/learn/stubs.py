@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import ast
 import functools
+import importlib
+import inspect
 import re
 import textwrap
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pop_ref
 from pop_ref.constants import DECISIONS, KINKS
@@ -23,6 +24,8 @@ programs.
 """
 # of a docstring's lines, before it is indented
 _WIDTH: Final = 114
+# of a class or a function, to be told
+_MOST_FIELDS: Final = 12
 _LABELS: Final = {label: f"the {words.partition(':')[0]}" for label, words in (DECISIONS | KINKS).items()}
 # what the functions of the course read of their settings
 _SETTINGS: Final = {
@@ -76,7 +79,10 @@ def stub(stage: Stage) -> str:
     about = textwrap.fill(" ".join(_ABOUT.format(chapters=_chapters_told(stage)).split()), 120)
     head = _HEAD.format(number=number, count=len(COURSE), name=stage.name, does=stage.does, about=about)
     functions = [_without_body(module, name) for module, names in stage.functions.items() for name in names]
-    return "\n\n".join(["\n".join([head, *_imports(stage)]), *functions])
+    imported = _imports(stage, set(re.findall(r"\w+", "".join([*functions, answer(stage)]))))
+    about = _at_hand(imported)
+    head = head.replace("\n    pop-learn", f"{about}\n    pop-learn") if about else head
+    return "\n\n".join(["\n".join([head, *imported]), *functions]) + "\n"
 
 
 def answer(stage: Stage) -> str:
@@ -138,13 +144,20 @@ def _chapters_told(stage: Stage) -> str:
 
 def _of_the_course(name: str, docstring: str) -> str:
     """Write labels in words, and explain of the settings what the course has."""
-    docstring = re.sub(r" \((?:A\d+(?:, )?)+(?::[^()]*)?\)", "", docstring)
-    docstring = re.sub(r"\b[DB]\d\b", lambda label: _LABELS[label[0]], docstring)
+    docstring = _labels_in_words(docstring)
     docstring = re.sub(r' Under "split".*?and split\.', "", docstring, flags=re.DOTALL)
+    chapter = next(stage.chapter_of(name) for stage in COURSE if name in stage.names)
+    docstring = re.sub(r"see the module's text", f"see chapter {chapter}", docstring)
+    docstring = docstring.replace("See the module's text", f"See chapter {chapter}")
     docstring = docstring.replace("gsplat's option of that name.", "not in this course; leave it out, or False.")
     for setting, about in _SETTINGS.get(name, {}).items():
         docstring = re.sub(f"    {setting}: .*", f"    {setting}: {about}", docstring)
     return "\n".join(_wrapped(line) for line in docstring.split("\n"))
+
+
+def _labels_in_words(text: str) -> str:
+    text = re.sub(r" \((?:A\d+(?:, )?)+(?::[^()]*)?\)", "", text)
+    return re.sub(r"\b[DB]\d\b", lambda label: _LABELS[label[0]], text)
 
 
 def _wrapped(line: str) -> str:
@@ -152,7 +165,9 @@ def _wrapped(line: str) -> str:
     if len(line) <= _WIDTH or ">>>" in line:
         return line
     indent = " " * (len(line) - len(line.lstrip()))
-    return textwrap.fill(line.strip(), _WIDTH, initial_indent=indent, subsequent_indent=f"{indent}    ")
+    # what follows a name and a colon is indented below it
+    hanging = "    " if re.match(r"\s*\w+: ", line) else ""
+    return textwrap.fill(line.strip(), _WIDTH, initial_indent=indent, subsequent_indent=indent + hanging)
 
 
 def _without_formulas(docstring: str) -> str:
@@ -167,30 +182,58 @@ def _formulas_in(text: str) -> list[str]:
     return [" ".join(quoted.split()) for quoted in _QUOTED.findall(text) if re.search("[=<>]", quoted)]
 
 
-def _imports(stage: Stage) -> Iterator[str]:
-    """Import what the oracle's module imports, and what else it defines that the stage does not ask for."""
-    yield "from __future__ import annotations\n"
-    own, seen = set(stage.names), set()
-    plain = ["import math", "import numpy as np"]
-    ours: dict[str, list[str]] = {}
+def _at_hand(imported: list[str]) -> str:
+    """Tell of the imported classes and functions that no student writes what they are called with and what they do."""
+    asked = {name for stage in COURSE for name in stage.names}
+    lines = []
+    for node in ast.parse("\n".join(imported)).body:
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("pop_ref."):
+            module = importlib.import_module(str(node.module))
+            for alias in node.names:
+                value = getattr(module, alias.name)
+                if alias.name not in asked and (inspect.isfunction(value) or inspect.isclass(value)):
+                    parameters = list(inspect.signature(value).parameters)
+                    # a table of settings is told of where a function takes it
+                    if len(parameters) <= _MOST_FIELDS and node.module != "pop_ref._shapes":
+                        lines += _told_of(f"{alias.name}({', '.join(parameters)})", value)
+    return "\n".join(["\nWritten for you:", "", *lines, ""]) if lines else ""
+
+
+def _told_of(called: str, value: Any) -> list[str]:
+    """Write how a class is made or a function called, and the first line of its docstring."""
+    first = _labels_in_words((value.__doc__ or "").strip().split("\n")[0])
+    return textwrap.wrap(f"{called}: {first}", 116, initial_indent="    ", subsequent_indent="        ")
+
+
+def _imports(stage: Stage, used: set[str]) -> list[str]:
+    """Import what the oracle's functions use of their module: types, and what other stages ask for, in any case."""
+    own, asked = set(stage.names), {name for each in COURSE for name in each.names}
+    plain, ours = {"import math", "import numpy as np"}, dict[str, list[str]]()
     for module in stage.functions:
-        body = ast.parse(_source(module)).body
-        for node in body:
-            if isinstance(node, ast.Import) or (isinstance(node, ast.ImportFrom) and node.module in ("math", "typing")):
-                plain.append(ast.unparse(node))
+        for node in ast.parse(_source(module)).body:
+            if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_"):
+                origin, names = f"pop_ref.{module}", [node.name]
             elif isinstance(node, ast.ImportFrom) and node.module != "__future__":
-                names = [alias.name for alias in node.names]
-                if str(node.module).startswith("pop_ref"):
-                    ours.setdefault(str(node.module), []).extend(names)
-                else:
-                    plain.append(ast.unparse(node))
-            elif isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_"):
-                ours.setdefault(f"pop_ref.{module}", []).append(node.name)
-    yield from sorted(set(plain))
-    yield ""
+                origin, names = str(node.module), [alias.name for alias in node.names]
+            else:
+                continue
+            # a type is needed where a result is made of it
+            fresh = [name for name in names if name in used | asked or re.match("[A-Z]+[a-z]", name)]
+            fresh = [name for name in fresh if name not in own]
+            if fresh:
+                ours.setdefault(origin, []).extend(fresh)
+    lines, seen = list[str](), set[str]()
     for origin, names in sorted(ours.items()):
-        fresh = [name for name in dict.fromkeys(names) if name not in own | seen]
+        fresh = [name for name in dict.fromkeys(names) if name not in seen]
         seen.update(fresh)
+        line = f"from {origin} import {', '.join(fresh)}"
+        long = f"from {origin} import (\n    " + ",\n    ".join(fresh) + ",\n)"
         if fresh:
-            line = f"from {origin} import {', '.join(fresh)}"
-            yield line if len(line) <= 120 else f"from {origin} import (\n    " + ",\n    ".join(fresh) + ",\n)"
+            lines.append(line if len(line) <= 120 else long)
+    standard = [line for line in lines if not line.startswith("from pop_ref")]
+    return [
+        "from __future__ import annotations\n",
+        *sorted({*plain, *standard}),
+        "",
+        *(x for x in lines if x not in standard),
+    ]

@@ -289,8 +289,9 @@ picture(
 # ## All of it at once
 #
 # `project` does what this chapter did, for every Gaussian: centre, conic and extent, as chapter 1 used them. It also
-# *culls*, that is leaves out, what cannot be seen: a Gaussian whose centre lies behind the camera or nearer to it than
-# the *near plane*, at depth 0.01 (decision D1), and one that does not reach the image (D2).
+# *culls*, that is leaves out, what cannot be seen: a Gaussian whose centre lies behind the camera, nearer to it than
+# the *near plane*, at depth 0.01, or beyond the far plane, at $10^{10}$ (decision D1), and one that does not reach the
+# image (D2).
 
 # %%
 scene = Gaussians(means, quats, scales, np.array([0.9, 0.6]), np.zeros((2, 1, 3)))

@@ -19,9 +19,9 @@
 #
 # {{source: pop_ref.losses.l2_vjp}}
 #
-# (A mask, where one is given, leaves pixels out.) L1 pulls equally hard at every error, L2 in proportion. In units of
-# $1/(3HW)$ L1 pulls with 1; L2 with 2/255 at an error of one step of a byte, with 2 at the largest error there is, and
-# with 1 at an error of 1/2.
+# (A mask, where one is given, leaves pixels out; the means are then over the others.) L1 pulls equally hard at every
+# error, L2 in proportion. In units of $1/(3HW)$ L1 pulls with 1; L2 with 2/255 at an error of one step of a byte, with
+# 2 at the largest error there is, and with 1 at an error of 1/2.
 
 # %%
 from dataclasses import replace

@@ -347,9 +347,11 @@ picture(
 )
 
 # %% [markdown]
-# Without the prior the photographs leave opacities wherever they are of use: a fifth is over 0.9, and most stay in
-# between. With it all but two have reached a pole when the prior ends, and a pixel blends 9.6 Gaussians instead of
-# 13.5. When the prior is off the crowd at the bottom frays: some of the faint, which still have gradients, rise again.
+# Without the prior the photographs leave opacities wherever they are of use: few end over 0.9, and most stay between
+# 0.1 and 0.9. With it, at least twice as many are under 0.1 or over 0.9 when the prior ends, and a pixel blends at
+# least an eighth fewer Gaussians. Once the prior is off, the photographs alone decide about the faint ones, which still
+# have gradients. (A test checks these sentences for other draws and other starts. The numbers below are those of this
+# run.)
 
 
 # %%
@@ -359,17 +361,23 @@ def at_poles(scene):
 
 
 without, with_prior = runs["without"], runs["with"]
-assert 0.15 < np.mean(without[-1].opacities > 0.9) < 0.25
-assert at_poles(without[POP_STEPS]) <= 0.25
-assert at_poles(with_prior[POP_STEPS]) == 1.0 - 2.0 / len(with_prior[POP_STEPS])
-faint = with_prior[POP_STEPS].opacities < 0.1
-assert np.any(with_prior[-1].opacities[faint] > 0.2)
 error_without, blended_without = measured(without[POP_STEPS])
 error_with, blended_with = measured(with_prior[POP_STEPS])
-print(f"blended per pixel: {blended_without:.1f} without, {blended_with:.1f} with")
 shares = [at_poles(run[POP_STEPS]) for run in (without, with_prior)]
-print(f"at a pole: {shares[0]:.0%} without, {shares[1]:.0%} with")
-assert np.allclose([blended_without, blended_with], [13.5, 9.6], atol=0.05)
+print("as the prior ends       without    with")
+print("at a pole              {:8.0%}{:8.0%}".format(*shares))
+print(f"blended per pixel      {blended_without:8.1f}{blended_with:8.1f}")
+last = without[-1].opacities
+assert np.mean(last > 0.9) < 0.35
+assert np.mean((last > 0.1) & (last < 0.9)) > 0.5
+assert shares[1] > max(0.7, 2.0 * shares[0])
+assert blended_with < 0.875 * blended_without
+faint = with_prior[POP_STEPS].opacities < 0.1
+view = render(with_prior[POP_STEPS], cameras[1])
+v_image = l2_vjp(view.image, photos[1], 1.0)
+assert np.any(
+    render_vjp(with_prior[POP_STEPS], cameras[1], v_image).opacities[faint] != 0.0
+)
 
 fig, (left, right) = axes(2, height=2.8)
 for name, colour in (("without", MUTED), ("with", ACCENT)):
@@ -382,26 +390,34 @@ right.legend()
 picture(fig, "What the prior saves (compare the paper's figure 4b), and what it costs.")
 
 # %% [markdown]
-# It is not free. When the prior ends the error is three times that of the run without it, and the ratio hardly changes
-# after: 4.8 dB of PSNR at the end. Forty Gaussians cannot spare any. Where there are enough, the price is small: in the
-# paper's ablation on Mip-NeRF 360 the prior takes the model from 583k to 268k Gaussians and from 27.22 to 27.01 dB.
+# It is not free. When the prior ends, the error is more than twice that of the run without it, and the steps that
+# follow do not make up for it: in every start that was tried, the picture ends more than 2 dB worse. Forty Gaussians
+# cannot spare any. Where there are enough, the price is small: in the paper's ablation on Mip-NeRF 360 the prior takes
+# the model from 583k to 268k Gaussians and from 27.22 to 27.01 dB.
 #
-# Two things do not show in so small a world. Hardly anything is pruned, for most faint Gaussians are not yet under
-# 0.005. And no pixel stops early, since that takes two layers of about 0.99. What the prior saves here is reach: an
-# opacity of 0.8 is over the floor of 1/255 up to 3.3 standard deviations from its centre, one of 0.03 up to 2.
+# Two things hardly show in so small a world. The steps are too few for all of the faint Gaussians to sink under 0.005,
+# where they would be pruned. And next to no pixel stops early, since that takes two layers of about 0.99. What the
+# prior saves here is reach: an opacity of 0.8 is over the floor of 1/255 up to 3.3 standard deviations from its centre,
+# one of 0.03 up to 2.
 
 # %%
-assert 2.8 < error_with / error_without < 3.3
 final_without, final_with = measured(without[-1])[0], measured(with_prior[-1])[0]
-assert np.isclose(10.0 * np.log10(final_with / final_without), 4.8, atol=0.05)
-assert (len(without[-1]), len(with_prior[-1])) == (40, 37)
+print(f"the prior costs {10.0 * np.log10(final_with / final_without):.1f} dB;", end=" ")
+n_pruned, n_faint = N - len(with_prior[-1]), np.sum(faint)
+print(f"it leaves {n_faint} faint Gaussians and has pruned {n_pruned}")
+assert error_with > 2.0 * error_without
+assert final_with > 10.0**0.2 * final_without
+assert n_pruned > 0 < n_faint
 assert np.allclose(
     np.sqrt(2.0 * np.log(255.0 * np.array([0.8, 0.03]))), [3.3, 2.0], atol=0.05
 )
+# what pixels went through, of what was listed for their tiles
+shares = []
 for camera in cameras:
     view = render(with_prior[POP_STEPS], camera)
     listed = np.array([len(ids) for ids in view.tile_lists])[np.arange(WIDTH) // 16]
-    assert np.array_equal(view.n_traversed[0], listed)
+    shares.append(np.mean(view.n_traversed[0] / listed))
+assert min(shares) > 0.95
 
 # %% [markdown]
 # And in three dimensions: the toy of chapter 0 once more, trained in this page. Train it to the end. Then change

@@ -53,7 +53,7 @@ viewmat[:3, :3] = np.array(
     [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
 )
 viewmat[:3, 3] = [0.3, -0.2, 0.5]
-K = np.array([[30.0, 0.0, 16.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]])
+K = np.array([[30.0, 0.0, WIDTH / 2], [0.0, 30.0, HEIGHT / 2], [0.0, 0.0, 1.0]])
 camera = Camera(viewmat, K, WIDTH, HEIGHT)
 tilted = (np.cos(np.deg2rad(20.0)), 0.0, 0.0, np.sin(np.deg2rad(20.0)))
 sideways = ((0.9, 0.3, -0.6), (0.8, 0.8, -0.8), (0.0, 0.0, 0.0), (0.5, -0.5, 0.5))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import pytest
 from pop_fast.cli import main
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from tests.app.interruptions import interrupt
+from tests.app.interruptions import run_until
 from tests.app.tiny import tiny_capture, tiny_config
 
 
@@ -25,24 +24,36 @@ class Outcome:
     err: str
 
 
-Pop = Callable[..., Outcome]
 # a capture of 8 photographs; 30 steps with a change of the Gaussians and all else that density control does
 TRAIN_AND_CHECK = ("--steps-scaler", "0.001", "--no-progress", "--pop.grow-grad2d", "1e-6")
 # without the renders of the report, which take longer than all of the rest
 TRAIN = (*TRAIN_AND_CHECK, "--skip-checks")
 
 
-@pytest.fixture
-def pop(capsys: pytest.CaptureFixture[str]) -> Pop:
-    """Call `pop WORD ...` in this process."""
+@dataclass(frozen=True)
+class Pop:
+    """Calls `pop WORD ...` in this process."""
 
-    def call(*words: object) -> Outcome:
-        capsys.readouterr()
+    capsys: pytest.CaptureFixture[str]
+
+    def __call__(self, *words: object) -> Outcome:
+        """Call it and return what it came to."""
+        self.capsys.readouterr()
         status = main([str(word) for word in words])
-        out, err = capsys.readouterr()
+        out, err = self.capsys.readouterr()
         return Outcome(status, out, err)
 
-    return call
+    def done(self, *words: object) -> Outcome:
+        """Call what must succeed."""
+        outcome = self(*words)
+        assert outcome.status == 0, outcome
+        return outcome
+
+
+@pytest.fixture
+def pop(capsys: pytest.CaptureFixture[str]) -> Pop:
+    """The command line, called in this process."""
+    return Pop(capsys)
 
 
 @pytest.fixture(scope="session")
@@ -77,9 +88,6 @@ def result(shared_result: Path, tmp_path: Path) -> Path:
 def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of thirty steps that was left after eleven: two checkpoints, after the fifth and the tenth."""
     folder = tmp_path_factory.mktemp("stopped")
-    with pytest.MonkeyPatch.context() as patch:
-        interrupt(patch, at=11)
-        with pytest.raises(KeyboardInterrupt):
-            TrainingRun(tiny_config(folder), tiny_capture()).run()
+    run_until(TrainingRun(tiny_config(folder), tiny_capture()), 11)
     assert [step for step, _ in ckpt.list_checkpoints(folder)] == [4, 9]
     return folder

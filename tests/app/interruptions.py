@@ -33,6 +33,24 @@ def interrupt(monkeypatch: pytest.MonkeyPatch, at: int) -> None:
 
 
 @contextmanager
+def interrupted(at: int) -> Iterator[None]:
+    """Let the run in this block be left at once, without a checkpoint, when it has taken `at` steps."""
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt(patch, at)
+        with pytest.raises(KeyboardInterrupt):
+            yield
+
+
+def run_until(training: TrainingRun, at: int | None = None) -> None:
+    """Run to the end, or leave at once, without a checkpoint, when `at` steps are taken."""
+    if at is None:
+        training.run()
+        return
+    with interrupted(at):
+        training.run()
+
+
+@contextmanager
 def killed_after(changes: int) -> Iterator[None]:
     """Let the first so many renames, removals and new folders happen and raise `Killed` at each one after them."""
     left = changes

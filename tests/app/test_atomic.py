@@ -21,8 +21,8 @@ from pop_fast.train import TrainingRun
 from pop_fast.train.results import ResultFolder
 from tests.app.captures import assert_one_line
 from tests.app.conftest import TRAIN, Pop
-from tests.app.damage import contents
-from tests.app.interruptions import Killed, interrupt, killed_after
+from tests.app.damage import contents, says
+from tests.app.interruptions import Killed, killed_after, run_until
 from tests.app.tiny import tiny_capture, tiny_config
 
 
@@ -390,9 +390,7 @@ def test_a_run_beside_a_live_one_is_refused_and_the_next_after_it_is_not(
     with subprocess.Popen([sys.executable, "-c", _HOLD, str(result)], stdout=subprocess.PIPE) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == b"held\n"
-        outcome = pop("train", shared_capture, "--out", result, *TRAIN, how)
-        assert outcome.status == 2
-        assert "another run is writing to this folder" in outcome.err
+        says(pop("train", shared_capture, "--out", result, *TRAIN, how), "another run is writing to this folder")
         assert contents(result) == before
         os.kill(holder.pid, signal.SIGKILL)
     assert pop("train", shared_capture, "--out", result, *TRAIN, how).status == 0
@@ -413,11 +411,8 @@ def test_of_two_that_found_no_folder_one_gets_it(tmp_path: Path) -> None:
 
 
 @needs_flock
-def test_a_run_that_stops_or_ends_gives_the_folder_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patch:
-        interrupt(patch, at=7)
-        with pytest.raises(KeyboardInterrupt):
-            TrainingRun(tiny_config(tmp_path), tiny_capture()).run()
+def test_a_run_that_stops_or_ends_gives_the_folder_back(tmp_path: Path) -> None:
+    run_until(TrainingRun(tiny_config(tmp_path), tiny_capture()), 7)
     lock = FolderLock(tmp_path)
     lock.take()
     lock.release()

@@ -120,16 +120,14 @@ def test_settings_that_the_device_does_not_know_are_refused_before_anything_is_r
 @pytest.mark.usefixtures("_without_compiled_blend")
 @pytest.mark.usefixtures("with_gpu")
 def test_a_run_on_a_gpu_from_the_command_line(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
-    outcome = pop("train", shared_capture, "--out", tmp_path / "r", *TRAIN, "--skip-sizes")
-    assert outcome.status == 0, outcome.err
+    outcome = pop.done("train", shared_capture, "--out", tmp_path / "r", *TRAIN, "--skip-sizes")
     assert "backend cuda: a GPU and the build are here" in outcome.out
     assert " s on drift, loading " in outcome.out
     assert settings(tmp_path / "r")["resolved"]["backend"] == "cuda"
     stats = json.loads((tmp_path / "r" / "stats" / "val_step0029.json").read_text())
     assert stats["gpu"] == "drift"
     assert stats["stepper"] == "cuda"
-    again = pop("train", shared_capture, "--out", tmp_path / "r", *TRAIN, "--resume", "--skip-sizes")
-    assert again.status == 0, again.err
+    again = pop.done("train", shared_capture, "--out", tmp_path / "r", *TRAIN, "--resume", "--skip-sizes")
     assert "backend cuda, with which the run was begun" in again.out
 
 
@@ -139,8 +137,7 @@ def test_a_result_of_a_gpu_can_be_measured_without_one(pop: Pop, result: Path, m
     given["resolved"]["backend"] = "cuda"
     (result / "cfg.json").write_text(json.dumps(given))
     monkeypatch.setattr("cuda_ext.why_not", lambda: NOT_BUILT)
-    outcome = pop("eval", result)
-    assert outcome.status == 0, outcome.err
+    outcome = pop.done("eval", result)
     assert f"note: backend 'fast' stands in for 'cuda': {NOT_BUILT}" in outcome.err
     assert renderer("auto")[1] is None
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from pop_fast.blocks.jobs import block_folder, parts_of
 from pop_fast.blocks.merge import TAKEN
 from pop_fast.blocks.plan import Job, read_job, read_plan
 from pop_fast.blocks.rounds import write_round_block
-from pop_fast.children import module_command
 from pop_fast.cli import main
 from pop_fast.data.load import load_capture
 from pop_fast.data.random_points import in_picture
@@ -25,26 +23,22 @@ from pop_fast.train.checkpoint import load_splats, save_checkpoint
 from pop_fast.train.evaluate import evaluate
 from pop_fast.train.load_result import CaptureRecord, load_splat, read_record
 from pop_fast.train.model import KEYS
-from pop_fast.train.results import ResultFolder, read_config
+from pop_fast.train.results import read_config
 from pop_fast.train.views import ViewTensors
 from tests.app.conftest import TRAIN, Pop
+from tests.app.damage import says
 from tests.app.interruptions import interrupt
+from tests.app.test_blocks import NAMES, in_this_process, stats_of
 
 SETTINGS = (*TRAIN, "--skip-sizes", "--threads", "1", "--checkpoint-every", "5")
 BLOCKS = ("--blocks", "2x1", *SETTINGS)
 ROUNDS = ("--blocks-rounds", "2", "--blocks-round-steps", "12")
-NAMES = ("0_0", "1_0")
 
 
 @pytest.fixture(autouse=True)
 def _one_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jobs, "_run", in_this_process)
     monkeypatch.setattr("pop_fast.blocks.jobs.has_snakemake", lambda: False)
-
-
-def in_this_process(words: Sequence[str], quiet: bool) -> int:
-    assert list(words[:4]) == module_command("pop_fast.cli")
-    return main(list(words[4:]))
 
 
 @pytest.fixture(scope="module")
@@ -62,12 +56,6 @@ def shared_rounds(shared_capture: Path, tmp_path_factory: pytest.TempPathFactory
 def rounds(shared_rounds: Path, tmp_path: Path) -> Path:
     """A copy of the run that a test may change."""
     return Path(shutil.copytree(shared_rounds, tmp_path / "rounds"))
-
-
-def stats_of(folder: Path) -> dict:
-    found = ResultFolder(folder).read_stats("val", 29)
-    assert found is not None
-    return found
 
 
 def core(folder: Path, number: int, name: str) -> dict[str, torch.Tensor]:
@@ -182,8 +170,7 @@ def test_statistics_say_what_every_round_came_to(shared_rounds):
 
 def test_without_rounds_nothing_of_them_is_there(pop: Pop, shared_capture, shared_rounds, tmp_path):
     folder = tmp_path / "out"
-    done = pop("train", shared_capture, "--out", folder, *BLOCKS, "--blocks-rounds", "0")
-    assert done.status == 0, done.err
+    done = pop.done("train", shared_capture, "--out", folder, *BLOCKS, "--blocks-rounds", "0")
     assert "merged after" not in done.out
     assert "rounds" not in stats_of(folder)
     assert not list((folder / "blocks").glob("round_*"))
@@ -193,8 +180,7 @@ def test_without_rounds_nothing_of_them_is_there(pop: Pop, shared_capture, share
     path = folder / "blocks" / "job.json"
     old = {name: value for name, value in json.loads(path.read_text()).items() if not name.startswith("round")}
     path.write_text(json.dumps(old))
-    again = pop("train", shared_capture, "--out", folder, *BLOCKS, "--resume")
-    assert again.status == 0, again.err
+    again = pop.done("train", shared_capture, "--out", folder, *BLOCKS, "--resume")
     assert "are trained and merged" in again.out
 
 
@@ -202,13 +188,11 @@ def test_rounds_can_be_added_to_a_run_that_is_finished(pop: Pop, shared_capture,
     folder = tmp_path / "out"
     for rounds in ("0", "1", "2"):
         how = ("--blocks-rounds", rounds, *(ROUNDS[2:] if rounds != "0" else ()), "--resume")
-        done = pop("train", shared_capture, "--out", folder, *BLOCKS, *how)
-        assert done.status == 0, done.err
+        done = pop.done("train", shared_capture, "--out", folder, *BLOCKS, *how)
     assert "block 0_0, 1 of 2" not in done.out.replace("round 2 of 2: block 0_0", "")
     assert same(folder, shared_rounds)
     # what is not said is as the run was begun
-    again = pop("train", shared_capture, "--out", folder, *BLOCKS, "--resume")
-    assert again.status == 0, again.err
+    again = pop.done("train", shared_capture, "--out", folder, *BLOCKS, "--resume")
     assert "are trained and merged" in again.out
 
 
@@ -225,8 +209,7 @@ def test_a_round_that_was_interrupted_goes_on_to_the_same_bits(
     assert "stopped after step 7" in stopped.err
     assert (folder / "blocks" / "round_0" / "merged").is_file()
     assert not (folder / "blocks" / "round_1" / "0_0" / "trained").exists()
-    gone_on = pop(*words, *ROUNDS, "--resume")
-    assert gone_on.status == 0, gone_on.err
+    gone_on = pop.done(*words, *ROUNDS, "--resume")
     assert gone_on.out.count("continuing from step 5") == 1
     assert same(folder, shared_rounds)
 
@@ -235,8 +218,7 @@ def test_parts_can_be_done_one_by_one_in_any_order_within_a_round(pop: Pop, roun
     shutil.rmtree(rounds / "blocks" / "round_2")
     (rounds / "blocks" / "merged").unlink()
     for words in (("train", "1_0"), ("train", "0_0"), ("merge",)):
-        done = pop("blocks", words[0], rounds, *words[1:], "--round", "2")
-        assert done.status == 0, done.err
+        pop.done("blocks", words[0], rounds, *words[1:], "--round", "2")
     assert (rounds / "blocks" / "merged").is_file()
     assert same(rounds, shared_rounds)
 
@@ -246,8 +228,7 @@ def test_a_core_without_gaussians_has_nothing_to_train(pop: Pop, rounds):
     none = {key: value[:0] for key, value in core(rounds, 1, "1_0").items()}
     save_checkpoint(rounds / "blocks" / "round_1" / "1_0.pt", {"step": 29, "splats": none})
     for words in (("train", "1_0"), ("train", "0_0"), ("merge",)):
-        done = pop("blocks", words[0], rounds, *words[1:], "--round", "2")
-        assert done.status == 0, done.err
+        pop.done("blocks", words[0], rounds, *words[1:], "--round", "2")
     assert stats_of(rounds)["num_GS"] == len(core(rounds, 1, "0_0")["means"])
 
 
@@ -278,10 +259,9 @@ def test_a_round_that_begins_with_other_gaussians_is_not_gone_on_with(pop: Pop, 
     other = core(rounds, 0, "1_0")
     other["sh0"] += 1.0
     save_checkpoint(rounds / "blocks" / "round_0" / "1_0.pt", {"step": 29, "splats": other})
-    outcome = pop("blocks", "train", rounds, "0_0", "--round", "1")
-    assert outcome.status == 2
-    assert "held fixed are others than this training was begun with" in outcome.err
-    assert outcome.err.count("\n") == 1
+    says(
+        pop("blocks", "train", rounds, "0_0", "--round", "1"), "held fixed are others than this training was begun with"
+    )
 
 
 @pytest.mark.parametrize(
@@ -296,10 +276,7 @@ def test_a_round_that_begins_with_other_gaussians_is_not_gone_on_with(pop: Pop, 
     ],
 )
 def test_rounds_that_cannot_be_are_refused_in_a_line(pop: Pop, shared_capture, tmp_path, words, said):
-    outcome = pop("train", shared_capture, "--out", tmp_path / "out", *TRAIN, *words)
-    assert outcome.status == 2
-    assert said in outcome.err
-    assert outcome.err.count("\n") == 1
+    says(pop("train", shared_capture, "--out", tmp_path / "out", *TRAIN, *words), said)
     assert not (tmp_path / "out").exists()
 
 
@@ -314,8 +291,7 @@ def test_a_run_with_other_rounds_is_not_gone_on_with(pop: Pop, shared_capture, r
 
 def test_the_steps_of_a_round_are_a_tenth_unless_they_are_said(pop: Pop, shared_capture, tmp_path, monkeypatch):
     monkeypatch.setattr(jobs, "_run", lambda words, quiet: 0)
-    done = pop("train", shared_capture, "--out", tmp_path / "out", *BLOCKS)
-    assert done.status == 0, done.err
+    pop.done("train", shared_capture, "--out", tmp_path / "out", *BLOCKS)
     job = read_job(tmp_path / "out")
     assert job is not None
     assert job.rounds > 0

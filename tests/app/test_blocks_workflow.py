@@ -15,6 +15,7 @@ from pop_fast.blocks import jobs
 from pop_fast.blocks.plan import read_job
 from pop_fast.cli import main
 from tests.app.conftest import TRAIN, Pop
+from tests.app.damage import says
 
 pytestmark = pytest.mark.skipif(
     not jobs.has_snakemake(), reason="snakemake is not installed; pip install 'pop-splatting[blocks]' brings it"
@@ -109,20 +110,19 @@ def test_the_slurm_profile_is_read(begun, tmp_path):
 
 
 def test_a_profile_that_is_none_is_refused(pop: Pop, shared_capture, tmp_path):
-    outcome = pop("train", shared_capture, "--out", tmp_path / "out", *BLOCKS, "--blocks-profile", "nowhere")
-    assert outcome.status == 2
-    assert "is neither one of slurm nor a folder with a config.yaml" in outcome.err
+    says(
+        pop("train", shared_capture, "--out", tmp_path / "out", *BLOCKS, "--blocks-profile", "nowhere"),
+        "is neither one of slurm nor a folder with a config.yaml",
+    )
 
 
 @pytest.mark.slow
 def test_the_workflow_trains_and_merges(pop: Pop, shared_capture, begun, tmp_path):
     folder = Path(shutil.copytree(begun, tmp_path / "copy"))
-    trained = pop(
+    pop.done(
         "train", shared_capture, "--out", folder, *BLOCKS, "--blocks-rounds", "1", "--blocks-jobs", "2", "--resume"
     )
-    assert trained.status == 0, trained.err
     assert (folder / "blocks" / "merged").is_file()
     assert len(json.loads((folder / "stats" / "val_step0029.json").read_text())["rounds"]) == 2
-    again = pop("train", shared_capture, "--out", folder, *BLOCKS, "--blocks-rounds", "1", "--resume")
-    assert again.status == 0
+    again = pop.done("train", shared_capture, "--out", folder, *BLOCKS, "--blocks-rounds", "1", "--resume")
     assert "are trained and merged" in again.out

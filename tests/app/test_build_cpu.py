@@ -20,6 +20,7 @@ from pop_fast.errors import PopError
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.gpu_proxy import renderer
 from tests.app.conftest import Pop
+from tests.app.damage import says
 from tests.app.tiny import tiny_config
 
 NO_GPU = "there is no GPU in this test"
@@ -146,8 +147,7 @@ def test_a_processor_that_nothing_is_known_of_gets_code_for_any(
 ) -> None:
     monkeypatch.setattr(building, "processor_features", lambda: None)
     building.library_path.cache_clear()
-    outcome = pop("build-cpu", "--verbose")
-    assert outcome.status == 0, outcome.err
+    outcome = pop.done("build-cpu", "--verbose")
     assert "=native" not in outcome.out
     assert compiled.available()
 
@@ -209,11 +209,9 @@ def test_the_compiler_that_is_asked_for_is_the_one_that_runs(
 ) -> None:
     monkeypatch.setenv("CXX", "clang++-of-tomorrow")
     outcome = pop("build-cpu")
-    assert outcome.status == 2
-    assert "CXX is 'clang++-of-tomorrow', which is not on this machine" in outcome.err
+    says(outcome, "CXX is 'clang++-of-tomorrow', which is not on this machine")
     monkeypatch.setenv("CXX", f"env {remembering}")
-    outcome = pop("build-cpu", "--verbose")
-    assert outcome.status == 0, outcome.err
+    outcome = pop.done("build-cpu", "--verbose")
     assert outcome.out.split()[0].endswith("/env")
 
 
@@ -222,9 +220,7 @@ def test_a_compiler_that_does_not_run_is_named(fresh: Path, pop: Pop, monkeypatc
     junk.write_bytes(bytes(64))
     junk.chmod(0o755)
     monkeypatch.setenv("CXX", str(junk))
-    outcome = pop("build-cpu")
-    assert outcome.status == 2
-    assert str(junk) in outcome.err
+    says(pop("build-cpu"), str(junk))
     assert not list(fresh.glob("*.so"))
 
 
@@ -249,8 +245,7 @@ def test_a_compiler_that_fails_is_quoted_and_leaves_nothing(
 ) -> None:
     compiler(fresh, "echo 'lanes.h:1: error: no such vectors' >&2; exit 1", monkeypatch)
     outcome = pop("build-cpu")
-    assert outcome.status == 2
-    assert "compiling the CPU kernels failed" in outcome.err
+    says(outcome, "compiling the CPU kernels failed")
     assert "error: no such vectors" in outcome.out
     assert not list(fresh.glob("*.so"))
 
@@ -261,17 +256,14 @@ def test_a_compiler_that_does_not_know_the_processor_makes_code_for_any(
 ) -> None:
     real = " ".join(find_compiler() or [])
     compiler(fresh, f'case "$*" in *=native*) echo "unknown value" >&2; exit 1;; esac; exec {real} "$@"', monkeypatch)
-    outcome = pop("build-cpu", "--verbose")
-    assert outcome.status == 0, outcome.err
+    outcome = pop.done("build-cpu", "--verbose")
     assert [line.count("=native") for line in outcome.out.splitlines()] == [1, 1, 1, 0, 0]
     assert compiled.available()
 
 
 def test_a_library_that_does_not_load_is_a_sentence(fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch) -> None:
     compiler(fresh, 'while [ "$1" != "-o" ]; do shift; done; echo "no library" > "$2"', monkeypatch)
-    outcome = pop("build-cpu")
-    assert outcome.status == 2
-    assert "the compiled CPU kernels do not load" in outcome.err
+    says(pop("build-cpu"), "the compiled CPU kernels do not load")
     with pytest.raises(PopError, match="backend 'compiled' cannot run: the compiled CPU kernels do not load"):
         get_backend("compiled").rasterization()
 
@@ -282,9 +274,7 @@ def test_a_folder_that_cannot_be_written_to_is_named(fresh: Path, pop: Pop, monk
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
     monkeypatch.setattr(building.tempfile, "mkstemp", refuse)
-    outcome = pop("build-cpu")
-    assert outcome.status == 2
-    assert f"{fresh} cannot be written to (Permission denied); install the package for yourself" in outcome.err
+    says(pop("build-cpu"), f"{fresh} cannot be written to (Permission denied); install the package for yourself")
 
 
 def test_a_library_of_another_layout_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,32 +24,9 @@ from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from tests.app.children import in_a_child, pop_in_a_child
 from tests.app.conftest import Outcome, Pop
-from tests.app.damage import contents, says
+from tests.app.damage import FORGED, INF, Content, contents, forge, latest, says, to
 from tests.app.drift import drift_engine
-from tests.app.forged import FORGED, INF, Content, forge, latest, to
 from tests.app.tiny import tiny_capture, tiny_config
-
-
-@pytest.fixture(scope="module")
-def stopped_run(tmp_path_factory):
-    """A run of thirty steps, of which the checkpoint after the tenth is the last that is left."""
-    folder = tmp_path_factory.mktemp("stopped")
-    trainer = TrainingRun(tiny_config(folder), tiny_capture())
-    trainer._milestones = _stop_after(trainer, 10)
-    with pytest.raises(KeyboardInterrupt):
-        trainer.run()
-    return folder
-
-
-def _stop_after(trainer, taken):
-    milestones = trainer._milestones
-
-    def stop(step):
-        milestones(step)
-        if step + 1 == taken:
-            raise KeyboardInterrupt
-
-    return stop
 
 
 def resume(folder, capture=None, **changes):
@@ -65,17 +42,17 @@ def resume(folder, capture=None, **changes):
         ({"threads": 2}, r"threads = 1, but this run has threads = 2"),
     ],
 )
-def test_other_settings_are_refused_by_name(stopped_run, changes, message):
-    before = {path: path.read_bytes() for path in stopped_run.rglob("*") if path.is_file()}
+def test_other_settings_are_refused_by_name(stopped, changes, message):
+    before = contents(stopped)
     with pytest.raises(PopError, match=message):
-        resume(stopped_run, **changes)
-    assert {path: path.read_bytes() for path in stopped_run.rglob("*") if path.is_file()} == before
+        resume(stopped, **changes)
+    assert contents(stopped) == before
 
 
-def test_another_nested_setting_is_refused_by_name(stopped_run):
-    config = tiny_config(stopped_run)
+def test_another_nested_setting_is_refused_by_name(stopped):
+    config = tiny_config(stopped)
     with pytest.raises(PopError, match=r"pop\.theta_blur = 0\.02, but this run has pop\.theta_blur = 0\.5"):
-        resume(stopped_run, strategy=replace(config.strategy, theta_blur=0.5))
+        resume(stopped, strategy=replace(config.strategy, theta_blur=0.5))
 
 
 def _changed(what: str) -> Capture:
@@ -97,9 +74,9 @@ def _changed(what: str) -> Capture:
 
 
 @pytest.mark.parametrize("what", ["view names", "photographs", "masks", "cameras", "sparse points"])
-def test_another_capture_is_refused_and_what_differs_is_named(stopped_run, what):
+def test_another_capture_is_refused_and_what_differs_is_named(stopped, what):
     with pytest.raises(PopError, match=f"another capture: the {what} differ"):
-        resume(stopped_run, _changed(what))
+        resume(stopped, _changed(what))
 
 
 def test_held_out_views_are_not_part_of_the_fingerprint():
@@ -139,8 +116,8 @@ def test_a_checkpoint_cannot_run_code(tmp_path):
     assert not (tmp_path / "boom").exists()
 
 
-def test_a_newer_format_is_named(stopped_run, tmp_path):
-    content = ckpt.load_checkpoint(ckpt.list_checkpoints(stopped_run)[-1][1])
+def test_a_newer_format_is_named(stopped, tmp_path):
+    content = ckpt.load_checkpoint(ckpt.list_checkpoints(stopped)[-1][1])
     path = tmp_path / "x.pt"
     torch.save({**content, "format": 99}, path)
     with pytest.raises(PopError, match="has format 99; this version reads format 1"):
@@ -190,20 +167,20 @@ def test_the_last_few_and_the_milestones_are_kept(tmp_path):
     assert (tmp_path / "ckpts" / "notes.txt").exists()
 
 
-def test_metrics_that_the_checkpoint_vouches_for_must_be_there(stopped_run, tmp_path):
+def test_metrics_that_the_checkpoint_vouches_for_must_be_there(stopped, tmp_path):
     (tmp_path / "ckpts").mkdir()
-    for _, path in ckpt.list_checkpoints(stopped_run):
+    for _, path in ckpt.list_checkpoints(stopped):
         (tmp_path / "ckpts" / path.name).write_bytes(path.read_bytes())
-    (tmp_path / "cfg.json").write_bytes((stopped_run / "cfg.json").read_bytes())
+    (tmp_path / "cfg.json").write_bytes((stopped / "cfg.json").read_bytes())
     (tmp_path / "metrics.jsonl").write_text("{}\n")
     with pytest.raises(PopError, match=r"metrics\.jsonl: has 3 bytes, fewer than"):
         resume(tmp_path)
 
 
-def test_processor_time_goes_on_from_a_checkpoint_and_is_not_told_where_a_part_was_not_counted(stopped_run, tmp_path):
+def test_processor_time_goes_on_from_a_checkpoint_and_is_not_told_where_a_part_was_not_counted(stopped, tmp_path):
     written = []
     for name in ("counted", "older"):
-        folder = shutil.copytree(stopped_run, tmp_path / name)
+        folder = shutil.copytree(stopped, tmp_path / name)
         [(_, path)] = ckpt.list_checkpoints(folder)[-1:]
         content = torch.load(path, weights_only=True)
         before = content["seconds"]["cpu"]
@@ -433,31 +410,10 @@ def mutated(data: bytes, seed: int, times: int) -> Iterator[bytes]:
     """Change, remove, repeat or swap words and lines of a header, or put numbers into it that nobody counts to."""
     head, rows = data.split(b"end_header\n")
     rng = random.Random(seed)
-    words = [
-        b"-1",
-        b"0",
-        b"4294967296",
-        b"9" * 30,
-        b"list",
-        b"uchar",
-        b"double",
-        b"element",
-        b"property",
-        b"vertex",
-        b"",
-    ]
-    words += [
-        b"ascii",
-        b"binary_big_endian",
-        b"nan",
-        b"x",
-        b"end_header",
-        b"comment",
-        b"\xff",
-        b"\r",
-        b"1e9",
-        b"list uchar int",
-    ]
+    words = (
+        b"-1 0 4294967296 list uchar double element property vertex ascii binary_big_endian nan x end_header".split()
+    )
+    words += [b"9" * 30, b"", b"comment", b"\xff", b"\r", b"1e9", b"list uchar int"]
     for _ in range(times):
         lines = head.split(b"\n")
         for _ in range(rng.choice((1, 1, 2, 4))):

@@ -7,14 +7,12 @@ from dataclasses import fields, replace
 from typing import Literal, get_args, get_origin, get_type_hints
 
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pop_fast.cli.train import arguments
 from pop_fast.density import DensityControl, GsplatStrategy, POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.stages.density import blur_set
 from pop_fast.train import LearningRates, TrainConfig
 from pop_fast.train.config import first_difference
 from pop_fast.train.jsonable import to_plain
@@ -93,12 +91,6 @@ def test_what_quick_has_of_its_own_reaches_no_other_preset(method):
     assert {"coarse_stop_iters", "lr.others_decay"} <= set(TrainConfig.of(method=method, preset="quick").binding())
     assert TrainConfig.of(preset="quick", steps_scaler=0.5).max_steps == 15_000
     assert TrainConfig.of(preset="quick", scale_lambda_pop=True).strategy.lambda_pop == pytest.approx(0.02)
-
-
-def test_eleven_pixels_are_blur_in_quick_and_ten_are_not():
-    plan = TrainConfig.of(preset="quick").strategy
-    counts = torch.tensor([10, 11])
-    assert blur_set(counts, 270, 480, plan.theta_blur, plan.blur_min_pixels).tolist() == [False, True]
 
 
 @pytest.mark.parametrize("preset", ["paper", "quick"])

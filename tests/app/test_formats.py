@@ -35,7 +35,6 @@ from pop_ref.covariance import covars_from_quats_scales
 from pop_ref.harmonics import sh_basis
 from tests.app.clouds import decoded, degrees, many, splats
 
-LOSSY = ("compressed-ply", "spz", "sog", "gltf-spz", "splat")
 BYTE = 0.5 / 255.0
 # of degree 0, in coefficients
 COLOR_BYTE = BYTE / SH_C0

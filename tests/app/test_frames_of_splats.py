@@ -18,12 +18,12 @@ from pop_fast.io.formats import default_name, format_names
 from pop_fast.io.ply import Frame, frame_of, load_ply, save_ply
 from tests.app.captures import assert_one_line
 from tests.app.conftest import TRAIN, Pop
+from tests.app.damage import says
 from tests.app.populations import make
 
 
 def psnr(pop: Pop, tmp_path: Path, *words: object) -> float:
-    outcome = pop("eval", *words, "--json", tmp_path / "e.json")
-    assert outcome.status == 0, outcome.err
+    outcome = pop.done("eval", *words, "--json", tmp_path / "e.json")
     assert "note" not in outcome.err
     return json.loads((tmp_path / "e.json").read_text())["psnr"]
 
@@ -68,8 +68,7 @@ def test_a_ply_that_says_nothing_is_taken_to_be_in_the_capture_s_frame_with_a_no
 ) -> None:
     assert pop("export", shared_result, "--out", tmp_path / "o.ply").status == 0
     save_ply(tmp_path / "s.ply", load_ply(tmp_path / "o.ply"))
-    outcome = pop("eval", tmp_path / "s.ply", "--capture", shared_capture, "--json", tmp_path / "e.json")
-    assert outcome.status == 0
+    outcome = pop.done("eval", tmp_path / "s.ply", "--capture", shared_capture, "--json", tmp_path / "e.json")
     assert json.loads((tmp_path / "e.json").read_text())["psnr"] == pytest.approx(trained, abs=1e-2)
     assert "s.ply: says nothing of its world, and is taken to be in the capture's own" in outcome.err
     assert "--training-frame" in outcome.err
@@ -86,12 +85,9 @@ def test_a_ply_of_a_trainer_that_moves_the_world_is_read_as_the_command_says(
     save_ply(tmp_path / "s.ply", load_ply(shared_result / "ply" / "point_cloud_29.ply"))
     about = ("--capture", shared_capture, "--training-frame")
     assert psnr(pop, tmp_path, tmp_path / "s.ply", *about) == pytest.approx(trained, abs=1e-2)
-    outcome = pop("export", tmp_path / "s.ply", "--out", tmp_path / "t.ply", *about, "--frame", "capture")
-    assert outcome.status == 0, outcome.err
+    pop.done("export", tmp_path / "s.ply", "--out", tmp_path / "t.ply", *about, "--frame", "capture")
     assert psnr(pop, tmp_path, tmp_path / "t.ply", "--capture", shared_capture) == pytest.approx(trained, abs=1e-2)
-    outcome = pop("eval", tmp_path / "s.ply", *about, "--own-frame")
-    assert outcome.status == 2
-    assert "--own-frame and --training-frame exclude each other" in outcome.err
+    says(pop("eval", tmp_path / "s.ply", *about, "--own-frame"), "--own-frame and --training-frame exclude each other")
 
 
 def test_another_capture_than_the_one_trained_on_is_refused(
@@ -101,9 +97,7 @@ def test_another_capture_than_the_one_trained_on_is_refused(
     ply = shared_result / "ply" / "point_cloud_29.ply"
     lone = tmp_path / "s.ply"
     lone.write_bytes(ply.read_bytes())
-    outcome = pop("eval", lone, "--capture", capture, "--missing", "skip")
-    assert outcome.status == 2
-    assert "normalizes otherwise than toy" in outcome.err
+    says(pop("eval", lone, "--capture", capture, "--missing", "skip"), "normalizes otherwise than toy")
 
 
 def test_the_comment_reads_back_to_the_last_bit(tmp_path: Path) -> None:
@@ -175,19 +169,16 @@ def assert_shows_the_same(pop: Pop, file: Path, turned: Path, run: Path, name: s
     """Hold `eval`, `render` and `compare` of a file to the PSNR of its run."""
     own, folder = stats(run)["psnr"], file.parent / "views"
     about = ("--capture", turned, *words)
-    outcome = pop("eval", file, *about, "--json", file.parent / "e.json")
-    assert outcome.status == 0, outcome.err
+    outcome = pop.done("eval", file, *about, "--json", file.parent / "e.json")
     assert ("says nothing of its world" in outcome.err) == (name == "splat" and not words)
     measured = json.loads((file.parent / "e.json").read_text())["psnr"]
     assert measured == pytest.approx(own, abs=LOSES[name])
-    outcome = pop("render", file, *about, "--out", folder, "--overwrite")
-    assert outcome.status == 0, outcome.err
+    outcome = pop.done("render", file, *about, "--out", folder, "--overwrite")
     listing = json.loads((folder / "renders.json").read_text())["renders"]
     psnrs = [shown_psnr(folder / entry["file"], turned / "images" / entry["view"]) for entry in listing]
     # pictures are rounded to bytes
     assert float(np.mean(psnrs)) == pytest.approx(measured, abs=0.02)
-    outcome = pop("compare", run, file, *about, "--markdown")
-    assert outcome.status == 0, outcome.err
+    outcome = pop.done("compare", run, file, *about, "--markdown")
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in outcome.out.splitlines()]
     column = rows[0].index("PSNR")
     assert [row[column] for row in rows[2:]] == [f"{own:.2f}", f"{measured:.2f}"]
@@ -213,8 +204,7 @@ def test_an_export_shows_what_was_trained(
     pop: Pop, turned: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, frame: tuple
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    outcome = pop("export", run, "--to", name, *frame)
-    assert outcome.status == 0, outcome.err
+    outcome = pop.done("export", run, "--to", name, *frame)
     (file,) = tmp_path.iterdir()
     # a format without room for the frame says what the commands that read it have to be told
     lost = name == "splat" and bool(frame)
@@ -228,16 +218,14 @@ def test_a_conversion_shows_what_was_trained(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert pop("export", run, "--out", "a.ply").status == 0
-    outcome = pop("convert", "a.ply", default_name("b", name), "--to", name)
-    assert outcome.status == 0, outcome.err
+    pop.done("convert", "a.ply", default_name("b", name), "--to", name)
     assert_shows_the_same(pop, tmp_path / default_name("b", name), turned, run, name)
 
 
 @pytest.mark.parametrize("name", ["splat", "sog"])
 def test_what_a_training_exports_shows_what_the_training_stated(pop: Pop, run: Path, tmp_path: Path, name: str) -> None:
     # in the result's folder it has a run, which is in another frame
-    outcome = pop("eval", run / "export" / f"toy_pop.{name}", "--json", tmp_path / "e.json")
-    assert outcome.status == 0, outcome.err
+    pop.done("eval", run / "export" / f"toy_pop.{name}", "--json", tmp_path / "e.json")
     measured = json.loads((tmp_path / "e.json").read_text())["psnr"]
     (stated,) = (entry["psnr"] for entry in stats(run)["encodings"] if entry["format"] == name)
     assert measured == pytest.approx(stated, abs=1e-3)

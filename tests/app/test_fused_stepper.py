@@ -35,7 +35,7 @@ from pop_fast.train.steps import why_not_trained
 from pop_fast.train.torch_stepper import TorchStepper
 from pop_ref.settings import PARAMETERS
 from tests.app.drift import MOST, Drift, drift_engine
-from tests.app.interruptions import interrupt as fixed_rows_interrupt
+from tests.app.interruptions import interrupted, run_until
 from tests.app.tiny import HEIGHT, N_POINTS, WIDTH, last_checkpoint, tiny_capture, tiny_config
 
 CLOCKS = ("it_per_s", "seconds")
@@ -257,24 +257,20 @@ def test_every_step_draws_the_fixed_rows_as_they_were_given(tmp_path, backend):
 
 
 @pytest.mark.parametrize("backend", ENGINES)
-def test_an_interrupted_training_goes_on_to_the_same_bits(tmp_path, backend, monkeypatch):
+def test_an_interrupted_training_goes_on_to_the_same_bits(tmp_path, backend):
     initial = first_rows()
     whole = trained(settings(tmp_path / "whole", backend), initial, OWN)
     config = settings(tmp_path / "stopped", backend)
-    with monkeypatch.context() as patch:
-        fixed_rows_interrupt(patch, at=7)
-        with pytest.raises(KeyboardInterrupt):
-            trained(config, initial, OWN)
+    with interrupted(at=7):
+        trained(config, initial, OWN)
     gone_on = trained(config, initial, OWN, resume=True)
     assert all(torch.equal(gone_on[key], whole[key]) for key in KEYS)
 
 
-def test_a_checkpoint_with_other_fixed_rows_is_refused(tmp_path, monkeypatch):
+def test_a_checkpoint_with_other_fixed_rows_is_refused(tmp_path):
     initial, config = first_rows(), settings(tmp_path, "fast")
-    with monkeypatch.context() as patch:
-        fixed_rows_interrupt(patch, at=7)
-        with pytest.raises(KeyboardInterrupt):
-            trained(config, initial, OWN)
+    with interrupted(at=7):
+        trained(config, initial, OWN)
     initial["opacities"][-1] += 1.0
     with pytest.raises(PopError, match="opacities of the Gaussians that are held fixed are others"):
         trained(config, initial, OWN, resume=True)
@@ -410,17 +406,7 @@ def test_a_run_of_batches_draws_as_many_views_a_step_and_continues_to_the_same_b
     assert all(len(record["view"].split(", ")) == 3 for record in records)
     assert any(record.get("cloned", 0) + record.get("split", 0) > 0 for record in records)
     config = tiny_config(tmp_path / "parts", batch_size=3)
-    first = TrainingRun(config, capture)
-    take_steps = first.take_steps
-
-    def until_17(last: int) -> Any:
-        if first.step == 17:
-            raise KeyboardInterrupt
-        return take_steps(last)
-
-    first.take_steps = until_17
-    with pytest.raises(KeyboardInterrupt):
-        first.run()
+    run_until(TrainingRun(config, capture), 17)
     second = TrainingRun(config, capture, resume=True)
     second.run()
     for key, value in whole.params.items():

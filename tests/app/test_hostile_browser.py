@@ -192,8 +192,7 @@ def test_a_training_does_not_hear_of_hostile_clients_and_ends_with_the_same_bits
     monkeypatch.setattr(cli_view, "announce", announce)
     monkeypatch.setattr(LiveView, "__call__", watch)
     words = ("train", shared_capture, "--out", tmp_path / "watched", *TRAIN, "--view", "--view-port", 18_800)
-    outcome = pop(*words)
-    assert outcome.status == 0, outcome.err
+    outcome = pop.done(*words)
     assert attacks[0].error is None, attacks[0].error
     assert attacks[0].ends == ENDS
     assert len(attacks[0].inside) <= MOST_VIEWS

@@ -92,8 +92,7 @@ def test_a_browser_draws_what_is_rendered(
 def test_a_page_of_a_result_starts_at_a_training_camera_and_asks_for_nothing(
     tab: Browser, pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path
 ) -> None:
-    outcome = pop("export", shared_result, "--out", tmp_path / "x.html")
-    assert outcome.status == 0, outcome.err
+    pop.done("export", shared_result, "--out", tmp_path / "x.html")
     tab.requests.clear()
     tab.open(tmp_path / "x.html", 40, 32, "#bare")
     tab.wait_for("document.getElementById('view')?.dataset.drawn === '0'")

@@ -42,13 +42,12 @@ def steps(asked: Callable[[int], bool], last: int = 40_000) -> list[int]:
 
 
 def test_every_method_densifies_and_resets_when_its_paper_says() -> None:
-    for method in ("gsplat", "3dgs", "3dgs-2023", "pup", "speedy-splat"):
+    for method in ("pop", "gsplat", "3dgs", "3dgs-2023", "pup", "speedy-splat"):
         plan = plan_of(method)
         assert steps(plan.is_refine_step) == list(range(600, 15_000, 100))
         assert len(steps(plan.is_refine_step)) == 144
-        assert steps(plan.is_reset_step) == [3_000, 6_000, 9_000, 12_000]
-    assert len(steps(plan_of("pop").is_blur_step)) == 41
-    assert steps(plan_of("pop").is_reset_step) == []
+        assert steps(plan.is_reset_step) == ([] if method == "pop" else [3_000, 6_000, 9_000, 12_000])
+    assert steps(plan_of("pop").is_blur_step) == list(range(3_000, 7_001, 100))
 
 
 def test_speedy_splat_prunes_softly_three_times_and_hard_five_times() -> None:

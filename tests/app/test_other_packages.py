@@ -1,4 +1,7 @@
-"""A package of somebody else adds a backend, a method, a loss, a profile, a format and a row, and no file of ours."""
+"""What other people write: a strategy, and a package with a backend, a method, a loss, a profile, a format and a row.
+
+The package changes no file of ours. The strategy follows gsplat's protocol and knows nothing of ours.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,27 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
+from pop_fast.api import registry
+from pop_fast.api.rasterize import rasterization
+from pop_fast.api.registry import BACKENDS
+from pop_fast.density import DensificationStep, POPStrategy
+from pop_fast.errors import PopError
+from pop_fast.stages.backend import FAST
+from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from tests.app.conftest import TRAIN
+from tests.app.conftest import TRAIN, Pop
+from tests.app.interruptions import run_until
+from tests.app.test_resume import assert_same_run
+from tests.app.tiny import tiny_capture, tiny_config
+from tests.fast.test_rasterization import cameras, scene
 
 ROOT = Path(__file__).resolve().parents[2]
 # no other file of the tree knows this name
@@ -160,6 +177,9 @@ def test_it_trains_saves_resumes_and_exports(site: Path, shared_capture: Path, t
     whole, parts = (ckpt.load_checkpoint(ckpt.checkpoint_path(tmp_path / n, 29))["splats"] for n in ("whole", "parts"))
     assert len(whole["means"]) > 0
     assert all(torch.equal(value, parts[name]) for name, value in whole.items())
+    asked = (site / "asked.txt").stat().st_size
+    call(site, "pop_fast.cli", "eval", tmp_path / "whole")
+    assert (site / "asked.txt").stat().st_size > asked
     (exported,) = (tmp_path / "whole" / "export").iterdir()
     assert exported.suffix == ".numbers"
     assert exported.stat().st_size == 12 * len(whole["means"])
@@ -181,3 +201,179 @@ def test_no_file_of_ours_names_it() -> None:
     assert len(texts) > 300
     named = [path for path in texts if NAME in path.read_text(encoding="utf-8")]
     assert named == []
+
+
+@dataclass
+class Jitter:
+    """Every fourth step the Gaussian that moved most on the screen gets a copy nearby, placed by torch's numbers."""
+
+    every: int = 4
+    tells: bool = False
+
+    def check_sanity(self, params: Any, optimizers: Any) -> None:
+        assert set(params) == set(optimizers)
+
+    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
+        return {"grad2d": None, "count": None, "scene_scale": scene_scale, "jitter": torch.tensor(0.1), "seen": 0}
+
+    def step_pre_backward(self, params: Any, optimizers: Any, state: Any, step: int, info: Any) -> None:
+        info["means2d"].retain_grad()
+
+    def step_post_backward(
+        self, params: Any, optimizers: Any, state: Any, step: int, info: Any, packed: bool = False
+    ) -> Any:
+        assert not packed
+        state["seen"] += 1
+        moved = info["means2d"].grad[0].norm(dim=-1)
+        state["grad2d"] = moved if state["grad2d"] is None else state["grad2d"] + moved
+        state["count"] = torch.ones_like(moved)
+        if step % self.every:
+            return None
+        source = int(state["grad2d"].argmax())
+        for key, optimizer in optimizers.items():
+            old = params[key]
+            row = old.detach()[source : source + 1].clone()
+            if key == "means":
+                row += state["jitter"] * torch.randn(1, 3)
+            new = torch.nn.Parameter(torch.cat([old.detach(), row]))
+            moments = optimizer.state.pop(old)
+            grown = {k: v if k == "step" else torch.cat([v, torch.zeros_like(row)]) for k, v in moments.items()}
+            optimizer.state[new] = grown
+            optimizer.param_groups[0]["params"] = [new]
+            params[key] = new
+        state["grad2d"] = state["count"] = None
+        return DensificationStep(cloned=1) if self.tells else None
+
+
+def run(folder: Any, stop_after: int | None = None, resume: bool = False, **options: Any) -> TrainingRun:
+    training = TrainingRun(tiny_config(folder), tiny_capture(), strategy=Jitter(**options), resume=resume)
+    run_until(training, stop_after)
+    return training
+
+
+def test_it_decides_over_the_population_and_the_loss_falls(tmp_path):
+    n = len(tiny_capture().points)
+    training = run(tmp_path)
+    # steps 0, 4, ... 28
+    assert len(training.params["means"]) == n + 8
+    stats = json.loads((tmp_path / "stats" / "val_step0029.json").read_text())
+    assert (stats["num_GS"], stats["stepper"], stats["method"]) == (n + 8, "torch", "Jitter")
+    records = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert records[-1]["loss"] < records[0]["loss"]
+    assert not any("cloned" in record or "pop" in record for record in records)
+
+
+def test_what_it_says_of_a_change_goes_into_the_records(tmp_path):
+    run(tmp_path, every=5, tells=True)
+    records = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [record["step"] for record in records if "cloned" in record] == [0, 5, 10, 15, 20, 25]
+    assert all(record["cloned"] == 1 and record["pruned"] == 0 for record in records if "cloned" in record)
+
+
+def test_a_run_that_is_resumed_goes_on_to_the_same_bits_whatever_it_drew_with(tmp_path):
+    run(tmp_path / "whole")
+    for place, stop_after in enumerate((7, 11, 18)):
+        torch.manual_seed(stop_after)
+        run(tmp_path / "parts", stop_after, resume=place > 0)
+    run(tmp_path / "parts", resume=True)
+    assert_same_run(tmp_path / "parts", tmp_path / "whole")
+
+
+def test_our_own_strategies_follow_the_protocol_too(tmp_path):
+    own = tiny_config("x").strategy
+    assert isinstance(own, POPStrategy)
+    given = TrainingRun(tiny_config(tmp_path / "given"), tiny_capture(), strategy=own)
+    given.run()
+    named = TrainingRun(tiny_config(tmp_path / "named"), tiny_capture())
+    # by gsplat's protocol a strategy is not told a seed
+    named.state["generator"].manual_seed(0)
+    named.run()
+    for key, value in named.params.items():
+        assert torch.equal(given.params[key], value), key
+
+
+def test_a_gpu_trains_with_the_strategies_of_this_package(tmp_path, monkeypatch):
+    monkeypatch.setattr("cuda_ext.why_not", lambda: None)
+    with pytest.raises(PopError, match="strategies of this package only; use --backend fast"):
+        TrainingRun(tiny_config(tmp_path, backend="cuda"), tiny_capture(), strategy=Jitter())
+
+
+# Backends of other packages: found under their entry point, they draw, train, save, resume and are measured.
+
+# as somebody else writes one who reads `pop_fast.api.backend.Backend`: torch's stages, and a count of who asks for them
+BACKEND_MODULE = """
+from dataclasses import dataclass
+
+from pop_fast.stages.backend import TorchBackend
+
+ASKED = []
+
+
+@dataclass(frozen=True)
+class MadeUp(TorchBackend):
+    def stages(self):
+        ASKED.append(self.name)
+        return super().stages()
+
+
+MINE = MadeUp("mine", "cpu", ("float32", "float64"), speed=None)
+"""
+BACKEND_ENTRIES = f"[{BACKENDS.group}]\nmine = made_up_backend:MINE\nbroken = no_such_package:BACKEND\n"
+
+
+@pytest.fixture
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[pytest.MonkeyPatch]:
+    """As where another distribution has registered two backends, one of which is not there; undoing it removes it."""
+    site = tmp_path_factory.mktemp("site")
+    (site / "made_up_backend.py").write_text(BACKEND_MODULE)
+    about = site / "made_up_backend-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: made-up-backend\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(BACKEND_ENTRIES)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(site))
+        look_again()
+        yield patch
+    look_again()
+
+
+def look_again() -> None:
+    BACKENDS.look_again()
+
+
+def test_a_registered_backend_is_known_by_its_name_and_draws(installed: pytest.MonkeyPatch) -> None:
+    assert registry.backend_names() == ("fast", "compiled", "cuda", "ref", "mine", "broken")
+    drawn = rasterization(**scene(), **cameras(), backend="mine")[0]
+    assert torch.equal(drawn, rasterization(**scene(), **cameras(), backend="fast")[0])
+    assert torch.equal(drawn, rasterization(**scene(), **cameras(), backend=registry.get_backend("mine"))[0])
+
+
+def test_one_that_cannot_be_loaded_is_named(installed: pytest.MonkeyPatch) -> None:
+    with pytest.raises(PopError, match=r"the backend at no_such_package:BACKEND cannot be loaded: No module named"):
+        registry.get_backend("broken")
+
+
+def test_a_name_that_nobody_registers_is_refused_before_anything_is_written(
+    installed: pytest.MonkeyPatch, pop: Pop, shared_capture: Path, tmp_path: Path
+) -> None:
+    made = TrainConfig.of(backend="mine").to_json()
+    installed.undo()
+    look_again()
+    for make in (lambda: TrainConfig(backend="mine"), lambda: TrainConfig.of(backend="mine")):
+        with pytest.raises(
+            PopError, match=r"backend is 'mine'; it must be one of auto, fast, compiled, cuda, ref; one"
+        ):
+            make()
+    with pytest.raises(PopError, match="where that is installed"):
+        TrainConfig.from_json(made)
+    assert pop("train", shared_capture, *TRAIN, "--backend", "mine", "--out", tmp_path / "none").status == 2
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("name", [FAST.name, "auto"])
+def test_names_of_this_package_are_known_without_a_look_at_what_is_installed(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: pytest.fail("looked"))
+    look_again()
+    assert TrainConfig.from_json(TrainConfig(backend=name).to_json()).backend == name

@@ -208,16 +208,9 @@ with VideoFile(Path(sys.argv[1])) as video:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX resource limits")
-@pytest.mark.parametrize(
-    ("name", "room", "told"),
-    [
-        ("clip.webm", 0, "of 12 frames could be read back after writing; the disk may be full: free some space"),
-        ("clip.webm", 4096, "of 12 frames could be read back after writing; the disk may be full: free some space"),
-        ("clip.avi", 4096, "of 12 frames could be read back after writing; the disk may be full: free some space"),
-    ],
-)
+@pytest.mark.parametrize(("name", "room"), [("clip.webm", 0), ("clip.webm", 4096), ("clip.avi", 4096)])
 def test_a_video_that_the_disk_has_no_room_for_is_told_and_leaves_the_old_file(
-    tmp_path: Path, name: str, room: int, told: str
+    tmp_path: Path, name: str, room: int
 ) -> None:
     path = tmp_path / name
     path.write_bytes(b"old")
@@ -226,7 +219,7 @@ def test_a_video_that_the_disk_has_no_room_for_is_told_and_leaves_the_old_file(
     assert done.returncode == 1
     last = done.stderr.strip().splitlines()[-1]
     assert last.startswith(f"pop_fast.errors.PopError: {path}: ")
-    assert told in last
+    assert "of 12 frames could be read back after writing; the disk may be full: free some space" in last
     assert path.read_bytes() == b"old"
     assert os.listdir(tmp_path) == [name]
 

@@ -23,8 +23,8 @@ from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.batch_stepper import check_batch
 from pop_fast.train.ranks import ALONE, Ranks, join
 from pop_fast.train.signals import stop_requests
-from tests.app.interruptions import interrupt
-from tests.app.launched import launched
+from tests.app.children import launched
+from tests.app.interruptions import interrupt, run_until
 from tests.app.tiny import last_checkpoint, tiny_capture, tiny_config
 
 ROOT = Path(__file__).parents[2]
@@ -34,20 +34,7 @@ CLOCKS = ("it_per_s", "seconds")
 
 def run_to(folder, stop_after=None, resume=False, method="pop"):
     """Train; leave at once, without any clean-up, after so many steps of the whole run."""
-    trainer = TrainingRun(tiny_config(folder, method=method), tiny_capture(), resume=resume)
-    take_steps = trainer.take_steps
-
-    def stepping(last):
-        if trainer.step == stop_after:
-            raise KeyboardInterrupt
-        return take_steps(last)
-
-    trainer.take_steps = stepping
-    if stop_after is None:
-        trainer.run()
-    else:
-        with pytest.raises(KeyboardInterrupt):
-            trainer.run()
+    run_until(TrainingRun(tiny_config(folder, method=method), tiny_capture(), resume=resume), stop_after)
 
 
 def everything(folder):

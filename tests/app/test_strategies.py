@@ -23,22 +23,6 @@ from pop_ref.settings import PopTerm
 from tests.app.populations import HEIGHT, KEYS, WIDTH, densified_at, make, make_info, moments, packed
 
 
-@pytest.mark.parametrize("strategy", [POPStrategy(), GsplatStrategy()])
-def test_the_population_changes_144_times_from_600_to_14900(strategy):
-    steps = [s for s in range(30_000) if strategy.is_refine_step(s)]
-    assert (len(steps), steps[0], steps[-1]) == (144, 600, 14_900)
-
-
-def test_blur_is_looked_at_41_times_both_ends_included():
-    steps = [s for s in range(30_000) if POPStrategy().is_blur_step(s)]
-    assert (len(steps), steps[0], steps[-1]) == (41, 3000, 7000)
-
-
-def test_plain_control_resets_four_times_and_pop_never():
-    assert [s for s in range(30_000) if GsplatStrategy().is_reset_step(s)] == [3000, 6000, 9000, 12_000]
-    assert not any(POPStrategy().is_reset_step(s) for s in range(30_000))
-
-
 def test_a_reset_at_step_0_is_a_switch():
     assert GsplatStrategy(reset_at_zero=True).is_reset_step(0)
     assert not GsplatStrategy().is_reset_step(0)

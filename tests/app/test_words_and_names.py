@@ -1,7 +1,12 @@
-"""What people type, and how they call their files: none of it is taken for something else or reaches a terminal raw."""
+"""What people type, and how they call their files: none of it is taken for something else or reaches a terminal raw.
+
+Bad captures and settings end with status 2 and one line that names file, field and fix. There is one of each kind here:
+`test_bad_input_data` and `test_config` have what is said of all others.
+"""
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -16,6 +21,7 @@ from pop_fast.cli.completion import bash, fish, options_of
 from pop_fast.cli.errors import describe, message, printable
 from pop_fast.cli.train import arguments, takes_hours
 from pop_fast.data import load_capture, run_sfm
+from pop_fast.io.ply import load_ply
 from pop_fast.stages.tiles import tile_lists
 from pop_fast.train import TrainConfig, choose
 from tests.app.captures import (
@@ -27,15 +33,14 @@ from tests.app.captures import (
     write_photograph,
 )
 from tests.app.conftest import TRAIN, Pop
-from tests.app.damage import says
+from tests.app.damage import photo, says
 from tests.app.interruptions import interrupt
 
 
 @pytest.mark.parametrize("name", ["a=b", "x y", "--", "-s"])
 def test_a_path_may_hold_an_equals_sign_or_a_space(pop: Pop, shared_capture: Path, tmp_path: Path, name: str) -> None:
     data = Path(shutil.copytree(shared_capture, tmp_path / name / "data=1"))
-    outcome = pop("train", data, "--out", tmp_path / f"{name} out=1", *TRAIN, "--max-steps", "2")
-    assert outcome.status == 0, outcome.err
+    pop.done("train", data, "--out", tmp_path / f"{name} out=1", *TRAIN, "--max-steps", "2")
     assert (tmp_path / f"{name} out=1" / "cfg.json").is_file()
 
 
@@ -50,8 +55,7 @@ def test_a_photograph_whose_name_is_no_text_is_trained_on(pop: Pop, tmp_path: Pa
     root = transforms_capture(tmp_path / "scene", 9)
     (root / "images" / "04.png").rename(root / "images" / odd)
     edit_transforms(root, lambda listing: listing["frames"][4].update(file_path=f"images/{odd}"))
-    outcome = pop("train", root, "--out", tmp_path / "r", *TRAIN, "--max-steps", "3", "--test-every", "2")
-    assert outcome.status == 0, outcome.err
+    pop.done("train", root, "--out", tmp_path / "r", *TRAIN, "--max-steps", "3", "--test-every", "2")
     assert (tmp_path / "r" / "report.html").is_file()
     assert "view" in (tmp_path / "r" / "stats" / "val_step0002.json").read_text()
     assert (
@@ -73,8 +77,7 @@ def test_escape_sequences_in_names_are_shown_and_not_obeyed(pop: Pop, shared_cap
     outcome = pop("eval", evil)
     says(outcome, r"a\x1b[31m", r"\u202eb")
     shutil.copytree(shared_capture, evil)
-    outcome = pop("train", evil, "--out", tmp_path / "r", *TRAIN, "--max-steps", "2")
-    assert outcome.status == 0
+    outcome = pop.done("train", evil, "--out", tmp_path / "r", *TRAIN, "--max-steps", "2")
     assert "\x1b" not in outcome.out + outcome.err
     assert r"a\x1b[31m" in outcome.out
     assert "\x1b" not in pop("data", "check", evil).out
@@ -134,9 +137,7 @@ def test_renders_that_are_nested_beyond_reading_are_somebody_else_s(
     out = tmp_path / "views"
     out.mkdir()
     (out / "renders.json").write_text("[" * 200_000)
-    outcome = pop("render", shared_result, "--out", out, "--overwrite")
-    assert outcome.status == 2
-    assert "renders.json" in outcome.err
+    says(pop("render", shared_result, "--out", out, "--overwrite"), "renders.json")
 
 
 def test_quiet_prints_nothing_and_no_progress_leaves_out_the_bars(
@@ -189,16 +190,13 @@ def test_a_run_without_numbers_keeps_no_other_from_being_compared(
     interrupt(monkeypatch, at=10)
     words = ("--eval-steps", "30", "--checkpoint-every", "5")
     assert pop("train", shared_capture, "--out", begun, *TRAIN, *words).status == 130
-    outcome = pop("compare", begun, shared_result)
-    assert outcome.status == 0
+    outcome = pop.done("compare", begun, shared_result)
     assert outcome.err.startswith(f"note: {begun}: has no statistics yet")
     _, row, finished = outcome.out.splitlines()
     assert row.split()[:2] == [shared_capture.name, "POP"]
     assert "dB" not in row
     assert f"{json.loads((shared_result / 'stats' / 'val_step0029.json').read_text())['psnr']:.2f}" in finished
-    outcome = pop("compare", begun)
-    assert outcome.status == 2
-    assert f"{begun}: has no statistics yet; train to the first evaluation" in outcome.err
+    says(pop("compare", begun), f"{begun}: has no statistics yet; train to the first evaluation")
 
 
 def test_which_folder_a_factor_reads_is_told(tmp_path: Path) -> None:
@@ -306,3 +304,157 @@ def test_a_replaced_stream_is_no_obstacle(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_numbers_of_a_run_stay_json(shared_result: Path) -> None:
     assert json.loads((shared_result / "cfg.json").read_text())["resolved"]["progress"] is False
+
+
+def test_a_damaged_capture_is_named_before_anything_is_written(pop: Pop, capture: Path, tmp_path: Path) -> None:
+    photo(capture, 3).unlink()
+    outcome = pop("train", capture, "--out", tmp_path / "r", *TRAIN)
+    says(outcome, "view_003.png", "absent", "--missing skip")
+    assert not (tmp_path / "r").exists()
+
+
+def test_settings_that_exclude_each_other_are_named(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
+    outcome = pop("train", shared_capture, "--out", tmp_path / "r", "--resume", "--overwrite")
+    says(outcome, "--resume and --overwrite")
+    assert not (tmp_path / "r").exists()
+
+
+# Disks that are full and folders that are forbidden: refused in one line, nothing touched.
+
+
+@pytest.mark.parametrize("command", ["train", "demo", "render", "export"])
+def test_a_full_disk_leaves_nothing_half_written(
+    pop: Pop, shared_capture: Path, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    target = tmp_path / "here" / ("out.ply" if command == "export" else "out")
+    words = {
+        "train": ["train", shared_capture, "--out", target, *TRAIN],
+        "demo": ["demo", target, "--views", "4", "--width", "16", "--height", "16"],
+        "render": ["render", shared_result, "--out", target],
+        "export": ["export", shared_result, "--out", target],
+    }
+    says(pop(*words[command]), str(target.parent), "the disk is full", "free some space")
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+@pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_that_may_not_be_written_is_named(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
+    (tmp_path / "locked").mkdir(mode=0o500)
+    says(pop("train", shared_capture, "--out", tmp_path / "locked" / "r", *TRAIN), "locked", "permission denied")
+
+
+# Damaged checkpoints, PLY files and results: refused in one line that names file, field and fix.
+
+
+def splat_file(shared_result: Path, path: Path, **changes: object) -> Path:
+    """Write a checkpoint or PLY like the tiny result's, with tensors changed or left out (None)."""
+    params = load_ply(shared_result / "ply" / "point_cloud_29.ply")
+    kept = {name: changes.get(name, value) for name, value in params.items()}
+    torch.save({"step": 29, "splats": {k: v for k, v in kept.items() if v is not None}}, path)
+    return path
+
+
+def with_value(shape: tuple[int, ...], index: tuple[int, ...], value: float) -> torch.Tensor:
+    tensor = torch.zeros(shape)
+    tensor[index] = value
+    return tensor
+
+
+def test_every_defect_of_a_checkpoint_is_named_with_its_tensor(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
+    n = len(load_ply(shared_result / "ply" / "point_cloud_29.ply")["means"])
+    cases: list[tuple[dict[str, object], tuple[str, ...]]] = [
+        ({"scales": None}, ("no splats.scales",)),
+        ({"means": with_value((n, 3), (4, 1), float("nan"))}, ("splats.means[4, 1] is nan",)),
+        ({"sh0": with_value((n, 1, 3), (0, 0, 2), float("inf"))}, ("splats.sh0[0, 0, 2] is inf",)),
+        ({"quats": torch.zeros((n, 3))}, (f"splats.quats has shape [{n}, 3]; it must be [{n}, 4]",)),
+        ({"shN": torch.zeros((n, 7, 3))}, ("splats.shN has shape", "or 0, 3 or 8")),
+        ({"opacities": torch.zeros(n, dtype=torch.int64)}, ("splats.opacities is torch.int64", "floats")),
+        ({"means": torch.zeros(())}, ("splats.means has shape []",)),
+        ({"means": [1.0]}, ("splats.means is list",)),
+    ]
+    for changes, parts in cases:
+        path = splat_file(shared_result, tmp_path / "broken.pt", **changes)
+        says(pop("export", path, "--out", tmp_path / "o.ply"), "broken.pt", *parts)
+    assert not (tmp_path / "o.ply").exists()
+
+
+def test_a_zero_quaternion_is_named_before_it_is_rendered_or_exported(
+    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path
+) -> None:
+    quats = load_ply(shared_result / "ply" / "point_cloud_29.ply")["quats"]
+    quats[2] = 0.0
+    path = splat_file(shared_result, tmp_path / "zero.pt", quats=quats)
+    says(pop("export", path, "--out", tmp_path / "o.ply"), "quats[2", "norm > 0")
+    says(pop("eval", path, "--capture", shared_capture), "quats[", "norm > 0")
+    assert not (tmp_path / "o.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["eval", "gone"], ("gone", "no such file or folder")),
+        (["report", "gone"], ("gone", "no cfg.json")),
+        (["compare", "gone"], ("gone", "no cfg.json")),
+        (["compare"], ("name one or more",)),
+        (["data", "check", "gone"], ("gone", "no such folder")),
+        (["sfm", "gone"], ("gone", "no such folder")),
+        (["demo", "here", "--views", "2"], ("2 views", "use 4")),
+        (["doctor", "--lpips-alex", "gone"], ("gone", "LPIPS")),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_the_other_subcommands_name_what_is_wrong(
+    pop: Pop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], parts: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    says(pop(*words), *parts)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_result_that_was_never_saved_is_named(pop: Pop, result: Path) -> None:
+    for path in [*(result / "ckpts").iterdir(), *(result / "ply").iterdir()]:
+        path.unlink()
+    says(pop("eval", result), "no checkpoint and no PLY", "--resume")
+
+
+def test_an_unknown_setting_in_cfg_json_is_named(pop: Pop, result: Path) -> None:
+    config = json.loads((result / "cfg.json").read_text())
+    (result / "cfg.json").write_text(json.dumps({**config, "resolved": {**config["resolved"], "colour": 1}}))
+    says(pop("eval", result), "config.colour", "not a setting")
+
+
+@pytest.mark.parametrize("text", ["", "{oops", '{"max_steps": 0}'], ids=["empty", "not JSON", "out of range"])
+@pytest.mark.parametrize("command", ["eval", "compare", "report"])
+def test_a_damaged_cfg_json_is_named_by_its_path(pop: Pop, result: Path, command: str, text: str) -> None:
+    (result / "cfg.json").write_text(text)
+    says(pop(command, result), str(result / "cfg.json"), "repair the file")
+
+
+def test_a_cfg_json_in_another_encoding_is_named(pop: Pop, result: Path) -> None:
+    (result / "cfg.json").write_bytes("{}".encode("utf-16"))
+    says(pop("eval", result), str(result / "cfg.json"), "repair the file")
+
+
+def test_a_capture_that_is_no_longer_there_is_asked_for(pop: Pop, capture: Path, result: Path) -> None:
+    config = json.loads((result / "cfg.json").read_text())
+    (result / "cfg.json").write_text(
+        json.dumps({**config, "resolved": {**config["resolved"], "data": str(capture.parent / "gone")}})
+    )
+    says(pop("eval", result), str(capture.parent / "gone"), "not there", "--capture DIR")
+    assert pop("eval", result, "--capture", capture).status == 0
+
+
+def test_held_out_views_too_small_to_be_measured_are_named(pop: Pop, shared_result: Path) -> None:
+    checkpoint = shared_result / "ckpts" / "ckpt_29_rank0.pt"
+    says(pop("eval", checkpoint, "--factor", "4"), "view_000.png is 10 x 8 px", "lower --factor")
+
+
+def test_endings_may_be_written_in_capitals(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
+    for source in (shared_result / "ply" / "point_cloud_29.ply", shared_result / "ckpts" / "ckpt_29_rank0.pt"):
+        loud = tmp_path / f"LOUD{source.suffix.upper()}"
+        loud.write_bytes(source.read_bytes())
+        pop.done("export", loud, "--out", tmp_path / f"{source.suffix[1:]}.splat")

@@ -15,10 +15,9 @@ from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.backends import shipped
 from pop_ref.conformance.cases import CASES, cotangent_like, rounded, sensitivity, transposed
 from pop_ref.conformance.error_bounds import pixel_error_bounds
-from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.plugin import parametrize_backends
-from pop_ref.conformance.scenes import cotangents
+from pop_ref.conformance.scenes import cotangents, golden_scene
 from pop_ref.conformance.strategies import arrays_of, scenes, viewmats
 from pop_ref.constants import PAPER
 from pop_ref.density import accumulate, zero_statistics
@@ -31,9 +30,8 @@ from tests.judged import law_classes
 if find_compiler() is None:
     pytest.skip("no C++ compiler: the host mirror cannot be built (install g++ or set CXX)", allow_module_level=True)
 
-from pop_ref.conformance.mirror_adapter import FOLDER, MirrorAdapter
+from pop_ref.conformance.mirror_adapter import FOLDER, STAGES, MirrorAdapter
 from pop_ref.conformance.mirror_library import Mirror
-from pop_ref.conformance.mirror_stages import STAGES
 
 MODULES = (
     *("activations", "agreement", "alpha", "camera", "compositing", "covariance", "dominance", "footprint"),

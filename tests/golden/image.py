@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pop_ref.conformance.adapter import View, oracle_view
-from pop_ref.conformance.golden import golden_scene
+from pop_ref.conformance.scenes import golden_scene
 
 FILE = Path(__file__).with_suffix(".txt")
 HEADER = "# column row: red green blue, light left, Gaussian that dominates; made by python -m tests.golden.image"

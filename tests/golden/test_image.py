@@ -9,7 +9,7 @@ from pop_ref.conformance.adapter import oracle_view
 from pop_ref.conformance.assertions import assert_same_bits, assert_same_image, assert_same_transmittance
 from pop_ref.conformance.backends import SHIPPED, shipped
 from pop_ref.conformance.error_bounds import pixel_error_bounds
-from pop_ref.conformance.golden import golden_scene
+from pop_ref.conformance.scenes import golden_scene
 from pop_ref.conformance.threshold_outcomes import assert_one_of_the_oracles_outcomes
 from tests.golden.image import written
 

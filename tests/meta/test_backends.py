@@ -18,12 +18,11 @@ from pop_ref.conformance.adapter import under
 from pop_ref.conformance.backends import ELSEWHERE, Absent, Unavailable, made_by, shipped, shipped_or_absent
 from pop_ref.conformance.capabilities import DERIVATIVES, EXTENTS, GRADIENTS, INRIAS, LOWER_CEILING, PROFILES, RENDER
 from pop_ref.conformance.failure_report import failure_report
-from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.inria_adapter import inria
 from pop_ref.conformance.law import missing
 from pop_ref.conformance.mutants import MUTANTS, living
 from pop_ref.conformance.mutants.trial import every_law, obeys
-from pop_ref.conformance.scenes import scene_as_code
+from pop_ref.conformance.scenes import golden_scene, scene_as_code
 from pop_ref.conformance.torch_adapter import TorchAdapter
 from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER
 from pop_ref.constants import PROFILES as ALL_PROFILES

@@ -22,11 +22,10 @@ from pop_ref.conformance.capabilities import (
     RENDER,
 )
 from pop_ref.conformance.failure_report import failure_report
-from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.law import missing
 from pop_ref.conformance.laws.test_whole import test_an_empty_scene_is_the_background as empty_scene_law
 from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
-from pop_ref.conformance.scenes import Scene
+from pop_ref.conformance.scenes import Scene, golden_scene
 from pop_ref.conformance.torch_adapter import TorchAdapter
 from pop_ref.conformance.views import ASKED
 from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, Profile

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,9 +35,14 @@ def test_a_sound_port_passes_every_vector(folder: Path, tmp_path: Path, name: st
     assert (found.missing, found.strange) == (unanswered, [])
     # the oracle is too slow for thousands of Gaussians, and no rasterizer says what it does with colours on the way
     large = [vector for vector in unanswered if vector.startswith("large_")]
-    assert unanswered == large
     assert bool(large) == (name == "oracle")
-    assert found.absent == ([] if name == "oracle" else ["effective_opacities", "colors"])
+    if name == "oracle":
+        # it draws frame by frame, from quaternions and scales
+        assert all(vector.startswith(("large_", "packed", "covariances")) for vector in unanswered)
+        assert found.absent == ["dominant_counts"]
+    else:
+        assert all(vector.startswith("stage_") for vector in unanswered)
+        assert [array for array in found.absent if not array.startswith("value")] == ["effective_opacities", "colors"]
     assert len(found.verdicts) > 400
 
 
@@ -80,9 +86,12 @@ def test_the_index_explains_every_array_of_every_vector(folder: Path) -> None:
             assert (sizes["W"], sizes["H"]) == (vector["options"]["width"], vector["options"]["height"])
 
 
-@pytest.mark.parametrize("kind", kinds())
-def test_every_rule_names_arrays_that_are_there(kind: str) -> None:
-    arrays = kinds()[kind]["arrays"]
+def test_every_rule_names_arrays_that_are_there() -> None:
+    for arrays in (kind["arrays"] for kind in kinds().values()):
+        _assert_rules_name_arrays(arrays)
+
+
+def _assert_rules_name_arrays(arrays: dict[str, dict[str, Any]]) -> None:
     for name, entry in arrays.items():
         assert ("compare" in entry) == (entry["role"] == "output"), name
         for rule in entry.get("compare", []):

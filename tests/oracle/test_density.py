@@ -129,11 +129,6 @@ def test_the_population_can_rest_after_a_reset() -> None:
     assert skipped == {reset + rest for reset in range(3000, 15_000, 3000) for rest in (0, 100, 200)}
 
 
-def test_a_count_exactly_at_the_blur_threshold_is_not_blurred() -> None:
-    for k in (1, 2, 3, 7, 20):
-        assert blur_set(np.array([k, k + 1]), 250 * k, 200, 2e-5).tolist() == [False, True]
-
-
 def test_blur_readings_part_over_a_window_of_views() -> None:
     theta = {"theta_blur": 0.055}
     seen = {}
@@ -246,45 +241,6 @@ def test_two_revised_children_are_as_opaque_as_their_parent(logit: float) -> Non
     child = split_rows(rows, EYE, draws(1), revised_opacity=True).params["opacities"][0]
     # 1 - o = 1 / (1 + e^logit) on both sides, in logarithms so that neither end is rounded away
     assert 2.0 * np.logaddexp(0.0, child) == pytest.approx(np.logaddexp(0.0, logit), rel=1e-12)
-
-
-def test_reset_lowers_opacities_and_forgets_their_moments_alone() -> None:
-    rows = population(3)
-    logits = np.array([9.0, -9.0, np.log(0.01 / 0.99)])
-    after = reset_opacities(replace(rows, params={**rows.params, "opacities": logits}))
-    assert after.params["opacities"].tolist() == [logits[2], -9.0, logits[2]]
-    assert not np.any(after.m["opacities"])
-    assert not np.any(after.v["opacities"])
-    for name in ("means", "scales", "quats", "tag"):
-        assert after.m[name] is rows.m[name]
-        assert after.params[name] is rows.params[name]
-
-
-masks_st = st.integers(0, 7).flatmap(
-    lambda n: st.lists(st.tuples(st.booleans(), st.booleans(), st.booleans()), min_size=n, max_size=n)
-)
-
-
-@given(masks_st)
-def test_a_densification_changes_the_number_by_clones_plus_splits_minus_prunes(
-    members: list[tuple[bool, bool, bool]],
-) -> None:
-    n = len(members)
-    high, small, faint = (np.array([row[k] for row in members], dtype=bool) for k in range(3))
-    rows = population(n)
-    scales = np.log(np.where(small[:, None], SMALL, LARGE) * np.ones((n, 3)))
-    opacities = np.where(faint, -9.0, 0.0)
-    rows = replace(rows, params={**rows.params, "scales": scales, "opacities": opacities})
-    after, s = densify_and_prune(rows, window(high.astype(float).tolist()), 1.0, 600, draws)
-    # copies are as faint as their sources; a split turns one faint parent into two faint children
-    clones, splits = int(np.sum(high & small)), int(np.sum(high & ~small))
-    prunes = int(np.sum(faint)) + int(np.sum(faint & high))
-    assert len(after) == n + clones + splits - prunes
-    assert np.all(after.params["opacities"] == 0.0)
-    for statistic in (s.grad_sum, s.n_visible, s.dominant_sum, s.blurred):
-        assert statistic.shape == (len(after),)
-        assert not np.any(statistic)
-    assert s.n_views == 0
 
 
 def test_order_after_a_densification_is_survivors_copies_first_children_second_children() -> None:

@@ -39,18 +39,10 @@ from pop_ref.mini_splatting import nearest_log_scales, samples_per_view, scene_i
 from pop_ref.selection import least_mass, lowest_share, sample_without_replacement
 from pop_ref.sensitivity import sensitivities
 from pop_ref.tiles import tile_lists
-from tests.oracle.by_definition import blended_pixels
+from tests.oracle.dense import blended_pixels
 from tests.oracle.scenes import camera, dyadic_camera, grey, random_gaussians, tilted_camera
 
 counts = st.integers(0, 10**7)
-
-
-@given(st.integers(1, 200), counts, counts)
-def test_the_budget_starts_at_the_start_ends_at_the_target_and_never_turns(n: int, start: int, target: int) -> None:
-    budgets = [taming.budget_at(x, n, start, target) for x in range(n + 1)]
-    assert (budgets[0], budgets[-1]) == (start, target)
-    steps = np.diff(budgets)
-    assert np.all(steps >= 0) if target >= start else np.all(steps <= 0)
 
 
 @given(st.integers(1, 200), st.data(), counts, counts)
@@ -108,15 +100,6 @@ def test_pixels_weigh_by_error_and_edge_each_from_nothing_to_fifty() -> None:
     framed = taming.pixel_weights(np.full((4, 4, 3), 0.5), black + np.uint8(51))
     assert np.all(framed[1:-1, 1:-1] == 0.0)
     assert np.all(framed[0] == 50.0)
-
-
-@given(st.lists(st.floats(-2.0, 1e6), max_size=12), st.sampled_from([0.1, 25.0]))
-def test_a_term_is_its_weight_at_the_lower_median(values: list[float], c: float) -> None:
-    found = taming.scaled_to_median(c, np.array(values, dtype=np.float64))
-    positive = [v for v in values if v > 0.0]
-    median = statistics.median_low(positive) if positive else 1.0
-    for value, term in zip(values, found.tolist(), strict=True):
-        assert term == (pytest.approx(c * value / median) if value > 0.0 else 0.0)
 
 
 def score_in_a_loop(photometric, grads, opacities, scales, depths, radii, found) -> list[float]:
@@ -206,16 +189,6 @@ def test_quotas_share_what_the_budget_leaves(budget: int, n: int, n_clone: int, 
 # Selection: counts by the rule, draws against exact probabilities of small cases.
 
 shares = st.one_of(st.sampled_from([0.0, 1.0, 0.5, 0.8, 0.3]), st.floats(0.0, 1.0))
-masses = st.lists(st.floats(0.0, 1e3), min_size=1, max_size=30)
-
-
-@given(st.permutations(range(17)), st.integers(1, 17), shares)
-def test_of_distinct_scores_as_many_go_as_the_rule_says(order, n: int, share: float) -> None:
-    scores = np.array(order[:n], dtype=np.float64)
-    gone = lowest_share(scores, share)
-    assert np.sum(gone) == int(share * (n - 1)) + 1
-    # and they are the lowest
-    assert np.max(scores[gone]) < np.min(scores[~gone], initial=np.inf)
 
 
 def test_ties_at_the_threshold_all_go_and_minus_infinity_goes_first() -> None:
@@ -234,17 +207,6 @@ def test_what_cannot_be_sorted_is_told() -> None:
         least_mass(np.zeros(2), -0.5)
     with pytest.raises(ValueError, match=r"importance\[0\] is -1.0; it must be >= 0 and finite"):
         least_mass(np.array([-1.0, 1.0]))
-
-
-@given(masses, st.sampled_from([0.01, 0.25, 0.9]))
-def test_the_first_mass_beyond_the_share_bounds_what_goes(values: list[float], share: float) -> None:
-    importance = np.array(values)
-    gone = least_mass(importance, share)
-    ascending = np.sort(importance) + 1e-6
-    beyond = np.cumsum(ascending) / np.sum(ascending) > share
-    # a boundary that rounding decides is left alone
-    if np.min(np.abs(np.cumsum(ascending) / np.sum(ascending) - share)) > 1e-12:
-        assert gone.tolist() == (importance <= ascending[np.argmax(beyond)]).tolist()
 
 
 def test_a_hundredth_of_the_mass_is_dropped_and_no_more_than_one_row_beyond_it() -> None:
@@ -286,19 +248,6 @@ def test_draws_are_distributed_as_one_after_the_other(weights: list[float], k: i
     assert set(seen) <= set(want), "what weighs nothing was drawn"
     statistic = sum((seen.get(key, 0) - n * p) ** 2 / (n * p) for key, p in want.items())
     assert statistic < chi2.ppf(0.999, len(want) - 1)
-
-
-def test_all_positive_weights_can_be_drawn_and_none() -> None:
-    weights, uniforms = np.array([0.0, 1.0, 1e-300, 0.0, 5.0]), np.linspace(0.0, 0.9, 5)
-    assert sample_without_replacement(weights, 3, uniforms).tolist() == [1, 2, 4]
-    assert sample_without_replacement(weights, 0, uniforms).tolist() == []
-
-
-def test_the_smallest_exponential_arrivals_are_drawn() -> None:
-    rng = np.random.default_rng(3)
-    weights, uniforms = rng.uniform(0.1, 2.0, 50), rng.uniform(size=50)
-    arrivals = -np.log(1.0 - uniforms) / weights
-    assert sample_without_replacement(weights, 20, uniforms).tolist() == sorted(np.argsort(arrivals)[:20].tolist())
 
 
 def test_impossible_draws_are_told_with_their_numbers() -> None:

@@ -16,8 +16,7 @@ from pop_ref.chord import chord_midpoint, dominant_points
 from pop_ref.compositing import composite
 from pop_ref.tight_tiles import accutile, snug_box, tight_tile_lists
 from pop_ref.tiles import tile_lists, tile_rects
-from tests.oracle.by_definition import blended_pixels
-from tests.oracle.dense import rotations
+from tests.oracle.dense import blended_pixels, rotations
 from tests.oracle.scenes import camera, dyadic_camera, grey, random_gaussians, tilted_camera
 
 quarter_px = st.integers(-40, 120).map(lambda k: k / 4.0)
@@ -65,13 +64,6 @@ def test_lists_are_row_major_and_hold_what_overlaps() -> None:
     means2d, radii = np.array([[1.0, 1.0], [5.0, 5.0], [3.0, 3.0]]), np.full((3, 2), 2)
     got = tiles.tile_lists(means2d, radii, np.array([1.0, 2.0, 3.0]), 8, 8, 4)
     assert got == [[0, 1, 2], [1, 2], [1, 2], [1, 2]]
-
-
-@given(st.lists(st.sampled_from([1.0, 2.0, 2.0 + 2.0**-40, 3.0]), max_size=8))
-def test_lists_are_sorted_by_depth_and_ties_keep_index_order(depths: list[float]) -> None:
-    n = len(depths)
-    (ids,) = tiles.tile_lists(np.full((n, 2), 2.0), np.full((n, 2), 1), np.array(depths), 4, 4, 16)
-    assert ids == [i for _, i in sorted(zip(depths, range(n), strict=True))]
 
 
 def test_a_culled_splat_is_in_no_list() -> None:

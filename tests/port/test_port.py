@@ -15,9 +15,9 @@ from cuda_ext.compiler import find_compiler, no_compiler
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.assertions import assert_same_image
 from pop_ref.conformance.error_bounds import pixel_error_bounds
-from pop_ref.conformance.golden import golden_scene
 from pop_ref.conformance.program_adapter import ProgramAdapter
 from pop_ref.conformance.program_pipe import ProgramError
+from pop_ref.conformance.scenes import golden_scene
 from pop_ref.constants import PAPER
 
 HERE = Path(__file__).parent

@@ -12,6 +12,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from paper_repro.figures import FIGURES, curves, opacities, style, tradeoffs
+from paper_repro.figures.data import Asked
+from paper_repro.figures.sheet import Drawn
 from paper_repro.jobs import Job, job_named
 from paper_repro.record import BINS, Result, run_id, settings_hash
 from paper_repro.scenes import SCENES
@@ -134,3 +137,25 @@ def values(result: Result) -> dict:
     found = {field.name: getattr(result, field.name) for field in fields(Result) if field.name not in TIMES}
     found["curve"] = [{key: value for key, value in point.items() if key not in TIMES} for point in result.curve]
     return found
+
+
+def asked(figure: str, results: list[Result], folder: Path = Path("nowhere"), scale: str = "small") -> Asked:
+    return Asked(figure, scale, [r for r in results if r.scale == scale], folder, folder)
+
+
+def drawn(figure: str, results: list[Result], **more) -> Drawn:
+    """Draw one figure of results that are nowhere on the disk."""
+    module = {"tradeoffs": tradeoffs, "opacities": opacities, "curves": curves}[FIGURES[figure][0]]
+    with style.look():
+        return getattr(module, FIGURES[figure][1])(asked(figure, results, **more))
+
+
+def lines(made: Drawn) -> list[dict]:
+    return [dict(zip(made.columns, row, strict=True)) for row in made.rows]
+
+
+def texts(made: Drawn) -> str:
+    """Read all that is written in a figure."""
+    from matplotlib.text import Text
+
+    return "\n".join(found.get_text() for found in made.figure.findobj(Text))

@@ -29,8 +29,7 @@ from paper_repro.record import BINS
 from paper_repro.results import Result, write
 from paper_repro.rows import load_rows
 from pop_fast.errors import PopError
-from tests.repro.drawing import asked, drawn, lines, texts
-from tests.repro.made import curve, result
+from tests.repro.made import asked, curve, drawn, lines, result, texts
 
 METHODS = ("3dgs", "gsplat", "pup", "mini_splatting", "taming", "speedy_splat", "pop")
 OF_RESULTS = ("1", "2", "4a", "4b", "6a", "6b", "7")

@@ -17,8 +17,7 @@ from paper_repro.jobs import job_named
 from paper_repro.results import RESULTS
 from paper_repro.train_row import Options, capture_folder, load_capture_of
 from pop_fast.errors import PopError
-from tests.repro.drawing import asked, lines, texts
-from tests.repro.made import result
+from tests.repro.made import asked, lines, result, texts
 
 
 def keep(folder: Path, row: str, scene: str, render: np.ndarray, photo: np.ndarray, psnr: float) -> None:

@@ -41,7 +41,7 @@ from pop_fast.io.images import read_image
 from pop_fast.stages import losses
 from pop_fast.train import TrainingRun
 from pop_fast.train.choose import choose_backend
-from tests.app.interruptions import interrupt
+from tests.app.interruptions import interrupt, interrupted
 from tests.repro.made import options, toy, values
 
 ROOT = Path(__file__).parents[2]
@@ -120,12 +120,10 @@ def test_a_finished_row_is_not_trained_again_and_leaves_no_bulk(made, monkeypatc
     assert toy("pop").file(how.results).read_bytes() == text
 
 
-def test_a_row_that_was_interrupted_ends_with_the_same_result(made, tmp_path, monkeypatch):
+def test_a_row_that_was_interrupted_ends_with_the_same_result(made, tmp_path):
     how = options(tmp_path, work=made[0].work.parent / "again")
-    with monkeypatch.context() as patch:
-        interrupt(patch, at=150)
-        with pytest.raises(KeyboardInterrupt):
-            train_row(toy("pop"), how)
+    with interrupted(at=150):
+        train_row(toy("pop"), how)
     assert not toy("pop").is_done(how.results)
     assert (toy("pop").work(how.work) / "ckpts" / "ckpt_99_rank0.pt").is_file()
     again = train_row(toy("pop"), how)
@@ -299,10 +297,8 @@ def test_a_row_that_begins_from_its_base_comes_to_what_it_comes_to_alone(
 
     steps, take = [], TrainingRun.take_steps
     monkeypatch.setattr(TrainingRun, "take_steps", lambda run, last: steps.append(run.step) or take(run, last))
-    with monkeypatch.context() as patch:
-        interrupt(patch, at=stop)
-        with pytest.raises(KeyboardInterrupt):
-            train_row(job, how)
+    with interrupted(at=stop):
+        train_row(job, how)
     assert kept.is_file()
     after = train_row(job, how)
     assert min(steps) == shared
@@ -408,13 +404,11 @@ def test_a_probe_is_the_mean_over_its_views(prepared):
     assert together["probe_traversed"] >= together["probe_blended"] > 1.0
 
 
-def test_what_was_probed_before_a_stop_is_taken_up(prepared, monkeypatch):
+def test_what_was_probed_before_a_stop_is_taken_up(prepared):
     config, capture = prepared
     whole = probed(config, "whole", capture)
-    with monkeypatch.context() as patch:
-        interrupt(patch, at=12)
-        with pytest.raises(KeyboardInterrupt):
-            probed(config, "stopped", capture)
+    with interrupted(at=12):
+        probed(config, "stopped", capture)
     # the checkpoint is of step 9, and what was probed after it is not of this run any more
     stale = {**points(whole), "10": {"num_gaussians": 1}}
     (whole._results.path.parent / "stopped" / PROBE).write_text(json.dumps(stale))

@@ -31,7 +31,7 @@ from pop_fast.train.stepper import Engine
 from pop_fast.train.steps import Phase, StepSettings
 from pop_ref.constants import PAPER
 from pop_ref.settings import PARAMETERS
-from tests.app.interruptions import interrupt
+from tests.app.interruptions import interrupted
 from tests.app.tiny import HEIGHT, WIDTH, last_checkpoint, tiny_capture, tiny_config
 
 REASON = get_backend("compiled").why_not()
@@ -205,9 +205,7 @@ def test_how_many_steps_are_taken_at_a_time_changes_no_bit(
 
 @needs_compiled
 @pytest.mark.parametrize("method", ["pop", "gsplat"])
-def test_a_run_goes_on_with_another_number_of_threads_to_the_same_bits(
-    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_goes_on_with_another_number_of_threads_to_the_same_bits(method: str, tmp_path: Path) -> None:
     # so many Gaussians that torch shares them out: those of the densification steps between the native ones too
     rng, many = np.random.default_rng(0), 33_000
     points, colors = rng.uniform(-1.0, 1.0, (many, 3)), rng.integers(0, 255, (many, 3), dtype=np.uint8)
@@ -220,10 +218,8 @@ def test_a_run_goes_on_with_another_number_of_threads_to_the_same_bits(
         TrainingRun(config, capture, resume=resume).run()
 
     run("whole", 1)
-    with monkeypatch.context() as patch:
-        interrupt(patch, at=4)
-        with pytest.raises(KeyboardInterrupt):
-            run("parts", 2)
+    with interrupted(at=4):
+        run("parts", 2)
     run("parts", 3, resume=True)
     whole, parts = (ckpt.load_checkpoint(ckpt.checkpoint_path(tmp_path / name, 6)) for name in ("whole", "parts"))
     assert (whole["threads"], parts["threads"]) == (1, 3)

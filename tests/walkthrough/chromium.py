@@ -83,15 +83,23 @@ class Page:
                     raise RuntimeError(f"{method}: {told['error']}")
                 return told["result"]
 
-    def open(self, path: Path, width: int = 900, height: int = 800, dark: bool = False, scripts: bool = True) -> None:
-        """Open a file and wait until it is there and has been drawn."""
+    def open(
+        self,
+        path: Path,
+        width: int = 900,
+        height: int = 800,
+        dark: bool = False,
+        scripts: bool = True,
+        fragment: str = "",
+    ) -> None:
+        """Open a file, which is not open yet, at a fragment; wait until it is there and has been drawn."""
         self.complaints.clear()
         self.call("Emulation.setScriptExecutionDisabled", value=not scripts)
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
         self.call("Emulation.setDeviceMetricsOverride", **size)
         self.call("Emulation.setTouchEmulationEnabled", enabled=width < 600)
         self._prefer(dark)
-        loader = self.call("Page.navigate", url=path.as_uri())["loaderId"]
+        loader = self.call("Page.navigate", url=path.as_uri() + fragment)["loaderId"]
         while (told := self._next()).get("method") != "Page.lifecycleEvent" or (
             told["params"]["name"] != "load" or told["params"]["loaderId"] != loader
         ):

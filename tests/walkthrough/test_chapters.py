@@ -84,17 +84,40 @@ def test_a_chapter_runs_and_holds_what_a_chapter_must(path: Path) -> None:
 
 
 # what a chapter concludes is no matter of the draw: by how much its seeds are moved here. 1b draws nothing and tries
-# other starts itself; 0, 8, 9, 9b, 10 and 12 tell what one run gave, and train for longer
+# other starts itself
 OTHER_DRAWS = {"2": 100, "3": 100, "4": 100, "4b": 100, "5": 300, "5b": 100, "6": 100, "7": 100, "11": 100}
+OTHER_DRAWS |= {"0": 100, "8": 100, "9": 300, "9b": 100, "10": 100, "12": 100}
+# of those that train or draw a scene: what else is written otherwise, a size, a start or the seed of a run
+OTHERWISE = {
+    "8, larger": ("8", 300, ("POP_STEPS, WEIGHT = 28, 40,", "POP_STEPS, WEIGHT = 32, 48,")),
+    "8, other places": ("8", 7, ("(-0.3, 0.0, 0.3)]", "(-0.25, 0.05, 0.35)]")),
+    "9, other starts": ("9", 0, ("rng = np.random.default_rng(seed)", "rng = np.random.default_rng(seed + 200)")),
+    "9b, more views": ("9b", 300, ("views=12", "views=14"), ("rng.choice(12", "rng.choice(14")),
+    "10, larger": ("10", 200, ("SIZE, N_VIEWS, SH_C0 = 24", "SIZE, N_VIEWS, SH_C0 = 28")),
+    "10, other run": ("10", 0, ("config = TrainConfig(", "config = TrainConfig(seed=7, ")),
+}
+
+
+def _run_otherwise(number: str, by: int, *changes: tuple[str, str]) -> None:
+    path = next(path for path in CHAPTERS if chapter_number(path) == number)
+    text = path.read_text(encoding="utf-8")
+    moved = re.sub(r"default_rng\((\d+)\)", lambda seed: f"default_rng({int(seed[1]) + by})", text)
+    assert (moved != text) == (by != 0), "nothing is drawn"
+    for old, new in changes:
+        assert old in moved, old
+        moved = moved.replace(old, new)
+    run_chapter(read_chapter(path, moved))
 
 
 @pytest.mark.parametrize("number", OTHER_DRAWS)
 def test_what_a_chapter_concludes_holds_for_other_draws_too(number: str) -> None:
-    path = next(path for path in CHAPTERS if chapter_number(path) == number)
-    text, by = path.read_text(encoding="utf-8"), OTHER_DRAWS[number]
-    moved = re.sub(r"default_rng\((\d+)\)", lambda seed: f"default_rng({int(seed[1]) + by})", text)
-    assert moved != text, "nothing is drawn"
-    run_chapter(read_chapter(path, moved))
+    _run_otherwise(number, OTHER_DRAWS[number])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", OTHERWISE)
+def test_what_a_chapter_concludes_holds_for_other_sizes_and_starts_too(name: str) -> None:
+    _run_otherwise(*OTHERWISE[name])
 
 
 @pytest.mark.parametrize("path", CHAPTERS, ids=lambda path: path.stem)
@@ -300,7 +323,8 @@ def test_a_directive_stands_for_what_the_package_says() -> None:
     page = _whole(GOOD.replace("# What is two?", "# {{source: pop_ref.alpha.falloff}}\n#\n# Decision D5 and `D6`."))
     assert "pop_ref/alpha.py" in page
     # the course asks for it, so it is folded, and says which stage it is
-    yours = re.search(r'<details class="yours"><summary>.*?</summary>(.*?)</details>', page, re.DOTALL)
+    shown = r'<details class="yours" data-stage="alpha"><summary>.*?</summary>(.*?)</details>'
+    yours = re.search(shown, page, re.DOTALL)
     assert yours is not None
     assert "falloff" in yours[1]
     assert "pop learn check alpha" in page

@@ -63,6 +63,28 @@ def test_a_page_fits_its_window_and_complains_of_nothing(page: Page, path: Path,
     assert not any(widgets)
 
 
+def test_a_printed_function_opens_when_its_stage_is_passed_or_at_the_second_click(page: Page, tmp_path: Path) -> None:
+    chapter, outcomes = ran(CHAPTERS[2])
+    written = chapter_page(chapter, outcomes, [read_chapter(each) for each in CHAPTERS])
+    for name in ("first.html", "second.html"):
+        (tmp_path / name).write_text(written, encoding="utf-8")
+    opened = "[...document.querySelectorAll('details.yours')].map(each => [each.dataset.stage, each.open])"
+    page.open(tmp_path / "first.html")
+    stages = [stage for stage, _ in page.ask(opened)]
+    assert set(stages) == {"activations", "optimizer"}
+    assert not any(is_open for _, is_open in page.ask(opened))
+    click = "document.querySelector('details.yours summary').click()"
+    page.ask(click)
+    assert not any(is_open for _, is_open in page.ask(opened))
+    assert f"pop learn check {stages[0]}" in page.ask("document.querySelector('details.yours summary').textContent")
+    page.ask(click)
+    assert [is_open for _, is_open in page.ask(opened)] == [True] + [False] * (len(stages) - 1)
+    # the names of passed stages, as `pop learn check` prints them behind an address
+    page.open(tmp_path / "second.html", fragment="#passed=tiles,optimizer")
+    assert page.ask(opened) == [[stage, stage == "optimizer"] for stage in stages]
+    assert set(page.ask("[...document.querySelectorAll('nav a')].map(a => a.hash)")) == {"#passed=tiles,optimizer"}
+
+
 def test_the_contents_fits_its_window_and_complains_of_nothing(page: Page, tmp_path: Path) -> None:
     file = tmp_path / "index.html"
     beside = {"notebooks": "notebooks", "slides": "slides.html", "PDF": "walkthrough.pdf"}

@@ -132,7 +132,7 @@ def _fraction_bits(means: np.ndarray) -> int:
 
 
 def _centres(cloud: Cloud, bits: int) -> np.ndarray:
-    """Return fixed-point centres, rounded to powers of two that are small beside the Gaussians. float64 [N, 3]"""
+    """Return fixed-point centres, rounded to powers of two that are small for the Gaussians. float64 [N, 3]"""
     smallest = cloud.log_scales.min(axis=1, keepdims=True).astype(np.float64) / np.log(2.0)
     step = 2.0 ** np.clip(np.floor(smallest + np.log2(_CENTRE_STEP)), -bits, max(-bits, -_LEAST_FRACTION_BITS))
     return np.clip(np.rint(cloud.means / step) * step * 2.0**bits, -_LARGEST, _LARGEST)

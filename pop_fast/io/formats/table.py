@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -94,17 +94,13 @@ SPZ: Final = Format(
     decode=spz.decode,
     order=_by_place,
 )
-SPZ_4: Final = Format(
+SPZ_4: Final = replace(
+    SPZ,
     name="spz-4",
-    suffix=".spz",
     title="Niantic SPZ, version 4",
-    source="https://github.com/nianticlabs/spz",
     size=("20, then Zstandard", "65, then Zstandard"),
-    losses=_SPZ_LOSSES,
     readers="Niantic's own programs, PlayCanvas's splat-transform",
     encode=partial(spz.encode, version=4),
-    decode=spz.decode,
-    order=_by_place,
     mark="-4",
 )
 SOG: Final = Format(
@@ -164,16 +160,15 @@ GLTF: Final = Format(
     encode=gltf.encode,
     decode=gltf.decode,
 )
-GLTF_SPZ: Final = Format(
+GLTF_SPZ: Final = replace(
+    GLTF,
     name="gltf-spz",
-    suffix=".glb",
     title=f"glTF with {gltf.SPZ_NAME} (a draft)",
     source=f"https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/{gltf.SPZ_NAME}",
     size=("19, then gzip", "64, then gzip"),
     losses={**_SPZ_LOSSES, "rotation": "2.6° (xyz as bytes), up to 14° within 72° of a half turn"},
     readers="Cesium",
     encode=gltf.encode_spz,
-    decode=gltf.decode,
     order=_by_place,
     mark="-spz",
 )

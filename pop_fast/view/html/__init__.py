@@ -21,7 +21,7 @@ from pop_fast.data.capture import View
 from pop_fast.io.formats import encoded
 from pop_fast.train.config import TrainConfig
 
-# of a larger capture every so many, evenly
+# of a larger capture, an even selection
 _MOST: Final = 60
 
 

@@ -63,6 +63,8 @@ class Checks:
         stops: how much brighter each photograph is than its render, in stops of exposure, by view.
         floaters: share of each held-out view's pixels (training views where none is held out) that Gaussians cover by a
             tenth or more which are nearer than half the distance of the nearest points; empty without points.
+        orbit_floaters: the same of the views of the orbit, which stand between the photographs, by their number.
+        steps: that were taken; None where an older version has measured.
     """
 
     photographs: int
@@ -73,6 +75,8 @@ class Checks:
     neighbour_degrees: float | None = None
     stops: Mapping[str, float] = field(default_factory=dict)
     floaters: Mapping[str, float] = field(default_factory=dict)
+    orbit_floaters: Mapping[str, float] = field(default_factory=dict)
+    steps: int | None = None
 
 
 def write_checks(
@@ -114,6 +118,9 @@ def write_checks(
                 _keep_picture(results, stem, view, layers)
             depth = np.where(layers.alpha >= _SEEN, layers.depth / capture.world_scale, np.nan).astype(np.float32)
             results.write_arrays(f"depth_step{step}_{i:04d}", name=view.name, depth=fit(depth, nearest=True))
+    # random points say nothing of where things are
+    known = "random ones" not in capture.source
+    turn = orbit_views(train)
     checks = Checks(
         photographs=len(train),
         train_psnr=float(np.mean([_psnr(view, seen[view.name].image) for view in some])),
@@ -122,13 +129,14 @@ def write_checks(
         matched_psnr=_mean([_psnr(view, _matched(view, seen[view.name].image)) for view in test]),
         neighbour_degrees=neighbour_degrees(np.stack([view.viewmat for view in train])),
         stops={view.name: stops_between(*_kept(view, seen[view.name].image)) for view in (*some, *test)},
-        # random points say nothing of where things are
-        floaters={} if "random ones" in capture.source else _floaters(capture, test or some, params, looked),
+        floaters=_floaters(capture, test or some, params, looked) if known else {},
+        orbit_floaters=_floaters(capture, turn, params, looked) if known else {},
+        steps=step + 1,
     )
     text = json.dumps(asdict(checks), indent=2) + "\n"
     target = folder / "report_data" / f"checks_step{step}.json"
     write_atomically(target, lambda file: file.write(text.encode()))
-    _film(folder / "videos" / f"orbit_step{step}.webm", train, looked)
+    _film(folder / "videos" / f"orbit_step{step}.webm", turn, looked)
     return checks
 
 
@@ -225,17 +233,21 @@ def _mean(values: Sequence[float]) -> float | None:
     return float(np.mean(values)) if values else None
 
 
-def _film(path: Path, train: Sequence[View], looked: Any) -> None:
-    """Film the orbit, as large as fits the report."""
+def orbit_views(train: Sequence[View]) -> list[View]:
+    """Make the cameras of the orbit, as large as fits the report."""
     lens = train[0]
     scale = min(1.0, _ORBIT_SIDE / max(lens.width, lens.height))
     width, height = (max(2, 2 * round(scale * side / 2)) for side in (lens.width, lens.height))
     K = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.K
     blank = np.zeros((height, width, 3), np.uint8)
+    path = camera_path("orbit", np.stack([view.viewmat for view in train]), _ORBIT_FRAMES)
+    return [View(f"frame {i} of the orbit", blank, viewmat, K) for i, viewmat in enumerate(path)]
+
+
+def _film(path: Path, views: Sequence[View], looked: Any) -> None:
     with VideoFile(path, _ORBIT_FPS) as video:
-        for i, viewmat in enumerate(camera_path("orbit", np.stack([v.viewmat for v in train]), _ORBIT_FRAMES)):
-            image = looked(View(f"orbit_{i}", blank, viewmat, K)).image
-            video.add(np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8))
+        for view in views:
+            video.add(np.round(np.clip(looked(view).image, 0.0, 1.0) * 255.0).astype(np.uint8))
 
 
 def read_checks(path: Path) -> Checks:
@@ -245,7 +257,7 @@ def read_checks(path: Path) -> Checks:
         PopError: it is damaged; names the entry.
     """
     entry = read_json(path, _FIX)
-    shares = {"stops", "floaters"}
+    shares = {"stops", "floaters", "orbit_floaters"}
     for name, value in entry.items():
         if name in shares:
             right = isinstance(value, dict) and all(_is_number(number) for number in value.values())

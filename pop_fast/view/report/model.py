@@ -13,6 +13,7 @@ import numpy as np
 
 from pop_fast.view.report.checks import Checks
 from pop_fast.view.report.curves import Window
+from pop_ref.settings import Recipe
 
 # training views are always matched better, dB
 _SOME_OVERFITTING: Final = 3.0
@@ -23,6 +24,12 @@ _FAR_APART: Final = 15.0  # degrees between neighbouring cameras
 _DRIFT: Final = 0.15  # stops, standard deviation over the photographs
 _ONE_OFF: Final = 0.35  # stops, of a single photograph
 _FLOATERS: Final = 0.01  # of the pixels
+_VEIL: Final = 0.25  # of the pixels of a view, which is then hidden
+_WON: Final = 0.5  # dB, by scaling each render to its photograph's brightness
+# training views under it contradict one another, or were not trained on for long; dB
+_FITS: Final = 22.0
+_FITS_BADLY: Final = 19.0
+_EPOCHS: Final = 30  # how often each photograph is to be seen
 
 Kind = Literal["good", "look", "bad"]
 
@@ -35,11 +42,13 @@ class Finding:
         kind: whether it is as it should be, worth a look, or what spoils the result.
         about: what it is about, in a word or two.
         text: the sentence.
+        next: what to type after `pop`, where it is not good; DATA is the capture and RESULT the result's folder.
     """
 
     kind: Kind
     about: str
     text: str
+    next: tuple[str, ...] = ()
 
 
 # held-out PSNR from which a render is called so, dB
@@ -66,7 +75,13 @@ def verdict(
     found = list(_quality(psnr))
     found += _course(held_out)
     if checks is not None:
-        found += [*_overfitting(checks), *_photographs(checks), *_exposure(checks), *_floating(checks)]
+        found += [
+            *_unfitting(checks),
+            *_overfitting(checks),
+            *_photographs(checks),
+            *_exposure(checks),
+            *_floating(checks),
+        ]
     return found
 
 
@@ -74,7 +89,8 @@ def _quality(psnr: float | None) -> Iterator[Finding]:
     if psnr is None:
         return
     _, kind, words = next(grade for grade in _GRADES if psnr >= grade[0])
-    yield Finding(kind, "Quality", f"Views that training never saw are {words}: {psnr:.2f} dB on average.")
+    text = f"Views that training never saw are {words}: {psnr:.2f} dB on average."
+    yield Finding(kind, "Quality", text, () if kind == "good" else ("data", "check", "DATA"))
 
 
 def _course(held_out: tuple[Sequence[float], Sequence[float]] | None) -> Iterator[Finding]:
@@ -84,44 +100,77 @@ def _course(held_out: tuple[Sequence[float], Sequence[float]] | None) -> Iterato
     best = int(np.argmax(values))
     if values[best] - values[-1] < _FELL:
         return
-    yield Finding(
-        "bad",
-        "Course",
+    text = (
         f"Held-out PSNR fell from {values[best]:.2f} dB after {steps[best]:,.0f} steps to {values[-1]:.2f} dB after "
-        f"{steps[-1]:,.0f}: what was learned since fits the training photographs alone. Fewer steps "
-        f"(--steps-scaler), or more photographs.",
+        f"{steps[-1]:,.0f}: what was learned since fits the training photographs alone. Fewer steps, or more "
+        "photographs."
     )
+    scaler = max(steps[best] / Recipe.max_steps, 1e-3)
+    yield Finding("bad", "Course", text, ("train", "DATA", "--steps-scaler", f"{scaler:.2g}"))
+
+
+def _unfitting(checks: Checks) -> Iterator[Finding]:
+    """Judge whether the training views fit: what training could not reach there is no question of views in between."""
+    text = f"training views, which it has seen, reach {checks.train_psnr:.2f} dB"
+    if checks.train_psnr >= _FITS:
+        yield Finding("good", "Fit", f"They fit together: {text}.")
+        return
+    short = " The run had few steps for it." if _too_short(checks) else ""
+    more = ("train", "DATA", "--minutes", "240") if short else ("data", "check", "DATA")
+    why = (
+        f"{text}.{short} A subject or a light that moved, or cameras that are wrong, leave photographs that contradict "
+    )
+    why += "one another"
+    yield Finding("bad" if checks.train_psnr < _FITS_BADLY else "look", "Fit", f"They do not all fit: {why}.", more)
+
+
+def _too_short(checks: Checks) -> bool:
+    """Tell whether a training view was seen less than a few dozen times."""
+    return checks.steps is not None and checks.steps < _EPOCHS * checks.photographs
+
+
+def _gap(checks: Checks) -> float:
+    return 0.0 if checks.held_out_psnr is None else checks.train_psnr - checks.held_out_psnr
 
 
 def _overfitting(checks: Checks) -> Iterator[Finding]:
     if checks.held_out_psnr is None:
-        text = "No view was held out, so that nothing says how views between the photographs look; --test-every 8 does."
-        yield Finding("look", "Overfitting", text)
+        text = "No view was held out, so that nothing says how views between the photographs look."
+        yield Finding("look", "Overfitting", text, ("train", "DATA", "--test-every", "8"))
         return
-    gap = checks.train_psnr - checks.held_out_psnr
+    gap = _gap(checks)
     numbers = f"training views {checks.train_psnr:.2f} dB, held-out views {checks.held_out_psnr:.2f} dB"
     if gap < _SOME_OVERFITTING:
+        if checks.train_psnr < _FITS:
+            # little of it says nothing good where the training views are missed as well
+            text = f"Not the trouble here: {numbers}, {gap:.1f} dB apart, both low."
+            yield Finding("look", "Overfitting", text, ("data", "check", "DATA"))
+            return
         yield Finding("good", "Overfitting", f"Little: {numbers}, {gap:.1f} dB apart.")
-    elif gap < _OVERFITTED:
-        yield Finding("look", "Overfitting", f"Some: {numbers}, {gap:.1f} dB apart.")
-    else:
-        text = f"Much: {numbers}, {gap:.1f} dB apart. The splat knows its photographs by heart and little in between."
-        yield Finding("bad", "Overfitting", text)
+        return
+    some = gap < _OVERFITTED
+    text = f"{'Some' if some else 'Much'}: {numbers}, {gap:.1f} dB apart."
+    text += "" if some else " The splat knows its photographs by heart and little in between."
+    half = (checks.steps or Recipe.max_steps) / Recipe.max_steps / 2.0
+    fewer = ("train", "DATA", "--steps-scaler", f"{half:.2g}")
+    yield Finding("look" if some else "bad", "Overfitting", text, fewer)
 
 
 def _photographs(checks: Checks) -> Iterator[Finding]:
-    n, apart = checks.photographs, checks.neighbour_degrees
-    gap = 0.0 if checks.held_out_psnr is None else checks.train_psnr - checks.held_out_psnr
+    """Judge count and spacing against the gap that was found: what leaves a wide one is not enough."""
+    n, apart, gap = checks.photographs, checks.neighbour_degrees, _gap(checks)
     spacing = "" if apart is None else f", neighbours {apart:.1f} degrees apart as the subject sees them (median)"
     few, far = n < _FEW, apart is not None and apart > _FAR_APART
-    if not few and not far:
+    missing = gap >= _OVERFITTED
+    if not few and not far and not missing:
         yield Finding("good", "Photographs", f"{n} trained on{spacing}: enough.")
         return
-    why = "few" if few else "far apart"
+    why = "few" if few else "far apart" if far else f"not enough for this subject, as the {gap:.1f} dB show"
     kind: Kind = "look"
     if gap >= _SOME_OVERFITTING:
-        kind, why = "bad", f"too {why}"
-    yield Finding(kind, "Photographs", f"{n} trained on{spacing}: {why}. Photographs between these would help most.")
+        kind, why = "bad", f"too {why}" if few or far else why
+    text = f"{n} trained on{spacing}: {why}. Photographs between these would help most."
+    yield Finding(kind, "Photographs", text, ("data", "check", "DATA"))
 
 
 def _exposure(checks: Checks) -> Iterator[Finding]:
@@ -130,35 +179,43 @@ def _exposure(checks: Checks) -> Iterator[Finding]:
     names, values = list(checks.stops), np.array(list(checks.stops.values()))
     spread, low, high = float(values.std()), int(values.argmin()), int(values.argmax())
     ends = f"{values[low]:+.2f} ({names[low]}) to {values[high]:+.2f} stops ({names[high]})"
-    if spread < _DRIFT and np.abs(values).max() < _ONE_OFF:
+    matched, measured = checks.matched_psnr, checks.held_out_psnr
+    won = 0.0 if matched is None or measured is None else matched - measured
+    if spread < _DRIFT and np.abs(values).max() < _ONE_OFF and won < _WON:
         text = f"Even: photographs differ from the splat by {ends}, standard deviation {spread:.2f}."
         yield Finding("good", "Exposure", text)
         return
     gain = ""
-    if checks.matched_psnr is not None and checks.held_out_psnr is not None:
-        gain = (
-            f" Scaling each held-out render to its photograph's brightness gives {checks.matched_psnr:.2f} dB instead "
-            f"of {checks.held_out_psnr:.2f}."
-        )
-    what = "It drifts" if spread >= _DRIFT else "Even, but for some"
+    if matched is not None and measured is not None:
+        gain = f" Scaling each held-out render to its photograph's brightness gives {matched:.2f} dB instead "
+        gain += f"of {measured:.2f}."
+    what = "It drifts" if spread >= _DRIFT or won >= _WON else "Even, but for some"
     text = f"{what}: photographs differ from the splat by {ends}, standard deviation {spread:.2f}.{gain}"
-    yield Finding("bad" if spread > 2.0 * _DRIFT else "look", "Exposure", f"{text} Lock exposure and white balance.")
+    text += " Lock exposure and white balance next time; for these photographs, learn each one's."
+    yield Finding("bad" if spread > 2.0 * _DRIFT else "look", "Exposure", text, ("train", "DATA", "--exposure"))
 
 
 def _floating(checks: Checks) -> Iterator[Finding]:
-    if not checks.floaters:
+    """Judge what covers views that are photographs, and those of the turn in between."""
+    shares = {**checks.floaters, **checks.orbit_floaters}
+    if not shares:
         return
-    names, shares = list(checks.floaters), np.array(list(checks.floaters.values()))
-    worst = int(shares.argmax())
+    names, values = list(shares), np.array(list(shares.values()))
+    worst = int(values.argmax())
     what = "of the pixels show floaters, Gaussians nearer to the camera than half the distance of its nearest points"
-    if shares.max() < _FLOATERS:
-        text = f"{100.0 * shares.mean():.2f} % {what}; at most {100.0 * shares[worst]:.2f} % of a view."
+    looked = f" (looked for in {len(checks.floaters)} photographs' views and {len(checks.orbit_floaters)} of the orbit)"
+    if values.max() < _FLOATERS:
+        text = f"{100.0 * values.mean():.2f} % {what}; at most {100.0 * values[worst]:.2f} % of a view{looked}."
         yield Finding("good", "Floaters", text)
         return
-    few = float(shares.mean()) < _FLOATERS
-    text = f"{100.0 * shares.mean():.1f} % {what}; worst {names[worst]}, {100.0 * shares[worst]:.1f} %."
-    fix = " pop explain shows which Gaussians these are; pop export --crop leaves out what lies outside a box."
-    yield Finding("look" if few else "bad", "Floaters", text + fix)
+    few = float(values.mean()) < _FLOATERS and values.max() < _VEIL
+    text = f"{100.0 * values.mean():.1f} % {what}; worst {names[worst]}, {100.0 * values[worst]:.1f} %{looked}."
+    covered = [name for name, share in checks.orbit_floaters.items() if share >= _VEIL]
+    if covered:
+        text += f" A veil hides much of {len(covered)} views between the photographs, as in {covered[0]}."
+    text += " Leaving out what no photograph needs takes away those that no photograph shows."
+    fix = ("export", "RESULT", "--to", "html", "--final-prune", "0.01")
+    yield Finding("look" if few else "bad", "Floaters", text, fix)
 
 
 @dataclass(frozen=True)

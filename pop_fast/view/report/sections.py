@@ -12,6 +12,7 @@ import numpy as np
 
 from pop_fast.errors import PopError
 from pop_fast.io import pictures
+from pop_fast.train.commands import shell_line
 from pop_fast.view.document import asset
 from pop_fast.view.report.model import Finding, ReportView
 
@@ -30,10 +31,14 @@ def verdict_section(findings: Sequence[Finding], checked: bool) -> str:
         return ""
     rows = "".join(
         f'<li class="{finding.kind}"><i title="{_SIGNS[finding.kind][1]}">{_SIGNS[finding.kind][0]}</i>'
-        f"<b>{escape(finding.about)}</b><span>{escape(finding.text)}</span></li>"
+        f"<b>{escape(finding.about)}</b><span>{escape(finding.text)}{_to_type(finding)}</span></li>"
         for finding in findings
     )
     return f'<h2>Verdict</h2>{"" if checked else _UNCHECKED}<ul class="verdict">{rows}</ul>'
+
+
+def _to_type(finding: Finding) -> str:
+    return f" <code>{escape(shell_line(['pop', *finding.next]))}</code>" if finding.next else ""
 
 
 def orbit_section(orbit: tuple[str, bytes] | None) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,7 +20,7 @@ from pop_fast.train.results import read_config
 from pop_fast.view.report.checks import Checks, read_checks
 from pop_fast.view.report.compare import threads_of
 from pop_fast.view.report.curves import Window
-from pop_fast.view.report.model import Histogram, ReportData, ReportView, Tile, verdict
+from pop_fast.view.report.model import Finding, Histogram, ReportData, ReportView, Tile, verdict
 from pop_fast.view.report.sections import checked_encodings, encoding_heads, encoding_rows
 
 # float32 numbers of a Gaussian: as gsplat's checkpoints hold it, and as Inria's PLY does (with three zero normals)
@@ -70,12 +71,25 @@ def read_result(folder: Path) -> ReportData:
         changes=[{key: change.get(key) for key in _CHANGE_COLUMNS} for change in changes],
         files=_files(stats, str(folder)),
         viewer=_viewer(folder),
-        verdict=verdict(stats, checks, curves.get("psnr_val")),
+        verdict=[_typed(found, config, folder) for found in verdict(stats, checks, curves.get("psnr_val"))],
         checked=checks is not None,
         orbit=_orbit(folder),
         commands=[(shell_line(entry["words"]), entry["folder"]) for entry in read_commands(folder)],
         links=list(_links(folder)),
     )
+
+
+def _typed(finding: Finding, config: TrainConfig, folder: Path) -> Finding:
+    """Put capture and folder into the command that a finding ends in; another training is as large, and has its own."""
+    if not finding.next:
+        return finding
+    places = {"DATA": config.data, "RESULT": str(folder)}
+    words = [places.get(word, word) for word in finding.next]
+    if words[0] == "train":
+        words += [] if config.method == "pop" else ["--method", config.method]
+        words += ["--factor", str(config.factor)] if config.factor > 1 else []
+        words += ["--out", f"{folder}_next"]
+    return replace(finding, next=tuple(words))
 
 
 _CHANGE_COLUMNS: Final = ("step", "cloned", "split", "pruned", "reset", "num_gaussians")

@@ -56,7 +56,7 @@ _PUNCTUATED: Final = re.compile(r'<span class="math inline">((?:(?!</math>).)*</
 _LABEL: Final = re.compile(r"(<(pre|code|a|math|h\d)\b.*?</\2>)|\b([DB][1-8])\b", re.DOTALL)
 # a printed function that the course asks the reader to write
 _YOURS: Final = re.compile(
-    r"<p>(<code>[\w/.]+</code>), yours to write first in <code>(pop learn check \w+)</code>:</p>\s*(<pre>.*?</pre>)",
+    r"<p>(<code>[\w/.]+</code>), yours to write first in <code>pop learn check (\w+)</code>:</p>\s*(<pre>.*?</pre>)",
     re.DOTALL,
 )
 _WIDGET: Final = re.compile(r"<p>\{\{widget: (\w+)\}\}</p>")
@@ -295,9 +295,11 @@ def _aside(title: str, code: str) -> str:
 
 
 def _folded_source(found: re.Match[str]) -> str:
-    """Fold a function that a reader may write first; a script opens it at the second click."""
-    told = f'<span role="status" data-first="Yours to write: {found[2]}. Click again to see it."></span>'
-    return f'<details class="yours"><summary>The oracle\'s, {found[1]} {told}</summary>{found[3]}</details>'
+    """Fold a function that a reader may write first; a script opens it for who has passed its stage."""
+    first = f"Yours to write: pop learn check {found[2]}. Click again to see it."
+    told = f'<span role="status" data-first="{first}"></span>'
+    summary = f"<summary>The oracle's, {found[1]} {told}</summary>"
+    return f'<details class="yours" data-stage="{found[2]}">{summary}{found[3]}</details>'
 
 
 def _code(text: str) -> str:

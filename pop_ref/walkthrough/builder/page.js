@@ -15,7 +15,20 @@ for (const asked of document.querySelectorAll(".asked")) {
     if (event.key === "Enter" && input.value.trim()) details.open = true;
   });
 }
-// a function that the course asks for opens at the second click, and stays open to who has opened it once
+// an address that ends in #passed=alpha,tiles, as `pop learn check` prints it, names the stages that the reader has
+// passed: their functions stand open, and what leads to other pages takes the names along
+const showPassed = () => {
+  const passed = (location.hash.match(/^#passed=([\w,]+)$/) ?? ["", ""])[1].split(",");
+  for (const yours of document.querySelectorAll("details.yours")) {
+    if (passed.includes(yours.dataset.stage)) yours.open = true;
+  }
+  for (const link of passed[0] ? document.querySelectorAll('a[href$=".html"]') : []) {
+    link.hash = `passed=${passed.join(",")}`;
+  }
+};
+addEventListener("hashchange", showPassed);
+showPassed();
+// a function of another stage opens at the second click, and stays open to who has opened it once
 for (const yours of document.querySelectorAll("details.yours")) {
   const summary = yours.querySelector("summary"), status = summary.querySelector("span");
   let asked = false;

@@ -1,0 +1,275 @@
+"""What a run without a preset does: size, length and terms, by what is there and how fast this machine is.
+
+Size: photographs are shrunk by the smallest whole number that brings their longest side to `SIDES` px or less. Length:
+the paper's schedule, or as much of it as the minutes allow. The minutes are foretold by a model that is measured where
+it is used: steps of the run's own engine, on the capture, with as many Gaussians as the run begins with, and with as
+many as it is expected to have; in between the time of a step is taken to be linear in their number.
+
+What is chosen goes into cfg.json with the run's settings, and is taken from there by a run that is gone on with.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from pop_fast.errors import PopError
+from pop_fast.io.heartbeat import duration
+from pop_fast.train.choose import on_gpu
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.presets import AUTOMATIC
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from pop_fast.data.capture import Capture
+
+# an evening
+MINUTES: Final = 120.0
+# the longest side that photographs may have, px: on a GPU, on a CPU, and there where less than this is allowed
+SIDES: Final = {"gpu": 2000, "cpu": 1100, "cpu, soon": 550}
+SOON: Final = 15.0  # minutes
+# of the paper's schedule; with fewer steps there is nothing to see, and more of them are another method
+SHORTEST: Final = 0.01
+# fewer of a step's kind do not tell how long it takes
+_TIMED_STEPS: Final = 40
+_TIMED_SECONDS: Final = 4.0
+# steps with trained Gaussians, which are opaque, take this share of what those with the first ones take, nearly
+# transparent all; processor time of whole runs on fox and bear_512 against what was timed before: 0.72 and 0.85
+_TRAINED: Final = 0.8
+# a render of a view takes this share of a step
+_RENDER: Final = 0.4
+# renders that end a run: the turn about the subject, training views of the report, views of the table of sizes
+_RENDERS: Final = 100
+_FILES: Final = 5.0  # s, for exports and the page
+# bytes of a Gaussian while it is trained: 59 numbers, their gradients, two moments of Adam, and what edits copy
+_GAUSSIAN_BYTES: Final = 59 * 4 * 6
+_PROGRAM_BYTES: Final = 450e6
+# of a photograph's pixel: it, its tensor and what SSIM needs of it
+_PIXEL_BYTES: Final = 30
+
+
+@dataclass(frozen=True)
+class Speed:
+    """How fast this machine takes steps of a run.
+
+    Attributes:
+        few, many: Gaussians that were trained.
+        seconds_few, seconds_many: a step with so many took.
+        took: s, all of the measurement.
+    """
+
+    few: int
+    many: int
+    seconds_few: float
+    seconds_many: float
+    took: float = 0.0
+
+    def seconds_a_step(self, gaussians: float) -> float:
+        """Give the time of a step with so many Gaussians, never less than with the fewest."""
+        slope = max(self.seconds_many - self.seconds_few, 0.0) / max(self.many - self.few, 1)
+        return self.seconds_few + slope * max(gaussians - self.few, 0.0)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What was chosen.
+
+    Attributes:
+        scaler: of the paper's schedule.
+        gaussians: expected at the end.
+        seconds: expected of training and measuring.
+        memory_bytes: expected of the process.
+    """
+
+    scaler: float
+    gaussians: float
+    seconds: float
+    memory_bytes: float
+
+
+def factor_for(sizes: Sequence[tuple[int, int]], gpu: bool, minutes: float) -> int:
+    """Choose the whole number that photographs are shrunk by.
+
+    Args:
+        sizes: width and height of the photographs, px; of none it is 1.
+        gpu: a GPU trains.
+        minutes: that the run may take.
+    """
+    limit = SIDES["gpu" if gpu else "cpu" if minutes >= SOON else "cpu, soon"]
+    return max([1, *(math.ceil(max(size) / limit) for size in sizes)])
+
+
+def expected_gaussians(first: int, scaler: float) -> tuple[float, float]:
+    """Foretell how many Gaussians a run has at its end, and on average over its steps.
+
+    Args:
+        first: Gaussians at the start.
+        scaler: of the paper's schedule.
+    """
+    grown = 1.0 + _GROWTH * scaler**_GROWTH_POWER
+    return first * grown, first * (1.0 + _MEAN_SHARE * (grown - 1.0))
+
+
+# fitted to runs of fox at scalers of 0.05 and 1 and the begin of one of bear_512 at 0.05
+_GROWTH: Final = 3.2
+_GROWTH_POWER: Final = 0.7
+_MEAN_SHARE: Final = 0.85
+
+
+def choose_length(
+    config: TrainConfig, speed: Speed, minutes: float, pixels: float, photographs: int, held_out: int
+) -> Choice:
+    """Choose as much of the paper's schedule as the minutes allow.
+
+    Args:
+        config: the settings; the paper's steps are read.
+        speed: of this machine.
+        minutes: that training, measuring and the report may take.
+        pixels: of a photograph.
+        photographs: there are, with those held out.
+        held_out: views that are measured.
+    """
+    steps = TrainConfig.of(method=config.method).max_steps
+
+    def seconds(scaler: float) -> float:
+        last, mean = expected_gaussians(speed.few, scaler)
+        renders = _RENDER * speed.seconds_a_step(last) * (3 * held_out + _RENDERS)
+        return speed.took + _TRAINED * steps * scaler * speed.seconds_a_step(mean) + renders + _FILES
+
+    low, high = SHORTEST, 1.0
+    if seconds(high) > 60.0 * minutes:
+        for _ in range(40):
+            middle = math.sqrt(low * high)
+            low, high = (middle, high) if seconds(middle) <= 60.0 * minutes else (low, middle)
+    scaler = float(f"{low if high < 1.0 else 1.0:.3g}")
+    gaussians = expected_gaussians(speed.few, scaler)[0]
+    memory = _PROGRAM_BYTES + _GAUSSIAN_BYTES * gaussians + _PIXEL_BYTES * pixels * photographs
+    return Choice(scaler, gaussians, seconds(scaler), memory)
+
+
+def choose_terms(capture: Capture) -> dict[str, Any]:
+    """Choose terms of the loss by the count and the spread of the photographs; none yet: the method's own hold."""
+    return {}
+
+
+def with_choice(config: TrainConfig, scaler: float | None, terms: Mapping[str, Any]) -> TrainConfig:
+    """Lay what was chosen under what the user said, which wins."""
+    given = config.given
+    assert given is not None
+    said = {**terms, **given.settings}
+    plan = {"scale_lambda_pop": given.scale_lambda_pop, "steps_scaler": scaler}
+    chosen = TrainConfig.of(method=given.method, preset=given.preset, **plan, **said)
+    # where it writes and which backend was found are nobody's word
+    return replace(
+        chosen, data=config.data, result_dir=config.result_dir, backend=config.backend, progress=config.progress
+    )
+
+
+def begun(folder: Path) -> dict[str, Any] | None:
+    """Read what a run in a folder was begun with, where it chose for itself: its scaler and its factor.
+
+    Returns:
+        None where there is no run, or one that had a preset; a damaged file is named by what reads all of it.
+    """
+    try:
+        plain = json.loads((folder / "cfg.json").read_text(encoding="utf-8"))
+        given, factor = plain["given"], plain["resolved"]["factor"]
+        scaler = given["steps_scaler"]
+        automatic = given["preset"] == AUTOMATIC
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    numbers = isinstance(factor, int) and isinstance(scaler, int | float) and not isinstance(scaler, bool)
+    return {"scaler": scaler, "factor": factor} if automatic and numbers else None
+
+
+def measure_speed(config: TrainConfig, capture: Capture, scaler: float) -> Speed:
+    """Time steps of a run on this machine, which leave nothing behind.
+
+    Args:
+        config: its settings, with the backend settled.
+        capture: loaded at the size that is trained on.
+        scaler: of the longest schedule that may be chosen: as many Gaussians as that has on average are the many.
+
+    Raises:
+        PopError: as `TrainingRun`.
+    """
+    from pop_fast.data.initialize import initialize_params
+    from pop_fast.train.environment import reproducible
+
+    start = time.perf_counter()
+    first = initialize_params(capture, config.seed, config.init_opacity, config.init_scale)
+    few = len(first["means"])
+    many = max(round(expected_gaussians(few, scaler)[1]), 2 * few)
+    with reproducible(config.threads):
+        times = [_seconds_a_step(config, capture, params) for params in (first, _grown(first, many))]
+    return Speed(few, many, *times, took=time.perf_counter() - start)
+
+
+def _grown(first: Mapping[str, Tensor], count: int) -> dict[str, Tensor]:
+    """Make more Gaussians of the first, smaller by as much, each at a place of its own within its parent."""
+    import torch
+
+    generator = torch.Generator().manual_seed(0)
+    n = len(first["means"])
+    parents = torch.arange(count) % n
+    grown = {name: tensor[parents].clone() for name, tensor in first.items()}
+    sizes = torch.exp(grown["scales"])
+    grown["means"] += sizes * torch.randn(count, 3, generator=generator, dtype=sizes.dtype)
+    grown["scales"] -= math.log(count / n) / 2.0
+    return grown
+
+
+def _seconds_a_step(config: TrainConfig, capture: Capture, initial: Mapping[str, Tensor]) -> float:
+    """Take steps with all colours, after a first one that loads what all need."""
+    from pop_fast.train.schedule import segment_end
+    from pop_fast.train.training_run import TrainingRun
+
+    training = TrainingRun(replace(config, sh_interval=1, given=None), capture, initial=initial)
+    training.take_steps(1)
+    while training.step < config.sh_degree:
+        training.take_steps(segment_end(training.config, training.strategy, training.step, 1))
+    start, before = time.perf_counter(), training.step
+    while True:
+        longest = max(1, min(training.stepper.longest, before + _TIMED_STEPS - training.step))
+        training.take_steps(segment_end(training.config, training.strategy, training.step, longest))
+        steps, seconds = training.step - before, time.perf_counter() - start
+        if steps >= _TIMED_STEPS or (seconds >= _TIMED_SECONDS and steps >= 3):
+            return seconds / steps
+
+
+def check_minutes(minutes: float | None, config: TrainConfig, automatic: bool) -> None:
+    """Refuse minutes that cannot be, or that contradict a schedule that was said.
+
+    Raises:
+        PopError: says which option to leave out.
+    """
+    if minutes is None:
+        return
+    if not 0.0 < minutes < math.inf:
+        raise PopError(f"--minutes is {minutes}; it must be > 0 and finite")
+    if not automatic:
+        said = f"--preset {config.preset}" if config.preset != "paper" else "--preset, --steps-scaler or --max-steps"
+        raise PopError(f"--minutes chooses the schedule, and {said} says another; leave one of them out")
+
+
+def line_of(choice: Choice, config: TrainConfig, size: tuple[int, int]) -> str:
+    """Say before the first step what is to come."""
+    where = "GPU" if on_gpu(config) else "CPU"
+    shrunk = f" (photographs shrunk by {config.factor})" if config.factor > 1 else ""
+    return (
+        f"chosen for this {where}: {size[0]}x{size[1]} px{shrunk}, {config.max_steps:,} steps, about "
+        f"{_rounded(choice.gaussians):,} Gaussians, {duration(choice.seconds)}, "
+        f"{choice.memory_bytes / 1e9:.1f} GB of memory; --minutes M, --preset paper or --factor N choose otherwise"
+    )
+
+
+def _rounded(count: float) -> int:
+    """Round to two digits, as nothing foretold is more exact."""
+    digits = max(len(str(round(count))) - 2, 0)
+    return round(count / 10**digits) * 10**digits

@@ -1,0 +1,270 @@
+"""Portable vectors of single stage functions: calls that laws made, kept because a broken stage answers them wrongly.
+
+`python -m pop_ref.conformance.vector_stages` takes the calls anew from the laws that the mutants of the oracle name,
+and writes `vector_stages.json`. What rounding may cost is measured: inputs are moved by float32's rounding, and the
+answer moves by so much.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import json
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Final
+
+import numpy as np
+
+from pop_ref.conformance import tolerances
+from pop_ref.conformance.adapter import OracleAdapter, stage_function
+from pop_ref.conformance.vector_schema import entry, equal
+from pop_ref.constants import Profile
+from pop_ref.contributions import Contributions
+from pop_ref.density import Statistics
+from pop_ref.records import Camera, Gaussians, Splats
+from pop_ref.settings import DensityConfig, LearningRates
+
+FILE: Final = Path(__file__).with_suffix(".json")
+# values that a call may hold besides numbers, and what they are made of
+TYPES: Final = {
+    each.__name__: each
+    for each in (Camera, Contributions, DensityConfig, Gaussians, LearningRates, Profile, Splats, Statistics)
+}
+EPS: Final = float(np.finfo(np.float32).eps)
+UNITS: Final = 64
+_TRIALS: Final = 6
+_LARGEST: Final = 6_000
+_EXAMPLES: Final = 12
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON holds it: arrays as type and nested lists, records by name and field.
+
+    Raises:
+        TypeError: it cannot be written.
+    """
+    if isinstance(value, np.ndarray):
+        return {"array": value.tolist(), "dtype": str(value.dtype), "shape": list(value.shape)}
+    if isinstance(value, np.generic):
+        return value.item()
+    if is_dataclass(value) and type(value).__name__ in TYPES:
+        return {"record": type(value).__name__, "of": {f.name: plain(getattr(value, f.name)) for f in fields(value)}}
+    if isinstance(value, tuple):
+        return {"tuple": [plain(each) for each in value]}
+    if isinstance(value, list):
+        return [plain(each) for each in value]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"{type(value).__name__} cannot be written")
+
+
+def made(value: Any) -> Any:
+    """Return the value that `plain` has written."""
+    if isinstance(value, list):
+        return [made(each) for each in value]
+    if not isinstance(value, dict):
+        return value
+    if "array" in value:
+        return np.array(value["array"], dtype=value["dtype"]).reshape(value["shape"])
+    if "tuple" in value:
+        return tuple(made(each) for each in value["tuple"])
+    return TYPES[value["record"]](**{name: made(each) for name, each in value["of"].items()})
+
+
+def numbers(value: Any, name: str = "") -> dict[str, np.ndarray]:
+    """Return the numbers of a value as arrays by name; ragged lists as their items and where each list ends."""
+    if value is None or isinstance(value, str):
+        return {}
+    if is_dataclass(value) or isinstance(value, SimpleNamespace):
+        # other programs' records come without a type
+        return _joined((f"{name}.{field}", each) for field, each in vars(value).items())
+    if isinstance(value, list) and value and isinstance(value[0], list):
+        ends = np.cumsum([len(each) for each in value]).astype(np.int64)
+        return {
+            f"{name}.items": np.array([item for each in value for item in each], dtype=np.int64),
+            f"{name}.ends": ends,
+        }
+    if isinstance(value, tuple | list) and not all(isinstance(each, int | float) for each in value):
+        return _joined((f"{name}.{k}", each) for k, each in enumerate(value))
+    array = np.asarray(value)
+    return {name: array.astype({"b": np.bool_, "i": np.int64, "u": np.int64}.get(array.dtype.kind, np.float64))}
+
+
+def _joined(parts: Iterable[tuple[str, Any]]) -> dict[str, np.ndarray]:
+    found: dict[str, np.ndarray] = {}
+    for name, value in parts:
+        found |= numbers(value, name.lstrip("."))
+    return found
+
+
+def moved(value: Any, change: Callable[[np.ndarray], np.ndarray]) -> Any:
+    """Return a value whose arrays of floats are changed, and nothing else."""
+    if isinstance(value, np.ndarray):
+        return change(value) if value.dtype.kind == "f" else value
+    if type(value).__name__ in TYPES and not isinstance(value, Profile | DensityConfig | LearningRates):
+        return type(value)(**{f.name: moved(getattr(value, f.name), change) for f in fields(value)})
+    if isinstance(value, tuple):
+        return tuple(moved(each, change) for each in value)
+    return [moved(each, change) for each in value] if isinstance(value, list) else value
+
+
+def outputs(value: Any) -> dict[str, np.ndarray]:
+    """Return what a stage function returned, as arrays by name; truth values as 0 and 1."""
+    found = numbers(value, "value")
+    return {k: v.astype(np.int64) if v.dtype.kind == "b" else v for k, v in found.items()}
+
+
+@functools.cache
+def recorded() -> tuple[tuple[str, list[Any]], ...]:
+    """Return the calls that are kept: the name of a stage function, and its arguments."""
+    return tuple((name, [made(each) for each in args]) for name, args in json.loads(FILE.read_text(encoding="utf-8")))
+
+
+def expected(name: str, args: list[Any]) -> dict[str, np.ndarray]:
+    """Return what the oracle answers, what rounding may cost, and which entries rounding does not decide."""
+    function = OracleAdapter().stage(name)
+    answer, found = outputs(function(*args)), {}
+    off = {key: np.zeros(value.shape) for key, value in answer.items()}
+    for trial in range(_TRIALS):
+        rng = np.random.default_rng(trial)
+
+        def change(x: np.ndarray, rng: np.random.Generator = rng) -> np.ndarray:
+            return x * (1.0 + EPS * rng.choice([-1.0, 1.0], x.shape))
+
+        again = outputs(function(*[moved(arg, change) for arg in args]))
+        for key, value in answer.items():
+            same = key in again and again[key].shape == value.shape
+            off[key] = np.maximum(off[key], np.abs(again[key] - value)) if same else np.full(value.shape, np.inf)
+    for key, value in answer.items():
+        sure = off[key] == 0.0 if value.dtype.kind == "i" else off[key] <= 2.0**-10 * (1.0 + np.abs(value))
+        sure &= np.isfinite(value)
+        found |= {key: np.where(sure, value, 0).astype(value.dtype), f"sure_{key}": sure}
+        if value.dtype.kind != "i":
+            # sums of large terms cancel: the largest entry pays for all
+            size = np.abs(value) + np.max(np.abs(value), initial=0.0, where=sure)
+            found[f"error_bound_{key}"] = np.where(sure, off[key] / EPS + size, 0.0)
+    return found
+
+
+@functools.cache
+def stage_vectors() -> dict[str, tuple[dict[str, np.ndarray], dict[str, Any]]]:
+    """Return the answers to the recorded calls by name; what is asked stands in the options, in the form of `plain`."""
+    found: dict[str, tuple[dict[str, np.ndarray], dict[str, Any]]] = {}
+    for k, (name, args) in enumerate(recorded()):
+        given = {key: plain(value) for key, value in zip(_parameters(name), args, strict=True)}
+        found[f"stage_{k}_{name}"] = (expected(name, args), {"function": name, "arguments": given})
+    return found
+
+
+@functools.cache
+def stage_kinds() -> dict[str, dict[str, Any]]:
+    """Return what the index says of every recorded call."""
+    limit = {"float32": UNITS * EPS, "float64": tolerances.AGREEMENT_FLOAT64}
+    found = {}
+    for name, (arrays, options) in stage_vectors().items():
+        about: dict[str, Any] = {}
+        for key, value in arrays.items():
+            shape, dtype = f"[{', '.join(map(str, value.shape))}]", str(value.dtype)
+            if key.startswith("sure_"):
+                about[key] = entry("mask", shape, "rounding decides nothing of it", dtype)
+            elif key.startswith("error_bound_"):
+                about[key] = entry("error_bound", shape, f"what rounding may cost in {key[12:]}", dtype)
+            else:
+                close = {"rule": "close", "error_bound": f"error_bound_{key}", "limit": limit, "where": f"sure_{key}"}
+                rule = equal(f"sure_{key}") if dtype == "int64" else close
+                about[key] = entry("output", shape, "what the function returns", dtype, [rule])
+        function = stage_function("pop_ref", options["function"])
+        said = (inspect.getdoc(function) or "").splitlines()[0]
+        found[name] = {"about": f"{options['function']}: {said}", "arrays": about}
+    return found
+
+
+def _parameters(name: str) -> list[str]:
+    return list(inspect.signature(OracleAdapter().stage(name)).parameters)
+
+
+class _Logging(OracleAdapter):
+    """The oracle, which notes what it is asked."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: dict[str, tuple[str, list[Any]]] = {}
+
+    def stage(self, name: str) -> Callable[..., Any]:
+        function = super().stage(name)
+
+        @functools.wraps(function)
+        def noted(*args: Any, **named: Any) -> Any:
+            try:
+                bound = inspect.signature(function).bind(*args, **named)
+                bound.apply_defaults()
+                written = json.dumps([name, [plain(each) for each in bound.arguments.values()]])
+                if len(written) < _LARGEST:
+                    self.calls.setdefault(written, (name, list(bound.arguments.values())))
+            except TypeError:
+                # what holds a function or random numbers cannot be kept
+                pass
+            return function(*args, **named)
+
+        return noted
+
+
+def record() -> list[Any]:
+    """Return calls, as JSON holds them, that tell the mutants of the oracle from it, each where a law makes one."""
+    from pop_ref.conformance.backends import shipped
+    from pop_ref.conformance.mutants import MUTANTS
+    from pop_ref.conformance.mutants.copies import living
+    from pop_ref.conformance.mutants.trial import law_named, obeys
+
+    sound = shipped("fast64")
+    found: list[Any] = []
+    kept: list[tuple[str, list[Any]]] = []
+    for mutant in MUTANTS:
+        if mutant.law.startswith("test_strategies"):
+            # vectors of trainings are about those
+            continue
+        with living(mutant) as backend:
+            if any(_differs(backend, *call) for call in kept):
+                continue
+            asked = _Logging()
+            obeys(law_named(mutant.law), asked, _EXAMPLES)
+            for name, args in asked.calls.values():
+                call = (name, [moved(arg, _in_float32) for arg in args])
+                # laws read parts of some records only, and a sound program may fill the rest otherwise
+                if _differs(backend, *call) and not (sound.has(name) and _differs(sound, *call)):
+                    kept.append(call)
+                    found.append([name, [plain(each) for each in call[1]]])
+                    print(f"{mutant.name}: {name}", flush=True)
+                    break
+    return found
+
+
+def _differs(backend: Any, name: str, args: list[Any]) -> bool:
+    try:
+        wanted = expected(name, args)
+    except Exception:
+        return False
+    try:
+        got = outputs(backend.stage(name)(*args))
+    except Exception:
+        return True
+    for key, value in got.items():
+        if key not in wanted or wanted[key].shape != value.shape:
+            return True
+        bound = wanted.get(f"error_bound_{key}", np.zeros(value.shape)) * 2.0 * UNITS * EPS
+        if np.any((np.abs(value - wanted[key]) > bound) & wanted[f"sure_{key}"]):
+            return True
+    return False
+
+
+def _in_float32(values: np.ndarray) -> np.ndarray:
+    return values.astype(np.float32).astype(np.float64)
+
+
+if __name__ == "__main__":
+    FILE.write_text(json.dumps(record()) + "\n", encoding="utf-8")
+    sys.exit(0)

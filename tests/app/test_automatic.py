@@ -1,0 +1,188 @@
+"""What `pop train` chooses where no schedule is said, and photographs that come as a video or in an archive."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pop_fast.cli.train_checks import chooses_for_itself
+from pop_fast.data.unpack import capture_folder, unpack
+from pop_fast.errors import CaptureError
+from pop_fast.train import TrainConfig, automatic
+from pop_fast.train import checkpoint as ckpt
+from pop_fast.train.automatic import MINUTES, SHORTEST, Speed, choose_length, expected_gaussians, factor_for
+from pop_fast.view.paths import VideoFile
+from tests.app.conftest import Pop
+from tests.app.damage import says
+from tests.app.interruptions import interrupt
+
+SPEED = Speed(few=10_000, many=40_000, seconds_few=0.02, seconds_many=0.05, took=5.0)
+QUICKLY = ("--checkpoint-every", "50", "--skip-checks", "--skip-sizes", "--no-progress")
+
+
+@pytest.mark.parametrize(
+    ("side", "gpu", "minutes", "left"),
+    [
+        *((4032, True, MINUTES, 1344), (3000, True, MINUTES, 1500), (1920, True, 1.0, 1920)),
+        *((4032, False, MINUTES, 1008), (1920, False, MINUTES, 960), (1920, False, 3.0, 480), (512, False, 1.0, 512)),
+    ],
+)
+def test_photographs_are_shrunk_to_what_the_machine_trains_on(side: int, gpu: bool, minutes: float, left: int) -> None:
+    assert side // factor_for([(side, side // 2), (64, 48)], gpu, minutes) == left
+
+
+def test_the_schedule_fills_the_minutes_and_is_at_most_the_papers() -> None:
+    config = TrainConfig.of(preset="auto")
+    choices = [choose_length(config, SPEED, minutes, 1e5, 50, 7) for minutes in (3.0, 8.0, 15.0)]
+    for minutes, choice in zip((3.0, 8.0, 15.0), choices, strict=True):
+        assert 0.97 * 60.0 * minutes <= choice.seconds <= 60.0 * minutes * 1.005
+    assert choices[0].scaler < choices[1].scaler < choices[2].scaler < 1.0
+    assert choose_length(config, SPEED, 1e4, 1e5, 50, 7).scaler == 1.0
+    shortest = choose_length(config, SPEED, 0.01, 1e5, 50, 7)
+    # what does not fit is not said to
+    assert shortest.scaler == SHORTEST
+    assert shortest.seconds > 0.6
+
+
+def test_a_step_with_more_gaussians_takes_longer_by_as_much_as_was_measured() -> None:
+    assert SPEED.seconds_a_step(10_000) == pytest.approx(0.02)
+    assert SPEED.seconds_a_step(25_000) == pytest.approx(0.035)
+    # a machine that was held up in the first measurement does not get faster with more
+    assert Speed(10, 20, 0.5, 0.4).seconds_a_step(30) == 0.5
+    last, mean = expected_gaussians(1_000, 0.1)
+    assert 1_000 < mean < last
+
+
+@pytest.mark.parametrize(
+    ("words", "chooses"),
+    [
+        (["photos"], True),
+        (["photos", "--minutes", "3", "--method", "gsplat"], True),
+        (["photos", "--preset=paper"], False),
+        (["photos", "--steps_scaler", "0.1"], False),
+        (["photos", "--max-steps", "10"], False),
+        (["photos", "--blocks", "2x1"], False),
+    ],
+)
+def test_a_run_chooses_where_no_schedule_is_said(words: list[str], chooses: bool) -> None:
+    assert chooses_for_itself(words) == chooses
+
+
+def test_a_run_without_options_says_what_it_chose_keeps_it_and_resumes_to_the_same_bits(
+    pop: Pop, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("train", shared_capture, "--minutes", "0.001", *QUICKLY)
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    outcome = pop(*words, "--out", whole)
+    assert outcome.status == 0, outcome.err
+    line = next(line for line in outcome.out.splitlines() if line.startswith("chosen for this"))
+    for part in ("40x32 px", "300 steps", "Gaussians", "GB of memory", "--preset paper"):
+        assert part in line
+    given = json.loads((whole / "cfg.json").read_text())["given"]
+    assert (given["preset"], given["steps_scaler"]) == ("auto", SHORTEST)
+    with monkeypatch.context() as patch:
+        interrupt(patch, at=120)
+        assert pop(*words, "--out", broken).status == 130
+    # a machine that is now a thousand times as fast goes on with the schedule that was begun
+    monkeypatch.setattr(automatic, "measure_speed", lambda *given: pytest.fail("a run that is gone on with is timed"))
+    resumed = pop("train", shared_capture, *QUICKLY, "--out", broken, "--resume")
+    assert resumed.status == 0, resumed.err
+    ours, theirs = (ckpt.load_splats(ckpt.checkpoint_path(folder, 299))[0] for folder in (whole, broken))
+    assert all((ours[name] == theirs[name]).all() for name in ours)
+
+
+def test_what_is_said_wins_over_what_is_chosen(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
+    said = ("--factor", "2", "--pop.blur-min-pixels", "3", "--log-every", "50")
+    words = ("train", shared_capture, "--out", tmp_path / "r", "--minutes", "0.001", *said, *QUICKLY)
+    assert pop(*words).status == 0
+    resolved = json.loads((tmp_path / "r" / "cfg.json").read_text())["resolved"]
+    assert (resolved["factor"], resolved["log_every"], resolved["strategy"]["blur_min_pixels"]) == (2, 50, 3.0)
+
+
+def test_the_papers_preset_is_the_protocol_to_the_letter() -> None:
+    config = TrainConfig.of(preset="paper")
+    assert (config.max_steps, config.factor, config.strategy.blur_min_pixels) == (30_000, 1, 0.0)
+
+
+@pytest.mark.parametrize("words", [("--preset", "quick"), ("--max-steps", "9"), ("--steps-scaler", "0.1")])
+def test_minutes_and_a_schedule_exclude_each_other(
+    pop: Pop, shared_capture: Path, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    outcome = pop("train", shared_capture, "--out", tmp_path / "r", "--minutes", "5", *words)
+    says(outcome, "--minutes", "leave one of them out")
+    says(pop("train", shared_capture, "--out", tmp_path / "r", "--minutes", "-1"), "--minutes is -1.0")
+
+
+def archive(path: Path, capture: Path, top: str = "") -> Path:
+    with zipfile.ZipFile(path, "w") as file:
+        for part in sorted(capture.rglob("*")):
+            if part.is_file():
+                file.write(part, top + part.relative_to(capture).as_posix())
+        file.writestr("__MACOSX/._a.jpg", b"nothing")
+    return path
+
+
+def test_an_archive_trains_without_a_second_command(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
+    packed = archive(tmp_path / "toy.zip", shared_capture, "walk/")
+    words = ("train", packed, "--out", tmp_path / "r", "--max-steps", "2", *QUICKLY)
+    outcome = pop(*words)
+    assert outcome.status == 0, outcome.err
+    assert "unpacked in" in outcome.out
+    folder = tmp_path / "toy_unpacked" / "walk"
+    assert json.loads((tmp_path / "r" / "cfg.json").read_text())["resolved"]["data"] == str(folder)
+    assert not (tmp_path / "toy_unpacked" / "__MACOSX").exists()
+    # a second time it is there
+    assert capture_folder(packed)[0] == folder
+
+
+@pytest.mark.parametrize("name", ["../out.jpg", "/out.jpg", "a/../../out.jpg", "c:/out.jpg", "..\\out.jpg"])
+def test_an_archive_writes_nothing_outside_its_folder(tmp_path: Path, name: str) -> None:
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
+        file.writestr("fine.jpg", b"1")
+        file.writestr(name, b"2")
+    with pytest.raises(CaptureError, match="outside of its folder"):
+        unpack(tmp_path / "a.zip", tmp_path / "deep" / "a")
+    assert not list(tmp_path.rglob("*.jpg"))
+
+
+def test_an_archive_that_would_fill_the_disk_or_is_damaged_is_refused(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "bomb.zip", "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("a.jpg", bytes(300_000_000))
+    with pytest.raises(CaptureError, match=r"bomb\.zip.*MB"):
+        unpack(tmp_path / "bomb.zip", tmp_path / "a")
+    with zipfile.ZipFile(tmp_path / "c.zip", "w") as file:
+        file.writestr("a.jpg", b"some bytes that are checked")
+    damaged = bytearray((tmp_path / "c.zip").read_bytes())
+    damaged[40] ^= 0xFF
+    (tmp_path / "c.zip").write_bytes(damaged)
+    with pytest.raises(CaptureError, match="cannot be unpacked"):
+        unpack(tmp_path / "c.zip", tmp_path / "c")
+    assert not (tmp_path / "a").exists()
+    assert not (tmp_path / "c").exists()
+
+
+def test_a_video_is_a_folder_of_its_frames_the_second_time_too(tmp_path: Path) -> None:
+    film = tmp_path / "walk.webm"
+    rng = np.random.default_rng(0)
+    with VideoFile(film, 5.0) as video:
+        for _ in range(6):
+            # nothing alike, or it would be a camera at rest
+            video.add(np.kron(rng.integers(0, 255, (6, 8, 3)), np.ones((16, 16, 1))).astype(np.uint8))
+    folder, said = capture_folder(film)
+    assert folder == tmp_path / "walk_frames"
+    assert said is not None
+    assert "of 6 frames" in said
+    taken = sorted(folder.iterdir())
+    assert len(taken) >= 2
+    again, said = capture_folder(film)
+    assert (again, sorted(again.iterdir())) == (folder, taken)
+    assert said is not None
+    assert "already" in said
+    os.utime(film, (folder.stat().st_mtime + 60.0,) * 2)
+    with pytest.raises(CaptureError, match="is older than"):
+        capture_folder(film)
