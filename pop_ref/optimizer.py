@@ -173,8 +173,8 @@ def learning_rates(
 ) -> dict[str, float]:
     """List every parameter's learning rate at a step; only the positions' changes, and none with the loss (A21).
 
-    Where `rates.others_decay` is not 1, as in no published method, those of scales, quaternions and harmonics decay with
-    the positions'. In a round of PUP-3DGS the others are multiplied by `round_decay` each `round_decay_every` steps.
+    Where `rates.others_decay` is not 1, as in no published method, those of scales, quaternions and harmonics decay
+    too. In a round of PUP-3DGS the others are multiplied by `round_decay` each `round_decay_every` steps.
 
     Source: Kerbl et al. 2023; values of gsplat's trainer; gaussian-splatting-pup.
     Departs: Inria's code since October 2024 uses 0.025 for opacities (`settings.INRIA_RATES`).

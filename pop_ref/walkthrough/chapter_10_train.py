@@ -312,7 +312,16 @@ print(*sorted(path.name for path in report.parent.iterdir() if path != report))
 scene, out = str(home / "scene"), str(home / "demo")
 with redirect_stdout(io.StringIO()) as said:
     made = command(["demo", scene, "--views", "16", "--width", "96", "--height", "72"])
-    asked = ["--out", out, "--steps-scaler", "0.1", "--pop.blur-min-pixels", "10", "--max-steps", "500"]
+    asked = [
+        "--out",
+        out,
+        "--steps-scaler",
+        "0.1",
+        "--pop.blur-min-pixels",
+        "10",
+        "--max-steps",
+        "500",
+    ]
     trained = command(["train", scene, *asked])
 assert (made, trained) == (0, 0)
 print(*[line for line in said.getvalue().splitlines() if line.startswith("PSNR")], sep="\n")
