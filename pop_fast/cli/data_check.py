@@ -12,6 +12,7 @@ import tyro
 
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.errors import printable
+from pop_fast.data.unpack import capture_folder
 
 if TYPE_CHECKING:
     from pop_fast.data.photo_quality import Finding
@@ -29,7 +30,7 @@ class Args:
     """
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """The capture."""
+    """The capture; of a video or a ZIP archive its photographs are taken out beside it, as pop train does."""
     images: str | None = None
     """The photographs are in this folder of the capture."""
     all: bool = False
@@ -39,7 +40,10 @@ class Args:
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "data check")
-    findings = look_over(args.capture, args.images)
+    folder, made = capture_folder(args.capture)
+    if made is not None:
+        print(f"note: {printable(made)}")
+    findings = look_over(folder, args.images)
     marks = {"ok": "ok", "warn": "LOOK", "bad": "BAD"}
     width = max(len(finding.about) for finding in findings) + 2
     shown: dict[tuple[str, str], int] = {}

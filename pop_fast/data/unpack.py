@@ -5,6 +5,7 @@ The folder lies beside the file, and a later call finds it there, with the camer
 
 from __future__ import annotations
 
+import errno
 import shutil
 import zipfile
 import zlib
@@ -18,6 +19,8 @@ from pop_fast.io.budget import check_members
 from pop_fast.io.images import VIDEO_SUFFIXES
 
 _FIX = "unpack it yourself, and give the folder"
+# what the system says of a member's name that cannot be a file's
+_NAMES = (errno.ENAMETOOLONG, errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.EINVAL, errno.EILSEQ)
 # beside the photographs of an archive, what other systems have put there
 _LEFT_OUT = ("__MACOSX", ".DS_Store", "Thumbs.db")
 
@@ -80,18 +83,25 @@ def unpack(path: Path, target: Path) -> None:
                     place.parent.mkdir(parents=True, exist_ok=True)
                     with archive.open(member) as source, place.open("wb") as file:
                         shutil.copyfileobj(source, file)
+    except OSError as error:
+        # a full disk is said as such by who catches it; a name that no folder can hold is the archive's
+        if error.errno not in _NAMES:
+            raise
+        raise CaptureError(f"{path}: cannot be unpacked: {error.strerror}; {_FIX}") from error
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
         # a RuntimeError asks for a password
         raise CaptureError(f"{path}: cannot be unpacked: {error}; {_FIX}") from error
 
 
 def _left_out(member: zipfile.ZipInfo) -> bool:
+    if not member.filename:
+        return False
     return member.is_dir() or any(part in _LEFT_OUT for part in PurePosixPath(member.filename).parts)
 
 
 def _inside(path: Path, member: zipfile.ZipInfo) -> str:
     name = PurePosixPath(member.filename.replace("\\", "/"))
-    if name.is_absolute() or ".." in name.parts or ":" in name.parts[0]:
+    if not name.parts or name.is_absolute() or ".." in name.parts or ":" in name.parts[0]:
         raise CaptureError(f"{path}: {member.filename!r} would be unpacked outside of its folder; {_FIX}")
     return str(name)
 
