@@ -12,7 +12,6 @@ import tyro
 
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.errors import printable
-from pop_fast.data.unpack import capture_folder
 
 if TYPE_CHECKING:
     from pop_fast.data.photo_quality import Finding
@@ -39,6 +38,8 @@ class Args:
 
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
+    from pop_fast.data.unpack import capture_folder
+
     args = parse(Args, argv, "data check")
     folder, made = capture_folder(args.capture)
     if made is not None:

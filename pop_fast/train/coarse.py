@@ -22,6 +22,22 @@ from pop_fast.train.views import ViewTensors
 SMALLEST_SIDE: Final = 32
 
 
+def coarse_to_fine(
+    views: Sequence[ViewTensors], order: Sequence[int], stops: Sequence[int], size: int
+) -> tuple[list[ViewTensors], list[int]]:
+    """Return the views at every size that is seen, and which of them every step sees.
+
+    Args:
+        views: to train on.
+        order: the views of every step, `size` of them a step.
+        stops: `coarse_stop_iters`.
+        size: views of a step.
+    """
+    return with_shrunk(views, stops), [
+        index_at(place // size, index, len(views), stops) for place, index in enumerate(order)
+    ]
+
+
 def with_shrunk(views: Sequence[ViewTensors], stops: Sequence[int]) -> list[ViewTensors]:
     """Return the views, then all of them shrunk by 2, by 4 and so on, one power for every entry of `stops`."""
     return [shrunk(view, 2**level) for level in range(len(stops) + 1) for view in views]

@@ -35,7 +35,7 @@ from pop_fast.train.appearance import Appearance
 from pop_fast.train.batch_stepper import check_batch
 from pop_fast.train.checkpoint import moved_to, on_cpu
 from pop_fast.train.choose import choose_backend
-from pop_fast.train.coarse import index_at, with_shrunk
+from pop_fast.train.coarse import coarse_to_fine
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import engine_of
 from pop_fast.train.environment import reproducible, run_facts, versions
@@ -116,9 +116,8 @@ class TrainingRun:
         self.optimizers = make_optimizers(self.params)
         self.strategy = self.config.strategy if strategy is None else ForeignStrategy(strategy)
         self.strategy.check_sanity(self.params, self.optimizers)
-        self.state = self.strategy.initialize_state(
-            self._scene_scale, seed=self.config.seed, count=len(self.params["means"])
-        )
+        first = len(self.params["means"])
+        self.state = self.strategy.initialize_state(self._scene_scale, seed=self.config.seed, count=first)
         self.updates = updates_of_strategy(self.config, self.strategy, self._scene_scale)
         self.step = 0
         self._watch = watch
@@ -299,12 +298,10 @@ class TrainingRun:
                     given = (self.params, self.optimizers, self.state)
                     self.params, self.optimizers = moved_to(self._engine.device, *given)
             config, size, done = self.config, self.config.batch_size, self.step
-            # the views of steps that were taken are not known any more
-            order = [0] * size * done + self._order.ahead(size * (config.max_steps - done))
-            stops, n_views = config.coarse_stop_iters, len(self._train)
-            views = with_shrunk(self._train, stops)
-            order = [index_at(place // size, index, n_views, stops) for place, index in enumerate(order)]
-            given = (config, self.strategy, views, order, self.updates, done, self.appearance, self._ranks)
+            # views of steps that were taken are not known any more
+            seen = [0] * size * done + self._order.ahead(size * (config.max_steps - done))
+            seen = coarse_to_fine(self._train, seen, config.coarse_stop_iters, size)
+            given = (config, self.strategy, *seen, self.updates, done, self.appearance, self._ranks)
             self._stepper = self._engine.make_stepper(Task(*given, self._stop))
             with translate_oom():
                 self._stepper.rebind(self.params, self.optimizers, self.state)

@@ -185,7 +185,8 @@ def test_what_is_no_folder_is_refused_in_the_same_words(pop: Pop, tmp_path: Path
     checked, trained = pop("data", "check", path), pop("train", path, "--out", tmp_path / "out")
     assert checked.status == trained.status == 2
     assert checked.err == trained.err
-    assert {"walk.mp4": "is no video", "photos.zip": "outside of its folder", "gone": "no such folder"}[name] in checked.err
+    words = {"walk.mp4": "is no video", "photos.zip": "outside of its folder", "gone": "no such folder"}
+    assert words[name] in checked.err
 
 
 def test_sizes_that_differ_are_called_mixed_cameras(pop: Pop, bare: Path, pictures: list[np.ndarray]) -> None:
