@@ -38,9 +38,9 @@ class Args:
 
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
+    args = parse(Args, argv, "data check")
     from pop_fast.data.unpack import capture_folder
 
-    args = parse(Args, argv, "data check")
     folder, made = capture_folder(args.capture)
     if made is not None:
         print(f"note: {printable(made)}")
