@@ -72,7 +72,10 @@ def test_what_docs_reliability_tells_of_was_tried_of_every_reader_and_kind_of_ru
     assert stored["fuzz"]["failures"] == {}
     again = stored["fuzz again"]
     assert again["failures"] == {}
-    assert again["readers"].keys() | {"photograph.heic"} == READERS.keys() | {"photograph.heic"}
+    # the reader of archives is younger than that run, and its own stands in the table
+    assert again["readers"].keys() | {"photograph.heic", "archive of photographs"} == READERS.keys() | {
+        "photograph.heic"
+    }
     assert all(sum(row[kind] for kind in OUTCOMES[:3]) >= 1_000 for row in again["readers"].values())
     told = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")
     assert f"(commit {again['commit']}, seed {again['seed']}) were given {again['inputs']:,} more inputs" in told
