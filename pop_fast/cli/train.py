@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 _EXAMPLES: Final = """
     pop train photos                         size and schedule by what is there; results in out/photos_pop
-    pop train walk.mp4 --minutes 10          a video, or photos.zip; no longer than that
+    pop train walk.mp4 --minutes 10          a video, or photos.zip; about so long
     pop train scene --preset paper           POP as published: 30,000 steps, photographs as they are
     pop train scene --preset quick           1,500 steps at rates of their own, for a first look
     pop train scene --method gsplat          the control: gsplat's default strategy, with opacity reset

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import random
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import count
@@ -155,7 +156,7 @@ def runs(row: str, *psnr: float, scene: str = "fox", n: int = 1000) -> list[Resu
     return [result(row, scene, seed=seed, n=n, psnr=value) for seed, value in zip(count(42), psnr, strict=False)]
 
 
-def compared(pop: list[Result], reset: list[Result], more: list[Result] = []) -> Comparison:  # noqa: B006
+def compared(pop: list[Result], reset: list[Result], more: Sequence[Result] = ()) -> Comparison:
     """Compare PSNR of two rows on fox."""
     found = compare(
         "PSNR", groups([*pop, *reset])["fox"], noise_of([*pop, *reset, *more]), PSNR, {"pop": 1.0, "reset": -1.0},
