@@ -63,7 +63,7 @@ def draw(result: Path, view: int = 0) -> bytes:
         psnr = float(kept["psnr"])
     parts = (
         ("before training: one Gaussian a point", before(result, view)),
-        (f"after two minutes on two cores: {psnr:.1f} dB", render),
+        (f"after a minute on two cores: {psnr:.1f} dB", render),
         ("the photograph, never seen in training", photo),
         ("the dominant Gaussian of each pixel", id_colors(ids)),
     )

@@ -195,7 +195,7 @@ picture(
 
 # %% [markdown]
 # Seventy steps leave a blur. The same toys, in photographs four times as wide, were trained for 3,000 steps before this
-# page was made, by `make demo`: two minutes on two cores. Gaussians were added where they
+# page was made, by `make demo`: a minute on two cores. Gaussians were added where they
 # were needed, and removed where they were not. The view is again one that no step has seen.
 
 # %%
