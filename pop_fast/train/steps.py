@@ -170,7 +170,7 @@ class Collected:
         return cls(torch.zeros(n, device=device), visible, dominant, flags, waiting)
 
 
-# settings that neither step of this package knows, with the one value that it trains with; "strategy." are the method's
+# settings that a step need not know, with the one value that it trains with; "strategy." are the method's
 _ONLY: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "batch_size": 1,
@@ -180,6 +180,9 @@ _ONLY: Final[Mapping[str, Any]] = MappingProxyType(
         "exposure": False,
         "random_background": False,
         "refine_cameras": False,
+        "depth_lambda": 0.0,
+        "opacity_reg": 0.0,
+        "scale_reg": 0.0,
     }
 )
 

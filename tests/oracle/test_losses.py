@@ -274,7 +274,7 @@ def test_a_point_whose_pixel_the_mask_leaves_out_says_nothing() -> None:
     np.testing.assert_array_equal(kept[1], disparities[left])
 
 
-def test_depth_at_points_is_interpolated_as_scipy_does_and_compared_inverse() -> None:
+def test_depth_at_points_is_interpolated_and_compared_inverse() -> None:
     depth = DEPTH_RNG.uniform(1.0, 9.0, (5, 7))
     # beyond the outer pixels' centres too
     places = np.vstack([DEPTH_RNG.uniform(0.0, 1.0, (40, 2)) * [7.0, 5.0], [[0.0, 0.0], [7.0 - 1e-9, 2.5]]])
