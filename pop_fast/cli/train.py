@@ -38,7 +38,7 @@ from pop_fast.cli.train_options import PLAN, BlocksOptions, overrides, plan_of, 
 from pop_fast.cli.view import LiveView, check_viewer
 from pop_fast.data.sfm_files import SfmOptions
 from pop_fast.errors import PopError
-from pop_fast.train.automatic import begun, check_minutes
+from pop_fast.train.automatic import about_held_out, begun, check_minutes
 from pop_fast.train.choose import choose_backend, on_gpu
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.presets import ALIASES, AUTOMATIC, LOSSES, METHODS, Given
@@ -229,7 +229,7 @@ def train_capture(
         The exit status.
     """
     from pop_fast.train.commands import COMMANDS_FILE, commands_text
-    from pop_fast.train.load_result import RECORD, record_text
+    from pop_fast.train.load_result import RECORD, read_record, record_text
 
     folder, start = Path(config.result_dir), time.perf_counter()
     capture = _open_in_turn(config, options, ranks)
@@ -245,11 +245,14 @@ def train_capture(
         print(f"cameras found in {duration(searching)}")
     for note in capture.notes:
         print(f"note: {printable(note)}")
-    config, told = with_length(config, capture, options) if chooses else (config, None)
+    config, told = with_length(config, capture, options) if chooses else (config, ())
     print(printable(f"{capture.name}: {capture.source}; {_plan(config)}"))
     print(chosen)
-    if told is not None:
-        print(told, flush=True)
+    for line in told:
+        print(line, flush=True)
+    advice = about_held_out(capture, config)
+    if advice is not None:
+        print(f"note: {advice}")
     large = about_large(capture, config)
     if large is not None:
         print(f"note: {large}")
@@ -258,7 +261,9 @@ def train_capture(
     how = {"resume": options.resume, "overwrite": options.overwrite, "loading_seconds": loading}
     how["sfm_seconds"] = searching
     commands = commands_text(folder if options.resume else None, ["pop", "train", *argv])
-    beside = {RECORD: record_text(record_of(capture, options)), COMMANDS_FILE: commands}
+    before = read_record(folder) if options.resume else None
+    record = record_of(capture, options, told[1:] if before is None else before.chosen)
+    beside = {RECORD: record_text(record), COMMANDS_FILE: commands}
     # absolute, so that the result can be looked at from another folder too
     absolute = replace(config, data=str(Path(config.data).absolute()))
     with ExitStack() as showing:
