@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -68,6 +68,22 @@ def about_large(capture: Capture, config: TrainConfig) -> str | None:
         f"(the time left is told after the first ones); --factor {config.factor * shrink} takes about "
         f"1/{shrink**2} of the time, at {round(view.width / shrink)}x{round(view.height / shrink)} px"
     )
+
+
+def notes_before(capture: Capture, config: TrainConfig) -> Iterator[str]:
+    """Say before the first step what large photographs, few of them and a long schedule cost."""
+    for note in (about_large(capture, config), automatic.about_held_out(capture, config)):
+        if note is not None:
+            yield note
+    if takes_hours(config):
+        yield f"{config.max_steps:,} steps take hours on a CPU; --preset quick takes 1,500"
+
+
+def takes_hours(config: TrainConfig) -> bool:
+    """Tell whether a CPU is given the paper's schedule by nobody's word: neither a preset nor steps were said."""
+    given = config.given
+    said = given is None or given.steps_scaler is not None or "max_steps" in given.settings
+    return not said and config.preset == "paper" and not on_gpu(config)
 
 
 def check_output(folder: Path, options: Any) -> None:
