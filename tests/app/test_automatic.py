@@ -20,7 +20,7 @@ from pop_fast.errors import CaptureError
 from pop_fast.train import TrainConfig, automatic
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.automatic import (
-    DEPTH_LAMBDA,
+    DEPTH_LAMBDAS,
     FEW,
     MINUTES,
     SHORTEST,
@@ -137,10 +137,14 @@ def chosen(capture: Capture, stops: float | None = None, **said: Any) -> Terms:
 
 def test_depth_is_held_to_sparse_points_where_photographs_are_few_and_say_which_they_see() -> None:
     few, many = tiny_capture(n_views=FEW), tiny_capture(n_views=2 * FEW)
-    terms = chosen(few)
-    assert terms.settings == {"depth_lambda": DEPTH_LAMBDA}
-    assert f"{len(few.train_views())} photographs are few, neighbours" in terms.why[0]
+    for capture in (few, tiny_capture()):
+        terms, count = chosen(capture), len(capture.train_views())
+        assert terms.settings == {"depth_lambda": next(weight for most, weight in DEPTH_LAMBDAS if count <= most)}
+        assert f"{count} photographs are few, neighbours" in terms.why[0]
+    assert chosen(tiny_capture()).settings["depth_lambda"] > chosen(few).settings["depth_lambda"] > 0.0
     assert chosen(many) == Terms()
+    # it was not measured with other methods
+    assert choose_terms(few, TrainConfig.of(preset="auto", method="gsplat", backend="fast"), None) == Terms()
     blind = replace(few, views=tuple(replace(view, seen=None) for view in few.views))
     assert chosen(blind).settings == {}
     assert "no tracks" in chosen(blind).why[0]
@@ -168,12 +172,13 @@ def test_what_was_chosen_for_few_photographs_is_said_kept_reported_and_gone_on_w
         interrupt(patch, at=120)
         outcome = pop(*words)
     assert outcome.status == 130
-    assert f"(--depth-lambda {DEPTH_LAMBDA:g}), as 7 photographs are few" in outcome.out
+    weight = DEPTH_LAMBDAS[0][1]
+    assert f"(--depth-lambda {weight:g}), as 7 photographs are few" in outcome.out
     assert "1 of 8 photographs are held out" in outcome.out
     assert "--test-every 0" in outcome.out
     assert pop(*words, "--resume").status == 0
     resolved = json.loads((tmp_path / "r" / "cfg.json").read_text())["resolved"]
-    assert resolved["depth_lambda"] == DEPTH_LAMBDA
+    assert resolved["depth_lambda"] == weight
     data = read_result(tmp_path / "r")
     assert "as 7 photographs are few" in data.config["chosen by the run"]
     # who says how many are held out is not told again

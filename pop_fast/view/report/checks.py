@@ -182,6 +182,8 @@ def nearer_than(params: Mapping[str, Tensor], view: View, limit: float) -> dict[
 def are_floaters(means: Tensor, capture: Capture, test_every: int) -> Tensor:
     """Tell which centres stand in the picture of a photograph's or the orbit's camera where nothing was photographed.
 
+    What reaches into such a picture from outside of it stays: of that, much is seen well by other photographs.
+
     Args:
         means: world. [N, 3]
         capture: in the same frame, with its own sparse points.
