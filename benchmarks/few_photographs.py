@@ -1,6 +1,7 @@
 """What terms for few photographs change: depth at sparse points, regularizers, exposure, corrected cameras.
 
     python benchmarks/few_photographs.py fox --factor 4 --left 8 12 20 25 --seed 42 43 44 --json few.json
+    python benchmarks/few_photographs.py --json few.json
     python benchmarks/few_photographs.py fox --gains 0.3 --only plain --only=--exposure
     python benchmarks/few_photographs.py fox --turned 0.3 --only plain --only=--refine-cameras
 
@@ -18,7 +19,7 @@ import argparse
 import shlex
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -147,10 +148,41 @@ def rows_of(args: argparse.Namespace, known: dict[str, Any]) -> Iterator[tuple[s
                 yield name, known[name]
 
 
+def table_of(known: Mapping[str, Any], only: Sequence[str] | None = None) -> str:
+    """Lay the rows of a JSON file out: PSNR / SSIM of a setting, the mean over so many seeds as are told.
+
+    Args:
+        known: the rows.
+        only: settings; None takes all.
+    """
+    cells: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for name, numbers in known.items():
+        if name == "machine":
+            continue
+        what, _, setting = name.partition(": ")
+        place = what.rpartition(", seed ")[0]
+        cells.setdefault(place, {}).setdefault(setting, []).append((numbers["psnr"], numbers["ssim"]))
+    settings = only or list(dict.fromkeys(setting for row in cells.values() for setting in row))
+    lines = [
+        f"| capture | {' | '.join(f'`{setting}`' for setting in settings)} |",
+        f"| --- |{' --- |' * len(settings)}",
+    ]
+    for place in sorted(cells, key=_by_count):
+        found = [cells[place].get(setting) for setting in settings]
+        shown = ["" if some is None else "{:.2f} / {:.3f} ({})".format(*np.mean(some, 0), len(some)) for some in found]
+        lines.append(f"| {place} | {' | '.join(shown)} |")
+    return "\n".join(lines)
+
+
+def _by_count(place: str) -> tuple[str, int]:
+    capture, count = place.split(", ")[:2]
+    return capture, int(count.split()[0])
+
+
 def main(words: list[str] | None = None) -> int:
     """Measure, a row for each number of photographs, setting and seed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("capture", type=Path)
+    parser.add_argument("capture", type=Path, nargs="?", help="without one, the rows of --json are laid out as a table")
     parser.add_argument("--factor", type=int, default=8)
     parser.add_argument("--left", type=int, nargs="+", help="training photographs; every other one is left by default")
     parser.add_argument("--steps", type=int, default=1500)
@@ -161,6 +193,9 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="keep the rows here, and go on from those that are in it")
     args = parser.parse_args(words)
     known = {} if args.json is None else read_json(args.json)
+    if args.capture is None:
+        print(table_of(known))
+        return 0
     known.setdefault("machine", machine())
     print(f"| run | {' | '.join(COLUMNS)} |\n| --- |{' --- |' * len(COLUMNS)}", flush=True)
     for name, numbers in rows_of(args, known):
