@@ -149,29 +149,36 @@ def rows_of(args: argparse.Namespace, known: dict[str, Any]) -> Iterator[tuple[s
 
 
 def table_of(known: Mapping[str, Any], only: Sequence[str] | None = None) -> str:
-    """Lay the rows of a JSON file out: PSNR / SSIM of a setting, the mean over so many seeds as are told.
+    """Lay the rows of a JSON file out: PSNR / SSIM of the plain runs, and what every setting changes of them.
+
+    A change is the mean over the seeds that were run with both; how many these are stands in brackets.
 
     Args:
         known: the rows.
         only: settings; None takes all.
     """
-    cells: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    found: dict[str, dict[str, dict[str, tuple[float, float]]]] = {}
     for name, numbers in known.items():
-        if name == "machine":
-            continue
-        what, _, setting = name.partition(": ")
-        place = what.rpartition(", seed ")[0]
-        cells.setdefault(place, {}).setdefault(setting, []).append((numbers["psnr"], numbers["ssim"]))
-    settings = only or list(dict.fromkeys(setting for row in cells.values() for setting in row))
-    lines = [
-        f"| capture | {' | '.join(f'`{setting}`' for setting in settings)} |",
-        f"| --- |{' --- |' * len(settings)}",
-    ]
-    for place in sorted(cells, key=_by_count):
-        found = [cells[place].get(setting) for setting in settings]
-        shown = ["" if some is None else "{:.2f} / {:.3f} ({})".format(*np.mean(some, 0), len(some)) for some in found]
-        lines.append(f"| {place} | {' | '.join(shown)} |")
+        if name != "machine":
+            what, _, setting = name.partition(": ")
+            place, _, seed = what.rpartition(", seed ")
+            found.setdefault(place, {}).setdefault(setting, {})[seed] = (numbers["psnr"], numbers["ssim"])
+    settings = [s for s in only or dict.fromkeys(s for row in found.values() for s in row) if s != "plain"]
+    titles = " | ".join(f"`{setting}`" for setting in settings)
+    lines = [f"| capture | plain | {titles} |", f"| --- | --- |{' --- |' * len(settings)}"]
+    for place in sorted(found, key=_by_count):
+        plain = found[place].get("plain", {})
+        cells = [_mean_of(list(plain.values()), "{:.2f} / {:.3f} ({})")]
+        for setting in settings:
+            seeds = found[place].get(setting, {})
+            both = [np.subtract(value, plain[seed]) for seed, value in seeds.items() if seed in plain]
+            cells.append(_mean_of(both, "{:+.2f} / {:+.3f} ({})"))
+        lines.append(f"| {place} | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def _mean_of(pairs: Sequence[Any], shown: str) -> str:
+    return shown.format(*np.mean(pairs, axis=0), len(pairs)) if len(pairs) else ""
 
 
 def _by_count(place: str) -> tuple[str, int]:

@@ -164,9 +164,8 @@ def few_photographs() -> str:
     """Make the table of captures with few photographs left, as benchmarks/few_photographs.py does."""
     script = runpy.run_path(str(ROOT / "benchmarks" / "few_photographs.py"))
     known = json.loads((ROOT / "benchmarks" / "results" / "few_photographs.json").read_text(encoding="utf-8"))
-    settings = ("plain", "--depth-lambda 0.01", "--depth-lambda 0.1", "--method gsplat")
-    more = ("--opacity-reg 0.001", "--scale-reg 0.01")
-    return str(script["table_of"](known, (*settings, *more)))
+    weights = ("--depth-lambda 0.1", "--depth-lambda 0.01", "--opacity-reg 0.001", "--scale-reg 0.01")
+    return str(script["table_of"](known, (*weights, "--method gsplat")))
 
 
 def _of_faults(name: str) -> Callable[[], str]:

@@ -13,6 +13,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from benchmarks.few_photographs import left_of, table_of
 from pop_fast.cli.train_checks import chooses_for_itself
 from pop_fast.data.capture import Capture
 from pop_fast.data.unpack import capture_folder, unpack
@@ -185,6 +186,28 @@ def test_what_was_chosen_for_few_photographs_is_said_kept_reported_and_gone_on_w
     said = pop(*words, "--overwrite", "--test-every", "4", "--depth-lambda", "0")
     assert "held out to measure by" not in said.out
     assert "--depth-lambda" not in said.out
+
+
+def test_few_photographs_are_left_evenly_with_the_points_that_two_of_them_see() -> None:
+    capture = tiny_capture(n_views=17)
+    left = left_of(capture, 4)
+    assert [view.name for view in left.test_views()] == [view.name for view in capture.test_views()]
+    assert [view.name for view in left.train_views()] == ["01.png", "05.png", "11.png", "15.png"]
+    assert 0 < len(left.points) < len(capture.points)
+    seen = np.bincount(np.concatenate([view.seen for view in left.train_views()]), minlength=len(left.points))
+    assert seen.min() >= 2
+    was = {view.name: {*map(tuple, capture.points[view.seen])} for view in capture.views}
+    assert all({*map(tuple, left.points[view.seen])} <= was[view.name] for view in left.views)
+
+
+def test_a_table_of_settings_compares_the_same_seeds_alone() -> None:
+    rows = {
+        "a / 2, 8 photographs, 9 steps, seed 1: plain": {"psnr": 20.0, "ssim": 0.5},
+        "a / 2, 8 photographs, 9 steps, seed 2: plain": {"psnr": 30.0, "ssim": 0.7},
+        "a / 2, 8 photographs, 9 steps, seed 2: --x": {"psnr": 31.0, "ssim": 0.6},
+    }
+    last = table_of({"machine": {}, **rows}).splitlines()[-1]
+    assert last == "| a / 2, 8 photographs, 9 steps | 25.00 / 0.600 (2) | +1.00 / -0.100 (1) |"
 
 
 def test_depth_that_no_track_tells_is_warned_of(pop: Pop, capture: Path, tmp_path: Path) -> None:
