@@ -11,6 +11,7 @@ is written, and the bits are the same for any number of threads wherever those o
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -44,11 +45,16 @@ _FITTED: Final = 32
 # Gaussians whose colours are fitted at a time
 _ROWS: Final = 8192
 # of the steps, what every way is tuned for before one is chosen
-_TRIAL: Final = 0.25
+TRIAL: Final = 0.25
 # what the rates of `LearningRates` are multiplied by; all but those of the opacities fall to a tenth. Coefficients
 # that are few, and have to show what the others did, move faster than in a training
 _RATES: Final = {**QUICK_RATES, "means": 1.2, "sh_rest": 60.0, "opacities": 0.3}
 _DECAY: Final = 0.1
+# files grow while they are tuned, as numbers become less round; one that has become so many times what it may be is cut
+# down and tuned again before it is compared
+_GROWN: Final = 1.1
+# Gaussians that tell whether a lower degree makes a file smaller
+_SAMPLE: Final = 2000
 # s of steps, after which is told how long all of them will take
 _SURE_AFTER: Final = 1.0
 
@@ -94,15 +100,13 @@ class _Trial:
 
     Attributes:
         compact: what came out.
+        scores: of its Gaussians. [N]
         psnr: of what is read back, in training views.
     """
 
     compact: Compact
+    scores: Tensor
     psnr: float
-
-    @property
-    def count(self) -> int:
-        return len(self.compact.params["means"])
 
 
 def degree_of(params: Params) -> int:
@@ -196,8 +200,10 @@ class Tuner:
     def psnr(self, params: Params, views: Sequence[ViewTensors] = ()) -> float:
         """Measure parameters in views, some for training if none is named, dB.
 
-        To a millionth, below which the order of sums decides.
+        To a millionth, below which the order of sums decides; nothing shown is the worst.
         """
+        if len(params["means"]) == 0:
+            return -math.inf
         views = views or evenly(self._train, _MEASURED)
         return round(float(evaluate(self.backend, params, views, self.config, degree_of(params))["psnr"]), 6)
 
@@ -280,22 +286,22 @@ def within(tuner: Tuner, score: Callable[[Params], Tensor], most: int, coding: C
     plain = _cut(whole, scores, most, coding, 0)
     if len(plain["means"]) == len(whole["means"]):
         return Compact(plain)
-    found = _ended(tuner, score, scores, most, coding, _chosen(tuner, scores, most, coding))
+    found = _ended(tuner, score, most, coding, _chosen(tuner, scores, most, coding))
     both = (found, Compact(plain))
     return max(both, key=lambda each: tuner.psnr(coding.shown(each.params, each.level)))
 
 
 def _chosen(tuner: Tuner, scores: Tensor, most: int, coding: Coding) -> _Trial:
     """Try every degree at a level in the middle, and the best one at levels between there and either end."""
-    steps, middle = round(_TRIAL * tuner.steps), (coding.levels - 1) // 2
+    steps, middle = round(TRIAL * tuner.steps), (coding.levels - 1) // 2
     others = sorted({middle // 2, (middle + coding.levels) // 2} - {middle}) if coding.levels > 1 else []
-    degrees = degree_of(tuner.whole)
-    tuner.plan(steps * (degrees + 1 + len(others)) + tuner.steps)
+    degrees = _degrees(tuner, scores, coding)
+    tuner.plan(steps * (len(degrees) + len(others)) + tuner.steps)
     best: _Trial | None = None
-    for degree in range(degrees, -1, -1):
+    for degree in degrees:
         trial = _tried(tuner, scores, most, coding, degree, middle if degree else 0, steps)
         best = trial if best is None or trial.psnr > best.psnr else best
-        if trial.count == len(scores):
+        if len(trial.scores) == len(scores):
             # a still lower degree would save bytes that nobody asks for
             break
     assert best is not None
@@ -307,22 +313,32 @@ def _chosen(tuner: Tuner, scores: Tensor, most: int, coding: Coding) -> _Trial:
     return best
 
 
+def _degrees(tuner: Tuner, scores: Tensor, coding: Coding) -> list[int]:
+    """List the degrees that colours may have, falling; of those that make no file smaller the highest and the lowest.
+
+    PLY has room for all bands always, and `.splat` for none.
+    """
+    most, kept = degree_of(tuner.whole), shrink.best(scores, _SAMPLE)
+    some = {name: value[kept] for name, value in tuner.whole.items()}
+    sizes = [len(coding.write({**some, "shN": some["shN"][:, : (d + 1) ** 2 - 1]})) for d in range(most + 1)]
+    return [d for d in range(most, -1, -1) if d in (most, 0) or sizes[d] != sizes[d + 1]]
+
+
 def _tried(tuner: Tuner, scores: Tensor, most: int, coding: Coding, degree: int, level: int, steps: int) -> _Trial:
     """Fit a splat in one way, tune it a little, and measure it as it is read back."""
     start = _cut(tuner.lowered(degree), scores, most, coding, level)
-    params = tuner.tuned(start, steps)
-    return _Trial(Compact(params, level), tuner.psnr(coding.shown(params, level)))
+    kept, params = scores[shrink.best(scores, len(start["means"]))], tuner.tuned(start, steps)
+    if len(coding.write(params, level)) > _GROWN * most:
+        start = _cut(params, kept, most, coding, level)
+        kept, params = kept[shrink.best(kept, len(start["means"]))], tuner.tuned(start, steps)
+    return _Trial(Compact(params, level), kept, tuner.psnr(coding.shown(params, level)))
 
 
-def _ended(
-    tuner: Tuner, score: Callable[[Params], Tensor], scores: Tensor, most: int, coding: Coding, trial: _Trial
-) -> Compact:
+def _ended(tuner: Tuner, score: Callable[[Params], Tensor], most: int, coding: Coding, trial: _Trial) -> Compact:
     """Tune what was chosen to the end, and see to it that it fits."""
     params, level = trial.compact.params, trial.compact.level
     if tuner.steps > 0:
-        # files grow as their numbers become less round, by a few hundredths
-        kept = scores[shrink.best(scores, trial.count)]
-        params = tuner.tuned(_cut(params, kept, most, coding, level), tuner.steps)
+        params = tuner.tuned(_cut(params, trial.scores, most, coding, level), tuner.steps)
     levels = range(max(level - 1, 0), min(level + 2, coding.levels)) if degree_of(params) else (level,)
     for finer in levels:
         if len(coding.write(params, finer)) <= most:
