@@ -150,7 +150,7 @@ def _budgets(record: dict[str, Any]) -> str:
 
 Published figures of methods that compress, on another scale: the nine scenes of Mip-NeRF 360, their photographs shrunk
 by 4 (outdoors) and 2 (indoors), tens of thousands of steps on a GPU. Each is the authors', as the survey
-[3DGS.zip](https://w-m.github.io/3dgs-compression-survey/) (arXiv 2407.09510) lists it, but for the first. They say what
+3DGS.zip (`w-m.github.io/3dgs-compression-survey`, arXiv 2407.09510) lists it, but for the first. They say what
 a method reaches there, and nothing about the table above.
 
 {_table(["method", "PSNR, dB", "MB", "source"], [list(row) for row in PUBLISHED])}"""
