@@ -32,6 +32,29 @@ PUBLISHED = (
 )
 _FIELDS = ("centre", "scale", "rotation", "opacity", "colour", "view dependence")
 
+_SMALLER = """## Smaller
+
+| option | what goes |
+|---|---|
+| `--min-opacity A` | Gaussians with a lower opacity; under 1/255 no picture changes |
+| `--crop XMIN YMIN ZMIN XMAX YMAX ZMAX` | those with their centre outside a box in the capture's own world frame |
+| `--final-prune SHARE` | those that contribute least and together make up this share of all blending weights |
+| `--max-gaussians N` | all but the N of the highest score |
+| `--target-mb M` | what a file of at most M megabytes has no room for: Gaussians of the lowest scores, bands of the \
+colours, and digits of their coefficients |
+
+Scores (`--score`) are Speedy-Splat's sensitivity, blending weights or dominated pixels, summed over the training views,
+or a guess from opacity and size where no capture is known. `pop train` takes the same options, for the files that
+`--export` names.
+
+Where the photographs are at hand, `--target-mb` measures what loses least. Every degree of the colours is tried, those
+of a lower one fitted to what the training views show, and the best one with finer and coarser coefficients, where the
+format has them. Each is tuned for a few steps, written, read back and measured in training views; the best is tuned for
+`--fine-tune-steps` (300; 0 tunes nothing), and so is what `--max-gaussians` keeps. The run's own engine and loss do
+that, without density control; how long it takes is told after its first second. Held-out views are measured at the end
+and decide nothing. Without photographs, Gaussians alone go, those that are least visible.
+"""
+
 
 def page() -> str:
     """Make the page."""
@@ -75,28 +98,7 @@ as they are.
 - `html` holds SPZ, and loses what that loses. It draws as the training's rasterizer does, to degree 3, but ends no
   pixel early; in the profile `inria` its cut-off is an ellipse of 3 standard deviations and not a square.
 
-## Smaller
-
-| option | what goes |
-|---|---|
-| `--min-opacity A` | Gaussians with a lower opacity; under 1/255 no picture changes |
-| `--crop XMIN YMIN ZMIN XMAX YMAX ZMAX` | those with their centre outside a box in the capture's own world frame |
-| `--final-prune SHARE` | those that contribute least and together make up this share of all blending weights |
-| `--max-gaussians N` | all but the N of the highest score |
-| `--target-mb M` | what a file of at most M megabytes has no room for: Gaussians of the lowest scores, bands of the \
-colours, and digits of their coefficients |
-
-Scores (`--score`) are Speedy-Splat's sensitivity, blending weights or dominated pixels, summed over the training views,
-or a guess from opacity and size where no capture is known. `pop train` takes the same options, for the files that
-`--export` names.
-
-Where the photographs are at hand, `--target-mb` measures what loses least. Every degree of the colours is tried, those
-of a lower one fitted to what the training views show, and the best one with finer and coarser coefficients, where the
-format has them. Each is tuned for a few steps, written, read back and measured in training views; the best is tuned for
-`--fine-tune-steps` (300; 0 tunes nothing), and so is what `--max-gaussians` keeps. The run's own engine and loss do
-that, without density control; how long it takes is told after its first second. Held-out views are measured at the end
-and decide nothing. Without photographs, Gaussians alone go, those that are least visible.
-
+{_SMALLER}
 ## Measured
 
 {_measured(json.loads(SIZES.read_text(encoding="utf-8")))}
