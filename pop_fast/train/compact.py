@@ -56,7 +56,7 @@ _GROWN: Final = 1.1
 # Gaussians that tell whether a lower degree makes a file smaller
 _SAMPLE: Final = 2000
 # s of steps, after which is told how long all of them will take
-_SURE_AFTER: Final = 1.0
+_SURE_AFTER: Final = 2.0
 
 
 class Coding(Protocol):
@@ -148,7 +148,7 @@ class Tuner:
         self.whole = {name: value.detach().cpu() for name, value in params.items()}
         self.whole["shN"] = self.whole["shN"][:, : (sh_degree + 1) ** 2 - 1].contiguous()
         self.steps, self._capture, self._learned, self._report = steps, capture, learned, report
-        self._taken, self._planned, self._seconds = 0, 0, 0.0
+        self._taken, self._planned, self._timed, self._seconds = 0, 0, 0, 0.0
         views = [ViewTensors.of(view) for view in capture.train_views(config.test_every)]
         self._train = self._run(self.whole, 1).appearance.seen(views)
         self.held_out = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
@@ -170,11 +170,14 @@ class Tuner:
             while run.step < steps:
                 began, before = time.perf_counter(), run.step
                 run.take_steps(segment_end(run.config, run.strategy, run.step, run.stepper.longest))
-                self._taken, self._seconds = (
-                    self._taken + run.step - before,
-                    self._seconds + time.perf_counter() - began,
-                )
-                known = self._seconds / self._taken * self._planned if self._seconds > _SURE_AFTER else None
+                self._taken += run.step - before
+                if before > 0:
+                    # a first step also loads what all of them need
+                    self._timed, self._seconds = (
+                        self._timed + run.step - before,
+                        self._seconds + time.perf_counter() - began,
+                    )
+                known = self._seconds / self._timed * self._planned if self._seconds > _SURE_AFTER else None
                 self._report(self._taken, self._planned, known)
         return {name: value.detach().cpu().clone() for name, value in run.params.items()}
 
