@@ -32,6 +32,7 @@ from pop_fast.train.automatic import (
     expected_gaussians,
     factor_for,
 )
+from pop_fast.train.presets import QUICK_SCALER
 from pop_fast.view.paths import VideoFile
 from pop_fast.view.report.source import read_result
 from tests.app.conftest import Pop
@@ -65,6 +66,30 @@ def test_the_schedule_fills_the_minutes_and_is_at_most_the_papers() -> None:
     # what does not fit is not said to
     assert shortest.scaler == SHORTEST
     assert shortest.seconds > 0.6
+
+
+@pytest.mark.parametrize("method", ["pop", "gsplat", "3dgs"])
+def test_a_short_schedule_has_the_rates_and_the_coarse_photographs_of_quick(method: str) -> None:
+    quick = TrainConfig.of(method=method, preset="quick")
+    same = TrainConfig.of(method=method, preset="auto", steps_scaler=QUICK_SCALER)
+    assert replace(same, given=None) == replace(quick, given=None)
+    longer = TrainConfig.of(method=method, preset="auto", steps_scaler=1.01 * QUICK_SCALER)
+    assert longer.lr == TrainConfig.of(method=method).lr
+    assert longer.coarse_stop_iters == ()
+    shorter = TrainConfig.of(method=method, preset="auto", steps_scaler=SHORTEST)
+    assert shorter.lr == quick.lr
+    assert [stop / shorter.max_steps for stop in shorter.coarse_stop_iters] == pytest.approx([1 / 6, 1 / 3], rel=0.01)
+    said = TrainConfig.of(
+        method=method, preset="auto", steps_scaler=SHORTEST, **{"lr.sh0": 0.5, "coarse_stop_iters": ()}
+    )
+    assert (said.lr.sh0, said.coarse_stop_iters) == (0.5, ())
+
+
+def test_no_minute_more_makes_a_schedule_shorter() -> None:
+    config = TrainConfig.of(preset="auto")
+    scalers = [choose_length(config, SPEED, minutes, 1e5, 50, 7).scaler for minutes in np.linspace(0.2, 4.0, 60)]
+    assert scalers == sorted(scalers)
+    assert min(scalers) < QUICK_SCALER < max(scalers)
 
 
 def test_a_step_with_more_gaussians_takes_longer_by_as_much_as_was_measured() -> None:
