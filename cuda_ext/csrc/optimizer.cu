@@ -152,8 +152,9 @@ __device__ __forceinline__ void adam_float(const AdamGroup& group, size_t at, fl
     group.v[at] = v;
 }
 
+template <bool VIEWS>
 __device__ __forceinline__ bool group_in_pieces(const AdamGroup& group) {
-    return in_pieces(group.param) && in_pieces(group.m) && in_pieces(group.v) && in_pieces(group.gradient);
+    return in_pieces(group.param) && in_pieces(group.m) && in_pieces(group.v) && (!VIEWS || in_pieces(group.gradient));
 }
 
 __device__ __forceinline__ bool last_view(const UpdateArrays& a) { return a.place + 1 == a.n_views; }
@@ -263,7 +264,7 @@ __device__ __forceinline__ void update_short_rows(const UpdateArrays& a, int fir
 #pragma unroll
     for (int group = 0; group < G_SHN; ++group) {
         rates[group] = __ldg(&a.constants->adam[group].rate);
-        pieces = pieces && group_in_pieces(a.groups[group]);
+        pieces = pieces && group_in_pieces<VIEWS>(a.groups[group]);
     }
     if (!pieces) {
 #pragma unroll
@@ -328,7 +329,7 @@ __device__ __forceinline__ void update_long_rows(const UpdateArrays& a, const Ro
     float* const waiting = a.sh_rest_sum;
     const int lane = threadIdx.x & (WARP - 1), total = rows * stride.floats;
     const size_t base = size_t(first) * stride.floats;
-    if (rows < WARP || !group_in_pieces(group)) {
+    if (rows < WARP || !group_in_pieces<VIEWS>(group)) {
 #pragma unroll 1
         for (int at = lane; at < total; at += WARP)
             if (staged_at<FLOATS>(at, stride) >= 0) {
