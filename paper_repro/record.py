@@ -308,7 +308,7 @@ def _result(take: _Fields) -> Result:
         threads=take.whole("threads", 1),
         versions=take.mapping("versions"),
         protocol=_protocol(take.inner("protocol")),
-        schedule=take.mapping("schedule"),
+        schedule=_schedule(take.inner("schedule")),
         seconds=_seconds(take.inner("seconds")),
         num_gaussians=n,
         checkpoint_mib=take.number("checkpoint_mib", 0.0),
@@ -331,7 +331,7 @@ def _result(take: _Fields) -> Result:
 def _agree(result: Result, take: _Fields) -> None:
     """Refuse a result whose fields do not agree with each other, naming the one that is not what the others say."""
     n, settings, protocol = result.num_gaussians, result.schedule, result.protocol
-    size, last = protocol["checkpoint_bytes_per_gaussian"], settings.get("max_steps", 0) - 1
+    size, last = protocol["checkpoint_bytes_per_gaussian"], settings["max_steps"] - 1
     views, edge = list(result.per_view.values()), BINS // 10
     due = {
         "config_hash": (settings_hash(settings), "the hash of the settings in schedule"),
@@ -367,6 +367,13 @@ def _protocol(take: _Fields) -> dict[str, Any]:
         take.text(_BASE, *_RUN)
     for name, kind in _PROTOCOL.items():
         _ = take.text(name) if kind is str else take.whole(name, 1)
+    return dict(take.found)
+
+
+def _schedule(take: _Fields) -> dict[str, Any]:
+    if "max_steps" not in take.found:
+        raise take.fail("max_steps", "there, a whole number of at least 1")
+    _ = take.whole("max_steps", 1)
     return dict(take.found)
 
 

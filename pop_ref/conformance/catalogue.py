@@ -73,7 +73,9 @@ class Mine(Adapter):  # pytest --pyargs pop_ref.conformance --adapter my.module:
 
 Programs in other languages are judged over their standard input and output: `--program "./port words"` starts one,
 sends it the scenes that laws make, and reads images, ids, transmittance and gradients. `program_adapter.py` states the
-protocol, one line of words and raw arrays each way; `tests/port/port.cpp` is a port in C++ that speaks it. A program
+protocol, one line of words and raw arrays each way; `tests/port/port.cpp` is a port in C++ that speaks it. Losses,
+density control, Adam, single stages, and calls with several cameras and modes of depth cross as functions that a
+program offers by name. A program
 that ends, hangs (`--program-timeout`) or answers what cannot be read breaks the law that asked, and what it wrote to
 standard error is shown.
 

@@ -13,23 +13,39 @@ written to standard error is shown where the program fails.
         -> ok NAME NAME ... and these arrays; at least those that are wanted
     gradients, the same, and v_image [H, W, 3], v_T_final [H, W]
         -> ok v_NAME v_NAME ... and these arrays
+    call FUNCTION NAME=VALUE ... and the arrays among the values
+        -> draw NUMBER, where a value is `draw`: the program goes on with NUMBER=[SHAPE], a line, and the array
+        -> ok NAME=[SHAPE] ... and these arrays
 
 PROFILE is one of `pop_ref.PROFILES`, whose constants every scene then has, or `any`, and CONSTANTS are the fields of
 `Profile` with 0 and 1 for false and true. Offered are arrays, by the names of `SHAPES` (integers cross as float64,
 too), and what `ABILITIES` lists. `image` and `T_final` belong together, as do `v_means`, `v_quats`, `v_scales`,
 `v_opacities` and `v_sh`. What is not offered is skipped by name; an answer that is malformed, late or missing breaks
 the law that asked, and the program is started again for the next one.
+
+Functions that may be offered, and are then called by their names:
+
+- every function of the oracle whose values cross (`program_values` says how they are written): losses and their
+  gradients, density control, Adam, single stages. Arguments have the oracle's names; the result is `value`, with a dot
+  and the field, key or place for each of its parts. Normal deviates of a split are asked for with `draw`.
+- `rasterization`, with gsplat's arguments: several cameras, batch dimensions, modes of depth, plain colours, clipping.
+  It answers `images` and `alphas`, and what it likes of gsplat's meta. With `rasterization_vjp` it is pulled back: the
+  same arguments, `v_images` and `v_alphas` give `v_` and the name of each array that has a gradient. Who offers it
+  need not offer `image` or `v_means`. An argument that a program does not have it refuses, in these words: `error
+  batch dimensions are not supported`.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import shlex
 from typing import Any, Final
 
 import numpy as np
 
 from pop_ref.conformance.adapter import Adapter, View
+from pop_ref.conformance.calls import Call, Called, Frame
 from pop_ref.conformance.capabilities import (
     ANTIALIASING,
     DETERMINISTIC,
@@ -42,6 +58,7 @@ from pop_ref.conformance.capabilities import (
     SCALE,
 )
 from pop_ref.conformance.program_pipe import Pipe, ProgramError
+from pop_ref.conformance.program_values import decoded, encoded, line_of, shape_of, signature_of
 from pop_ref.conformance.scene_files import scene_arrays
 from pop_ref.conformance.scenes import Scene
 from pop_ref.constants import PROFILES, profile_named
@@ -80,6 +97,7 @@ ABILITIES: Final = {
     "rowwise": ROWWISE,
     "thousands": SCALE,
 }
+RASTERIZATION: Final = ("rasterization", "rasterization_vjp")
 _TOGETHER: Final = (("image", "T_final"), ("v_means", "v_quats", "v_scales", "v_opacities", "v_sh"))
 
 
@@ -102,6 +120,12 @@ class ProgramAdapter(Adapter):
         self.profile = None if words["profile"] == "any" else profile_named(words["profile"])
         self.offers = tuple(words["offers"].split(","))
         self.able = tuple(ABILITIES[word] for word in self.offers if word in ABILITIES)
+        for name in self.offers:
+            # an array and a function of one name: the array was meant
+            if name not in SHAPES and signature_of(name) is not None:
+                setattr(self, name, functools.partial(self._stage, name))
+        if "rasterization" in self.offers:
+            self.call = self._rasterize
 
     def _greeting(self) -> dict[str, str]:
         answer = self._pipe.ask(f"hello protocol={PROTOCOL}")
@@ -119,9 +143,10 @@ class ProgramAdapter(Adapter):
                     f"{self._pipe} greets with {key}={words[key]}; it must be one of {', '.join(values)}"
                 )
         offers = words["offers"].split(",")
-        unknown = [word for word in offers if word not in SHAPES and word not in ABILITIES]
+        words_known = (*SHAPES, *ABILITIES, *RASTERIZATION)
+        unknown = [word for word in offers if word not in words_known and signature_of(word) is None]
         if unknown:
-            known = ", ".join((*SHAPES, *ABILITIES))
+            known = ", ".join(words_known) + " and functions of the oracle whose values cross"
             raise ProgramError(f"{self._pipe} offers {unknown[0]!r}; what may be offered is {known}")
         for group in _TOGETHER:
             lacks = [name for name in group if name not in offers]
@@ -131,30 +156,123 @@ class ProgramAdapter(Adapter):
 
     def has(self, need: str) -> bool:
         """Tell whether the program offers it."""
-        arrays = {
-            RENDER: "image",
-            GRADIENTS: "v_means",
-            DOMINANCE: "dominant_ids",
-            DOMINANT_WEIGHTS: "dominant_weights",
-            DOMINANT_COUNTS: "dominant_counts",
+        known = {
+            RENDER: ("image", "rasterization"),
+            GRADIENTS: ("v_means", "rasterization_vjp"),
+            DOMINANCE: ("dominant_ids",),
+            DOMINANT_WEIGHTS: ("dominant_weights",),
+            DOMINANT_COUNTS: ("dominant_counts",),
         }
         if need == SCALE:
             return SCALE in self.able
-        return arrays[need] in self.offers if need in arrays else super().has(need)
+        return any(word in self.offers for word in known[need]) if need in known else super().has(need)
 
     def render(self, scene: Scene) -> View:
         """Draw a scene and ask for everything that is offered."""
-        return View(**self._ask("render", scene, [name for name in OF_A_VIEW if name in self.offers]))
+        return self._view(scene, [name for name in OF_A_VIEW if name in self.offers])
 
     def plainly(self, scene: Scene) -> View:
         """Draw a scene and ask for nothing but the image."""
-        return View(**self._ask("render", scene, ["image", "T_final"]))
+        return self._view(scene, ["image", "T_final"])
+
+    def _view(self, scene: Scene, wanted: list[str]) -> View:
+        if "image" in self.offers:
+            return View(**self._ask("render", scene, wanted))
+        called = self._rasterize(Call(((Frame(scene),),)))
+        return View(image=called.images[0, 0], T_final=1.0 - called.alphas[0, 0])
 
     def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
         """Ask for the cotangents that are offered."""
-        wanted = [name for name in OF_GRADIENTS if name in self.offers]
-        found = self._ask("gradients", scene, wanted, v_image, v_T_final)
-        return {name.removeprefix("v_"): value for name, value in found.items()}
+        if "v_means" in self.offers:
+            wanted = [name for name in OF_GRADIENTS if name in self.offers]
+            found = self._ask("gradients", scene, wanted, v_image, v_T_final)
+            return {name.removeprefix("v_"): value for name, value in found.items()}
+        v_images, v_alphas = np.asarray(v_image)[None, None], -np.asarray(v_T_final)[None, None]
+        found = self._rasterize(Call(((Frame(scene),),)), v_images, v_alphas).gradients
+        of_camera = {"colors": "sh", "viewmats": "viewmat", "backgrounds": "background"}
+        return {of_camera.get(name, name): value[0] if name in ("viewmats", "backgrounds") else value
+                for name, value in found.items()}  # fmt: skip
+
+    def takes(self, argument: str) -> bool:
+        """Tell whether a call may say how it is computed: every program is told the side of tiles."""
+        return argument in ("tile_size", "dominance")
+
+    def _stage(self, name: str, *args: Any, **kwargs: Any) -> Any:
+        """Call a stage function of the program."""
+        found = signature_of(name)
+        assert found is not None
+        signature, kind = found
+        bound = signature.bind(*args, **kwargs)
+        bound.apply_defaults()
+        arrays = self._called(name, [word for key, each in bound.arguments.items() for word in encoded(each, key)])
+        try:
+            return decoded(kind, arrays, "value")
+        except (KeyError, ValueError, IndexError) as error:
+            what = f"lacks {error.args[0]}" if isinstance(error, KeyError) else str(error)
+            raise ProgramError(f"{self._pipe} answers {name} with {', '.join(arrays) or 'nothing'}: {what}") from error
+
+    def _called(self, name: str, words: list[tuple[str, Any]]) -> dict[str, np.ndarray]:
+        """Send a call and return the arrays of its answer by name."""
+        draws = [value for _, value in words if callable(value)]
+        arrays = [value for _, value in words if isinstance(value, np.ndarray)]
+        answer = self._pipe.ask(f"call {name} {line_of(words)}", arrays, draws[0] if draws else None)
+        shapes: dict[str, tuple[int, ...]] = {}
+        try:
+            for word in answer.split():
+                key, _, shape = word.partition("=")
+                if key in shapes:
+                    raise ValueError(f"{key} is there twice")
+                shapes[key] = shape_of(shape)
+        except ValueError as error:
+            self._pipe.stop()
+            raise ProgramError(f"{self._pipe} answers {name} with 'ok {answer[:200]}': {error}") from error
+        found = {key: self._pipe.read_array(key, shape) for key, shape in shapes.items()}
+        self._pipe.done()
+        return found
+
+    def _rasterize(self, call: Call, v_images: Any = None, v_alphas: Any = None) -> Called:
+        """Make a call with gsplat's arguments, and pull cotangents back where the program can.
+
+        Raises:
+            NotImplementedError: rows are to be packed, which is a way to hand over memory.
+        """
+        if call.packed or call.sparse_grad:
+            raise NotImplementedError("a program answers rows of all Gaussians; packed rows do not cross")
+        (B, C, _), camera = call.shape, call.first.scene.camera
+        given = {
+            **call.tensors(),
+            "Ks": call.intrinsics(),
+            "width": camera.width,
+            "height": camera.height,
+            "sh_degree": call.sh_degree,
+            "render_mode": call.render_mode,
+            "rasterize_mode": "antialiased" if call.antialiased else "classic",
+            "radius_clip": call.radius_clip,
+            "tile_size": call.tile_size,
+            "profile": dataclasses.replace(call.profile, tile_size=call.tile_size),
+        }
+        words = [word for name, value in given.items() for word in encoded(value, name)]
+        found = self._called("rasterization", words)
+        images, alphas = (self._held(found, name, "rasterization") for name in ("images", "alphas"))
+        gradients: dict[str, np.ndarray] = {}
+        if v_images is not None and "rasterization_vjp" in self.offers:
+            v = {"v_images": np.asarray(v_images), "v_alphas": np.asarray(v_alphas)}
+            words += [(name, call.batched(value)) for name, value in v.items()]
+            pulled = self._called("rasterization_vjp", words)
+            gradients = {name.removeprefix("v_"): value for name, value in pulled.items()}
+        shape = (B, C, camera.height, camera.width)
+        try:
+            images, alphas = images.reshape(*shape, call.n_channels), alphas.reshape(shape)
+        except ValueError:
+            raise ProgramError(f"{self._pipe} answers images {list(images.shape)} and alphas {list(alphas.shape)}; "
+                               f"they must be {[*shape, call.n_channels]} and {list(shape)}") from None  # fmt: skip
+        whole = {name: value.astype(np.int64) if name in INTEGERS else value for name, value in found.items()}
+        return Called(images, alphas, whole, gradients)
+
+    def _held(self, found: dict[str, np.ndarray], name: str, function: str) -> np.ndarray:
+        if name not in found:
+            raise ProgramError(f"{self._pipe} answers {function} with {', '.join(found) or 'nothing'}, without {name}")
+        return found[name]
 
     def _ask(self, verb: str, scene: Scene, wanted: list[str], *cotangents: Any) -> dict[str, np.ndarray]:
         n, n_sh, _ = scene.gaussians.sh.shape

@@ -10,6 +10,7 @@ import tempfile
 import threading
 import time
 import weakref
+from collections.abc import Callable
 from typing import IO, Any, Final
 
 import numpy as np
@@ -17,6 +18,7 @@ import numpy as np
 # the longest line of an answer, and how much of what a failing program wrote to standard error is shown, bytes
 LONGEST_LINE: Final = 1 << 16
 SHOWN: Final = 2000
+MOST_DRAWN: Final = 10**6
 _CHUNK: Final = 1 << 16
 
 
@@ -46,25 +48,29 @@ class Pipe:
     def __str__(self) -> str:
         return f"program {' '.join(self.command)}"
 
-    def ask(self, line: str, arrays: list[Any] | None = None) -> str:
+    def ask(self, line: str, arrays: list[Any] | None = None, draw: Callable[[int], Any] | None = None) -> str:
         """Send a request and return its answer's line without the leading ok; arrays are read with `read_array`.
+
+        Args:
+            line: the request.
+            arrays: that follow it.
+            draw: answers a line `draw NUMBER` that may come before the program's own answer.
 
         Raises:
             ProgramError: there is no such line in time.
         """
         self._start()
         self.nothing_left()
-        self._asked, self._asked_at = line.split()[0], time.monotonic()
-        body = b"".join(np.ascontiguousarray(a, dtype="<f8").tobytes() for a in arrays or [])
-        # beside the reading, because a program may begin to answer before it has read everything
-        threading.Thread(target=_write, args=(self._process, line.encode() + b"\n" + body), daemon=True).start()
-        while b"\n" not in self._buffer:
-            if len(self._buffer) > LONGEST_LINE:
-                raise self._failed(f"begins its answer with {len(self._buffer)} bytes that hold no line")
-            self._receive("a line")
-        text, _, rest = bytes(self._buffer).partition(b"\n")
-        self._buffer = bytearray(rest)
-        answer = text.decode("utf-8", "backslashreplace").strip()
+        self._asked, self._asked_at = " ".join(line.split()[: 2 if line.startswith("call ") else 1]), time.monotonic()
+        self._send(line, arrays or [])
+        answer = self._line()
+        if draw is not None and answer.startswith("draw "):
+            number = answer.removeprefix("draw ")
+            if not number.isdecimal() or int(number) > MOST_DRAWN:
+                raise self._failed(f"answers {answer[:80]!r}; it must be draw and a whole number up to {MOST_DRAWN}")
+            drawn = np.asarray(draw(int(number)), dtype=np.float64)
+            self._send(f"{number}=[{','.join(map(str, drawn.shape))}]", [drawn])
+            answer = self._line()
         first, _, words = answer.partition(" ")
         if first == "error":
             self.done()
@@ -72,6 +78,20 @@ class Pipe:
         if first != "ok":
             raise self._failed(f"answers {answer[:80]!r}, which begins neither with ok nor with error")
         return words
+
+    def _send(self, line: str, arrays: list[Any]) -> None:
+        body = b"".join(np.ascontiguousarray(a, dtype="<f8").tobytes() for a in arrays)
+        # beside the reading, because a program may begin to answer before it has read everything
+        threading.Thread(target=_write, args=(self._process, line.encode() + b"\n" + body), daemon=True).start()
+
+    def _line(self) -> str:
+        while b"\n" not in self._buffer:
+            if len(self._buffer) > LONGEST_LINE:
+                raise self._failed(f"begins its answer with {len(self._buffer)} bytes that hold no line")
+            self._receive("a line")
+        text, _, rest = bytes(self._buffer).partition(b"\n")
+        self._buffer = bytearray(rest)
+        return text.decode("utf-8", "backslashreplace").strip()
 
     def read_array(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
         """Read an array of the answer."""

@@ -4,6 +4,16 @@ import struct
 import sys
 import time
 
+CALLED = {
+    "call shapeless": "ok value",
+    "call negative": "ok value=[-1]",
+    "call huge": "ok value=[65536,65536]",
+    "call twice": "ok value=[] value=[]",
+    "call wide": "ok value=[2]",
+    "call nothing": "ok",
+    "call draws": "draw 3",
+    "call refuses": "error not today",
+}
 HELLO = "ok name=bad dtype=float32 profile=paper offers=image,T_final,dominant_ids"
 GREETINGS = {
     "nameless": "ok dtype=float32 profile=paper offers=image,T_final",
@@ -24,7 +34,14 @@ def main(mode: str) -> None:
     while line := sys.stdin.buffer.readline().decode():
         verb, *words = line.split()
         if verb == "hello":
-            write(GREETINGS.get(mode, HELLO))
+            write(GREETINGS.get(mode, f"{HELLO},l2,densify_and_prune" if mode.startswith(("call", "draw")) else HELLO))
+            continue
+        if verb == "call":
+            # what a call brings with it: two pictures of two by two pixels, or nothing
+            sys.stdin.buffer.read(8 * 24 if words[0] == "l2" else 0)
+            if mode == "call ends":
+                sys.exit(4)
+            write(CALLED.get(mode, mode), *([0.0] * {"call wide": 2}.get(mode, 0)))
             continue
         given = dict(word.split("=") for word in words)
         n, n_sh, pixels = int(given["N"]), int(given["n_sh"]), int(given["width"]) * int(given["height"])

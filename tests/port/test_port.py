@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -85,6 +86,68 @@ def test_the_port_of_the_page_obeys_the_laws_of_images_and_a_broken_one_does_not
     )
     assert done.returncode == status, done.stdout
     assert int(done.stdout.split(" passed")[0].split()[-1]) >= (30 if status == 0 else 1), done.stdout
+
+
+def oracle_port(*broken: str) -> str:
+    """The command of a program that answers calls of functions with the oracle's results."""
+    return shlex.join([sys.executable, str(HERE / "oracle_port.py"), *broken])
+
+
+def test_losses_density_control_adam_and_calls_with_several_cameras_cross_a_pipe_without_loss(tmp_path: Path) -> None:
+    stages = ("losses", "density", "optimizer", "signature", "gradients")
+    words = (word for stage in stages for word in ("--stage", stage))
+    done = judged(tmp_path, "--program", oracle_port(), *words, "-rs", profile="quick")
+    assert done.returncode == 0, done.stdout
+    # packed rows, and what only meta tells, are skipped
+    assert int(done.stdout.split(" passed")[0].split()[-1]) >= 90, done.stdout
+    assert "refuses the request call rasterization: covariances are not supported" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("broken", "stage", "law"),
+    [
+        ("losses", "losses", "test_l2_is_the_oracles"),
+        ("density", "density", "the_small_are_cloned_and_the_large_are_split"),
+        ("cameras", "signature", "several_cameras_in_one_call_see_what_each_sees_alone"),
+        ("depth", "signature", "the_accumulated_depth_is_the_oracles"),
+    ],
+)
+def test_a_program_with_one_wrong_function_breaks_a_law_about_it(
+    tmp_path: Path, broken: str, stage: str, law: str
+) -> None:
+    done = judged(tmp_path, "--program", oracle_port(broken), "--stage", stage, "-x", "-k", law, profile="quick")
+    assert done.returncode == 1, done.stdout
+    assert law in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("mode", "words"),
+    [
+        ("call shapeless", "answers l2 with 'ok value': '' is no shape such as"),
+        ("call negative", r"'\[-1\]' is no shape of an answer"),
+        ("call huge", "is no shape of an answer"),
+        ("call twice", "value is there twice"),
+        ("call wide", r"value has shape \[2\]; it must be one number"),
+        ("call nothing", "answers l2 with nothing: lacks value"),
+        ("call draws", "answers 'draw 3', which begins neither with ok nor with error"),
+        ("call refuses", "refuses the request call l2: not today"),
+        ("call ends", "ended with status 4 before it had answered call l2"),
+    ],
+)
+def test_a_function_that_answers_wrongly_is_named_with_what_is_wrong(mode: str, words: str) -> None:
+    backend = bad(mode)
+    for _ in range(2):
+        with pytest.raises(ProgramError, match=words):
+            backend.stage("l2")(np.zeros((2, 2, 3)), np.ones((2, 2, 3)))
+
+
+@pytest.mark.parametrize("number", ["many", "-1", "1000001"])
+def test_only_a_sound_number_of_deviates_is_drawn(number: str) -> None:
+    asked: list[int] = []
+    pipe = bad(f"draw {number}")._pipe
+    with pytest.raises(ProgramError, match="it must be draw and a whole number up to 1000000"):
+        pipe.ask("call densify_and_prune noise=draw", [], lambda n: asked.append(n) or np.zeros(n))
+    assert asked == []
 
 
 def test_a_port_says_how_large_its_error_is(port: Path) -> None:
