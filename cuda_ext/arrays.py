@@ -13,7 +13,7 @@ from pop_ref.constants import Profile
 
 NOT_BAD = 2**31 - 1
 # places in DeviceState (csrc/launch.h)
-OVERFLOW, N_INSTANCES, N_BUCKETS, N_IMPORTANT, BAD_ROW, STEP, VIEW = range(7)
+OVERFLOW, N_INSTANCES, N_BUCKETS, N_IMPORTANT, BAD_ROW, STEP, VIEW, N_OTHERS = range(8)
 
 
 class CudaMemoryError(RuntimeError):

@@ -36,6 +36,8 @@ void bind_training(nb::module_& m) {
     POINTER(schedule, Schedule, K);
     POINTER(schedule, Schedule, rates);
     POINTER(schedule, Schedule, numbers);
+    VALUE(schedule, Schedule, n_views);
+    VALUE(schedule, Schedule, place);
     VALUE(schedule, Schedule, beta1);
     VALUE(schedule, Schedule, beta2);
     VALUE(schedule, Schedule, eps);
@@ -62,6 +64,8 @@ void bind_training(nb::module_& m) {
     update.def(nb::init<>());
     VALUE(update, UpdateArrays, n);
     VALUE(update, UpdateArrays, n_rest);
+    VALUE(update, UpdateArrays, n_views);
+    VALUE(update, UpdateArrays, place);
     VALUE(update, UpdateArrays, lambda_pop);
     VALUE(update, UpdateArrays, blur_own_view);
     POINTER(update, UpdateArrays, constants);
@@ -74,7 +78,11 @@ void bind_training(nb::module_& m) {
     POINTER(update, UpdateArrays, dominant_sum);
     POINTER(update, UpdateArrays, blur_pixels);
     POINTER(update, UpdateArrays, blurred);
-    update.def("set_group", [](UpdateArrays& s, int group, uintptr_t param, uintptr_t m, uintptr_t v) {
-        s.groups[group] = {reinterpret_cast<float*>(param), reinterpret_cast<float*>(m), reinterpret_cast<float*>(v)};
-    });
+    update.def(
+        "set_group",
+        [](UpdateArrays& s, int group, uintptr_t param, uintptr_t m, uintptr_t v, uintptr_t gradient) {
+            s.groups[group] = {reinterpret_cast<float*>(param), reinterpret_cast<float*>(m),
+                               reinterpret_cast<float*>(v), reinterpret_cast<float*>(gradient)};
+        },
+        nb::arg("group"), nb::arg("param"), nb::arg("m"), nb::arg("v"), nb::arg("gradient") = 0);
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -76,6 +77,19 @@ class Phase(Protocol):
     def objective(self) -> Objective: ...
 
 
+class Ranks(Protocol):
+    """Processes that train together; `pop_fast.train.ranks` explains each."""
+
+    @property
+    def rank(self) -> int: ...
+    @property
+    def size(self) -> int: ...
+    def positions(self, batch: int) -> range: ...
+    def gather(self, mine: Sequence[Tensor]) -> list[Tensor]: ...
+    def exchange(self, sent: Sequence[Tensor], received: Sequence[int]) -> list[Tensor]: ...
+    def share(self, whole: Tensor, bounds: Sequence[int]) -> None: ...
+
+
 @dataclass
 class Collected:
     """What the kernels collect, one entry a Gaussian, until new rows come.
@@ -96,3 +110,8 @@ class Collected:
         flags = torch.zeros(n, dtype=torch.uint8, device=device)
         waiting = None if n_rest is None else torch.zeros((n, n_rest, 3), device=device)
         return cls(torch.zeros(n, device=device), visible, dominant, flags, waiting)
+
+    def rows(self, own: slice) -> Collected:
+        """Return some rows, in the same memory."""
+        waiting = None if self.sh_rest_sum is None else self.sh_rest_sum[own]
+        return Collected(self.grad_sum[own], self.n_visible[own], self.dominant_sum[own], self.blurred[own], waiting)

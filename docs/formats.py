@@ -52,8 +52,8 @@ Where the photographs are at hand, `--target-mb` measures what loses least. Ever
 of a lower one fitted to what the training views show, and the best one with finer and coarser coefficients, where the
 format has them. Each is tuned for a few steps, written, read back and measured in training views; the best is tuned for
 `--fine-tune-steps` (300; 0 tunes nothing), and so is what `--max-gaussians` keeps. The run's own engine and loss do
-that, without density control; how long it takes is told after its first two seconds. Held-out views are measured at the end
-and decide nothing. Without photographs, Gaussians alone go, those that are least visible.
+that, without density control; how long it takes is told after its first two seconds. Held-out views are measured at
+the end and decide nothing. Without photographs, Gaussians alone go, those that are least visible.
 """
 
 

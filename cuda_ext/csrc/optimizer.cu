@@ -31,7 +31,8 @@ constexpr __host__ __device__ int floats_before(int group) {
 
 __global__ void begin_step_kernel(Schedule schedule, StepConstants* constants, DeviceState* state) {
     if (halted(state)) return;
-    const int k = threadIdx.x, step = state->step, view = schedule.views[step];
+    const int k = threadIdx.x, step = state->step;
+    const int view = schedule.views[schedule.n_views * step + schedule.place];
     if (k == 0) {
         state->view = view;
         state->n_important = state->n_others = 0;
@@ -151,8 +152,25 @@ __device__ __forceinline__ void adam_float(const AdamGroup& group, size_t at, fl
     group.v[at] = v;
 }
 
+template <bool VIEWS>
 __device__ __forceinline__ bool group_in_pieces(const AdamGroup& group) {
-    return in_pieces(group.param) && in_pieces(group.m) && in_pieces(group.v);
+    return in_pieces(group.param) && in_pieces(group.m) && in_pieces(group.v) && (!VIEWS || in_pieces(group.gradient));
+}
+
+__device__ __forceinline__ bool last_view(const UpdateArrays& a) { return a.place + 1 == a.n_views; }
+
+// Add the gradients of the views before, one after the other in the order of the batch. Those of the last view become
+// the mean; those of the others are kept, and nothing is moved.
+__device__ __forceinline__ float with_views(const UpdateArrays& a, const float* kept, float g) {
+    if (a.place > 0) g = *kept + g;
+    return last_view(a) ? g / float(a.n_views) : g;
+}
+
+__device__ __forceinline__ float4 with_views(const UpdateArrays& a, const float* kept, float4 g) {
+    const float4 before = a.place > 0 ? *reinterpret_cast<const float4*>(kept) : float4{};
+    if (a.place > 0) g = {before.x + g.x, before.y + g.y, before.z + g.z, before.w + g.w};
+    const float views = float(a.n_views);
+    return last_view(a) ? float4{g.x / views, g.y / views, g.z / views, g.w / views} : g;
 }
 
 // what a lane reads of its Gaussian before anything is made of it
@@ -235,7 +253,7 @@ __device__ __forceinline__ void make_gradients(const UpdateArrays& a, const View
 }
 
 // Adam on the five groups whose rows are short: a piece of each to a lane, all read before the first is used
-template <int DEGREE>
+template <int DEGREE, bool VIEWS>
 __device__ __forceinline__ void update_short_rows(const UpdateArrays& a, int first, int rows,
                                                   const Staged<DEGREE>& staged) {
     const int lane = threadIdx.x & (WARP - 1);
@@ -246,29 +264,41 @@ __device__ __forceinline__ void update_short_rows(const UpdateArrays& a, int fir
 #pragma unroll
     for (int group = 0; group < G_SHN; ++group) {
         rates[group] = __ldg(&a.constants->adam[group].rate);
-        pieces = pieces && group_in_pieces(a.groups[group]);
+        pieces = pieces && group_in_pieces<VIEWS>(a.groups[group]);
     }
     if (!pieces) {
 #pragma unroll
         for (int group = 0; group < G_SHN; ++group) {
             step.rate = rates[group];
 #pragma unroll 1
-            for (int at = lane; at < rows * row_floats(group); at += WARP)
-                adam_float(a.groups[group], size_t(first) * row_floats(group) + at, staged.rows(group)[at], step);
+            for (int at = lane; at < rows * row_floats(group); at += WARP) {
+                const size_t place = size_t(first) * row_floats(group) + at;
+                float g = staged.rows(group)[at];
+                if constexpr (VIEWS) g = with_views(a, a.groups[group].gradient + place, g);
+                if (VIEWS && !last_view(a))
+                    a.groups[group].gradient[place] = g;
+                else
+                    adam_float(a.groups[group], place, g, step);
+            }
         }
         return;
     }
     Piece held[G_SHN];
 #pragma unroll
     for (int group = 0; group < G_SHN; ++group)
-        if (lane < WARP / 4 * row_floats(group))
+        if (lane < WARP / 4 * row_floats(group) && (!VIEWS || last_view(a)))
             held[group] = load_piece(a.groups[group], size_t(first) * row_floats(group) + 4 * lane);
 #pragma unroll
     for (int group = 0; group < G_SHN; ++group) {
         step.rate = rates[group];
-        if (lane < WARP / 4 * row_floats(group))
-            adam_piece(a.groups[group], size_t(first) * row_floats(group) + 4 * lane, held[group],
-                       reinterpret_cast<const float4*>(staged.rows(group))[lane], step);
+        if (lane >= WARP / 4 * row_floats(group)) continue;
+        const size_t place = size_t(first) * row_floats(group) + 4 * lane;
+        float4 g = reinterpret_cast<const float4*>(staged.rows(group))[lane];
+        if constexpr (VIEWS) g = with_views(a, a.groups[group].gradient + place, g);
+        if (VIEWS && !last_view(a))
+            store_piece(a.groups[group].gradient + place, g);
+        else
+            adam_piece(a.groups[group], place, held[group], g, step);
     }
 }
 
@@ -288,7 +318,7 @@ __device__ __forceinline__ float4 with_waiting(float* sum, float4 g, bool due) {
 
 // Adam on the bands beyond the first. Bands above the active degree have had no gradient yet: their moments are zero
 // and Adam would not move them.
-template <int DEGREE>
+template <int DEGREE, bool VIEWS>
 __device__ __forceinline__ void update_long_rows(const UpdateArrays& a, const RowStride& stride, int first, int rows,
                                                  const Staged<DEGREE>& staged) {
     constexpr int FLOATS = ACTIVE<DEGREE, false>, AT_ONCE = 4;
@@ -299,13 +329,17 @@ __device__ __forceinline__ void update_long_rows(const UpdateArrays& a, const Ro
     float* const waiting = a.sh_rest_sum;
     const int lane = threadIdx.x & (WARP - 1), total = rows * stride.floats;
     const size_t base = size_t(first) * stride.floats;
-    if (rows < WARP || !group_in_pieces(group)) {
+    if (rows < WARP || !group_in_pieces<VIEWS>(group)) {
 #pragma unroll 1
         for (int at = lane; at < total; at += WARP)
             if (staged_at<FLOATS>(at, stride) >= 0) {
-                const float g = staged_float<FLOATS>(staged.rest, at, stride);
+                float g = staged_float<FLOATS>(staged.rest, at, stride);
+                if constexpr (VIEWS) g = with_views(a, group.gradient + base + at, g);
                 float* const sum = waiting == nullptr ? nullptr : waiting + base + at;
-                adam_float(group, base + at, with_waiting(sum, g, due), step);
+                if (VIEWS && !last_view(a))
+                    group.gradient[base + at] = g;
+                else
+                    adam_float(group, base + at, with_waiting(sum, g, due), step);
             }
         return;
     }
@@ -316,24 +350,28 @@ __device__ __forceinline__ void update_long_rows(const UpdateArrays& a, const Ro
         for (int k = 0; k < AT_ONCE; ++k) {
             const int at = begin + 4 * WARP * k;
             counts[k] = at < total && piece_counts<FLOATS>(at, stride, FULL_WARP);
-            if (counts[k]) held[k] = load_piece(group, base + at);
+            if (counts[k] && (!VIEWS || last_view(a))) held[k] = load_piece(group, base + at);
         }
 #pragma unroll
         for (int k = 0; k < AT_ONCE; ++k) {
             const int at = begin + 4 * WARP * k;
             if (!counts[k]) continue;
-            const float4 g = staged_piece<FLOATS>(staged.rest, at, stride);
+            float4 g = staged_piece<FLOATS>(staged.rest, at, stride);
+            if constexpr (VIEWS) g = with_views(a, group.gradient + base + at, g);
             float* const sum = waiting == nullptr ? nullptr : waiting + base + at;
-            adam_piece(group, base + at, held[k], with_waiting(sum, g, due), step);
+            if (VIEWS && !last_view(a))
+                store_piece(group.gradient + base + at, g);
+            else
+                adam_piece(group, base + at, held[k], with_waiting(sum, g, due), step);
         }
     }
 }
 
-template <int DEGREE>
-__global__ void __launch_bounds__(BLOCK, 4)
-    update_kernel(UpdateArrays a, ViewArrays view, ProjectSettings settings, SplatArrays splats, RowStride stride,
-                  const DeviceState* state) {
-    __shared__ Staged<DEGREE> of_warps[BLOCK / WARP];
+template <int DEGREE, bool VIEWS>
+__device__ __forceinline__ void update_rows(const UpdateArrays& a, const ViewArrays& view,
+                                            const ProjectSettings& settings, const SplatArrays& splats,
+                                            const RowStride& stride, const DeviceState* state,
+                                            Staged<DEGREE>* of_warps) {
     const int lane = threadIdx.x & (WARP - 1), warp = threadIdx.x / WARP;
     const int first = blockIdx.x * BLOCK + warp * WARP, rows = min(WARP, a.n - first);
     if (rows <= 0 || halted(state)) return;
@@ -350,8 +388,25 @@ __global__ void __launch_bounds__(BLOCK, 4)
         make_gradients<DEGREE>(a, view, settings, camera, n_important, n_others, blur_pixels, first + lane, given,
                                staged);
     __syncwarp();
-    update_short_rows<DEGREE>(a, first, rows, staged);
-    if constexpr (DEGREE > 0) update_long_rows<DEGREE>(a, stride, first, rows, staged);
+    update_short_rows<DEGREE, VIEWS>(a, first, rows, staged);
+    if constexpr (DEGREE > 0) update_long_rows<DEGREE, VIEWS>(a, stride, first, rows, staged);
+}
+
+template <int DEGREE>
+__global__ void __launch_bounds__(BLOCK, 4)
+    update_kernel(UpdateArrays a, ViewArrays view, ProjectSettings settings, SplatArrays splats, RowStride stride,
+                  const DeviceState* state) {
+    __shared__ Staged<DEGREE> of_warps[BLOCK / WARP];
+    update_rows<DEGREE, false>(a, view, settings, splats, stride, state, of_warps);
+}
+
+// one view of a step of several
+template <int DEGREE>
+__global__ void __launch_bounds__(BLOCK, 4)
+    update_views_kernel(UpdateArrays a, ViewArrays view, ProjectSettings settings, SplatArrays splats,
+                        RowStride stride, const DeviceState* state) {
+    __shared__ Staged<DEGREE> of_warps[BLOCK / WARP];
+    update_rows<DEGREE, true>(a, view, settings, splats, stride, state, of_warps);
 }
 
 }  // namespace
@@ -380,8 +435,11 @@ void update(const UpdateArrays& arrays, const ViewArrays& view, const ProjectSet
     const RowStride stride = row_stride(3 * arrays.n_rest);
     with_degree(settings.sh_degree, [&](auto degree) {
         constexpr int DEGREE = decltype(degree)::value;
-        update_kernel<DEGREE>
-            <<<blocks_for(arrays.n, BLOCK), BLOCK, 0, stream>>>(arrays, view, settings, splats, stride, state);
+        const int blocks = blocks_for(arrays.n, BLOCK);
+        if (arrays.n_views > 1)
+            update_views_kernel<DEGREE><<<blocks, BLOCK, 0, stream>>>(arrays, view, settings, splats, stride, state);
+        else
+            update_kernel<DEGREE><<<blocks, BLOCK, 0, stream>>>(arrays, view, settings, splats, stride, state);
     });
     POP_LAUNCHED("update_kernel");
 }

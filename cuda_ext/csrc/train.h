@@ -38,6 +38,7 @@ struct LossArrays {
 
 struct AdamGroup {
     float *param, *m, *v;
+    float* gradient;  // as param: summed over the views of a step; null where a step has one
 };
 
 enum Group { G_MEANS, G_SCALES, G_QUATS, G_OPACITIES, G_SH0, G_SHN, N_GROUPS };
@@ -47,7 +48,8 @@ struct StepConstants {
 };
 
 struct Schedule {
-    const int* views;        // [steps], the view of every step
+    const int* views;        // [steps, n_views], the views of every step
+    int n_views, place;      // views of a step; which of them is begun, from 0
     const double* rates;     // [steps, N_GROUPS], learning rates
     const int* numbers;      // [steps, N_GROUPS], of the updates, from 1; 0 where a group is not moved
     double beta1, beta2, eps;
@@ -60,6 +62,9 @@ struct Schedule {
 struct UpdateArrays {
     AdamGroup groups[N_GROUPS];
     int n, n_rest;               // Gaussians; rows of harmonics beyond the first
+    // views of a step, and which of them sums are of, from 0: gradients are added up, and their mean moves parameters
+    // with the last one; the rest is the view's own
+    int n_views, place;
     const StepConstants* constants;
     float* sh_rest_sum;          // [n, n_rest, 3], gradients that wait for an update; null where none do
     const float* sums;           // [n, RECORD]

@@ -62,6 +62,7 @@ KERNELS = {
     "tile_order_kernel": ("image", 512),
     "total_kernel": ("step", 1),
     "update_kernel": ("32 Gaussians", 128),
+    "update_views_kernel": ("32 Gaussians", 128),
     "windows_kernel": ("128 pixels", 256),
 }
 # a comment at the end of a loop's line says what one iteration of a warp is, and how often it is passed where that is

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from cuda_ext import load
-from cuda_ext.arrays import STEP, Settings, empty, new_state
+from cuda_ext.arrays import STEP, Settings, empty, fill, new_state
 from cuda_ext.render.capacity import Size
-from cuda_ext.render.lists import LOWER, TileBuffers, list_tile
+from cuda_ext.render.lists import LOWER, TileBuffers, list_tile, splat_struct
 from cuda_ext.train_settings import Collected, StepSettings
 from cuda_ext.training.resident import ResidentViews
 
@@ -83,15 +84,46 @@ class Shared:
 
 
 @dataclass(frozen=True)
+class SplatBuffers:
+    """What is drawn of Gaussians, and what comes back.
+
+    Attributes:
+        splats: projected.
+        records: packed for the blend.
+        sums: gradient sums.
+    """
+
+    splats: dict[str, Tensor]
+    records: Tensor
+    sums: Tensor
+
+    @classmethod
+    def make(cls, n: int, device: torch.device) -> SplatBuffers:
+        """Allocate for n Gaussians.
+
+        Raises:
+            CudaMemoryError: no room.
+        """
+        kernels, rows = load(), max(n, 1)
+        shapes = {"means2d": (n, 2), "depths": (n,), "conics": (n, 3), "opacities": (n,)}
+        splats = {name: empty("the splats", LOWER, shape, device) for name, shape in shapes.items()}
+        splats["radii"] = empty("the splats", LOWER, (n, 2), device, torch.int32)
+        records = empty("packed splats", LOWER, (rows, kernels.RECORD), device)
+        return cls(splats, records, torch.zeros((rows, kernels.RECORD), device=device))
+
+    def struct(self) -> Any:
+        """Return the kernels' view; splats are packed for blending as they are projected."""
+        return fill(splat_struct(**self.splats, colors=None), records=self.records)
+
+
+@dataclass(frozen=True)
 class RowBuffers:
     """Gaussians between two densification steps, and what a step makes of each.
 
     Attributes:
         params, m, v: raw parameters and Adam's moments.
         statistics: what density control reads.
-        splats: projected.
-        records: packed for the blend.
-        sums: gradient sums.
+        drawn: their splats.
         pop_sides: where each stands in the POP term.
         pop_sums: sums of the POP term.
     """
@@ -100,29 +132,21 @@ class RowBuffers:
     m: Rows
     v: Rows
     statistics: Collected
-    splats: dict[str, Tensor]
-    records: Tensor
-    sums: Tensor
+    drawn: SplatBuffers
     pop_sides: Tensor
     pop_sums: Tensor
 
     @classmethod
-    def make(cls, params: Rows, m: Rows, v: Rows, waits: bool) -> RowBuffers:
-        """Allocate what belongs to the rows; statistics start from nothing, and so do gradients where they wait."""
+    def make(cls, params: Rows, m: Rows, v: Rows, statistics: Collected) -> RowBuffers:
+        """Allocate what belongs to the rows but for the statistics."""
         kernels, n, device = load(), len(params["means"]), params["means"].device
-        shapes = {"means2d": (n, 2), "depths": (n,), "conics": (n, 3), "opacities": (n,)}
-        splats = {name: empty("the splats", LOWER, shape, device) for name, shape in shapes.items()}
-        splats["radii"] = empty("the splats", LOWER, (n, 2), device, torch.int32)
-        rows = max(n, 1)
         return cls(
             dict(params),
             dict(m),
             dict(v),
-            Collected.zeros(n, device, params["shN"].shape[1] if waits else None),
-            splats,
-            empty("packed splats", LOWER, (rows, kernels.RECORD), device),
-            torch.zeros((rows, kernels.RECORD), device=device),
-            torch.zeros(rows, dtype=torch.uint8, device=device),
+            statistics,
+            SplatBuffers.make(n, device),
+            torch.zeros(max(n, 1), dtype=torch.uint8, device=device),
             torch.zeros((max(kernels.important_blocks(n), 1), 2), device=device),
         )
 

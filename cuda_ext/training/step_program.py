@@ -8,18 +8,50 @@ from torch import Tensor
 
 from cuda_ext import load
 from cuda_ext.arrays import fill, pointer, stream_of
-from cuda_ext.render.lists import splat_struct
+from cuda_ext.render.capacity import Size
 from cuda_ext.train_settings import Phase
 from cuda_ext.training.resident import MARGIN
-from cuda_ext.training.step_buffers import FrameBuffers, RowBuffers, Shared
+from cuda_ext.training.step_buffers import FrameBuffers, RowBuffers, Rows, Shared, SplatBuffers
 from pop_ref.settings import PARAMETERS
 
 
-class StepProgram:
-    """The steps of one phase and one image size, for the present rows.
+class DrawProgram:
+    """What lists, draws, compares with a photograph and goes back to sums of every splat, for one image size and phase.
 
     Everything that a launch needs is made here, and held for as long as the program is: its tensors' addresses go into
     the kernels, and into a graph that is captured of `launch`.
+
+    Args:
+        shared: what all steps share.
+        drawn: the splats, projected and packed by who launches it.
+        frame: buffers of the image size.
+        phase: what the steps do.
+    """
+
+    def __init__(self, shared: Shared, drawn: SplatBuffers, frame: FrameBuffers, phase: Phase) -> None:
+        self._shared, self._drawn, self._frame = shared, drawn, frame
+        self._profile, self._splats = shared.render(frame.size, phase.sh_degree).kernel_profile(), drawn.struct()
+        self._photographs, self._objective = shared.views.photographs(), _objective(phase)
+        self._loss = _loss(shared, frame)
+        self._forward, self._backward = _blends(shared, drawn, frame, phase)
+        self.counts: Tensor | None = frame.render_stats["dominant_counts"] if phase.dominance else None
+
+    def launch(self) -> None:
+        """Ask the device's current stream for the view that `begin_step` has picked."""
+        kernels, shared, splats, profile = load(), self._shared, self._splats, self._profile
+        lists, stream = self._frame.lists.struct, stream_of(shared.device)
+        state = pointer("state", shared.state, "int32")
+        kernels.count_instances(lists, splats, profile, state, stream)
+        kernels.make_tile_lists(lists, splats, profile, pointer("dominant_counts", self.counts, "int32"), state, stream)
+        kernels.blend_forward(lists, self._forward, profile, stream)
+        kernels.photometric(self._photographs, self._loss, self._objective, state, stream)
+        if not shared.settings.deterministic:
+            kernels.clear(pointer("sums", self._drawn.sums), self._drawn.sums.nbytes, stream)
+        kernels.blend_backward(lists, self._backward, profile, state, stream)
+
+
+class StepProgram:
+    """The steps of one phase and one image size, for the present rows; see `DrawProgram`.
 
     Args:
         shared: what all steps share.
@@ -29,50 +61,42 @@ class StepProgram:
     """
 
     def __init__(self, shared: Shared, rows: RowBuffers, frame: FrameBuffers, phase: Phase) -> None:
-        self._shared, self._rows, self._frame, self._phase = shared, rows, frame, phase
-        kernels, (width, height) = load(), frame.size
-        render = shared.render(frame.size, phase.sh_degree)
-        self._profile, self._project = render.kernel_profile(), render.project_settings()
-        # packed for blending as they are projected: nothing else reads their colours
-        self._splats = fill(splat_struct(**rows.splats, colors=None), records=rows.records)
-        self._view = fill(kernels.View(), viewmat=shared.viewmat, K=shared.K, width=width, height=height)
-        self._schedule, self._gaussians = _schedule(shared), _gaussians(rows)
-        self._photographs, self._objective = shared.views.photographs(), _objective(phase)
-        self._loss = _loss(shared, frame)
-        self._forward, self._backward = _blends(shared, rows, frame, phase)
-        self._term = _pop_term(shared, rows, frame, phase) if phase.pop else None
-        self._update, self._record = _update(shared, rows, frame, phase), _record(shared, rows, phase)
+        self._shared, self._rows, self._draw = shared, rows, DrawProgram(shared, rows.drawn, frame, phase)
+        self._project = shared.render(frame.size, phase.sh_degree).project_settings()
+        self._view, self._splats = view_of(shared, frame.size), rows.drawn.struct()
+        self._schedule, self._gaussians = schedule(shared), gaussians(rows)
+        self._term = pop_term(shared, rows, self._draw.counts) if phase.pop else None
+        self._update, self._record = update(shared, rows, self._draw.counts, phase), _record(shared, rows, phase)
 
     def launch(self) -> None:
         """Ask the device's current stream for one step."""
-        kernels, shared, rows = load(), self._shared, self._rows
+        kernels, shared, splats, view = load(), self._shared, self._splats, self._view
         state, stream = pointer("state", shared.state, "int32"), stream_of(shared.device)
-        lists, splats, view, profile = self._frame.lists.struct, self._splats, self._view, self._profile
         kernels.begin_step(self._schedule, pointer("constants", shared.constants), state, stream)
         kernels.project(self._gaussians, view, self._project, splats, state, stream)
-        kernels.count_instances(lists, splats, profile, state, stream)
-        counts = self._frame.render_stats["dominant_counts"] if self._phase.dominance else None
-        kernels.make_tile_lists(lists, splats, profile, pointer("dominant_counts", counts, "int32"), state, stream)
-        kernels.blend_forward(lists, self._forward, profile, stream)
-        kernels.photometric(self._photographs, self._loss, self._objective, state, stream)
-        if not shared.settings.deterministic:
-            kernels.clear(pointer("sums", rows.sums), rows.sums.nbytes, stream)
-        kernels.blend_backward(lists, self._backward, profile, state, stream)
+        self._draw.launch()
         if self._term is not None:
             kernels.count_important(self._term, state, stream)
         kernels.update(self._update, view, self._project, splats, state, stream)
         kernels.end_step(self._record, state, stream)
 
 
-def _schedule(shared: Shared) -> Any:
+def view_of(shared: Shared, size: Size) -> Any:
+    """Return the kernels' form of the camera that `begin_step` picks, for an image size."""
+    return fill(load().View(), viewmat=shared.viewmat, K=shared.K, width=size[0], height=size[1])
+
+
+def schedule(shared: Shared, n_views: int = 1) -> Any:
+    """Return what `begin_step` reads, of steps of so many views."""
     s, views = shared.settings, shared.views
-    made = fill(load().Schedule(), views=shared.order, viewmats=views.viewmats, Ks=views.Ks)
+    made = fill(load().Schedule(), views=shared.order, viewmats=views.viewmats, Ks=views.Ks, n_views=n_views)
     fill(made, viewmat=shared.viewmat, K=shared.K, rates=shared.rates, numbers=shared.numbers, eps=s.eps)
     made.beta1, made.beta2 = s.betas
     return made
 
 
-def _gaussians(rows: RowBuffers) -> Any:
+def gaussians(rows: RowBuffers) -> Any:
+    """Return the kernels' form of raw parameters."""
     p = rows.params
     own = {k: p[k] for k in ("means", "quats", "scales", "opacities")}
     made = fill(load().Gaussians(), n=len(rows), raw=True, **own, sh_first=p["sh0"], sh_rest=p["shN"])
@@ -95,33 +119,46 @@ def _loss(shared: Shared, frame: FrameBuffers) -> Any:
     return fill(made, width=frame.size[0], height=frame.size[1])
 
 
-def _blends(shared: Shared, rows: RowBuffers, frame: FrameBuffers, phase: Phase) -> tuple[Any, Any]:
+def _blends(shared: Shared, drawn: SplatBuffers, frame: FrameBuffers, phase: Phase) -> tuple[Any, Any]:
     kernels, deterministic = load(), shared.settings.deterministic
     passed = {key: frame.work.get(key) for key in ("T_final", "last", "checkpoints")}
-    drawn = {"channels": 3, "records": rows.records, "background": shared.background, "image": frame.image, **passed}
-    forward = fill(kernels.BlendForward(), **drawn)
+    both = {"channels": 3, "records": drawn.records, "background": shared.background, "image": frame.image, **passed}
+    forward = fill(kernels.BlendForward(), **both)
     if phase.dominance:
         fill(forward, **frame.render_stats, masks=shared.views.masks, state=shared.state)
-    backward = fill(kernels.BlendBackward(), **drawn, absolute=False, v_image=frame.work["v_image"])
-    fill(backward, v_T_final=None, rows=frame.work.get("rows"), sums=rows.sums)
+    backward = fill(kernels.BlendBackward(), **both, absolute=False, v_image=frame.work["v_image"])
+    fill(backward, v_T_final=None, rows=frame.work.get("rows"), sums=drawn.sums)
     backward.set_backward(frame.lists.buckets, not deterministic)
     return forward, backward
 
 
-def _pop_term(shared: Shared, rows: RowBuffers, frame: FrameBuffers, phase: Phase) -> Any:
+def pop_term(shared: Shared, rows: RowBuffers, counts: Tensor | None) -> Any:
+    """Return the POP term of the kernels.
+
+    Args:
+        shared: what all steps share.
+        rows: the Gaussians.
+        counts: pixels that each dominates in this view. [n]
+    """
     s = shared.settings
     before: Tensor | None = rows.statistics.dominant_sum if s.pop_views == "window" else None
-    shown: Tensor | None = rows.splats["radii"] if s.pop_over == "visible" else None
-    made = fill(
-        load().PopTerm(), n=len(rows), dominant_counts=frame.render_stats["dominant_counts"], window_counts=before
-    )
+    shown: Tensor | None = rows.drawn.splats["radii"] if s.pop_over == "visible" else None
+    made = fill(load().PopTerm(), n=len(rows), dominant_counts=counts, window_counts=before)
     return fill(made, radii=shown, logits=rows.params["opacities"], sides=rows.pop_sides, sums=rows.pop_sums)
 
 
-def _update(shared: Shared, rows: RowBuffers, frame: FrameBuffers, phase: Phase) -> Any:
+def update(shared: Shared, rows: RowBuffers, counts: Tensor | None, phase: Phase, gradients: Rows | None = None) -> Any:
+    """Return what the kernels' update takes.
+
+    Args:
+        shared: what all steps share.
+        rows: the Gaussians.
+        counts: pixels that each dominates in this view, where the phase tells. [n]
+        phase: what the steps do.
+        gradients: where those of several views are added up, by parameter; None where a step has one view.
+    """
     s, found = shared.settings, rows.statistics
-    made = fill(load().UpdateArrays(), n=len(rows), n_rest=rows.params["shN"].shape[1], sums=rows.sums)
-    counts = frame.render_stats["dominant_counts"] if phase.dominance else None
+    made = fill(load().UpdateArrays(), n=len(rows), n_rest=rows.params["shN"].shape[1], sums=rows.drawn.sums)
     fill(made, constants=shared.constants, dominant_counts=counts, pop_sides=rows.pop_sides)
     fill(made, sh_rest_sum=found.sh_rest_sum)
     made.lambda_pop = s.lambda_pop if phase.pop else 0.0
@@ -132,8 +169,9 @@ def _update(shared: Shared, rows: RowBuffers, frame: FrameBuffers, phase: Phase)
         fill(made, blurred=found.blurred, blur_pixels=shared.blur_pixels)
     if phase.blur or phase.window:
         fill(made, dominant_sum=found.dominant_sum)
+    groups = (rows.params, rows.m, rows.v, *(() if gradients is None else (gradients,)))
     for k, name in enumerate(PARAMETERS):
-        made.set_group(k, *(pointer(name, group[name]) for group in (rows.params, rows.m, rows.v)))
+        made.set_group(k, *(pointer(name, group[name]) for group in groups))
     return made
 
 

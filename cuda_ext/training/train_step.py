@@ -76,7 +76,8 @@ class FusedTrainer:
         self._rows = None
         self._capacity.settle(len(params["means"]))
         with torch.cuda.device_of(params["means"]):
-            self._rows = RowBuffers.make(params, m, v, self.settings.updates.sh_rest_every > 1)
+            waits = params["shN"].shape[1] if self.settings.updates.sh_rest_every > 1 else None
+            self._rows = RowBuffers.make(params, m, v, Collected.zeros(len(params["means"]), self.device, waits))
 
     def run(self, until: int, phase: Phase) -> None:
         """Take steps until the counter stands at `until`, all of one phase.
@@ -138,7 +139,7 @@ class FusedTrainer:
     @property
     def radii(self) -> Tensor:
         """Extents of the last step's splats, px, 0 where culled. [N, 2] int32"""
-        return self._population.splats["radii"]
+        return self._population.drawn.splats["radii"]
 
     def render_stats(self) -> dict[Size, dict[str, Tensor]]:
         """Return, by image size, what the last step of a phase that asks for dominant Gaussians found at every pixel.

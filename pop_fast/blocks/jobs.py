@@ -13,10 +13,12 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import platform
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -25,6 +27,8 @@ from pop_fast.api.registry import get_backend
 from pop_fast.blocks.plan import FOLDER, Job
 from pop_fast.children import SAFE_PATH, module_command
 from pop_fast.errors import PopError
+from pop_fast.io.atomic import FolderLock
+from pop_fast.train.choose import count_gpus
 from pop_fast.train.signals import stop_requests
 
 
@@ -160,6 +164,47 @@ def _begins(part: Part, job: Job) -> str:
     return f"{of_round}block {part.block}, {job.names.index(part.block) + 1} of {count}"
 
 
+def gpus_for(backend: str) -> int:
+    """Return how many GPUs of this machine blocks can be trained on at a time by a backend."""
+    return count_gpus() if get_backend(backend).device == "cuda" else 0
+
+
+@contextmanager
+def own_gpu(folder: Path, backend: str) -> Iterator[None]:
+    """Train on a GPU of this machine that no other block of a run is trained on.
+
+    Args:
+        folder: the run's.
+        backend: what trains.
+
+    Raises:
+        PopError: a block is trained on each of them.
+    """
+    count = gpus_for(backend)
+    lock = _free_gpu(folder, count) if count > 1 else None
+    try:
+        yield
+    finally:
+        if lock is not None:
+            lock.release()
+
+
+def _free_gpu(folder: Path, count: int) -> FolderLock:
+    import torch
+
+    for number in range(count):
+        # a folder that several machines share has a lock for each of their GPUs
+        lock = FolderLock(folder / FOLDER / "gpus" / f"{platform.node() or 'machine'}_{number}")
+        lock.path.mkdir(parents=True, exist_ok=True)
+        try:
+            lock.take()
+        except PopError:
+            continue
+        torch.cuda.set_device(number)
+        return lock
+    raise PopError(f"{folder}: a block is trained on each of the {count} GPUs; wait until one is done")
+
+
 def run_workflow(
     folder: Path, job: Job, jobs: int, threads: int, backend: str, profile: Path | None, quiet: bool = False
 ) -> int:
@@ -168,7 +213,7 @@ def run_workflow(
     Args:
         folder: the run's.
         job: what was asked for.
-        jobs: how many blocks are trained at a time on this machine.
+        jobs: how many blocks are trained at a time on this machine; as many as it has GPUs where one trains.
         threads: of a training.
         backend: what trains; one on a GPU asks for one each.
         profile: a profile's folder, by which it runs on a cluster; None stays here.
@@ -192,9 +237,10 @@ def workflow_words(
     """
     place = folder.absolute()
     each = threads or os.cpu_count() or 1
-    many = min(jobs, len(job.names))
-    # a machine is taken to have one GPU; the folder is locked by who calls this
-    here = ["--cores", str(each * many), "--resources", "gpu=1", "--nolock"]
+    gpus = gpus_for(backend)
+    many = min(gpus or jobs, len(job.names))
+    # the folder is locked by who calls this
+    here = ["--cores", str(each * many), "--resources", f"gpu={max(gpus, 1)}", "--nolock"]
     where = here if profile is None else ["--profile", str(profile), "--nolock"]
     command = module_command("snakemake", "-s", str(SNAKEFILE), "--directory", str(place / FOLDER))
     settings = {"folder": place, "threads": each, "gpus": int(get_backend(backend).device != "cpu")}

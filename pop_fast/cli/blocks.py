@@ -72,9 +72,12 @@ def run(argv: Sequence[str]) -> int:
     part = _part(args, job)
     if part.block is None:
         return _merge(folder, config, record, job, part)
-    if part.round:
-        return _train_round(folder, config, record, job, part)
-    return _train(folder, config, part.block, argv)
+    from pop_fast.blocks.jobs import own_gpu
+
+    with own_gpu(folder, config.backend):
+        if part.round:
+            return _train_round(folder, config, record, job, part)
+        return _train(folder, config, part.block, argv)
 
 
 def _part(args: Args, job: Job) -> Part:

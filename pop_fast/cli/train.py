@@ -39,7 +39,7 @@ from pop_fast.cli.view import LiveView, check_viewer
 from pop_fast.data.sfm_files import SfmOptions
 from pop_fast.errors import PopError
 from pop_fast.train.automatic import begun, check_minutes
-from pop_fast.train.choose import choose_backend
+from pop_fast.train.choose import check_gpus, choose_backend, on_gpu
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.presets import ALIASES, AUTOMATIC, LOSSES, METHODS, Given
 from pop_fast.train.steps import why_not_trained
@@ -147,6 +147,9 @@ def run(argv: Sequence[str]) -> int:
         config = _in_a_folder(config)
         config, chosen = choose_backend(config, options.resume)
         check_backend(config)
+        idle = check_gpus(config, 1 if ranks is None else ranks.size)
+        if idle is not None and options.blocks is None:
+            chosen = f"{chosen}\nnote: {idle}"
         if chooses:
             config = with_size(config, options)
         check_early(config, options.source, options.images, ranks)

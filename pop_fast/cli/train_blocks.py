@@ -118,7 +118,7 @@ def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequen
     Returns:
         The exit status.
     """
-    from pop_fast.blocks.jobs import has_snakemake, marker_of, profile_folder, run_in_turn, run_workflow
+    from pop_fast.blocks.jobs import gpus_for, has_snakemake, marker_of, profile_folder, run_in_turn, run_workflow
     from pop_fast.blocks.plan import FOLDER, read_plan
     from pop_fast.io.atomic import FolderLock
 
@@ -149,6 +149,9 @@ def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequen
             print(f"all blocks of {folder} are trained and merged")
             return 0
         if options.blocks_profile is None and not has_snakemake():
+            gpus = gpus_for(config.backend)
+            if gpus > 1:
+                print(f"note: blocks are trained one after the other, on 1 of {gpus} GPUs; with Snakemake one on each")
             status = run_in_turn(folder, job, options.quiet, lambda line: print(line, flush=True))
         else:
             profile = None if options.blocks_profile is None else profile_folder(options.blocks_profile)

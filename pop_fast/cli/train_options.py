@@ -29,7 +29,8 @@ class BlocksOptions:
         blocks_rounds: how often the merged blocks are trained on: each round trains what a block has in its core among
             all others as they are, and merges again. With --resume a finished run takes further rounds. (default: 2)
         blocks_round_steps: steps of a block in a round. (default: a tenth of --max-steps)
-        blocks_jobs: how many blocks are trained at a time on this machine; more than one needs Snakemake.
+        blocks_jobs: how many blocks are trained at a time on the CPU of this machine; GPUs train one each. More than
+            one needs Snakemake.
         blocks_profile: hand the blocks to a cluster by this Snakemake profile: slurm, or a folder of yours.
     """
 

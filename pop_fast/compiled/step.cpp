@@ -29,26 +29,39 @@ bool Stepper::next(Work &work) {
     return true;
   case 1:
     if (!all_finite() || !few_enough()) return false;
-    sort_by_depth();
-    work = count_entries();
+    work = count_buckets();
     return true;
   case 2:
-    work = place_entries();
+    work = fill_buckets();
     return true;
   case 3:
-    work = blend_tiles();
+    work = sort_buckets();
     return true;
   case 4:
-    work = loss();
+    work = count_entries();
     return true;
   case 5:
-    work = image_gradient();
+    work = add_up_parts();
     return true;
   case 6:
+    work = place_entries();
+    return true;
+  case 7:
+    work = blend_tiles();
+    return true;
+  case 8:
+    work = loss();
+    return true;
+  case 9:
+    work = image_gradient();
+    return true;
+  case 10:
     work = transpose_tiles();
     return true;
+  case 11:
+    work = count_sides();
+    return true;
   case UPDATE_STAGE:
-    count_sides();
     work = update();
     return true;
   default:
@@ -61,7 +74,9 @@ bool Stepper::next(Work &work) {
 
 // Add the time since the last work began to what that was a part of.
 void Stepper::book_time() {
-  constexpr StepPart part_of[] = {PROJECT, LIST, LIST, BLEND, LOSS, IMAGE_GRADIENT, TRANSPOSE, UPDATE};
+  constexpr StepPart part_of[] = {PROJECT, LIST, LIST, LIST,           LIST,      LIST,   LIST,
+                                  BLEND,   LOSS, IMAGE_GRADIENT, TRANSPOSE, UPDATE, UPDATE};
+  static_assert(sizeof(part_of) / sizeof(part_of[0]) == UPDATE_STAGE + 1);
   const auto now = std::chrono::steady_clock::now();
   if (stage > 0) given->seconds[part_of[stage - 1]] += std::chrono::duration<double>(now - stage_began).count();
   stage_began = now;

@@ -81,6 +81,9 @@ constexpr int PRIOR_SUMS = 5;       // of a part: opacities of both sides of the
 constexpr int MOST_COLUMNS = 10;    // of an entry's row: six moments, colours, depth
 constexpr int EXPOSURE = 12;        // numbers of an exposure
 constexpr int64_t ROWS = 256;       // Gaussians in a part
+constexpr int64_t BUCKETS = 512;    // of depths
+constexpr int64_t SOME_TILES = 64;  // whose entries are added up at a time
+constexpr int64_t SIDE_PARTS = 16;  // parts whose sides of the POP term are counted at a time
 static_assert(ROWS % ROW_BLOCK == 0);
 constexpr int SHORT = 14;           // floats of a row besides the bands beyond the first
 
@@ -133,10 +136,16 @@ struct StepCounts {
   int64_t reached;  // of these, those where it changed a pixel: transposed
 };
 
+// The least and the greatest of some depths, as bits in their order.
+struct Depths {
+  uint32_t low = ~uint32_t(0), high = 0;
+};
+
 // What has come of a part's Gaussians so far.
 struct Part {
   uint64_t *keys;                       // of the visible ones
   int64_t visible = 0, slot = 0, bad = -1;  // slots given out; the first row that is not finite, or -1
+  Depths depths;
 };
 
 class Stepper : public Plan {
@@ -161,6 +170,13 @@ private:
   Buffer<int32_t> counts;
   Buffer<uint64_t> keys, sorted;
   std::vector<int64_t> part_visible, part_slots;
+  std::vector<Depths> part_depths;
+  // of depths: keys of each group of parts by bucket, where a bucket begins; a bucket is the depth above the lowest one,
+  // without its last bits
+  std::vector<int64_t> buckets, bucket_begins;
+  uint32_t lowest = 0;
+  int bucket_shift = 0;
+  int64_t group_parts = 1;
   // of tiles and entries
   std::vector<int64_t> starts, offsets, first_chunks, n_reached;
   Buffer<int64_t> ids;
@@ -170,12 +186,13 @@ private:
   // of pixels
   Buffer<float> difference, alphas, unexposed, partials, v_image, v_alphas;
   std::vector<double> tile_sums, window_sums, exposure_sums, pop_sums;
+  std::vector<int64_t> sides;  // important and others, of each SIDE_PARTS parts
   double depth_sum = 0.0;
 
   // of the step that is taken
   const StepGiven *given = nullptr, *last_given = nullptr;
   // the next work of the step; the last one, the update, is `UPDATE_STAGE`
-  static constexpr int UPDATE_STAGE = 7;
+  static constexpr int UPDATE_STAGE = 12;
   std::atomic<int> stage{0};
   const int32_t *asked = nullptr;
   bool ended = false;
@@ -199,10 +216,16 @@ private:
   template <class F> void each_tile(const Seen &of, F f) const;
   bool all_finite() const;
   bool few_enough() const;
-  void sort_by_depth();
+  Work count_buckets();
+  template <class F> void each_key(int64_t first, int64_t last, F f) const;
+  int64_t bucket_of(uint64_t key) const { return (uint32_t(key >> 32) - lowest) >> bucket_shift; }
+  Work fill_buckets();
+  Work sort_buckets();
+  void sort_bucket(uint64_t *first, uint64_t *last, uint64_t *spare) const;
   int64_t list_part() const;
   template <class F> void each_entry(int64_t first, int64_t last, F f) const;
   Work count_entries();
+  Work add_up_parts();
   Work place_entries();
   Work blend_tiles();
   void expose(int64_t tile);
@@ -214,7 +237,7 @@ private:
   void unexpose_gradient(int64_t begin, int64_t end, double *sums);
   void compare_depth();
   Work transpose_tiles();
-  void count_sides();
+  Work count_sides();
   int side_of(int64_t i) const;
   Work update();
   float *gradients_of(Worker &own, StepGroup group) const;

@@ -35,6 +35,7 @@ Work Stepper::project() {
   const int64_t n_parts = parts_of(given->n, ROWS);
   part_visible.assign(size_t(n_parts), 0);
   part_slots.assign(size_t(n_parts), 0);
+  part_depths.resize(size_t(n_parts));
   keys.get(given->n);
   Work work = {given->n, ROWS, {}};
   with_degree(given->degree, [&](auto degree) {
@@ -66,6 +67,7 @@ template <int DEGREE> void Stepper::project_part(Worker &own, int64_t first, int
     project_block<DEGREE>(own.block, block, std::min(last, block + ROW_BLOCK), part);
   part_visible[first / ROWS] = part.bad < 0 ? part.visible : -part.bad - 1;
   part_slots[first / ROWS] = part.slot;
+  part_depths[first / ROWS] = part.depths;
 }
 
 template <int DEGREE> void Stepper::project_block(RowBlock &block, int64_t first, int64_t last, Part &part) {
@@ -87,7 +89,11 @@ template <int DEGREE> void Stepper::project_block(RowBlock &block, int64_t first
     if (!project_splat<DEGREE>(block, i, i - first, row)) continue;
     row.first = int32_t(part.slot);
     part.slot += row.n;
-    if (row.n > 0) part.keys[part.visible++] = uint64_t(ordered_bits(row.depth)) << 32 | uint64_t(i);
+    if (row.n == 0) continue;
+    const uint32_t depth = ordered_bits(row.depth);
+    part.depths.low = std::min(part.depths.low, depth);
+    part.depths.high = std::max(part.depths.high, depth);
+    part.keys[part.visible++] = uint64_t(depth) << 32 | uint64_t(i);
   }
 }
 
@@ -131,27 +137,75 @@ void Stepper::reach_tiles(Seen &of) const {
 
 // ---- list: tile by tile, front to back (D3, D4)
 
-// By depth, then by row: digit by digit from the lowest of the depth's bits, each pass keeping the order before it.
-void Stepper::sort_by_depth() {
-  constexpr int DIGIT = 11, VALUES_OF_DIGIT = 1 << DIGIT, PASSES = 3;
-  std::vector<int32_t> places(PASSES * VALUES_OF_DIGIT);
-  uint64_t *from = keys.get(given->n), *to = sorted.get(given->n);
+// By depth, then by row. Depths are dealt into buckets, one group of parts to a thread, and every bucket is sorted by
+// itself: no two keys are alike, so that their order depends on neither.
+Work Stepper::count_buckets() {
+  uint32_t high = 0;
+  lowest = ~uint32_t(0);
   n_visible = 0;
   for (size_t part = 0; part < part_visible.size(); part++) {
-    std::memmove(from + n_visible, from + int64_t(part) * ROWS, size_t(part_visible[part]) * sizeof(uint64_t));
     n_visible += part_visible[part];
+    lowest = std::min(lowest, part_depths[part].low);
+    high = std::max(high, part_depths[part].high);
   }
-  const auto digit = [](uint64_t key, int pass) { return int(key >> (32 + DIGIT * pass) & (VALUES_OF_DIGIT - 1)); };
-  for (int64_t k = 0; k < n_visible; k++)
-    for (int pass = 0; pass < PASSES; pass++) places[pass * VALUES_OF_DIGIT + digit(from[k], pass)]++;
-  for (int pass = 0; pass < PASSES; pass++) {
-    int32_t *place = &places[pass * VALUES_OF_DIGIT], before = 0;
-    for (int value = 0; value < VALUES_OF_DIGIT; value++) before += std::exchange(place[value], before);
-    for (int64_t k = 0; k < n_visible; k++) to[place[digit(from[k], pass)]++] = from[k];
+  bucket_shift = 0;
+  while (n_visible > 0 && (high - lowest) >> bucket_shift >= uint32_t(BUCKETS)) bucket_shift++;
+  const int64_t n_parts = int64_t(part_visible.size());
+  group_parts = std::max<int64_t>(1, parts_of(n_parts, pool.size()));
+  buckets.resize(size_t(parts_of(n_parts, group_parts) * BUCKETS));
+  bucket_begins.assign(BUCKETS + 1, 0);
+  return {n_parts, group_parts, [this](int, int64_t first, int64_t last) {
+            int64_t *const count = &buckets[size_t(first / group_parts * BUCKETS)];
+            std::fill(count, count + BUCKETS, 0);
+            each_key(first, last, [&](uint64_t key) { count[bucket_of(key)]++; });
+          }};
+}
+
+// Calls f(key) for the visible Gaussians of some parts, row by row.
+template <class F> void Stepper::each_key(int64_t first, int64_t last, F f) const {
+  for (int64_t part = first; part < last; part++)
+    for (int64_t k = part * ROWS; k < part * ROWS + part_visible[size_t(part)]; k++) f(keys[k]);
+}
+
+Work Stepper::fill_buckets() {
+  int64_t *const begin = bucket_begins.data();
+  for (size_t group = 0; group < buckets.size(); group += BUCKETS)
+    for (int64_t k = 0; k < BUCKETS; k++) begin[k] += std::exchange(buckets[group + size_t(k)], begin[k]);
+  int64_t before = 0;
+  for (int64_t k = 0; k <= BUCKETS; k++) before += std::exchange(begin[k], before);
+  uint64_t *const to = sorted.get(given->n);
+  return {int64_t(part_visible.size()), group_parts, [=](int, int64_t first, int64_t last) {
+            int64_t *const next = &buckets[size_t(first / group_parts * BUCKETS)];
+            for (int64_t k = 0; k < BUCKETS; k++) next[k] += begin[k];
+            each_key(first, last, [&](uint64_t key) { to[next[bucket_of(key)]++] = key; });
+          }};
+}
+
+Work Stepper::sort_buckets() {
+  // the keys have been dealt out: their memory is free
+  uint64_t *const spare = keys.get(given->n), *const all = sorted.get(given->n);
+  return {n_visible > 0 ? BUCKETS : 0, BUCKETS / 64, [=](int, int64_t first, int64_t last) {
+            for (int64_t k = first; k < last; k++)
+              sort_bucket(all + bucket_begins[size_t(k)], all + bucket_begins[size_t(k + 1)], spare + bucket_begins[size_t(k)]);
+          }};
+}
+
+// Digit by digit from the lowest of the bits that the depths of a bucket may differ in, each pass keeping the order
+// before it, which was that of the rows.
+void Stepper::sort_bucket(uint64_t *first, uint64_t *last, uint64_t *spare) const {
+  constexpr int DIGIT = 9, VALUES_OF_DIGIT = 1 << DIGIT, FEW = 32;
+  const int64_t n = last - first;
+  if (n <= FEW) return std::sort(first, last);
+  uint64_t *from = first, *to = spare;
+  for (int shift = 0; shift < bucket_shift; shift += DIGIT) {
+    const auto digit = [&](uint64_t key) { return (uint32_t(key >> 32) - lowest) >> shift & (VALUES_OF_DIGIT - 1); };
+    int32_t places[VALUES_OF_DIGIT] = {}, before = 0;
+    for (int64_t k = 0; k < n; k++) places[digit(from[k])]++;
+    for (int32_t &place : places) before += std::exchange(place, before);
+    for (int64_t k = 0; k < n; k++) to[places[digit(from[k])]++] = from[k];
     std::swap(from, to);
   }
-  // an odd number of passes ends in `sorted`
-  static_assert(PASSES % 2 == 1);
+  if (from != first) std::copy(from, from + n, first);
 }
 
 // Gaussians in depth order that are listed at a time; each part counts and places its own entries.
@@ -181,21 +235,33 @@ Work Stepper::count_entries() {
   int64_t n_slots = 0;
   for (auto &slot : part_slots) n_slots += std::exchange(slot, n_slots);
   const int64_t part = list_part(), n_tiles = blend.tiles();
-  starts.assign(size_t(parts_of(n_visible, part) * n_tiles), 0);
+  starts.resize(size_t(parts_of(n_visible, part) * n_tiles));
   return {n_visible, part, [=](int, int64_t first, int64_t last) {
             int64_t *const count = &starts[size_t(first / part * n_tiles)];
+            std::fill(count, count + n_tiles, 0);
             each_entry(first, last, [&](int64_t, int64_t tile, int64_t) { count[tile]++; });
           }};
 }
 
+// Tile by tile, where each part's entries begin among the tile's own.
+Work Stepper::add_up_parts() {
+  const int64_t n_parts = parts_of(n_visible, list_part()), n_tiles = blend.tiles();
+  return {n_tiles, SOME_TILES, [=](int, int64_t first, int64_t last) {
+            std::fill(offsets.begin() + first, offsets.begin() + last, 0);
+            for (int64_t k = 0; k < n_parts; k++)
+              for (int64_t tile = first; tile < last; tile++)
+                offsets[size_t(tile)] += std::exchange(starts[size_t(k * n_tiles + tile)], offsets[size_t(tile)]);
+          }};
+}
+
 Work Stepper::place_entries() {
-  const int64_t part = list_part(), n_parts = parts_of(n_visible, part), n_tiles = blend.tiles();
+  const int64_t part = list_part(), n_tiles = blend.tiles();
   int64_t total = 0, n_chunks = 0;
   for (int64_t tile = 0; tile < n_tiles; tile++) {
-    offsets[size_t(tile)] = total;
+    const int64_t entries = std::exchange(offsets[size_t(tile)], total);
     first_chunks[size_t(tile)] = n_chunks;
-    for (int64_t k = 0; k < n_parts; k++) total += std::exchange(starts[size_t(k * n_tiles + tile)], total);
-    n_chunks += parts_of(total - offsets[size_t(tile)], CHUNK);
+    total += entries;
+    n_chunks += parts_of(entries, CHUNK);
   }
   offsets[size_t(n_tiles)] = total;
   int64_t *const to_ids = ids.get(total);
@@ -207,6 +273,7 @@ Work Stepper::place_entries() {
   blend.rows = rows.get(total * blend.columns());
   return {n_visible, part, [=](int, int64_t first, int64_t last) {
             int64_t *const next = &starts[size_t(first / part * n_tiles)];
+            for (int64_t tile = 0; tile < n_tiles; tile++) next[tile] += offsets[size_t(tile)];
             each_entry(first, last, [&](int64_t i, int64_t tile, int64_t slot) {
               to_ids[next[tile]] = i;
               to_slots[next[tile]++] = int32_t(slot);

@@ -25,17 +25,27 @@ int Stepper::side_of(int64_t i) const {
   return int(before || blend.dominant_counts[i] > 0 ? PopSide::important : PopSide::other);
 }
 
-void Stepper::count_sides() {
-  n_important = n_others = 0;
-  if (given->lambda_pop == 0.0) return;
-  for (int64_t i = 0; i < given->n; i++) {
-    const int side = side_of(i);
-    n_important += side == int(PopSide::important);
-    n_others += side == int(PopSide::other);
-  }
+Work Stepper::count_sides() {
+  const int64_t part = SIDE_PARTS * ROWS, n = given->lambda_pop == 0.0 ? 0 : given->n;
+  sides.assign(size_t(2 * parts_of(n, part)), 0);
+  return {n, part, [=](int, int64_t first, int64_t last) {
+            int64_t important = 0, others = 0;
+            for (int64_t i = first; i < last; i++) {
+              const int side = side_of(i);
+              important += side == int(PopSide::important);
+              others += side == int(PopSide::other);
+            }
+            sides[size_t(2 * (first / part))] = important;
+            sides[size_t(2 * (first / part) + 1)] = others;
+          }};
 }
 
 Work Stepper::update() {
+  n_important = n_others = 0;
+  for (size_t k = 0; k < sides.size(); k += 2) {
+    n_important += sides[k];
+    n_others += sides[k + 1];
+  }
   pop_sums.assign(size_t(PRIOR_SUMS * parts_of(given->n, ROWS)), 0.0);
   Work work = {given->n, ROWS, {}};
   with_degree(given->degree, [&](auto degree) {

@@ -53,15 +53,16 @@ class CudaBackend(BaseBackend):
 
     def whole_step(self) -> WholeStep:
         """Return the fused step, which takes all steps on a GPU: a setting that it does not know is refused."""
-        known = WholeStep("cuda", _fused_trainer, most=500)
-        return replace(known, only={**known.only, "strategy.lambda_entropy": 0.0})
+        known = WholeStep("cuda", _make_fused, most=500)
+        only = {name: value for name, value in known.only.items() if name != "batch_size"}
+        return replace(known, only={**only, "strategy.lambda_entropy": 0.0})
 
 
-def _fused_trainer(task: Task) -> MakeFused:
-    """Make the fused step, with the photographs on the GPU."""
-    from pop_fast.cuda.training import fused_trainer
+def _make_fused(task: Task) -> MakeFused:
+    """Return what makes the fused step, with the photographs on the GPU."""
+    from pop_fast.cuda.training import make_fused
 
-    return fused_trainer
+    return make_fused(task)
 
 
 CUDA: Final = CudaBackend(

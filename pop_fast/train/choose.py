@@ -71,6 +71,50 @@ def on_gpu(config: TrainConfig) -> bool:
     return config.backend != "auto" and get_backend(config.backend).device != "cpu"
 
 
+def check_gpus(config: TrainConfig, processes: int = 1) -> str | None:
+    """Settle which GPUs of this machine a run uses.
+
+    Args:
+        config: with a backend's name.
+        processes: that train together, of which LOCAL_WORLD_SIZE run here where a launcher says so.
+
+    Returns:
+        A line on GPUs that are left idle, and how they would be used; None where there are none.
+
+    Raises:
+        PopError: this process has no GPU of its own.
+    """
+    if get_backend(config.backend).device != "cuda":
+        return None
+    from pop_fast.train.ranks import local_rank
+
+    count, rank = count_gpus(), local_rank() if processes > 1 else 0
+    if rank >= count > 0:
+        raise PopError(
+            f"process {rank} of this machine has no GPU of its own, as there {_are(count)}; start one process a GPU "
+            f"(--nproc-per-node {count}), or train on CPUs (--backend fast)"
+        )
+    here = os.environ.get("LOCAL_WORLD_SIZE", "") if processes > 1 else "1"
+    used = int(here) if here.isdigit() else processes
+    if used >= count:
+        return None
+    return (
+        f"{used} of {count} GPUs {'is' if used == 1 else 'are'} used; torchrun --nproc-per-node {count} --no-python "
+        f"pop train ... --batch-size {count} uses all, for steps of {count} views"
+    )
+
+
+def _are(count: int) -> str:
+    return "is 1" if count == 1 else f"are {count}"
+
+
+def count_gpus() -> int:
+    """Return how many GPUs this process may use."""
+    import torch
+
+    return torch.cuda.device_count()
+
+
 def has_gpu() -> bool:
     """Tell whether the system shows an NVIDIA GPU: its driver's devices, or on WSL the host's."""
     return any(Path(device).exists() for device in ("/dev/nvidiactl", "/dev/nvidia0", "/dev/dxg")) or os.name == "nt"

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
+import torch
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
@@ -59,7 +60,7 @@ MakeFused = Callable[[Rows, Rows, Rows, Sequence[ViewTensors], Sequence[int], St
 
 @dataclass
 class FusedStepper:
-    """Takes steps by `make`; see `Stepper`.
+    """Takes steps by `make`, of `batch_size` views where that knows them; see `Stepper` and `batch_stepper`.
 
     Args:
         task: what is trained; its settings are known to the step.
@@ -75,7 +76,7 @@ class FusedStepper:
     fused: Fused | None = None
 
     def __post_init__(self) -> None:
-        self.step = self.task.step
+        self.step, self._views = self.task.step, self.task.config.batch_size
         # of the last steps, a pixel
         self._seconds: float | None = None
         self._optimizers: Mapping[str, Adam] = {}
@@ -102,15 +103,16 @@ class FusedStepper:
         if self._seconds is None:
             return 1
         seconds = 0.0
-        for count, index in enumerate(self.task.order[self.step : self.step + self.most]):
-            seconds += self._seconds * self._pixels(index)
+        for count in range(min(self.most, len(self.task.order) // self._views - self.step)):
+            seconds += self._seconds * self._pixels(self.step + count, self.step + count + 1)
             if seconds > BLOCK_SECONDS:
                 return max(count, 1)
         return self.most
 
-    def _pixels(self, index: int) -> int:
-        view = self.task.views[index]
-        return view.height * view.width
+    def _pixels(self, first: int, last: int) -> int:
+        """Return how many pixels the views of some steps have."""
+        views = [self.task.views[index] for index in self.task.order[first * self._views : last * self._views]]
+        return sum(view.height * view.width for view in views)
 
     def steps(self, first: int, last: int, phase: Phase) -> list[StepStats]:
         """See `Stepper.steps`."""
@@ -123,8 +125,10 @@ class FusedStepper:
         if last <= first:
             return []
         self._take_statistics(self.fused.statistics, first, last, phase)
-        pixels = sum(map(self._pixels, self.task.order[first:last]))
-        self._seconds = (time.perf_counter() - start) / max(pixels, 1)
+        took = torch.tensor([time.perf_counter() - start], dtype=torch.float64)
+        # processes that train together agree on how many steps come next
+        took = max(float(one) for one in self.task.ranks.gather([took]))
+        self._seconds = took / max(self._pixels(first, last), 1)
         numbers = self.task.updates.numbers[first:last].amax(0).tolist()
         for key, number in zip(KEYS, numbers, strict=True):
             if number > 0:
@@ -140,7 +144,7 @@ class FusedStepper:
         state, pop = self._state, self.task.config.strategy
         if phase.statistics:
             state["grad2d"], state["count"] = found.grad_sum.clone(), found.n_visible.to(found.grad_sum.dtype)
-            state["views"] += last - first
+            state["views"] += (last - first) * self._views
         if found.sh_rest_sum is not None:
             state["sh_rest_sum"] = found.sh_rest_sum.clone()
         summed = phase.blur and pop.blur_window == "sum"
@@ -149,7 +153,7 @@ class FusedStepper:
         if not phase.blur:
             return
         if summed:
-            view = self.task.views[self.task.order[last - 1]]
+            view = self.task.views[self.task.order[last * self._views - 1]]
             bound = (view.width, view.height, pop.theta_blur, pop.blur_min_pixels, view.kept_pixels)
             state["blurred"] = blur_set(state["dominant_sum"], *bound)
         else:

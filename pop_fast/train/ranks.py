@@ -1,13 +1,15 @@
 """Processes that train one model together: whose views are whose, and how what each has found is put together.
 
-Every process holds all parameters, moments and statistics and takes every decision itself; only the drawing of a step's
-views is shared out. What is added up is added view by view in the order of the batch, wherever a view was drawn, so
-that the bits do not depend on the number of processes. torch carries it: gloo between CPUs, NCCL between GPUs.
+Every process holds all parameters, moments and statistics and takes every decision itself. On CPUs only the drawing of
+a step's views is shared out; on GPUs (`cuda_ext.training.batch_step`) within a block of steps the Gaussians are too.
+What is added up is added view by view in the order of the batch, wherever a view was drawn, so that the bits do not
+depend on the number of processes. torch carries it: gloo between CPUs, NCCL between GPUs.
 """
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import timedelta
@@ -18,7 +20,7 @@ from torch import Tensor
 
 from pop_fast.errors import PopError
 
-__all__ = ["ALONE", "Ranks", "TorchRanks", "join"]
+__all__ = ["ALONE", "Ranks", "TorchRanks", "join", "local_rank"]
 
 T = TypeVar("T")
 
@@ -68,6 +70,23 @@ class Ranks:
         for part in parts:
             total += part
         return total
+
+    def exchange(self, sent: Sequence[Tensor], received: Sequence[int]) -> list[Tensor]:
+        """Send rows to every process, and return what every process has sent here.
+
+        Args:
+            sent: for each process. [rows, width] each
+            received: how many rows come from each.
+        """
+        return list(sent)
+
+    def share(self, whole: Tensor, bounds: Sequence[int]) -> None:
+        """Give all processes, in place, the rows of a tensor that each of them holds.
+
+        Args:
+            whole: contiguous.
+            bounds: the process `rank` holds the rows from `bounds[rank]` to before `bounds[rank + 1]`.
+        """
 
     def any(self, flag: bool) -> bool:
         """Tell whether any process says so."""
@@ -120,6 +139,20 @@ class TorchRanks(Ranks):
         self._together(lambda: self._group.all_gather(whole, added))
         return torch.cat(whole)[:length]
 
+    def exchange(self, sent: Sequence[Tensor], received: Sequence[int]) -> list[Tensor]:
+        """See `Ranks.exchange`."""
+        mine = torch.cat(list(sent))
+        theirs = torch.empty((sum(received), *mine.shape[1:]), dtype=mine.dtype, device=mine.device)
+        lengths = [len(rows) for rows in sent]
+        self._together(lambda: self._group.all_to_all_single(theirs, mine, list(received), lengths))
+        return list(theirs.split(list(received)))
+
+    def share(self, whole: Tensor, bounds: Sequence[int]) -> None:
+        """See `Ranks.share`."""
+        for rank, (first, last) in enumerate(itertools.pairwise(bounds)):
+            if first < last:
+                self._together(lambda rank=rank, rows=whole[first:last]: self._group.broadcast(rows, rank))
+
     def any(self, flag: bool) -> bool:
         """See `Ranks.any`."""
         return any(bool(said) for said in self.gather([torch.tensor(flag)]))
@@ -157,6 +190,19 @@ class TorchRanks(Ranks):
 ALONE: Final = Ranks()
 
 
+def local_rank() -> int:
+    """Return which of the processes of this machine this one is, from 0: LOCAL_RANK, or RANK where nobody says it.
+
+    Raises:
+        PopError: it is no whole number.
+    """
+    name = next((name for name in ("LOCAL_RANK", "RANK") if os.environ.get(name)), None)
+    said = "0" if name is None else os.environ[name]
+    if not (said.isascii() and said.isdigit()):
+        raise PopError(f"{name} is {said!r}; it must be the number of this process, from 0: start them with torchrun")
+    return int(said)
+
+
 def join() -> Ranks:
     """Meet the other processes that were launched with this one, or return `ALONE` where there are none.
 
@@ -170,6 +216,9 @@ def join() -> Ranks:
     if not group.is_available():
         raise PopError("this torch was built without torch.distributed; start one process, or install another build")
     by_gpu = torch.cuda.is_available() and group.is_nccl_available()
+    if local_rank() < torch.cuda.device_count():
+        # before anything is put on a GPU; who has none of its own is refused where it needs one
+        torch.cuda.set_device(local_rank())
     try:
         group.init_process_group("cpu:gloo,cuda:nccl" if by_gpu else "gloo", timeout=_PATIENCE)
     except (RuntimeError, ValueError) as error:

@@ -35,7 +35,7 @@ def launched(words: Sequence[object], size: int = 2, seconds: float = 300.0) -> 
     started: list[subprocess.Popen[str]] = []
     try:
         for rank in range(size):
-            told = {name: str(value) for name, value in {**together, "RANK": rank}.items()}
+            told = {name: str(value) for name, value in {**together, "RANK": rank, "LOCAL_RANK": rank}.items()}
             command = [sys.executable, *map(str, words)]
             pipe, environment = subprocess.PIPE, {**os.environ, **told}
             child = subprocess.Popen(command, stdout=pipe, stderr=pipe, env=environment, cwd=ROOT, text=True)

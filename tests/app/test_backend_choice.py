@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,11 +15,12 @@ import torch
 
 from pop_fast.api.rasterize import rasterization
 from pop_fast.api.registry import get_backend
+from pop_fast.blocks import jobs
 from pop_fast.cli.train import check_backend
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.train import TrainConfig, TrainingRun
-from pop_fast.train.choose import choose_backend
+from pop_fast.train.choose import check_gpus, choose_backend
 from pop_fast.train.engines import whole_engine
 from pop_fast.train.environment import reproducible
 from pop_fast.train.gpu_proxy import GpuProxy, renderer, translate_oom
@@ -305,3 +307,74 @@ def test_statistics_name_what_decides_a_comparison(tmp_path):
     assert {"method", "preset", "seed", "lambda_pop", "theta_blur_pixels", "blur_min_pixels", "blur_events"} <= set(
         stats
     )
+
+
+# Machines with several GPUs: counted stubs of them, at the doors that a user uses.
+
+
+@pytest.fixture
+def eight_gpus(monkeypatch: pytest.MonkeyPatch, with_gpu: None) -> list[int]:
+    """As on a machine with eight GPUs; returns the numbers that are chosen."""
+    chosen: list[int] = []
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 8)
+    monkeypatch.setattr(torch.cuda, "set_device", chosen.append)
+    return chosen
+
+
+def test_gpus_that_are_left_idle_are_said_with_what_would_use_them(
+    pop: Pop, shared_capture: Path, tmp_path: Path, eight_gpus: list[int]
+) -> None:
+    outcome = pop.done("train", shared_capture, "--out", tmp_path / "r", *TRAIN, "--skip-sizes")
+    note = "note: 1 of 8 GPUs is used; torchrun --nproc-per-node 8 --no-python pop train ... --batch-size 8 uses all"
+    assert f"\n{note}, for steps of 8 views\n" in outcome.out
+    assert eight_gpus == []
+
+
+@pytest.mark.usefixtures("eight_gpus")
+def test_processes_use_as_many_gpus_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, chosen = choose_backend(tiny_config(tmp_path, backend="auto", batch_size=8))
+    assert (config.backend, chosen) == ("cuda", "backend cuda: a GPU and the build are here")
+    monkeypatch.setenv("LOCAL_RANK", "7")
+    assert check_gpus(config, 8) is None
+    assert (check_gpus(config, 2) or "").startswith("2 of 8 GPUs are used")
+    # two machines of two processes each
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    assert (check_gpus(config, 4) or "").startswith("2 of 8 GPUs are used")
+    assert check_gpus(replace(config, backend="fast"), 4) is None
+    monkeypatch.setenv("LOCAL_RANK", "8")
+    with pytest.raises(PopError, match=r"process 8 of this machine has no GPU of its own, as there are 8; start one"):
+        check_gpus(config, 16)
+    monkeypatch.setenv("LOCAL_RANK", "-1")
+    with pytest.raises(PopError, match=r"LOCAL_RANK is '-1'; it must be the number of this process, from 0"):
+        check_gpus(config, 16)
+
+
+def test_each_block_is_trained_on_a_gpu_of_its_own(
+    pop: Pop, shared_capture: Path, tmp_path: Path, eight_gpus: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[list[str]] = []
+    monkeypatch.setattr(jobs, "has_snakemake", lambda: True)
+    monkeypatch.setattr(jobs, "_run", lambda words, quiet: begun.append(list(words)) or 0)
+    folder = tmp_path / "blocks"
+    words = ("train", shared_capture, "--out", folder, *TRAIN, "--skip-sizes", "--threads", "3", "--blocks", "2x1")
+    pop.done(*words)
+    (command,) = begun
+    # eight GPUs, two blocks with three threads each, a GPU for each
+    assert command[command.index("--resources") + 1] == "gpu=8"
+    assert command[command.index("--cores") + 1] == "6"
+    assert "gpus=1" in command
+    with jobs.own_gpu(folder, "cuda"):
+        pop.done("blocks", "train", folder, "0_0")
+        assert eight_gpus == [0, 1]
+    pop.done("blocks", "train", folder, "1_0")
+    assert eight_gpus == [0, 1, 0]
+    with ExitStack() as others:
+        for _ in range(8):
+            others.enter_context(jobs.own_gpu(folder, "cuda"))
+        outcome = pop("blocks", "train", folder, "1_0")
+        assert (
+            outcome.err == f"pop: error: {folder}: a block is trained on each of the 8 GPUs; wait until one is done\n"
+        )
+    monkeypatch.setattr(jobs, "has_snakemake", lambda: False)
+    again = pop.done(*words, "--overwrite")
+    assert "note: blocks are trained one after the other, on 1 of 8 GPUs; with Snakemake one on each" in again.out

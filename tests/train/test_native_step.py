@@ -140,6 +140,41 @@ def test_six_steps_are_torchs(what: str, tmp_path: Path) -> None:
 
 
 @needs_compiled
+def test_gaussians_of_one_depth_are_blended_row_by_row_however_many_there_are(tmp_path: Path) -> None:
+    # on four planes before cameras that look along z: buckets of depths are sorted digit by digit, ties by row
+    n, found = 6000, []
+    g = torch.Generator().manual_seed(6)
+    planes = torch.tensor([2.0, 2.000001, 3.0, 900.0])[torch.randint(0, 4, (n,), generator=g)]
+    spread = torch.rand((n, 2), generator=g) - 0.5
+    initial = {
+        "means": torch.cat((spread * planes[:, None], planes[:, None]), 1),
+        "scales": torch.log(0.01 * planes)[:, None].repeat(1, 3),
+        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+        "opacities": torch.full((n,), 0.5),
+        "sh0": torch.rand((n, 1, 3), generator=g),
+        "shN": torch.zeros((n, 15, 3)),
+    }
+    capture = tiny_capture()
+    capture = replace(capture, views=tuple(replace(view, viewmat=np.eye(4)) for view in capture.views))
+    for threads in (1, 5, 0):
+        engine = whole_engine() if threads else torch_engine("fast")
+        torch.set_num_threads(max(threads, 1))
+        config = tiny_config(tmp_path / str(threads))
+        config = replace(config, strategy=replace(config.strategy, blur_window="sum", **WATCHED))
+        run = TrainingRun(config, capture, engine=engine, initial=initial)
+        (stats,) = run.take_steps(1).stats
+        found.append((stats, run.params, run.state["dominant_sum"]))
+    torch.set_num_threads(1)
+    (one, params, _), (many, others, dominant), (torchs, _, wanted) = found
+    assert one.objective == many.objective
+    assert all(torch.equal(params[key], others[key]) for key in KEYS)
+    assert one.objective == pytest.approx(torchs.objective, rel=1e-5)
+    # who is in front wins pixels
+    assert torch.equal(dominant.long(), wanted.long())
+    assert int((wanted > 0).sum()) > 50
+
+
+@needs_compiled
 @pytest.mark.parametrize("what", ["on grey, with a mask", "antialiased", "all for few photographs"])
 def test_the_bits_depend_neither_on_threads_nor_on_how_many_steps_are_asked_for_at_once(
     what: str, tmp_path: Path

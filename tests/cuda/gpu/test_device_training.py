@@ -49,6 +49,12 @@ CASES = {
         lambda capture: capture,
     ),
     "any view": ({"strategy": {"blur_window": "any_view"}}, masked),
+    "batch": ({"batch_size": 3}, lambda capture: masked(mixed_sizes(capture))),
+    "batch, window": (
+        {"batch_size": 2, "strategy": {"pop_views": "window", "refine_start_iter": 8, "refine_stop_iter": 7}},
+        lambda capture: capture,
+    ),
+    "batch, visible": ({"batch_size": 2, "sh_interval": 2, "strategy": {"pop_over": "visible"}}, masked),
 }
 
 

@@ -1,0 +1,201 @@
+"""Steps of several views on emulated GPUs: the CPU's, and the same bits on any number of them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from cuda_ext.host import emulate
+from cuda_ext.render import capacity
+from cuda_ext.training.batch_step import STRETCH, stretches
+from pop_fast.cli import main
+from pop_fast.density import POPStrategy
+from pop_fast.errors import PopError
+from pop_fast.train import TrainingRun
+from pop_fast.train import checkpoint as ckpt
+from pop_fast.train.ranks import ALONE, Ranks, join
+from tests.app.children import launched
+from tests.app.test_resume import needs_gloo, same
+from tests.app.tiny import last_checkpoint, tiny_capture, tiny_config
+from tests.cuda.conftest import FOLDER, emulated_engine
+from tests.cuda.gpu.test_device_training import masked, mixed_sizes, records
+
+SIZE = 4
+# all of density control, with resets; dominance by the window, its blur by the last view, masks and sizes
+RUNS = {
+    "pop": ({}, lambda capture: capture),
+    "window": (
+        {"strategy": {"pop_views": "window", "blur_window": "own_view"}},
+        lambda capture: masked(mixed_sizes(capture)),
+    ),
+    "gsplat": ({}, lambda capture: capture),
+}
+
+
+def train(folder: Path, name: str, ranks: Ranks = ALONE, resume: bool = False) -> TrainingRun:
+    changes, edit = RUNS[name]
+    method = "gsplat" if name == "gsplat" else "pop"
+    config = tiny_config(folder / name, method, batch_size=SIZE)
+    strategy = type(config.strategy)(**{**vars(config.strategy), **changes.get("strategy", {})})
+    config = tiny_config(folder / name, method, batch_size=SIZE, strategy=strategy)
+    run = TrainingRun(config, edit(tiny_capture()), engine=emulated_engine(), ranks=ranks, resume=resume)
+    run.run()
+    return run
+
+
+def train_all(folder: Path) -> None:
+    """What each process does."""
+    patch = pytest.MonkeyPatch()
+    emulate.install(patch, emulate.build(FOLDER))
+    torch.set_num_threads(1)
+    ranks = join()
+    for name in RUNS:
+        run = train(folder, name, ranks)
+        trainer = run.stepper.fused
+        torch.save((trainer.received, len(trainer._of_place[0])), folder / f"{name}_{ranks.rank}.pt")
+    ranks.leave()
+
+
+@pytest.fixture(scope="module")
+def together(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    reason = emulate.why_not()
+    if reason is not None:
+        pytest.skip(reason)
+    emulate.build(FOLDER)
+    folder = tmp_path_factory.mktemp("together")
+    outcomes = launched([__file__, folder])
+    assert [outcome.status for outcome in outcomes] == [0, 0], outcomes
+    return folder
+
+
+@needs_gloo
+@pytest.mark.parametrize("name", RUNS)
+def test_two_gpus_train_to_the_bits_of_one(gpu, together: Path, tmp_path: Path, name: str) -> None:
+    train(tmp_path, name)
+    same(together / name, tmp_path / name)
+    assert records_of(together / name) == records_of(tmp_path / name)
+    # density control had something to decide, and both owned Gaussians
+    assert len(last_checkpoint(together / name)[".splats.means"]) > 70
+    for rank in (0, 1):
+        received, own = torch.load(together / f"{name}_{rank}.pt")
+        assert own >= STRETCH
+        assert min(received.values()) > 0
+
+
+@needs_gloo
+def test_one_gpu_continues_what_two_began(gpu, together: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "window"
+    shutil.copytree(together / "window", folder)
+    kept = [path for number, path in ckpt.list_checkpoints(folder) if number < 29]
+    ckpt.checkpoint_path(folder, 29).unlink()
+    # in the middle of a window
+    assert (ckpt.list_checkpoints(folder)[-1][0] + 1) % 4
+    assert kept
+    train(tmp_path, "window", resume=True)
+    same(folder, together / "window")
+
+
+def test_buffers_that_overflow_in_a_step_of_several_views_lose_nothing(gpu, tmp_path: Path, monkeypatch) -> None:
+    whole = train(tmp_path / "whole", "window")
+    monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 1))
+    cramped = train(tmp_path / "cramped", "window")
+    assert cramped.stepper.facts()["instance_buffers_grown"] > 0
+    assert whole.stepper.facts()["instance_buffers_grown"] == 0
+    for key, value in whole.params.items():
+        assert torch.equal(cramped.params[key], value), key
+
+
+@pytest.mark.parametrize("sh_interval", [1000, 1], ids=["first band", "all bands"])
+def test_a_step_of_several_views_has_the_cpus_gradients_and_statistics(gpu, tmp_path: Path, sh_interval: int) -> None:
+    strategy = POPStrategy(refine_start_iter=50, blur_start_iter=0, blur_window="sum")
+    found = []
+    for engine in (None, emulated_engine()):
+        config = tiny_config(tmp_path / str(engine is None), batch_size=3, strategy=strategy, sh_interval=sh_interval)
+        run = TrainingRun(config, masked(mixed_sizes(tiny_capture())), engine=engine)
+        # a sphere has no rotation to be moved by
+        run.params["scales"].data += 0.3 * torch.randn((60, 3), generator=torch.Generator().manual_seed(4))
+        run.take_steps(1)
+        run.take_steps(2)
+        moments = {key: run.optimizers[key].state[run.params[key]] for key in run.params}
+        found.append((moments, run.state))
+    (moments, state), (wanted, of_cpu) = found[1], found[0]
+    for key, group in wanted.items():
+        for name in ("exp_avg", "exp_avg_sq"):
+            most = float(group[name].abs().max())
+            assert most > 0 or (key == "shN" and sh_interval == 1000), key
+            assert float((moments[key][name] - group[name]).abs().max()) <= 1e-3 * most, (key, name)
+    torch.testing.assert_close(state["grad2d"], of_cpu["grad2d"], rtol=1e-3, atol=1e-6)
+    for name in ("count", "dominant_sum"):
+        assert torch.equal(state[name].long(), of_cpu[name].long()), name
+    assert state["views"] == of_cpu["views"] == 6
+    assert int(state["dominant_sum"].sum()) > 0
+
+
+def test_a_number_that_is_not_finite_is_found_in_a_step_of_several_views(gpu, tmp_path: Path) -> None:
+    config = tiny_config(tmp_path, batch_size=2)
+    run = TrainingRun(config, tiny_capture(), engine=emulated_engine())
+    run.take_steps(2)
+    run.params["quats"].data[47, 2] = float("nan")
+    with pytest.raises(PopError, match=r"quats\[47, 2\] is nan after 2 steps"):
+        run.take_steps(3)
+
+
+def test_a_warps_rows_have_one_owner() -> None:
+    for n, size in ((0, 3), (1, 2), (60, 2), (64, 3), (1000, 7), (270_001, 8)):
+        bounds = stretches(n, size)
+        assert (bounds[0], bounds[-1], len(bounds)) == (0, n, size + 1)
+        assert all(low <= high for low, high in itertools.pairwise(bounds))
+        assert all(bound % STRETCH == 0 for bound in bounds[:-1] if bound < n)
+        assert max(high - low for low, high in itertools.pairwise(bounds)) <= n / size + STRETCH
+
+
+# `pop train` on a machine that claims eight GPUs, as torchrun starts it: argument 1 is the rank's file, the rest words
+OF_EIGHT = """
+import sys
+import pytest
+import torch
+from cuda_ext.host import emulate
+from pop_fast.cli import main
+from pop_fast.train import engines
+from tests.cuda.conftest import FOLDER, emulated_engine
+
+patch, chosen = pytest.MonkeyPatch(), []
+emulate.install(patch, emulate.build(FOLDER))
+patch.setattr(engines, "whole_engine", lambda backend: emulated_engine())
+patch.setattr(torch.cuda, "device_count", lambda: 8)
+patch.setattr(torch.cuda, "set_device", chosen.append)
+status = main(sys.argv[1:])
+print("chosen", chosen, file=sys.stderr)
+sys.exit(status)
+"""
+
+
+@needs_gloo
+def test_two_processes_on_a_machine_of_eight_gpus_train_on_two_of_them(gpu, tmp_path: Path) -> None:
+    folder = tmp_path / "toy"
+    assert main(["demo", str(folder), "--views", "8", "--width", "40", "--height", "32"]) == 0
+    words = ["train", folder, "--out", tmp_path / "r", "--steps-scaler", "0.0003", "--no-progress"]
+    words += ["--batch-size", "2", "--threads", "1", "--skip-sizes", "--skip-checks", "--max-renders", "1"]
+    first, second = launched(["-c", OF_EIGHT, *words])
+    assert (first.status, second.status) == (0, 0), (first.err, second.err)
+    assert "backend cuda: a GPU and the build are here\nnote: 2 of 8 GPUs are used; torchrun" in first.out
+    assert ("chosen [0]" in first.err, "chosen [1]" in second.err) == (True, True)
+    stats = json.loads(next((tmp_path / "r" / "stats").glob("val_step*.json")).read_text())
+    assert (stats["backend"], stats["stepper"]) == ("cuda", "cuda")
+
+
+def records_of(folder: Path) -> list[dict]:
+    return [
+        {key: value for key, value in record.items() if key not in ("it_per_s", "seconds")}
+        for record in records(folder)
+    ]
+
+
+if __name__ == "__main__":
+    train_all(Path(sys.argv[1]))
