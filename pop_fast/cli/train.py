@@ -39,7 +39,7 @@ from pop_fast.cli.view import LiveView, check_viewer
 from pop_fast.data.sfm_files import SfmOptions
 from pop_fast.errors import PopError
 from pop_fast.train.automatic import begun, check_minutes
-from pop_fast.train.choose import check_gpus, choose_backend, on_gpu
+from pop_fast.train.choose import check_gpus, choose_backend
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.presets import ALIASES, AUTOMATIC, LOSSES, METHODS, Given
 from pop_fast.train.steps import why_not_trained
