@@ -42,6 +42,8 @@ class LimitOptions:
     Attributes:
         min_opacity: leave out Gaussians with a lower opacity; 1/255 = 0.0039 changes no picture.
         crop: keep those with their centres in the box XMIN YMIN ZMIN XMAX YMAX ZMAX, in the capture's own world frame.
+        without_floaters: leave out those that stand, in the picture of a photograph's camera or of one that turns about
+            the subject, nearer than half the distance of the nearest sparse points there: haze and veils.
         final_prune: leave out those that contribute least and together make up this share of all blending weights in
             the training views, as 0.003, and those that no training view shows.
         max_gaussians: keep at most so many, those of the highest scores.
@@ -57,6 +59,7 @@ class LimitOptions:
 
     min_opacity: float | None = None
     crop: tuple[float, float, float, float, float, float] | None = None
+    without_floaters: bool = False
     final_prune: float | None = None
     max_gaussians: int | None = None
     target_mb: float | None = None
@@ -67,7 +70,7 @@ class LimitOptions:
     def any(self) -> bool:
         """Tell whether something may be left out."""
         limits = (self.min_opacity, self.crop, self.final_prune, self.max_gaussians, self.target_mb)
-        return any(limit is not None for limit in limits)
+        return self.without_floaters or any(limit is not None for limit in limits)
 
     def check(self) -> None:
         """Refuse what cannot be before anything is loaded.
@@ -208,6 +211,8 @@ def limited(shown: Shown, limits: LimitOptions, output: Output) -> Limited:
         left.keep(shrink.opaque_enough(left.params, limits.min_opacity), f"opacity >= {limits.min_opacity:g}")
     if limits.crop is not None:
         left.keep(shrink.inside(_means_of_capture(left.params, shown), limits.crop), "in the box")
+    if limits.without_floaters:
+        left.keep(~_floaters(shown, left.params), "without floaters")
     if limits.final_prune is not None:
         kept = shrink.all_but_the_least(_scores(shown, left.params, "contributions"), limits.final_prune)
         left.keep(kept, f"all but {limits.final_prune:.2%} of the blending weights")
@@ -317,6 +322,16 @@ def _means_of_capture(params: dict[str, Tensor], shown: Shown) -> Tensor:
 
     double = {name: value.double() for name, value in params.items()}
     return to_capture_frame(double, shown.world_transform)["means"]
+
+
+def _floaters(shown: Shown, params: Mapping[str, Tensor]) -> Tensor:
+    """Tell which Gaussians are floaters."""
+    if shown.open is None:
+        raise PopError("floaters are found from the places of the photographs; give --capture DIR")
+    from pop_fast.view.report.checks import are_floaters
+
+    capture, config = shown.open()
+    return are_floaters(params["means"], capture, config.test_every)
 
 
 def _scores(shown: Shown, params: Mapping[str, Tensor], score: Score) -> Tensor:

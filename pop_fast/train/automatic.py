@@ -159,10 +159,10 @@ def choose_length(
     return Choice(scaler, gaussians, seconds(scaler), memory)
 
 
-# photographs to train on up to which where a Gaussian lies along a ray is left open by too many of its pixels
-FEW: Final = 30
-# of the depth at sparse points; by benchmarks/few_photographs.py
-DEPTH_LAMBDA: Final = 0.01
+# photographs to train on up to which POP holds depth to the sparse points, and the weight; measured on three captures,
+# where the count told more than the angles did: benchmarks/results/few_photographs.json
+DEPTH_LAMBDAS: Final = ((15, 0.1), (30, 0.01))
+FEW: Final = DEPTH_LAMBDAS[-1][0]
 # settings that `choose_terms` may choose
 TERMS: Final = ("depth_lambda", "exposure")
 
@@ -198,11 +198,12 @@ def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> 
     spread = "" if apart is None else f", neighbours {apart:.0f} degrees apart"
     wanted: list[tuple[str, Any, str]] = []
     why: list[str] = []
-    if len(trained) <= FEW:
+    weight = next((weight for most, weight in DEPTH_LAMBDAS if len(trained) <= most), None)
+    if weight is not None and config.method == "pop":
         few = f"{len(trained)} photographs are few{spread}"
         if any(view.seen is not None and len(view.seen) for view in trained):
-            text = f"depth is held to the sparse points (--depth-lambda {DEPTH_LAMBDA:g}), as {few}"
-            wanted.append(("depth_lambda", DEPTH_LAMBDA, text))
+            text = f"depth is held to the sparse points (--depth-lambda {weight:g}), as {few}"
+            wanted.append(("depth_lambda", weight, text))
         elif "depth_lambda" not in _said(config):
             why.append(f"{few}, and depth is not held to sparse points: the capture has no tracks of them")
     if stops is not None and stops > DRIFT_STOPS and config.batch_size == 1:
