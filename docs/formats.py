@@ -52,8 +52,8 @@ Where the photographs are at hand, `--target-mb` measures what loses least. Ever
 of a lower one fitted to what the training views show, and the best one with finer and coarser coefficients, where the
 format has them. Each is tuned for a few steps, written, read back and measured in training views; the best is tuned for
 `--fine-tune-steps` (300; 0 tunes nothing), and so is what `--max-gaussians` keeps. The run's own engine and loss do
-that, without density control; how long it takes is told after its first two seconds. Held-out views are measured at
-the end and decide nothing. Without photographs, Gaussians alone go, those that are least visible.
+that, without density control; how long it takes is told after its first seconds. Held-out views are measured at the end
+and decide nothing. Without photographs, Gaussians alone go, those that are least visible.
 """
 
 
@@ -137,8 +137,13 @@ def _budgets(record: dict[str, Any]) -> str:
     rows, sources = [], []
     for name, found in record["captures"].items():
         sources.append(
-            f"{name}, photographs shrunk by {found['factor']}: {found['gaussians']:,} Gaussians, {found['psnr']:.2f} "
-            f"dB, after the same steps of tuning {found['psnr_tuned']:.2f} dB"
+            [
+                name,
+                str(found["factor"]),
+                f"{found['gaussians']:,}",
+                f"{found['psnr']:.2f}",
+                f"{found['psnr_tuned']:.2f}",
+            ]
         )
         for row in found["rows"]:
             cells = [f"{row[kind]['psnr'] - found['psnr']:+.2f} dB" for kind in ("fewer", "spent", "tuned")]
@@ -146,10 +151,14 @@ def _budgets(record: dict[str, Any]) -> str:
             rows.append([name, f"`{row['format']}`", size, *cells])
     return f"""Change of the held-out PSNR in a tenth and a twentieth of the bytes of the whole splat's PLY. POP,
 `--preset quick`, which ends before the splat is as good as it gets: what is tuned can be better than the whole.
-{"; ".join(sources)}. "Fewer Gaussians alone" is what `--target-mb` did before, "harmonics and digits too" is
-`--fine-tune-steps 0`, the last column the default of {record["steps"]} steps (`benchmarks/budgets.py`).
+"Fewer Gaussians alone" is what `--target-mb` did before, "harmonics and digits too" is `--fine-tune-steps 0`, the last
+column the default of {record["steps"]} steps (`benchmarks/budgets.py`).
 
 {_table(head, rows)}
+
+The whole splats, and what they come to when they are tuned for the same steps:
+
+{_table(["capture", "photographs shrunk by", "Gaussians", "PSNR, dB", "tuned, dB"], sources)}
 
 Published figures of methods that compress, on another scale: the nine scenes of Mip-NeRF 360, their photographs shrunk
 by 4 (outdoors) and 2 (indoors), tens of thousands of steps on a GPU. Each is the authors', as the survey

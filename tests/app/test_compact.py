@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from pop_ref import harmonics
 from tests.app.clouds import many
 from tests.app.conftest import TRAIN, Pop
 from tests.app.damage import contents, says
+
+MEASURED = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "budgets.json"
 
 
 def tuner_of(result: Path, steps: int, degree: int = 3, bands: float = 0.3, own: bool = False) -> compact.Tuner:
@@ -177,3 +180,13 @@ def test_a_budget_that_cannot_be_is_one_line(
 ) -> None:
     says(pop("export", shared_result, "--out", tmp_path / "x.spz", *words), part)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_measured_budgets_lose_at_most_half_of_what_fewer_gaussians_alone_lose() -> None:
+    captures = json.loads(MEASURED.read_text(encoding="utf-8"))["captures"]
+    assert len(captures) >= 4
+    for found in captures.values():
+        for row in found["rows"]:
+            before, after = (found["psnr"] - row[kind]["psnr"] for kind in ("fewer", "tuned"))
+            assert after <= 0.5 * before
+            assert all(row[kind]["bytes"] <= row["bytes"] for kind in ("fewer", "spent", "tuned"))
