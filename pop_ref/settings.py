@@ -261,6 +261,10 @@ class Recipe(Objective, PopTerm):
         profile: of the renderer (A24).
         updates: when Adam moves what.
         adam_restarts: steps after which Adam begins anew, its moments zero: where all Gaussians are replaced.
+        depth_lambda: weight of the disparities' error at the sparse points that a photograph sees, times the scene's
+            scale; 0 leaves it out.
+        opacity_reg: weight of the mean opacity; 0 leaves it out.
+        scale_reg: weight of the mean scale, per world unit; 0 leaves it out.
     """
 
     l2_stop_iter: int | None = None
@@ -271,3 +275,6 @@ class Recipe(Objective, PopTerm):
     profile: Profile = PAPER
     updates: UpdateRules = UpdateRules()
     adam_restarts: tuple[int, ...] = ()
+    depth_lambda: float = 0.0
+    opacity_reg: float = 0.0
+    scale_reg: float = 0.0

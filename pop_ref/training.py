@@ -11,8 +11,9 @@ Label decided here: A27 (whose dominant counts).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import isqrt
+from typing import Any
 
 import numpy as np
 
@@ -41,6 +42,13 @@ from pop_ref.optimizer import adam_step, learning_rates, sh_degree_at, update_nu
 from pop_ref.polarization import importance_mask, opacity_entropy, opacity_entropy_vjp, pop_loss, pop_loss_vjp
 from pop_ref.recipes import RECIPES, Recipe
 from pop_ref.records import Camera, Gaussians, Render
+from pop_ref.regularizers import (
+    depth_samples,
+    mean_activation,
+    mean_activation_vjp,
+    sparse_depth_loss,
+    sparse_depth_loss_vjp,
+)
 from pop_ref.render import RenderGradients, render, render_vjp
 
 # the objective of every pixelwise loss, and its transpose
@@ -95,6 +103,7 @@ def train_step(
     scene_scale: float,
     normals: Callable[[int], np.ndarray],
     recipe: Recipe = RECIPES["POP"],
+    points: Float64[np.ndarray, "P 3"] | None = None,
 ) -> tuple[Training, float]:
     """Take one step with one view.
 
@@ -109,6 +118,7 @@ def train_step(
         scene_scale: world units.
         normals: given n, standard normal draws [2, n, 3], for instance `lambda n: rng.standard_normal((2, n, 3))`.
         recipe: what is minimised.
+        points: sparse points that the photograph sees, world, for `Recipe.depth_lambda`; None where none are known.
 
     Returns:
         The state after the step; the loss before it.
@@ -125,11 +135,21 @@ def train_step(
     rows, step = state.rows, state.step
     gaussians = gaussians_from_params(rows.params)
     degree = sh_degree_at(step, recipe.sh_interval, isqrt(gaussians.sh.shape[1]) - 1, recipe.updates.sh_start_iter)
-    view = render(gaussians, camera, sh_degree=degree, profile=recipe.profile)
+    deep = points is not None and recipe.depth_lambda != 0.0
+    mode = "RGB+ED" if deep else "RGB"
+    options: dict[str, Any] = {"sh_degree": degree, "profile": recipe.profile, "render_mode": mode}
+    view = render(gaussians, camera, **options)
     # the dominant counts of this very forward pass say who is important (A27)
-    loss, v_image, v_opacities = objective(view, gaussians, target, state, recipe)
-    gradients = render_vjp(gaussians, camera, v_image, sh_degree=degree, profile=recipe.profile)
+    colored = replace(view, image=view.image[..., :3])
+    loss, v_image, v_opacities = objective(colored, gaussians, target, state, recipe)
+    if points is not None and deep:
+        samples, weight = depth_samples(points, camera), recipe.depth_lambda * scene_scale
+        loss += weight * sparse_depth_loss(view.image[..., 3], *samples)
+        v_depth = sparse_depth_loss_vjp(view.image[..., 3], *samples, weight)
+        v_image = np.concatenate((v_image, v_depth[..., None]), axis=2)
+    gradients = render_vjp(gaussians, camera, v_image, **options)
     grads = params_vjp(rows.params, gradients, v_opacities)
+    loss += _add_regularizers(grads, gaussians, rows.params, recipe)
     if recipe.lambda_entropy != 0.0 and recipe.pop_start_iter <= step < recipe.pop_stop_iter:
         loss += recipe.lambda_entropy * opacity_entropy(rows.params["opacities"])
         grads["opacities"] += opacity_entropy_vjp(rows.params["opacities"], recipe.lambda_entropy)
@@ -140,6 +160,22 @@ def train_step(
     # rows that wait are not those of Gaussians that have been edited
     waiting = {} if densifies_at(step, recipe.density) else waiting
     return Training(rows, statistics, step + 1, waiting), loss
+
+
+def _add_regularizers(
+    grads: dict[str, np.ndarray], gaussians: Gaussians, params: Mapping[str, np.ndarray], recipe: Recipe
+) -> float:
+    """Add what the mean opacity and the mean scale pull, where they weigh; return what they cost."""
+    loss = 0.0
+    if recipe.opacity_reg != 0.0:
+        loss += recipe.opacity_reg * mean_activation(gaussians.opacities)
+        v_opacities = mean_activation_vjp(gaussians.opacities, recipe.opacity_reg)
+        grads["opacities"] += opacities_from_logits_vjp(params["opacities"], v_opacities)
+    if recipe.scale_reg != 0.0:
+        loss += recipe.scale_reg * mean_activation(gaussians.scales)
+        v_scales = mean_activation_vjp(gaussians.scales, recipe.scale_reg)
+        grads["scales"] += scales_from_log_scales_vjp(params["scales"], v_scales)
+    return loss
 
 
 def update(

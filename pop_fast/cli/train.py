@@ -23,11 +23,11 @@ from pop_fast.cli.finish import FinishOptions, finish
 from pop_fast.cli.limits import LimitOptions
 from pop_fast.cli.train_blocks import check_blocks, train_in_blocks
 from pop_fast.cli.train_checks import (
-    about_large,
     as_begun,
     check_early,
     check_output,
     chooses_for_itself,
+    notes_before,
     record_of,
     resumption,
     stopped,
@@ -39,7 +39,7 @@ from pop_fast.cli.view import LiveView, check_viewer
 from pop_fast.data.sfm_files import SfmOptions
 from pop_fast.errors import PopError
 from pop_fast.train.automatic import begun, check_minutes
-from pop_fast.train.choose import check_gpus, choose_backend, on_gpu
+from pop_fast.train.choose import check_gpus, choose_backend
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.presets import ALIASES, AUTOMATIC, LOSSES, METHODS, Given
 from pop_fast.train.steps import why_not_trained
@@ -232,7 +232,7 @@ def train_capture(
         The exit status.
     """
     from pop_fast.train.commands import COMMANDS_FILE, commands_text
-    from pop_fast.train.load_result import RECORD, record_text
+    from pop_fast.train.load_result import RECORD, read_record, record_text
 
     folder, start = Path(config.result_dir), time.perf_counter()
     capture = _open_in_turn(config, options, ranks)
@@ -248,20 +248,19 @@ def train_capture(
         print(f"cameras found in {duration(searching)}")
     for note in capture.notes:
         print(f"note: {printable(note)}")
-    config, told = with_length(config, capture, options) if chooses else (config, None)
+    config, told = with_length(config, capture, options) if chooses else (config, ())
     print(printable(f"{capture.name}: {capture.source}; {_plan(config)}"))
     print(chosen)
-    if told is not None:
-        print(told, flush=True)
-    large = about_large(capture, config)
-    if large is not None:
-        print(f"note: {large}")
-    if takes_hours(config):
-        print(f"note: {config.max_steps:,} steps take hours on a CPU; --preset quick takes 1,500")
+    for line in told:
+        print(line, flush=True)
+    for note in notes_before(capture, config):
+        print(f"note: {note}")
     how = {"resume": options.resume, "overwrite": options.overwrite, "loading_seconds": loading}
     how["sfm_seconds"] = searching
     commands = commands_text(folder if options.resume else None, ["pop", "train", *argv])
-    beside = {RECORD: record_text(record_of(capture, options)), COMMANDS_FILE: commands}
+    before = read_record(folder) if options.resume else None
+    record = record_of(capture, options, told[1:] if before is None else before.chosen)
+    beside = {RECORD: record_text(record), COMMANDS_FILE: commands}
     # absolute, so that the result can be looked at from another folder too
     absolute = replace(config, data=str(Path(config.data).absolute()))
     with ExitStack() as showing:
@@ -285,13 +284,6 @@ def _trained(training: TrainingRun, folder: Path, capture: Capture, options: Any
         return 0
     print(summary(stats), flush=True)
     return finish(folder, capture, options) or report(folder)
-
-
-def takes_hours(config: TrainConfig) -> bool:
-    """Tell whether a CPU is given the paper's schedule by nobody's word: neither a preset nor steps were said."""
-    given = config.given
-    said = given is None or given.steps_scaler is not None or "max_steps" in given.settings
-    return not said and config.preset == "paper" and not on_gpu(config)
 
 
 def report(folder: Path) -> int:

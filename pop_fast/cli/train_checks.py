@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -70,6 +70,22 @@ def about_large(capture: Capture, config: TrainConfig) -> str | None:
     )
 
 
+def notes_before(capture: Capture, config: TrainConfig) -> Iterator[str]:
+    """Say before the first step what large photographs, few of them and a long schedule cost."""
+    for note in (about_large(capture, config), automatic.about_held_out(capture, config)):
+        if note is not None:
+            yield note
+    if takes_hours(config):
+        yield f"{config.max_steps:,} steps take hours on a CPU; --preset quick takes 1,500"
+
+
+def takes_hours(config: TrainConfig) -> bool:
+    """Tell whether a CPU is given the paper's schedule by nobody's word: neither a preset nor steps were said."""
+    given = config.given
+    said = given is None or given.steps_scaler is not None or "max_steps" in given.settings
+    return not said and config.preset == "paper" and not on_gpu(config)
+
+
 def check_output(folder: Path, options: Any) -> None:
     """Refuse an output folder that cannot be written to before the minutes of loading, not after.
 
@@ -108,8 +124,14 @@ def as_begun(folder: Path, options: Any) -> Any:
     )
 
 
-def record_of(capture: Capture, options: Any) -> CaptureRecord:
-    """Return what capture.json says of a capture that was read as the options of `pop train` say."""
+def record_of(capture: Capture, options: Any, chosen: Sequence[str] = ()) -> CaptureRecord:
+    """Return what capture.json says of a capture that was read as the options of `pop train` say.
+
+    Args:
+        capture: as it was read.
+        options: those of `pop train`.
+        chosen: what the run chose for itself, in sentences.
+    """
     from pop_fast.train.load_result import CaptureRecord
 
     return CaptureRecord(
@@ -118,6 +140,7 @@ def record_of(capture: Capture, options: Any) -> CaptureRecord:
         masks=not options.ignore_masks,
         source=options.source,
         world_transform=capture.world_transform.tolist(),
+        chosen=list(chosen),
     )
 
 
@@ -168,7 +191,7 @@ def with_size(config: TrainConfig, options: Any) -> TrainConfig:
         return config
     before = automatic.begun(Path(config.result_dir)) if options.resume else None
     if before is not None:
-        return automatic.with_choice(config, before["scaler"], {"factor": before["factor"]})
+        return automatic.with_choice(config, before["scaler"], before["terms"])
     if "factor" in given.settings:
         return config
     minutes = automatic.MINUTES if options.minutes is None else options.minutes
@@ -192,17 +215,22 @@ def photographs_of(config: TrainConfig, options: Any) -> list[Path]:
     return [path for path in found if path is not None]
 
 
-def with_length(config: TrainConfig, capture: Capture, options: Any) -> tuple[TrainConfig, str | None]:
-    """Choose the schedule of a run that chooses for itself, by the speed of this machine; and say what is to come.
+def with_length(config: TrainConfig, capture: Capture, options: Any) -> tuple[TrainConfig, tuple[str, ...]]:
+    """Choose terms and schedule of a run that chooses for itself, by the photographs and the speed of this machine.
 
     Returns:
-        The settings, and a line; None where the run is gone on with and its schedule stands.
+        The settings, and lines that say what is to come, and why; none where the run is gone on with as it was begun.
     """
+    from pop_fast.data.photo_quality import exposure_stops
     from pop_fast.io.heartbeat import Heartbeat
+    from pop_fast.io.image_header import read_exif
 
     given = config.given
     if given is None or given.steps_scaler is not None:
-        return config, None
+        return config, ()
+    stops = exposure_stops([read_exif(path) for path in photographs_of(config, options)])
+    terms = automatic.choose_terms(capture, config, stops)
+    config = automatic.with_choice(config, None, {"factor": config.factor, **terms.settings})
     minutes = automatic.MINUTES if options.minutes is None else options.minutes
     with Heartbeat(config.progress) as beat:
         beat.say("timing a few steps of this capture on this machine")
@@ -211,6 +239,5 @@ def with_length(config: TrainConfig, capture: Capture, options: Any) -> tuple[Tr
     held_out = len(capture.test_views(config.test_every))
     choice = automatic.choose_length(config, speed, minutes, pixels, len(capture.views), held_out)
     largest = max(capture.views, key=lambda view: view.width * view.height)
-    terms = {"factor": config.factor, **automatic.choose_terms(capture)}
-    config = automatic.with_choice(config, choice.scaler, terms)
-    return config, automatic.line_of(choice, config, (largest.width, largest.height))
+    config = automatic.with_choice(config, choice.scaler, {"factor": config.factor, **terms.settings})
+    return config, (automatic.line_of(choice, config, (largest.width, largest.height)), *terms.why)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -42,14 +42,20 @@ class CompiledBackend(TorchBackend):
 
     def whole_step(self) -> WholeStep:
         """Return the step in C++."""
-        return WholeStep("native", _native_trainer, most=20, depends_on_threads=False)
+        step = WholeStep("native", _native_trainer, most=20, depends_on_threads=False)
+        return replace(step, only={name: known for name, known in step.only.items() if name not in _LEARNED})
+
+
+# settings of which the native step knows every value
+_LEARNED: Final = frozenset({"exposure", "depth_lambda", "opacity_reg", "scale_reg"})
 
 
 def _native_trainer(task: Task) -> MakeFused:
     """Make the native step, with what it needs of the photographs in the memory that the settings give it."""
     from pop_fast.compiled.native_step import NativeTrainer
 
-    return partial(NativeTrainer, cache_mb=task.config.target_cache_mb, stop=task.stop)
+    exposures = task.appearance if task.config.exposure else None
+    return partial(NativeTrainer, cache_mb=task.config.target_cache_mb, stop=task.stop, exposures=exposures)
 
 
 COMPILED: Final = CompiledBackend("compiled", "cpu", ("float32", "float64"), speed=1)

@@ -86,9 +86,12 @@ class StepGiven(ctypes.Structure):
         *_fields(_WHOLE, "near_inclusive", "centred", "inria_clamp", "square", "antialiased", "ceiling_passes"),
         *_fields(_REAL, "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas", "alpha_floor"),
         *_fields(_REAL, "floor_below", "alpha_ceiling", "stop"),
+        *_fields(_POINTER, "exposure", "samples"),
+        *_fields(_WHOLE, "n_samples"),
         *_fields(_REAL * 3, "background"),
         *_fields(_WHOLE, "degree", "border", "l1"),
         *_fields(_REAL, "pixel_weight", "ssim_weight", "lambda_pop", "lambda_entropy"),
+        *_fields(_REAL, "depth_weight", "opacity_reg", "scale_reg"),
         *_fields(_WHOLE, "dominance", "pop_window", "pop_visible", "blur_own_view"),
         *_fields(_REAL, "blur_pixels"),
         *_fields(_REAL * len(PARAMETERS), "lr"),
@@ -97,7 +100,7 @@ class StepGiven(ctypes.Structure):
         *_fields(_WHOLE * len(PARAMETERS), "updates"),
         *_fields(_POINTER, "sh_rest_sum"),
         *_fields(_POINTER, "grad_sum", "n_visible", "dominant_sum", "blurred"),
-        *_fields(_POINTER, "values", "seconds", "bad_row"),
+        *_fields(_POINTER, "v_exposure", "values", "seconds", "bad_row"),
     )
 
 
@@ -124,6 +127,26 @@ class TrainingView(Protocol):
         """Intrinsics, px. [1, 3, 3]"""
         ...
 
+    def depth_samples(self) -> tuple[Tensor, Tensor] | None:
+        """Return where it shows its sparse points, px [M, 2], and their disparities [M]; None without any."""
+        ...
+
+
+class Exposures(Protocol):
+    """What is learned of the photographs' exposures, as `pop_fast.train.appearance.Appearance`."""
+
+    def exposure(self, index: int) -> Tensor:
+        """Return the exposure of a view's photograph as it is kept. float32 [3, 4]"""
+        ...
+
+    def pull_exposure(self, index: int, gradient: Tensor) -> None:
+        """Take the gradient of a step with that view. [3, 4]"""
+        ...
+
+    def update(self, step: int) -> None:
+        """Move by the gradients of a step."""
+        ...
+
 
 @dataclass(frozen=True)
 class _Target:
@@ -136,9 +159,11 @@ class _Target:
     s_yy: Tensor
     kept: Tensor | None
     kept_windows: Tensor | None
+    # where its sparse points lie, px, and their disparities. [M, 3]
+    samples: Tensor | None
 
     @classmethod
-    def of(cls, view: TrainingView, padding: Padding) -> _Target:
+    def of(cls, view: TrainingView, padding: Padding, with_depth: bool) -> _Target:
         height, width = view.photo.shape[:2]
         check_size(view.photo, padding)
         border = border_of(padding)
@@ -151,6 +176,7 @@ class _Target:
             {"photograph": view.photo, "target": target, "mu_y": mu_y, "s_yy": s_yy},
         )
         mask = view.mask
+        found = view.depth_samples() if with_depth else None
         return cls(
             view.viewmat.reshape(4, 4).float().contiguous(),
             view.K.reshape(3, 3).float().contiguous(),
@@ -159,6 +185,7 @@ class _Target:
             s_yy,
             None if mask is None else mask.contiguous(),
             None if mask is None else kept_windows(mask, padding, 1, torch.float32).contiguous(),
+            None if found is None else torch.cat((found[0], found[1][:, None]), 1).float().contiguous(),
         )
 
     @property
@@ -180,6 +207,7 @@ class NativeTrainer:
         threads: None takes torch's number.
         cache_mb: memory for what is made of photographs; the others' is made anew at every visit, to the same bits.
         stop: whether somebody has asked for an end; a step that is being taken is then left, and changes nothing.
+        exposures: of the photographs, which learn with every step; None where none are learned.
 
     Attributes:
         step: steps taken.
@@ -201,10 +229,12 @@ class NativeTrainer:
         threads: int | None = None,
         cache_mb: float = 1024,
         stop: StopRequest | None = None,
+        exposures: Exposures | None = None,
     ) -> None:
         self.settings, self.step = settings, step
         self._stop, self._alone = stop or StopRequest(), stop is None
         self._padding: Padding = settings.padding
+        self._exposures = exposures
         self._views, self._order = views, list(order)
         self._targets: dict[int, _Target] = {}
         self._cache_left = cache_mb * 2**20
@@ -216,6 +246,7 @@ class NativeTrainer:
         weakref.finalize(self, self._functions.close, self._stepper)
         self._given = StepGiven()
         self._seconds = torch.zeros(len(PARTS), dtype=torch.float64)
+        self._v_exposure = torch.zeros((3, 4), dtype=torch.float64)
         self._bad_row = torch.full((1,), -1, dtype=torch.int64)
         self._history: dict[int, StepStats] = {}
         self._describe()
@@ -272,8 +303,10 @@ class NativeTrainer:
         """
         self._history = {}
         self._set_phase(phase)
+        # exposures move between two steps
+        longest = LONGEST if self._exposures is None else 1
         while self.step < until and not self._asked:
-            self._take(min(until - self.step, LONGEST))
+            self._take(min(until - self.step, longest))
 
     @property
     def _asked(self) -> bool:
@@ -302,9 +335,12 @@ class NativeTrainer:
         given.pop_visible, given.pop_window = settings.pop_over == "visible", settings.pop_views == "window"
         given.blur_own_view = settings.blur_window == "own_view"
         (given.beta1, given.beta2), given.eps = settings.betas, settings.eps
+        given.depth_weight = settings.depth_weight
+        given.opacity_reg, given.scale_reg = settings.opacity_reg, settings.scale_reg
         given.most_entries = MOST_ENTRIES
         given.seconds = self._seconds.data_ptr()
         given.bad_row = self._bad_row.data_ptr()
+        given.v_exposure = self._v_exposure.data_ptr()
 
     def _set_phase(self, phase: Phase) -> None:
         given, settings, found = self._given, self.settings, self.statistics
@@ -338,6 +374,9 @@ class NativeTrainer:
             raise MemoryError("the native training step ran out of memory")
         for k in range(taken):
             self._history[self.step + k] = StepStats(*values[k].tolist())
+        if self._exposures is not None and taken > 0:
+            self._exposures.pull_exposure(self._order[self.step], self._v_exposure)
+            self._exposures.update(self.step)
         self.step += taken
         if int(self._bad_row) >= 0:
             raise ValueError(f"step {self.step}: Gaussian {int(self._bad_row)} has a value that is not finite")
@@ -356,6 +395,11 @@ class NativeTrainer:
         given.kept_windows = None if view.kept_windows is None else view.kept_windows.data_ptr()
         given.n_kept = given.width * given.height if view.kept is None else int(view.kept.sum())
         given.n_windows = view.mu_y[0].numel() if view.kept_windows is None else int(view.kept_windows.sum())
+        given.samples = None if view.samples is None else view.samples.data_ptr()
+        given.n_samples = 0 if view.samples is None else len(view.samples)
+        if self._exposures is not None:
+            # a row of what the exposures are kept in
+            given.exposure = self._exposures.exposure(self._order[step]).data_ptr()
         given.blur_pixels = settings.blur_pixels(given.n_kept)
         rates, numbers, _ = settings.updates
         given.lr = (_REAL * len(PARAMETERS))(*rates[step].tolist())
@@ -364,7 +408,7 @@ class NativeTrainer:
     def _target(self, index: int) -> _Target:
         if index in self._targets:
             return self._targets[index]
-        made = self._called(_Target.of, self._views[index], self._padding)
+        made = self._called(_Target.of, self._views[index], self._padding, self.settings.depth_weight != 0.0)
         if made.bytes <= self._cache_left:
             self._cache_left -= made.bytes
             self._targets[index] = made

@@ -26,7 +26,7 @@ struct RowBlock {
   // backward
   Columns<2> v_means2d;
   Columns<3> v_conics, v_means, v_scales;
-  Columns<1> v_effective, v_opacities;
+  Columns<1> v_depths, v_effective, v_opacities;
   Columns<4> v_quats;
   Columns<MAX_BASIS> v_basis;
 
@@ -101,7 +101,7 @@ template <int DEGREE, bool ANTIALIASED>
     const Vec3<float> dir = view_dir(g.mean, camera);
     const Vec3<float> v_dir = basis_of_dir_vjp(dir, unit_dir(dir), DEGREE, v_basis);
     const SplatCotangents<float> v_splat = {{rows.v_means2d[0][l], rows.v_means2d[1][l]},
-                                            0.0f,
+                                            rows.v_depths[0][l],
                                             {rows.v_conics[0][l], rows.v_conics[1][l], rows.v_conics[2][l]},
                                             rows.v_effective[0][l],
                                             0.0f};

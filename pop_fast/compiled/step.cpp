@@ -103,7 +103,7 @@ void Stepper::begin() {
 
   blend = {};
   blend.n = g.n;
-  blend.channels = 3;
+  blend.channels = g.samples ? 4 : 3;
   blend.tiles_x = parts_of(g.width, STEP_TILE);
   blend.tiles_y = parts_of(g.height, STEP_TILE);
   blend.tile_size = STEP_TILE;
@@ -125,12 +125,15 @@ void Stepper::begin() {
   blend.first_chunks = first_chunks.data();
   blend.n_reached = n_reached.data();
   // the picture gives way to its difference from the photograph, tile by tile
-  blend.image = difference.get(3 * n_pixels);
+  blend.image = difference.get(blend.channels * n_pixels);
   blend.kept = g.kept;
   const bool lit_from_behind = g.background[0] != 0.0 || g.background[1] != 0.0 || g.background[2] != 0.0;
-  blend.alphas = lit_from_behind ? alphas.get(n_pixels) : nullptr;
-  blend.v_image = v_image.get(3 * n_pixels);
-  blend.v_alphas = lit_from_behind ? v_alphas.get(n_pixels) : nullptr;
+  // depth is held against what covers a pixel
+  const bool covered = lit_from_behind || g.samples;
+  blend.alphas = covered ? alphas.get(n_pixels) : nullptr;
+  blend.v_image = v_image.get(blend.channels * n_pixels);
+  blend.v_alphas = covered ? v_alphas.get(n_pixels) : nullptr;
+  if (g.exposure) unexposed.get(3 * n_pixels);
   seen.get(g.n);
   counts.get(g.n);
   if (g.dominance) blend.dominant_counts = counts.get(g.n);
@@ -141,12 +144,14 @@ void Stepper::begin() {
 
 void Stepper::make_workers() {
   const int64_t stride = padded_line<float>(given->width + Ssim<float>::REACH);
-  if (!workers.empty() && worker_stride == stride && worker_rest == given->n_rest) return;
+  const bool fit = worker_stride == stride && worker_rest == given->n_rest && worker_channels == blend.channels;
+  if (!workers.empty() && fit) return;
   workers.clear();
   for (int64_t k = 0; k < pool.size(); k++)
-    workers.push_back(std::make_unique<Worker>(pixels, stride, given->n_rest));
+    workers.push_back(std::make_unique<Worker>(pixels, blend.channels, stride, given->n_rest));
   worker_stride = stride;
   worker_rest = given->n_rest;
+  worker_channels = blend.channels;
 }
 
 // ---- what the step was like
@@ -165,14 +170,21 @@ void Stepper::finish() {
   g.values[SQUARE] = pixels_summed[2] / n_values;
   g.values[POP] = g.lambda_pop * (sides[0] / double(std::max<int64_t>(n_important, 1)) +
                                   sides[1] / double(std::max<int64_t>(n_others, 1))) +
-                  g.lambda_entropy * sides[2] / double(std::max<int64_t>(g.n, 1));
+                  g.lambda_entropy * sides[2] / double(std::max<int64_t>(g.n, 1)) +
+                  g.opacity_reg * sides[3] / double(std::max<int64_t>(g.n, 1)) +
+                  g.scale_reg * sides[4] / double(std::max<int64_t>(3 * g.n, 1)) +
+                  g.depth_weight * depth_sum / double(std::max<int64_t>(g.n_samples, 1));
+  for (size_t k = 0; g.exposure && k < EXPOSURE; k++) {
+    g.v_exposure[k] = 0.0;
+    for (size_t part = 0; part < exposure_sums.size(); part += EXPOSURE) g.v_exposure[k] += exposure_sums[part + k];
+  }
   ended = true;
 }
 
 int64_t Stepper::bytes() const {
   return seen.bytes() + splats.bytes() + counts.bytes() + keys.bytes() + sorted.bytes() + ids.bytes() +
          slots.bytes() + transmittances.bytes() + rows.bytes() + reached.bytes() + difference.bytes() + alphas.bytes() +
-         partials.bytes() + v_image.bytes() + v_alphas.bytes();
+         unexposed.bytes() + partials.bytes() + v_image.bytes() + v_alphas.bytes();
 }
 
 }  // namespace pop

@@ -5,7 +5,7 @@
 //     list            depth order; each tile's list, front to back
 //     blend           the picture tile by tile, who dominates it, its difference from the photograph
 //     loss            SSIM and its derivatives by the windows' moments
-//     image_gradient  the gradient of the loss with respect to the picture
+//     image_gradient  the gradient of the loss with respect to the picture, and to its exposure and depth
 //     transpose       tile by tile back to the entries of the lists
 //     update          entries added up, back to raw parameters, the POP term, statistics of density control, Adam
 // The arithmetic of one Gaussian is the one that the CUDA kernels run. Every sum is over parts that do not depend on the
@@ -46,10 +46,14 @@ struct StepGiven {
   int64_t near_inclusive, centred, inria_clamp, square, antialiased, ceiling_passes;  // see profile.cuh
   double near_plane, far_plane, eps2d, frustum_margin, extent_sigmas, alpha_floor;
   double floor_below, alpha_ceiling, stop;        // as in `Blend`
+  const float *exposure;                          // of the photograph, null: none is learned. [3, 4]
+  const float *samples;                           // sparse points it sees: place, px, disparity; null: no depth. [M, 3]
+  int64_t n_samples;
   double background[3];
   int64_t degree, border, l1;                     // active band; black pixels around the image for SSIM; L1 instead of L2
   double pixel_weight, ssim_weight;
   double lambda_pop, lambda_entropy;              // each 0 where its term is off
+  double depth_weight, opacity_reg, scale_reg;    // likewise
   int64_t dominance, pop_window, pop_visible, blur_own_view;  // dominance: counts are made
   double blur_pixels;                             // a view's count above it blurs
   double lr[GROUPS], beta1, beta2, eps;
@@ -59,6 +63,7 @@ struct StepGiven {
   float *grad_sum;                                // statistics of density control, each null where not asked for. [N]
   int32_t *n_visible, *dominant_sum;
   uint8_t *blurred;
+  double *v_exposure;                             // where an exposure is learned. [3, 4]
   double *values;                                 // by `StepValue`
   double *seconds;                                // by `StepPart`, added to
   int64_t *bad_row;                               // first Gaussian that is not finite, or -1
@@ -72,8 +77,9 @@ struct Seen {
   int32_t n, first;                            // entries, -1 where it is culled; the first one's slot in its part
 };
 
-constexpr int PRIOR_SUMS = 3;       // of a part: opacities of both sides of the POP term, entropies
-constexpr int COLUMNS = 9;          // of an entry's row: six moments, colours
+constexpr int PRIOR_SUMS = 5;       // of a part: opacities of both sides of the POP term, entropies, opacities, scales
+constexpr int MOST_COLUMNS = 10;    // of an entry's row: six moments, colours, depth
+constexpr int EXPOSURE = 12;        // numbers of an exposure
 constexpr int64_t ROWS = 256;       // Gaussians in a part
 constexpr int64_t BUCKETS = 512;    // of depths
 constexpr int64_t SOME_TILES = 64;  // whose entries are added up at a time
@@ -91,8 +97,8 @@ struct Worker {
   Blur<float> blur;
   RowBlock block = {};
   std::vector<float> gradients;  // of ROW_BLOCK Gaussians, parameter by parameter
-  Worker(const Pixels<float> &pixels, int64_t stride, int64_t n_rest)
-      : canvas(pixels, 3), transpose(pixels, 3), products(stride), blur(stride),
+  Worker(const Pixels<float> &pixels, int64_t channels, int64_t stride, int64_t n_rest)
+      : canvas(pixels, channels), transpose(pixels, channels), products(stride), blur(stride),
         gradients(size_t(ROW_BLOCK * (SHORT + 3 * n_rest))) {}
 };
 
@@ -157,7 +163,7 @@ private:
   Pool pool;
   Pixels<float> pixels;
   std::vector<std::unique_ptr<Worker>> workers;
-  int64_t worker_stride = 0, worker_rest = -1;
+  int64_t worker_stride = 0, worker_rest = -1, worker_channels = 0;
   // of Gaussians
   Buffer<Seen> seen;
   Buffer<Splat> splats;
@@ -178,8 +184,9 @@ private:
   Buffer<float> transmittances, rows;
   Buffer<uint16_t> reached;
   // of pixels
-  Buffer<float> difference, alphas, partials, v_image, v_alphas;
-  std::vector<double> tile_sums, window_sums, pop_sums;
+  Buffer<float> difference, alphas, unexposed, partials, v_image, v_alphas;
+  std::vector<double> tile_sums, window_sums, exposure_sums, pop_sums;
+  double depth_sum = 0.0;
   std::vector<int64_t> sides;  // important and others, of each SIDE_PARTS parts
 
   // of the step that is taken
@@ -221,11 +228,14 @@ private:
   Work add_up_parts();
   Work place_entries();
   Work blend_tiles();
+  void expose(int64_t tile);
   void differ(int64_t tile);
   Ssim<float> ssim_of(int channel);
   Work loss();
   Work image_gradient();
   void image_gradient_rows(Worker &own, int64_t first, int64_t last);
+  void unexpose_gradient(int64_t begin, int64_t end, double *sums);
+  void compare_depth();
   Work transpose_tiles();
   Work count_sides();
   int side_of(int64_t i) const;

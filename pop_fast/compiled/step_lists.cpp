@@ -106,6 +106,7 @@ template <int DEGREE> [[gnu::flatten]] bool Stepper::project_splat(const RowBloc
   take_column(block.basis, l, basis);
   put(color, color_from_basis(harmonics_of(*given, i), basis, (DEGREE + 1) * (DEGREE + 1)));
   blend.splats[i] = splat_of(mean2d, conic, splat.opacity, color, 3);
+  blend.splats[i].rgb[3] = splat.depth;
   const TileGrid grid = grid_of(int(given->width), int(given->height), STEP_TILE, STEP_TILE);
   const TileRect rect = tile_rect(splat.mean2d, splat.radii, grid, profile);
   to = {mean2d[0], mean2d[1], conic[0], conic[1], conic[2], splat.opacity, 0.0f, splat.depth,
@@ -269,7 +270,7 @@ Work Stepper::place_entries() {
   blend.slots = to_slots;
   blend.transmittances = transmittances.get(n_chunks * pixels.padded());
   blend.reached = reached.get(n_chunks * pixels.strips);
-  blend.rows = rows.get(total * COLUMNS);
+  blend.rows = rows.get(total * blend.columns());
   return {n_visible, part, [=](int, int64_t first, int64_t last) {
             int64_t *const next = &starts[size_t(first / part * n_tiles)];
             for (int64_t tile = 0; tile < n_tiles; tile++) next[tile] += offsets[size_t(tile)];

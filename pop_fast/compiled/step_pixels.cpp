@@ -10,13 +10,37 @@ namespace pop {
 // ---- blend: the picture, and its difference from the photograph
 
 Work Stepper::blend_tiles() {
-  const auto one_tile = blend.dominance() ? blend_tile<float, 3, true, true> : blend_tile<float, 3, true, false>;
+  const auto colored = blend.dominance() ? blend_tile<float, 3, true, true> : blend_tile<float, 3, true, false>;
+  const auto deep = blend.dominance() ? blend_tile<float, 4, true, true> : blend_tile<float, 4, true, false>;
+  const auto one_tile = given->samples ? deep : colored;
   return {blend.tiles(), 2, [=](int thread, int64_t first, int64_t last) {
             for (int64_t tile = first; tile < last; tile++) {
               one_tile(blend, pixels, tile, workers[size_t(thread)]->canvas);
+              if (given->exposure) expose(tile);
               differ(tile);
             }
           }};
+}
+
+// Lay a tile of the picture over the background and map its colours, y = A c + b; what they were is kept.
+void Stepper::expose(int64_t tile) {
+  const StepGiven &g = *given;
+  const int64_t stride = blend.channel_stride;
+  const Place<float> place(blend, tile);
+  place.each_row([&](int64_t, int64_t at) {
+    for (int64_t x = at; x < at + place.columns(); x++) {
+      float color[3];
+      for (int c = 0; c < 3; c++) {
+        color[c] = blend.image[c * stride + x];
+        if (blend.alphas) color[c] += (1.0f - blend.alphas[x]) * float(g.background[c]);
+        unexposed.get(3 * stride)[c * stride + x] = color[c];
+      }
+      for (int c = 0; c < 3; c++) {
+        const float *const row = g.exposure + 4 * c;
+        blend.image[c * stride + x] = row[0] * color[0] + row[1] * color[1] + row[2] * color[2] + row[3];
+      }
+    }
+  });
 }
 
 // Turn a tile of the picture into its difference from the photograph, 0 where the mask leaves a pixel out, and sum up
@@ -27,7 +51,7 @@ void Stepper::differ(int64_t tile) {
   const Place<float> place(blend, tile);
   float absolute[STEP_TILE] = {}, squared[STEP_TILE] = {}, clamped_squared[STEP_TILE] = {};
   for (int channel = 0; channel < 3; channel++) {
-    const float behind = float(g.background[channel]);
+    const float behind = g.exposure ? 0.0f : float(g.background[channel]);
     float *const plane = blend.image + channel * blend.channel_stride;
     const float *const photograph = g.target + channel * blend.channel_stride;
     place.each_row([&](int64_t, int64_t at) {
@@ -90,6 +114,7 @@ Work Stepper::loss() {
 }
 
 Work Stepper::image_gradient() {
+  exposure_sums.assign(size_t(EXPOSURE * parts_of(given->height, WINDOW_ROWS)), 0.0);
   return {given->height, WINDOW_ROWS,
           [this](int thread, int64_t first, int64_t last) { image_gradient_rows(*workers[size_t(thread)], first, last); }};
 }
@@ -100,28 +125,84 @@ void Stepper::image_gradient_rows(Worker &own, int64_t first, int64_t last) {
   const float unit = float(g.pixel_weight / double(3 * std::max<int64_t>(g.n_kept, 1))), twice = 2.0f * unit;
   float *const v_alpha = blend.v_alphas ? v_alphas.get(n_pixels) : nullptr;
   if (v_alpha) std::fill(v_alpha + begin, v_alpha + end, 0.0f);
+  float *const v_depth = g.samples ? v_image.get(4 * n_pixels) + 3 * n_pixels : nullptr;
+  if (v_depth) std::fill(v_depth + begin, v_depth + end, 0.0f);
   for (int channel = 0; channel < 3; channel++) {
     const Ssim<float> &of = ssim[channel];
     pop::gather_rows(of, own.blur, first, last);
-    const float behind = float(g.background[channel]), *const d = of.difference;
+    const float *const d = of.difference;
     for (int64_t at = begin; at < end; at++) {
       const float slope = g.l1 ? (d[at] > 0.0f ? unit : d[at] < 0.0f ? -unit : 0.0f) : twice * d[at];
       of.gradient[at] = !g.kept || g.kept[at] ? of.gradient[at] + slope : 0.0f;
     }
-    for (int64_t at = begin; v_alpha && at < end; at++) v_alpha[at] -= behind * of.gradient[at];
+  }
+  if (g.exposure) unexpose_gradient(begin, end, &exposure_sums[size_t(EXPOSURE * (first / WINDOW_ROWS))]);
+  for (int channel = 0; v_alpha && channel < 3; channel++) {
+    const float behind = float(g.background[channel]), *const v = ssim[channel].gradient;
+    for (int64_t at = begin; at < end; at++) v_alpha[at] -= behind * v[at];
+  }
+}
+
+// Pull the gradient of some pixels' exposed colours back: v_A += v c^T, v_b += v, and v gives way to A^T v.
+void Stepper::unexpose_gradient(int64_t begin, int64_t end, double *sums) {
+  const float *const e = given->exposure, *const was = unexposed.get(0);
+  const int64_t n_pixels = blend.channel_stride;
+  for (int64_t at = begin; at < end; at++) {
+    float v[3];
+    for (int c = 0; c < 3; c++) v[c] = ssim[c].gradient[at];
+    for (int c = 0; c < 3; c++) {
+      for (int k = 0; k < 3; k++) sums[4 * c + k] += double(v[c] * was[k * n_pixels + at]);
+      sums[4 * c + 3] += double(v[c]);
+      ssim[c].gradient[at] = e[c] * v[0] + e[4 + c] * v[1] + e[8 + c] * v[2];
+    }
+  }
+}
+
+// Hold the expected depth against the disparities of the sparse points, and give their pixels its gradient.
+void Stepper::compare_depth() {
+  const StepGiven &g = *given;
+  const int64_t n_pixels = g.width * g.height;
+  const float *const accumulated = blend.image + 3 * n_pixels, *const covered = blend.alphas;
+  float *const v_depth = v_image.get(4 * n_pixels) + 3 * n_pixels, *const v_alpha = v_alphas.get(n_pixels);
+  const double smallest = 1e-10, each = g.depth_weight / double(std::max<int64_t>(g.n_samples, 1));
+  for (int64_t j = 0; j < g.n_samples; j++) {
+    const float *const sample = g.samples + 3 * j;
+    const double u = std::clamp(double(sample[0]) - 0.5, 0.0, double(g.width - 1));
+    const double v = std::clamp(double(sample[1]) - 0.5, 0.0, double(g.height - 1));
+    const int64_t left = int64_t(u), top = int64_t(v);
+    const int64_t right = std::min(left + 1, g.width - 1), bottom = std::min(top + 1, g.height - 1);
+    const double a = u - double(left), b = v - double(top);
+    const int64_t around[4] = {top * g.width + left, top * g.width + right, bottom * g.width + left, bottom * g.width + right};
+    const double weights[4] = {(1.0 - a) * (1.0 - b), a * (1.0 - b), (1.0 - a) * b, a * b};
+    double sampled = 0.0;
+    for (int k = 0; k < 4; k++)
+      sampled += weights[k] * double(accumulated[around[k]]) / std::max(double(covered[around[k]]), smallest);
+    // where nothing is rendered the disparity is 0, and a constant
+    const double disparity = sampled > 0.0 ? 1.0 / sampled : 0.0, apart = disparity - double(sample[2]);
+    depth_sum += std::fabs(apart);
+    const double slope = (apart > 0.0 ? -each : apart < 0.0 ? each : 0.0) * disparity * disparity;
+    for (int k = 0; k < 4; k++) {
+      const int64_t at = around[k];
+      const double opacity = covered[at], divisor = std::max(opacity, smallest), pulled = slope * weights[k] / divisor;
+      v_depth[at] += float(pulled);
+      if (opacity >= smallest) v_alpha[at] -= float(pulled * double(accumulated[at]) / divisor);
+    }
   }
 }
 
 // ---- transpose: back to the entries
 
 Work Stepper::transpose_tiles() {
-  const auto one_tile = transpose_tile<float, 3, true>;
+  depth_sum = 0.0;
+  if (given->samples) compare_depth();
+  const auto one_tile = given->samples ? transpose_tile<float, 4, true> : transpose_tile<float, 3, true>;
+  const int64_t columns = blend.columns();
   return {blend.tiles(), 2, [=](int thread, int64_t first, int64_t last) {
             for (int64_t tile = first; tile < last; tile++) {
               one_tile(blend, pixels, tile, workers[size_t(thread)]->transpose);
               // what lies behind the last pixel's stop passes nothing back
               for (int64_t entry = offsets[size_t(tile)] + n_reached[size_t(tile)]; entry < offsets[size_t(tile) + 1]; entry++)
-                std::fill_n(blend.rows + COLUMNS * blend.slots[entry], COLUMNS, 0.0f);
+                std::fill_n(blend.rows + columns * blend.slots[entry], columns, 0.0f);
             }
           }};
 }

@@ -76,6 +76,19 @@ template <int DEGREE> void Stepper::update_block(Worker &own, int64_t first, int
       pop_sum[2] += opacity_entropy_one(logit);
       v_logits[i - first] += opacity_entropy_vjp_one(logit, float(g.lambda_entropy / double(g.n)));
     }
+    if (g.opacity_reg != 0.0) {
+      const float logit = g.params[OPACITIES][i];
+      pop_sum[3] += opacity_from_logit(logit);
+      v_logits[i - first] += opacity_from_logit_vjp(logit, float(g.opacity_reg / double(g.n)));
+    }
+    if (g.scale_reg != 0.0) {
+      const Vec3<float> scale = scale_from_log_scale(vec3_of(g.params[SCALES] + 3 * i));
+      const float each = float(g.scale_reg / double(3 * g.n)), of_axis[3] = {scale.x, scale.y, scale.z};
+      for (int k = 0; k < 3; k++) {
+        pop_sum[4] += of_axis[k];
+        gradients_of(own, SCALES)[3 * (i - first) + k] += each * of_axis[k];
+      }
+    }
     if (blend.dominant_counts) {
       const int32_t count = blend.dominant_counts[i];
       if (g.lambda_pop != 0.0) {
@@ -137,15 +150,20 @@ template <int DEGREE> void Stepper::transpose_block(Worker &own, int64_t first, 
 template <int DEGREE> [[gnu::flatten]] Vec3<float> Stepper::transpose_entries(int64_t i, int64_t l, RowBlock &block) {
   const StepGiven &g = *given;
   const Seen &of = seen[i];
-  double sums[COLUMNS] = {};
-  const float *entry = blend.rows + COLUMNS * (part_slots[size_t(i / ROWS)] + of.first);
-  for (int32_t k = 0; k < of.n; k++, entry += COLUMNS)
-    for (int j = 0; j < COLUMNS; j++) sums[j] += double(entry[j]);
+  double sums[MOST_COLUMNS] = {};
+  const auto add_up = [&](auto columns) {
+    const float *entry = blend.rows + columns * (part_slots[size_t(i / ROWS)] + of.first);
+    for (int32_t k = 0; k < of.n; k++, entry += columns)
+      for (int j = 0; j < columns; j++) sums[j] += double(entry[j]);
+  };
+  if (g.samples) add_up(std::integral_constant<int, MOST_COLUMNS>());
+  else add_up(std::integral_constant<int, MOST_COLUMNS - 1>());
   const double a = of.a, b = of.b, c = of.c;
   const Vec2<float> v_mean2d = {float(-(a * sums[1] + b * sums[2])), float(-(b * sums[1] + c * sums[2]))};
   block.v_means2d[0][l] = v_mean2d.x;
   block.v_means2d[1][l] = v_mean2d.y;
   put_column({float(-0.5 * sums[3]), float(-sums[4]), float(-0.5 * sums[5])}, l, block.v_conics);
+  block.v_depths[0][l] = float(sums[9]);
   block.v_effective[0][l] = of.opacity == 0.0f ? 0.0f : float(sums[0] / double(of.opacity));
   if (g.grad_sum) {
     g.grad_sum[i] += densification_gradient(v_mean2d, int(g.width), int(g.height));

@@ -20,7 +20,7 @@ constexpr int CHUNK = 16;  // list entries at a time, after which T of every pix
 // What blending needs of a splat, once a render: log2(alpha) = log2_opacity - (a dx^2 + c dy^2) / 2 - b dx dy.
 struct alignas(64) Splat {
   double x, y, a, b, c, log2_opacity;
-  float rgb[4];  // of three channels of floats, which lie in the same line of the cache so
+  float rgb[4];  // of three channels of floats, which lie in the same line of the cache so; the step's fourth is depth
 };
 
 template <class Real>
@@ -35,7 +35,7 @@ inline Splat splat_of(const Real *mean2d, const Real *conic, Real opacity, const
 
 // Everything of one call; eight bytes each, in the order of `library.py`. Null where a result is not asked for.
 template <class Real> struct Blend {
-  const Real *means2d, *conics, *opacities, *colors;  // [N, 2], [N, 3], [N], [N, D]
+  const Real *means2d, *conics, *opacities, *colors;  // [N, 2], [N, 3], [N], [N, D]; colours null: all in `splats`
   const int64_t *ids, *offsets;                       // tile lists: splat of every entry, [tiles + 1]
   const int64_t *first_chunks;                        // chunks of all tiles before this one. [tiles]
   int64_t n, channels, tiles_x, tiles_y, tile_size, width, height, threads;
@@ -120,7 +120,7 @@ template <class Real> struct Place {
 template <class Real> struct Entries {
   int count;
   alignas(64) Real f[6][CHUNK], u[CHUNK], v[CHUNK];  // u, v: splat's centre from the tile's
-  alignas(64) Real rgb[CHUNK][4];                    // where there are three channels
+  alignas(64) Real rgb[CHUNK][4];                    // where there are three channels, or the step's four
   const Real *color[CHUNK];
 
   // n entries from `first` on; those from `next` on are asked for while these are worked on
@@ -139,7 +139,7 @@ template <class Real> struct Entries {
       b[k] = s.b;
       c[k] = s.c;
       top[k] = s.log2_opacity;
-      if (blend.channels != 3) {
+      if (blend.colors && blend.channels != 3) {
         color[k] = blend.colors + id * blend.channels;
       } else if (sizeof(Real) == 4) {
         std::memcpy(rgb[k], s.rgb, sizeof s.rgb);

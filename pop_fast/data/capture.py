@@ -35,6 +35,8 @@ class View:
         split: the capture's own assignment, or None where every n-th file is held out.
         alpha: opacity of a photograph with transparency, which `image` has laid over the background, of 255; None
             where the file has none. uint8 [H, W]
+        seen: rows of the capture's points that this photograph sees, by the tracks of the search for cameras; None
+            where there are no tracks. int32 [M]
         was_read: False where only the camera was asked for; `image` then has the right size and no content.
     """
 
@@ -46,6 +48,7 @@ class View:
     split: Split | None = None
     alpha: np.ndarray | None = None
     was_read: bool = True
+    seen: np.ndarray | None = None
 
     @property
     def width(self) -> int:
@@ -185,6 +188,7 @@ class PosedImage:
         split: the list's own assignment, if any.
         turns: quarter turns clockwise that make the photograph upright; `camera` and `viewmat` are those of its pixels
             as they are stored.
+        seen: rows of the sparse points that it sees; None where that is not known. int32 [M]
     """
 
     name: str
@@ -196,6 +200,7 @@ class PosedImage:
     mask: Path | None = None
     split: Split | None = None
     turns: int = 0
+    seen: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)

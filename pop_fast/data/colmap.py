@@ -100,8 +100,9 @@ def read_model(model: Path) -> tuple[list[PosedImage], SparsePoints]:
     for camera in found.cameras.values():
         _check_camera(model / f"cameras{suffix}", camera)
     shots: dict[str, PosedImage] = {}
+    seen = _seen_points(found)
     for image in found.images:
-        shot = _shot(model / f"images{suffix}", image, found.cameras)
+        shot = _shot(model / f"images{suffix}", image, found.cameras, seen)
         if shot.name in shots:
             raise CaptureError(f"{model}/images{suffix}: {image.where}: its name is listed twice; remove one of them")
         shots[shot.name] = shot
@@ -123,7 +124,7 @@ def _check_camera(path: Path, camera: Any) -> None:
         raise CaptureError(f"{where}: has focal length {focal.min()}; it must be > 0; {_FIX}")
 
 
-def _shot(path: Path, image: ImageRecord, cameras: dict[int, Any]) -> PosedImage:
+def _shot(path: Path, image: ImageRecord, cameras: dict[int, Any], seen: dict[int, np.ndarray] | None) -> PosedImage:
     where = f"{path}: {image.where}"
     if image.camera_id not in cameras:
         raise CaptureError(f"{where}: its CAMERA_ID {image.camera_id} is not in cameras{path.suffix}; {_FIX}")
@@ -132,7 +133,21 @@ def _shot(path: Path, image: ImageRecord, cameras: dict[int, Any]) -> PosedImage
     except ValueError as error:
         raise CaptureError(f"{where}: {error}; {_FIX}") from error
     name = image.name.replace("\\", "/")
-    return PosedImage(name=name, folder="images", file=name, camera=cameras[image.camera_id], viewmat=viewmat)
+    points = None if seen is None else seen.get(image.image_id, np.zeros(0, np.int32))
+    return PosedImage(name, "images", name, cameras[image.camera_id], viewmat, seen=points)
+
+
+def _seen_points(model: Model) -> dict[int, np.ndarray] | None:
+    """Turn tracks round: which points, by their rows in order of their ids, each image sees; None without any track."""
+    lengths = np.array([len(track) for track in model.tracks], np.int64)
+    if not lengths.sum():
+        return None
+    rows = np.empty(len(lengths), np.int32)
+    rows[np.argsort(model.point_ids, kind="stable")] = np.arange(len(lengths), dtype=np.int32)
+    images, points = np.concatenate(model.tracks).astype(np.int64), np.repeat(rows, lengths)
+    order = np.lexsort((points, images))
+    ids, first = np.unique(images[order], return_index=True)
+    return {int(image): np.unique(part) for image, part in zip(ids, np.split(points[order], first[1:]), strict=True)}
 
 
 def _cloud(path: Path, model: Model) -> SparsePoints:

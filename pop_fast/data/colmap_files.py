@@ -32,6 +32,7 @@ class ImageRecord:
         translation: world -> camera. float64 [3]
         camera_id: of its camera.
         name: relative file name, as stored.
+        image_id: by which tracks name it.
     """
 
     where: str
@@ -39,6 +40,7 @@ class ImageRecord:
     translation: np.ndarray
     camera_id: int
     name: str
+    image_id: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +53,7 @@ class Model:
         point_ids: uint64 [P]
         xyz: float64 [P, 3]
         rgb: uint8 [P, 3]
+        tracks: ids of the images that see each point, which need not all be in `images`; empty where it has no track.
     """
 
     cameras: dict[int, Any]
@@ -58,6 +61,7 @@ class Model:
     point_ids: np.ndarray
     xyz: np.ndarray
     rgb: np.ndarray
+    tracks: list[np.ndarray]
 
 
 @cache
@@ -86,6 +90,7 @@ def parameter_count(name: str) -> int:
 
 _FIX = "copy the model again, or run COLMAP again"
 _BINARY_POINT = struct.Struct("<Q3d3Bd")
+_NO_TRACK = np.zeros(0, np.uint32)
 
 
 class _Cursor:
@@ -141,6 +146,7 @@ def read_binary(folder: Path) -> Model:
         np.array([point[0] for point in points], dtype=np.uint64),
         np.array([point[1:4] for point in points], dtype=np.float64).reshape(-1, 3),
         np.array([point[4:7] for point in points], dtype=np.uint8).reshape(-1, 3),
+        [point[-1] for point in points],
     )
 
 
@@ -181,14 +187,17 @@ def _binary_image(cursor: _Cursor) -> ImageRecord:
         ) from None
     (observations,) = cursor.read("<Q")
     cursor.skip(24 * observations)
-    return ImageRecord(f"image {image_id} ({name})", np.array(pose[:4]), np.array(pose[4:]), camera_id, name)
+    where = f"image {image_id} ({name})"
+    return ImageRecord(where, np.array(pose[:4]), np.array(pose[4:]), camera_id, name, image_id)
 
 
 def _binary_point(cursor: _Cursor) -> tuple[Any, ...]:
     point = cursor.read(_BINARY_POINT)
     (track,) = cursor.read("<Q")
+    start = cursor.at
     cursor.skip(8 * track)
-    return point
+    # pairs of an image and of a place among its observations; copied, so that the file's bytes need not be kept
+    return *point, np.frombuffer(cursor.data, "<u4", 2 * track, start)[::2].copy() if track else _NO_TRACK
 
 
 def _walk_rig(cursor: _Cursor) -> None:
@@ -237,6 +246,7 @@ def read_text(folder: Path) -> Model:
         np.array([point[0] for point in points], dtype=np.uint64),
         np.array([point[1:4] for point in points], dtype=np.float64).reshape(-1, 3),
         np.array([point[4:7] for point in points], dtype=np.uint8).reshape(-1, 3),
+        [point[-1] for point in points],
     )
 
 
@@ -333,13 +343,19 @@ def _text_camera(line: _Line) -> Any:
 def _text_image(line: _Line) -> ImageRecord:
     name = line.words[-1].strip()
     pose = np.array([line.number(field, float) for field in _IMAGE[1:8]])
-    where = f"image {line.number('IMAGE_ID', _whole)} ({name})"
-    return ImageRecord(where, pose[:4], pose[4:], line.number("CAMERA_ID", _whole), name)
+    image_id = line.number("IMAGE_ID", _whole)
+    where = f"image {image_id} ({name})"
+    return ImageRecord(where, pose[:4], pose[4:], line.number("CAMERA_ID", _whole), name, image_id)
 
 
-def _text_point(line: _Line) -> tuple[float, ...]:
+def _text_point(line: _Line) -> tuple[Any, ...]:
     color = [line.number(field, _whole) for field in "RGB"]
     if max(color) > 255:
         raise CaptureError(f"{line.where}: R, G, B are {color}; each must be a whole number from 0 to 255")
     place = [line.number(field, float) for field in "XYZ"]
-    return (line.number("POINT3D_ID", _whole), *place, *color)
+    # what follows the error is the track: pairs of an image and of a place among its observations
+    track = line.words[-1].split()[1:]
+    if len(track) % 2:
+        raise CaptureError(f"{line.where}: TRACK[] has {len(track)} numbers; it must be pairs of IMAGE_ID, POINT2D_IDX")
+    seen = [line.parse("TRACK[] IMAGE_ID", word, _whole) for word in track[::2]]
+    return (line.number("POINT3D_ID", _whole), *place, *color, np.array(seen, np.int64))

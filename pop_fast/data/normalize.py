@@ -1,4 +1,4 @@
-"""Put the world of a capture into the frame that gsplat trains in, and remember how.
+"""Put the world of a capture into the frame that gsplat trains in, and remember how; and where its cameras look.
 
 Three steps, each one similarity: (1) turn the mean up direction of the cameras to -y, put the origin at the median of
 the points of the optical axes that are nearest to the capture's origin, and scale the median camera distance to 1;
@@ -17,8 +17,6 @@ from pop_fast.errors import CaptureError
 
 # of a point from the middle of all, times the median camera distance
 _FARTHEST = 1e100
-
-__all__ = ["normalizing_transform", "transform_points", "transform_viewmats"]
 
 
 def transform_points(transform: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -39,7 +37,7 @@ def transform_viewmats(transform: np.ndarray, viewmats: np.ndarray) -> np.ndarra
     linear = transform[:3, :3]
     scale = np.cbrt(np.linalg.det(linear))
     rotations = viewmats[:, :3, :3] @ (linear / scale).T
-    centers = transform_points(transform, _centers(viewmats))
+    centers = transform_points(transform, camera_centers(viewmats))
     moved = viewmats.copy()
     moved[:, :3, :3] = rotations
     moved[:, :3, 3] = -np.einsum("vij,vj->vi", rotations, centers)
@@ -66,8 +64,37 @@ def normalizing_transform(viewmats: np.ndarray, points: np.ndarray | None) -> np
     return transform
 
 
-def _centers(viewmats: np.ndarray) -> np.ndarray:
+def camera_centers(viewmats: np.ndarray) -> np.ndarray:
+    """Give the cameras' centres in the world: c = -R^T t. [V, 3]"""
     return -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+
+
+def focus_point(viewmats: np.ndarray) -> np.ndarray:
+    """Give the point nearest to all optical axes: sum_i (I - d_i d_i^T)(x - c_i) = 0.
+
+    Parallel axes meet nowhere, and those that spread meet behind the cameras; then it is the point one mean camera
+    distance ahead of the cameras' mean.
+    """
+    centers, forward = camera_centers(viewmats), viewmats[:, 2, :3]
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    total = across.sum(axis=0)
+    if np.linalg.cond(total) < 1e6:
+        focus = np.linalg.solve(total, np.einsum("mij,mj->i", across, centers))
+        if np.median(np.einsum("mj,mj->m", focus - centers, forward)) > 0.0:
+            return focus
+    spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean())
+    return centers.mean(axis=0) + (spread or 1.0) * forward.mean(axis=0)
+
+
+def neighbour_degrees(viewmats: np.ndarray) -> float | None:
+    """Give the median angle from a camera to the nearest other one, seen from the point they look at. [V, 4, 4]"""
+    if len(viewmats) < 2:
+        return None
+    offsets = camera_centers(viewmats) - focus_point(viewmats)
+    rays = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)
+    cosines = rays @ rays.T
+    np.fill_diagonal(cosines, -1.0)
+    return float(np.degrees(np.median(np.arccos(np.clip(cosines.max(axis=1), -1.0, 1.0)))))
 
 
 def _from_cameras(viewmats: np.ndarray) -> np.ndarray:
@@ -75,7 +102,7 @@ def _from_cameras(viewmats: np.ndarray) -> np.ndarray:
     up = -viewmats[:, 1, :3].mean(axis=0)
     length = np.linalg.norm(up)
     turn = _rotation_between(up / length, np.array([0.0, -1.0, 0.0])) if length > 1e-6 else np.eye(3)
-    centers = _centers(viewmats) @ turn.T
+    centers = camera_centers(viewmats) @ turn.T
     forwards = viewmats[:, 2, :3] @ turn.T
     nearest = centers - np.sum(forwards * centers, axis=1, keepdims=True) * forwards
     origin = np.median(nearest, axis=0)

@@ -46,7 +46,7 @@ _NEIGHBOURS: Final = 4
 # share of pixels at the end of the scale
 _CLIPPED: Final = 0.25
 # stops between the darkest and the brightest of a set
-_STOPS: Final = 1.5
+DRIFT_STOPS: Final = 1.5
 _THUMB: Final = 24
 _FEATURES: Final = 500
 # mean difference of two thumbnails, of 255: noise and compression leave less, a step to the side more
@@ -212,15 +212,20 @@ def _about_exposure(shown: Sequence[Shown]) -> Iterator[Finding]:
                 "exposure",
                 f"{len(names)} {number(len(names), 'is', 'are')} over a quarter pure {what}, {some(names)}",
             )
-    taken = [one.exif.exposure * one.exif.iso for one in shown if one.exif.exposure and one.exif.iso]
-    stops = float(np.log2(max(taken) / min(taken))) if len(taken) == len(shown) else 0.0
+    stops = exposure_stops([one.exif for one in shown])
     fix = "lock the exposure, or train with --exposure: without it training takes one brightness for all"
-    if stops > _STOPS:
+    if stops is not None and stops > DRIFT_STOPS:
         yield Finding("warn", "exposure", f"exposures differ by {stops:.1f} stops; {fix}")
     elif not dark and not bright:
         levels = [one.brightness for one in shown]
-        known = f"within {stops:.1f} stops, " if taken and len(taken) == len(shown) else ""
+        known = "" if stops is None else f"within {stops:.1f} stops, "
         yield Finding("ok", "exposure", f"{known}mean brightness {min(levels):.0f} to {max(levels):.0f} of 255")
+
+
+def exposure_stops(noted: Sequence[Exif]) -> float | None:
+    """Give how many stops lie between the exposures that cameras noted; None where one of them noted none."""
+    taken = [exif.exposure * exif.iso for exif in noted if exif.exposure and exif.iso]
+    return float(np.log2(max(taken) / min(taken))) if taken and len(taken) == len(noted) else None
 
 
 def _about_copies(shown: Sequence[Shown]) -> Iterator[Finding]:

@@ -198,7 +198,7 @@ def _read(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
     if size != (width, height):
         image = _shrunk(image, size, options.resize)
         alpha = None if alpha is None else _shrunk(alpha, size, options.resize)
-    view = View(photo.shot.name, image, photo.shot.viewmat, K, mask, photo.shot.split, alpha)
+    view = View(photo.shot.name, image, photo.shot.viewmat, K, mask, photo.shot.split, alpha, seen=photo.shot.seen)
     return _upright(view, photo.shot.turns)
 
 
@@ -229,7 +229,9 @@ def _camera_alone(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
         stored = (width, height)
     _, (width, height), K = _placed(photo, stored, rectify)
     view = _upright(View(photo.shot.name, _blank(width, height), photo.shot.viewmat, K), photo.shot.turns)
-    return replace(view, image=_blank(view.width, view.height), split=photo.shot.split, was_read=False)
+    return replace(
+        view, image=_blank(view.width, view.height), split=photo.shot.split, was_read=False, seen=photo.shot.seen
+    )
 
 
 def _blank(width: int, height: int) -> np.ndarray:

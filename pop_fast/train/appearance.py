@@ -58,6 +58,16 @@ class Appearance:
             return image
         return expose(image, self.params["exposures"][self._photo(index)])
 
+    def exposure(self, index: int) -> Tensor:
+        """Return the exposure of a training view's photograph, without its graph [3, 4]."""
+        return self.params["exposures"].detach()[self._photo(index)]
+
+    def pull_exposure(self, index: int, gradient: Tensor) -> None:
+        """Take the gradient of a training view's exposure [3, 4] from a step that is no graph; see `update`."""
+        exposures = self.params["exposures"]
+        exposures.grad = torch.zeros_like(exposures)
+        exposures.grad[self._photo(index)] = gradient.to(exposures)
+
     def background(self, step: int) -> Tensor | None:
         """Return the background of a step [3], or None for that of the settings."""
         return background_at(step, self._config.seed) if self._config.random_background else None

@@ -14,15 +14,17 @@ import json
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from pop_fast.api.registry import get_backend
 from pop_fast.errors import PopError
 from pop_fast.io.heartbeat import duration
 from pop_fast.train.choose import on_gpu
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.presets import AUTOMATIC
+from pop_fast.train.steps import why_not_trained
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -153,9 +155,80 @@ def choose_length(
     return Choice(scaler, gaussians, seconds(scaler), memory)
 
 
-def choose_terms(capture: Capture) -> dict[str, Any]:
-    """Choose terms of the loss by the count and the spread of the photographs; none yet: the method's own hold."""
-    return {}
+# photographs to train on up to which where a Gaussian lies along a ray is left open by too many of its pixels
+FEW: Final = 30
+# of the depth at sparse points; by benchmarks/few_photographs.py
+DEPTH_LAMBDA: Final = 0.01
+# settings that `choose_terms` may choose
+TERMS: Final = ("depth_lambda", "exposure")
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Terms of the loss that were chosen.
+
+    Attributes:
+        settings: by name, those that nobody said.
+        why: a sentence for each that was chosen, or that could not be.
+    """
+
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    why: tuple[str, ...] = ()
+
+
+def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> Terms:
+    """Choose terms of the loss by the count and the spread of the photographs, and by the drift of their exposures.
+
+    Args:
+        capture: with the points that its photographs see, where that is known.
+        config: whose backend must know a term, and whose words win.
+        stops: between the exposures that the cameras noted; None where they noted none.
+    """
+    import numpy as np
+
+    from pop_fast.data.normalize import neighbour_degrees
+    from pop_fast.data.photo_quality import DRIFT_STOPS
+
+    trained = capture.train_views(config.test_every)
+    apart = neighbour_degrees(np.stack([view.viewmat for view in trained])) if trained else None
+    spread = "" if apart is None else f", neighbours {apart:.0f} degrees apart"
+    wanted: list[tuple[str, Any, str]] = []
+    why: list[str] = []
+    if len(trained) <= FEW:
+        few = f"{len(trained)} photographs are few{spread}"
+        if any(view.seen is not None and len(view.seen) for view in trained):
+            text = f"depth is held to the sparse points (--depth-lambda {DEPTH_LAMBDA:g}), as {few}"
+            wanted.append(("depth_lambda", DEPTH_LAMBDA, text))
+        elif "depth_lambda" not in _said(config):
+            why.append(f"{few}, and depth is not held to sparse points: the capture has no tracks of them")
+    if stops is not None and stops > DRIFT_STOPS and config.batch_size == 1:
+        text = f"each photograph's exposure is learned (--exposure), as their exposures are {stops:.1f} stops apart"
+        wanted.append(("exposure", True, text))
+    settings: dict[str, Any] = {}
+    for name, value, text in wanted:
+        if name in _said(config):
+            continue
+        reason = why_not_trained(get_backend(config.backend), replace(config, given=None, **{name: value}))
+        if reason is None:
+            settings[name] = value
+        why.append(text if reason is None else f"{text.partition(',')[2].removeprefix(' as ')}: {reason}")
+    return Terms(settings, tuple(why))
+
+
+def _said(config: TrainConfig) -> Mapping[str, Any]:
+    return {} if config.given is None else config.given.settings
+
+
+def about_held_out(capture: Capture, config: TrainConfig) -> str | None:
+    """Say what holding out costs where photographs are few and nobody has asked for it; else None."""
+    held_out, count = len(capture.test_views(config.test_every)), len(capture.views)
+    own = any(view.split is not None for view in capture.views)
+    if own or not held_out or count > FEW or "test_every" in _said(config):
+        return None
+    return (
+        f"{held_out} of {count} photographs are held out to measure by, {100 * held_out / count:.0f} % of what there "
+        "is to learn from; --test-every 0 trains on all of them, and measures nothing"
+    )
 
 
 def with_choice(config: TrainConfig, scaler: float | None, terms: Mapping[str, Any]) -> TrainConfig:
@@ -172,7 +245,7 @@ def with_choice(config: TrainConfig, scaler: float | None, terms: Mapping[str, A
 
 
 def begun(folder: Path) -> dict[str, Any] | None:
-    """Read what a run in a folder was begun with, where it chose for itself: its scaler and its factor.
+    """Read what a run in a folder was begun with, where it chose for itself: its scaler, its factor and its terms.
 
     Returns:
         None where there is no run, or one that had a preset; a damaged file is named by what reads all of it.
@@ -181,11 +254,13 @@ def begun(folder: Path) -> dict[str, Any] | None:
         plain = json.loads((folder / "cfg.json").read_text(encoding="utf-8"))
         given, factor = plain["given"], plain["resolved"]["factor"]
         scaler = given["steps_scaler"]
+        terms = {name: value for name, value in given["settings"].items() if name in TERMS}
         automatic = given["preset"] == AUTOMATIC
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
     numbers = isinstance(factor, int) and isinstance(scaler, int | float) and not isinstance(scaler, bool)
-    return {"scaler": scaler, "factor": factor} if automatic and numbers else None
+    usable = numbers and all(isinstance(value, bool | int | float) for value in terms.values())
+    return {"scaler": scaler, "terms": {"factor": factor, **terms}} if automatic and usable else None
 
 
 def measure_speed(config: TrainConfig, capture: Capture, scaler: float) -> Speed:

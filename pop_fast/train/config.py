@@ -79,6 +79,10 @@ class TrainConfig:
         ssim_padding: "valid" as gsplat, or "same" as Inria (and method "3dgs").
         d_ssim_halved: (1 - SSIM) / 2 instead of 1 - SSIM.
         lr: learning rates.
+        depth_lambda: weight of the depth at the sparse points that a photograph sees (COLMAP's tracks), for captures of
+            few photographs: mean difference of disparities, times the scene's scale; gsplat's trainer has 0.01. 0: off.
+        opacity_reg: weight of the mean opacity, as gsplat's trainer has it; 0: off.
+        scale_reg: weight of the mean scale, per world unit, as gsplat's trainer has it; 0: off.
         exposure: learn an affine map of colours for every photograph, for captures whose exposure or white balance
             changes; held-out views are then also measured after fitting their colours (cc_psnr), as gsplat's trainer.
         random_background: lay another colour behind everything at every step, drawn from seed and step: what nothing
@@ -128,6 +132,9 @@ class TrainConfig:
     ssim_padding: Literal["valid", "same"] = Recipe.padding
     d_ssim_halved: bool = Recipe.d_ssim_halved
     lr: LearningRates = Recipe.lr
+    depth_lambda: float = Recipe.depth_lambda
+    opacity_reg: float = Recipe.opacity_reg
+    scale_reg: float = Recipe.scale_reg
     exposure: bool = False
     random_background: bool = False
     refine_cameras: bool = False
@@ -310,13 +317,14 @@ class TrainConfig:
 
     def binding(self) -> dict[str, Any]:
         """Return the settings that a resumed run must share, flat."""
-        # a batch of one, a profile's own near plane, photographs at their size and rates that stay are what every run
-        # had before there were others: its checkpoints say nothing of them
+        # a batch of one, a profile's own near plane, photographs at their size, rates that stay and no regularizers are
+        # what every run had before there were others: its checkpoints say nothing of them
         usual = {
             "batch_size": self.batch_size == 1,
             "near_plane": self.near_plane is None,
             "coarse_stop_iters": not self.coarse_stop_iters,
             "lr.others_decay": self.lr.others_decay == 1.0,
+            **{name: getattr(self, name) == 0.0 for name in ("depth_lambda", "opacity_reg", "scale_reg")},
         }
         free = _FREE | {name for name, is_usual in usual.items() if is_usual}
         return {name: value for name, value in self.flat().items() if name not in free}

@@ -91,7 +91,7 @@ class FusedStepper:
         m, v = ({key: moments[key][name] for key in KEYS} for name in ("exp_avg", "exp_avg_sq"))
         if self.fused is None:
             task = self.task
-            settings = step_settings(task.config, task.updates)
+            settings = step_settings(task.config, task.updates, task.scene_scale)
             self.fused = self.make(rows, m, v, task.views, task.order, settings, self.step)
         else:
             self.fused.rebind(rows, m, v)
@@ -167,12 +167,13 @@ class FusedStepper:
                 target.copy_(self._state[key])
 
 
-def step_settings(config: TrainConfig, updates: Updates) -> StepSettings:
+def step_settings(config: TrainConfig, updates: Updates, scene_scale: float = 1.0) -> StepSettings:
     """Return what stays the same over a run.
 
     Args:
         config: step numbers as they are run.
         updates: which parameters Adam moves at which step.
+        scene_scale: world units.
     """
     pop = config.strategy
     return StepSettings(
@@ -185,6 +186,9 @@ def step_settings(config: TrainConfig, updates: Updates) -> StepSettings:
         blur_window=pop.blur_window,
         theta_blur=pop.theta_blur,
         blur_min_pixels=pop.blur_min_pixels,
+        depth_weight=config.depth_lambda * scene_scale,
+        opacity_reg=config.opacity_reg,
+        scale_reg=config.scale_reg,
         background=config.background,
         profile=config.renderer,
         antialiased=config.antialiased,

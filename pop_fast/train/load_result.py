@@ -78,13 +78,14 @@ class CaptureOptions:
 
 @dataclass(frozen=True)
 class CaptureRecord:
-    """What `pop train` leaves in capture.json: how the capture was read, and its training frame."""
+    """What `pop train` leaves in capture.json: how the capture was read, its training frame, and what was chosen."""
 
     images: str | None = None
     missing: Literal["error", "skip"] = "error"
     masks: bool = True
     source: Literal["auto", "colmap", "transforms", "polycam", "metashape", "realitycapture", "photos"] = "auto"
     world_transform: list[list[float]] = field(default_factory=lambda: np.eye(4).tolist())
+    chosen: list[str] = field(default_factory=list)
 
 
 def record_text(record: CaptureRecord) -> str:
@@ -102,7 +103,10 @@ def read_record(folder: Path | None) -> CaptureRecord | None:
     if path is None or not path.is_file():
         return None
     try:
-        return CaptureRecord(**json.loads(path.read_text(encoding="utf-8")))
+        record = CaptureRecord(**json.loads(path.read_text(encoding="utf-8")))
+        if not isinstance(record.chosen, list) or not all(isinstance(line, str) for line in record.chosen):
+            raise TypeError(f"chosen is {record.chosen!r}")
+        return record
     except (ValueError, TypeError, RecursionError) as error:
         fix = "remove it, and say again how to read the capture (--images, --missing)"
         raise PopError(f"{path}: is not what 'pop train' writes ({error}); {fix}") from error

@@ -112,6 +112,11 @@ def find_warnings(config: TrainConfig, views: Sequence[ViewTensors]) -> Iterator
             "paper's smallest images make it 10.7: nearly every Gaussian that is seen will count as blur and grow; "
             f"--{config.method}.blur-min-pixels {ENOUGH_PIXELS} fixes it"
         )
+    if config.depth_lambda != 0.0 and not any(view.points is not None and len(view.points) for view in views):
+        yield (
+            f"depth_lambda is {config.depth_lambda}, and the term does nothing: the capture does not say which "
+            "photograph sees which sparse point (COLMAP's tracks); pop sfm and COLMAP write that with the cameras"
+        )
     if profile_named(config.profile).principal_point == "centred":
         away = {view.name: _off_centre(view) for view in views}
         worst = max(away, key=lambda name: away[name])

@@ -249,6 +249,9 @@ def values_of(recipe: Recipe) -> dict[str, Any]:
         "d_ssim_halved": recipe.d_ssim_halved,
         "profile": recipe.profile.name,
         "lr": recipe.lr,
+        "depth_lambda": recipe.depth_lambda,
+        "opacity_reg": recipe.opacity_reg,
+        "scale_reg": recipe.scale_reg,
     }
 
 

@@ -75,6 +75,7 @@ class Task:
         appearance: what is learned of the photographs.
         ranks: the processes that draw the views of a step.
         stop: whether somebody has asked for an end.
+        scene_scale: by which depth is compared, world units.
     """
 
     config: TrainConfig
@@ -86,6 +87,7 @@ class Task:
     appearance: Appearance
     ranks: Ranks = ALONE
     stop: StopRequest = field(default_factory=StopRequest)
+    scene_scale: float = 1.0
 
     @property
     def may_abandon(self) -> bool:

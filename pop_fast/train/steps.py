@@ -57,6 +57,8 @@ class StepSettings:
             the caller makes it of the summed counts.
         theta_blur: share of the image a Gaussian must dominate to be blurred.
         blur_min_pixels: and at least so many pixels.
+        depth_weight: weight of the disparities at sparse points, the scene's scale included.
+        opacity_reg, scale_reg: weights of the mean opacity and of the mean scale.
         background: colour behind everything.
         profile, antialiased: of the renderer.
         backward, deterministic: of the step on a GPU, as `cuda_ext.arrays.Settings` says.
@@ -74,6 +76,9 @@ class StepSettings:
     blur_window: str = DensityConfig.blur_window
     theta_blur: float = DensityConfig.theta_blur
     blur_min_pixels: float = DensityConfig.blur_min_pixels
+    depth_weight: float = 0.0
+    opacity_reg: float = 0.0
+    scale_reg: float = 0.0
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     profile: Profile = Recipe.profile
     antialiased: bool = False
@@ -127,7 +132,7 @@ class StepStats(NamedTuple):
         ssim: SSIM.
         objective: the photometric objective.
         square: mean square of the difference, the render clamped to [0, 1].
-        pop: the weighted regularizer of the strategy, as the POP term is, 0 where it is off.
+        pop: the weighted regularizers: the strategy's, as the POP term is, and those of the settings; 0 without any.
         n_blended: Gaussians that a pixel blends, on average.
         n_traversed: entries of its tile's list that a pixel visits, on average.
     """
@@ -165,7 +170,7 @@ class Collected:
         return cls(torch.zeros(n, device=device), visible, dominant, flags, waiting)
 
 
-# settings that neither step of this package knows, with the one value that it trains with; "strategy." are the method's
+# settings that a step need not know, with the one value that it trains with; "strategy." are the method's
 _ONLY: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "batch_size": 1,
@@ -175,6 +180,9 @@ _ONLY: Final[Mapping[str, Any]] = MappingProxyType(
         "exposure": False,
         "random_background": False,
         "refine_cameras": False,
+        "depth_lambda": 0.0,
+        "opacity_reg": 0.0,
+        "scale_reg": 0.0,
     }
 )
 

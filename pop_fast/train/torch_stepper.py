@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +14,9 @@ from torch.optim import Adam
 
 from pop_fast.api.backend import Backend
 from pop_fast.density.protocol import State
+from pop_fast.stages.covariance import scales_from_log_scales
 from pop_fast.stages.losses import TargetMoments, l2, photometric, target_moments
+from pop_fast.stages.regularizers import mean_activation, sparse_depth_loss
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.evaluate import gaussians_per_pixel
 from pop_fast.train.model import adam_step
@@ -28,7 +30,7 @@ from pop_ref.settings import Objective
 
 @dataclass(frozen=True)
 class ViewGradient:
-    """A view after its backward pass: its index, render, photometric loss, prior or None, and their sum.
+    """A view after its backward pass: its index, render, photometric loss, regularizers or None, and their sum.
 
     `behind` is what its photograph was laid over if that is transparent; None where that is the settings' background.
     """
@@ -155,24 +157,42 @@ class TorchStepper:
         image = self._task.appearance.exposed(rendered.image, index)
         behind = self._task.appearance.behind_photo(index, step)
         objective = self._photo_loss(image, index, phase.objective, behind)
-        term = strategy.regularizer(rendered.opacities, state, step, rendered.info)
+        terms = [strategy.regularizer(rendered.opacities, state, step, rendered.info), *self._terms(rendered, index)]
+        found = [term for term in terms if term is not None]
+        term = sum(found[1:], found[0]) if found else None
         strategy.step_pre_backward(params, optimizers, state, step, rendered.info)
         loss = objective if term is None else objective + term
         loss.backward()
         return ViewGradient(index, replace(rendered, image=image), behind, objective, term, loss)
+
+    def _terms(self, rendered: Rendered, index: int) -> Iterator[Tensor]:
+        """Give the weighted terms of the settings, whatever the strategy: depth at sparse points, opacities, scales."""
+        config = self._task.config
+        if rendered.depth is not None:
+            samples = self._seen_from(index).depth_samples()
+            assert samples is not None
+            yield config.depth_lambda * self._task.scene_scale * sparse_depth_loss(rendered.depth, *samples)
+        if config.opacity_reg != 0.0:
+            yield config.opacity_reg * mean_activation(rendered.opacities)
+        if config.scale_reg != 0.0:
+            yield config.scale_reg * mean_activation(scales_from_log_scales(self._params["scales"]))
+
+    def _seen_from(self, index: int) -> ViewTensors:
+        return self._task.appearance.seen_from(self._task.views[index], index)
 
     def _render(self, index: int, step: int, phase: Phase) -> Rendered:
         config, strategy, appearance = self._task.config, self._task.strategy, self._task.appearance
         return render_view(
             self._backend,
             self._params,
-            appearance.seen_from(self._task.views[index], index),
+            self._seen_from(index),
             config,
             phase.sh_degree,
             dominance=strategy.needs_dominance(step),
             counts=step % config.log_every == 0,
             absgrad=strategy.absgrad,
             background=appearance.background(step),
+            depth=config.depth_lambda != 0.0 and self._task.views[index].points is not None,
         )
 
     def _require_finite(self, loss: Tensor, index: int, step: int) -> None:

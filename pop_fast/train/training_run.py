@@ -135,8 +135,8 @@ class TrainingRun:
             initial = initialize_params(capture, config.seed, config.init_opacity, config.init_scale)
         check_start(capture.name, initial)
         self.params = {key: Parameter(initial[key].clone(memory_format=torch.contiguous_format)) for key in KEYS}
-        dtype = self.params["means"].dtype
-        self._train = [ViewTensors.of(view, dtype) for view in capture.train_views(config.test_every)]
+        dtype, points = self.params["means"].dtype, capture.points if config.depth_lambda != 0.0 else None
+        self._train = [ViewTensors.of(view, dtype, points) for view in capture.train_views(config.test_every)]
         self._test = [ViewTensors.of(view, dtype) for view in capture.test_views(config.test_every)]
         if not self._train:
             raise PopError(f"{capture.name}: has no view to train on; lower test_every or set it to 0")
@@ -302,7 +302,7 @@ class TrainingRun:
             seen = [0] * size * done + self._order.ahead(size * (config.max_steps - done))
             seen = coarse_to_fine(self._train, seen, config.coarse_stop_iters, size)
             given = (config, self.strategy, *seen, self.updates, done, self.appearance, self._ranks)
-            self._stepper = self._engine.make_stepper(Task(*given, self._stop))
+            self._stepper = self._engine.make_stepper(Task(*given, self._stop, self._scene_scale))
             with translate_oom():
                 self._stepper.rebind(self.params, self.optimizers, self.state)
         return self._stepper

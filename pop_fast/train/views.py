@@ -14,6 +14,7 @@ from pop_fast.data.capture import View
 from pop_fast.errors import PopError
 from pop_fast.stages.appearance import over_background
 from pop_fast.stages.covariance import opacities_from_logits, scales_from_log_scales
+from pop_fast.stages.regularizers import depth_samples
 from pop_fast.train.config import TrainConfig
 
 
@@ -29,6 +30,8 @@ class ViewTensors:
         K: intrinsics, px, likewise. [1, 3, 3]
         alpha: opacity of a photograph with transparency, which `photo` has laid over the settings' background, of 255;
             None where it has none. uint8 [H, W]
+        points: sparse points that it sees, world, in the precision of the camera; None where they are not known or not
+            asked for. [P, 3]
     """
 
     name: str
@@ -37,10 +40,16 @@ class ViewTensors:
     viewmat: Tensor
     K: Tensor
     alpha: Tensor | None = None
+    points: Tensor | None = None
 
     @classmethod
-    def of(cls, view: View, dtype: torch.dtype = torch.float32) -> ViewTensors:
+    def of(cls, view: View, dtype: torch.dtype = torch.float32, points: np.ndarray | None = None) -> ViewTensors:
         """Take over a view of a capture, its camera in a precision.
+
+        Args:
+            view: the view.
+            dtype: the precision.
+            points: the capture's, of which those that the view sees are kept; None keeps none.
 
         Raises:
             PopError: only the view's camera was read.
@@ -54,6 +63,7 @@ class ViewTensors:
             viewmat=torch.from_numpy(view.viewmat).to(dtype)[None],
             K=torch.from_numpy(view.K).to(dtype)[None],
             alpha=None if view.alpha is None else torch.from_numpy(view.alpha),
+            points=None if points is None or view.seen is None else torch.from_numpy(points[view.seen]).to(dtype),
         )
 
     @property
@@ -70,6 +80,16 @@ class ViewTensors:
     def kept_pixels(self) -> int:
         """How many pixels count: those that the mask keeps."""
         return self.height * self.width if self.mask is None else int(self.mask.count_nonzero())
+
+    def depth_samples(self) -> tuple[Tensor, Tensor] | None:
+        """Return where the photograph shows its sparse points, px [M, 2], and their disparities [M]; None without any.
+
+        The camera is that of the view, and no gradient goes to it.
+        """
+        if self.points is None:
+            return None
+        camera = (self.viewmat[0].detach(), self.K[0], self.width, self.height)
+        return depth_samples(self.points, *camera, self.mask)
 
     def target(self) -> Tensor:
         """Return the photograph as floats in [0, 1]. [H, W, 3]"""
@@ -88,11 +108,15 @@ class ViewTensors:
 
 @dataclass(frozen=True)
 class Rendered:
-    """A rendered view: the image [H, W, 3], the activated opacities that made it [N], and rasterization's `info`."""
+    """A rendered view: the image [H, W, 3], the activated opacities that made it [N], and rasterization's `info`.
+
+    `depth` is the expected depth, world units, 0 where nothing is [H, W]; None where it was not asked for.
+    """
 
     image: Tensor
     opacities: Tensor
     info: dict[str, Any]
+    depth: Tensor | None = None
 
 
 def render_view(
@@ -105,6 +129,7 @@ def render_view(
     counts: bool = False,
     absgrad: bool = False,
     background: Tensor | None = None,
+    depth: bool = False,
 ) -> Rendered:
     """Render a view from raw parameters.
 
@@ -120,13 +145,17 @@ def render_view(
         counts: Gaussians per pixel will be read from `info`.
         absgrad: so will the gradient of the screen centres summed of absolute values.
         background: colour behind everything in the place of the config's. [3]
+        depth: also render the expected depth.
     """
     given = rasterization_arguments(params, view, config, sh_degree, background)
-    colors, _, info = backend.rasterization(**given, absgrad=absgrad, dominance=dominance, counts=counts)
+    mode = {"render_mode": "RGB+ED"} if depth else {}
+    colors, _, info = backend.rasterization(**given, **mode, absgrad=absgrad, dominance=dominance, counts=counts)
     opacities = given["opacities"]
     if dominance and view.mask is not None:
         info["dominant_counts"] = _counts_inside(info["dominant_ids"], view.mask, len(opacities))
         info["kept_pixels"] = view.kept_pixels
+    if depth:
+        return Rendered(colors[0, ..., :3], opacities, info, colors[0, ..., 3])
     return Rendered(colors[0], opacities, info)
 
 

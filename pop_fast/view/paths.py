@@ -22,6 +22,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from pop_fast.data.normalize import camera_centers, focus_point
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import file_atomically
 from pop_fast.io.images import SILENT, set_log_level
@@ -138,33 +139,11 @@ def camera_path(name: str, viewmats: np.ndarray, n_frames: int) -> np.ndarray:
     return PATHS[name](np.asarray(viewmats, dtype=np.float64), n_frames)
 
 
-def camera_centers(viewmats: np.ndarray) -> np.ndarray:
-    """Give the cameras' centres in the world: c = -R^T t. [M, 3]"""
-    return -np.einsum("mji,mj->mi", viewmats[:, :3, :3], viewmats[:, :3, 3])
-
-
 def mean_up(viewmats: np.ndarray) -> np.ndarray:
     """Give the direction that is up on average: minus the cameras' y axes, unit length. [3]"""
     up = -viewmats[:, 1, :3].mean(axis=0)
     norm = float(np.linalg.norm(up))
     return up / norm if norm > 1e-9 else -viewmats[0, 1, :3]
-
-
-def focus_point(viewmats: np.ndarray) -> np.ndarray:
-    """Give the point nearest to all optical axes: sum_i (I - d_i d_i^T)(x - c_i) = 0.
-
-    Parallel axes meet nowhere, and those that spread meet behind the cameras; then it is the point one mean camera
-    distance ahead of the cameras' mean.
-    """
-    centers, forward = camera_centers(viewmats), viewmats[:, 2, :3]
-    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    total = across.sum(axis=0)
-    if np.linalg.cond(total) < 1e6:
-        focus = np.linalg.solve(total, np.einsum("mij,mj->i", across, centers))
-        if np.median(np.einsum("mj,mj->m", focus - centers, forward)) > 0.0:
-            return focus
-    spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean())
-    return centers.mean(axis=0) + (spread or 1.0) * forward.mean(axis=0)
 
 
 def look_at(centers: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:

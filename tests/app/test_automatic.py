@@ -5,21 +5,38 @@ from __future__ import annotations
 import json
 import os
 import zipfile
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pycolmap
 import pytest
 
 from pop_fast.cli.train_checks import chooses_for_itself
+from pop_fast.data.capture import Capture
 from pop_fast.data.unpack import capture_folder, unpack
 from pop_fast.errors import CaptureError
 from pop_fast.train import TrainConfig, automatic
 from pop_fast.train import checkpoint as ckpt
-from pop_fast.train.automatic import MINUTES, SHORTEST, Speed, choose_length, expected_gaussians, factor_for
+from pop_fast.train.automatic import (
+    DEPTH_LAMBDA,
+    FEW,
+    MINUTES,
+    SHORTEST,
+    Speed,
+    Terms,
+    choose_length,
+    choose_terms,
+    expected_gaussians,
+    factor_for,
+)
 from pop_fast.view.paths import VideoFile
+from pop_fast.view.report.source import read_result
 from tests.app.conftest import Pop
 from tests.app.damage import says
 from tests.app.interruptions import interrupt
+from tests.app.tiny import tiny_capture
 
 SPEED = Speed(few=10_000, many=40_000, seconds_few=0.02, seconds_many=0.05, took=5.0)
 QUICKLY = ("--checkpoint-every", "50", "--skip-checks", "--skip-sizes", "--no-progress")
@@ -102,6 +119,84 @@ def test_what_is_said_wins_over_what_is_chosen(pop: Pop, shared_capture: Path, t
     assert pop(*words).status == 0
     resolved = json.loads((tmp_path / "r" / "cfg.json").read_text())["resolved"]
     assert (resolved["factor"], resolved["log_every"], resolved["strategy"]["blur_min_pixels"]) == (2, 50, 3.0)
+
+
+def with_tracks(root: Path, every: int) -> Path:
+    """Let every photograph of a COLMAP capture see every so manieth point; none at 0."""
+    model = pycolmap.Reconstruction(root / "sparse" / "0")
+    for number, point in enumerate(model.points3D.values()):
+        images = model.images if every and number % every == 0 else ()
+        point.track.elements = [pycolmap.TrackElement(image, 0) for image in images]
+    model.write_binary(str(root / "sparse" / "0"))
+    return root
+
+
+def chosen(capture: Capture, stops: float | None = None, **said: Any) -> Terms:
+    return choose_terms(capture, TrainConfig.of(preset="auto", **{"backend": "fast", **said}), stops)
+
+
+def test_depth_is_held_to_sparse_points_where_photographs_are_few_and_say_which_they_see() -> None:
+    few, many = tiny_capture(n_views=FEW), tiny_capture(n_views=2 * FEW)
+    terms = chosen(few)
+    assert terms.settings == {"depth_lambda": DEPTH_LAMBDA}
+    assert f"{len(few.train_views())} photographs are few, neighbours" in terms.why[0]
+    assert chosen(many) == Terms()
+    blind = replace(few, views=tuple(replace(view, seen=None) for view in few.views))
+    assert chosen(blind).settings == {}
+    assert "no tracks" in chosen(blind).why[0]
+    assert chosen(few, depth_lambda=0.0) == chosen(blind, depth_lambda=0.0) == Terms()
+
+
+def test_exposures_are_learned_where_cameras_noted_that_they_drift() -> None:
+    capture = tiny_capture(n_views=2 * FEW)
+    assert chosen(capture, 2.0).settings == {"exposure": True}
+    assert "2.0 stops apart" in chosen(capture, 2.0).why[0]
+    assert chosen(capture, 1.0) == chosen(capture, 2.0, exposure=False) == chosen(capture, 2.0, batch_size=2) == Terms()
+
+
+def test_a_term_that_the_backend_does_not_know_is_not_chosen_and_that_is_said() -> None:
+    terms = chosen(tiny_capture(), 2.0, backend="cuda")
+    assert terms.settings == {}
+    assert ["depth_lambda" in why or "exposure" in why for why in terms.why] == [True, True]
+
+
+def test_what_was_chosen_for_few_photographs_is_said_kept_reported_and_gone_on_with(
+    pop: Pop, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("train", with_tracks(capture, 4), "--minutes", "0.001", "--out", tmp_path / "r", *QUICKLY)
+    with monkeypatch.context() as patch:
+        interrupt(patch, at=120)
+        outcome = pop(*words)
+    assert outcome.status == 130
+    assert f"(--depth-lambda {DEPTH_LAMBDA:g}), as 7 photographs are few" in outcome.out
+    assert "1 of 8 photographs are held out" in outcome.out
+    assert "--test-every 0" in outcome.out
+    assert pop(*words, "--resume").status == 0
+    resolved = json.loads((tmp_path / "r" / "cfg.json").read_text())["resolved"]
+    assert resolved["depth_lambda"] == DEPTH_LAMBDA
+    data = read_result(tmp_path / "r")
+    assert "as 7 photographs are few" in data.config["chosen by the run"]
+    # who says how many are held out is not told again
+    said = pop(*words, "--overwrite", "--test-every", "4", "--depth-lambda", "0")
+    assert "held out to measure by" not in said.out
+    assert "--depth-lambda" not in said.out
+
+
+def test_depth_that_no_track_tells_is_warned_of(pop: Pop, capture: Path, tmp_path: Path) -> None:
+    words = (
+        "train",
+        with_tracks(capture, 0),
+        "--max-steps",
+        "2",
+        "--out",
+        tmp_path / "r",
+        "--depth-lambda",
+        "0.01",
+        *QUICKLY,
+    )
+    outcome = pop(*words)
+    assert outcome.status == 0
+    assert "depth_lambda is 0.01, and the term does nothing" in outcome.err
 
 
 def test_the_papers_preset_is_the_protocol_to_the_letter() -> None:

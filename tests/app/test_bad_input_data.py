@@ -303,10 +303,16 @@ def edit(root: Path, file: str, old: str, new: str) -> None:
         ("images.txt", " 1 00.png", " 1 01.png", ("01.png", "listed twice")),
         ("images.txt", " 1 00.png", " 00.png", ("line 5", "NAME is absent")),
         ("points3D.txt", "1 ", "one ", ("line 4", "POINT3D_ID is 'one'", "whole number")),
+        ("points3D.txt", None, " 1", ("line 4", "TRACK[] has 1 numbers", "IMAGE_ID, POINT2D_IDX")),
+        ("points3D.txt", None, " x 0", ("line 4", "TRACK[] IMAGE_ID is 'x'", "whole number")),
     ],
 )
-def test_a_wrong_field_is_named(tmp_path: Path, file: str, old: str, new: str, words: tuple[str, ...]) -> None:
+def test_a_wrong_field_is_named(tmp_path: Path, file: str, old: str | None, new: str, words: tuple[str, ...]) -> None:
     root = colmap_capture(tmp_path, binary=False)
+    if old is None:
+        # at the end of the first record
+        old = (root / "sparse" / "0" / file).read_text().splitlines()[3].rstrip()
+        new = old + new
     edit(root, file, old, new)
     assert_one_line(lambda: load_capture(root), file, *words)
 

@@ -62,6 +62,26 @@ def test_a_model_is_loaded_as_it_was_written(tmp_path: Path, binary: bool) -> No
     assert capture.source == "COLMAP model: 4 views, 20 points"
 
 
+@pytest.mark.parametrize("binary", [True, False])
+def test_a_view_knows_the_points_that_it_sees_where_the_model_has_tracks(tmp_path: Path, binary: bool) -> None:
+    root = colmap_capture(tmp_path / "scene", binary=binary)
+    assert all(view.seen is None for view in raw(root).views)
+    model = pycolmap.Reconstruction(root / "sparse" / "0")
+    tracks = {9: [2, 1, 1], 5: [2], 17: [4, 2]}
+    for point, images in tracks.items():
+        # an image may see a point at two places; its row is that of the order of ids
+        elements = [pycolmap.TrackElement(image, place) for place, image in enumerate(images)]
+        model.points3D[point].track.elements = elements
+    (model.write_binary if binary else model.write_text)(str(root / "sparse" / "0"))
+    ids = sorted(model.points3D)
+    wanted = {1: [9], 2: [5, 9, 17], 3: [], 4: [17]}
+    capture = raw(root)
+    for number, view in enumerate(capture.views, start=1):
+        assert [ids[row] for row in view.seen] == wanted[number]
+    assert np.allclose(capture.points[ids.index(9)], model.points3D[9].xyz)
+    assert np.array_equal(raw(root, photographs="none").views[1].seen, capture.views[1].seen)
+
+
 @pytest.mark.parametrize("place", ["sparse/0", "sparse/1", "sparse", "colmap/sparse/0", "."])
 def test_the_model_is_found_wherever_programs_put_it(tmp_path: Path, place: str) -> None:
     root = colmap_capture(tmp_path / "scene")

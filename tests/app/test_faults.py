@@ -129,7 +129,7 @@ with runs.scene("native step") as scene:
     one = scene.whole["splats"]["means"][0, 0]
     one.copy_(one.nextafter(one + 1.0))
     print(scene.finish("run"))
-    runs.KINDS["native step"] = runs.Kind(("--exposure",), 1, "native")
+    runs.KINDS["native step"] = runs.Kind(("--refine-cameras",), 1, "native")
 try:
     with runs.scene("native step"):
         pass

@@ -13,14 +13,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pop_fast.data.normalize import camera_centers, focus_point
 from pop_fast.errors import PopError
 from pop_fast.view import paths
 from pop_fast.view.paths import (
     PATHS,
     VideoFile,
-    camera_centers,
     camera_path,
-    focus_point,
     frames_in,
     has_h264,
     interpolate,

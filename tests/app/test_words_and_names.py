@@ -19,7 +19,8 @@ import torch
 from pop_fast.cli import COMMANDS, main
 from pop_fast.cli.completion import bash, fish, options_of
 from pop_fast.cli.errors import describe, message, printable
-from pop_fast.cli.train import arguments, takes_hours
+from pop_fast.cli.train import arguments
+from pop_fast.cli.train_checks import takes_hours
 from pop_fast.data import load_capture, run_sfm
 from pop_fast.io.ply import load_ply
 from pop_fast.stages.tiles import tile_lists

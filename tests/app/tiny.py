@@ -48,7 +48,7 @@ def tiny_capture(seed: int = 0, n_views: int = 5, mask: np.ndarray | None = None
         for j in np.argsort(-cam[:, 2]):
             u, v = (K @ cam[j])[:2] / cam[j, 2]
             image[(xs - u) ** 2 + (ys - v) ** 2 < (8.0 / cam[j, 2]) ** 2] = colors[j]
-        views.append(View(f"{i:02d}.png", image, viewmat, K, mask))
+        views.append(View(f"{i:02d}.png", image, viewmat, K, mask, seen=np.arange(i % 3, N_POINTS, 3)))
     return Capture("tiny", tuple(views), points, colors, source="made up")
 
 

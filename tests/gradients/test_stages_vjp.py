@@ -23,6 +23,7 @@ from pop_ref import (
 from pop_ref.appearance import expose, expose_vjp
 from pop_ref.polarization import pop_loss, pop_loss_vjp
 from pop_ref.refinement import refined_viewmat, refined_viewmat_vjp, rotmat_from_vector, rotmat_from_vector_vjp
+from pop_ref.regularizers import mean_activation, mean_activation_vjp, sparse_depth_loss, sparse_depth_loss_vjp
 from tests.gradients.checks import assert_vjp_matches, complex_step_gradient
 from tests.oracle.scenes import tilted_camera
 
@@ -452,3 +453,28 @@ def test_pop_loss_transpose_matches_differences(mask: np.ndarray, visible: np.nd
         lambda o, v: pop_loss_vjp(o, mask, float(v), visible),
         [OPACITIES],
     )
+
+
+def test_sparse_depth_transpose_matches_differences() -> None:
+    rng = np.random.default_rng(8)
+    # far from where the disparities agree; several points share pixels, and some lie beyond the outer centres
+    places, disparities = rng.uniform(0.0, 1.0, (12, 2)) * [4.0, 3.0], rng.choice([0.02, 3.0], 12)
+
+    def loss(depth: np.ndarray) -> np.ndarray:
+        return np.array(sparse_depth_loss(depth, places, disparities))
+
+    def loss_vjp(depth: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return sparse_depth_loss_vjp(depth, places, disparities, float(v))
+
+    assert_vjp_matches(loss, loss_vjp, [rng.uniform(1.0, 8.0, (3, 4))])
+
+
+@pytest.mark.parametrize("shape", [(5,), (5, 3)])
+def test_means_of_activations_transpose_matches_differences(shape: tuple[int, ...]) -> None:
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.array(mean_activation(values))
+
+    def mean_vjp(values: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return mean_activation_vjp(values, float(v))
+
+    assert_vjp_matches(mean, mean_vjp, [RNG.uniform(0.1, 1.0, shape)])

@@ -269,6 +269,9 @@ TESTS = {
     "refinement.rotmat_from_vector": "test_appearance.test_a_rotation_is_the_exponential_of_its_generator",
     "refinement.without_common_motion": "test_appearance.test_what_is_taken_out_is_orthogonal_to_what_is_left",
     "refinement.refined_viewmat": "test_appearance.test_a_corrected_camera_is_rigid_and_moves_points_in_its_own_axes",
+    "regularizers.depth_samples": "test_losses.test_samples_are_the_points_that_a_camera_shows_where_it_shows_them",
+    "regularizers.sparse_depth_loss": "test_losses.test_depth_at_points_is_interpolated_and_compared_inverse",
+    "regularizers.mean_activation": "test_losses.test_means_of_activations_are_numpys_and_none_is_zero",
     "ssim.gaussian_window": "test_losses.test_window_is_the_impulse_response_of_scipys_gaussian_filter",
     "ssim.ssim_map": "test_losses.test_ssim_of_equal_images_is_one_and_is_its_maximum",
     "ssim.replace_left_out": "test_losses.test_l1_at_equality_has_the_mean_of_its_one_sided_slopes",
@@ -292,6 +295,7 @@ LADDER = (
 )
 DOCTESTS = (
     *("appearance.expose_vjp", "refinement.rotmat_from_vector_vjp", "refinement.refined_viewmat_vjp"),
+    *("regularizers.sparse_depth_loss_vjp", "regularizers.mean_activation_vjp"),
     "depth.expected_depth",
     "depth.expected_depth_vjp",
     "depth.with_depth_channel",

@@ -1,4 +1,4 @@
-"""The losses against definitions written down elsewhere: eq. 4, scikit-image, scipy."""
+"""The losses and regularizers against definitions written down elsewhere: eq. 4, scikit-image, scipy."""
 
 from __future__ import annotations
 
@@ -13,7 +13,16 @@ from skimage.metrics import structural_similarity
 
 from pop_ref import losses
 from pop_ref.polarization import pop_loss, pop_loss_vjp
+from pop_ref.records import Camera
+from pop_ref.regularizers import (
+    depth_samples,
+    mean_activation,
+    mean_activation_vjp,
+    sparse_depth_loss,
+    sparse_depth_loss_vjp,
+)
 from pop_ref.ssim import WINDOW_SIGMA, gaussian_window
+from tests.oracle.scenes import tilted_camera
 
 SIZES = ((11, 11), (12, 17), (16, 13))
 
@@ -229,3 +238,72 @@ def test_an_invisible_population_gives_no_loss_under_the_visible_reading() -> No
     o, mask, visible = np.array([0.25, 0.5]), np.array([True, False]), np.array([False, False])
     assert pop_loss(o, mask, visible) == 0.0
     assert pop_loss_vjp(o, mask, 1.0, visible).tolist() == [0.0, 0.0]
+
+
+# Sparse depth against scipy's interpolation, and the means that opacities and scales are held down by.
+
+DEPTH_RNG = np.random.default_rng(17)
+
+
+def samples_of_points() -> tuple[np.ndarray, Camera, np.ndarray, np.ndarray]:
+    camera, rng = tilted_camera(), np.random.default_rng(3)
+    points = rng.uniform(-6.0, 6.0, (2000, 3))
+    return points, camera, *depth_samples(points, camera)
+
+
+def test_samples_are_the_points_that_a_camera_shows_where_it_shows_them() -> None:
+    points, camera, places, disparities = samples_of_points()
+    homogeneous = np.hstack([points, np.ones((len(points), 1))]) @ camera.viewmat[:3].T
+    z, on_screen = homogeneous[:, 2], homogeneous @ camera.K.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = on_screen[:, 0] / z, on_screen[:, 1] / z
+    shown = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    assert 10 < shown.sum() < len(points)
+    np.testing.assert_allclose(places, np.stack([u, v], axis=1)[shown], rtol=1e-12)
+    np.testing.assert_allclose(disparities, 1.0 / z[shown], rtol=1e-13)
+
+
+def test_a_point_whose_pixel_the_mask_leaves_out_says_nothing() -> None:
+    points, camera, places, disparities = samples_of_points()
+    mask = np.zeros((camera.height, camera.width), dtype=bool)
+    mask[:, : camera.width // 2] = True
+    left = places[:, 0] < camera.width // 2
+    kept = depth_samples(points, camera, mask)
+    assert 0 < left.sum() < len(places)
+    np.testing.assert_array_equal(kept[0], places[left])
+    np.testing.assert_array_equal(kept[1], disparities[left])
+
+
+def test_depth_at_points_is_interpolated_and_compared_inverse() -> None:
+    depth = DEPTH_RNG.uniform(1.0, 9.0, (5, 7))
+    # beyond the outer pixels' centres too
+    places = np.vstack([DEPTH_RNG.uniform(0.0, 1.0, (40, 2)) * [7.0, 5.0], [[0.0, 0.0], [7.0 - 1e-9, 2.5]]])
+    disparities = DEPTH_RNG.uniform(0.05, 1.2, len(places))
+    at = scipy.ndimage.map_coordinates(depth, (places - 0.5).T[::-1], order=1, mode="nearest")
+    expected = np.mean(np.abs(1.0 / at - disparities))
+    assert sparse_depth_loss(depth, places, disparities) == pytest.approx(expected, rel=1e-14)
+
+
+def test_depth_loss_scales_inversely_with_the_world() -> None:
+    depth, places = DEPTH_RNG.uniform(1.0, 9.0, (4, 4)), DEPTH_RNG.uniform(0.0, 4.0, (9, 2))
+    disparities = DEPTH_RNG.uniform(0.1, 1.0, 9)
+    loss = sparse_depth_loss(depth, places, disparities)
+    assert loss > 0.0
+    # so that the scene's scale times it does not depend on the unit of length
+    assert sparse_depth_loss(4.0 * depth, places, disparities / 4.0) == loss / 4.0
+
+
+def test_where_nothing_is_rendered_the_disparity_is_zero_and_nothing_is_pulled() -> None:
+    places, disparities = np.array([[0.5, 0.5], [2.5, 0.5]]), np.array([0.5, 0.25])
+    depth = np.array([[0.0, 0.0, 8.0]])
+    assert sparse_depth_loss(depth, places, disparities) == (0.5 + 0.125) / 2.0
+    assert sparse_depth_loss_vjp(depth, places, disparities, 1.0).tolist() == [[0.0, 0.0, 0.5 / 64.0]]
+    assert sparse_depth_loss(depth, np.zeros((0, 2)), np.zeros(0)) == 0.0
+
+
+def test_means_of_activations_are_numpys_and_none_is_zero() -> None:
+    for shape in ((7,), (7, 3)):
+        values = DEPTH_RNG.uniform(0.0, 1.0, shape)
+        assert mean_activation(values) == pytest.approx(float(np.mean(values)), rel=1e-14)
+    assert mean_activation(np.zeros((0, 3))) == 0.0
+    assert mean_activation_vjp(np.zeros((0, 3)), 2.0).shape == (0, 3)

@@ -74,5 +74,5 @@ def capture() -> Capture:
         for j in np.argsort(-cam[:, 2]):
             u, v = (K @ cam[j])[:2] / cam[j, 2]
             image[(xs - u) ** 2 + (ys - v) ** 2 < (9.0 / cam[j, 2]) ** 2] = colors[j]
-        views.append(View(f"{i}.png", image, viewmat, K))
+        views.append(View(f"{i}.png", image, viewmat, K, seen=np.arange(i % 2, N_POINTS, 2, dtype=np.int32)))
     return Capture("steps", tuple(views), points, colors, source="made up")

@@ -292,7 +292,9 @@ def test_transparency_matters_to_a_random_background_alone(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("name", sorted(ALL))
-def test_fused_steps_refuse_each_setting_and_the_compiled_backend_takes_torchs(tmp_path: Path, name: str) -> None:
+def test_the_fused_step_refuses_each_setting_and_the_native_one_takes_exposures_alone(
+    tmp_path: Path, name: str
+) -> None:
     config = tiny_config(tmp_path, **{name: True})
     assert name in str(why_not_trained(CUDA, config))
     assert why_not_trained(CUDA, tiny_config(tmp_path)) is None
@@ -300,7 +302,7 @@ def test_fused_steps_refuse_each_setting_and_the_compiled_backend_takes_torchs(t
     if reason is not None:
         pytest.skip(reason)
     run = TrainingRun(replace(config, backend="compiled"), tiny_capture())
-    assert run.stepper.name == "torch"
+    assert run.stepper.name == ("native" if name == "exposure" else "torch")
     assert engine_of(replace(config, backend="compiled")).name == "compiled"
 
 
@@ -345,6 +347,7 @@ def test_what_no_run_can_have_learned_is_refused_and_named(case: str, finished: 
 def test_the_line_about_the_backend_says_that_autograd_takes_the_steps(tmp_path: Path) -> None:
     asked = replace(tiny_config(tmp_path), backend="compiled")
     assert choose_backend(asked)[1] == "backend compiled, as asked for"
-    said = choose_backend(replace(asked, exposure=True))[1]
-    assert said == "backend compiled, as asked for; its fused step has no exposure, so autograd takes the steps"
-    assert choose_backend(replace(asked, backend="fast", exposure=True))[1] == "backend fast, as asked for"
+    said = choose_backend(replace(asked, refine_cameras=True))[1]
+    assert said == "backend compiled, as asked for; its fused step has no refine_cameras, so autograd takes the steps"
+    assert choose_backend(replace(asked, backend="fast", refine_cameras=True))[1] == "backend fast, as asked for"
+    assert choose_backend(replace(asked, exposure=True))[1] == "backend compiled, as asked for"

@@ -59,6 +59,13 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "the prior over the window": {"pop_views": "window"},
     "blur of any view": {"blur_window": "any_view"},
     "blur of summed counts": {"blur_window": "sum"},
+    "depth at sparse points": {"depth_lambda": 0.03},
+    "depth on grey, with a mask": {"depth_lambda": 0.02, "background": (0.5, 0.25, 0.125), "mask": MASK},
+    "depth, antialiased, without the prior": {"depth_lambda": 0.02, "antialiased": True, "lambda_pop": 0.0},
+    "opacities and scales": {"opacity_reg": 0.1, "scale_reg": 0.05},
+    "exposures": {"exposure": True},
+    "exposures on grey, with a mask": {"exposure": True, "background": (0.5, 0.25, 0.125), "mask": MASK},
+    "all for few photographs": {"exposure": True, "depth_lambda": 0.02, "opacity_reg": 0.1, "scale_reg": 0.05},
     "profile inria": {"profile": "inria"},
     "profile gsplat_1_6": {"profile": "gsplat_1_6"},
     "no harmonics": {"sh_degree": 0},
@@ -108,7 +115,15 @@ def test_six_steps_are_torchs(what: str, tmp_path: Path) -> None:
         found, wanted = (run.take_steps(step + 1).stats[0] for run in (mine, its))
         for name in ("objective", "pop"):
             assert getattr(found, name) == pytest.approx(getattr(wanted, name), rel=3e-6, abs=1e-8), name
+        for name, learned in its.appearance.params.items():
+            torch.testing.assert_close(mine.appearance.params[name], learned, rtol=1e-4, atol=1e-6)
         for key, param in its.params.items():
+            if step == 0:
+                # the first moments are those of one gradient, whose size Adam forgets
+                wanted_moment = its.optimizers[key].state[param]["exp_avg"]
+                size = float(wanted_moment.abs().max()) if param.numel() else 0.0
+                moment = mine.optimizers[key].state[mine.params[key]]["exp_avg"]
+                torch.testing.assert_close(moment, wanted_moment, rtol=1e-3, atol=1e-4 * size)
             update = (param.detach() - start[key]).abs().max() if param.numel() else 0.0
             moved[key] = max(moved[key], float(update))
             # where a gradient is rounding, Adam makes its sign a whole step: what nearly all entries do is compared
@@ -160,7 +175,7 @@ def test_gaussians_of_one_depth_are_blended_row_by_row_however_many_there_are(tm
 
 
 @needs_compiled
-@pytest.mark.parametrize("what", ["on grey, with a mask", "antialiased"])
+@pytest.mark.parametrize("what", ["on grey, with a mask", "antialiased", "all for few photographs"])
 def test_the_bits_depend_neither_on_threads_nor_on_how_many_steps_are_asked_for_at_once(
     what: str, tmp_path: Path
 ) -> None:
@@ -324,6 +339,8 @@ def test_a_run_trains_natively_where_it_can_and_says_so(tmp_path: Path) -> None:
     assert TrainingRun(config, tiny_capture()).stepper.name == "native"
     by_absolute_gradients = replace(config, strategy=replace(config.strategy, absgrad=True))
     assert TrainingRun(by_absolute_gradients, tiny_capture()).stepper.name == "torch"
+    terms = {"exposure": True, "depth_lambda": 0.01, "opacity_reg": 0.01, "scale_reg": 0.01}
+    assert TrainingRun(replace(config, **terms), tiny_capture()).stepper.name == "native"
     assert engine_of(config, own_strategy=False).make_stepper is not None
 
 
@@ -349,6 +366,9 @@ class Photo:
     viewmat: torch.Tensor
     K: torch.Tensor
     mask: None = None
+
+    def depth_samples(self) -> None:
+        """None of its sparse points is known."""
 
 
 def gaussians(n: int = 400) -> dict[str, torch.Tensor]:

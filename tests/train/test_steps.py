@@ -104,6 +104,7 @@ RULES = UpdateRules(
 UPDATES = replace(SHORT, updates=RULES, sh_interval=1)
 ENTROPY = replace(SHORT, lambda_pop=0.0, lambda_entropy=0.3)
 BOTH_PRIORS = replace(SHORT, lambda_entropy=0.3)
+FEW = replace(SHORT, depth_lambda=0.05, opacity_reg=0.2, scale_reg=0.3)
 PRUNED = replace(SHORT, density=replace(SHORT.density, final_prune_iter=9, final_prune_opa=0.4))
 
 
@@ -122,8 +123,8 @@ def rules_run_of(recipe: Recipe, folder: Path, engine: Any, dtype: torch.dtype) 
 
 @pytest.mark.parametrize(
     "recipe",
-    [UPDATES, ENTROPY, BOTH_PRIORS, PRUNED],
-    ids=["updates", "entropy", "both", "pruned"],
+    [UPDATES, ENTROPY, BOTH_PRIORS, PRUNED, replace(FEW, depth_lambda=0.0), FEW],
+    ids=["updates", "entropy", "both", "pruned", "regularized", "few photographs"],
 )
 def test_ten_steps_in_double_precision_are_the_oracles(recipe: Recipe, tmp_path: Path) -> None:
     run = rules_run_of(recipe, tmp_path, torch_engine("fast"), torch.float64)
@@ -132,8 +133,10 @@ def test_ten_steps_in_double_precision_are_the_oracles(recipe: Recipe, tmp_path:
         segment = run.take_steps(step + 1)
         view = next(view for view in run._train if view.name == segment.views[0])
         camera = Camera(view.viewmat[0].numpy(), view.K[0].numpy(), view.width, view.height)
-        scene_scale = capture().scene_scale()
-        state, loss = train_step(state, camera, view.photo.double().numpy() / 255.0, scene_scale, normals, recipe)
+        scene_scale, photo = capture().scene_scale(), view.photo.double().numpy() / 255.0
+        seen = None if view.points is None else view.points.numpy()
+        assert (seen is None) == (recipe.depth_lambda == 0.0)
+        state, loss = train_step(state, camera, photo, scene_scale, normals, recipe, seen)
         assert segment.stats[0].objective + segment.stats[0].pop == pytest.approx(loss, rel=1e-10)
         for key in KEYS:
             np.testing.assert_allclose(run.params[key].detach().numpy(), state.rows.params[key], rtol=1e-7, atol=1e-9)

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.data.capture import Capture, View
+from pop_fast.data.normalize import neighbour_degrees
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.pictures import fit
@@ -187,19 +188,6 @@ def stops_between(photo: np.ndarray, render: np.ndarray) -> float:
     theirs, ours = photo.mean(axis=1), render.mean(axis=1)
     telling = (np.minimum(ours, theirs) > _DARK) & (np.maximum(ours, theirs) < 1.0 - _DARK)
     return float(_GAMMA * np.median(np.log2(theirs[telling] / ours[telling]))) if telling.any() else 0.0
-
-
-def neighbour_degrees(viewmats: np.ndarray) -> float | None:
-    """Give the median angle from a camera to the nearest other one, seen from the point they look at. [M, 4, 4]"""
-    from pop_fast.view.paths import camera_centers, focus_point
-
-    if len(viewmats) < 2:
-        return None
-    offsets = camera_centers(viewmats) - focus_point(viewmats)
-    rays = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)
-    cosines = rays @ rays.T
-    np.fill_diagonal(cosines, -1.0)
-    return float(np.degrees(np.median(np.arccos(np.clip(cosines.max(axis=1), -1.0, 1.0)))))
 
 
 def _floaters(capture: Capture, views: Sequence[View], params: Mapping[str, Tensor], looked: Any) -> dict[str, float]:

@@ -15,6 +15,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.read_back import check_record, parse_json, read_arrays, read_json
 from pop_fast.train.commands import read_commands, shell_line
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.load_result import read_record
 from pop_fast.train.presets import METHODS
 from pop_fast.train.results import read_config
 from pop_fast.view.report.checks import Checks, read_checks
@@ -67,7 +68,7 @@ def read_result(folder: Path) -> ReportData:
         dominant=dominant,
         views=views,
         n_held_out=stats.get("views"),
-        config=_settings(config),
+        config=_settings(config, folder),
         changes=[{key: change.get(key) for key in _CHANGE_COLUMNS} for change in changes],
         files=_files(stats, str(folder)),
         viewer=_viewer(folder),
@@ -344,12 +345,13 @@ def _numbered(folder: Path, pattern: str) -> list[tuple[int, Path]]:
     return sorted((int(match[1]), path) for match, path in found if match)
 
 
-def _settings(config: TrainConfig) -> dict[str, Any]:
-    given = config.given
+def _settings(config: TrainConfig, folder: Path) -> dict[str, Any]:
+    given, record = config.given, read_record(folder)
     if given is None:
         return config.flat()
     return {
         "preset": given.preset,
         "steps_scaler": given.scaler,
         "scale_lambda_pop": given.scale_lambda_pop,
+        **({"chosen by the run": "; ".join(record.chosen)} if record is not None and record.chosen else {}),
     } | config.flat()
