@@ -1,6 +1,7 @@
 """What terms for few photographs change: depth at sparse points, regularizers, exposure, corrected cameras.
 
     python benchmarks/few_photographs.py fox --factor 4 --left 8 12 20 25 --seed 42 43 44 --json few.json
+    python benchmarks/few_photographs.py --json few.json
     python benchmarks/few_photographs.py fox --gains 0.3 --only plain --only=--exposure
     python benchmarks/few_photographs.py fox --turned 0.3 --only plain --only=--refine-cameras
 
@@ -18,7 +19,7 @@ import argparse
 import shlex
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -147,10 +148,48 @@ def rows_of(args: argparse.Namespace, known: dict[str, Any]) -> Iterator[tuple[s
                 yield name, known[name]
 
 
+def table_of(known: Mapping[str, Any], only: Sequence[str] | None = None) -> str:
+    """Lay the rows of a JSON file out: PSNR / SSIM of the plain runs, and what every setting changes of them.
+
+    A change is the mean over the seeds that were run with both; how many these are stands in brackets.
+
+    Args:
+        known: the rows.
+        only: settings; None takes all.
+    """
+    found: dict[str, dict[str, dict[str, tuple[float, float]]]] = {}
+    for name, numbers in known.items():
+        if name != "machine":
+            what, _, setting = name.partition(": ")
+            place, _, seed = what.rpartition(", seed ")
+            found.setdefault(place, {}).setdefault(setting, {})[seed] = (numbers["psnr"], numbers["ssim"])
+    settings = [s for s in only or dict.fromkeys(s for row in found.values() for s in row) if s != "plain"]
+    titles = " | ".join(f"`{setting}`" for setting in settings)
+    lines = [f"| capture | plain | {titles} |", f"| --- | --- |{' --- |' * len(settings)}"]
+    for place in sorted(found, key=_by_count):
+        plain = found[place].get("plain", {})
+        cells = [_mean_of(list(plain.values()), "{:.2f} / {:.3f} ({})")]
+        for setting in settings:
+            seeds = found[place].get(setting, {})
+            both = [np.subtract(value, plain[seed]) for seed, value in seeds.items() if seed in plain]
+            cells.append(_mean_of(both, "{:+.2f} / {:+.3f} ({})"))
+        lines.append(f"| {place} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _mean_of(pairs: Sequence[Any], shown: str) -> str:
+    return shown.format(*np.mean(pairs, axis=0), len(pairs)) if len(pairs) else ""
+
+
+def _by_count(place: str) -> tuple[str, int]:
+    capture, count = place.split(", ")[:2]
+    return capture, int(count.split()[0])
+
+
 def main(words: list[str] | None = None) -> int:
     """Measure, a row for each number of photographs, setting and seed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("capture", type=Path)
+    parser.add_argument("capture", type=Path, nargs="?", help="without one, the rows of --json are laid out as a table")
     parser.add_argument("--factor", type=int, default=8)
     parser.add_argument("--left", type=int, nargs="+", help="training photographs; every other one is left by default")
     parser.add_argument("--steps", type=int, default=1500)
@@ -161,6 +200,9 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="keep the rows here, and go on from those that are in it")
     args = parser.parse_args(words)
     known = {} if args.json is None else read_json(args.json)
+    if args.capture is None:
+        print(table_of(known))
+        return 0
     known.setdefault("machine", machine())
     print(f"| run | {' | '.join(COLUMNS)} |\n| --- |{' --- |' * len(COLUMNS)}", flush=True)
     for name, numbers in rows_of(args, known):

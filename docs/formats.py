@@ -16,7 +16,45 @@ from pop_fast.io.formats import FORMATS, Format
 
 PAGE = Path(__file__).resolve().parent / "FORMATS.md"
 SIZES = PAGE.parents[1] / "benchmarks" / "results" / "sizes.json"
+BUDGETS = SIZES.with_name("budgets.json")
+# Mip-NeRF 360, mean of nine scenes: method, dB, MB, source; sizes of the source in bytes are divided by 10^6
+PUBLISHED = (
+    ("3DGS, 30,000 steps, not compressed", "27.21", "734", "Kerbl et al. 2023, table 1"),
+    ("LightGaussian", "27.28", "44.0", "arXiv 2311.17245"),
+    ("Compact3DGS, with entropy coding", "27.03", "30.5", "arXiv 2311.13681"),
+    ("Reduced 3DGS", "27.10", "30.4", "Papantonakis et al. 2024"),
+    ("Compressed 3DGS (Niedermayr et al.)", "26.98", "30.2", "arXiv 2401.02436"),
+    ("Self-Organizing Gaussians", "27.08", "40.3", "Morgenstern et al. 2024, `eval-release` of its code"),
+    ("CompGS (Navaneet et al.), 16K", "27.03", "18.9", "arXiv 2311.18159"),
+    ("RDO-Gaussian", "27.05", "23.5", "results in its code's repository"),
+    ("gsplat, 1,000,000 Gaussians, PNG", "27.29", "16.0", "`examples/benchmarks/compression` of gsplat"),
+    ("HAC, low rate", "27.30", "15.1", "issue 14 of its code's repository"),
+)
 _FIELDS = ("centre", "scale", "rotation", "opacity", "colour", "view dependence")
+
+_SMALLER = """## Smaller
+
+| option | what goes |
+|---|---|
+| `--min-opacity A` | Gaussians with a lower opacity; under 1/255 no picture changes |
+| `--crop XMIN YMIN ZMIN XMAX YMAX ZMAX` | those with their centre outside a box in the capture's own world frame |
+| `--without-floaters` | those that stand before a camera where nothing was photographed |
+| `--final-prune SHARE` | those that contribute least and together make up this share of all blending weights |
+| `--max-gaussians N` | all but the N of the highest score |
+| `--target-mb M` | what a file of at most M megabytes has no room for: Gaussians of the lowest scores, bands of the \
+colours, and digits of their coefficients |
+
+Scores (`--score`) are Speedy-Splat's sensitivity, blending weights or dominated pixels, summed over the training views,
+or a guess from opacity and size where no capture is known. `pop train` takes the same options, for the files that
+`--export` names.
+
+Where the photographs are at hand, `--target-mb` measures what loses least. Every degree of the colours is tried, those
+of a lower one fitted to what the training views show, and the best one with finer and coarser coefficients, where the
+format has them. Each is tuned for a few steps, written, read back and measured in training views; the best is tuned for
+`--fine-tune-steps` (300; 0 tunes nothing), and so is what `--max-gaussians` keeps. The run's own engine and loss do
+that, without density control; how long it takes is told after its first two seconds. Held-out views are measured at
+the end and decide nothing. Without photographs, Gaussians alone go, those that are least visible.
+"""
 
 
 def page() -> str:
@@ -61,23 +99,14 @@ as they are.
 - `html` holds SPZ, and loses what that loses. It draws as the training's rasterizer does, to degree 3, but ends no
   pixel early; in the profile `inria` its cut-off is an ellipse of 3 standard deviations and not a square.
 
-## Smaller
-
-| option | what goes |
-|---|---|
-| `--min-opacity A` | Gaussians with a lower opacity; under 1/255 no picture changes |
-| `--crop XMIN YMIN ZMIN XMAX YMAX ZMAX` | those with their centre outside a box in the capture's own world frame |
-| `--final-prune SHARE` | those that contribute least and together make up this share of all blending weights |
-| `--max-gaussians N` | all but the N of the highest score |
-| `--target-mb M` | all but those of the highest score that make a file of at most M megabytes |
-
-Scores (`--score`) are Speedy-Splat's sensitivity, blending weights or dominated pixels, summed over the training views,
-or a guess from opacity and size where no capture is known. `pop train` takes the same options, for the files that
-`--export` names.
-
+{_SMALLER}
 ## Measured
 
 {_measured(json.loads(SIZES.read_text(encoding="utf-8")))}
+
+## A tenth and a twentieth
+
+{_budgets(json.loads(BUDGETS.read_text(encoding="utf-8")))}
 """
 
 
@@ -101,6 +130,33 @@ def _measured(sizes: dict[str, Any]) -> str:
 (`benchmarks/sizes.py`).
 
 {_table(head, rows)}"""
+
+
+def _budgets(record: dict[str, Any]) -> str:
+    head = ["capture", "format", "bytes", "fewer Gaussians alone", "harmonics and digits too", "and tuned"]
+    rows, sources = [], []
+    for name, found in record["captures"].items():
+        sources.append(
+            f"{name}, photographs shrunk by {found['factor']}: {found['gaussians']:,} Gaussians, {found['psnr']:.2f} "
+            f"dB, after the same steps of tuning {found['psnr_tuned']:.2f} dB"
+        )
+        for row in found["rows"]:
+            cells = [f"{row[kind]['psnr'] - found['psnr']:+.2f} dB" for kind in ("fewer", "spent", "tuned")]
+            size = f"{row['bytes'] / 1e6:.2f} MB, 1/{row['share']}"
+            rows.append([name, f"`{row['format']}`", size, *cells])
+    return f"""Change of the held-out PSNR in a tenth and a twentieth of the bytes of the whole splat's PLY. POP,
+`--preset quick`, which ends before the splat is as good as it gets: what is tuned can be better than the whole.
+{"; ".join(sources)}. "Fewer Gaussians alone" is what `--target-mb` did before, "harmonics and digits too" is
+`--fine-tune-steps 0`, the last column the default of {record["steps"]} steps (`benchmarks/budgets.py`).
+
+{_table(head, rows)}
+
+Published figures of methods that compress, on another scale: the nine scenes of Mip-NeRF 360, their photographs shrunk
+by 4 (outdoors) and 2 (indoors), tens of thousands of steps on a GPU. Each is the authors', as the survey
+3DGS.zip (`w-m.github.io/3dgs-compression-survey`, arXiv 2407.09510) lists it, but for the first. They say what
+a method reaches there, and nothing about the table above.
+
+{_table(["method", "PSNR, dB", "MB", "source"], [list(row) for row in PUBLISHED])}"""
 
 
 def _described(format: Format) -> str:

@@ -42,6 +42,7 @@ STAGES = (
         ("compiled/losses.py",),
     ),
     Stage("importance mask and POP loss", "eqs. 7, 8", ("polarization",)),
+    Stage("terms for few photographs: sparse depth, mean opacity, mean scale", "–", ("regularizers",)),
     Stage("density control", "eqs. 3, 6", ("density", "density_config", "density_rows")),
     Stage("Adam and its schedules", "4.1", ("optimizer",), ("train/model.py", "train/schedule.py")),
     Stage("exposure of photographs, random backgrounds", "–", ("appearance",), ("train/appearance.py",)),
@@ -92,6 +93,7 @@ LAWS_ELSEWHERE = {
     "training": "tests/golden",
     "appearance": "tests/oracle/test_appearance.py",
     "refinement": "tests/oracle/test_appearance.py",
+    "regularizers": "tests/oracle/test_losses.py",
     "margins": "tests/thresholds",
 }
 

@@ -160,6 +160,14 @@ def differences() -> str:
     return str(runpy.run_path(str(ROOT / "benchmarks" / "results_table.py"))["differences"]())
 
 
+def few_photographs() -> str:
+    """Make the table of captures with few photographs left, as benchmarks/few_photographs.py does."""
+    script = runpy.run_path(str(ROOT / "benchmarks" / "few_photographs.py"))
+    known = json.loads((ROOT / "benchmarks" / "results" / "few_photographs.json").read_text(encoding="utf-8"))
+    weights = ("--depth-lambda 0.1", "--depth-lambda 0.01", "--opacity-reg 0.001", "--scale-reg 0.01")
+    return str(script["table_of"](known, (*weights, "--method gsplat")))
+
+
 def _of_faults(name: str) -> Callable[[], str]:
     """Make a table as benchmarks/fault_tables.py does."""
     return lambda: str(runpy.run_path(str(ROOT / "benchmarks" / "fault_tables.py"))[name]())
@@ -343,6 +351,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "summary": summary,
     "results": results,
     "differences": differences,
+    "few_photographs": few_photographs,
     **{name: _of_faults(name) for name in ("fuzzed", "disturbed", "sanitized", "loads")},
     "blocks": blocks,
     "recipes": recipes,

@@ -202,6 +202,56 @@ def colors_from_sh_vjp(
     return v_sh, v_dirs
 
 
+def lower_degree(
+    sh: Float64[np.ndarray, "N n_coefficients 3"],
+    dirs: Float64[np.ndarray, "C N 3"],
+    weights: Float64[np.ndarray, "C N"],
+    degree: int,
+    uniform: float = 1.0,
+) -> Float64[np.ndarray, "N n_sh 3"]:
+    """Fit harmonics of a lower degree to the colours of a higher one, where views show them.
+
+    `x` minimises `sum_v w_v |Y(d_v) . x - Y(d_v) . sh|^2 + u mean_d |Y(d) . x - Y(d) . sh|^2`, the mean over all
+    directions. As the harmonics are orthogonal, the second term is `u / 4 pi` times the squares of the change of the
+    bands that stay, and what views do not show is left as it was: with no view, `x` is `sh` cut off.
+
+    Source: least squares; orthogonality of the real harmonics (Sloan 2013).
+    Departs: the clamp of colours at 0 (B2) is left out.
+
+    Args:
+        sh: coefficients.
+        dirs: from the camera centres to the Gaussians, world frame, any norm > 0.
+        weights: how much each view counts, as the sum of a Gaussian's blending weights over its pixels; >= 0.
+        degree: of the result, 0, 1, 2 or 3.
+        uniform: how much all directions together count, in the unit of the weights; > 0.
+
+    Returns:
+        The first (degree + 1)^2 coefficients.
+
+    Raises:
+        ValueError: the degree is not 0 to 3, or `sh` has fewer than (degree + 1)^2 coefficients.
+
+    Example:
+        >>> sh = np.zeros((1, 4, 3))
+        >>> sh[0, 2] = 1.0
+        >>> seen_from_below = np.array([[[0.0, 0.0, 1.0]]])
+        >>> lower_degree(sh, seen_from_below, np.array([[3.0]]), 0)[0, 0].round(4)
+        array([1.299, 1.299, 1.299])
+    """
+    n_sh = _enough(sh, degree)
+    every = math.isqrt(sh.shape[1]) - 1
+    bases = [sh_basis(_unit(view), every) for view in dirs]
+    lower = np.zeros((len(sh), n_sh, 3))
+    for i in range(len(sh)):
+        left, right = uniform / (4.0 * math.pi) * np.eye(n_sh), np.zeros((n_sh, 3))
+        for basis, weight in zip(bases, weights[:, i], strict=True):
+            kept, dropped = basis[i, :n_sh], basis[i, n_sh:] @ sh[i, n_sh:]
+            left += weight * np.outer(kept, kept)
+            right += weight * np.outer(kept, dropped)
+        lower[i] = sh[i, :n_sh] + np.linalg.solve(left, right)
+    return lower
+
+
 def _unit(dirs: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
     units = np.zeros_like(dirs)
     for i in range(len(dirs)):

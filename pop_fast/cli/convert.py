@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -12,12 +12,10 @@ import tyro
 
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.export import HTML, check_file, file_format, note_lost_frame, say_written
-from pop_fast.cli.limits import FormatName, LimitOptions, Shown, limited
+from pop_fast.cli.limits import FormatName, LimitOptions, Output, Shown, limited
 from pop_fast.errors import PopError
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from pop_fast.io.formats import Stored
     from pop_fast.train.config import TrainConfig
 
@@ -61,28 +59,27 @@ def run(argv: Sequence[str]) -> int:
     stored = load_splat_file(args.source)
     note_lost_frame(args.out, name, stored.frame)
     config = TrainConfig(antialiased=stored.antialiased)
-    write = _writer(args, name, stored, config)
+    output = _output(args, name, stored, config)
     move = _training_frame(args.source, stored) if args.crop is not None else None
-    shown = Shown(params=stored.params, sh_degree=_MOST_BANDS, config=config, world_transform=move, capture=None)
-    kept, said = limited(shown, args, lambda rows: len(write(rows)))
-    for line in said:
+    shown = Shown(params=stored.params, sh_degree=_MOST_BANDS, config=config, world_transform=move, open=None)
+    left = limited(shown, args, output)
+    for line in left.said:
         print(line)
-    data = write(kept)
+    data = output.write(left.params, left.level)
     write_atomically(args.out, lambda file: file.write(data))
-    say_written(args.out, len(kept["means"]), len(data))
+    say_written(args.out, len(left.params["means"]), len(data))
     return 0
 
 
-def _writer(args: Args, name: str, stored: Stored, config: TrainConfig) -> Callable[[dict[str, Tensor]], bytes]:
-    """Return what makes the file's bytes of raw parameters."""
+def _output(args: Args, name: str, stored: Stored, config: TrainConfig) -> Output:
+    """Return what is made of raw parameters."""
     if name == HTML:
         from pop_fast.view.html import page_of
 
         # no capture is known: it starts at a camera that sees most of the splat
-        return lambda params: page_of(params, [], config, _MOST_BANDS, args.source.resolve().name)
-    from pop_fast.io.formats import encoded
-
-    return lambda params: encoded(name, params, stored.antialiased, stored.frame)
+        rest = ([], config, _MOST_BANDS, args.source.resolve().name)
+        return Output(HTML, stored.antialiased, page=lambda params, level: page_of(params, *rest, level))
+    return Output(name, stored.antialiased, stored.frame)
 
 
 def _training_frame(source: Path, stored: Stored) -> np.ndarray | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
@@ -13,16 +13,15 @@ import tyro
 
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
-from pop_fast.cli.limits import FormatName, LimitOptions, Shown, limited
+from pop_fast.cli.limits import FormatName, LimitOptions, Output, Shown, limited
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import check_folder, check_place
 from pop_fast.train.load_result import Splat, frame_of_splat, load_splat, read_record
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from pop_fast.data import Capture
     from pop_fast.io.frame import Frame
+    from pop_fast.train.config import TrainConfig
 
 HTML: Final = "html"
 _EXAMPLES: Final = """
@@ -68,21 +67,19 @@ def run(argv: Sequence[str]) -> int:
     opened = _Opened(splat, args)
     if args.drop_invisible:
         splat = without_invisible(splat)
-    write = _writer(args, out, name, splat, opened)
-    params, said = limited(
-        Shown(
-            params=splat.params,
-            sh_degree=splat.sh_degree,
-            config=opened.config,
-            world_transform=_training_frame(splat, args) if args.crop is not None else None,
-            capture=opened.capture if opened.known else None,
-        ),
-        args,
-        lambda params: len(write(params)),
+    output = _output(args, out, name, splat, opened)
+    shown = Shown(
+        params=splat.params,
+        sh_degree=splat.sh_degree,
+        config=opened.config,
+        world_transform=_training_frame(splat, args) if args.crop is not None else None,
+        open=opened.capture if opened.known else None,
+        checkpoint=splat.path,
     )
-    for line in said:
+    left = limited(shown, args, output)
+    for line in left.said:
         print(line)
-    say_written(out, len(params["means"]), _write(out, write(params)))
+    say_written(out, len(left.params["means"]), _write(out, output.write(left.params, left.level)))
     return 0
 
 
@@ -112,11 +109,11 @@ class _Opened:
         """Tell whether there is one to load."""
         return self._options.capture is not None or bool(self.config.data and Path(self.config.data).is_dir())
 
-    def capture(self) -> Capture:
-        """Return it, in the frame of the splat."""
+    def capture(self) -> tuple[Capture, TrainConfig]:
+        """Return it, in the frame of the splat, and the settings to look at it with."""
         if self._found is None:
             self._found, self.config = open_with_bars(self._splat, self._options)
-        return self._found
+        return self._found, self.config
 
 
 def planned_file(args: Args) -> tuple[Path, str]:
@@ -189,25 +186,17 @@ def check_file(out: Path, source: Path, overwrite: bool) -> None:
     check_place(out)
 
 
-def _writer(args: Args, out: Path, name: str, splat: Splat, opened: _Opened) -> Callable[[dict[str, Tensor]], bytes]:
-    """Return what makes the file's bytes of raw parameters in the splat's frame."""
+def _output(args: Args, out: Path, name: str, splat: Splat, opened: _Opened) -> Output:
+    """Return what is made of raw parameters in the splat's frame."""
     if name == HTML:
         from pop_fast.view.html import cameras_of, page_of
 
-        cameras = cameras_of(opened.capture().train_views(opened.config.test_every)) if opened.known else []
-        return lambda params: page_of(params, cameras, opened.config, splat.sh_degree, args.splat.resolve().name)
-    from pop_fast.data import to_capture_frame
-    from pop_fast.io.formats import encoded
-
+        cameras = cameras_of(opened.capture()[0].train_views(opened.config.test_every)) if opened.known else []
+        rest = (cameras, opened.config, splat.sh_degree, args.splat.resolve().name)
+        return Output(HTML, splat.config.antialiased, page=lambda params, level: page_of(params, *rest, level))
     transform, frame = _output_frame(splat, args)
     note_lost_frame(out, name, frame)
-    antialiased = splat.config.antialiased
-
-    def write(params: dict[str, Tensor]) -> bytes:
-        moved = params if transform is None else to_capture_frame(params, transform)
-        return encoded(name, moved, antialiased, frame)
-
-    return write
+    return Output(name, splat.config.antialiased, frame, transform)
 
 
 def _write(out: Path, data: bytes) -> int:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED
 from pop_fast.cli.errors import describe
-from pop_fast.cli.export import file_name, say_written
-from pop_fast.cli.limits import FormatName, LimitOptions, Shown, limited
+from pop_fast.cli.export import HTML, file_name, say_written
+from pop_fast.cli.limits import FormatName, LimitOptions, Output, Shown, limited
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -68,30 +68,43 @@ def finish(folder: Path, capture: Capture, options: Any) -> int:
 
 def _finish(folder: Path, capture: Capture, options: FinishOptions) -> None:
     from pop_fast.io.atomic import write_atomically
+    from pop_fast.io.frame import Frame
     from pop_fast.train.load_result import load_splat
     from pop_fast.view.html import cameras_of, page_of
 
     splat = load_splat(folder)
-    cameras = cameras_of(capture.train_views(splat.config.test_every))
     title = folder.resolve().name
 
-    def page(params: dict[str, Tensor]) -> bytes:
-        return page_of(params, cameras, splat.config, splat.sh_degree, title)
-
+    rest = (cameras_of(capture.train_views(splat.config.test_every)), splat.config, splat.sh_degree, title)
+    shown = Shown(
+        params=splat.params,
+        sh_degree=splat.sh_degree,
+        config=splat.config,
+        world_transform=capture.world_transform,
+        open=lambda: (capture, splat.config),
+        checkpoint=splat.path,
+    )
+    page = Output(HTML, splat.config.antialiased, page=lambda params, level: page_of(params, *rest, level))
+    # what the page and the table of sizes show, and every file whose size is not limited
+    kept = limited(shown, dataclasses.replace(options, target_mb=None), page)
     names = options.export or (("ply",) if options.any else ())
-    for index, name in enumerate(names):
-        kept, said = _limited(splat, capture, options, name, page)
-        for line in said if index == 0 or options.target_mb is not None else ():
-            print(line)
+    for line in kept.said if names and options.target_mb is None else ():
+        print(line)
+    frame = Frame("capture", tuple(map(tuple, capture.world_transform.tolist())))
+    for name in names:
+        output, left = page if name == HTML else Output(name, page.antialiased, frame, capture.world_transform), kept
+        if options.target_mb is not None:
+            left = limited(shown, options, output)
+            for line in left.said:
+                print(line)
         path = folder / EXPORTS / file_name(title, name)
-        data = _encoded(name, kept, splat, capture, page)
+        data = output.write(left.params, left.level)
         write_atomically(path, lambda file, data=data: file.write(data))
-        say_written(path, len(kept["means"]), len(data))
-    kept, _ = _limited(splat, capture, dataclasses.replace(options, target_mb=None), "ply", page)
-    shown = page(kept)
-    write_atomically(folder / VIEWER, lambda file: file.write(shown))
+        say_written(path, len(left.params["means"]), len(data))
+    shown_page = page.write(kept.params)
+    write_atomically(folder / VIEWER, lambda file: file.write(shown_page))
     if not options.skip_sizes:
-        _sizes(folder, splat, capture, kept)
+        _sizes(folder, splat, capture, kept.params)
     if not options.skip_checks:
         checked(folder, splat, capture, splat.config)
 
@@ -108,30 +121,6 @@ def checked(folder: Path, splat: Splat, capture: Capture, config: TrainConfig) -
         beat.say("rendering depth and the orbit for the report")
         step = config.max_steps - 1 if splat.step is None else splat.step
         write_checks(folder, capture, splat.params, config, splat.sh_degree, backend, step)
-
-
-def _limited(
-    splat: Splat, capture: Capture, limits: LimitOptions, name: str, page: Any
-) -> tuple[dict[str, Tensor], list[str]]:
-    shown = Shown(
-        params=splat.params,
-        sh_degree=splat.sh_degree,
-        config=splat.config,
-        world_transform=capture.world_transform,
-        capture=lambda: capture,
-    )
-    return limited(shown, limits, lambda params: len(_encoded(name, params, splat, capture, page)))
-
-
-def _encoded(name: str, params: dict[str, Tensor], splat: Splat, capture: Capture, page: Any) -> bytes:
-    if name == "html":
-        return page(params)
-    from pop_fast.data import to_capture_frame
-    from pop_fast.io.formats import encoded
-    from pop_fast.io.frame import Frame
-
-    frame = Frame("capture", tuple(map(tuple, capture.world_transform.tolist())))
-    return encoded(name, to_capture_frame(params, capture.world_transform), splat.config.antialiased, frame)
 
 
 def _sizes(folder: Path, splat: Splat, capture: Capture, params: dict[str, Tensor]) -> None:

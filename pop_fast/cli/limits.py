@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, Literal
 
 from pop_fast.errors import PopError
 from pop_fast.io.format_registry import format_names
+from pop_fast.io.heartbeat import duration
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import numpy as np
     from torch import Tensor
 
     from pop_fast.data import Capture
     from pop_fast.density.shrink import Score
+    from pop_fast.io.frame import Frame
+    from pop_fast.train.compact import Compact, Tuner
     from pop_fast.train.config import TrainConfig
 
     FormatName = str
@@ -25,6 +31,8 @@ else:
 _MOST_VIEWS: Final = 100
 # bytes of what `--target-mb` counts in
 _MEGABYTE: Final = 1_000_000
+# of fine-tuning; more is a training
+_MOST_STEPS: Final = 30_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,10 +42,16 @@ class LimitOptions:
     Attributes:
         min_opacity: leave out Gaussians with a lower opacity; 1/255 = 0.0039 changes no picture.
         crop: keep those with their centres in the box XMIN YMIN ZMIN XMAX YMAX ZMAX, in the capture's own world frame.
+        without_floaters: leave out those that stand, in the picture of a photograph's camera or of one that turns about
+            the subject, nearer than half the distance of the nearest sparse points there: haze and veils.
         final_prune: leave out those that contribute least and together make up this share of all blending weights in
             the training views, as 0.003, and those that no training view shows.
         max_gaussians: keep at most so many, those of the highest scores.
-        target_mb: keep as many, those of the highest scores, as make a file of at most so many megabytes (10^6 bytes).
+        target_mb: make a file of at most so many megabytes (10^6 bytes): by fewer Gaussians, those of the highest
+            scores, and where photographs are at hand also by a lower degree and a coarser encoding of the colours,
+            whatever loses least in the training views.
+        fine_tune_steps: after max_gaussians or target_mb, train what is left for so many steps on the photographs, if
+            they are at hand; 0 leaves it as it is.
         score: what `max-gaussians` and `target-mb` go by: Speedy-Splat's sensitivity, the blending weights
             (contributions) or the pixels dominated (dominance), each over all training views, or opacity and size alone
             (visibility); "auto" is sensitivity where a capture is known, otherwise visibility.
@@ -45,16 +59,18 @@ class LimitOptions:
 
     min_opacity: float | None = None
     crop: tuple[float, float, float, float, float, float] | None = None
+    without_floaters: bool = False
     final_prune: float | None = None
     max_gaussians: int | None = None
     target_mb: float | None = None
+    fine_tune_steps: int = 300
     score: Literal["auto", "contributions", "dominance", "sensitivity", "visibility"] = "auto"
 
     @property
     def any(self) -> bool:
         """Tell whether something may be left out."""
         limits = (self.min_opacity, self.crop, self.final_prune, self.max_gaussians, self.target_mb)
-        return any(limit is not None for limit in limits)
+        return self.without_floaters or any(limit is not None for limit in limits)
 
     def check(self) -> None:
         """Refuse what cannot be before anything is loaded.
@@ -70,8 +86,10 @@ class LimitOptions:
             raise PopError(f"--final-prune {self.final_prune:g} must be in [0, 1)")
         if self.max_gaussians is not None and self.max_gaussians < 1:
             raise PopError(f"--max-gaussians {self.max_gaussians} must be at least 1")
-        if self.target_mb is not None and not self.target_mb > 0.0:
-            raise PopError(f"--target-mb {self.target_mb:g} must be over 0")
+        if self.target_mb is not None and not 0.0 < self.target_mb < math.inf:
+            raise PopError(f"--target-mb {self.target_mb:g} must be over 0 and finite")
+        if not 0 <= self.fine_tune_steps <= _MOST_STEPS:
+            raise PopError(f"--fine-tune-steps {self.fine_tune_steps} must be 0 to {_MOST_STEPS:,}")
 
 
 @dataclass(frozen=True)
@@ -83,65 +101,218 @@ class Shown:
         sh_degree: highest active colour band.
         config: how it is drawn.
         world_transform: the training frame from the capture's; None where they are the same.
-        capture: opens its capture; None where none is known.
+        open: opens its capture, and gives the settings to look at it with; None where none is known.
+        checkpoint: that it was read from, if any.
     """
 
     params: dict[str, Tensor]
     sh_degree: int
     config: TrainConfig
     world_transform: np.ndarray | None
-    capture: Callable[[], Capture] | None
+    open: Callable[[], tuple[Capture, TrainConfig]] | None
+    checkpoint: Path | None = None
 
 
-def limited(
-    shown: Shown, limits: LimitOptions, size_of: Callable[[dict[str, Tensor]], int]
-) -> tuple[dict[str, Tensor], list[str]]:
+@dataclass(frozen=True)
+class Output:
+    """The file that a splat becomes.
+
+    Attributes:
+        name: of its format, or "html".
+        antialiased: to be drawn with antialiasing.
+        frame: the world that the file is in, where it is known.
+        transform: what `to_capture_frame` moves the splat into that by; None where nothing moves. [4, 4]
+        page: makes a page of raw parameters, at a level of coarseness.
+    """
+
+    name: str
+    antialiased: bool = False
+    frame: Frame | None = None
+    transform: np.ndarray | None = None
+    page: Callable[[Mapping[str, Tensor], int], bytes] | None = None
+
+    @property
+    def levels(self) -> int:
+        """See `pop_fast.train.compact.Coding`."""
+        from pop_fast.io.formats import levels
+
+        return levels(self._format)
+
+    @property
+    def _format(self) -> str:
+        # what a page holds is SPZ
+        return self.name if self.page is None else "spz"
+
+    def write(self, params: Mapping[str, Tensor], level: int = 0) -> bytes:
+        """Return the file's bytes; see `pop_fast.train.compact.Coding`."""
+        return self._encoded(params, level) if self.page is None else self.page(params, level)
+
+    def shown(self, params: Mapping[str, Tensor], level: int = 0) -> dict[str, Tensor]:
+        """Return what is read from the file, in the frame of the parameters."""
+        from pop_fast.data import apply_similarity
+        from pop_fast.io.formats import decoded
+
+        back = decoded(self._format, self._encoded(params, level)).params
+        return back if self.transform is None else apply_similarity(back, self.transform)
+
+    def _encoded(self, params: Mapping[str, Tensor], level: int) -> bytes:
+        from pop_fast.data import to_capture_frame
+        from pop_fast.io.formats import encoded
+
+        moved = params if self.transform is None else to_capture_frame(dict(params), self.transform)
+        return encoded(self._format, moved, self.antialiased, self.frame, level)
+
+
+@dataclass
+class Limited:
+    """What limits have left.
+
+    Attributes:
+        params: raw parameters, in the training frame.
+        level: of coarseness that they are to be written at.
+        said: a line for every limit that left something out.
+    """
+
+    params: dict[str, Tensor]
+    level: int = 0
+    said: list[str] = field(default_factory=list)
+
+    def keep(self, kept: Tensor, what: str) -> None:
+        """Keep the Gaussians that are marked.
+
+        Raises:
+            PopError: none is.
+        """
+        before, after = len(kept), int(kept.sum())
+        self.said.append(f"{what}: {after:,} of {before:,} Gaussians kept")
+        if after == 0 and before > 0:
+            raise PopError(f"{what} leaves no Gaussian of {before:,}; ask for less")
+        self.params = {name: value[kept] for name, value in self.params.items()}
+
+
+def limited(shown: Shown, limits: LimitOptions, output: Output) -> Limited:
     """Leave out what the limits say.
 
     Args:
         shown: the splat.
         limits: the options.
-        size_of: bytes of the file that raw parameters in the training frame make.
+        output: the file that is made of it.
 
     Returns:
-        Raw parameters of those that stay, in their order, and a line for every limit that left some out.
+        What is left, its Gaussians in their order.
 
     Raises:
         PopError: a limit cannot be met, or no Gaussian is left.
     """
     from pop_fast.density import shrink
 
-    params, said = shown.params, list[str]()
-
-    def keep(kept: Tensor, what: str) -> None:
-        nonlocal params
-        before, after = len(kept), int(kept.sum())
-        said.append(f"{what}: {after:,} of {before:,} Gaussians kept")
-        if after == 0 and before > 0:
-            raise PopError(f"{what} leaves no Gaussian of {before:,}; ask for less")
-        params = {name: value[kept] for name, value in params.items()}
-
+    left = Limited(shown.params)
     if limits.min_opacity is not None:
-        keep(shrink.opaque_enough(params, limits.min_opacity), f"opacity >= {limits.min_opacity:g}")
+        left.keep(shrink.opaque_enough(left.params, limits.min_opacity), f"opacity >= {limits.min_opacity:g}")
     if limits.crop is not None:
-        keep(shrink.inside(_means_of_capture(params, shown), limits.crop), "in the box")
+        left.keep(shrink.inside(_means_of_capture(left.params, shown), limits.crop), "in the box")
+    if limits.without_floaters:
+        left.keep(~_floaters(shown, left.params), "without floaters")
     if limits.final_prune is not None:
-        kept = shrink.all_but_the_least(_scores(shown, params, "contributions"), limits.final_prune)
-        keep(kept, f"all but {limits.final_prune:.2%} of the blending weights")
+        kept = shrink.all_but_the_least(_scores(shown, left.params, "contributions"), limits.final_prune)
+        left.keep(kept, f"all but {limits.final_prune:.2%} of the blending weights")
     if limits.max_gaussians is None and limits.target_mb is None:
-        return params, said
-    by_itself: shrink.Score = "visibility" if shown.capture is None else "sensitivity"
+        return left
+    by_itself: shrink.Score = "visibility" if shown.open is None else "sensitivity"
     score = by_itself if limits.score == "auto" else limits.score
-    scores = _scores(shown, params, score)
     if limits.max_gaussians is not None:
-        kept = shrink.best(scores, limits.max_gaussians)
-        keep(kept, f"highest {score}")
-        scores = scores[kept]
-    if limits.target_mb is not None:
-        most, rows = int(limits.target_mb * _MEGABYTE), params
-        kept = shrink.best_within(scores, most, lambda kept: size_of({key: v[kept] for key, v in rows.items()}))
-        keep(kept, f"highest {score} in {limits.target_mb:g} MB")
-    return params, said
+        left.keep(shrink.best(_scores(shown, left.params, score), limits.max_gaussians), f"highest {score}")
+    if shown.open is None:
+        _fit_unseen(left, limits, output)
+    else:
+        _fit_seen(left, limits, output, shown, score)
+    return left
+
+
+def _fit_unseen(left: Limited, limits: LimitOptions, output: Output) -> None:
+    """Fit a splat without photographs into its bytes, by fewer Gaussians alone: what else would lose is not known."""
+    from pop_fast.density import shrink
+
+    if limits.target_mb is None:
+        return
+    rows, most = left.params, int(limits.target_mb * _MEGABYTE)
+
+    def size(kept: Tensor) -> int:
+        return len(output.write({name: value[kept] for name, value in rows.items()}))
+
+    left.keep(shrink.best_within(shrink.visibility(rows), most, size), f"highest visibility in {limits.target_mb:g} MB")
+
+
+def _fit_seen(left: Limited, limits: LimitOptions, output: Output, shown: Shown, score: Score) -> None:
+    """Fit a splat into its bytes by what loses least in its training views, and tune what is left on them."""
+    from pop_fast.cli.progress import bars
+    from pop_fast.train import compact
+
+    capture, config, learned = _photographs(shown, left, limits.crop is not None)
+    steps = limits.fine_tune_steps
+    if learned is None:
+        left.said.append("not fine-tuned: what the run has learned of its photographs is in its checkpoints alone")
+        steps = 0
+    told = False
+    with bars() as progress:
+
+        def report(done: int, planned: int, seconds: float | None) -> None:
+            nonlocal told
+            if seconds is not None and not told:
+                told = True
+                print(f"fine-tuning: about {duration(seconds)}; --fine-tune-steps 0 leaves it out", flush=True)
+            progress("fine-tuning", done, planned)
+
+        tuner = compact.Tuner(left.params, shown.sh_degree, config, capture, learned or {}, steps, report)
+        if limits.target_mb is None:
+            left.params = compact.tuned_to_the_end(tuner) if steps else left.params
+            return
+        scored = replace(shown, config=config, open=lambda: (capture, config))
+        found = compact.within(
+            tuner, lambda params: _scores(scored, params, score), int(limits.target_mb * _MEGABYTE), output
+        )
+    before, after = len(left.params["means"]), len(found.params["means"])
+    if after == 0 and before > 0:
+        raise PopError(f"--target-mb {limits.target_mb:g} leaves no Gaussian of {before:,}; ask for more")
+    left.params, left.level = found.params, found.level
+    left.said.append(
+        f"in {limits.target_mb:g} MB: {after:,} of {before:,} Gaussians, colours of degree {found.degree} of "
+        f"{compact.degree_of(tuner.whole)}, written at level {found.level + 1} of {output.levels}"
+    )
+    left.said.append(_quality(tuner, found, output))
+
+
+def _quality(tuner: Tuner, found: Compact, output: Output) -> str:
+    """Say how well a file shows the held-out views, or the training views where none is held out."""
+    views = tuner.held_out
+    where = f"{len(views)} held-out views" if views else "training views"
+    before, after = (tuner.psnr(params, views) for params in (tuner.whole, output.shown(found.params, found.level)))
+    return f"PSNR of the file in {where}: {after:.2f} dB, of the whole splat {before:.2f} dB"
+
+
+def _photographs(
+    shown: Shown, left: Limited, cropped: bool
+) -> tuple[Capture, TrainConfig, Mapping[str, Mapping[str, Tensor]] | None]:
+    """Return the capture that a splat is measured by, its settings, and what was learned of its photographs.
+
+    Photographs show what a crop has left out, so that pictures of what is left stand in for them. What was learned is
+    None where it is not at hand.
+    """
+    assert shown.open is not None
+    capture, config = shown.open()
+    if cropped:
+        from pop_fast.train.compact import with_pictures
+
+        return *with_pictures(capture, left.params, config, shown.sh_degree), {}
+    if not (config.exposure or config.refine_cameras):
+        return capture, config, {}
+    if shown.checkpoint is None or shown.checkpoint.suffix != ".pt":
+        return capture, config, None
+    from pop_fast.train.checkpoint import load_checkpoint
+
+    learned = load_checkpoint(shown.checkpoint)["appearance"]
+    fits = all(len(found["value"]) == len(capture.train_views(config.test_every)) for found in learned.values())
+    return capture, config, learned if fits else None
 
 
 def _means_of_capture(params: dict[str, Tensor], shown: Shown) -> Tensor:
@@ -153,25 +324,36 @@ def _means_of_capture(params: dict[str, Tensor], shown: Shown) -> Tensor:
     return to_capture_frame(double, shown.world_transform)["means"]
 
 
-def _scores(shown: Shown, params: dict[str, Tensor], score: Score) -> Tensor:
+def _floaters(shown: Shown, params: Mapping[str, Tensor]) -> Tensor:
+    """Tell which Gaussians are floaters."""
+    if shown.open is None:
+        raise PopError("floaters are found from the places of the photographs; give --capture DIR")
+    from pop_fast.view.report.checks import are_floaters
+
+    capture, config = shown.open()
+    return are_floaters(params["means"], capture, config.test_every)
+
+
+def _scores(shown: Shown, params: Mapping[str, Tensor], score: Score) -> Tensor:
     """Return the scores of all Gaussians."""
     from pop_fast.density import shrink
 
     if score == "visibility":
         return shrink.visibility(params)
-    if shown.capture is None:
+    if shown.open is None:
         raise PopError(f"{score} is summed over the training views; give --capture DIR, or take --score visibility")
-    import numpy as np
     import torch
 
     from pop_fast.density.passes import Passes
+    from pop_fast.train.compact import degree_of
     from pop_fast.train.gpu_proxy import renderer
-    from pop_fast.train.views import ViewTensors
+    from pop_fast.train.views import ViewTensors, evenly
 
-    views = shown.capture().train_views(shown.config.test_every)
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _MOST_VIEWS)).round().astype(int))
-    backend, _ = renderer(shown.config.backend)
+    capture, config = shown.open()
+    views = evenly(capture.train_views(config.test_every), _MOST_VIEWS)
+    backend, _ = renderer(config.backend)
     device = torch.device(backend.device)
-    passes = Passes.of(backend, [ViewTensors.of(views[i]) for i in chosen], shown.config, device)
+    passes = Passes.of(backend, [ViewTensors.of(view) for view in views], config, device)
     placed = {name: value.to(device) for name, value in params.items()}
-    return shrink.view_scores(score, passes, placed, shown.sh_degree)
+    degree = min(shown.sh_degree, degree_of(params))
+    return shrink.view_scores(score, passes, placed, degree)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pop_fast.train.config import TrainConfig
 
 # of what is written at the end, what looks at all training photographs, which the merge does not hold
-_NEED_ALL = ("final_prune", "max_gaussians", "target_mb")
+_NEED_ALL = ("without_floaters", "final_prune", "max_gaussians", "target_mb")
 
 
 def check_blocks(config: TrainConfig, options: Any) -> None:
@@ -53,7 +53,7 @@ def check_blocks(config: TrainConfig, options: Any) -> None:
             "fit together; leave it out with --blocks"
         )
     for name in _NEED_ALL:
-        if getattr(options, name) is not None:
+        if getattr(options, name) not in (None, False):
             option = "--" + name.replace("_", "-")
             raise PopError(
                 f"{option} looks at all training photographs, which are not in memory when blocks are merged; leave it "

@@ -186,8 +186,8 @@ private:
   // of pixels
   Buffer<float> difference, alphas, unexposed, partials, v_image, v_alphas;
   std::vector<double> tile_sums, window_sums, exposure_sums, pop_sums;
-  double depth_sum = 0.0;
   std::vector<int64_t> sides;  // important and others, of each SIDE_PARTS parts
+  double depth_sum = 0.0;
 
   // of the step that is taken
   const StepGiven *given = nullptr, *last_given = nullptr;

@@ -262,8 +262,13 @@ def _background(color: tuple[float, float, float]) -> tuple[float, float, float]
 
 
 def beside_the_model(root: Path, shots: list[PosedImage], images: str | None) -> list[PosedImage]:
-    """Look for a COLMAP model's photographs in `images`, or in the capture itself where there is no such folder."""
-    if (root / (images or "images")).is_dir():
+    """Look for a COLMAP model's photographs in `images`, or in the capture itself where they are not there.
+
+    Names may begin with that folder, as `pop sfm` writes them of a capture that has one.
+    """
+    first = shots[0].file
+    named = images is None and find_image(root / "images", first) is None and find_image(root, first) is not None
+    if (root / (images or "images")).is_dir() and not named:
         return shots
     if images is None and any(find_image(root, shot.file) for shot in shots):
         return [replace(shot, folder="") for shot in shots]

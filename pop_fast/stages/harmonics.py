@@ -69,6 +69,20 @@ def colors_from_sh_vjp(sh: Tensor, dirs: Tensor, degree: int, v_colors: Tensor) 
     return v_sh, v_dirs
 
 
+def lower_degree(sh: Tensor, dirs: Tensor, weights: Tensor, degree: int, uniform: float = 1.0) -> Tensor:
+    """See `pop_ref.harmonics.lower_degree`.
+
+    Optimizations: all Gaussians' normal equations are made at once and solved as one batch.
+    """
+    n_sh, (n_views, n, _) = _n_sh(degree), dirs.shape
+    rows = (dirs / torch.sqrt((dirs * dirs).sum(-1, keepdim=True))).reshape(-1, 3)
+    basis = sh_basis(rows, math.isqrt(sh.shape[1]) - 1).reshape(n_views, n, -1)
+    kept, dropped = basis[..., :n_sh], torch.einsum("cnk,nkd->cnd", basis[..., n_sh:], sh[:, n_sh:])
+    weighted = (weights[..., None] * kept).permute(1, 2, 0)
+    A = weighted @ kept.transpose(0, 1) + uniform / (4.0 * math.pi) * torch.eye(n_sh, dtype=sh.dtype)
+    return sh[:, :n_sh] + torch.linalg.solve(A, weighted @ dropped.transpose(0, 1))
+
+
 @dataclass(frozen=True)
 class Evaluation:
     """Harmonics evaluated, with what the transpose needs, all component-major.

@@ -23,7 +23,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.heartbeat import duration
 from pop_fast.train.choose import on_gpu
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.presets import AUTOMATIC
+from pop_fast.train.presets import AUTOMATIC, QUICK_SCALER
 from pop_fast.train.steps import why_not_trained
 
 if TYPE_CHECKING:
@@ -44,6 +44,9 @@ _TIMED_SECONDS: Final = 4.0
 # steps with trained Gaussians, which are opaque, take this share of what those with the first ones take, nearly
 # transparent all; processor time of whole runs on fox and bear_512 against what was timed before: 0.72 and 0.85
 _TRAINED: Final = 0.8
+# and those of a run with few steps, whose first photographs are coarse, this share of that: whole runs of preset
+# "quick" took 0.76 to 0.88 of what they would have if all their steps had taken what the last ones did
+_COARSE: Final = 0.8
 # a render of a view takes this share of a step
 _RENDER: Final = 0.4
 # renders that end a run: the turn about the subject, training views of the report, views of the table of sizes
@@ -142,7 +145,8 @@ def choose_length(
     def seconds(scaler: float) -> float:
         last, mean = expected_gaussians(speed.few, scaler)
         renders = _RENDER * speed.seconds_a_step(last) * (3 * held_out + _RENDERS)
-        return speed.took + _TRAINED * steps * scaler * speed.seconds_a_step(mean) + renders + _FILES
+        share = _TRAINED * (_COARSE if scaler <= QUICK_SCALER else 1.0)
+        return speed.took + share * steps * scaler * speed.seconds_a_step(mean) + renders + _FILES
 
     low, high = SHORTEST, 1.0
     if seconds(high) > 60.0 * minutes:
@@ -155,10 +159,10 @@ def choose_length(
     return Choice(scaler, gaussians, seconds(scaler), memory)
 
 
-# photographs to train on up to which where a Gaussian lies along a ray is left open by too many of its pixels
-FEW: Final = 30
-# of the depth at sparse points; by benchmarks/few_photographs.py
-DEPTH_LAMBDA: Final = 0.01
+# photographs to train on up to which POP holds depth to the sparse points, and the weight; measured on three captures,
+# where the count told more than the angles did: benchmarks/results/few_photographs.json
+DEPTH_LAMBDAS: Final = ((15, 0.1), (30, 0.01))
+FEW: Final = DEPTH_LAMBDAS[-1][0]
 # settings that `choose_terms` may choose
 TERMS: Final = ("depth_lambda", "exposure")
 
@@ -194,11 +198,12 @@ def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> 
     spread = "" if apart is None else f", neighbours {apart:.0f} degrees apart"
     wanted: list[tuple[str, Any, str]] = []
     why: list[str] = []
-    if len(trained) <= FEW:
+    weight = next((weight for most, weight in DEPTH_LAMBDAS if len(trained) <= most), None)
+    if weight is not None and config.method == "pop":
         few = f"{len(trained)} photographs are few{spread}"
         if any(view.seen is not None and len(view.seen) for view in trained):
-            text = f"depth is held to the sparse points (--depth-lambda {DEPTH_LAMBDA:g}), as {few}"
-            wanted.append(("depth_lambda", DEPTH_LAMBDA, text))
+            text = f"depth is held to the sparse points (--depth-lambda {weight:g}), as {few}"
+            wanted.append(("depth_lambda", weight, text))
         elif "depth_lambda" not in _said(config):
             why.append(f"{few}, and depth is not held to sparse points: the capture has no tracks of them")
     if stops is not None and stops > DRIFT_STOPS and config.batch_size == 1:

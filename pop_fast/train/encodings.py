@@ -14,7 +14,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.formats import decoded, encoded, format_names
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.evaluate import evaluate
-from pop_fast.train.views import ViewTensors
+from pop_fast.train.views import ViewTensors, evenly
 
 # held-out views that are rendered for every format, at most; of more, an even selection
 _MOST_VIEWS: Final = 4
@@ -68,7 +68,7 @@ def measure_encodings(
     Yields:
         One format after the other, as soon as it is measured.
     """
-    some = [views[i] for i in _evenly(len(views), _MOST_VIEWS)]
+    some = evenly(views, _MOST_VIEWS)
     plain = {name: value.detach().cpu() for name, value in params.items()}
     own = to_capture_frame(plain, world_transform)
     for name in format_names() if names is None else names:
@@ -79,7 +79,3 @@ def measure_encodings(
         back = apply_similarity(decoded(name, data)[0], world_transform)
         psnr = evaluate(backend, back, some, config, sh_degree)["psnr"] if some else None
         yield Encoding(name, len(data), len(own["means"]), psnr, len(some))
-
-
-def _evenly(count: int, most: int) -> list[int]:
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist() if count else []

@@ -117,8 +117,8 @@ class Given:
             "taming" and "speedy-splat"; or one that another package registers.
         preset: "paper" is the paper's 30,000 steps, for a GPU or a night; "quick" 1,500 steps at higher rates that
             fall, from coarse photographs to fine ones, with thresholds for small images; "auto" has these thresholds
-            and as much of the schedule as the time allows, which `pop train` chooses. It gives defaults: what is said
-            besides wins.
+            and as much of the schedule as the time allows, which `pop train` chooses; where that is no more than
+            "quick" has, it is as "quick" is. It gives defaults: what is said besides wins.
         steps_scaler: multiplies the default of every step number; None takes the preset's.
         scale_lambda_pop: divide the default of lambda_pop by the scaler, so that the push of the prior adds up to the
             same over a short schedule; it then weighs more against the photographs than in the paper.
@@ -193,6 +193,11 @@ class Given:
         """What the defaults of step numbers are multiplied by."""
         return PRESETS[self.preset] if self.steps_scaler is None else self.steps_scaler
 
+    @property
+    def few_steps(self) -> bool:
+        """Whether rates, growth and photographs are those for few steps, as of "quick"."""
+        return self.preset == "quick" or (self.preset == AUTOMATIC and self.scaler <= QUICK_SCALER)
+
 
 def method_of(strategy: DensityControl) -> str:
     """Return the name of the method that a strategy belongs to; that of its class where it is somebody else's."""
@@ -214,7 +219,7 @@ def defaults(given: Given) -> dict[str, Any]:
     def scaled(step: int) -> int:
         return max(round(step * by), 1)
 
-    if given.preset == "quick":
+    if given.few_steps:
         strategy = _quick(strategy)
         lr = recipe.lr
         rates = {name: factor * getattr(lr, name) for name, factor in QUICK_RATES.items()}

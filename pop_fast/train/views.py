@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -16,6 +16,8 @@ from pop_fast.stages.appearance import over_background
 from pop_fast.stages.covariance import opacities_from_logits, scales_from_log_scales
 from pop_fast.stages.regularizers import depth_samples
 from pop_fast.train.config import TrainConfig
+
+V = TypeVar("V")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +106,12 @@ class ViewTensors:
             return self.target()
         alpha = self.alpha.to(self.viewmat.dtype).div_(255.0)
         return over_background(self.target(), alpha, was.to(alpha), background.to(alpha))
+
+
+def evenly(views: Sequence[V], most: int) -> list[V]:
+    """Return at most so many of a list, evenly spread from the first to the last."""
+    places = np.linspace(0, len(views) - 1, min(len(views), most)).round() if len(views) else []
+    return [views[int(place)] for place in np.unique(places)]
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from benchmarks.few_photographs import left_of, table_of
 from pop_fast.cli.train_checks import chooses_for_itself
 from pop_fast.data.capture import Capture
 from pop_fast.data.unpack import capture_folder, unpack
@@ -20,7 +21,7 @@ from pop_fast.errors import CaptureError
 from pop_fast.train import TrainConfig, automatic
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.automatic import (
-    DEPTH_LAMBDA,
+    DEPTH_LAMBDAS,
     FEW,
     MINUTES,
     SHORTEST,
@@ -31,6 +32,7 @@ from pop_fast.train.automatic import (
     expected_gaussians,
     factor_for,
 )
+from pop_fast.train.presets import QUICK_SCALER
 from pop_fast.view.paths import VideoFile
 from pop_fast.view.report.source import read_result
 from tests.app.conftest import Pop
@@ -64,6 +66,30 @@ def test_the_schedule_fills_the_minutes_and_is_at_most_the_papers() -> None:
     # what does not fit is not said to
     assert shortest.scaler == SHORTEST
     assert shortest.seconds > 0.6
+
+
+@pytest.mark.parametrize("method", ["pop", "gsplat", "3dgs"])
+def test_a_short_schedule_has_the_rates_and_the_coarse_photographs_of_quick(method: str) -> None:
+    quick = TrainConfig.of(method=method, preset="quick")
+    same = TrainConfig.of(method=method, preset="auto", steps_scaler=QUICK_SCALER)
+    assert replace(same, given=None) == replace(quick, given=None)
+    longer = TrainConfig.of(method=method, preset="auto", steps_scaler=1.01 * QUICK_SCALER)
+    assert longer.lr == TrainConfig.of(method=method).lr
+    assert longer.coarse_stop_iters == ()
+    shorter = TrainConfig.of(method=method, preset="auto", steps_scaler=SHORTEST)
+    assert shorter.lr == quick.lr
+    assert [stop / shorter.max_steps for stop in shorter.coarse_stop_iters] == pytest.approx([1 / 6, 1 / 3], rel=0.01)
+    said = TrainConfig.of(
+        method=method, preset="auto", steps_scaler=SHORTEST, **{"lr.sh0": 0.5, "coarse_stop_iters": ()}
+    )
+    assert (said.lr.sh0, said.coarse_stop_iters) == (0.5, ())
+
+
+def test_no_minute_more_makes_a_schedule_shorter() -> None:
+    config = TrainConfig.of(preset="auto")
+    scalers = [choose_length(config, SPEED, minutes, 1e5, 50, 7).scaler for minutes in np.linspace(0.2, 4.0, 60)]
+    assert scalers == sorted(scalers)
+    assert min(scalers) < QUICK_SCALER < max(scalers)
 
 
 def test_a_step_with_more_gaussians_takes_longer_by_as_much_as_was_measured() -> None:
@@ -137,10 +163,14 @@ def chosen(capture: Capture, stops: float | None = None, **said: Any) -> Terms:
 
 def test_depth_is_held_to_sparse_points_where_photographs_are_few_and_say_which_they_see() -> None:
     few, many = tiny_capture(n_views=FEW), tiny_capture(n_views=2 * FEW)
-    terms = chosen(few)
-    assert terms.settings == {"depth_lambda": DEPTH_LAMBDA}
-    assert f"{len(few.train_views())} photographs are few, neighbours" in terms.why[0]
+    for capture in (few, tiny_capture()):
+        terms, count = chosen(capture), len(capture.train_views())
+        assert terms.settings == {"depth_lambda": next(weight for most, weight in DEPTH_LAMBDAS if count <= most)}
+        assert f"{count} photographs are few, neighbours" in terms.why[0]
+    assert chosen(tiny_capture()).settings["depth_lambda"] > chosen(few).settings["depth_lambda"] > 0.0
     assert chosen(many) == Terms()
+    # it was not measured with other methods
+    assert choose_terms(few, TrainConfig.of(preset="auto", method="gsplat", backend="fast"), None) == Terms()
     blind = replace(few, views=tuple(replace(view, seen=None) for view in few.views))
     assert chosen(blind).settings == {}
     assert "no tracks" in chosen(blind).why[0]
@@ -168,18 +198,41 @@ def test_what_was_chosen_for_few_photographs_is_said_kept_reported_and_gone_on_w
         interrupt(patch, at=120)
         outcome = pop(*words)
     assert outcome.status == 130
-    assert f"(--depth-lambda {DEPTH_LAMBDA:g}), as 7 photographs are few" in outcome.out
+    weight = DEPTH_LAMBDAS[0][1]
+    assert f"(--depth-lambda {weight:g}), as 7 photographs are few" in outcome.out
     assert "1 of 8 photographs are held out" in outcome.out
     assert "--test-every 0" in outcome.out
     assert pop(*words, "--resume").status == 0
     resolved = json.loads((tmp_path / "r" / "cfg.json").read_text())["resolved"]
-    assert resolved["depth_lambda"] == DEPTH_LAMBDA
+    assert resolved["depth_lambda"] == weight
     data = read_result(tmp_path / "r")
     assert "as 7 photographs are few" in data.config["chosen by the run"]
     # who says how many are held out is not told again
     said = pop(*words, "--overwrite", "--test-every", "4", "--depth-lambda", "0")
     assert "held out to measure by" not in said.out
     assert "--depth-lambda" not in said.out
+
+
+def test_few_photographs_are_left_evenly_with_the_points_that_two_of_them_see() -> None:
+    capture = tiny_capture(n_views=17)
+    left = left_of(capture, 4)
+    assert [view.name for view in left.test_views()] == [view.name for view in capture.test_views()]
+    assert [view.name for view in left.train_views()] == ["01.png", "05.png", "11.png", "15.png"]
+    assert 0 < len(left.points) < len(capture.points)
+    seen = np.bincount(np.concatenate([view.seen for view in left.train_views()]), minlength=len(left.points))
+    assert seen.min() >= 2
+    was = {view.name: {*map(tuple, capture.points[view.seen])} for view in capture.views}
+    assert all({*map(tuple, left.points[view.seen])} <= was[view.name] for view in left.views)
+
+
+def test_a_table_of_settings_compares_the_same_seeds_alone() -> None:
+    rows = {
+        "a / 2, 8 photographs, 9 steps, seed 1: plain": {"psnr": 20.0, "ssim": 0.5},
+        "a / 2, 8 photographs, 9 steps, seed 2: plain": {"psnr": 30.0, "ssim": 0.7},
+        "a / 2, 8 photographs, 9 steps, seed 2: --x": {"psnr": 31.0, "ssim": 0.6},
+    }
+    last = table_of({"machine": {}, **rows}).splitlines()[-1]
+    assert last == "| a / 2, 8 photographs, 9 steps | 25.00 / 0.600 (2) | +1.00 / -0.100 (1) |"
 
 
 def test_depth_that_no_track_tells_is_warned_of(pop: Pop, capture: Path, tmp_path: Path) -> None:

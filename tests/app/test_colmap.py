@@ -106,6 +106,17 @@ def test_subfolders_and_spaces_in_names_are_kept(tmp_path: Path) -> None:
     assert all(np.array_equal(view.image, photograph(i)) for i, view in enumerate(capture.views))
 
 
+def test_names_that_begin_with_the_folder_of_the_photographs_are_found(tmp_path: Path) -> None:
+    # as pop sfm finds them in a capture whose photographs lie in `images`
+    root = colmap_capture(tmp_path, names=["images/0.png", "images/1.png"])
+    for photo in (root / "images" / "images").iterdir():
+        photo.rename(root / "images" / photo.name)
+    (root / "images" / "images").rmdir()
+    capture = raw(root)
+    assert [view.name for view in capture.views] == ["images/0.png", "images/1.png"]
+    assert all(np.array_equal(view.image, photograph(i)) for i, view in enumerate(capture.views))
+
+
 def test_photographs_are_paired_by_name_whatever_else_lies_in_the_folder(tmp_path: Path) -> None:
     root = colmap_capture(tmp_path)
     write_photograph(root / "images" / "00a.png", photograph(9))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 import typing
 from pathlib import Path
 
@@ -249,13 +250,27 @@ def test_a_box_is_in_the_frame_of_the_capture(pop: Pop, shared_result: Path, tmp
     assert len(kept) == int(((whole >= low) & (whole <= high)).all(1).sum())
 
 
-@pytest.mark.parametrize("file", ["x.spz", "x.sog", "x.ply"])
-def test_a_size_is_met(pop: Pop, shared_result: Path, tmp_path: Path, file: str) -> None:
-    exported(pop, shared_result, "--out", tmp_path / f"whole-{file}")
-    whole = (tmp_path / f"whole-{file}").stat().st_size
-    said = exported(pop, shared_result, "--out", tmp_path / file, "--target-mb", f"{0.6 * whole / 1e6:.6f}")
-    assert "highest sensitivity in " in said
-    assert 0.4 * whole < (tmp_path / file).stat().st_size <= 0.6 * whole
+@pytest.mark.parametrize("share", [0.6, 0.4])
+@pytest.mark.parametrize("name", typing.get_args(FormatName))
+def test_a_size_is_met_in_every_format_and_the_file_shows_what_was_told(
+    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str,
+    share: float,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    exported(pop, shared_result, "--to", name)
+    (file,) = tmp_path.iterdir()
+    # most of a tiny page is its script
+    whole, script = file.stat().st_size, 27_000 if name == "html" else 0
+    most = script + int(share * (whole - script))
+    budget = ("--target-mb", f"{most / 1e6:.6f}", "--fine-tune-steps", "8")
+    said = exported(pop, shared_result, "--to", name, "--overwrite", *budget)
+    assert file.stat().st_size <= most
+    # with fewer bands all of them may fit, and nothing is left to spend on
+    assert file.stat().st_size > 0.7 * most or " 461 of 461 Gaussians" in said
+    told = re.search(r"PSNR of the file in 1 held-out views: ([0-9.]+) dB", said)
+    assert told is not None, said
+    if name != "html":
+        assert f"{psnr(pop, tmp_path, file, '--capture', shared_capture):.2f}" == told[1]
 
 
 def test_scores_of_views_need_a_capture(pop: Pop, shared_result: Path, tmp_path: Path) -> None:

@@ -23,18 +23,21 @@ from pop_fast.cli.export import Args as Export
 from pop_fast.cli.train import arguments as train_arguments
 from pop_fast.data import load_capture
 from pop_fast.data.capture import View
+from pop_fast.data.normalize import neighbour_degrees
 from pop_fast.errors import PopError
 from pop_fast.io import pictures
+from pop_fast.io.frame import Frame
 from pop_fast.io.pictures import colormap_table
+from pop_fast.io.ply import save_ply
 from pop_fast.train.gpu_proxy import renderer
 from pop_fast.train.load_result import load_splat
 from pop_fast.view.paths import frames_in
 from pop_fast.view.report import checks, write_report
 from pop_fast.view.report.checks import (
     Checks,
+    are_floaters,
     near_limit,
     nearer_than,
-    neighbour_degrees,
     read_checks,
     stops_between,
     write_checks,
@@ -45,8 +48,10 @@ from pop_fast.view.report.sections import depth_picture, depth_range
 from pop_fast.view.report.source import read_result, running_mean, thin_out
 from tests.app.browser import browser
 from tests.app.conftest import TRAIN, TRAIN_AND_CHECK, Pop
+from tests.app.damage import says
 from tests.app.result_folder import VIEWS, write_result
 from tests.app.test_paths import ring
+from tests.app.tiny import tiny_capture
 
 
 class Tags(HTMLParser):
@@ -451,7 +456,36 @@ def test_a_veil_between_the_photographs_is_found(result: Path, shared_capture: P
     assert found.floaters == pytest.approx(before.floaters, abs=0.01)
     told = [one for one in verdict({}, found, None) if one.about == "Floaters"]
     assert told[0].kind != "good"
-    assert told[0].next == ("export", "RESULT", "--to", "html", "--final-prune", "0.01")
+    assert told[0].next == ("export", "RESULT", "--to", "html", "--without-floaters")
+    # what it says to type takes the veil away, and little else
+    gone = are_floaters(params["means"], capture, splat.config.test_every)
+    assert gone[-1]
+    assert gone.float().mean() < 0.05
+    after = looked({name: tensor[~gone] for name, tensor in params.items()})
+    assert max(after.orbit_floaters.values()) <= max(before.orbit_floaters.values())
+    assert after.orbit_floaters[worst] < 0.01
+    assert after.held_out_psnr > before.held_out_psnr - 0.1
+
+
+def test_floaters_are_left_out_of_a_file_by_their_places(
+    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path
+) -> None:
+    params, view = load_splat(shared_result).params, load_capture(shared_capture).views[3]
+    place = torch.from_numpy(view.camera_center + 0.05 * view.viewmat[2, :3]).float()
+    planted = {name: torch.cat([t, (place if name == "means" else t[0])[None]]) for name, t in params.items()}
+    save_ply(tmp_path / "planted.ply", planted, frame=Frame("training"))
+    words = ("export", tmp_path / "planted.ply", "--out", tmp_path / "a.ply", "--without-floaters")
+    outcome = pop(*words, "--capture", shared_capture)
+    assert outcome.status == 0, outcome.err
+    many = len(params["means"])
+    assert f"without floaters: {many:,} of {many + 1:,} Gaussians kept" in outcome.out
+    says(pop(*words, "--overwrite"), "floaters are found from the places of the photographs; give --capture")
+
+
+def test_what_points_that_were_made_up_say_of_floaters_is_refused() -> None:
+    capture = replace(tiny_capture(), source="no points: 60 random ones (seed 0)")
+    with pytest.raises(PopError, match="no sparse points of its own"):
+        are_floaters(torch.zeros(1, 3), capture, 8)
 
 
 @pytest.mark.usefixtures("short_orbit")

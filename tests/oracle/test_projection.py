@@ -321,6 +321,38 @@ def test_the_basis_is_orthonormal_by_gauss_legendre_quadrature() -> None:
     np.testing.assert_allclose((basis * weights[:, None]).T @ basis, np.eye(16), atol=1e-14)
 
 
+def test_a_lower_degree_loses_least_where_views_show_it_and_little_elsewhere() -> None:
+    nodes, node_weights = np.polynomial.legendre.leggauss(8)
+    z, phi = (grid.ravel() for grid in np.meshgrid(nodes, 2.0 * np.pi * np.arange(16) / 16, indexing="ij"))
+    r = np.sqrt(1.0 - z * z)
+    sphere = harmonics.sh_basis(np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1), 3)
+    shares = np.repeat(node_weights, 16) / 32.0
+    sh, dirs = HARMONICS_RNG.normal(size=(6, 16, 3)), HARMONICS_RNG.normal(size=(5, 6, 3))
+    weights = HARMONICS_RNG.uniform(0.0, 4.0, size=(5, 6))
+    weights[:, 5] = 0.0
+    shown = [harmonics.sh_basis(view / np.linalg.norm(view, axis=1, keepdims=True), 3) for view in dirs]
+
+    def loss(lower: np.ndarray, i: int) -> float:
+        change = sh[i].copy()
+        change[: len(lower)] -= lower
+        seen = sum(w[i] * ((basis[i] @ change) ** 2).sum() for w, basis in zip(weights, shown, strict=True))
+        return float(seen + 2.0 * (shares @ (sphere @ change) ** 2).sum())
+
+    for degree in range(4):
+        lower = harmonics.lower_degree(sh, dirs, weights, degree, uniform=2.0)
+        # seen by no view: cut off
+        np.testing.assert_allclose(lower[5], sh[5, : (degree + 1) ** 2], rtol=1e-15)
+        for i in range(6):
+            least = loss(lower[i], i)
+            for _ in range(5):
+                step = 1e-3 * HARMONICS_RNG.normal(size=lower[i].shape)
+                # a quadratic is as much higher on one side of its minimum as on the other
+                higher = [loss(lower[i] + sign * step, i) - least for sign in (-1.0, 1.0)]
+                assert min(higher) > 0.0
+                assert higher[0] == pytest.approx(higher[1], rel=1e-6)
+    np.testing.assert_allclose(harmonics.lower_degree(sh, dirs, weights, 3), sh, rtol=1e-15)
+
+
 def test_wrong_degrees_and_too_few_coefficients_are_refused() -> None:
     with pytest.raises(ValueError, match="sh_degree is 4; it must be 0, 1, 2 or 3"):
         harmonics.sh_basis(UNITS, 4)

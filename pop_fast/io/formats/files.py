@@ -84,7 +84,18 @@ def named_format(path: Path, to: str | None = None) -> str:
     return to
 
 
-def encoded(name: str, params: Mapping[str, Tensor], antialiased: bool = False, frame: Frame | None = None) -> bytes:
+def levels(name: str) -> int:
+    """Return how many levels of coarseness a format is written at."""
+    return 1 if name == PLY else len(FORMATS[name].encoders)
+
+
+def encoded(
+    name: str,
+    params: Mapping[str, Tensor],
+    antialiased: bool = False,
+    frame: Frame | None = None,
+    level: int = 0,
+) -> bytes:
     """Return a splat as a file's bytes.
 
     Args:
@@ -92,6 +103,7 @@ def encoded(name: str, params: Mapping[str, Tensor], antialiased: bool = False, 
         params: raw parameters, as for `pop_fast.io.ply.save_ply`.
         antialiased: to be drawn with antialiasing.
         frame: the world that they are in, where it is known; `.splat` has no room for it.
+        level: how coarsely view dependence is written, from 0, less than `levels(name)`.
 
     Raises:
         PopError: a parameter is absent, of the wrong shape, NaN or Inf, or the format cannot hold it.
@@ -99,7 +111,7 @@ def encoded(name: str, params: Mapping[str, Tensor], antialiased: bool = False, 
     if name == PLY:
         return ply_bytes(dict(params), antialiased, frame)
     format, cloud = FORMATS[name], Cloud.of(params, antialiased, frame)
-    return format.encode(cloud if format.order is None else cloud.take(format.order(cloud)))
+    return format.encoders[level](cloud if format.order is None else cloud.take(format.order(cloud)))
 
 
 def decoded(name: str, data: bytes, path: Path = Path("memory")) -> Stored:

@@ -41,13 +41,17 @@ def encode(cloud: Cloud) -> bytes:
     return _glb(turned, {name: array.tobytes() for name, array in _attributes(turned).items()}, None)
 
 
-def encode_spz(cloud: Cloud) -> bytes:
+def encode_spz(cloud: Cloud, sh_step: float = spz.SH_STEP) -> bytes:
     """Write .glb with an SPZ stream; the order of the Gaussians is kept.
+
+    Args:
+        cloud: what to write.
+        sh_step: as of `spz.encode`.
 
     Raises:
         PopError: as `spz.encode`.
     """
-    return _glb(cloud.turned("z"), {}, spz.encode(replace(cloud, frame=None), version=2))
+    return _glb(cloud.turned("z"), {}, spz.encode(replace(cloud, frame=None), version=2, sh_step=sh_step))
 
 
 def _attributes(turned: Cloud) -> dict[str, np.ndarray]:

@@ -145,8 +145,12 @@ _IN_MEMORY: Final = 700
 _WRITE_AGAIN: Final = "copy or write the file again"
 
 
-def encode(cloud: Cloud) -> bytes:
+def encode(cloud: Cloud, shared_by: int = _SHARED_BY) -> bytes:
     """Write SOG; the order of the Gaussians is kept, and should be one where neighbours are close.
+
+    Args:
+        cloud: what to write.
+        shared_by: Gaussians for a row of the palette of colours, as far as its size allows.
 
     Returns:
         The bytes of the ZIP file.
@@ -191,7 +195,7 @@ def encode(cloud: Cloud) -> bytes:
         "sh0": {"codebook": _numbers(colors), "files": [picture("sh0.webp", rgba)]},
     }
     if cloud.degree and n:
-        palette, labels = _palette(cloud)
+        palette, labels = _palette(cloud, shared_by)
         codes = codebook(palette.ravel())
         rows = -(-len(palette) // _ROW)
         indices = nearest(codes, palette).reshape(-1, 3)
@@ -210,9 +214,9 @@ def _numbers(codes: np.ndarray) -> list[float]:
     return [float(f"{code:.6g}") for code in codes]
 
 
-def _palette(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
+def _palette(cloud: Cloud, shared_by: int) -> tuple[np.ndarray, np.ndarray]:
     rows = cloud.rest.reshape(len(cloud), -1)
-    count = min(_LARGEST_PALETTE, max(_ROW, len(rows) // _SHARED_BY))
+    count = min(_LARGEST_PALETTE, max(_ROW, len(rows) // shared_by))
     seen = cloud.visibility
     return row_palette(rows, seen / max(float(seen.mean()), 1e-30) + 1e-6, count)
 

@@ -57,7 +57,7 @@ _COLOR: Final = 0.15 * 255.0
 # of a Gaussian's smallest scale, what its centre is a multiple of at most
 _CENTRE_STEP: Final = 1.0 / 8.0
 # steps of the coefficients of a Gaussian of typical visibility, and the widest, of 128 in [0, 1]
-_SH_STEP: Final = 2.5
+SH_STEP: Final = 2.5
 _WIDEST_STEP: Final = 64
 # what deflate can expand a byte to, at most; Zstandard can do more, and splats come nowhere near
 _EXPANSION: Final = 1032
@@ -66,7 +66,7 @@ _IN_MEMORY: Final = 700
 _WRITE_AGAIN: Final = "copy or write the file again"
 
 
-def encode(cloud: Cloud, version: int = 3, sh_step: float = _SH_STEP) -> bytes:
+def encode(cloud: Cloud, version: int = 3, sh_step: float = SH_STEP) -> bytes:
     """Write SPZ; the order of the Gaussians is kept.
 
     Compression makes the less of the bytes the rounder their numbers are: centres are rounded to an eighth of the

@@ -31,6 +31,7 @@ class Format:
         order: of the Gaussians in the file; None keeps theirs.
         mark: what a file's name has before the suffix where nobody names it, so that no two formats share a name.
         has_frame: whether it has room for the world that the splat is in.
+        coarser: encoders that spend ever fewer bytes on view dependence, for files that have to be small.
     """
 
     name: str
@@ -45,10 +46,21 @@ class Format:
     order: Callable[[Cloud], np.ndarray] | None = None
     mark: str = ""
     has_frame: bool = True
+    coarser: tuple[Callable[[Cloud], bytes], ...] = ()
+
+    @property
+    def encoders(self) -> tuple[Callable[[Cloud], bytes], ...]:
+        """All encoders, the usual one first."""
+        return self.encode, *self.coarser
 
 
 def _by_place(cloud: Cloud) -> np.ndarray:
     return morton_order(cloud.means)
+
+
+# steps of the coefficients of SPZ, in 1/128, and Gaussians for a row of SOG's palette; see `Format.coarser`
+_SH_STEPS: Final = (4.0, 8.0, 12.0, 18.0, 27.0)
+_SHARED_BY: Final = (4, 8, 16, 32, 64)
 
 
 _BYTE_OPACITY: Final = "half of 1/255"
@@ -93,6 +105,7 @@ SPZ: Final = Format(
     encode=spz.encode,
     decode=spz.decode,
     order=_by_place,
+    coarser=tuple(partial(spz.encode, sh_step=step) for step in _SH_STEPS),
 )
 SPZ_4: Final = replace(
     SPZ,
@@ -102,6 +115,7 @@ SPZ_4: Final = replace(
     readers="Niantic's own programs, PlayCanvas's splat-transform",
     encode=partial(spz.encode, version=4),
     mark="-4",
+    coarser=tuple(partial(spz.encode, version=4, sh_step=step) for step in _SH_STEPS),
 )
 SOG: Final = Format(
     name="sog",
@@ -121,6 +135,7 @@ SOG: Final = Format(
     encode=sog.encode,
     decode=sog.decode,
     order=_by_place,
+    coarser=tuple(partial(sog.encode, shared_by=each) for each in _SHARED_BY),
 )
 SPLAT: Final = Format(
     name="splat",
@@ -171,6 +186,7 @@ GLTF_SPZ: Final = replace(
     encode=gltf.encode_spz,
     order=_by_place,
     mark="-spz",
+    coarser=tuple(partial(gltf.encode_spz, sh_step=step) for step in _SH_STEPS),
 )
 
 # what is read and not written, by suffix

@@ -20,6 +20,7 @@ from torch import Tensor
 from pop_fast.data.capture import View
 from pop_fast.io.formats import encoded
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.views import evenly
 
 # of a larger capture, an even selection
 _MOST: Final = 60
@@ -64,11 +65,7 @@ class PageCamera:
 
 def cameras_of(views: Sequence[View]) -> list[PageCamera]:
     """Take over the cameras of views, at most sixty, evenly."""
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _MOST)).round().astype(int)) if views else []
-    return [
-        PageCamera(views[i].name, views[i].viewmat, views[i].K, views[i].image.shape[1], views[i].image.shape[0])
-        for i in chosen
-    ]
+    return [PageCamera(view.name, view.viewmat, view.K, view.width, view.height) for view in evenly(views, _MOST)]
 
 
 def camera_of_points(means: Tensor) -> PageCamera:
@@ -117,6 +114,7 @@ def page_of(
     config: TrainConfig,
     sh_degree: int,
     title: str,
+    level: int = 0,
 ) -> bytes:
     """Make the page.
 
@@ -129,6 +127,7 @@ def page_of(
         config: profile, background and antialiasing are read.
         sh_degree: highest colour band to draw.
         title: of the page.
+        level: how coarsely view dependence is written, as of SPZ.
 
     Returns:
         The file's bytes.
@@ -138,7 +137,7 @@ def page_of(
     """
     drawn = {**params, "shN": params["shN"][:, : (sh_degree + 1) ** 2 - 1]}
     scene = _scene(params["means"].detach().cpu(), cameras, config)
-    data = base64.b64encode(encoded("spz", drawn, config.antialiased)).decode("ascii")
+    data = base64.b64encode(encoded("spz", drawn, config.antialiased, level=level)).decode("ascii")
     scripts = [
         ("scene", "application/json", json.dumps(scene).replace("<", "\\u003c")),
         ("splat", "application/octet-stream", data),

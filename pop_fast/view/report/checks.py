@@ -38,6 +38,8 @@ _NEAREST_POINTS: Final = 0.02  # quantile, as a few points are always wrong
 _FEWEST_POINTS: Final = 20
 # what covers a pixel by as much is seen
 _SEEN: Final = 0.1
+# in what a capture says of its points, where they were made up
+_RANDOM: Final = "random ones"
 _ORBIT_SIDE: Final = 400
 _ORBIT_FRAMES: Final = 60
 _ORBIT_FPS: Final = 15.0
@@ -120,7 +122,7 @@ def write_checks(
             depth = np.where(layers.alpha >= _SEEN, layers.depth / capture.world_scale, np.nan).astype(np.float32)
             results.write_arrays(f"depth_step{step}_{i:04d}", name=view.name, depth=fit(depth, nearest=True))
     # random points say nothing of where things are
-    known = "random ones" not in capture.source
+    known = _RANDOM not in capture.source
     turn = orbit_views(train)
     checks = Checks(
         photographs=len(train),
@@ -175,6 +177,38 @@ def nearer_than(params: Mapping[str, Tensor], view: View, limit: float) -> dict[
     depths = params["means"].detach() @ axis[:3] + axis[3]
     chosen = (depths > 0.0) & (depths < limit)
     return {name: tensor.detach()[chosen] for name, tensor in params.items()}
+
+
+def are_floaters(means: Tensor, capture: Capture, test_every: int) -> Tensor:
+    """Tell which centres stand in the picture of a photograph's or the orbit's camera where nothing was photographed.
+
+    What reaches into such a picture from outside of it stays: of that, much is seen well by other photographs.
+
+    Args:
+        means: world. [N, 3]
+        capture: in the same frame, with its own sparse points.
+        test_every: as `Capture.train_views`; held-out cameras look too.
+
+    Returns:
+        bool [N]
+
+    Raises:
+        PopError: the points are random ones, which say nothing of where things are.
+    """
+    if _RANDOM in capture.source:
+        raise PopError(f"{capture.name}: has no sparse points of its own, without which floaters are not told from it")
+    found = torch.zeros(len(means), dtype=torch.bool)
+    for view in (*capture.views, *orbit_views(capture.train_views(test_every))):
+        limit = near_limit(view, capture.points)
+        if limit is None:
+            continue
+        viewmat, K = (torch.from_numpy(matrix).double() for matrix in (view.viewmat, view.K))
+        seen = means.detach().cpu().double() @ viewmat[:3, :3].T + viewmat[:3, 3]
+        near = (seen[:, 2] > 0.0) & (seen[:, 2] < limit)
+        pixels = seen @ K[:2].T / seen[:, 2:]
+        size = torch.tensor([view.width, view.height])
+        found |= near & ((pixels >= 0.0) & (pixels < size)).all(1)
+    return found
 
 
 def stops_between(photo: np.ndarray, render: np.ndarray) -> float:

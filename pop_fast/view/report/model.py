@@ -213,8 +213,8 @@ def _floating(checks: Checks) -> Iterator[Finding]:
     covered = [name for name, share in checks.orbit_floaters.items() if share >= _VEIL]
     if covered:
         text += f" A veil hides much of {len(covered)} views between the photographs, as in {covered[0]}."
-    text += " Leaving out what no photograph needs takes away those that none shows; a veil that some do show stays."
-    fix = ("export", "RESULT", "--to", "html", "--final-prune", "0.01")
+    text += " Leaving out those whose centres stand there takes part of it away, and costs the photographs little."
+    fix = ("export", "RESULT", "--to", "html", "--without-floaters")
     yield Finding("look" if few else "bad", "Floaters", text, fix)
 
 
