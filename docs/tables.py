@@ -24,6 +24,7 @@ from paper_repro.methods import load_pinned
 from paper_repro.status import everything, status_table
 from pop_fast.train.presets import METHODS, options_for
 from pop_ref.conformance.capabilities import STAGES as LAW_STAGES
+from pop_ref.conformance.law_coverage import LIMITS, reason
 from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM
 from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.conformance.scorecard import outcomes
@@ -37,6 +38,7 @@ PAGES = (README, *sorted(path for path in (ROOT / "docs").glob("*.md") if path.n
 MUTANT_LIST = ROOT / "docs" / "MUTANTS.md"
 CARDS = ROOT / "benchmarks" / "results" / "scorecards"
 TEETH = ROOT / "benchmarks" / "results" / "teeth.json"
+LAW_COVERAGE = ROOT / "benchmarks" / "results" / "law_coverage.json"
 VECTOR_KILLS = ROOT / "benchmarks" / "results" / "vector_kills.json"
 CPU_TIMES = ROOT / "benchmarks" / "results" / "cpu.json"
 # the judged, in the order of their columns, and the card that each stands on
@@ -240,6 +242,33 @@ def power() -> str:
     )
 
 
+def reached() -> str:
+    """Make the tables of what laws reach: ranges of arguments, and lines of the oracle that none runs."""
+    logged = json.loads(LAW_COVERAGE.read_text(encoding="utf-8"))
+    ranges = [[name, f"{low:.3g}", f"{high:.3g}", LIMITS[name]] for name, (low, high) in logged["ranges"].items()]
+    choices = [[name, ", ".join(f"`{value}`" for value in values)] for name, values in logged["choices"].items()]
+    modules = logged["modules"]
+    lines, left = (
+        sum(each) for each in zip(*((m["lines"], len(m["unreached"])) for m in modules.values()), strict=True)
+    )
+    refusals, others = 0, dict[tuple[str, str], int]()
+    for file, found in modules.items():
+        for function, _ in found["unreached"]:
+            why = reason(file, function)
+            refusals += why is None
+            if why is not None:
+                others[file, why] = others.get((file, why), 0) + 1
+    rows = [[f"`{file}`", str(count), why] for (file, why), count in others.items()]
+    rows.append(["all", str(refusals), "arguments are refused: tests of the oracle give wrong ones, laws give none"])
+    said = f"Of {lines:,} lines in the oracle's functions the laws run {lines - left:,}. The others:"
+    return "\n\n".join((
+        _table(["argument", "least", "largest", "why no further"], ranges),
+        _table(["argument", "values"], choices),
+        said,
+        _table(["module", "lines not reached", "why"], rows),
+    ))  # fmt: skip
+
+
 def speed() -> str:
     """Make the tables of CPU times, those of a row taken in turns in one process: training steps, renders, blends."""
     timed = json.loads(CPU_TIMES.read_text(encoding="utf-8"))
@@ -364,6 +393,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "scorecards": scorecards,
     "surfaces": surfaces,
     "power": power,
+    "reached": reached,
     "broken": broken_laws,
 }
 
