@@ -61,7 +61,7 @@ def run(argv: Sequence[str]) -> int:
     config = TrainConfig(antialiased=stored.antialiased)
     output = _output(args, name, stored, config)
     move = _training_frame(args.source, stored) if args.crop is not None else None
-    shown = Shown(params=stored.params, sh_degree=_MOST_BANDS, config=config, world_transform=move, open=None)
+    shown = Shown(params=stored.params, sh_degree=_MOST_BANDS, config=config, world_transform=move, photographed=None)
     left = limited(shown, args, output)
     for line in left.said:
         print(line)

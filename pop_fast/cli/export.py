@@ -73,7 +73,7 @@ def run(argv: Sequence[str]) -> int:
         sh_degree=splat.sh_degree,
         config=opened.config,
         world_transform=_training_frame(splat, args) if args.crop is not None else None,
-        open=opened.capture if opened.known else None,
+        photographed=opened.capture if opened.known else None,
         checkpoint=splat.path,
     )
     left = limited(shown, args, output)

@@ -81,7 +81,7 @@ def _finish(folder: Path, capture: Capture, options: FinishOptions) -> None:
         sh_degree=splat.sh_degree,
         config=splat.config,
         world_transform=capture.world_transform,
-        open=lambda: (capture, splat.config),
+        photographed=lambda: (capture, splat.config),
         checkpoint=splat.path,
     )
     page = Output(HTML, splat.config.antialiased, page=lambda params, level: page_of(params, *rest, level))

@@ -101,7 +101,7 @@ class Shown:
         sh_degree: highest active colour band.
         config: how it is drawn.
         world_transform: the training frame from the capture's; None where they are the same.
-        open: opens its capture, and gives the settings to look at it with; None where none is known.
+        photographed: opens its capture, and gives the settings to look at it with; None where none is known.
         checkpoint: that it was read from, if any.
     """
 
@@ -109,7 +109,7 @@ class Shown:
     sh_degree: int
     config: TrainConfig
     world_transform: np.ndarray | None
-    open: Callable[[], tuple[Capture, TrainConfig]] | None
+    photographed: Callable[[], tuple[Capture, TrainConfig]] | None
     checkpoint: Path | None = None
 
 
@@ -218,11 +218,11 @@ def limited(shown: Shown, limits: LimitOptions, output: Output) -> Limited:
         left.keep(kept, f"all but {limits.final_prune:.2%} of the blending weights")
     if limits.max_gaussians is None and limits.target_mb is None:
         return left
-    by_itself: shrink.Score = "visibility" if shown.open is None else "sensitivity"
+    by_itself: shrink.Score = "visibility" if shown.photographed is None else "sensitivity"
     score = by_itself if limits.score == "auto" else limits.score
     if limits.max_gaussians is not None:
         left.keep(shrink.best(_scores(shown, left.params, score), limits.max_gaussians), f"highest {score}")
-    if shown.open is None:
+    if shown.photographed is None:
         _fit_unseen(left, limits, output)
     else:
         _fit_seen(left, limits, output, shown, score)
@@ -267,7 +267,7 @@ def _fit_seen(left: Limited, limits: LimitOptions, output: Output, shown: Shown,
         if limits.target_mb is None:
             left.params = compact.tuned_to_the_end(tuner) if steps else left.params
             return
-        scored = replace(shown, config=config, open=lambda: (capture, config))
+        scored = replace(shown, config=config, photographed=lambda: (capture, config))
         found = compact.within(
             tuner, lambda params: _scores(scored, params, score), int(limits.target_mb * _MEGABYTE), output
         )
@@ -298,8 +298,8 @@ def _photographs(
     Photographs show what a crop has left out, so that pictures of what is left stand in for them. What was learned is
     None where it is not at hand.
     """
-    assert shown.open is not None
-    capture, config = shown.open()
+    assert shown.photographed is not None
+    capture, config = shown.photographed()
     if cropped:
         from pop_fast.train.compact import with_pictures
 
@@ -326,11 +326,11 @@ def _means_of_capture(params: dict[str, Tensor], shown: Shown) -> Tensor:
 
 def _floaters(shown: Shown, params: Mapping[str, Tensor]) -> Tensor:
     """Tell which Gaussians are floaters."""
-    if shown.open is None:
+    if shown.photographed is None:
         raise PopError("floaters are found from the places of the photographs; give --capture DIR")
     from pop_fast.view.report.checks import are_floaters
 
-    capture, config = shown.open()
+    capture, config = shown.photographed()
     return are_floaters(params["means"], capture, config.test_every)
 
 
@@ -340,7 +340,7 @@ def _scores(shown: Shown, params: Mapping[str, Tensor], score: Score) -> Tensor:
 
     if score == "visibility":
         return shrink.visibility(params)
-    if shown.open is None:
+    if shown.photographed is None:
         raise PopError(f"{score} is summed over the training views; give --capture DIR, or take --score visibility")
     import torch
 
@@ -349,7 +349,7 @@ def _scores(shown: Shown, params: Mapping[str, Tensor], score: Score) -> Tensor:
     from pop_fast.train.gpu_proxy import renderer
     from pop_fast.train.views import ViewTensors, evenly
 
-    capture, config = shown.open()
+    capture, config = shown.photographed()
     views = evenly(capture.train_views(config.test_every), _MOST_VIEWS)
     backend, _ = renderer(config.backend)
     device = torch.device(backend.device)

@@ -45,6 +45,7 @@ EXEMPT = {
     "pop_fast.compiled.native_step": "opens a handle of the compiled library, no file",
     "pop_fast.machine": SYSTEM,
     "pop_fast.train.environment": SYSTEM,
+    "pop_fast.cli.limits:_photographs": "takes what load_checkpoint has judged",
     "pop_fast.blocks.merge:merge": "takes what read_round has judged",
     "paper_repro.figures.qualitative:_view": "takes what read_view has judged",
     "paper_repro.published:publish": "takes what read_view has judged",
