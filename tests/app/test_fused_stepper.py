@@ -439,10 +439,13 @@ def test_the_step_in_cpp_leaves_batches_to_autograd() -> None:
     assert isinstance(run.stepper, BatchStepper)
 
 
-def test_the_fused_step_on_a_gpu_refuses_batches() -> None:
-    reason = why_not_trained(CUDA, tiny_config("x", batch_size=2))
-    assert reason is not None
-    assert "batch_size = 1 only, not 2; use --backend fast, or leave batch_size as it is" in reason
+def test_the_fused_step_on_a_gpu_trains_batches_and_refuses_terms_that_it_does_not_know() -> None:
+    assert why_not_trained(CUDA, tiny_config("x", batch_size=2)) is None
+    for setting, option in (("exposure", True), ("depth_lambda", 0.1)):
+        reason = why_not_trained(CUDA, tiny_config("x", **{setting: option}))
+        assert reason is not None
+        assert f"trains with{'out' if option is True else ''} {setting}" in reason, reason
+        assert "use --backend fast" in reason
 
 
 def test_a_strategy_of_somebody_else_takes_one_view_a_step() -> None:
