@@ -139,7 +139,8 @@ template <class Real> struct Entries {
       b[k] = s.b;
       c[k] = s.c;
       top[k] = s.log2_opacity;
-      if (blend.colors && blend.channels != 3) {
+      // without channels nothing is read, and torch gives a null pointer for what is empty
+      if (blend.channels == 0 || (blend.colors && blend.channels != 3)) {
         color[k] = blend.colors + id * blend.channels;
       } else if (sizeof(Real) == 4) {
         std::memcpy(rgb[k], s.rgb, sizeof s.rgb);
