@@ -10,6 +10,7 @@ the block alone.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,7 @@ import numpy as np
 
 from pop_fast.data.capture import Listing, PosedImage, SparsePoints
 from pop_fast.data.fields import Numbers, check_size
-from pop_fast.data.pinhole import make_camera
+from pop_fast.data.pinhole import PINHOLES, make_camera
 from pop_fast.errors import CaptureError, PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.read_back import read_arrays, read_json
@@ -75,8 +76,11 @@ def read_block(folder: Path) -> Listing:
     except Exception as error:
         raise CaptureError(f"{path}: is not what 'pop train --blocks' writes ({error!r}); {_FIX}") from error
     cloud = _points(points)
-    if not root.is_dir():
-        raise CaptureError(f"{path}: is a block of {root}, which is not there; put the capture back, or {_FIX}")
+    # a name may be longer than the system takes, which Path's own question raises
+    if not os.path.isdir(root):
+        raise CaptureError(
+            f"{path}: is a block of {str(root)[:200]}, which is not there; put the capture back, or {_FIX}"
+        )
     return Listing(root, path, shots, cloud, BLOCK, transform=transform)
 
 
@@ -137,6 +141,8 @@ def _shot(entry: Any) -> PosedImage:
         params = [float(p) for p in lens["params"]]
         if not np.isfinite(params).all():
             raise ValueError(f"{where} has parameters that are not finite")
+        if lens["model"] in PINHOLES and len(params) != max(PINHOLES[lens["model"]][1]) + 1:
+            raise ValueError(f"{where} has {len(params)} parameters, which are not those of {lens['model']}")
         camera = make_camera(lens["id"], lens["model"], width, height, params)
     shot = PosedImage(entry["name"], entry["folder"], entry["file"], camera, _matrix(entry["viewmat"]))
     mask = None if entry["mask"] is None else Path(entry["mask"])

@@ -19,10 +19,11 @@ _NUMBERS: Final = frozenset(
     {
         *("step", "num_GS", "num_GS_above_floor", "opacity_below_0.1", "opacity_above_0.9", "psnr", "ssim", "lpips"),
         *("n_blended", "n_traversed", "views", "threads", "seconds", "seconds_total", "seconds_loading", "seconds_sfm"),
-        "seconds_cpu",
+        *("seconds_cpu", "lambda_pop", "blur_min_pixels", "blur_events", "seed", "max_steps"),
         *("memory_bytes", "mem", "ellipse_time", "loss", "pop", "num_gaussians", "cloned", "split", "pruned"),
     }
 )
+_COUNTS: Final = frozenset({"num_GS", "num_GS_above_floor", "views", "threads", "num_gaussians"})
 # what is drawn is squared, and its logarithm taken and undone
 _LARGEST: Final = 1e150
 
@@ -73,6 +74,8 @@ def check_record(record: Any, where: str, fix: str, needed: tuple[str, ...] = ()
             raise PopError(f"{where}: {key} is {_shown(value)}; it must be a text; {fix}")
         if key in _NUMBERS and not _is_number(value, whole=key in needed):
             raise PopError(f"{where}: {key} is {_shown(value)}; it must be a number; {fix}")
+        if key in _COUNTS and not math.isfinite(value):
+            raise PopError(f"{where}: {key} is {_shown(value)}; it must be finite; {fix}")
         if key == "versions" and not isinstance(value, dict):
             raise PopError(f"{where}: {key} is {_shown(value)}; it must be an object; {fix}")
     return record
