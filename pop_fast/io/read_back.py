@@ -74,7 +74,7 @@ def check_record(record: Any, where: str, fix: str, needed: tuple[str, ...] = ()
             raise PopError(f"{where}: {key} is {_shown(value)}; it must be a text; {fix}")
         if key in _NUMBERS and not _is_number(value, whole=key in needed):
             raise PopError(f"{where}: {key} is {_shown(value)}; it must be a number; {fix}")
-        if key in _COUNTS and not math.isfinite(value):
+        if key in _COUNTS and not math.isfinite(float(value)):
             raise PopError(f"{where}: {key} is {_shown(value)}; it must be finite; {fix}")
         if key == "versions" and not isinstance(value, dict):
             raise PopError(f"{where}: {key} is {_shown(value)}; it must be an object; {fix}")
