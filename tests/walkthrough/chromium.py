@@ -147,9 +147,13 @@ class Page:
         self.call("Input.dispatchMouseEvent", type="mouseReleased", x=x1, y=y1, button="left", clickCount=1)
 
     def touch(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        """Put a finger down at one place and lift it at another."""
+        """Put a finger down at one place, lift it at another, and wait until the page has heard of it."""
+        # the protocol's answer may come before the page's own listeners have run
+        heard = "['touchend', 'touchcancel'].forEach(kind => addEventListener(kind, () => done(1), {once: true}))"
+        self.ask(f"window.lifted = new Promise(done => {heard}), 1")
         for kind, points in (("touchStart", [start]), ("touchMove", [end]), ("touchEnd", [])):
             self.call("Input.dispatchTouchEvent", type=kind, touchPoints=[{"x": x, "y": y} for x, y in points])
+        self.ask("window.lifted")
 
     def picture(self, selector: str = "body") -> bytes:
         """Take the picture of an element, as PNG."""
