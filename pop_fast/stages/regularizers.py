@@ -5,22 +5,22 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pop_fast.stages.types import Camera
 
-def depth_samples(
-    points: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, mask: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """See `pop_ref.regularizers.depth_samples`; points [P, 3], viewmat [4, 4], K [3, 3], mask bool [H, W] or None.
+
+def depth_samples(points: Tensor, camera: Camera, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """See `pop_ref.regularizers.depth_samples`; points [P, 3], mask bool [H, W] or None.
 
     Optimizations: all points at once.
     """
-    in_camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    in_camera = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     in_camera = in_camera[in_camera[:, 2] > 0.0]
     depths = in_camera[:, 2]
-    places = (in_camera / depths[:, None]) @ K[:2].T
-    shown = (places >= 0.0).all(1) & (places[:, 0] < width) & (places[:, 1] < height)
+    places = (in_camera / depths[:, None]) @ camera.K[:2].T
+    shown = (places >= 0.0).all(1) & (places[:, 0] < camera.width) & (places[:, 1] < camera.height)
     if mask is not None:
         column, row = places.nan_to_num().long().unbind(1)
-        shown &= mask[row.clamp(0, height - 1), column.clamp(0, width - 1)]
+        shown &= mask[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
     return places[shown], 1.0 / depths[shown]
 
 

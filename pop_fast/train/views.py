@@ -15,6 +15,7 @@ from pop_fast.errors import PopError
 from pop_fast.stages.appearance import over_background
 from pop_fast.stages.covariance import opacities_from_logits, scales_from_log_scales
 from pop_fast.stages.regularizers import depth_samples
+from pop_fast.stages.types import Camera
 from pop_fast.train.config import TrainConfig
 
 V = TypeVar("V")
@@ -90,8 +91,8 @@ class ViewTensors:
         """
         if self.points is None:
             return None
-        camera = (self.viewmat[0].detach(), self.K[0], self.width, self.height)
-        return depth_samples(self.points, *camera, self.mask)
+        camera = Camera(self.viewmat[0].detach(), self.K[0], self.width, self.height)
+        return depth_samples(self.points, camera, self.mask)
 
     def target(self) -> Tensor:
         """Return the photograph as floats in [0, 1]. [H, W, 3]"""

@@ -24,6 +24,7 @@ STAGES: Final = (
     "whole",
     "losses",
     "polarization",
+    "few_photographs",
     "density",
     "optimizer",
     "training",

@@ -76,6 +76,10 @@ pinholes = arrays_of((N, 4)).map(
 # 132 numbers are too many to draw one by one: a few seeds of dyadic patterns say as much
 pictures = st.integers(0, 255).map(lambda k: pattern(k, (12, 11, 1)))
 masks = st.lists(st.booleans(), min_size=N, max_size=N).map(np.array)
+pixels, rgb = st.integers(0, 255).map(lambda k: pattern(k, (9, 3))), arrays_of((3,), 0.0, 1.0)
+# something is rendered everywhere: the laws of this stage try what is where nothing is
+depth_maps = arrays_of((3, 4), 0.5, 8.0)
+sparse_places, sparse_disparities = arrays_of((3, 2), 0.0, 3.0), arrays_of((3,), 0.125, 2.0)
 pinhole_inputs = st.tuples(in_front, st.just(K), st.just(W), st.just(H), profiles)
 pair = st.tuples(pictures, pictures)
 
@@ -114,6 +118,13 @@ CASES = (
     Case("photometric_3dgs", "losses", pair, (0,), 2, magnitude=_ssim_magnitude),
     Case("photometric_pop", "losses", pair, (0,), 2, magnitude=_ssim_magnitude),
     Case("pop_loss", "polarization", st.tuples(_stacked(st.tuples(opacities())).map(np.ravel), masks), (0,)),
+    Case("mean_activation", "few_photographs", st.tuples(_vectors(3, 0.0, 4.0)), (0,)),
+    Case("sparse_depth_loss", "few_photographs", st.tuples(depth_maps, sparse_places, sparse_disparities), (0,)),
+    Case("expose", "few_photographs", st.tuples(arrays_of((3, 2, 3)), arrays_of((3, 4))), (0, 1)),
+    Case("centred_exposures", "few_photographs", st.tuples(arrays_of((3, 3, 4)))),
+    Case("color_correct", "few_photographs", st.tuples(pixels, pixels)),
+    Case("over_background", "few_photographs", st.tuples(arrays_of((2, 3, 3)), arrays_of((2, 3), 0.0, 1.0), rgb, rgb)),
+    Case("refined_viewmat", "few_photographs", st.tuples(viewmats(), arrays_of((6,), -1.0, 1.0)), (0, 1)),
 )
 
 BY_NAME = {case.name: case for case in CASES}

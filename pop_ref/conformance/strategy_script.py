@@ -218,6 +218,7 @@ _READINGS: Final[tuple[tuple[str, dict[str, Any], dict[str, Any]], ...]] = (
     ("gsplat", {"prune_opa": 0.3, "prune_too_big": False}, {"steps": EVERY_STEP[:14]}),
     ("mini-splatting", {"importance": "outdoor", "max_gaussians": 40}, {"cameras": 2}),
     ("taming", {"final_count": 30, "misaligned_prune_weights": False}, {"packed": True}),
+    ("pop", SCREEN, {"width": 8, "height": 16}),
 )
 # trainings under every other reading of a method
 READINGS: Final = tuple(

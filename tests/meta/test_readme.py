@@ -41,7 +41,6 @@ TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
 # functions whose fast twin cannot have the oracle's parameters, and why
 OTHER_PARAMETERS = {
     "compositing.composite": "autograd has to see the arrays themselves, so they are not wrapped in Splats",
-    "regularizers.depth_samples": "a camera's tensors, of which steps have no record",
     "splatting.project": "the same: arrays, and what all cameras share (covariances) is made once outside",
 }
 

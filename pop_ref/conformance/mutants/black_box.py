@@ -33,11 +33,11 @@ class BlackBox:
     breaks: Callable[[Rasterization, dict[str, Any]], Any]
     law: str
 
-    def adapter(self) -> Any:
-        """Return it as the kit is handed any rasterizer, in float32."""
+    def adapter(self, dtype: str = "float32") -> Any:
+        """Return it as the kit is handed any rasterizer, in float32 or float64."""
         from pop_ref.conformance.torch_adapter import TorchAdapter
 
-        return TorchAdapter(self.name, self.rasterization(), dtype="float32")
+        return TorchAdapter(self.name, self.rasterization(), dtype=dtype)
 
     def rasterization(self) -> Rasterization:
         """Return the broken function, with the arguments that gsplat has."""

@@ -30,7 +30,7 @@ class Mutant:
         file: the module, as a path in the package.
         old, new: the line before and after; `old` occurs once in the file.
         law: module and name of the law that kills it, as `test_alpha:a_negative_exponent_is_skipped`.
-        package: what is copied: the oracle, or the program, whose copy is judged in float32.
+        package: what is copied: the oracle, or the program.
     """
 
     name: str
@@ -113,8 +113,13 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 @contextmanager
-def living(mutant: Mutant) -> Iterator[Any]:
-    """Bring a mutant to life as a backend for the duration of a with statement; one lives at a time."""
+def living(mutant: Mutant, dtype: str = "float32") -> Iterator[Any]:
+    """Bring a mutant to life as a backend for the duration of a with statement; one lives at a time.
+
+    Args:
+        mutant: to be imported.
+        dtype: the precision that a copy of the program is judged in; the oracle has one only.
+    """
     # a change that cannot be made must not pass for one that breaks a law
     mutant.broken_source()
     finder = _Finder(mutant)
@@ -124,7 +129,7 @@ def living(mutant: Mutant) -> Iterator[Any]:
         if mutant.package == ORACLE:
             yield OracleAdapter(mutant.copy, mutant.name)
         else:
-            yield program(mutant.name, mutant.copy, "fast", "float32")
+            yield program(mutant.name, mutant.copy, "fast", dtype)
     finally:
         sys.meta_path.remove(finder)
         _forget(mutant.copy)

@@ -1,0 +1,124 @@
+"""Laws of what training adds where photographs are few or unlike: sparse depth, exposures, backgrounds, cameras."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import strategies as st
+
+from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.assertions import assert_close, assert_same_bits
+from pop_ref.conformance.law import law
+from pop_ref.conformance.strategies import arrays_of, dyadic, viewmats
+from pop_ref.records import Camera
+
+ORACLE = OracleAdapter()
+H, W = 4, 6
+# dyadic, so that where something is rendered, and which disparity is the larger, is no matter of rounding
+depths = st.lists(st.sampled_from([0.0, 0.5, 1.0, 2.0, 2.5, 4.0, 9.0]), min_size=H * W, max_size=H * W).map(
+    lambda values: np.array(values).reshape(H, W)
+)
+places = st.tuples(dyadic(0.0, W - 0.125), dyadic(0.0, H - 0.125))
+samples = st.lists(st.tuples(places, st.sampled_from([0.125, 0.25, 0.5, 0.75, 2.0])), max_size=5)
+
+
+def _columns(samples):
+    return np.array([place for place, _ in samples]).reshape(-1, 2), np.array([d for _, d in samples])
+
+
+@law("few_photographs", "sparse_depth_loss", "sparse_depth_loss_vjp", depth=depths, samples=samples)
+def test_the_depth_of_sparse_points_is_compared_as_the_oracle_compares_it(backend, depth, samples):
+    at, d = _columns(samples)
+    # with nothing to compare with, the mean is that of the disparities alone; squared, of the slopes
+    rendered = [ORACLE.stage("sparse_depth_loss")(depth, at[k : k + 1], np.zeros(1)) for k in range(len(d))]
+    expected = ORACLE.stage("sparse_depth_loss")(depth, at, d)
+    found = backend.stage("sparse_depth_loss")(depth, at, d)
+    size = float(np.sum(rendered) + np.sum(d)) / max(len(d), 1)
+    assert_close("few_photographs.depth", found, expected, size, backend.dtype, against_oracle=True)
+    expected = ORACLE.stage("sparse_depth_loss_vjp")(depth, at, d, 0.75)
+    found = backend.stage("sparse_depth_loss_vjp")(depth, at, d, 0.75)
+    size = float(np.sum(np.square(rendered))) / max(len(d), 1)
+    assert_close("few_photographs.depth_vjp", found, expected, size, backend.dtype, against_oracle=True)
+
+
+@law("few_photographs", "sparse_depth_loss", depth=depths, x=st.integers(0, W - 1), y=st.integers(0, H - 1))
+def test_a_point_at_the_centre_of_a_pixel_reads_the_depth_of_that_pixel_alone(backend, depth, x, y):
+    # centres lie at +0.5; where nothing is rendered the disparity is 0
+    expected = 1.0 / depth[y, x] if depth[y, x] > 0.0 else 0.0
+    found = backend.stage("sparse_depth_loss")(depth, np.array([[x + 0.5, y + 0.5]]), np.zeros(1))
+    assert_close("few_photographs.depth", found, expected, expected, backend.dtype)
+
+
+@law("few_photographs", "sparse_depth_loss", "sparse_depth_loss_vjp", samples=samples)
+def test_where_nothing_is_rendered_no_depth_pulls(backend, samples):
+    at, d = _columns(samples)
+    nothing = np.zeros((H, W))
+    found = backend.stage("sparse_depth_loss")(nothing, at, d)
+    assert_close("few_photographs.depth", found, float(np.sum(d)) / max(len(d), 1), 2.0, backend.dtype)
+    assert_same_bits("pull", backend.stage("sparse_depth_loss_vjp")(nothing, at, d, 1.0), nothing)
+
+
+@law(
+    "few_photographs",
+    "depth_samples",
+    viewmat=viewmats(),
+    at=st.lists(
+        st.tuples(dyadic(-2.0, W + 2.0, 1), dyadic(-2.0, H + 2.0, 1), st.sampled_from([-2.0, 0.25, 1.0, 4.0])),
+        max_size=6,
+    ),
+    masked=st.booleans(),
+)
+def test_points_behind_the_camera_outside_the_picture_or_left_out_by_a_mask_have_no_depth(backend, viewmat, at, masked):
+    # quarters of a pixel off the pixels' borders, where rounding decides nothing
+    u, v, z = (np.array([point[axis] for point in at]) for axis in range(3))
+    u, v = u + 0.25, v + 0.25
+    K = np.array([[4.0, 0.0, 2.5], [0.0, 2.0, 1.5], [0.0, 0.0, 1.0]])
+    seen_from_camera = np.stack([(u - 2.5) / 4.0 * z, (v - 1.5) / 2.0 * z, z], 1)
+    points = (seen_from_camera - viewmat[:3, 3]) @ viewmat[:3, :3]
+    mask = (np.arange(W)[None] + 2 * np.arange(H)[:, None]) % 3 > 0 if masked else None
+    shown = (z > 0.0) & (u >= 0.0) & (u < W) & (v >= 0.0) & (v < H)
+    if mask is not None:
+        shown[shown] = mask[v[shown].astype(int), u[shown].astype(int)]
+    places, disparities = backend.stage("depth_samples")(points, Camera(viewmat, K, W, H), mask)
+    # a point's way to the camera and back is rounded like its largest term
+    size = 1.0 + np.max(np.abs(points), initial=0.0) + np.max(np.abs(viewmat[:3, 3]))
+    expected = np.stack([u, v], 1)[shown]
+    assert_close("few_photographs.places", places, expected, 256.0 * size, backend.dtype)
+    assert_close("few_photographs.places", disparities, 1.0 / z[shown], 256.0 * size, backend.dtype)
+
+
+@law("few_photographs", "mean_activation", "mean_activation_vjp")
+def test_of_no_gaussians_the_mean_is_zero(backend):
+    assert_same_bits("mean", backend.stage("mean_activation")(np.zeros((0, 3))), 0.0)
+    assert backend.stage("mean_activation_vjp")(np.zeros((0, 3)), 1.0).shape == (0, 3)
+
+
+@law("few_photographs", "centred_exposures", exposures=arrays_of((3, 3, 4)))
+def test_centred_exposures_change_nothing_on_average_and_differ_as_before(backend, exposures):
+    found = backend.stage("centred_exposures")(exposures)
+    assert_close("few_photographs.exposures", np.mean(found, 0), np.eye(3, 4), 4.0, backend.dtype)
+    assert_close("few_photographs.exposures", found[1:] - found[0], exposures[1:] - exposures[0], 4.0, backend.dtype)
+
+
+@law("few_photographs", "background_at", step=st.integers(0, 2**31), seed=st.integers(0, 2**63))
+def test_the_background_of_a_step_hangs_on_the_step_and_the_seed_alone(backend, step, seed):
+    background = backend.stage("background_at")
+    expected = ORACLE.stage("background_at")(step, seed).astype(backend.dtype)
+    assert_same_bits("background", np.asarray(background(step, seed)).astype(backend.dtype), expected)
+    background(step + 1, seed)
+    assert_same_bits("asked again", np.asarray(background(step, seed)).astype(backend.dtype), expected)
+
+
+@law("few_photographs", "without_common_motion", viewmat=viewmats(), motion=arrays_of((6,), -1.0, 1.0))
+def test_corrections_that_move_all_cameras_alike_are_taken_out_and_others_stay(backend, viewmat, motion):
+    K, t = viewmat[:3, :3], viewmat[:3, 3]
+    # of the world by a small twist, in the axes of this camera and of one at the origin
+    turned = K @ motion[:3]
+    here = np.concatenate([turned, np.cross(t, turned) + K @ motion[3:]])
+    cameras, common = np.stack([viewmat, np.eye(4)]), np.stack([here, motion])
+    stage = backend.stage("without_common_motion")
+    size = 1.0 + float(np.sum(t * t))
+    assert_close("few_photographs.motion", stage(common, cameras), np.zeros((2, 6)), 8.0 * size, backend.dtype)
+    of_one = np.zeros((2, 6))
+    of_one[0] = motion
+    expected = ORACLE.stage("without_common_motion")(of_one, cameras)
+    assert_close("few_photographs.motion", stage(of_one, cameras), expected, 8.0 * size, backend.dtype)
