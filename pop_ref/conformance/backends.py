@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 from pop_ref.conformance.adapter import Adapter, OracleAdapter
+from pop_ref.conformance.capabilities import RENDER
 from pop_ref.constants import PAPER, Profile
 
 # what this project's own tests judge everywhere, and what else the kit knows how to judge where it can run
@@ -46,6 +47,44 @@ def function_named(path: str) -> Callable[..., Any]:
     if not callable(function):
         raise ValueError(f"module {module_name} has no function {attribute}")
     return function
+
+
+def usual(path: str, dtype: str = "float32") -> tuple[str, str]:
+    """Return the constants that a rasterizer has as far as its name says, and the device that it draws on.
+
+    Args:
+        path: of the function; gsplat's own says by its version which constants it has.
+        dtype: that it is judged in.
+
+    Returns:
+        The profile's name; "cpu", or "cuda" where torch has a GPU and the CPU is refused.
+    """
+    function = function_named(path)
+    profile = "paper"
+    if path.partition(":")[0].split(".")[0] == "gsplat":
+        version = getattr(importlib.import_module("gsplat"), "__version__", "1.5")
+        profile = importlib.import_module("pop_ref.conformance.gsplat_adapter").constants_of(version).name
+    try:
+        torch = importlib.import_module("torch")
+    except ModuleNotFoundError as error:
+        raise Unavailable(f"{path} needs torch, which is not installed") from error
+    if not torch.cuda.is_available():
+        return profile, "cpu"
+    from pop_ref.conformance.torch_adapter import TorchAdapter
+
+    return profile, "cpu" if TorchAdapter(path, function, dtype=dtype).first_error() is None else "cuda"
+
+
+def require_a_picture(adapter: Any) -> None:
+    """Raise ValueError where a rasterizer draws nothing, in which case every law of pictures would say so at length."""
+    error = adapter.first_error() if adapter.has(RENDER) else None
+    if error is not None:
+        words = str(error).splitlines()[0] if str(error) else "no words"
+        hint = "; backend gsplat-torch32 judges gsplat's stages in plain torch" if "gsplat" in adapter.name else ""
+        raise ValueError(
+            f"{adapter.name} draws nothing on {adapter.device}: a first small picture raises "
+            f"{type(error).__name__}: {words}; mend that, or name another --device{hint}"
+        )
 
 
 def made_by(path: str) -> Adapter:

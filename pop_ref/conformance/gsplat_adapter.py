@@ -94,11 +94,15 @@ def gsplat_torch(name: str, dtype: str) -> TorchAdapter:
     return TorchAdapter(name, dtype=dtype, profile=GSPLAT_1_5, stages=torch_stages())
 
 
+def constants_of(version: str) -> Profile:
+    """Return the constants of a version of gsplat, written as 1.5.3."""
+    return GSPLAT_1_6 if tuple(int(part) for part in version.split(".")[:2]) >= (1, 6) else GSPLAT_1_5
+
+
 def gsplat_cuda(name: str) -> TorchAdapter:
     """Return the adapter of `gsplat.rasterization` on the first GPU."""
     gsplat: Any = importlib.import_module("gsplat")
-    version = tuple(int(part) for part in gsplat.__version__.split(".")[:2])
-    profile = GSPLAT_1_6 if version >= (1, 6) else GSPLAT_1_5
+    profile = constants_of(gsplat.__version__)
     return TorchAdapter(
         name, gsplat.rasterization, dtype="float32", device="cuda", profile=profile, deterministic=False
     )

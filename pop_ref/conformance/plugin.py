@@ -58,13 +58,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
     group.addoption("--stages", metavar="PACKAGE", help="a package whose stage modules carry the oracle's names")
     group.addoption("--dtype", default="float32", choices=["float32", "float64"], help="precision of --rasterizer")
-    group.addoption("--device", default="cpu", help="torch device of --rasterizer")
+    group.addoption(
+        "--device", help="torch device of --rasterizer; by default the CPU, or a GPU where it draws on that alone"
+    )
     group.addoption(
         "--unordered-sums",
         action="store_true",
         help="--rasterizer adds in another order on every run, as atomics do: laws of equal bits are skipped",
     )
-    group.addoption("--profile", default="paper", help="constants that --rasterizer implements, default paper")
+    group.addoption(
+        "--profile", help="constants that --rasterizer implements; default paper, and gsplat's own for gsplat"
+    )
     group.addoption("--backend", action="append", default=[], help="judge an adapter that comes with the kit, by name")
     group.addoption(
         "--stage", action="append", default=[], choices=STAGES, help="only the laws of this stage; may be repeated"
@@ -96,6 +100,15 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Make the backends that the options name, so that a wrong name is one line and not an error in every file."""
     _chosen_backends(session.config)
+
+
+def pytest_report_header(config: pytest.Config) -> list[str]:
+    """Say what is judged, what is refused or not offered, and what to do next."""
+    if not _chosen(config):
+        return []
+    from pop_ref.conformance.surface import introduction
+
+    return [line for backend in _chosen_backends(config) for line in introduction(backend)]
 
 
 def _chosen(config: pytest.Config) -> str:
@@ -149,9 +162,11 @@ def _make_backends(config: pytest.Config) -> list[Any]:
         Unavailable,
         adapter_for,
         made_by,
+        require_a_picture,
         shipped,
         shipped_or_absent,
         strategy_named,
+        usual,
     )
     from pop_ref.conformance.program_adapter import ProgramAdapter
     from pop_ref.conformance.program_pipe import ProgramError
@@ -166,10 +181,13 @@ def _make_backends(config: pytest.Config) -> list[Any]:
         chosen += [ProgramAdapter(command, option("--program-timeout")) for command in option("--program")]
         path, package = option("--rasterizer"), option("--stages")
         if path or package:
-            profile = profile_named(option("--profile"))
-            name = path or package
-            ordered = not option("--unordered-sums")
-            chosen.append(adapter_for(path, name, package, option("--dtype"), option("--device"), profile, ordered))
+            own_profile, own_device = usual(path, option("--dtype")) if path else ("paper", "cpu")
+            profile = profile_named(option("--profile") or own_profile)
+            name, device = path or package, option("--device") or own_device
+            # whoever was found to draw on a GPU alone adds by atomics, as far as anybody knows
+            ordered = not option("--unordered-sums") and (device == "cpu" or bool(option("--device")))
+            chosen.append(adapter_for(path, name, package, option("--dtype"), device, profile, ordered))
+            require_a_picture(chosen[-1])
     except (Unavailable, ProgramError, ValueError) as error:
         raise pytest.UsageError(str(error)) from error
     return chosen or [shipped("oracle")]
@@ -221,7 +239,8 @@ class _Recorder:
         if self.path.suffix not in (".json", ".html"):
             raise pytest.UsageError(f"scorecard {self.path} must end in .json or .html")
         single = option("--rasterizer") or option("--stages")
-        how = f", {option('--dtype')}, profile {option('--profile')}" if single else ""
+        profile = getattr(_chosen_backends(config)[-1], "profile", None) if single else None
+        how = f", {option('--dtype')}, profile {profile.name if profile else 'any'}" if single else ""
         self.card = Scorecard(f"{_chosen(config) or 'oracle'}{how}")
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:

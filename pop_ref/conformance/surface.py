@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import Any, Final
 
 import numpy as np
@@ -17,12 +18,40 @@ from pop_ref.conformance.capabilities import (
     RENDER,
     SCALE,
     SIGNATURE,
+    STAGES,
 )
+from pop_ref.conformance.law import missing
 from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.conformance.views import ASKED
 
 WHOLE: Final = (RENDER, GRADIENTS, DOMINANCE, DOMINANT_WEIGHTS, DOMINANT_COUNTS, ANTIALIASING, INSTRUMENTS,
                 DETERMINISTIC, SCALE)  # fmt: skip
+
+
+def introduction(backend: Any) -> list[str]:
+    """Return the lines that a session begins with: who is judged, as what, by how many laws, and what is not."""
+    if hasattr(backend, "reason"):
+        return [f"conformance: {backend.name} is not judged: {backend.reason}"]
+    laws = list(every_law().values())
+    as_what = [np.dtype(backend.dtype).name, f"constants {backend.profile.name if backend.profile else 'any'}"]
+    as_what += [f"on {backend.device}"] if hasattr(backend, "device") else []
+    otherwise = "" if backend.profile is None else " (--dtype, --profile, --device say otherwise)"
+    lines = [f"conformance: {backend.name}, {', '.join(as_what)}{otherwise}"]
+    judged = [law for law in laws if not missing(backend, law.needs)]
+    lines.append(f"  judged: {len(judged)} of {len(laws)} laws, of {_listed({law.stage for law in judged})}")
+    if backend.has(SIGNATURE):
+        taken = [need for need in ASKED if backend.has(need)]
+        lines.append(f"  arguments taken: {'; '.join(taken) or 'none'}")
+        lines += [f"  refused, and not judged: {need} ({words})" for need in ASKED if (words := backend.why_not(need))]
+    idle = {law.stage for law in laws} - {law.stage for law in judged}
+    if idle:
+        lines.append(f"  no law of {_listed(idle)}: --stages, --adapter and --strategy name who offers them")
+    lines.append("  next: a broken law prints where, and a scene or call to paste; --scorecard card.html tells of all")
+    return [part for line in lines for part in textwrap.wrap(line, 110, subsequent_indent="    ")]
+
+
+def _listed(stages: set[str]) -> str:
+    return ", ".join(stage for stage in STAGES if stage in stages) or "nothing"
 
 
 def stage_functions() -> list[str]:

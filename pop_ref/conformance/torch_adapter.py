@@ -78,7 +78,7 @@ class TorchAdapter(Adapter):
         self.dtype = {"float64": np.float64, "float32": np.float32}[dtype]
         self._torch = importlib.import_module("torch")
         self._float = getattr(self._torch, dtype)
-        self._device = device
+        self.device = self._device = device
         self._package = package
         self._rasterization = rasterization
         parameters = inspect.signature(rasterization).parameters if rasterization else {}
@@ -130,6 +130,15 @@ class TorchAdapter(Adapter):
         except Exception:
             # it tells nothing, or cannot draw, which the laws will find
             return None
+
+    def first_error(self) -> Exception | None:
+        """Draw one small picture; return what is raised in its place, None where it is drawn."""
+        scene = super().sees(golden_scene())
+        try:
+            self._call(scene, self._leaves(scene, grad=False), dominance=False, counts=False)
+        except Exception as error:
+            return error
+        return None
 
     def _asked_for_gradients(self) -> bool:
         """Tell whether an image follows its Gaussians in autograd; a renderer that only draws does not."""

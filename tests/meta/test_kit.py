@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from importlib.metadata import entry_points
@@ -215,6 +216,7 @@ def test_a_session_that_judges_nothing_is_left_alone(tmp_path: Path) -> None:
     [
         (("--rasterizer", "no_such.module:f"), "no_such.module:f needs no_such, which is not installed"),
         (("--rasterizer", "numpy"), "'numpy' must be written module:name, as my.module:rasterization"),
+        (("--rasterizer", "math:exp"), "math:exp draws nothing on cpu: a first small picture raises TypeError"),
         (("--rasterizer", "math:exp", "--profile", "gsplat_2"), "profile 'gsplat_2' is unknown; use one of paper"),
         (("--adapter", "pathlib:Path"), "pathlib:Path makes no adapter: it has no dtype"),
         (("--backend", "gsplt"), "backend 'gsplt' is unknown; use one of oracle, fast64"),
@@ -283,6 +285,22 @@ def test_a_stranger_with_gsplats_signature_is_judged_by_what_it_offers(
     assert done.returncode == (1 if shift else 0), done.stdout + done.stderr
     if shift:
         assert "a_round_splat_on_the_axis_looks_as_the_formula_says" in done.stdout
+
+
+def test_who_has_gsplat_and_nothing_else_reads_first_what_is_judged_and_what_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # nothing is said of constants: a module of that name tells them by its version
+    (tmp_path / "gsplat.py").write_text(f'__version__ = "1.5.3"\n{STRANGER.format(shift=0.0)}')
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{ROOT}")
+    done = _kit("-v", "--rasterizer", "gsplat:rasterization", "-k", "empty_scene")
+    told = " ".join(done.stdout.split())
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "conformance: gsplat:rasterization, float32, constants gsplat_1_5, on cpu (--dtype, --profile" in told
+    assert re.search(r"judged: \d+ of \d+ laws, of camera, footprint, tiles, alpha, compositing, gradients", told)
+    assert "arguments taken: several cameras in one call; batch dimensions; packed rows; plain colours" in told
+    assert "refused, and not judged: depth modes (TypeError: " in told
+    assert "--stages, --adapter and --strategy name who offers them next: a broken law prints where" in told
 
 
 @pytest.mark.parametrize("name", ["fast32", "compiled32"])
