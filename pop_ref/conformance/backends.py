@@ -175,16 +175,17 @@ def program(name: str, package: str, backend: str, dtype: str) -> Any:
 
     rasterization = partial(function_named(f"{package}.api.rasterize:rasterization"), backend=backend)
     stages = f"{package}.stages" if backend == "fast" else f"{package}.{backend}"
-    trains = training_stages(package)
+    own_adam = {}
+    if backend == "compiled" and dtype == "float32":
+        # what trains in this precision is the native step, which has an Adam of its own
+        native = importlib.import_module(f"{package}.compiled.native_step")
+        own_adam = {name: getattr(native, name) for name in ("adam_step", "adam_steps")}
+    trains = training_stages(package, own_adam.get("adam_step")) | own_adam
     if backend == "compiled":
         # one module of its own holds the passes over views
         scores = importlib.import_module(f"{package}.compiled.scores")
         passes = ("contributions", "sensitivities", "screen_moments", "fisher_blocks", "dominant_points")
         trains |= {name: getattr(scores, name) for name in passes}
-    if backend == "compiled" and dtype == "float32":
-        # what trains in this precision is the native step, which has an Adam of its own
-        native = importlib.import_module(f"{package}.compiled.native_step")
-        trains |= {name: getattr(native, name) for name in ("adam_step", "adam_steps")}
     return TorchAdapter(name, rasterization, stages, dtype, stages=trains)
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -261,6 +262,10 @@ def mirror(name: str) -> MirrorAdapter:
     return made
 
 
+# whole trainings by a script: the rows are those of torch's strategies, and the mirror's Adam moves them
+TRAININGS: Final = ("scripted_steps", "method_settings", "optimizers")
+
+
 class MirrorAdapter(Adapter):
     """The kernels' mathematics on the host.
 
@@ -283,13 +288,33 @@ class MirrorAdapter(Adapter):
 
     def has(self, need: str) -> bool:
         """Tell what the mirror offers."""
-        return super().has(need) or need in STAGES
+        return super().has(need) or need in STAGES or need in TRAININGS
 
     def stage(self, name: str) -> Callable[..., Any]:
-        """Return a stage function with the oracle's signature."""
+        """Return a stage function with the oracle's signature; a training is moved by the fused step's Adam."""
+        if name in TRAININGS:
+            return self._scripted_steps if name == "scripted_steps" else getattr(self._trainer, name)
         if name not in STAGES:
             raise LookupError(f"the mirror has no stage function {name}")
         return partial(STAGES[name], self.mirror)
+
+    @functools.cached_property
+    def _trainer(self) -> Any:
+        """Make the trainer whose strategies edit the rows that the mirror moves."""
+        return importlib.import_module("pop_ref.conformance.torch_training").Trainer("pop_fast", self._adam)
+
+    def _adam(self, params: Any, grads: Any, m: Any, v: Any, step: int, lr: Any) -> Any:
+        torch: Any = importlib.import_module("torch")
+        arrays = [{key: t.numpy().astype(np.float64) for key, t in of.items()} for of in (params, grads, m, v)]
+        moved = adam_step(self.mirror, *arrays, step=step, lr=lr)
+        return tuple({key: torch.as_tensor(value) for key, value in of.items()} for of in moved)
+
+    def _scripted_steps(self, script: Any, rows: Any) -> Any:
+        torch: Any = importlib.import_module("torch")
+        dtype = torch.float64 if self.dtype == np.float64 else torch.float32
+        given = (rows.params, rows.m, rows.v)
+        of = [{key: torch.as_tensor(value).to(dtype) for key, value in part.items()} for part in given]
+        return self._trainer.scripted_steps(script, importlib.import_module(type(self._trainer).__module__).Rows(*of))
 
     def render(self, scene: Scene) -> View:
         """Draw a scene."""

@@ -7,6 +7,7 @@ torch and the trainer are imported when the stages are made, never when the kit 
 
 from __future__ import annotations
 
+import functools
 import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -19,6 +20,8 @@ from pop_ref.conformance.torch_strategy import ScriptedPasses, arrays_of
 from pop_ref.density_config import DensityConfig
 from pop_ref.settings import LearningRates, Recipe, UpdateRules
 
+# `pop_ref.optimizer.adam_step` on tensors
+Adam = Callable[..., tuple[dict[str, Any], dict[str, Any], dict[str, Any]]]
 # at this step nothing but statistics happens
 QUIET_STEP = 1
 
@@ -43,13 +46,14 @@ class Statistics:
     blurred: Any
 
 
-def training_stages(package: str) -> dict[str, Callable[..., Any]]:
+def training_stages(package: str, adam: Adam | None = None) -> dict[str, Callable[..., Any]]:
     """Return the stage functions, on tensors, of a trainer laid out as `pop_fast` is.
 
     Args:
         package: the trainer's.
+        adam: of an engine, which then moves the rows that strategies edit; None takes the optimizers' own.
     """
-    trainer, density = Trainer(package), importlib.import_module(f"{package}.stages.density")
+    trainer, density = Trainer(package, adam), importlib.import_module(f"{package}.stages.density")
     # what a strategy decides by is a function already; everything else is what it does
     decided = ("average_grads", "grow_masks", "prune_mask")
     done = [name for name in vars(Trainer) if not name.startswith("_")]
@@ -62,7 +66,8 @@ class Trainer:
     Every method has the name, the parameters and the meaning of a function of the oracle, on tensors.
     """
 
-    def __init__(self, package: str) -> None:
+    def __init__(self, package: str, adam: Adam | None = None) -> None:
+        self._adam = adam
         self._torch: Any = importlib.import_module("torch")
         self._ops: Any = importlib.import_module(f"{package}.density.rows")
         self._model: Any = importlib.import_module(f"{package}.train.model")
@@ -252,8 +257,16 @@ class Trainer:
         def move(params: Any, optimizers: Any, step: int, state: Any) -> None:
             self._model.adam_step(params, optimizers, updates, step, state)
 
-        trainer = torch_strategy.Trainer(self._model.make_optimizers, move, extras)
+        trainer = torch_strategy.Trainer(self._optimizers, move, extras)
         return arrays_of(torch_strategy.drive(strategy, script, rows, trainer, dtype))
+
+    def _optimizers(self, params: dict[str, Any]) -> dict[str, Any]:
+        """Make the trainer's optimizers; where an engine has an Adam of its own, that is what their step calls."""
+        made: dict[str, Any] = self._model.make_optimizers(params)
+        if self._adam is not None:
+            for optimizer in made.values():
+                optimizer.step = functools.partial(_step_by, self._adam, optimizer)
+        return made
 
     def _move(self, leaves: Any, optimizers: Any, grads: Mapping[str, Any], lr: Mapping[str, float], step: int) -> None:
         for key, grad in grads.items():
@@ -313,3 +326,16 @@ class Trainer:
             dominant_sum=none.long() if won is None else won,
             blurred=none.bool() if blurred is None else blurred,
         )
+
+
+def _step_by(adam: Adam, optimizer: Any) -> None:
+    """Move the parameter of a torch optimizer, and the moments that it holds, by an engine's Adam."""
+    group = optimizer.param_groups[0]
+    (param,) = group["params"]
+    if param.grad is None:
+        return
+    of = optimizer.state[param]
+    given = (param.detach(), param.grad, of["exp_avg"], of["exp_avg_sq"])
+    moved = adam(*({"means": value} for value in given), int(of["step"]) + 1, {"means": group["lr"]})
+    for held, value in zip((param.data, of["exp_avg"], of["exp_avg_sq"]), moved, strict=True):
+        held.copy_(value["means"])

@@ -123,6 +123,12 @@ def _call(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
     for name, key in (("dominant_ids", "dominant_ids"), ("n_blended", "n_contrib")):
         if key in called.meta:
             found[name] = called.meta[key].reshape(called.alphas.shape)
+    if "final_T" in called.meta:
+        found["T_final"] = called.meta["final_T"].reshape(called.alphas.shape)
+    # of a rasterizer whose tiles have a side of their own nothing is expected
+    told = ("n_cameras", "n_batches", *(("tile_size",) if backend.takes("tile_size") else ()))
+    entries = call.shape[0]
+    found |= {name: np.full(entries, called.meta[name]) for name in told if name in called.meta}
     if "dominant_counts" in called.meta:
         found["dominant_counts"] = called.meta["dominant_counts"].reshape(call.shape)
     for name in ("radii", "means2d", "depths", "conics"):

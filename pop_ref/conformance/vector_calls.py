@@ -72,6 +72,7 @@ def calls() -> dict[str, Call]:
         "small_splats_of_one_axis_stay": seen(34, 2, radius_clip=4.5),
         "without_backgrounds": seen(35, 2, no_background=True),
         "plain_batches": seen(36, 2, batch=(2,), channels=3),
+        "small_splats_of_one_camera": seen(37, 1, radius_clip=4.5),
     }
 
 
@@ -88,6 +89,8 @@ _OF_ROWS: Final = {
     "depths": ("[C, N]", "camera z"),
     "conics": ("[C, N, 3]", "inverse of the blurred screen covariance: xx, xy, yy, px^-2"),
 }
+# what gsplat's meta tells of a call besides
+_TOLD: Final = {"n_cameras": "cameras", "n_batches": "batch entries", "tile_size": "px, as the option"}
 _MASKS: Final = {
     "unambiguous": ("[C, H, W]", "every decision of the pixel is clear of rounding"),
     "decided": ("[C, H, W]", "unambiguous, and the dominant Gaussian is clear too"),
@@ -117,6 +120,9 @@ def call_kind(kind: str) -> dict[str, Any]:
     arrays = {name: entry("input", *about) for name, about in given.items()}
     arrays |= output("images", "[C, H, W, X]", "what every camera sees", "agreement.image", "unambiguous")
     arrays |= output("alphas", "[C, H, W]", "1 - T_final", "agreement.T_final", "unambiguous")
+    arrays |= output("T_final", "[C, H, W]", "transmittance that is left", "agreement.T_final", "unambiguous")
+    for name, said in _TOLD.items():
+        arrays[name] = entry("output", "[]", said, "int64", [equal()])
     for name, where in (("dominant_ids", "decided"), ("n_blended", "unambiguous")):
         arrays[name] = entry("output", "[C, H, W]", IMAGES[name][1], "int64", [equal(where)])
     counted = "pixels that each Gaussian dominates"
@@ -159,6 +165,9 @@ def _entry(call: Call, b: int, row: list[Expected]) -> dict[str, np.ndarray]:
     arrays["error_bound_images"] = np.stack([e.image_error_bounds for e in row])
     arrays["alphas"] = 1.0 - np.stack([e.render.T_final for e in row])
     arrays["error_bound_alphas"] = np.stack([e.error_bounds.T_final + 1.0 for e in row])
+    arrays |= {"T_final": 1.0 - arrays["alphas"], "error_bound_T_final": arrays["error_bound_alphas"]}
+    told = (len(row), len(call.frames), call.tile_size or call.profile.tile_size)
+    arrays |= {name: np.array(value) for name, value in zip(_TOLD, told, strict=True)}
     for name in ("dominant_ids", "n_blended"):
         arrays[name] = np.stack([getattr(e.render, name) for e in row])
     n = len(given["means"])

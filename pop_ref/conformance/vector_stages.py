@@ -214,16 +214,17 @@ class _Logging(OracleAdapter):
 
 
 def record() -> list[Any]:
-    """Return calls, as JSON holds them, that tell the mutants of the oracle from it, each where a law makes one."""
+    """Return calls, as JSON holds them, that tell mutants from the oracle, each where a law makes one."""
     from pop_ref.conformance.backends import shipped
     from pop_ref.conformance.mutants import MUTANTS
     from pop_ref.conformance.mutants.copies import living
+    from pop_ref.conformance.mutants.trainers import TRAINERS
     from pop_ref.conformance.mutants.trial import law_named, obeys
 
     sound = shipped("fast64")
     found: list[Any] = []
     kept: list[tuple[str, list[Any]]] = []
-    for mutant in MUTANTS:
+    for mutant in (*MUTANTS, *TRAINERS):
         if mutant.law.startswith("test_strategies"):
             # vectors of trainings are about those
             continue

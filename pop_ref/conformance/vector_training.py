@@ -23,6 +23,7 @@ LOSSES = {
     "l1": losses.l1,
     "l2": losses.l2,
     "ssim": ssim.ssim,
+    "d_ssim": ssim.d_ssim,
     "photometric_3dgs": losses.photometric_3dgs,
     "photometric_pop": losses.photometric_pop,
 }
@@ -30,6 +31,7 @@ _PULLED: dict[str, Callable[..., Any]] = {
     "l1": losses.l1_vjp,
     "l2": losses.l2_vjp,
     "ssim": ssim.ssim_vjp,
+    "d_ssim": ssim.d_ssim_vjp,
     "photometric_3dgs": losses.photometric_3dgs_vjp,
     "photometric_pop": losses.photometric_pop_vjp,
 }
@@ -52,8 +54,8 @@ def loss_kind() -> dict[str, Any]:
     }
     about = (
         "'l1', 'l2': mean absolute, mean squared difference. 'ssim': mean similarity under 11 x 11 Gaussian windows of "
-        "deviation 1.5, K1 = 0.01, K2 = 0.03. 'photometric_3dgs': (1 - share) L1 + share D-SSIM; 'photometric_pop' "
-        "with L2. D-SSIM = 1 - SSIM. 'padding': 'valid' takes windows inside the image, 'same' all, zeros around. "
+        "deviation 1.5, K1 = 0.01, K2 = 0.03. 'd_ssim': 1 - SSIM. 'photometric_3dgs': (1 - share) L1 + share D-SSIM; "
+        "'photometric_pop' with L2. 'padding': 'valid' takes windows inside the image, 'same' all, zeros around. "
         "Masked, the mean is over kept pixels, and the picture is the target elsewhere for the windows"
     )
     return {"about": about, "arrays": arrays}
@@ -79,7 +81,9 @@ def loss_arguments(options: dict[str, Any], mask: np.ndarray) -> tuple[Any, ...]
     kept = mask if options["masked"] else None
     if options["loss"] in ("l1", "l2"):
         return (kept,)
-    return (options["padding"],) if options["loss"] == "ssim" else (options["share"], options["padding"], kept)
+    if options["loss"] == "ssim":
+        return (options["padding"],)
+    return (*(() if options["loss"] == "d_ssim" else (options["share"],)), options["padding"], kept)
 
 
 def _loss(
@@ -93,7 +97,7 @@ def _loss(
     if name not in ("l1", "l2"):
         forms = [d_ssim_magnitudes(picture, target, padding, mask, form) for form in ("textbook", "difference")]
         of_value, of_gradient = max(f.value for f in forms) + 1.0, np.maximum(*[f.gradient for f in forms])
-    if name != "ssim":
+    if name not in ("ssim", "d_ssim"):
         pixels = pixelwise_magnitudes(picture, target, 2 if name in ("l2", "photometric_pop") else 1, mask)
         of_value, of_gradient = of_value + pixels.value, of_gradient + pixels.gradient
     arrays = {

@@ -21,7 +21,7 @@ from pop_ref.conformance.failure_report import failure_report
 from pop_ref.conformance.inria_adapter import inria
 from pop_ref.conformance.law import missing
 from pop_ref.conformance.mutants import MUTANTS, living
-from pop_ref.conformance.mutants.trial import every_law, obeys
+from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
 from pop_ref.conformance.scenes import golden_scene, scene_as_code
 from pop_ref.conformance.torch_adapter import TorchAdapter
 from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER
@@ -272,3 +272,22 @@ def test_what_the_compiled_backend_has_of_its_own_is_judged(name: str) -> None:
     own = ("tile_lists", "contributions", "sensitivities", "fisher_blocks", "dominant_points", "adam_step")
     assert [stage for stage in own if not backend.has(stage)] == []
     assert all("compiled" in backend._stage(stage).__module__ for stage in own[:-1])
+
+
+@pytest.mark.parametrize("name", ["compiled32", "mirror32"])
+def test_an_engines_own_adam_moves_what_strategies_edit(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    backend = shipped_or_absent(name)
+    if isinstance(backend, Absent):
+        pytest.skip(backend.reason)
+    law = law_named("test_strategies:a_training_by_gsplat_is_the_oracles_at_every_step")
+    assert obeys(law, backend) is None
+    # an engine that takes steps of half the length is no longer the oracle's, whatever torch's own Adam does
+    module = importlib.import_module("pop_ref.conformance.torch_training")
+    sound = module._step_by
+
+    def halved(adam: Any, optimizer: Any) -> None:
+        optimizer.param_groups[0]["lr"] *= 0.5
+        sound(adam, optimizer)
+
+    monkeypatch.setattr(module, "_step_by", halved)
+    assert "training.rows" in (obeys(law, backend) or "")
