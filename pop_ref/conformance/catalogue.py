@@ -54,7 +54,11 @@ packed and not, with signed and absolute gradients. `pop_ref.methods` says what 
 Taming-3DGS, Speedy-Splat and PUP-3DGS do at every step. `torch_training.training_stages` makes stage functions of a
 trainer's strategies, row operations, schedules and optimizers, and `TorchAdapter(stages=...)` takes any such functions.
 `--strategy gsplat.strategy:DefaultStrategy` judges somebody's strategy by the laws of training that are about no
-method. Pictures take no part: that the step of an engine makes its statistics of renders rightly is not judged here.
+method. An engine with an Adam of its own moves the rows by it (`training_stages(package, adam)`). Pictures take no
+part: that the step of an engine makes its statistics of renders rightly is not judged here.
+
+What training adds where photographs are few or unlike, depth at sparse points, means of opacities and sizes,
+exposures, other backgrounds, corrections of cameras, is judged as stage functions of these names, with gradients.
 
 An adapter defines what there is, under the oracle's names, on arrays. With `composite` alone the oracle projects and
 lists the splats of whole scenes; a stage function such as `project_means` is judged by its own laws.
