@@ -24,7 +24,7 @@ _COMPILE = "import time; t = time.time(); from gsplat.cuda._backend import _C; p
 _COMPILE += "assert _C is not None, 'gsplat found no CUDA toolkit'"
 # what a training run is judged by
 _KEPT = ("step", "seconds", "seconds_loading", "seconds_total", "num_GS", "num_GS_above_floor", "psnr", "ssim", "views")
-_KEPT += ("gpu", "gpu_memory_bytes", "instance_buffers_grown")
+_KEPT += ("gpu", "gpu_memory_bytes", "instance_buffers_grown", "photograph_bytes", "photographs_passing")
 
 
 def wheels_stage(check: Check) -> dict[str, Any]:

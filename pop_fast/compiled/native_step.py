@@ -211,10 +211,7 @@ class NativeTrainer:
 
     Attributes:
         step: steps taken.
-        grown: 0; what is too small grows before a step writes to it.
     """
-
-    grown = 0
 
     def __init__(
         self,
@@ -319,6 +316,13 @@ class NativeTrainer:
     def step_stats(self, first: int, last: int) -> list[StepStats]:
         """Return the measurements of the steps from `first` to before `last`; the last `run` must have taken them."""
         return [self._history[step] for step in range(first, last)]
+
+    def synchronize(self) -> None:
+        """Do nothing: no other process moves anything."""
+
+    def facts(self) -> dict[str, int]:
+        """Return nothing: what is too small grows before a step writes to it, and memory is the machine's."""
+        return {}
 
     def _describe(self) -> None:
         """Set what stays the same over a run."""
