@@ -6,6 +6,7 @@ import itertools
 import json
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -82,15 +83,17 @@ def train_all(folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def together(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def together(made_once: Callable[..., Path]) -> Path:
     reason = emulate.why_not()
     if reason is not None:
         pytest.skip(reason)
-    emulate.build(FOLDER)
-    folder = tmp_path_factory.mktemp("together")
-    outcomes = launched([__file__, folder])
-    assert [outcome.status for outcome in outcomes] == [0, 0], outcomes
-    return folder
+
+    def make(folder: Path) -> None:
+        emulate.build(FOLDER)
+        outcomes = launched([__file__, folder])
+        assert [outcome.status for outcome in outcomes] == [0, 0], outcomes
+
+    return made_once("emulated-together", make)
 
 
 @needs_gloo
