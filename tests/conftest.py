@@ -13,6 +13,10 @@ from typing import Any
 
 import pytest
 
+# before torch is imported, here and in children: workers share the cores, and threads that wait for each other would
+# spin on them (a training on two threads took five times as much of the processor)
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 # not `alpha` and `pixel`, where to count calls costs as much as the work
 SHAPES_CHECKED = tuple(
     f"pop_ref.{module}"
