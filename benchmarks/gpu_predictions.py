@@ -1,4 +1,4 @@
-"""What the kernels' machine code allows, before any card has run it: the two CUDA tables of NOTES.md.
+"""What kernels and ranks should take, before any card has run them: the three CUDA tables of NOTES.md.
 
     python benchmarks/gpu_predictions.py            print them
     python benchmarks/gpu_predictions.py --write    put them into NOTES.md, between their marks
@@ -8,6 +8,8 @@ The first holds counts (`results/sass.json`, made by `make sass`). The second is
 of `gpu_floors`, for one case on an H200:
 
     predicted = max(lane instructions / issue rate, bytes / bandwidth) / USED + NODE * nodes of the graph
+
+The third is `cuda_ext.training.batch_step.step_bytes`, which a test holds to what emulated ranks count.
 """
 
 from __future__ import annotations
@@ -17,6 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from gpu_floors import SASS, Card, Loads, floors
+
+from cuda_ext.training.batch_step import step_bytes
 
 NOTES = Path(__file__).resolve().parent / "NOTES.md"
 # 132 processors of 128 lanes at the clock that an H200 holds under load; the bandwidth that a copy reaches on it
@@ -38,6 +42,9 @@ NODES = {
     "update": 1,
     "end_step": 1,
 }
+# Gaussians and processes, each of which draws one view of a step; steps between two changes of the Gaussians
+TOGETHER = ((270_000, 8), (3_000_000, 8), (40_000_000, 64))
+BETWEEN = 100
 # the instantiations that training takes, and what else is compared with them
 SHOWN = {
     "project_kernel<3, false>": "project",
@@ -99,9 +106,23 @@ def predictions() -> str:
     return "\n".join(lines)
 
 
+def exchanged() -> str:
+    """Make the table of bytes that a rank receives in a step."""
+    head = "| Gaussians, ranks | gradients summed, MB | every view shows all, MB | | every view shows a tenth, MB | |"
+    lines = [head, "|---|---|---|---|---|---|"]
+    for n, size in TOGETHER:
+        # gradients are summed in two exchanges; statistics of every view are 24 bytes a Gaussian
+        whole = (2 * 4 * 59 + 24 * size) * n * (size - 1) / size
+        now = [sum(step_bytes(n, size, size, shown, BETWEEN).values()) for shown in (1.0, 0.1)]
+        cells = " | ".join(f"{bytes_ / 1e6:,.0f} | {whole / bytes_:.0f} times fewer" for bytes_ in now)
+        lines.append(f"| {n:,}, {size} | {whole / 1e6:,.0f} | {cells} |")
+    return "\n".join(lines)
+
+
 def with_tables(text: str) -> str:
-    """Put both tables between their marks."""
-    for name, table in (("machine code", machine_code(SASS)), ("predictions", predictions())):
+    """Put the tables between their marks."""
+    tables = {"machine code": machine_code(SASS), "predictions": predictions(), "ranks": exchanged()}
+    for name, table in tables.items():
         begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
         head, rest = text.split(begin)
         text = head + begin + table + "\n" + end + rest.split(end)[1]
@@ -118,7 +139,7 @@ def main(words: list[str]) -> int:
             print("NOTES.md: the CUDA tables are not what the counts give; run gpu_predictions.py --write")
             return 1
     else:
-        print(machine_code(SASS), predictions(), sep="\n\n")
+        print(machine_code(SASS), predictions(), exchanged(), sep="\n\n")
     return 0
 
 

@@ -11,7 +11,7 @@ processes there are, since no two of them add to one number.
     for each view:      sums and dominated pixels, back                                     40 bytes a splat, sent
                         gradients of own rows, added up; with the last view Adam
 
-Between two calls of `run` all processes hold all rows; within one they hold the others' as these were at its start.
+A process holds the others' rows as these were when `synchronize` was last called.
 """
 
 from __future__ import annotations
@@ -60,6 +60,27 @@ def stretches(n: int, size: int) -> list[int]:
     """Return where the rows of each of `size` processes begin, and where the last one's end."""
     warps = -(-n // STRETCH)
     return [min(STRETCH * (warps * rank // size), n) for rank in range(size + 1)]
+
+
+def step_bytes(n: int, size: int, n_views: int, shown: float, steps: int, n_rest: int = 15) -> dict[str, float]:
+    """Return how many bytes a process receives of the others in a step, where everything is spread evenly.
+
+    Args:
+        n: Gaussians.
+        size: processes.
+        n_views: of a step.
+        shown: share of the Gaussians that a view shows.
+        steps: between two calls of `synchronize`.
+        n_rest: coefficients of colour above the first, three channels each.
+
+    Returns:
+        Bytes by the names of `BatchTrainer.received`.
+    """
+    of_others = (size - 1) / size
+    # parameters and both moments; gradient sum, views, dominated pixels, blur
+    row = 4 * 3 * (3 + 4 + 3 + 1 + 3 + 3 * n_rest) + 13
+    crossing = shown * n * n_views / size * of_others
+    return {"splats": 4 * SENT * crossing, "sums": 4 * RETURNED * crossing, "rows": row * n * of_others / steps}
 
 
 @dataclass(frozen=True)
@@ -151,15 +172,19 @@ class BatchTrainer:
             while self.step < until:
                 bad = self._step(phase)
                 if bad is not None:
-                    self._share_rows()
+                    self.synchronize()
                     raise ValueError(f"step {self.step}: Gaussian {bad} has a value that is not finite")
-            self._share_rows()
 
     def step_stats(self, first: int, last: int) -> list[list[float]]:
         """Return the measurements of the steps from `first` to before `last`: means over the views of each."""
         return [self._history[step] for step in range(first, last)]
 
-    def _share_rows(self) -> None:
+    def facts(self) -> dict[str, int]:
+        """Return how often buffers grew, how the photographs lie, and the bytes that other processes have sent."""
+        told = {"instance_buffers_grown": self.grown, "received_bytes": sum(self.received.values())}
+        return {**told, **self.views.facts()}
+
+    def synchronize(self) -> None:
         """Give every process what the others have moved and counted."""
         tensors = [tensor for group in self._whole for tensor in group.values()]
         for tensor in (*tensors, *(found for found in vars(self.statistics).values() if found is not None)):
@@ -243,6 +268,7 @@ class BatchTrainer:
         splats["depths"][at], splats["conics"][at] = rows[:, _RECORD], rows[:, _RECORD + 1 : _RECORD + 4]
         splats["radii"].zero_()
         splats["radii"][at] = rows[:, _RECORD + 4 : _RECORD + 6].contiguous().view(torch.int32)
+        self.views.fetch(view)
         program = self._launched(place, self.views.sizes[view], phase)
         counts = torch.zeros(len(rows), device=self.device)
         if program.counts is not None:

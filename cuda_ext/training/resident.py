@@ -1,8 +1,12 @@
-"""Photographs and cameras that stay on the GPU: bytes, masks, and the blurred values that SSIM needs every time."""
+"""Photographs and cameras on the GPU: bytes, masks, and the blurred values that SSIM needs every time.
+
+Photographs for which there is no room pass through one place: each is copied there before a step that compares with it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -16,7 +20,7 @@ LOWER = "the photographs' size or number"
 
 
 class ResidentViews:
-    """All training views on the device.
+    """The training views, of which as many photographs as have room stay on the device.
 
     Args:
         images: uint8 [H, W, 3] each, on any device.
@@ -25,7 +29,14 @@ class ResidentViews:
         masks: bool [H, W] each, True keeps, or None; one list entry a view, or None for no masks at all.
         padding: SSIM's border, "valid" or "same".
         device: the GPU.
-        cache_moments: keep the photographs' blurred values, 24 bytes a pixel.
+        cache_moments: keep the photographs' blurred values, 24 bytes a pixel, where all photographs stay.
+        room: bytes that photographs and masks may take, None for what they need. The place that the others pass
+            through is part of it, and is there also where the room is smaller.
+
+    Attributes:
+        bytes: what photographs and masks take.
+        n_passing: how many photographs do not stay.
+        copied: how many were copied since, each for a step.
 
     Raises:
         ValueError: a photograph is not uint8 [H, W, 3], a mask has another size, or "valid" has no window.
@@ -41,8 +52,9 @@ class ResidentViews:
         padding: str,
         device: torch.device,
         cache_moments: bool = True,
+        room: int | None = None,
     ) -> None:
-        self.device, self._margin = device, MARGIN if padding == "valid" else 0
+        self.device, self._margin, self.copied = device, MARGIN if padding == "valid" else 0, 0
         kept = [None] * len(images) if masks is None else list(masks)
         for k, (image, mask) in enumerate(zip(images, kept, strict=True)):
             self._check(k, image, mask)
@@ -50,20 +62,33 @@ class ResidentViews:
         self.kept_pixels = [_kept(size, mask) for size, mask in zip(self.sizes, kept, strict=True)]
         self.viewmats = viewmats.to(device, torch.float32).contiguous()
         self.Ks = Ks.to(device, torch.float32).contiguous()
-        self._images = [self._uploaded("the photographs", image) for image in images]
-        self._tables = {"images": self._table(self._images)}
-        shares = [self._share(size, mask) for size, mask in zip(self.sizes, kept, strict=True)]
-        self._shares = torch.tensor(shares, dtype=torch.float32, device=device)
+        planes = {"images": list(images)}
         if any(mask is not None for mask in kept):
             whole = [torch.ones(1, 1, dtype=torch.bool).expand(image.shape[:2]) for image in images]
-            given = [w if mask is None else mask for mask, w in zip(kept, whole, strict=True)]
-            self._masks = [self._uploaded("the masks", mask) for mask in given]
-            self._tables["masks"] = self._table(self._masks)
-        if cache_moments:
+            planes["masks"] = [w if mask is None else mask for mask, w in zip(kept, whole, strict=True)]
+        self._place(planes, room)
+        shares = [self._share(size, mask) for size, mask in zip(self.sizes, kept, strict=True)]
+        self._shares = torch.tensor(shares, dtype=torch.float32, device=device)
+        if cache_moments and not self.n_passing:
             what, lower = "the photographs' blurred values", f"{LOWER}, or use cache_moments=False"
             self._moments = [empty(what, lower, (6, h, w), device) for w, h in self.sizes]
             self._tables["moments"] = self._table(self._moments)
             self._fill_moments()
+
+    def fetch(self, view: int) -> None:
+        """Have a photograph on the device when what is asked of its current stream from now on runs.
+
+        The host waits where it must be copied, since photographs lie in pageable memory.
+        """
+        if view in self._passing and view != self._there:
+            for there, pixels in zip(self._passage, self._passing[view], strict=True):
+                there[: pixels.numel()].copy_(pixels.reshape(-1))
+            self._there = view
+            self.copied += 1
+
+    def facts(self) -> dict[str, int]:
+        """Return the bytes of photographs and masks on the device, and how many photographs pass."""
+        return {"photograph_bytes": self.bytes, "photographs_passing": self.n_passing}
 
     @property
     def masks(self) -> Tensor | None:
@@ -83,9 +108,23 @@ class ResidentViews:
         if mask is not None and mask.shape != image.shape[:2]:
             raise ValueError(f"masks[{k}] is {list(mask.shape)}; it must be {list(image.shape[:2])} as images[{k}]")
 
-    def _uploaded(self, what: str, pixels: Tensor) -> Tensor:
-        there = empty(what, LOWER, tuple(pixels.shape), self.device, torch.uint8)
-        return there.copy_(pixels)
+    def _place(self, planes: Mapping[str, Sequence[Tensor]], room: int | None) -> None:
+        """Copy what stays, and make the place for what passes: its pointers stand in the tables from now on."""
+        needs = [sum(plane.numel() for plane in of_view) for of_view in zip(*planes.values(), strict=True)]
+        stays = _how_many_stay(needs, room)
+        self.n_passing, self._there = len(needs) - stays, None
+        self._passing = {k: [planes[name][k] for name in planes] for k in range(stays, len(needs))}
+        self._passage = []
+        self._tables, self._kept = {}, []
+        for name, of_views in planes.items():
+            what = f"the {'photographs' if name == 'images' else name}", LOWER
+            dtype, most = of_views[0].dtype, max((plane.numel() for plane in of_views[stays:]), default=0)
+            kept = [empty(*what, tuple(plane.shape), self.device, dtype).copy_(plane) for plane in of_views[:stays]]
+            passage = empty(*what, (most,), self.device, dtype)
+            self._passage.append(passage)
+            self._kept += kept
+            self._tables[name] = self._table([*kept, *[passage] * self.n_passing])
+        self.bytes = sum(tensor.numel() for tensor in (*self._kept, *self._passage))
 
     def _share(self, size: tuple[int, int], mask: Tensor | None) -> tuple[float, float]:
         m, (width, height) = self._margin, size
@@ -110,6 +149,14 @@ class ResidentViews:
             blank = torch.zeros((height, width, 3), device=self.device)
             loss = fill(kernels.LossArrays(), image=blank, width=width, height=height)
             kernels.target_moments(self.photographs(), loss, settings, state.data_ptr(), stream_of(self.device))
+
+
+def _how_many_stay(needs: Sequence[int], room: int | None) -> int:
+    """Return how many photographs, from the first on, fit together with the place for the largest of the others."""
+    if room is None or sum(needs) <= room:
+        return len(needs)
+    most, before = max(needs), itertools.accumulate(needs)
+    return next(k for k, taken in enumerate(before) if taken + most > room)
 
 
 def _kept(size: tuple[int, int], mask: Tensor | None) -> int:

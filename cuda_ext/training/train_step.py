@@ -93,7 +93,9 @@ class FusedTrainer:
         watch = self._watch
         while self.step < until or watch:
             if self.step < until:
-                self._take(self.views.sizes[self._order[self.step]], phase)
+                view = self._order[self.step]
+                self.views.fetch(view)
+                self._take(self.views.sizes[view], phase)
                 watch.post()
                 self.step += 1
                 if len(watch) <= LATE and self.step < until:
@@ -110,6 +112,13 @@ class FusedTrainer:
         They are in the order of csrc/train.h: pixelwise loss, SSIM, objective, square, POP term.
         """
         return self._shared.history[first:last].tolist()
+
+    def synchronize(self) -> None:
+        """Do nothing: no other process moves anything."""
+
+    def facts(self) -> dict[str, int]:
+        """Return how often buffers grew, and how the photographs lie."""
+        return {"instance_buffers_grown": self.grown, **self.views.facts()}
 
     @property
     def n(self) -> int:

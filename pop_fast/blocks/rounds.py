@@ -322,6 +322,10 @@ class HoldingStepper:
                 place.copy_(self._rows[key])
         return found
 
+    def synchronize(self) -> None:
+        """See `Stepper.synchronize`."""
+        self._stepper.synchronize()
+
     def facts(self) -> dict[str, Any]:
         """See `Stepper.facts`; `fixed_gaussians` says how many are held."""
         return {**self._stepper.facts(), "fixed_gaussians": len(self._rows["means"])}

@@ -211,10 +211,7 @@ class NativeTrainer:
 
     Attributes:
         step: steps taken.
-        grown: 0; what is too small grows before a step writes to it.
     """
-
-    grown = 0
 
     def __init__(
         self,
@@ -294,6 +291,23 @@ class NativeTrainer:
         self._functions.counts(self._stepper, found)
         return dict(zip(COUNTS, found, strict=True))
 
+    def traced(self, until: int, phase: Phase) -> Tensor:
+        """Take steps as `run` does, all parts of their works by this thread alone, and return what each took.
+
+        The parts are cut as they are for all threads, so that one machine tells what a larger one has to share out.
+
+        Returns:
+            In order: 0 and the seconds that one thread has for itself before a work, or 1 and those of a part of it.
+            The first 2**20 of them. [n, 2] float64
+        """
+        pairs = torch.zeros((1 << 20, 2), dtype=torch.float64)
+        self._functions.trace(self._stepper, pairs.data_ptr(), len(pairs))
+        try:
+            self.run(until, phase)
+        finally:
+            n = self._functions.trace(self._stepper, None, 0)
+        return pairs[:n].clone()
+
     def run(self, until: int, phase: Phase) -> None:
         """Take steps until the counter stands at `until`, all of one phase, or until somebody has asked for an end.
 
@@ -319,6 +333,13 @@ class NativeTrainer:
     def step_stats(self, first: int, last: int) -> list[StepStats]:
         """Return the measurements of the steps from `first` to before `last`; the last `run` must have taken them."""
         return [self._history[step] for step in range(first, last)]
+
+    def synchronize(self) -> None:
+        """Do nothing: no other process moves anything."""
+
+    def facts(self) -> dict[str, int]:
+        """Return nothing: what is too small grows before a step writes to it, and memory is the machine's."""
+        return {}
 
     def _describe(self) -> None:
         """Set what stays the same over a run."""

@@ -14,7 +14,8 @@ from pop_fast.train.stepper import Task
 from pop_fast.train.steps import StepSettings
 from pop_fast.train.views import ViewTensors
 
-# of the card's free memory, what the photographs' blurred values may take; the rest is for Gaussians and tile lists
+# of the card's free memory, what photographs may take, and their blurred values; the rest is for Gaussians and lists
+PHOTOGRAPHS_SHARE = 0.25
 MOMENTS_SHARE = 0.25
 _BYTES_OF_MOMENTS = 24  # a pixel
 
@@ -51,4 +52,5 @@ def _resident(views: Sequence[ViewTensors], settings: StepSettings, device: torc
         settings.padding,
         device,
         cache_moments=_BYTES_OF_MOMENTS * pixels <= MOMENTS_SHARE * free,
+        room=int(PHOTOGRAPHS_SHARE * free),
     )

@@ -33,8 +33,6 @@ class Fused(Protocol):
     """What takes whole steps: `cuda_ext.training.train_step.FusedTrainer`, where each of these is explained."""
 
     step: int
-    # how often a step was taken again because its buffers were too small
-    grown: int
 
     @property
     def statistics(self) -> Any:
@@ -51,6 +49,14 @@ class Fused(Protocol):
 
     def step_stats(self, first: int, last: int) -> Sequence[Sequence[float]]:
         """Return the measurements of the steps from `first` to before `last`, in the order of `StepStats`."""
+        ...
+
+    def synchronize(self) -> None:
+        """Take over the rows, moments and statistics that other processes moved since the last time."""
+        ...
+
+    def facts(self) -> dict[str, int]:
+        """Return what the statistics of a run tell of the device."""
         ...
 
 
@@ -82,6 +88,8 @@ class FusedStepper:
         self._optimizers: Mapping[str, Adam] = {}
         self._params: dict[str, Parameter] = {}
         self._state: State = {}
+        # the last step taken and its phase, while what was collected is not in the strategy's state
+        self._collected: tuple[int, Phase] | None = None
 
     def rebind(self, params: dict[str, Parameter], optimizers: Mapping[str, Adam], state: State) -> None:
         """See `Stepper.rebind`."""
@@ -117,6 +125,8 @@ class FusedStepper:
     def steps(self, first: int, last: int, phase: Phase) -> list[StepStats]:
         """See `Stepper.steps`."""
         assert self.fused is not None
+        if self._collected is not None and self._collected[1] != phase:
+            self.synchronize()
         start = time.perf_counter()
         try:
             self.fused.run(last, phase)
@@ -124,7 +134,11 @@ class FusedStepper:
             self.step = last = self.fused.step
         if last <= first:
             return []
-        self._take_statistics(self.fused.statistics, first, last, phase)
+        self._collected = last, phase
+        if phase.statistics:
+            self._state["views"] += (last - first) * self._views
+        if self.task.ranks.size == 1:
+            self.synchronize()
         took = torch.tensor([time.perf_counter() - start], dtype=torch.float64)
         # processes that train together agree on how many steps come next
         took = max(float(one) for one in self.task.ranks.gather([took]))
@@ -135,16 +149,22 @@ class FusedStepper:
                 self._optimizers[key].state[self._params[key]]["step"].fill_(float(number))
         return [StepStats(*row) for row in self.fused.step_stats(first, last)]
 
+    def synchronize(self) -> None:
+        """See `Stepper.synchronize`."""
+        if self.fused is not None and self._collected is not None:
+            self.fused.synchronize()
+            self._take_statistics(self.fused.statistics, *self._collected)
+            self._collected = None
+
     def facts(self) -> dict[str, Any]:
         """See `Stepper.facts`."""
-        return {"instance_buffers_grown": 0 if self.fused is None else self.fused.grown}
+        return {} if self.fused is None else dict(self.fused.facts())
 
-    def _take_statistics(self, found: Collected, first: int, last: int, phase: Phase) -> None:
+    def _take_statistics(self, found: Collected, last: int, phase: Phase) -> None:
         """Copy what was collected into the strategy's state."""
         state, pop = self._state, self.task.config.strategy
         if phase.statistics:
             state["grad2d"], state["count"] = found.grad_sum.clone(), found.n_visible.to(found.grad_sum.dtype)
-            state["views"] += (last - first) * self._views
         if found.sh_rest_sum is not None:
             state["sh_rest_sum"] = found.sh_rest_sum.clone()
         summed = phase.blur and pop.blur_window == "sum"

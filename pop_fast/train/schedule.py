@@ -127,11 +127,16 @@ def segment_end(config: TrainConfig, strategy: DensityControl | ForeignStrategy,
     """
     phase, step = phase_at(config, strategy, first), first
     while True:
-        if strategy.changes_after(step) or is_milestone(config, step + 1) or step + 1 - first == longest:
+        if reads_rows(config, strategy, step + 1) or step + 1 - first == longest:
             return step + 1
         step += 1
         if phase_at(config, strategy, step) != phase:
             return step
+
+
+def reads_rows(config: TrainConfig, strategy: DensityControl | ForeignStrategy, taken: int) -> bool:
+    """Tell whether density control, a measurement or a file reads all Gaussians when so many steps have been taken."""
+    return strategy.changes_after(taken - 1) or is_milestone(config, taken)
 
 
 def is_milestone(config: TrainConfig, taken: int) -> bool:

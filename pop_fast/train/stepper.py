@@ -26,7 +26,8 @@ class Stepper(Protocol):
     """Takes training steps: render, objective, backward pass, Adam, the statistics of density control.
 
     It works on what it is bound to and owns nothing that a checkpoint needs: after `steps` the parameters, the
-    optimizers' state and the strategy's statistics in `state` are those of the last step.
+    optimizers' state and the strategy's statistics in `state` are those of the last step; where several processes train
+    together, after `synchronize`.
 
     Attributes:
         name: of the engine, for the statistics of a run.
@@ -54,6 +55,10 @@ class Stepper(Protocol):
         Raises:
             ValueError: a number is no longer finite; `step` tells at which step, which has not changed the parameters.
         """
+        ...
+
+    def synchronize(self) -> None:
+        """Take over what other processes moved and counted since the last time; all of them do so together."""
         ...
 
     def facts(self) -> dict[str, Any]:

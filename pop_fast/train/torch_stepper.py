@@ -116,6 +116,9 @@ class TorchStepper:
         self._optimizers: Mapping[str, Adam] = {}
         self._state: State = {}
 
+    def synchronize(self) -> None:
+        """See `Stepper.synchronize`: every process takes whole steps, so that nothing is left to take over."""
+
     def rebind(self, params: dict[str, Parameter], optimizers: Mapping[str, Adam], state: State) -> None:
         """See `Stepper.rebind`."""
         self._params, self._optimizers, self._state = params, optimizers, state

@@ -47,7 +47,7 @@ from pop_fast.train.preflight import check_start, check_views, facts, find_warni
 from pop_fast.train.ranks import ALONE, Ranks
 from pop_fast.train.records import Segment, Stopwatch, Times, record_of
 from pop_fast.train.results import ResultFolder
-from pop_fast.train.schedule import ViewOrder, active_sh_degree, phase_at, segment_end, updates_of_strategy
+from pop_fast.train.schedule import ViewOrder, active_sh_degree, phase_at, reads_rows, segment_end, updates_of_strategy
 from pop_fast.train.signals import Abandoned, StopRequest, stop_requests
 from pop_fast.train.stepper import Engine, Stepper, Task
 from pop_fast.train.steps import Phase, StepStats
@@ -120,14 +120,13 @@ class TrainingRun:
         self.state = self.strategy.initialize_state(self._scene_scale, seed=self.config.seed, count=first)
         self.updates = updates_of_strategy(self.config, self.strategy, self._scene_scale)
         self.step = 0
-        self._watch = watch
+        self._watch, self._watched = watch, False
         self._stepper: Stepper | None = None
         self._stop = StopRequest()
         self._times = Times(loading_seconds, sfm_seconds)
         # the first Gaussians' opacities while the folder is still as it was found
         self._unwritten: np.ndarray | None = None
-        # the training PSNR of the last record, in words
-        self._latest = ""
+        self._latest = ""  # the training PSNR of the last record, in words
 
     def _prepare_capture(self, capture: Capture, initial: Mapping[str, Tensor] | None) -> None:
         config = self.config
@@ -200,15 +199,17 @@ class TrainingRun:
         config = self.config
         shown = config.progress and self._ranks.writes
         bars = tqdm(total=config.max_steps, initial=self.step, disable=None if shown else True)
+        # also where another process shows the run: all take the same steps at a time
+        self._watched = self._ranks.any(self._watch is not None)
         with bars as bar, Heartbeat(shown, draw=bar.refresh) as beat:
             beat.say(f"step {self.step:,} of {config.max_steps:,}, {len(self.params['means']):,} Gaussians")
             while self.step < config.max_steps:
-                longest = min(self.stepper.longest, config.max_steps if self._watch is None else _WATCHED_STEPS)
+                longest = min(self.stepper.longest, _WATCHED_STEPS if self._watched else config.max_steps)
                 segment = self.take_steps(segment_end(config, self.strategy, self.step, longest))
                 if segment.stats:
                     self._log(segment, bar)
-                    n, seconds = len(self.params["means"]), self._times.train
-                    beat.say(so_far(self.step, config.max_steps, n, seconds, self._latest))
+                    n = len(self.params["means"])
+                    beat.say(so_far(self.step, config.max_steps, n, self._times.train, self._latest))
                     if self._unwritten is not None:
                         # a rate can be so high that the first step is the last; that is no reason to replace anything
                         self._require_finite()
@@ -240,8 +241,7 @@ class TrainingRun:
         Raises:
             PopError: a number is no longer finite; names it.
         """
-        took = Stopwatch()
-        first, before = self.step, len(self.params["means"])
+        took, first, before = Stopwatch(), self.step, len(self.params["means"])
         phase, stepper = phase_at(self.config, self.strategy, first), self.stepper
         size = self.config.batch_size
         with translate_oom():
@@ -262,8 +262,11 @@ class TrainingRun:
             self._require_finite()
             raise PopError(f"{error}; {self._what_is_left}") from error
         self.step = stepper.step
+        bad = [step for step, found in enumerate(stats, first) if not math.isfinite(found.objective + found.pop)]
+        if bad or self._watched or self._unwritten is not None or reads_rows(self.config, self.strategy, self.step):
+            stepper.synchronize()
         for step, found in enumerate(stats, first):
-            if not math.isfinite(found.objective + found.pop):
+            if step in bad:
                 self._require_finite()
                 raise PopError(f"the loss of step {step} is {found.objective + found.pop}; {self._what_is_left}")
         return stats
@@ -370,17 +373,13 @@ class TrainingRun:
         return stats
 
     def _facts(self) -> dict[str, Any]:
-        stepper, engine = self.stepper, self._engine
-        return {
-            **run_facts(engine.backend.name, self._times.train, self._times.total),
-            "stepper": stepper.name,
-            **self._times.facts(on_cpu=engine.device.type == "cpu"),
-            **engine.facts(),
-            **stepper.facts(),
-        }
+        engine, stepper = self._engine, self.stepper
+        names = {**run_facts(engine.backend.name, self._times.train, self._times.total), "stepper": stepper.name}
+        return {**names, **self._times.facts(engine.device.type == "cpu"), **engine.facts(), **stepper.facts()}
 
     def _save(self) -> None:
         """Write a checkpoint, if this is the process that writes and all hold the same."""
+        self.stepper.synchronize()
         self._require_finite()
         self._ranks.require_same(self._detached(), self.step)
         if not self._ranks.writes:
@@ -406,8 +405,8 @@ class TrainingRun:
     def _restore(self, path: Path) -> None:
         content = ckpt.load_checkpoint(path)
         threads = torch.get_num_threads() if self._engine.depends_on_threads else None
-        n_views = len(self._train)
-        ckpt.check_fits(path, content, self.config, self._fingerprint, threads, n_views, self.state.keys())
+        given = (self.config, self._fingerprint, threads, len(self._train), self.state.keys())
+        ckpt.check_fits(path, content, *given)
         self.params = {key: Parameter(content["splats"][key]) for key in KEYS}
         self.optimizers = make_optimizers(self.params)
         ckpt.unpack_optimizers(self.optimizers, content["optimizers"])

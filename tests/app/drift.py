@@ -61,6 +61,12 @@ class Drift:
     def step_stats(self, first: int, last: int) -> list[StepStats]:
         return [self._stats[step] for step in range(first, last)]
 
+    def synchronize(self) -> None:
+        """Nothing: there is one process."""
+
+    def facts(self) -> dict[str, int]:
+        return {"instance_buffers_grown": self.grown}
+
     def before_step(self, step: int) -> None:
         """Nothing; for tests."""
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import shutil
 import sys
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -13,13 +16,14 @@ import torch
 
 from cuda_ext.host import emulate
 from cuda_ext.render import capacity
-from cuda_ext.training.batch_step import STRETCH, stretches
+from cuda_ext.training.batch_step import RETURNED, SENT, STRETCH, BatchTrainer, step_bytes, stretches
 from pop_fast.cli import main
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.ranks import ALONE, Ranks, join
+from pop_fast.train.training_run import Watch
 from tests.app.children import launched
 from tests.app.test_resume import needs_gloo, same
 from tests.app.tiny import last_checkpoint, tiny_capture, tiny_config
@@ -38,13 +42,15 @@ RUNS = {
 }
 
 
-def train(folder: Path, name: str, ranks: Ranks = ALONE, resume: bool = False) -> TrainingRun:
+def train(
+    folder: Path, name: str, ranks: Ranks = ALONE, resume: bool = False, watch: Watch | None = None
+) -> TrainingRun:
     changes, edit = RUNS[name]
     method = "gsplat" if name == "gsplat" else "pop"
     config = tiny_config(folder / name, method, batch_size=SIZE)
     strategy = type(config.strategy)(**{**vars(config.strategy), **changes.get("strategy", {})})
     config = tiny_config(folder / name, method, batch_size=SIZE, strategy=strategy)
-    run = TrainingRun(config, edit(tiny_capture()), engine=emulated_engine(), ranks=ranks, resume=resume)
+    run = TrainingRun(config, edit(tiny_capture()), engine=emulated_engine(), ranks=ranks, resume=resume, watch=watch)
     run.run()
     return run
 
@@ -55,37 +61,130 @@ def train_all(folder: Path) -> None:
     emulate.install(patch, emulate.build(FOLDER))
     torch.set_num_threads(1)
     ranks = join()
+    synchronize, exchanged = BatchTrainer.synchronize, []
+
+    def noted(trainer: BatchTrainer) -> None:
+        exchanged.append((trainer.step, trainer._bounds[-1]))
+        synchronize(trainer)
+
+    looked = []
+
+    def look(run: TrainingRun) -> None:
+        looked.append((run.step, float(run.params["means"].detach().double().sum())))
+
+    patch.setattr(BatchTrainer, "synchronize", noted)
     for name in RUNS:
-        run = train(folder, name, ranks)
+        exchanged.clear()
+        # one of the processes shows its run, for which all take fewer steps at a time
+        run = train(folder, name, ranks, watch=look if name == "gsplat" and ranks.writes else None)
         trainer = run.stepper.fused
-        torch.save((trainer.received, len(trainer._of_place[0])), folder / f"{name}_{ranks.rank}.pt")
+        told = trainer.received, len(trainer._of_place[0]), list(exchanged)
+        torch.save(told, folder / f"{name}_{ranks.rank}.pt")
+    torch.save(looked, folder / f"looked_{ranks.rank}.pt")
     ranks.leave()
 
 
 @pytest.fixture(scope="module")
-def together(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def together(made_once: Callable[..., Path]) -> Path:
     reason = emulate.why_not()
     if reason is not None:
         pytest.skip(reason)
-    emulate.build(FOLDER)
-    folder = tmp_path_factory.mktemp("together")
-    outcomes = launched([__file__, folder])
-    assert [outcome.status for outcome in outcomes] == [0, 0], outcomes
-    return folder
+
+    def make(folder: Path) -> None:
+        emulate.build(FOLDER)
+        outcomes = launched([__file__, folder])
+        assert [outcome.status for outcome in outcomes] == [0, 0], outcomes
+
+    return made_once("emulated-together", make)
+
+
+@dataclass
+class Alone:
+    """A run on one GPU: its folder, and of every view drawn the Gaussians then, its place, and those that it saw."""
+
+    folder: Path
+    run: TrainingRun
+    seen: list[tuple[int, int, torch.Tensor]]
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Alone]:
+    """What trains on one GPU under a name, once; the emulated one is there while a test runs."""
+    folder = tmp_path_factory.mktemp("alone")
+
+    @functools.cache
+    def trained(name: str) -> Alone:
+        seen: list[tuple[int, int, torch.Tensor]] = []
+        projected = BatchTrainer._projected
+
+        def noted(trainer: BatchTrainer, place: int, view: int, phase):
+            of = projected(trainer, place, view, phase)
+            seen.append((trainer._bounds[-1], place, of.seen.clone()))
+            return of
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(BatchTrainer, "_projected", noted)
+            run = train(folder, name)
+        return Alone(folder / name, run, seen)
+
+    return trained
 
 
 @needs_gloo
 @pytest.mark.parametrize("name", RUNS)
-def test_two_gpus_train_to_the_bits_of_one(gpu, together: Path, tmp_path: Path, name: str) -> None:
-    train(tmp_path, name)
-    same(together / name, tmp_path / name)
-    assert records_of(together / name) == records_of(tmp_path / name)
+def test_two_gpus_train_to_the_bits_of_one(gpu, together: Path, alone, name: str) -> None:
+    same(together / name, alone(name).folder)
+    assert records_of(together / name) == records_of(alone(name).folder)
     # density control had something to decide, and both owned Gaussians
     assert len(last_checkpoint(together / name)[".splats.means"]) > 70
     for rank in (0, 1):
-        received, own = torch.load(together / f"{name}_{rank}.pt")
+        received, own, _ = torch.load(together / f"{name}_{rank}.pt")
         assert own >= STRETCH
         assert min(received.values()) > 0
+
+
+@needs_gloo
+@pytest.mark.parametrize("name", RUNS)
+def test_two_gpus_exchange_the_bytes_that_the_model_says(gpu, together: Path, alone, name: str) -> None:
+    run, seen = alone(name).run, alone(name).seen
+    told = [torch.load(together / f"{name}_{rank}.pt") for rank in (0, 1)]
+    splats, sums = [0, 0], [0, 0]
+    for n, place, rows in seen:
+        # of four views the first two are drawn by the first process
+        drawer, border = place // (SIZE // 2), stretches(n, 2)[1]
+        crossing = int(((rows >= border) if drawer == 0 else (rows < border)).sum())
+        splats[drawer] += 4 * SENT * crossing
+        sums[1 - drawer] += 4 * RETURNED * crossing
+    assert [received["splats"] for received, _, _ in told] == splats
+    assert [received["sums"] for received, _, _ in told] == sums
+    steps, shown = run.config.max_steps, sum(len(rows) for _, _, rows in seen) / sum(n for n, _, _ in seen)
+    assert 0.1 < shown <= 1.0
+    exchanges = told[0][2]
+    assert exchanges == told[1][2]
+    # all rows are read after a change of the Gaussians, a phase and a milestone, not after every step
+    assert 1 < len(exchanges) < steps
+    n = round(sum(n for n, _, _ in seen) / len(seen))
+    model = step_bytes(n, 2, SIZE, shown, 1, n_rest=run.params["shN"].shape[1])
+    for what in ("splats", "sums"):
+        assert sum(received[what] for received, _, _ in told) == pytest.approx(2 * steps * model[what], rel=0.1), what
+    rows = sum(2 * step_bytes(n, 2, SIZE, shown, 1)["rows"] for _, n in exchanges)
+    assert sum(received["rows"] for received, _, _ in told) == pytest.approx(rows, rel=1e-9)
+
+
+@needs_gloo
+def test_who_watches_a_run_of_two_gpus_sees_the_rows_of_both(gpu, together: Path, tmp_path: Path) -> None:
+    seen: dict[int, float] = {}
+
+    def look(run: TrainingRun) -> None:
+        seen[run.step] = float(run.params["means"].detach().double().sum())
+
+    train(tmp_path, "gsplat", watch=look)
+    looked = dict(torch.load(together / "looked_0.pt"))
+    # how many steps come at a time is also a matter of their seconds
+    common = seen.keys() & looked.keys()
+    assert len(common) > 3
+    assert {step: looked[step] for step in common} == {step: seen[step] for step in common}
+    assert torch.load(together / "looked_1.pt") == []
 
 
 @needs_gloo
@@ -101,8 +200,8 @@ def test_one_gpu_continues_what_two_began(gpu, together: Path, tmp_path: Path) -
     same(folder, together / "window")
 
 
-def test_buffers_that_overflow_in_a_step_of_several_views_lose_nothing(gpu, tmp_path: Path, monkeypatch) -> None:
-    whole = train(tmp_path / "whole", "window")
+def test_buffers_that_overflow_in_a_step_of_several_views_lose_nothing(gpu, alone, tmp_path: Path, monkeypatch) -> None:
+    whole = alone("window").run
     monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 1))
     cramped = train(tmp_path / "cramped", "window")
     assert cramped.stepper.facts()["instance_buffers_grown"] > 0

@@ -134,6 +134,31 @@ def test_buffers_that_overflow_between_views_of_several_sizes_lose_nothing(engin
         assert torch.equal(cramped.params[key], value), key
 
 
+@pytest.mark.parametrize("batch_size", [1, 3])
+def test_photographs_without_room_pass_through_to_the_same_bits(engine, tmp_path, monkeypatch, batch_size):
+    from pop_fast.cuda import training
+
+    capture = masked(mixed_sizes(tiny_capture()))
+    runs = []
+    monkeypatch.setattr(training, "MOMENTS_SHARE", 0.0)
+    # room for all, for some, and for none
+    for name, share in (("all", 1.0), ("some", 0.6), ("none", 0.0)):
+        most = runs[0].stepper.facts()["photograph_bytes"] if runs else 1 << 30
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda *_, free=most: (free, free))
+        monkeypatch.setattr(training, "PHOTOGRAPHS_SHARE", share)
+        runs.append(TrainingRun(tiny_config(tmp_path / name, batch_size=batch_size), capture, engine=engine))
+        runs[-1].run()
+    facts = [run.stepper.facts() for run in runs]
+    n = len(runs[0].stepper.task.views)
+    assert [told["photographs_passing"] for told in facts] == [0, facts[1]["photographs_passing"], n]
+    assert 0 < facts[1]["photographs_passing"] < n
+    assert facts[0]["photograph_bytes"] > facts[1]["photograph_bytes"] > facts[2]["photograph_bytes"] > 0
+    assert [run.stepper.fused.views.copied > 0 for run in runs] == [False, True, True]
+    for run in runs[1:]:
+        for key, value in runs[0].params.items():
+            assert torch.equal(run.params[key], value), key
+
+
 def test_a_number_that_is_not_finite_is_found_on_the_device(engine, tmp_path):
     trainer = TrainingRun(tiny_config(tmp_path, strategy=GsplatStrategy()), tiny_capture(), engine=engine)
     take_steps = trainer.take_steps
