@@ -238,7 +238,7 @@ def power() -> str:
     sound = f"{refused} of {len(failed)} refused", f"{len(of_vectors)} of {len(vectors['sound'])} refused"
     rows.append(["sound backends of this project", "", *sound])
     return _table(
-        ["broken on purpose", "mutants", "killed by a named law in every precision", "noticed by the portable vectors alone"], rows
+        ["broken on purpose", "mutants", "killed in every precision", "noticed by the portable vectors alone"], rows
     )
 
 

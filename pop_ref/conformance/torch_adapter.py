@@ -133,9 +133,8 @@ class TorchAdapter(Adapter):
 
     def first_error(self) -> Exception | None:
         """Draw one small picture; return what is raised in its place, None where it is drawn."""
-        scene = super().sees(golden_scene())
         try:
-            self._call(scene, self._leaves(scene, grad=False), dominance=False, counts=False)
+            self._call(s := super().sees(golden_scene()), self._leaves(s, grad=False), dominance=False, counts=False)
         except Exception as error:
             return error
         return None
