@@ -25,6 +25,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from busy import time_beside
 from cases import RASTER_CASES, STEP_CASES, capture_of
+from cores import simulate
 from memory import measure
 from parts import floors
 from peak import LARGEST, bytes_per_s, vector_ops_per_s
@@ -71,6 +72,11 @@ def steps(given: argparse.Namespace) -> Any:
     return {"peak": {"threads": threads, **rates}, "cases": rows}
 
 
+def cores(given: argparse.Namespace) -> Any:
+    """Simulate training steps on machines of more cores."""
+    return [simulate(case) for case in STEP_CASES if case.name in given.cases]
+
+
 def memory(_: argparse.Namespace) -> Any:
     """Measure the memory of a render and of training steps."""
     return [*(measure("render", name) for name in backends()), *(measure("step", name) for name in engines())]
@@ -94,6 +100,7 @@ def first_step(given: argparse.Namespace) -> Any:
 PARTS: dict[str, Callable[[argparse.Namespace], Any]] = {
     "raster": raster,
     "steps": steps,
+    "cores": cores,
     "memory": memory,
     "first-step": first_step,
     "busy": busy,

@@ -92,6 +92,19 @@ def counts(timed: Mapping[str, Any]) -> str:
     return _table(["", *map(title, cases)], rows)
 
 
+def cores(timed: Mapping[str, Any]) -> str:
+    """Make the table of simulated steps on machines of more cores."""
+    rows = []
+    for case in timed["cores"]:
+        one = sum(case["machines"]["1"].values())
+        for threads, shares in case["machines"].items():
+            ms = sum(shares.values())
+            name = f"{case['width']}x{case['height']}, {case['num_gaussians']:,} Gaussians"
+            rows.append([name, threads, f"{ms:.2f}", f"{one / ms:.1f}", *(f"{part:.2f}" for part in shares.values())])
+    head = ["case", "cores", "ms", "times one core", *timed["cores"][0]["machines"]["1"]]
+    return _table(head, rows)
+
+
 def _shares(did: Mapping[str, int]) -> str:
     return ", ".join(f"{16 * did[name] / did['pairs']:.0%}" for name in ("marked", "reached"))
 
@@ -146,6 +159,7 @@ TABLES: dict[str, tuple[str, Callable[[Mapping[str, Any]], str]]] = {
     "native step": ("steps", native),
     "where a step goes": ("steps", parts),
     "what a step has to do": ("steps", counts),
+    "cores": ("cores", cores),
     "busy machine": ("busy", busy),
     "first step": ("first-step", startup),
     "memory": ("memory", memory),

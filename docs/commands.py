@@ -324,6 +324,9 @@ def main() -> int:
         names = sys.argv[sys.argv.index("--only") + 1 :]
         PAGE.write_text(with_sections_of(names, PAGE.read_text(encoding="utf-8")), encoding="utf-8")
         return 0
+    if sys.argv[1:] not in ([], ["--write"]):
+        print(__doc__)
+        return 2
     made = page()
     if "--write" in sys.argv:
         PAGE.write_text(made, encoding="utf-8")

@@ -159,6 +159,8 @@ def why_not() -> str | None:
 def scene(kind: str) -> Iterator[Scene]:
     """Train once, undisturbed, in this process, which then has imported all that its children need."""
     run_parts(in_children=True)
+    # a child has none of its parent's threads, and waits for ever to dismiss a pool that torch had made here
+    torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         capture = HERE / "colmap"
         if kind.startswith("blocks"):

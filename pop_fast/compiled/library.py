@@ -205,13 +205,14 @@ class Library:
 
 @dataclass(frozen=True)
 class StepperFunctions:
-    """The functions of a stepper: make one for so many threads, let go of it, take steps, its bytes, its counts."""
+    """The functions of a stepper: make one for so many threads, let go, take steps, its bytes, its counts, a trace."""
 
     open: Callable[[int], int | None]
     close: Callable[[int], None]
     steps: Callable[..., int]
     bytes: Callable[[int], int]
     counts: Callable[..., None]
+    trace: Callable[[int, int | None, int], int]
 
 
 def stepper_functions(given_bytes: int) -> StepperFunctions:
@@ -235,12 +236,15 @@ def stepper_functions(given_bytes: int) -> StepperFunctions:
     steps.argtypes, steps.restype = (_POINTER, _POINTER, _WHOLE, _POINTER), _WHOLE
     loaded.pop_stepper_bytes.argtypes, loaded.pop_stepper_bytes.restype = (_POINTER,), _WHOLE
     loaded.pop_stepper_counts.argtypes, loaded.pop_stepper_counts.restype = (_POINTER, _POINTER), None
+    trace = loaded.pop_stepper_trace
+    trace.argtypes, trace.restype = (_POINTER, _POINTER, _WHOLE), _WHOLE
     return StepperFunctions(
         loaded.pop_stepper_open,
         loaded.pop_stepper_close,
         loaded.pop_stepper_steps,
         loaded.pop_stepper_bytes,
         loaded.pop_stepper_counts,
+        trace,
     )
 
 

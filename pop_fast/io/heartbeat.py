@@ -94,4 +94,6 @@ def so_far(step: int, of: int, n_gaussians: int, seconds: float, latest: str) ->
         latest: what was measured last, in words that begin with a comma, or nothing.
     """
     line = f"step {step:,} of {of:,}, {n_gaussians:,} Gaussians{latest}"
+    if step == of:
+        return f"{line}, measuring and writing"
     return f"{line}, {step / max(seconds, 1e-9):.1f} steps a second, {duration(seconds * (of - step) / step)} left"

@@ -472,6 +472,15 @@ def test_the_time_that_is_left_is_told(capsys: pytest.CaptureFixture[str], monke
     assert "pop: matching pairs of photographs: 100 of 300, 2 min 0 s left (" in told
 
 
+def test_a_training_whose_steps_are_all_taken_says_what_it_does_then() -> None:
+    assert (
+        heartbeat.so_far(100, 400, 50, 20.0, "") == "step 100 of 400, 50 Gaussians, 5.0 steps a second, 1 min 0 s left"
+    )
+    assert heartbeat.so_far(400, 400, 50, 80.0, ", PSNR 21.00") == (
+        "step 400 of 400, 50 Gaussians, PSNR 21.00, measuring and writing"
+    )
+
+
 @pytest.mark.parametrize("quiet", [True, False])
 def test_a_terminal_and_a_quiet_run_are_told_nothing(monkeypatch: pytest.MonkeyPatch, quiet: bool) -> None:
     stream = io.StringIO() if quiet else Terminal()
