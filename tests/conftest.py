@@ -5,11 +5,17 @@ from __future__ import annotations
 import functools
 import importlib.util
 import os
+import shutil
 import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
+
+# before torch is imported, here and in children: workers share the cores, and threads that wait for each other would
+# spin on them (a training on two threads took five times as much of the processor)
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 # not `alpha` and `pixel`, where to count calls costs as much as the work
 SHAPES_CHECKED = tuple(
@@ -71,6 +77,33 @@ def pytest_configure() -> None:
     from pop_ref.conformance.hypothesis_profiles import load_profile
 
     load_profile(os.environ.get("HYPOTHESIS_PROFILE", "dev"))
+
+
+@pytest.fixture(scope="session")
+def made_once(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str, Callable[[Path], object]], Path]:
+    """`made_once(name, make)` is a folder that tests only read, filled by `make(folder)` once for all workers."""
+    import fcntl  # not at the top: Windows has none, and runs the tests that ask for nothing shared
+
+    base = tmp_path_factory.getbasetemp()
+    # a worker of xdist has a folder of its own in that of the session; a session within a worker shares nothing
+    shared = base.parent if hasattr(request.config, "workerinput") else base
+
+    def made(name: str, make: Callable[[Path], object]) -> Path:
+        folder = shared / f"once-{name}"
+        with (shared / f"once-{name}.lock").open("a+") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            lock.seek(0)
+            if lock.read() != "made":
+                # of a worker that failed in it
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                make(folder)
+                lock.write("made")
+        return folder
+
+    return made
 
 
 @pytest.fixture(autouse=True)

@@ -86,7 +86,12 @@ def _split(arguments: str) -> list[str]:
 
 
 def build(folder: Path) -> Path:
-    """Compile the emulated module into a folder, unless the same sources were compiled there before."""
+    """Compile the emulated module into a folder, unless the same sources were compiled there before.
+
+    It takes a minute: of several processes one compiles, and the others wait.
+    """
+    import fcntl  # not at the top: Windows has none
+
     import nanobind
 
     compiler = find_compiler()
@@ -99,8 +104,17 @@ def build(folder: Path) -> Path:
     for file in files:
         digest.update(file.read_bytes())
     library = folder / f"emulated_{digest.hexdigest()[:16]}" / "_kernels.so"
-    if library.exists():
-        return library
+    library.parent.mkdir(parents=True, exist_ok=True)
+    with (library.parent / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not library.exists():
+            _compile(compiler, library)
+    return library
+
+
+def _compile(compiler: list[str], library: Path) -> None:
+    import nanobind
+
     work = library.parent / f"source_{os.getpid()}"
     (work / "csrc").mkdir(parents=True, exist_ok=True)
     for file in (CUDA_EXT / "csrc").iterdir():
@@ -122,7 +136,6 @@ def build(folder: Path) -> Path:
         raise RuntimeError(f"the kernels cannot be compiled for the host:\n{done.stderr[-4000:]}")
     partial.replace(library)
     shutil.rmtree(work)
-    return library
 
 
 class Kernels:

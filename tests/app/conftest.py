@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,11 +58,13 @@ def pop(capsys: pytest.CaptureFixture[str]) -> Pop:
 
 
 @pytest.fixture(scope="session")
-def shared_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def shared_capture(made_once: Callable[..., Path]) -> Path:
     """A tiny demo capture that tests only read."""
-    folder = tmp_path_factory.mktemp("capture") / "toy"
-    assert main(["demo", str(folder), "--views", "8", "--width", "40", "--height", "32"]) == 0
-    return folder
+
+    def make(folder: Path) -> None:
+        assert main(["demo", str(folder / "toy"), "--views", "8", "--width", "40", "--height", "32"]) == 0
+
+    return made_once("capture", make) / "toy"
 
 
 @pytest.fixture
@@ -71,11 +74,13 @@ def capture(shared_capture: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def shared_result(shared_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def shared_result(shared_capture: Path, made_once: Callable[..., Path]) -> Path:
     """The result of training on the tiny capture, which tests only read."""
-    folder = tmp_path_factory.mktemp("result") / "toy_pop"
-    assert main(["train", str(shared_capture), "--out", str(folder), *TRAIN_AND_CHECK]) == 0
-    return folder
+
+    def make(folder: Path) -> None:
+        assert main(["train", str(shared_capture), "--out", str(folder / "toy_pop"), *TRAIN_AND_CHECK]) == 0
+
+    return made_once("result", make) / "toy_pop"
 
 
 @pytest.fixture
@@ -85,9 +90,8 @@ def result(shared_result: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def stopped(made_once: Callable[..., Path]) -> Path:
     """A run of thirty steps that was left after eleven: two checkpoints, after the fifth and the tenth."""
-    folder = tmp_path_factory.mktemp("stopped")
-    run_until(TrainingRun(tiny_config(folder), tiny_capture()), 11)
+    folder = made_once("stopped", lambda folder: run_until(TrainingRun(tiny_config(folder), tiny_capture()), 11))
     assert [step for step, _ in ckpt.list_checkpoints(folder)] == [4, 9]
     return folder

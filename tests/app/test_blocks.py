@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -59,14 +59,16 @@ def _one_process(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 
 
 @pytest.fixture(scope="module")
-def shared_blocks(shared_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def shared_blocks(shared_capture: Path, made_once: Callable[..., Path]) -> Path:
     """A run in two blocks that tests only read."""
-    folder = tmp_path_factory.mktemp("blocks") / "toy"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jobs, "_run", in_this_process)
-        patch.setattr("pop_fast.blocks.jobs.has_snakemake", lambda: False)
-        assert main(["train", str(shared_capture), "--out", str(folder), *BLOCKS]) == 0
-    return folder
+
+    def make(folder: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(jobs, "_run", in_this_process)
+            patch.setattr("pop_fast.blocks.jobs.has_snakemake", lambda: False)
+            assert main(["train", str(shared_capture), "--out", str(folder / "toy"), *BLOCKS]) == 0
+
+    return made_once("blocks", make) / "toy"
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -42,14 +43,16 @@ def _one_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def shared_rounds(shared_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def shared_rounds(shared_capture: Path, made_once: Callable[..., Path]) -> Path:
     """A run in two blocks and two rounds that tests only read."""
-    folder = tmp_path_factory.mktemp("rounds") / "toy"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jobs, "_run", in_this_process)
-        patch.setattr("pop_fast.blocks.jobs.has_snakemake", lambda: False)
-        assert main(["train", str(shared_capture), "--out", str(folder), *BLOCKS, *ROUNDS]) == 0
-    return folder
+
+    def make(folder: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(jobs, "_run", in_this_process)
+            patch.setattr("pop_fast.blocks.jobs.has_snakemake", lambda: False)
+            assert main(["train", str(shared_capture), "--out", str(folder / "toy"), *BLOCKS, *ROUNDS]) == 0
+
+    return made_once("rounds", make) / "toy"
 
 
 @pytest.fixture

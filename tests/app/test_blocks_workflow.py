@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -24,13 +25,15 @@ BLOCKS = ("--blocks", "2x1", "--blocks-rounds", "0", *TRAIN, "--skip-sizes", "--
 
 
 @pytest.fixture(scope="module")
-def begun(shared_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def begun(shared_capture: Path, made_once: Callable[..., Path]) -> Path:
     """A run whose capture is divided, and whose blocks are not trained."""
-    folder = tmp_path_factory.mktemp("workflow") / "toy"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jobs, "_run", lambda words, quiet: 0)
-        assert main(["train", str(shared_capture), "--out", str(folder), *BLOCKS]) == 0
-    return folder
+
+    def make(folder: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(jobs, "_run", lambda words, quiet: 0)
+            assert main(["train", str(shared_capture), "--out", str(folder / "toy"), *BLOCKS]) == 0
+
+    return made_once("workflow", make) / "toy"
 
 
 def planned(folder: Path, tmp_path: Path, *words: str, profile: Path | None = None) -> str:

@@ -6,6 +6,7 @@ import errno
 import os
 import stat
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -55,15 +56,18 @@ shutil.copyfile(kept, words[at])
 
 
 @pytest.fixture(scope="session")
-def remembering(tmp_path_factory: pytest.TempPathFactory) -> str | None:
+def remembering(made_once: Callable[..., Path]) -> str | None:
     """Return a command that compiles as the compiler of this machine, the same sources once; None without one."""
-    real, folder = find_compiler(), tmp_path_factory.mktemp("remembered")
+    real = find_compiler()
     if real is None:
         return None
-    program = folder / "remembering"
-    program.write_text(REMEMBERING.format(python=sys.executable, kept=str(folder), real=real))
-    program.chmod(0o755)
-    return str(program)
+
+    def make(folder: Path) -> None:
+        program = folder / "remembering"
+        program.write_text(REMEMBERING.format(python=sys.executable, kept=str(folder), real=real))
+        program.chmod(0o755)
+
+    return str(made_once("remembered", make) / "remembering")
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +25,14 @@ STORED = ROOT / "benchmarks" / "results" / "faults.json"
 
 
 @pytest.fixture(scope="module")
-def tried(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    out = tmp_path_factory.mktemp("faults") / "faults.json"
-    command = [sys.executable, "-m", "benchmarks.faults", "--quick", "--out", str(out)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT, timeout=600)
-    assert out.exists(), done.stderr[-3000:]
-    found = json.loads(out.read_text())
-    assert (done.returncode == 0) == ("nothing failed" in done.stdout)
-    return found
+def tried(made_once: Callable[..., Path]) -> dict[str, Any]:
+    def make(folder: Path) -> None:
+        command = [sys.executable, "-m", "benchmarks.faults", "--quick", "--out", str(folder / "faults.json")]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT, timeout=600)
+        assert (folder / "faults.json").exists(), done.stderr[-3000:]
+        assert (done.returncode == 0) == ("nothing failed" in done.stdout)
+
+    return json.loads((made_once("faults", make) / "faults.json").read_text())
 
 
 @pytest.mark.parametrize("reader", READERS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -140,23 +141,28 @@ LOSES = {
 
 
 @pytest.fixture(scope="module")
-def turned(shared_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def turned(shared_capture: Path, made_once: Callable[..., Path]) -> Path:
     """The tiny capture in another world."""
-    folder = Path(shutil.copytree(shared_capture, tmp_path_factory.mktemp("turned") / "toy"))
-    model = pycolmap.Reconstruction(folder / "sparse" / "0")
-    rotation = pycolmap.Rotation3d(Rotation.from_rotvec([1.1, -0.7, 2.0]).as_matrix())
-    model.transform(pycolmap.Sim3d(3.5, rotation, np.array([40.0, -25.0, 60.0])))
-    model.write(folder / "sparse" / "0")
-    return folder
+
+    def make(folder: Path) -> None:
+        sparse = Path(shutil.copytree(shared_capture, folder / "toy")) / "sparse" / "0"
+        model = pycolmap.Reconstruction(sparse)
+        rotation = pycolmap.Rotation3d(Rotation.from_rotvec([1.1, -0.7, 2.0]).as_matrix())
+        model.transform(pycolmap.Sim3d(3.5, rotation, np.array([40.0, -25.0, 60.0])))
+        model.write(sparse)
+
+    return made_once("turned", make) / "toy"
 
 
 @pytest.fixture(scope="module")
-def run(turned: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(turned: Path, made_once: Callable[..., Path]) -> Path:
     """A result on it, which tests only read."""
-    folder = tmp_path_factory.mktemp("run") / "toy_pop"
-    words = ("--out", str(folder), *TRAIN, "--steps-scaler", "0.01", "--export", "splat", "sog")
-    assert main(["train", str(turned), *words]) == 0
-    return folder
+
+    def make(folder: Path) -> None:
+        words = ("--out", str(folder / "toy_pop"), *TRAIN, "--steps-scaler", "0.01", "--export", "splat", "sog")
+        assert main(["train", str(turned), *words]) == 0
+
+    return made_once("run", make) / "toy_pop"
 
 
 def stats(run: Path) -> dict[str, Any]:

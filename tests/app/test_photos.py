@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -33,23 +34,26 @@ CENTERS = [(4.0 * np.cos(a), 4.0 * np.sin(a), 1.5 + 0.2 * (i % 2)) for i, a in e
 
 
 @pytest.fixture(scope="module")
-def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("photographs")
-    scene = make_scene(0)
-    for i, center in enumerate(CENTERS):
-        write_photograph(folder / f"walk {i}.png", render_view(scene, look_at(center, (0.0, 0.0, 0.4)), K, 320, 240))
-    return folder
+def photographs(made_once: Callable[..., Path]) -> Path:
+    def make(folder: Path) -> None:
+        scene = make_scene(0)
+        for i, center in enumerate(CENTERS):
+            view = render_view(scene, look_at(center, (0.0, 0.0, 0.4)), K, 320, 240)
+            write_photograph(folder / f"walk {i}.png", view)
+
+    return made_once("photographs", make)
 
 
 @pytest.fixture(scope="module")
-def found(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("sfm") / "capture"
-    result = run_sfm(photographs, out)
-    assert result.capture == out
-    assert result.registered == result.photographs == len(CENTERS)
-    assert result.points >= 50
-    assert result.reprojection_error < 1.0
-    return out
+def found(photographs: Path, made_once: Callable[..., Path]) -> Path:
+    def make(folder: Path) -> None:
+        result = run_sfm(photographs, folder / "capture")
+        assert result.capture == folder / "capture"
+        assert result.registered == result.photographs == len(CENTERS)
+        assert result.points >= 50
+        assert result.reprojection_error < 1.0
+
+    return made_once("sfm", make) / "capture"
 
 
 def test_cameras_are_found_where_the_photographs_were_taken(found: Path) -> None:

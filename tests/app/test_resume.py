@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -62,10 +63,8 @@ def records(folder):
 
 
 @pytest.fixture(scope="module", params=["pop", "gsplat"])
-def uninterrupted(request, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("whole")
-    run_to(folder, method=request.param)
-    return request.param, folder
+def uninterrupted(request, made_once):
+    return request.param, made_once(f"whole-{request.param}", lambda folder: run_to(folder, method=request.param))
 
 
 def test_stopping_anywhere_and_going_on_changes_nothing(uninterrupted, tmp_path):
@@ -241,11 +240,12 @@ def train_all(folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def together(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("together")
-    outcomes = launched([__file__, folder])
-    assert [outcome.status for outcome in outcomes] == [0, 0], outcomes
-    return folder
+def together(made_once: Callable[..., Path]) -> Path:
+    def make(folder: Path) -> None:
+        outcomes = launched([__file__, folder])
+        assert [outcome.status for outcome in outcomes] == [0, 0], outcomes
+
+    return made_once("together", make)
 
 
 def same(ours: Path, theirs: Path) -> None:

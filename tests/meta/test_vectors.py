@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,9 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("vectors")
-    export(made)
-    return made
+def folder(made_once: Callable[..., Path]) -> Path:
+    # tests/app reads the same folder, whoever makes it
+    return made_once("vectors", lambda folder: export(folder / "vectors")) / "vectors"
 
 
 @pytest.mark.parametrize("name", SHIPPED)

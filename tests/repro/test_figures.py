@@ -73,15 +73,17 @@ def full() -> list[Result]:
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory):
+def written(made_once):
     """The figures that need results alone, drawn by the command from files."""
-    folder = tmp_path_factory.mktemp("figures")
-    for one in full():
-        write(one, folder / "results")
-    for figure in OF_RESULTS:
-        words = ["figure", figure, "--scale", "small", "--results", folder / "results", "--out", folder / "out"]
-        assert main([str(word) for word in words]) == 0
-    return folder
+
+    def make(folder: Path) -> None:
+        for one in full():
+            write(one, folder / "results")
+        for figure in OF_RESULTS:
+            words = ["figure", figure, "--scale", "small", "--results", folder / "results", "--out", folder / "out"]
+            assert main([str(word) for word in words]) == 0
+
+    return made_once("figures", make)
 
 
 @pytest.mark.parametrize("figure", OF_RESULTS)

@@ -168,8 +168,11 @@ def test_a_check_names_what_the_machine_lacks(change, says, capsys, tmp_path, mo
 
 @pytest.fixture(scope="module")
 def queued(tmp_path_factory):
-    """A queue of two toy rows that is stopped by SIGTERM in the first, then called again to the end."""
+    """A queue of two toy rows that is stopped by SIGTERM in the first, then called again, with --commit, to the end."""
     folder = tmp_path_factory.mktemp("queue")
+    new_repository(folder)
+    (folder / "other.txt").write_text("not to be committed")
+    git(folder, "add", "other.txt")
     words = ["--scale", "toy", "--rows", "l2_pop", "l1_div_100", "--results", "results", "--work", "work"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     command = [sys.executable, "-m", "paper_repro", "queue", *words, "--checkpoint-every", "50"]
@@ -184,6 +187,7 @@ def queued(tmp_path_factory):
     process.send_signal(signal.SIGTERM)
     said.append((process.communicate(timeout=120)[0], process.returncode))
     left = sorted(path.parent.name for path in folder.rglob("ckpts/*.pt"))
+    command.append("--commit")
     done = subprocess.run(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=folder, env=environment
     )
@@ -243,19 +247,14 @@ def new_repository(folder):
         git(folder, *words)
 
 
-def test_results_are_committed_where_that_is_asked_for(tmp_path):
-    new_repository(tmp_path)
-    (tmp_path / "other.txt").write_text("not to be committed")
-    git(tmp_path, "add", "other.txt")
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    words = ["--scale", "toy", "--rows", "l1_div_100", "--results", "results", "--work", "work", "--commit"]
-    command = [sys.executable, "-m", "paper_repro", "queue", *words]
-    subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True)
-    shown = git(tmp_path, "show", "--stat", "--format=%s")
-    assert shown.startswith("Result: l1_div_100 on demo, toy scale, seed 42\n")
-    assert "results/toy/l1_div_100.jsonl" in shown
-    assert "other.txt" not in shown
-    assert [result.row for result in read_all("toy", tmp_path / "results")] == ["l1_div_100"]
+def test_results_are_committed_where_that_is_asked_for(queued):
+    committed = {
+        git(queued[0], "show", "--format=%s", "--name-only", place).replace("\n\n", "\n").strip()
+        for place in ("HEAD", "HEAD~1")
+    }
+    assert committed == {
+        f"Result: {row} on demo, toy scale, seed 42\nresults/toy/{row}.jsonl" for row in ("l1_div_100", "l2_pop")
+    }
 
 
 def test_pages_made_from_the_packages_results_are_committed_with_them_unless_somebody_edits_them(tmp_path, monkeypatch):

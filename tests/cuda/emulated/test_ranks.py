@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import shutil
 import sys
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -82,23 +85,56 @@ def train_all(folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def together(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def together(made_once: Callable[..., Path]) -> Path:
     reason = emulate.why_not()
     if reason is not None:
         pytest.skip(reason)
-    emulate.build(FOLDER)
-    folder = tmp_path_factory.mktemp("together")
-    outcomes = launched([__file__, folder])
-    assert [outcome.status for outcome in outcomes] == [0, 0], outcomes
-    return folder
+
+    def make(folder: Path) -> None:
+        emulate.build(FOLDER)
+        outcomes = launched([__file__, folder])
+        assert [outcome.status for outcome in outcomes] == [0, 0], outcomes
+
+    return made_once("emulated-together", make)
+
+
+@dataclass
+class Alone:
+    """A run on one GPU: its folder, and of every view drawn the Gaussians then, its place, and those that it saw."""
+
+    folder: Path
+    run: TrainingRun
+    seen: list[tuple[int, int, torch.Tensor]]
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Alone]:
+    """What trains on one GPU under a name, once; the emulated one is there while a test runs."""
+    folder = tmp_path_factory.mktemp("alone")
+
+    @functools.cache
+    def trained(name: str) -> Alone:
+        seen: list[tuple[int, int, torch.Tensor]] = []
+        projected = BatchTrainer._projected
+
+        def noted(trainer: BatchTrainer, place: int, view: int, phase):
+            of = projected(trainer, place, view, phase)
+            seen.append((trainer._bounds[-1], place, of.seen.clone()))
+            return of
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(BatchTrainer, "_projected", noted)
+            run = train(folder, name)
+        return Alone(folder / name, run, seen)
+
+    return trained
 
 
 @needs_gloo
 @pytest.mark.parametrize("name", RUNS)
-def test_two_gpus_train_to_the_bits_of_one(gpu, together: Path, tmp_path: Path, name: str) -> None:
-    train(tmp_path, name)
-    same(together / name, tmp_path / name)
-    assert records_of(together / name) == records_of(tmp_path / name)
+def test_two_gpus_train_to_the_bits_of_one(gpu, together: Path, alone, name: str) -> None:
+    same(together / name, alone(name).folder)
+    assert records_of(together / name) == records_of(alone(name).folder)
     # density control had something to decide, and both owned Gaussians
     assert len(last_checkpoint(together / name)[".splats.means"]) > 70
     for rank in (0, 1):
@@ -109,19 +145,8 @@ def test_two_gpus_train_to_the_bits_of_one(gpu, together: Path, tmp_path: Path, 
 
 @needs_gloo
 @pytest.mark.parametrize("name", RUNS)
-def test_two_gpus_exchange_the_bytes_that_the_model_says(
-    gpu, together: Path, tmp_path: Path, monkeypatch, name: str
-) -> None:
-    seen: list[tuple[int, int, torch.Tensor]] = []
-    projected = BatchTrainer._projected
-
-    def noted(trainer: BatchTrainer, place: int, view: int, phase):
-        of = projected(trainer, place, view, phase)
-        seen.append((trainer._bounds[-1], place, of.seen.clone()))
-        return of
-
-    monkeypatch.setattr(BatchTrainer, "_projected", noted)
-    run = train(tmp_path, name)
+def test_two_gpus_exchange_the_bytes_that_the_model_says(gpu, together: Path, alone, name: str) -> None:
+    run, seen = alone(name).run, alone(name).seen
     told = [torch.load(together / f"{name}_{rank}.pt") for rank in (0, 1)]
     splats, sums = [0, 0], [0, 0]
     for n, place, rows in seen:
@@ -148,17 +173,17 @@ def test_two_gpus_exchange_the_bytes_that_the_model_says(
 
 @needs_gloo
 def test_who_watches_a_run_of_two_gpus_sees_the_rows_of_both(gpu, together: Path, tmp_path: Path) -> None:
-    alone: dict[int, float] = {}
+    seen: dict[int, float] = {}
 
     def look(run: TrainingRun) -> None:
-        alone[run.step] = float(run.params["means"].detach().double().sum())
+        seen[run.step] = float(run.params["means"].detach().double().sum())
 
     train(tmp_path, "gsplat", watch=look)
     looked = dict(torch.load(together / "looked_0.pt"))
     # how many steps come at a time is also a matter of their seconds
-    common = alone.keys() & looked.keys()
+    common = seen.keys() & looked.keys()
     assert len(common) > 3
-    assert {step: looked[step] for step in common} == {step: alone[step] for step in common}
+    assert {step: looked[step] for step in common} == {step: seen[step] for step in common}
     assert torch.load(together / "looked_1.pt") == []
 
 
@@ -175,8 +200,8 @@ def test_one_gpu_continues_what_two_began(gpu, together: Path, tmp_path: Path) -
     same(folder, together / "window")
 
 
-def test_buffers_that_overflow_in_a_step_of_several_views_lose_nothing(gpu, tmp_path: Path, monkeypatch) -> None:
-    whole = train(tmp_path / "whole", "window")
+def test_buffers_that_overflow_in_a_step_of_several_views_lose_nothing(gpu, alone, tmp_path: Path, monkeypatch) -> None:
+    whole = alone("window").run
     monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 1))
     cramped = train(tmp_path / "cramped", "window")
     assert cramped.stepper.facts()["instance_buffers_grown"] > 0
