@@ -1,8 +1,9 @@
-"""Everything that only a GPU can tell, in three jobs of limited length, on a bare GPU node: no network, pip or git.
+"""Everything that only a GPU can tell, in four jobs of limited length, on a bare GPU node: no network, pip or git.
 
     python3 -m cuda_ext.gpu_check            job 1: build, a smoke of half a minute, the benchmark, gsplat beside it
     python3 -m cuda_ext.gpu_check --job 2    job 2: laws, steps, sanitizer, training
     python3 -m cuda_ext.gpu_check --job 3    job 3: rows of the paper's tables, on captures that were brought along
+    python3 -m cuda_ext.gpu_check --job 4    job 4, on a node of several GPUs: steps shared by ranks, blocks at once
 
 What has to be there: Python 3.11 or newer with torch for CUDA, NumPy, nanobind, hypothesis and pytest, cmake, nvcc.
 Results go to the folder named first, else to $OUT, else to out/gpu_check/results: one JSON file a job, and beside it
@@ -141,7 +142,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="python3 -m cuda_ext.gpu_check", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("out", type=Path, nargs="?", help="the folder of results; default: $OUT")
-    parser.add_argument("--job", type=int, choices=list(JOBS), default=1, help="which of the three; default 1")
+    parser.add_argument("--job", type=int, choices=list(JOBS), default=1, help="which of the four; default 1")
     parser.add_argument("--stages", nargs="+", choices=list(STAGES), help="others than the job's, in this order")
     parser.add_argument("--limit-s", type=float, default=560.0, help="seconds for all stages together; default 560")
     parser.add_argument("--packed", type=Path, help="what was brought along; default: out/gpu_pack, if it is there")

@@ -112,13 +112,18 @@ def python_path(*folders: Path) -> str:
     return os.pathsep.join(filter(None, [*map(str, folders), os.environ.get("PYTHONPATH", "")]))
 
 
-def first_line(command: list[str]) -> str | None:
-    """Return the first line that a command says, or None where there is no such command or it fails."""
+def all_lines(command: list[str]) -> list[str]:
+    """Return the lines that a command says, none where there is no such command or it fails."""
     if shutil.which(command[0]) is None:
-        return None
+        return []
     done = subprocess.run(command, cwd=ROOT, text=True, capture_output=True, check=False)
-    lines = done.stdout.strip().splitlines()
-    return lines[0] if done.returncode == 0 and lines else None
+    return done.stdout.strip().splitlines() if done.returncode == 0 else []
+
+
+def first_line(command: list[str]) -> str | None:
+    """Return the first line that a command says, or None where it says nothing; see `all_lines`."""
+    lines = all_lines(command)
+    return lines[0] if lines else None
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from cuda_ext.gpu_check.several import blocks_stage, ranks_stage
 from cuda_ext.gpu_check.shared import NOTHING, ROOT, Check, Command, Share, python_path, read_json, skipped
 from cuda_ext.gpu_check.tests import (
     laws_of_gaussian_parallel_stage,
@@ -17,14 +17,11 @@ from cuda_ext.gpu_check.tests import (
     smoke_stage,
     steps_stage,
 )
+from cuda_ext.gpu_check.training import no_capture, train_stage
 from pop_fast.children import python_command
 
-_TRAIN = "from pop_fast.cli import main; raise SystemExit(main())"
 _COMPILE = "import time; t = time.time(); from gsplat.cuda._backend import _C; print(round(time.time() - t), 's');"
 _COMPILE += "assert _C is not None, 'gsplat found no CUDA toolkit'"
-# what a training run is judged by
-_KEPT = ("step", "seconds", "seconds_loading", "seconds_total", "num_GS", "num_GS_above_floor", "psnr", "ssim", "views")
-_KEPT += ("gpu", "gpu_memory_bytes", "instance_buffers_grown", "photograph_bytes", "photographs_passing")
 
 
 def wheels_stage(check: Check) -> dict[str, Any]:
@@ -76,25 +73,6 @@ def gsplat_stage(check: Check) -> dict[str, Any]:
     return found | {"compilation": compiled}
 
 
-def train_stage(check: Check) -> dict[str, Any]:
-    """Train POP on every capture as `pop train --backend cuda` does; seconds, Gaussians, PSNR, SSIM."""
-    packed = sorted((check.packed / "captures").glob("*/")) if check.packed else []
-    captures = [*packed, *check.captures]
-    if not captures:
-        return skipped("no captures were given (--captures DIR ...) or brought along")
-    if importlib.util.find_spec("tyro") is None and not (check.site / "tyro").is_dir():
-        return skipped(
-            "`pop train` needs tyro, which is neither installed nor among the wheels that were brought along"
-        )
-    found: dict[str, Any] = {"status": 0, "seconds": 0.0, "runs": {}}
-    for k, path in enumerate(captures):
-        one = train_one(check, path, (check.seconds - found["seconds"]) / (len(captures) - k))
-        found["runs"][path.name] = one
-        found |= {"status": found["status"] or one["status"], "seconds": round(found["seconds"] + one["seconds"], 1)}
-        check.note(found)
-    return found
-
-
 def reproduce_stage(check: Check) -> dict[str, Any]:
     """Train the rows of the paper's tables that are missing, the cheapest first, as `pop-repro queue` does.
 
@@ -103,7 +81,7 @@ def reproduce_stage(check: Check) -> dict[str, Any]:
     """
     folder = check.packed / "captures" if check.packed else check.captures[0].parent if check.captures else None
     if folder is None:
-        return skipped("no captures were given (--captures DIR ...) or brought along")
+        return no_capture()
     results = check.out / "paper_repro"
     words = ["-m", "paper_repro", "queue", "--scale", "toy" if check.rehearsal else "full", "--data", str(folder)]
     words += ["--results", str(results), "--work", str(check.work / "paper_repro"), "--threads", "0"]
@@ -112,26 +90,6 @@ def reproduce_stage(check: Check) -> dict[str, Any]:
     if found["status"] == 130:
         found |= {"status": 0, "note": "the time was up; the rows that were finished are under `rows`"}
     return found | {"rows": sorted(str(path.relative_to(results)) for path in results.rglob("*.jsonl"))}
-
-
-def train_one(check: Check, path: Path, limit: float, backend: str = "cuda") -> dict[str, Any]:
-    """Train on one capture, or continue with the training of an earlier call at the same commit."""
-    folder = check.work / f"{path.name}_{backend}_{check.steps_scaler:g}_{check.commit[:12]}"
-    words = ["train", str(path), "--out", str(folder), "--backend", backend]
-    words += ["--steps-scaler", str(check.steps_scaler), "--no-progress", "--max-renders", "1"]
-    words += ["--skip-sizes", "--skip-checks"]
-    words += ["--resume"] if (folder / "cfg.json").exists() else []
-    found = check.run(check.python("-c", _TRAIN, *words), limit)
-    stats = sorted((folder / "stats").glob("val_step*.json"), key=lambda file: int(file.stem.split("step")[1]))
-    if found["status"] == 130:
-        found |= {"status": 124, "note": "the time was up; where the folder survives, the next call continues"}
-    elif found["status"] == 0 and not stats:
-        found["status"] = 1
-    if not stats:
-        return found
-    last = read_json(stats[-1])
-    result = {name: last.get(name) for name in _KEPT}
-    return {**result, **found, "seconds_training": last.get("seconds")}
 
 
 def _start_gsplat(check: Check) -> None:
@@ -173,6 +131,8 @@ STAGES: dict[str, Callable[[Check], dict[str, Any]]] = {
     "train": train_stage,
     "laws_of_gaussian_parallel": laws_of_gaussian_parallel_stage,
     "reproduce": reproduce_stage,
+    "ranks": ranks_stage,
+    "blocks": blocks_stage,
 }
 # what settles the paper's claims, first of all the two rows of the whole schedule
 REPRODUCED = ("pop", "l2_blur", "reset", "gsplat", "3dgs", "pop_any_view", "l2", "l2_pop")
@@ -188,9 +148,12 @@ SHARES = {
     "train": Share(90, 250),
     "laws_of_gaussian_parallel": Share(20, 1e9),
     "reproduce": Share(120, 1e9),
+    "ranks": Share(150, 1e9),
+    "blocks": Share(120, 1e9),
 }
 JOBS = {
     1: ("wheels", "build", "smoke", "bench", "gsplat"),
     2: ("wheels", "build", "laws", "steps", "sanitizer", "train", "laws_of_gaussian_parallel"),
     3: ("wheels", "build", "reproduce"),
+    4: ("wheels", "build", "ranks", "blocks"),
 }

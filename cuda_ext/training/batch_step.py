@@ -180,8 +180,9 @@ class BatchTrainer:
         return [self._history[step] for step in range(first, last)]
 
     def facts(self) -> dict[str, int]:
-        """Return how often buffers grew, and how the photographs lie."""
-        return {"instance_buffers_grown": self.grown, **self.views.facts()}
+        """Return how often buffers grew, how the photographs lie, and the bytes that other processes have sent."""
+        told = {"instance_buffers_grown": self.grown, "received_bytes": sum(self.received.values())}
+        return {**told, **self.views.facts()}
 
     def synchronize(self) -> None:
         """Give every process what the others have moved and counted."""

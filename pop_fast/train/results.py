@@ -28,7 +28,8 @@ A record of metrics.jsonl holds: step, view (or the names of a batch), loss, l1 
 pop (weighted, absent when off), psnr (of the training view), num_gaussians, n_blended and n_traversed (per pixel; not
 in runs on a GPU), sh_degree, lr_means, it_per_s, seconds (training alone); after a change of the Gaussians also
 cloned, split, pruned, and reset when opacities were. Statistics of runs on a GPU also hold gpu, gpu_memory_bytes,
-instance_buffers_grown, photograph_bytes (on the GPU) and photographs_passing (copied there for each of their steps).
+instance_buffers_grown, photograph_bytes (on the GPU) and photographs_passing (copied there for each of their steps);
+where processes train together also received_bytes, which others have sent to the one that writes.
 """
 
 from __future__ import annotations

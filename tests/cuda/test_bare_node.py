@@ -1,4 +1,4 @@
-"""Both jobs of the GPU check on what a bare node has: no git, no network, no package but the usual ones, $OUT set.
+"""The jobs of the GPU check on what a bare node has: no git, no network, no package but the usual ones, $OUT set.
 
 The kernels are emulated and the cases tiny (`--rehearse`); everything else is what runs on a node with a GPU.
 """
@@ -131,3 +131,15 @@ def test_job_two_judges_and_trains(node, tmp_path):
     assert trained["step"] == 29
     assert trained["psnr"] > 5.0
     assert trained["gpu"] == "emulated"
+
+
+def test_job_four_trains_by_several(node, tmp_path):
+    stages = job(node, 4, tmp_path)["stages"]
+    ranks = stages["ranks"]
+    assert (ranks["gpus"], ranks["same_bits"]) == (2, True)
+    alone, two = ranks["runs"]["1"], ranks["runs"]["2"]
+    assert alone["step"] == two["step"] == 7
+    assert alone["received_bytes"] == 0 < two["received_bytes"]
+    assert len(alone["sha256"]) == 64
+    assert stages["blocks"]["runs"]["blocks"]["psnr"] > 5.0
+    assert stages["blocks"]["runs"]["whole"]["gpu"] == "emulated"

@@ -18,10 +18,12 @@ from cuda_ext.gpu_check import command as gpu_check
 from cuda_ext.gpu_check import shared as gpu_check_tools
 from cuda_ext.gpu_check import stages as gpu_check_stages
 from cuda_ext.gpu_check import tests as gpu_check_tests
+from cuda_ext.gpu_check import training as gpu_check_training
 from cuda_ext.gpu_check.command import commit_of, main
 from cuda_ext.gpu_check.outcomes import outcomes
 from cuda_ext.gpu_check.shared import MARGIN, Budget, Check, Command, Share, first_line, run, write_json
-from cuda_ext.gpu_check.stages import JOBS, SHARES, STAGES, train_one, wheels_stage
+from cuda_ext.gpu_check.stages import JOBS, SHARES, STAGES, wheels_stage
+from cuda_ext.gpu_check.training import train_one
 from pop_fast.cli import main as pop
 from pop_fast.data import load_capture
 from tests.app.captures import colmap_capture
@@ -192,16 +194,16 @@ def test_a_training_that_cannot_be_says_why_and_the_next_is_begun(tmp_path):
     notes: list[dict[str, object]] = []
     missing = (tmp_path / "a", tmp_path / "b")
     shared = check(tmp_path, captures=missing, note=lambda told: notes.append(json.loads(json.dumps(told))))
-    found = gpu_check_stages.train_stage(shared)
+    found = gpu_check_training.train_stage(shared)
     assert found["status"] != 0
     assert [list(note["runs"]) for note in notes] == [["a"], ["a", "b"]]  # type: ignore[call-overload]
     assert all("pop: error: " in one["output"] for one in found["runs"].values())
-    assert "no captures" in gpu_check_stages.train_stage(check(tmp_path))["skipped"]
+    assert "no captures" in gpu_check_training.train_stage(check(tmp_path))["skipped"]
 
 
 def test_a_training_without_the_package_of_the_command_line_is_skipped(tmp_path, monkeypatch):
-    monkeypatch.setattr(gpu_check_stages.importlib.util, "find_spec", lambda name: None)
-    found = gpu_check_stages.train_stage(check(tmp_path, captures=(tmp_path,)))
+    monkeypatch.setattr(gpu_check_training.importlib.util, "find_spec", lambda name: None)
+    found = gpu_check_training.train_stage(check(tmp_path, captures=(tmp_path,)))
     assert (found["status"], "needs tyro" in found["skipped"]) == (0, True)
 
 
