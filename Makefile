@@ -54,8 +54,8 @@ test: setup  ## run every test
 # float64 of the torch path stands for that of the compiled one; what failed last comes first
 test-fast: setup  ## run in two minutes what a change most likely breaks: renderers, gradients, laws (5 examples), steps
 	HYPOTHESIS_PROFILE=quick $(TESTS) -q --failed-first \
-		-m "not slow" -k "not compiled64" tests/fast tests/gradients tests/golden tests/laws tests/oracle tests/thresholds \
-		tests/train tests/meta/test_architecture.py tests/meta/test_architecture.py
+		-m "not slow" -k "not compiled64" tests/fast tests/gradients tests/golden tests/laws tests/oracle tests/train \
+		tests/meta/test_architecture.py
 
 explore: setup  ## run the tests that draw examples with fresh ones, once for each of SEEDS="1 2 3"
 	@broken=; for seed in $(or $(SEEDS),$$(date +%s)); do \

@@ -94,7 +94,7 @@ LAWS_ELSEWHERE = {
     "appearance": "tests/oracle/test_appearance.py",
     "refinement": "tests/oracle/test_appearance.py",
     "regularizers": "tests/oracle/test_losses.py",
-    "margins": "tests/thresholds",
+    "margins": "tests/oracle/test_margins.py",
 }
 
 

@@ -32,7 +32,7 @@ def l1(
     Args:
         image: the render, encoded rgb, not clamped.
         target: the photograph in [0, 1].
-        mask: True where a pixel counts: the mean is over those alone; None keeps all.
+        mask: True where a pixel counts: the mean is over those alone, 0 if there are none; None keeps all.
 
     Returns:
         The loss, >= 0.
@@ -94,7 +94,7 @@ def l2(
     Args:
         image: the render, encoded rgb, not clamped.
         target: the photograph in [0, 1].
-        mask: True where a pixel counts: the mean is over those alone; None keeps all.
+        mask: True where a pixel counts: the mean is over those alone, 0 if there are none; None keeps all.
 
     Returns:
         The loss, >= 0.

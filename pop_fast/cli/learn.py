@@ -174,7 +174,7 @@ def _subject(args: Train):
 
     capture = load_capture(args.scene)
     views = []
-    for view in capture.views[:: max(1, len(capture.views) // 24)]:
+    for view in capture.views[:: max(1, len(capture.views) // 72)]:
         by = SIZE / view.width
         height = max(1, round(view.height * by))
         K = view.K.copy()

@@ -36,12 +36,14 @@ def _shifted(right: float, down: float) -> Mistake:
     )
 
 
-def _pixel_vjp(tail: bool) -> Callable[..., Any]:
-    """Make `composite_pixel_vjp` without what is behind a splat, or with the splats behind it but no background."""
+def _pixel_vjp(tail: bool, background_seen: bool = False, dims: bool = True) -> Callable[..., Any]:
+    """Make `composite_pixel_vjp` without what is behind a splat, without the background, or with splats that do not dim
+    what is behind them."""
 
     def made(o: Oracle, pixel: Any, rows: Any, px: float, py: float, background: Any, v_color: Any, v_T_final: float,
              totals: Any, *profile: Any) -> None:  # fmt: skip
         behind = v_T_final if tail else 0.0
+        behind += float(np.dot(background, v_color)) if background_seen else 0.0
         totals.v_background[:] += pixel.T_final * np.array(v_color)
         for i, alpha, T in zip(
             reversed(pixel.ids), reversed(pixel.alphas), reversed(pixel.transmittances), strict=True
@@ -49,7 +51,7 @@ def _pixel_vjp(tail: bool) -> Callable[..., Any]:
             color_dot_grad = float(np.dot(rows.colors[i], v_color))
             totals.v_colors[i] += T * alpha * np.array(v_color)
             v_alpha = T * (color_dot_grad - behind)
-            behind += alpha * (color_dot_grad - behind) if tail else 0.0
+            behind += alpha * (color_dot_grad - (behind if dims else 0.0)) if tail else 0.0
             sigma = o["sigma_at_pixel"](rows.means2d[i], rows.conics[i], px, py)
             v_sigma, v_opacity = o["alpha_from_sigma_vjp"](sigma, rows.opacities[i], v_alpha, *profile)
             v_mean2d, v_conic = o["sigma_at_pixel_vjp"](rows.means2d[i], rows.conics[i], px, py, v_sigma)
@@ -99,6 +101,19 @@ def _split_beside(o: Oracle, rows: Any, mask: Any, normals: Any, *revised: Any) 
     return type(kept)(both(rows.params, kept.params), both(rows.m, kept.m), both(rows.v, kept.v))
 
 
+def _split_otherwise(name: str, change: Callable[[Any], Any], to: str) -> Callable[..., Any]:
+    """Make `split_rows` that reads a parameter changed, and takes another parameter of the children from that."""
+
+    def made(o: Oracle, rows: Any, mask: Any, normals: Any, *revised: Any) -> Any:
+        changed = type(rows)({**rows.params, name: change(rows.params[name])}, rows.m, rows.v)
+        split, other = (o["split_rows"](each, mask, normals, *revised) for each in (rows, changed))
+        n = int(np.sum(~mask))
+        taken = np.concatenate([split.params[to][:n], other.params[to][n:]])
+        return type(split)({**split.params, to: taken}, split.m, split.v)
+
+    return made
+
+
 def _unturned(o: Oracle, rows: Any, mask: Any, normals: Any, *revised: Any) -> Any:
     """Make `split_rows` that draws children along the world's axes."""
     upright = {**rows.params, "quats": np.tile([1.0, 0.0, 0.0, 0.0], (len(mask), 1))}
@@ -109,6 +124,18 @@ def _unturned(o: Oracle, rows: Any, mask: Any, normals: Any, *revised: Any) -> A
 
 def _pixel(o: Oracle, ids: Any, rows: Any, px: float, py: float, background: Any, *profile: Any) -> Any:
     return o["composite_pixel"](ids, rows, px, py, [0.0] * len(background), *profile)
+
+
+def _clone_with_moments(o: Oracle, rows: Any, mask: Any) -> Any:
+    """Make `clone_rows` whose copies have the moments of their sources."""
+    both = ({name: np.concatenate([x, x[mask]]) for name, x in each.items()} for each in (rows.m, rows.v))
+    return type(rows)(o["clone_rows"](rows, mask).params, *both)
+
+
+def _over_all(o: Oracle, opacities: Any, mask: Any, v_loss: float, visible: Any = None) -> Any:
+    """Make `pop_loss_vjp` whose sides are both divided by the number of all Gaussians."""
+    part = np.ones(len(mask), dtype=bool) if visible is None else visible
+    return v_loss * np.where(part, np.where(mask, -1.0, 1.0), 0.0) / len(mask)
 
 
 _HALF: Final = "The exponent of a Gaussian is half of d^T Q d: exp(-x^2 / 2) has a 2 under its square."
@@ -248,6 +275,51 @@ MISTAKES: Final = (
         _unturned,
         "The draws are not turned: the children must lie along the parent's own axes.",
         "mean + R(q) (s * eps): scale each draw first, then turn it.",
+    ),
+    Mistake(
+        "composite_pixel_vjp",
+        _pixel_vjp(tail=True, background_seen=True, dims=False),
+        "A splat hides what is behind it: the light behind must lose the share alpha before the splat's own is added.",
+        "behind += alpha (color_dot_grad - behind), the same as alpha color_dot_grad + (1 - alpha) behind.",
+    ),
+    Mistake(
+        "pop_loss_vjp",
+        _over_all,
+        "Both sides are divided by the number of all Gaussians: the important have a mean of their own, and so have the"
+        " others.",
+        "Divide the first sum by N_imp and the second by N - N_imp.",
+    ),
+    Mistake(
+        "clone_rows",
+        _clone_with_moments,
+        "The copies have Adam's moments of their sources: newcomers start with moments of 0.",
+        "Append copies to the parameters, and zeros to m and v.",
+    ),
+    Mistake(
+        "split_rows",
+        _split_otherwise("scales", lambda x: x + np.log(1.6) - 1.6, "scales"),
+        "You subtract 1.6 from the logarithms of the widths: to divide a width by 1.6, subtract log 1.6.",
+        "params['scales'] holds logarithms.",
+    ),
+    Mistake(
+        "split_rows",
+        _split_otherwise("scales", np.zeros_like, "means"),
+        "The draws are not scaled: a child lies as far from its parent's centre as the parent is wide.",
+        "mean + R(q) (s * eps): scale each draw first, then turn it.",
+    ),
+    Mistake(
+        "grow_masks",
+        lambda o, window, scales, *given: o["grow_masks"](
+            window, np.repeat(scales.mean(axis=1, keepdims=True), 3, axis=1), *given
+        ),
+        "You compare the mean of the three widths: a Gaussian is small if its largest one is.",
+        "scales.max(axis=1).",
+    ),
+    Mistake(
+        "params_vjp",
+        lambda o, params, gradients, v_opacities: o["params_vjp"](params, gradients, np.zeros_like(v_opacities)),
+        "The prior's pull is missing: v_opacities is added to the gradient of the render's opacities.",
+        "gradients.opacities + v_opacities, then back through the sigmoid.",
     ),
 )
 

@@ -278,4 +278,37 @@ GEOMETRY: Final = (
         "Your last two numbers are the number of tiles; what is asked for is one past the last tile.",
         "(x0, y0, x1, y1), half open: x1 - x0 tiles lie between.",
     ),
+    Mistake(
+        "scales_from_log_scales_vjp",
+        lambda o, log_scales, v: log_scales * v,
+        "You multiply by the logarithm; the derivative of exp(x) is exp(x).",
+        "v_scales times the scales themselves.",
+    ),
+    Mistake(
+        "scales_from_log_scales_vjp",
+        lambda o, log_scales, v: v.copy(),
+        "The exponential's slope is missing: the derivative of exp(x) is exp(x).",
+        "v_scales times the scales themselves.",
+    ),
+    Mistake(
+        "unit_quats_from_quats_vjp",
+        lambda o, quats, v: v / np.linalg.norm(quats, axis=1, keepdims=True),
+        "The part along q is still in it: a longer q is the same rotation, so the loss does not ask for it.",
+        "Take u (u . v) from v before you divide by the length.",
+    ),
+    Mistake(
+        "project_means",
+        lambda o, means_cam, K, *given: o["project_means"](means_cam, K[[1, 0, 2]][:, [1, 0, 2]], *given),
+        "The numbers of K for x and for y are exchanged: x goes with fx and cx, y with fy and cy.",
+        "fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2].",
+    ),
+    Mistake(
+        "radii_from_covars2d",
+        lambda o, covars2d, *given: (
+            o["radii_from_covars2d"](covars2d * covars2d * np.eye(2), *given)
+            * (o["radii_from_covars2d"](covars2d, *given) > 0)
+        ),
+        "You take variances for standard deviations: the covariance's diagonal holds squares.",
+        "The reach is k times the root of the diagonal's entry.",
+    ),
 )

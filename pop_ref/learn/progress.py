@@ -100,10 +100,7 @@ def toy() -> dict[str, np.ndarray]:
     """Cover the toy's balls and floor with flat Gaussians of their colour, as raw parameters."""
     means, normals, sizes, colors = [], [], [], []
     for centre, radius, paint in zip(*BALLS, PAINT, strict=True):
-        # points of a spiral lie evenly on a sphere
-        k = np.arange(90)
-        z, turn = 1.0 - (2.0 * k + 1.0) / 90, np.pi * (3.0 - np.sqrt(5.0)) * k
-        n = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
+        n = evenly(90)
         means.append(centre + radius * n)
         normals.append(n)
         sizes.append(np.full(90, 0.16 * radius))
@@ -123,6 +120,18 @@ def toy() -> dict[str, np.ndarray]:
         "opacities": np.full(len(n), 3.0),
         "sh0": ((color - 0.5) / SH_C0)[:, None],
     }
+
+
+def evenly(n: int) -> np.ndarray:
+    """Spread points evenly over the unit sphere, along a spiral. [n, 3]
+
+    Example:
+        >>> evenly(90).mean(axis=0).round(2) + 0.0
+        array([0., 0., 0.])
+    """
+    k = np.arange(n)
+    z, turn = 1.0 - (2.0 * k + 1.0) / n, np.pi * (3.0 - np.sqrt(5.0)) * k
+    return np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
 
 
 def _notes(folder: Path) -> dict[str, Any]:

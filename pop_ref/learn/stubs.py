@@ -38,9 +38,12 @@ _SETTINGS: Final = {
     "train_step": {
         "recipe": "what is minimised: `objective` reads it, `learning_rates` takes its `max_steps` and `lr`,"
         " `accumulate` and `control` take its `density`. Adam's first step is number 1, `state.step` counts from 0. The"
-        " course draws harmonics of degree 0; `waiting` and the entropy term belong to other methods."
+        " course draws harmonics of degree 0; `waiting` belongs to another method.",
+        "points": "not in this course; leave it out.",
     },
 }
+# what the oracle's loop does for other methods; a stub does not speak of it
+_OF_OTHER_METHODS: Final = re.compile(r"opacity_entropy|depth_samples|sparse_depth_loss")
 _QUOTED: Final = re.compile(r"`([^`]*)`")
 _HEAD: Final = '''"""Stage {number} of {count}, {name}: {does}.
 
@@ -219,7 +222,7 @@ def _imports(stage: Stage, used: set[str]) -> list[str]:
                 continue
             # a type is needed where a result is made of it
             fresh = [name for name in names if name in used | asked or re.match("[A-Z]+[a-z]", name)]
-            fresh = [name for name in fresh if name not in own]
+            fresh = [name for name in fresh if name not in own and not _OF_OTHER_METHODS.match(name)]
             if fresh:
                 ours.setdefault(origin, []).extend(fresh)
     lines, seen = list[str](), set[str]()

@@ -10,11 +10,13 @@ from typing import Any, Final
 import numpy as np
 
 from pop_ref.learn.course import COURSE
-from pop_ref.learn.progress import toy
+from pop_ref.learn.progress import evenly, toy
 from pop_ref.learn.splat import SH_C0, l2, orbit, photograph
 from pop_ref.learn.student import Borrowed, Work, borrowing, said, where
 
 SIZE: Final = 64
+# Gaussians of a capture's far sphere
+_FAR: Final = 80
 # a camera as `records.Camera` takes it, and what it sees, [H, W, 3] in [0, 1]
 View = tuple[tuple[np.ndarray, np.ndarray, int, int], np.ndarray]
 
@@ -24,7 +26,7 @@ class Subject:
     """What is trained on.
 
     Attributes:
-        views: cameras and photographs; training draws one a step.
+        views: cameras and photographs; training takes one a step, all in a random order, then all again.
         shown: the view that the film shows.
         params: raw parameters of the Gaussians to start from.
         scene_scale: world units.
@@ -96,9 +98,11 @@ def a_picture(image: np.ndarray, size: int = SIZE, cells: int = 16) -> Subject:
 
 
 def a_capture(
-    views: Sequence[View], points: np.ndarray, colors: np.ndarray, scene_scale: float, n: int = 300
+    views: Sequence[View], points: np.ndarray, colors: np.ndarray, scene_scale: float, n: int = 1000
 ) -> Subject:
-    """Start from some of a capture's points; the first view is put aside and shown.
+    """Start from some of a capture's points, and from a far sphere; the first view is put aside and shown.
+
+    Sky and bare walls have no points, and what no Gaussian covers has no gradient: the sphere covers it.
 
     Args:
         views: small ones, see `shrunk`.
@@ -116,10 +120,18 @@ def a_capture(
         )
     picked = np.random.default_rng(0).permutation(len(points))[:n]
     means = points[picked]
+    centers = np.array([-viewmat[:3, :3].T @ viewmat[:3, 3] for (viewmat, *_), _ in views])
+    middle = centers.mean(axis=0)
+    radius = 8.0 * max(float(np.linalg.norm(centers - middle, axis=1).max()), 1e-6 * scene_scale)
+    sphere = middle + radius * evenly(_FAR)
     # so wide that each reaches its third neighbour
     apart = np.sqrt(np.sum((means[:, None] - means) ** 2, axis=2))
-    widths = np.sort(apart, axis=1)[:, 1 : min(4, len(means))].mean(axis=1) if len(means) > 1 else np.ones(1)
-    return Subject(views[1:], views[0], _started(means, colors[picked], 0.6 * widths), scene_scale)
+    near = np.sort(apart, axis=1)[:, 1 : min(4, len(means))].mean(axis=1) if len(means) > 1 else np.ones(1)
+    widths = np.concatenate([near, np.full(_FAR, radius * np.sqrt(4.0 * np.pi / _FAR))])
+    mean_color = np.mean([photo.mean(axis=(0, 1)) for _, photo in views], axis=0)
+    tints = np.concatenate([colors[picked], np.tile(mean_color, (_FAR, 1))])
+    params = _started(np.concatenate([means, sphere]), tints, 0.6 * widths)
+    return Subject(views[1:], views[0], params, scene_scale)
 
 
 def shrunk(image: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -142,7 +154,7 @@ def _started(means: np.ndarray, colors: np.ndarray, widths: Any) -> dict[str, np
         "means": means,
         "quats": np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
         "scales": np.log(np.broadcast_to(np.reshape(widths, (-1, 1)), (n, 3))),
-        "opacities": np.full(n, 0.5),
+        "opacities": np.full(n, 1.5),
         "sh0": ((colors - 0.5) / SH_C0)[:, None],
     }
 
@@ -178,7 +190,7 @@ def _steps(borrowed: Borrowed, subject: Subject, steps: int, every: int, rng: np
     density = replace(density, grow_grad2d=1e-3)
     recipe = replace(recipe, max_steps=steps, lr=rates, density=density, pop_stop_iter=steps // 2)
     camera, target = types.Camera(*subject.shown[0]), subject.shown[1]
-    state, loss = training.start(subject.params), float("nan")
+    state, loss, waiting = training.start(subject.params), float("nan"), list[int]()
     for step in range(steps + 1):
         if step % every == 0 or step == steps:
             gaussians = training.gaussians_from_params(state.rows.params)
@@ -186,6 +198,8 @@ def _steps(borrowed: Borrowed, subject: Subject, steps: int, every: int, rng: np
             psnr = -10.0 * np.log10(l2(np.clip(image, 0.0, 1.0), target)[0])
             yield Told(step, loss, float(psnr), len(gaussians), np.concatenate([target, image], axis=1))
         if step < steps:
-            seen, photo = subject.views[int(rng.integers(len(subject.views)))]
+            # every view once before any comes again
+            waiting = waiting or rng.permutation(len(subject.views)).tolist()
+            seen, photo = subject.views[waiting.pop()]
             normals = lambda n: rng.standard_normal((2, n, 3))  # noqa: E731
             state, loss = training.train_step(state, types.Camera(*seen), photo, scale, normals, recipe)

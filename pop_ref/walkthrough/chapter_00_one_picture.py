@@ -53,6 +53,7 @@ picture(fig, "Four of the sixteen photographs. The last is not trained on.")
 
 # %%
 points, tints = capture.points, capture.points_rgb / 255.0
+assert 1000 < len(points) < 4000
 print(
     f"{len(points)} points; the first: position {points[0].round(3)}, colour {tints[0].round(2)}"
 )
@@ -118,6 +119,8 @@ params = {
     "opacities": np.full(n, -0.5),
     "sh0": ((tints[picked] - 0.5) / splat.SH_C0)[:, None],
 }
+# what training begins with; it makes new arrays
+started = dict(params)
 
 
 def drawn(params, k=UNSEEN):
@@ -195,8 +198,8 @@ picture(
 
 # %% [markdown]
 # Seventy steps leave a blur. The same toys, in photographs four times as wide, were trained for 3,000 steps before this
-# page was made, by `make demo`: a minute on two cores. Gaussians were added where they
-# were needed, and removed where they were not. The view is again one that no step has seen.
+# page was made, by `make demo`. Gaussians were added where they were needed, and removed
+# where they were not. The view is again one that no step has seen.
 
 # %%
 kept = plt.imread(str(files("pop_ref.walkthrough") / "trained.png"))[..., :3]
@@ -287,7 +290,7 @@ picture(
 # ## What to know before, and how long it takes
 #
 # Vectors, matrices, eigenvalues, and the chain rule; Python and a little NumPy. Nothing about graphics or learning.
-# Chapters 0 to 9b and 12 run on NumPy alone, 10 and 11 need torch.
+# Chapters 10 and 11 need torch, the others do not.
 #
 # {{chapters}}
 #
@@ -314,13 +317,6 @@ picture(
 # %% answer
 # The opacities and the colours. A point cloud says nothing of opacities, and a point's colour is that of single pixels,
 # while a splat's must suit all that it covers. Least change the places, which a point cloud knows best.
-started = {
-    "means": points[picked],
-    "quats": np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
-    "scales": np.tile(np.log(0.5 * apart)[:, None], (1, 3)),
-    "opacities": np.full(n, -0.5),
-    "sh0": ((tints[picked] - 0.5) / splat.SH_C0)[:, None],
-}
 moved = {
     name: np.mean(np.abs(params[name] - started[name])) / rates[name] for name in params
 }
@@ -339,4 +335,5 @@ assert min(moved, key=lambda name: moved[name]) == "means"
 numbers = sum(x.size for x in params.values())
 print(15 * HEIGHT * WIDTH * 3, numbers)
 assert numbers == 14 * n < 20_000
+assert 11 < 216_000 / numbers < 14
 assert 15 * HEIGHT * WIDTH * 3 == 216_000

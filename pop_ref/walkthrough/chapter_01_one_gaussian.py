@@ -16,8 +16,8 @@
 # - an *opacity* $o$ between 0 and 1: how much it hides at its centre;
 # - a colour $c$, three numbers.
 #
-# How a Gaussian in space becomes a splat is chapter 2. Here is one to look at; the widget at the end of the page lets
-# you drag one about.
+# How a Gaussian in space becomes a splat is chapter 2. Here is one to look at; the widget below lets you drag one
+# about.
 
 # %%
 import math

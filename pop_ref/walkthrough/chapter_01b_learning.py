@@ -58,7 +58,7 @@ o = opacities_from_logits(x)
 fig, (left, right) = axes(2, height=2.6)
 left.plot(x, o, color=ACCENT, label="opacity")
 left.plot(x, o * (1 - o), color=SECOND, label="how fast it changes, $o(1-o)$")
-left.set(xlabel="logit", title="the sigmoid")
+left.set(xlabel="logit", title="the sigmoid", ylim=(-0.05, 1.5))
 left.legend(loc="upper left")
 right.plot(o, o * (1 - o), color=SECOND)
 right.set(xlabel="opacity", title="how fast it changes with its logit")
@@ -69,8 +69,8 @@ picture(
 )
 
 # %% [markdown]
-# Two more reasons speak for raw parameters. A step of 0.1 in a logarithm is ten percent, for a width of a millimetre as
-# for one of ten metres. And the sum of two raw parameters is one, too, so no step has to be checked.
+# Two more reasons speak for raw parameters. A step of 0.1 in a logarithm is about ten percent, for a width of a
+# millimetre as for one of ten metres. And the sum of two raw parameters is one, too, so no step has to be checked.
 #
 # ## Gradient descent
 #
@@ -108,7 +108,9 @@ just_right, too_large = walk(descent(0.019), 60), walk(descent(0.0202), 60)
 print("after 60 steps at rate 0.019: ", just_right[-1].round(3))
 print("after 60 steps at rate 0.0202:", too_large[-1].round(3))
 assert valley(just_right[-1]) < valley(just_right[0])
-assert abs(too_large[-1, 0]) > 1.0
+assert abs(too_large[-1, 0]) > 3.0
+assert abs(just_right[-1, 0]) < 0.01
+assert round(abs(just_right[-1, 1]) / 2.0, 1) == 0.3
 
 # %% [markdown]
 # At 0.019 the steep coordinate jumps to and fro and slowly settles, while the flat one hardly moves: after sixty steps
@@ -405,6 +407,6 @@ assert np.isclose((np.log((3.0 + h) * 5.0) - np.log((3.0 - h) * 5.0)) / (2 * h),
 
 # %% answer
 # $m$ is not divided by $1 - \beta_1^t$. It starts at 0 and has only a tenth of the first gradient, so the first steps
-# are a tenth of what they should be. A training would only look a little slow at the start, and it
-# would not be noticed without a law that measures the first step.
+# are a tenth of what they should be. A training would only look a little slow at the start, and it would not be noticed
+# without a law that measures the first step.
 print(caught("adam_without_bias_correction"))

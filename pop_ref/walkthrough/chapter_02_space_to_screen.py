@@ -156,6 +156,21 @@ for seed in (1, 2, 3):
 print("middle 68 % reach, in standard deviations of the ellipse:")
 print(f"small and far {sides(0, 1).round(2)}, large and near {sides(1, 1).round(2)}")
 
+# farther out on the same ray, the large one is less and less lopsided
+lopsided = []
+for away in (1.0, 2.0, 4.0):
+    there = away * means_cam[1]
+    points = np.random.default_rng(4).multivariate_normal(there, covars_cam[1], 20_000)
+    at = project_means(
+        np.concatenate([there[None], points[points[:, 2] > 0.01]]), K, width, height
+    )
+    J_there = projection_jacobians(there[None], K, width, height)
+    _, directions = np.linalg.eigh(project_covars(covars_cam[1:], J_there)[0])
+    ends = np.sort(np.abs(np.quantile((at[1:] - at[0]) @ directions[:, 1], [0.16, 0.84])))
+    lopsided.append(ends[1] / ends[0])
+assert lopsided == sorted(lopsided, reverse=True)
+assert lopsided[2] < 1.0 + 0.5 * (lopsided[0] - 1.0)
+
 rng = np.random.default_rng(1)
 clouds = [
     project_means(rng.multivariate_normal(m, c, 6000), K, width, height)

@@ -266,7 +266,7 @@ for ax, colour in ((left, "white"), (right, INK)):
     ax.set(xlabel="x, px", ylabel="y, px")
 picture(
     fig,
-    r"The arrow is the way downhill for the splat\'s centre: the sum of $\Gamma d$ over its pixels, times $Q$.",
+    r"The arrow is the way downhill for the splat's centre: the sum of $\Gamma d$ over its pixels, times $Q$.",
 )
 
 # %% [markdown]
@@ -320,11 +320,13 @@ by_difference = np.array([[difference(unit, h) for unit in np.eye(56)] for h in 
 errors = np.linalg.norm(by_difference - by_hand, axis=1) / np.linalg.norm(by_hand)
 # a hundredfold for each tenfold, until rounding
 np.testing.assert_allclose(errors[-2:] / errors[-3:-1], 100.0, rtol=0.1)
-print(
-    "relative difference:",
-    " ".join(f"h={h:.0e}: {e:.0e}" for h, e in zip(steps, errors, strict=True)),
-)
+print("step h              ", *(f"{h:6.0e}" for h in steps))
+print("relative difference ", *(f"{e:6.0e}" for e in errors))
 assert errors.min() < 1e-9 < 1e-8 < errors[0]
+# a gradient with a mistake of a thousandth: the difference falls no further than that
+slip = 1e-3 * np.linalg.norm(by_hand) * np.eye(56)[5]
+stuck = np.linalg.norm(by_difference - (by_hand + slip), axis=1) / np.linalg.norm(by_hand)
+np.testing.assert_allclose(stuck[:-1], 1e-3, rtol=0.01)
 
 fig, ax = axes(1, width=4.6, height=2.8)
 ax.loglog(steps, errors, "o-", color=ACCENT, label="all 56 parameters")

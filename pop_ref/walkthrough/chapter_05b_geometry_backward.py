@@ -318,6 +318,8 @@ picture(
     "gradient, and no picture shows it.",
 )
 assert np.linalg.norm(through_J) > 0.03 * np.linalg.norm(through_center)
+sizes = np.array([np.linalg.norm(part, axis=1) for part in shares.values()])
+assert np.mean(np.argmax(sizes, axis=0) == 0) > 0.5
 
 # %% [markdown]
 # ### Exercise 1: predict
@@ -381,6 +383,13 @@ assert np.allclose(v_t, by_difference[:3, 3], rtol=1e-5, atol=1e-9)
 # {{bug: conic_off_diagonal_twice}}
 
 # %% answer
-# The off-diagonal cotangent is not halved, so turned splats get twice the gradient that would turn or shear them.
-# Splats along the axes are not affected, and everything still trains.
+# The off-diagonal cotangent is not halved. A splat along the axes gets twice the gradient that would turn or shear it,
+# and the right one for its widths; for a turned splat all of it is wrong. It points downhill often enough for a
+# training to go on.
+V_twice = np.array([[v_A, v_B], [v_B, v_C]])
+along_axes = np.diag([2.0, 0.5])
+right, wrong = (-along_axes @ each @ along_axes for each in (V, V_twice))
+assert np.array_equal(np.diag(right), np.diag(wrong))
+assert np.isclose(wrong[0, 1], 2.0 * right[0, 1])
+assert not np.allclose(np.diag(-Q @ V_twice @ Q), np.diag(v_covar2d), rtol=1e-2)
 print(caught("conic_off_diagonal_twice"))

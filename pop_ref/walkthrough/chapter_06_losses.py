@@ -235,8 +235,8 @@ picture(
 
 # %% [markdown]
 # L1's map is one flat tone: it says which way, never how far. L2's map is the error itself, doubled. SSIM's map is
-# something else: where it is complete, away from the border, the sizes of gradient and error correlate weakly, by 0.5
-# here and by 0.2 to 0.6 for other draws of the haze (the paper says: no direct relation). That is its reason for L2: of
+# something else: where it is complete, away from the border, the sizes of gradient and error correlate weakly, by less
+# than 0.7 here and for other draws of the haze (the paper says: no direct relation). That is its reason for L2: of
 # the three it alone spends its force where the artifacts are. (Here opacities are simply set, so the picture shows the
 # gradients and not the fight.)
 

@@ -359,7 +359,11 @@ assert same[0] > same[1]
 # {{bug: tie_to_the_back}}
 
 # %% answer
-# `>=` lets a later splat of equal weight take over, so ties go to the back. Clones lie exactly on their originals and
-# tie at small alphas: the copy would win, and the original would be called unimportant and die. (With weights of 0 it
-# even makes a winner of a splat that gives nothing.)
+# `>=` lets a later splat of equal weight take over, so ties go to the back: of alphas 1/3 and 1/2 the second would win.
+# Exact ties are rare, and no clone ties with its original, which takes its share of the light first; so pictures and
+# trainings hardly tell. But a program that is compared with another must agree on every pixel.
+assert np.isclose(*ray([1 / 3, 1 / 2])[1], rtol=1e-15)
+for alpha in (1 / 255, 0.01, 0.5, 0.9):
+    original, copy = ray([alpha, alpha])[1]
+    assert copy < original
 print(caught("tie_to_the_back"))

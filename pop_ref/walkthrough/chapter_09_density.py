@@ -502,6 +502,8 @@ assert haze["all at 0.5"] > ends["prior"]["haze"]
 
 # %% answer
 # The moments are cut to the right length instead of gathered by the same rows, so each Gaussian after a removed one
-# continues with the momentum of its predecessor. After every densification step they
-# move in wrong directions for some hundred steps.
+# continues with the momentum of its predecessor. After every densification step they move in wrong directions for some
+# ten steps, until $m$ has forgotten ($0.9^{22} = 0.1$), and by wrong lengths for some hundred, until $v$ has.
+assert round(0.9**22, 1) == 0.1
+assert 0.999**700 < 0.5 < 0.999**600
 print(caught("moments_left_behind"))

@@ -13,23 +13,22 @@
 #
 # {{source: pop_ref.training.train_step}}
 #
-# Line by line: raw parameters become Gaussians (1b). The degree of the harmonics grows with the step (3). The view is
-# **rendered** (2 to 4b). The **objective** (6, 8) gives the loss, its gradient with respect to the image, and what the
-# prior adds to the opacities; which Gaussians are important is read off this very render (7). The image's gradient goes
-# **back** to the Gaussians (5, 5b) and to the raw parameters (1b). The entropy term belongs to another method and is
-# off. `update` is **Adam** (1b). Then **density control** (9): the screen gradients, which Gaussians are visible, and
-# the dominant counts are added to the window's statistics, and where the schedule says so, `control` clones, splits and
-# prunes. "Windows" and "waiting" serve options of other methods.
+# Raw parameters become Gaussians (1b), whose harmonics grow with the step (3). The view is **rendered** (2 to 4b). The
+# **objective** (6, 8) gives the loss, its gradient with respect to the image, and what the prior adds to the opacities;
+# who is important is read off this very render (7). The gradient goes **back** (5, 5b) to the raw parameters (1b).
+# `update` is **Adam** (1b). Then **density control** (9): `accumulate` counts what this view shows, and `control`
+# clones, splits and prunes when it is time. Points, entropy, regularizers and "waiting" serve other methods and are
+# off.
 #
-# This is what is minimised, and where eq. 9 stands:
+# What is minimised, eq. 9:
 #
 # {{source: pop_ref.training.objective}}
 #
 # ## Ten photographs
 #
-# Two balls stand on a chequered floor; ten cameras walk round them. The photographs are 24 by 24 pixels, so that a
-# training takes seconds, and they are drawn from 90 opaque Gaussians, so that we know what is there. There are 40 good
-# points to start from, and 40 that are plainly wrong.
+# Two balls on a chequered floor, seen by ten cameras. The photographs are 24 by 24 pixels, so that a training takes
+# seconds, and drawn from 90 opaque Gaussians, so that we know what is there. Of the points to start from 40 are good
+# and 40 plainly wrong.
 
 # %% setup
 import io
@@ -147,16 +146,15 @@ assert state.step == 30
 # %% [markdown]
 # ## A training
 #
-# The program takes the same steps, only faster. A run is decided by one frozen value, `TrainConfig`; its defaults are
-# the paper's, 30,000 steps. Ours has 200, so the schedule shrinks with it: the population changes every 20 steps up to
-# step 150, the blur rule (POP paper, eq. 6) is on from 30 to 60, the prior (eq. 8) until 150. The prior has 150 steps
-# instead of 15,000, so it must push harder: its weight is 0.02 and not 0.001. The objective is the paper's,
+# The program takes the same steps, only faster. `TrainConfig` decides a run; its defaults are the paper's, 30,000
+# steps. Ours has 200, so the schedule shrinks with it: the population changes every 20 steps up to step 150, the blur
+# rule (POP paper, eq. 6) is on from 30 to 60, the prior (eq. 8) until 150. With so few steps the prior must push
+# harder: its weight is 0.02 and not 0.001. The objective is the paper's,
 #
 # $$L = (1 - \lambda_{\mathrm{SSIM}}) L_2 + \lambda_{\mathrm{SSIM}} L_{\mathrm{D-SSIM}} +
 # \lambda_{\mathrm{POP}} L_{\mathrm{POP}} \qquad \text{(POP paper, eq. 9)}.$$
 #
-# We train twice, with the prior and with its weight at 0, and nothing else changed. With a capture in a folder the same
-# is `pop train scene --out out/prior`.
+# We train twice, with the prior and with its weight at 0, and nothing else changed.
 
 # %%
 strategy = POPStrategy(
@@ -203,9 +201,8 @@ for name, weight in (("prior", 0.02), ("none", 0.0)):
 # %% [markdown]
 # ## Its curves
 #
-# A run leaves `metrics.jsonl`, one record every few steps and one at every change of the population; `stats/`, what was
-# measured on the held-out views; `ply/`, the Gaussians, for any viewer; and what the report needs. Let us redraw the
-# report's curves from the records.
+# A run leaves `metrics.jsonl`, one record every few steps and one at every change of the population; `stats/`, measured
+# on the held-out views; and `ply/`, the Gaussians, for any viewer. Here are its curves.
 
 # %%
 records = {}
@@ -229,7 +226,7 @@ def histogram(name, step):
 fig, panels = axes(2, 2, height=5.0)
 for name, color in (("prior", ACCENT), ("none", MUTED)):
     label = "with the prior" if name == "prior" else "without"
-    panels[0].step(*curve(name, "num_gaussians"), color=color, where="post", label=label)
+    panels[0].step(*curve(name, "num_gaussians"), color=color, where="post")
     panels[1].plot(200, stats[name]["psnr"], "o", color=color)
     for panel, key in zip(panels[1:3], ("psnr", "n_blended"), strict=True):
         step, value = curve(name, key)
@@ -237,14 +234,14 @@ for name, color in (("prior", ACCENT), ("none", MUTED)):
         panel.plot(step, mean, color=color)
     tenths = histogram(name, 199).reshape(10, 10).sum(axis=1)
     places = np.arange(10) / 10 + (0.03 if name == "prior" else 0.07)
-    panels[3].bar(places, tenths, 0.04, color=color)
+    panels[3].bar(places, tenths, 0.04, color=color, label=label)
 titles = "Gaussians", "PSNR [dB]", "blended per pixel"
 for panel, title in zip(panels, titles, strict=False):
     panel.axvspan(30, 60, color=SECOND, alpha=0.15, lw=0)
     panel.axvline(150, color=THIRD, lw=1.0, ls="--")
     panel.set(title=title, xlabel="step")
 panels[3].set(title="share of Gaussians at the end", xlabel="opacity")
-panels[0].legend(loc="lower right")
+panels[3].legend(loc="upper center")
 caption = "Shaded: the blur window. Dashed: the end of the prior and of all changes. PSNR is of the training views, "
 picture(fig, caption + "averaged over seven records; the dots are the held-out views.")
 
@@ -285,12 +282,9 @@ assert curve("prior", "psnr")[1][-5:].mean() > curve("prior", "psnr")[1][:5].mea
 # %% [markdown]
 # ## The report
 #
-# `report.html` shows all of this and more on one page: the headline numbers, these curves with the schedule, opacities
-# at three moments, dominance maps, held-out views beside their photographs with the Gaussian that dominates each pixel,
-# every setting, and every change of the population. It is one file that loads nothing, so open it with any browser.
-# `pop train` writes it at the end, `pop report FOLDER` writes it again, also for a run that was stopped, and `pop
-# compare A B` puts two side by side. The runs of this page are in a temporary folder; set `home` to one of your own and
-# its `report.html` stays there.
+# `report.html` shows all of this and more on one page, from held-out views beside their photographs to every setting.
+# It is one file that loads nothing. `pop train` writes it at the end, `pop report FOLDER` writes it again, and `pop
+# compare A B` puts two side by side. (The runs of this page are in a temporary folder; set `home` to keep them.)
 
 # %%
 report = write_report(home / "prior")
@@ -347,24 +341,22 @@ for panel in panels:
 picture(fig, "A view that no step has seen, and the pixel that is furthest off.")
 
 # %% [markdown]
-# Why? `pop explain` walks through the pixel as chapter 4 does, by the oracle's own functions, and prints one line a
-# splat: its depth, its distance $d$ in pixels from the pixel, its falloff, its alpha, the transmittance before it, its
-# weight and colour, the colour so far; then what the gradients of chapter 5 and the prior of chapter 8 would do to it.
+# Why? `pop explain` walks through the pixel as chapter 4 does and prints one line a splat: its depth, its distance $d$
+# in pixels from the pixel, its falloff, its alpha, the transmittance before it, its weight and colour, the colour so
+# far; then what the gradients of chapter 5 and the prior of chapter 8 would do to it.
 
 # %%
 explained = command(["explain", out, "--view", "0", "--pixel", f"{x},{y}"])
 assert explained == 0
 
 # %% [markdown]
-# Read such a table in this order. Compare **colour** and **photograph**. Then follow the **sum**: at which line does it
-# leave the right track? If that is the line with the star, the dominant Gaussian, something stands there that should
-# not; if it happens little by little over the first lines, look at their depths: splats at a depth of a few tenths,
-# many px away from the pixel and yet covering it, are *floaters*, large faint Gaussians right before the camera, which
-# no training view saw from this side. Last, look at **dL/do**: minus its sign is the direction in which training with
-# *this* pixel would move each opacity. It knows what is wrong; the other photographs decide whether it may.
+# Compare **colour** and **photograph**. Then follow the **sum**: at which line does it leave the right track? If that
+# is the line with the star, the dominant Gaussian, something stands there that should not; if it happens little by
+# little over the first lines, look at their depths: splats at a depth of a few tenths, many px away from the pixel and
+# yet covering it, are *floaters*, large faint Gaussians right before the camera. Last, **dL/do**: minus its sign is the
+# direction in which training with *this* pixel would move each opacity; the other photographs have a say, too.
 #
-# `--html why.html` makes a page of it, with the splats' outlines drawn over the picture. It is the best way to end a
-# training: pick the worst pixel, and ask.
+# `--html why.html` makes a page of it, with the splats' outlines over the picture.
 
 # %% [markdown]
 # ### Exercise 1: predict

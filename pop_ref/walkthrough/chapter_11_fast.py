@@ -409,6 +409,6 @@ assert np.allclose(by_sums, v_means2d[:, 0])
 # {{bug: stale_last_contributor}}
 
 # %% answer
-# The walk begins one splat too early in the list, so the last splat that a pixel blended gets no gradient from it. It
-# is usually the one that hides the background: surfaces stay a little transparent, and nothing crashes.
+# The walk begins one splat too early in the list, so the last splat that a pixel blended gets no gradient from it.
+# Nothing crashes, and no picture shows it (chapter 12 draws one).
 print(caught("stale_last_contributor"))

@@ -4,7 +4,7 @@
 # # 12. Break it: each mutant, and the law that catches it
 #
 # A test that no bug fails is worth nothing. So the kit that judges rasterizers is judged itself: by broken copies of
-# the oracle, each wrong in one line, most of them as some program once was. At the end of this chapter you have
+# the oracle, each wrong in one line, many of them as some program once was. At the end of this chapter you have
 # seen what such bugs do to a picture, that most of them do nothing to it, and which law catches which.
 #
 # ## A law and a mutant

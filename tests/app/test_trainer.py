@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from pop_fast.api.registry import get_backend
 from pop_fast.cli import progress
@@ -371,6 +370,9 @@ def pictures(seed=0, height=40, width=30):
 
 
 def test_psnr_is_scikit_images_on_the_clamped_render():
+    # here, since it takes seconds to import and every worker imports every module
+    from skimage.metrics import peak_signal_noise_ratio
+
     image, target = pictures()
     want = peak_signal_noise_ratio(target.double().numpy(), image.clamp(0, 1).double().numpy(), data_range=1.0)
     assert psnr(image, target) == pytest.approx(want, rel=1e-6)
@@ -383,6 +385,8 @@ def test_psnr_of_equal_pictures_is_infinite_and_of_black_on_white_zero():
 
 
 def test_ssim_is_scikit_images_over_whole_windows():
+    from skimage.metrics import structural_similarity
+
     image, target = pictures()
     clamped = image.clamp(0, 1)
     _, full = structural_similarity(

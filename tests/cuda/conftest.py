@@ -51,6 +51,12 @@ def emulated_card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     torch.set_num_threads(before)
 
 
+@pytest.fixture
+def gpu(emulated_card: Any) -> Any:
+    """Return the device of the emulated GPU; the tests in `gpu/` run on the card as well."""
+    return emulated_card
+
+
 def emulated_engine() -> Any:
     """Return the emulated GPU, once it is installed, as `pop train` takes one."""
     import torch

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -14,14 +17,85 @@ from pop_fast import compiled
 from pop_fast.compiled import losses as compiled_losses
 from pop_fast.stages import losses, ssim
 from pop_fast.stages.polarization import importance_mask, pop_loss, pop_loss_vjp
+from pop_ref import losses as oracle_losses
 from pop_ref import polarization as oracle
 from pop_ref import ssim as oracle_ssim
 from pop_ref.loss_magnitudes import Form, LossMagnitudes, d_ssim_magnitudes, pixelwise_magnitudes
-from tests.fast.loss_cases import Case, bands_of, both, cases
 
 NAMES = ("l1", "l2", "ssim", "d_ssim", "photometric_3dgs", "photometric_pop")
 COMPILED = pytest.mark.skipif(not compiled.available(), reason=compiled.why_not() or "")
 FLOAT64 = 1e-12
+
+
+@contextmanager
+def bands_of(values: int) -> Iterator[None]:
+    before = ssim._BAND_VALUES
+    ssim._BAND_VALUES = values
+    try:
+        yield
+    finally:
+        ssim._BAND_VALUES = before
+
+
+class Case(NamedTuple):
+    """A pair of images to compare; small when printed."""
+
+    height: int = 12
+    width: int = 12
+    channels: int = 3
+    kind: str = "noisy"
+    seed: int = 0
+    masked: bool = False
+    padding: str = "valid"
+
+    def images(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return a render and a photograph whose values float32 holds exactly."""
+        rng = np.random.default_rng(self.seed)
+        y = rng.random((self.height, self.width, self.channels))
+        if self.kind == "flat":
+            y = np.full_like(y, 0.75)
+        if self.kind == "black and white":
+            y = np.round(y)
+        noise = {"close": 1e-3, "equal": 0.0}.get(self.kind, 0.25)
+        x = rng.random(y.shape) if self.kind == "unrelated" else y + noise * rng.normal(size=y.shape)
+        return x.astype(np.float32).astype(np.float64), y.astype(np.float32).astype(np.float64)
+
+    def tensors(self, dtype: torch.dtype = torch.float32) -> tuple[torch.Tensor, torch.Tensor]:
+        x, y = self.images()
+        return torch.tensor(x, dtype=dtype), torch.tensor(y, dtype=dtype)
+
+    def mask(self) -> np.ndarray | None:
+        return np.random.default_rng(self.seed).random((self.height, self.width)) < 0.75 if self.masked else None
+
+    def options(self, name: str) -> dict[str, str]:
+        return {} if name in ("l1", "l2") else {"padding": self.padding}
+
+
+def cases() -> st.SearchStrategy[Case]:
+    common = {
+        "channels": st.sampled_from([3, 1, 4]),
+        "kind": st.sampled_from(["noisy", "close", "equal", "flat", "black and white", "unrelated"]),
+        "seed": st.integers(0, 2**16),
+        "masked": st.booleans(),
+    }
+    whole, any_size = st.integers(11, 24), st.integers(1, 24)
+    inside = st.builds(Case, whole, whole, **common, padding=st.just("valid"))
+    return inside | st.builds(Case, any_size, any_size, **common, padding=st.just("same"))
+
+
+def both(
+    name: str, case: Case, dtype: torch.dtype, module: ModuleType = losses, **options
+) -> tuple[float, np.ndarray, float, np.ndarray]:
+    """Return value and gradient of the oracle_losses, then of the fast loss."""
+    options, (x, y), mask = {**case.options(name), **options}, case.images(), case.mask()
+    value = getattr(oracle_losses, name)(x, y, mask=mask, **options)
+    v_image = getattr(oracle_losses, name + "_vjp")(x, y, 1.0, mask=mask, **options)
+    image = torch.tensor(x, dtype=dtype, requires_grad=True)
+    kept = None if mask is None else torch.tensor(mask)
+    loss = getattr(module, name)(image, torch.tensor(y, dtype=dtype), mask=kept, **options)
+    loss.backward()
+    assert loss.dtype == image.grad.dtype == dtype
+    return value, v_image, loss.item(), image.grad.numpy()
 
 
 @pytest.mark.parametrize(("name", "scale"), [("photometric_3dgs", "l1_scale"), ("photometric_pop", "l2_scale")])

@@ -9,7 +9,6 @@ import pytest
 import scipy.ndimage
 from hypothesis import given
 from hypothesis import strategies as st
-from skimage.metrics import structural_similarity
 
 from pop_ref import losses
 from pop_ref.polarization import pop_loss, pop_loss_vjp
@@ -67,6 +66,9 @@ def test_window_is_the_impulse_response_of_scipys_gaussian_filter() -> None:
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
 def test_ssim_valid_equals_scikit_image(height: int, width: int) -> None:
+    # here, since it takes seconds to import and every worker imports every module
+    from skimage.metrics import structural_similarity
+
     image, target = pair(height, width)
     expected, full = structural_similarity(
         *(image, target),

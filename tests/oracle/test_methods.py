@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from PIL import Image, ImageFilter
 from scipy.ndimage import correlate
 from scipy.spatial import cKDTree
-from scipy.stats import chi2
 
 from pop_ref import (
     INRIA,
@@ -236,6 +235,9 @@ def exact_probabilities(weights: list[float], k: int) -> dict[tuple[int, ...], f
 
 @pytest.mark.parametrize(("weights", "k"), [([1.0, 2.0, 4.0], 1), ([1.0, 0.0, 2.0, 5.0], 2), ([0.5, 3, 1, 1, 2], 3)])
 def test_draws_are_distributed_as_one_after_the_other(weights: list[float], k: int) -> None:
+    # here, since it takes seconds to import and every worker imports every module
+    from scipy.stats import chi2
+
     rng = np.random.default_rng(7)
     n = 20_000
     seen: dict[tuple[int, ...], int] = {}

@@ -95,6 +95,13 @@ OTHERWISE = {
     "9b, more views": ("9b", 300, ("views=12", "views=14"), ("rng.choice(12", "rng.choice(14")),
     "10, larger": ("10", 200, ("SIZE, N_VIEWS, SH_C0 = 24", "SIZE, N_VIEWS, SH_C0 = 28")),
     "10, other run": ("10", 0, ("config = TrainConfig(", "config = TrainConfig(seed=7, ")),
+    "12, larger": (
+        "12",
+        100,
+        ("WIDTH, HEIGHT = 32, 24", "WIDTH, HEIGHT = 40, 30"),
+        ("[30.0, 0.0,", "[37.5, 0.0,"),
+        ("[0.0, 30.0,", "[0.0, 37.5,"),
+    ),
 }
 
 

@@ -175,6 +175,10 @@ def test_slides_turn_by_key_button_and_finger_and_show_notes(
     page.press("n")
     assert page.ask(notes) == "block"
     page.open(file, width=400, height=700)
+    # what scrolls by itself would take a swipe for its own
+    turned = "each => getComputedStyle(each).touchAction"
+    parts = "document.querySelectorAll('.slide.here, .slide.here .face, .slide.here .body')"
+    assert page.ask(f"[...new Set([...{parts}].map({turned}))]") == ["pan-y pinch-zoom"]
     page.touch((300, 300), (100, 310))
     assert page.ask(here) == 1
     page.touch((100, 300), (300, 310))

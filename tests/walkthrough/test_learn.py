@@ -223,6 +223,7 @@ def test_stubs_write_labels_in_words_and_explain_the_settings_that_the_course_ha
     for setting in ("grow_grad2d", "grow_scale3d", "blur_start_iter", "blur_stop_iter", "prune_opa"):
         assert f"`{setting}` (" in density or f"`{setting}`" in density
     assert not re.search("blur_rule|prune_too_big|grow_on_gradient|inclusive", density)
+    assert not re.search("entropy|depth", stubs.stub(BY_NAME["loop"]))
 
 
 def _colored(image: np.ndarray, color: np.ndarray) -> int:
@@ -419,6 +420,20 @@ def test_a_capture_is_trained_on_from_its_points(mine: Path) -> None:
         a_capture(views[:1], capture.points, capture.points_rgb / 255.0, 1.0)
     with pytest.raises(ValueError, match="it must be 64 px at least"):
         a_picture(np.zeros((10, 80, 3)))
+
+
+@pytest.mark.slow
+def test_a_capture_of_ones_own_ends_above_20_db_and_not_by_what_came_last(
+    mine: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _written(mine)
+    make_demo(mine / "demo", views=16, width=64, height=48)
+    assert main(["learn", "train", str(mine), "--steps", "60", "--scene", str(mine / "demo")]) == 0
+    told_ = capsys.readouterr().out
+    psnrs = [float(text) for text in re.findall(r"([\d.]+) dB", told_)]
+    assert psnrs[-1] > max(20.0, max(psnrs) - 1.0)
+    sizes = re.findall(r"(\d+) Gaussians", told_)
+    assert len(set(sizes[3:])) == 1 < len(set(sizes)), "the number of Gaussians changes after half time"
 
 
 def test_all_is_judged_with_a_score_also_as_json(mine: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -115,6 +115,13 @@ def test_the_first_cell_finds_the_clone_that_the_notebook_lies_in(tmp_path: Path
     done = _first_cell(below, [])
     assert "matplotlib missing. Start Jupyter inside the clone" in done.stderr
     assert f"{sys.executable} -m pip install matplotlib" in done.stderr
+    # chapter 0 reads a capture, for which the clone's other package must be installed
+    cells = json.loads(notebook(read_chapter(CHAPTERS[0])))["cells"]
+    first = "".join(next(each for each in cells if each["cell_type"] == "code")["source"])
+    code = f"import sys; sys.path += {[str(tmp_path / 'clone')]!r}\n{first}"
+    done = subprocess.run([sys.executable, "-ISc", code], cwd=below, capture_output=True, text=True)
+    assert "cv2, matplotlib, numpy, pop_fast missing" in done.stderr
+    assert "-m pip install ./pop_ref . matplotlib numpy\n" in done.stderr
 
 
 # the first nine chapters are read without torch; from the last on, so that two workers seldom wait for one chapter

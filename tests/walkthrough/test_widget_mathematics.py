@@ -33,7 +33,7 @@ from pop_ref.walkthrough.widgets import mathematics
 NODE = shutil.which("node")
 pytestmark = pytest.mark.skipif(NODE is None, reason="there is no node here to run JavaScript")
 
-STAGES = ("alpha", "footprint", "pixel", "covariance", "projection", "harmonics")
+FILES = ("splats", "projection", "harmonics")
 CALLS = """
 const calls = JSON.parse(require("fs").readFileSync(0, "utf8"));
 const functions = { %s };
@@ -43,7 +43,7 @@ N = 200
 
 
 def _run(name: str, parameters: list[list[Any]]) -> list[Any]:
-    script = mathematics(*STAGES) + CALLS % name
+    script = mathematics(*FILES) + CALLS % name
     calls = json.dumps([[name, each] for each in parameters])
     done = subprocess.run([NODE or "", "-e", script], input=calls, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

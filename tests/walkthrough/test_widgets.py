@@ -47,6 +47,13 @@ BEYOND = """[...document.querySelectorAll('.pop-widget :is(dd, dt, output, butto
         return box.width && (box.left < room.left - 1 || box.right > room.right + 1); })
     .map(each => each.tagName + ' ' + each.textContent)"""
 
+# letters that stick out of the drawing that they are in
+CUT = """[...document.querySelectorAll('.pop-widget svg text')].filter(each => {
+    const box = each.getBoundingClientRect(), room = each.ownerSVGElement.getBoundingClientRect();
+    const out = box.left < room.left - 1 || box.right > room.right + 1 || box.top < room.top - 2;
+    return box.width && each.getAttribute('opacity') !== '0' && (out || box.bottom > room.bottom + 2);
+}).map(each => each.textContent)"""
+
 
 def _image(png: bytes) -> np.ndarray:
     return matplotlib.image.imread(io.BytesIO(png), format="png")[..., :3]
@@ -86,6 +93,7 @@ def test_a_widget_is_drawn_without_complaint_and_fits(
     assert page.complaints == []
     assert page.ask("document.documentElement.scrollWidth") == width
     assert page.ask(BEYOND) == []
+    assert page.ask(CUT) == []
     png = page.picture(".pop-widget")
     keep(png, f"widget_{name}_{width}_{'dark' if dark else 'light'}.png")
     image = _image(png)
@@ -225,6 +233,27 @@ def test_a_globe_turns_and_a_gaussian_is_walked_around(page: Page, files: dict[s
         page.drag((x, y), (x + 60, y + 20))
         assert _reading(page, reading) != turned
         assert page.complaints == []
+
+
+@browser
+def test_the_names_of_directions_stand_on_the_globe_and_not_in_its_ring(page: Page, files: dict[str, Path]) -> None:
+    page.open(files["harmonics"])
+    _settle(page)
+    # how far the corners of each name are from the globe's middle, in its radii; the ring's is a tenth
+    corners = """[...document.querySelectorAll('svg.pw-over text')].filter(each => each.getAttribute('opacity') > 0.5)
+        .map(each => { const [box, globe] = [each, each.ownerSVGElement].map(one => one.getBoundingClientRect());
+            const far = (x, y) => Math.hypot(x - globe.x - globe.width / 2, y - globe.y - globe.height / 2);
+            const [xs, ys] = [[box.left, box.right], [box.top + 3, box.bottom - 3]];
+            const all = xs.flatMap(x => ys.map(y => 2 * far(x, y) / globe.width));
+            return [Math.min(...all), Math.max(...all)]; })"""
+    assert len(page.ask(corners)) == 3
+    for _ in range(8):
+        for nearest, farthest in page.ask(corners):
+            assert nearest > 0.1
+            assert farthest < 1.01
+        page.ask("document.querySelector('[role=application]').focus()")
+        for key in ("ArrowRight", "ArrowRight", "ArrowDown"):
+            page.press(key)
 
 
 def _trained(page: Page, steps: int) -> list[float]:

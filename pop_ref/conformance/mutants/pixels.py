@@ -137,7 +137,7 @@ PIXELS: Final = (
     ),
     Mutant(
         "tie_to_the_back",
-        "a weight that is as large takes over: of two clones the one behind survives",
+        "a weight that is as large takes over: of alphas 1/3 and 1/2 the one behind wins",
         "dominance.py",
         "if weight > best_weight:",
         "if weight >= best_weight:",

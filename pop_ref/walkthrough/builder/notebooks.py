@@ -28,9 +28,12 @@ if importlib.util.find_spec("pop_ref") is None:
     sys.path[:0] = [str(p) for p in (here, *here.parents) if (p / "pop_ref" / "notation.py").is_file()][:1]
 missing = [name for name in {needed} if importlib.util.find_spec(name) is None]
 if missing:
+    # the two packages of the clone are installed from its folder, and what pop_fast needs with it
+    of_the_clone = {{"cv2": "./pop_ref .", "pop_fast": "./pop_ref .", "pop_ref": "./pop_ref"}}
+    asked = dict.fromkeys(of_the_clone.get(name, name) for name in missing)
     raise ImportError(
-        f"{{', '.join(missing)}} missing. Start Jupyter inside the clone of pop-splatting, or install what is missing "
-        f"into the Python of this kernel: {{sys.executable}} -m pip install {{' '.join(missing)}}"
+        f"{{', '.join(missing)}} missing. Start Jupyter inside the clone of pop-splatting, or run in the clone, with "
+        f"this Python: {{sys.executable}} -m pip install {{' '.join(asked)}}"
     )"""
 
 
@@ -79,11 +82,14 @@ def _needed(chapter: Chapter) -> tuple[str, ...]:
     taken |= {each.name for node in nodes if isinstance(node, ast.Import) for each in node.names}
     # the kit, which judges the mistakes that readers look for, draws its examples with hypothesis
     needs = {"hypothesis"} if "pop_ref.walkthrough.bugs" in taken else set()
-    return tuple(sorted((needs | {name.partition(".")[0] for name in taken}) & _ABSENT))
+    needs |= {name.partition(".")[0] for name in taken}
+    # a clone whose packages are not installed has pop_fast and not what its readers of captures import
+    needs |= {"cv2"} if "pop_fast" in needs else set()
+    return tuple(sorted(needs & _ABSENT))
 
 
 # what a chapter imports and a Python need not have
-_ABSENT: Final = {"hypothesis", "matplotlib", "numpy", "pop_fast", "pop_ref", "torch"}
+_ABSENT: Final = {"cv2", "hypothesis", "matplotlib", "numpy", "pop_fast", "pop_ref", "torch"}
 
 
 def _told(cell: Cell) -> list[dict[str, Any]]:

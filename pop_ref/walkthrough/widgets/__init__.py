@@ -1,7 +1,7 @@
 """Widgets for the pages: pictures that answer to a finger, a mouse or the arrow keys, with no network and no framework.
 
-Each is one plain script beside this file. Its mathematics stands apart in `math/`, one file a stage and its functions
-named as the oracle's; a test runs those against the oracle. The constants are those of the profile `paper`.
+Each is one plain script beside this file. Its mathematics stands apart in `math/`, its functions named as the
+oracle's; a test runs those against the oracle. The constants are those of the profile `paper`.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ FOLDER: Final = Path(__file__).resolve().parent
 
 @dataclass(frozen=True)
 class Widget:
-    """What a widget is called, what to try with it, and the stages whose mathematics it, or its worker, needs."""
+    """What a widget is called, what to try with it, and the files of the mathematics that it, or its worker, needs."""
 
     title: str
     prompt: str
-    stages: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()
     worker: tuple[str, ...] = ()
 
 
@@ -32,18 +32,18 @@ WIDGETS: Final = {
     "splat2d": Widget(
         "One splat on the screen",
         "drag the splat over the pixels, then take its opacity down to 0.02: where does the orange edge go?",
-        ("alpha", "footprint"),
+        ("splats",),
     ),
     "stack": Widget(
         "A stack of splats at one pixel",
         "put a wall in the middle, then bring it to the front: which splats still have a weight, and which a gradient?",
-        ("alpha", "pixel"),
+        ("splats",),
     ),
     "orbit": Widget(
         "A Gaussian in space and its ellipse",
         "walk around it by dragging, then come as near as 2 world units: is the ellipse as wide as the points, and are "
         "its two sides theirs?",
-        ("covariance", "projection"),
+        ("projection",),
     ),
     "harmonics": Widget(
         "Sixteen harmonics",
@@ -55,7 +55,7 @@ WIDGETS: Final = {
         "Two trainings, without and with the prior",
         "train, and watch the histograms. Then make the prior ten times as heavy and start again: which opacities go, "
         "and what does the picture lose?",
-        worker=("training", "toy"),
+        worker=("training",),
     ),
 }
 
@@ -86,15 +86,15 @@ def html(name: str) -> str:
     )
 
 
-def mathematics(*stages: str) -> str:
-    """Read the pure functions of stages, with the constants that they use in front."""
+def mathematics(*files: str) -> str:
+    """Read the pure functions of files in `math/`, with the constants that they use in front."""
     constants = {
         key: value for key, value in asdict(PAPER).items() if isinstance(value, float)
     }
     return "\n".join(
         [
             f"const PAPER = {json.dumps(constants)};",
-            *(_text(f"math/{stage}.js") for stage in stages),
+            *(_text(f"math/{name}.js") for name in files),
         ]
     )
 
@@ -109,7 +109,7 @@ def _script(name: str, widget: Widget) -> str:
         f"{{ root.hidden = false; {name}(root); }}"
     )
     parts = (
-        mathematics(*widget.stages),
+        mathematics(*widget.needs),
         _text("kit.js"),
         worker,
         _text(f"{name}.js"),

@@ -113,7 +113,11 @@ function harmonics(root) {
     told.raw(`${kit.number(least)} \u2026 ${kit.number(most)}`);
     names.forEach((node, k) => {
       const at = [0, 1].map((axis) => 110 - 94 * view[axis][k]);
-      kit.set(node, { x: at[0], y: at[1] + 4, opacity: view[2][k] > -0.2 ? 0.9 : 0 });
+      // above or below the ring in the middle, and as far inside the globe as the letters are wide
+      if (Math.abs(at[0] - 110) < 32 && Math.abs(at[1] - 110) < 20) at[1] = at[1] < 110 ? 90 : 130;
+      const room = Math.sqrt(Math.max(0, 104 ** 2 - (Math.abs(at[1] - 110) + 6) ** 2)) - 19;
+      const x = 110 + Math.min(Math.max(at[0] - 110, -room), room);
+      kit.set(node, { x, y: at[1] + 4, opacity: view[2][k] > -0.2 ? 0.9 : 0 });
       node.style.fill = colors_from_sh(sh, [0, 1, 2].map((j) => (j === k ? 1 : 0)), 3)[1] > 0.5 ? "#111" : "#fff";
     });
   }

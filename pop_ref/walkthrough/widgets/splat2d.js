@@ -75,7 +75,7 @@ function splat2d(root) {
     kit.svg(plot, "text", { x: (34 + right) / 2, y: 149, "text-anchor": "middle" }, "distance, standard deviations");
     kit.svg(plot, "text", { x: right, y: 12, "text-anchor": "end", class: "pw-strong" }, "alpha");
     kit.svg(plot, "path", { d: `M34 ${at.y(1 / 255)}H${right}`, class: "pw-thin pw-2", "stroke-width": 1 });
-    kit.svg(plot, "text", { x: right, y: at.y(1 / 255) - 4, "text-anchor": "end" }, "floor, 1/255");
+    kit.svg(plot, "text", { x: 38, y: at.y(1 / 255) + 11 }, "floor, 1/255");
     const shown = kit.svg(plot, "path", { class: "pw-thin pw-1", "stroke-width": 2 });
     const skipped = kit.svg(plot, "path", { class: "pw-thin pw-1 pw-dots" });
     const dot = kit.svg(plot, "circle", { r: 4, style: "fill:var(--w-c4)" });
