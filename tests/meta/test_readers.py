@@ -63,6 +63,7 @@ EXEMPT = {
     "cuda_ext.gpu_check.shared:Command._words": "the end of a log that it has written, with any bytes",
     "cuda_ext.gpu_check.several:_train": "shows what its own training has written",
     "cuda_ext.gpu_check.training": "the same",
+    "cuda_ext.gpu_check.stages": "shows what its own benchmark has written",
     "cuda_ext.gpu_check.command:commit_of": "takes one text of a file that read_json has judged",
     "cuda_ext.host": OWN,
     "cuda_ext.machine_code": OWN,
