@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _EXAMPLES: Final = """
     pop convert scene.ply scene.sog
     pop convert scene.spz scene.ply
-    pop convert scene_sog/meta.json scene.spz --to spz-4
+    pop convert scene_sog scene.spz --to spz-4
     pop convert scene.ply scene.html
     pop convert scene.ply small.spz --max-gaussians 100000
 """
@@ -35,7 +35,7 @@ class Args(LimitOptions):
     """Turn a splat's file into another format; names say which. docs/FORMATS.md says what each keeps."""
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="IN")]
-    """A .ply, .compressed.ply, .spz, .sog, .splat, .glb or .ksplat, or the meta.json of SOG in a folder."""
+    """A .ply, .compressed.ply, .spz, .sog, .splat, .glb or .ksplat, or the folder of an unbundled SOG."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """The file to write, in the same frame."""
     to: FormatName | None = None

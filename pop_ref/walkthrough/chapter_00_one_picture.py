@@ -119,6 +119,8 @@ params = {
     "opacities": np.full(n, -0.5),
     "sh0": ((tints[picked] - 0.5) / splat.SH_C0)[:, None],
 }
+# what training begins with; it makes new arrays
+started = dict(params)
 
 
 def drawn(params, k=UNSEEN):
@@ -315,13 +317,6 @@ picture(
 # %% answer
 # The opacities and the colours. A point cloud says nothing of opacities, and a point's colour is that of single pixels,
 # while a splat's must suit all that it covers. Least change the places, which a point cloud knows best.
-started = {
-    "means": points[picked],
-    "quats": np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
-    "scales": np.tile(np.log(0.5 * apart)[:, None], (1, 3)),
-    "opacities": np.full(n, -0.5),
-    "sh0": ((tints[picked] - 0.5) / splat.SH_C0)[:, None],
-}
 moved = {
     name: np.mean(np.abs(params[name] - started[name])) / rates[name] for name in params
 }

@@ -6,6 +6,7 @@ import ast
 import json
 import re
 import typing
+import zipfile
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.faults.ksplat import ksplat_of
 from pop_fast.cli.limits import FormatName
 from pop_fast.data import load_capture
 from pop_fast.data.colmap import read_model
@@ -298,6 +300,7 @@ def test_scores_of_views_need_a_capture(pop: Pop, shared_result: Path, tmp_path:
         (("a.ply", "b.spz", "--score", "dominance"), "needs the training views"),
         (("empty.spz", "b.ply"), "empty.spz: is cut off in its header"),
         (("empty.splat2", "b.ply"), "must end in one of"),
+        ((".", "b.ply"), "is a folder without SOG's meta.json; 'pop export' reads the folder of a training"),
     ],
 )
 def test_what_cannot_be_converted_is_said(
@@ -310,6 +313,21 @@ def test_what_cannot_be_converted_is_said(
         Path(file).touch()
     says(pop("convert", *words), part)
     assert not Path("b.ply").exists()
+
+
+def test_sog_in_a_folder_and_ksplat_are_converted_and_drawn(
+    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path
+) -> None:
+    exported(pop, shared_result, "--out", tmp_path / "a.sog")
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        archive.extractall(tmp_path / "folder")
+    (tmp_path / "a.ksplat").write_bytes(ksplat_of(load_splat_file(tmp_path / "a.sog").params, 0))
+    of_sog = psnr(pop, tmp_path, tmp_path / "a.sog", "--capture", shared_capture)
+    for source in ("folder", "folder/meta.json", "a.ksplat"):
+        out = tmp_path / f"{source.replace('/', '_')}.ply"
+        pop.done("convert", tmp_path / source, out)
+        for file in (tmp_path / source, out):
+            assert abs(psnr(pop, tmp_path, file, "--capture", shared_capture) - of_sog) < 0.01, file
 
 
 # Fewer Gaussians in a file: who goes, and how far down a size is met.

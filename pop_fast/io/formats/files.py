@@ -159,12 +159,16 @@ def load_splat_file(path: str | os.PathLike[str]) -> Stored:
     """Read a splat in any format.
 
     Args:
-        path: the file; the meta.json of SOG in a folder stands for all of it.
+        path: the file; for SOG in a folder that folder, or its meta.json.
 
     Raises:
         PopError: the file is absent, of an unknown kind or damaged; names the field.
     """
     path = Path(path)
+    if path.is_dir():
+        if not (path / sog.META).is_file():
+            raise PopError(f"{path}: is a folder without SOG's meta.json; 'pop export' reads the folder of a training")
+        path = path / sog.META
     suffix = path.suffix.lower()
     if path.name.lower() == sog.META:
         return _stored(sog.decode_folder(path))
