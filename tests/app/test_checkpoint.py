@@ -22,8 +22,7 @@ from pop_fast.io.ply import load_ply, save_ply
 from pop_fast.io.ply_rows import read_points
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from tests.app.children import in_a_child, pop_in_a_child
-from tests.app.conftest import Outcome, Pop
+from tests.app.conftest import Outcome, Pop, in_a_child, pop_in_a_child
 from tests.app.damage import FORGED, INF, Content, contents, forge, latest, says, to
 from tests.app.drift import drift_engine
 from tests.app.tiny import tiny_capture, tiny_config

@@ -26,8 +26,7 @@ from pop_fast.data.sfm import SfmResult
 from pop_fast.errors import PopError
 from pop_fast.train import TrainConfig
 from tests.app.captures import write_photograph
-from tests.app.children import ROOT
-from tests.app.conftest import TRAIN, Pop
+from tests.app.conftest import ROOT, TRAIN, Pop
 from tests.app.damage import says
 from tests.app.interruptions import interrupt
 

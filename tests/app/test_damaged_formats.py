@@ -28,9 +28,8 @@ from pop_fast.io.budget import check_memory
 from pop_fast.io.formats import FORMATS, encoded, load_splat_file
 from pop_fast.io.images import read_image
 from pop_fast.io.read_back import read_arrays
-from tests.app.children import in_a_child
 from tests.app.clouds import many
-from tests.app.conftest import Pop
+from tests.app.conftest import Pop, in_a_child
 from tests.app.damage import says
 
 # 2^28 bytes in a few thousand

@@ -16,7 +16,7 @@ from benchmarks.faults import sanitizers
 from benchmarks.faults.__main__ import KILLS
 from benchmarks.faults.fuzz import FAILURES, OUTCOMES, kept
 from benchmarks.faults.readers import READERS
-from tests.app.children import ROOT, in_a_child
+from tests.app.conftest import ROOT, in_a_child
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="children are forked, and limited as Linux does")
 

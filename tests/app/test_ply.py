@@ -21,7 +21,7 @@ from pop_fast.io.formats import save_as
 from pop_fast.io.ply import is_antialiased, load_ply, save_ply
 from pop_fast.io.ply_rows import read_points
 from tests.app.captures import assert_one_line
-from tests.app.children import pop_in_a_child
+from tests.app.conftest import pop_in_a_child
 from tests.app.damage import says
 
 ANY = {"allow_nan": False, "allow_infinity": False, "width": 32}

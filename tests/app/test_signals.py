@@ -21,8 +21,7 @@ from pop_fast.api.registry import get_backend
 from pop_fast.train import TrainingRun, training_run
 from pop_fast.train import checkpoint as ckpt
 from tests.app.captures import PINHOLE, camera, photograph, ring, write_model, write_photograph
-from tests.app.children import in_a_child
-from tests.app.conftest import TRAIN
+from tests.app.conftest import TRAIN, in_a_child
 from tests.app.damage import contents
 from tests.app.tiny import last_checkpoint, tiny_capture, tiny_config
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.app.children import ROOT, in_a_child
+from tests.app.conftest import ROOT, in_a_child
 
 PACKAGES = ("pop_ref", "pop_fast", "cuda_ext", "paper_repro")
 # what reads a file or decodes its bytes, by the name that is called and by how it is written
@@ -61,7 +61,9 @@ EXEMPT = {
     "pop_fast.data.sfm_search": "reads what the search has written, and what its own child process says",
     "pop_fast.io.jpeg:main": "a child process that decodes what has been read; its end harms nobody",
     "cuda_ext.gpu_check.shared:Command._words": "the end of a log that it has written, with any bytes",
-    "cuda_ext.gpu_check.stages": "shows what its own training has written",
+    "cuda_ext.gpu_check.several:_train": "shows what its own training has written",
+    "cuda_ext.gpu_check.training": "the same",
+    "cuda_ext.gpu_check.stages": "shows what its own benchmark has written",
     "cuda_ext.gpu_check.command:commit_of": "takes one text of a file that read_json has judged",
     "cuda_ext.host": OWN,
     "cuda_ext.machine_code": OWN,

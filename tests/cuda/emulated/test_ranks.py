@@ -24,7 +24,7 @@ from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.ranks import ALONE, Ranks, join
 from pop_fast.train.training_run import Watch
-from tests.app.children import launched
+from tests.app.conftest import launched
 from tests.app.test_resume import needs_gloo, same
 from tests.app.tiny import last_checkpoint, tiny_capture, tiny_config
 from tests.cuda.conftest import FOLDER, emulated_engine
