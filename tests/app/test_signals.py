@@ -154,7 +154,10 @@ def test_sigterm_while_a_capture_is_read_is_one_line_and_the_end(shared_capture:
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc")
-def test_a_training_on_photographs_of_12_megapixels_is_gone_after_less_than_two_seconds_of_work(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_training_on_photographs_of_12_megapixels_is_gone_after_less_than_two_seconds_of_work(
+    tmp_path: Path, number: signal.Signals
+) -> None:
     reason = get_backend("compiled").why_not()
     if reason is not None:
         pytest.skip(reason)
@@ -167,7 +170,7 @@ def test_a_training_on_photographs_of_12_megapixels_is_gone_after_less_than_two_
     process = start(tmp_path, "train", tmp_path / "large", *words)
     wait_until(lambda: (folder / "metrics.jsonl").exists(), process)
     before = sum(map(int, Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[11:13]))
-    process.terminate()
+    process.send_signal(number)
     # by what it does and not by the clock, which depends on who else is at work
     _, status, used = os.wait4(process.pid, 0)
     assert os.waitstatus_to_exitcode(status) == 130
