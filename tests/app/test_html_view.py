@@ -16,7 +16,7 @@ from pop_fast.io.formats import load_splat_file, save_as
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
 from pop_fast.train.views import ViewTensors, render_view
-from pop_fast.view.html import PageCamera, camera_of_points, cameras_of, page_of, view_distances
+from pop_fast.view.html import PageCamera, camera_of_points, cameras_of, first_view, page_of, view_distances
 from tests.app.browser import Browser, browser
 from tests.app.clouds import many
 from tests.app.conftest import Pop
@@ -95,16 +95,17 @@ def test_a_page_of_a_result_starts_at_a_training_camera_and_asks_for_nothing(
     pop.done("export", shared_result, "--out", tmp_path / "x.html")
     tab.requests.clear()
     tab.open(tmp_path / "x.html", 40, 32, "#bare")
-    tab.wait_for("document.getElementById('view')?.dataset.drawn === '0'")
+    splat = load_splat(shared_result)
+    capture, config = open_capture(splat, CaptureOptions())
+    views = capture.train_views(config.test_every)
+    first = first_view(cameras_of(views))
+    tab.wait_for(f"document.getElementById('view')?.dataset.drawn === '{first}'")
     picture = tab.screenshot()
     assert all(url.startswith(("file:", "blob:", "about:", "data:")) for url in tab.requests)
     files = {url.partition("#")[0] for url in tab.requests if url.startswith("file:")}
     assert files == {(tmp_path / "x.html").as_uri()}
-    splat = load_splat(shared_result)
-    capture, config = open_capture(splat, CaptureOptions())
-    first = ViewTensors.of(capture.train_views(config.test_every)[0])
     # beside what the browser changes, what SPZ loses
-    assert psnr(picture, rendered(splat.params, first, config, splat.sh_degree)) > 40.0
+    assert psnr(picture, rendered(splat.params, ViewTensors.of(views[first]), config, splat.sh_degree)) > 40.0
 
 
 def test_the_page_refers_to_no_other_file() -> None:
@@ -209,6 +210,24 @@ def test_cameras_that_look_the_same_way_turn_about_the_median_gaussian() -> None
         cameras.append(PageCamera("x", viewmat, np.eye(3), 10, 10))
     for distance in view_distances(cameras, many(2000)["means"]):
         assert distance == pytest.approx(7.0, abs=0.2)
+
+
+def test_a_page_starts_where_most_photographs_stand_with_the_subject_in_the_middle() -> None:
+    def stand(degrees: float, distance: float, aside: float = 0.0) -> PageCamera:
+        angle = np.radians(degrees)
+        eye = distance * np.array([np.sin(angle), 0.0, -np.cos(angle)])
+        viewmat = look_at(eye)
+        viewmat[0, 3] += aside
+        K = np.array([[100.0, 0.0, 60.0], [0.0, 100.0, 45.0], [0.0, 0.0, 1.0]])
+        return PageCamera(f"{degrees}", viewmat, K, 120, 90)
+
+    arc = [stand(degrees, 4.0) for degrees in (-60.0, -40.0, -20.0, 0.0, 20.0, 40.0, 60.0)]
+    assert first_view(arc) == 3
+    # one that stands apart does not become the first, nor one that cuts the subject, nor one that looks past it
+    assert first_view([stand(160.0, 4.0), *arc]) == 4
+    assert first_view([*arc, stand(0.0, 1.5)]) == 3
+    assert first_view([*arc[:3], stand(0.0, 4.0, aside=1.9), *arc[4:]]) in {2, 4}
+    assert first_view(arc[:1]) == 0
 
 
 def test_a_splat_without_cameras_is_seen_from_the_front() -> None:

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.data.capture import View
+from pop_fast.data.normalize import focus_point
 from pop_fast.io.formats import encoded
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.views import evenly
@@ -84,20 +85,43 @@ def view_distances(cameras: Sequence[PageCamera], means: Tensor) -> list[float]:
     It is at the depth of the point that is nearest to all optical axes, or where that is behind the camera, of the
     median Gaussian ahead of it.
     """
-    axes = np.stack([camera.viewmat[2, :3] for camera in cameras])
-    eyes = np.stack([camera.eye for camera in cameras])
-    across = np.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
-    # parallel axes meet nowhere: then it is the least-norm answer, which the test below mostly refuses
-    focus = np.linalg.lstsq(across.sum(0), (across @ eyes[:, :, None]).sum(0)[:, 0], rcond=1e-6)[0]
+    focus = focus_point(np.stack([camera.viewmat for camera in cameras]))
     points = means.double().numpy()
     found = []
-    for axis, eye in zip(axes, eyes, strict=True):
+    for camera in cameras:
+        axis, eye = camera.viewmat[2, :3], camera.eye
         depths = (points - eye) @ axis
         ahead = depths[depths > 0.0]
         typical = float(np.median(ahead)) if len(ahead) else 1.0
         depth = float((focus - eye) @ axis)
         found.append(depth if 0.1 * typical < depth < 10.0 * typical else typical)
     return found
+
+
+def first_view(cameras: Sequence[PageCamera]) -> int:
+    """Return the camera that a page starts with: of those that have what all look at in the middle, the most typical.
+
+    The subject is the point that is nearest to all optical axes. In the middle is what lies within a quarter of the
+    image's size from its centre; where no camera has the subject there, all are asked. Of these, the half that stands
+    farthest away, which cuts least of the subject, and of that half the one whose direction from the subject is nearest
+    to those of all cameras: the largest sum of cosines, the first of equals.
+    """
+    viewmats = np.stack([camera.viewmat for camera in cameras])
+    focus = focus_point(viewmats)
+    seen = viewmats[:, :3, :3] @ focus + viewmats[:, :3, 3]
+    sizes = np.array([(camera.width, camera.height) for camera in cameras], dtype=float)
+    focal = np.array([(camera.K[0, 0], camera.K[1, 1]) for camera in cameras])
+    centers = np.array([camera.K[:2, 2] for camera in cameras])
+    depths = np.maximum(seen[:, 2:], 1e-12)
+    off = np.abs(focal * seen[:, :2] / depths + centers - sizes / 2) / sizes
+    middle = (seen[:, 2] > 0.0) & (off < 0.25).all(axis=1)
+    asked = np.flatnonzero(middle) if middle.any() else np.arange(len(cameras))
+    offsets = np.stack([camera.eye for camera in cameras]) - focus
+    distances = np.linalg.norm(offsets, axis=1)
+    rays = offsets / np.maximum(distances, 1e-12)[:, None]
+    typical = rays @ rays.sum(axis=0)
+    far = asked[distances[asked] >= np.median(distances[asked])]
+    return int(far[np.argmax(np.round(typical[far], 9))])
 
 
 _KEYS: Final = "drag: turn · shift or right button: move · wheel: nearer · arrows, + −, wasd · n, p: cameras · r: back"
@@ -176,6 +200,7 @@ def _scene(means: Tensor, cameras: Sequence[PageCamera], config: TrainConfig) ->
     norm = np.linalg.norm(upwards)
     return {
         "cameras": [camera.entry(distance) for camera, distance in zip(chosen, distances, strict=True)],
+        "first": first_view(chosen),
         "up": (upwards / norm if norm > 1e-3 else np.array([0.0, -1.0, 0.0])).tolist(),
         "extent": max(distances),
         "background": [float(value) for value in torch.tensor(config.background)],

@@ -333,7 +333,7 @@
 
   document.body.classList.toggle("bare", hash.has("bare"));
   say("Sorting ...");
-  choose(Number(hash.get("camera")) || 0);
+  choose(hash.has("camera") ? Number(hash.get("camera")) || 0 : scene.first);
 })().catch((error) => {
   const message = document.getElementById("message");
   message.textContent = `The splat cannot be shown: ${error.message}`;
