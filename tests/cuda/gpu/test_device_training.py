@@ -1,4 +1,4 @@
-"""`pop train --backend cuda` beside `--backend fast` on a tiny capture, and beside itself, interrupted."""
+"""`pop train --backend cuda` against `--backend fast` on a tiny capture, and against itself, interrupted."""
 
 from __future__ import annotations
 
