@@ -12,7 +12,7 @@ import numpy as np
 
 from pop_fast.data.capture import Listing, PosedImage, SparsePoints
 from pop_fast.data.colmap import find_model
-from pop_fast.data.exposure_drift import DRIFT, exposures, levels_at
+from pop_fast.data.exposure_drift import UNEVEN, exposures, levels_at
 from pop_fast.data.load import find_listing
 from pop_fast.data.photo_quality import (
     Finding,
@@ -235,14 +235,16 @@ def about_drift(photos: Sequence[Photo]) -> Iterator[Finding]:
     known = [photo for photo in photos if photo.levels is not None and photo.shot.seen is not None]
     seen = [photo.shot.seen for photo in known if photo.shot.seen is not None]
     found = exposures([photo.levels for photo in known if photo.levels is not None], seen)
-    width = found.drift
+    width, uneven = found.drift, found.unevenness(np.array([photo.shot.viewmat for photo in known]))
     if width is None:
         return
     extremes = (int(np.nanargmin(found.stops)), int(np.nanargmax(found.stops)))
     ends = [f"{found.stops[i]:+.2f} ({known[i].shot.name})" for i in extremes]
     text = f"the same points differ by {width:.2f} stops from photograph to photograph, {ends[0]} to {ends[1]}"
-    fix = "; lock the exposure, or train with --exposure" if width > DRIFT else ""
-    yield Finding("warn" if fix else "ok", "exposure", text + fix)
+    text += "" if uneven is None else f"; from those taken next to it one differs by {uneven:.2f}"
+    bad = uneven is not None and uneven > UNEVEN
+    fix = "; lock the exposure, or train with --exposure" if bad else ""
+    yield Finding("warn" if bad else "ok", "exposure", text + fix)
 
 
 def about_memory(photos: Sequence[Photo], cloud: SparsePoints | None, free: int) -> Iterator[Finding]:

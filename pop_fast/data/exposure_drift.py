@@ -15,18 +15,21 @@ import cv2
 import numpy as np
 
 from pop_fast.data.capture import Capture
+from pop_fast.data.normalize import camera_centers
 
 # brightness is a mean over a square of this share of the photograph's longer side, 5 px at least
 _PATCH: Final = 0.01
 # what photographs do to the light, nearly: a power
 GAMMA: Final = 2.2
-# stops, standard deviation over the photographs: beyond it training learns their exposures, and a report says so
-DRIFT: Final = 0.15
+# stops by which photographs may differ from those taken next to them; what changes slowly, as the automatic exposure
+# of a video does, harmonics take up as the colour of a direction: fox drifts by 0.20 stops in this way
+UNEVEN: Final = 0.15
 # of full brightness: what is darker, and what lacks as much to white, tells nothing of exposure
 _DARK: Final = 0.06
 # points of a photograph that others see too, under which nothing is said of it
 _FEWEST: Final = 20
 _ROUNDS: Final = 10
+_NEIGHBOURS: Final = 4
 
 
 def levels_at(image: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -66,14 +69,42 @@ class Exposures:
 
     @property
     def drift(self) -> float | None:
-        """The standard deviation over the photographs less what the scatter of points explains, stops.
+        """The standard deviation over the photographs, stops; None where fewer than two have an exposure."""
+        return self._beyond_errors(self.stops)
 
-        None where fewer than two photographs have an exposure.
+    def unevenness(self, viewmats: np.ndarray) -> float | None:
+        """Return the standard deviation of what differs from the median of the four photographs taken nearest.
+
+        Args:
+            viewmats: world -> camera, as many. float64 [V, 4, 4]
+
+        Returns:
+            Stops; None where fewer than five photographs have an exposure.
         """
-        known = np.isfinite(self.stops)
+        known = np.flatnonzero(np.isfinite(self.stops))
+        if len(known) <= _NEIGHBOURS:
+            return None
+        apart = _apart(viewmats[known])
+        nearest = np.argsort(apart, axis=1, kind="stable")[:, :_NEIGHBOURS]
+        found = np.full(len(self.stops), np.nan)
+        found[known] = self.stops[known] - np.median(self.stops[known][nearest], axis=1)
+        return self._beyond_errors(found)
+
+    def _beyond_errors(self, values: np.ndarray) -> float | None:
+        known = np.isfinite(values)
         if known.sum() < 2:
             return None
-        return float(np.sqrt(max(self.stops[known].var() - np.mean(self.errors[known] ** 2), 0.0)))
+        return float(np.sqrt(max(values[known].var() - np.mean(self.errors[known] ** 2), 0.0)))
+
+
+def _apart(viewmats: np.ndarray) -> np.ndarray:
+    """Return how far cameras are apart: in median distances from their middle, plus the angle in radians. [V, V]"""
+    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
+    scale = np.median(np.linalg.norm(centers - centers.mean(axis=0), axis=1))
+    moved = np.linalg.norm(centers[:, None] - centers, axis=2) / max(float(scale), 1e-12)
+    apart = moved + np.arccos(np.clip(axes @ axes.T, -1.0, 1.0))
+    np.fill_diagonal(apart, np.inf)
+    return apart
 
 
 def exposures(levels: Sequence[np.ndarray], seen: Sequence[np.ndarray]) -> Exposures:

@@ -192,7 +192,7 @@ def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> 
     """
     import numpy as np
 
-    from pop_fast.data.exposure_drift import DRIFT, exposures_of
+    from pop_fast.data.exposure_drift import UNEVEN, exposures_of
     from pop_fast.data.normalize import neighbour_degrees
     from pop_fast.data.photo_quality import DRIFT_STOPS
 
@@ -209,10 +209,10 @@ def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> 
             wanted.append(("depth_lambda", weight, text))
         elif "depth_lambda" not in _said(config):
             why.append(f"{few}, and depth is not held to sparse points: the capture has no tracks of them")
-    found = exposures_of(capture).drift
+    found = exposures_of(capture).unevenness(np.stack([view.viewmat for view in capture.views]))
     drifts = []
-    if found is not None and found > DRIFT:
-        drifts.append(f"the same points differ by {found:.2f} stops from photograph to photograph")
+    if found is not None and found > UNEVEN:
+        drifts.append(f"the same points differ by {found:.2f} stops from those of photographs taken next to them")
     if stops is not None and stops > DRIFT_STOPS:
         drifts.append(f"their exposures are {stops:.1f} stops apart")
     if drifts and config.batch_size == 1:

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from pop_fast.data import Capture, load_capture
-from pop_fast.data.exposure_drift import DRIFT, GAMMA, exposures, exposures_of, levels_at
+from pop_fast.data.exposure_drift import GAMMA, UNEVEN, Exposures, exposures, exposures_of, levels_at
 from pop_fast.demo import make_demo
 from pop_fast.train import TrainConfig
 from pop_fast.train.automatic import choose_terms
+from tests.app.captures import ring
 from tests.app.conftest import Pop
 
 _N_VIEWS, _N_POINTS = 30, 400
@@ -62,6 +63,21 @@ def test_photographs_of_nothing_in_common_do_not_drift(seed: int) -> None:
     levels = [rng.normal(-2.0, 1.0, 40) for _ in seen]
     assert np.nanstd(exposures(levels, seen).stops) > 0.15
     assert (exposures(levels, seen).drift or 0.0) < 0.1
+
+
+def test_what_changes_from_place_to_place_is_no_unevenness() -> None:
+    viewmats = ring(_N_VIEWS)
+    slow = np.sin(np.linspace(0.0, 2.0 * np.pi, _N_VIEWS, endpoint=False))
+    order = np.random.default_rng(0).permutation(_N_VIEWS)
+    for stops, low, high in ((slow, 0.0, 0.1), (slow[order], 0.6, 1.2), (np.zeros(_N_VIEWS), 0.0, 0.001)):
+        found = Exposures(stops, np.full(_N_VIEWS, 0.01))
+        assert found.drift == pytest.approx(stops.std(), abs=0.01)
+        assert low <= (found.unevenness(viewmats) or 0.0) < high
+    # photographs in another order are the same photographs
+    assert Exposures(slow[order], np.zeros(_N_VIEWS)).unevenness(viewmats[order]) == pytest.approx(
+        Exposures(slow, np.zeros(_N_VIEWS)).unevenness(viewmats)
+    )
+    assert Exposures(slow[:4], np.zeros(4)).unevenness(viewmats[:4]) is None
 
 
 def test_a_photograph_that_shares_no_points_has_no_exposure() -> None:
@@ -126,7 +142,7 @@ def test_data_check_says_what_training_will_do(pop: Pop, folder: Path, tmp_path:
     assert line.startswith("LOOK")
     told = float(line.partition("differ by ")[2].split()[0])
     assert told == pytest.approx(stops.std(), abs=0.1)
-    assert told > DRIFT
+    assert float(line.partition("one differs by ")[2].split(";")[0]) > UNEVEN
     darkest, brightest = paths[int(stops.argmin())].name, paths[int(stops.argmax())].name
-    assert re.search(rf"photograph, -0\.\d+ \({darkest}\) to \+0\.\d+ \({brightest}\); ", line)
+    assert re.search(rf"photograph, -0\.\d+ \({darkest}\) to \+0\.\d+ \({brightest}\); from ", line)
     assert line.endswith("; lock the exposure, or train with --exposure")

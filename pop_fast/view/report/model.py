@@ -11,7 +11,6 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from pop_fast.data.exposure_drift import DRIFT
 from pop_fast.view.report.checks import Checks
 from pop_fast.view.report.curves import Window
 from pop_ref.settings import Recipe
@@ -22,6 +21,7 @@ _OVERFITTED: Final = 6.0
 _FELL: Final = 0.3  # dB between the best held-out measurement and the last
 _FEW: Final = 20
 _FAR_APART: Final = 15.0  # degrees between neighbouring cameras
+_DRIFT: Final = 0.15  # stops, standard deviation over the photographs
 _ONE_OFF: Final = 0.35  # stops, of a single photograph
 _FLOATERS: Final = 0.01  # of the pixels
 _VEIL: Final = 0.25  # of the pixels of a view, which is then hidden
@@ -181,7 +181,7 @@ def _exposure(checks: Checks) -> Iterator[Finding]:
     ends = f"{values[low]:+.2f} ({names[low]}) to {values[high]:+.2f} stops ({names[high]})"
     matched, measured = checks.matched_psnr, checks.held_out_psnr
     won = 0.0 if matched is None or measured is None else matched - measured
-    if spread < DRIFT and np.abs(values).max() < _ONE_OFF and won < _WON:
+    if spread < _DRIFT and np.abs(values).max() < _ONE_OFF and won < _WON:
         text = f"Even: photographs differ from the splat by {ends}, standard deviation {spread:.2f}."
         yield Finding("good", "Exposure", text)
         return
@@ -189,10 +189,10 @@ def _exposure(checks: Checks) -> Iterator[Finding]:
     if matched is not None and measured is not None:
         gain = f" Scaling each held-out render to its photograph's brightness gives {matched:.2f} dB instead "
         gain += f"of {measured:.2f}."
-    what = "It drifts" if spread >= DRIFT or won >= _WON else "Even, but for some"
+    what = "It drifts" if spread >= _DRIFT or won >= _WON else "Even, but for some"
     text = f"{what}: photographs differ from the splat by {ends}, standard deviation {spread:.2f}.{gain}"
     text += " Lock exposure and white balance next time; for these photographs, learn each one's."
-    yield Finding("bad" if spread > 2.0 * DRIFT else "look", "Exposure", text, ("train", "DATA", "--exposure"))
+    yield Finding("bad" if spread > 2.0 * _DRIFT else "look", "Exposure", text, ("train", "DATA", "--exposure"))
 
 
 def _floating(checks: Checks) -> Iterator[Finding]:
