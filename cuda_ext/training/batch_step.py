@@ -50,8 +50,9 @@ _SUMS: Final = 9
 # what is sent of a splat, and what comes back of it, floats: a record, depth, conic, extents and row; sums and a count
 SENT: Final = _RECORD + 1 + 3 + 2 + 1
 RETURNED: Final = _SUMS + 1
-# the POP term is told as a sum of whole numbers, which no order changes
+# the POP term and the regularizers are told as sums of whole numbers, which no order changes; scales have no bound
 _POP_UNIT: Final = 2.0**30
+_OWN_UNIT: Final = 2.0**20
 # sides of the POP term, `PopSide` of csrc/polarization.cuh
 _IMPORTANT, _OTHER = 1, 2
 
@@ -317,7 +318,11 @@ class BatchTrainer:
             pointers = pointer("state", state, "int32"), stream_of(self.device)
             load().update(given, camera, how, of.rows.drawn.struct(), *pointers)
         weight = self.settings.lambda_pop / _POP_UNIT if phase.pop else 0.0
-        return [weight * (a / max(n_a, 1) + b / max(n_b, 1)) + c / _POP_UNIT for n_a, n_b, a, b, c in totals.tolist()]
+        own_weights = [w / _OWN_UNIT for w in regularizers(self.settings, phase, self._bounds[-1]).values()]
+        return [
+            weight * (a / max(n_a, 1) + b / max(n_b, 1)) + sum(w * c for w, c in zip(own_weights, own, strict=True))
+            for n_a, n_b, a, b, *own in totals.tolist()
+        ]
 
     def _take_counts(self, of: _Place, back: Tensor) -> None:
         self._counts.zero_()
@@ -327,9 +332,9 @@ class BatchTrainer:
         """Settle who of own rows is important in a view.
 
         Returns:
-            How many are, how many are not, the terms of both, and the weighted regularizers. [5]
+            How many are, how many are not, the terms of both, and the sums of the regularizers. [7]
         """
-        own = self._regularized(of.rows, phase).mul(_POP_UNIT).round().long()
+        own = _regularized(of.rows)
         if not phase.pop:
             return torch.cat((torch.zeros(4, dtype=torch.int64, device=self.device), own))
         self._begin(place)
@@ -344,11 +349,11 @@ class BatchTrainer:
         whole = terms.mul(_POP_UNIT).round().long().sum(1)
         return torch.cat((state[[N_IMPORTANT, N_OTHERS]].long(), whole, own))
 
-    def _regularized(self, rows: RowBuffers, phase: Phase) -> Tensor:
-        """Sum what own Gaussians add to the loss by themselves. float64 [1]"""
-        weights = regularizers(self.settings, phase, self._bounds[-1])
-        logits = rows.params["opacities"].double()
-        opacities, softplus = torch.sigmoid(logits), torch.nn.functional.softplus
-        entropies = opacities * softplus(-logits) + (1.0 - opacities) * softplus(logits)
-        terms = {"entropy": entropies, "opacity": opacities, "scale": rows.params["scales"].double().exp()}
-        return torch.stack([weight * terms[name].sum() for name, weight in weights.items()]).sum(0, keepdim=True)
+
+def _regularized(rows: RowBuffers) -> Tensor:
+    """Sum what Gaussians add to the loss by themselves, without weights, in the order of `regularizers`. int64 [3]"""
+    logits = rows.params["opacities"].double()
+    opacities, softplus = torch.sigmoid(logits), torch.nn.functional.softplus
+    entropies = opacities * softplus(-logits) + (1.0 - opacities) * softplus(logits)
+    terms = (entropies, opacities, rows.params["scales"].double().exp().sum(1))
+    return torch.stack([term.mul(_OWN_UNIT).round().long().sum() for term in terms])
