@@ -3,6 +3,7 @@
 from pop_ref.conformance.mutants.baselines import BASELINES
 from pop_ref.conformance.mutants.black_box import BLACK_BOXES as SINGLE
 from pop_ref.conformance.mutants.black_box import BlackBox
+from pop_ref.conformance.mutants.collected import COLLECTED
 from pop_ref.conformance.mutants.combined import COMBINED
 from pop_ref.conformance.mutants.copies import Mutant, living
 from pop_ref.conformance.mutants.geometry import GEOMETRY
@@ -15,7 +16,7 @@ from pop_ref.conformance.mutants.training import TRAINING
 
 # of the oracle, and of the program that trains
 MUTANTS = (*GEOMETRY, *PIXELS, *TRAINING, *BASELINES, *METHOD_MUTANTS)
-PROGRAM = (*LINES, *TRAINERS)
+PROGRAM = (*LINES, *TRAINERS, *COLLECTED)
 # behind gsplat's signature: one argument broken, several together; autograd, memory, size
 BLACK_BOXES = (*SINGLE, *COMBINED, *SEAMS, *TRAINERS_BOXES)
 
