@@ -221,7 +221,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, Any, Any]:
-    """Tell of a broken law what its report says, and where a rasterizer's own error comes from; `--tb` asks for more."""
+    """Tell of a broken law what its report says, and where its error was raised, unless --tb is given."""
     report = yield
     usual = item.config.getoption("tbstyle") == "auto" and _chosen(item.config)
     if report.failed and call.excinfo is not None and "law" in dict(item.user_properties) and usual:
@@ -233,13 +233,24 @@ def _told(error: BaseException) -> list[str]:
     """Return the lines that tell of an error: its words, its notes, and the last lines of code outside the kit."""
     first, *rest = str(error).splitlines() or [""]
     lines = [f"{type(error).__name__}: {first}", *rest]
-    kit = str(Path(__file__).parent)
     cause = error.__cause__ or error
-    outside = [at for at in traceback.extract_tb(cause.__traceback__)
-               if not at.filename.startswith(kit) and not re.search(r"[/\\](_pytest|pluggy|hypothesis)[/\\]", at.filename)
-               ]  # fmt: skip
+    inside = re.compile(re.escape(str(Path(__file__).parent)) + r"|[/\\](_pytest|pluggy|hypothesis)[/\\]")
+    outside = [at for at in traceback.extract_tb(cause.__traceback__) if not inside.search(at.filename)]
     lines += [f"raised at {at.filename}:{at.lineno}: {at.line}" for at in outside[-2:]]
     return [*lines, *(line for note in getattr(error, "__notes__", ()) for line in note.splitlines())]
+
+
+def _cause(text: str) -> str:
+    """Return what a failure's report names as its cause, or what differs first."""
+    told = dict(line.split(": ", 1) for line in DIFFERENCES.findall(text) if line.startswith("first "))
+    if "first cause" in told:
+        return f"{told['first cause']}: {told['first difference']}"
+    first = next(iter(told.items()), None)
+    return text.splitlines()[0].removeprefix("E").strip() if first is None else ": ".join(first)
+
+
+def _law_of(report: Any) -> str:
+    return dict(report.user_properties)["law"][2].replace("_", " ")
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
@@ -250,15 +261,9 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
           for kind in ("passed", "failed", "skipped")}  # fmt: skip
     causes: dict[str, list[str]] = {}
     for report in of["failed"]:
-        told = [line for line in DIFFERENCES.findall(report.longreprtext) if line.startswith("first ")][:2]
-        cause = (
-            ": ".join(line.partition(": ")[2] for line in reversed(told))
-            or report.longreprtext.splitlines()[0].removeprefix("E").strip()
-        )
-        causes.setdefault(cause, []).append(dict(report.user_properties)["law"][2].replace("_", " "))
+        causes.setdefault(_cause(report.longreprtext), []).append(_law_of(report))
     terminalreporter.section("conformance")
-    counts = ", ".join(f"{len(of[kind])} {words}" for kind, words in
-                       (("passed", "laws hold"), ("failed", "are broken"), ("skipped", "are not judged")))  # fmt: skip
+    counts = f"{len(of['passed'])} laws hold, broken {len(of['failed'])}, not judged {len(of['skipped'])}"
     terminalreporter.write_line(f"{_chosen(config)}: {counts}")
     for cause, laws in sorted(causes.items(), key=lambda pair: -len(pair[1])):
         terminalreporter.write_line(f"  {cause}")
