@@ -48,7 +48,7 @@ FACTORS: Final[dict[str, tuple[Level, ...]]] = {
         ("1", {}), ("2", {"count": 2}), ("3", {"count": 3}), ("2, the first sees nothing", {"count": 2, "blind": 0}),
         ("2, the last sees nothing", {"count": 2, "blind": 1}),
     ),
-    "batch": _levels(("none", {}), ("[2]", {"batch": (2,)}), ("[1, 2]", {"batch": (1, 2)})),
+    "batch": _levels(("none", {}), ("[1]", {"batch": (1,)}), ("[2]", {"batch": (2,)}), ("[1, 2]", {"batch": (1, 2)})),
     "packed": _levels(("False", {}), ("True", {"packed": True})),
     "colors": _levels(
         ("harmonics of degree 1", {}), ("harmonics of degree 0", {"degree": 0}),
