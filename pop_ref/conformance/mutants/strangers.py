@@ -28,8 +28,7 @@ _LINES: Final = (
     ),
     (
         "gradients_by_the_longer_side",
-        "both components of the screen gradient are scaled by the longer side (OpenSplat and splatfacto, "
-        "0.5 * max(width, height))",
+        "both components of the screen gradient are scaled by the longer side (OpenSplat, splatfacto)",
         "density/control.py",
         'unit = grads.new_tensor([0.5 * info["width"] * cameras, 0.5 * info["height"] * cameras])',
         'unit = grads.new_tensor([0.5 * max(info["width"], info["height"]) * cameras] * 2)',
@@ -37,8 +36,7 @@ _LINES: Final = (
     ),
     (
         "blurred_of_any_size_are_split",
-        "a second criterion is put behind the bound of size and passes it by (Gaussian-Splatting-with-Stochastic-Solids"
-        "#14)",
+        "a second criterion passes the bound of size by (Gaussian-Splatting-with-Stochastic-Solids#14)",
         "stages/density.py",
         "return (by_grad | by_blur) & small, (by_grad | by_blur) & ~small",
         "return (by_grad | by_blur) & small, (by_grad & ~small) | by_blur",
@@ -70,8 +68,7 @@ _LINES: Final = (
     ),
     (
         "adam_counts_the_training",
-        "the bias correction takes the training's iteration for the number of updates (fused Adam kernels that are "
-        "handed it)",
+        "the bias correction is of the training's iteration, not of the updates (fused Adam kernels)",
         "train/model.py",
         "counter.fill_(float(number - 1))",
         "counter.fill_(float(step))",
@@ -184,8 +181,7 @@ _LINES: Final = (
     ),
     (
         "smaller_views_without_rounding",
-        "a smaller view has a whole number of pixels and focal lengths of the quotient (nerfstudio's "
-        "rescale_output_resolution)",
+        "pixels of a smaller view are rounded, its K is not (nerfstudio's rescale_output_resolution)",
         "density/passes.py",
         "K[1] *= height / view.height",
         "K[1] /= divisor",
@@ -337,11 +333,6 @@ def _alphas_without_gradient(sound: Rasterization, given: Given) -> Any:
     return images, alphas.detach(), meta
 
 
-def _below(given: Given) -> Given:
-    clip = float(given["radius_clip"])
-    return {"radius_clip": clip * (1.0 - 2.0**-20)}
-
-
 _BOXES: Final = (
     (
         "render_at_most_white",
@@ -369,7 +360,7 @@ _BOXES: Final = (
     ),
     (
         "one_gaussian_fails",
-        "of a single Gaussian an axis is squeezed away (GaussianSplats3D PR#264: only one splat)",
+        "of a single Gaussian an axis is squeezed away (GaussianSplats3D PR#264)",
         _fails(lambda given: given["means"].shape[-2] == 1, "squeeze"),
         "test_agreement:the_image_is_one_of_the_oracles_outcomes",
     ),
@@ -405,8 +396,7 @@ _BOXES: Final = (
     ),
     (
         "absolute_of_the_sum",
-        "packed rows have the absolute value of the sum for the sum of absolute values "
-        "(absolute gradients untested: fvdb-core#354)",
+        "packed rows have the absolute value of the sum, not the sum of absolute values (fvdb-core#354)",
         _absolute_of_the_sum,
         "test_signature_cameras:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same",
     ),
@@ -424,8 +414,7 @@ _BOXES: Final = (
     ),
     (
         "background_of_the_call_before",
-        "without backgrounds those of the call before are behind (a buffer that stays; "
-        "splatfacto's background in evaluation)",
+        "without backgrounds those of the call before are behind (splatfacto's background in evaluation)",
         _background_of_the_call_before(),
         "test_signature_arguments:without_a_background_it_is_black",
     ),
@@ -450,7 +439,7 @@ _BOXES: Final = (
     (
         "radius_clip_exclusive",
         "who is exactly as large as radius_clip is drawn (gsplat compares with <=)",
-        _given(_below),
+        _given(lambda given: {"radius_clip": given["radius_clip"] * (1.0 - 2.0**-20)}),
         "test_signature_arguments:what_is_no_larger_than_radius_clip_is_culled",
     ),
 )
