@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import os
 import pkgutil
 from collections.abc import Iterable
 from typing import Any
@@ -15,6 +16,8 @@ from pop_ref.conformance.backends import SHIPPED, Absent, shipped, shipped_or_ab
 from pop_ref.conformance.law import missing
 from pop_ref.conformance.plugin import parametrize_backends
 
+# what is dear is judged in one precision, every night in both (.github/workflows/nightly.yml)
+EVERY_PRECISION = os.environ.get("POP_EVERY_PRECISION") == "1"
 # test_alpha is written alpha
 LAW_MODULES = tuple(sorted(m.name.removeprefix("test_") for m in pkgutil.iter_modules(laws.__path__)))
 
@@ -41,6 +44,9 @@ def judge_own_backends(metafunc: pytest.Metafunc) -> None:
     everywhere, compiled = own_backends()
     if metafunc.cls is not None and metafunc.cls.__name__ == "TestAgreement":
         everywhere = [backend for backend in everywhere if backend.name != "oracle"]
+    if metafunc.cls is not None and metafunc.cls.__name__ == "TestSignaturePairs" and not EVERY_PRECISION:
+        # most of the time is the oracle's, once for each precision
+        everywhere, compiled = ([b for b in of if b.name not in ("fast64", "compiled32")] for of in own_backends())
     concerned = [b for b in compiled if isinstance(b, Absent) or not (stated and missing(b, stated.needs))]
     parametrize_backends(metafunc, [*everywhere, *concerned])
 
