@@ -42,11 +42,12 @@ def judge_own_backends(metafunc: pytest.Metafunc) -> None:
     """
     stated = getattr(metafunc.function, "law", None)
     everywhere, compiled = own_backends()
-    if metafunc.cls is not None and metafunc.cls.__name__ == "TestAgreement":
-        everywhere = [backend for backend in everywhere if backend.name != "oracle"]
-    if metafunc.cls is not None and metafunc.cls.__name__ == "TestSignaturePairs" and not EVERY_PRECISION:
+    name = "" if metafunc.cls is None else metafunc.cls.__name__
+    left_out = {"oracle"} if name in ("TestAgreement", "TestSignaturePairs") else set[str]()
+    if name == "TestSignaturePairs" and not EVERY_PRECISION:
         # most of the time is the oracle's, once for each precision
-        everywhere, compiled = ([b for b in of if b.name not in ("fast64", "compiled32")] for of in own_backends())
+        left_out |= {"fast64", "compiled32"}
+    everywhere, compiled = ([b for b in of if b.name not in left_out] for of in (everywhere, compiled))
     concerned = [b for b in compiled if isinstance(b, Absent) or not (stated and missing(b, stated.needs))]
     parametrize_backends(metafunc, [*everywhere, *concerned])
 
